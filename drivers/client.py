@@ -40,8 +40,8 @@ from rig.transport import DEFAULT_ENDPOINT, Client
 
 _PATIENCE_S = 10.0
 """How long a rig that runs may send nothing [s]."""
-_STEP_S = 20.0
-"""How long a step may take, and ten times what it simulates [s]."""
+_TURN_S = 600.0
+"""How long a device may wait for those before it by name to be done with a block [s]."""
 
 
 class NotSeenError(TimeoutError):
@@ -318,18 +318,20 @@ class Rig(Console):
         """Join, and be done with each block when the next one is asked for."""
         blocks = self._blocks = self._blocks or Blocks(self._client, self.daq, self._name)
         begin, self._joined = self.join(patience_s=patience_s).tick, True
+        usual_s, self._timeout_s = self._timeout_s, _TURN_S if self._steps else self._timeout_s
         try:
             while (end := blocks.next()) is not None:
                 if end.tick > begin:
                     yield from blocks.rows(end)
                     self.done(end.tick)
         except RefusedError as error:
-            if "a run that ended" not in str(error):
+            if wire.ENDED not in str(error):
                 raise
         except ConnectionError:
             if self.daq.ended is None:
                 raise
         finally:
+            self._timeout_s = usual_s
             self._part()
 
     def _part(self) -> None:
@@ -383,8 +385,7 @@ class Rig(Console):
     def _step(self, ticks: float) -> None:
         """Step by whole blocks, so many ticks at least."""
         whole = math.ceil(ticks / self._block_ticks - 1e-9) * self._block_ticks
-        # A rig that was killed never answers.
-        taken = self.step(whole, timeout_s=_STEP_S + 10.0 * whole / self._tick_rate_hz)
+        taken = self.step(whole)
         self._at = taken.tick
         self.lost |= taken.lost
 
@@ -419,10 +420,8 @@ class Rig(Console):
             self._seen.append(event)
 
     def _on_event(self, _: str, payload: bytes) -> None:
-        try:
+        with contextlib.suppress(ValueError):
             self._events.put(event_in(payload))
-        except ValueError:
-            return
 
     # ---- the truth, by name ----
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
 from collections.abc import Mapping
@@ -11,7 +12,7 @@ from typing import Any, Self
 from rig import wire
 from rig.closing import Closing
 from rig.errors import InputError, RefusedError
-from rig.transport import DEFAULT_ENDPOINT, Client
+from rig.transport import DEFAULT_ENDPOINT, Client, NoReplyError
 
 
 @dataclass(frozen=True, slots=True)
@@ -261,6 +262,14 @@ class Console(Closing):
         """By which certificates the rig and this console know each other; None without TLS."""
         return getattr(self._client, "connection", None)
 
+    def _waited_for(self) -> str:
+        """Devices that a rig which is there waits for, in words."""
+        with contextlib.suppress(NoReplyError):
+            rows = self.status().get("devices", ()) if self._client.rig is not None else ()
+            if late := [f"{row['name']} ({row['behind_s']:.0f} s)" for row in rows if row.get("behind_s")]:
+                return f"; it waits for {', '.join(late)}"
+        return ""
+
     def _command(self, command: str, timeout_s: float | None = None, /, **fields: Any) -> Accepted:
         reply = self._reply(command, timeout_s, **fields)
         return Accepted(command=command, id=reply["id"], tick=reply["tick"], time_s=reply["time_s"])
@@ -270,7 +279,10 @@ class Console(Closing):
             if isinstance(value, float) and not math.isfinite(value):
                 raise InputError(name, "a finite number", value)
         request = wire.encode_document({"from": self._name, **fields})
-        payload = self._client.request(wire.command_key(command), request, timeout_s=timeout_s or self._timeout_s)
+        try:
+            payload = self._client.request(wire.command_key(command), request, timeout_s=timeout_s or self._timeout_s)
+        except NoReplyError as error:
+            raise NoReplyError(f"{error}{self._waited_for()}") from None
         reply = wire.decode_document(payload)
         if not reply.get("accepted"):
             raise RefusedError(str(reply.get("error", f"the rig refused {command} without a reason")))

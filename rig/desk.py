@@ -28,6 +28,8 @@ REQUEST_BYTES = 10_000
 _PENDING_COMMANDS = 256
 _AT_ONCE = 64
 """Commands that are taken between two blocks: they take some ms."""
+_TAKEN_BYTES = 500_000
+"""What is told to latecomers of the commands so far."""
 _KINDS = 100
 """Kinds of warnings that become events; the status shows the latest of the others too."""
 _FIGURES = re.compile(r"\d+(\.\d+)?(e[-+]?\d+)?")
@@ -278,6 +280,29 @@ class Desk:
     def troubles(self) -> list[str]:
         """What failed, the latest of each place."""
         return list(self._troubles.values())
+
+
+class Kept:
+    """Commands that a run took, for latecomers, within bounds: the oldest go first, and are counted."""
+
+    def __init__(self) -> None:
+        self.told: dict[str, Any] = {"taken": ()}
+        """For the scene document, from any thread: `taken`, and how many of these are `forgotten`."""
+        self._bytes = 0
+
+    def add(self, taken: dict[str, Any]) -> None:
+        """Keep one more."""
+        rows, forgotten = (*self.told["taken"], taken), self.told.get("forgotten", 0)
+        self._bytes += _size(taken)
+        while self._bytes > _TAKEN_BYTES:
+            self._bytes -= _size(rows[0])
+            rows, forgotten = rows[1:], forgotten + 1
+        # A new one, as other threads read it.
+        self.told = {"taken": rows, **({"forgotten": forgotten} if forgotten else {})}
+
+
+def _size(taken: dict[str, Any]) -> int:
+    return len(wire.encode_document(taken))
 
 
 class _Signed(Outside):

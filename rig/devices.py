@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 from rig.errors import InputError
 
 _MOST = 64
 """Devices that are told of; of those that are lost, the ones lost longest ago are forgotten first."""
+
+
+class Said(Protocol):
+    """What a client has said: a command, by the name that it gives itself."""
+
+    command: str
+    sender: str
 
 
 @dataclass(slots=True)
@@ -18,6 +26,8 @@ class _Device:
     tick: int
     """End of the last block that it is done with."""
     lost: str | None = None
+    since_s: float = 0.0
+    """When it last had to wait for others, where that is behind the end of the block [s, monotonic]."""
 
 
 class Devices:
@@ -86,31 +96,64 @@ class Devices:
         del self._devices[name]
         self._tell()
 
-    def behind(self, end: int) -> bool:
-        """Whether any is not yet done with the block that ends at a tick."""
-        return any(device.lost is None and device.tick < end for device in self._devices.values())
+    def behind(self, end: int) -> list[str]:
+        """Those that are not yet done with the block that ends at a tick."""
+        return [name for name, device in self._devices.items() if device.lost is None and device.tick < end]
 
-    def put_out_late(self, end: int, waited_s: float) -> dict[str, str]:
-        """Put out who was not done in time with the block that ends at a tick; returns the reasons by name."""
-        late = [
-            name
-            for name, device in self._devices.items()
-            if device.lost is None and device.tick < end and waited_s >= device.patience_s
+    def first_due(self, waiting: Sequence[Said], end: int) -> int | None:
+        """Place of the first that can be taken of what was said; None where all wait.
+
+        Whose comes first of two devices must not be chance: what one commands is taken once those before it by name are
+        done with the block that ends at a tick. That it is done itself is taken behind what it has commanded.
+        """
+        behind = self.behind(end)
+        for place, said in enumerate(waiting):
+            own = self._devices.get(said.sender)
+            if said.command == "done":
+                waits = any(before.sender == said.sender for before in waiting[:place])
+            else:
+                waits = own is not None and own.lost is None and any(other < said.sender for other in behind)
+            if not waits:
+                return place
+        return None
+
+    def put_out_late(self, end: int, since_s: float, now_s: float, waiting: Set[str]) -> tuple[dict[str, str], float]:
+        """Put out who is not done in time with the block that ends at a tick.
+
+        Args:
+            end: That tick.
+            since_s: When they were told that the block is over [s].
+            now_s: Now [s].
+            waiting: Devices that wait for others, so that their time has not begun.
+
+        Returns:
+            The reasons by name, and how long it is until the next one is late [s].
+        """
+        late, left_s = dict[str, str](), math.inf
+        for name in self.behind(end):
+            device = self._devices[name]
+            if name in waiting:
+                device.since_s = now_s
+            left = device.patience_s - (now_s - max(since_s, device.since_s))
+            if left <= 0.0:
+                within = f"within {device.patience_s:g} s"
+                late[name] = self._put_out(name, f"it was not done with the block that ends at tick {end} {within}")
+            else:
+                left_s = min(left_s, left)
+        return late, left_s
+
+    def told(self, over: int, since_s: float, now_s: float) -> list[dict[str, Any]]:
+        """Rows for the status, with how long each that is joined has been behind [s]; from any thread.
+
+        Args:
+            over: End of the last block that they were told is over [ticks].
+            since_s: When they were told [s].
+            now_s: Now [s].
+        """
+        return [
+            {**row, "behind_s": round(now_s - since_s, 3) if row["reason"] is None and row["tick"] < over else 0.0}
+            for row in self.rows
         ]
-        return {
-            name: self._put_out(
-                name,
-                f"it was not done with the block that ends at tick {end} within {self._devices[name].patience_s:g} s",
-            )
-            for name in late
-        }
-
-    def patience_s(self, end: int) -> float:
-        """The shortest patience with those who are not yet done [s]."""
-        return min(
-            (device.patience_s for device in self._devices.values() if device.lost is None and device.tick < end),
-            default=0.0,
-        )
 
     def _joined(self, command: str, name: str) -> _Device:
         device = self._devices.get(name)

@@ -67,11 +67,11 @@ class Written(BaseModel):
 
 
 def a_line(most: int) -> AfterValidator:
-    """Text of 1 to so many characters, without line breaks and without anything that a terminal would act on."""
+    """Text of 1 to so many characters, not all blank, without line breaks or anything that a terminal would act on."""
 
     def check_line(text: str) -> str:
-        if not text.isprintable() or not 1 <= len(text) <= most:
-            raise ValueError(f"a line of 1 to {most} printable characters")
+        if not text.isprintable() or not text.strip() or len(text) > most:
+            raise ValueError(f"a line of 1 to {most} printable characters, not all blank")
         return text
 
     return AfterValidator(check_line)
@@ -321,6 +321,7 @@ def input_error(error: ValidationError, where: str, model: type[BaseModel]) -> I
     field = ".".join(part for part in (where, *_place(first["loc"], first["type"])) if part)
     message = first["msg"].removeprefix("Value error, ").removeprefix("Input should be ").partition(", unable")[0]
     message = re.sub(r"^\w+ should have ", "a value of ", message).replace("a valid tuple", "a list")
+    message = message.partition(" after validation, not ")[0]
     if first["type"] == "union_tag_invalid":
         context = first.get("ctx", {})
         name = str(context.get("discriminator")).strip("'")

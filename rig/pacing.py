@@ -295,7 +295,9 @@ class Lockstep(Clock):
             while self._allowed == 0 and not self._woken:
                 left_s = self._timeout_s - (self._now_ns() - self._idle_since_ns) / _NS
                 if left_s <= 0:
-                    raise StepTimeoutError(f"no step was granted within {self._timeout_s:g} s")
+                    raise StepTimeoutError(
+                        f"no step was granted within {self._timeout_s:g} s, after which a rig in lockstep ends"
+                    )
                 self._wait(self._changed, left_s)
             self._woken = False
             granted = min(self._allowed, ticks)

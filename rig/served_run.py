@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from rig import wire
@@ -88,6 +88,10 @@ class ServedRun(ABC):
         Raises:
             InputError: It cannot be done.
         """
+
+    def _arrived(self) -> Iterator[Pending]:
+        """The commands that have come, in the order in which they are taken."""
+        return self._desk.taken()
 
     @abstractmethod
     def _warn(self, text: str) -> None:
@@ -193,7 +197,7 @@ class ServedRun(ABC):
     def _take_commands(self) -> list[dict[str, Any]]:
         """Carry out all commands that have arrived; returns the events that tell of them."""
         events = []
-        for pending in self._desk.taken():
+        for pending in self._arrived():
             try:
                 event = self._carry_out(pending)
                 if event is not None:

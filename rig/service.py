@@ -11,13 +11,13 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from rig import wire
 from rig.bounded_queue import BoundedQueue
-from rig.desk import Done, Join, Leave, Note, Pending, Step
+from rig.desk import Done, Join, Kept, Leave, Note, Pending, Step
 from rig.devices import Devices
 from rig.errors import InputError, Words
 from rig.faults import DOORS, Message
@@ -41,10 +41,12 @@ _STEP_S = 3600
 """Longest single step [s of simulated time]."""
 _HELD_S = 0.1
 """How long devices are waited for at a time, where none of them must be put out sooner [s]."""
+_WAITING = 256
+"""Commands that may wait for other devices."""
+_ANY_HZ = 1e9
+"""Commands a second of one sender in lockstep: any."""
 _HELD_UP_S = 1.0
 """Blocks that wait to be published for longer than this are told [s]."""
-_TAKEN_BYTES = 500_000
-"""What is told to latecomers of the commands so far; the oldest go first, and are counted."""
 
 
 @dataclass(slots=True)
@@ -79,7 +81,7 @@ class Service(ServedRun):
             with one client that stalls in the middle of its recovery.
         status_period_s: Wall time between status messages [s].
         linger_s: At the end of a run, wait at most this long [s] until clients have recovered what they missed.
-        limit: How many commands a second are taken.
+        limit: How many commands a second are taken; in lockstep any unless given.
 
     Raises:
         InputError: `block_ticks` does not fit the simulation.
@@ -111,7 +113,8 @@ class Service(ServedRun):
             },
             running="the rig runs",
             linger_s=linger_s,
-            limit=limit,
+            # In lockstep nobody is held up by many, and none may be refused by the clock on the wall.
+            limit=limit or (CommandLimit(_ANY_HZ) if isinstance(clock, Lockstep) else None),
         )
         simulation.serve(tuple(doors_of(server)))
         self._simulation = simulation
@@ -130,11 +133,10 @@ class Service(ServedRun):
         self._health: dict[str, Any] = {}
         self._next_health_s = 0.0
 
-        self._taken: tuple[dict[str, Any], ...] = ()
+        self._kept = Kept()
         """Commands that the simulation took: whoever comes later cannot run the scene again without them."""
-        self._taken_bytes = 0
-        self._forgotten = 0
-        """Of these, how many are no longer told."""
+        self._waiting: list[Pending] = []
+        """Commands of devices that wait for those of others."""
         self._steps: list[tuple[int, Pending, dict[str, Any]]] = []
         self._step_target: int | None = None
 
@@ -185,7 +187,7 @@ class Service(ServedRun):
             health=self._health,
             warnings=warnings,
         )
-        return {**status, "devices": list(self._devices.rows)}
+        return {**status, "devices": self._devices.told(*self._over, time.monotonic())}
 
     def _warn(self, text: str) -> None:
         self._queue.push(_Entry([self._event("warning", self._simulation.tick, text=text)]))
@@ -199,8 +201,7 @@ class Service(ServedRun):
         return self._simulation.catalogue(), self._simulation.parameters_document()
 
     def _scene_now(self) -> dict[str, Any]:
-        forgotten = {"forgotten": self._forgotten} if self._forgotten else {}
-        return {**self._scene, "taken": self._taken, **forgotten}
+        return {**self._scene, **self._kept.told}
 
     def _go(self) -> str:
         simulation = self._simulation
@@ -264,14 +265,13 @@ class Service(ServedRun):
 
     def _hold(self, events: list[dict[str, Any]]) -> None:
         """Wait for devices that are not yet done with the last block; who takes too long over it is put out."""
-        tick, (over, since_s) = self._simulation.tick, self._over
+        tick, now_s, (over, since_s) = self._simulation.tick, time.monotonic(), self._over
         # Their time begins when they can know that the block is over.
-        waited_s = time.monotonic() - since_s if over == tick else 0.0
-        late = self._devices.put_out_late(tick, waited_s)
+        since_s = since_s if over == tick else now_s
+        late, left_s = self._devices.put_out_late(tick, since_s, now_s, {each.sender for each in self._waiting})
         self._defer([*events, *(self._device(name, "lost", reason=reason) for name, reason in late.items())])
         if not late:
-            left_s = self._devices.patience_s(tick) - waited_s
-            self._clock.hold(min(left_s, _HELD_S) if over == tick else _HELD_S)
+            self._clock.hold(min(left_s, _HELD_S))
 
     def _device(self, name: str, state: str, **more: Any) -> dict[str, Any]:
         return self._event("device", self._simulation.tick, device=name, state=state, **more)
@@ -282,6 +282,19 @@ class Service(ServedRun):
             text = "the publisher does not keep up: the oldest blocks in the queue are dropped"
             self._queue.push(_Entry([self._event("warning", self._simulation.tick, text=text)]))
         self._overflowing = bool(dropped)
+
+    def _arrived(self) -> Iterator[Pending]:
+        """What has come, of devices in the order of their names: whose comes first of two must not be chance.
+
+        What one of them commands is taken once those before it are done with the block.
+        """
+        for pending in self._desk.taken():
+            if len(self._waiting) < _WAITING:
+                self._waiting.append(pending)
+            else:
+                pending.refuse(InputError("commands", f"at most {_WAITING} that wait for other devices", _WAITING + 1))
+        while (place := self._devices.first_due(self._waiting, self._simulation.tick)) is not None:
+            yield self._waiting.pop(place)
 
     def _carry_out(self, pending: Pending) -> dict[str, Any] | None:
         asked, tick, done_tick = pending.asked, self._simulation.tick, None
@@ -295,7 +308,9 @@ class Service(ServedRun):
         elif not isinstance(asked, Note):
             tick = self._simulation.submit(pending.command, dict(pending.request))
             told = self._simulation.told
-            self._keep({"id": self._accepted + 1, "tick": tick, "command": pending.command, "request": pending.request})
+            self._kept.add(
+                {"id": self._accepted + 1, "tick": tick, "command": pending.command, "request": pending.request}
+            )
         reply = self._accept(pending, tick if done_tick is None else done_tick)
         if done_tick is None:
             pending.answer({**reply, **told})
@@ -335,16 +350,6 @@ class Service(ServedRun):
         if isinstance(self._clock, Lockstep):
             return self._clock
         raise InputError(command, "sent to a rig that runs with --pace lockstep", Words(f"--pace {self._clock.pace}"))
-
-    def _keep(self, taken: dict[str, Any]) -> None:
-        """Remember a command for latecomers, within bounds."""
-        rows = (*self._taken, taken)
-        self._taken_bytes += _size(taken)
-        while self._taken_bytes > _TAKEN_BYTES:
-            self._taken_bytes -= _size(rows[0])
-            rows = rows[1:]
-            self._forgotten += 1
-        self._taken = rows  # a new one, as other threads read it
 
     def _check_step(self, asked: Step) -> int:
         """Grant a step; returns the tick at which it is done."""
@@ -387,7 +392,7 @@ class Service(ServedRun):
             self._desk.warn(text)
 
     def _end(self, reason: str) -> dict[str, Any]:
-        self._desk.close(f"a run that ended: {reason}", [pending for _, pending, _ in self._steps])
+        self._desk.close(f"{wire.ENDED}: {reason}", [*(each for _, each, _ in self._steps), *self._waiting])
         self._end_event = self._event("end", self._simulation.tick, reason=reason)
         self._queue.close()
         if self._publisher.ident is not None:
@@ -476,7 +481,3 @@ class Service(ServedRun):
     def _answer(entry: _Entry) -> None:
         for pending, document in entry.replies:
             pending.answer(document)
-
-
-def _size(taken: dict[str, Any]) -> int:
-    return len(wire.encode_document(taken))

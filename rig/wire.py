@@ -31,6 +31,8 @@ FAULTS = f"{TRUTH}/faults"
 """What is told of faults, row by row: documents, beside the blocks of truth."""
 BLOCK = f"{ROOT}/block"
 """What is told behind all else of a block while devices have joined: that it is over."""
+ENDED = "a run that ended"
+"""What a command that comes too late is told that it met; why it ended follows."""
 COMMAND = f"{ROOT}/command"
 CLIENTS = f"{ROOT}/clients"
 

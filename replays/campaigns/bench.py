@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
 import itertools
 import json
 import math
 import os
-import queue
 import statistics
 import sys
-import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -98,6 +95,18 @@ class BenchSettings:
             "scene": self.scene, "pace": self.pace, "block_ms": self.block_ms, "set": dict(self.set),
             "commands": commands, "duration_s": self.duration_s, "can": self.can,
         }  # fmt: skip
+
+
+def check_replay(path: Path) -> None:
+    """Refuse what no campaign is run on, before anything runs.
+
+    Raises:
+        InputError: It is no recording, or was cut off: what is not in it would be taken for what did not happen.
+    """
+    from recorder.reader import Recording
+
+    if not Recording.open(path).complete:
+        raise InputError("--replay", "a recording that was finished", Words(f"{path}, which was cut off"))
 
 
 class Bench(Closing):
@@ -256,48 +265,24 @@ class Bench(Closing):
             try:
                 reply = self._step(int(ticks))
             except RefusedError as error:
-                if "a run that ended: stopped" in str(error):
+                if f"{wire.ENDED}: stopped" in str(error):
                     return  # as a device may
                 raise BenchError(f"the rig does not go on: {error}") from None
             tick = reply.tick
 
     def _step(self, ticks: int) -> AcceptedStep:
-        """Step the rig, and see whether it still can be.
+        """Step the rig.
 
         Raises:
             BenchError: It has died, or waits for a device for too long.
             RefusedError: It refuses to.
         """
-        answer: queue.SimpleQueue[AcceptedStep | Exception] = queue.SimpleQueue()
-
-        def ask() -> None:
-            try:
-                answer.put(self._console.step(ticks, timeout_s=_STEP_S))
-            except Exception as error:
-                answer.put(error)
-
-        threading.Thread(target=ask, daemon=True).start()
-        since_s, tick = time.monotonic(), -1
-        while True:
-            with contextlib.suppress(queue.Empty):
-                got = answer.get(timeout=_LOOK_S)
-                if isinstance(got, Exception):
-                    raise got
-                return got
-            if self._program is not None and self._program.status is not None:
-                raise BenchError(f"the rig has died (status {self._program.status}): {self._program.last_line}")
-            try:
-                status = self.status()
-            except ConnectionError:
-                continue  # the next look tells why, or the step's own patience
-            if status["tick"] != tick:
-                since_s, tick = time.monotonic(), status["tick"]
-            elif time.monotonic() - since_s > _DEVICE_S:
-                behind = [row["name"] for row in status.get("devices", []) if row["tick"] < tick]
-                waits = ", ".join(behind) or "nobody that has joined"
-                raise BenchError(
-                    f"the rig has stood at {tick / TICKS_HZ:g} s for {_DEVICE_S:g} s: it waits for {waits}"
-                )
+        try:
+            return self._console.step(ticks, timeout_s=_STEP_S)
+        except ConnectionError as error:
+            if self._program is not None and (status := self._program.wait(_DIES_S)) is not None:
+                raise BenchError(f"the rig has died (status {status}): {self._program.last_line}") from None
+            raise BenchError(f"the rig does not go on: {error}") from None
 
     def floor_ms(self) -> tuple[float, float]:
         """Round trips of a request to the rig: median and longest [ms], what a command's latency cannot be below."""
@@ -374,8 +359,9 @@ _SHORT_S = 0.01
 _PIECE = 1_000_000
 """Ticks that are stepped at a time."""
 _STEP_S = 600.0
-_LOOK_S, _DEVICE_S = 1.0, 60.0
-"""How often a rig that is stepped is looked after, and how long it may stand at one time, waiting for a device [s]."""
+"""Longest that a step takes, where it waits for devices that are patient [s]."""
+_DIES_S = 2.0
+"""How soon a rig whose link has gone has ended, if it has [s]."""
 
 
 def _ticks(time_s: float) -> int:

@@ -13,16 +13,17 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import Field, FiniteFloat
+from pydantic import AfterValidator, BeforeValidator, Field, FiniteFloat
 
 from replays.campaigns.bench import BenchSettings, Pace
 from replays.campaigns.device import PLACES, check_program
-from replays.campaigns.expectation import KINDS, Expect, Time, Units
+from replays.campaigns.expectation import KINDS, Expect
 from replays.campaigns.lines import line_of, lines_of
 from replays.campaigns.measurement import split_quantity
+from replays.campaigns.seen import Time, Units
 from rig import units
 from rig.commands import COMMANDS, FaultCommand, TimedCommand, check_command
-from rig.errors import InputError, UnknownNameError, Words
+from rig.errors import InputError, UnknownNameError, Words, such_as
 from rig.faults import channels_of, stream_of
 from rig.faults.blocks import OfBlocks
 from rig.kernels import signals
@@ -38,9 +39,24 @@ _BLOCK_MS = (1.0, 1000.0)
 Line = Annotated[str, Field(min_length=1, max_length=1000)]
 
 
+def _a_name(text: str) -> str:
+    if not re.fullmatch(r"[\w.-]{1,50}", text):
+        raise ValueError("1 to 50 letters, digits, dots, dashes and underscores")
+    return text
+
+
+def _a_quantity(given: Any) -> str:
+    if not isinstance(given, str):
+        raise ValueError("a number with its unit as a text, such as '0.2 mm'")
+    return given
+
+
+Quantity = Annotated[str, BeforeValidator(_a_quantity)]
+
+
 class _Device(Written):
     command: Line
-    name: Annotated[str, Field(pattern=r"^[\w.-]{1,50}$")] = "device"
+    name: Annotated[str, AfterValidator(_a_name)] = "device"
     joins: bool = True
     """Whether it takes part in lockstep; without, the rig does not wait for it."""
     commands: bool = True
@@ -51,7 +67,7 @@ class _Matrix(Written):
     scene: list[str] = Field(default=[])
     set: dict[str, Annotated[list[Any], Field(min_length=1)]] = Field(default={})
     fault: list[dict[str, Any]] = Field(default=[])
-    limits: dict[str, Annotated[list[str], Field(min_length=1)]] = Field(default={})
+    limits: dict[str, Annotated[list[Quantity], Field(min_length=1)]] = Field(default={})
     device: dict[str, Annotated[list[str | int | float], Field(min_length=1)]] = Field(default={})
 
 
@@ -66,7 +82,7 @@ class _File(Written):
     channels: str = ""
     can: bool = False
     device: _Device | None = None
-    limits: dict[str, str] = Field(default={})
+    limits: dict[str, Quantity] = Field(default={})
     matrix: _Matrix = _Matrix()
     steps: list[dict[str, Any]] = Field(default=[])
     expect: Annotated[list[dict[str, Any]], Field(min_length=1)]
@@ -334,7 +350,8 @@ def _filled(value: Any, places: Mapping[str, str], field: str, kept: tuple[str, 
         if name in kept:
             return match[0]
         if name not in places:
-            raise UnknownNameError(field, "of places that are filled in", match[0], [*places, *kept])
+            must = "with names of [limits] or [matrix.device] between braces"
+            raise InputError(field, such_as(must, name, [*places, *kept]), match[0])
         if unit is None:
             return places[name]
         number, own = split_quantity(places[name], field=field)

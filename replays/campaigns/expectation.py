@@ -3,38 +3,30 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
-from pathlib import Path
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, FiniteFloat
+from pydantic import Field
 
 from replays.campaigns.measurement import Measurement, Must, quantity
-from rig import units as units_of
+from replays.campaigns.scored import ExpectScore
+from replays.campaigns.seen import Expected, Seen, Time, Units, asked, in_unit
+from rig.commands import COMMANDS
 from rig.errors import InputError, UnknownNameError, Words
 from rig.outside import Written
+from rig.service import REPLAY_COMMANDS
 
-if TYPE_CHECKING:
-    from recorder.reader import Recording
-    from replays.score.scorecard import Scorecard, ScoreRow
-    from rig.samples import Samples
-
-Time = Annotated[FiniteFloat, Field(ge=0.0, le=86_400.0)]
 Take = Literal[
     "peak", "max", "min", "mean", "rms", "std", "peak to peak", "value", "first beyond", "last beyond", "time beyond",
     "whirl frequency",
 ]  # fmt: skip
 _TIMES = ("first beyond", "last beyond", "time beyond")
-Units = Mapping[str, Mapping[str, str]]
-"""Units of columns by table: "" for the channels, else a table of the truth."""
-EventName = Literal[
-    "start", "end", "command", "note", "warning", "device", "hammer", "speed", "release", "fault", "clear", "pause",
-    "resume", "seek", "rate",
-]  # fmt: skip
-"""What a rig or a replay tells of."""
+if TYPE_CHECKING:
+    EventName = str
+else:
+    EventName = Literal["start", "end", "command", "note", "warning", "device", *COMMANDS, *REPLAY_COMMANDS]
+    """What a rig or a replay tells of."""
 
 
 class _Signal(Written):
@@ -135,14 +127,7 @@ class Since(_Signal):
         return float(times_s[rows[0]]) if len(rows) else math.nan
 
 
-class _Expect(Written):
-    name: str = ""
-    source: str = ""
-    when: dict[str, Any] = Field(default={})
-    """Only in the cases that have these values, or one of several, on the matrix's axes."""
-
-
-class _Within(_Expect):
+class _Within(Expected):
     from_s: Time = 0.0
     to_s: Time | None = None
 
@@ -180,7 +165,7 @@ class ExpectSignal(_Signal, _Within):
             if self.take not in ("first beyond", "last beyond"):
                 raise InputError(f"{where}.since", "left out, but where take is first beyond or last beyond", self.take)
             self.since.check(units, where=f"{where}.since")
-        return _asked(self.must, unit, where=where, of=self.label)
+        return asked(self.must, unit, where=where, of=self.label)
 
     @property
     def label(self) -> str:
@@ -197,7 +182,7 @@ class ExpectSignal(_Signal, _Within):
         unit = "s" if self.beyond else "Hz" if self.take == "whirl frequency" else self.unit(units, where="expect")
         exact = f"1 row, {1e6 * row_s:g} us" if self.beyond else ""
         channels = () if self.truth else self.names
-        yield Measurement(self.label, _in_unit(value, unit, must), must, self.source, exact, note, at_s, channels)
+        yield Measurement(self.label, in_unit(value, unit, must), must, self.source, exact, note, at_s, channels)
 
     def _value(self, seen: Seen, units: Units) -> tuple[float, float | None, str]:
         times_s, values = self.values(seen)
@@ -268,23 +253,24 @@ class ExpectEvent(_Within):
             return Must("==" if not self.appears else ">=", 0.0 if not self.appears else 1.0, "1")
         if not self.appears:
             raise InputError(f"{where}.appears", "left out with must", False)
-        return _asked(self.must, "1" if self.take == "count" else "s", where=where, of=self.label)
+        return asked(self.must, "1" if self.take == "count" else "s", where=where, of=self.label)
 
     @property
-    def _event(self) -> EventOf:
+    def of(self) -> EventOf:
+        """The event."""
         return EventOf(event=self.event, where=self.where, text=self.text)
 
     @property
     def label(self) -> str:
         """What is measured, in words."""
         what = "time" if self.must and self.take == "time" else "number"
-        return self.name or f"{what} of {self._event}"
+        return self.name or f"{what} of {self.of}"
 
     def measure(self, seen: Seen, units: Units) -> Iterator[Measurement]:
         """What the recording shows of it."""
         must = self.check(units, where="expect")
         to_s = math.inf if self.to_s is None else self.to_s
-        times_s = [each for each in self._event.times_s(seen) if self.from_s <= each < to_s]
+        times_s = [each for each in self.of.times_s(seen) if self.from_s <= each < to_s]
         if not self.must or self.take == "count":
             at_s = times_s[0] if times_s else None
             yield Measurement(self.label, float(len(times_s)), must, self.source, at_s=at_s)
@@ -293,7 +279,7 @@ class ExpectEvent(_Within):
         since_s = 0.0 if self.since is None else self.since.time_s(seen, units, from_s=self.from_s)
         # What it is counted from is what makes it come: what was there before that is another one.
         at_s = next((each for each in times_s if not each < since_s), math.nan)
-        note = "" if math.isfinite(at_s) else f"no {self._event} came"
+        note = "" if math.isfinite(at_s) else f"no {self.of} came"
         note = "what it is counted from never came" if math.isnan(since_s) else note
         value = math.nan
         if math.isfinite(at_s - since_s):
@@ -301,7 +287,7 @@ class ExpectEvent(_Within):
         about = at_s if math.isfinite(at_s) else since_s
         channels = () if self.since is None or self.since.truth or not self.since.signal else self.since.names
         at_s = about if math.isfinite(about) else None
-        yield Measurement(self.label, _in_unit(value, "s", must), must, self.source, exact, note, at_s, channels)
+        yield Measurement(self.label, in_unit(value, "s", must), must, self.source, exact, note, at_s, channels)
 
 
 class ExpectOrder(_Within):
@@ -331,85 +317,6 @@ class ExpectOrder(_Within):
         yield Measurement(self.label, float(count), self.check(units, where=""), self.source, note=note, at_s=at_s)
 
 
-class ExpectScore(_Expect):
-    """Rows of the scorecard of what a DAQ under test has written: a quantity, or `all`.
-
-    With `must` a quantity's own value is held against that with its whole interval, and not against limits of the card:
-    also for what none ask about, such as the trigger row, and for rows that have to be missing.
-    """
-
-    score: str
-    channel: str = ""
-    file: Annotated[str, Field(min_length=1)]
-    limits: str | None = None
-    path: Literal["digital", "analogue"] | None = None
-    must: str = ""
-
-    def check(self, units: Units, *, where: str) -> Must:
-        """Nothing fails, or what is asked of the quantity's values.
-
-        Raises:
-            InputError: There is no such quantity, or limits, or it has no values in the unit of what is asked.
-        """
-        from replays.score.limits import load_limits
-        from replays.score.scorecard import QUANTITIES
-
-        known = {quantity: about for quantities in QUANTITIES.values() for quantity, about in quantities.items()}
-        if self.score not in {*known, "all"}:
-            raise UnknownNameError(f"{where}.score", "a quantity of `rig score`, or all", self.score, sorted(known))
-        load_limits(self.limits)
-        if not self.must:
-            return Must("==", 0.0, "1")
-        if self.score in ("all", "mapping", "polarity"):
-            raise InputError(f"{where}.must", f"left out where score is {self.score}", self.must)
-        if not (unit := known[self.score].unit or units[""].get(self.channel, "")):
-            what = f"one of the channels with must, as {self.score} is in the unit of its channel"
-            raise UnknownNameError(f"{where}.channel", what, self.channel, units[""])
-        return _asked(self.must, unit, where=where, of=self.score)
-
-    def measure(self, seen: Seen, units: Units) -> Iterator[Measurement]:
-        """A measurement for each row that is not as asked, or that shows nothing; else one for all of them."""
-        from replays.score.scorecard import FAIL, NOT_SHOWN, PASS
-
-        must = self.check(units, where="expect")
-        what = self.name or f"failing rows of {self.score} {self.channel}".strip()
-        try:
-            card = seen.card(self.file, self.limits, self.path)
-        except InputError as error:
-            yield Measurement(what, math.nan, must, self.source, note=str(error))
-            return
-        rows = [
-            row for row in card.rows
-            if self.score in ("all", row.quantity) and self.channel in ("", *row.channel.split(", "))
-        ]  # fmt: skip
-        if self.must:
-            yield from self._values(rows, must)
-            return
-        # Of one quantity, nothing shown is nothing passed; of all, some are never shown.
-        bad = [row for row in rows if row.verdict == FAIL or (row.verdict == NOT_SHOWN and self.score != "all")]
-        shown = sum(row.verdict == PASS for row in rows)
-        told = "; ".join(" ".join(filter(None, (*row.cells(), row.note))) for row in bad[:4])
-        source = self.source or ", ".join(dict.fromkeys(row.limit.source for row in bad if row.limit is not None))
-        value = float(len(bad)) if shown or bad else math.nan
-        hidden = sum(row.verdict == NOT_SHOWN for row in rows)
-        note = told or (
-            f"{card.path} path, {shown} rows pass, {hidden} not shown" if shown else "nothing of it is shown"
-        )
-        yield Measurement(what, value, must, source, note=note, channels=tuple(row.channel for row in bad[:2]))
-
-    def _values(self, rows: Sequence[ScoreRow], must: Must) -> Iterator[Measurement]:
-        """Of each row that end of the interval, or the value, which is nearest to what it must not be."""
-        for row in rows:
-            what = self.name or f"{row.quantity} {row.channel}".strip()
-            ends = [_in_unit(float(each), row.unit, must) for each in (row.value, row.low, row.high)]
-            value = min(ends, key=must.margin) if all(map(math.isfinite, ends)) else math.nan
-            note = row.note or ("" if math.isfinite(value) else "this run does not show it")
-            yield Measurement(what, value, must, self.source, note=note, channels=(row.channel,))
-        if not rows:
-            what = self.name or f"{self.score} {self.channel}".strip()
-            yield Measurement(what, math.nan, must, self.source, note="nothing of it is shown")
-
-
 Expect = ExpectSignal | ExpectEvent | ExpectOrder | ExpectScore
 KINDS: dict[str, type[Expect]] = {
     "signal": ExpectSignal, "event": ExpectEvent, "order": ExpectOrder, "score": ExpectScore,
@@ -417,79 +324,13 @@ KINDS: dict[str, type[Expect]] = {
 """What an expectation is about, by the key that says so."""
 
 
-@dataclass
-class Seen:
-    """What a case has left: its recording, in time of the case.
-
-    Attributes:
-        recording: All that the rig sent.
-        folder: Where the device under test has put its files.
-        origin_s: Simulated time at which the case began [s].
-    """
-
-    recording: Recording
-    folder: Path
-    origin_s: float = 0.0
-    _cards: dict[tuple[Any, ...], Scorecard] = field(default_factory=dict)
-    _rows: dict[tuple[str, tuple[str, ...]], Samples] = field(default_factory=dict)
-
-    @property
-    def tick_rate_hz(self) -> float:
-        """Ticks a simulated second [Hz]."""
-        return float(self.recording.catalogue["tick_rate_hz"])
-
-    def tick(self, time_s: float) -> int:
-        """A time of the case to the nearest tick of the case."""
-        return round(time_s * self.tick_rate_hz)
-
-    @cached_property
-    def units(self) -> Units:
-        """Units of the channels, and of the tables of the truth, that were recorded."""
-        tables = self.recording.catalogue.get("truth", {})
-        channels = {name: channel.unit for name, channel in self.recording.table.channels.items()}
-        truth = {name: {one["name"]: one["unit"] for one in table["columns"]} for name, table in tables.items()}
-        return {"": channels, **truth}
-
-    @cached_property
-    def events(self) -> list[tuple[float, dict[str, Any]]]:
-        """Events with their times, in order of these [s of the case]."""
-        rate, origin = self.tick_rate_hz, round(self.origin_s * self.tick_rate_hz)
-        timed = [(event["tick"] - origin, event) for event in self.recording.events if event.get("tick") is not None]
-        return [(tick / rate, event) for tick, event in sorted(timed, key=lambda each: each[0])]
-
-    def rows(self, truth: str, names: tuple[str, ...]) -> Samples:
-        """Rows of channels, or of a table of the truth."""
-        key = truth, names
-        if key not in self._rows:
-            found = self.recording.truth(truth) if truth else self.recording.samples(*names)
-            self._rows[key] = found.only(*names)
-        return self._rows[key]
-
-    def card(self, file: str, limits: str | None, path: Literal["digital", "analogue"] | None) -> Scorecard:
-        """The scorecard of a file in the folder."""
-        from replays.score.judgement import judge
-        from replays.score.limits import load_limits
-
-        key = file, limits, path
-        if key not in self._cards:
-            sent = [part.path for part in self.recording.parts]
-            self._cards[key] = judge(self.folder / file, sent, limits=load_limits(limits), path=path)
-        return self._cards[key]
-
-
-def _asked(text: str, unit: str, *, where: str, of: str) -> Must:
-    """What is asked, kept in the unit that it is asked in where that says more, such as ms of a time."""
-    field = f"{where}.must"
-    asked = Must.parse(text, field=field)
-    asked.within(unit, field=field, of=of)
-    return asked
-
-
-def _in_unit(value: float, unit: str, must: Must) -> float:
-    """A value in the unit that it is asked in; without the last digits, which conversions and times leave."""
-    same = units_of.canonical(unit) == units_of.canonical(must.unit)
-    scale = 1.0 if same else units_of.size_si(unit) / units_of.size_si(must.unit)
-    return float(f"{value * scale:.12g}")
+def expected_events(expects: Iterable[Expect]) -> Iterator[EventOf]:
+    """Events that are expected, alone or in order."""
+    for expect in expects:
+        if isinstance(expect, ExpectOrder):
+            yield from expect.order
+        elif isinstance(expect, ExpectEvent) and expect.appears:
+            yield expect.of
 
 
 def _name(names: tuple[str, ...]) -> str:

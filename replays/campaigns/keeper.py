@@ -14,6 +14,8 @@ import threading
 
 PATIENCE_S = 5.0
 """How long a program may take to end by itself [s]."""
+KILLED = 128 + signal.SIGKILL
+"""Exit status of one that did not."""
 
 
 def keep(command: list[str]) -> int:

@@ -61,7 +61,7 @@ def _seconds(results: Document, case: Document) -> str:
 
 
 def _failure(report: Report, case: Document, folder: Path) -> None:
-    report.heading(f"{case['outcome']}: {case['id']}")
+    report.heading(f"{case['outcome']}: {case['id']}", note=case["reason"])
     failed = [each for each in case["measurements"] if not each["good"]]
     if not failed:
         report.text(case["reason"])

@@ -39,12 +39,21 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_configure(config: pytest.Config) -> None:
     """Register the marker, and on the process that gathers them the results."""
     config.addinivalue_line("markers", _MARKER)
-    folder, against = config.option.rig_results, config.option.rig_against
-    if folder and not hasattr(config, "workerinput"):
-        from replays.campaigns.results import Results
+    folder, against, replay = config.option.rig_results, config.option.rig_against, config.option.rig_replay
+    if hasattr(config, "workerinput") or not (folder or replay):
+        return
+    from replays.campaigns.bench import check_replay
+    from replays.campaigns.results import Results
+    from rig.errors import DiskError, InputError
 
-        results = Results(Path(folder), None if against is None else Path(against), config)
-        config.pluginmanager.register(results, "rig-results")
+    try:
+        if replay:
+            check_replay(Path(replay))
+        if folder:
+            results = Results(Path(folder), None if against is None else Path(against), config)
+            config.pluginmanager.register(results, "rig-results")
+    except (InputError, DiskError) as error:
+        raise pytest.UsageError(str(error)) from None
 
 
 def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> pytest.Collector | None:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from replays.report import junit
 from replays.studies import provenance
-from rig.errors import InputError, whole_file
+from rig.errors import DiskError, InputError, whole_file
 from rig.outside import open_file, read_json, unreadable
 from rig.text import finite, printable
 
@@ -40,9 +40,14 @@ class Results:
         folder: Where to; made if it is not there.
         against: Results of an earlier campaign.
         config: Of the run.
+
+    Raises:
+        InputError: Another campaign writes there, or the results of the earlier one are none.
+        DiskError: The folder cannot be made.
     """
 
     def __init__(self, folder: Path, against: Path | None, config: pytest.Config) -> None:
+        self._lock = _locked(folder)
         self._folder, self._config = folder, config
         self._earlier = None if against is None else load_results(against)
         if (folder / "results.json").is_file():  # what is written anew has none of the old evidence
@@ -91,7 +96,6 @@ class Results:
         """Write all of it."""
         if hasattr(self._config, "workerinput"):
             return
-        self._folder.mkdir(parents=True, exist_ok=True)
         document = self.document()
         with whole_file(self._folder / "results.json") as draft:
             draft.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")
@@ -99,6 +103,7 @@ class Results:
         from replays.campaigns.page import make_page
 
         make_page(document, self._folder, self._earlier).write(self._folder / "index.html")
+        os.close(self._lock)
 
     def document(self) -> dict[str, Any]:
         """All of it as a document for JSON."""
@@ -133,6 +138,23 @@ class Results:
         more = [("--url", self._config.getoption("rig_url")), ("--replay", self._config.getoption("rig_replay"))]
         options = [word for option, value in more if value for word in (option, value)]
         return shlex.join(["rig", "campaign", f"{file}{colons}{rest}", *options])
+
+
+def _locked(folder: Path) -> int:
+    """A folder, made if it is not there, that nobody else writes to until this is closed."""
+    import fcntl
+
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        handle = os.open(folder, os.O_RDONLY)
+    except OSError as error:
+        raise DiskError(f"{folder}: {error.strerror}") from None
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        os.close(handle)
+        raise InputError("--output", "a folder that no other campaign writes to now", str(folder)) from None
+    return handle
 
 
 def reason_of(report: Any) -> str:

@@ -7,8 +7,11 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from replays.campaigns.bench import NotThereError
-from replays.campaigns.expectation import EventOf, Seen
+from replays.campaigns.expectation import EventOf, expected_events
+from replays.campaigns.keeper import KILLED, PATIENCE_S
 from replays.campaigns.measurement import Measurement, Must
+from replays.campaigns.seen import Seen
+from rig import wire
 from rig.commands import ClearCommand, FaultCommand, HammerCommand, SpeedCommand, TimedCommand
 from rig.errors import RefusedError
 
@@ -64,9 +67,10 @@ def run_case(case: Case, trial: Trial) -> None:
             record.wait()
     trial.recording = record.stop()
     if device is not None:
-        _end(device, trial, case)
+        end_device(device, trial)
     seen = Seen(trial.recording, trial.folder, trial.origin_s)
     _measure_device(seen, trial)
+    measure_end(seen, trial, case)
     for expect in case.expects:
         for measurement in expect.measure(seen, seen.units):
             exact = measurement.resolution
@@ -99,6 +103,8 @@ def _send(machine: Rig, step: Step) -> None:
         else:
             machine.release()
     except RefusedError as error:
+        if wire.ENDED in str(error):
+            return  # the verdict is of the run's end
         raise NotThereError(f"the rig refuses a step at {step.at_s:g} s: {error}") from None
 
 
@@ -109,17 +115,31 @@ def _stop(machine: Rig) -> None:
         return  # it has come to its end
 
 
-def _end(device: Device, trial: Trial, case: Case) -> None:
+def end_device(device: Device, trial: Trial) -> None:
     """Let a device end by itself, as the run has ended, and judge how it did."""
     deadline = time.monotonic() + _LAST_S
     while device.program.status is None and time.monotonic() < deadline and trial.target.own:
         time.sleep(0.02)
     status = device.program.status
     device.program.end()
-    if status is not None and case.device is not None:
-        note = "" if not status else f"its last line: {device.program.last_line}"
+    note = f"its last line: {device.program.last_line}" if status else ""
+    if status is None and device.program.status == KILLED:
+        status, note = KILLED, f"it had to be killed: it did not end within {PATIENCE_S:g} s of a SIGTERM"
+    if status is not None:
         must = Must("==", 0.0, "1")
         trial.take(Measurement(f"exit status of {device.name}", float(status), must, note=note))
+
+
+def measure_end(seen: Seen, trial: Trial, case: Case) -> None:
+    """A run that was stopped before the case was over has shown nothing of the rest, but where that is expected."""
+    ended = next(((at_s, event) for at_s, event in seen.events if event["event"] == "end"), None)
+    if ended is None or ended[1].get("reason") == "completed" or ended[0] >= case.duration_s - 1e-6:
+        return
+    if not any(event.event == "end" or event.where.get("command") == "stop" for event in expected_events(case.expects)):
+        at_s, event = ended
+        by = next((event["from"] for _, event in seen.events if event.get("command") == "stop"), "")
+        note = f"{event.get('reason')}{f' by {by}' if by else ''}, before the case was over"
+        trial.take(Measurement("end of the run", at_s, Must(">=", case.duration_s, "s"), note=note, at_s=at_s))
 
 
 def _measure_device(seen: Seen, trial: Trial) -> None:

@@ -328,7 +328,7 @@ class Player(ServedRun):
 
     def _end(self, reason: str) -> dict[str, Any]:
         """End the stream: as it was recorded, where that belongs to what was played."""
-        self._desk.close(f"a run that ended: {reason}", [] if self._step is None else [self._step.reply])
+        self._desk.close(f"{wire.ENDED}: {reason}", [] if self._step is None else [self._step.reply])
         self._playhead.hold(self._playhead.play_ns)
         if self._ahead is not None:
             self._ahead.close()

@@ -53,10 +53,11 @@ class Row:
 
 @dataclass(frozen=True)
 class Heading:
-    """A heading; level 1 opens a part, level 2 a section in it."""
+    """A heading; level 1 opens a part, level 2 a section in it; the note stands beside it in the contents."""
 
     text: str
     level: int = 1
+    note: str = ""
 
 
 @dataclass(frozen=True)
@@ -133,9 +134,9 @@ class Report:
         self.mark: Mark = mark
         self.parts: list[ReportPart] = []
 
-    def heading(self, text: str, *, level: int = 1) -> None:
-        """Add a heading; level 1 or 2."""
-        self.parts.append(Heading(printable(text), level))
+    def heading(self, text: str, *, level: int = 1, note: str = "") -> None:
+        """Add a heading; level 1 or 2; with a note beside it in the contents."""
+        self.parts.append(Heading(printable(text), level, printable(note)))
 
     def text(self, text: str) -> None:
         """Add a paragraph."""

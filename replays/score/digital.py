@@ -312,6 +312,7 @@ def _score_rows(
     for name, altered in zip(names, found.altered, strict=True):
         add("altered values", name, altered.pairs(), altered.rows)
     told = {
+        "row step": _exact(one.step),
         "rows before the first": _exact(max(0, found.first)),
         "rows after the last": _exact(found.sent - 1 - found.last), **stamps.judged(session.wall_s),
         "trigger row": None if trigger is None else _exact(trigger),

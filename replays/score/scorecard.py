@@ -54,6 +54,7 @@ DIGITAL = {
     "doubled rows": Quantity("1", _EXACT, _LONGER),
     "swapped rows": Quantity("1", _EXACT, _LONGER),
     "foreign rows": Quantity("1", _EXACT, _LONGER),
+    "row step": Quantity("1", "by the rate of the stamps, then equal counts", _STAMPED),
     "rows before the first": Quantity("1", _EXACT, _LONGER),
     "rows after the last": Quantity("1", _EXACT, _LONGER),
     "stamp offset": Quantity("s", "straight line through means of batches, Student's t", _STAMPED),

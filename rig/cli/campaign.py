@@ -102,9 +102,9 @@ def _checked(files: list[str], against: Path | None, replay: Path | None) -> lis
     if against is not None:
         load_results(against)
     if replay is not None:
-        from recorder.reader import Recording
+        from replays.campaigns.bench import check_replay
 
-        Recording.open(replay)
+        check_replay(replay)
     return paths
 
 

@@ -85,12 +85,15 @@ class Progress:
         if before != "passed" and name not in self.reasons:
             from replays.campaigns.results import reason_of
 
-            self.reasons[name] = reason_of(report)
+            # Of a campaign's file a line for each value that is not as it must be.
+            lines = report.longrepr.splitlines() if isinstance(report.longrepr, str) else ()
+            self.reasons[name] = "\n      ".join([reason_of(report), *map(printable, lines[1:])])
         if report.when == "teardown":
             self.done.add(name)
             self.running.pop(name, None)
             reason = f": {self.reasons[name]}" if name in self.reasons else ""
-            self._tell(f"{WORDS[before]:5} {name}{reason}")
+            for line in f"{WORDS[before]:5} {name}{reason}".split("\n"):
+                self._tell(line)
             self._show()
 
     def _tell(self, line: str) -> None:

@@ -50,8 +50,9 @@ _FROM_CLIENTS = {
 be about to connect, for how long [ms]: whoever opens connections and says nothing must not shut out all others."""
 _FROM_AFAR = {"transport/unicast/max_sessions": 32, "transport/unicast/accept_pending": 32}
 """Where it is exposed; a client that subscribes has two sessions."""
-_OPENING_S, _OPENING_TLS_S = 0.5, 2.0
-"""How long one attempt to connect may take: beyond the loopback it is several times there and back."""
+_OPENING_S, _OPENING_TLS_S, _BACK_S = 0.5, 2.0, 5.0
+"""How long one attempt to connect may take: beyond the loopback it is several times there and back. And how long a
+request without a link waits for a rig that is started again."""
 
 
 class Exposure(NamedTuple):
@@ -90,8 +91,7 @@ class ZenohServer(Closing):
         host, port = place_to_listen(endpoint, field="listen")
         self.endpoint = f"{host}:{port}"
         self._ports = {port}
-        locators = [locator(host, port)]
-        settings: dict[str, Any] = dict(_FROM_CLIENTS)
+        locators, settings = [locator(host, port)], dict[str, Any](_FROM_CLIENTS)
         if exposed is not None:
             host, port = parse_endpoint(exposed.endpoint, field="expose")
             self._ports.add(port)
@@ -285,8 +285,7 @@ class ZenohClient(Closing):
         return False
 
     def _from_rig(self, sample: Any) -> bool:
-        info = sample.source_info
-        return self._is_rigs(None if info is None else str(info.source_id.zid))
+        return self._is_rigs(None if (info := sample.source_info) is None else str(info.source_id.zid))
 
     def _open(self, wait_s: float) -> Session:
         import zenoh
@@ -425,18 +424,18 @@ class ZenohClient(Closing):
         """Ask the rig and return its reply.
 
         Raises:
-            NoReplyError: Nobody answered in time, or the answer is that the rig failed to make one.
+            NoReplyError: Nobody answered in time, or the rig failed to, or went, and may have done what was asked.
         """
         import zenoh
 
-        deadline = time.monotonic() + timeout_s
+        begun, asked = time.monotonic(), self._linked()
         while True:
             replies: Iterator[Any] = self._session.session.get(
                 key,
                 payload=payload,
-                timeout=max(deadline - time.monotonic(), 0.01),
-                # Replies inherit both. One that waits for room in the queue of a stalled client would hold up all
-                # others and close the link after 5 s; and replies need not queue behind recovered blocks.
+                timeout=max(begun + timeout_s - time.monotonic(), 0.01),
+                # Replies inherit both: one that waited for a stalled client would hold up all others and close its link
+                # after 5 s; and replies need not queue behind recovered blocks.
                 congestion_control=zenoh.CongestionControl.DROP,
                 priority=zenoh.Priority.INTERACTIVE_HIGH,
             )
@@ -446,9 +445,11 @@ class ZenohClient(Closing):
                     return payload_back
                 if (text := payload_back.decode(errors="replace")) != "Timeout":
                     raise NoReplyError(f"the rig at {self.endpoint} could not answer {key}: {text}")
+            if asked and not asked & self._linked():
+                raise NoReplyError(f"the rig at {self.endpoint} has gone, and has not answered {key}")
             # Without a rig the reply is empty at once: it may be about to start. So it is where the rig denies this.
-            late = time.monotonic() + 0.05 >= deadline
-            role = None if self._holder is None else self._holder.name
+            role, most_s = self._holder and self._holder.name, timeout_s if self._linked() else min(timeout_s, _BACK_S)
+            late = time.monotonic() + 0.05 >= begun + most_s
             denied = not allows(role, Verb.ASK, key)
             if (late or denied) and self.tokens(wire.ALIVE):
                 what = f"denies {key} to {role or 'everybody'}" if denied else f"does not answer {key}"
@@ -483,8 +484,7 @@ class ZenohClient(Closing):
             payload,
             encoding=encoding_of(key, None),
             congestion_control=zenoh.CongestionControl.DROP,
-            # Not to the own subscriptions of this client.
-            allowed_destination=zenoh.Locality.REMOTE,
+            allowed_destination=zenoh.Locality.REMOTE,  # not to the own subscriptions of this client
         )
 
     def close(self) -> None:

@@ -111,6 +111,7 @@ def test_a_device_in_lockstep_is_judged_alike_each_time(folder: Path) -> None:
     assert told["time to trip"]["resolution"] == "1 tick, 1 us; 10 ms blocks, in lockstep"
     assert 1e3 * told["time to trip"]["at_s"] % 10.0 == 0.0  # the end of a block
     assert "exit status of protection must be == 0; instead received 1 (its last line: out of order)" in out
+    assert "\n      time to trip must be <= 20 ms; instead received nothing (no note tags=trip came)" in out
     assert dies["reason"].startswith("exit status of protection must be == 0")
     assert [each["good"] for each in fixtures["measurements"]] == [True, True, False]
     assert fixtures["reason"].startswith("force must be <= 1 N; instead received ")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,6 +14,7 @@ import rig
 from drivers.client import Rig
 from drivers.console import AcceptedStep
 from rig.errors import InputError, RefusedError
+from rig.transport import NoReplyError
 from tests import processes
 
 DEVICE = """
@@ -35,7 +37,7 @@ import sys
 import rig
 
 with rig.connect(sys.argv[1], channels=["P_E"], name="a") as machine:
-    for _ in machine.blocks(patience_s=0.5):
+    for _ in machine.blocks(patience_s=float(sys.argv[2])):
         pass
 """
 PLAIN = str(processes.ROOT / "docs/plain_device.py")
@@ -95,7 +97,7 @@ def test_devices_over_zenoh_and_over_can_react_at_the_same_ticks_however_slow_th
 
 
 def test_a_device_that_is_killed_is_told_and_the_rig_goes_on() -> None:
-    with bench() as (machine, endpoint), processes.python("-c", WAITS, f"zenoh:{endpoint}") as device:
+    with bench() as (machine, endpoint), processes.python("-c", WAITS, f"zenoh:{endpoint}", "0.5") as device:
         machine.event("device", timeout_s=60.0)
         machine.step(10_000)
         device.kill()
@@ -104,6 +106,18 @@ def test_a_device_that_is_killed_is_told_and_the_rig_goes_on() -> None:
         assert machine.step(50_000).lost == {"a": reason}
         lost = machine.event("device")
         assert (lost["state"], lost["tick"], lost["reason"]) == ("lost", 20_000, reason)
+
+
+def test_whoever_waits_for_a_rig_that_waits_for_a_device_is_told_so() -> None:
+    with bench() as (machine, endpoint), processes.python("-c", WAITS, f"zenoh:{endpoint}", "60") as device:
+        machine.event("device", timeout_s=60.0)
+        device.send_signal(signal.SIGSTOP)
+        with pytest.raises(NoReplyError, match=r"does not answer rig/command/step; it waits for a \(\d+ s\)$"):
+            machine.step(10_000, timeout_s=1.0)
+        (row,) = machine.status()["devices"]
+        assert (row["state"], row["tick"]) == ("joined", 0)
+        assert row["behind_s"] > 0.5
+        device.kill()
 
 
 def test_a_program_of_the_client_is_the_same_device_over_can() -> None:

@@ -114,7 +114,22 @@ WRONG = {
     "unknown place": (
         HEAD + '[device]\ncommand = "python -m json.tool {danger}"\n' + PEAK,
         4,
-        "of places that are filled in",
+        "with names of [limits] or [matrix.device] between braces, such as",
+    ),
+    "misspelt place": (
+        HEAD + '[limits]\ndanger = "2 mm"\n' + PEAK.replace("2 mm", "{dangr}"),
+        7,
+        "expect.must must be with names of [limits] or [matrix.device] between braces, such as danger; instead",
+    ),
+    "limit that is a number": (
+        HEAD + "[limits]\ndanger = 2\n" + PEAK,
+        4,
+        "limits.danger must be a number with its unit as a text, such as '0.2 mm'; instead received 2",
+    ),
+    "name of a device": (
+        HEAD + '[device]\ncommand = "python -m json.tool"\nname = " "\n' + PEAK,
+        5,
+        "device.name must be 1 to 50 letters, digits, dots, dashes and underscores; instead received ' '",
     ),
     "place in another unit": (
         HEAD + '[limits]\ndanger = "2 mm"\n[device]\ncommand = "python -m json.tool {danger:N}"\n' + PEAK,

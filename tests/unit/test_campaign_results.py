@@ -5,19 +5,26 @@ from __future__ import annotations
 import json
 import math
 import re
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 
 from recorder.reader import Recording
-from replays.campaigns.expectation import KINDS, Seen
+from replays.campaigns.bench import Target, check_replay
+from replays.campaigns.campaign import load_campaign, shipped
+from replays.campaigns.expectation import KINDS
 from replays.campaigns.measurement import Measurement, Must, measured
 from replays.campaigns.page import changes, make_page
 from replays.campaigns.picture import draw
-from replays.campaigns.results import load_results, write_junit
+from replays.campaigns.results import Results, load_results, write_junit
+from replays.campaigns.run import end_device, measure_end
+from replays.campaigns.seen import Seen
+from replays.campaigns.trial import Trial
 from replays.report import junit
 from rig.channels import default_table
 from rig.errors import InputError
@@ -117,6 +124,68 @@ def test_rows_that_have_to_be_missing_are_an_expectation(tmp_path: Path) -> None
     assert (scale.value, scale.good) == (0.0, True)
     absent = one(session, score="gain", channel="disk_x", file="daq.parquet", must="-1 to 1 ppm")
     assert (absent.good, absent.note) == (False, "nothing of it is shown")
+
+
+def test_all_asks_for_every_channel_and_row_that_was_sent_but_for_what_is_granted(tmp_path: Path) -> None:
+    counts = counts_of("probes", np.cumsum(np.random.default_rng(1).normal(size=(4000, 4)), axis=0) * 1e-3, None)
+    session = Seen(Recording.open(write_session(tmp_path / "sent.mcap", {"probes": counts})), tmp_path)
+    names, times_s = default_table().groups["probes"].names, np.arange(4000) / 20_000
+
+    def told(rows: slice, columns: list[str], **more: Any) -> tuple[bool, str]:
+        file = write_parquet(
+            tmp_path / f"{rows}{columns}.parquet",
+            {"time_s": times_s[rows], **dict(zip(columns, counts[rows].T, strict=False))},
+        )
+        made = one(session, score="all", file=file.name, **more)
+        return made.good, made.note
+
+    whole, part, half = slice(None), slice(1000, 3600), slice(None, None, 2)
+    assert told(whole, list(names))[0]
+    assert told(whole, list(names)[:3]) == (False, "ring_y is not in the file, or not found in it")
+    assert told(whole, list(names)[:3], channel=["disk_x", "ring_x"])[0]
+    good, note = told(whole, ["disk_y", "disk_x", *names[2:]])
+    assert (good, "mapping disk_y disk_x fail" in note) == (False, True)
+    assert told(half, list(names)) == (False, "row step of probes: 2, not 1")
+    assert told(half, list(names), every=2)[0]
+    assert told(part, list(names)) == (
+        False,
+        "rows before the first of probes: 1000; rows after the last of probes: 400",
+    )
+    assert told(part, list(names), begins_s=0.05, ends_s=0.01) == (False, "rows after the last of probes: 400")
+    assert told(part, list(names), begins_s=0.05, ends_s=0.02)[0]
+
+
+def test_a_run_that_is_stopped_before_the_case_is_over_fails_unless_that_is_expected(tmp_path: Path) -> None:
+    stop = {"event": "command", "command": "stop", "from": "guard", "tick": 10_000, "time_s": 0.01}
+    end = {"event": "end", "reason": "stopped", "tick": 10_000, "time_s": 0.01}
+    counts = counts_of("probes", np.zeros((200, 4)), None)
+    recording = Recording.open(write_session(tmp_path / "sent.mcap", {"probes": counts}))
+    case = next(iter(load_campaign(shipped()["hammer"]).cases))
+
+    def told(*events: dict[str, Any], **expected: Any) -> list[str]:
+        trial, session = Trial("a", folder=tmp_path), Seen(recording, tmp_path)
+        session.events = [(event["time_s"], event) for event in events]
+        expects = (check(KINDS["event"], expected, field=""),) if expected else ()
+        measure_end(session, trial, replace(case, duration_s=0.5, expects=expects))
+        return [each.line for each in trial.measurements]
+
+    (line,) = told(stop, end)
+    assert line == (
+        "end of the run must be >= 0.5 s; instead received 0.01 s (stopped by guard, before the case was over)"
+        " [margin -0.49 s]"
+    )
+    assert told(stop, end, event="note") == [line]
+    assert told(stop, end, event="end") == told(stop, end, event="command", where={"command": "stop"}) == []
+    assert told({**end, "reason": "completed"}) == told({**end, "time_s": 0.5}) == told() == []
+
+
+def test_a_device_that_has_to_be_killed_fails_and_one_that_ends_when_it_is_told_to_does_not(tmp_path: Path) -> None:
+    for status, notes in ((137, ["it had to be killed: it did not end within 5 s of a SIGTERM"]), (143, []), (0, [])):
+        program = SimpleNamespace(status=None, last_line="", end=lambda: None)
+        program.end = lambda program=program, status=status: setattr(program, "status", status)
+        trial = Trial("a", folder=tmp_path, target=Target(url="zenoh:elsewhere"))
+        end_device(cast("Any", SimpleNamespace(name="guard", program=program)), trial)
+        assert [each.note for each in trial.measurements if not each.good] == notes
 
 
 @pytest.mark.parametrize(("op", "limit", "value", "margin", "good"), [
@@ -238,11 +307,29 @@ def test_the_page_says_first_what_failed_then_what_changed(tmp_path: Path) -> No
     make_page(now, tmp_path, then).write(tmp_path / "index.html")
     page = (tmp_path / "index.html").read_text(encoding="utf-8")
     order = (
-        "1 failed, 1 error, 1 skipped, 1 passed.", "failed: x.campaign.toml::bad</h2>", "it is 1.25 mm", "<img",
+        "1 failed, 1 error, 1 skipped, 1 passed.", "</a>: no rig</li>", "failed: x.campaign.toml::bad</h2>",
+        "it is 1.25 mm", "<img",
         "rig campaign x.campaign.toml::bad", "Against the earlier campaign</h2>", "Measurements</h2>", "median 0.3 ms",
     )  # fmt: skip
     places = [page.index(words) for words in order]
     assert places == sorted(places)
+
+
+def test_a_recording_that_was_cut_off_is_no_bench(tmp_path: Path) -> None:
+    data, half = (ROOT / "replays/sessions/hammer-6.2.mcap").read_bytes(), tmp_path / "half.mcap"
+    half.write_bytes(data[: len(data) // 2])
+    check_replay(ROOT / "replays/sessions/hammer-6.2.mcap")
+    with pytest.raises(InputError, match=r"^--replay must be a recording that was finished; instead.*half.mcap, which"):
+        check_replay(half)
+
+
+def test_two_campaigns_do_not_write_into_one_folder(tmp_path: Path) -> None:
+    config = cast("Any", SimpleNamespace())
+    first = Results(tmp_path / "out", None, config)
+    with pytest.raises(InputError, match=r"^--output must be a folder that no other campaign writes to now; instead"):
+        Results(tmp_path / "out", None, config)
+    first.pytest_sessionfinish(cast("Any", None))
+    Results(tmp_path / "out", None, config).pytest_sessionfinish(cast("Any", None))
 
 
 def test_results_that_are_none_are_told(tmp_path: Path) -> None:

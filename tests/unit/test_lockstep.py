@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -187,6 +188,7 @@ def test_a_stop_does_not_wait_for_devices() -> None:
         ("join", {"device": "a"}, "join.device must be a name under which no other device has joined; instead"),
         ("join", {"device": "b", "patience_s": 0}, "join.patience_s must be greater than 0"),
         ("join", {"device": "b\n"}, "join.device must be a line of 1 to 100 printable characters"),
+        ("join", {"device": "  "}, "join.device must be a line of 1 to 100 printable characters, not all blank"),
         ("join", {}, "join.device must be given"),
         ("done", {"device": "b", "tick": 0}, "done.device must be one that has joined; instead received 'b'"),
         ("done", {"device": "a", "tick": -1}, "done.tick must be greater than or equal to 0"),
@@ -226,3 +228,63 @@ def test_of_too_many_devices_those_that_are_lost_are_forgotten_first() -> None:
         names = [row["name"] for row in rig.console.status()["devices"]]
         assert (len(names), names[-1]) == (64, "one more")
         assert "device 5" not in names
+
+
+def test_what_two_devices_command_at_one_tick_is_taken_in_the_order_of_their_names() -> None:
+    with running() as rig:
+        first, second = Device(rig, "a"), Device(rig, "b")
+        first.join()
+        second.join(patience_s=0.3)
+        steps = Steps(rig, BLOCK)
+        second.wait(1)
+        numbers: list[int] = []
+
+        def command() -> None:
+            numbers.extend((second.speed(2.0).id, second.note("two").id))
+            second.done(BLOCK)
+
+        thread = threading.Thread(target=command)
+        thread.start()
+        time.sleep(0.4)  # who waits for others is not late
+        assert first.speed(1.0).id == 4
+        assert rig.console.note("of nobody that has joined").id == 5
+        assert numbers == []
+        first.done(BLOCK)
+        thread.join(20.0)
+        assert numbers == [6, 7]
+        assert steps.join()[0].lost == {}
+    assert [event["request"] for event in rig.listener.named("command")[-2:]] == [{"speed_hz": 1.0}, {"speed_hz": 2.0}]
+
+
+def test_a_stop_refuses_what_waits_for_others() -> None:
+    with running() as rig:
+        first, second = Device(rig, "a"), Device(rig, "b")
+        first.join()
+        second.join()
+        caught: list[str] = []
+
+        def refused(ask: Callable[[], object]) -> threading.Thread:
+            def ask_it() -> None:
+                try:
+                    ask()
+                except RefusedError as error:
+                    caught.append(str(error))
+
+            thread = threading.Thread(target=ask_it)
+            thread.start()
+            return thread
+
+        step = refused(lambda: rig.console.step(BLOCK))
+        second.wait(1)
+        speed = refused(lambda: second.speed(2.0))
+        time.sleep(0.1)  # it comes, and waits
+        rig.console.stop()
+        step.join(20.0)
+        speed.join(20.0)
+    assert len(caught) == 2
+    assert all("a run that ended: stopped" in each for each in caught)
+
+
+def test_in_lockstep_no_command_is_refused_by_the_clock_on_the_wall() -> None:
+    with running() as rig:
+        assert [rig.console.note("again").id for _ in range(1000)] == list(range(1, 1001))

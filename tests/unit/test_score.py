@@ -19,7 +19,7 @@ from replays.recordings.formats.source import open_source
 from replays.score.judgement import judge
 from replays.score.limits import load_limits
 from replays.score.rows import NO_COUNT, follow
-from replays.score.scorecard import FAIL, NO_LIMIT, NOT_SHOWN, PASS, Scorecard, judge_row
+from replays.score.scorecard import FAIL, NO_LIMIT, NOT_SHOWN, PASS, QUANTITIES, Scorecard, judge_row
 from replays.score.sine import fit_sine, is_sine, quality
 from replays.score.stimulus import EDGE, Exact, Sampled
 from replays.score.waveform import behind_filter, fit_waveform, order_of, response, split_noise, student
@@ -28,6 +28,7 @@ from rig.errors import InputError
 from rig.scenes import load_scene
 from rig.simulation import Simulation
 from tests.commands import said
+from tests.processes import ROOT
 from tests.score_daqs import RATE_HZ, Tones, chips, counts_of, write_parquet, write_session
 
 TABLE = default_table()
@@ -334,6 +335,12 @@ def test_an_interval_that_reaches_over_its_limit_shows_nothing() -> None:
         (0.0, -5.0, 5.0), (200.0, 150.0, 250.0), (95.0, 80.0, 110.0), None,
     )] == [PASS, FAIL, NOT_SHOWN, NOT_SHOWN]  # fmt: skip
     assert judge_row("analogue", "start", "", (1.0, 0.0, 2.0)).verdict == NO_LIMIT
+
+
+def test_every_quantity_stands_in_the_documentation() -> None:
+    text = " ".join((ROOT / "docs/score.md").read_text("utf-8").split())
+    for path, known in QUANTITIES.items():
+        assert f"- {path}: {', '.join(known)} " in text
 
 
 def test_limits_say_where_they_are_from() -> None:

@@ -253,7 +253,9 @@ def test_lockstep_without_a_partner_ends_as_a_failure() -> None:
     service = Service(FakeSimulation(), server, Lockstep(timeout_s=0.01), block_ticks=BLOCK)
     with pytest.raises(StepTimeoutError):
         service.run()
-    assert listener.events[-1]["reason"] == "failed: no step was granted within 0.01 s"
+    assert (
+        listener.events[-1]["reason"] == "failed: no step was granted within 0.01 s, after which a rig in lockstep ends"
+    )
 
 
 def test_stop_ends_the_run_and_refuses_what_comes_later() -> None:

@@ -115,6 +115,22 @@ def test_a_client_waits_for_a_rig_that_comes_later() -> None:
             server.close()
 
 
+def test_a_request_ends_when_the_rig_that_was_asked_goes(server: ZenohServer) -> None:
+    asked = threading.Event()
+
+    def never(_: str, __: bytes) -> Future[bytes]:
+        asked.set()
+        return Future()
+
+    server.answer_all("rig/command/*", never)
+    with ZenohClient(server.endpoint) as client:
+        goes = threading.Thread(target=lambda: (asked.wait(20.0), server.close()))
+        goes.start()
+        with pytest.raises(NoReplyError, match=f"^the rig at {server.endpoint} has gone, and has not answered rig/com"):
+            client.request("rig/command/step", timeout_s=600.0)
+        goes.join()
+
+
 def test_requests_are_answered_and_a_failing_handler_answers_the_next_one(server: ZenohServer) -> None:
     def handler(payload: bytes) -> bytes:
         if payload == b"bad":
