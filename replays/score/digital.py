@@ -188,8 +188,14 @@ def settle(
                     return taken(scale, step, begin, index)
         return None
 
-    settled = {name: one for name, wire in wires.items() if wire.channel and (one := taken_of(name, wire.channel))}
-    found = dict(wires)
+    settled, found = dict[str, Taken](), dict(wires)
+    for name, wire in wires.items():
+        # Counts are sure where stamps, by which signals are likened, are not: those of a rig that waits for steps.
+        for of in dict.fromkeys(each for each in (wire.channel, name) if each in session.channels):
+            if (one := taken_of(name, of)) is not None:
+                settled[name] = one
+                found[name] = wire if of == wire.channel else replace(wire, channel=of, rivals=())
+                break
     if 2 * len(settled) <= len(wires):
         return found, settled
     for name, wire in wires.items():
