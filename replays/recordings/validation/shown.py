@@ -88,11 +88,11 @@ class Shown:
         """Residuals over the floor, shape (n,)."""
         return (self.values - self.foretold) / self.floor
 
-    @property
+    @cached_property
     def price(self) -> float:
         """What another number must take away: more than noise makes, and than what is wrong elsewhere brings along."""
-        moving = excess(self.apart - self.apart.mean())  # a level may be off by far more than anything moves
-        return max(DECIDES, _SLIGHT * moving, _SLIGHT**2 * excess(self.apart))
+        level = np.ones(len(self.values))  # may be off by far more than anything moves
+        return max(DECIDES, _SLIGHT * excess(self.left([level], self.values - self.foretold)[1]))
 
     def cost(self, left: np.ndarray, count: int) -> float:
         """Of a law with so many numbers that leaves so much over the floor, shape (n,) or fewer."""

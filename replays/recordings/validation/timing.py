@@ -54,6 +54,8 @@ def late(one: Shown) -> Iterator[Law]:
         for columns in [[delayed], [delayed, ones]][one.counts is not None :]:
             factors, left = one.left(columns)
             what, also = gain_words(gain := float(factors[0]))
+            if what == "signal":
+                continue  # what is not there is not late
             yield Law(f"{what} and delay", f"{also}, {change}", gain - 1.0, left, 1 + len(columns), "", of)
     if one.counts is None or one.channel.signal == "keyphasor":
         return  # of a log, the time of all is fitted before; pulses tell by their edges
