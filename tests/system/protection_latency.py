@@ -20,18 +20,18 @@ from tests import processes
 
 OPTIONS = (
     "--alert-um", "300", "--danger-um", "300", "--alert-delay-s", "0", "--danger-delay-s", "0", "--window-s", "0.05",
-    "--startup-s", "0.1",
+    "--startup-s", "0.1", "--ok-recovery-s", "0.05",
 )  # fmt: skip
 PARTS = {"p50": 50.0, "p99": 99.0, "p99.9": 99.9, "most": 100.0}
 
 
 def latencies_ms(trips: int, block_ms: str) -> tuple[np.ndarray, dict]:
-    """Of each trip [ms], shape (trips,); and the rig's status at the end."""
+    """Of each trip [ms], shape (trips,), infinite where none came; and the rig's status at the end."""
     endpoint, found = processes.free_endpoint(), []
     rng = np.random.default_rng(1)
     with (
         processes.rig(
-            "run", "stable-run", "--listen", endpoint, "--block-ms", block_ms, "--duration-s", str(60 + trips),
+            "run", "stable-run", "--listen", endpoint, "--block-ms", block_ms, "--duration-s", str(60 + 4 * trips),
             stdout=None, stderr=None,
         ) as child,
         rig.connect(url := f"zenoh:{endpoint}", wait_s=processes.COMPILE_S) as machine,
@@ -43,10 +43,17 @@ def latencies_ms(trips: int, block_ms: str) -> tuple[np.ndarray, dict]:
         while len(found) < trips:
             fault = machine.fault("disk_x", "offset", value=0.5, for_s=0.02)
             tick = fault.first_row["probes"] * 50
-            trip = machine.event(lambda event, tick=tick: event["event"] == "speed" and event["tick"] > tick)
-            found.append(1e-3 * (trip["tick"] - tick))
+            try:
+                trip = machine.event(
+                    lambda event, tick=tick: event["event"] == "speed" and event["tick"] > tick, timeout_s=2.0
+                )
+                found.append(1e-3 * (trip["tick"] - tick))
+            except NotSeenError:
+                # A monitor that lost rows begins anew, and may be blind just then.
+                found.append(np.inf)
             time.sleep(0.1 + rng.uniform(0.0, 0.01))
-            assert any(_again(machine) for _ in range(20)), "it is reset once the step has left the window"
+            again = any(_again(machine) for _ in range(20)) or not np.isfinite(found[-1])
+            assert again, "it is reset once the step has left the window"
         status = machine.status()
         child.terminate()
     return np.array(found), status
@@ -67,9 +74,8 @@ def main(trips: str = "1000", block_ms: str = "1") -> None:
     """Print the latency's distribution."""
     found, status = latencies_ms(int(trips), block_ms)
     told = [f"p{part:g} {np.percentile(found, part):.2f} ms" for part in (0, 10, 50, 99, 99.9, 100)]
-    print(
-        f"{trips} trips, blocks of {block_ms} ms: {', '.join(told)}; lateness of the rig [ms]: {status['lateness_ms']}"
-    )
+    missed = f"{np.isinf(found).sum()} missed, blocks of {block_ms} ms"
+    print(f"{trips} trips, {missed}: {', '.join(told)}; lateness of the rig [ms]: {status['lateness_ms']}")
 
 
 if __name__ == "__main__":
