@@ -330,6 +330,8 @@ def _score_rows(
             f"arrival here less that of the rig's block, from {_BACKLOG_S:g} s on; {longest_s:.2g} s at most; "
             f"a line through a pipe takes {arrivals.floor_s:.2g} s"
         )
+        if (late := told["latency"]) is not None:  # without a limit, its row is not among the first
+            card.remarks.append(f"{table}: latency {1e3 * late[0]:.3g} ms, {1e3 * longest_s:.2g} ms at most")
     for quantity, estimate in told.items():
         card.add(quantity, table, estimate, note=notes.get(quantity, ""))
     card.pictures[f"stamps {table}"] = stamps.picture()
