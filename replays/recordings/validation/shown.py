@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from replays.recordings.validation.explanation import DECIDES, excess
+from replays.recordings.validation.explanation import DECIDES
 from rig.channels import Channel
 
 if TYPE_CHECKING:
@@ -92,7 +92,8 @@ class Shown:
     def price(self) -> float:
         """What another number must take away: more than noise makes, and than what is wrong elsewhere brings along."""
         level = np.ones(len(self.values))  # may be off by far more than anything moves
-        return max(DECIDES, _SLIGHT * excess(self.left([level], self.values - self.foretold)[1]))
+        left = self.left([level], self.values - self.foretold)[1]
+        return max(DECIDES, _SLIGHT * float(left @ left))
 
     def cost(self, left: np.ndarray, count: int) -> float:
         """Of a law with so many numbers that leaves so much over the floor, shape (n,) or fewer."""
