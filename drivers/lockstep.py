@@ -19,7 +19,7 @@ from rig.transport import Client
 LOST_S = 2.0
 """Rows of a block that is over are there, or lost [s]."""
 _ENDED_S = 0.2
-"""How often whoever waits for a block looks whether the run is over [s]."""
+"""How often whoever waits for a block looks whether the run is over, where no event has told so [s]."""
 
 
 class Blocks:
@@ -33,7 +33,7 @@ class Blocks:
 
     def __init__(self, client: Client, daq: Daq, device: str) -> None:
         self._client, self._daq, self._device = client, daq, device
-        self._ends: queue.SimpleQueue[BlockEnd] = queue.SimpleQueue()
+        self._ends: queue.SimpleQueue[BlockEnd | None] = queue.SimpleQueue()
         self._lost = ""
         client.subscribe(wire.BLOCK, self._on_end)
         client.subscribe(wire.EVENTS, self._on_event)
@@ -49,6 +49,10 @@ class Blocks:
             if event["event"] == "device" and event.get("device") == self._device:
                 lost = event.get("state") == "lost"
                 self._lost = str(event.get("reason", "not done in time, or with another block")) if lost else ""
+                if lost:
+                    self._ends.put(None)
+            elif event["event"] == "end":
+                self._ends.put(None)
 
     def next(self) -> BlockEnd | None:
         """The end of the next block; None at that of the run.
@@ -57,13 +61,15 @@ class Blocks:
             RefusedError: The device was put out.
         """
         while True:
-            try:
-                return self._ends.get(timeout=_ENDED_S)
-            except queue.Empty:
-                if self._lost:
-                    raise RefusedError(f"the rig waits for {self._device} no longer: {self._lost}") from None
-                if self._daq.ended is not None:
-                    return None
+            end = None
+            with contextlib.suppress(queue.Empty):
+                end = self._ends.get(timeout=_ENDED_S)
+            if end is not None:
+                return end
+            if self._lost:
+                raise RefusedError(f"the rig waits for {self._device} no longer: {self._lost}")
+            if self._daq.ended is not None:
+                return None
 
     def rows(self, end: BlockEnd) -> Iterator[Samples]:
         """All rows that have come up to the end of a block, parted where rows are missing."""

@@ -122,6 +122,7 @@ class _Mapping(_Document):
 
 class _Import(_Document):
     mapping: _Mapping = _Mapping()
+    unsure: dict[str, Annotated[_Finite, Field(gt=0.0)]] = {}
 
 
 class Scene(_Document):

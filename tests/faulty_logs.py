@@ -238,4 +238,6 @@ CASES = tuple(
        for us, gain in ((200, 1.1), (100, 0.5), (1000, 2.0))]
     + [Case(f"{rows} rows lost at {at_s:g} s", "time rows|clock: [-+]", behind=_lost(at_s, rows))
        for at_s, rows in ((0.5, 20), (0.5, 200), (0.81, 100))]
+    + [Case(f"{a} and {b} swapped, inverted", f"{a} and {b} swapped and both inverted",
+            before=lambda v, _, a=a, b=b: v | {a: -v[b], b: -v[a]}) for a, b in (("ring_x", "ring_y"), PROBES[:2])]
 )  # fmt: skip

@@ -6,8 +6,8 @@ On the same build the same experiment gives the same payloads, bit for bit.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
 import numpy as np
@@ -38,12 +38,14 @@ class Experiment:
         commands: What was sent to the rig beside the scene's own commands.
         first_s: Simulated time at which the recording begins [s].
         begin: Where it is taken up, of a log from the middle of a run; None: at 0, where its scene begins.
+        unsure: Standard deviation of what a log tells less surely than by a channel of its own, by key, in its unit.
     """
 
     scene: Scene
     commands: tuple[SentCommand, ...] = ()
     first_s: float = 0.0
     begin: Begin | None = None
+    unsure: Mapping[str, float] = field(default_factory=dict)
 
     @classmethod
     def of(cls, recording: Recording) -> Self:
@@ -76,7 +78,8 @@ class Experiment:
         ]
         first_s = min(float(stream.first_time_s) for stream in streams)
         begin = _taken_up(recording, scene, first_s) if is_from_the_middle(recording) else None
-        return cls(scene=scene, commands=tuple(sent), first_s=first_s, begin=begin)
+        unsure = recording.scene.get("import", {}).get("unsure", {})
+        return cls(scene=scene, commands=tuple(sent), first_s=first_s, begin=begin, unsure=unsure)
 
     def changed(self, changes: dict[str, Any]) -> Experiment:
         """The same with other values of scene or parameters, by dotted key, each in its own unit.

@@ -48,8 +48,9 @@ _MARGIN_S = 1e-4
 _ROWS_HZ = TICK_RATE_HZ // ROW_TICKS
 _COMMAND_KEY = re.compile(r"(hammer|speed|release)\.([1-9][0-9]*)\.(\w+)")
 _TICK_S = 1.0 / TICK_RATE_HZ
-_STEPS = {"at_s": 25.0 * _TICK_S, "duration_ms": 0.025}
-"""Steps of difference quotients of what a simulation rounds to ticks, by field of a command, in the field's unit."""
+_STEPS = {"at_s": 2.0 * _TICK_S, "duration_ms": 2e3 * _TICK_S}
+"""Steps of difference quotients of what a simulation rounds to ticks, by field of a command, in the field's unit: as
+few ticks as go, as impacts far ahead bend over more."""
 _SCALES = {"at_s": 1e-3, "direction": 10.0}
 """What counts as a change of size 1 where the value itself may be 0 [s], [degrees]."""
 
@@ -232,15 +233,35 @@ class Predictor:
         base = self.predict(values)
         found: list[dict[str, np.ndarray]] = []
         smooth = np.zeros(len(self.keys), dtype=bool)
-        for place, key in enumerate(self.keys):
+        directions = [self._direction(values, place) for place in range(len(self.keys))]
+        for place, (key, direction) in enumerate(zip(self.keys, directions, strict=True)):
             grid, scale = _step_of(key), self.scales[place]
             slope: dict[str, np.ndarray] = {}
             for step in _shorter(grid or _STEP * scale, grid or _LEAST_STEP * scale):
-                slope, smooth[place] = self._quotient(values, place, step, base)
+                slope, smooth[place] = self._quotient(values, place, step * direction, base)
                 if smooth[place]:
                     break
             found.append(slope)
+        for place, (slope, direction) in enumerate(zip(found, directions, strict=True)):
+            for other in np.flatnonzero(direction):  # what went along is no part of the slope
+                if other != place:
+                    slope |= {name: one - direction[other] * found[other][name] for name, one in slope.items()}
         return Derivatives(base, tuple(found), smooth)
+
+    def _direction(self, values: np.ndarray, place: int) -> np.ndarray:
+        """How values go with one while its difference quotient is taken, shape (keys,).
+
+        With a pulse's length goes its force, so that the impulse stays. The length goes by whole ticks, and through
+        impacts as much impulse is no small step: its quotient would not cancel against that of the force, and what is
+        left would pass for the shape of the pulse, which hardly shows.
+        """
+        direction = np.zeros(len(self.keys))
+        direction[place] = 1.0
+        force = self.keys[place].replace(".duration_ms", ".force_n")
+        if force != self.keys[place] and force in self.keys:
+            other = self.keys.index(force)
+            direction[other] = -values[other] / values[place]
+        return direction
 
     def _later(self, key: str) -> bool:
         """Whether a command comes only behind the last row: nothing of it is seen."""
@@ -257,13 +278,12 @@ class Predictor:
         return replace(first, values=both)
 
     def _quotient(
-        self, values: np.ndarray, place: int, step: float, base: Prediction
+        self, values: np.ndarray, place: int, step: np.ndarray, base: Prediction
     ) -> tuple[dict[str, np.ndarray], bool]:
         """A difference quotient, and whether the contacts were the same ones on both sides."""
         sides: list[tuple[float, Prediction]] = []
         for sign in (1.0, -1.0):
-            moved = values.copy()
-            moved[place] += sign * step
+            moved = values + sign * step
             try:
                 sides.append((moved[place], self.predict(moved)))
             except (InputError, SimulationError):

@@ -143,8 +143,8 @@ def _asked(text: str) -> list[str]:
 
     found, table = [], ""
     for line in text.splitlines():
-        if line.startswith("["):
-            table = line.partition("#")[0].strip()
+        if (bare := line.removeprefix("# ")).startswith("["):
+            table = bare.partition("#")[0].strip()
         if CHECK in line:
             held, _, question = line.partition(f"# {CHECK}: ")
             held = held.strip().removeprefix("# ")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import tomllib
 from pathlib import Path
@@ -15,6 +16,7 @@ from replays.recordings.experiment import Experiment
 from replays.recordings.export import write_run
 from replays.recordings.identification import ask, identify
 from replays.recordings.identification.horizon import horizon
+from replays.recordings.identification.judgement import Finding, widened
 from replays.recordings.identification.question import measured_noise
 from replays.recordings.identification.window import Window
 from rig.cli.main import main
@@ -88,6 +90,17 @@ def test_bounds_decide_what_counts_as_seen(file: Path) -> None:
     standing, wide = half_width({})
     assert standing == "identified"
     assert half_width({"magnet.stiffness": (1.7 - wide / 2, 1.7 + wide / 2)})[0] == "not seen"
+
+
+def test_an_interval_wider_than_what_was_believed_is_no_result(file: Path) -> None:
+    recording = Recording.open(file)
+    (unknown,) = ask(recording, Experiment.of(recording), ["hammer.1.force_n"]).unknowns
+    finding = Finding(unknown, 110.0, 1.0, "identified", "identified")
+    wider = widened(finding, 20.0)
+    assert (wider.standing, wider.half_width) == ("identified", 21.0)
+    lost = widened(finding, unknown.reach)
+    assert (lost.standing, lost.half_width) == ("not seen", math.inf)
+    assert lost.words.endswith("its interval would be wider than the value itself")
 
 
 def test_a_prior_narrows_the_interval_as_two_measurements_do(file: Path) -> None:

@@ -136,6 +136,22 @@ def test_derivatives_are_secants_of_small_steps(experiment: Experiment) -> None:
             assert np.abs(secant - slope).max() < 0.02 * np.abs(slope).max()
 
 
+def test_the_length_of_a_pulse_acts_through_impacts_by_its_impulse_above_all(experiment: Experiment) -> None:
+    """What its slope has beside that of the force is a secant at the same impulse: ticks of length bend the rest."""
+    parts = rows(("ring_x", "P_E"), np.arange(1200) / 20_000)
+    predictor = Predictor(experiment, ("hammer.1.duration_ms", "hammer.1.force_n"), parts)
+    length_ms, force_n = predictor.start
+    by_length, by_force = predictor.derivatives(predictor.start).slopes
+    longer, shorter = (
+        predictor.predict((length_ms + step, force_n * length_ms / (length_ms + step))).values
+        for step in (0.001, -0.001)
+    )
+    for name in parts:
+        shape = by_length[name] - force_n / length_ms * by_force[name]
+        assert np.abs(shape - (longer[name] - shorter[name]) / 0.002).max() < 0.05 * np.abs(shape).max()
+        assert np.abs(shape).max() < 0.1 * np.abs(by_length[name]).max()
+
+
 def test_a_value_that_acts_on_nothing_has_no_derivative(experiment: Experiment) -> None:
     predictor = Predictor(experiment, ["contact.friction"], rows(CHANNELS, np.arange(400) / 20_000))  # before the blow
     assert not any(slope.any() for slope in predictor.derivatives(predictor.start).slopes[0].values())

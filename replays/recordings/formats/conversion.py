@@ -17,6 +17,7 @@ from replays.recordings.formats import clock, events
 from replays.recordings.formats.group import ImportedChannel, PlacedGroup, nominal_hz, place, quantise, rotate
 from replays.recordings.formats.mapped import Log, MappedSignal, check_rows, engineering
 from replays.recordings.formats.mapping import Mapping
+from replays.recordings.formats.motion import Motion
 from rig import wire
 from rig.channels import ChannelTable, default_table
 from rig.errors import InputError
@@ -25,6 +26,10 @@ TICK_RATE_HZ = 1_000_000
 _BLOCK_S = 0.05
 _LATE = 2.6131 / (2.0 * math.pi)
 """Delay of a Butterworth low-pass of order 4 far below its corner, times the corner [1]."""
+_BESIDE = 1.01
+"""So far above half of the rate a corner may be told, as clocks are off."""
+_REST = 0.25
+"""Part of the time between two hammer pulses behind which a log may begin to be judged by the second."""
 NO_SCENE = "none (imported)"
 _EPOCH_S = (946_684_800.0, 4_102_444_800.0)
 """Times from 2000 to 2100 in seconds since 1970: none that a measurement began at 0 would reach."""
@@ -101,6 +106,7 @@ def convert(
         entry.axis = axis.moved(-entry.mapping.delay_us * 1e-6)
     check_rows(taken)
     for entry in taken:
+        _check_corner(entry, mapping, remarks)
         engineering(entry, mapping)
     pulses, low_s, high_s = _range(taken, log)
     say("placing samples")
@@ -126,9 +132,13 @@ def convert(
     end_s = max(first_s[name] + group.rows / group.rate_hz for name, group in groups.items())
     experiment = None
     if mapping.experiment is not None:
-        speed = events.speed_before(groups, edges, kept, zero_s=zero_s)
+        motions = [
+            Motion(channel, entry.values, clock.Axis(first_s[name], group.rate_hz, group.rows))
+            for name, group in groups.items()
+            for channel, entry in group.channels.items()
+        ]
         experiment = events.build_experiment(
-            mapping.experiment, kept, duration_s=end_s, speed_hz=speed, table=table, remarks=remarks
+            mapping.experiment, kept, duration_s=end_s, motions=motions, edges=edges, table=table, remarks=remarks
         )
     document = {
         "files": [
@@ -140,11 +150,30 @@ def convert(
         "mapping": mapping.document(),
         "channels": {channel.name: channel.document() for channel in channels},
         "remarks": remarks,
+        **({"unsure": experiment.unsure} if experiment is not None and experiment.unsure else {}),
     }
     return Conversion(
         table=table, counts=counts, present=present, first_s=first_s, rates_hz=rates_hz, edges=edges, pulses=kept,
         channels=tuple(channels), remarks=tuple(remarks), document=document, start=begin, experiment=experiment,
     )  # fmt: skip
+
+
+def _check_corner(entry: MappedSignal, mapping: Mapping, remarks: list[str]) -> None:
+    """Refuse the default of all as the corner of a channel too slow for it; what a channel says itself is remarked.
+
+    Raises:
+        InputError: The channel has to say its own.
+    """
+    corner_hz, most_hz = entry.mapping.bandwidth_hz, 0.5 * entry.axis.rate_hz
+    if corner_hz is None or corner_hz <= _BESIDE * most_hz:
+        return
+    if "bandwidth_hz" not in entry.mapping.model_fields_set:
+        must = f"given, as that of [defaults] is above half of its rate ({most_hz:.6g} Hz)"
+        raise InputError(f"channels.{entry.name}.bandwidth_hz", must, corner_hz)
+    remarks.append(
+        f"{entry.name}: bandwidth_hz {corner_hz:g} is above half of its rate ({most_hz:.6g} Hz), as of a converter "
+        "without a low-pass of its own: what is faster appears as something slower"
+    )
 
 
 def _of_the_axes(groups: dict[str, PlacedGroup]) -> list[str]:
@@ -213,7 +242,7 @@ def _range(taken: Sequence[MappedSignal], log: Log) -> tuple[tuple[events.Hammer
     pulses: tuple[events.HammerPulse, ...] = ()
     if mapping.hammer is not None:
         hammer = next(entry for entry in taken if entry.name == "hammer")
-        found = events.find_pulses(hammer.values, hammer.axis, mapping.hammer)
+        found, passed_over = events.find_pulses(hammer.values, hammer.axis, mapping.hammer)
         pulses = tuple(pulse for pulse in found if low <= pulse.at_s <= high)
         if not pulses:
             largest = float(np.nanmax(hammer.values))
@@ -221,6 +250,17 @@ def _range(taken: Sequence[MappedSignal], log: Log) -> tuple[tuple[events.Hammer
                              mapping.hammer.threshold_n)  # fmt: skip
         told = ", ".join(f"{b.force_n:.4g} N for {b.duration_ms:.3g} ms" for b in pulses[:5])
         log.remarks.append(f"{len(pulses)} hammer pulses found: {told}")
+        if lost := [f"{b.force_n:.4g} N at {b.at_s:.4f} s" for b in passed_over if low <= b.at_s <= high]:
+            log.remarks.append(
+                f"{len(lost)} hammer pulses too soon behind another do not count, and nothing foretells what they do "
+                f"(hammer.dead_s, hammer.threshold_n): {', '.join(lost[:5])}"
+            )
+        for second in pulses[1:2]:
+            from_s = pulses[0].at_s + _REST * (second.at_s - pulses[0].at_s)
+            log.remarks.append(
+                f"`rig validate` begins before the first of them and compares samples for as long as motion behind it "
+                f"can be foretold; to begin behind it: [time] from_s = {from_s:.4g}"
+            )
         if mapping.hammer.pre_s is not None:
             low = max(low, pulses[0].at_s - mapping.hammer.pre_s)
     return pulses, low, high

@@ -3,23 +3,39 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping as Mapped
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from replays.recordings.formats.motion import Impact, Motion, impact, turning
 from rig.channels import ChannelTable, default_table
 from rig.errors import InputError, Words
 
 if TYPE_CHECKING:
     from replays.recordings.formats.clock import Axis
-    from replays.recordings.formats.group import PlacedGroup
     from replays.recordings.formats.mapping import ExperimentMapping, HammerMapping
+    from rig.scenes import Scene
 
 _FOOT = 0.05
 """A pulse is summed out to this part of its peak on either side."""
+_DEAD_S = 0.1
+"""So soon behind a pulse one counts only [s] ..."""
+_RESTED, _LARGE = 2.0, 0.2
+"""... if the hammer has been below the threshold for so many times as long as the one before, and it is this part of
+that in force: ringing does not rest, and rebounds are small."""
+_BY_HAND, _UNTOLD = 0.01, 0.2
+"""Standard deviation of a speed that is given or that a channel shows, and of one that is the scene's, as a part."""
+_BY_EDGES = 1e-3
+"""Part by which the speed of two edges may be off."""
+_PROBES = "the motion of the probes"
+_ALONG_DEG = 5.0
+"""Hammers hit along x; an angle that is seen with less is no other direction [degrees]."""
+_BY_EYE = {"hammer.1.duration_ms": 0.1, "clock.offset_s": 1e-3}
+"""Of a hammer pulse that no channel shows: of its length, as a part of it, and of its time [s]."""
+_FORETOLD_S = 0.02
+"""So long behind what is sudden in a log the command may stand that explains it [s]."""
 
 
 @dataclass(frozen=True)
@@ -46,8 +62,11 @@ class HammerPulse:
         }  # fmt: skip
 
 
-def find_pulses(force_n: np.ndarray, axis: Axis, wanted: HammerMapping) -> list[HammerPulse]:
-    """Hammer pulses in a force: stretches above the threshold, at least the dead time apart.
+def find_pulses(force_n: np.ndarray, axis: Axis, wanted: HammerMapping) -> tuple[list[HammerPulse], list[HammerPulse]]:
+    """Hammer pulses in a force: those that count, and those that are of their own but come too soon behind another.
+
+    A pulse is a stretch above the threshold. Behind one the dead time has to pass, if it is given; else a pulse counts
+    at once that is clearly one of its own.
 
     Args:
         force_n: Force of the hammer [N], shape (n,).
@@ -57,45 +76,81 @@ def find_pulses(force_n: np.ndarray, axis: Axis, wanted: HammerMapping) -> list[
     times_s = axis.instants()
     force = np.nan_to_num(force_n)
     above = force >= wanted.threshold_n
+    loud_s = times_s[np.abs(force) >= wanted.threshold_n]  # ringing goes to both sides
     starts = np.flatnonzero(above & ~np.concatenate([[False], above[:-1]]))
     found: list[HammerPulse] = []
+    passed_over: list[HammerPulse] = []
     free_s = -math.inf
     for start in starts.tolist():
-        if times_s[start] < free_s:
+        at_s = float(times_s[start])
+        last = found[-1] if found else None
+        soon = last is not None and at_s < free_s
+        if last is not None and soon:
+            before = int(np.searchsorted(loud_s, at_s))
+            if at_s - loud_s[before - 1] < _RESTED * 1e-3 * last.duration_ms:
+                continue
+        pulse = _pulse(force, times_s, start, axis.rate_hz, wanted)
+        if last is not None and soon and (wanted.dead_s is not None or pulse.force_n < _LARGE * last.force_n):
+            passed_over.append(pulse)
             continue
-        free_s = float(times_s[start]) + wanted.dead_s
-        end = start
-        while end < len(force) and force[end] >= wanted.threshold_n:
-            end += 1
-        foot = _FOOT * float(force[start:end].max())
-        low, high = start, end
-        while low > 0 and force[low - 1] > foot:
-            low -= 1
-        while high < len(force) and force[high] > foot:
-            high += 1
-        pulse, when = force[low:high], times_s[low:high]
-        peak, impulse = float(pulse.max()), float(pulse.sum()) / axis.rate_hz
-        duration = 0.5 * math.pi * impulse / peak
-        centre = float(pulse @ when) / float(pulse.sum())
-        start_s = centre - 0.5 * duration - wanted.delay_us * 1e-6
-        found.append(HammerPulse(start_s, peak, duration * 1e3, wanted.direction))
-    return found
+        free_s = at_s + (_DEAD_S if wanted.dead_s is None else wanted.dead_s)
+        found.append(pulse)
+    return found, passed_over
 
 
-def speed_before(
-    groups: Mapped[str, PlacedGroup], edges: np.ndarray, pulses: Sequence[HammerPulse], *, zero_s: float
-) -> float | None:
-    """Mean speed before the first hammer pulse, else of the whole [Hz]: of the channel `speed`, else of the edges."""
-    drive = next((group for group in groups.values() if "speed" in group.channels), None)
-    until_s = pulses[0].at_s if pulses else math.inf
-    if drive is not None:
-        values = drive.channels["speed"].values[
-            : max(1, round((min(until_s, 1e6) + zero_s - drive.start_s) * drive.rate_hz))
-        ]
-        return float(np.nanmean(values))
+def _pulse(force: np.ndarray, times_s: np.ndarray, start: int, rate_hz: float, wanted: HammerMapping) -> HammerPulse:
+    """The pulse that rises above the threshold at a row."""
+    end = start
+    while end < len(force) and force[end] >= wanted.threshold_n:
+        end += 1
+    foot = _FOOT * float(force[start:end].max())
+    low, high = start, end
+    while low > 0 and force[low - 1] > foot:
+        low -= 1
+    while high < len(force) and force[high] > foot:
+        high += 1
+    pulse, when = force[low:high], times_s[low:high]
+    peak, impulse = float(pulse.max()), float(pulse.sum()) / rate_hz
+    duration = 0.5 * math.pi * impulse / peak
+    centre = float(pulse @ when) / float(pulse.sum())
+    return HammerPulse(centre - 0.5 * duration - wanted.delay_us * 1e-6, peak, duration * 1e3, wanted.direction)
+
+
+class Speed(NamedTuple):
+    """A speed that a log tells, its standard deviation [Hz], and what tells it."""
+
+    hz: float
+    deviation_hz: float
+    by: str
+
+    @property
+    def text(self) -> str:
+        """In words."""
+        within = f" ±{2.0 * self.deviation_hz:.1g}" if self.by == _PROBES else ""
+        return f"{self.hz:.4g}{within} Hz by {self.by}"
+
+
+def speeds_before(motions: Sequence[Motion], edges: np.ndarray, until_s: float) -> list[Speed]:
+    """Mean speeds up to some time, else of the whole: of the channel `speed`, of the edges, else of the probes' motion.
+
+    Args:
+        motions: Channels, in the time of the recording.
+        edges: Of the keyphasor [ticks], shape (turns,).
+        until_s: Up to here the drive alone acts [s].
+    """
+    found = []
+    if (own := next((one for one in motions if one.name == "speed"), None)) is not None:
+        rows = max(1, round((min(until_s, 1e6) - own.axis.first_s) * own.axis.rate_hz))
+        hz = float(np.nanmean(own.values[:rows]))
+        found.append(Speed(hz, _BY_HAND * abs(hz), "the channel `speed`"))
     times = edges[edges < until_s * 1e6]
     times = times if len(times) > 1 else edges
-    return (len(times) - 1) * 1e6 / float(times[-1] - times[0]) if len(times) > 1 else None
+    if len(times) > 1:
+        hz = (len(times) - 1) * 1e6 / float(times[-1] - times[0])
+        found.append(Speed(hz, 0.0, "the keyphasor"))
+    if not found and (turned := turning(motions, until_s=until_s)) is not None:
+        found.append(Speed(*turned, _PROBES))
+    return found
 
 
 class ExperimentDocuments(NamedTuple):
@@ -106,6 +161,8 @@ class ExperimentDocuments(NamedTuple):
     scene: dict[str, Any]
     commands: list[dict[str, Any]]
     """The scene's commands, each with at_s."""
+    unsure: dict[str, float]
+    """Standard deviation of what the log tells less surely than by a channel of its own, by key, in its unit."""
 
 
 def build_experiment(
@@ -113,11 +170,21 @@ def build_experiment(
     pulses: Sequence[HammerPulse],
     *,
     duration_s: float,
-    speed_hz: float | None,
+    motions: Sequence[Motion],
+    edges: np.ndarray,
     table: ChannelTable,
     remarks: list[str],
 ) -> ExperimentDocuments:
     """The scene that a mapping tells, with what was found in the log, as the documents of a recording.
+
+    Args:
+        wanted: What the mapping tells.
+        pulses: Hammer pulses that were found.
+        duration_s: Of the recording [s].
+        motions: Channels, in the time of the recording.
+        edges: Of the keyphasor [ticks], shape (turns,).
+        table: Channel table of the recording.
+        remarks: Grows by what was done, and by what of the log is at odds with what is told.
 
     Raises:
         InputError: The scene cannot be so.
@@ -127,13 +194,6 @@ def build_experiment(
 
     scene = load_scene(wanted.scene, dict(wanted.set))
     data = scene.model_dump()
-    if wanted.speed_hz is not None:
-        speed = speed_hz if wanted.speed_hz == "measured" else wanted.speed_hz
-        if speed is None:
-            raise InputError(
-                "experiment.speed_hz", "a number, or measured by a channel `speed` or a keyphasor", Words("measured")
-            )
-        data["drive"] = {**data["drive"], "speed_hz": max(0.0, speed), "profile": ()}
     if wanted.commands == "detected":
         others = [timed for timed in data["commands"] if timed["request"]["command"] != "hammer"]
         data["commands"] = [*others, *(pulse.command() for pulse in pulses)]
@@ -155,6 +215,74 @@ def build_experiment(
         scene = parse_scene(data)
         remarks.append("the scene samples at the rig's own rates, as it cannot at the log's")
     remarks.append(f"scene {scene.name}: what was done as the mapping tells it, on assumed parameters until identified")
+    hits = [timed for timed in scene.commands if timed.request.command == "hammer"]
+    first_s = min((timed.at_s for timed in hits), default=math.inf)
+    unsure = dict[str, float]()
+    if wanted.commands != "scene":
+        hit = impact(motions)
+        if hit is not None and all(timed.at_s > hit.at_s + _FORETOLD_S for timed in scene.commands):
+            remarks.append(
+                f"from {hit.at_s:.3f} s on {', '.join(hit.names)} move as never before, as behind an impact, and no "
+                f"command comes by then: what follows is predicted wrongly; [experiment] commands = [{told_as(hit)}]"
+            )
+            first_s = hit.at_s
+        if hits and all(one.name != "hammer" for one in motions):
+            unsure |= _BY_EYE
+            unsure["hammer.1.duration_ms"] *= hits[0].request.model_dump()["duration_ms"]
+    scene, deviation_hz = _driven(scene, wanted, speeds_before(motions, edges, first_s), edges, remarks)
+    if deviation_hz:
+        unsure["drive.speed_hz"] = deviation_hz
     simulation = Simulation(scene)
     commands = [{"at_s": timed.at_s, **timed.request.model_dump()} for timed in scene.commands]
-    return ExperimentDocuments(scene.name, simulation.parameters_document(), simulation.scene_document(), commands)
+    return ExperimentDocuments(
+        scene.name, simulation.parameters_document(), simulation.scene_document(), commands, unsure
+    )
+
+
+def told_as(hit: Impact) -> str:
+    """An impact as a command in TOML, as far as the probes tell it."""
+    at_s, force_n, duration_ms, degrees = hit.pulse or (hit.at_s, 100.0, 5.0, 0.0)
+    way = f", direction = {round(degrees)}" if abs(degrees) > _ALONG_DEG else ""
+    return (
+        f'{{ at_s = {at_s:.5f}, command = "hammer", force_n = {min(max(force_n, 1.0), 1000.0):.3g}, '
+        f"duration_ms = {min(max(duration_ms, 0.5), 50.0):.3g}{way} }}"
+    )
+
+
+def _driven(
+    scene: Scene, wanted: ExperimentMapping, speeds: Sequence[Speed], edges: np.ndarray, remarks: list[str]
+) -> tuple[Scene, float]:
+    """The scene at the speed that is told, and its standard deviation where the log does not show it [Hz], else 0.
+
+    Raises:
+        InputError: It is to be measured, and cannot be.
+    """
+    from rig.scenes import parse_scene
+
+    measured = wanted.speed_hz == "measured"
+    if measured and not speeds:
+        must = "a number, or measured by a channel `speed`, a keyphasor or probes that turn"
+        raise InputError("experiment.speed_hz", must, Words("measured"))
+    number = wanted.set.get("drive.speed_hz") if wanted.speed_hz is None else None if measured else wanted.speed_hz
+    if measured:
+        told = speeds[0]
+    elif number is not None:
+        told = Speed(float(number), _BY_HAND * abs(float(number)), "the mapping")
+    elif wanted.commands == "scene" or scene.drive.profile:
+        return scene, 0.0
+    else:
+        told = Speed(scene.drive.speed_hz, 0.0, f"the scene {scene.name}, as experiment.speed_hz is left out")
+    apart = [
+        one for one in speeds
+        if abs(one.hz - told.hz) > 2.0 * math.hypot(one.deviation_hz, told.deviation_hz, _BY_EDGES * told.hz)
+    ]  # fmt: skip
+    shown = any(one.by != _PROBES for one in speeds)
+    if apart or not (shown or number is not None):
+        others = f", but {' and '.join(one.text for one in apart)}" * bool(apart)
+        remarks.append(f"speed: {told.text}{others}" + ("" if shown else "; `rig validate` fits it"))
+    if wanted.speed_hz is not None:
+        data = scene.model_dump()
+        scene = parse_scene({**data, "drive": {**data["drive"], "speed_hz": max(0.0, told.hz), "profile": ()}})
+    if len(edges) > 2 or (measured and shown):
+        return scene, 0.0
+    return scene, told.deviation_hz or _UNTOLD * told.hz

@@ -93,6 +93,12 @@ class Look:
         peak = float(off.max())
         return peak > _BLOW * usual and float(np.mean(off > 0.3 * peak)) < _SELDOM and not len(self.edges)
 
+    @property
+    def struck_s(self) -> float:
+        """When it first goes a tenth of the way to its largest pulse [s]."""
+        off = np.abs(self.values - float(np.median(self.values)))
+        return float(self.axis.instants()[int(np.argmax(off > 0.1 * off.max()))])
+
     @cached_property
     def corner_hz(self) -> float | None:
         """Where its noise ends [Hz], if it shows."""

@@ -193,8 +193,8 @@ class HammerMapping(_Section):
 
     threshold_n: PositiveFloat = 10.0
     """Force from which on it is a hammer pulse [N]."""
-    dead_s: PositiveFloat = 0.1
-    """Time after a hammer pulse in which there is no other one [s]."""
+    dead_s: PositiveFloat | None = None
+    """Time after a hammer pulse in which no other one counts [s]; left out: 0.1, but for a pulse clearly of its own."""
     pre_s: Annotated[FiniteFloat, Field(ge=0.0)] | None = None
     """The recording begins so long before the first hammer pulse [s]."""
     delay_us: FiniteFloat = 0.0
@@ -211,7 +211,8 @@ class ExperimentMapping(_Section):
     set: dict[str, Any] = {}
     """Changes of the scene or its parameters, by dotted key."""
     speed_hz: FiniteFloat | Literal["measured"] | None = None
-    """Speed of the drive [Hz]; measured: the mean of the channel `speed`, or of the edges, before the first command."""
+    """Speed of the drive [Hz]; measured: by the channel `speed`, the edges, or the probes, before the first pulse. Left
+    out: the scene's."""
     commands: tuple[dict[str, Any], ...] | Literal["scene", "detected"] = "scene"
     """Commands with at_s in the recording's time; those of the scene; or the hammer pulses that were found."""
     lead_s: Annotated[FiniteFloat, Field(ge=0.0, le=60.0)] | None = None
@@ -280,4 +281,7 @@ def parse_mapping(data: dict[str, Any], *, name: str) -> Mapping:
         channel: entry if entry.bandwidth_hz is not None else entry.model_copy(update=corner)
         for channel, entry in mapping.channels.items()
     }
+    for channel, entry in told.items():
+        if mapping.channels[channel].bandwidth_hz is None:
+            entry.model_fields_set.discard("bandwidth_hz")  # no word of its own: the import holds it against the rate
     return mapping.model_copy(update={"channels": told})

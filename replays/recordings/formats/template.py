@@ -10,8 +10,10 @@ from importlib.resources import files as files_of
 from pathlib import Path
 
 from replays.recordings.formats.attached import Attached, attached
+from replays.recordings.formats.events import told_as
 from replays.recordings.formats.guess import SURE, Guess, guess
 from replays.recordings.formats.mapping import FileOptions
+from replays.recordings.formats.motion import Motion, impact, turning
 from replays.recordings.formats.noise import white_or_not
 from replays.recordings.formats.source import Entry, Source, open_source
 from rig import units
@@ -72,7 +74,8 @@ def _text(sources: Sequence[Source], known: dict[Path, Attached], guesses: Seque
     if dialect := sources[0].options:
         lines += ["", "[file]", *(f"{key} = {_quoted(value)}" for key, value in dialect.items())]
     lines += _time(guesses)
-    lines += _filters(guesses, known)
+    filters, corner_hz = _filters(guesses, known)
+    lines += filters
     taken: set[str] = set()
     for each in guesses:
         if each.look.missing == len(each.look.values):
@@ -82,6 +85,8 @@ def _text(sources: Sequence[Source], known: dict[Path, Attached], guesses: Seque
         if (channel := known[each.source.path].channels.get(each.entry.name)) is not None:
             lines += [f"bandwidth_hz = {channel.bandwidth_hz!r}"]
             lines += [f"highpass_hz = {channel.highpass_hz!r}"] * bool(channel.highpass_hz)
+        elif each.look.timed and corner_hz > (most_hz := 0.5 * each.look.axis.rate_hz):
+            lines += [f"bandwidth_hz = {most_hz:.6g}    # {CHECK}: half of its rate; that of [defaults] is above it"]
     lines += _happened(guesses, several=len(sources) > 1)
     first, about = sources[0].path, known[sources[0].path]
     if about.experiment:
@@ -123,11 +128,11 @@ def _time(guesses: Sequence[Guess]) -> list[str]:
     return ["", told, "[time]", f'stamps = "line"    # {asked}']
 
 
-def _filters(guesses: Sequence[Guess], known: dict[Path, Attached]) -> list[str]:
-    """The question after the low-passes before the converter, and what the noise says of them."""
+def _filters(guesses: Sequence[Guess], known: dict[Path, Attached]) -> tuple[list[str], float]:
+    """The question after the low-passes before the converter, and the corner that the noise shows, else 0 [Hz]."""
     open_ones = [each for each in guesses if each.channel and each.entry.name not in known[each.source.path].channels]
     if not open_ones:
-        return []
+        return [], 0.0
     lines = [
         "",
         "[defaults]    # of all channels that do not say it themselves",
@@ -139,11 +144,14 @@ def _filters(guesses: Sequence[Guess], known: dict[Path, Attached]) -> list[str]
     alike = [corner for corner in corners if abs(corner / middle - 1.0) < _COMMON_CORNERS]
     if 2 * len(alike) > len(open_ones):
         text = f"the noise of {len(alike)} of {len(open_ones)} signals ends there, as behind a low-pass of order 4"
-        return [*lines, f"bandwidth_hz = {float(f'{middle:.3g}'):g}    # {CHECK}: {text}"]
+        return [*lines, f"bandwidth_hz = {float(f'{middle:.3g}'):g}    # {CHECK}: {text}"], middle
+    rates = [each.look.axis.rate_hz for each in open_ones if each.look.timed]
+    apart = len(rates) and max(rates) > 1.01 * min(rates)
+    slow = f"; channels of {min(rates):.6g} Hz have their own, at most half of that" if apart else ""
     return [
         *lines,
-        f"# bandwidth_hz = HZ    # {CHECK}: the low-pass before the converter; the noise does not show it",
-    ]
+        f"# bandwidth_hz = HZ    # {CHECK}: the low-pass before the converter; the noise does not show it{slow}",
+    ], 0.0
 
 
 def _happened(guesses: Sequence[Guess], *, several: bool) -> list[str]:
@@ -184,14 +192,45 @@ def _example_of(table: str, guesses: Sequence[Guess]) -> list[str]:
         return _shared(kept, guesses)
     if table != "[experiment]":
         return kept
-    without = {"set", "lead_s", *(() if {each.channel for each in guesses} & {"speed", "keyphasor"} else ("speed_hz",))}
-    kept = [line for line in kept if line.split(" ")[0] not in without and not line.startswith(" ")]
-    if any(each.channel == "hammer" and each.look.blows for each in guesses):
-        return kept
-    quiet = {"scene": 'scene = "stable-run"                # a name of `rig scenes`, or a file',
-             "commands": "commands = []                       # no hammer pulse was found; where one was: "
-             '[{ at_s = 0.8, command = "hammer", force_n = 100, duration_ms = 5 }]'}  # fmt: skip
-    return [quiet.get(line.split(" ")[0], line) for line in kept]
+    kept = [line for line in kept if line.split(" ")[0] not in ("set", "lead_s") and not line.startswith(" ")]
+    motions, zero_s = _motions(guesses)
+    struck = any(each.channel == "hammer" and each.look.blows for each in guesses)
+    hit = None if struck else impact(motions)
+    said = {}
+    if hit is not None:
+        at = f"{', '.join(hit.names[:4])}{' and more' if len(hit.names) > 4 else ''} move suddenly at {hit.at_s:.3f} s"
+        force = "force and length assumed" if hit.pulse is None else "time, force and length as the probes show them"
+        said["commands"] = f"commands = [{told_as(hit)}]    # {CHECK}: no hammer pulse is known, but {at}: {force}"
+    elif not struck:
+        said["scene"] = 'scene = "stable-run"                # a name of `rig scenes`, or a file'
+        said["commands"] = (
+            "commands = []                       # no hammer pulse was found; where one was: "
+            '[{ at_s = 0.8, command = "hammer", force_n = 100, duration_ms = 5 }]'
+        )
+    if not {each.channel for each in guesses} & {"speed", "keyphasor"} and any(one.kind == "mm" for one in motions):
+        blow = next((each.look for each in guesses if struck and each.channel == "hammer"), None)
+        until_s = math.inf if hit is None else hit.at_s
+        until_s = until_s if blow is None else blow.struck_s - zero_s
+        turned = turning(motions, until_s=until_s)
+        shown = "# speed_hz = HZ" if turned is None else 'speed_hz = "measured"'
+        tell = "nor do the probes" if turned is None else f"the probes turn at {turned[0]:.4g} ±{2 * turned[1]:.1g} Hz"
+        said["speed_hz"] = f"{shown}    # {CHECK}: no channel tells the speed; {tell}"
+    return [said.get(line.split(" ")[0], line) for line in kept]
+
+
+def _motions(guesses: Sequence[Guess]) -> tuple[list[Motion], float]:
+    """The channels as they move, in the time of the recording, and where that begins [s]."""
+    table = default_table().channels
+    known = [each for each in guesses if each.look.timed and each.gain and table[each.channel].unit != "1"]
+    first = dict[str, float]()
+    for each in known:
+        group = table[each.channel].group
+        first[group] = max(first.get(group, -math.inf), each.look.axis.first_s)
+    zero_s = min(first.values(), default=0.0)
+    return [
+        Motion(each.channel, each.gain * (each.look.values - each.zero), each.look.axis.moved(-zero_s))
+        for each in known
+    ], zero_s
 
 
 def _shared(lines: list[str], guesses: Sequence[Guess]) -> list[str]:

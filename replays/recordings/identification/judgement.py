@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -240,23 +240,34 @@ def _finding(
     part: np.ndarray,
 ) -> Finding:
     unknown = unknowns[place]
-    known = "the prior" if unknown.prior is not None else "the bounds" if unknown.bounded else "the value itself"
     if alone[place]:
-        words = f"not seen in this window: its interval would be wider than {known}"
-        return Finding(unknown, value, math.inf, "not seen", words)
+        return Finding(unknown, value, math.inf, "not seen", _not_seen(unknown))
     if part[place] > _NAMED:
-        return Finding(unknown, value, math.inf, "only together", _together(place, unknowns, blind, known))
+        return Finding(unknown, value, math.inf, "only together", _together(place, unknowns, blind))
     if min(value - unknown.low, unknown.high - value) < 1e-6 * unknown.scale:
         return Finding(unknown, value, math.inf, "at its bound", "at its bound: the interval does not hold there")
-    return Finding(unknown, value, half, "identified", "identified")
+    return widened(Finding(unknown, value, half, "identified", "identified"), 0.0)
 
 
-def _together(place: int, unknowns: tuple[Unknown, ...], blind: np.ndarray, known: str) -> str:
+def widened(finding: Finding, by: float) -> Finding:
+    """With an interval wider by so much to either side, in its unit; not seen where it leaves what was believed."""
+    half = finding.half_width + by
+    if finding.standing == "identified" and half > finding.unknown.reach:
+        return Finding(finding.unknown, finding.value, math.inf, "not seen", _not_seen(finding.unknown))
+    return replace(finding, half_width=half)
+
+
+def _not_seen(unknown: Unknown) -> str:
+    known = "the prior" if unknown.prior is not None else "the bounds" if unknown.bounded else "the value itself"
+    return f"not seen in this window: its interval would be wider than {known}"
+
+
+def _together(place: int, unknowns: tuple[Unknown, ...], blind: np.ndarray) -> str:
     """With what an unknown acts together, and how one makes up for the other."""
     direction = blind[:, int(np.argmax(np.abs(blind[place])))]
     others = [n for n in np.argsort(-np.abs(direction)) if n != place and abs(direction[n]) > _NAMED]
     if not others:
-        return f"not seen in this window: its interval would be wider than {known}"
+        return _not_seen(unknowns[place])
     change = 0.01 * unknowns[place].scale
     rates = [change * direction[n] * unknowns[n].reach / (direction[place] * unknowns[place].reach) for n in others]
     made_up = " and ".join(

@@ -15,15 +15,13 @@ import numpy as np
 
 from recorder.reader import Recording
 from replays.recordings.experiment import Experiment
+from replays.recordings.identification.agreement import stretches, without_each
 from replays.recordings.identification.fit import Identification
-from replays.recordings.identification.judgement import Judgement, judge
+from replays.recordings.identification.judgement import Judgement, judge, widened
 from replays.recordings.identification.nuisance import NUISANCES, looks_from, nuisances_of, tune
 from replays.recordings.identification.question import Question, ask, first_command_s
 from replays.recordings.identification.window import Window
 from replays.recordings.prediction import Measured
-
-_LONG_S, _SHORT_S = 0.1, 0.004
-"""Length of the stretches that are left out, before the hammer pulse and from it on [s]."""
 
 
 def identify_log(
@@ -89,33 +87,27 @@ def identify_log(
     here = _step(question, slopes, residuals)
     for one in shown:
         moved = np.hypot(moved, np.abs(_step(question, slopes, one) - here))
+    judgement, why = (
+        judge(window, z, slopes, residuals, known),
+        "the model, or a search that follows it, goes no further",
+    )
+    if tuned.end_s < tuned.longest_s and any(one.standing == "not seen" for one in judgement.findings[: len(keys)]):
+        why += "; what comes next may show what is not seen: with another --start, or another law of the contact"
     return Identification(
-        question=question, judgement=_wider(judge(window, z, slopes, residuals, known), moved * scale), window=window,
-        z=z, stages=(), why="the model, or a search that follows it, goes no further", runs=window.runs, narrowed={},
+        question=question, judgement=_wider(judgement, moved * scale), window=window,
+        z=z, stages=(), why=why, runs=window.runs, narrowed={},
     )  # fmt: skip
 
 
 def _jackknife(question: Question, slopes: np.ndarray, residuals: np.ndarray) -> np.ndarray:
-    """Half of 95 % intervals by what values do without one part of the samples, in scales, shape (unknowns,).
-
-    Whatever the model lacks acts on some channels and at some times more than on others. Tukey's jackknife with groups
-    left out (J. Shao and C. F. J. Wu, Annals of Statistics 17, 1989): once by channels, once by stretches of time.
-    """
-    from scipy.stats import t
-
+    """Half of 95 % intervals by what values do without single channels, and stretches of time, in scales."""
     times_s = question.observation.times_s[: len(residuals)]
-    before_s = times_s - first_command_s(question.experiment)
-    stretches = np.floor(before_s / np.where(before_s < 0.0, _LONG_S, _SHORT_S)).astype(int)
-    halves = []
-    for groups in (np.broadcast_to(np.arange(residuals.shape[1]), residuals.shape),
-                   np.broadcast_to(stretches[:, None], residuals.shape)):  # fmt: skip
-        parts = np.unique(groups)
-        if (n := len(parts)) < 2:
-            continue
-        without = np.array([_step(question, slopes, residuals, groups != one) for one in parts])
-        deviation = np.sqrt((n - 1) / n * ((without - without.mean(axis=0)) ** 2).sum(axis=0))
-        halves.append(float(t.ppf(0.975, n - 1)) * deviation)
-    return np.max(halves, axis=0)
+    number = stretches(times_s, first_command_s(question.experiment))
+    return np.max([
+        without_each(np.array([_step(question, slopes, residuals, groups != one) for one in np.unique(groups)]))
+        for groups in (np.broadcast_to(np.arange(residuals.shape[1]), residuals.shape),
+                       np.broadcast_to(number[:, None], residuals.shape))
+    ], axis=0)  # fmt: skip
 
 
 def _of(question: Question, parts: dict[str, Measured] | None = None) -> Window:
@@ -141,8 +133,7 @@ def _step(question: Question, slopes: np.ndarray, residuals: np.ndarray, kept: n
 
 def _wider(judgement: Judgement, moved: np.ndarray) -> Judgement:
     """With intervals that hold what the values move by as well."""
-    findings = [
-        replace(finding, half_width=finding.half_width + float(far))
-        for finding, far in zip(judgement.findings, moved, strict=True)
-    ]
-    return replace(judgement, findings=tuple(findings))
+    findings = tuple(widened(finding, float(far)) for finding, far in zip(judgement.findings, moved, strict=True))
+    told = np.array([finding.standing == "identified" for finding in findings])
+    correlation = np.where(np.outer(told, told), judgement.correlation, np.nan)
+    return replace(judgement, findings=findings, correlation=correlation)

@@ -17,10 +17,13 @@ from recorder.reader import Recording
 from replays.recordings.experiment import BEFORE_S, Experiment
 from replays.recordings.identification.agreement import (
     BEYOND,
+    Here,
     approach,
     by_agreement,
     centred,
     channels_of,
+    elsewhere,
+    jackknife,
     look,
     rms,
     signals_of,
@@ -48,7 +51,8 @@ _DEVIATIONS = {"clock.rate_ppm": 50.0, "clock.offset_s": 1e-4, "ring.offset_x": 
 """What is known before, as standard deviations: of a crystal [ppm]; of a trigger that is found in samples behind a
 filter [s]; of a ring that was put where it is by hand [mm]; ..."""
 _RELATIVE = {"drive.speed_hz": 1e-4, "hammer.1.duration_ms": 0.01}
-"""... and of a speed and the length of a pulse that are read off the log, as a part of them."""
+"""... and of a speed and the length of a pulse that are read off the log, as a part of them; `Experiment.unsure` has
+what is told less surely."""
 _ANOTHER = 0.2
 """Part by which two instruments do not differ that measure one speed."""
 _LOOSER = 100.0
@@ -78,7 +82,7 @@ _BROKEN = 10.0
 class Fitted:
     """One fitted number: where it began, where it ended, and half of its 95 % interval, in its unit.
 
-    The interval is that of the noise, with what the last samples that came moved the number by.
+    The interval is that of the noise, with what the last samples that came moved the number by, and a jackknife.
     """
 
     key: str
@@ -125,6 +129,7 @@ class Tuned:
             that what the model lacks makes.
         about_s: Where the clocks differ by the offset alone [s].
         end_s: End of the samples that it rests on [s].
+        longest_s: To where it would have gone on, had the model explained it [s].
         scales: RMS of what is left of each channel over its noise, at least 1.
     """
 
@@ -136,6 +141,7 @@ class Tuned:
     moves: np.ndarray
     about_s: float
     end_s: float
+    longest_s: float
     scales: dict[str, float]
 
     def on_time(self, parts: dict[str, Measured]) -> dict[str, Measured]:
@@ -191,7 +197,7 @@ def nuisances_of(
             value = value_of(experiment, key)
         except InputError:
             continue  # no hammer pulse
-        deviation = _DEVIATIONS.get(key) or _RELATIVE.get(key, 0.0) * abs(value)
+        deviation = experiment.unsure.get(key) or _DEVIATIONS.get(key) or _RELATIVE.get(key, 0.0) * abs(value)
         found[key] = (value, deviation) if deviation else None
     return found
 
@@ -322,7 +328,7 @@ def tune(
         looser = wanted | {key: (told[0], _LOOSER * told[1]) for key in far if (told := wanted[key]) is not None}
         found = max(found, _best(begun, looser, whole, progress), key=_Grown.worth)
     values, covariance = found.values, found.covariance
-    half = 1.96 * np.sqrt(np.diag(covariance) + np.mean(found.moves**2, axis=0))
+    half = np.hypot(1.96 * np.sqrt(np.diag(covariance) + np.mean(found.moves**2, axis=0)), found.lacking)
     told = dict(zip(wanted, values.tolist(), strict=True))
     return Tuned(
         begun=begun,
@@ -336,6 +342,7 @@ def tune(
         moves=found.moves,
         about_s=min(float(part.times_s[0]) for part in whole.values()),
         end_s=found.end_s,
+        longest_s=end_s,
         scales=dict(zip((name for part in whole.values() for name in part.names), found.scales, strict=True)),
     )
 
@@ -362,6 +369,7 @@ class _Grown:
         moves: What the last growths of the window moved them by, shape (growths, keys).
         end_s: End of the window [s].
         scales: What is left of each channel over its noise.
+        lacking: Half of 95 % intervals by what they do without parts of the samples, shape (keys,).
     """
 
     values: np.ndarray
@@ -369,6 +377,7 @@ class _Grown:
     moves: np.ndarray
     end_s: float
     scales: list[float]
+    lacking: np.ndarray
 
     @property
     def odds(self) -> float:
@@ -433,6 +442,7 @@ def _grown(
     first_s, every = _told_until_s(begun), [name not in without for part in whole.values() for name in part.names]
     values = np.array([value_of(begun, key) for key in wanted])
     covariance, end_s, scales, moves = np.eye(len(values)), first_s, list[float](), [np.zeros(len(values))]
+    lacking = np.zeros(len(values))
     for length in _WINDOWS_S:
         progress(f"{len(wanted)} numbers that the log does not tell exactly: to {first_s + length:.3f} s")
         parts = {name: part.until(first_s + length) for name, part in whole.items()}
@@ -440,21 +450,36 @@ def _grown(
         # Without a prior a value is held as loosely as makes no difference, so that what is not seen stays.
         loose = zip(predictor.start, predictor.scales, strict=True)
         known = np.array([prior or held for prior, held in zip(wanted.values(), loose, strict=True)]).T
-        found, here = approach(predictor, values, known, trusting=trusting, heard=every)
-        heard = [has and rms(z) <= _BROKEN for z, has in zip(here.apart, every, strict=True)]
-        if len(heard) / 2.0 < sum(heard) < len(heard):
-            # What is plainly wrong has no say at all: the little that it keeps moves what no other channel tells.
-            found, here = approach(predictor, found, known, trusting=True, heard=heard)
-        now = [max(1.0, rms(z)) for z in here.apart]
-        worse = [b / a for a, b in zip(scales, now, strict=False) if b > _WORSE * a]
-        if 2 * len(worse) > len(now) or 3 * sum(times < _BROKEN for times in worse) > len(now):
+
+        def fitted(start: np.ndarray) -> tuple[np.ndarray, Here, list[float]]:
+            found, here = approach(predictor, start, known, trusting=trusting, heard=every)  # noqa: B023
+            heard = [has and rms(z) <= _BROKEN for z, has in zip(here.apart, every, strict=True)]
+            if len(heard) / 2.0 < sum(heard) < len(heard):
+                # What is plainly wrong has no say at all: the little that it keeps moves what no other channel tells.
+                found, here = approach(predictor, found, known, trusting=True, heard=heard)  # noqa: B023
+            return found, here, [max(1.0, rms(z)) for z in here.apart]
+
+        found, here, now = fitted(values)
+        unseen = [
+            place for place, key in enumerate(wanted)
+            if key not in NUISANCES and covariance[place, place] > 0.25 * known[1, place] ** 2
+        ]  # fmt: skip
+        if scales and unseen and _is_worse(now, scales):
+            found, here, now = fitted(elsewhere(predictor, values, unseen, every))
+        if _is_worse(now, scales):
             break  # the model no longer explains it: that is to be judged, and not to be fitted away
         scales = now
         square = sum(one.T @ one / scale**2 for one, scale in zip(here.slopes, scales, strict=True))
         moves.append(found - values)
         covariance, values = np.linalg.inv(square + np.diag(known[1] ** -2.0)), found
-        end_s = first_s + length
-    return _Grown(values, covariance, np.array(moves[-_LAST:]), end_s, scales)
+        end_s, lacking = first_s + length, jackknife(here, parts, scales, known[1], first_s)
+    return _Grown(values, covariance, np.array(moves[-_LAST:]), end_s, scales, lacking)
+
+
+def _is_worse(now: list[float], before: list[float]) -> bool:
+    """Whether what is left of channels is no longer what it was on a shorter window."""
+    worse = [b / a for a, b in zip(before, now, strict=False) if b > _WORSE * a]
+    return 2 * len(worse) > len(now) or 3 * sum(times < _BROKEN for times in worse) > len(now)
 
 
 def _told_until_s(experiment: Experiment) -> float:

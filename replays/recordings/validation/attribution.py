@@ -201,6 +201,7 @@ def explain_log(
     sensors = sensor_faults(parts, nominal, end_s, others)
     # What one fault brings along elsewhere, in the fit before, is none of its own.
     most = max((one.explained for one in sensors), default=0.0)
+    brought = [one for one in sensors if one.explained <= _BESIDE * most]
     sensors = [one for one in sensors if one.explained > _BESIDE * most]
     trigger = any(one.name == "hammer delay" for one in sensors)
     far = [one for one in tuned.fitted if one.beyond and not (trigger and one.key == "clock.offset_s")]
@@ -209,14 +210,14 @@ def explain_log(
     # One that explains no more than the sensors do is not told beside them.
     numbers = [one for one in numbers if one.at_floor or one.explained > MOST]
     conclusion, best = conclude([*sensors, *numbers], sensors if cured else [], rules, end_s=end_s)
+    if brought and cured:
+        conclusion += f"; {_and(channels_in(brought, tuned.scales))} beside it: brought along, or another fault"
     early = next((one.value for one in sensors if one.name == "hammer delay" and one.value < 0.0), None)
     probes = [name for name in tuned.scales if name in default_table().groups["probes"].names]
     if early is not None and best and len(probes) > 1:
         # Until forces answer, nothing but the probes tells of time.
-        conclusion += (
-            f"; or sensor: {', '.join(probes)} delay {-early * 1e6:+.4g} µs: up to the first contact these look "
-        )
-        conclusion += "alike, and this log cannot tell"
+        conclusion += f"; or sensor: {', '.join(probes)} delay {-early * 1e6:+.4g} µs: "
+        conclusion += "up to the first contact these look alike, and this log cannot tell"
     if far:
         also = f"; {conclusion}" if best else ""
         best = (*(one.key for one in far), *best)
@@ -225,13 +226,12 @@ def explain_log(
         conclusion = f"what signals show by themselves comes first: {'; '.join(one.line for one in faults)}"
     elif not best and float(np.median(list(tuned.scales.values()))) > _AT_ODDS:
         if touching:
-            conclusion = "the log begins in contact, and where the shaft was before that, it does not tell: "
-            conclusion += "take one that begins before the hammer pulse"
+            conclusion = "the log begins in contact, and where the shaft was before that, it does not tell: take one "
+            conclusion += "that begins before the hammer pulse"
         else:
             conclusion = "nothing goes together from the hammer pulse on: its time, several channels, or the model is "
             conclusion += "off; this log cannot tell"
-    elif not best and sum(one.explained for one in sensors) > rules.enough:
-        part = sum(one.explained for one in sensors)
+    elif not best and (part := sum(one.explained for one in sensors)) > rules.enough:
         conclusion = (
             f"nearest are {_listed(sensors)}: {part:.0%} of the difference; the rest is another fault, or the model"
         )

@@ -16,19 +16,24 @@ from replays.recordings.experiment import Experiment, is_imported, parameter_dou
 from replays.recordings.identification.nuisance import Tuned, looks_from, tune
 from replays.recordings.identification.question import first_command_s
 from replays.recordings.prediction import Measured, Prediction, bare, measured, predict
+from replays.recordings.sensitivity import with_values
 from replays.recordings.validation.attribution import FEW_CHANNELS, Explained, attribute, explain_log, own_explained
 from replays.recordings.validation.bits import Bits, StreamBits
 from replays.recordings.validation.criteria import Criteria, load_criteria
 from replays.recordings.validation.explanation import Explanation
 from replays.recordings.validation.faults import late_together
+from replays.recordings.validation.numbers import changes_of
 from replays.recordings.validation.outcome import Validation
 from replays.recordings.validation.own import as_faults, own_faults
-from replays.recordings.validation.phases import PHASES
+from replays.recordings.validation.phases import CONTACT, PHASES, Phase
 from replays.recordings.validation.signals import SignalFault, edge_faults, signal_faults
 from replays.recordings.validation.statistics import perturbed, statistics
 from replays.recordings.validation.trajectory import foreseeable_s, residuals
 from replays.recordings.validation.truth import judge_truth, recorded_truth
 from rig.wire import TRUTH
+
+_MOST_HELD = 3
+"""Of numbers of the model that are named, so many are held against the phases."""
 
 
 def validate(
@@ -72,7 +77,7 @@ def validate(
         step("statistics by phase, and their spread")
         phases, judged = statistics(again.quick, again.parts, again.nominal, tables, again.criteria, again.members)
     validation = Validation(
-        path=recording.path, scene=experiment.scene.name, criteria=criteria.title, changes=dict(changes or {}),
+        path=recording.path, scene=experiment.scene.name, criteria=again.criteria.title, changes=dict(changes or {}),
         bits=again.bits, bit_exact=bool(again.bits) and all(one.equal for one in again.bits.values()),
         declared=declared, window_s=(begin, end), window_reason=reason, residuals=tuple(trajectory),
         truth=tuple(truth), phases=tuple(phases), statistics=tuple(judged),
@@ -80,14 +85,28 @@ def validate(
         skipped=sum(one.skipped for one in again.bits.values())
         or sum(stream.lost - stream.declared for stream in recording.streams.values()),
         explained=None, fitted=again.tuned.fitted if again.tuned is not None else (),
-        parts=again.parts, nominal=again.nominal, files=len(recording.parts),
+        parts=again.parts, nominal=again.nominal, files=len(recording.parts), **_contact(again, phases, end),
         doubts=(*recording.doubts, *parameter_doubts(recording)), faults=again.faults,
     )  # fmt: skip
     firsts = [one.first_s for one in trajectory if one.first_s is not None]
     # Without the truth a number of the model may be it, where that is off from the beginning on.
     if again.own and (again.same_motion or (not firsts and all(one.sure for one in again.own))):
         return replace(validation, faults=as_faults(again.own), explained=own_explained(again.own))
-    if validation.good or validation.doubts or not firsts or not moves:
+    if validation.good or validation.doubts or not moves:
+        return validation
+    touching = bool(phases) and phases[0].name not in (PHASES[0], PHASES[-1])
+    untold = again.tuned is not None and first_command_s(experiment) == 0.0 and not touching
+    if untold and any(one.quantity == "contact_fraction" and one.foretold == 0.0 < one.recorded for one in judged):
+        return replace(validation, explained=_unexplained(
+            next(one.from_s for one in phases if one.name in CONTACT), "the shaft touches the ring from there on, and "
+            "what was done, as it is told, brings none: a hammer pulse that the mapping does not tell ([[commands]])",
+        ))  # fmt: skip
+    if not firsts and again.tuned is not None and not again.faults:
+        return replace(validation, explained=_unexplained(
+            end, "until then all channels agree; what differs behind it is a number of the contact, or its law: "
+            "`rig identify --fit contact.friction,contact.restitution` fits them",
+        ))  # fmt: skip
+    if not firsts:
         return validation
     step("what explains the difference")
     if again.tuned is None:
@@ -96,7 +115,6 @@ def validate(
             step=step,
         )  # fmt: skip
         return replace(validation, explained=explained)
-    touching = bool(phases) and phases[0].name not in (PHASES[0], PHASES[-1])
     explained = _log_explained(again, from_s=min(firsts), end_s=end, touching=touching)
     late_s = late_together(explained.ranked, again.parts)
     if late_s:
@@ -104,7 +122,33 @@ def validate(
         other = _log_done_again(recording, experiment, criteria, step, late_s=late_s)
         if other.tuned is not None and other.tuned.better_than(again.tuned):
             explained = _log_explained(other, from_s=min(firsts), end_s=min(end, other.tuned.end_s), touching=touching)
+    named = [one for one in explained.ranked if one.kind == "model" and one.name in explained.best][:_MOST_HELD]
+    if named and any(one.good is False for one in judged):
+        # What takes away the beginning may be no more than what is nearest to it.
+        off = []
+        for one in named:
+            step(f"the same with {one.name} {one.change}")
+            changed = with_values(experiment, changes_of(experiment, criteria.attribution, one))
+            other = _log_done_again(recording, changed, criteria, step)
+            _, held = statistics(other.quick, other.parts, other.nominal, tables, other.criteria, other.members)
+            off.append(sum(result.good is False for result in held))
+        if min(off) > 0:
+            text = f"nearest is {explained.conclusion}; but with that {min(off)} of {len(judged)} quantities are off "
+            text += "behind it: another number, or several at once; `rig identify` fits them"
+            explained = replace(explained, conclusion=text, best=())
     return replace(validation, explained=explained)
+
+
+def _unexplained(from_s: float, conclusion: str) -> Explained:
+    return Explained(from_s, from_s, (), conclusion, ())
+
+
+def _contact(again: _DoneAgain, phases: list[Phase], end_s: float) -> dict[str, float | None]:
+    """When the first contact of a log comes that was not compared, and whether it should have been."""
+    first_s = next((one.from_s for one in phases if one.name in CONTACT), -math.inf)
+    if again.tuned is None or first_s < end_s:
+        return {}
+    return {"contact_s": first_s, "due_s": first_s if first_s < again.tuned.longest_s else None}
 
 
 @dataclass(frozen=True)
@@ -203,7 +247,7 @@ def _log_done_again(
     faults += edge_faults(recording.edges(), until_s, tuned.begun.scene.drive.speed_hz)
     return _DoneAgain(
         faults=tuple(faults), members=tuple(one.predict(parts) for one in drawn),
-        quick=bare(tuned.experiment), criteria=criteria.loosened(rules.noise, rules.statistics),
+        quick=bare(tuned.experiment), criteria=criteria.of_log(),
         parts=tuned.on_time(parts),
         nominal=nominal, others=tuple(others), bits={}, tuned=tuned,
     )  # fmt: skip

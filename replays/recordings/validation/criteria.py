@@ -121,6 +121,8 @@ class Imported(_Section):
     """What is asked of logs of other systems, which tell less exactly what was done and how loud their sensors are."""
 
     reason: Reason
+    title: str = ""
+    """What they are judged by; "" for the title of all."""
     nuisances: tuple[str, ...]
     """Numbers that are fitted before anything is compared."""
     noise: NotNegative
@@ -173,15 +175,17 @@ class Criteria(_Section):
     attribution: Attribution
     imported: Imported
 
-    def loosened(self, part: float, statistics: float) -> Criteria:
+    def of_log(self) -> Criteria:
         """For channels whose noise is known only to a part of it, and quantities that models as right leave open."""
-        wide = 1.0 + part
+        rules = self.imported
+        wide = 1.0 + rules.noise
         wider = tuple(
             c.model_copy(update={"rms": c.rms * wide, "peak": c.peak * wide, "drift": c.drift * wide * _LASTING})
             for c in self.trajectory
         )
-        more = tuple(c.model_copy(update={"relative": c.relative + statistics}) for c in self.statistics)
-        return self.model_copy(update={"trajectory": wider, "statistics": more})
+        more = tuple(c.model_copy(update={"relative": c.relative + rules.statistics}) for c in self.statistics)
+        title = rules.title or self.title
+        return self.model_copy(update={"title": title, "trajectory": wider, "statistics": more})
 
     def trajectory_of(self, channel: str) -> TrajectoryCriterion | None:
         """The criterion of a channel."""

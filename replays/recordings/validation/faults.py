@@ -203,6 +203,7 @@ class _Telling:
 def _swapped(a: Shown, b: Shown, told: _Telling) -> Explanation | None:
     """Two channels that show each other's signal, each at what it shows at rest."""
     crossed, own, before = np.empty(0), np.inf, np.concatenate([a.apart, b.apart])
+    signs = set[float]()
     if a.counts is None and not (a.moves and b.moves):
         return None
     for x, y in ((a, b), (b, a)):
@@ -213,7 +214,8 @@ def _swapped(a: Shown, b: Shown, told: _Telling) -> Explanation | None:
             signal = (volts - x.channel.bias_v) / x.channel.sensitivity_v
         shown = x.coupled(times_s, signal)
         factors, left = x.left([shown, x.level])
-        if y.moves and signal.std() > x.noise and abs(factors[0] - 1.0) > 0.1:
+        signs.add(math.copysign(1.0, factors[0]) if x.counts is None else 1.0)
+        if y.moves and signal.std() > x.noise and abs(factors[0] - min(signs)) > 0.1:
             if x.counts is None:
                 return None
             continue  # its converter may be too small for it: the other of the two tells
@@ -227,7 +229,10 @@ def _swapped(a: Shown, b: Shown, told: _Telling) -> Explanation | None:
         return None
     if not is_noise(crossed) and excess(crossed) > 0.01 * (own if a.counts is None else excess(before)):
         return None
-    return told(f"{a.name} and {b.name}", "swapped", 0.0, crossed, before)
+    if len(signs) > 1:
+        return None  # one of them inverted, which is a quarter of a turn
+    change = "swapped" if signs == {1.0} else "swapped and both inverted"
+    return told(f"{a.name} and {b.name}", change, 0.0, crossed, before)
 
 
 def _turned(a: Shown, b: Shown, told: _Telling) -> Explanation | None:

@@ -48,6 +48,8 @@ _NOTHING = 0.02
 """What shows no more than this part of its signal shows nothing."""
 _CLEARLY = 0.25
 """Of what a straight line leaves of a log, that a curve may leave: what is off elsewhere bends, too."""
+_STEADY = 0.6
+"""Of what noise is by its deviation, that it is by its median at least."""
 _SPARSE = 0.3
 """Fewer than this part of the samples are spikes."""
 
@@ -333,7 +335,9 @@ def _at_random(one: Shown) -> Iterator[Law]:
             yield Law("jitter", f"{1e6 * rms_s:.4g} µs about {1e6 * late_s:.4g} µs", rms_s, z / z.std(), 2, "s")
             return
     tied = one.moves and abs(float(np.corrcoef(rest, e)[0, 1])) > 0.1
-    if _white(rest) and not tied:
+    # Noise is loud all the time: what is off at impacts alone is none.
+    loud = 1.48 * float(np.median(np.abs(rest - np.median(rest)))) > _STEADY * float(rest.std())
+    if _white(rest) and not tied and loud:
         ratio = float(rest.std())
         if one.counts is None:
             yield Law("noise", f"x {ratio:.2f}", ratio, rest / ratio)

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from replays.recordings.experiment import Experiment
 from replays.recordings.identification.agreement import BEYOND
 from replays.recordings.identification.nuisance import Tuned
 from replays.recordings.identification.question import unit_of
@@ -67,8 +68,7 @@ def numbers_of_the_model(
     far = np.array([one.beyond for one in tuned.fitted])
     found, before = [], excess(z) + float(off[far] @ off[far])
     for one in candidates:
-        relative = not (one.unit or any(value_of(tuned.begun, key) == 0.0 for key in one.keys))
-        sizes = [value_of(tuned.begun, key) if relative else 1.0 for key in one.keys]
+        relative, sizes = _sizes(tuned.begun, one)
         column = sum(size * columns[key] for size, key in zip(sizes, one.keys, strict=True))
         table = np.column_stack([column, *(columns[key] for key in along)])
         square, side = table.T @ table, table.T @ z
@@ -89,6 +89,21 @@ def numbers_of_the_model(
             )
         )  # fmt: skip
     return found
+
+
+def changes_of(experiment: Experiment, rules: Attribution, one: Explanation) -> dict[str, float]:
+    """The values that a number of the model has by an explanation, by key."""
+    candidate = next(each for each in rules.candidates if each.name == one.name)
+    _, sizes = _sizes(experiment, candidate)
+    pairs = zip(candidate.keys, sizes, strict=True)
+    return {key: value_of(experiment, key) + one.value * size for key, size in pairs}
+
+
+def _sizes(experiment: Experiment, candidate: Candidate) -> tuple[bool, list[float]]:
+    """Whether a number changes its values by a part, and what each changes by with 1."""
+    values = [value_of(experiment, key) for key in candidate.keys]
+    relative = not (candidate.unit or 0.0 in values)
+    return relative, values if relative else [1.0] * len(values)
 
 
 def _is_in(tuned: Tuned, candidate: Candidate) -> bool:

@@ -124,6 +124,8 @@ class Validation:
         files: Number of files that the recording was in.
         faults: What signals of a log show by themselves to be wrong.
         doubts: What in the recording does not fit the rest of it: then nothing that is left of it is good.
+        contact_s: First contact of a log that the trajectory does not reach [s]; None where it does, or there is none.
+        due_s: The same where the trajectory would have reached it, had the model explained what is there.
     """
 
     path: Path
@@ -148,6 +150,8 @@ class Validation:
     files: int = 1
     faults: tuple[SignalFault, ...] = ()
     doubts: tuple[str, ...] = ()
+    contact_s: float | None = None
+    due_s: float | None = None
 
     @property
     def good(self) -> bool:
@@ -170,6 +174,9 @@ class Validation:
                 measure, value, limit = one.broken
                 criterion = f"{one.channel}, residual over noise: {measure}"
                 found.append(Failure(criterion, f"{value:.3g}", one.alone(measure), f"≤ {limit:.3g}"))
+        if self.due_s is not None:
+            reached = f"{self.window_s[1]:.4f}"
+            found.append(Failure("trajectory, to the first contact [s]", reached, f"{self.due_s:.4f}", "beyond it"))
         for one in self.truth:
             if not one.good:
                 criterion = f"truth {one.table}.{one.column}, part that it is off"
@@ -221,7 +228,8 @@ class Validation:
         """The outcome in one line."""
         if self.good:
             basis = "bit by bit" if self.bit_exact and not self.declared else f"by the criteria: {self.criteria}"
-            return f"good, {basis}"
+            unseen = "; no contact was compared sample by sample" if self.contact_s is not None else ""
+            return f"good, {basis}{unseen}"
         if self.doubts:
             more = f", and {len(self.doubts) - 1} more" if self.doubts[1:] else ""
             return f"NOT GOOD, the recording does not fit together: {self.doubts[0]}{more}"
@@ -233,12 +241,14 @@ class Validation:
         tables = [one.table for one in self.truth if not one.good]
         phases = [one.phase for one in self.statistics if one.good is False]
         parts = [f"trajectory of {_few(channels)}"] if channels else []
+        parts += ["trajectory, which ends before the first contact"] if self.due_s is not None else []
         parts += [f"truth of {_few(tables)}"] if tables else []
         if phases:
             parts.append(
                 "quantities: " + ", ".join(f"{phases.count(name)} of {name}" for name in dict.fromkeys(phases))
             )
         asked = sum(one.good is not None for one in (*self.residuals, *self.statistics)) + len(self.truth)
+        asked += self.due_s is not None
         return f"FAILS {len(self.failures)} of {asked} criteria: {'; '.join(parts)}"
 
     def document(self) -> dict[str, Any]:

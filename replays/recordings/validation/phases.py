@@ -15,6 +15,8 @@ from rig.orbit import whirl_frequency
 
 PHASES = ("free run", "impacts", "whirl", "rest", "decay")
 """Before the first contact; contact that comes and goes; lasting contact that goes round, or does not; after it."""
+CONTACT = ("impacts", "whirl", "rest")
+"""Those in which the shaft touches the ring."""
 WINDOW_S = 0.05
 """Lasting contact is looked for in windows of this length [s]."""
 LASTING = 0.95
