@@ -18,6 +18,7 @@ from replays.recordings.formats.group import ImportedChannel, PlacedGroup, nomin
 from replays.recordings.formats.mapped import Log, MappedSignal, check_rows, engineering
 from replays.recordings.formats.mapping import Mapping
 from replays.recordings.formats.motion import Motion
+from replays.recordings.formats.pulses import HammerPulse, find_pulses
 from rig import wire
 from rig.channels import ChannelTable, default_table
 from rig.errors import InputError
@@ -60,7 +61,7 @@ class Conversion:
     first_s: dict[str, float]
     rates_hz: dict[str, float]
     edges: np.ndarray
-    pulses: tuple[events.HammerPulse, ...]
+    pulses: tuple[HammerPulse, ...]
     channels: tuple[ImportedChannel, ...]
     remarks: tuple[str, ...]
     document: dict[str, Any]
@@ -234,15 +235,15 @@ def _digest(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _range(taken: Sequence[MappedSignal], log: Log) -> tuple[tuple[events.HammerPulse, ...], float, float]:
+def _range(taken: Sequence[MappedSignal], log: Log) -> tuple[tuple[HammerPulse, ...], float, float]:
     """Hammer pulses (in the time of the source), and from when to when is imported [s]."""
     mapping = log.mapping
     low = -math.inf if mapping.time.from_s is None else mapping.time.from_s
     high = math.inf if mapping.time.to_s is None else mapping.time.to_s
-    pulses: tuple[events.HammerPulse, ...] = ()
+    pulses: tuple[HammerPulse, ...] = ()
     if mapping.hammer is not None:
         hammer = next(entry for entry in taken if entry.name == "hammer")
-        found, passed_over = events.find_pulses(hammer.values, hammer.axis, mapping.hammer)
+        found, passed_over = find_pulses(hammer.values, hammer.axis, mapping.hammer)
         pulses = tuple(pulse for pulse in found if low <= pulse.at_s <= high)
         if not pulses:
             largest = float(np.nanmax(hammer.values))

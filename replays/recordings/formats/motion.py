@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from replays.recordings.formats.clock import Axis
+from replays.recordings.formats.pulses import find_pulses
 from rig.channels import default_table
 
 _STEP_S, _SLOWEST_HZ = 1e-3, 200.0
@@ -99,10 +100,9 @@ def _sudden_s(motion: Motion) -> float | None:
 
 
 def _pulse(motions: Mapping[str, Motion], at_s: float) -> tuple[float, float, float, float] | None:
-    """The half sine that gives the shaft the acceleration which a pair of probes shows: as `events.find_pulses`."""
+    """The half sine that gives the shaft the acceleration which a pair of probes shows: as `pulses.find_pulses`."""
     from scipy.signal import savgol_filter
 
-    from replays.recordings.formats.events import find_pulses
     from replays.recordings.formats.mapping import HammerMapping
     from rig.parameters import load_parameters
 
