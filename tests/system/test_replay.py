@@ -170,6 +170,7 @@ def test_ctrl_c_ends_the_stream_and_says_so(path: Path) -> None:
         ZenohClient(endpoint, wait_s=30.0) as client,
     ):
         client.subscribe(wire.EVENTS, lambda _, payload: events.append(json.loads(payload)))
+        client.settle()  # the status comes over another link
         until(lambda: Console(client).status()["state"] == "running")
         child.send_signal(signal.SIGINT)
         output, errors = child.communicate(timeout=30.0)
