@@ -330,12 +330,14 @@ def tune(
     values, covariance = found.values, found.covariance
     half = np.hypot(1.96 * np.sqrt(np.diag(covariance) + np.mean(found.moves**2, axis=0)), found.lacking)
     told = dict(zip(wanted, values.tolist(), strict=True))
+    # What was known before goes on being known, about where it was.
+    loosest = [1.96 * math.hypot(one[1], told[key] - one[0]) if one else math.inf for key, one in wanted.items()]
     return Tuned(
         begun=begun,
         experiment=with_values(begun, told),
         fitted=tuple(
-            Fitted(key, value_of(experiment, key), value, float(width), wanted[key])
-            for (key, value), width in zip(told.items(), half, strict=True)
+            Fitted(key, value_of(experiment, key), value, width, wanted[key])
+            for (key, value), width in zip(told.items(), np.minimum(half, loosest).tolist(), strict=True)
         ),
         values=told,
         covariance=covariance,
@@ -495,5 +497,4 @@ def looks_from(experiment: Experiment) -> float:
 
 def _thinned(part: Measured, until_s: float) -> Measured:
     """All rows from a time on, and some of those before it."""
-    rows = np.arange(len(part.times_s))
-    return part.chosen(rows[(part.times_s >= until_s) | (rows % _EVERY == 0)])
+    return part.chosen(np.flatnonzero((part.times_s >= until_s) | (np.arange(len(part.times_s)) % _EVERY == 0)))
