@@ -178,10 +178,8 @@ class Protection:
         settings, index = self.settings, np.arange(first, first + signals.shape[1])
         probes, armed = (settings.x, settings.y), index >= self._armed
         levels, volts = self._levels(signals[:2]), settings.bias_v + 1e-3 * settings.scale_v_per_mm * signals[:2]
-        inside, recovery = (
-            (volts >= settings.ok_low_v) & (volts <= settings.ok_high_v),
-            self._rows(settings.ok_recovery_s),
-        )
+        inside = (volts >= settings.ok_low_v) & (volts <= settings.ok_high_v)
+        recovery = self._rows(settings.ok_recovery_s)
         good = np.array([self._run(("ok", name), each) > recovery for name, each in zip(probes, inside, strict=True)])
         causes = {("not-ok", name): (~good[place], volts[place]) for place, name in enumerate(probes)}
         if settings.measure == "smax":
@@ -192,12 +190,9 @@ class Protection:
         ):
             for name, level, okay in zip(probes, levels, good, strict=True):
                 high = self.multiply * set_um
-                enabled = okay & armed & (name not in self.bypassed)
-                above = self._above(
-                    (kind, name), np.where(enabled, level, -1.0), high, high * (1.0 - settings.hysteresis)
-                )
-                run = self._run((kind, name), above)
-                causes[kind, name] = run > self._rows(delay_s), level
+                enabled = np.where(okay & armed & (name not in self.bypassed), level, -1.0)
+                above = self._above((kind, name), enabled, high, high * (1.0 - settings.hysteresis))
+                causes[kind, name] = self._run((kind, name), above) > self._rows(delay_s), level
         if settings.timed:
             causes |= self._speed(signals[2], index, armed & (settings.keyphasor not in self.bypassed))
         self._causes = {alarm: bool(on[-1]) for alarm, (on, _) in causes.items()}
@@ -273,10 +268,7 @@ class Protection:
 
 def _changes(on: np.ndarray, before: bool) -> np.ndarray:
     """Rows at which a truth is another one than at the row before, shape (changes,)."""
-    changes = on.copy()
-    changes[0] ^= before
-    changes[1:] ^= on[:-1]
-    return np.flatnonzero(changes)
+    return np.flatnonzero(np.diff(on, prepend=before))
 
 
 def _sliding(extreme: Callable[..., np.ndarray], values: np.ndarray, window: int) -> np.ndarray:
