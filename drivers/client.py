@@ -40,8 +40,9 @@ from rig.transport import DEFAULT_ENDPOINT, Client
 
 _PATIENCE_S = 10.0
 """How long a rig that runs may send nothing [s]."""
-_TURN_S = 600.0
-"""How long a device may wait for those before it by name to be done with a block [s]."""
+_TURN_S = 120.0
+"""How long a device may wait for those before it by name to be done with a block [s]: zenoh keeps a kB of each request
+for as long as the request might have taken, 50 MB of 400 a second."""
 
 
 class NotSeenError(TimeoutError):
