@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import json
 import math
@@ -38,6 +39,10 @@ Pace = Literal["lockstep", "real-time"]
 
 class BenchError(RuntimeError):
     """The bench or the device under test failed, which is no verdict on a measurement; one line."""
+
+
+class BehindError(BenchError):
+    """The rig did not keep real time: what is not as it must be may be of this machine, and not of the device."""
 
 
 class NotThereError(RuntimeError):
@@ -127,6 +132,7 @@ class Bench(Closing):
         self.name = f"bench-{os.getpid()}-{next(_NUMBERS)}"
         self._program: Program | None = None
         self._clients: list[Rig] = []
+        self._late = self._late_before = 0
         self.can_url: str | None = None
         """Where the rig is on a CAN bus, for `rig.connect` and `Daq.open`; None without one."""
         if target.url is not None:
@@ -175,8 +181,18 @@ class Bench(Closing):
         if self.target.replay is not None:
             self._console.resume()
             return 0.0
-        own = self.target.own and self.pace == "lockstep"
-        return 0.0 if own else float(self.status()["time_s"])
+        if self.target.own and self.pace == "lockstep":
+            return 0.0
+        status = self.status()
+        self._late_before = status["overruns"]
+        return float(status["time_s"])
+
+    def late_blocks(self) -> int:
+        """Blocks of a rig in real time that were not ready when they were due, since the test began."""
+        if self.target.own and self.pace == "real-time":
+            with contextlib.suppress(RefusedError, ConnectionError):  # it has ended: as many as were seen last
+                self._late = self.status()["overruns"] - self._late_before
+        return self._late
 
     # ---- what tests use ----
 

@@ -92,7 +92,6 @@ class CampaignItem(pytest.Item):
         """Run it."""
         from replays.campaigns.bench import NotThereError
         from replays.campaigns.run import run_case
-        from replays.campaigns.trial import MeasurementError
 
         trial = self.stash[_TRIAL]
         try:
@@ -103,7 +102,7 @@ class CampaignItem(pytest.Item):
             for measurement in trial.measurements:
                 self.user_properties.extend(measurement.properties())
         if trial.first_bad:
-            raise MeasurementError(trial.first_bad)
+            raise trial.failed(trial.first_bad)
 
     def teardown(self) -> None:
         """End what runs, and keep the evidence of a failure."""
@@ -130,9 +129,12 @@ class CampaignItem(pytest.Item):
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) -> Generator[None, Any, Any]:
     """Note what failed, and put what a trial has left into the last report of its test."""
+    from replays.campaigns.bench import BehindError
+
     report = yield
     if report.failed:
         item.stash[_FAILED] = True
+        report.rig_error = call.excinfo is not None and call.excinfo.errisinstance(BehindError)
     if report.when == "teardown" and (trial := item.stash.get(_TRIAL, None)) is not None:
         title = item.case.title if isinstance(item, CampaignItem) else item.path.name
         report.rig = {"title": title, **trial.document()}
@@ -203,13 +205,12 @@ def measure(request: pytest.FixtureRequest, rig_trial: Trial) -> Callable[..., f
     ) -> float:  # fmt: skip
         __tracebackhide__ = True
         from replays.campaigns.measurement import measured
-        from replays.campaigns.trial import MeasurementError
 
         told = {"source": source, "resolution": rig_trial.resolution, "at_s": at_s, "channels": tuple(channels)}
         made = rig_trial.take(measured(name, value, unit, op, limit, unit_of_limit=unit_of_limit, **told))
         request.node.user_properties.extend(made.properties())
         if not made.good:
-            raise MeasurementError(made.line)
+            raise rig_trial.failed(made.line)
         return value
 
     return hold

@@ -79,7 +79,8 @@ class Results:
         case["duration_s"] += report.duration
         case |= getattr(report, "rig", {})
         if report.failed:
-            case["outcome"] = "failed" if report.when == "call" and case["outcome"] != "error" else "error"
+            judged = report.when == "call" and not getattr(report, "rig_error", False)
+            case["outcome"] = "failed" if judged and case["outcome"] != "error" else "error"
             case["reason"] = reason_of(report) if case["reason"] == _UNFINISHED else case["reason"]
         elif report.skipped:
             case |= {"outcome": "skipped", "reason": reason_of(report)}

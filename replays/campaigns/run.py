@@ -63,6 +63,7 @@ def run_case(case: Case, trial: Trial) -> None:
             _send(machine, step)
         bench.advance_to(trial.origin_s + case.duration_s)
         if trial.target.own:
+            bench.late_blocks()  # while it can be asked
             _stop(machine)
             record.wait()
     trial.recording = record.stop()

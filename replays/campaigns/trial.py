@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from replays.campaigns.bench import Bench, BenchSettings, Target
+from replays.campaigns.bench import BehindError, Bench, BenchSettings, Target
 from replays.campaigns.device import Device
 from replays.campaigns.measurement import Measurement
 from rig.errors import DiskError, InputError
@@ -107,6 +107,13 @@ class Trial:
         """Keep a measurement, whatever comes of it."""
         self.measurements.append(replace(measurement, note=self.lasting(measurement.note)))
         return self.measurements[-1]
+
+    def failed(self, line: str) -> MeasurementError | BehindError:
+        """What a measurement that is not as it must be raises: of the device, unless the rig was behind meanwhile."""
+        late = 0 if self.bench is None else self.bench.late_blocks()
+        if not late:
+            return MeasurementError(line)
+        return BehindError(f"not judged, as the rig fell behind real time in {late} blocks (lockstep cannot): {line}")
 
     def lasting(self, text: str) -> str:
         """A text of this run without what is another in the next: folders, ports and names."""

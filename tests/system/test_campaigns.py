@@ -69,6 +69,9 @@ where = { command = "speed", from = "protection", "request.speed_hz" = 0.0 }
 order = [{ event = "hammer" }, { event = "note", text = "hit" }, { event = "note", where = { tags = "trip" } }]
 """
 TESTS = """
+import time
+
+import psutil
 import pytest
 
 @pytest.mark.bench(scene="stable-run", block_ms=20, channels=["disk_x", "P_E"], duration_s=0.3,
@@ -83,6 +86,15 @@ def test_fixtures(bench, dut, record, measure):
         assert len(recording.samples("disk_x")) == 4000
         assert device.program.status is None
         measure("force", rows["P_E"].max(), "N", "<=", 1.0, at_s=0.15, channels=["P_E"])
+
+@pytest.mark.bench(scene="stable-run", pace="real-time")
+def test_behind(bench, measure):
+    (rig,) = psutil.Process(bench._program._kept.pid).children()
+    rig.suspend()
+    time.sleep(0.1)
+    rig.resume()
+    bench.advance_to(bench.status()["time_s"] + 0.05)
+    measure("time to trip", 2.0, "ms", "<=", 1.0)
 """
 
 
@@ -104,8 +116,8 @@ def campaign(folder: Path, *arguments: str, status: int) -> tuple[str, dict[str,
 
 def test_a_device_in_lockstep_is_judged_alike_each_time(folder: Path) -> None:
     out, both = campaign(folder, "x.campaign.toml", "test_x.py", status=1)
-    well, dies, again, fixtures = both["cases"]
-    assert [case["outcome"] for case in both["cases"]] == ["passed", "failed", "passed", "failed"]
+    well, dies, again, fixtures, behind = both["cases"]
+    assert [case["outcome"] for case in both["cases"]] == ["passed", "failed", "passed", "failed", "error"]
     told = {each["name"]: each for each in well["measurements"]}
     assert told["time to trip"]["good"]
     assert told["time to trip"]["resolution"] == "1 tick, 1 us; 10 ms blocks, in lockstep"
@@ -116,11 +128,14 @@ def test_a_device_in_lockstep_is_judged_alike_each_time(folder: Path) -> None:
     assert [each["good"] for each in fixtures["measurements"]] == [True, True, False]
     assert fixtures["reason"].startswith("force must be <= 1 N; instead received ")
     assert fixtures["resolution"] == "20 ms blocks, in lockstep"
+    # A rig that was stopped for a tenth of a second judges no device.
+    assert behind["reason"].startswith("not judged, as the rig fell behind real time in ")
+    assert behind["reason"].partition(": ")[2].startswith("time to trip must be <= 1 ms; instead received 2 ms")
     # The evidence: of the case that failed, about the moment where it did.
     logs = folder / "out/evidence/test_x.py_test_fixtures"
     assert [Path(file).name for file in fixtures["evidence"]] == ["rig.log", "watcher.log", "event.mcap", "event.png"]
     assert Recording.open(logs / "event.mcap").span_s == (0.0, pytest.approx(0.2, abs=1e-3))
-    assert len(check_junit(folder / "out/junit.xml")) == 4
+    assert len(check_junit(folder / "out/junit.xml")) == 5
     assert "<img" in (folder / "out/index.html").read_text(encoding="utf-8")
     # Another run is the same, byte for byte.
     assert well["repeat"] == "rig campaign x.campaign.toml::how=well"
