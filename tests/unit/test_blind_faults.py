@@ -164,12 +164,8 @@ def some_fault(rng: random.Random) -> dict[str, Any]:
 @pytest.mark.skipif("RIG_BLIND_FAULTS" not in os.environ, reason="RIG_BLIND_FAULTS=250: four minutes")
 def test_random_faults_have_their_names(tmp_path: Path) -> None:
     """Those that change a count: 95 of 100 by their name, and at most one of them by another."""
-    rng, seen, wrong, unnamed = (
-        random.Random(int(os.environ.get("RIG_BLIND_SEED", "2030"))),
-        0,
-        list[str](),
-        list[str](),
-    )
+    rng = random.Random(int(os.environ.get("RIG_BLIND_SEED", "2030")))
+    seen, wrong, unnamed = 0, list[str](), list[str]()
     for n in range(int(os.environ["RIG_BLIND_FAULTS"])):
         pulse = {"at_s": 0.02, "command": "hammer", "force_n": rng.uniform(1.0, 150.0), "duration_ms": 5.0}
         fault, speed = some_fault(rng), rng.choice((6.2, rng.uniform(4.0, 14.9)))
