@@ -359,7 +359,7 @@ def test_every_fault_has_its_name(case: faulty_logs.Case, motion: second_rig.Mot
 @pytest.mark.parametrize(("number", "told"), [
     ("r0 = 0.945e-3", "model: ring.clearance"), ("P0 = 3300.0", "model: house.preload"),
     ("eps = 0.11e-3", "model: shaft.unbalance_eccentricity"), ("K_mag = 1751.0", "model: magnet.stiffness"),
-    ("Ixx = 0.0848", "nearest|neither|no "),
+    ("Ixx = 0.0848", "shaft.transverse_inertia|nearest|neither|no "),
 ])  # fmt: skip
 def test_another_number_of_the_model_passes_for_no_sensor(number: str, told: str, tmp_path: Path) -> None:
     name, _, value = number.partition(" = ")

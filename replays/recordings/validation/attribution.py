@@ -209,7 +209,8 @@ def explain_log(
     numbers = numbers_of_the_model(parts, nominal, others, tuned, rules, end_s=end_s) if sensors or far else []
     # One that explains no more than the sensors do is not told beside them.
     numbers = [one for one in numbers if one.at_floor or one.explained > MOST]
-    conclusion, best = conclude([*sensors, *numbers], sensors if cured else [], rules, end_s=end_s)
+    told_s = min((one.to_s for one in numbers), default=end_s)
+    conclusion, best = conclude([*sensors, *numbers], sensors if cured else [], rules, end_s=told_s)
     if brought and cured:
         conclusion += f"; {_and(channels_in(brought, tuned.scales))} beside it: brought along, or another fault"
     early = next((one.value for one in sensors if one.name == "hammer delay" and one.value < 0.0), None)
@@ -232,9 +233,8 @@ def explain_log(
             conclusion = "nothing goes together from the hammer pulse on: its time, several channels, or the model is "
             conclusion += "off; this log cannot tell"
     elif not best and (part := sum(one.explained for one in sensors)) > rules.enough:
-        conclusion = (
-            f"nearest are {_listed(sensors)}: {part:.0%} of the difference; the rest is another fault, or the model"
-        )
+        conclusion = f"nearest are {_listed(sensors)}: {part:.0%} of the difference; "
+        conclusion += "the rest is another fault, or the model"
     elif not best and 0 < len(few := channels_in(sensors, tuned.scales)) < FEW_CHANNELS * len(tuned.scales):
         conclusion = f"of {len(tuned.scales)} channels {_and(few)} alone: a fault that has no name here, "
         conclusion += "or a number of the model that moves no other; this log cannot tell"

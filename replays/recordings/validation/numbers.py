@@ -9,13 +9,16 @@ import numpy as np
 from replays.recordings.experiment import Experiment
 from replays.recordings.identification.agreement import BEYOND
 from replays.recordings.identification.nuisance import Tuned
-from replays.recordings.identification.question import unit_of
+from replays.recordings.identification.question import first_command_s, unit_of
 from replays.recordings.prediction import Measured, Prediction
 from replays.recordings.sensitivity import Predictor, value_of
 from replays.recordings.validation.criteria import Attribution, Candidate
 from replays.recordings.validation.explanation import Explanation, excess, smooth_columns
 from replays.recordings.validation.trajectory import floors
 from rig.errors import InputError
+
+_SOONER = 0.6
+"""Part of what is behind the hammer pulse that is looked at again."""
 
 
 def numbers_of_the_model(
@@ -26,6 +29,7 @@ def numbers_of_the_model(
     rules: Attribution,
     *,
     end_s: float,
+    shorten: bool = True,
 ) -> list[Explanation]:
     """What each number of the model explains where all that was fitted moves along with it.
 
@@ -39,6 +43,7 @@ def numbers_of_the_model(
         tuned: What was fitted.
         rules: The numbers.
         end_s: How far the model has been followed [s].
+        shorten: If there is none, look again on a shorter part of it.
     """
     along = tuple(tuned.values)
     candidates = [one for one in rules.candidates if _is_in(tuned, one) and not set(one.keys) & set(along)]
@@ -88,6 +93,11 @@ def numbers_of_the_model(
                 explained=1.0 - (excess(left) + float(back[far] @ back[far])) / before, to_s=end_s,
             )
         )  # fmt: skip
+    hit_s = first_command_s(tuned.begun)
+    if not found and shorten and hit_s < end_s:
+        # Where every number takes what was fitted beyond what is known, impacts have bent what slopes tell.
+        sooner_s = hit_s + _SOONER * (end_s - hit_s)
+        return numbers_of_the_model(parts, nominal, others, tuned, rules, end_s=sooner_s, shorten=False)
     return found
 
 
