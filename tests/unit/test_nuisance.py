@@ -19,6 +19,7 @@ from replays.recordings.identification.log import identify_log
 from replays.recordings.identification.nuisance import nuisances_of, tune
 from replays.recordings.sensitivity import ANGLE, value_of, with_values
 from replays.recordings.validation import load_criteria, validate
+from replays.recordings.validation.signals import edge_faults
 from rig.errors import InputError
 from rig.offline import simulate
 from rig.scenes import load_scene
@@ -367,3 +368,14 @@ def test_another_number_of_the_model_passes_for_no_sensor(number: str, told: str
     found = validate(whole(tmp_path, other, seed=4))
     assert found.explained is not None
     assert re.search(told, found.explained.conclusion)
+
+
+def test_a_pulse_that_is_missing_is_told_wherever_it_is() -> None:
+    """Before the hammer pulse with few turns there, and while whirl slows the shaft down."""
+    turns = np.r_[np.full(3, 0.16), 0.16 * np.linspace(1.0, 2.0, 20)]
+    edges = np.concatenate([[0.0], np.cumsum(turns)])
+    assert not edge_faults(edges, 0.5, 6.25)
+    for gone in (1, 2, 3, 12):
+        (told,) = edge_faults(np.delete(edges, gone), 0.5, 6.25)
+        assert told.line.startswith("keyphasor pulses: ")
+        assert (told.from_s, told.to_s) == (pytest.approx(edges[gone - 1]), pytest.approx(edges[gone + 1]))

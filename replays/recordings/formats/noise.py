@@ -15,6 +15,8 @@ _TONE = 9
 """Lines of which the middle one counts, so that a single tone does not."""
 _TONES = 3.0
 """So many times what its neighbours have, a line may have."""
+_RARE = 0.02
+"""Part of a signal's second differences that are 0 where it is not stuck."""
 _ORDER = 4
 """Of the low-pass, a Butterworth, as the channel table has it."""
 _FALL = 6.0
@@ -33,6 +35,9 @@ def _spectra(values: np.ndarray) -> np.ndarray:
     second = np.diff(values, 2)
     second = second[np.isfinite(second)]
     stretches = second[: len(second) // _LENGTH * _LENGTH].reshape(-1, _LENGTH)
+    still = ~stretches.any(axis=1)
+    if not still.all() and (stretches[~still] == 0.0).mean() < _RARE:
+        stretches = stretches[~still]  # where it is stuck it has no noise; where all of it is coarse it has little
     window = np.hanning(_LENGTH + 1)[:-1]
     lines = np.abs(np.fft.rfft(stretches * window, axis=1)[:, _LOW:-1]) ** 2 / float(window @ window)
     return lines / (2.0 * np.sin(np.pi * np.arange(_LOW, _LENGTH // 2) / _LENGTH)) ** 4

@@ -95,7 +95,7 @@ class Fitted:
     @property
     def beyond(self) -> bool:
         """Whether it is as far from what is known of it as it may go."""
-        return _is_beyond(self.value, self.known)
+        return _is_beyond(self.value, self.known) and abs(self.value - self.start) > self.half_width
 
     @property
     def line(self) -> str:
@@ -327,9 +327,8 @@ def tune(
     if far:
         looser = wanted | {key: (told[0], _LOOSER * told[1]) for key in far if (told := wanted[key]) is not None}
         found = max(found, _best(begun, looser, whole, progress), key=_Grown.worth)
-    values, covariance = found.values, found.covariance
-    half = np.hypot(1.96 * np.sqrt(np.diag(covariance) + np.mean(found.moves**2, axis=0)), found.lacking)
-    told = dict(zip(wanted, values.tolist(), strict=True))
+    half = np.hypot(1.96 * np.sqrt(np.diag(found.covariance) + np.mean(found.moves**2, axis=0)), found.lacking)
+    told = dict(zip(wanted, found.values.tolist(), strict=True))
     # What was known before goes on being known, about where it was.
     loosest = [1.96 * math.hypot(one[1], told[key] - one[0]) if one else math.inf for key, one in wanted.items()]
     return Tuned(
@@ -340,7 +339,7 @@ def tune(
             for (key, value), width in zip(told.items(), np.minimum(half, loosest).tolist(), strict=True)
         ),
         values=told,
-        covariance=covariance,
+        covariance=found.covariance,
         moves=found.moves,
         about_s=min(float(part.times_s[0]) for part in whole.values()),
         end_s=found.end_s,
@@ -400,7 +399,8 @@ def _best(
     """Where channels are at odds from the start, it depends on whom one believes: the log, or all but the hammer."""
     found = _grown(begun, wanted, whole, progress, trusting=False)
     for without in ((), ("hammer",)):
-        if max(found.scales) > _BROKEN and (found.odds > _BROKEN or not without):
+        early = without and found.end_s <= _told_until_s(begun) + _WINDOWS_S[0]  # the hammer is no witness of that
+        if early or (max(found.scales) > _BROKEN and (found.odds > _BROKEN or not without)):
             other = _grown(begun, wanted, whole, progress, trusting=True, without=without)
             found = max(found, other, key=_Grown.worth)
     return found

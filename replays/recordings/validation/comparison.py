@@ -103,8 +103,8 @@ def validate(
         ))  # fmt: skip
     if not firsts and again.tuned is not None and not again.faults:
         return replace(validation, explained=_unexplained(
-            end, "until then all channels agree; what differs behind it is a number of the contact, or its law: "
-            "`rig identify --fit contact.friction,contact.restitution` fits them",
+            end, "until then all channels agree; behind it differs what the shaft meets: contact (`rig identify --fit "
+            "contact.friction,contact.restitution`), ring or house; or a sensor that changes there",
         ))  # fmt: skip
     if not firsts:
         return validation

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +18,8 @@ _RAIL, _AT_RAIL = 2, 4
 """Rows in a row at the largest or smallest number, and in all, that make a rail of it."""
 _UNEVEN, _UNEVEN_S = 8.0, 5e-5
 """A turn is off by so many deviations of turns, and by as much [s]."""
+_MISSED = 1.6
+"""Times as long as both turns beside it, a turn has two pulses' time."""
 _ANOTHER = 0.2
 """Part by which pulses are more or fewer than turns."""
 _SHARP, _MOSTLY = 10.0, 0.995
@@ -92,17 +95,25 @@ def _jumps(part: Measured) -> list[SignalFault]:
 
 
 def edge_faults(edges_s: np.ndarray, until_s: float, speed_hz: float) -> list[SignalFault]:
-    """Pulses that are missing or too many while the shaft turns evenly.
+    """Pulses that are missing or too many while the shaft turns evenly; missing ones behind that, too.
 
     Args:
         edges_s: Keyphasor edges [s].
         until_s: Up to when it does [s].
         speed_hz: At what speed [Hz].
     """
-    steps = np.diff(edges_s[edges_s < until_s])
-    if len(steps) < 3:
-        return []
-    turns, found = steps / np.median(steps), list[SignalFault]()
+    steps, found = np.diff(edges_s[edges_s < until_s]), list[SignalFault]()
+    even = len(steps) if len(steps) >= 3 else 0
+    later = np.diff(edges_s[max(0, even - 1) :])
+    beside = np.maximum([*later[1:2], *later[:-1]], [*later[1:], math.inf]) if len(later) > 1 else later
+    # No shaft is that much slower for a turn, and fast again.
+    for at in np.flatnonzero(later > _MISSED * beside) + max(0, even - 1):
+        begin, end = float(edges_s[at]), float(edges_s[at + 1])
+        text = f"missing between {begin:.3f} and {end:.3f} s"
+        found.append(SignalFault("keyphasor", "pulses", begin, end, text))
+    if not even:
+        return found
+    turns = steps / np.median(steps)
     a_turn = 1.0 / (float(np.median(steps)) * speed_hz) if speed_hz > 0.0 else 1.0
     if abs(a_turn - 1.0) > _ANOTHER:
         begin, end = float(edges_s[0]), float(edges_s[len(steps)])
@@ -113,8 +124,7 @@ def edge_faults(edges_s: np.ndarray, until_s: float, speed_hz: float) -> list[Si
             begin, end = float(edges_s[at[0]]), float(edges_s[at[-1] + 1])
             text = f"pulses {what} in {len(at)} of {len(steps)} turns, the first at {begin:.3f} s"
             found.append(SignalFault("keyphasor", "pulses", begin, end, text))
-    even = np.abs(turns - 1.0) < 0.3
-    off_s = np.where(even, steps - np.median(steps), 0.0)
+    off_s = np.where(np.abs(turns - 1.0) < 0.3, steps - np.median(steps), 0.0)
     for at in np.flatnonzero(np.abs(off_s) > max(_UNEVEN * 1.5 * float(np.median(np.abs(off_s))), _UNEVEN_S)):
         text = f"the turn that ends at {edges_s[at + 1]:.4f} s is {1e3 * off_s[at]:+.4g} ms long beside the others: "
         text += "samples are missing in it, or double" if off_s[at] < 0.0 else "its time jumps"

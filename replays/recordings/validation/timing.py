@@ -142,10 +142,10 @@ def filtered(one: Shown) -> Iterator[Law]:
         factors, left = one.left([slope, np.gradient(slope, one.times_s)], one.values - one.foretold)
         lower = "lower" if factors[1] > 0.0 else "higher"
         yield Law("bandwidth", f"{lower} than told", float(factors[1]), left, 2)
+    channel = one.channel
+    if not one.uniform or not channel.bandwidth_hz:
         return
-    if not one.uniform:
-        return
-    channel, (begin, wave, turn) = one.channel, _waves(one)
+    begin, wave, turn = _waves(one)
 
     def through(corner_hz: float) -> np.ndarray:
         poles, residues, direct = channel_poles(
@@ -165,7 +165,7 @@ def filtered(one: Shown) -> Iterator[Law]:
 
     def left_by(other: np.ndarray | float) -> np.ndarray:
         left = one.values - np.fft.irfft(plain * other)[begin:][: len(one.values)]
-        left = one.left([one.level], left)[1] if channel.highpass_hz else left / one.floor
+        left = one.left([one.level], left)[1] if channel.highpass_hz and one.counts is not None else left / one.floor
         known = slice(margin, -round(_ENDS_S / one.period_s))  # how it goes on tells of what is behind a filter
         left[: known.start] = left[known.stop :] = rms_of(left[known])
         return left
@@ -179,6 +179,9 @@ def filtered(one: Shown) -> Iterator[Law]:
     corner_hz = math.exp(least_at(cost, near - step, min(near + step, grid[-1])))
     margin = max(margin, min(len(one.values) // 2, round(_SETTLED / corner_hz / one.period_s)))
     left, differs = left_by(through(corner_hz)), one.apart[margin : -round(_ENDS_S / one.period_s)]
+    if one.counts is None:
+        yield Law("bandwidth", f"lower than told: {corner_hz:.3g} Hz", corner_hz, left, 1, "Hz")
+        return
     if rms_of(left) < _SAME * max(1.0, one.noise / float(one.floor[0])):  # else noise of another time is in it
         seen = rms_of(differs) > _SEEN * rms_of(one.apart)
         yield Law("bandwidth", f"{corner_hz:.4g} Hz", corner_hz, left, 1, "Hz", sure=seen)
