@@ -240,4 +240,5 @@ CASES = tuple(
        for at_s, rows in ((0.5, 20), (0.5, 200), (0.81, 100))]
     + [Case(f"{a} and {b} swapped, inverted", f"{a} and {b} swapped and both inverted",
             before=lambda v, _, a=a, b=b: v | {a: -v[b], b: -v[a]}) for a, b in (("ring_x", "ring_y"), PROBES[:2])]
+    + [Case("hammer as lbf for N", "hammer gain .*as lbf for N", before=_gain(("hammer",), 1.0 / 4.4482))]
 )  # fmt: skip

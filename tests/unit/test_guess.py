@@ -40,6 +40,8 @@ from tests.commands import said, shown
         ("Kraftaufnehmer O", "force", "", "", "O"),
         ("Beschl. Innengehäuse x", "acceleration", "inner", "x", ""),
         ("accelOuterY", "acceleration", "outer", "y", ""),
+        ("Beschl. außen H", "acceleration", "outer", "x", ""),
+        ("Beschl. innen V", "acceleration", "inner", "y", ""),
         ("Drehzahlsignal", "speed", "", "", ""),
         ("Shaft RPM", "speed", "", "", ""),
         ("KPH", "keyphasor", "", "", ""),

@@ -27,8 +27,8 @@ _PLACES = {
     "outer": "out outer aussen aussengehaeuse exterieur exterior esterno buiten",
 }
 _AXES = {
-    "x": "x ax fx hor horiz horizontal horizontale waagrecht waagerecht",
-    "y": "y ay fy ver vert vertical verticale vertikal senkrecht lotrecht",
+    "x": "x ax fx h hor horiz horizontal horizontale waagrecht waagerecht",
+    "y": "y ay fy v ver vert vertical verticale vertikal senkrecht lotrecht",
 }
 _SIDES = {
     "N": "n fn pn north nord norte noord noorden norden", "S": "s fs ps south sued sud sur zuid sueden",

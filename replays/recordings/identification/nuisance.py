@@ -95,7 +95,7 @@ class Fitted:
     @property
     def beyond(self) -> bool:
         """Whether it is as far from what is known of it as it may go."""
-        return _is_beyond(self.value, self.known) and abs(self.value - self.start) > self.half_width
+        return _is_beyond(self.value, self.known)
 
     @property
     def line(self) -> str:
