@@ -29,6 +29,8 @@ _RINGS_HZ, _RINGS = (20.0, 4000.0), 60
 """Between these resonances are looked for, at so many."""
 _RINGS_LONGEST = 1000.0
 """A quality that no transducer has."""
+_CLEARLY, _PASSES = 0.97, 0.1
+"""Of what a delay leaves of a log, that a low-pass may leave at most; and of the signal, that it lets pass."""
 _SEEN = 0.3
 """Of what differs, that must be left where a filter has settled."""
 _SAME = 0.8
@@ -180,7 +182,11 @@ def filtered(one: Shown) -> Iterator[Law]:
     margin = max(margin, min(len(one.values) // 2, round(_SETTLED / corner_hz / one.period_s)))
     left, differs = left_by(through(corner_hz)), one.apart[margin : -round(_ENDS_S / one.period_s)]
     if one.counts is None:
-        yield Law("bandwidth", f"lower than told: {corner_hz:.3g} Hz", corner_hz, left, 1, "Hz")
+        delayed = (one.values - delayed_by(one)[1]) / one.floor
+        passed = float((one.values - left * one.floor).std())
+        # Of what is slow beside it, a low-pass makes a delay; and what lets nothing pass is none.
+        if rms_of(left) < _CLEARLY * rms_of(delayed) and passed > _PASSES * float(one.foretold.std()):
+            yield Law("bandwidth", f"lower than told: {corner_hz:.3g} Hz", corner_hz, left, 1, "Hz")
         return
     if rms_of(left) < _SAME * max(1.0, one.noise / float(one.floor[0])):  # else noise of another time is in it
         seen = rms_of(differs) > _SEEN * rms_of(one.apart)
