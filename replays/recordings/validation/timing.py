@@ -185,7 +185,7 @@ def filtered(one: Shown) -> Iterator[Law]:
         delayed = (one.values - delayed_by(one)[1]) / one.floor
         passed = float((one.values - left * one.floor).std())
         # Of what is slow beside it, a low-pass makes a delay; and what lets nothing pass is none.
-        if rms_of(left) < _CLEARLY * rms_of(delayed) and passed > _PASSES * float(one.foretold.std()):
+        if max(1.0, rms_of(left)) < _CLEARLY * rms_of(delayed) and passed > _PASSES * float(one.foretold.std()):
             yield Law("bandwidth", f"lower than told: {corner_hz:.3g} Hz", corner_hz, left, 1, "Hz")
         return
     if rms_of(left) < _SAME * max(1.0, one.noise / float(one.floor[0])):  # else noise of another time is in it
