@@ -220,7 +220,7 @@ CASES = tuple(
     + [Case(f"hammer {ms:g} ms late", "hammer delay|time: shifted", before=_late(("hammer",), ms * 1e-3))
        for ms in (0.3, 1.0, 3.0)]
     + [Case(f"{name} behind {hz} Hz", f"{name} {told}", before=_slow(name, hz))
-       for name, hz, told in (("P_E", 3000, "(bandwidth|delay)"), ("P_E", 1000, "bandwidth"), ("P_N", 300, "bandwidth"))]
+       for name, hz, told in (("P_E", 3000, "(bandwidth|delay)"), ("P_E", 1000, "band"), ("P_N", 300, "band"))]
     + [Case(f"{name} nonlinear to {end:g}", f"{name} nonlinear", before=_bent(name, end))
        for name, end in (("P_E", 20000.0), ("P_E", 6000.0), ("P_N", 3000.0), ("disk_x", 4.0), ("ring_y", 0.4))]
     + [Case(f"{name} hum {size:g}", f"{name} hum", before=_added(name, lambda t, k=size: k * np.sin(314.0 * t)))
