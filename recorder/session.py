@@ -382,8 +382,10 @@ class RecordingSession:
         """After the end: whatever may still come has had its time."""
         if now_s - ended_s > PATIENCE_S or self._replaced:
             return True
-        # The `end` event can overtake blocks that are being recovered: while a stream is short of it, wait longer.
-        whole = self._end_rows is not None and not self.waiting and not writer.tally.short_of(self._end_rows)
+        # The `end` event can overtake blocks that are being recovered, and what is told of blocks that were refused:
+        # while a stream is short of it, wait longer.
+        due = self.waiting or self._intake.refused or self._end_rows is None
+        whole = not due and not writer.tally.short_of(self._end_rows or {})
         if whole and self._last_status and writer.tally.next.keys() >= (self._end_rows or {}).keys():
             return True
         quiet_s = now_s - max(ended_s, self._heard_s)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import random
 import threading
 import time
@@ -55,7 +56,9 @@ def published(kind: str) -> list[tuple[str, bytes]]:
     return [*items, (wire.EVENTS, wire.encode_document(rows.tell(end)))]
 
 
-def recorded(path: Path, kind: str, items: list[tuple[str, bytes]], **options: Any) -> Summary:
+def recorded(
+    path: Path, kind: str, items: list[tuple[str, bytes]], *, late: tuple[tuple[str, bytes], ...] = (), **options: Any
+) -> Summary:
     simulation, client = Simulation(scene(kind)), ScriptedClient()
     for key, document in (
         (wire.CATALOGUE, simulation.catalogue()),
@@ -68,6 +71,10 @@ def recorded(path: Path, kind: str, items: list[tuple[str, bytes]], **options: A
         while wire.STATUS not in client.subscribed:
             time.sleep(0.002)
         for item in items:
+            client.publish(*item)
+        if late:
+            time.sleep(0.1)
+        for item in late:
             client.publish(*item)
 
     thread = threading.Thread(target=publish)
@@ -140,6 +147,13 @@ def test_what_is_told_comes_in_bursts(seed: int, tmp_path: Path) -> None:
         held += stream[:most]
         del stream[:most]
     assert recorded(tmp_path / "bursts.mcap", "restart", [*held, end]).good
+
+
+def test_what_is_told_of_a_block_may_come_behind_the_end(tmp_path: Path) -> None:
+    items = published("restart")
+    last = max(n for n, (key, payload) in enumerate(items) if key == wire.FAULTS and json.loads(payload).get("blocks"))
+    summary = recorded(tmp_path / "late.mcap", "restart", items[:last] + items[last + 1 :], late=(items[last],))
+    assert (summary.losses, summary.refused) == ((), 0)
 
 
 @pytest.mark.parametrize("kind", ["lose-blocks", "reorder-blocks"])
