@@ -318,7 +318,8 @@ def test_intervals_hold_the_truth_as_often_as_they_say(tmp_path: Path) -> None:
         held += np.abs(off) < 1.0
         print(seed, f"to {found.window.end_s:.3f} s:", " ".join(f"{one:+.2f}" for one in off), held, flush=True)
     assert held.min() >= 0.85 * seeds
-    assert held.sum() >= 0.91 * len(keys) * seeds
+    for those in (held[: len(FIVE)], held):  # the pulse's make up for none of the five
+        assert those.sum() >= 0.91 * len(those) * seeds
 
 
 @LONG
