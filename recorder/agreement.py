@@ -318,6 +318,8 @@ class Agreement:
                 self._doubt(f"{at} in {EVENTS} that neither the scene nor a command asks for")
             for where, request in causes if len(causes) == 1 and causes[0][1] is not None else ():
                 for field, value in _complete(name, request).items():
+                    if (field, value) == ("id", "all"):
+                        continue  # each event has the number of one of the faults that end
                     self._say(f"{at}, {field}", **{where: value, EVENTS: event.get(field)})
         if not self._events or {"series", "recovered"} & set(self._file.metadata):
             return  # the events of a part may stand in the next one, or be lost

@@ -133,7 +133,7 @@ class Faulty:
                 self.targets(command, tick)
 
     def check(self, command: FaultCommand | ClearCommand, tick: int, waiting: Sequence[object]) -> dict[str, Any]:
-        """What a command that is given now will come to, as `take` tells it.
+        """What a command that is given now will come to, as `begin` reports it.
 
         Args:
             command: To begin a fault, or to end some.
@@ -158,24 +158,38 @@ class Faulty:
             raise InputError("clear.id", f"the number of a fault that there is ({there}), or all", command.id)
         return {}
 
-    def take(self, command: FaultCommand | ClearCommand, tick: int, pending: list[tuple[int, Any]]) -> dict[str, Any]:
-        """Begin or end faults at the first row at or behind a tick.
+    def clear(self, command: ClearCommand, tick: int) -> list[dict[str, Any]]:
+        """End faults at the first row at or after a tick.
 
         Args:
-            command: What is done.
-            tick: When.
-            pending: Takes the end of one that is to last for some time.
+            command: Which faults end.
+            tick: Tick of the command.
 
         Returns:
-            Numbers, channels, and the first rows that it changes, by group.
+            For each fault that ends its number as `id` and in the list `fault`, its channels, and the first sound rows
+            by group. Where none ends, one entry with an empty list, as every command has an effect that is reported.
         """
         row = self._row_at(tick)
-        if isinstance(command, ClearCommand):
-            ended = [one for one in self._all() if command.id in ("all", one.id) and one.end > row]
-            for one in ended:
-                one.end = row
-            names = tuple(dict.fromkeys(name for one in ended for name in one.names))
-            return {**self._told(0, names, tick), "fault": [one.id for one in ended]}
+        ended = [one for one in self._all() if command.id in ("all", one.id) and one.end > row]
+        for one in ended:
+            one.end = row
+        if not ended:
+            number = None if command.id == "all" else command.id
+            return [{**self._told(0, (), tick), "id": number, "fault": []}]
+        return [{**self._told(0, one.names, tick), "id": one.id, "fault": [one.id]} for one in ended]
+
+    def begin(self, command: FaultCommand, tick: int, pending: list[tuple[int, Any]]) -> dict[str, Any]:
+        """Begin a fault at the first row at or after a tick.
+
+        Args:
+            command: The fault.
+            tick: Tick of the command.
+            pending: Commands that wait; the end of a fault that lasts for some time is added to them.
+
+        Returns:
+            Its number, its channels, and the first rows that it changes, by group.
+        """
+        row = self._row_at(tick)
         self._begun += 1
         names, what = self.targets(command, tick), command.what
         places = {name: n for n, name in enumerate(self.channels)}

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -48,7 +48,7 @@ class Event(Outside):
     reason: _Text | None = None
     text: _Text | None = None
     tags: list[_Text] | None = None
-    id: int | None = None
+    id: int | Literal["all"] | None = None  # "all": a clear of all faults, in recordings made before 0.2.0 was released
     command: _Text | None = None
     request: dict[str, Any] | None = None
     rows: dict[str, Count] | None = None

@@ -382,8 +382,11 @@ class Simulation:
                 self._pulse = (command, self.tick, self.tick + max(1, length))
             elif isinstance(command, SpeedCommand):
                 self._ramp_to(2.0 * math.pi * command.speed_hz)
-            elif isinstance(command, FaultCommand | ClearCommand):
-                event |= self._faulty.take(command, self.tick, self._pending)
+            elif isinstance(command, FaultCommand):
+                event |= self._faulty.begin(command, self.tick, self._pending)
+            elif isinstance(command, ClearCommand):
+                events += [event | ended for ended in self._faulty.clear(command, self.tick)]
+                continue
             else:
                 self._release()
             events.append(event)
