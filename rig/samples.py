@@ -80,8 +80,8 @@ class Columns:
 
     def to_si(self) -> Self:
         """The same rows in SI: mm become m, Hz of a speed rad/s. A unit that is not known stays."""
-        names, sizes = zip(*map(units.in_si, self.units), strict=True) if self.units else ((), ())
-        return cast(Self, replace(cast(Any, self), units=names, values=self.values * np.array(sizes)))
+        names, sizes, zeros = zip(*map(units.in_si, self.units), strict=True) if self.units else ((), (), ())
+        return cast(Self, replace(cast(Any, self), units=names, values=self.values * np.array(sizes) + np.array(zeros)))
 
     def __repr__(self) -> str:
         pairs = zip(self.units, self.names, strict=True)

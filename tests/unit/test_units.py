@@ -1,0 +1,129 @@
+"""The table of units: every quantity, the spellings that files use, and what is refused instead of assumed."""
+
+import math
+
+import numpy as np
+import pytest
+
+from rig import units
+from rig.errors import InputError
+from rig.samples import Samples
+
+LB, IN, G = 4.4482216152605, 0.0254, 9.80665
+
+SIZES = {
+    "length": {"um": 1e-6, "mil": 25.4e-6, "thou": 25.4e-6, "nm": 1e-9, "ft": 0.3048, "in": IN, "cm": 0.01},
+    "force": {"mN": 1e-3, "daN": 10.0, "kN": 1e3, "lbf": LB, "kip": 1e3 * LB, "kgf": G},
+    "acceleration": {"mm/s^2": 1e-3, "cm/s^2": 0.01, "um/s^2": 1e-6, "g": G, "mg": 1e-3 * G, "in/s^2": IN},
+    "velocity": {"m/s": 1.0, "mm/s": 1e-3, "um/s": 1e-6, "in/s": IN, "mil/s": 25.4e-6, "ft/s": 0.3048},
+    "speed of rotation": {"Hz": 2 * math.pi, "rpm": math.pi / 30, "krpm": 100 * math.pi / 3, "deg/s": math.pi / 180},
+    "angle": {"deg": math.pi / 180, "rev": 2 * math.pi, "mrad": 1e-3},
+    "torque": {"N m": 1.0, "kN m": 1e3, "mN m": 1e-3, "N mm": 1e-3, "lbf ft": 1.3558179483314004,
+               "lbf in": 0.1129848290276167, "daN m": 10.0, "kgf m": G},
+    "pressure": {"Pa": 1.0, "hPa": 100.0, "kPa": 1e3, "MPa": 1e6, "GPa": 1e9, "bar": 1e5, "mbar": 100.0,
+                 "psi": 6894.757293168},
+    "temperature": {"K": 1.0, "degC": 1.0, "degF": 5 / 9},
+    "voltage": {"mV": 1e-3, "uV": 1e-6, "kV": 1e3},
+    "current": {"A": 1.0, "mA": 1e-3, "uA": 1e-6},
+    "time": {"ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "d": 86400.0},
+}  # fmt: skip
+
+SPELLINGS = {
+    "um": "UM µm μm micron Microns micrometre",
+    "mil": "mils MIL MILS",
+    "thou": "THOU Thou",
+    "mm": "MM millimeter millimetres",
+    "m": "metres METER",
+    "in": 'IN inch inches "',
+    "N": "newton Newtons",
+    "daN": "DAN dan decanewton",
+    "kN": "KN kn kilonewtons",
+    "lbf": "LBF lb lbs",
+    "kgf": "KGF kp",
+    "g": "G gn g's gs",
+    "m/s^2": "m/s2 M/S2 m/s² m/s**2 m/s/s m·s⁻² m*s^-2 m.s-2 (m/s²) m/sÂ²",
+    "mm/s": "MM/S mm·s⁻¹ mm/sec [mm/s]",
+    "in/s": "IPS ips in/sec",
+    "rpm": "RPM 1/min U/min min-1 min⁻¹ min^-1 rev/min r/min cpm",
+    "Hz": "HZ hz 1/s s-1 s⁻¹ rps",
+    "deg": "° degrees DEG degree",
+    "degC": "°C ℃ DEGC deg_C Celsius ˚C",
+    "degF": "°F Fahrenheit",
+    "N m": "Nm N·m N.m N*m N⋅m",
+    "lbf in": "in-lb in·lbf lbf.in",
+    "bar": "BAR Bar",
+    "s": "S sec SEC seconds",
+    "ms": "MS msec Msec milliseconds",
+    "min": "MIN mins minutes Minute",
+    "h": "H hr hrs hours",
+    "d": "days Day D",
+    "1": "- none [-] V/V",
+}
+
+
+@pytest.mark.parametrize(("quantity", "name", "size"), [(q, n, s) for q, row in SIZES.items() for n, s in row.items()])
+def test_a_unit_has_its_quantity_and_its_size(quantity: str, name: str, size: float) -> None:
+    assert units.kind(name) == quantity
+    assert units.size_si(name) == pytest.approx(size, rel=1e-12)
+    assert units.parse(name, field="x") == name
+
+
+def test_any_unambiguous_spelling_is_the_unit() -> None:
+    wrong = {text: units.canonical(text) for name, row in SPELLINGS.items() for text in row.split()
+             if units.canonical(text) != name}  # fmt: skip
+    assert not wrong
+    assert units.canonical("m s-2") == "m/s^2"
+    assert units.canonical("u/  min") == "rpm"
+    assert units.canonical(" N m ") == units.canonical("n-m") == "N m"
+    assert units.canonical("") == "1"
+
+
+def test_every_unit_of_the_table_is_found_by_its_own_name() -> None:
+    for row in SIZES.values():
+        assert [units.canonical(name) for name in row] == list(row)
+
+
+@pytest.mark.parametrize(
+    ("text", "choices"),
+    [("M", "m or min"), ("MN", "mN or meganewton"), ("MV", "mV or megavolt"), ("MG", "mg or megagram"),
+     ("C", "degC or coulomb"), ("F", "degF or farad"), ("NM", "N m or nm"), ("MPA", "MPa or mPa"), ("k", "K or kilo")],
+)  # fmt: skip
+def test_an_ambiguous_spelling_is_no_unit_and_the_choices_are_named(text: str, choices: str) -> None:
+    assert not units.known(text)
+    assert units.kind(text) == ""
+    with pytest.raises(InputError, match=f"x must be unambiguous: {choices}; instead received '{text}'"):
+        units.parse(text, field="x")
+    with pytest.raises(InputError, match="unambiguous"):
+        units.factor(text, "mm", field="x")
+
+
+@pytest.mark.parametrize(
+    ("text", "unit"),
+    [("mm/s rms", "mm/s"), ("mm/s (RMS)", "mm/s"), ("um pk-pk", "um"), ("mils pk-pk", "mil"), ("mil pp", "mil"),
+     ("Vrms", "V"), ("grms", "g"), ("g pk", "g"), ("µm p-p", "um"), ("um 0-pk", "um"),
+     ("mm peak to peak", "mm"), ("Vpp", "V")],
+)  # fmt: skip
+def test_a_detectors_suffix_is_asked_for_and_never_dropped(text: str, unit: str) -> None:
+    assert not units.known(text)
+    with pytest.raises(InputError, match=f"such as {unit} .* is the reading of a detector"):
+        units.parse(text, field="x")
+    with pytest.raises(InputError, match="detector"):
+        units.factor(text, unit, field="x")
+
+
+@pytest.mark.parametrize("text", ["bananas", "counts", "%", "peak", "_", "*", "x", "kk", "dB"])
+def test_an_unknown_unit_is_refused_with_its_spelling(text: str) -> None:
+    with pytest.raises(InputError, match=r"x must be a known unit.*instead received"):
+        units.parse(text, field="x")
+
+
+def test_temperatures_of_another_zero_are_not_scaled() -> None:
+    assert units.factor("°C", "degC", field="x") == 1.0
+    with pytest.raises(InputError, match="x must be degC, as degF counts from another zero"):
+        units.factor("degF", "degC", field="x")
+    rows = Samples(
+        "t", np.zeros(1), np.zeros(1), np.array([[212.0, 100.0, 1.0]]), ("a", "b", "c"), ("degF", "degC", "mm"), 1
+    )
+    si = rows.to_si()
+    assert si.units == ("K", "K", "m")
+    np.testing.assert_allclose(si.values, [[373.15, 373.15, 1e-3]], rtol=1e-14)
