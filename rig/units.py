@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-import unicodedata
 from dataclasses import dataclass
 
 from rig.errors import InputError
@@ -48,7 +47,7 @@ _TABLE: dict[str, tuple[tuple[str, float, str], ...]] = {
         ("kgf", _STANDARD_GRAVITY, "kp|kilopond"),
     ),
     "acceleration": (
-        ("m/s^2", 1.0, "ms-2|m/s/s|mps2|m/s\u00e22"), ("mm/s^2", 1e-3, "mms-2|mm/s/s"), ("cm/s^2", 1e-2, "cms-2"),
+        ("m/s^2", 1.0, "ms-2|m/s/s|mps2|m/s\u00c22"), ("mm/s^2", 1e-3, "mms-2|mm/s/s"), ("cm/s^2", 1e-2, "cms-2"),
         ("um/s^2", 1e-6, "ums-2"), ("g", _STANDARD_GRAVITY, "gn|g0|g's"), ("mg", 1e-3 * _STANDARD_GRAVITY, ""),
         ("in/s^2", _INCH, "ins-2|ips2|in/s/s"), ("ft/s^2", _FOOT, "fts-2|ft/s/s"),
     ),
@@ -108,10 +107,16 @@ _DETECTOR = re.compile(
 _SENSITIVITY = re.compile(r"\s*([-+0-9.eE]+)\s*([a-zA-Z\u00b5\u03bc]+)\s*/\s*(\S.*)")
 
 
+_PLAIN = str.maketrans({
+    "\u00b5": "u", "\u03bc": "u", "\u00b9": "1", "\u00b2": "2", "\u207b": "-", "\u2212": "-", "\u2013": "-",
+    "\u2044": "/", "\u00b0": "deg", "\u00ba": "deg", "\u02da": "deg", "\u2103": "degC", "\u2109": "degF",
+})  # fmt: skip
+"""Non-ASCII signs of units: micro, powers, minus, slash and degree."""
+
+
 def _key(spelling: str) -> str:
     """Return a spelling without blanks, brackets and signs of multiplication and power, with u for micro."""
-    text = unicodedata.normalize("NFKC", spelling.strip().strip("[]()").replace("\u02da", "\u00b0"))
-    text = text.replace("\u03bc", "u").replace("\u2212", "-").replace("\u2044", "/").replace("\u00b0", "deg")
+    text = spelling.strip().strip("[]()").translate(_PLAIN)
     return re.sub(r"\*\*|[\s^*_·⋅∙]|(?<=[A-Za-z])\.(?=[A-Za-z]|$)", "", text)
 
 
