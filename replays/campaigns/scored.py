@@ -69,7 +69,7 @@ class ExpectScore(Expected):
 
     def measure(self, seen: Seen, units: Units) -> Iterator[Measurement]:
         """A measurement for each row that is not as asked, or that shows nothing; else one for all of them."""
-        from replays.score.scorecard import FAIL, NOT_SHOWN, PASS
+        from replays.score.scorecard import FAIL, INCONCLUSIVE, PASS
 
         must = self.check(units, where="expect")
         what = self.name or " ".join(("failing rows of", self.score, *self._channels))
@@ -84,12 +84,12 @@ class ExpectScore(Expected):
             return
         lacking = list(self._lacking(card, rows, seen)) if self.score == "all" else []
         # Of one quantity, nothing shown is nothing passed; of all, some are never shown.
-        bad = [row for row in rows if row.verdict == FAIL or (row.verdict == NOT_SHOWN and self.score != "all")]
+        bad = [row for row in rows if row.verdict == FAIL or (row.verdict == INCONCLUSIVE and self.score != "all")]
         shown = sum(row.verdict == PASS for row in rows)
         told = [text for _, text in lacking] + [" ".join(filter(None, (*row.cells(), row.note))) for row in bad]
         source = self.source or ", ".join(dict.fromkeys(row.limit.source for row in bad if row.limit is not None))
         value = float(len(told)) if shown or told else math.nan
-        hidden = sum(row.verdict == NOT_SHOWN for row in rows)
+        hidden = sum(row.verdict == INCONCLUSIVE for row in rows)
         note = "; ".join(told[:4]) or (
             f"{card.path} path, {shown} rows pass, {hidden} not shown" if shown else "nothing of it is shown"
         )
@@ -109,7 +109,7 @@ class ExpectScore(Expected):
 
     def _lacking(self, card: Scorecard, rows: Sequence[ScoreRow], seen: Seen) -> Iterator[tuple[str, str]]:
         """What was sent and is not shown to be there: the channel, if it is about one, and in words."""
-        from replays.score.scorecard import NOT_SHOWN, PASS
+        from replays.score.scorecard import INCONCLUSIVE, PASS
 
         groups = _sent(seen)
         wires = {row.value: row for row in card.rows if row.quantity == "mapping"}
@@ -117,7 +117,7 @@ class ExpectScore(Expected):
             wire = wires.get(name)
             if wire is None:
                 yield name, f"{name} is not in the file, or not found in it"
-            elif wire.verdict == NOT_SHOWN:
+            elif wire.verdict == INCONCLUSIVE:
                 yield name, f"whether {wire.channel} is {name}, this run does not show; it takes {wire.run}"
             elif not any(row.verdict == PASS for row in rows if row.channel == wire.channel and row is not wire):
                 yield name, f"nothing of {name} is shown"
@@ -138,7 +138,7 @@ class ExpectScore(Expected):
             what = self.name or f"{row.quantity} {row.channel}".strip()
             ends = [in_unit(float(each), row.unit, must) for each in (row.value, row.low, row.high)]
             value = min(ends, key=must.margin) if all(map(math.isfinite, ends)) else math.nan
-            note = row.note or ("" if math.isfinite(value) else "this run does not show it")
+            note = row.note or ("" if math.isfinite(value) else "inconclusive")
             yield Measurement(what, value, must, self.source, note=note, channels=(row.channel,))
         if not rows:
             what = self.name or " ".join((self.score, *self._channels))

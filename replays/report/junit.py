@@ -1,4 +1,4 @@
-"""JUnit's XML as Jenkins and others read it: suites with their properties, and cases that pass, fail or are skipped."""
+"""JUnit's XML as Jenkins and others read it: suites with their properties, and cases with their outcomes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Literal
 from rig.errors import whole_file
 
 _NOT_XML = re.compile("[^\t\n\r -\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
-Outcome = Literal["passed", "failure", "error", "skipped"]
+Outcome = Literal["passed", "failure", "error", "inconclusive", "skipped"]
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,10 @@ def write_junit(path: Path, suites: Sequence[Suite], *, name: str = "") -> None:
         for case in suite.cases:
             about = {"classname": _xml(case.classname), "name": _xml(case.name), "time": _seconds(case.time_s)}
             one = SubElement(element, "testcase", about)
-            if case.outcome != "passed":
+            if case.outcome == "inconclusive":  # the schema has no such element
+                about = {"message": _xml(case.message), "type": "inconclusive"}
+                SubElement(one, "error", about).text = _xml(case.text) or None
+            elif case.outcome != "passed":
                 SubElement(one, case.outcome, {"message": _xml(case.message)}).text = _xml(case.text) or None
             elif case.text:
                 SubElement(one, "system-out").text = _xml(case.text)
@@ -86,7 +89,8 @@ def write_junit(path: Path, suites: Sequence[Suite], *, name: str = "") -> None:
 
 def _counts(cases: Sequence[Case]) -> dict[str, str]:
     found = Counter(case.outcome for case in cases)
-    told = {"tests": len(cases), "failures": found["failure"], "errors": found["error"], "skipped": found["skipped"]}
+    errors = found["error"] + found["inconclusive"]
+    told = {"tests": len(cases), "failures": found["failure"], "errors": errors, "skipped": found["skipped"]}
     return {**{key: str(count) for key, count in told.items()}, "time": _seconds(sum(case.time_s for case in cases))}
 
 

@@ -16,7 +16,7 @@ from replays.score.digital import Taken, score_digital, settle
 from replays.score.limits import Limits, load_limits
 from replays.score.live import Arrivals
 from replays.score.recorded import Recorded, open_recorded
-from replays.score.scorecard import FAIL, NO_LIMIT, NOT_SHOWN, PASS, QUANTITIES, Scorecard, ScoreRow, Verdict
+from replays.score.scorecard import FAIL, INCONCLUSIVE, NO_LIMIT, PASS, QUANTITIES, Scorecard, ScoreRow, Verdict
 from replays.score.sent import Formula, Session
 from replays.score.wiring import Wire, find_wires
 from rig.errors import InputError, Words
@@ -25,6 +25,8 @@ _LOUD, _MANY = 4.0, 1000
 """Noises of a channel, and rows, from which on what was sent has to be seen."""
 _NEAR = 0.01
 """Part by which the rate of a DAQ that took rows may be off by its stamps."""
+_CORE = {"digital": "altered values", "analogue": "gain"}
+"""Quantity without which nothing is known of a channel."""
 
 
 def judge(
@@ -80,7 +82,24 @@ def judge(
         score_digital(card, recorded, wires, rows, session, arrivals)
     else:
         score_analogue(card, recorded, wires, session, {**session.formulas(), **(formulas or {})})
+    card.doubts += _missing_evidence(card)
     return card
+
+
+def _missing_evidence(card: Scorecard) -> list[str]:
+    """Return the reasons why recorded channels are not shown to be right.
+
+    A channel is shown by its core quantity: on the digital path its counts, on the analogue path its gain. Where a
+    limit asks for that quantity, its whole interval must lie within the limit or outside.
+    """
+    core = _CORE[card.path]
+    found = []
+    for channel in dict.fromkeys(row.channel for row in card.rows if row.quantity == "mapping" and row.value != "-"):
+        rows = [row for row in card.rows if (row.quantity, row.channel) == (core, channel)]
+        if not any(row.verdict != INCONCLUSIVE for row in rows):
+            note = next((row.note for row in rows if row.note), "")
+            found.append(f"{channel}: {core} is inconclusive{': ' if note else ''}{note}")
+    return found
 
 
 def _near(rate_hz: float, sent_hz: float) -> float:
@@ -132,7 +151,7 @@ def _score_wires(
         if not wire.channel and card.path == "analogue" and name in loud and recorded[name].rows >= _MANY:
             verdict, note = FAIL, "nothing of what was sent is in it"
         elif not wire.channel or not certain:
-            verdict = NOT_SHOWN
+            verdict = INCONCLUSIVE
             note += f"; as like {', '.join(wire.rivals)}" if wire.rivals else ""
         elif name in known:
             verdict = PASS if wire.channel == name else FAIL
@@ -140,7 +159,7 @@ def _score_wires(
         if wire.channel:
             turned = wire.polarity < 0 if scale is None else scale.turned
             open_ = wire.turned if scale is None else not scale.known
-            verdict = NOT_SHOWN if open_ else FAIL if turned else PASS
+            verdict = INCONCLUSIVE if open_ else FAIL if turned else PASS
             note = "half a period later it would be the other" if wire.turned and open_ else ""
             card.rows.append(_row(card, "polarity", name, "turned" if turned else "as sent", verdict, note))
     taken = [wire.channel for wire in wires.values() if wire.channel]
@@ -153,5 +172,5 @@ def _score_wires(
 
 def _row(card: Scorecard, quantity: str, name: str, value: str, verdict: Verdict, note: str) -> ScoreRow:
     about = QUANTITIES[card.path][quantity]
-    run = about.run if verdict == NOT_SHOWN else ""
+    run = about.run if verdict == INCONCLUSIVE else ""
     return ScoreRow(quantity, name, value, 0.0, 0.0, "1", about.method, None, verdict, run, note)

@@ -10,12 +10,14 @@ import numpy as np
 from replays.report import Mark, Report, Row
 from replays.report.canvas import BLUE, ORANGE, RED, draw_signals, house_style, label_of, new_figure
 from replays.score.analogue import Fitted
-from replays.score.scorecard import FAIL, NO_LIMIT, NOT_SHOWN, PASS, Scorecard, Verdict
+from replays.score.scorecard import FAIL, INCONCLUSIVE, NO_LIMIT, PASS, Scorecard, Verdict
+from rig.outcome import Outcome
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_MARKS: dict[Verdict, Mark] = {FAIL: "bad", NOT_SHOWN: "open", PASS: "good", NO_LIMIT: "plain"}
+_OUTCOMES: dict[Outcome, Mark] = {Outcome.FAIL: "bad", Outcome.INCONCLUSIVE: "open", Outcome.PASS: "good"}
+_MARKS: dict[Verdict, Mark] = {FAIL: "bad", INCONCLUSIVE: "open", PASS: "good", NO_LIMIT: "plain"}
 _STRETCHES = 100
 """Parts of a record of which the lateness is shown."""
 
@@ -28,21 +30,21 @@ def make_report(card: Scorecard, *, origin: Mapping[str, str] | None = None) -> 
         origin: What the report is made by, each by name.
     """
     verdict = card.verdict_line
-    failed = any(row.verdict == FAIL for row in card.rows)
-    mark: Mark = "bad" if failed else "good" if card.good else "open"
-    report = Report(f"Scorecard of {card.title}", f"{verdict[0].upper()}{verdict[1:]}.", origin=origin, mark=mark)
-    for remark in card.remarks:
-        report.text(remark)
+    report = Report(
+        f"Scorecard of {card.title}", f"{verdict[0].upper()}{verdict[1:]}.", origin=origin, mark=_OUTCOMES[card.outcome]
+    )
+    for line in (*card.doubts, *card.remarks):
+        report.text(line)
     rows = sorted(card.rows, key=lambda row: list(_MARKS).index(row.verdict))
     report.heading("Scorecard")
     report.table(
         ("quantity", "channel", "value", "95 % interval", "unit", "limit", "note", "verdict"),
         [Row((*row.cells()[:-1], row.note, row.verdict), _MARKS[row.verdict]) for row in rows],
-        caption="A row passes, or fails, with its whole interval; one that reaches over its limit shows neither.",
+        caption="A quantity passes or fails with its whole interval; one that reaches over its limit is inconclusive.",
     )
-    unshown = {row.quantity: row.run for row in card.rows if row.verdict == NOT_SHOWN}
+    unshown = {row.quantity: row.run for row in card.rows if row.verdict == INCONCLUSIVE}
     if unshown:
-        report.heading("What this run does not show")
+        report.heading("Inconclusive in this run")
         report.table(("quantity", "what to run"), list(unshown.items()))
     report.heading("Limits and methods")
     told = {(row.quantity, row.method, row.limit.source if row.limit else "nothing asks") for row in card.rows}

@@ -11,10 +11,11 @@ from typing import Any, Literal
 
 from replays.report import junit
 from rig.errors import UnknownNameError
+from rig.outcome import Outcome
 from rig.text import finite
 
-PASS, FAIL, NOT_SHOWN, NO_LIMIT = "pass", "fail", "this run does not show it", "no limit"
-Verdict = Literal["pass", "fail", "this run does not show it", "no limit"]
+PASS, FAIL, INCONCLUSIVE, NO_LIMIT = "pass", "fail", "inconclusive", "no limit"
+Verdict = Literal["pass", "fail", "inconclusive", "no limit"]
 Path_ = Literal["digital", "analogue"]
 Interval = tuple[float, float, float]
 """Value, low and high end."""
@@ -177,7 +178,7 @@ def judge_row(
     """
     about = QUANTITIES[path][quantity]
     value, low, high = (math.nan,) * 3 if estimate is None else estimate
-    verdict: Verdict = NOT_SHOWN
+    verdict: Verdict = INCONCLUSIVE
     if estimate is not None:
         if limit is None:
             verdict = NO_LIMIT
@@ -185,7 +186,7 @@ def judge_row(
             verdict = PASS
         elif high < limit.low or low > limit.high:
             verdict = FAIL
-    run = about.run if verdict == NOT_SHOWN else ""
+    run = about.run if verdict == INCONCLUSIVE else ""
     return ScoreRow(quantity, channel, value, low, high, about.unit or unit, about.method, limit, verdict, run, note)
 
 
@@ -200,6 +201,8 @@ class Scorecard:
         asked: What they ask of a path's quantity, on a channel of the session's table.
         rows: The rows.
         remarks: What was assumed.
+        doubts: Reasons why the record shows too little for a pass; without a failing quantity the outcome is
+            inconclusive then.
         pictures: What pictures are made of, by kind and channel.
         runs: Numbers of rows by what became of them, as pairs of first and last.
     """
@@ -210,6 +213,7 @@ class Scorecard:
     asked: Callable[..., Bounds | None]
     rows: list[ScoreRow] = field(default_factory=list)
     remarks: list[str] = field(default_factory=list)
+    doubts: list[str] = field(default_factory=list)
     pictures: dict[str, Any] = field(default_factory=dict)
     runs: dict[str, list[tuple[int, int]]] = field(default_factory=dict)
 
@@ -222,19 +226,23 @@ class Scorecard:
         self.rows.append(judge_row(self.path, quantity, channel, estimate, unit=unit, limit=limit, note=note))
 
     @property
-    def good(self) -> bool:
-        """Whether nothing fails, and something is shown."""
-        verdicts = [row.verdict for row in self.rows]
-        return FAIL not in verdicts and PASS in verdicts
+    def outcome(self) -> Outcome:
+        """Fail where a quantity fails; pass where one passes and there is no doubt; else inconclusive."""
+        verdicts = {row.verdict for row in self.rows}
+        return Outcome.of(failed=FAIL in verdicts, shown=PASS in verdicts and not self.doubts)
 
     @property
     def verdict_line(self) -> str:
-        """What comes out, in a line."""
+        """Path, outcome, number of quantities by verdict, and the first doubt, in one line."""
         counts = Counter(row.verdict for row in self.rows)
         failed = list(dict.fromkeys(row.quantity for row in self.rows if row.verdict == FAIL))
-        told = f"{self.path} path: {'pass' if self.good else 'FAIL' if failed else 'nothing is shown'}"
         parts = [f"{counts[PASS]} pass", f"{counts[FAIL]} fail" + (f" ({', '.join(failed)})" if failed else "")]
-        return f"{told}: {', '.join(parts)}, {counts[NOT_SHOWN]} not shown, {counts[NO_LIMIT]} without a limit"
+        parts += [f"{counts[INCONCLUSIVE]} inconclusive, {counts[NO_LIMIT]} without a limit"]
+        reason = ""
+        if self.outcome is Outcome.INCONCLUSIVE:
+            more = f"; and {len(self.doubts) - 1} more" if self.doubts[1:] else ""
+            reason = f"; {self.doubts[0]}{more}" if self.doubts else "; no quantity passes"
+        return f"{self.path} path: {self.outcome}: {', '.join(parts)}{reason}"
 
     def row(self, quantity: str, channel: str = "") -> ScoreRow:
         """One of the rows.
@@ -254,27 +262,44 @@ class Scorecard:
         for row, told in zip(self.rows, rows, strict=True):
             told |= {"value": row.value, "low": row.low, "high": row.high}
         return finite({
-            "title": self.title, "path": self.path, "good": self.good, "verdict": self.verdict_line,
-            "limits": self.limits, "rows": rows, "remarks": self.remarks, "runs": self.runs,
+            "title": self.title, "path": self.path, "outcome": self.outcome, "good": self.outcome is Outcome.PASS,
+            "verdict": self.verdict_line, "doubts": self.doubts, "limits": self.limits, "rows": rows,
+            "remarks": self.remarks, "runs": self.runs,
         })  # fmt: skip
 
 
 def write_junit(card: Scorecard, path: Path) -> None:
-    """Write a scorecard as JUnit's XML: a case a row; what is not shown, or not asked, is skipped.
+    """Write a scorecard as JUnit's XML.
+
+    The outcome is one case, and each quantity that passes or fails is one; an inconclusive outcome is an error of that
+    type. Quantities without a verdict, on which the outcome does not depend, are properties and never skipped cases.
 
     Raises:
         DiskError: The disk refused.
     """
-    junit.write_junit(path, [junit.Suite(f"rig score, {card.path}", [_case(card, row) for row in card.rows])])
+    judged = [row for row in card.rows if row.verdict in (PASS, FAIL)]
+    others = [(f"{row.quantity} {row.channel}".strip(), _line(row)) for row in card.rows if row not in judged]
+    cases = [_outcome_case(card), *(_case(card, row) for row in judged)]
+    junit.write_junit(path, [junit.Suite(f"rig score, {card.path}", cases, others)])
+
+
+def _outcome_case(card: Scorecard) -> junit.Case:
+    result: dict[Outcome, junit.Outcome] = {
+        Outcome.PASS: "passed", Outcome.FAIL: "failure", Outcome.INCONCLUSIVE: "inconclusive",
+    }  # fmt: skip
+    lines = "\n".join(card.doubts)
+    return junit.Case(f"score.{card.path}", "outcome", result[card.outcome], card.verdict_line, lines)
 
 
 def _case(card: Scorecard, row: ScoreRow) -> junit.Case:
+    classname, name, line = f"score.{card.path}", f"{row.quantity} {row.channel}".strip(), _line(row)
+    if row.verdict == PASS:
+        return junit.Case(classname, name, text=line)
+    source = "" if row.limit is None else row.limit.source
+    return junit.Case(classname, name, "failure", line, f"{line}\nsource: {source}\n{row.note}")
+
+
+def _line(row: ScoreRow) -> str:
     _, _, value, interval, unit, limit, verdict = row.cells()
-    classname, name = f"score.{card.path}", f"{row.quantity} {row.channel}".strip()
-    line = f"{value} {unit} ({interval or 'exact'}); limit {limit or 'none'}"
-    if row.verdict == FAIL:
-        source = "" if row.limit is None else row.limit.source
-        return junit.Case(classname, name, "failure", line, f"{line}\nsource: {source}\n{row.note}")
-    if row.verdict != PASS:
-        return junit.Case(classname, name, "skipped", f"{verdict}{': ' if row.run else ''}{row.run}")
-    return junit.Case(classname, name, text=line)
+    run = f"; to show it: {row.run}" if row.run else ""
+    return f"{verdict}: {value} {unit} ({interval or 'exact'}); limit {limit or 'none'}{run}"

@@ -32,7 +32,7 @@ class _Way(StrEnum):
     ANALOGUE = "analogue"
 
 
-_STYLES = {"pass": "", "fail": "red", "this run does not show it": "yellow", "no limit": ""}
+_STYLES = {"pass": "", "fail": "red", "inconclusive": "yellow", "no limit": ""}
 
 
 def score(
@@ -69,8 +69,8 @@ def score(
     """Judge a DAQ by what it recorded, against what the rig sent.
 
     A DAQ that took counts is judged row by row, exactly; one that sampled by itself by least squares against the known
-    signal. Where FILE is -, what comes in is judged against what the rig at --connect sends meanwhile. Ends with 1
-    where a limit is not kept, or nothing is shown.
+    signal. Where FILE is -, what comes in is judged against what the rig at --connect sends meanwhile. Exit
+    status: 0 pass, 1 fail, 2 wrong input, 3 inconclusive.
     """
     from replays.report import check_report
     from replays.score.judgement import judge
@@ -109,8 +109,8 @@ def score(
     for made in (output, junit, as_json):
         if made is not None:
             echo(f"written  {made}")
-    if not card.good:
-        raise typer.Exit(1)
+    if card.outcome.exit_status:
+        raise typer.Exit(card.outcome.exit_status)
 
 
 def _judge_live(
@@ -141,17 +141,17 @@ def _judge_live(
 
 
 def _show(card: Scorecard, console: Console, *, wide: bool) -> None:
-    from replays.score.scorecard import FAIL, NOT_SHOWN
+    from replays.score.scorecard import FAIL, INCONCLUSIVE
 
     console.print(shown(f"{card.title}, limits {card.limits}"))
     console.print(shown(card.verdict_line))
-    for remark in card.remarks:
-        console.print(shown(remark))
+    for line in (*card.doubts[1:], *card.remarks):
+        console.print(shown(line))
     table = new_table(
         "", "quantity", "channel", ">value", "95 %", "unit", "limit", "verdict", "note", "to show it", "source",
         wrapped=("note", "to show it", "source"), spare=("source", "to show it", "note", "95 %"),
     )  # fmt: skip
-    told = [row for row in card.rows if wide or row.verdict in (FAIL, NOT_SHOWN)]
+    told = [row for row in card.rows if wide or row.verdict in (FAIL, INCONCLUSIVE)]
     for row in told:
         source = "" if row.limit is None else row.limit.source
         table.add_row(*row.cells(), row.note, row.run, source, style=_STYLES[row.verdict])

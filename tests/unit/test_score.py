@@ -6,7 +6,9 @@ import json
 import math
 import os
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from typing import Any, cast
 from xml.etree import ElementTree
 
 import numpy as np
@@ -19,12 +21,13 @@ from replays.recordings.formats.source import open_source
 from replays.score.judgement import judge
 from replays.score.limits import load_limits
 from replays.score.rows import NO_COUNT, follow
-from replays.score.scorecard import FAIL, NO_LIMIT, NOT_SHOWN, PASS, QUANTITIES, Scorecard, judge_row
+from replays.score.scorecard import FAIL, INCONCLUSIVE, NO_LIMIT, PASS, QUANTITIES, Scorecard, judge_row, write_junit
 from replays.score.sine import fit_sine, is_sine, quality
 from replays.score.stimulus import EDGE, Exact, Sampled
 from replays.score.waveform import behind_filter, fit_waveform, order_of, response, split_noise, student
 from rig.channels import default_table
 from rig.errors import InputError
+from rig.outcome import Outcome
 from rig.scenes import load_scene
 from rig.simulation import Simulation
 from tests.commands import said
@@ -76,7 +79,7 @@ def test_a_perfect_daq_has_every_row_once_with_every_count(
     assert (card.path, red(card)) == ("digital", set())
     assert card.row("missing rows", "probes").verdict == PASS
     assert card.row("rows before the first", "probes").value == 500
-    assert card.row("stamp rate", "probes").verdict == NOT_SHOWN  # there are no stamps in the file
+    assert card.row("stamp rate", "probes").verdict == INCONCLUSIVE  # there are no stamps in the file
 
 
 def test_the_session_itself_is_perfect_and_its_stamps_are_the_ticks(sent: tuple[Path, np.ndarray]) -> None:
@@ -242,7 +245,7 @@ def test_without_a_formula_the_sessions_own_noise_leaves_open_what_it_hides(
     card = judge(write_parquet(tmp_path / "daq.parquet", columns), [sent[0]])
     assert red(card) == set()
     assert card.row("gain", "disk_x").verdict == PASS
-    assert card.row("noise", "disk_x").verdict == NOT_SHOWN
+    assert card.row("noise", "disk_x").verdict == INCONCLUSIVE
     assert card.row("alias rejection").run
 
 
@@ -333,8 +336,41 @@ def test_an_interval_that_reaches_over_its_limit_shows_nothing() -> None:
     limit = load_limits().bounds("analogue", "gain")
     assert [judge_row("analogue", "gain", "", each, limit=limit).verdict for each in (
         (0.0, -5.0, 5.0), (200.0, 150.0, 250.0), (95.0, 80.0, 110.0), None,
-    )] == [PASS, FAIL, NOT_SHOWN, NOT_SHOWN]  # fmt: skip
+    )] == [PASS, FAIL, INCONCLUSIVE, INCONCLUSIVE]  # fmt: skip
     assert judge_row("analogue", "start", "", (1.0, 0.0, 2.0)).verdict == NO_LIMIT
+
+
+def scorecard(*verdicts: str, doubts: tuple[str, ...] = ()) -> Scorecard:
+    card = Scorecard("DAQ", "digital", "limits", lambda *_, **__: None, doubts=list(doubts))
+    for n, verdict in enumerate(verdicts):
+        row = judge_row("digital", "altered values", f"channel {n}", (0.0, 0.0, 0.0))
+        card.rows.append(replace(row, verdict=cast(Any, verdict)))
+    return card
+
+
+@pytest.mark.parametrize(
+    ("card", "outcome"),
+    [
+        (scorecard(), Outcome.INCONCLUSIVE),
+        (scorecard(NO_LIMIT), Outcome.INCONCLUSIVE),
+        (scorecard(INCONCLUSIVE), Outcome.INCONCLUSIVE),
+        (scorecard(PASS, NO_LIMIT, INCONCLUSIVE), Outcome.PASS),
+        (scorecard(PASS, doubts=("half of the record was not judged",)), Outcome.INCONCLUSIVE),
+        (scorecard(PASS, FAIL), Outcome.FAIL),
+        (scorecard(PASS, FAIL, doubts=("half of the record was not judged",)), Outcome.FAIL),
+    ],
+)
+def test_an_outcome_is_a_pass_only_without_a_failing_quantity_and_without_a_doubt(
+    card: Scorecard, outcome: Outcome, tmp_path: Path
+) -> None:
+    assert card.outcome is outcome
+    assert f"digital path: {outcome}" in card.verdict_line
+    assert outcome is not Outcome.INCONCLUSIVE or (card.doubts or ["no quantity passes"])[0] in card.verdict_line
+    write_junit(card, tmp_path / "r.xml")
+    first = ElementTree.parse(tmp_path / "r.xml").getroot()[0].find("testcase")
+    assert first is not None
+    errors = [each.get("type") for each in first.findall("error")]
+    assert errors == (["inconclusive"] if outcome is Outcome.INCONCLUSIVE else [])
 
 
 def test_every_quantity_stands_in_the_documentation() -> None:
@@ -363,10 +399,11 @@ def test_the_command_writes_report_junit_and_json(
     files = ("-o", made[0], "--junit", made[1], "--json", made[2])
     status, out, _ = said(capsys, "score", daq, "--against", session, *files)
     assert status == 1
-    assert "FAIL: 23 pass, 1 fail (missing rows)" in out
+    assert "digital path: fail: 23 pass, 1 fail (missing rows)" in out
     suite = ElementTree.parse(made[1]).getroot()[0]
     failed = [case.get("name") for case in suite if case.find("failure") is not None]
-    assert (suite.get("failures"), failed) == ("1", ["missing rows probes"])
+    assert (suite.get("failures"), failed) == ("2", ["outcome", "missing rows probes"])
+    assert suite.get("skipped") == "0"
     told = json.loads(made[2].read_text(encoding="utf-8"))
     assert told["runs"] == {"missing rows probes": [[1177, 1177]]}
     assert made[0].read_text(encoding="utf-8").count("<img") == 0  # there are no stamps to draw
