@@ -138,7 +138,8 @@ class Series(Sink):
         self._number += 1
         new = part_path(self.path, self._number)
         self._close(old, "rotated", {"next": new.name})
-        self._kept = self.kept()
+        if self._limits.when_full == "stop":  # no file is removed, so one sum is enough
+            self._kept = self.kept()
         self._sizes.append(old.file.size_bytes)
         try:
             self._file = self._writer = self._open(new, previous=old.path.name, due=dict(old.tally.next))
@@ -160,5 +161,6 @@ class Series(Sink):
                 return
             self.files.pop(0)
             self._room.finished_bytes -= self._sizes.pop(0)
+            self._kept.pop(0)
             self.removed += 1
             why = self._room.lack(self._file)

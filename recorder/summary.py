@@ -43,10 +43,10 @@ class Summary:
         error: What went wrong at the disk or in the recorder, or that there was no more room; empty if nothing did.
         first_time_s: Simulated time of the first row in the files [s].
         duration_s: Simulated time from the first to the last row; of all captures in sum [s].
-        rows: Rows in the files by key.
+        rows: Rows by key in the files that are on the disk.
         lost: Rows that were lost, by key, only keys that lost some; of captures also those lost between them.
         declared: Rows that a fault of the rig has taken, which told so, by key: none of the lost.
-        gaps: Number of gaps that they are in.
+        gaps: Gaps that the files contain.
         missed: Messages that the transport gave up, by key.
         dropped: Payloads that found the inbox full; they are among the lost.
         malformed: Payloads that were not what their key promises; they are in the file as they came.

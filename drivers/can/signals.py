@@ -202,6 +202,10 @@ def _other_messages() -> list[Message]:
             ),
         ),
         Message(
+            "Clock", 0x6FF, 8, False, 1.0, True, RIG, "How often the times and the index of other frames have wrapped",
+            (Signal("seconds", 0, 32, unit="s", label="End of the last block, whole seconds of simulated time"),),
+        ),
+        Message(
             "Status", 0x700, 8, False, 0.5, True, RIG, "How the rig does; rig/status has it all",
             (
                 Signal("state", 0, 4, label="What the rig does", choices=_choices(State)),

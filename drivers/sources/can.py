@@ -1,7 +1,8 @@
 """Samples from a CAN bus: one stream a message of `drivers.can.signals`, in the FD layout where it is sent.
 
-The numbers in the frames are cut short; Rates says how samples were picked, and Sync which number is due now. What
-comes before both are known waits. Nothing is sent: the client takes part in the bus only by acknowledging.
+Numbers in the frames wrap. Rates contains the decimation, Sync the sample number that is due now, and Clock the
+simulated time, which gives the number in full. Frames that come before Rates and Sync wait for them. Nothing is sent:
+the client takes part in the bus only by acknowledging.
 """
 
 from __future__ import annotations
@@ -32,6 +33,8 @@ _SETTLED_S = 0.05
 _EARLY = 50_000
 """Frames that wait for Rates and Sync: about 5 s of everything."""
 _TICK_RATE_HZ = 1e6
+_WRAP = 1 << 32
+"""The index in a Sync is modulo this number of samples: 59.7 h at 20 kHz."""
 
 
 class Layout:
@@ -100,6 +103,11 @@ def _lengthen(short: np.ndarray, bits: int, about: int) -> np.ndarray:
     return first + np.concatenate([[0], np.cumsum(steps)])
 
 
+def full_index(short: int, near: int) -> int:
+    """Return the number of a sample of which the last 32 bits are known, within 2^31 samples of another one."""
+    return near + (short - near + _WRAP // 2) % _WRAP - _WRAP // 2
+
+
 class CanSource:
     """The rig's sample messages on a bus.
 
@@ -110,7 +118,8 @@ class CanSource:
         wait_s: How long to wait for a rig to be there [s]; it tells of itself once a second.
         table: Messages; by default those of the rig's own channel table.
         on_frame: Takes name and raw values of each frame of the rig that carries no samples, behind those that came
-            before it; on the thread that reads.
+            before it; on the thread that reads. Of a Sync it receives `index` without the wrap, and `rate`, once Rates
+            has come.
 
     Raises:
         InputError: There is no such bus.
@@ -149,6 +158,10 @@ class CanSource:
         """Whether the rig runs in lockstep, where nothing comes before it is stepped."""
         self._started = (0, 0)
         self._sync: int | None = None
+        self._new_sync: int | None = None
+        """Index of the latest Sync, as it is in the frame, until Rates has come."""
+        self._clock_s: int | None = None
+        """Simulated time of the latest Clock [s]."""
         self._end_us = 0
         self._known = threading.Event()
         self._early: deque[tuple[int, bytes]] = deque(maxlen=_EARLY)
@@ -281,7 +294,10 @@ class CanSource:
             return None
         raw, state = row.decode(data), None
         if row.name == "Sync":
-            self._sync = raw["index"]
+            self._new_sync = raw["index"]
+        elif row.name == "Clock":
+            self._clock_s = raw["seconds"]
+            self._new_sync = self._new_sync if self._sync is None else self._sync % _WRAP
         elif row.name == "Rates":
             self.rates = raw
         elif row.name == "Heartbeat":
@@ -289,10 +305,15 @@ class CanSource:
             self._other_layout = raw["layout"] if raw["layout"] not in (0, self._table.layout) else 0
             self.lockstep |= state == State.LOCKSTEP
             self._end_us = raw["time"]
+        if self._new_sync is not None and self.rates is not None and (rate_hz := self.rates["rate"]):
+            near = (self._sync or 0) if self._clock_s is None else self._clock_s * rate_hz
+            self._sync, self._new_sync = full_index(self._new_sync, near), None
+            if self._on_frame is not None:
+                self._on_frame("Sync", {"index": self._sync, "rate": rate_hz})
         if self.lockstep and self._sync is None and self.rates is not None:
             # No Sync before the first step: what comes next is behind the last block.
             self._sync = self._end_us * self.rates["rate"] // 1_000_000
-        if self._on_frame is not None:
+        if self._on_frame is not None and row.name != "Sync":
             self.hand_on()
             self._on_frame(row.name, raw)
         if self._sync is not None and self.rates is not None and self.rates["rate"]:

@@ -22,6 +22,8 @@ from rig.transport import NoReplyError
 
 _US = 1e-6
 _WRAP = 1 << 32
+_MAX_SYNC_AGE_TICKS = 60_000_000
+"""A Sync corrects a time that is further off: the client has just joined, or a new run has begun [us]."""
 _BEAT_S = 1.5
 """A heartbeat comes within this time [s]."""
 _DIRECTIONS = {"x": 0.0, "y": 90.0, "-x": 180.0, "-y": 270.0}
@@ -83,6 +85,11 @@ class CanClient(Closing):
                 self._at(raw["time"])
                 self._beats += 1
                 self._changed.notify_all()
+        elif name == "Sync":
+            tick = raw["index"] * 1_000_000 // raw["rate"]
+            if abs(tick - self._tick) > _MAX_SYNC_AGE_TICKS:
+                self._tick = tick
+                self._at(self._beat.get("time", tick))
         elif name == "Status":
             self._status = raw
         elif name == "Acknowledge":

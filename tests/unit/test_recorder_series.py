@@ -202,6 +202,20 @@ def test_the_oldest_files_make_room_where_that_was_asked_for(tmp_path):
     assert int(Recording.open(file.files[0]).metadata["series"]["number"]) == file.removed
 
 
+@pytest.mark.parametrize("more", [{"budget_mb": 5.0, "when_full": "remove-oldest"}, {}])
+def test_the_counts_are_those_of_the_files_that_are_there(tmp_path, more):
+    """Rows, gaps, payloads that were no blocks, and times: of files that made room nothing is counted."""
+    file, items = series(tmp_path / "run.mcap", rotate_mb=1.0, **more), list(stream(500))
+    lost = [item for number, item in enumerate(items) if item[0] != PROBES or number % 100]
+    write(file, [*lost[:50], (PROBES, b"no block"), *lost[50:-9], (PROBES, b"no block"), *lost[-9:]])
+    assert (file.removed > 0) == bool(more)
+    (counted,), found = file.kept(), join(file.files)
+    assert counted.rows == {key: stream.rows for key, stream in found.streams.items() if stream.rows}
+    assert counted.first_time_ns == pytest.approx(1e9 * found.streams[PROBES].first_time_s)
+    assert counted.gaps == len(found.gaps) > 0
+    assert counted.malformed == sum(stream.odd for stream in found.streams.values()) == (1 if more else 2)
+
+
 def test_the_oldest_files_make_room_on_a_disk_of_which_nothing_is_to_be_left(tmp_path, monkeypatch):
     disk_bytes = 8_000_000
 

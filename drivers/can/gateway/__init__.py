@@ -126,6 +126,7 @@ class Gateway(Closing):
         self._ended = False
         self._status: dict[str, Any] = {}
         self._beat = 0
+        self._last_sync: dict[str, int] | None = None
         self._event_number = 0
         self._next_status_s = self._next_heartbeat_s = now()
 
@@ -324,9 +325,8 @@ class Gateway(Closing):
         for index in range(-(-block.index // every) * every, block.index + len(block.values), every):
             # As the block says: whoever ties bus time to the stream meets stamps that do not go on.
             time_s = block.start_s + (index - block.index) / self._rate_hz
-            self.outbox.put_one(
-                self._messages["Sync"], time_s, index=index & _WORD_32, time=round(1e6 * time_s) & _WORD_32
-            )
+            self._last_sync = {"index": index & _WORD_32, "time": round(1e6 * time_s) & _WORD_32}
+            self.outbox.put_one(self._messages["Sync"], time_s, **self._last_sync)
 
     def _on_edges(self, block: wire.Block) -> None:
         for number, ticks in enumerate(block.values[:, 0].tolist(), start=block.index):
@@ -379,6 +379,10 @@ class Gateway(Closing):
         if now >= self._next_heartbeat_s:
             self._next_heartbeat_s = max(self._next_heartbeat_s + _HEARTBEAT_S, now)
             self._beat = self._beat + 1 & 0xFF
+            if self.state == State.LOCKSTEP and self._last_sync is not None:
+                # Between two steps a node that joins would wait for the next Sync in vain.
+                self.outbox.answer(self._messages["Sync"], **self._last_sync)
+            self.outbox.answer(self._messages["Clock"], seconds=self._time_us // 1_000_000 & _WORD_32)
             self.outbox.answer(
                 self._messages["Heartbeat"],
                 state=self.state,

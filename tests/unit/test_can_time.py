@@ -1,0 +1,117 @@
+"""Simulated time over a CAN bus: a client that joins late, and a run whose counters have wrapped."""
+
+from __future__ import annotations
+
+import itertools
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import can  # noqa: TID253 - the subject
+import numpy as np
+import pytest
+
+from drivers.can.gateway import Gateway
+from drivers.can.schedule import Schedule
+from drivers.daq import Daq
+from drivers.sources.can import CanSource, full_index
+from drivers.sources.can_client import CanClient
+from rig import wire
+from rig.channels import default_table
+from rig.transport.memory import MemoryClient, MemoryServer
+from tests.unit.instruments_fake import FakeRig
+from tests.waiting import until
+
+pytestmark = pytest.mark.wallclock
+GROUPS = tuple(default_table().groups)
+RATE_HZ = default_table().groups["probes"].rate_hz
+ROWS = 200
+_numbers = itertools.count()
+
+INSTANTS_S = [0.0, 20 * 60, 40 * 60, 80 * 60, 60 * 3600, 300 * 3600]
+"""Each wrap is passed: of half of 2^32 us (35.8 min), of 2^32 us (71.6 min), of 2^32 samples (59.7 h at 20 kHz)."""
+
+
+class LateRig(FakeRig):
+    """A rig that is at a simulated time, and accepts commands then."""
+
+    def __init__(self, server: MemoryServer, time_s: float) -> None:
+        super().__init__(server)
+        self.index = dict.fromkeys(GROUPS, round(time_s * RATE_HZ))
+
+    def step(self) -> None:
+        """Publish a block that is over 10 ms later, with its end, in every group."""
+        for group, index in self.index.items():
+            values = np.zeros((ROWS, len(default_table().groups[group].names)), np.int32)
+            block = wire.Block(index * 1_000_000 // RATE_HZ, index, float(RATE_HZ), 1e6, values)
+            self.server.publish(wire.sensor_key(group), wire.encode_block(block))
+            self.index[group] = index + ROWS
+
+    @property
+    def tick(self) -> int:
+        return self.index["probes"] * 1_000_000 // RATE_HZ
+
+    def _command(self, name: str, payload: bytes) -> bytes:
+        return wire.encode_document({"accepted": True, "id": 1, "tick": self.tick, "time_s": self.tick * 1e-6})
+
+
+@contextmanager
+def late_rig(time_s: float, *, lockstep: bool = False) -> Iterator[tuple[LateRig, str]]:
+    channel = f"late{next(_numbers)}"
+    with (
+        MemoryServer(cache=10) as server,
+        MemoryClient(server) as client,
+        can.Bus(channel, interface="virtual", ignore_config=True) as bus,
+    ):
+        rig = LateRig(server, time_s)
+        with Gateway(client, bus, Schedule(), paced=False) as gateway:
+            if lockstep:
+                server.publish(wire.STATUS, wire.encode_document({"pace": "lockstep"}))
+                rig.step()
+                until(lambda: gateway.outbox.sent > 50)  # the block, not the status alone
+                yield rig, channel
+                return
+            ends = threading.Event()
+
+            def run() -> None:
+                while not ends.wait(0.02):
+                    rig.step()
+
+            running = threading.Thread(target=run)
+            running.start()
+            try:
+                yield rig, channel
+            finally:
+                ends.set()
+                running.join()
+
+
+@pytest.mark.parametrize("time_s", INSTANTS_S)
+def test_a_client_that_joins_late_has_the_time_of_the_rig(time_s: float) -> None:
+    with late_rig(time_s) as (rig, channel), CanClient(f"virtual:{channel}") as client:
+        status = wire.decode_document(client.request(wire.STATUS))
+        assert time_s - 0.3 <= status["time_s"] <= rig.tick * 1e-6
+        reply = wire.decode_document(client.request(wire.command_key("release"), b"{}"))
+        assert reply["accepted"]
+        assert status["time_s"] <= reply["time_s"] <= rig.tick * 1e-6
+
+
+@pytest.mark.parametrize("time_s", [80 * 60, 60 * 3600])
+def test_samples_that_are_read_late_have_the_time_of_the_rig(time_s: float) -> None:
+    with late_rig(time_s) as (rig, channel), Daq(CanSource(f"virtual:{channel}"), channels=["P_E"]) as daq:
+        block = daq.read(10)
+        assert time_s <= block.tick * 1e-6 <= rig.tick * 1e-6
+
+
+@pytest.mark.parametrize("time_s", [40 * 60, 60 * 3600])
+def test_a_client_that_joins_between_two_steps_has_the_time_of_the_rig(time_s: float) -> None:
+    with late_rig(time_s, lockstep=True) as (rig, channel), CanClient(f"virtual:{channel}") as client:
+        assert client.source.lockstep
+        status = wire.decode_document(client.request(wire.STATUS))
+        assert status["time_s"] == pytest.approx(rig.tick * 1e-6)
+
+
+def test_an_index_is_the_nearest_that_ends_in_its_32_bits() -> None:
+    wrap = 1 << 32
+    for index, near in ((7, 0), (wrap + 5, wrap - 5), (wrap - 5, wrap + 5), (3 * wrap, 3 * wrap + wrap // 4)):
+        assert full_index(index % wrap, near) == index
