@@ -9,6 +9,7 @@ module, the longest first.
 from __future__ import annotations
 
 import gc
+import os
 import re
 import signal
 from collections.abc import Generator
@@ -16,6 +17,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numba
 import pytest
 
 from rig.engines import ENGINES
@@ -69,6 +71,9 @@ def _place(nodeid: str) -> tuple[int, int]:
 
 
 def pytest_configure() -> None:
+    # One cache for all processes that tests start: a program on a bus alone, which knows no kernels of the rig, would
+    # keep its machine code elsewhere, and 25 s of compiling would come twice.
+    os.environ.setdefault("NUMBA_CACHE_DIR", str(numba.config.CACHE_DIR))
     # Whoever starts the tests in the background may have signals ignored, and what a test starts would inherit that.
     for number, usual in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL)):
         if signal.getsignal(number) is signal.SIG_IGN:

@@ -37,6 +37,7 @@ from rig.transport.zenoh import ZenohClient, ZenohServer
 from tests.hostile import inputs
 from tests.processes import free_endpoint
 from tests.unit.recorder_stream import TRUTH_COLUMNS, ScriptedClient, block_of, documents
+from tests.waiting import until
 
 pytestmark = [pytest.mark.wallclock, pytest.mark.timeout(7200)]
 KEYS = [wire.sensor_key(group) for group in default_table().groups] + [wire.truth_key(table) for table in TRUTH_COLUMNS]
@@ -389,7 +390,20 @@ def test_what_another_session_publishes_is_left_out_and_counted(monkeypatch: pyt
             for lossless, taken in got.items():
                 client.subscribe(PROBES, lambda _, p, taken=taken: taken.append(p), lossless=lossless)
             client.subscribe(wire.EVENTS, lambda _, p: events.append(p), history=True)
-            time.sleep(0.5)
+            # Until both subscriptions are in effect, what the lossy one misses is not recovered.
+            number = 0
+
+            def reached() -> bool:
+                nonlocal number
+                number += 1
+                server.publish(PROBES, truth.payload(PROBES, number))
+                return all(got.values())
+
+            until(reached, every_s=0.05)
+            begun = number + 1
+            until(lambda: all(taken[-1] == truth.payload(PROBES, number) for taken in got.values()))
+            for taken in got.values():
+                taken.clear()
             config = zenoh.Config()
             for name, value in (
                 ("mode", "client"), ("connect/endpoints", [f"tcp/{endpoint}"]), ("scouting/multicast/enabled", False),
@@ -397,15 +411,15 @@ def test_what_another_session_publishes_is_left_out_and_counted(monkeypatch: pyt
                 config.insert_json5(name, json.dumps(value))
             with zenoh.open(config) as forger:
                 publisher = forger.declare_publisher(PROBES)
-                for number in range(1, 51):
+                for number in range(begun, begun + 50):
                     server.publish(PROBES, truth.payload(PROBES, number))
                     publisher.put(b"forged")
                     forger.put(PROBES, truth.payload(PROBES, 10**6 + number))
                     forger.put(wire.EVENTS, b'{"event":"end","reason":"forged","rows":{}}')
                     forger.put(f"{PROBES}/@adv/pub/{forger.zid()}/1/_", b"\x07\x00\x00\x00")
                     time.sleep(0.002)
-                time.sleep(0.5)
-            sent = [truth.payload(PROBES, number) for number in range(1, 51)]
+                sent = [truth.payload(PROBES, number) for number in range(begun, begun + 50)]
+                until(lambda: all(len(taken) >= 50 for taken in got.values()) and client.foreign >= 4 * 50)
             assert got == {True: sent, False: sent}
             assert events == []
             assert client.foreign >= 4 * 50

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import signal
 import subprocess
-import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from functools import partial
@@ -19,7 +18,7 @@ from drivers.can.bus import codec
 from drivers.can.interface import ZenohBus
 from rig.cli.main import main
 from rig.transport.zenoh import ZenohClient
-from tests.processes import free_endpoint, python
+from tests.processes import free_endpoint, line_of, python
 from tests.waiting import PATIENCE_S, until
 
 pytestmark = pytest.mark.wallclock
@@ -33,10 +32,7 @@ def hub_process() -> Iterator[tuple[subprocess.Popen[str], str]]:
     endpoint = free_endpoint()
     arguments = ("can", "hub", "can0", "can1", "--speed", "1M/8M", "--listen", endpoint)
     with process("-m", "rig", *arguments) as child:
-        assert child.stdout is not None
-        # The first start after a change compiles, and says so.
-        said = next(line for line in child.stdout if not line.startswith("compiling"))
-        assert "Ctrl-C ends it" in said
+        line_of(child, "Ctrl-C ends it")  # the first start after a change compiles, and says so
         yield child, endpoint
 
 
@@ -54,7 +50,7 @@ class Bench:
         return json.loads(self._client.request(codec.request_key(channel, "status"), timeout_s=10.0))
 
     def nodes(self, count: int, channel: str = "can0") -> None:
-        until(lambda: len(self.status(channel)["nodes"]) == count, timeout_s=PATIENCE_S)
+        until(lambda: len(self.status(channel)["nodes"]) == count, of=self.child)
 
     def bus(self, channel: str = "can0", **settings: Any) -> ZenohBus:
         return self._stack.enter_context(ZenohBus(channel, endpoint=self.endpoint, **settings))
@@ -135,22 +131,32 @@ def test_stock_logger_and_player_keep_every_frame(hub: Bench, tmp_path: Path) ->
     for item in messages(count):
         sender.send(item, timeout=10.0)
     until(lambda: hub.status()["counts"]["frames"] - before["frames"] == count)
-    # The logger writes what it has read before it ends, but need not have read all.
-    time.sleep(0.5)
+
+    def has_all() -> bool:
+        """Whether the logger has written the last message; more of it make it empty its buffer."""
+        sender.send_records(codec.records_of(messages(count)[-1:] * 100), timeout=PATIENCE_S)
+        return path.exists() and path.read_text(encoding="utf-8").count("\n") >= count
+
+    until(has_all, of=logger, every_s=0.05)
+    sender.shutdown()
+    hub.nodes(1)
     assert "Connected to ZenohBus: zenoh can0" in end(logger)
-    logged = log(path)
+    everything = log(path)
+    logged = everything[:count]
     assert content(logged) == content(messages(count))
     assert [item.timestamp for item in logged] == sorted(item.timestamp for item in logged)
-    sender.shutdown()
+    assert content(everything[count:]) == content(messages(count)[-1:] * (len(everything) - count))
 
     hub.nodes(0)
+    between = hub.status()["counts"]
+    assert between == {**before, "frames": between["frames"]}
     receiver = hub.bus()
     player = hub.tool("player", "--ignore-timestamps", "-g", "0", str(path))
-    found = take(receiver, count)
+    found = take(receiver, len(everything))
     output, _ = player.communicate(timeout=PATIENCE_S)
     assert player.returncode == 0, output
-    assert content(found) == content(messages(count))
-    assert hub.status()["counts"] == {**before, "frames": before["frames"] + 2 * count}
+    assert content(found) == content(everything)
+    assert hub.status()["counts"] == {**between, "frames": between["frames"] + len(everything)}
 
 
 def test_stock_bridge_joins_two_channels(hub: Bench) -> None:
@@ -229,8 +235,7 @@ def test_an_endpoint_that_stalls_or_dies_slows_nobody(hub: Bench, how: signal.Si
     count = 20_000
     sender, receiver = hub.bus(), hub.bus()
     with process("-c", IDLE, hub.endpoint) as child:
-        assert child.stdout is not None
-        assert child.stdout.readline() == "up\n"
+        line_of(child, "up")
         assert take(receiver, 1)[0].arbitration_id == 7
         child.send_signal(how)
         data = bytes(60)
@@ -267,8 +272,7 @@ with can.Bus("can0", interface="zenoh", endpoint=sys.argv[1]) as bus:
     bus = hub.bus()
     before = hub.status()["counts"]["frames"]
     with process("-c", echo, hub.endpoint) as child:
-        assert child.stdout is not None
-        assert child.stdout.readline() == "up\n"
+        line_of(child, "up")
         for number in range(1000):
             bus.send(can.Message(arbitration_id=1, data=number.to_bytes(8, "big")))
             (answer,) = take(bus, 1)

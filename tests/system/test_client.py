@@ -15,19 +15,19 @@ from drivers.client import NotSeenError, Rig
 from drivers.samples import StreamEndedError
 from rig.errors import InputError, UnknownNameError
 from tests import processes
+from tests.waiting import PATIENCE_S
 
 CHANNELS = ("disk_x", "disk_y", "keyphasor")
 
 
 @contextmanager
 def connected(pace: str = "lockstep", **settings: Any) -> Iterator[Rig]:
-    endpoint = processes.free_endpoint()
-    changes = ("--set", "drive.speed_hz=12", "--set", "commands=[]", "--duration-s", "4")
-    with processes.rig("run", "hammer", "--pace", pace, "--listen", endpoint, *changes) as child:
-        with rig.connect(f"zenoh:{endpoint}", wait_s=processes.COMPILE_S, **settings) as machine:
-            yield machine
-        child.terminate()
-        child.communicate(timeout=30.0)
+    changes = ("--pace", pace, "--set", "drive.speed_hz=12", "--set", "commands=[]")
+    with (
+        processes.running_rig("hammer", *changes) as (_, endpoint),
+        rig.connect(f"zenoh:{endpoint}", wait_s=PATIENCE_S, **settings) as machine,
+    ):
+        yield machine
 
 
 def test_a_program_reads_the_same_rows_as_the_model_makes() -> None:

@@ -22,9 +22,9 @@ from drivers.proximity.driver import Proximity
 from drivers.samples import StreamEndedError
 from rig.errors import RefusedError
 from rig.transport.zenoh import ZenohClient
-from tests.processes import COMPILE_S, free_endpoint
+from tests.processes import free_endpoint, running_rig
 from tests.processes import rig as command
-from tests.system.test_service_run import rig_run
+from tests.waiting import PATIENCE_S
 
 pytestmark = pytest.mark.wallclock
 
@@ -52,10 +52,9 @@ def test_drivers_and_daq_show_the_same_rig() -> None:
         "proximity": Proximity, "force": Force, "accelerometer": Accelerometer, "drive": Drive, "hammer": Hammer,
     }  # fmt: skip
     with (
-        rig_run("hammer", "--duration-s", "120", "--seed", "3") as (rig, endpoint),
-        ZenohClient(endpoint, wait_s=COMPILE_S) as client,
+        running_rig("hammer", "--seed", "3") as (rig, endpoint),
+        ZenohClient(endpoint, wait_s=PATIENCE_S) as client,
     ):
-        assert Console(client, timeout_s=COMPILE_S).status()["state"] == "running"
         with twins("--zenoh", "--pty", "--listen", free_endpoint(), "--connect", endpoint) as (child, urls):
             assert set(urls) == {*drivers, "magnet"}
             assert all([url.partition(":")[0] for url in found] == ["zenoh", "pty"] for found in urls.values())
@@ -107,7 +106,7 @@ def test_drivers_and_daq_show_the_same_rig() -> None:
             _, errors = child.communicate(timeout=20.0)
             assert child.returncode == 0, errors
             assert "Traceback" not in errors
-        status = Console(client).status()
+        status = Console(client, timeout_s=PATIENCE_S).status()
         assert (status["state"], status["queue"]["dropped"]) == ("running", 0)
         rig.send_signal(signal.SIGTERM)
         rig.communicate(timeout=60.0)

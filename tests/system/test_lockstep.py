@@ -16,6 +16,7 @@ from drivers.console import AcceptedStep
 from rig.errors import InputError, RefusedError
 from rig.transport import NoReplyError
 from tests import processes
+from tests.waiting import PATIENCE_S
 
 DEVICE = """
 import random, sys, time
@@ -45,13 +46,12 @@ PLAIN = str(processes.ROOT / "docs/plain_device.py")
 
 @contextmanager
 def bench(*arguments: str) -> Iterator[tuple[Rig, str]]:
-    endpoint = processes.free_endpoint()
-    changes = ("--set", "drive.speed_hz=12", "--set", "commands=[]", "--duration-s", "4", *arguments)
-    with processes.rig("run", "hammer", "--pace", "lockstep", "--listen", endpoint, *changes) as child:
-        with rig.connect(f"zenoh:{endpoint}", wait_s=processes.COMPILE_S) as machine:
-            yield machine, endpoint
-        child.terminate()
-        child.communicate(timeout=30.0)
+    changes = ("--pace", "lockstep", "--set", "drive.speed_hz=12", "--set", "commands=[]", *arguments)
+    with (
+        processes.running_rig("hammer", *changes) as (_, endpoint),
+        rig.connect(f"zenoh:{endpoint}", wait_s=PATIENCE_S) as machine,
+    ):
+        yield machine, endpoint
 
 
 def reactions(slow_s: float) -> tuple[list[str], list[dict[str, Any]]]:
@@ -132,10 +132,15 @@ def test_a_program_of_the_client_is_the_same_device_over_can() -> None:
             with pytest.raises(RefusedError, match="speed was refused over CAN: out of range"):
                 device.speed(1000.0)
             stepped: list[AcceptedStep] = []
-            steps = threading.Thread(target=lambda: stepped.append(machine.step(30_000)))
-            # The first rows are asked for, and so the device joins, before anybody steps.
-            waits = threading.Timer(0.5, steps.start)
-            waits.start()
+            told: list[dict[str, Any]] = []
+
+            def step() -> None:
+                # The device joins as it asks for its first rows.
+                told.append(machine.event("device", timeout_s=PATIENCE_S))
+                stepped.append(machine.step(30_000))
+
+            steps = threading.Thread(target=step)
+            steps.start()
             ticks = []
             for samples in device.blocks():
                 assert len(samples) == 10
@@ -143,12 +148,12 @@ def test_a_program_of_the_client_is_the_same_device_over_can() -> None:
                 if len(ticks) == 3:
                     break
             fault = device.fault("P_E", "gain", factor=2.0)
-            steps.join(20.0)
+            steps.join(PATIENCE_S)
             assert ticks == [(0, 10_000), (10_000, 20_000), (20_000, 30_000)]
             assert (fault.fault, fault.channels, fault.first_row) == (1, ("P_E",), {"forces": 600})
             assert [device.event("hammer")["force_n"] for _ in range(2)] == [80.0] * 2
             assert stepped[0].lost == {}
-        told = [machine.event("device") for _ in range(2)]
+        told.append(machine.event("device"))
         assert [(each["device"], each["state"], each["tick"]) for each in told] == [
             ("CAN 3", "joined", 0),
             ("CAN 3", "left", 30_000),

@@ -11,6 +11,7 @@ from drivers.protection import Protection
 from drivers.protection.__main__ import parse
 from drivers.samples import Samples
 from tests import processes
+from tests.waiting import PATIENCE_S
 
 OPTIONS = ("--alert-um", "500", "--danger-um", "1500", "--startup-s", "0.02", "--danger-delay-s", "0.0123")  # 246 rows
 BLOCK_TICKS = 10_000
@@ -18,11 +19,10 @@ BLOCK_TICKS = 10_000
 
 def trip() -> tuple[list[str], list[dict[str, Any]], list[Samples]]:
     """Lines of the monitor, events of the stream by it, and the rows before and after a blow."""
-    endpoint = processes.free_endpoint()
-    changes = ("--set", "commands=[]", "--duration-s", "4", "--block-ms", str(BLOCK_TICKS // 1000))
-    with processes.rig("run", "hammer", "--pace", "lockstep", "--listen", endpoint, *changes) as child:
+    changes = ("--pace", "lockstep", "--set", "commands=[]", "--block-ms", str(BLOCK_TICKS // 1000))
+    with processes.running_rig("hammer", *changes) as (child, endpoint):
         url = f"zenoh:{endpoint}"
-        with rig.connect(url, channels=["disk_x", "disk_y", "speed"], wait_s=processes.COMPILE_S) as machine:
+        with rig.connect(url, channels=["disk_x", "disk_y", "speed"], wait_s=PATIENCE_S) as machine:
             with processes.python("-m", "drivers.protection", url, *OPTIONS) as device:
                 assert machine.event("device", timeout_s=60.0)["state"] == "joined"
                 rows = [machine.advance(0.1)]
@@ -34,7 +34,7 @@ def trip() -> tuple[list[str], list[dict[str, Any]], list[Samples]]:
             lines = said.splitlines()[1:]
             # A note that it is there, one for each line, and the trip's command.
             events = [machine.event(lambda event: event["event"] in ("speed", "note")) for _ in range(len(lines) + 2)]
-        child.communicate(timeout=30.0)
+        child.wait(timeout=PATIENCE_S)
     return lines, [{**event, "wall_s": 0.0} for event in events], rows
 
 

@@ -26,7 +26,7 @@ from rig.wire import (
     schema_of,
     sensor_key,
 )
-from tests.processes import free_port, python
+from tests.processes import free_port, line_of, python
 from tests.waiting import PATIENCE_S, until
 
 from ..unit.recorder_stream import documents, stream
@@ -139,7 +139,7 @@ def test_a_whole_run_arrives_without_loss(tmp_path, history):
     port = free_port()
     path = tmp_path / "run.mcap"
     with publisher(port) as rig, recorder(path, port, f"history={history}") as process:
-        until(lambda: received(rig) > 0)
+        until(lambda: received(rig) > 0, of=process)
         joined = {key: len(payloads) for key, payloads in rig.sent.items()}
         until(lambda: rig.blocks() > 150)
         rig.end()
@@ -165,7 +165,7 @@ def test_a_killed_recorder_loses_half_a_second_at_most_and_the_rest_reads(tmp_pa
             path = tmp_path / f"run{trial}.mcap"
             rig.beats.clear()
             with recorder(path, port) as process:
-                until(lambda: received(rig) > 0)
+                until(lambda: received(rig) > 0, of=process)
                 first = rig.blocks()
                 time.sleep(0.3 + rng.random())
                 killed_at = rig.blocks()
@@ -199,12 +199,11 @@ threading.Event().wait()
 def test_a_killed_rig_leaves_a_file_that_is_closed_well(tmp_path):
     port = free_port()
     path = tmp_path / "run.mcap"
-    with python("-c", RIG, str(port), stderr=None) as rig:
-        assert rig.stdout is not None
-        assert rig.stdout.readline() == "ready\n"
+    with python("-c", RIG, str(port), stderr=subprocess.STDOUT) as rig:
+        line_of(rig, "ready")
         with recorder(path, port) as process:
             part = path.with_name(path.name + ".part")
-            until(lambda: part.exists() and part.stat().st_size > 300_000)
+            until(lambda: part.exists() and part.stat().st_size > 300_000, of=process)
             rig.kill()
             output, errors = process.communicate(timeout=PATIENCE_S)
         assert process.returncode == 1, errors
@@ -220,7 +219,7 @@ def test_a_signal_ends_the_recording_well(tmp_path, number):
     port = free_port()
     path = tmp_path / "run.mcap"
     with publisher(port) as rig, recorder(path, port) as process:
-        until(lambda: received(rig) > 0)
+        until(lambda: received(rig) > 0, of=process)
         process.send_signal(number)
         output, errors = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 0, errors
@@ -252,7 +251,7 @@ def test_a_rotating_recorder_loses_nothing_at_its_seams(tmp_path):
     port = free_port()
     path = tmp_path / "run.mcap"
     with publisher(port) as rig, recorder(path, port, "rotate_s=0.4") as process:
-        until(lambda: received(rig) > 0)
+        until(lambda: received(rig) > 0, of=process)
         begun = rig.blocks()
         until(lambda: rig.blocks() > begun + 200)
         rig.end()
@@ -284,7 +283,7 @@ def test_a_trigger_makes_a_file_of_its_own(tmp_path):
     port = free_port()
     options = "trigger=['hammer'], pre_s=0.2, post_s=0.3, trigger_count=1"
     with publisher(port) as rig, recorder(tmp_path / "run.mcap", port, options) as process:
-        until(lambda: received(rig) > 0)
+        until(lambda: received(rig) > 0, of=process)
         begun = rig.blocks()
         until(lambda: rig.blocks() > begun + 60)  # longer than is kept before a trigger
         tick = rig.blocks() * 10_000
@@ -304,13 +303,13 @@ def test_a_recorder_that_was_stopped_for_longer_than_its_link_lives_goes_on(tmp_
     path = tmp_path / "run.mcap"
     code = "import rig.transport.session; rig.transport.session._LEASE_S = 1.0; "
     with publisher(port) as rig, recorder(path, port, before=code) as process:
-        until(lambda: received(rig) > 0)
+        until(lambda: received(rig) > 0, of=process)
         links = rig.server.congestion()["links"]
         process.send_signal(signal.SIGSTOP)
         until(lambda: rig.server.congestion()["links"] < links)
         process.send_signal(signal.SIGCONT)
-        until(lambda: rig.server.congestion()["links"] == links)
-        until(lambda: received(rig) > 200 * rig.blocks() - 4000)
+        until(lambda: rig.server.congestion()["links"] == links, of=process)
+        until(lambda: received(rig) > 200 * rig.blocks() - 4000, of=process)
         rig.end()
         output, errors = process.communicate(timeout=PATIENCE_S)
     # Where the link is there again before the recorder has noticed, there is nothing to tell while nothing is lost.
@@ -329,7 +328,7 @@ def test_a_recorder_that_was_stopped_for_longer_than_its_link_lives_goes_on(tmp_
 def test_a_run_that_failed_is_an_exit_status(tmp_path):
     port = free_port()
     with publisher(port) as rig, recorder(tmp_path / "run.mcap", port) as process:
-        until(lambda: received(rig) > 0)
+        until(lambda: received(rig) > 0, of=process)
         rig.end("failed: SimulationError: not finite")
         output, _ = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 1
@@ -341,12 +340,12 @@ def test_a_second_recorder_to_the_same_file_is_refused_and_the_first_one_goes_on
     port = free_port()
     path = tmp_path / "run.mcap"
     with publisher(port) as rig, recorder(path, port) as first:
-        until(lambda: received(rig) > 0)
+        until(lambda: received(rig) > 0, of=first)
         with recorder(path, port, "force=True") as second, recorder(tmp_path / "other.mcap", port) as third:
             _, errors = second.communicate(timeout=PATIENCE_S)
             assert second.returncode == 1
             assert "no other recording is writing to" in errors
-            until(lambda: len(rig.reached) == 2)
+            until(lambda: len(rig.reached) == 2, of=third)
             rig.end()
             for process in (first, third):
                 output, errors = process.communicate(timeout=PATIENCE_S)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import signal
+import subprocess
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -27,12 +28,12 @@ from rig.cli.can_output import CanMessages, CanOptions, CanOutput
 from rig.errors import RefusedError
 from rig.pacing import FreeRun, RealTime
 from rig.transport.zenoh import ZenohClient, ZenohServer
-from tests.processes import free_endpoint
+from tests.processes import free_endpoint, line_of
 from tests.processes import rig as command
 from tests.system.test_can_run import check_against_recording
 from tests.unit.player_recording import BLOCKS, by_key, write_recording
 from tests.unit.recorder_stream import stream
-from tests.waiting import until
+from tests.waiting import PATIENCE_S, until
 
 pytestmark = pytest.mark.wallclock
 _channels = itertools.count()
@@ -142,14 +143,22 @@ def test_frames_on_a_bus_are_those_of_the_recording(path: Path) -> None:
     assert 0.95 < compared / (15 * 11 * 10 * BLOCKS) <= 1.0
 
 
-def test_the_command_is_led_from_elsewhere_and_stopped(path: Path) -> None:
+@contextmanager
+def replaying(path: Path, *arguments: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """Start `rig replay`, and wait until it listens."""
     endpoint = free_endpoint()
+    with command("replay", str(path), "--listen", endpoint, *arguments) as child:
+        line_of(child, "listening on")
+        yield child, endpoint
+
+
+def test_the_command_is_led_from_elsewhere_and_stopped(path: Path) -> None:
     with (
-        command("replay", str(path), "--pause", "--listen", endpoint) as child,
-        ZenohClient(endpoint, wait_s=30.0) as client,
+        replaying(path, "--pause") as (child, endpoint),
+        ZenohClient(endpoint, wait_s=PATIENCE_S) as client,
     ):
         console = Console(client)
-        until(lambda: console.status()["replay"]["paused"])
+        until(lambda: console.status()["replay"]["paused"], of=child)
         assert console.step(20_000).time_s == pytest.approx(0.02)
         assert console.seek(0.5).time_s == pytest.approx(0.5)
         with pytest.raises(RefusedError, match="takes no hammer"):
@@ -163,15 +172,14 @@ def test_the_command_is_led_from_elsewhere_and_stopped(path: Path) -> None:
 
 
 def test_ctrl_c_ends_the_stream_and_says_so(path: Path) -> None:
-    endpoint = free_endpoint()
     events: list[dict] = []
     with (
-        command("replay", str(path), "--rate", "0.01", "--listen", endpoint) as child,
-        ZenohClient(endpoint, wait_s=30.0) as client,
+        replaying(path, "--rate", "0.01") as (child, endpoint),
+        ZenohClient(endpoint, wait_s=PATIENCE_S) as client,
     ):
         client.subscribe(wire.EVENTS, lambda _, payload: events.append(json.loads(payload)))
         client.settle()  # the status comes over another link
-        until(lambda: Console(client).status()["state"] == "running")
+        until(lambda: Console(client).status()["state"] == "running", of=child)
         child.send_signal(signal.SIGINT)
         output, errors = child.communicate(timeout=30.0)
         until(lambda: bool(events))

@@ -6,7 +6,7 @@ import json
 import signal
 import subprocess
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stdout
 from io import StringIO
 from typing import Any
@@ -17,7 +17,7 @@ from rig import wire
 from rig.cli import app
 from rig.errors import InputError, RefusedError
 from rig.transport.zenoh import ZenohClient, ZenohServer
-from tests.processes import free_endpoint, python
+from tests.processes import free_endpoint, line_of, python
 from tests.waiting import PATIENCE_S, until
 
 pytestmark = pytest.mark.wallclock
@@ -26,9 +26,9 @@ pytestmark = pytest.mark.wallclock
 @contextmanager
 def rig(pace: str, *duration_s: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
     endpoint = free_endpoint()
-    with python("-m", "tests.unit.service_fake", endpoint.rpartition(":")[2], pace, *duration_s, stderr=None) as child:
-        assert child.stdout is not None
-        assert child.stdout.readline() == "ready\n"
+    arguments = ("-m", "tests.unit.service_fake", endpoint.rpartition(":")[2], pace, *duration_s)
+    with python(*arguments, stdin=subprocess.PIPE, stderr=subprocess.STDOUT) as child:
+        line_of(child, "ready")
         yield child, endpoint
 
 
@@ -67,7 +67,7 @@ class Listener:
 def test_a_paced_rig_keeps_time_and_loses_nothing() -> None:
     with rig("real-time", "2") as (child, endpoint), ZenohClient(endpoint, wait_s=10.0) as client:
         listener = Listener(client)
-        output, _ = child.communicate(timeout=30.0)
+        output, _ = child.communicate("start\n", timeout=60.0)
         until(listener.complete)
         summary = json.loads(output)
     assert child.returncode == 0
@@ -82,7 +82,7 @@ def test_a_paced_rig_keeps_time_and_loses_nothing() -> None:
 def test_a_free_rig_waits_for_its_subscribers_and_loses_nothing() -> None:
     with rig("free", "20") as (child, endpoint), ZenohClient(endpoint, wait_s=10.0) as client:
         listener = Listener(client)
-        output, _ = child.communicate(timeout=60.0)
+        output, _ = child.communicate("start\n", timeout=60.0)
         until(listener.complete)
         summary = json.loads(output)
     assert listener.gaps == []
@@ -93,7 +93,7 @@ def test_a_free_rig_waits_for_its_subscribers_and_loses_nothing() -> None:
 def test_a_signal_ends_the_stream_in_good_order() -> None:
     with rig("real-time") as (child, endpoint), ZenohClient(endpoint, wait_s=10.0) as client:
         listener = Listener(client)
-        until(lambda: bool(listener.follow.received))
+        until(lambda: bool(listener.follow.received), of=child)
         child.send_signal(signal.SIGTERM)
         output, _ = child.communicate(timeout=30.0)
         until(listener.complete)
@@ -106,7 +106,7 @@ def test_a_signal_ends_the_stream_in_good_order() -> None:
 def test_a_killed_rig_is_noticed_long_before_the_lease_ends() -> None:
     with rig("real-time") as (child, endpoint), ZenohClient(endpoint, wait_s=10.0) as client:
         listener = Listener(client)
-        until(lambda: bool(listener.follow.received and listener.events) and listener.alive == [True])
+        until(lambda: bool(listener.follow.received and listener.events) and listener.alive == [True], of=child)
         child.kill()
         until(lambda: listener.alive == [True, False])
     assert listener.gaps == []
@@ -193,9 +193,24 @@ def test_a_script_that_never_closes_its_client_still_ends() -> None:
             assert child.wait(timeout=30.0) == 0
 
 
-def invoke(endpoint: str, *arguments: str) -> str:
+class Printed(StringIO):
+    """Standard output of a command, and what to do as soon as it has printed a line."""
+
+    def __init__(self, at_first_line: Callable[[], object] = bool) -> None:
+        super().__init__()
+        self._at_first_line = at_first_line
+
+    def write(self, text: str) -> int:
+        first = "\n" not in self.getvalue()
+        written = super().write(text)
+        if first and "\n" in text:
+            self._at_first_line()
+        return written
+
+
+def invoke(endpoint: str, *arguments: str, at_first_line: Callable[[], object] = bool) -> str:
     """What a command prints; raises what it raises."""
-    with redirect_stdout(StringIO()) as printed:
+    with redirect_stdout(Printed(at_first_line)) as printed:
         app.rig().main([*arguments, "--connect", endpoint], standalone_mode=False)
     return printed.getvalue()
 
@@ -246,8 +261,8 @@ def test_a_malformed_endpoint_is_refused() -> None:
 
 
 def test_watching_a_rig_ends_with_it() -> None:
-    with rig("real-time", "1.5") as (child, endpoint):
-        lines = invoke(endpoint, "status", "--watch", "--json").splitlines()
+    with rig("real-time") as (child, endpoint):
+        lines = invoke(endpoint, "status", "--watch", "--json", at_first_line=child.terminate).splitlines()
         ticks = [json.loads(line)["tick"] for line in lines]
         assert ticks == sorted(ticks)
         assert len(ticks) >= 1

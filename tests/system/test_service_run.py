@@ -13,8 +13,8 @@ from drivers.console import Console
 from rig.cli.options import SceneChanges
 from rig.errors import InputError
 from rig.transport.zenoh import ZenohClient
-from tests.processes import COMPILE_S, free_endpoint, python
-from tests.waiting import until
+from tests.processes import COMPILE_S, free_endpoint, line_of, python
+from tests.waiting import PATIENCE_S, until
 
 PROGRAM = """
 import sys, typer
@@ -54,15 +54,13 @@ def test_a_free_run_ends_with_a_summary() -> None:
 @pytest.mark.wallclock
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_ctrl_c_ends_the_run_in_good_order(number: signal.Signals) -> None:
-    with (
-        rig_run("stable-run", "--duration-s", "3600") as (child, endpoint),
-        ZenohClient(endpoint, wait_s=COMPILE_S) as client,
-    ):
-        # Answered once everything is compiled.
-        assert Console(client, timeout_s=COMPILE_S).status()["state"] == "running"
-        until(lambda: Console(client).status()["tick"] > 0)
-        child.send_signal(number)
-        output, errors = child.communicate(timeout=60.0)
+    with rig_run("stable-run") as (child, endpoint):
+        line_of(child, "listening on")  # compiled
+        with ZenohClient(endpoint, wait_s=PATIENCE_S) as client:
+            console = Console(client, timeout_s=PATIENCE_S)
+            until(lambda: console.status()["tick"] > 0, of=child)
+            child.send_signal(number)
+            output, errors = child.communicate(timeout=60.0)
     assert child.returncode == 0, errors
     assert "scene stable-run: stopped at" in output
     assert "Traceback" not in errors

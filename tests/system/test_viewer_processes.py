@@ -19,7 +19,7 @@ import pytest
 
 from recorder.viewer import window
 from recorder.viewer.window import Window, WindowError, environment, free_port
-from tests.processes import ROOT, free_endpoint, python
+from tests.processes import ROOT, free_endpoint, line_of, python
 from tests.unit.viewer_recording import Saved, Synthetic, documents_of, stream_of
 
 pytestmark = pytest.mark.wallclock
@@ -44,8 +44,7 @@ def started(command: list[str]) -> Iterator[subprocess.Popen[str]]:
 def rig(*, duration_s: float) -> Iterator[tuple[subprocess.Popen[str], int]]:
     port = int(free_endpoint().rpartition(":")[2])
     with started(["-m", "tests.system.viewer_rig", str(port), str(duration_s)]) as process:
-        assert process.stdout is not None
-        assert process.stdout.readline() == "ready\n"
+        line_of(process, "ready")
         yield process, port
 
 
@@ -141,8 +140,7 @@ def test_live_view_notices_that_the_rig_was_killed(tmp_path: Path) -> None:
         rig(duration_s=30.0) as (server, port),
         started([*VIEW, "--live", "--connect", f"127.0.0.1:{port}", "--save", str(target)]) as viewer,
     ):
-        assert server.stdout is not None
-        assert server.stdout.readline().startswith("rig/clients/viewer")
+        line_of(server, "rig/clients/viewer")
         server.send_signal(signal.SIGKILL)
         out, _ = viewer.communicate(timeout=60)
     assert viewer.returncode == 1
@@ -154,8 +152,7 @@ def test_the_web_viewer_is_on_loopback_only_and_goes_with_the_command(recorded: 
     import psutil
 
     with started([*VIEW, str(recorded)]) as viewer:
-        assert viewer.stdout is not None
-        address = re.search(r"http://127\.0\.0\.1:\d+/\S*", viewer.stdout.readline())
+        address = re.search(r"http://127\.0\.0\.1:\d+/\S*", line_of(viewer, "http://"))
         assert address is not None
         assert len(address[0]) <= 30
         with urllib.request.urlopen(address[0], timeout=10) as page:

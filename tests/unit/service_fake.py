@@ -1,6 +1,7 @@
 """A simulation without physics: as many streams and bytes as the real one, values that tell their row number.
 
-Run as a program it is a whole rig on one port: `python -m tests.unit.service_fake PORT PACE [DURATION_S]`.
+Run as a program it is a whole rig on one port: `python -m tests.unit.service_fake PORT PACE [DURATION_S]`. With a
+duration it starts when it has read a line, so that whoever starts it can be connected before it ends.
 """
 
 from __future__ import annotations
@@ -118,6 +119,8 @@ def main(port: int, pace: str, duration_s: float | None) -> None:
         service = Service(FakeSimulation(duration_s=duration_s), server, clock, block_ticks=10_000)
         signal.signal(signal.SIGTERM, lambda *_: service.stop())
         print("ready", flush=True)
+        if duration_s is not None:
+            sys.stdin.readline()
         summary = service.run()
     print(json.dumps(summary), flush=True)
 

@@ -1,0 +1,30 @@
+"""Waits of the tests: one for a process ends when the process does, and its message has what the process printed."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.processes import line_of, python
+from tests.waiting import PATIENCE_S, sooner_than, until
+
+ENDS = "print('out of order', flush=True); raise SystemExit(3)"
+
+
+def test_a_wait_for_a_process_that_has_ended_fails_at_once_with_its_output() -> None:
+    told = r"ended with status 3 before that:\nout of order"
+    with python("-S", "-c", ENDS) as child, sooner_than(PATIENCE_S), pytest.raises(AssertionError, match=told):
+        until(lambda: False, of=child)
+
+
+def test_what_has_come_before_the_process_ended_is_no_failure() -> None:
+    with python("-S", "-c", ENDS) as child:
+        until(lambda: child.poll() is not None, of=child)
+
+
+def test_a_line_that_never_comes_is_told_with_those_that_came() -> None:
+    told = r"status 0 and without 'listening on':\ncompiling"
+    silent = python("-S", "-c", "import sys; print('compiling', file=sys.stderr)")
+    with silent as child, pytest.raises(AssertionError, match=told):
+        line_of(child, "listening on")
+    with python("-S", "-c", "print('no rig'); print('ready')", stderr=None) as child:
+        assert line_of(child, "ready") == "ready\n"
