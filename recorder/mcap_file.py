@@ -13,8 +13,8 @@ from mcap.records import ChunkIndex
 from mcap.stream_reader import MAGIC_SIZE
 from mcap.writer import Writer
 
+from recorder.chunks import CHUNK, RECORD
 from recorder.draft import Draft
-from recorder.records import CHUNK, RECORD
 from recorder.schemas import Definition
 
 _CHUNK_BYTES = 1 << 20
@@ -52,7 +52,7 @@ class McapFile:
         """Number of the channel of each topic, and the numbers of its messages."""
         self.mcap = Writer(draft.file, chunk_size=_CHUNK_BYTES, enable_data_crcs=True)
         setattr(self.mcap, _CHUNK_LIST, _ChunkIndexes(draft.file))
-        self.mcap.start(profile="ros2", library="rotor-stator-rig recorder")
+        self.mcap.start(profile="", library="rotor-stator-rig recorder")
 
     @property
     def index_bytes(self) -> int:

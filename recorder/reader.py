@@ -13,8 +13,8 @@ from typing import Any, Self
 import numpy as np
 
 from recorder import documents, schemas
+from recorder.chunks import Chunk
 from recorder.recording_file import Message, RecordingFile
-from recorder.records import Chunk
 from recorder.samples import row_times_s, samples_of
 from recorder.survey import OnBlock, Stream, Survey
 from rig.declared import Declared, in_order

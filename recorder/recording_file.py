@@ -12,8 +12,9 @@ from typing import BinaryIO
 from mcap.exceptions import McapError
 
 from recorder import documents, schemas
+from recorder.chunks import Chunk, DamagedError, messages, unpack
 from recorder.payload import block_in
-from recorder.records import COPY, MAGIC, Chunk, DamagedError, messages, read_contents, unpack
+from recorder.records import COPY, MAGIC, read_contents
 from rig import intake
 from rig.errors import InputError, Words
 from rig.outside import open_file, read_json, unreadable

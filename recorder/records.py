@@ -5,23 +5,33 @@ from __future__ import annotations
 import contextlib
 import struct
 import zlib
-from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from io import BytesIO
 from itertools import pairwise
 from typing import BinaryIO
 
-import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Attachment, AttachmentIndex, Channel, Metadata, MetadataIndex, Statistics
 
+from recorder.chunks import (
+    CHUNK,
+    LONGEST_NAME,
+    MESSAGE,
+    MOST_CHUNK_BYTES,
+    PIECE,
+    RECORD,
+    Chunk,
+    DamagedError,
+    records,
+    stamp,
+    unpack,
+)
+
 MAGIC = b"\x89MCAP0\r\n"
 COPY = "metadata.json"
 """Attachment that repeats the metadata at the start of a file: a record of metadata has no checksum of its own."""
-MOST_CHUNK_BYTES = 64 << 20
-"""Largest chunk, unpacked: a writer closes one at 1 MiB, and the message that it closes with may be long."""
 _MOST_ATTACHED = 64 << 20
 """Attachments of a file, together [bytes]."""
 _MOST_METADATA = 16 << 20
@@ -34,43 +44,16 @@ _MOST_PACKED = 1000
 """Chunks unpack to at most so many times the file, and to `MOST_CHUNK_BYTES` of a small one."""
 _LEAST_RECORD = 24
 """A file of records shorter than this, on the whole, is none of a recorder's [bytes]."""
-RECORD = struct.Struct("<BQ")
-MESSAGE = struct.Struct("<HIQQ")
-CHUNK = struct.Struct("<QQQII")
 _CHUNK_INDEX = struct.Struct("<QQQQI")
 _INDEXED = struct.Struct("<HQ")
+_BARE = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
+"""What may stand in chunks, or outside them."""
+_LAST_OPCODE = 0x0F
+"""Records of a higher number are of a later version of the format, or private (0x80 on); a reader passes over them."""
+_SURE = 0x8F
+"""In a file without an end a number up to this one may be a known one with a flipped bit, which no checksum covers."""
 _FOOTER = struct.Struct("<BQQQI")
 _DATA_END = struct.Struct("<BQI")
-_PIECE = 1 << 20
-_CUT_PIECE = 4096
-_LONGEST_NAME = 32
-
-
-class DamagedError(ValueError):
-    """A record is not what was written: its checksum, or its form, says so."""
-
-
-@dataclass(frozen=True)
-class Chunk:
-    """Messages in a row that were packed together; see `Recording.chunks`.
-
-    Attributes:
-        offset: Where its record begins in its file [bytes].
-        length: Length of the record's body [bytes].
-        begin_ns: Least simulated time of its messages [ns].
-        end_ns: Greatest simulated time of its messages [ns].
-        channels: Channels with messages in it, where the file says so.
-        cut: The file ends in it.
-        part: Number of the file that it is in, of `Recording.parts`.
-    """
-
-    offset: int
-    length: int
-    begin_ns: int = 0
-    end_ns: int = 0
-    channels: frozenset[int] | None = None
-    cut: bool = False
-    part: int = 0
 
 
 @dataclass
@@ -115,53 +98,84 @@ def read_contents(file: BinaryIO, size: int, *, salvage: bool) -> Contents:
     """
     footer = _footer(file, size)
     if footer is None or salvage:
-        found = _walked(file, size)
+        found, _ = _walked(file, size)
         if footer is not None:
             found.finished = True
             with contextlib.suppress(DamagedError):  # a chunk with channels may be among the damaged ones
-                summary = _summary(file, size, footer)[0]
+                summary = _summary(file, size, footer).found
                 found.topics, found.about = summary.topics | found.topics, summary.about | found.about
         return _counted(file, found)
-    found, indexed, data_end = _summary(file, size, footer)
-    _take_data(file, found, indexed, data_end)
-    file.seek(data_end)
-    opcode, length, expected = _DATA_END.unpack(file.read(_DATA_END.size))
-    if (opcode, length) != (Opcode.DATA_END, 4):
-        raise DamagedError("no end of the data")
-    if expected or COPY in found.attachments:
-        if _sum(file, data_end) != expected:
-            raise DamagedError("the checksum of the whole does not fit")
-    else:
-        found.unchecked = ("its metadata (by an earlier version, without a checksum of the whole)",)
+    summary = _summary(file, size, footer)
+    room = _Room(size)
+    found, data_end = summary.found, summary.start - _DATA_END.size
+    if not summary.indexed or not _take_data(file, summary, data_end, room):
+        found, data_end = _walked(file, size, finished=True)
+        if data_end is None or found.damaged:
+            raise DamagedError("records of the data section that are not what was written")
+        _check_against(summary, _counted(file, found))
+    _check_end(file, found, data_end)
     found.complete = found.finished = True
     return found
 
 
-def _take_data(file: BinaryIO, found: Contents, indexed: set[tuple[int, int]], data_end: int) -> None:
-    """Hold the records of the data against their index, and take metadata and attachments."""
-    position, room, chunks = len(MAGIC), _Room(data_end), set()
-    for chunk in found.chunks:
-        indexed.add((chunk.offset, chunk.length + RECORD.size))
+def _check_end(file: BinaryIO, found: Contents, data_end: int) -> None:
+    """Hold the data section against its checksum; where none was written, name what nothing covers."""
+    file.seek(data_end)
+    opcode, length, expected = _DATA_END.unpack(file.read(_DATA_END.size))
+    if opcode != Opcode.DATA_END or length < 4:
+        raise DamagedError("no end of the data")
+    if expected:
+        if _sum(file, data_end) != expected:
+            raise DamagedError("the checksum of the whole does not fit")
+        found.unchecked = ()
+    elif COPY not in found.attachments:
+        found.unchecked = ("its metadata (by an earlier version, without a checksum of the whole)",)
+    else:
+        found.unchecked += ("what has no checksum of its own (its writer made none of the whole)",)
+
+
+def _check_against(summary: _Summary, found: Contents) -> None:
+    """Hold what was found in the data section against what the summary states of it."""
+    stated, chunks = summary.found, {chunk.offset for chunk in found.chunks}
+    if found.damaged or not set(found.counts) <= set(found.topics):
+        raise DamagedError("chunks that are not what was written")
+    if not {chunk.offset for chunk in stated.chunks if chunk.channels} <= chunks:
+        raise DamagedError("an index that does not fit what is there")
+    if summary.counted and {number: count for number, count in stated.counts.items() if count} != found.counts:
+        raise DamagedError("counts that do not fit the index")
+
+
+def _take_data(file: BinaryIO, summary: _Summary, data_end: int, room: _Room) -> bool:
+    """Hold the records of the data against their index, and take metadata and attachments.
+
+    Returns:
+        Whether the index leads to all messages; False where messages stand outside chunks.
+    """
+    found, position, places = summary.found, len(MAGIC), set()
+    indexed = summary.places | {(chunk.offset, chunk.length + RECORD.size) for chunk in found.chunks}
     found.chunks = [chunk for chunk in found.chunks if chunk.channels]  # one without an index has no messages
     while position < data_end:
         file.seek(position)
         opcode, length = _head(file)
         end = position + RECORD.size + length
-        if end > data_end or opcode == Opcode.MESSAGE:
-            raise DamagedError("records that do not end with the data, or messages outside of chunks")
+        if end > data_end:
+            raise DamagedError("records that do not end with the data")
+        if opcode == Opcode.MESSAGE:
+            return False
         room.take(opcode, file, length)
-        if opcode in (Opcode.CHUNK, Opcode.METADATA, Opcode.ATTACHMENT):
-            chunks.add((position, end - position))
-            if opcode != Opcode.CHUNK:
-                _take(found, opcode, file.read(length))
+        if opcode == Opcode.CHUNK or opcode in summary.kinds:
+            places.add((position, end - position))
+        if opcode in (Opcode.METADATA, Opcode.ATTACHMENT):
+            _take(found, opcode, file.read(length))
         position = end
-    if chunks != indexed:
+    if places != indexed:
         raise DamagedError("an index that does not fit what is there")
     if sum(found.counts.values()) > room.unpacked // (RECORD.size + MESSAGE.size):
         raise DamagedError("more messages counted than there is room for")
     counted = {number for number, count in found.counts.items() if count}
     if counted != set().union(*(chunk.channels or () for chunk in found.chunks)):
         raise DamagedError("counts that do not fit the index")
+    return True
 
 
 class _Room:
@@ -203,7 +217,7 @@ def _sum(file: BinaryIO, end: int) -> int:
     """CRC-32 of a file up to a place."""
     file.seek(0)
     checksum = 0
-    while (left := end - file.tell()) > 0 and (data := file.read(min(_PIECE, left))):
+    while (left := end - file.tell()) > 0 and (data := file.read(min(PIECE, left))):
         checksum = zlib.crc32(data, checksum)
     return checksum
 
@@ -219,20 +233,48 @@ def _footer(file: BinaryIO, size: int) -> tuple[int, int] | None:
     return (start, checksum) if whole else None
 
 
-def _summary(file: BinaryIO, size: int, footer: tuple[int, int]) -> tuple[Contents, set[tuple[int, int]], int]:
-    """Channels, counts and chunks by the summary; where metadata and attachments are; where the data end."""
+@dataclass
+class _Summary:
+    """What a file states at its end, each part of which a writer may leave out.
+
+    Attributes:
+        start: Where it begins [bytes].
+        found: Channels, counts and chunks.
+        counted: It has statistics.
+        places: Offset and length of indexed metadata and attachments.
+        kinds: Opcodes of those of the two that are indexed.
+    """
+
+    start: int
+    found: Contents = field(default_factory=Contents)
+    counted: bool = False
+    places: set[tuple[int, int]] = field(default_factory=set)
+    kinds: set[int] = field(default_factory=set)
+
+    @property
+    def indexed(self) -> bool:
+        """Whether the messages can be found by it: channels, counts, and an index of the chunks with their channels."""
+        chunks, counts = self.found.chunks, {number for number, count in self.found.counts.items() if count}
+        listed = set().union(*(chunk.channels or () for chunk in chunks))
+        return self.counted and bool(listed) and counts | listed <= set(self.found.topics)
+
+
+def _summary(file: BinaryIO, size: int, footer: tuple[int, int]) -> _Summary:
+    """Read what the file states at its end."""
     start, expected = footer
-    data_end, end = start - _DATA_END.size, size - len(MAGIC) - _FOOTER.size
-    if data_end < len(MAGIC) or start > end:
+    if start == 0:
+        return _Summary(start)
+    end = size - len(MAGIC) - _FOOTER.size
+    if start < len(MAGIC) + _DATA_END.size or start > end:
         raise DamagedError("a footer that points nowhere")
     if size - start > _MOST_SUMMARY:
         raise DamagedError(f"a summary of {size - start} bytes")
     file.seek(start)
     data = file.read(size - len(MAGIC) - 4 - start)
-    if zlib.crc32(data) != expected:
+    if expected and zlib.crc32(data) != expected:
         raise DamagedError("the checksum of the summary does not fit")
-    found, places = Contents(), set()
-    room = _Room(len(data))
+    summary = _Summary(start)
+    found, room = summary.found, _Room(len(data))
     for opcode, at, stop in records(data[: end - start]):
         room.take(opcode, file, 0)
         if opcode == Opcode.CHUNK_INDEX:
@@ -243,17 +285,17 @@ def _summary(file: BinaryIO, size: int, footer: tuple[int, int]) -> tuple[Conten
             channel = Channel.read(body)
             _add_topic(found, channel)
         elif opcode == Opcode.STATISTICS:
-            found.counts = dict(Statistics.read(body).channel_message_counts)
+            found.counts, summary.counted = dict(Statistics.read(body).channel_message_counts), True
         elif opcode in (Opcode.ATTACHMENT_INDEX, Opcode.METADATA_INDEX):
-            index = (AttachmentIndex if opcode == Opcode.ATTACHMENT_INDEX else MetadataIndex).read(body)
-            places.add((index.offset, index.length))
+            attached = opcode == Opcode.ATTACHMENT_INDEX
+            index = (AttachmentIndex if attached else MetadataIndex).read(body)
+            summary.places.add((index.offset, index.length))
+            summary.kinds.add(Opcode.ATTACHMENT if attached else Opcode.METADATA)
+    found.chunks.sort(key=lambda chunk: chunk.offset)
     for earlier, later in pairwise(found.chunks):
         if later.offset < earlier.offset + earlier.length:
             raise DamagedError("chunks that lie upon each other")
-    used = set(found.counts).union(*(chunk.channels or () for chunk in found.chunks))
-    if not used <= set(found.topics):
-        raise DamagedError("messages on a channel that is not there")
-    return found, places, data_end
+    return summary
 
 
 def _chunk_indexed(body: bytes) -> Chunk:
@@ -280,31 +322,37 @@ def _take(found: Contents, opcode: int, body: bytes) -> None:
     stream = ReadDataStream(BytesIO(body))
     try:
         if opcode == Opcode.ATTACHMENT:
-            if len(body) < 4 or zlib.crc32(body[:-4]) != int.from_bytes(body[-4:], "little"):
-                raise DamagedError("an attachment whose checksum does not fit")
             attachment = Attachment.read(stream)
+            stated = int.from_bytes(body[stream.count - 4 : stream.count], "little")
+            if stated and zlib.crc32(body[: stream.count - 4]) != stated:  # 0: the writer made none
+                raise DamagedError("an attachment whose checksum does not fit")
             kept, name, value = found.attachments, attachment.name, attachment.data
         else:
             metadata = Metadata.read(stream)
             kept, name, value = found.metadata, metadata.name, metadata.metadata
     except (McapError, struct.error, UnicodeDecodeError):
         raise DamagedError("a record that does not end where it should") from None
-    if stream.count != len(body) or name in kept:
+    if stream.count > len(body) or name in kept:  # bytes after the last field are for later versions of the format
         raise DamagedError(f"{name} twice" if name in kept else "a record that does not end where it should")
     kept[name] = value  # type: ignore[assignment]
 
 
-def _walked(file: BinaryIO, size: int) -> Contents:
-    """The records of a file that was cut off, one behind the other, as far as it goes.
+def _walked(file: BinaryIO, size: int, *, finished: bool = False) -> tuple[Contents, int | None]:
+    """Return what the records of a file contain, read from its beginning, and where the data section ends.
 
-    A record counts only if all of it lies in the file: a cut at any byte costs at most the chunk it went through.
+    A record counts only if all of it lies in the file: a cut at any byte costs at most the chunk it went through. The
+    end is None where the file does not reach it.
     """
-    found = Contents()
+    found, bare_from = Contents(), 0
     position, room = len(MAGIC), _Room(size)
     while position + RECORD.size <= size:
         file.seek(position)
         opcode, length = _head(file)
         end = position + RECORD.size + length
+        bare = opcode in _BARE and end <= size
+        if bare_from and not (bare and end - bare_from <= PIECE):
+            found.chunks.append(Chunk(bare_from, position - bare_from, bare=True))
+            bare_from = 0
         if opcode == 0 or end > size:
             # Cut off, or zeros where a power cut left unwritten pages; else its length is not what was written.
             if opcode == Opcode.CHUNK and _says(file, length):
@@ -312,25 +360,30 @@ def _walked(file: BinaryIO, size: int) -> Contents:
             elif not (length == 0 and _zeros(file) if opcode == 0 else _says_index(file, opcode, length)):
                 found.damaged += 1
             break
-        if opcode == Opcode.DATA_END and length == 4:
-            break
+        if opcode == Opcode.DATA_END and length >= 4:
+            return found, position
         room.take(opcode, file, length)
-        if opcode == Opcode.CHUNK:
+        if bare:
+            bare_from = bare_from or position
+        elif opcode == Opcode.CHUNK:
             found.chunks.append(Chunk(position, length))
         elif opcode in (Opcode.METADATA, Opcode.ATTACHMENT):
             try:
                 _take(found, opcode, file.read(length))
             except DamagedError:
                 found.damaged += 1
-        elif opcode not in (Opcode.HEADER, Opcode.MESSAGE_INDEX):
+        elif opcode not in (Opcode.HEADER, Opcode.MESSAGE_INDEX) and opcode <= (_LAST_OPCODE if finished else _SURE):
             found.damaged += 1
         position = end
-    return found
+    else:
+        if bare_from:
+            found.chunks.append(Chunk(bare_from, position - bare_from, bare=True))
+    return found, None
 
 
 def _says(file: BinaryIO, length: int) -> bool:
     """Whether a chunk that was cut is as long as it says in two places, as far as the file goes."""
-    head = file.read(CHUNK.size + _LONGEST_NAME + 8)
+    head = file.read(CHUNK.size + LONGEST_NAME + 8)
     if len(head) < CHUNK.size:
         return True
     name = CHUNK.unpack_from(head)[-1]
@@ -343,11 +396,11 @@ def _says_index(file: BinaryIO, opcode: int, length: int) -> bool:
     if opcode == Opcode.MESSAGE_INDEX:
         head = file.read(6)
         return len(head) < 6 or 6 + int.from_bytes(head[2:], "little") == length
-    return opcode in (Opcode.METADATA, Opcode.ATTACHMENT, Opcode.DATA_END)
+    return opcode in (Opcode.METADATA, Opcode.ATTACHMENT, Opcode.DATA_END, *_BARE)
 
 
 def _zeros(file: BinaryIO) -> bool:
-    while data := file.read(_PIECE):
+    while data := file.read(PIECE):
         if data.count(0) < len(data):
             return False
     return True
@@ -355,7 +408,7 @@ def _zeros(file: BinaryIO) -> bool:
 
 def _counted(file: BinaryIO, found: Contents) -> Contents:
     """Find channels, counts and times of a cut file in its chunks; one that does not unpack is passed over."""
-    good, counts, unchecked = [], [], 0
+    good, counts, unchecked, bare = [], [], 0, 0
     for chunk in found.chunks:
         times_ns: list[int] = []
         inside: dict[int, int] = {}
@@ -363,7 +416,7 @@ def _counted(file: BinaryIO, found: Contents) -> Contents:
             data = unpack(file, chunk)
             for opcode, start, end in records(data, cut=chunk.cut):
                 if opcode == Opcode.MESSAGE:
-                    number, _, time_ns, _ = _stamp(data, start, end)
+                    number, _, time_ns, _ = stamp(data, start, end)
                     inside[number] = inside.get(number, 0) + 1
                     times_ns.append(time_ns)
                 elif opcode == Opcode.CHANNEL:
@@ -375,6 +428,7 @@ def _counted(file: BinaryIO, found: Contents) -> Contents:
             good.append(replace(chunk, begin_ns=min(times_ns), end_ns=max(times_ns), channels=frozenset(inside)))
             counts.append(inside)
             unchecked += len(times_ns) if chunk.cut else 0
+            bare += len(times_ns) if chunk.bare else 0
     for inside in counts:
         if not set(inside) <= set(found.topics):
             found.damaged += 1
@@ -385,93 +439,6 @@ def _counted(file: BinaryIO, found: Contents) -> Contents:
         found.unchecked += ("its metadata (by an earlier version)",)
     if unchecked:
         found.unchecked += (f"the last {unchecked} messages (of the chunk in which it was cut off)",)
+    if bare:
+        found.unchecked += (f"{bare} messages outside chunks",)
     return found
-
-
-def _stamp(data: bytes, start: int, end: int) -> tuple[int, int, int, int]:
-    """Channel, number, simulated time [ns] and wall time of arrival [unix ns] of a message."""
-    if end - start < MESSAGE.size:
-        raise DamagedError("a message without a head")
-    return MESSAGE.unpack_from(data, start)
-
-
-def records(data: bytes, *, cut: bool = False) -> Iterator[tuple[int, int, int]]:
-    """Opcode, start and end of the body of each record.
-
-    Args:
-        data: Records behind each other.
-        cut: The last one may be cut off.
-
-    Raises:
-        DamagedError: They do not end with the data.
-    """
-    position = 0
-    while position + RECORD.size <= len(data):
-        opcode, length = RECORD.unpack_from(data, position)
-        if opcode == 0:  # no record: zeros
-            break
-        start = position + RECORD.size
-        position = start + length
-        if position <= len(data):
-            yield opcode, start, position
-    if position != len(data) and not cut:
-        raise DamagedError("records that do not end with their chunk")
-
-
-def messages(data: bytes, *, cut: bool = False) -> Iterator[tuple[int, int, int, bytes]]:
-    """Channel, simulated time [ns], wall time of arrival [unix ns] and payload of each message of a chunk."""
-    for opcode, start, end in records(data, cut=cut):
-        if opcode == Opcode.MESSAGE:
-            number, _, log_time, publish_time = _stamp(data, start, end)
-            yield number, log_time, publish_time, data[start + MESSAGE.size : end]
-
-
-def unpack(file: BinaryIO, chunk: Chunk) -> bytes:
-    """Records of a chunk, unpacked to the size that it declares and checked against their sum.
-
-    Raises:
-        DamagedError: It is not what was written, or larger than a recorder makes one.
-    """
-    if chunk.length > MOST_CHUNK_BYTES + _PIECE:
-        raise DamagedError(f"a chunk of {chunk.length} bytes")
-    file.seek(chunk.offset + RECORD.size)
-    body = file.read(chunk.length)
-    if len(body) < CHUNK.size + 8:
-        if chunk.cut:
-            return b""
-        raise DamagedError("a chunk without a head")
-    *_, size, checksum, name_length = CHUNK.unpack_from(body)
-    name, packed = body[CHUNK.size : CHUNK.size + name_length], body[CHUNK.size + name_length + 8 :]
-    if size > MOST_CHUNK_BYTES or name not in (b"", b"zstd"):
-        raise DamagedError(f"a chunk of {size} bytes, packed by {name[:_LONGEST_NAME]!r}")
-    if chunk.cut:
-        return _unpack_cut(packed, size) if name else packed
-    stated = int.from_bytes(body[CHUNK.size + name_length : CHUNK.size + name_length + 8], "little")
-    if stated != len(packed):
-        raise DamagedError("a chunk that does not end where it should")
-    data = packed
-    if name:
-        try:
-            # What the packed data say of their size is allocated, so it is asked first.
-            if zstandard.frame_content_size(packed) not in (-1, size):
-                raise DamagedError("a chunk of another size than it says")
-            data = zstandard.ZstdDecompressor().decompress(packed, max_output_size=size)
-        except zstandard.ZstdError as error:
-            raise DamagedError(str(error)) from None
-    if len(data) != size or zlib.crc32(data) != checksum:
-        raise DamagedError("a chunk whose checksum does not fit")
-    return data
-
-
-def _unpack_cut(packed: bytes, size: int) -> bytes:
-    """What can be unpacked of a chunk that the file ends in; the last record in it may be cut."""
-    found, length = [], 0
-    # In small pieces: where it ends in zeros or in nothing, the blocks before that are good.
-    with (
-        contextlib.suppress(zstandard.ZstdError),
-        zstandard.ZstdDecompressor().stream_reader(BytesIO(packed), read_size=_CUT_PIECE) as reader,
-    ):
-        while length < size and (data := reader.read(min(_CUT_PIECE, size - length))):
-            found.append(data)
-            length += len(data)
-    return b"".join(found)

@@ -6,8 +6,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from recorder.chunks import Chunk
 from recorder.reader import join
-from recorder.records import Chunk
 from rig import wire
 from rig.channels import ChannelTable
 from rig.errors import InputError
