@@ -27,6 +27,8 @@ class ExpectScore(Expected):
 
     score: str
     channel: str | list[str] = ""
+    channels: Annotated[tuple[str, ...], Field(min_length=1)] | None = None
+    """Channels that the device was to record, as `rig score --channels`; all of the session unless given."""
     file: Annotated[str, Field(min_length=1)]
     limits: str | None = None
     path: Literal["digital", "analogue"] | None = None
@@ -58,9 +60,12 @@ class ExpectScore(Expected):
         for name, usual in (("begins_s", 0.0), ("ends_s", 0.0), ("every", 1)):
             if self.score != "all" and getattr(self, name) != usual:
                 raise InputError(f"{where}.{name}", "left out, but where score is all", getattr(self, name))
+        for name in self.channels or ():
+            if name not in units[""]:
+                raise UnknownNameError(f"{where}.channels", "channels that the rig sends", name, units[""])
         if not self.must:
             return Must("==", 0.0, "1")
-        if self.score in ("all", "mapping", "polarity"):
+        if self.score in ("all", "recorded", "mapping", "polarity"):
             raise InputError(f"{where}.must", f"left out where score is {self.score}", self.must)
         if not (unit := known[self.score].unit or units[""].get(" ".join(self._channels), "")):
             what = f"one of the channels with must, as {self.score} is in the unit of its channel"
@@ -74,7 +79,7 @@ class ExpectScore(Expected):
         must = self.check(units, where="expect")
         what = self.name or " ".join(("failing rows of", self.score, *self._channels))
         try:
-            card = seen.card(self.file, self.limits, self.path)
+            card = seen.card(self.file, self.limits, self.path, self.channels)
         except InputError as error:
             yield Measurement(what, math.nan, must, self.source, note=str(error))
             return
@@ -113,10 +118,12 @@ class ExpectScore(Expected):
 
         groups = _sent(seen)
         wires = {row.value: row for row in card.rows if row.quantity == "mapping"}
+        found = {row.channel for row in card.rows if row.quantity == "recorded" and row.verdict == PASS}
         for name in [name for each in self._channels or groups for name in groups.get(each, [each])]:
             wire = wires.get(name)
             if wire is None:
-                yield name, f"{name} is not in the file, or not found in it"
+                if name in found:  # otherwise the quantity `recorded` fails, or the channel was not to be recorded
+                    yield name, f"nothing of {name} is found in the file"
             elif wire.verdict == INCONCLUSIVE:
                 yield name, f"whether {wire.channel} is {name}, this run does not show; it takes {wire.run}"
             elif not any(row.verdict == PASS for row in rows if row.channel == wire.channel and row is not wire):

@@ -81,15 +81,19 @@ class Seen:
             self._rows[key] = found.only(*names)
         return self._rows[key]
 
-    def card(self, file: str, limits: str | None, path: Literal["digital", "analogue"] | None) -> Scorecard:
+    def card(
+        self, file: str, limits: str | None, path: Literal["digital", "analogue"] | None,
+        channels: tuple[str, ...] | None = None,
+    ) -> Scorecard:  # fmt: skip
         """The scorecard of a file in the folder."""
         from replays.score.judgement import judge
         from replays.score.limits import load_limits
 
-        key = file, limits, path
+        key = file, limits, path, channels
         if key not in self._cards:
             sent = [part.path for part in self.recording.parts]
-            self._cards[key] = judge(self.folder / file, sent, limits=load_limits(limits), path=path)
+            asked = load_limits(limits)
+            self._cards[key] = judge(self.folder / file, sent, limits=asked, path=path, channels=channels)
         return self._cards[key]
 
 

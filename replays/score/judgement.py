@@ -19,7 +19,7 @@ from replays.score.recorded import Recorded, open_recorded
 from replays.score.scorecard import FAIL, INCONCLUSIVE, NO_LIMIT, PASS, QUANTITIES, Scorecard, ScoreRow, Verdict
 from replays.score.sent import Formula, Session
 from replays.score.wiring import Wire, find_wires
-from rig.errors import InputError, Words
+from rig.errors import InputError, UnknownNameError, Words
 
 _LOUD, _MANY = 4.0, 1000
 """Noises of a channel, and rows, from which on what was sent has to be seen."""
@@ -32,7 +32,7 @@ _CORE = {"digital": "altered values", "analogue": "gain"}
 def judge(
     file: Path, against: Sequence[Path], *, limits: Limits | None = None,
     path: Literal["digital", "analogue"] | None = None, formulas: Mapping[str, Formula] | None = None,
-    options: FileOptions | None = None, arrivals: Arrivals | None = None,
+    options: FileOptions | None = None, arrivals: Arrivals | None = None, channels: Sequence[str] | None = None,
 ) -> Scorecard:  # fmt: skip
     """Make the scorecard of a DAQ.
 
@@ -45,12 +45,14 @@ def judge(
             test signal has it, or its own samples.
         options: How a text file is read, where it does not say so itself.
         arrivals: When the lines of a text file came, headings included, where it was delivered live.
+        channels: Channels or groups of the session that were to be recorded; all unless given.
 
     Raises:
         InputError: A file cannot be read, or nothing in it is like what was sent.
     """
     limits = load_limits() if limits is None else limits
     session = Session(against)
+    due = _select_channels(session, channels)
     opened = open_can_log(file, session.recording.table) if is_can_log(file) else open_recorded(file, options)
     recorded = _by_name(opened)
     sent = {}
@@ -75,6 +77,7 @@ def judge(
         raise InputError("--path", "analogue, as no counts can be told from the values", path)
     card = Scorecard(f"{file.name} against {session.path.name}", path, limits.title, limits.bounds)
     _score_wires(card, recorded, wires, session, rows if path == "digital" else {}, sent)
+    _score_recorded(card, recorded, wires, due)
     if path == "digital":
         if arrivals is not None:
             headings = int(arrivals.rows[-1]) - max(each.rows for each in recorded.values())
@@ -114,7 +117,7 @@ def _connect(
     """Wires of all signals that have values; those that have stamps of their own need not begin with the others."""
     tables: dict[int, dict[str, tuple[np.ndarray, float]]] = {}
     for name, signal in recorded.items():
-        if signal.rows > 1:
+        if signal.rows > 1 and np.isfinite(signal.early).any():
             own = id(signal.table) if signal.table.stamped else 0
             tables.setdefault(own, {})[name] = signal.early, rates[name]
     wires = {name: wire for part in tables.values() for name, wire in find_wires(part, sent).items()}
@@ -163,11 +166,38 @@ def _score_wires(
             note = "half a period later it would be the other" if wire.turned and open_ else ""
             card.rows.append(_row(card, "polarity", name, "turned" if turned else "as sent", verdict, note))
     taken = [wire.channel for wire in wires.values() if wire.channel]
-    if absent := [name for name in session.channels if name not in taken]:
-        card.remarks.append(f"not in the file, or not found in it: {', '.join(absent)}")
     for channel in dict.fromkeys(each for each in taken if taken.count(each) > 1):
         names = ", ".join(name for name, wire in wires.items() if wire.channel == channel)
         card.remarks.append(f"{channel} is recorded more than once: {names}")
+
+
+def _select_channels(session: Session, channels: Sequence[str] | None) -> list[str]:
+    """Return the names of the channels that were to be recorded.
+
+    Raises:
+        UnknownNameError: A name is neither a channel nor a group of the session.
+    """
+    if channels is None:
+        return list(session.channels)
+    for name in channels:
+        if name not in session.channels and name not in session.groups:
+            known = (*session.channels, *session.groups)
+            raise UnknownNameError("--channels", f"channels or groups of {session.path.name}", name, known)
+    return list(dict.fromkeys(each for name in channels for each in session.groups.get(name, (name,))))
+
+
+def _score_recorded(
+    card: Scorecard, recorded: Mapping[str, Recorded], wires: Mapping[str, Wire], due: Sequence[str]
+) -> None:
+    """Add for each channel that was to be recorded whether the file has it: by its name, or by what is in it."""
+    found = {wire.channel for wire in wires.values()}
+    found |= {name for name, signal in recorded.items() if np.isfinite(signal.early).any()}
+    about = QUANTITIES[card.path]["recorded"]
+    for name in due:
+        verdict: Verdict = PASS if name in found else FAIL
+        note = "" if verdict == PASS else "not in the file, or not found in it; " + about.run
+        value = "yes" if verdict == PASS else "no"
+        card.rows.append(ScoreRow("recorded", name, value, 0.0, 0.0, "1", about.method, None, verdict, "", note))
 
 
 def _row(card: Scorecard, quantity: str, name: str, value: str, verdict: Verdict, note: str) -> ScoreRow:

@@ -11,11 +11,13 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 from replays.score.scorecard import ANALOGUE, DIGITAL, Bounds
 from rig import units
 from rig.channels import Channel
-from rig.errors import InputError, UnknownNameError
+from rig.errors import InputError, UnknownNameError, Words
 from rig.outside import check, read_toml
 
 FOLDER = Path(__file__).parent / "sets"
 DEFAULT = "as-calibrated"
+_KINDS = {units.kind(unit) for unit in "m m/s m/s^2 N N*m Hz V s K Pa rad 1".split()} - {""}
+"""Kinds of unit that a limit can be restricted to: those of the SI units."""
 Told = Literal[
     "noise",
     "lsb",
@@ -97,7 +99,16 @@ class Limits(BaseModel):
                 ends.append(bound.times * _told(channel, bound.of, amplitude, noises) + bound.plus)
             else:
                 ends.append(none if bound is None else bound)
-        return None if any(map(math.isnan, ends)) else Bounds(ends[0], ends[1], limit.text())
+        if any(map(math.isnan, ends)):
+            return None
+        _check_order(f"limit {quantity}{'' if channel is None else f' of {channel.name}'}", *ends)
+        return Bounds(ends[0], ends[1], limit.text())
+
+
+def _check_order(field: str, low: float | _Of | None, high: float | _Of | None) -> None:
+    """Raise InputError where the low end of a limit lies above its high end; ends from the table are checked later."""
+    if isinstance(low, float) and isinstance(high, float) and low > high:
+        raise InputError(field, "with low at most high", Words(f"low = {low:g}, high = {high:g}"))
 
 
 def _told(channel: Channel, what: Told, amplitude: float, noises: int) -> float:
@@ -136,6 +147,10 @@ def load_limits(given: Path | str | None = None) -> Limits:
         for quantity, limit in getattr(limits, name).items():
             if quantity not in known:
                 raise UnknownNameError(f"{path.name}: {name}", "a quantity of a scorecard", quantity, known)
+            where = f"{path.name}: {name}.{quantity}"
             if limit.low is None and limit.high is None:
-                raise InputError(f"{path.name}: {name}.{quantity}", "with low or high", None)
+                raise InputError(where, "with low or high", None)
+            if limit.measures is not None and limit.measures not in _KINDS:
+                raise UnknownNameError(f"{where}.measures", "a kind of unit", limit.measures, sorted(_KINDS))
+            _check_order(where, limit.low, limit.high)
     return limits

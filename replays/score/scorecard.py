@@ -45,7 +45,11 @@ _BEYOND = "a signal beyond the corner (test-chirp, test-prbs)"
 _SINE = "a sine near full scale on the channel (test-sine, 10 s)"
 _DIGITS = "a recording that keeps every digit of the counts"
 _STAMPED = "a recording that keeps time stamps"
+_RECORDED = Quantity(
+    "1", "by name, equal counts or correlation", "--channels NAME,... where fewer channels were to be recorded"
+)
 DIGITAL = {
+    "recorded": _RECORDED,
     "mapping": Quantity("1", "cross-correlation, then equal counts", _RICH),
     "polarity": Quantity("1", "sign of the scale", _RICH),
     "scale": Quantity("ppm", "least squares, then every count equal", _DIGITS),
@@ -70,6 +74,7 @@ DIGITAL = {
     "trigger row": Quantity("1", _EXACT, "a triggered recording of a scene with a hammer or another command"),
 }
 ANALOGUE = {
+    "recorded": _RECORDED,
     "mapping": Quantity("1", "cross-correlation of all pairs", _RICH),
     "polarity": Quantity("1", "cross-correlation of all pairs", _RICH),
     "gain": Quantity("ppm", _SANDWICH, _LONGER),

@@ -11,7 +11,7 @@ import typer
 
 from rig.cli.connection import Connection
 from rig.cli.groups import panel
-from rig.cli.options import Force, Wide
+from rig.cli.options import Channels, Force, Wide, names_of
 from rig.cli.origin import origin
 from rig.cli.tables import echo, new_table, shown, table_console
 from rig.errors import InputError, Words, check_new_file, check_not_among, whole_file
@@ -62,6 +62,7 @@ def score(
     limits: Annotated[
         str | None, typer.Option(metavar="SET", help="as-calibrated, api-670, iso-20816, or a .toml file.")
     ] = None,
+    channels: Channels = None,
     path: Annotated[_Way | None, typer.Option(help="How the DAQ is fed, if not as the file looks.")] = None,
     force: Force = False,
     wide: Wide = False,
@@ -84,6 +85,7 @@ def score(
             check_new_file(made, field=field, suffixes=(suffix,), force=force)
             check_not_among([file, *(against or ())], made, field=field)
     asked = load_limits(limits)
+    due = None if channels is None else names_of(channels)
     way = None if path is None else "digital" if path is _Way.DIGITAL else "analogue"
     live = str(file) == "-"
     if live == (against is not None):
@@ -92,9 +94,9 @@ def score(
     if for_s is not None and not live:
         raise InputError("--for-s", "left out where a file is judged", for_s)
     if live:
-        card = _judge_live(connection, _FOR_S if for_s is None else for_s, asked, way)
+        card = _judge_live(connection, _FOR_S if for_s is None else for_s, asked, way, due)
     else:
-        card = judge(file, against or [], limits=asked, path=way)
+        card = judge(file, against or [], limits=asked, path=way, channels=due)
     if output is not None:
         from replays.score.report import make_report
 
@@ -114,8 +116,9 @@ def score(
 
 
 def _judge_live(
-    connection: Connection, for_s: float, limits: Limits, path: Literal["digital", "analogue"] | None
-) -> Scorecard:
+    connection: Connection, for_s: float, limits: Limits, path: Literal["digital", "analogue"] | None,
+    channels: list[str] | None,
+) -> Scorecard:  # fmt: skip
     """Take down what comes in by standard input, and what the rig sends meanwhile, and judge that."""
     import sys
     import tempfile
@@ -134,7 +137,7 @@ def _judge_live(
     with tempfile.TemporaryDirectory(prefix="rig-score-") as folder:
         with connection.client() as client, reporting() as reporter, stopping_on_signals(stopped.set):
             found = collect(client, sys.stdin.fileno(), Path(folder), for_s, stopped=stopped, tell=reporter.part)
-        card = judge(found.file, [found.session], limits=limits, path=path, arrivals=found.arrivals)
+        card = judge(found.file, [found.session], limits=limits, path=path, arrivals=found.arrivals, channels=channels)
     card.title = f"what came in, against the rig at {connection.connect}"
     card.remarks[:0] = found.remarks
     return card

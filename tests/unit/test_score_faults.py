@@ -74,6 +74,7 @@ TABLE = {
 RATE_HZ, ROWS_HZ, SECONDS, TURN_HZ = 20_000, 100_000, 0.5, 15.0
 GROUPS = [default_table().groups[name] for name in ("probes", "forces", "accelerations", "drive")]
 CHANNELS = [channel for group in GROUPS for channel in group.channels if channel.name != "speed"]
+DUE = [channel.name for channel in CHANNELS]
 
 
 Sessions = dict[bool, tuple[Path, dict[str, np.ndarray]]]
@@ -165,13 +166,13 @@ def together(most: int) -> list[tuple[str, ...]]:
 
 @pytest.mark.parametrize("kinds", together(13), ids=len)
 def test_a_daq_that_samples_by_itself(kinds: tuple[str, ...], rig: Rig, sessions: Sessions, tmp_path: Path) -> None:
-    card = judge(daq(tmp_path / "daq.parquet", rig.counts(kinds, noisy=True)), [sessions[False][0]], path="analogue")
+    card = judge(daq(tmp_path / "daq.parquet", rig.counts(kinds, noisy=True)), [sessions[False][0]], path="analogue", channels=DUE)
     assert red(card) == declared(kinds)
 
 
 @pytest.mark.parametrize("kinds", together(5), ids=len)
 def test_a_daq_that_takes_counts(kinds: tuple[str, ...], rig: Rig, sessions: Sessions, tmp_path: Path) -> None:
-    card = judge(daq(tmp_path / "daq.parquet", rig.counts(kinds, noisy=True)), [sessions[True][0]])
+    card = judge(daq(tmp_path / "daq.parquet", rig.counts(kinds, noisy=True)), [sessions[True][0]], channels=DUE)
     assert card.path == "digital"
     assert red(card) == declared(kinds, {"altered values"})
 
@@ -238,7 +239,7 @@ def test_a_logger_of_a_can_bus(suffix: str, fd: bool, sessions: Sessions, tmp_pa
                     "timestamp": 1e9 + n * form.rows * step / RATE_HZ,
                 }
                 log(can.Message(arbitration_id=message.identifier, data=data.tobytes(), **settings))
-    card = judge(tmp_path / f"bus{suffix}", [session])
+    card = judge(tmp_path / f"bus{suffix}", [session], channels=[channel.name for channel in form.channels])
     assert red(card) == {("probes", "missing rows")}
     lost = 40 + len(first) // 2 * form.rows * step
     assert card.runs == {"missing rows probes": [(lost, lost + (form.rows - 1) * step)]}
@@ -247,7 +248,7 @@ def test_a_logger_of_a_can_bus(suffix: str, fd: bool, sessions: Sessions, tmp_pa
 @pytest.mark.parametrize("defect", OWN)
 def test_a_daqs_own_defects(defect: str, sessions: Sessions, tmp_path: Path) -> None:
     (session, counts), (change, declares) = sessions[True], OWN[defect]
-    assert red(judge(daq(tmp_path / "daq.parquet", counts, change), [session])) == declares
+    assert red(judge(daq(tmp_path / "daq.parquet", counts, change), [session], channels=DUE)) == declares
 
 
 def test_stamps_of_the_computers_clock_show_latency(sessions: Sessions, tmp_path: Path) -> None:

@@ -1,0 +1,95 @@
+"""Inputs of `rig score`: which channels were to be recorded, limits, and files that are not whole."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from replays.score.judgement import judge
+from replays.score.limits import load_limits
+from replays.score.scorecard import FAIL, PASS, Scorecard
+from rig.channels import default_table
+from rig.errors import InputError
+from tests.commands import said
+from tests.score_daqs import RATE_HZ, counts_of, write_parquet, write_session
+
+PROBES = default_table().groups["probes"]
+
+
+def red(card: Scorecard) -> set[tuple[str, str]]:
+    return {(row.quantity, row.channel) for row in card.rows if row.verdict == FAIL}
+
+
+def columns_of(counts: np.ndarray, *names: str) -> dict[str, np.ndarray]:
+    values = PROBES.engineering(counts)
+    return {f"{name} [mm]": values[:, PROBES.names.index(name)] for name in names or PROBES.names}
+
+
+@pytest.fixture(scope="module")
+def counts() -> np.ndarray:
+    """One second of noise on the probes."""
+    return counts_of("probes", np.random.default_rng(7).standard_normal((RATE_HZ, 4)), None)
+
+
+@pytest.fixture(scope="module")
+def session(counts: np.ndarray, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_session(tmp_path_factory.mktemp("sent") / "session.mcap", {"probes": counts})
+
+
+@pytest.mark.parametrize("path", [None, "analogue"])
+def test_a_channel_that_is_absent_fails_unless_fewer_were_to_be_recorded(
+    path: None, session: Path, counts: np.ndarray, tmp_path: Path
+) -> None:
+    daq = write_parquet(tmp_path / "daq.parquet", columns_of(counts, "disk_x", "ring_y"))
+    card = judge(daq, [session], path=path)
+    assert red(card) >= {("recorded", "disk_y"), ("recorded", "ring_x")}
+    assert "--channels" in card.row("recorded", "disk_y").note
+    card = judge(daq, [session], path=path, channels=["disk_x", "ring_y"])
+    assert not {quantity for quantity, _ in red(card)} & {"recorded"}
+    assert card.row("recorded", "disk_x").verdict == PASS
+    assert ("recorded", "disk_y") in red(judge(daq, [session], path=path, channels=["disk_x", "disk_y"]))
+    assert ("recorded", "disk_y") in red(judge(daq, [session], path=path, channels=["probes"]))
+
+
+def test_a_column_without_a_value_is_absent(session: Path, counts: np.ndarray, tmp_path: Path) -> None:
+    columns = columns_of(counts) | {"ring_x [mm]": np.full(len(counts), np.nan)}
+    assert ("recorded", "ring_x") in red(judge(write_parquet(tmp_path / "daq.parquet", columns), [session]))
+
+
+def test_a_channel_that_the_session_lacks_is_one_line(
+    session: Path, counts: np.ndarray, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    daq = write_parquet(tmp_path / "daq.parquet", columns_of(counts))
+    status, _, err = said(capsys, "score", daq, "--against", str(session), "--channels", "disk_x,disk_z")
+    assert (status, err.count("\n")) == (2, 1), err
+    assert "--channels must be" in err
+    assert "disk_z" in err
+
+
+@pytest.mark.parametrize(
+    ("ends", "told"),
+    [
+        ("low = 20.0, high = -20.0", "low = 20, high = -20"),
+        ("low = 1, high = 0", "low = 1, high = 0"),
+        ("low = nan", "gain.low"),
+        ("high = inf", "gain.high"),
+        ('high = 1.0, measures = "lenght"', "lenght"),
+    ],
+)
+def test_a_limit_that_nothing_or_anything_keeps_is_refused(ends: str, told: str, tmp_path: Path) -> None:
+    file = tmp_path / "ours.toml"
+    file.write_text(f'title = "x"\n[analogue]\ngain = {{ {ends}, kind = "assumed", source = "me" }}\n')
+    with pytest.raises(InputError) as error:
+        load_limits(file)
+    assert told in str(error.value)
+
+
+def test_ends_of_a_limit_that_the_channel_table_turns_round_are_refused(tmp_path: Path) -> None:
+    file = tmp_path / "ours.toml"
+    file.write_text(
+        'title = "x"\n[analogue]\nnoise = { low = 1e9, high = { of = "noise" }, kind = "assumed", source = "me" }\n'
+    )
+    with pytest.raises(InputError, match="limit noise of disk_x must be with low at most high"):
+        load_limits(file).bounds("analogue", "noise", PROBES.channels[0])
