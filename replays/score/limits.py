@@ -16,7 +16,7 @@ from rig.outside import check, read_toml
 
 FOLDER = Path(__file__).parent / "sets"
 DEFAULT = "as-calibrated"
-_KINDS = {units.kind(unit) for unit in "m m/s m/s^2 N N*m Hz V s K Pa rad 1".split()} - {""}
+_KINDS = {units.kind(unit) for unit in ["m", "m/s", "m/s^2", "N", "N*m", "Hz", "V", "s", "K", "Pa", "rad", "1"]} - {""}
 """Kinds of unit that a limit can be restricted to: those of the SI units."""
 Told = Literal[
     "noise",
