@@ -1,9 +1,10 @@
 """How the tests are shared out where several run at once (`-n`), and what many of them use.
 
 Tests that read the clock or start processes wait most of their time: the modules marked so as a whole make up two
-queues, each gone through by one worker. Those within a process come at once; those that start real rigs come when the
-engine that they run on is compiled. Then the other engines are compiled, each once, and all else is taken module by
-module, the longest first.
+queues, each gone through by one worker. Those within a process come at once, the few that run an engine last; those
+that start real rigs come after them, when the engine that they run on is compiled. A second worker compiles all engines
+one after another, for two that compile at the same time both compile what engines share. A third worker has the tools
+meanwhile, which need no engine. All else is taken module by module, the longest first.
 """
 
 from __future__ import annotations
@@ -20,14 +21,12 @@ from typing import Any
 import numba
 import pytest
 
-from rig.engines import ENGINES
+import rig.kernels  # noqa: F401 - names the cache of compiled code
 
 ROOT = Path(__file__).parents[1]
 COMPILING = "tests/parity/test_compiling.py"
-FIRST_COMPILED = tuple(f"[{engine}]" for engine in list(ENGINES)[:2])
-"""Rigs run on the first engine; another worker has the second meanwhile."""
+TOOLS = "tests/house/test_tools.py"
 LONGEST = (
-    "tests/house/test_tools.py",
     "tests/physics/test_identification.py",
     "tests/unit/test_paper.py",
     "tests/unit/test_chart.py",
@@ -41,6 +40,7 @@ LONGEST = (
 )
 """Modules that take more than 8 s, for which nobody is to wait at the end."""
 _CLOCK = re.compile(r"^pytestmark = .*\bwallclock\b", re.MULTILINE)
+_ENGINE = re.compile(r"^from rig\.simulation import .*\bSimulation\b", re.MULTILINE)
 
 
 def _module(nodeid: str) -> str:
@@ -56,15 +56,22 @@ def _queue(module: str) -> str | None:
     return "rigs" if module.startswith("tests/system/") else "clock"
 
 
+@cache
+def _runs_engine(module: str) -> bool:
+    return _ENGINE.search((ROOT / module).read_text(encoding="utf-8")) is not None
+
+
 def _place(nodeid: str) -> tuple[int, int]:
-    """Where a test stands in the order: what waits, what rigs need, what starts them, what takes long, all others."""
+    """Where a test stands in the order: what waits, engines, tools, what starts rigs, what takes long, all others."""
     module = _module(nodeid)
     if _queue(module) == "clock":
-        return 0, 0
+        return 0, int(_runs_engine(module))
     if module == COMPILING:
-        return 1 if nodeid.endswith(FIRST_COMPILED) else 3, 0
-    if _queue(module) == "rigs":
+        return 1, 0
+    if module == TOOLS:
         return 2, 0
+    if _queue(module) == "rigs":
+        return 3, 0
     if module in LONGEST:
         return 4, LONGEST.index(module)
     return 5, 0
@@ -105,7 +112,7 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
 
         def _split_scope(self, nodeid: str) -> str:
             module = _module(nodeid)
-            return nodeid if module == COMPILING else _queue(module) or module
+            return _queue(module) or module
 
     config.option.loadscopereorder = False  # the order is ours
     return ByModule(config, log)

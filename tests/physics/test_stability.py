@@ -11,6 +11,7 @@
 from __future__ import annotations
 
 import math
+from functools import cache
 
 import numpy as np
 import pytest
@@ -26,10 +27,16 @@ from rig.errors import InputError
 from rig.levels import ModelLevels
 
 
+@cache
+def quick(trial: str, engine: str) -> tuple[Cell, ...]:
+    """Return the cells of a quick trial; they are the same each time."""
+    return tuple(TRIALS[trial].run(engine, True))
+
+
 @pytest.mark.parametrize("trial", TRIALS)
 @pytest.mark.parametrize("engine", ENGINES)
 def test_every_cell_agrees(engine, trial):
-    wrong = [cell for cell in TRIALS[trial].run(engine, True) if not cell.agrees]
+    wrong = [cell for cell in quick(trial, engine) if not cell.agrees]
     assert not wrong, "\n".join(
         f"{c.case}: {c.value:.3g} against {c.limit:.3g}, expected {c.expected}: {c.because}" for c in wrong
     )
@@ -37,7 +44,7 @@ def test_every_cell_agrees(engine, trial):
 
 def test_known_failures_are_expected_to_fail():
     # The table must be able to say no: these cells exist and are expected to fail.
-    found = {(cell.case, cell.holds) for trial in ("T1", "T2", "T7", "T14") for cell in TRIALS[trial].run("rk4", True)
+    found = {(cell.case, cell.holds) for trial in ("T1", "T2", "T7", "T14") for cell in quick(trial, "rk4")
              if cell.expected is False}  # fmt: skip
     assert {case for case, _ in found} >= {"step of h w = 3", "step of 200 us", "v_s = 1e-05 m/s", "v0 = 1e-05 m/s"}
     assert not any(holds for _, holds in found)
