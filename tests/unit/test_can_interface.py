@@ -31,6 +31,7 @@ from rig import wire
 from rig.cli import can as can_command
 from rig.errors import InputError
 from rig.transport.zenoh import ZenohServer
+from tests.hostile import inputs
 from tests.processes import free_endpoint
 from tests.waiting import PATIENCE_S, until
 
@@ -607,7 +608,8 @@ def test_random_payloads_leave_the_hub_as_it_was() -> None:
     with Rig("process", "1M/8M") as rig:
         villain, sender, receiver = rig.bus(), rig.bus(), rig.bus()
         secret = bytes.fromhex(villain.secret)
-        for number in range(100_000):
+        count = inputs(20_000)
+        for number in range(count):
             payload = fuzz(rng)
             rig.hub.offer(villain.name if number % 2 else rng.choice(["", "x"]), secret + payload)
             if number % 50 == 0:
@@ -616,8 +618,8 @@ def test_random_payloads_leave_the_hub_as_it_was() -> None:
                     rng.choice([payload, b"[]", b'{"endpoint": 3}', b'{"endpoint": "fuzz"}', b"[" * 4000]),
                 )
         counts = rig.hub.status()["counts"]
-        assert counts["strange"] == 50_000
-        assert min(counts["malformed"], counts["invalid"], counts["surplus"], counts["frames"]) > 100
+        assert counts["strange"] == count // 2
+        assert min(counts["malformed"], counts["invalid"], counts["surplus"], counts["frames"]) > count // 1000
         assert any(thread.name == "can hub can0" for thread in threading.enumerate())
         villain.shutdown()
         until(lambda: rig.hub.endpoints.waiting == 0)
