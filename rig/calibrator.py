@@ -11,7 +11,7 @@ import numpy as np
 
 from rig.channels import Group
 from rig.engines import Engine
-from rig.faults import At, Kind, Swap
+from rig.faults import At, Kind, plugged
 from rig.generators import Instants, Source, exact
 from rig.kernels.constants import Constants, Inputs
 from rig.kernels.signals import SPIN_RATE, THETA_RATE
@@ -126,6 +126,8 @@ class Generated:
 
     def __init__(self, calibrator: Calibrator, faults: Mapping[str, list[Active]]) -> None:
         self._calibrator, self._faults = calibrator, faults
+        swaps = {one.id: one for faults_here in faults.values() for one in faults_here}
+        self._plugs = plugged(swaps[number] for number in sorted(swaps))
         self._channels = {channel.name: channel for group in calibrator.groups for channel in group.channels}
 
     def _ats(self, name: str, n: np.ndarray) -> Iterator[tuple[Kind, At]]:
@@ -157,10 +159,7 @@ class Generated:
         for what, at in ats:
             more = what.late_s(at)
             late_s += 0.0 if more is None else np.minimum(more, at.t)  # nothing from before the fault
-        source = name
-        for one in self._faults[name]:
-            if isinstance(one.what, Swap):
-                source = next(other for other in one.names if other != name)
+        source = self._plugs.get(name, name)
         instants = Instants.of_samples(n, self._channels[name].rate_hz).later(late_s)
         volts = self._conditioned(source, instants, ats if source == name else self._ats(source, n))
         for what, at in ats:

@@ -81,6 +81,7 @@ class Active:
         key: Stream of one that is about blocks.
         end: Tick from which on there is none, a whole row.
         kept: What it keeps.
+        noise: Converter noise of each channel whose samples it takes at times of their own.
     """
 
     id: int
@@ -91,6 +92,7 @@ class Active:
     key: str = ""
     end: float = math.inf
     kept: dict[str, float] = field(default_factory=dict)
+    noise: dict[str, np.random.Generator] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)

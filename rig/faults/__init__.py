@@ -5,12 +5,12 @@ from __future__ import annotations
 from rig.channels import ChannelTable
 from rig.errors import InputError, UnknownNameError
 from rig.faults.blocks import DOORS, Message, OfBlocks, Restart
-from rig.faults.kind import At, Draws, Kind, Setting
-from rig.faults.kinds import KINDS, AnyKind, NoFilter, Swap
+from rig.faults.kind import At, Draws, Kind, Setting, acts
+from rig.faults.kinds import KINDS, AnyKind, NoFilter, Swap, plugged
 
 __all__ = [
     "DOORS", "KINDS", "AnyKind", "At", "Draws", "Kind", "Message", "NoFilter", "OfBlocks", "Restart", "Setting",
-    "Swap", "channels_of", "described", "stream_of", "supported",
+    "Swap", "acts", "channels_of", "described", "plugged", "stream_of", "supported",
 ]  # fmt: skip
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from typing import ClassVar, NamedTuple, get_args
 
 import numpy as np
@@ -22,6 +23,7 @@ class Draws:
 
     def __init__(self, *key: int) -> None:
         self._key = np.random.SeedSequence(key).generate_state(2, np.uint64)
+        self._next, self._bits = -1, np.random.Philox()
 
     def uniform(self, n: np.ndarray) -> np.ndarray:
         """Four numbers at each place, shape (len(n), 4).
@@ -32,9 +34,10 @@ class Draws:
         if not len(n):
             return np.empty((0, 4))
         first, count = int(n[0]), int(n[-1] - n[0]) + 1
-        bits = (
-            np.random.Philox(key=self._key, counter=[first + (1 << 62), 0, 0, 0]).random_raw(4 * count).reshape(-1, 4)
-        )
+        if first != self._next:  # a generator costs more than the numbers of a block
+            self._bits = np.random.Philox(key=self._key, counter=[first + (1 << 62), 0, 0, 0])
+        self._next = first + count
+        bits = self._bits.random_raw(4 * count).reshape(-1, 4)
         return ((bits >> np.uint64(11)) + 0.5)[n - first] * 2.0**-53
 
     def normal(self, n: np.ndarray) -> np.ndarray:
@@ -43,7 +46,7 @@ class Draws:
         return np.sqrt(-2.0 * np.log(u[:, 0])) * np.cos(2.0 * math.pi * u[:, 1])
 
 
-@dataclass(frozen=True)
+@dataclass(slots=True)
 class At:
     """Where a fault acts: rows of the model, or samples.
 
@@ -154,3 +157,17 @@ class Kind(Written):
         `at.angle` and `at.rate` are the shaft's at the edges.
         """
         return ticks
+
+
+@cache
+def _methods(kind: type[Kind]) -> frozenset[str]:
+    """Names of the methods by which a kind acts."""
+    return frozenset(name for name in _ACTING if getattr(kind, name) is not getattr(Kind, name))
+
+
+def acts(what: Kind, *methods: str) -> bool:
+    """Whether a fault acts by one of these methods of a kind."""
+    return not _methods(type(what)).isdisjoint(methods)
+
+
+_ACTING = ("signal", "volts", "chain", "late_s", "counts", "edges")

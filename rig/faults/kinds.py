@@ -8,8 +8,9 @@ sample n: the same in every run with the same seed, however it is cut into block
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from itertools import pairwise
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Literal, Protocol, get_args
 
 import numpy as np
 from pydantic import AfterValidator, Field, FiniteFloat
@@ -242,7 +243,7 @@ class Saturation(Kind):
 
 
 class Swap(Kind):
-    """Two cables changed over: v' = v of the other channel, and the other way round."""
+    """Two cables changed over: v' = v of the other channel, and the other way round; several, one after the other."""
 
     stage = "cable"
     kind: Literal["swap"] = "swap"
@@ -254,6 +255,23 @@ class Swap(Kind):
 
     def on(self, names: tuple[str, ...]) -> tuple[str, ...]:
         return (*names, self.other)
+
+
+class _Acting(Protocol):
+    """A fault that acts: what it is, and its channels."""
+
+    what: Kind
+    names: tuple[str, ...]
+
+
+def plugged(active: Iterable[_Acting]) -> dict[str, str]:
+    """Return whose conditioner each channel of a swap is connected to, after all swaps in their order."""
+    found: dict[str, str] = {}
+    for one in active:
+        if isinstance(one.what, Swap):
+            a, b = one.names
+            found[a], found[b] = found.get(b, b), found.get(a, a)
+    return found
 
 
 # ---- filter ----

@@ -269,3 +269,72 @@ def test_only_a_fault_that_there_is_can_be_cleared() -> None:
     simulation.submit("clear", {"id": 1})
     assert {"id": "all"}
     assert simulation.submit("clear", {}) == 0
+
+
+@pytest.mark.parametrize("kind", ["late", "jitter", "wander", "clock"])
+def test_a_clock_fault_of_a_group_leaves_each_channel_its_own_noise(kind: str) -> None:
+    """Third differences leave little but the converters' noise: it is as independent as in sound channels."""
+    still = load_scene("stable-run", {"duration_s": 0.3, "sensors.groups": ["forces", "probes"]})
+    late = {"channel": "forces", "kind": kind, "at_s": 0.1, **EXAMPLES[kind]}
+    alone = {"channel": "disk_x", "kind": kind, "at_s": 0.1, **EXAMPLES[kind]}
+    there, _ = run(late, alone, scene=still)
+    names = ("P_N", "P_S", "P_E", "P_W", "disk_x")
+    rough = np.array([np.diff(there[name][2400:].astype(float), 3) for name in names])
+    if kind != "jitter":  # which makes noise of its own, of motion, the same in all channels of the group
+        off = np.corrcoef(rough) - np.eye(len(names))
+        assert np.abs(off).max() < 0.1
+    # White noise of one standard deviation has third differences of sqrt(20) of it.
+    loud = np.array([still.table.channels[name].noise_v / still.table.channels[name].lsb_v for name in names])
+    assert (rough[:4].std(axis=1) / loud[:4] / math.sqrt(20.0) < 1.2).all()
+
+
+def plugged_volts(scene: Any, *faults: dict[str, Any]) -> dict[str, float]:
+    """What the forces show on average after 0.2 s [V], of 1.1, 2.2, 3.3, 4.4 V at P_N, P_S, P_E, P_W."""
+    found, _ = run(*faults, scene=scene)
+    table = scene.table.channels
+    return {
+        name: round(float(found[name][4000:].mean()) * table[name].lsb_v, 2) for name in ("P_N", "P_S", "P_E", "P_W")
+    }
+
+
+@pytest.mark.parametrize(("swaps", "shown"), [
+    ([("P_N", "P_S"), ("P_S", "P_E")], (2.0, 3.0, 1.0, 4.0)),
+    ([("P_S", "P_E"), ("P_N", "P_S")], (3.0, 1.0, 2.0, 4.0)),
+    ([("P_N", "P_S"), ("P_S", "P_N")], (1.0, 2.0, 3.0, 4.0)),
+    ([("P_N", "P_S"), ("P_S", "P_E"), ("P_E", "P_N")], (1.0, 3.0, 2.0, 4.0)),
+    ([("P_N", "P_S"), ("P_E", "P_W"), ("P_S", "P_E")], (2.0, 4.0, 1.0, 3.0)),
+])  # fmt: skip
+@pytest.mark.parametrize("physics", [True, False])
+def test_swaps_that_share_a_channel_are_done_in_their_order(
+    swaps: list[tuple[str, str]], shown: tuple[float, ...], physics: bool
+) -> None:
+    """Whatever is swapped, each signal is shown by one channel; offsets of transducers go with the cables."""
+    names, volts = ("P_N", "P_S", "P_E", "P_W"), (1.1, 2.2, 3.3, 4.4)
+    if physics:
+        scene = load_scene("stable-run", {"duration_s": 0.22, "sensors.groups": ["forces"]})
+        still = plugged_volts(scene)
+    else:
+        scene = load_scene(
+            "test-sine", {"duration_s": 0.22, "sensors.groups": ["forces"], "generator.amplitude_v": 1e-3}
+        )
+        still = dict.fromkeys(names, 0.0)
+    sensitivity = scene.table.channels["P_N"].sensitivity_v
+    offsets = [
+        {"channel": name, "kind": "offset", "value": (v - still[name]) / sensitivity, "at_s": 0.1}
+        for name, v in zip(names, volts, strict=True)
+    ]
+    changed = [{"channel": a, "kind": "swap", "other": b, "at_s": 0.15} for a, b in swaps]
+    found = plugged_volts(scene, *offsets, *changed)
+    assert tuple(found.values()) == pytest.approx([1.1 * volts for volts in shown], abs=0.02)
+
+
+def test_a_swap_that_ends_leaves_the_others_as_if_it_had_never_been() -> None:
+    scene = load_scene("stable-run", {"duration_s": 0.25, "sensors.groups": ["forces", "probes"]})
+    pairs = [("P_N", "P_S"), ("P_S", "disk_x"), ("disk_x", "P_E")]
+    swaps = [{"channel": a, "kind": "swap", "other": b, "at_s": 0.1} for a, b in pairs]
+    ended, _ = run(swaps[0], {**swaps[1], "for_s": 0.05}, swaps[2], scene=scene)
+    never, _ = run(swaps[0], swaps[2], scene=scene)
+    all_, _ = run(*swaps, scene=scene)
+    # The filters of those that stay swapped remember it for some samples.
+    assert all(first >= 2000 and last < 3100 for first, last in differs(ended, never).values())
+    assert all(first >= 3000 for first, _ in differs(ended, all_).values())

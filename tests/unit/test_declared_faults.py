@@ -25,7 +25,7 @@ from replays.recordings.validation import validate
 from rig import wire
 from rig.declared import Declared
 from rig.errors import InputError
-from rig.scenes import parse_scene
+from rig.scenes import load_scene, parse_scene
 from rig.simulation import Simulation
 from tests.unit.recorder_stream import ScriptedClient
 from tests.unit.test_channel_faults import BLOCKS
@@ -230,5 +230,38 @@ def test_a_validation_knows_blocks_by_what_was_told_of_them(kind: str, tmp_path:
     taken = kind in ("dropout", "lose-blocks")
     assert (known.skipped > 0) == taken
     blind = validate(recording, blind=True)
-    assert bool(blind.doubts) == (kind not in ("dropout", "lose-blocks", "late-blocks"))
+    assert bool(blind.doubts) == (kind != "late-blocks")
     assert blind.good == (not blind.doubts)
+    if taken:
+        assert blind.skipped == known.skipped
+        assert f"{known.skipped} of 8000 rows of {PROBES} are missing" in blind.verdict_line
+
+
+@pytest.mark.parametrize(("from_s", "rows"), [(0.0, 8000), (0.1, 6000), (0.38, 400)])
+def test_rows_that_are_missing_at_the_end_count_too(from_s: float, rows: int, tmp_path: Path) -> None:
+    """A stream that never begins, or ends before the others: blind, nothing else tells it."""
+    fault = {"at_s": from_s, "channel": "probes", "kind": "dropout"}
+    whole = parse_scene({"duration_s": 0.4, "sensors": {"groups": ["probes", "drive"]}, "faults": [fault]})
+    write_run(Simulation(whole), tmp_path / "a.mcap")
+    found = validate(Recording.open(tmp_path / "a.mcap"), blind=True)
+    if rows < _EDGE_ROWS:  # no more than a recorder lacks that ends within a block
+        assert found.good
+    else:
+        assert (found.good, found.skipped) == (False, rows)
+        assert f"{rows} of 8000 rows of {PROBES} are missing" in found.verdict_line
+
+
+_EDGE_ROWS = 1000
+
+
+@pytest.mark.parametrize("kind", ["stale-stamps", "duplicate-blocks"])
+def test_instants_out_of_order_end_in_a_verdict(kind: str, tmp_path: Path) -> None:
+    """Spectra need ascending instants: of a whirl without them nothing is judged but what does not fit together."""
+    pulse = {"at_s": 0.02, "command": "hammer", "force_n": 120.0}
+    fault = {"at_s": 0.5, "command": "fault", "channel": "probes", "for_s": 0.05, "kind": kind, **BLOCKS[kind]}
+    whirl = load_scene("hammer", {"duration_s": 0.8, "sensors.groups": ["probes", "drive"], "commands": [pulse, fault]})
+    write_run(Simulation(whirl), tmp_path / "a.mcap")
+    found = validate(Recording.open(tmp_path / "a.mcap"), blind=True)
+    assert not found.good
+    assert found.verdict_line.startswith("NOT GOOD, the recording does not fit together")
+    assert "times of probes do not ascend: no quantity of its motion is judged" in found.doubts

@@ -5,6 +5,7 @@ Columns are matched by name: of a recording that was cut to some channels, these
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
@@ -17,6 +18,8 @@ from rig.wire import EDGES, Block, encode_block, schema_of, sensor_key, truth_ke
 
 _MOST = 400_000
 """So many rows that differ are looked at."""
+_EDGE_S = 0.05
+"""Streams may begin and end apart by this [s]: a recorder that starts between blocks receives those of one first."""
 
 
 @dataclass
@@ -112,6 +115,35 @@ class Bits:
     def finish(self) -> dict[str, StreamBits]:
         """The outcome, by key."""
         return {key: follower.finish() for key, follower in self.streams.items()}
+
+
+def missing_rows(recording: Recording) -> dict[str, tuple[int, int]]:
+    """Count the sample rows that a recording lacks, whatever it is told of them.
+
+    Args:
+        recording: The recording.
+
+    Returns:
+        By key of a stream that lacks rows: how many, and how many there should be in the span of all streams.
+    """
+    groups = {sensor_key(name): group.rate_hz for name, group in recording.table.groups.items()}
+    filled = [one for key, one in recording.streams.items() if key != EDGES and one.rows]
+    if not filled:
+        return {}
+    first_s, last_s = min(one.first_time_s for one in filled), max(one.last_time_s for one in filled)
+    found: dict[str, tuple[int, int]] = {}
+    for key, rate in groups.items():
+        due = math.floor(last_s * rate + 1e-6) + 1 - math.ceil(first_s * rate - 1e-6)
+        spans = sorted((block.index, block.index + len(block.values)) for block in recording.blocks(key))
+        there, reached = 0, -1
+        for begin, end in spans:
+            there += max(0, end - max(begin, reached))
+            reached = max(reached, end)
+        inside = spans[-1][1] - spans[0][0] - there if spans else 0
+        outside = due - there - inside
+        if lost := inside + (outside if outside > _EDGE_S * rate else 0):
+            found[key] = lost, due
+    return found
 
 
 @dataclass

@@ -18,7 +18,7 @@ from replays.recordings.identification.question import first_command_s
 from replays.recordings.prediction import Measured, Prediction, bare, measured, predict
 from replays.recordings.sensitivity import with_values
 from replays.recordings.validation.attribution import FEW_CHANNELS, Explained, attribute, explain_log, own_explained
-from replays.recordings.validation.bits import Bits, StreamBits
+from replays.recordings.validation.bits import Bits, StreamBits, missing_rows
 from replays.recordings.validation.criteria import Criteria, load_criteria
 from replays.recordings.validation.explanation import Explanation
 from replays.recordings.validation.faults import late_together
@@ -71,7 +71,13 @@ def validate(
     trajectory = residuals(again.parts, again.nominal, again.others, again.criteria, end_s=end)
     tables = recorded_truth(recording, longest_s=begin + criteria.window.longest_s)
     truth = judge_truth(tables, again.nominal, again.others[0], criteria, end_s=end)
-    moves = experiment.scene.generator is None  # test signals have no phases of motion, and none of its causes
+    doubts = [*recording.doubts, *parameter_doubts(recording)]
+    lost = missing_rows(recording) if blind else {}
+    doubts += [f"{rows} of {due} rows of {key} are missing" for key, (rows, due) in lost.items()]
+    back = [name for name, part in again.parts.items() if (np.diff(part.times_s) <= 0.0).any()]
+    doubts += [f"times of {name} do not ascend: no quantity of its motion is judged" for name in back]
+    # Test signals have no phases of motion, and none of its causes; instants out of order have no spectrum.
+    moves = experiment.scene.generator is None and not back
     phases, judged = [], []
     if moves:
         step("statistics by phase, and their spread")
@@ -82,11 +88,12 @@ def validate(
         declared=declared, window_s=(begin, end), window_reason=reason, residuals=tuple(trajectory),
         truth=tuple(truth), phases=tuple(phases), statistics=tuple(judged),
         calibration=tuple(calibration(recording, experiment)),
-        skipped=sum(one.skipped for one in again.bits.values())
+        skipped=sum(rows for rows, _ in lost.values())
+        or sum(one.skipped for one in again.bits.values())
         or sum(stream.lost - stream.declared for stream in recording.streams.values()),
         explained=None, fitted=again.tuned.fitted if again.tuned is not None else (),
         parts=again.parts, nominal=again.nominal, files=len(recording.parts), **_contact(again, phases, end),
-        doubts=(*recording.doubts, *parameter_doubts(recording)), faults=again.faults,
+        doubts=tuple(doubts), faults=again.faults,
     )  # fmt: skip
     firsts = [one.first_s for one in trajectory if one.first_s is not None]
     # Without the truth a number of the model may be it, where that is off from the beginning on.
