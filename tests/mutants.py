@@ -1,0 +1,318 @@
+"""Mutants of what judges: `python -m tests.mutants [-n N] [--seed S] [--folder FOLDER] [--only NUMBER] [--list]`.
+
+Changes one place of the scorecard, the faults, the validation or the table of units in a copy of this tree, and runs
+the tests of that module until one fails, for at most 20 s of processor time. A mutant that no test kills shows what the
+tests do not see. Hand-picked mutants come first; the others are drawn blindly, by a seed, from all places where a
+comparison can be turned, a constant changed, an operand of `and` or `or` dropped, an absolute value dropped, a sign
+turned or a branch swapped. Results stand in a journal, where an interrupted run continues. Status 1 where fewer than 9
+of 10 are killed.
+
+The copy stays in its folder, so that kernels, none of which is mutated, compile there once.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import hashlib
+import json
+import os
+import random
+import resource
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).parent.parent
+CPU_S = 20
+"""Processor time of the tests of a mutant [s]."""
+MIN_KILLED = 0.9
+_UNIT = "tests/unit/test_{}.py"
+_FAULTS = ("faults", "channel_faults", "block_faults", "declared_faults")
+TESTS = {
+    "replays/score/": ("score", "score_quantities", "score_population", "score_faults", "score_live"),
+    "rig/faulty.py": _FAULTS, "rig/faults/": _FAULTS, "replays/recordings/validation/": ("validation", "verdict"),
+    "rig/units.py": ("units", "import"), "replays/campaigns/": ("campaign_file", "campaign_results"),
+}  # fmt: skip
+"""Test files of each folder or module, in the order in which they run; those that exist."""
+MUTATED = ("replays/score", "rig/faulty.py", "rig/faults", "replays/recordings/validation", "rig/units.py")
+_TURNED = {
+    ast.Lt: ">=", ast.LtE: ">", ast.Gt: "<=", ast.GtE: "<", ast.Eq: "!=", ast.NotEq: "==", ast.In: "not in",
+    ast.NotIn: "in", ast.Is: "is not", ast.IsNot: "is",
+}  # fmt: skip
+_SHOWN = ("__repr__", "__str__", "picture", "verdict_line", "describe")
+"""Functions whose places are left out: what they return is only shown."""
+PICKED = (
+    ("replays/score/scorecard.py", "shown=PASS in verdicts and not self.doubts", "shown=not self.doubts"),
+    ("replays/score/scorecard.py", "shown=PASS in verdicts and not self.doubts", "shown=PASS in verdicts"),
+    ("replays/score/scorecard.py", "limit.low <= low and high <= limit.high", "limit.low <= value <= limit.high"),
+    ("replays/score/scorecard.py", "high < limit.low or low > limit.high", "low < limit.low or high > limit.high"),
+    ("replays/score/intervals.py", "t.ppf(0.975, freedom)", "t.ppf(0.95, freedom)"),
+    ("replays/score/sine.py", "for p in (0.025, 0.975)", "for p in (0.05, 0.95)"),
+    ("replays/score/sine.py", "np.hanning(len(values) + 1)[:-1]", "np.hanning(len(values))"),
+    ("replays/score/digital.py", "for p in (0.975, 0.025)", "for p in (0.95, 0.05)"),
+    ("replays/score/waveform.py", "half = student(freedom) *", "half = 0.84 * student(freedom) *"),
+    ("replays/score/limits.py", "None if any(map(math.isnan, ends)) else", ""),
+    ("replays/score/limits.py", "whole_v = noise_v * math.sqrt(noises)", "whole_v = noise_v * noises"),
+    ("rig/units.py", '("thou", 1e-3 * _INCH, "")', '("thou", _INCH, "")'),
+    ("rig/units.py", '("mil", 1e-3 * _INCH, "")', '("mil", 1e-6 * _INCH, "")'),
+)  # fmt: skip
+"""File, what stands there once, and what takes its place."""
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """One change.
+
+    Attributes:
+        file: Path in the tree.
+        begin, end: Place in its text [characters].
+        new: What stands there then.
+        kind: What is changed.
+    """
+
+    file: str
+    begin: int
+    end: int
+    new: str
+    kind: str
+
+    def applied(self, text: str) -> str:
+        """Return the file's text with the change."""
+        return text[: self.begin] + self.new + text[self.end :]
+
+    def told(self, text: str) -> str:
+        """Return file, line and change."""
+        line = text.count("\n", 0, self.begin) + 1
+        return f"{self.file}:{line} {self.kind}: {' '.join(text[self.begin : self.end].split())} -> {self.new}"
+
+
+class _Places(ast.NodeVisitor):
+    """Collects the mutants of a file."""
+
+    def __init__(self, file: str, text: str) -> None:
+        self.file, self.text, self.found = file, text, list[Mutant]()
+        self._starts = [0]
+        for line in text.splitlines(keepends=True):
+            self._starts.append(self._starts[-1] + len(line.encode()))
+        self._bytes = text.encode()
+
+    def _at(self, line: int, column: int) -> int:
+        return len(self._bytes[: self._starts[line - 1] + column].decode())
+
+    def _span(self, node: ast.expr) -> tuple[int, int]:
+        return self._at(node.lineno, node.col_offset), self._at(node.end_lineno or 0, node.end_col_offset or 0)
+
+    def _source(self, node: ast.expr) -> str:
+        begin, end = self._span(node)
+        return self.text[begin:end]
+
+    def _add(self, node: ast.expr, new: str, kind: str) -> None:
+        self.found.append(Mutant(self.file, *self._span(node), new, kind))
+
+    def _between(self, left: ast.expr, right: ast.expr, new: str, kind: str) -> None:
+        """Replace an operator, which stands between two operands, with the brackets around them."""
+        begin, end = self._span(left)[1], self._span(right)[0]
+        held = self.text[begin:end]
+        if "#" not in held and "\n" not in held:
+            closed = held[: len(held) - len(held.lstrip(") "))]
+            opened = held[len(held.rstrip("( ")) :]
+            self.found.append(Mutant(self.file, begin, end, f"{closed.rstrip()} {new} {opened.lstrip()}", kind))
+
+    def visit_FunctionDef(self, node: ast.FunctionDef) -> None:
+        if node.name not in _SHOWN:
+            for each in (*node.args.defaults, *[d for d in node.args.kw_defaults if d], *node.body):
+                self.visit(each)
+
+    def visit_ClassDef(self, node: ast.ClassDef) -> None:
+        for each in node.body:  # without its decorators and bases
+            self.visit(each)
+
+    def visit_keyword(self, node: ast.keyword) -> None:
+        if node.arg != "strict":
+            self.generic_visit(node)
+
+    def visit_AnnAssign(self, node: ast.AnnAssign) -> None:
+        if node.value is not None:
+            self.visit(node.value)
+
+    def visit_JoinedStr(self, node: ast.JoinedStr) -> None:
+        """Leave texts out."""
+
+    def visit_Raise(self, node: ast.Raise) -> None:
+        """Leave messages out."""
+
+    def visit_Compare(self, node: ast.Compare) -> None:
+        if len(node.ops) == 1:
+            self._between(node.left, node.comparators[0], _TURNED[type(node.ops[0])], "comparison turned")
+        self.generic_visit(node)
+
+    def visit_BoolOp(self, node: ast.BoolOp) -> None:
+        self._add(node, self._source(node.values[0]), f"operands of {type(node.op).__name__.lower()} dropped")
+        self.generic_visit(node)
+
+    def visit_Call(self, node: ast.Call) -> None:
+        if (isinstance(node.func, ast.Name) and node.func.id == "abs") or (
+            isinstance(node.func, ast.Attribute) and node.func.attr == "abs"
+        ):
+            self._add(node, f"({self._source(node.args[0])})", "absolute value dropped")
+        self.generic_visit(node)
+
+    def visit_BinOp(self, node: ast.BinOp) -> None:
+        new = {ast.Add: "-", ast.Sub: "+", ast.Mult: "/", ast.Div: "*"}.get(type(node.op))
+        if new and not any(
+            isinstance(s, ast.Constant | ast.JoinedStr) and not isinstance(getattr(s, "value", 0.0), int | float)
+            for s in (node.left, node.right)
+        ):
+            self._between(node.left, node.right, new, "sign turned" if new in "+-" else "factor turned")
+        self.generic_visit(node)
+
+    def visit_Constant(self, node: ast.Constant) -> None:
+        if isinstance(node.value, bool):
+            self._add(node, str(not node.value), "constant changed")
+        elif isinstance(node.value, int):
+            self._add(node, str(node.value + 1), "off by one")
+        elif isinstance(node.value, float):
+            self._add(node, repr(0.5 * node.value if node.value else 1.0), "constant changed")
+
+    def visit_If(self, node: ast.If) -> None:
+        self._add(node.test, f"not ({self._source(node.test)})", "branch swapped")
+        self.generic_visit(node)
+
+    def visit_IfExp(self, node: ast.IfExp) -> None:
+        self._add(node.test, f"(not ({self._source(node.test)}))", "branch swapped")
+        self.generic_visit(node)
+
+
+def places(file: str) -> list[Mutant]:
+    """Return all mutants of a file that can still be read."""
+    text = (ROOT / file).read_text(encoding="utf-8")
+    visitor = _Places(file, text)
+    visitor.visit(ast.parse(text))
+    return [each for each in visitor.found if _parses(each.applied(text))]
+
+
+def _parses(text: str) -> bool:
+    try:
+        ast.parse(text)
+    except SyntaxError:
+        return False
+    return True
+
+
+def chosen(count: int, seed: int) -> list[Mutant]:
+    """Return so many mutants: the picked ones that still apply, then as many of each module, drawn blindly."""
+    found = []
+    for file, old, new in PICKED:
+        text = (ROOT / file).read_text(encoding="utf-8")
+        if text.count(old) >= 1 and _parses(text.replace(old, new, 1)):
+            found.append(Mutant(file, text.index(old), text.index(old) + len(old), new, "picked"))
+    draw, stacks = random.Random(seed), []
+    for module in MUTATED:
+        files = [module] if module.endswith(".py") else [str(p.relative_to(ROOT)) for p in (ROOT / module).glob("*.py")]
+        kinds: dict[str, list[Mutant]] = {}
+        for each in (mutant for file in sorted(files) for mutant in places(file)):
+            kinds.setdefault(each.kind, []).append(each)
+        for each in kinds.values():
+            draw.shuffle(each)
+        stacks.append(_in_turn([kinds[kind] for kind in sorted(kinds)]))
+    drawn = _in_turn(stacks)
+    return [*found, *drawn][:count]
+
+
+def _in_turn(stacks: list[list[Mutant]]) -> list[Mutant]:
+    """Return one of each in turn until all are used."""
+    longest = max(map(len, stacks), default=0)
+    return [stack[n] for n in range(longest) for stack in stacks if n < len(stack)]
+
+
+def tests_of(file: str) -> list[str]:
+    """Return the test files of a module that exist."""
+    names = next(names for prefix, names in TESTS.items() if file.startswith(prefix))
+    return [path for name in names if (ROOT / (path := _UNIT.format(name))).exists()]
+
+
+def copied(folder: Path) -> Path:
+    """Bring the copy of the tree up to date; files that are the same are left alone."""
+    tree = folder / "tree"
+    words = ("git", "ls-files", "--cached", "--others", "--exclude-standard", "-z")
+    names = subprocess.run(words, cwd=ROOT, check=True, capture_output=True).stdout.decode().split("\0")
+    for name in filter(None, names):
+        source, target = ROOT / name, tree / name
+        if not source.is_file() or (target.is_file() and target.read_bytes() == source.read_bytes()):
+            continue
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(source, target)
+    return tree
+
+
+def run(tree: Path, tests: list[str]) -> tuple[str, float]:
+    """Run tests until one fails; returns killed, lived or out of time, and the processor time [s]."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    words = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "-p", "no:randomly", *tests]
+    ended = subprocess.run(
+        words, cwd=tree, capture_output=True, check=False,
+        env={**os.environ, "PYTHONPATH": str(tree), "PYTHONDONTWRITEBYTECODE": "1"},
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_CPU, (CPU_S, CPU_S)),
+    )  # fmt: skip
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    used_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    # A test module that cannot be imported is a kill, too; a signal is that of the limit.
+    return {0: "lived", 1: "killed", 2: "killed"}.get(ended.returncode, "out of time"), round(used_s, 1)
+
+
+def _lines(journal: Path) -> Iterator[dict[str, object]]:
+    if journal.exists():
+        yield from map(json.loads, journal.read_text(encoding="utf-8").splitlines())
+
+
+def main(words: list[str] | None = None) -> int:
+    """Run mutants; return 1 where too many live."""
+    parser = argparse.ArgumentParser(prog="python -m tests.mutants", description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("-n", type=int, default=60)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--folder", type=Path, default=Path(tempfile.gettempdir()) / "rig-mutants")
+    parser.add_argument("--only", type=int, help="run one mutant, by its number, whatever the journal has of it")
+    parser.add_argument("--list", action="store_true", help="print the mutants and run nothing")
+    asked = parser.parse_args(words)
+    mutants = chosen(asked.n, asked.seed)
+    texts = {each.file: (ROOT / each.file).read_text(encoding="utf-8") for each in mutants}
+    if asked.list:
+        print("\n".join(f"{n:3} {each.told(texts[each.file])}" for n, each in enumerate(mutants)))
+        return 0
+    tree = copied(asked.folder)
+    journal = asked.folder / "journal.jsonl"
+    known = {line["key"]: line for line in _lines(journal)}
+    results = []
+    for number, mutant in enumerate(mutants):
+        if asked.only not in (None, number):
+            continue
+        tests, text = tests_of(mutant.file), texts[mutant.file]
+        told = mutant.told(text)
+        whole = told + text + "".join((ROOT / test).read_text(encoding="utf-8") for test in tests)
+        key = hashlib.sha256(whole.encode()).hexdigest()[:16]
+        if key not in known or asked.only is not None:
+            target = tree / mutant.file
+            try:
+                target.write_text(mutant.applied(text), encoding="utf-8")
+                result, used_s = run(tree, tests)
+            finally:
+                target.write_text(text, encoding="utf-8")
+            known[key] = {"key": key, "mutant": told, "result": result, "cpu_s": used_s}
+            with journal.open("a", encoding="utf-8") as file:
+                file.write(json.dumps(known[key]) + "\n")
+        results.append(str(known[key]["result"]))
+        print(f"{number:3} {results[-1]:12} {known[key]['cpu_s']:5} s  {told}", flush=True)
+    killed = results.count("killed")
+    print(
+        f"{killed} of {len(results)} killed; {results.count('out of time')} out of time, {results.count('lived')} lived"
+    )
+    return 0 if killed >= MIN_KILLED * len(results) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
