@@ -32,6 +32,8 @@ _HUM = 20.0
 """Power of a line against its surroundings that raises doubt."""
 _STRAY = 30.0
 """Multiple of the median deviation beyond which a clock pair is left out."""
+_ACCURACY = "accuracy: "
+"""Begin of a warning about the run's own error, in every version."""
 _DIFFERENCES = 6
 _GAIN = math.sqrt(math.comb(2 * _DIFFERENCES, _DIFFERENCES))
 """Standard deviation of the sixth difference of white noise of deviation 1: root of the sum of squared binomials."""
@@ -292,11 +294,12 @@ def _with_findings(recording: Recording, channels: list[ChannelHealth]) -> Healt
     span_s = float(np.ptp(clock[:, 1])) if len(clock) else 0.0
     pace, jitter_ms, jitter_max_ms, strays = pace_of(clock)
     last = recording.last_status or {}
-    kept = ("pace", "real_time_factor", "lateness_ms", "overruns", "queue", "energy", "engine")
-    warnings = dict.fromkeys(
-        [str(event.get("text", "")) for event in recording.events if event.get("event") == "warning"]
-        + [str(text) for text in last.get("warnings", [])]
-    )
+    kept = ("pace", "real_time_factor", "lateness_ms", "overruns", "queue", "energy", "engine", "accuracy")
+    told = [str(event.get("text", "")) for event in recording.events if event.get("event") == "warning"]
+    told += [str(text) for text in last.get("warnings", [])]
+    # The estimate grows during a run: of its warnings only the last one counts.
+    latest = [text for text in told if text.startswith(_ACCURACY)][-1:]
+    warnings = dict.fromkeys(text for text in told if not text.startswith(_ACCURACY) or text in latest)
     findings = list(recording.doubts)
     dropped = last.get("queue", {}).get("dropped", 0)
     if dropped:

@@ -1,4 +1,4 @@
-"""The motion that an engine moves on: its start, and how far it can be trusted, by energy ledger and companion."""
+"""The motion that an engine moves on: its start, its steps, and its energy ledger."""
 
 from __future__ import annotations
 
@@ -22,13 +22,6 @@ SUPPLIED = ("drive_work", "hammer_work", "unbalance_work", "gap_work", "release_
 DISSIPATED = ("bearing_loss", "house_loss", "contact_loss", "friction_loss")
 BRANCH_ALARM = 1e-2
 """Energy residual over dissipated energy above which a run may have missed a contact or made one up."""
-FINER = 1.0 / 16.0
-"""Part of the tolerance that a companion is asked for."""
-DOUBT = 10.0
-"""How many times engine.tolerance the estimate may come to before the run is in doubt."""
-_FIRST, _LOST = 1e-9, 0.1
-"""Growth is measured from the first distance above rounding, and up to where two runs no longer have to do with each
-other."""
 
 
 class Begin(NamedTuple):
@@ -135,59 +128,6 @@ class Motion:
             elif not whole and beyond + steps * step == row_ticks and row + 1 < len(rows):
                 rows[row + 1] = out[1]
             tick += steps * step
-
-
-@dataclass
-class Accuracy:
-    """What is known of a run's error, by its distance from a companion.
-
-    Attributes:
-        estimate: Largest error estimate so far: RMS of the scaled states (`STATE_SCALE`) [1].
-        grown_per_s: Rate at which a small distance has grown since the first contact, on the whole [1/s].
-        doubted_s: When the estimate came above `DOUBT` times the tolerance; None: never.
-    """
-
-    tolerance: float
-    estimate: float = 0.0
-    grown_per_s: float = 0.0
-    doubted_s: float | None = None
-    _first: tuple[float, float] | None = None
-
-    def compare(self, rows: np.ndarray, companion: np.ndarray, times_s: np.ndarray) -> str | None:
-        """Take note of both runs at the same instants, one after the other.
-
-        Args:
-            rows: Observed rows, shape (n, N_ROW).
-            companion: The companion's, alike.
-            times_s: Instants [s], shape (n,).
-
-        Returns:
-            What to say, if the run has come into doubt in these.
-        """
-        away = (rows[:, : S.N_STATE] - companion[:, : S.N_STATE]) / S.STATE_SCALE
-        said = None
-        for time, distance in zip(times_s.tolist(), np.sqrt(np.mean(away**2, axis=1)).tolist(), strict=True):
-            self.estimate = max(self.estimate, distance)
-            if self._first is None and distance > _FIRST:
-                self._first = time, distance
-            elif self._first is not None and self._first[1] < distance < _LOST:
-                self.grown_per_s = math.log(distance / self._first[1]) / (time - self._first[0])
-            if self.doubted_s is None and self.estimate > DOUBT * self.tolerance:
-                self.doubted_s = time
-                said = self.warning()
-        return said
-
-    def document(self) -> dict[str, float | None]:
-        """As JSON."""
-        return {"estimate": self.estimate, "growth_per_s": self.grown_per_s, "doubted_s": self.doubted_s}
-
-    def warning(self) -> str:
-        """What to say of a run that is in doubt."""
-        return (
-            f"accuracy: off by about {self.estimate:.1e} (scaled), above {DOUBT:g} times engine.tolerance "
-            f"({self.tolerance:g}), since {self.doubted_s or 0.0:.4f} s; small differences grow by "
-            f"{self.grown_per_s:.3g} 1/s: trust its statistics, or ask for a finer engine.tolerance"
-        )
 
 
 def energy_balance(rows: np.ndarray, first: np.ndarray) -> dict[str, np.ndarray]:

@@ -50,7 +50,7 @@ class EngineChoice(Written):
     tolerance: Annotated[FiniteFloat, Field(ge=0.0, le=0.1)] = 0.0
     """Scaled error: of the whole run with split, of a step with another adaptive engine; left out: the engine's own."""
     companion: bool = False
-    """A second run beside it, at a sixteenth of the tolerance, tells the error; left out: with split only."""
+    """A second run at a sixteenth of the tolerance estimates the error; left out: with split only."""
 
     @field_validator("name")
     @classmethod

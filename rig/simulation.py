@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from rig import calibrator
+from rig.accuracy import Accuracy, choose_companion
 from rig.channels import ChannelTable
 from rig.commands import ClearCommand, FaultCommand, HammerCommand, ReleaseCommand, SpeedCommand, check_command
 from rig.engines import ENGINES, load_engine
@@ -29,7 +30,7 @@ from rig.kernels.constants import Inputs
 from rig.kernels.magnet import magnet_force
 from rig.kernels.signals import COLUMN
 from rig.model import build_model, describe
-from rig.motion import BRANCH_ALARM, FINER, Accuracy, Begin, Motion, energy_balance, initial_state
+from rig.motion import BRANCH_ALARM, Begin, Motion, energy_balance, initial_state
 from rig.scenes import Scene, load_scene, scene_document
 from rig.sending import Frame
 from rig.sensors.conditioning import Conditioner
@@ -84,7 +85,7 @@ class Simulation:
         self.tick_rate_hz = TICK_RATE_HZ
         self._warm = False
         self.model = build_model(scene.load_parameters(), scene.model)
-        self._engine = calibrator.STILL if scene.generator is not None else load_engine(scene.engine.name)
+        self._engines = [calibrator.STILL if scene.generator is not None else load_engine(scene.engine.name)]
         self._method = ENGINES[scene.engine.name]
         sensors, self.row_ticks = scene.sensors, scene.row_ticks
         # Steps are as long as may be of those that end on the rows.
@@ -144,9 +145,14 @@ class Simulation:
         self._motion = Motion(initial, self._step_ticks, self._stride, choice.tolerance)
         self._companion: Motion | None = None
         if choice.companion:
+            name, tolerance = choose_companion(choice.name, choice.tolerance, scene.model.friction)
+            self._engines.append(
+                load_engine(name) if name != choice.name and scene.generator is None else self._engines[0]
+            )
             stride = self.block_ticks // self._step_ticks
-            self._companion = Motion(initial.copy(), self._step_ticks, stride, FINER * choice.tolerance)
-        self._accuracy = Accuracy(choice.tolerance)
+            self._companion = Motion(initial.copy(), self._step_ticks, stride, tolerance)
+        clearance = self.model.constants.contact.clearance
+        self._accuracy = Accuracy(choice.tolerance, clearance, self.block_ticks / TICK_RATE_HZ)
         self._rows = np.empty((0, S.N_ROW))
         self._last: np.ndarray | None = None
 
@@ -157,10 +163,10 @@ class Simulation:
     def first_row(self) -> np.ndarray:
         """The observed row at time zero, shape (N_ROW,). The first use starts the engine, which compiles it."""
         row = np.empty((1, S.N_ROW))
-        engine, constants, inputs = self._engine, self.model.constants, self._inputs()
-        for motion in self._motions():
+        constants, inputs = self.model.constants, self._inputs()
+        for motion, engine in zip(self._motions(), self._engines, strict=True):
             motion.begin(engine, constants, inputs)
-        copy.deepcopy(self._motion).run(engine, constants, inputs, row, self.tick, self.tick, self.tick + 1)
+        copy.deepcopy(self._motion).run(self._engines[0], constants, inputs, row, self.tick, self.tick, self.tick + 1)
         return row[0]
 
     def _motions(self) -> list[Motion]:
@@ -187,8 +193,8 @@ class Simulation:
         while self.tick < end:
             self._take_effect(events)
             stop, inputs = min(end, self._next_change()), self._inputs()
-            for motion, out in zip(self._motions(), (rows, companion), strict=False):
-                motion.run(self._engine, self.model.constants, inputs, out, start, self.tick, stop)
+            for motion, engine, out in zip(self._motions(), self._engines, (rows, companion), strict=False):
+                motion.run(engine, self.model.constants, inputs, out, start, self.tick, stop)
             self.tick = stop
             # What changes on a row changes behind it: sensors see the row before the change, then that after it.
             row, beyond = divmod(stop - start, self.row_ticks)
@@ -215,10 +221,11 @@ class Simulation:
     def _doubts(self, rows: np.ndarray, companion: np.ndarray, start: int) -> list[dict[str, Any]]:
         every = self.block_ticks // self.row_ticks
         times_s = (start + self.block_ticks * np.arange(len(companion))) / TICK_RATE_HZ
-        text, since_s = self._accuracy.compare(rows[::every], companion, times_s), self._accuracy.doubted_s
-        if text is None or since_s is None:
-            return []
-        return [{"event": "warning", "tick": round(since_s * TICK_RATE_HZ), "time_s": since_s, "text": text}]
+        warnings = self._accuracy.compare(rows[::every], companion, times_s)
+        return [
+            {"event": "warning", "tick": round(time_s * TICK_RATE_HZ), "time_s": time_s, "text": text}
+            for time_s, text in warnings
+        ]
 
     def submit(self, name: str, request: dict[str, Any]) -> int:
         """Check a command and schedule it for the present tick.
@@ -275,8 +282,9 @@ class Simulation:
         residual, dissipated = float(balance["residual"][0]), float(balance["dissipated"][0])
         memory, warnings = self._motion.memory, list[str]()
         choice = {**self.scene.engine.model_dump(), "step_us": self._step_ticks}
-        if self._accuracy.doubted_s is not None:
-            warnings.append(self._accuracy.warning())
+        accuracy = self._accuracy.completed()
+        if text := accuracy.warning():
+            warnings.append(text)
         # Where little is dissipated, what was stored is what the ledger has to account for.
         turned_over = max(dissipated, abs(float(balance["stored"][0])), 1e-6)
         if abs(residual) > self._method.energy * turned_over:
@@ -303,7 +311,7 @@ class Simulation:
                 "residual_share": residual / max(dissipated, 1e-6),
                 "alarm_share": self._method.energy,
             },
-            "accuracy": None if self._companion is None else self._accuracy.document(),
+            "accuracy": None if self._companion is None else accuracy.document(),
             "engine": {**choice, "levels": self.scene.model.model_dump()},
             "contacts": int(memory[CONTACTS]),
             "peak_normal_force_n": float(memory[PEAK_FORCE]),

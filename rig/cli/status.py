@@ -125,7 +125,7 @@ def status_table(document: dict[str, Any]) -> Table:
     if engine and share is not None:
         rows.append(("engine", f"{engine['name']}, {engine['step_us']} us"))
         if accuracy := document.get("accuracy"):
-            rows.append(("error estimate", f"{accuracy['estimate']:.1e} (scaled), for {engine['tolerance']:g} asked"))
+            rows.append(("error estimate", accuracy_text(accuracy)))
         # Reference-free: what the method makes or loses of the energy that it should account for.
         alarm = energy.get("alarm_share", 1e-3)
         rows.append(("energy left open", f"{share:.1e} of what was dissipated (alarm at {alarm:g})"))
@@ -156,5 +156,18 @@ def status_table(document: dict[str, Any]) -> Table:
     return facts(f"rig: {document['scene']}, {document['state']}", rows, warning="yellow")
 
 
-def _figure(value: float | None, unit: str) -> str:
-    return "not finite" if value is None else f"{value:.4g} {unit}"
+def accuracy_text(accuracy: dict[str, Any]) -> str:
+    """Return the error estimate of a status, each quantity in its unit; before version 0.2 it was one number."""
+    quantities = accuracy.get("quantities")
+    if not isinstance(quantities, dict):
+        return _figure(accuracy.get("estimate"), "(scaled)")
+    parts = []
+    for one in (one for one in quantities.values() if isinstance(one, dict)):
+        limit = one.get("tolerance")
+        within = f" (tolerance {limit:.2g})" if isinstance(limit, float | int) else ""
+        parts.append(f"{one.get('label')} {_figure(one.get('error'), one.get('unit', ''), digits=2)}{within}")
+    return ", ".join(parts)
+
+
+def _figure(value: float | None, unit: str, *, digits: int = 4) -> str:
+    return f"{value:.{digits}g} {unit}" if isinstance(value, float | int) else "not finite"

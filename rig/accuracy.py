@@ -1,0 +1,247 @@
+"""The error of a run, estimated by the distance from its companion, one quantity at a time in its own unit.
+
+Both runs are compared in windows of samples at the same instants. A whirl that is ahead or behind in angle has other
+instantaneous values although it is the same motion, so a difference also counts only as far as it remains where both
+runs are compared at the same whirl angle.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from rig.engines import ENGINES
+from rig.kernels import signals as S
+from rig.kernels.signals import COLUMN
+
+COMPANION_REFINEMENT = 1.0 / 16.0
+"""Companion's tolerance over engine.tolerance: the difference is then the run's own error to about 6 %."""
+QUANTITIES = {
+    "radius": ("whirl radius", "um", 1e6),
+    "force": ("contact force", "N", 1.0),
+    "frequency": ("whirl frequency", "Hz", 1.0),
+    "state": ("state", "(scaled)", 1.0),
+    "angle": ("whirl angle", "deg", math.degrees(1.0)),
+    "spin_angle": ("spin angle", "deg", math.degrees(1.0)),
+}
+"""Label, unit and units per SI unit of each quantity; the two angles have no tolerance and never warn."""
+STATE_FACTOR = 10.0
+"""Tolerance of the scaled state over engine.tolerance: the warning level of version 0.1."""
+FORCE_FLOOR_N = 100.0
+"""Smallest force scale [N], the default hammer's peak: a light graze does not warn for millinewtons."""
+FREQUENCY_SCALE_HZ = 100.0
+"""Whirl frequency scale [Hz]: the rig whirls at 40 to 130 Hz."""
+_WINDOW_ROWS, _WINDOW_S = 64, 0.064
+"""At least this many samples and this long [s], which is three turns of the slowest whirl that rolls."""
+_HARMONICS = np.arange(1, 5)
+"""Harmonics of the whirl angle in what a value is as a function of it; weight and stiffness give the first two."""
+_MIN_FIT_ROWS = 30
+"""Samples that a fit of twelve coefficients needs to have a residual that means something."""
+_MIN_WHIRL_RADIUS = 0.5
+"""Part of the clearance above which an orbit has a whirl angle."""
+_COLUMNS = [*range(S.N_STATE), COLUMN["ring_x"], COLUMN["ring_y"], COLUMN["normal_force"]]
+_FIRST, _LOST = 1e-9, 0.1
+"""Growth is measured from the first distance above rounding, up to where two runs no longer have to do with each
+other."""
+
+
+def choose_companion(engine: str, tolerance: float, friction: str) -> tuple[str, float]:
+    """Return engine and tolerance of the companion.
+
+    A per-step tolerance bounds nothing where the step is limited by the grid, as with `tsit5` at 1e-3: a companion of
+    the same method then shares the error. Other engines are compared with the default engine, or with `rk8` where the
+    default engine does not take the friction law.
+
+    Args:
+        engine: Name of the run's own engine.
+        tolerance: engine.tolerance of the run.
+        friction: Friction law of the model.
+    """
+    default = next(iter(ENGINES))
+    name = default if friction in ENGINES[default].frictions else "rk8"
+    return name, COMPANION_REFINEMENT * (tolerance if name == engine else min(tolerance, ENGINES[name].tolerance))
+
+
+@dataclass
+class Accuracy:
+    """Error estimate of a run.
+
+    Attributes:
+        tolerance: engine.tolerance [1].
+        clearance: Radial clearance of the ring [m].
+        block_s: Time between compared samples [s].
+        estimate: Largest distance of all states at the same instant, RMS of the scaled states (`STATE_SCALE`) [1].
+        grown_per_s: Mean growth rate of a small distance [1/s].
+        errors: Largest error of each of `QUANTITIES` [SI], shape (6,).
+        since_s: Start of the window in which a quantity exceeded its tolerance [s].
+        peak_force: Largest contact force of the compared samples [N].
+    """
+
+    tolerance: float
+    clearance: float
+    block_s: float
+    estimate: float = 0.0
+    grown_per_s: float = 0.0
+    errors: np.ndarray = field(default_factory=lambda: np.zeros(len(QUANTITIES)))
+    since_s: dict[str, float] = field(default_factory=dict)
+    peak_force: float = 0.0
+    _first: tuple[float, float] | None = None
+    _window: np.ndarray = field(default_factory=lambda: np.empty((0, 1 + 2 * len(_COLUMNS))))
+    _waiting: np.ndarray = field(default_factory=lambda: np.empty((0, 1 + 2 * len(_COLUMNS))))
+
+    def compare(self, rows: np.ndarray, companion: np.ndarray, times_s: np.ndarray) -> list[tuple[float, str]]:
+        """Add samples of both runs.
+
+        Args:
+            rows: Observed rows, shape (n, N_ROW).
+            companion: The companion's rows at the same instants, shape (n, N_ROW).
+            times_s: Instants [s], shape (n,).
+
+        Returns:
+            Time [s] and text of a warning for each window in which another quantity exceeded its tolerance.
+        """
+        added = np.column_stack([times_s, rows[:, _COLUMNS], companion[:, _COLUMNS]])
+        self._waiting = np.concatenate([self._waiting, added])
+        size, warnings = max(_WINDOW_ROWS, math.ceil(_WINDOW_S / self.block_s)), []
+        while len(self._waiting) >= size:
+            self._window, self._waiting = self._waiting[:size], self._waiting[size:]
+            if self._add_window(self._window):
+                warnings.append((float(self._window[-1, 0]), self.warning()))
+        return warnings
+
+    def completed(self) -> Accuracy:
+        """Return a copy that includes the samples of the window that is not full yet."""
+        done = copy.deepcopy(self)
+        done.complete()
+        return done
+
+    def complete(self) -> None:
+        """Add the samples of the window that is not full yet, filled up by those before them."""
+        if len(self._waiting):
+            self._add_window(
+                np.concatenate([self._window, self._waiting])[-max(len(self._window), len(self._waiting)) :]
+            )
+
+    def document(self) -> dict[str, Any]:
+        """Return the estimate as JSON: each quantity's largest error and tolerance in its unit, and since when."""
+        tolerances = [*self._tolerances().tolist(), None, None]
+        return {
+            "estimate": self.estimate,
+            "growth_per_s": self.grown_per_s,
+            "doubted_s": min(self.since_s.values(), default=None),
+            "quantities": {
+                name: {
+                    "label": label,
+                    "unit": unit,
+                    "error": error * per_si,
+                    "tolerance": None if tolerance is None else tolerance * per_si,
+                    "exceeded_s": self.since_s.get(name),
+                }
+                for (name, (label, unit, per_si)), error, tolerance in zip(
+                    QUANTITIES.items(), self.errors.tolist(), tolerances, strict=True
+                )
+            },
+        }
+
+    def warning(self) -> str:
+        """Return a sentence that names each quantity above its tolerance; empty if there is none."""
+        parts = [
+            f"{one['label']} off by {one['error']:.2g} {one['unit']} (tolerance {one['tolerance']:.2g}) "
+            f"since {one['exceeded_s']:.3f} s"
+            for one in self.document()["quantities"].values()
+            if one["exceeded_s"] is not None
+        ]
+        advice = (
+            f"differences grow by {self.grown_per_s:.3g} 1/s: ask for a finer engine.tolerance ({self.tolerance:g})"
+        )
+        return f"accuracy: {'; '.join(parts)}; {advice}, or use statistics only" if parts else ""
+
+    def _tolerances(self) -> np.ndarray:
+        """Tolerances of all quantities but the angles [SI], shape (4,)."""
+        force = max(self.peak_force, FORCE_FLOOR_N)
+        return self.tolerance * np.array([self.clearance, force, FREQUENCY_SCALE_HZ, STATE_FACTOR])
+
+    def _add_window(self, window: np.ndarray) -> bool:
+        """Update all estimates by one window; return whether another quantity exceeds its tolerance."""
+        times_s, (own, other) = window[:, 0], np.split(window[:, 1:], 2, axis=1)
+        away = np.nan_to_num((own - other)[:, : S.N_STATE] / S.STATE_SCALE, nan=math.inf)
+        for time, distance in zip(times_s.tolist(), np.sqrt(np.mean(away**2, axis=1)).tolist(), strict=True):
+            self.estimate = max(self.estimate, distance)
+            if self._first is None and distance > _FIRST:
+                self._first = time, distance
+            elif self._first is not None and self._first[1] < distance < _LOST:
+                self.grown_per_s = math.log(distance / self._first[1]) / (time - self._first[0])
+        self.peak_force = max(self.peak_force, float(own[:, -1].max()))
+        orbit, orbit_other = (part[:, -3] + 1j * part[:, -2] for part in (own, other))
+        values, values_other = (
+            np.column_stack([np.abs(z), part[:, -1], part[:, : S.N_STATE] / S.STATE_SCALE])
+            for z, part in ((orbit, own), (orbit_other, other))
+        )
+        turned = np.unwrap(np.angle(orbit * np.conj(orbit_other)))
+        whirls = np.minimum(np.abs(orbit), np.abs(orbit_other)) > _MIN_WHIRL_RADIUS * self.clearance
+        apart = np.nan_to_num(np.abs(values - values_other), nan=math.inf)
+        theta = 2 + S.THETA
+        errors = self._at_instant(apart, theta)
+        if len(window) >= _MIN_FIT_ROWS and np.isfinite(apart).all() and (errors > self.errors[[0, 1, 3]]).any():
+            phases = (
+                np.column_stack([np.angle(z), part[:, S.THETA]]) for z, part in ((orbit, own), (orbit_other, other))
+            )
+            same_angle = _apart_at_same_angle(values, values_other, *phases, times_s)
+            errors = self._at_instant(np.minimum(apart, same_angle), theta)
+        radius, force, state = errors
+        span_s = times_s[-1] - times_s[0]
+        frequency = 0.0
+        if whirls.all() and span_s >= 0.5 * _WINDOW_S:
+            frequency = abs(turned[-1] - turned[0]) / (2.0 * math.pi * span_s)
+        angle = np.abs(np.angle(np.exp(1j * turned[whirls]))).max(initial=0.0)
+        found = np.array([radius, force, frequency, state, angle, apart[:, theta].max()])
+        self.errors = np.maximum(self.errors, found)
+        exceeded = [
+            name
+            for name, error, tolerance in zip(QUANTITIES, self.errors, self._tolerances(), strict=False)
+            if error > tolerance and name not in self.since_s
+        ]
+        self.since_s |= dict.fromkeys(exceeded, float(times_s[0]))
+        return bool(exceeded)
+
+    @staticmethod
+    def _at_instant(apart: np.ndarray, theta: int) -> np.ndarray:
+        """Largest radius [m], force [N] and scaled state (without the spin angle) error, shape (3,)."""
+        state = np.delete(apart, [0, 1, theta], axis=1)
+        rms = np.sqrt(np.sum(state**2, axis=1) / S.N_STATE)
+        return np.array([apart[:, 0].max(), apart[:, 1].max(), rms.max()])
+
+
+def _apart_at_same_angle(
+    own: np.ndarray, other: np.ndarray, phase: np.ndarray, phase_other: np.ndarray, times_s: np.ndarray
+) -> np.ndarray:
+    """Return how far another run is from this one at the same whirl angle.
+
+    This run's values are fitted as a function of its whirl angle, of that angle from the turning unbalance, and of
+    time; the fit's own residual is added, so that a motion that is no such function, as impacts are, is never explained
+    by an angle.
+
+    Args:
+        own: Values of this run, shape (n, k).
+        other: Values of the other run, shape (n, k).
+        phase: Whirl angle and spin angle of this run [rad], shape (n, 2).
+        phase_other: Those of the other run [rad], shape (n, 2).
+        times_s: Instants [s], shape (n,).
+
+    Returns:
+        Distances in the units of the values, shape (n, k).
+    """
+    elapsed = (times_s - times_s.mean()) / max(np.ptp(times_s), 1e-9)
+
+    def basis(at: np.ndarray) -> np.ndarray:
+        turns = np.column_stack([np.outer(at[:, 0], _HARMONICS), at[:, 0] - at[:, 1]])
+        return np.column_stack([np.ones_like(elapsed), elapsed, np.cos(turns), np.sin(turns)])
+
+    terms = basis(phase)
+    coefficients, *_ = np.linalg.lstsq(terms, own)
+    residual = np.abs(own - terms @ coefficients).max(axis=0)
+    return np.abs(other - basis(phase_other) @ coefficients) + residual
