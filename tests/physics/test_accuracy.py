@@ -1,12 +1,16 @@
 """The error estimate of a run: which quantity is off, in its unit, and what is only an angle."""
 
 import copy
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from recorder.reader import join
 from rig.accuracy import Accuracy, choose_companion
+from rig.cli.info import describe
+from rig.cli.status import accuracy_text
 from rig.kernels import signals as S
 from rig.kernels.signals import COLUMN
 from rig.offline import simulate
@@ -131,3 +135,33 @@ def test_settled_whirl_is_off_in_angle_only() -> None:
     health = run.simulation.health()
     assert health["warnings"] == []
     assert 0.0 < health["accuracy"]["quantities"]["angle"]["error"] < 2.0
+
+
+OLD = {"estimate": 9.9e-3, "growth_per_s": 0.4, "doubted_s": 23.178}
+
+
+@pytest.mark.parametrize(
+    ("accuracy", "text"),
+    [
+        (OLD, "0.0099 (scaled)"),
+        (
+            {"quantities": {"radius": {"label": "whirl radius", "unit": "um", "error": 0.09, "tolerance": 0.2778}}},
+            "whirl radius 0.09 um (tolerance 0.28)",
+        ),
+        (
+            {"quantities": {"angle": {"label": "whirl angle", "unit": "deg", "error": None, "tolerance": None}}},
+            "whirl angle not finite",
+        ),
+        ({"quantities": 3}, "not finite"),
+    ],
+)
+def test_text_of_an_estimate_of_any_version(accuracy: dict[str, Any], text: str) -> None:
+    assert accuracy_text(accuracy) == text
+
+
+def test_info_of_an_older_recording_has_its_warning_once() -> None:
+    recording = join([Path(__file__).parents[2] / "replays" / "sessions" / "partial-rub.mcap"])
+    event = next(event for event in recording.events if event["event"] == "warning")
+    later = event["text"].replace("1.1e-02", "2.2e-01")
+    recording.events.append({**event, "tick": 500_000, "time_s": 0.5, "text": later})
+    assert describe(recording, quick=False)["health"]["warnings"] == [later]
