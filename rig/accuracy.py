@@ -187,10 +187,10 @@ class Accuracy:
         theta = 2 + S.THETA
         errors = self._at_instant(apart, theta)
         if len(window) >= _MIN_FIT_ROWS and np.isfinite(apart).all() and (errors > self.errors[[0, 1, 3]]).any():
-            phases = (
+            phase, phase_other = (
                 np.column_stack([np.angle(z), part[:, S.THETA]]) for z, part in ((orbit, own), (orbit_other, other))
             )
-            same_angle = _apart_at_same_angle(values, values_other, *phases, times_s)
+            same_angle = _apart_at_same_angle(values, values_other, phase, phase_other, times_s)
             errors = self._at_instant(np.minimum(apart, same_angle), theta)
         radius, force, state = errors
         span_s = times_s[-1] - times_s[0]
