@@ -38,7 +38,7 @@ _channels = itertools.count()
 
 
 def check_against_recording(
-    frames: dict[int, list[bytes]], path: Path, *, rates: dict[bool, int], from_start: bool = True
+    frames: dict[int, list[bytes]], path: Path, *, rates: dict[bool, int], from_start: bool = True, whole: bool = True
 ) -> int:
     """Check that the decoded values of all sample frames equal those of the recording.
 
@@ -47,6 +47,7 @@ def check_against_recording(
         path: The recording.
         rates: Rate of the frames [Hz], by whether they are CAN FD.
         from_start: Whether the frames begin within the first half second of the run.
+        whole: Whether every frame from the first one to the end of the run is there.
 
     Returns:
         Number of values compared.
@@ -61,19 +62,22 @@ def check_against_recording(
             continue
         data = np.frombuffer(b"".join(frames[message.identifier]), np.uint8).reshape(-1, message.length)
         numbers, values = samples.unpack(data)
-        # Every frame is there from the first one on that was heard.
         step, first = 20_000 // rates[message.fd], int(numbers[0])
         each = step if message.fd else 1
         assert first < 10_000 or not from_start
-        assert np.array_equal(numbers, first + np.arange(len(data)) * samples.rows * each)
+        if whole:
+            assert np.array_equal(numbers, first + np.arange(len(data)) * samples.rows * each)
+        assert (np.diff(numbers.astype(np.int64)) > 0).all()
+        rows = ((numbers.astype(np.int64)[:, None] // each + np.arange(samples.rows)) * step).ravel()
         got = samples.engineering(values)
         for column, channel in enumerate(samples.channels):
             group = default_table().groups[channel.group]
             recorded = np.concatenate([block.values for block in recording.blocks(wire.sensor_key(channel.group))])
-            expected = group.engineering(recorded)[first // each * step :: step, group.names.index(channel.name)]
-            assert 0 <= len(expected) - len(got) < samples.rows
+            expected = group.engineering(recorded)[rows, group.names.index(channel.name)]
+            if whole:
+                assert 0 <= len(recorded[int(rows[0]) :: step]) - len(got) < samples.rows
             tolerance = channel.scale * (1e-6 if message.fd else 256)
-            assert np.all(np.abs(got[:, column] - expected[: len(got)]) <= tolerance)
+            assert np.all(np.abs(got[:, column] - expected) <= tolerance)
             compared += len(got)
     return compared
 
@@ -203,8 +207,9 @@ def test_rig_run_on_a_virtual_bus_between_processes(tmp_path: Path, options: lis
             asked = stopped = False
             links: dict[str, float] = {}
             while True:
-                message = bus.recv(PATIENCE_S)
-                assert message is not None, "the bus is silent"
+                if (message := bus.recv(20.0)) is None:
+                    assert stopped, "the bus is silent"
+                    break  # the frame of the end was dropped
                 assert not message.is_error_frame
                 frames.setdefault(message.arbitration_id, []).append(bytes(message.data))
                 if message.arbitration_id == TABLE.by_name["Sync"].identifier and not asked:
@@ -223,12 +228,18 @@ def test_rig_run_on_a_virtual_bus_between_processes(tmp_path: Path, options: lis
     assert child.returncode == 0, errors
     sent = sum(len(rows) for rows in frames.values())
     assert int(output.rpartition("CAN: ")[2].split()[0]) >= sent
-    assert output.endswith(" frames sent, 0 dropped, commands taken 1, refused 0\n"), output
+    assert output.endswith(" dropped, commands taken 1, refused 0\n"), output
+    found = re.search(r"lateness .* max (\d+\.\d+) .*sent, (\d+) dropped", output, re.DOTALL)
+    assert found is not None, output
+    # A rig that was held up for longer sends more frames at once than wait for a bus: it drops some, and counts them.
+    late, dropped = float(found[1]) > 100.0, int(found[2])
+    assert late or not dropped, output
     (reply,) = [TABLE.by_name["Acknowledge"].decode(data) for data in frames[TABLE.by_name["Acknowledge"].identifier]]
     assert reply["result"] == Result.ACCEPTED
-    assert links["can_dropped"] == 0
-    assert 0.2 < links["can_load"] < 1.0
-    compared = check_against_recording(frames, tmp_path / "run.mcap", rates=rates, from_start=False)
+    assert links["can_dropped"] <= dropped
+    assert links["can_load"] > 0.2
+    assert links["can_load"] < 1.0 or late
+    compared = check_against_recording(frames, tmp_path / "run.mcap", rates=rates, from_start=False, whole=not dropped)
     assert compared > 0.9 * 15 * 2 * sum(rates.values())
 
 
