@@ -34,7 +34,7 @@ MIN_KILLED = 0.9
 _UNIT = "tests/unit/test_{}.py"
 _FAULTS = ("faults", "channel_faults", "block_faults", "declared_faults")
 TESTS = {
-    "replays/score/": ("score", "score_quantities", "score_population", "score_faults", "score_live"),
+    "replays/score/": ("score_intervals", "score", "score_overlap", "score_population", "score_faults", "score_live"),
     "rig/faulty.py": _FAULTS, "rig/faults/": _FAULTS, "replays/recordings/validation/": ("validation", "verdict"),
     "rig/units.py": ("units", "import"), "replays/campaigns/": ("campaign_file", "campaign_results"),
 }  # fmt: skip
@@ -189,11 +189,11 @@ class _Places(ast.NodeVisitor):
 
 
 def places(file: str) -> list[Mutant]:
-    """Return all mutants of a file that can still be read."""
+    """Return all mutants of a file, of which some may not be readable."""
     text = (ROOT / file).read_text(encoding="utf-8")
     visitor = _Places(file, text)
     visitor.visit(ast.parse(text))
-    return [each for each in visitor.found if _parses(each.applied(text))]
+    return visitor.found
 
 
 def _parses(text: str) -> bool:
@@ -220,8 +220,10 @@ def chosen(count: int, seed: int) -> list[Mutant]:
         for each in kinds.values():
             draw.shuffle(each)
         stacks.append(_in_turn([kinds[kind] for kind in sorted(kinds)]))
-    drawn = _in_turn(stacks)
-    return [*found, *drawn][:count]
+    for each in _in_turn(stacks):
+        if len(found) < count and _parses(each.applied((ROOT / each.file).read_text(encoding="utf-8"))):
+            found.append(each)
+    return found[:count]
 
 
 def _in_turn(stacks: list[list[Mutant]]) -> list[Mutant]:

@@ -1,0 +1,127 @@
+"""Widths of a scorecard's intervals, and limits made of the channel table, against closed forms."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from replays.score.digital import Stamps
+from replays.score.intervals import sandwich, student
+from replays.score.limits import load_limits
+from replays.score.recorded import Table
+from replays.score.scorecard import FAIL, INCONCLUSIVE, PASS, Bounds, judge_row
+from replays.score.sine import fit_sine, quality
+from replays.score.waveform import Waveform, split_noise
+from rig.channels import default_table
+
+PROBE = default_table().channels["disk_x"]
+NOISE_V = math.hypot(1e-3, PROBE.lsb_v / math.sqrt(12.0))
+
+
+def test_students_t_is_that_of_two_sides() -> None:
+    # Tables of the 97.5 % quantile.
+    assert student([1.0, 5.0, 30.0, 1e9]) == pytest.approx([12.7062, 2.5706, 2.0423, 1.95996], rel=1e-4)
+
+
+def test_a_sandwich_has_the_variance_of_white_noise() -> None:
+    generator, n = np.random.default_rng(1), 6400
+    matrix = np.column_stack([np.ones(n), np.linspace(-1.0, 1.0, n)])
+    found = [sandwich(matrix, 3.0 * generator.standard_normal(n))[0].diagonal() for _ in range(30)]
+    assert np.mean(found, axis=0) == pytest.approx([9.0 / n, 27.0 / n], rel=0.15)
+
+
+def _fit(noise: float, jitter_s: float, generator: np.random.Generator, n: int = 6400) -> Waveform:
+    """Return a fit of a sine of 1 V at 1 kHz whose residual is noise and jitter."""
+    times_s = np.arange(n) / 20e3
+    slope = 2000.0 * np.pi * np.cos(2000.0 * np.pi * times_s * 1.000137)
+    residual = noise * generator.standard_normal(n) + jitter_s * slope * generator.standard_normal(n)
+    return Waveform(1.0, 0.0, 0.0, 0.0, np.eye(4), np.ones(4), 0.0, times_s, residual, slope / 6283.0, slope, residual)
+
+
+def test_intervals_of_noise_and_jitter_are_two_standard_deviations_to_each_side() -> None:
+    # The spread of an rms is rms / sqrt(2 n); that of jitter is measured over the fits themselves.
+    generator = np.random.default_rng(2)
+    splits = [split_noise(_fit(1e-3, 2e-7, generator)) for _ in range(40)]
+    alone = [split_noise(_fit(1e-3, 0.0, generator)).left for _ in range(12)]
+    widths = np.mean([high - low for _, low, high in alone])
+    assert widths == pytest.approx(2.0 * 1.96 * 1e-3 / math.sqrt(2.0 * 6400), rel=0.08)
+    jitters = [split.jitter_s for split in splits if split.jitter_s is not None]
+    assert len(jitters) == 40
+    ratio = np.mean([high - low for _, low, high in jitters]) / (2.0 * 1.96 * np.std([value for value, *_ in jitters]))
+    assert 0.85 < ratio < 1.35
+    assert np.mean([low < 2e-7 < high for _, low, high in jitters]) >= 0.88
+
+
+def test_a_floor_is_taken_off_the_low_end_of_the_noise_alone() -> None:
+    found, generator = [], np.random.default_rng(3)
+    fit = _fit(1e-3, 0.0, generator)
+    for floor in (0.0, 0.6e-3):
+        found.append(split_noise(fit, floor=floor).left)
+    (value, low, high), (same, lower, still) = found
+    assert (value, high) == (same, still)
+    assert lower == pytest.approx(math.sqrt(low**2 - 0.36e-6))
+
+
+def test_the_interval_of_sinad_is_that_of_chi_squared() -> None:
+    from scipy.stats import chi2
+
+    n, t = 500, np.arange(500)
+    values = np.sin(2.0 * np.pi * 0.0713 * t) + 0.01 * np.random.default_rng(4).standard_normal(n)
+    value, low, high = quality(fit_sine(values)).sinad_db
+    ends = [10.0 * math.log10(chi2.ppf(p, n - 4) / (n - 4)) for p in (0.025, 0.975)]
+    assert (low - value, high - value) == pytest.approx(ends)
+
+
+def test_the_interval_of_stamp_jitter_is_that_of_chi_squared() -> None:
+    from scipy.stats import chi2
+
+    n = 4096
+    table = Table(n, 1, lambda columns: [np.zeros((n, 1 + len(columns)))])
+    stamps, since_s = Stamps(table, shown=True), np.arange(n) / 20e3
+    stamps.times_s = 0.25 + since_s * (1.0 + 5e-5) + 1e-6 * np.random.default_rng(5).standard_normal(n)
+    stamps.take(0.0, since_s, np.arange(n), n)
+    found = stamps.judged(None)
+    assert found["stamp jitter"] is not None
+    value, low, high = found["stamp jitter"]
+    freedom = n // 16 * 15
+    ends = [value * math.sqrt(freedom / chi2.ppf(p, freedom)) for p in (0.975, 0.025)]
+    assert (low, high) == pytest.approx(ends, rel=2e-3)
+    for name, true in (("stamp offset", 0.25), ("stamp rate", 50.0)):
+        told = found[name]
+        assert told is not None
+        assert told[1] < true < told[2]
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "verdict"),
+    [(-1.0, 1.0, PASS), (-1.0, 1.5, INCONCLUSIVE), (-1.5, 1.0, INCONCLUSIVE), (1.5, 2.0, FAIL), (-2.0, -1.5, FAIL),
+     (-3.0, 3.0, INCONCLUSIVE), (1.0, 1.0, PASS)],
+)  # fmt: skip
+def test_the_whole_interval_decides(low: float, high: float, verdict: str) -> None:
+    limit = Bounds(-1.0, 1.0, "a test")
+    assert judge_row("analogue", "gain", "", (0.5 * (low + high), low, high), limit=limit).verdict == verdict
+
+
+def test_limits_made_of_the_table_are_closed_forms() -> None:
+    limits = load_limits()
+
+    def ends(quantity: str, **told: float) -> tuple[float, float] | None:
+        found = limits.bounds("analogue", quantity, PROBE, **told)  # type: ignore[arg-type]
+        return None if found is None else (found.low, found.high)
+
+    noise_mm = NOISE_V / 3.94
+    assert ends("offset") == pytest.approx((-noise_mm, noise_mm))
+    assert ends("noise") == pytest.approx((-math.inf, 1.1 * noise_mm))
+    assert ends("skew") == pytest.approx((-500.0, 500.0))
+    assert ends("jitter") == pytest.approx((-math.inf, 50.0))
+    assert ends("corner") == pytest.approx((4950.0, math.inf))
+    assert ends("effective bits") == pytest.approx((math.log2(40.0 / (NOISE_V * math.sqrt(12.0))) - 0.14, math.inf))
+    assert ends("dynamic range") == pytest.approx((20.0 * math.log10(20.0 / math.sqrt(2.0) / NOISE_V) - 0.83, math.inf))
+    sine_db = 20.0 * math.log10(1.0 / math.sqrt(2.0) / noise_mm)
+    assert ends("SINAD", amplitude=1.0) == pytest.approx((sine_db - 0.83, math.inf))
+    assert ends("ENOB", amplitude=1.0) == pytest.approx(((sine_db - 1.76) / 6.02 - 0.14, math.inf))
+    # Two noises in a record are 3 dB more; without an amplitude nothing is asked.
+    assert ends("SINAD", amplitude=1.0, noises=2) == pytest.approx((sine_db - 0.83 - 3.0103, math.inf), rel=1e-5)
+    assert ends("SINAD") is None
