@@ -3,24 +3,33 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from replays.score.intervals import student
+from replays.score.alignment import Alignment, Source, align
+from replays.score.intervals import sandwich, student
 from replays.score.recorded import Recorded
-from replays.score.scorecard import Interval, Scorecard
+from replays.score.scorecard import (
+    ANALOGUE,
+    FAIL,
+    INCONCLUSIVE,
+    NO_LIMIT,
+    PASS,
+    Interval,
+    Scorecard,
+    Verdict,
+    text_row,
+)
 from replays.score.sent import Formula, Session
 from replays.score.sine import fit_sine, is_sine, quality
 from replays.score.stimulus import Exact, Sampled, Stimulus, parted
 from replays.score.waveform import (
     Response,
     Waveform,
-    beginnings,
     behind_filter,
     fit_waveform,
-    folded,
     response,
     split_noise,
     through,
@@ -39,15 +48,19 @@ _OWN_CLOCK = 3.0, 1e-6
 """A clock is a channel's own where it is off the others' by more than so many half intervals, and by so much."""
 _PURER = 1.5
 """Noises of a channel that what is not the sine in a sine may come to."""
-_BETTER = 0.8
-"""A fit of less than this part of what another leaves is the better one."""
 _SINE = ("SINAD", "ENOB", "THD", "SFDR")
 _SEEN = 4.0
 """Noises of a channel that what is above half of the rate has to come to."""
 _LONGEST = 1 << 14
 """Samples by which a signal is told to be a sine."""
+_LOUD, _MANY = 4.0, 1000
+"""Noises of a channel, and rows, from which what was sent must be found."""
+_NAMED = 5
+"""Steps that are named in a note; the JSON has all."""
+_EDGE = 100
+"""Rows outside the session from which a remark says so: its ends are not interpolated."""
 
-_NOT_SURE = "what was sent nearly repeats, and no beginning leaves noise alone: what is left may be of a wrong one"
+_AMBIGUOUS = "what was sent repeats, and other begins explain the record as well"
 _ODD = "behind a low-pass that is none of Butterworth's"
 
 
@@ -90,67 +103,46 @@ class Fitted:
 def fit_channels(
     recorded: Mapping[str, Recorded], wires: Mapping[str, Wire], session: Session, formulas: Mapping[str, Formula],
     remarks: list[str],
-) -> list[Fitted]:  # fmt: skip
-    """Fit all signals that are connected; those of which it is not sure to what, only where that explains them."""
+) -> tuple[list[Fitted], list[Alignment]]:  # fmt: skip
+    """Fit all connected signals, and align their tables with the session.
+
+    A signal that may be of several channels is fitted only where its channel explains it.
+    """
     zero_s = min((signal.first_s for signal in recorded.values() if signal.first_s is not None), default=0.0)
-
-    def known(name: str, wire: Wire) -> Stimulus:
-        sent, first_s, sent_hz = session.whole(wire.channel)
-        formula = formulas.get(wire.channel)
-        if formula is None:
-            return Sampled(sent, first_s, sent_hz)
-        return Exact(formula, (first_s, first_s + len(sent) / sent_hz), recorded[name].rate_hz or sent_hz)
-
-    def fit(name: str, wire: Wire) -> Fitted | None:
-        signal, channel = recorded[name], session.channels[wire.channel]
-        _, first_s, sent_hz = session.whole(wire.channel)
-        rate = signal.rate_hz or sent_hz
-        begin_s = 0.0 if signal.first_s is None else signal.first_s - zero_s
-        times_s = begin_s + np.arange(signal.rows) / rate
-        within_s = wire.within_s[0] + begin_s, wire.within_s[1] + begin_s
-        wire = replace(wire, own_s=wire.own_s - begin_s, within_s=within_s)
-        exact = wire.channel in formulas or not session.noisy
-        values = in_unit(signal, channel)[0]
-        return _fit(name, channel, values, times_s, known(name, wire), first_s, wire, sent_hz, exact=exact)
-
-    wires = {name: wire for name, wire in wires.items() if wire.channel}
-    wires |= _begun(fit, known, wires, remarks)
-    found = []
+    tables: dict[int, list[Source]] = {}
+    parts_of: dict[str, tuple[Sampled, Sampled, Sampled] | None] = {}
     for name, wire in wires.items():
-        signal, channel = recorded[name], session.channels[wire.channel]
+        signal = recorded[name]
+        if not wire.channel or signal.rows < 2:
+            continue
+        channel = session.channels[wire.channel]
         if signal.rate_hz is None:
             remarks.append(f"{name}: the file tells no rate; taken for the session's, {channel.rate_hz:g} Hz")
-        if not in_unit(signal, channel)[1]:
+        values, told = in_unit(signal, channel)
+        if not told:
             remarks.append(f"{name}: the unit {signal.unit or 'is not told'}; taken for {channel.unit}")
-        one = fit(name, wire)
-        if one is not None and (one.good or name == wire.channel or not wire.rivals):
-            found.append(one)
-    return found
-
-
-def _begun(
-    fit: Callable[[str, Wire], Fitted | None], known: Callable[[str, Wire], Stimulus], wires: Mapping[str, Wire],
-    remarks: list[str],
-) -> dict[str, Wire]:  # fmt: skip
-    """Wires with another beginning, where what is nearly periodic fits better from there."""
-    if not wires:
-        return {}
-    name = max(wires, key=lambda each: (len(wires[each].others_s) > 0, wires[each].likeness))
-    wire, best = wires[name], (math.inf, 0.0)
-    shifts = [0.0, *(other_s - wire.late_s for other_s in wire.others_s)]
-    for n, shift in enumerate(shifts):
-        one = fit(name, replace(wire, own_s=wire.own_s + shift))
-        if one is not None:
-            if not n and wire.others_s:
-                shifts[1:1] = beginnings(one.clean, known(name, wire))
-            left = float(np.std(one.clean.residual))
-            best = (left, shift) if left < _BETTER * best[0] else best
-            if left < _PURER * one.channel.noise_v / abs(one.channel.sensitivity_v):
-                break
-    else:
-        if len(set(wire.others_s) - {wire.late_s}) > 1:
-            remarks.append(_NOT_SURE)
-    return {each: replace(wire, own_s=wire.own_s + best[1]) for each, wire in wires.items() if wire.others_s}
+        sent, first_s, sent_hz = session.whole(wire.channel)
+        formula, rate_hz = formulas.get(wire.channel), signal.rate_hz or sent_hz
+        stimulus: Stimulus = Sampled(sent, first_s, sent_hz)
+        if formula is not None:
+            stimulus = Exact(formula, (first_s, first_s + len(sent) / sent_hz), rate_hz)
+        least = _SEEN * math.hypot(channel.noise_v, channel.lsb_v) / abs(channel.sensitivity_v)
+        parts = parts_of[name] = parted(stimulus, rate_hz, sent_hz, least)
+        begin_s = 0.0 if signal.first_s is None else signal.first_s - zero_s
+        within_s = wire.within_s[0] + begin_s, wire.within_s[1] + begin_s
+        wire = replace(wire, own_s=wire.own_s - begin_s, within_s=within_s)
+        source = Source(name, channel, wire, values, begin_s, rate_hz, stimulus if parts is None else parts[0], first_s)
+        tables.setdefault(id(signal.table), []).append(source)
+    found, alignments = [], []
+    for sources in tables.values():
+        alignment = align(sources)
+        alignments += [] if alignment is None else [alignment]
+        for source in sources:
+            exact = source.wire.channel in formulas or not session.noisy
+            one = _fit(source, alignment, parts_of[source.name], exact=exact)
+            if one is not None and (one.good or source.name == source.wire.channel or not source.wire.rivals):
+                found.append(one)
+    return found, alignments
 
 
 def in_unit(signal: Recorded, channel: Channel) -> tuple[np.ndarray, bool]:
@@ -165,15 +157,18 @@ def in_unit(signal: Recorded, channel: Channel) -> tuple[np.ndarray, bool]:
 
 
 def _fit(
-    name: str, channel: Channel, values: np.ndarray, times_s: np.ndarray, stimulus: Stimulus, first_s: float,
-    wire: Wire, sent_hz: float, *, exact: bool,
-) -> Fitted | None:  # fmt: skip
-    rate = (len(times_s) - 1) / (times_s[-1] - times_s[0])
-    parts = parted(
-        stimulus, rate, sent_hz, _SEEN * math.hypot(channel.noise_v, channel.lsb_v) / abs(channel.sensitivity_v)
-    )
-    stimulus = stimulus if parts is None else parts[0]
-    whole = fit_waveform(values, times_s, stimulus, wire.own_s + first_s, within_s=wire.within_s)
+    source: Source, alignment: Alignment | None, parts: tuple[Sampled, Sampled, Sampled] | None, *, exact: bool
+) -> Fitted | None:
+    name, channel, stimulus, wire = source.name, source.channel, source.stimulus, source.wire
+    if alignment is None:
+        values, whole = source.values, fit_waveform(
+            source.values, source.times_s, stimulus, source.late_s, within_s=wire.within_s
+        )  # fmt: skip
+    else:
+        values, times_s, curve = alignment.even(source)
+        whole = fit_waveform(
+            values, times_s, stimulus, source.late_s + alignment.begin_s, within_s=wire.within_s, curve=curve
+        )
     if whole is None:
         return None
     shown = response(whole) if whole.likeness >= _SOME else None
@@ -187,11 +182,30 @@ def _fit(
             clean = low
     folds, alias = None, 0.0
     if parts is not None:
-        at_s = clean.times_s + low.late_s + low.drift * (clean.times_s - low.middle_s)
-        alias, amounts = folded(clean, [each(at_s)[0] for each in parts[1:]])
+        at_s = clean.times_s + low.late_at(clean.times_s)
+        alias, amounts = _folded(clean, [each(at_s)[0] for each in parts[1:]])
         folds = _scaled(amounts, 1.0 / abs(low.gain))
         clean = replace(clean, residual=clean.residual - alias)
     return Fitted(name, channel, low, clean, shown, corner_hz, odd, values, exact, folds, alias)
+
+
+def _folded(found: Waveform, above: Sequence[np.ndarray]) -> tuple[np.ndarray, tuple[float, float, float]]:
+    """What of a residual is of frequencies above half of the rate, and times what was sent with its 95 % interval.
+
+    Args:
+        found: A fit of what is below.
+        above: What is above at the fitted instants, and that a quarter of a period later, each shape (n,).
+    """
+    columns = [*above, found.known, found.slope, np.ones(len(found.known))]
+    sizes = np.maximum([np.sqrt(np.mean(each**2)) for each in columns], 1e-300)
+    matrix = np.column_stack(columns) / sizes
+    parts = np.linalg.lstsq(matrix, found.residual, rcond=None)[0]
+    covariance, freedom = sandwich(matrix, found.residual - matrix @ parts)
+    both = parts[:2] / sizes[:2]
+    amount = max(float(np.linalg.norm(both)), 1e-300)
+    way = both / amount / sizes[:2]
+    half = float(student(freedom[:2].min())) * math.sqrt(way @ covariance[:2, :2] @ way)
+    return matrix @ parts, (amount, max(0.0, amount - half), amount + half)
 
 
 def _about(value: float, half: float, size: float = 1.0) -> Interval:
@@ -203,13 +217,16 @@ def score_analogue(
     formulas: Mapping[str, Formula],
 ) -> None:  # fmt: skip
     """Put the rows of the analogue path onto a scorecard."""
-    found = fit_channels(recorded, wires, session, formulas, card.remarks)
+    found, alignments = fit_channels(recorded, wires, session, formulas, card.remarks)
     fitted = {one.name for one in found}
+    _score_rows(card, alignments, recorded)
     for name, wire in wires.items():
         if name not in fitted:
             note = "nothing that was sent explains it" if wire.channel else "no channel is like it"
             card.add("gain", name, None, note=note)
-    _score_time(card, [one for one in found if one.good], wires)
+    ambiguous = {name for each in alignments if each.alike for name in each.names}
+    _score_time(card, [one for one in found if one.good], ambiguous)
+    _score_wires(card, recorded, wires, found, ambiguous, session)
     sines = []
     for one in found:
         _score_fit(card, one)
@@ -222,39 +239,132 @@ def score_analogue(
         card.add(quantity, "", None)
 
 
-def _score_time(card: Scorecard, found: list[Fitted], wires: Mapping[str, Wire]) -> None:
+def _score_rows(card: Scorecard, alignments: list[Alignment], recorded: Mapping[str, Recorded]) -> None:
+    """Lost and doubled samples, and the part of each table that is judged."""
+    if not alignments:
+        card.doubts.append("no channel is found in the session")
+        for quantity in ("lost samples", "doubled samples", "judged part"):
+            card.add(quantity, "", None)
+    for alignment in alignments:
+        name = alignment.names[0] if len(alignments) > 1 else ""
+        steps = alignment.track.steps() if len(alignment.track.blocks) else None
+        note = "up to whole periods" if alignment.alike else ""
+        for quantity, sign in (("lost samples", 1), ("doubled samples", -1)):
+            if steps is None:
+                card.add(quantity, name, None, note="the signal is too slow for a step by one sample to show")
+                continue
+            here = [(first, last, sign * size) for first, last, size in steps if sign * size > 0]
+            rows = ", ".join(
+                f"{size} at row {last}" if first == last else f"{size} in rows {first} to {last}"
+                for first, last, size in here[:_NAMED]
+            )
+            told = "; ".join(each for each in (rows, f"and {len(here) - _NAMED} more" * (len(here) > _NAMED)) if each)
+            count = float(sum(size for _, _, size in here))
+            card.add(
+                quantity, name, (count,) * 3, note="; ".join(each for each in (told, note if here else "") if each)
+            )
+            card.runs[f"{quantity} {name}".strip()] = [(first, last) for first, last, _ in here]
+        judged = alignment.judged()
+        card.add("judged part", name, judged)
+        if card.rows[-1].verdict == INCONCLUSIVE:
+            card.doubts.append("begins that explain the record alike leave different parts of it unexplained")
+        for rows, what in zip(
+            (alignment.track.inside[0], alignment.rows - alignment.track.inside[1]),
+            ("before the session's begin", "after the session's end"), strict=True,
+        ):  # fmt: skip
+            if rows > _EDGE:
+                card.remarks.append(f"{rows / alignment.rate_hz:.6g} s of the record lie {what} and are not judged")
+
+
+def _score_time(card: Scorecard, found: list[Fitted], ambiguous: set[str]) -> None:
     """Clock of all channels together, start of one in the middle of them, and skew of the others against it."""
     # One channel that is off has no say in what the others are: the reference is in the middle of them.
-    inner = sorted((one for one in found if not one.odd), key=lambda one: one.low.late_s) or found
+    middle_s = float(np.median([one.low.middle_s for one in found])) if found else 0.0
+
+    def late_s(one: Fitted) -> float:
+        # Of the same instant, by the mean time error and the clock: the drift alone is not known as well.
+        return one.low.late_s + one.low.drift * (middle_s - one.low.middle_s)
+
+    inner = sorted((one for one in found if not one.odd), key=late_s) or found
     if not inner:
         return
     reference = inner[(len(inner) - 1) // 2] if len(inner) > 2 else found[0]
+    low = reference.low
     halves = np.maximum([one.low.half[3] for one in found], 1e-15)
     drifts = np.array([one.low.drift for one in found])
-    middle = np.sort(drifts)[(len(found) - 1) // 2] if len(found) > 2 else reference.low.drift
+    middle = np.sort(drifts)[(len(found) - 1) // 2] if len(found) > 2 else low.drift
     own = np.abs(drifts - middle) > np.maximum(_OWN_CLOCK[0] * halves, _OWN_CLOCK[1])
-    weights = np.where(own, 0.0, halves**-2.0)
-    told = [("", float(weights @ drifts / weights.sum()), float(weights.sum() ** -0.5))]
-    told += [(found[n].name, drifts[n], halves[n]) for n in np.flatnonzero(own)]
-    for name, drift, half in told:
-        # Its clock runs fast where the session's time goes slowly over its own.
-        note = "off the clock of the others" if name else ""
-        card.add("clock", name, _about(-drift / (1.0 + drift), half, 1e6), note=note)
-    turned = any(wires[one.name].turned for one in found)
-    note = "a periodic signal: up to whole periods" if turned else ""
-    back = np.array([0.0, 0.0, 1.0, -reference.low.middle_s])  # to time zero of the file, at its own clock
-    spread = math.sqrt(back @ reference.low.covariance @ back)
-    begin_s = reference.low.late_s - reference.low.drift * reference.low.middle_s
-    start = _about(begin_s, float(student(reference.low.freedom[2:].min())) * spread)
+    bend_halves = np.maximum([one.low.half[4] for one in found], 1e-15)
+    bends = np.array([one.low.bend for one in found])
+    for quantity, values, half, others in (("clock", drifts, halves, own), ("clock drift", bends, bend_halves, own)):
+        weights = np.where(others, 0.0, half**-2.0)
+        told = [("", float(weights @ values / weights.sum()), float(weights.sum() ** -0.5))]
+        told += [(found[n].name, values[n], half[n]) for n in np.flatnonzero(others) if quantity == "clock"]
+        for name, value, wide in told:
+            # Its clock runs fast where the session's time goes slowly over its own.
+            note = "off the clock of the others" if name else ""
+            slow = value / (1.0 + value) if quantity == "clock" else value
+            card.add(quantity, name, _about(-slow, wide, 1e6), note=note)
+    open_ = reference.name in ambiguous
+    note = _AMBIGUOUS if open_ else ""
+    # To time zero of the file, at its own clock.
+    back = np.array([0.0, 0.0, 1.0, -low.middle_s, 0.5 * low.middle_s**2 - low.half_s**2 / 6.0])
+    spread = math.sqrt(back @ low.covariance @ back)
+    start = _about(float(low.late_at(np.zeros(1))[0]), float(student(low.freedom[2:].min())) * spread)
     card.add("start", reference.name, start, of=reference.channel, note=note)
+    if open_:
+        card.rows[-1] = replace(card.rows[-1], verdict=INCONCLUSIVE, run=ANALOGUE["start"].run)
     for one in found:
         if one is not reference:
-            apart = one.low.late_s - reference.low.late_s
-            both = math.hypot(one.low.half[2], reference.low.half[2])
+            apart = late_s(one) - late_s(reference)
+            both = math.hypot(one.low.half[2], low.half[2])
             odd = _ODD if one.odd or reference.odd else ""
             said = "; ".join(each for each in (f"against {reference.name}", note, odd) if each)
             skew = None if odd else _about(apart, both, 1e9)
             card.add("skew", one.name, skew, of=one.channel, note=said)
+            if open_ and card.rows[-1].verdict != FAIL:  # a skew that fails does so from each of the begins
+                card.rows[-1] = replace(card.rows[-1], verdict=INCONCLUSIVE, run=ANALOGUE["skew"].run)
+
+
+def _is_loud(session: Session, name: str) -> bool:
+    """Return whether a channel's signal is well above its noise."""
+    channel = session.channels[name]
+    return float(np.std(session.whole(name)[0])) > _LOUD * channel.noise_v / abs(channel.sensitivity_v)
+
+
+def _score_wires(
+    card: Scorecard, recorded: Mapping[str, Recorded], wires: Mapping[str, Wire], found: list[Fitted],
+    ambiguous: set[str], session: Session,
+) -> None:  # fmt: skip
+    """Mapping and polarity of the signals whose gain is found; a name of the rig's has to be that channel."""
+    fits = {one.name: one for one in found if one.good}
+    signs = {name: one.low.gain > 0.0 for name, one in fits.items()}
+    open_ = {name for name in fits if name in ambiguous and wires[name].turned}
+    mixed = len({signs[name] for name in open_}) > 1
+    rows = []
+    for name, wire in wires.items():
+        verdict: Verdict = NO_LIMIT
+        note = f"correlation {wire.likeness:.4f}"
+        if not wire.channel and name in session.channels and recorded[name].rows >= _MANY and _is_loud(session, name):
+            verdict, note = FAIL, "nothing of what was sent is in it"
+        elif not wire.channel or wire.rivals or name not in fits:
+            verdict = INCONCLUSIVE
+            note += f"; as like {', '.join(wire.rivals)}" if wire.rivals else ""
+        elif name in session.channels:
+            verdict = PASS if wire.channel == name else FAIL
+        rows.append(text_row(card.path, "mapping", name, wire.channel or "-", verdict, note))
+        if not wire.channel:
+            continue
+        upright = signs.get(name, wire.polarity > 0)
+        verdict, note = PASS if upright else FAIL, ""
+        if name not in fits:
+            verdict = INCONCLUSIVE
+        elif name in open_ and not (mixed and not upright):
+            verdict, note = INCONCLUSIVE, "half a period later it would be the other"
+        elif name in open_:
+            note = "turned against the others, from whichever begin"
+        rows.append(text_row(card.path, "polarity", name, "as sent" if upright else "turned", verdict, note))
+    card.rows[:0] = rows
 
 
 def _score_fit(card: Scorecard, one: Fitted) -> None:
@@ -294,12 +404,15 @@ def _score_fit(card: Scorecard, one: Fitted) -> None:
 
 def _score_sine(card: Scorecard, one: Fitted) -> bool:
     """The standard's sine fit beside the known signal; whether that is a sine, and no value is missing."""
-    gaps = not np.isfinite(one.values).all()
+    # The longest stretch without a lost sample.
+    gaps = np.flatnonzero(~np.isfinite(np.concatenate([[np.nan], one.values, [np.nan]])))
+    at = int(np.argmax(np.diff(gaps)))
+    values = one.values[gaps[at] : gaps[at + 1] - 1]
     noises = 1 if one.exact else 2
     quiet = _PURER * math.hypot(one.channel.noise_v, one.channel.lsb_v) / abs(one.channel.sensitivity_v)
-    if gaps or not is_sine(one.low.known[:_LONGEST], quiet):
+    if len(values) < _MANY or not is_sine(one.low.known[:_LONGEST], quiet):
         return False
-    fit = fit_sine(one.values)
+    fit = fit_sine(values)
     told = quality(fit)
     for quantity, estimate in zip(_SINE, (told.sinad_db, told.enob, told.thd_db, told.sfdr_db), strict=True):
         note = "" if noises == 1 else "of the record as it is: the rig's own noise is in it"

@@ -16,13 +16,21 @@ from replays.score.digital import Taken, score_digital, settle
 from replays.score.limits import Limits, load_limits
 from replays.score.live import Arrivals
 from replays.score.recorded import Recorded, open_recorded
-from replays.score.scorecard import FAIL, INCONCLUSIVE, NO_LIMIT, PASS, QUANTITIES, Scorecard, ScoreRow, Verdict
+from replays.score.scorecard import (
+    FAIL,
+    INCONCLUSIVE,
+    NO_LIMIT,
+    PASS,
+    QUANTITIES,
+    Scorecard,
+    ScoreRow,
+    Verdict,
+    text_row,
+)
 from replays.score.sent import Formula, Session
 from replays.score.wiring import Wire, find_wires
 from rig.errors import InputError, UnknownNameError, Words
 
-_LOUD, _MANY = 4.0, 1000
-"""Noises of a channel, and rows, from which on what was sent has to be seen."""
 _NEAR = 0.01
 """Part by which the rate of a DAQ that took rows may be off by its stamps."""
 _CORE = {"digital": "altered values", "analogue": "gain"}
@@ -70,13 +78,15 @@ def judge(
         told = sum(each.scale.known for each in rows.values())
         path = "digital" if 2 * told > len(wires) else "analogue"
     if path == "analogue":
-        wires = _connect(recorded, sent, {name: each.rate_hz or rate for name, each in recorded.items()})
+        whole = {name: (values, hz) for name in session.channels for values, _, hz in [session.whole(name)]}
+        rates = {name: each.rate_hz or rate for name, each in recorded.items()}
+        wires = _connect(recorded, whole, rates, whole=True)
     if not any(wire.channel for wire in wires.values()):
         raise InputError("FILE", f"a recording of what {session.path.name} has", Words(f"{file}, of which nothing is"))
     if path == "digital" and not rows:
         raise InputError("--path", "analogue, as no counts can be told from the values", path)
     card = Scorecard(f"{file.name} against {session.path.name}", path, limits.title, limits.bounds)
-    _score_wires(card, recorded, wires, session, rows if path == "digital" else {}, sent)
+    _score_wires(card, wires, session, rows if path == "digital" else {})
     _score_recorded(card, recorded, wires, due)
     if path == "digital":
         if arrivals is not None:
@@ -112,14 +122,18 @@ def _near(rate_hz: float, sent_hz: float) -> float:
 
 
 def _connect(
-    recorded: Mapping[str, Recorded], sent: Mapping[str, tuple[np.ndarray, float]], rates: Mapping[str, float]
-) -> dict[str, Wire]:
-    """Wires of all signals that have values; those that have stamps of their own need not begin with the others."""
+    recorded: Mapping[str, Recorded], sent: Mapping[str, tuple[np.ndarray, float]], rates: Mapping[str, float],
+    *, whole: bool = False,
+) -> dict[str, Wire]:  # fmt: skip
+    """Wires of all signals that have values; those that have stamps of their own need not begin with the others.
+
+    The whole record is searched, or its first rows.
+    """
     tables: dict[int, dict[str, tuple[np.ndarray, float]]] = {}
     for name, signal in recorded.items():
         if signal.rows > 1 and np.isfinite(signal.early).any():
             own = id(signal.table) if signal.table.stamped else 0
-            tables.setdefault(own, {})[name] = signal.early, rates[name]
+            tables.setdefault(own, {})[name] = signal.values if whole else signal.early, rates[name]
     wires = {name: wire for part in tables.values() for name, wire in find_wires(part, sent).items()}
     return {name: wires[name] for name in recorded if name in wires}
 
@@ -135,36 +149,26 @@ def _by_name(signals: Sequence[Recorded]) -> dict[str, Recorded]:
     return found
 
 
-def _score_wires(
-    card: Scorecard, recorded: Mapping[str, Recorded], wires: Mapping[str, Wire], session: Session,
-    rows: Mapping[str, Taken], sent: Mapping[str, tuple[np.ndarray, float]],
-) -> None:  # fmt: skip
-    """Mapping and polarity: a name of the rig's has to be that channel."""
-    loud = {
-        name
-        for name, channel in session.channels.items()
-        if np.std(sent[name][0]) > _LOUD * channel.noise_v / channel.lsb_v
-    }
-    for name, wire in wires.items():
+def _score_wires(card: Scorecard, wires: Mapping[str, Wire], session: Session, rows: Mapping[str, Taken]) -> None:
+    """Mapping and polarity on the digital path: a name of the rig's has to be that channel."""
+    for name, wire in (wires if card.path == "digital" else {}).items():
         known = session.channels.keys()
         verdict: Verdict = NO_LIMIT
         note = f"correlation {wire.likeness:.4f}"
         scale = rows[name].scale if name in rows else None
         certain = not wire.rivals if scale is None else scale.known
-        if not wire.channel and card.path == "analogue" and name in loud and recorded[name].rows >= _MANY:
-            verdict, note = FAIL, "nothing of what was sent is in it"
-        elif not wire.channel or not certain:
+        if not wire.channel or not certain:
             verdict = INCONCLUSIVE
             note += f"; as like {', '.join(wire.rivals)}" if wire.rivals else ""
         elif name in known:
             verdict = PASS if wire.channel == name else FAIL
-        card.rows.append(_row(card, "mapping", name, wire.channel or "-", verdict, note))
+        card.rows.append(text_row(card.path, "mapping", name, wire.channel or "-", verdict, note))
         if wire.channel:
             turned = wire.polarity < 0 if scale is None else scale.turned
             open_ = wire.turned if scale is None else not scale.known
             verdict = INCONCLUSIVE if open_ else FAIL if turned else PASS
             note = "half a period later it would be the other" if wire.turned and open_ else ""
-            card.rows.append(_row(card, "polarity", name, "turned" if turned else "as sent", verdict, note))
+            card.rows.append(text_row(card.path, "polarity", name, "turned" if turned else "as sent", verdict, note))
     taken = [wire.channel for wire in wires.values() if wire.channel]
     for channel in dict.fromkeys(each for each in taken if taken.count(each) > 1):
         names = ", ".join(name for name, wire in wires.items() if wire.channel == channel)
@@ -198,9 +202,3 @@ def _score_recorded(
         note = "" if verdict == PASS else "not in the file, or not found in it; " + about.run
         value = "yes" if verdict == PASS else "no"
         card.rows.append(ScoreRow("recorded", name, value, 0.0, 0.0, "1", about.method, None, verdict, "", note))
-
-
-def _row(card: Scorecard, quantity: str, name: str, value: str, verdict: Verdict, note: str) -> ScoreRow:
-    about = QUANTITIES[card.path][quantity]
-    run = about.run if verdict == INCONCLUSIVE else ""
-    return ScoreRow(quantity, name, value, 0.0, 0.0, "1", about.method, None, verdict, run, note)

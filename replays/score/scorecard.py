@@ -38,6 +38,7 @@ class Quantity:
 
 _EXACT = "exact, row by row"
 _SANDWICH = "least squares, block sandwich of 64 blocks, Student's t"
+_FOLLOWED = "time error of each block, steps by whole samples by likelihood ratio"
 _SPLIT = "weighted least squares of squared residuals on squared slope, block sandwich, Student's t"
 _LONGER = "a longer run"
 _RICH = "a signal of many frequencies on every channel (test-prbs, 2 s)"
@@ -82,6 +83,12 @@ ANALOGUE = {
     "skew": Quantity("ns", _SANDWICH, _RICH),
     "start": Quantity("s", _SANDWICH, _RICH),
     "clock": Quantity("ppm", f"{_SANDWICH}, weighted mean of channels", "a longer run with a signal above 100 Hz"),
+    "clock drift": Quantity(
+        "ppm/s", f"{_SANDWICH}, weighted mean of channels", "a longer run with a signal above 100 Hz"
+    ),
+    "lost samples": Quantity("1", _FOLLOWED, "a signal above 100 Hz on every channel"),
+    "doubled samples": Quantity("1", _FOLLOWED, "a signal above 100 Hz on every channel"),
+    "judged part": Quantity("1", "rows explained over rows in the session", "a signal that does not repeat"),
     "noise": Quantity("", _SPLIT, _LONGER),
     "jitter": Quantity("ns", _SPLIT, "a steep signal (test-sine at 1 kHz or more, or two tones), 10 s"),
     "effective bits": Quantity("bit", "of the rms of all that is left, log2(range / (rms sqrt 12))", _LONGER),
@@ -193,6 +200,13 @@ def judge_row(
             verdict = FAIL
     run = about.run if verdict == INCONCLUSIVE else ""
     return ScoreRow(quantity, channel, value, low, high, about.unit or unit, about.method, limit, verdict, run, note)
+
+
+def text_row(path: Path_, quantity: str, channel: str, value: str, verdict: Verdict, note: str) -> ScoreRow:
+    """Return a row whose value is a text, with a verdict that is known."""
+    about = QUANTITIES[path][quantity]
+    run = about.run if verdict == INCONCLUSIVE else ""
+    return ScoreRow(quantity, channel, value, 0.0, 0.0, "1", about.method, None, verdict, run, note)
 
 
 @dataclass

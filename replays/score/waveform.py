@@ -1,6 +1,6 @@
-"""Least squares against the known signal: y = gain s(t + late + drift t) + offset, with what is left over.
+"""Least squares against the known signal: y = gain s(t + late + drift t + bend t^2 / 2) + offset, and its residual.
 
-Intervals of these four are those of the block sandwich: scores of the fit are summed over consecutive blocks, whose
+Intervals of these five are those of the block sandwich: scores of the fit are summed over consecutive blocks, whose
 spread is the covariance, so that noise may have any colour and be larger where the signal is steep. Errors of the known
 signal itself, as of samples between which it is interpolated, are part of what is left, and so of the intervals.
 """
@@ -8,7 +8,6 @@ signal itself, as of samples between which it is interpolated, are part of what 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -29,8 +28,6 @@ _SETTLED = 1e-3
 _MOST_DRIFT = 0.02
 _LEAST = 400
 """Fewest samples that are fitted."""
-_MOST, _FINER, _LIKE = 1 << 17, 4, 12
-"""Samples by which other beginnings are looked for, places between two of them, and how many are told."""
 _TAPS = 96
 _PASSES = 3
 """Rounds in which a fit behind a filter takes the signal at the times that the last one found."""
@@ -49,10 +46,10 @@ class Waveform:
     """What a fit of one channel comes to.
 
     Attributes:
-        gain, offset, late_s, drift: The four [1, unit, s, s/s], `late_s` in the middle of the record.
-        covariance: Of the four, shape (4, 4).
-        freedom: Degrees of freedom of the four variances, shape (4,).
-        middle_s: The middle of the record by the clock of the file [s].
+        gain, offset, late_s, drift, bend: The five [1, unit, s, s/s, 1/s], `late_s` and `drift` means over the record.
+        covariance: Of the five, shape (5, 5).
+        freedom: Degrees of freedom of the five variances, shape (5,).
+        middle_s, half_s: The middle of the fitted rows by the clock of the file, and half of their length [s].
         times_s: Of the rows that were fitted, by the clock of the file, shape (n,).
         values: As recorded [unit], shape (n,).
         known, slope: The signal and its slope there, without gain [unit, unit/s], shape (n,).
@@ -63,9 +60,11 @@ class Waveform:
     offset: float
     late_s: float
     drift: float
+    bend: float
     covariance: np.ndarray
     freedom: np.ndarray
     middle_s: float
+    half_s: float
     times_s: np.ndarray
     values: np.ndarray
     known: np.ndarray
@@ -74,13 +73,22 @@ class Waveform:
 
     @property
     def spread(self) -> np.ndarray:
-        """Standard deviation of the four, shape (4,)."""
+        """Standard deviation of the five, shape (5,)."""
         return np.sqrt(np.diag(self.covariance))
 
     @property
     def half(self) -> np.ndarray:
-        """Half of the 95 % interval of the four, shape (4,)."""
+        """Half of the 95 % interval of the five, shape (5,)."""
         return student(self.freedom) * self.spread
+
+    def late_at(self, times_s: np.ndarray) -> np.ndarray:
+        """Time of the stimulus less time of the record, at times of the record [s], shape (n,)."""
+        return np.polynomial.polynomial.polyval(times_s - self.middle_s, self.curve)
+
+    @property
+    def curve(self) -> tuple[float, float, float]:
+        """The same by powers of the time from the middle [s, 1, 1/s]."""
+        return self.late_s - self.bend * self.half_s**2 / 6.0, self.drift, 0.5 * self.bend
 
     @property
     def likeness(self) -> float:
@@ -91,7 +99,7 @@ class Waveform:
 
 def fit_waveform(
     values: np.ndarray, times_s: np.ndarray, stimulus: Stimulus, late_s: float, *,
-    within_s: tuple[float, float] | None = None,
+    within_s: tuple[float, float] | None = None, curve: tuple[float, float, float] | None = None,
 ) -> Waveform | None:  # fmt: skip
     """Fit a channel; None where the known signal is not in it, or too little of it.
 
@@ -101,42 +109,54 @@ def fit_waveform(
         stimulus: The known signal.
         late_s: Time of the stimulus less time of the file, to a part of a period of the signal [s].
         within_s: Where in the file that is so [s]; None: anywhere.
+        curve: The same over all of the file, by powers of the time from its middle [s, 1, 1/s]; None: not known.
     """
     low, high = stimulus.span_s
     moved = times_s + late_s
     inside = np.isfinite(values) & (moved >= low) & (moved <= high)
     if inside.sum() < _LEAST:
         return None
+    best = followed = None
+    if curve is not None:
+        followed = _solve(values, times_s, stimulus, curve, slice(0, len(values)), final=True)
+        if followed is not None and followed.likeness > _FOUND:
+            return followed
     first, last = np.flatnonzero(inside)[[0, -1]]
     near = (first, last + 1)
     if within_s is not None:
         begin, end = np.searchsorted(times_s, within_s)
         near = max(first, min(begin, last + 1 - _LEAST)), min(last + 1, max(end, first + _LEAST))
-    best = None
     for first_s in _FIRST_S:
-        found = _grow(values, times_s, stimulus, late_s, (first, last + 1), _steepest(values, times_s, *near, first_s))
+        stretch = _steepest(values, times_s, *near, first_s)
+        found = _grow(values, times_s, stimulus, late_s, (first, last + 1), stretch, bent=curve is None)
         if found is not None and (best is None or found.likeness > best.likeness):
             best = found
         if best is not None and best.likeness > _FOUND:
             break
-    return best
+    return best or followed
+
+
+def fit_stretch(
+    values: np.ndarray, times_s: np.ndarray, stimulus: Stimulus, late_s: float, stretch: tuple[int, int]
+) -> Waveform | None:
+    """Fit a channel over a stretch of its rows only, as `fit_waveform`, without intervals."""
+    return _solve(values, times_s, stimulus, (late_s, 0.0, 0.0), slice(*stretch), final=False)
 
 
 def _grow(
     values: np.ndarray, times_s: np.ndarray, stimulus: Stimulus, late_s: float, rows: tuple[int, int],
-    stretch: tuple[int, int],
+    stretch: tuple[int, int], *, bent: bool,
 ) -> Waveform | None:  # fmt: skip
-    """The fit of all of some rows, from that of a stretch of them."""
-    middle, (begin, end), line = 0.5 * (times_s[0] + times_s[-1]), stretch, (late_s, 0.0)
+    """The fit of all of some rows, from that of a stretch of them; the clock's drift only if `bent`."""
+    middle, (begin, end), line = 0.5 * (times_s[0] + times_s[-1]), stretch, (late_s, 0.0, 0.0)
     while True:
         whole = (begin, end) == rows
-        found = _solve(values, times_s, stimulus, line, slice(begin, end), final=whole)
+        found = _solve(values, times_s, stimulus, line, slice(begin, end), final=whole, bent=bent)
         if found is None or abs(found.drift) > _MOST_DRIFT:
             return None
-        centre = 0.5 * (times_s[begin] + times_s[end - 1])
-        line = (found.late_s + found.drift * (middle - centre), found.drift)
         if whole:
-            return replace(found, late_s=line[0])
+            return found
+        line = (found.late_s + found.drift * (middle - found.middle_s), found.drift, 0.0)
         wider = end - begin
         begin, end = max(rows[0], begin - wider // 2), min(rows[1], end + wider - wider // 2)
 
@@ -152,37 +172,43 @@ def _steepest(values: np.ndarray, times_s: np.ndarray, first: int, last: int, wa
 
 
 def _solve(
-    values: np.ndarray, times_s: np.ndarray, stimulus: Stimulus, line: tuple[float, float], rows: slice, *, final: bool
-) -> Waveform | None:
-    """Gauss and Newton's steps over some rows, about their own centre; `line` is about the centre of all."""
-    middle = 0.5 * (times_s[0] + times_s[-1])
+    values: np.ndarray, times_s: np.ndarray, stimulus: Stimulus, curve: tuple[float, float, float], rows: slice, *,
+    final: bool, bent: bool = True,
+) -> Waveform | None:  # fmt: skip
+    """Gauss and Newton's steps over some rows, about their own centre; `curve` is about the centre of all.
+
+    The clock's drift is fitted over all rows only, and if `bent`; else it has a standard deviation of 1 /s.
+    """
     y, t = values[rows], times_s[rows]
-    centre = 0.5 * (t[0] + t[-1])
-    late, drift = line[0] + line[1] * (centre - middle), line[1]
-    since = t - centre
     low, high = stimulus.span_s
-    span = max(since[-1], 1e-300)
-    number = 0
+    start_s = np.polynomial.polynomial.polyval(t - 0.5 * (times_s[0] + times_s[-1]), curve)
+    held = np.isfinite(y) & (t + start_s >= low) & (t + start_s <= high)
+    if held.sum() < _LEAST:
+        return None
+    y, t, start_s = y[held], t[held], start_s[held]
+    centre, span = 0.5 * (t[0] + t[-1]), 0.5 * max(t[-1] - t[0], 1e-300)
+    u = (t - centre) / span
+    shape = np.column_stack([np.ones(len(u)), u, u**2 - 1.0 / 3.0][: 3 if final and bent else 2])
+    moved, number = np.zeros(shape.shape[1]), 0
     while True:
-        at = t + late + drift * since
-        use = np.isfinite(y) & (at >= low) & (at <= high)
+        at = t + start_s + shape @ moved
+        use = (at >= low) & (at <= high)
         if use.sum() < _LEAST:
             return None
         s, ds = stimulus(at[use])
         scale = max(float(np.std(s)), 1e-300)
         steep = max(float(np.sqrt(np.mean(ds**2))), 1e-300)
-        ones, u = np.ones(len(s)), since[use] / span
+        ones = np.ones(len(s))
         # Gain and offset follow linearly; the step of time is taken about them.
         gain, offset = np.linalg.lstsq(np.column_stack([s / scale, ones]), y[use], rcond=None)[0]
         gain /= scale
         if not gain:
             return None
-        jacobian = np.column_stack([s / scale, ones, ds / steep, ds / steep * u])
+        jacobian = np.column_stack([s / scale, ones, (ds / steep)[:, None] * shape[use]])
         residual = y[use] - gain * s - offset
         inverse = np.linalg.pinv(jacobian.T @ jacobian)
         step = inverse @ (jacobian.T @ residual)
-        units = np.array([scale, 1.0, gain * steep, gain * steep * span])
-        late, drift = late + step[2] / units[2], drift + step[3] / units[3]
+        moved = moved + step[2:] / (gain * steep)
         small = (
             np.abs(step[2:])
             < (_SETTLED if final else 0.1) * np.sqrt(np.diag(inverse)[2:] * np.mean(residual**2)) + 1e-300
@@ -190,59 +216,21 @@ def _solve(
         number += 1
         if number > 1 and (small.all() or number >= _ROUNDS + (_FINAL if final else 0)):
             break
+    # The curve that the fit began with, about this centre, is part of what was found.
+    begun = np.linalg.lstsq(np.column_stack([np.ones(len(u)), u, u**2 - 1.0 / 3.0]), start_s, rcond=None)[0]
+    begun[: len(moved)] += moved
     residual = residual - jacobian @ step
-    covariance, freedom = sandwich(jacobian, residual)
+    units = np.array([scale, 1.0, gain * steep, gain * steep * span, 0.5 * gain * steep * span**2])
+    units = np.where(np.abs(units) > 1e-140, units, 1e-140)
+    covariance, freedom = np.diag([0.0, 0.0, 0.0, 0.0, units[4] ** 2]), np.ones(5)
+    if final:
+        fitted = slice(jacobian.shape[1])
+        covariance[fitted, fitted], freedom[fitted] = sandwich(jacobian, residual)
     return Waveform(
-        float(gain + step[0] / scale), float(offset + step[1]), float(late), float(drift),
-        covariance / np.outer(units, units), freedom, middle, t[use], y[use], s, ds, residual,
+        float(gain + step[0] / scale), float(offset + step[1]), float(begun[0]), float(begun[1] / span),
+        float(2.0 * begun[2] / span**2), covariance / np.outer(units, units), freedom, centre, span,
+        t[use], y[use], s, ds, residual,
     )  # fmt: skip
-
-
-def beginnings(found: Waveform, stimulus: Stimulus) -> list[float]:
-    """Shifts of time after which the known signal is as like what was recorded, by the clock of a fit [s].
-
-    The likeliest are first. Where a signal nearly repeats, a fit finds its clock from any beginning.
-    """
-    from scipy.signal import correlate
-
-    low, high = stimulus.span_s
-    step_s = (1.0 + found.drift) * (found.times_s[-1] - found.times_s[0]) / (len(found.times_s) - 1)
-    rows = math.floor((high - low) / step_s)
-    y = found.values[: min(_MOST, rows // 2)]
-    n = len(y)
-    curve = np.zeros((rows - n, _FINER))
-    for phase in range(_FINER):
-        s, _ = stimulus(low + (np.arange(rows - 1) + phase / _FINER) * step_s)
-        sums, squares = (np.cumsum(np.concatenate([[0.0], each])) for each in (s, s**2))
-        power = squares[n:] - squares[:-n] - (sums[n:] - sums[:-n]) ** 2 / n
-        alike = correlate(s, y - y.mean(), "valid", "fft") / np.sqrt(np.maximum(power, 1e-12 * power.max()))
-        curve[:, phase] = np.abs(alike)
-    curve = curve.ravel()
-    at = np.flatnonzero((curve[1:-1] > curve[:-2]) & (curve[1:-1] >= curve[2:])) + 1
-    bend = curve[at - 1] - 2.0 * curve[at] + curve[at + 1]
-    aside = 0.5 * (curve[at - 1] - curve[at + 1]) / bend
-    best = np.argsort(-(curve[at] - 0.25 * (curve[at - 1] - curve[at + 1]) * aside))[:_LIKE]
-    began_s = found.times_s[0] + found.late_s + found.drift * (found.times_s[0] - found.middle_s)
-    return (low + (at[best] + aside[best]) * (step_s / _FINER) - began_s).tolist()
-
-
-def folded(found: Waveform, above: Sequence[np.ndarray]) -> tuple[np.ndarray, tuple[float, float, float]]:
-    """What of a residual is of frequencies above half of the rate, and times what was sent with its 95 % interval.
-
-    Args:
-        found: A fit of what is below.
-        above: What is above at the fitted instants, and that a quarter of a period later, each shape (n,).
-    """
-    columns = [*above, found.known, found.slope, np.ones(len(found.known))]
-    sizes = np.maximum([np.sqrt(np.mean(each**2)) for each in columns], 1e-300)
-    matrix = np.column_stack(columns) / sizes
-    parts = np.linalg.lstsq(matrix, found.residual, rcond=None)[0]
-    covariance, freedom = sandwich(matrix, found.residual - matrix @ parts)
-    both = parts[:2] / sizes[:2]
-    amount = max(float(np.linalg.norm(both)), 1e-300)
-    way = both / amount / sizes[:2]
-    half = float(student(freedom[:2].min())) * math.sqrt(way @ covariance[:2, :2] @ way)
-    return matrix @ parts, (amount, max(0.0, amount - half), amount + half)
 
 
 @dataclass(frozen=True)
@@ -373,6 +361,13 @@ def _corner(f: np.ndarray, log: np.ndarray, spread: np.ndarray) -> tuple[float, 
     return at * math.exp(root), at * math.exp(root - half), at * math.exp(root + half)
 
 
+def _places(times_s: np.ndarray) -> tuple[np.ndarray, float]:
+    """Numbers of rows on an even grid, of which some may be missing, shape (n,), and its step [s]."""
+    step_s = float(np.median(np.diff(times_s)))
+    places = np.rint((times_s - times_s[0]) / step_s).astype(int)
+    return places, (times_s[-1] - times_s[0]) / max(1, int(places[-1]))
+
+
 def through(found: Waveform) -> Waveform:
     """The fit behind the linear response of the channel: 96 taps by least squares, so that what is left is noise."""
     from scipy.linalg import solve_toeplitz
@@ -387,7 +382,9 @@ def through(found: Waveform) -> Waveform:
     taps = solve_toeplitz(auto, cross)
     known = np.convolve(x, taps)[half : half + n]
     slope = np.convolve(found.slope, taps)[half : half + n]
-    kept = slice(_TAPS, -_TAPS)
+    places, _ = _places(found.times_s)
+    kept = np.zeros(n, bool)  # where the taps meet no lost sample
+    kept[_TAPS:-_TAPS] = places[_TAPS + half : n - half] - places[half : n - _TAPS - half] == _TAPS
     left = (y - known)[kept]
     return replace(
         found, gain=1.0, times_s=found.times_s[kept], values=y[kept], known=known[kept], slope=slope[kept],
@@ -411,7 +408,7 @@ Corner = tuple[float, float, float]
 def behind_filter(found: Waveform, stimulus: Stimulus, shown: Response) -> tuple[Waveform, Corner] | None:
     """The fit anew with a Butterworth low-pass between signal and record, and its corner with its interval.
 
-    Gain is then that at low frequencies, time without the filter's delay. None where values miss, or no corner fits.
+    Gain is then that at low frequencies, time without the filter's delay. None where no corner fits.
 
     Args:
         found: The fit without it.
@@ -422,12 +419,12 @@ def behind_filter(found: Waveform, stimulus: Stimulus, shown: Response) -> tuple
     order, corner_hz, near, late_s = order_of(shown), shown.corner_hz[0], found, None
     better = None
     for _ in range(_PASSES):
-        better = _behind(near, corner_hz, order, late_s)
+        better = _behind(near, stimulus, corner_hz, order, late_s)
         if better is None:
             return None
         # Once more, with the signal at the times that are known now.
         fit, (corner_hz, _, _) = better
-        known, slope = stimulus(found.times_s + fit.late_s + fit.drift * (found.times_s - found.middle_s))
+        known, slope = stimulus(found.times_s + fit.late_at(found.times_s))
         near, late_s = replace(fit, times_s=found.times_s, values=found.values, known=known, slope=slope), 0.0
     assert better is not None
     fit, (corner_hz, low, high) = better
@@ -435,53 +432,61 @@ def behind_filter(found: Waveform, stimulus: Stimulus, shown: Response) -> tuple
     return fit, (true * corner_hz, true * low, true * high)
 
 
-def _behind(found: Waveform, corner_hz: float, order: int, late_s: float | None) -> tuple[Waveform, Corner] | None:
+def _behind(
+    found: Waveform, stimulus: Stimulus, corner_hz: float, order: int, late_s: float | None
+) -> tuple[Waveform, Corner] | None:
     """The same about a corner and a delay that are nearly known; without a delay, about that of low frequencies."""
-    n, span_s = len(found.times_s), found.times_s[-1] - found.times_s[0]
-    step_s = span_s / (n - 1)
+    span_s = found.times_s[-1] - found.times_s[0]
+    places, step_s = _places(found.times_s)
+    n = int(places[-1]) + 1
     if late_s is None:  # by as much as the filter delays low frequencies
         late_s = 1.0 / (2.0 * math.pi * corner_hz * math.sin(math.pi / (2.0 * order)))
     cut = math.ceil(_SETTLING / (corner_hz * step_s))
-    if np.ptp(np.diff(found.times_s)) > 0.5 * step_s or n < 8 * cut + _LEAST:
-        return None
-    y = found.values
     # What the ends do to the filter is left out.
-    spectra = [np.fft.rfft(values) for values in (found.known, found.slope)]
+    kept = slice(*np.searchsorted(places, (cut, n - cut)))
+    if n < 8 * cut + _LEAST or kept.stop - kept.start < _LEAST:
+        return None
+    y, known, slope = found.values, found.known, found.slope
+    if n > len(places):  # the filter needs the instants of lost samples, too
+        even_s = found.times_s[0] + step_s * np.arange(n)
+        known, slope = stimulus(even_s + found.late_at(even_s))
+    spectra = [np.fft.rfft(values) for values in (known, slope)]
     f = np.fft.rfftfreq(n, step_s)
     poles = np.exp(1j * np.pi * (2.0 * np.arange(1, order + 1) + order - 1.0) / (2.0 * order))
-    kept, log = slice(cut, n - cut), math.log(corner_hz)
+    log = math.log(corner_hz)
 
     def passed(spectrum: np.ndarray, log_corner: float) -> np.ndarray:
         s = 1j * f / math.exp(log_corner)
         loss = np.prod([1.0 - s / pole for pole in poles], axis=0)
-        return np.fft.irfft(spectrum * np.exp(2j * np.pi * f * late_s) / loss, n)[kept]
+        return np.fft.irfft(spectrum * np.exp(2j * np.pi * f * late_s) / loss, n)[places[kept]]
 
-    u, ones = (2.0 * (found.times_s - found.middle_s) / span_s)[kept], np.ones(n)[kept]
+    u = (2.0 * (found.times_s - found.middle_s) / span_s)[kept]
+    ones = np.ones(len(u))
     solved = None
     for _ in range(2 * _ROUNDS):
         s, ds = (passed(spectrum, log) for spectrum in spectra)
         moved = (passed(spectra[0], log + _RISE) - passed(spectra[0], log - _RISE)) / (2.0 * _RISE)
         gain = float(np.linalg.lstsq(np.column_stack([s, ones]), y[kept], rcond=None)[0][0])
-        matrix = np.column_stack([s, ones, gain * ds, gain * ds * u, gain * moved])
+        matrix = np.column_stack([s, ones, gain * ds, gain * ds * u, gain * ds * (u**2 - 1.0 / 3.0), gain * moved])
         sizes = np.maximum(np.sqrt(np.mean(matrix**2, axis=0)), 1e-300)
         jacobian = matrix / sizes
         parts = np.linalg.lstsq(jacobian, y[kept], rcond=None)[0] / sizes
-        late_s, log = late_s + parts[2], log + float(np.clip(parts[4], -0.2, 0.2))
+        late_s, log = late_s + parts[2], log + float(np.clip(parts[5], -0.2, 0.2))
         if abs(log - math.log(corner_hz)) > _FAR:
             return None
         solved = s, ds, matrix, jacobian, sizes, parts
-        if abs(parts[4]) < 1e-9 and abs(parts[2]) < 1e-13:
+        if abs(parts[5]) < 1e-9 and abs(parts[2]) < 1e-13:
             break
     assert solved is not None
     s, ds, matrix, jacobian, sizes, parts = solved
     residual = y[kept] - matrix @ parts
     covariance, freedom = sandwich(jacobian, residual)
-    sizes = sizes * np.array([1.0, 1.0, 1.0, 0.5 * span_s, 1.0])
+    sizes = sizes * np.array([1.0, 1.0, 1.0, 0.5 * span_s, 0.125 * span_s**2, 1.0])
     covariance = covariance / np.outer(sizes, sizes)
-    half = float(student(freedom[4])) * math.sqrt(covariance[4, 4])
+    half = float(student(freedom[5])) * math.sqrt(covariance[5, 5])
     fitted = Waveform(
         float(parts[0]), float(parts[1]), found.late_s + float(late_s or 0.0),
-        found.drift + float(parts[3]) / (0.5 * span_s),
-        covariance[:4, :4], freedom[:4], found.middle_s, found.times_s[kept], y[kept], s, ds, residual,
+        found.drift + float(parts[3]) / (0.5 * span_s), found.bend + float(parts[4]) / (0.125 * span_s**2),
+        covariance[:5, :5], freedom[:5], found.middle_s, found.half_s, found.times_s[kept], y[kept], s, ds, residual,
     )  # fmt: skip
     return fitted, (math.exp(log), math.exp(log - half), math.exp(log + half))

@@ -20,6 +20,12 @@ _LAGS = 12
 """Lags that are told beside the likeliest, at most."""
 _MOST = 1 << 17
 """Samples of a signal that are correlated, at most."""
+_PART_S = 30.0
+"""Part of a session that is searched at once [s]; parts overlap by a stretch."""
+_SURE = 0.7
+"""Median likeness of the signals from which another stretch is not tried."""
+_GRID_S = 0.01
+"""Steps by which the busiest stretch is looked for [s]."""
 _TAKEN_S = (2.0, 0.25)
 """Stretches of a recording that are looked for, the second where clocks are apart, or rows lost, in the first."""
 
@@ -64,23 +70,64 @@ def find_wires(
         A wire for each recorded signal.
     """
     long, short = _TAKEN_S
-    wires = _find(recorded, sent, 0.0, long)
-    if all(wire.likeness > _CLEAR and not wire.others_s for wire in wires.values()):
-        return wires
-    # Where most of them vary most.
-    rate = min(each for _, each in recorded.values())
-    powers = [np.nan_to_num(np.diff(_even(values, each, rate, long)) ** 2) for values, each in recorded.values()]
-    rows, size = min(map(len, powers)), max(1, round(short * rate))
-    whole = np.sum([power[:rows] / max(float(power.sum()), 1e-300) for power in powers], axis=0)
-    sums = np.cumsum(np.concatenate([[0.0], whole]))
-    begin = int(np.argmax(sums[size:] - sums[:-size])) if rows > size else 0
-    more = _find(recorded, sent, begin / rate, short)
+    best: dict[str, Wire] = {}
+    length_s = max(len(values) / each for values, each in sent.values())
+    found_s = 0.0
+    for from_s in dict.fromkeys([0.0, _busiest_s(recorded, 0.0, long)]):
+        for part_s in np.arange(0.0, max(length_s - long, 1e-9), _PART_S - long):
+            rows = {
+                name: slice(round(part_s * each), round((part_s + _PART_S) * each)) for name, (_, each) in sent.items()
+            }
+            part = {
+                name: (values[rows[name]], each)
+                for name, (values, each) in sent.items()
+                if rows[name].start < len(values)
+            }
+            wires = {name: _later(wire, float(part_s)) for name, wire in _find(recorded, part, from_s, long).items()}
+            if all(wire.likeness > _CLEAR and not wire.others_s for wire in wires.values()):
+                return wires
+            if _likeness_of(wires) > _likeness_of(best):
+                best, found_s, here = wires, from_s, (float(part_s), part)
+            if np.median([wire.likeness for wire in wires.values()]) > _CLEAR:
+                break
+        if np.median([wire.likeness for wire in best.values()]) > _SURE:
+            break
+    wires = best
+    more = _find(recorded, here[1], _busiest_s(recorded, found_s, short), short)
+    more = {name: _later(wire, here[0]) for name, wire in more.items()}
     alike = [sum(wire.likeness for wire in found.values()) for found in (wires, more)]
     first, second = (more, wires) if alike[1] > alike[0] else (wires, more)
     return {
         name: replace(wire, others_s=(second[name].late_s, *second[name].others_s, *wire.others_s))
         for name, wire in first.items()
     }
+
+
+def _likeness_of(wires: Mapping[str, Wire]) -> float:
+    return sum((wire.likeness for wire in wires.values()), -1.0)
+
+
+def _later(wire: Wire, shift_s: float) -> Wire:
+    """A wire to a part of the session that begins so much later [s]."""
+    others_s = tuple(each + shift_s for each in wire.others_s)
+    return replace(wire, late_s=wire.late_s + shift_s, own_s=wire.own_s + shift_s, others_s=others_s)
+
+
+def _busiest_s(recorded: Mapping[str, tuple[np.ndarray, float]], from_s: float, taken_s: float) -> float:
+    """Begin of the stretch of some length where most signals vary most; a short one lies in a long one [s]."""
+    long, short = _TAKEN_S
+    within_s = long if taken_s == short else math.inf
+    total: np.ndarray | None = None
+    for values, each in recorded.values():
+        part = np.nan_to_num(values[round(from_s * each) : round(min(from_s + within_s, 1e9) * each)])
+        steps = np.add.reduceat(np.diff(part) ** 2, range(0, max(1, len(part) - 1), max(1, round(_GRID_S * each))))
+        power = steps / max(float(steps.sum()), 1e-300)
+        total = power if total is None else total[: len(power)] + power[: len(total)]
+    assert total is not None
+    size = max(1, round(taken_s / _GRID_S))
+    sums = np.cumsum(np.concatenate([[0.0], total]))
+    begin = int(np.argmax(sums[size:] - sums[:-size])) if len(total) > size else 0
+    return from_s + begin * _GRID_S
 
 
 def _find(

@@ -282,8 +282,8 @@ def test_intervals_are_as_wide_as_cramer_and_rao_have_it() -> None:
         one * math.sqrt(2.0) / amplitude, one, one * math.sqrt(2.0) / (amplitude * 2.0 * np.pi * hz),
         one * math.sqrt(24.0) / (amplitude * 2.0 * np.pi * hz * seconds),
     ]  # fmt: skip
-    assert found.spread == pytest.approx(floors, rel=0.35)
-    widths = student(found.freedom) * found.spread
+    assert found.spread[:4] == pytest.approx(floors, rel=0.35)
+    widths = (student(found.freedom) * found.spread)[:4]
     # Gain 10 ppm, offset 20 uV, skew of two such 20 ns, clock 0.01 ppm.
     assert (widths < [10e-6, 20e-6, 20e-9 / math.sqrt(2.0), 0.01e-6]).all()
 

@@ -103,7 +103,7 @@ class Rig:
         faulty = Faulty(default_table(), [chain], seed=2, row_ticks=10, setting=Setting())
         for kind in faults:
             command = {"channel": TABLE[kind].channel, "kind": kind, **TABLE[kind].numbers}
-            faulty.take(FaultCommand.model_validate(command), 0, [])
+            faulty.begin(FaultCommand.model_validate(command), 0, [])
         return faulty.counts(self.rows, self.made, 0)
 
 
