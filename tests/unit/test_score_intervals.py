@@ -11,7 +11,7 @@ from replays.score.digital import Stamps
 from replays.score.intervals import sandwich, student
 from replays.score.limits import load_limits
 from replays.score.recorded import Table
-from replays.score.scorecard import FAIL, INCONCLUSIVE, PASS, Bounds, judge_row
+from replays.score.scorecard import FAIL, INCONCLUSIVE, PASS, Bounds, Scorecard, judge_row
 from replays.score.sine import fit_sine, quality
 from replays.score.waveform import Waveform, split_noise
 from rig.channels import default_table
@@ -102,6 +102,20 @@ def test_the_interval_of_stamp_jitter_is_that_of_chi_squared() -> None:
 def test_the_whole_interval_decides(low: float, high: float, verdict: str) -> None:
     limit = Bounds(-1.0, 1.0, "a test")
     assert judge_row("analogue", "gain", "", (0.5 * (low + high), low, high), limit=limit).verdict == verdict
+
+
+@pytest.mark.parametrize(
+    ("values", "doubts", "outcome"),
+    [((0.0,), [], "pass"), ((0.0,), ["a doubt"], "inconclusive"), ((9.0, 0.0), [], "fail"), ((9.0,), ["one"], "fail"),
+     ((math.nan,), [], "inconclusive"), ((0.0, math.nan), [], "pass"), ((), [], "inconclusive")],
+)  # fmt: skip
+def test_a_pass_needs_a_quantity_that_passes_and_no_doubt(
+    values: tuple[float, ...], doubts: list[str], outcome: str
+) -> None:
+    card = Scorecard("a test", "analogue", "", lambda *_, **__: Bounds(-1.0, 1.0, "a test"), doubts=doubts)
+    for value in values:
+        card.add("gain", "", None if math.isnan(value) else (value, value, value))
+    assert card.outcome == outcome
 
 
 def test_limits_made_of_the_table_are_closed_forms() -> None:
