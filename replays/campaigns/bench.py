@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from replays.campaigns.measurement import InconclusiveError
 from replays.campaigns.process import Program
 from rig import wire
 from rig.closing import Closing
@@ -41,7 +42,7 @@ class BenchError(RuntimeError):
     """The bench or the device under test failed, which is no verdict on a measurement; one line."""
 
 
-class BehindError(BenchError):
+class BehindError(BenchError, InconclusiveError):
     """The rig did not keep real time: what is not as it must be may be of this machine, and not of the device."""
 
 

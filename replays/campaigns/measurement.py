@@ -9,6 +9,7 @@ from typing import Any
 
 from rig import units
 from rig.errors import InputError, Words
+from rig.outcome import Outcome
 from rig.text import finite
 
 OPERATORS = ("<=", "<", ">=", ">", "==", "!=", "between")
@@ -18,6 +19,10 @@ _MUST = re.compile(rf"\s*(?:(<=|>=|==|!=|<|>)\s*({_NUMBER})|({_NUMBER})\s+to\s+(
 _UNITLESS = ("", "1")
 
 Limit = float | tuple[float, float]
+
+
+class InconclusiveError(Exception):
+    """A case in which nothing failed, but which shows too little for a pass; one line."""
 
 
 @dataclass(frozen=True)
@@ -96,6 +101,7 @@ class Measurement:
         note: What else is to be known, such as why there is no value.
         at_s: Simulated time that it is about [s].
         channels: Channels that it is about.
+        open_reason: Reason why the value neither passes nor fails; empty where it does.
     """
 
     name: str
@@ -106,11 +112,19 @@ class Measurement:
     note: str = ""
     at_s: float | None = None
     channels: tuple[str, ...] = ()
+    open_reason: str = ""
+
+    @property
+    def outcome(self) -> Outcome:
+        """Inconclusive where there is a reason for that, else pass or fail by the limit."""
+        if self.open_reason:
+            return Outcome.INCONCLUSIVE
+        return Outcome.PASS if self.must.holds(self.value) else Outcome.FAIL
 
     @property
     def good(self) -> bool:
-        """Whether it is as asked."""
-        return self.must.holds(self.value)
+        """Whether it passes."""
+        return self.outcome is Outcome.PASS
 
     @property
     def line(self) -> str:
@@ -124,6 +138,8 @@ class Measurement:
             f"resolution {self.resolution}" if self.resolution else "",
         ]
         rest = "; ".join(part for part in parts if part)
+        if self.open_reason:
+            return f"{self.name} must be {self.must}; inconclusive: {self.open_reason}" + (f" [{rest}]" if rest else "")
         return (
             f"{self.name} must be {self.must}; instead received {told}"
             if not self.good
@@ -135,8 +151,9 @@ class Measurement:
         return finite({
             "name": self.name, "value": self.value, "unit": self.must.unit,
             "op": self.must.op, "limit": self.must.limit,
-            "margin": self.must.margin(self.value), "good": self.good, "source": self.source,
-            "resolution": self.resolution, "note": self.note, "at_s": self.at_s,
+            "margin": self.must.margin(self.value), "outcome": self.outcome.value, "good": self.good,
+            "source": self.source, "resolution": self.resolution, "note": self.open_reason or self.note,
+            "at_s": self.at_s,
         })  # fmt: skip
 
     def properties(self) -> list[tuple[str, str]]:

@@ -12,8 +12,9 @@ from replays.report.document import Picture
 
 Document = Mapping[str, Any]
 _MARKS: dict[str, Mark] = {
-    "failed": "bad", "error": "bad", "interrupted": "open", "skipped": "open", "passed": "good",
+    "failed": "bad", "error": "bad", "inconclusive": "open", "interrupted": "open", "skipped": "open", "passed": "good",
 }  # fmt: skip
+_OUTCOMES: dict[str, Mark] = {"pass": "good", "fail": "bad", "inconclusive": "open"}
 _SMALL = 1e-9
 """Part of a margin that is no change."""
 
@@ -28,7 +29,8 @@ def make_page(results: Document, folder: Path, earlier: Document | None = None) 
     """
     counts, cases = results["counts"], results["cases"]
     bad = [case for case in cases if _MARKS[case["outcome"]] == "bad"]
-    mark: Mark = "bad" if bad else "open" if counts["interrupted"] or not counts["passed"] else "good"
+    unsure = [case for case in cases if case["outcome"] == "inconclusive"]
+    mark: Mark = "bad" if bad else "open" if unsure or counts["interrupted"] or not counts["passed"] else "good"
     told = ", ".join(f"{count} {outcome}" for outcome, count in counts.items() if count) or "no case"
     wall = results["wall"]
     origin = {
@@ -37,7 +39,7 @@ def make_page(results: Document, folder: Path, earlier: Document | None = None) 
         "rig": wall["rig"],
     }
     report = Report("; ".join(results["titles"]) or "Campaign", f"{told}.", origin=origin, mark=mark)
-    for case in bad:
+    for case in [*bad, *unsure]:
         _failure(report, case, folder)
     if earlier is not None:
         _trend(report, results, earlier)
@@ -62,7 +64,7 @@ def _seconds(results: Document, case: Document) -> str:
 
 def _failure(report: Report, case: Document, folder: Path) -> None:
     report.heading(f"{case['outcome']}: {case['id']}", note=case["reason"])
-    failed = [each for each in case["measurements"] if not each["good"]]
+    failed = [each for each in case["measurements"] if each["outcome"] != "pass"]
     if not failed:
         report.text(case["reason"])
     for each in failed:
@@ -70,7 +72,8 @@ def _failure(report: Report, case: Document, folder: Path) -> None:
         margin = f", margin {_number(each['margin'], each['unit'])}" if each["margin"] is not None else ""
         told = f" Source: {each['source']}." if each["source"] else ""
         note = f" ({each['note']})" if each["note"] else ""
-        report.text(f"{each['name']} must be {limit}; it is {value}{margin}{note}.{told}")
+        verdict = "inconclusive" if each["outcome"] == "inconclusive" else f"it is {value}{margin}"
+        report.text(f"{each['name']} must be {limit}; {verdict}{note}.{told}")
     for file in case["evidence"]:
         path = folder / file
         if path.suffix == ".png" and path.is_file():
@@ -90,8 +93,8 @@ def _measurements(report: Report, results: Document, case: Document) -> None:
         Row((
             each["name"], _number(each["value"], each["unit"], "nothing"), _limit(each),
             "" if each["margin"] is None else _number(each["margin"], each["unit"]), each["source"], each["note"],
-            "pass" if each["good"] else "fail",
-        ), "good" if each["good"] else "bad")
+            each["outcome"],
+        ), _OUTCOMES[each["outcome"]])
         for each in case["measurements"]
     ]  # fmt: skip
     headings = ("measurement", "value", "must be", "margin", "source", "note", "verdict")

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from rig.outcome import Outcome
+
 if TYPE_CHECKING:
     from replays.campaigns.bench import Bench
     from replays.campaigns.campaign import Case
@@ -101,8 +103,6 @@ class CampaignItem(pytest.Item):
         finally:
             for measurement in trial.measurements:
                 self.user_properties.extend(measurement.properties())
-        if trial.first_bad:
-            raise trial.failed(trial.first_bad)
 
     def teardown(self) -> None:
         """End what runs, and keep the evidence of a failure."""
@@ -112,13 +112,14 @@ class CampaignItem(pytest.Item):
     def repr_failure(self, excinfo: pytest.ExceptionInfo[BaseException], style: Any = None) -> Any:
         """A line for each value that is not as it must be, or the one of what failed."""
         from replays.campaigns.bench import BenchError
+        from replays.campaigns.measurement import InconclusiveError
         from replays.campaigns.trial import MeasurementError
         from rig.errors import DiskError, InputError
 
-        if isinstance(excinfo.value, MeasurementError):
-            return "\n".join(each.line for each in self.stash[_TRIAL].measurements if not each.good)
         if isinstance(excinfo.value, BenchError | InputError | DiskError | ConnectionError | TimeoutError):
             return self.stash[_TRIAL].lasting(str(excinfo.value))
+        if isinstance(excinfo.value, MeasurementError | InconclusiveError):
+            return "\n".join(each.line for each in self.stash[_TRIAL].measurements if not each.good)
         return super().repr_failure(excinfo, style)
 
     def reportinfo(self) -> tuple[Path, int | None, str]:
@@ -127,20 +128,38 @@ class CampaignItem(pytest.Item):
 
 
 @pytest.hookimpl(wrapper=True)
+def pytest_runtest_call(item: pytest.Item) -> Generator[None, Any, Any]:
+    """Raise the outcome of a trial's measurements, once its test has ended without an error of its own."""
+    result = yield
+    if (trial := item.stash.get(_TRIAL, None)) is not None:
+        trial.raise_outcome()
+    return result
+
+
+@pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) -> Generator[None, Any, Any]:
-    """Note what failed, and put what a trial has left into the last report of its test."""
-    from replays.campaigns.bench import BehindError
+    """Keep whether a test failed, and put what a trial has left into the last report of its test."""
+    from replays.campaigns.measurement import InconclusiveError
 
     report = yield
     if report.failed:
         item.stash[_FAILED] = True
-        report.rig_error = call.excinfo is not None and call.excinfo.errisinstance(BehindError)
+        error = None if call.excinfo is None else call.excinfo.value
+        if isinstance(error, InconclusiveError):
+            # In its phase "call" pytest reports a failure, and in every other phase an error.
+            report.when, report.rig_inconclusive = "verdict", True
+            report.longrepr = report.longrepr if isinstance(item, CampaignItem) else str(error)
     if report.when == "teardown" and (trial := item.stash.get(_TRIAL, None)) is not None:
         title = item.case.title if isinstance(item, CampaignItem) else item.path.name
         report.rig = {"title": title, **trial.document()}
         if trial.kept:
             report.sections.append(("evidence", "\n".join(map(str, trial.kept))))
     return report
+
+
+def pytest_report_teststatus(report: pytest.TestReport | pytest.CollectReport) -> tuple[str, str, str] | None:
+    """Count an inconclusive test among the errors."""
+    return ("error", "I", "INCONCLUSIVE") if getattr(report, "rig_inconclusive", False) else None
 
 
 def _trial_of(item: pytest.Item) -> Trial:
@@ -209,7 +228,7 @@ def measure(request: pytest.FixtureRequest, rig_trial: Trial) -> Callable[..., f
         told = {"source": source, "resolution": rig_trial.resolution, "at_s": at_s, "channels": tuple(channels)}
         made = rig_trial.take(measured(name, value, unit, op, limit, unit_of_limit=unit_of_limit, **told))
         request.node.user_properties.extend(made.properties())
-        if not made.good:
+        if made.outcome is Outcome.FAIL:
             raise rig_trial.failed(made.line)
         return value
 

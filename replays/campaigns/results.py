@@ -24,10 +24,11 @@ if TYPE_CHECKING:
     import pytest
 
 FORMAT = 1
-OUTCOMES = ("failed", "error", "interrupted", "skipped", "passed")
+OUTCOMES = ("failed", "error", "interrupted", "inconclusive", "skipped", "passed")
 """What may become of a case, the worst first."""
 _JUNIT: dict[str, junit.Outcome] = {
-    "failed": "failure", "error": "error", "interrupted": "error", "skipped": "skipped", "passed": "passed",
+    "failed": "failure", "error": "error", "interrupted": "error", "inconclusive": "inconclusive",
+    "skipped": "skipped", "passed": "passed",
 }  # fmt: skip
 _LONGEST = 2000
 _UNFINISHED = "it was ended while it ran"
@@ -79,8 +80,8 @@ class Results:
         case["duration_s"] += report.duration
         case |= getattr(report, "rig", {})
         if report.failed:
-            judged = report.when == "call" and not getattr(report, "rig_error", False)
-            case["outcome"] = "failed" if judged and case["outcome"] != "error" else "error"
+            outcome = outcome_of(report)
+            case["outcome"] = outcome if case["outcome"] in ("interrupted", "inconclusive") else "error"
             case["reason"] = reason_of(report) if case["reason"] == _UNFINISHED else case["reason"]
         elif report.skipped:
             case |= {"outcome": "skipped", "reason": reason_of(report)}
@@ -158,6 +159,13 @@ def _locked(folder: Path) -> int:
     return handle
 
 
+def outcome_of(report: Any) -> str:
+    """Return what a failing phase of a test makes of it: failed, error or inconclusive."""
+    if getattr(report, "rig_inconclusive", False):
+        return "inconclusive"
+    return "failed" if report.when == "call" else "error"
+
+
 def reason_of(report: Any) -> str:
     """Why a phase of a test failed, or was skipped, in a line."""
     told = report.longrepr
@@ -222,5 +230,4 @@ def _properties(case: dict[str, Any]) -> Any:
 
 
 def _told(each: dict[str, Any]) -> str:
-    verdict = "ok  " if each["good"] else "FAIL"
-    return f"{verdict} {each['name']}: {each['value']} {each['unit']}, {each['op']} {each['limit']}"
+    return f"{each['outcome']}: {each['name']}: {each['value']} {each['unit']}, {each['op']} {each['limit']}"

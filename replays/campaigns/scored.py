@@ -11,6 +11,7 @@ from pydantic import Field
 from replays.campaigns.measurement import Measurement, Must
 from replays.campaigns.seen import Expected, Seen, Time, Units, asked, in_unit
 from rig.errors import InputError, UnknownNameError
+from rig.outcome import Outcome
 from rig.wire import sensor_key
 
 if TYPE_CHECKING:
@@ -87,19 +88,26 @@ class ExpectScore(Expected):
         if self.must:
             yield from self._values(rows, must)
             return
-        lacking = list(self._lacking(card, rows, seen)) if self.score == "all" else []
-        # Of one quantity, nothing shown is nothing passed; of all, some are never shown.
-        bad = [row for row in rows if row.verdict == FAIL or (row.verdict == INCONCLUSIVE and self.score != "all")]
-        shown = sum(row.verdict == PASS for row in rows)
-        told = [text for _, text in lacking] + [" ".join(filter(None, (*row.cells(), row.note))) for row in bad]
-        source = self.source or ", ".join(dict.fromkeys(row.limit.source for row in bad if row.limit is not None))
-        value = float(len(told)) if shown or told else math.nan
-        hidden = sum(row.verdict == INCONCLUSIVE for row in rows)
-        note = "; ".join(told[:4]) or (
-            f"{card.path} path, {shown} rows pass, {hidden} not shown" if shown else "nothing of it is shown"
-        )
-        channels = [channel for channel, _ in lacking if channel] + [row.channel for row in bad]
-        yield Measurement(what, value, must, source, note=note, channels=tuple(channels[:2]))
+        found = list(self._missing(card, rows, seen)) if self.score == "all" else []
+        for row in rows:
+            # One quantity that is asked for must be shown; of all, some never are.
+            if row.verdict == FAIL or (row.verdict == INCONCLUSIVE and self.score != "all"):
+                text = " ".join(filter(None, (*row.cells(), row.note)))
+                found.append((row.channel, text, Outcome(row.verdict)))
+        failing = [(channel, text) for channel, text, outcome in found if outcome is Outcome.FAIL]
+        reasons = [text for _, text, outcome in found if outcome is Outcome.INCONCLUSIVE]
+        reasons += card.doubts if self.score == "all" else []
+        limits = [row.limit.source for row in rows if row.verdict == FAIL and row.limit is not None]
+        shown, hidden = (sum(row.verdict == verdict for row in rows) for verdict in (PASS, INCONCLUSIVE))
+        note = f"{card.path} path, {shown} quantities pass, {hidden} inconclusive"
+        if not shown and not failing and not reasons:
+            reasons.append("no quantity of it has a verdict")
+        yield Measurement(
+            what, float(len(failing)), must, self.source or ", ".join(dict.fromkeys(limits)),
+            note="; ".join([text for _, text in failing][:4]) or note,
+            channels=tuple(channel for channel, _, _ in found if channel)[:2],
+            open_reason="" if failing else "; ".join(reasons[:4]),
+        )  # fmt: skip
 
     def _about(self, card: Scorecard, seen: Seen) -> Iterator[ScoreRow]:
         """Rows of the quantity, of the channels, and of groups with them."""
@@ -112,8 +120,8 @@ class ExpectScore(Expected):
             if self.score in ("all", row.quantity) and (not wanted or own & wanted):
                 yield row
 
-    def _lacking(self, card: Scorecard, rows: Sequence[ScoreRow], seen: Seen) -> Iterator[tuple[str, str]]:
-        """What was sent and is not shown to be there: the channel, if it is about one, and in words."""
+    def _missing(self, card: Scorecard, rows: Sequence[ScoreRow], seen: Seen) -> Iterator[tuple[str, str, Outcome]]:
+        """Yield what was sent and is not in the record, or not shown to be: channel if it is of one, text, outcome."""
         from replays.score.scorecard import INCONCLUSIVE, PASS
 
         groups = _sent(seen)
@@ -123,21 +131,22 @@ class ExpectScore(Expected):
             wire = wires.get(name)
             if wire is None:
                 if name in found:  # otherwise the quantity `recorded` fails, or the channel was not to be recorded
-                    yield name, f"nothing of {name} is found in the file"
+                    yield name, f"nothing of {name} is found in the file", Outcome.FAIL
             elif wire.verdict == INCONCLUSIVE:
-                yield name, f"whether {wire.channel} is {name}, this run does not show; it takes {wire.run}"
+                text = f"whether {wire.channel} is {name} is inconclusive; to show it: {wire.run}"
+                yield name, text, Outcome.INCONCLUSIVE
             elif not any(row.verdict == PASS for row in rows if row.channel == wire.channel and row is not wire):
-                yield name, f"nothing of {name} is shown"
+                yield name, f"no quantity of {name} has a verdict", Outcome.INCONCLUSIVE
         granted_s = {"rows before the first": seen.origin_s + self.begins_s, "rows after the last": self.ends_s}
         for row in rows:
             about = f"{row.quantity} of {row.channel}: {row.cells()[2]}"
             if row.quantity == "row step" and row.value != self.every:
-                yield "", f"{about}, not {self.every}"
+                yield "", f"{about}, not {self.every}", Outcome.FAIL
             elif row.quantity in granted_s:
                 table = seen.recording.table.groups
                 rate_hz = max(table[name].rate_hz for name in groups if name in row.channel or "all" in row.channel)
                 if float(row.value) * self.every / rate_hz > granted_s[row.quantity] + 1e-9:
-                    yield "", about
+                    yield "", about, Outcome.FAIL
 
     def _values(self, rows: Sequence[ScoreRow], must: Must) -> Iterator[Measurement]:
         """Of each row that end of the interval, or the value, which is nearest to what it must not be."""
@@ -145,11 +154,13 @@ class ExpectScore(Expected):
             what = self.name or f"{row.quantity} {row.channel}".strip()
             ends = [in_unit(float(each), row.unit, must) for each in (row.value, row.low, row.high)]
             value = min(ends, key=must.margin) if all(map(math.isfinite, ends)) else math.nan
-            note = row.note or ("" if math.isfinite(value) else "inconclusive")
-            yield Measurement(what, value, must, self.source, note=note, channels=(row.channel,))
+            reason = "" if math.isfinite(value) else row.note or f"this run does not show it; to show it: {row.run}"
+            yield Measurement(
+                what, value, must, self.source, note=row.note, channels=(row.channel,), open_reason=reason
+            )
         if not rows:
             what = self.name or " ".join((self.score, *self._channels))
-            yield Measurement(what, math.nan, must, self.source, note="nothing of it is shown")
+            yield Measurement(what, math.nan, must, self.source, open_reason="the scorecard has no such quantity")
 
 
 def _sent(seen: Seen) -> dict[str, tuple[str, ...]]:

@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING, Any
 
 from replays.campaigns.bench import BehindError, Bench, BenchSettings, Target
 from replays.campaigns.device import Device
-from replays.campaigns.measurement import Measurement
+from replays.campaigns.measurement import InconclusiveError, Measurement
 from rig.errors import DiskError, InputError
+from rig.outcome import Outcome
 
 if TYPE_CHECKING:
     from recorder.reader import Recording
@@ -105,7 +106,8 @@ class Trial:
 
     def take(self, measurement: Measurement) -> Measurement:
         """Keep a measurement, whatever comes of it."""
-        self.measurements.append(replace(measurement, note=self.lasting(measurement.note)))
+        note, reason = self.lasting(measurement.note), self.lasting(measurement.open_reason)
+        self.measurements.append(replace(measurement, note=note, open_reason=reason))
         return self.measurements[-1]
 
     def failed(self, line: str) -> MeasurementError | BehindError:
@@ -184,13 +186,16 @@ class Trial:
             "floor_ms": None if self.floor_ms is None else [round(each, 3) for each in self.floor_ms],
         }
 
-    @property
-    def first_bad(self) -> str:
-        """The first measurement that is not as it must be, and how many more, in a line; empty where all are."""
-        bad = [each for each in self.measurements if not each.good]
-        if not bad:
-            return ""
-        return bad[0].line + (f"; and {len(bad) - 1} more" if len(bad) > 1 else "")
+    def raise_outcome(self) -> None:
+        """Raise what became of the measurements, a failure before an inconclusive one; nothing where all pass.
+
+        Raises:
+            MeasurementError: A measurement fails; the line has the first and the number of others.
+            InconclusiveError: None fails, and one is inconclusive; or the rig was behind real time meanwhile.
+        """
+        for outcome, error in ((Outcome.FAIL, self.failed), (Outcome.INCONCLUSIVE, InconclusiveError)):
+            if found := [each for each in self.measurements if each.outcome is outcome]:
+                raise error(found[0].line + (f"; and {len(found) - 1} more" if found[1:] else ""))
 
 
 def plain(name: str) -> str:

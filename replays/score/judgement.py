@@ -95,20 +95,21 @@ def judge(
         score_digital(card, recorded, wires, rows, session, arrivals)
     else:
         score_analogue(card, recorded, wires, session, {**session.formulas(), **(formulas or {})})
-    card.doubts += _missing_evidence(card)
+    card.doubts += _missing_evidence(card, due)
     return card
 
 
-def _missing_evidence(card: Scorecard) -> list[str]:
-    """Return the reasons why recorded channels are not shown to be right.
+def _missing_evidence(card: Scorecard, due: Sequence[str]) -> list[str]:
+    """Return the reasons why channels that were to be recorded are not shown to be right.
 
     A channel is shown by its core quantity: on the digital path its counts, on the analogue path its gain. Where a
     limit asks for that quantity, its whole interval must lie within the limit or outside.
     """
-    core = _CORE[card.path]
-    found = []
-    for channel in dict.fromkeys(row.channel for row in card.rows if row.quantity == "mapping" and row.value != "-"):
-        rows = [row for row in card.rows if (row.quantity, row.channel) == (core, channel)]
+    core, found = _CORE[card.path], []
+    signals = {str(row.value): row.channel for row in card.rows if row.quantity == "mapping"}
+    absent = {row.channel for row in card.rows if row.quantity == "recorded" and row.verdict == FAIL}
+    for channel in (name for name in due if name not in absent):
+        rows = [row for row in card.rows if (row.quantity, row.channel) == (core, signals.get(channel))]
         if not any(row.verdict != INCONCLUSIVE for row in rows):
             note = next((row.note for row in rows if row.note), "")
             found.append(f"{channel}: {core} is inconclusive{': ' if note else ''}{note}")

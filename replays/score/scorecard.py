@@ -281,7 +281,7 @@ class Scorecard:
         for row, told in zip(self.rows, rows, strict=True):
             told |= {"value": row.value, "low": row.low, "high": row.high}
         return finite({
-            "title": self.title, "path": self.path, "outcome": self.outcome, "good": self.outcome is Outcome.PASS,
+            "title": self.title, "path": self.path, "outcome": self.outcome.value, "good": self.outcome is Outcome.PASS,
             "verdict": self.verdict_line, "doubts": self.doubts, "limits": self.limits, "rows": rows,
             "remarks": self.remarks, "runs": self.runs,
         })  # fmt: skip

@@ -12,6 +12,7 @@ import typer
 from rig.cli.folder import check_folder
 from rig.cli.tables import echo, progress_bar
 from rig.errors import InputError, UnknownNameError, Words
+from rig.outcome import Outcome
 
 _INTERRUPTED = 130
 _EXTRA = "installed with its extra: pip install 'rotor-stator-rig[campaigns]'"
@@ -47,8 +48,8 @@ def campaign(
 ) -> None:
     """Run scripted tests of a device in the loop, and judge them.
 
-    Exit status 0: all cases passed, or were skipped. 1: one failed. 2: wrong input, or nothing to run. Ctrl-C leaves
-    nothing running, and the results of what was done.
+    Exit status: 0 pass, 1 a case failed, 2 wrong input or nothing to run, 3 inconclusive: no case failed, and one is
+    inconclusive, or all were skipped. Ctrl-C leaves nothing running, and the results of what was done.
     """
     if not files:
         _list()
@@ -138,5 +139,6 @@ def _run(files: list[str], options: list[str], output: Path | None) -> int:
     if status == pytest.ExitCode.INTERRUPTED and not progress.collecting_failed:
         return _INTERRUPTED
     if status in (pytest.ExitCode.OK, pytest.ExitCode.TESTS_FAILED):
-        return int(status)
+        failed = bool(counts["failed"] or counts["error"])
+        return Outcome.of(failed=failed, shown=bool(counts["passed"]) and not counts["inconclusive"]).exit_status
     return 2

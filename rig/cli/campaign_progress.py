@@ -14,7 +14,7 @@ import pytest
 from rig.cli.tables import echo, plain
 from rig.text import printable
 
-WORDS = {"passed": "pass", "failed": "FAIL", "error": "ERROR", "skipped": "skip"}
+WORDS = {"passed": "pass", "failed": "FAIL", "error": "ERROR", "inconclusive": "OPEN", "skipped": "skip"}
 """What is said of a case that came to this."""
 
 
@@ -75,16 +75,16 @@ class Progress:
 
     def pytest_runtest_logreport(self, report: Any) -> None:
         """A phase of a case is over."""
+        from replays.campaigns.results import outcome_of, reason_of
+
         name = report.nodeid
         before = self.outcomes.get(name, "passed")
         if report.failed:
-            before = "failed" if report.when == "call" and before != "error" else "error"
+            before = outcome_of(report) if before in ("passed", "inconclusive") else "error"
         elif report.skipped:
             before = "skipped"
         self.outcomes[name] = before
         if before != "passed" and name not in self.reasons:
-            from replays.campaigns.results import reason_of
-
             # Of a campaign's file a line for each value that is not as it must be.
             lines = report.longrepr.splitlines() if isinstance(report.longrepr, str) else ()
             self.reasons[name] = "\n      ".join([reason_of(report), *map(printable, lines[1:])])
@@ -109,7 +109,7 @@ class Progress:
     def _show(self) -> None:
         if self.task is None:
             self.task = self.bar.add_task("", total=len(self.planned) or None)
-        bad = sum(self.counts[each] for each in ("failed", "error"))
+        bad = sum(self.counts[each] for each in ("failed", "error", "inconclusive"))
         now = next(iter(self.running), "").rpartition("::")[2]
         told = f"{len(self.done)} of {len(self.planned)} cases, {bad} bad; {now}"
         self.bar.update(self.task, description=printable(told, 70), completed=len(self.done))

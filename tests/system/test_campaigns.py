@@ -5,8 +5,11 @@ from __future__ import annotations
 import json
 import os
 import signal
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import pytest
 
@@ -117,7 +120,7 @@ def campaign(folder: Path, *arguments: str, status: int) -> tuple[str, dict[str,
 def test_a_device_in_lockstep_is_judged_alike_each_time(folder: Path) -> None:
     out, both = campaign(folder, "x.campaign.toml", "test_x.py", status=1)
     well, dies, again, fixtures, behind = both["cases"]
-    assert [case["outcome"] for case in both["cases"]] == ["passed", "failed", "passed", "failed", "error"]
+    assert [case["outcome"] for case in both["cases"]] == ["passed", "failed", "passed", "failed", "inconclusive"]
     told = {each["name"]: each for each in well["measurements"]}
     assert told["time to trip"]["good"]
     assert told["time to trip"]["resolution"] == "1 tick, 1 us; 10 ms blocks, in lockstep"
@@ -183,8 +186,55 @@ def test_ctrl_c_leaves_nothing_running_and_tells_what_was_done(tmp_path: Path) -
     waiting.until(lambda: not any(each.is_running() and each.status() != "zombie" for each in left), every_s=0.1)
     assert "1 passed, 3 not run" in out
     results = json.loads((tmp_path / "out/results.json").read_text(encoding="utf-8"))
-    assert results["counts"] == {"failed": 0, "error": 0, "interrupted": 3, "skipped": 0, "passed": 1}
+    assert results["counts"] == {
+        "failed": 0, "error": 0, "interrupted": 3, "inconclusive": 0, "skipped": 0, "passed": 1,
+    }  # fmt: skip
     assert (tmp_path / "out/index.html").is_file()
+
+
+OPEN = """
+import math
+
+import pytest
+from replays.campaigns.measurement import Measurement, Must
+
+def take(trial, value, reason):
+    return trial.take(Measurement("gap", value, Must("<=", 1.0, "mm"), open_reason=reason))
+
+def test_pass(measure):
+    measure("gap", 0.5, "mm", "<=", 1.0)
+
+def test_open(rig_trial):
+    take(rig_trial, math.nan, "nothing moved")
+
+def test_open_and_fail(rig_trial):
+    take(rig_trial, math.nan, "nothing moved")
+    take(rig_trial, 2.0, "")
+
+def test_skip():
+    pytest.skip("no bus")
+"""
+
+
+def test_an_inconclusive_case_is_an_error_of_that_type_and_ends_with_status_3(tmp_path: Path) -> None:
+    (tmp_path / "test_open.py").write_text(OPEN, encoding="utf-8")
+    out, document = campaign(
+        tmp_path, "test_open.py", "-k", "test_pass or test_skip or (test_open and not fail)", status=3
+    )
+    assert [case["outcome"] for case in document["cases"]] == ["passed", "inconclusive", "skipped"]
+    assert "OPEN  test_open.py::test_open: gap must be <= 1 mm; inconclusive: nothing moved" in out
+    (error,) = ElementTree.parse(tmp_path / "out/junit.xml").getroot().iter("error")
+    assert error.get("type") == "inconclusive"
+    campaign(tmp_path, "test_open.py", "-k", "test_skip", status=3)
+    campaign(tmp_path, "test_open.py", "-k", "test_pass", status=0)
+    _, document = campaign(tmp_path, "test_open.py", status=1)
+    assert document["cases"][2]["reason"].startswith("gap must be <= 1 mm; instead received 2 mm")
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--junitxml=plain.xml", "test_open.py"]
+    found = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert "1 failed, 1 passed, 1 skipped, 1 error" in found.stdout, found.stdout + found.stderr
+    cases = list(ElementTree.parse(tmp_path / "plain.xml").getroot().iter("testcase"))
+    told = [[each.tag for each in case if each.tag != "properties"] for case in cases]
+    assert told == [[], ["error"], ["failure"], ["skipped"]]
 
 
 THERE = """

@@ -29,6 +29,7 @@ from replays.report import junit
 from rig.channels import default_table
 from rig.errors import InputError
 from rig.orbit import whirl_frequency
+from rig.outcome import Outcome
 from rig.outside import check
 from tests.processes import ROOT
 from tests.score_daqs import counts_of, write_parquet, write_session
@@ -123,7 +124,7 @@ def test_rows_that_have_to_be_missing_are_an_expectation(tmp_path: Path) -> None
     scale = one(session, score="scale", channel="disk_x", file="daq.parquet", must="-1 to 1 ppm")
     assert (scale.value, scale.good) == (0.0, True)
     absent = one(session, score="gain", channel="disk_x", file="daq.parquet", must="-1 to 1 ppm")
-    assert (absent.good, absent.note) == (False, "nothing of it is shown")
+    assert (absent.outcome, absent.open_reason) == (Outcome.INCONCLUSIVE, "the scorecard has no such quantity")
 
 
 def test_all_asks_for_every_channel_and_row_that_was_sent_but_for_what_is_granted(tmp_path: Path) -> None:
@@ -230,7 +231,8 @@ def results(**margins: float) -> dict[str, Any]:
     cases.append({**cases[0], "id": "x.py::broken", "outcome": "error", "reason": "no rig", "measurements": []})
     wall = {case["id"]: {"duration_s": 1.25, "floor_ms": [0.3, 0.9]} for case in cases}
     return {
-        "format": 1, "titles": ["T"], "counts": {"failed": 1, "error": 1, "interrupted": 0, "skipped": 1, "passed": 1},
+        "format": 1, "titles": ["T"],
+        "counts": {"failed": 1, "error": 1, "interrupted": 0, "inconclusive": 0, "skipped": 1, "passed": 1},
         "cases": cases,
         "wall": {"begun": "2026-01-01T08:00:00", "duration_s": 2.5, "machine": "M", "rig": "0", "cases": wall},
     }  # fmt: skip
