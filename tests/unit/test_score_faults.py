@@ -166,7 +166,12 @@ def together(most: int) -> list[tuple[str, ...]]:
 
 @pytest.mark.parametrize("kinds", together(13), ids=len)
 def test_a_daq_that_samples_by_itself(kinds: tuple[str, ...], rig: Rig, sessions: Sessions, tmp_path: Path) -> None:
-    card = judge(daq(tmp_path / "daq.parquet", rig.counts(kinds, noisy=True)), [sessions[False][0]], path="analogue", channels=DUE)
+    card = judge(
+        daq(tmp_path / "daq.parquet", rig.counts(kinds, noisy=True)),
+        [sessions[False][0]],
+        path="analogue",
+        channels=DUE,
+    )
     assert red(card) == declared(kinds)
 
 
