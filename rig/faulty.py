@@ -24,6 +24,7 @@ from rig.faults import (
     DOORS,
     At,
     Draws,
+    Kind,
     NoFilter,
     OfBlocks,
     Restart,
@@ -31,6 +32,9 @@ from rig.faults import (
     Swap,
     acts,
     channels_of,
+    check_draws,
+    check_size,
+    check_time,
     stream_of,
 )  # fmt: skip
 from rig.kernels.signals import COLUMN, N_ROW
@@ -93,7 +97,6 @@ class Faulty:
         self.table, self.conditioners, self._seed, self.row_ticks = table, conditioners, seed, row_ticks
         self._setting = setting
         self.sending = Sending()
-        """Where blocks go, and what befalls them."""
         self.doors: tuple[str, ...] = DOORS
         """Where they leave the rig."""
         self.channels = table.channels
@@ -145,9 +148,39 @@ class Faulty:
         Raises:
             InputError: The first fault that makes no sense.
         """
+        number = self._begun
         for tick, command in timed:
             if isinstance(command, FaultCommand):
-                self.targets(command, tick)
+                number += 1
+                self._check_effect(command, self.targets(command, tick), tick, number)
+
+    def _check_effect(self, command: FaultCommand, names: tuple[str, ...], tick: int, number: int) -> None:
+        """Refuse a fault that could not change a count, or a block.
+
+        Args:
+            command: The fault.
+            names: Its channels.
+            tick: When it is to begin.
+            number: The number that it will have.
+
+        Raises:
+            InputError: It is too small, too short or too rare; the message has what would be enough.
+        """
+        what, places = command.what, {name: n for n, name in enumerate(self.channels)}
+        for name in names[:1] if isinstance(what, OfBlocks) else names:
+            channel = self.channels[name]
+            source = self.channels[what.reads[0]] if what.reads else None
+            check_time(what, channel.rate_hz, tick, self.row_ticks, command.for_s)
+            check_size(what, channel, source, command.for_s)
+            row, draws = first_row(self._row_at(tick), channel.rate_hz), self._draws(number, what, places[name])
+            check_draws(what, channel.rate_hz, row, tick, command.for_s, draws)
+
+    def _draws(self, number: int, what: Kind, place: int) -> Draws:
+        """Return a fault's own numbers on a channel.
+
+        A hum, a clock, a loose plug and a block are one for all channels of a group; noise is each channel's own.
+        """
+        return Draws(self._seed, number, place + 1 if what.stage == "converter" else 0)
 
     def check(self, command: FaultCommand | ClearCommand, tick: int, waiting: Sequence[object]) -> dict[str, Any]:
         """What a command that is given now will come to, as `begin` reports it.
@@ -169,7 +202,9 @@ class Faulty:
         if isinstance(command, FaultCommand):
             if len(known) >= _MOST:
                 raise InputError("fault", f"one of at most {_MOST} at a time", Words("another"))
-            return self._told(begun + 1, self.targets(command, tick), tick)
+            names = self.targets(command, tick)
+            self._check_effect(command, names, tick, begun + 1)
+            return self._told(begun + 1, names, tick)
         if command.id != "all" and command.id not in known:
             there = ", ".join(map(str, known)) or "none"
             raise InputError("clear.id", f"the number of a fault that there is ({there}), or all", command.id)
@@ -210,11 +245,9 @@ class Faulty:
         self._begun += 1
         names, what = self.targets(command, tick), command.what
         places = {name: n for n, name in enumerate(self.channels)}
-        # A hum, a clock and a loose plug are one for all channels of a group; noise is each channel's own.
-        own = what.stage == "converter"
-        draws = {name: Draws(self._seed, self._begun, places[name] + 1 if own else 0) for name in names}
+        draws = {name: self._draws(self._begun, what, places[name]) for name in names}
         if isinstance(what, OfBlocks):
-            draws = {"": Draws(self._seed, self._begun, 0)}
+            draws = {"": self._draws(self._begun, what, 0)}
             self.sending.active.append(Active(self._begun, what, names, row, draws, sensor_key(command.channel)))
         else:
             noise: dict[str, np.random.Generator] = {}

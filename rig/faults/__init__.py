@@ -5,12 +5,14 @@ from __future__ import annotations
 from rig.channels import ChannelTable
 from rig.errors import InputError, UnknownNameError
 from rig.faults.blocks import DOORS, Message, OfBlocks, Restart
+from rig.faults.effect import check_draws, check_size, check_time
 from rig.faults.kind import At, Draws, Kind, Setting, acts
 from rig.faults.kinds import KINDS, AnyKind, NoFilter, Swap, plugged
 
 __all__ = [
     "DOORS", "KINDS", "AnyKind", "At", "Draws", "Kind", "Message", "NoFilter", "OfBlocks", "Restart", "Setting",
-    "Swap", "acts", "channels_of", "described", "plugged", "stream_of", "supported",
+    "Swap", "acts", "channels_of", "check_draws",
+    "check_size", "check_time", "described", "plugged", "stream_of", "supported",
 ]  # fmt: skip
 
 

@@ -86,31 +86,39 @@ class Dropout(OfBlocks):
         return []
 
 
-class LoseBlocks(OfBlocks):
+class _Random(OfBlocks):
+    """A fault of some blocks."""
+
+    part: Some = 0.1
+
+    def chance(self, rate_hz: int) -> tuple[str, float, float]:
+        return "part", 1.0, self.block_s
+
+
+class LoseBlocks(_Random):
     """Blocks with u(n) < part are not sent."""
 
     kind: Literal["lose-blocks"] = "lose-blocks"
-    part: Annotated[FiniteFloat, Field(gt=0.0, lt=1.0)] = 0.1
+    part: Annotated[FiniteFloat, Field(gt=0.0, lt=1.0)] = 0.1  # all of them: dropout
 
     def sent(self, message: Message, u: float, first: tuple[int, int]) -> list[Message]:
         return [] if u < self.part else [message]
 
 
-class DuplicateBlocks(OfBlocks):
+class DuplicateBlocks(_Random):
     """Blocks with u(n) < part are sent twice, one right behind the other."""
 
     kind: Literal["duplicate-blocks"] = "duplicate-blocks"
-    part: Some = 0.1
 
     def sent(self, message: Message, u: float, first: tuple[int, int]) -> list[Message]:
         return [message] * (2 if u < self.part else 1)
 
 
-class ReorderBlocks(OfBlocks):
+class ReorderBlocks(_Random):
     """Blocks with u(n) < part are sent block_s later, behind those that are due by then."""
 
     kind: Literal["reorder-blocks"] = "reorder-blocks"
-    part: Annotated[FiniteFloat, Field(gt=0.0, lt=1.0)] = 0.1
+    part: Annotated[FiniteFloat, Field(gt=0.0, lt=1.0)] = 0.1  # all of them: late-blocks
 
     def sent(self, message: Message, u: float, first: tuple[int, int]) -> list[Message]:
         later = message.due + self.ticks
@@ -121,7 +129,7 @@ class LateBlocks(OfBlocks):
     """Blocks are sent delay_s later, in their order; what is still held back when it ends is sent then."""
 
     kind: Literal["late-blocks"] = "late-blocks"
-    delay_s: Annotated[FiniteFloat, Field(gt=0.0, le=MOST_LATE_S)]
+    delay_s: Annotated[FiniteFloat, Field(ge=1e-6, le=MOST_LATE_S)]
 
     def sent(self, message: Message, u: float, first: tuple[int, int]) -> list[Message]:
         return [message._replace(due=message.due + round(1e6 * self.delay_s))]

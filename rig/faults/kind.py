@@ -6,16 +6,31 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
-from typing import ClassVar, NamedTuple, get_args
+from typing import Annotated, ClassVar, NamedTuple, Self, get_args
 
 import numpy as np
-from pydantic import ConfigDict
+from pydantic import AfterValidator, ConfigDict, Field, FiniteFloat
 
 from rig.channels import Channel
 from rig.outside import Written
 
 SIGMAS = 4.0
 """A jitter is late by so many of its deviations on the mean, and no sample by more than twice that."""
+
+
+Part = Annotated[FiniteFloat, Field(gt=0.0, lt=1.0)]
+Positive = Annotated[FiniteFloat, Field(gt=0.0)]
+
+
+def but(*values: float, must: str) -> AfterValidator:
+    """Refuse values that would change nothing, or that another kind is for."""
+
+    def other(value: float) -> float:
+        if value in values:
+            raise ValueError(must)
+        return value
+
+    return AfterValidator(other)
 
 
 class Draws:
@@ -87,6 +102,16 @@ class Setting(NamedTuple):
     generated: bool = False
 
 
+def swing_v(channel: Channel) -> float:
+    """Return how far a conditioner's output can be from its bias [V]."""
+    return max(abs(limit - channel.bias_v) for limit in channel.range_v)
+
+
+def late_v(channel: Channel, late_s: float) -> float:
+    """Return the largest change of a channel that is late, with a signal as fast as its bandwidth lets through [V]."""
+    return swing_v(channel) * min(1.0, 2.0 * math.pi * min(channel.bandwidth_hz, 1e9) * late_s)
+
+
 class Kind(Written):
     """One kind of fault. What it does not change stays as it was."""
 
@@ -97,6 +122,10 @@ class Kind(Written):
     """Signal of the only channels that it is for."""
     first: ClassVar[tuple[str, ...]] = ()
     """Its main number, where that is not the first."""
+    sized: ClassVar[str] = ""
+    """The number that is its size, where that is not the main one."""
+    neutral: ClassVar[float] = 0.0
+    """Size with which it would change nothing."""
     of_blocks: ClassVar[bool] = False
     """It is about blocks, not about what stands in them (`rig.faults.blocks`)."""
 
@@ -130,6 +159,20 @@ class Kind(Written):
 
     def refuse(self, channel: Channel) -> None:
         """Raise InputError where with these numbers it would change nothing, or nothing that makes sense."""
+
+    def reach_v(self, channel: Channel, lasts_s: float, source: Channel) -> float:
+        """Return the largest change that it can make at a channel's converter [V]; infinite where no size decides."""
+        return math.inf
+
+    def times(self, factor: float) -> Self:
+        """Return the same with its size farther from where it has no effect, by a factor."""
+        name = self.sized or self.main()
+        size = self.neutral + factor * (getattr(self, name) - self.neutral)
+        return self.model_copy(update={name: size})
+
+    def chance(self, rate_hz: int) -> tuple[str, float, float] | None:
+        """Return the field that decides how often it happens, u(n) that one of it is, and seconds from n to n + 1."""
+        return None
 
     def signal(self, x: np.ndarray, at: At) -> np.ndarray:
         """What the sensor feels [its unit], shape (n,)."""

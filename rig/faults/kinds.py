@@ -10,37 +10,27 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from itertools import pairwise
-from typing import Annotated, Literal, Protocol, get_args
+from typing import Annotated, Literal, Protocol, Self, get_args
 
 import numpy as np
-from pydantic import AfterValidator, Field, FiniteFloat
+from pydantic import Field, FiniteFloat
 
 from rig.channels import Channel
 from rig.errors import InputError
 from rig.faults.blocks import BlockKind
-from rig.faults.kind import SIGMAS, At, Kind, Setting
+from rig.faults.converter import ConverterKind
+from rig.faults.kind import At, Kind, Part, Positive, Setting, but, swing_v
 from rig.faults.pulses import PulseKind
 
-Part = Annotated[FiniteFloat, Field(gt=0.0, lt=1.0)]
-Positive = Annotated[FiniteFloat, Field(gt=0.0)]
 NotNegative = Annotated[FiniteFloat, Field(ge=0.0)]
-MOST_LATE_US = 10_000.0
-"""Latest that a sample may be taken [us]."""
 
 
 def _grown(at: At, ramp_s: float) -> np.ndarray | float:
     return np.minimum(at.t / ramp_s, 1.0) if ramp_s else 1.0
 
 
-def _but(*values: float, must: str) -> AfterValidator:
-    """Refuse values that would change nothing, or that another kind is for."""
-
-    def other(value: float) -> float:
-        if value in values:
-            raise ValueError(must)
-        return value
-
-    return AfterValidator(other)
+def _grown_to(lasts_s: float, ramp_s: float) -> float:
+    return min(lasts_s / ramp_s, 1.0) if ramp_s else 1.0
 
 
 # ---- transducer ----
@@ -51,8 +41,12 @@ class Gain(Kind):
 
     stage = "transducer"
     kind: Literal["gain"] = "gain"
-    factor: Annotated[FiniteFloat, _but(1.0, -1.0, must="other than 1, and than -1, which is polarity")]
+    factor: Annotated[FiniteFloat, but(1.0, -1.0, must="other than 1, and than -1, which is polarity")]
     ramp_s: NotNegative = 0.0
+    neutral = 1.0
+
+    def reach_v(self, channel: Channel, lasts_s: float, source: Channel) -> float:
+        return abs(self.factor - 1.0) * swing_v(channel) * _grown_to(lasts_s, self.ramp_s)
 
     def signal(self, x: np.ndarray, at: At) -> np.ndarray:
         return x * (1.0 + (self.factor - 1.0) * _grown(at, self.ramp_s))
@@ -63,8 +57,11 @@ class Offset(Kind):
 
     stage = "transducer"
     kind: Literal["offset"] = "offset"
-    value: Annotated[FiniteFloat, _but(0.0, must="other than 0")]
+    value: Annotated[FiniteFloat, but(0.0, must="other than 0")]
     ramp_s: NotNegative = 0.0
+
+    def reach_v(self, channel: Channel, lasts_s: float, source: Channel) -> float:
+        return abs(self.value * channel.sensitivity_v) * _grown_to(lasts_s, self.ramp_s)
 
     def signal(self, x: np.ndarray, at: At) -> np.ndarray:
         return x + self.value * _grown(at, self.ramp_s)
@@ -75,8 +72,12 @@ class Drift(Kind):
 
     stage = "transducer"
     kind: Literal["drift"] = "drift"
-    rate: Annotated[FiniteFloat, _but(0.0, must="other than 0")]
+    rate: Annotated[FiniteFloat, but(0.0, must="other than 0")]
     tau_s: Positive | None = None
+
+    def reach_v(self, channel: Channel, lasts_s: float, source: Channel) -> float:
+        far_s = lasts_s if self.tau_s is None else -self.tau_s * math.expm1(-lasts_s / self.tau_s)
+        return abs(self.rate * channel.sensitivity_v) * far_s
 
     def signal(self, x: np.ndarray, at: At) -> np.ndarray:
         far_s = at.t if self.tau_s is None else -self.tau_s * np.expm1(-at.t / self.tau_s)
@@ -112,6 +113,13 @@ class Nonlinear(Kind):
     stage = "transducer"
     kind: Literal["nonlinear"] = "nonlinear"
     end: Positive
+
+    def reach_v(self, channel: Channel, lasts_s: float, source: Channel) -> float:
+        end_v = self.end * abs(channel.sensitivity_v)
+        return swing_v(channel) - end_v * math.tanh(swing_v(channel) / end_v)
+
+    def times(self, factor: float) -> Self:
+        return self.model_copy(update={"end": self.end / factor})
 
     def signal(self, x: np.ndarray, at: At) -> np.ndarray:
         return self.end * np.tanh(x / self.end)
@@ -185,6 +193,9 @@ class Intermittent(Open):
     part: Part = 0.2
     slot_s: Annotated[FiniteFloat, Field(ge=1e-4, le=100.0)] = 0.01
 
+    def chance(self, rate_hz: int) -> tuple[str, float, float]:
+        return "part", 1.0, self.slot_s
+
     def volts(self, v: np.ndarray, at: At) -> np.ndarray:
         slots = np.floor(at.t / self.slot_s + 1e-9).astype(np.int64)
         slots_here = np.arange(slots[0], slots[-1] + 1)
@@ -208,6 +219,10 @@ class Hum(Kind):
     third: Annotated[FiniteFloat, Field(ge=0.0, le=1.0)] = 0.0
     offset_v: Annotated[FiniteFloat, Field(ge=-10.0, le=10.0)] = 0.0
 
+    def reach_v(self, channel: Channel, lasts_s: float, source: Channel) -> float:
+        turn = min(0.5 * math.pi, 2.0 * math.pi * self.frequency_hz * lasts_s)
+        return self.amplitude_v * (math.sin(turn) + self.third) + abs(self.offset_v)
+
     def volts(self, v: np.ndarray, at: At) -> np.ndarray:
         turn = 2.0 * math.pi * self.frequency_hz * at.t
         return v + self.amplitude_v * (np.sin(turn) + self.third * np.sin(3.0 * turn)) + self.offset_v
@@ -220,10 +235,17 @@ class Crosstalk(Kind):
     kind: Literal["crosstalk"] = "crosstalk"
     source: str
     db: Annotated[FiniteFloat, Field(ge=-120.0, le=0.0)] = -40.0
+    sized = "db"
 
     @property
     def reads(self) -> tuple[str, ...]:
         return (self.source,)
+
+    def reach_v(self, channel: Channel, lasts_s: float, source: Channel) -> float:
+        return 10.0 ** (self.db / 20.0) * swing_v(source)
+
+    def times(self, factor: float) -> Self:
+        return self.model_copy(update={"db": self.db + 20.0 * math.log10(factor)})
 
     def volts(self, v: np.ndarray, at: At) -> np.ndarray:
         return v + 10.0 ** (self.db / 20.0) * at.other(self.source)
@@ -235,6 +257,10 @@ class Saturation(Kind):
     stage = "cable"
     kind: Literal["saturation"] = "saturation"
     part: Part
+    neutral = 1.0
+
+    def reach_v(self, channel: Channel, lasts_s: float, source: Channel) -> float:
+        return (1.0 - self.part) * 0.5 * (channel.range_v[1] - channel.range_v[0])
 
     def volts(self, v: np.ndarray, at: At) -> np.ndarray:
         low, high = at.channel.range_v
@@ -302,161 +328,18 @@ class Bandwidth(NoFilter):
         if self.corner_hz == channel.bandwidth_hz:
             raise InputError("corner_hz", f"other than the channel's own, {self.corner_hz:g}", self.corner_hz)
 
+    def reach_v(self, channel: Channel, lasts_s: float, source: Channel) -> float:
+        return (1.0 - self.corner_hz / channel.bandwidth_hz) * channel.filter_order * swing_v(channel)
+
+    def times(self, factor: float) -> Self:
+        return self.model_copy(update={"corner_hz": self.corner_hz / factor})
+
     def chain(self, channel: Channel) -> Channel:
         return channel.model_copy(update={"bandwidth_hz": self.corner_hz})
 
 
-# ---- clock ----
-
-
-class Late(Kind):
-    """A sample of time s shows what was at s - late_us: a multiplexer's skew. Nothing from before the fault is shown.
-
-    Nothing can be early: what is not yet cannot be shown. Make all the others late instead.
-    """
-
-    stage = "clock"
-    kind: Literal["late"] = "late"
-    late_us: Annotated[FiniteFloat, Field(gt=0.0, le=MOST_LATE_US)]
-
-    def late_s(self, at: At) -> np.ndarray:
-        return np.full(len(at.t), 1e-6 * self.late_us)
-
-
-class Clock(Kind):
-    """A clock that is fast: a sample of time t since it began is taken at t / (1 + ppm 1e-6), 10 ms late at most.
-
-    One that is slow, with ppm below 0, begins 10 ms late, as none can be early, and is right 10 ms / (-1e-6 ppm) on.
-    """
-
-    stage = "clock"
-    kind: Literal["clock"] = "clock"
-    ppm: Annotated[FiniteFloat, Field(ge=-1e5, le=1e5), _but(0.0, must="other than 0")]
-
-    def late_s(self, at: At) -> np.ndarray:
-        most_s = 1e-6 * MOST_LATE_US
-        begun_s = 0.0 if self.ppm > 0.0 else most_s
-        return np.clip(begun_s + at.t * (1.0 - 1.0 / (1.0 + 1e-6 * self.ppm)), 0.0, most_s)
-
-
-class Jitter(Kind):
-    """Samples late by rms_us (4 + g(n)), white, g within 4: the mean of 4 rms_us is a delay, as none can be early."""
-
-    stage = "clock"
-    kind: Literal["jitter"] = "jitter"
-    rms_us: Annotated[FiniteFloat, Field(gt=0.0, le=1000.0)]
-
-    def late_s(self, at: At) -> np.ndarray:
-        return 1e-6 * self.rms_us * (SIGMAS + np.clip(at.draw.normal(at.n), -SIGMAS, SIGMAS))
-
-
-class Wander(Kind):
-    """Samples late by amplitude_us (1 - cos(2 pi t / period_s))."""
-
-    stage = "clock"
-    kind: Literal["wander"] = "wander"
-    amplitude_us: Annotated[FiniteFloat, Field(gt=0.0, le=MOST_LATE_US / 2.0)]
-    period_s: Annotated[FiniteFloat, Field(ge=0.01, le=3600.0)] = 1.0
-
-    def late_s(self, at: At) -> np.ndarray:
-        return 1e-6 * self.amplitude_us * (1.0 - np.cos(2.0 * math.pi * at.t / self.period_s))
-
-
-# ---- converter ----
-
-
-class Noise(Kind):
-    """c' = c + sqrt(factor^2 - 1) noise_v g(n) / step: its noise times factor."""
-
-    stage = "converter"
-    kind: Literal["noise"] = "noise"
-    factor: Annotated[FiniteFloat, Field(gt=1.0, le=1e6)]
-
-    @classmethod
-    def needs(cls, channel: Channel, setting: Setting) -> str:
-        if setting.ideal or not setting.noisy or not channel.noise_v:
-            return f"one for a channel without noise, as {channel.name} here, such as spikes"
-        return ""
-
-    def counts(self, c: np.ndarray, at: At) -> np.ndarray:
-        more = math.sqrt(self.factor**2 - 1.0) * at.channel.noise_v / at.channel.lsb_v
-        return c + np.rint(more * at.draw.normal(at.n))
-
-
-class Spikes(Kind):
-    """c' = c + size_v / step with either sign, in samples whose u(n) < rate_hz / their rate."""
-
-    stage = "converter"
-    kind: Literal["spikes"] = "spikes"
-    rate_hz: Positive = 10.0
-    size_v: Positive = 1.0
-
-    def counts(self, c: np.ndarray, at: At) -> np.ndarray:
-        u = at.draw.uniform(at.n)
-        size = np.where(u[:, 1] < 0.5, -1.0, 1.0) * np.rint(self.size_v / at.channel.lsb_v)
-        return c + np.where(u[:, 0] < self.rate_hz / at.channel.rate_hz, size, 0.0)
-
-
-class Bits(Kind):
-    """The lowest bits are lost: c' = 2^lost floor(c / 2^lost)."""
-
-    stage = "converter"
-    kind: Literal["bits"] = "bits"
-    lost: Annotated[int, Field(ge=1, le=31)]
-
-    def refuse(self, channel: Channel) -> None:
-        if self.lost >= channel.adc_bits:
-            raise InputError("lost", f"below the converter's {channel.adc_bits} bits", self.lost)
-
-    def counts(self, c: np.ndarray, at: At) -> np.ndarray:
-        return np.floor(c / 2.0**self.lost) * 2.0**self.lost
-
-
-class StuckBit(Kind):
-    """One bit of the counts, from 0 for the lowest, is always the same."""
-
-    stage = "converter"
-    kind: Literal["stuck-bit"] = "stuck-bit"
-    bit: Annotated[int, Field(ge=0, le=30)]
-    value: Literal[0, 1] = 1
-
-    def refuse(self, channel: Channel) -> None:
-        if self.bit > channel.adc_bits - 2:
-            raise InputError("bit", f"at most {channel.adc_bits - 2}, below the sign", self.bit)
-
-    def counts(self, c: np.ndarray, at: At) -> np.ndarray:
-        whole, mask = c.astype(np.int64), np.int64(1 << self.bit)
-        return ((whole | mask) if self.value else (whole & ~mask)).astype(float)
-
-
-class Clip(Kind):
-    """A smaller reference: c' = c within part of the converter's range."""
-
-    stage = "converter"
-    kind: Literal["clip"] = "clip"
-    part: Part
-
-    def counts(self, c: np.ndarray, at: At) -> np.ndarray:
-        most = math.floor(self.part * 2.0 ** (at.channel.adc_bits - 1))
-        return np.clip(c, -most, most - 1)
-
-
-class Freeze(Kind):
-    """c'(n) = c(0): one and the same number, without noise."""
-
-    stage = "converter"
-    kind: Literal["freeze"] = "freeze"
-
-    def counts(self, c: np.ndarray, at: At) -> np.ndarray:
-        return np.full(len(c), at.kept.setdefault(at.channel.name, float(c[0])) if len(c) else 0.0)
-
-    def edges(self, ticks: np.ndarray, at: At) -> np.ndarray:
-        return ticks[:0]
-
-
 AnyKind = (
     Gain | Offset | Drift | Polarity | Stuck | Nonlinear | Open | Short | Intermittent | Hum | Crosstalk | Saturation
-    | Swap | Resonance | NoFilter | Bandwidth | Late | Clock | Jitter | Wander | Noise | Spikes | Bits | StuckBit | Clip
-    | Freeze | PulseKind | BlockKind
+    | Swap | Resonance | NoFilter | Bandwidth | ConverterKind | PulseKind | BlockKind
 )  # fmt: skip
 KINDS: dict[str, type[Kind]] = {kind.name(): kind for kind in get_args(AnyKind)}

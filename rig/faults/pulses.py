@@ -8,7 +8,11 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, FiniteFloat
 
-from rig.faults.kind import SIGMAS, At, Kind
+from rig.channels import Channel
+from rig.faults.kind import SIGMAS, At, Kind, late_v
+
+MAX_TURNS_HZ = 100.0
+"""No shaft here turns faster: a fault of turns has no more of them [1/s]."""
 
 
 class MissPulses(Kind):
@@ -18,6 +22,9 @@ class MissPulses(Kind):
     channel_only = "keyphasor"
     kind: Literal["miss-pulses"] = "miss-pulses"
     part: Annotated[FiniteFloat, Field(gt=0.0, le=1.0)] = 0.2
+
+    def chance(self, rate_hz: int) -> tuple[str, float, float]:
+        return "part", 1.0, 1.0 / MAX_TURNS_HZ
 
     def signal(self, x: np.ndarray, at: At) -> np.ndarray:
         return np.where(_picked(at, self.part), 0.0, x)
@@ -48,6 +55,9 @@ class EdgeJitter(Kind):
     channel_only = "keyphasor"
     kind: Literal["edge-jitter"] = "edge-jitter"
     rms_us: Annotated[FiniteFloat, Field(gt=0.0, le=1000.0)]
+
+    def reach_v(self, channel: Channel, lasts_s: float, source: Channel) -> float:
+        return late_v(channel, 2e-6 * SIGMAS * self.rms_us)
 
     def _late_s(self, at: At) -> np.ndarray:
         turns, known = _turns(at)

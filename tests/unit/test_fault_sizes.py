@@ -1,0 +1,166 @@
+"""Faults that could change no count are refused, and the message has the smallest size that would."""
+
+from __future__ import annotations
+
+import math
+import re
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rig.channels import Channel
+from rig.errors import InputError
+from rig.faults import KINDS
+from rig.scenes import load_scene, parse_scene
+from rig.simulation import Simulation
+from tests.unit.test_channel_faults import EXAMPLES, differs, run
+
+SCENE = load_scene("stable-run", {"duration_s": 0.2, "sensors.groups": ["probes", "forces", "drive"]})
+TINY: dict[str, tuple[str, dict[str, Any], str]] = {
+    "gain": ("disk_x", {"factor": 1.0 + 1e-12}, "factor"), "offset": ("disk_x", {"value": -1e-12}, "value"),
+    "drift": ("P_E", {"rate": 1e-9, "for_s": 0.05}, "rate"), "nonlinear": ("disk_x", {"end": 1e9}, "end"),
+    "hum": ("P_E", {"amplitude_v": 1e-9}, "amplitude_v"), "saturation": ("P_E", {"part": 1.0 - 1e-12}, "part"),
+    "bandwidth": ("disk_x", {"corner_hz": 5000.0 - 1e-9}, "corner_hz"),
+    "late": ("disk_x", {"late_us": 1e-9}, "late_us"),
+    "clock": ("disk_x", {"ppm": 1e-9, "for_s": 0.05}, "ppm"), "jitter": ("disk_x", {"rms_us": 1e-9}, "rms_us"),
+    "wander": ("disk_x", {"amplitude_us": 1e-9}, "amplitude_us"), "noise": ("P_E", {"factor": 1.0 + 1e-9}, "factor"),
+    "spikes": ("P_E", {"size_v": 1e-9}, "size_v"), "clip": ("disk_x", {"part": 0.999}, "part"),
+    "edge-jitter": ("keyphasor", {"rms_us": 1e-9}, "rms_us"),
+}  # fmt: skip
+RARE: dict[str, tuple[str, str]] = {
+    "intermittent": ("P_E", "part"), "spikes": ("P_E", "rate_hz"), "lose-blocks": ("forces", "part"),
+    "duplicate-blocks": ("forces", "part"), "reorder-blocks": ("forces", "part"), "miss-pulses": ("keyphasor", "part"),
+    "extra-pulses": ("keyphasor", "part"),
+}  # fmt: skip
+SIZELESS = {
+    "polarity", "stuck", "open", "short", "swap", "no-filter", "resonance", "bits", "stuck-bit", "freeze", "dropout",
+    "stale-stamps", "restart",
+}  # fmt: skip
+
+
+def refused(request: dict[str, Any], scene: Any = SCENE) -> str:
+    """What a live command is refused with; a fault of the scene is refused with the same."""
+    with pytest.raises(InputError) as caught:
+        Simulation(scene).submit("fault", request)
+    timed = {"at_s": 0.0, "command": "fault", **request}
+    with pytest.raises(InputError) as in_scene:
+        Simulation(scene.model_copy(update={"commands": parse_scene({"commands": [timed]}).commands}))
+    assert str(caught.value) == str(in_scene.value)
+    return str(caught.value)
+
+
+def test_every_kind_with_a_size_is_looked_at() -> None:
+    assert {*TINY, *RARE, "crosstalk", "late-blocks"} | SIZELESS == set(KINDS)
+
+
+@pytest.mark.parametrize("kind", TINY)
+def test_a_fault_below_a_step_is_refused_with_the_smallest_size(kind: str) -> None:
+    channel, numbers, field = TINY[kind]
+    text = refused({"channel": channel, "kind": kind, **numbers})
+    found = re.match(rf"{field} must be at (least|most) (\S+) to change a count of {channel}, whose", text)
+    assert found is not None, text
+    enough = {"channel": channel, "kind": kind, **numbers, field: float(found[2])}
+    Simulation(SCENE).submit("fault", enough)
+    # A fifth less is refused again: the message has the smallest, and no safe one.
+    neutral = {"gain": 1.0, "noise": 1.0, "saturation": 1.0, "bandwidth": 5000.0}.get(kind, 0.0)
+    less = neutral + 0.8 * (float(found[2]) - neutral)
+    if kind == "nonlinear":
+        less = 1.25 * float(found[2])
+    elif kind == "clip":
+        less = float(found[2]) + 1e-4
+    refused({**enough, field: less})
+
+
+@pytest.mark.parametrize(("kind", "numbers"), [
+    ("offset", {}), ("hum", {"frequency_hz": 150.0}), ("spikes", {"rate_hz": 5000.0}), ("late", {}), ("jitter", {}),
+])  # fmt: skip
+def test_the_smallest_size_changes_counts(kind: str, numbers: dict[str, Any]) -> None:
+    channel, tiny, field = TINY[kind]
+    given = {"channel": channel, "kind": kind, **tiny, **numbers}
+    size = float(refused(given).split()[5])
+    sound, _ = run(scene=SCENE)
+    there, _ = run({**given, field: size, "at_s": 0.05}, scene=SCENE)
+    assert set(differs(there, sound)) == {channel}
+
+
+@pytest.mark.parametrize("kind", RARE)
+def test_a_random_fault_that_never_happens_is_refused(kind: str) -> None:
+    channel, field = RARE[kind]
+    tiny = {"channel": channel, "kind": kind, "for_s": 0.1, field: 1e-9}
+    found = re.match(rf"{field} must be above (\S+) to happen once", refused(tiny))
+    assert found is not None
+    often = 1.01 * float(found[1])
+    Simulation(SCENE).submit("fault", {**tiny, field: often})
+    if kind in ("intermittent", "spikes"):
+        sound, _ = run(scene=SCENE)
+        there, _ = run({**tiny, field: often, "at_s": 0.0}, scene=SCENE)
+        assert set(differs(there, sound)) == {channel}
+
+
+def coarse(bits: int, noise_v: float) -> Any:
+    """The scene with a converter of few bits at P_E."""
+    table = SCENE.table
+    change = {"adc_bits": bits, "noise_v": noise_v}
+    groups = {
+        name: group.model_copy(
+            update={
+                "channels": tuple(one.model_copy(update=change if one.name == "P_E" else {}) for one in group.channels)
+            }
+        )
+        for name, group in table.groups.items()
+    }
+    document = table.model_copy(update={"groups": groups}).model_dump(mode="json")
+    return load_scene("stable-run", {"duration_s": 0.2, "channels": document, "sensors.groups": ["forces", "probes"]})
+
+
+def noise_of(scene: Any, *faults: dict[str, Any]) -> float:
+    """Standard deviation of P_E's counts after 0.05 s."""
+    found, _ = run(*faults, scene=scene)
+    return float(np.std(found["P_E"][1000:]))
+
+
+def test_noise_of_a_coarse_converter_is_refused_until_it_shows() -> None:
+    scene = coarse(12, 0.002)
+    channel: Channel = scene.table.channels["P_E"]
+    assert channel.noise_v / channel.lsb_v == pytest.approx(0.41, abs=0.01)
+    noise = {"channel": "P_E", "kind": "noise"}
+    text = refused({**noise, "factor": 1.1}, scene)
+    least = float(text.split()[5])
+    assert 1.5 < least < 1.7
+    sound = noise_of(scene)
+    more = noise_of(scene, {**noise, "factor": least, "at_s": 0.0})
+    # Rounding to counts adds a twelfth of a step squared to both.
+    added = (least**2 - 1.0) * (channel.noise_v / channel.lsb_v) ** 2
+    assert more == pytest.approx(math.sqrt(sound**2 + added), rel=0.15)
+
+
+def test_crosstalk_below_a_step_of_a_coarse_converter_is_refused() -> None:
+    scene, given = coarse(12, 0.002), {"channel": "P_E", "kind": "crosstalk", "source": "P_N"}
+    least = float(refused({**given, "db": -100.0}, scene).split()[5])
+    Simulation(scene).submit("fault", {**given, "db": least})
+    refused({**given, "db": least - 1.0}, scene)
+    Simulation(SCENE).submit("fault", {**given, "db": -100.0})
+
+
+@pytest.mark.parametrize(("channel", "kind", "at_s", "least_s"), [
+    ("disk_x", "open", 0.0, 1e-6), ("disk_x", "open", 10e-6, 41e-6), ("P_E", "gain", 51e-6, 50e-6),
+    ("forces", "dropout", 26e-6, 25e-6), ("forces", "stale-stamps", 0.0, 10_001e-6),
+])  # fmt: skip
+def test_a_fault_that_ends_before_the_next_sample_is_refused(
+    channel: str, kind: str, at_s: float, least_s: float
+) -> None:
+    def scene(for_s: float) -> Simulation:
+        fault = {"at_s": at_s, "channel": channel, "kind": kind, "for_s": for_s, **EXAMPLES.get(kind, {})}
+        return Simulation(
+            parse_scene({"duration_s": 0.05, "sensors": {"groups": ["probes", "forces"]}, "faults": [fault]})
+        )
+
+    scene(least_s)
+    if least_s > 1e-6:
+        with pytest.raises(InputError, match=f"for_s must be at least {least_s:g}, to reach a sample at 20000 Hz"):
+            scene(least_s - 1e-6)
+
+
+def test_blocks_held_back_by_nothing_are_refused() -> None:
+    assert "delay_s must be" in refused({"channel": "probes", "kind": "late-blocks", "delay_s": 1e-9})
