@@ -35,5 +35,9 @@ class Outcome(StrEnum):
         return cls.of(failed=cls.FAIL in found, shown=found == {cls.PASS})
 
 
+class InconclusiveError(Exception):
+    """A test in which nothing failed, but which shows too little for a pass; one line."""
+
+
 _EXIT_STATUS = {Outcome.PASS: 0, Outcome.FAIL: 1, Outcome.INCONCLUSIVE: 3}
 """2 is wrong input, in every command."""

@@ -15,11 +15,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from replays.campaigns.measurement import InconclusiveError
 from replays.campaigns.process import Program
 from rig import wire
 from rig.closing import Closing
 from rig.errors import InputError, RefusedError, Words
+from rig.outcome import InconclusiveError
 from rig.sampling import TICKS_HZ
 from rig.transport.endpoint import free_port
 

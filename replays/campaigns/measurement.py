@@ -21,10 +21,6 @@ _UNITLESS = ("", "1")
 Limit = float | tuple[float, float]
 
 
-class InconclusiveError(Exception):
-    """A case in which nothing failed, but which shows too little for a pass; one line."""
-
-
 @dataclass(frozen=True)
 class Must:
     """What is asked of a value.

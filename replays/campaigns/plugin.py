@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from rig.outcome import Outcome
+from rig.outcome import InconclusiveError, Outcome
 
 if TYPE_CHECKING:
     from replays.campaigns.bench import Bench
@@ -112,7 +112,6 @@ class CampaignItem(pytest.Item):
     def repr_failure(self, excinfo: pytest.ExceptionInfo[BaseException], style: Any = None) -> Any:
         """A line for each value that is not as it must be, or the one of what failed."""
         from replays.campaigns.bench import BenchError
-        from replays.campaigns.measurement import InconclusiveError
         from replays.campaigns.trial import MeasurementError
         from rig.errors import DiskError, InputError
 
@@ -139,8 +138,6 @@ def pytest_runtest_call(item: pytest.Item) -> Generator[None, Any, Any]:
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) -> Generator[None, Any, Any]:
     """Keep whether a test failed, and put what a trial has left into the last report of its test."""
-    from replays.campaigns.measurement import InconclusiveError
-
     report = yield
     if report.failed:
         item.stash[_FAILED] = True

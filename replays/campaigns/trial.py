@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 
 from replays.campaigns.bench import BehindError, Bench, BenchSettings, Target
 from replays.campaigns.device import Device
-from replays.campaigns.measurement import InconclusiveError, Measurement
+from replays.campaigns.measurement import Measurement
 from rig.errors import DiskError, InputError
-from rig.outcome import Outcome
+from rig.outcome import InconclusiveError, Outcome
 
 if TYPE_CHECKING:
     from recorder.reader import Recording
