@@ -44,6 +44,7 @@ class RecordingFile:
         messages: Number of messages by topic.
         chunks: Where its messages are, in file order.
         stated_rows: Rows by key, as the file itself says at its end.
+        stated_begin_s: Simulated time of the first row, likewise [s].
     """
 
     def __init__(self, path: Path, *, salvage: bool = False) -> None:
@@ -65,10 +66,11 @@ class RecordingFile:
         self.complete, self.unchecked = found.complete, found.unchecked
         self.damaged += found.damaged
         self.attachments, self.chunks, self._topics = found.attachments, tuple(found.chunks), found.topics
-        self.about, self.stated_rows = found.about, dict[str, int]()
+        self.about, self.stated_rows, self.stated_begin_s = found.about, dict[str, int](), None
         with contextlib.suppress(InputError):
             stated = found.metadata.get("end", {}) if found.finished else {}  # one that was cut off lacks what it lacks
-            self.stated_rows = read_json(documents.read_metadata(documents.End, stated, field="end").rows.encode())
+            end = documents.read_metadata(documents.End, stated, field="end")
+            self.stated_rows, self.stated_begin_s = read_json(end.rows.encode()), end.first_time_s
         self.messages = {self._topics[number]: count for number, count in sorted(found.counts.items())}
         if len(set(self._topics.values())) < len(self._topics):
             raise InputError("file", "a recording with each channel once", str(path))

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import json
 import math
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from itertools import count
@@ -100,8 +101,8 @@ def recover(
         on_progress: Called with the part done, 0 to 1.
 
     Raises:
-        InputError: The file is being written, cannot be read, or has no whole calibration; or the new one cannot be
-            written.
+        InputError: The file is being written, cannot be read, has no whole calibration, or has lost all of its rows;
+            or the new one cannot be written.
         RecordingError: The disk refused.
     """
     output = output or recovered_path(source)
@@ -115,15 +116,41 @@ def recover(
             "unchecked": "; ".join(recording.unchecked),
             "short": "; ".join(recording.short),
         }
+        lost = InputError("file", "a recording with rows that can be read", Words(f"{source}, of which all are lost"))
+        due, ends = _lost_ends(recording)
         counts = _write(
             recording,
             output,
             metadata={"recovered": about},
             reason="recovered",
             force=force,
+            due=due,
+            ends=ends,
+            empty=lost if recording.damaged or recording.short else None,
             on_progress=on_progress,
         )
     return Rewritten(output, counts, recording.damaged, recording.unchecked, recording.short)
+
+
+def _lost_ends(recording: Recording) -> tuple[dict[str, int], dict[str, int]]:
+    """Return where the rows of each stream that lost some at its ends began and ended, by what the file states.
+
+    Returns:
+        Number of the first row, and number of the row after the last one, by key.
+    """
+    due: dict[str, int] = {}
+    ends: dict[str, int] = {}
+    file = recording.parts[0]
+    for key, stream in recording.streams.items():
+        noted = [gap.size for gap in recording.gaps if gap.key == key and stream.first < gap.index < stream.due]
+        rows = stream.missing - max(0, stream.lost - sum(noted))  # those between two blocks are counted as gaps
+        if rows > 0:
+            late_s = stream.first_time_s - (file.stated_begin_s or 0.0) if stream.rows else 0.0
+            rate_hz = file.promises[key].rate_hz if key in file.promises else 0.0
+            first = min(rows, stream.first, max(0, round(late_s * rate_hz)))
+            due[key] = stream.first - first
+            ends[key] = stream.due + rows - first
+    return due, ends
 
 
 def cut(
@@ -229,10 +256,15 @@ def _write(
     scene: dict[str, Any] | None = None,
     catalogue: dict[str, Any] | None = None,
     change: Callable[[Payload], Payload | None] = lambda payload: payload,
+    due: dict[str, int] | None = None,
+    ends: dict[str, int] | None = None,
     empty: InputError | None = None,
     on_progress: Callable[[float], None] | None,
 ) -> Counts:
-    """Copy what was recorded, changed or left out (None), and derive the rest anew; without a row, raise `empty`."""
+    """Copy what was recorded, changed or left out (None), and derive the rest anew; without a row, raise `empty`.
+
+    `due` and `ends` are the first row and the row after the last one, by key, of streams that lost rows there.
+    """
     check_destination(output, force=force)
     about = recording.metadata["rig"]
     left_out = {"rig", "end"} if "recovered" in metadata else {"rig", "end", "series"}  # a cut is no part of a series
@@ -247,7 +279,7 @@ def _write(
             scene=scene or recording.scene,
             view_rate_hz=float(about.get("view_rate_hz", 0.0)),
             force=force,
-            beginning=Beginning(metadata=metadata, attachments=attachments),
+            beginning=Beginning(metadata=metadata, attachments=attachments, due=due or {}),
             sync_every_s=2.0,
         )
         stack.callback(writer.abandon)  # nothing half-written stays; does nothing once it is finished
@@ -267,6 +299,7 @@ def _write(
                 writer.take(changed)
         if empty is not None and not any(writer.counts().rows.values()):
             raise empty
+        writer.note_short(ends or {}, time.time_ns())
         writer.finish(reason)
     return writer.counts()
 

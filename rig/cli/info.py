@@ -79,7 +79,10 @@ def describe(
     if not quick:
         health = asdict(examine(recording, progress))  # the one pass in which the streams are counted, too
         health["findings"] += parameter_doubts(recording)
-        document["streams"] = {key: asdict(stream) for key, stream in recording.streams.items()}
+        document["streams"] = {
+            key: {**asdict(stream), "lost": stream.lost + _lost_at_ends(recording, key)}
+            for key, stream in recording.streams.items()
+        }
         document["health"] = health
     return finite(document)
 
@@ -163,6 +166,17 @@ def _verdict(document: dict[str, Any]) -> list[tuple[str, str]]:
 def _lost(stream: dict[str, Any]) -> int:
     """Rows that never came, less those that a fault took."""
     return max(0, stream["lost"] - stream["declared"])
+
+
+def _lost_at_ends(recording: Recording, key: str) -> int:
+    """Return the rows noted as lost before the first and after the last row, less those that a fault took."""
+    stream = recording.streams[key]
+    gaps = [(gap.index, gap.size) for gap in recording.gaps if gap.key == key and gap.index >= 0 < gap.size]
+    lost, taken = (
+        sum(rows for row, rows in each if row + rows <= stream.first or row >= stream.due)
+        for each in (gaps, stream.around)
+    )
+    return max(0, lost - taken)
 
 
 def _number(value: float | None, noise: float) -> str:

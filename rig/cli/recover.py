@@ -24,7 +24,7 @@ def recover(
 ) -> None:
     """Make finished recordings of files that were cut off or damaged; these stay as they are.
 
-    Of a file that is whole nothing is made, unless with --force.
+    Of a file that is whole nothing is made, unless with --force. Ends with 1 where rows or records are lost.
     """
     from recorder.draft import check_destination
     from recorder.rewrite import recovered_path
@@ -41,8 +41,9 @@ def recover(
     outputs = [output or recovered_path(file) for file in broken]
     for new in outputs:
         check_destination(new, force=force)
-    for file, new in zip(broken, outputs, strict=True):
-        _recover(file, new, force=force)
+    good = [_recover(file, new, force=force) for file, new in zip(broken, outputs, strict=True)]
+    if not all(good):
+        raise typer.Exit(1)
 
 
 def _is_whole(file: Path) -> bool:
@@ -55,13 +56,14 @@ def _is_whole(file: Path) -> bool:
     return whole
 
 
-def _recover(file: Path, new: Path, *, force: bool) -> None:
+def _recover(file: Path, new: Path, *, force: bool) -> bool:
+    """Recover a file; return whether nothing of it is lost."""
     from recorder.rewrite import recover as recover_file
 
     with reporting() as report:
         made = recover_file(file, new, force=force, on_progress=lambda done: report.part(done, f"recovering {file}"))
     counts = made.counts
-    lost = sum(counts.lost.values())
+    lost = counts.really_lost
     echo(
         f"{new}: {(counts.first_time_ns or 0) / 1e9:.3f} s to {counts.last_time_ns / 1e9:.3f} s, "
         f"{sum(counts.rows.values())} rows, {new.stat().st_size / 1e6:.1f} MB"
@@ -70,3 +72,4 @@ def _recover(file: Path, new: Path, *, force: bool) -> None:
         + (f"; {lost} rows are missing in it" if lost else "")
         + "".join(f"; {text}" for text in made.short)
     )
+    return not (made.damaged or lost or made.short)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from recorder.chunks import Chunk
 from recorder.reader import Recording
 from recorder.summary import Progress, Summary
 from recorder.writer import RecordingWriter
@@ -99,7 +100,7 @@ def test_recover_takes_several_files(path, tmp_path, capsys):
         part = tmp_path / f"{number}.mcap.part"
         part.write_bytes(path.read_bytes()[:length])
         parts.append(part)
-    assert run("recover", *parts) == 0
+    assert run("recover", *parts) == 1  # the recorder had lost rows
     assert "0.recovered.mcap: 0.000 s to" in capsys.readouterr().out
     for number in range(2):
         assert Recording.open(tmp_path / f"{number}.recovered.mcap").end_reason == "recovered"
@@ -111,7 +112,7 @@ def test_of_a_whole_file_nothing_is_made(path, tmp_path, capsys):
     assert run("recover", source) == 0
     assert "run.mcap is whole" in capsys.readouterr().out
     assert list(tmp_path.iterdir()) == [source]
-    assert run("recover", source, "--force") == 0
+    assert run("recover", source, "--force") == 1
     assert (tmp_path / "run.recovered.mcap").exists()
 
 
@@ -121,12 +122,12 @@ def test_a_finished_file_with_a_damaged_chunk_is_not_whole(path, tmp_path, capsy
     chunk = Recording.open(path).chunks[0]
     data[chunk.offset + chunk.length // 2] ^= 0xFF
     source.write_bytes(data)
-    assert run("recover", source) == 0
+    assert run("recover", source) == 1
     assert "1 damaged records" in capsys.readouterr().out
     # A .part that was finished but not yet renamed is still to become a recording.
     part = tmp_path / "other.mcap.part"
     part.write_bytes(path.read_bytes())
-    assert run("recover", part) == 0
+    assert run("recover", part) == 1
     assert (tmp_path / "other.recovered.mcap").exists()
 
 
@@ -234,3 +235,66 @@ def test_a_disk_that_refuses_is_told_in_a_line(path, tmp_path, capsys, monkeypat
     assert exit_info.value.code == 1
     assert capsys.readouterr().err.strip().endswith("new.mcap.part could not be begun")
     assert not list(tmp_path.glob("new*"))
+
+
+CHUNKS = 8
+
+
+@pytest.fixture(scope="module")
+def in_chunks(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording without gaps in chunks of 64 KiB; see `_damaged`."""
+    from tests.unit import mcap_variants
+
+    folder, about = tmp_path_factory.mktemp("chunks"), documents()
+    with RecordingWriter(
+        folder / "whole.mcap", catalogue=about[CATALOGUE], parameters=about[PARAMETERS], scene=about[SCENE]
+    ) as file:
+        for number, (key, payload) in enumerate(stream(40)):
+            file.write(key, payload, 1_700_000_000_000_000_000 + number * 1_000_000)
+        file.finish("completed")
+    return mcap_variants.write(folder / "whole.mcap", folder / "run.mcap", "zstd")
+
+
+@pytest.mark.parametrize(
+    "which", ["first", "middle", "last", "first and last", "all but the first", "all but the last"]
+)
+def test_recover_ends_with_1_and_info_counts_each_row_that_is_lost(
+    in_chunks: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], which: str
+) -> None:
+    recording = Recording.open(in_chunks)
+    chunks = [one for one in recording.chunks if any(key == sensor_key("probes") for key, *_ in recording.read(one))]
+    middle = len(chunks) // 2
+    assert len(chunks) > 4
+    hit = {
+        "first": chunks[:1], "middle": chunks[middle : middle + 1], "last": chunks[-1:],
+        "first and last": [chunks[0], chunks[-1]], "all but the first": chunks[1:], "all but the last": chunks[:-1],
+    }[which]  # fmt: skip
+    source, made = _damaged(in_chunks, tmp_path / "x.mcap", hit), tmp_path / "made.mcap"
+    assert run("recover", source, "-o", made) == 1
+    assert f"{len(hit)} damaged records passed over" in capsys.readouterr().out
+    whole, kept = recording.streams, Recording.open(made).streams
+    assert run("info", "--json", made) == 0
+    streams = json.loads(capsys.readouterr().out)["streams"]
+    gone = {key: whole[key].rows - kept[key].rows for key in kept}
+    assert {key: each["lost"] for key, each in streams.items()} == gone
+    assert run("info", made) == 0
+    assert f"{sum(gone.values())} rows in " in capsys.readouterr().out
+    assert set(Recording.open(made).doubts) <= set(recording.doubts)
+
+
+def test_recover_makes_no_file_where_every_chunk_is_unreadable(
+    in_chunks: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source = _damaged(in_chunks, tmp_path / "x.mcap", Recording.open(in_chunks).chunks)
+    assert run("recover", source) == 2
+    assert "must be a recording with rows that can be read" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == [source]
+
+
+def _damaged(source: Path, target: Path, chunks: Sequence[Chunk]) -> Path:
+    """Write a recording with a changed byte in some of its chunks."""
+    data = bytearray(source.read_bytes())
+    for chunk in chunks:
+        data[chunk.offset + chunk.length // 2] ^= 0xFF
+    target.write_bytes(data)
+    return target
