@@ -15,6 +15,7 @@ import numpy as np
 
 from replays.score.intervals import student
 from replays.score.live import Arrivals
+from replays.score.overlap import find_begin
 from replays.score.recorded import Recorded, Table
 from replays.score.rows import NO_COUNT, Followed, follow, located, stretches
 from replays.score.scorecard import Interval, Scorecard
@@ -25,12 +26,14 @@ from rig.channels import Channel
 
 _NEAR = 0.49
 """Part of a count by which a recovered one may be off a whole number: rounding of the file."""
-_NOTHING = 0.01
-"""Counts that are none."""
+_REFITTED = 8
+"""Stretches on which a scale is fitted although a known one explains others."""
 _PIECE = 512
 """Most consecutive rows on which a scale is found: a row may be lost before and behind them."""
 _LOOKED = 1 << 16
 """Rows of a recording by which its scale is found."""
+_SEARCHED = 3
+"""Signals of a table by which its place in the session is searched over the whole of both."""
 _ENOUGH = 0.99
 _BATCHES, _APART = 256, 32
 """Of stamps that are shown, and that are judged."""
@@ -90,25 +93,51 @@ def find_scale(values: np.ndarray, unit: str, counts: np.ndarray, channel: Chann
         return bool(moving.any()) and min(same.mean(), same[moving].mean()) >= _ENOUGH
 
     candidates = _candidates(unit, channel)
-    for scale in candidates:
-        if any(shows(scale, p) for p in pieces):
-            return scale
-    for p in pieces:
-        x, y = counts[p].astype(float), values[p]
+    shown = [[n for n, p in enumerate(pieces) if shows(scale, p)] for scale in candidates]
+    best = max(range(len(candidates)), key=lambda n: len(shown[n]))
+    # A small gain shows where counts are large: the pieces with the largest counts come first.
+    others = [n for n in range(len(pieces)) if n not in shown[best]]
+    others.sort(key=lambda n: -int(np.abs(counts[pieces[n]]).max()))
+    for n in others[: _REFITTED if shown[best] else None]:
+        x, y = counts[pieces[n]].astype(float), values[pieces[n]]
         if not np.isfinite(y).all() or not np.ptp(x):
             continue
         each, zero = map(float, np.polyfit(x - x.mean(), y, 1))
-        zero -= each * float(x.mean())
-        if each and shows(Scale(each, zero, "fitted"), p):
-            near = min(candidates, key=lambda one: abs(math.log(abs(each / one.each))))
-            ratio = each / near.each
-            # Digits that the file leaves out, and those of numbers, are no gain and no zero.
-            unsure = 5.0 * float(np.std((y - zero) / each - x)) / math.sqrt(len(x))
-            gain, shift = abs(ratio) - 1.0, (zero - ratio * near.zero) / each  # beside that gain, about a value of zero
-            gain = gain if abs(gain) * np.std(x) > unsure + _NOTHING else 0.0
-            shift = shift if abs(shift) > unsure * math.hypot(1.0, x.mean() / np.std(x)) + _NOTHING else 0.0
-            return Scale(each, zero, f"fitted, beside {near.what}", 1e6 * gain, shift, ratio < 0.0)
-    return None
+        fitted = Scale(each, zero - each * float(x.mean()), "fitted")
+        if each and shows(fitted, pieces[n]):
+            return _judge_fit(fitted, values, counts, candidates)
+    if not shown[best]:
+        return None
+    fitted = _judge_fit(candidates[best], values, counts, candidates)
+    ends = np.array([counts.min(), counts.max()])
+    changed = np.abs((fitted.each * ends + fitted.zero - candidates[best].zero) / candidates[best].each - ends)
+    return fitted if changed.max() >= 0.5 else candidates[best]
+
+
+def _judge_fit(fitted: Scale, values: np.ndarray, counts: np.ndarray, candidates: list[Scale]) -> Scale:
+    """Return the scale of all rows that a first one explains, and how far its gain and zero are off the nearest known.
+
+    Either a gain or a zero is taken where it alone leaves as little as both: a channel with little spread about a large
+    mean has its gain from the mean. What the digits of the file leave open is neither.
+    """
+    near = min(candidates, key=lambda one: abs(math.log(abs(fitted.each / one.each))))
+    same = fitted.counts(values) == counts
+    x, sign = counts[same].astype(float), 1.0 if fitted.each / near.each > 0.0 else -1.0
+    off = (sign * values[same] - near.zero) / near.each - x
+    mean, spread = float(x.mean()), float(np.ptp(x))
+    slope = float(np.polyfit(x - mean, off, 1)[0]) if spread else 0.0
+    alone = float(off @ x / (x @ x)) if x.any() else 0.0
+    forms = ((0.0, 0.0), (alone, 0.0), (0.0, float(off.mean())), (slope, float(off.mean()) - slope * mean))
+    left = [float(np.sqrt(np.mean((off - gain * x - zero) ** 2))) for gain, zero in forms]
+    # Rounding of 64-bit numbers, and a tenth more than the least.
+    enough = max(1.1 * left[-1], 1e-14 * (float(np.abs(x).max()) + abs(near.zero / near.each)))
+    gain, zero = next(form for form, each in zip(forms, left, strict=True) if each <= enough)
+    if (gain, zero) == (0.0, 0.0):
+        return near if sign > 0.0 else Scale(-near.each, -near.zero, f"fitted, beside {near.what}", turned=True)
+    each = sign * near.each * (1.0 + gain)
+    return Scale(
+        each, sign * (near.zero + zero * near.each), f"fitted, beside {near.what}", 1e6 * gain, zero, sign < 0.0
+    )
 
 
 def _candidates(unit: str, channel: Channel) -> list[Scale]:
@@ -129,13 +158,15 @@ class Taken:
     Attributes:
         scale: Of its counts.
         step, phase: Those rows whose number is the phase, modulo the step.
-        early: So many of its own rows, at the beginning, were sent before the session began.
+        early: Number of its first rows that stand before the session.
+        start: Place among those rows of the session at which the first of the others is due.
     """
 
     scale: Scale
     step: int = 1
     phase: int = 0
     early: int = 0
+    start: int = 0
 
 
 def settle(
@@ -149,13 +180,19 @@ def settle(
     held = {group: session.early(group) for group in session.groups}
 
     begins: dict[int, int] = {}
+    searched: dict[int, set[str]] = {}
 
     def tried(name: str, of: str, begin: int) -> tuple[np.ndarray, str, np.ndarray, Channel]:
         """Values and counts of the same rows: row j of the file was sent `begin` and j steps behind the first one."""
         channel, signal, step = session.channels[of], recorded[name], step_of(name, of)
         skipped = max(0, -(begin // step))
-        values = signal.early[skipped:]
-        counts = held[channel.group][1][begin + skipped * step :: step, session.place(of)]
+        place, few = begin + skipped * step, _LOOKED
+        values, there = signal.early[skipped:], held[channel.group][1][place:]
+        if skipped and len(values) < min(_LOOKED, signal.rows - skipped):
+            values = signal.table.stretch(skipped, _LOOKED)[:, 1 + signal.column]
+        if place and len(there) < _LOOKED * step:
+            there = session.stretch(channel.group, place, _LOOKED * step)
+        counts = there[::step, session.place(of)]
         few = min(len(values), len(counts), _LOOKED)
         return values[:few], signal.unit, counts[:few] >> signal.lost_bits << signal.lost_bits, channel
 
@@ -164,9 +201,8 @@ def settle(
         return max(1, round(sent_hz / (recorded[name].rate_hz or sent_hz)))
 
     def taken(scale: Scale, step: int, begin: int, index: int) -> Taken:
-        # Before its run a rig has sent nothing.
-        early = -(begin // step) if begin < 0 <= index + begin else 0
-        return Taken(scale, step, (index + begin) % step, early)
+        phase = (index + begin) % step
+        return Taken(scale, step, phase, max(0, -(begin // step)), max(0, begin - (phase - index) % step) // step)
 
     def taken_of(name: str, of: str) -> Taken | None:
         """By where its table begins, as far as that is known; else by where its counts are."""
@@ -186,6 +222,29 @@ def settle(
                 if begin is not None:
                     begins[table] = begin
                     return taken(scale, step, begin, index)
+            begin = overlapping(name, of, step)
+            if begin is not None:
+                values, unit, there, _ = tried(name, of, begin)
+                if len(values) > 1 and (scale := find_scale(values, unit, there, channel)) is not None:
+                    begins[table] = begin
+                    return taken(scale, step, begin, index)
+        return None
+
+    def overlapping(name: str, of: str, step: int) -> int | None:
+        """Where the table begins, by all rows of both; a few of its signals are asked, as each reads both sides."""
+        signal, channel = recorded[name], session.channels[of]
+        sent, asked = Sent(session, [channel.group]), searched.setdefault(id(signal.table), set())
+        rows = session.rows(channel.group)
+        beyond = signal.rows > len(signal.early) or rows > len(held[channel.group][1])
+        if not beyond or name in asked or len(asked) >= _SEARCHED:
+            return None
+        asked.add(name)
+        column, fewest = sent.names.index(of), min(signal.rows, rows // step)
+        for scale in _candidates(signal.unit, channel):
+            here = (scale.counts(part[:, 1]) for part in signal.table.parts([signal.column]))
+            there = (part[:, column] >> signal.lost_bits << signal.lost_bits for part in Sent(session, [channel.group]))
+            if (begin := find_begin(here, there, step, fewest)) is not None:
+                return begin
         return None
 
     settled, found = dict[str, Taken](), dict(wires)
@@ -280,7 +339,7 @@ def _score_rows(
 
     bits = np.array([recorded[name].lost_bits for name in names])
     found, trigger, at = Followed(), None, one.early
-    for places, found in follow((chunk[:, columns] >> bits << bits for chunk in sent), counts(), sound):  # noqa: B007
+    for places, found in follow((chunk[:, columns] >> bits << bits for chunk in sent), counts(), sound, one.start):  # noqa: B007
         known = np.flatnonzero(places >= 0)
         since_s = sent.since_s(places[known]) if len(known) else np.empty(0)
         stamps.take(sent.first_s, since_s, known, len(places))
@@ -314,6 +373,11 @@ def _score_rows(
         first = int(np.sum(foreign == np.arange(len(foreign))))
         foreign, early = foreign[first:], early + first
         card.remarks.append(f"{table}: the first {early} rows are not judged: they stand before the session's first")
+    after = foreign[foreign + found.last - found.last_row >= found.sent]
+    after = after[after > found.last_row]
+    if len(after):
+        foreign = foreign[: -len(after)]
+        card.remarks.append(f"{table}: the last {len(after)} rows are not judged: they stand after the session's last")
     add("foreign rows", table, stretches(foreign + one.early), numbered=False)
     for name, altered in zip(names, found.altered, strict=True):
         add("altered values", name, altered.pairs(), altered.rows)

@@ -61,7 +61,8 @@ def judge(
     limits = load_limits() if limits is None else limits
     session = Session(against)
     due = _select_channels(session, channels)
-    opened = open_can_log(file, session.recording.table) if is_can_log(file) else open_recorded(file, options)
+    remarks: list[str] = []
+    opened = open_can_log(file, session.recording.table) if is_can_log(file) else open_recorded(file, options, remarks)
     recorded = _by_name(opened)
     sent = {}
     for group, names in session.groups.items():
@@ -85,7 +86,7 @@ def judge(
         raise InputError("FILE", f"a recording of what {session.path.name} has", Words(f"{file}, of which nothing is"))
     if path == "digital" and not rows:
         raise InputError("--path", "analogue, as no counts can be told from the values", path)
-    card = Scorecard(f"{file.name} against {session.path.name}", path, limits.title, limits.bounds)
+    card = Scorecard(f"{file.name} against {session.path.name}", path, limits.title, limits.bounds, remarks=remarks)
     _score_wires(card, wires, session, rows if path == "digital" else {})
     _score_recorded(card, recorded, wires, due)
     if path == "digital":

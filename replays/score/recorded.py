@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -42,8 +42,9 @@ class Table:
 
     def parts(self, columns: Sequence[int]) -> Iterator[np.ndarray]:
         """Stamps [s] and columns, nan where there is no value that a measurement can have, in parts of one length."""
-        held: list[np.ndarray] = []
+        held, left = list[np.ndarray](), self.rows
         for piece in self._pieces(columns):
+            piece, left = piece[:left], left - len(piece[:left])
             with np.errstate(invalid="ignore"):
                 piece[:, 1:][~(np.abs(piece[:, 1:]) <= _MOST)] = np.nan
             held.append(piece)
@@ -57,12 +58,17 @@ class Table:
     @cached_property
     def early(self) -> np.ndarray:
         """Stamps and all columns of its first rows, shape (n, 1 + columns)."""
-        found: list[np.ndarray] = []
+        return self.stretch(0, _EARLY)
+
+    def stretch(self, row: int, rows: int) -> np.ndarray:
+        """Return stamps and all columns of some rows from a row on, as far as there are any, shape (n, 1 + columns)."""
+        found, at = [np.empty((0, 1 + self._columns))], 0
         for part in self.parts(range(self._columns)):
-            found.append(part)
-            if sum(map(len, found)) >= _EARLY:
+            found.append(part[max(0, row - at) : max(0, row + rows - at)])
+            at += len(part)
+            if at >= row + rows:
                 break
-        return np.concatenate(found) if found else np.empty((0, 1 + self._columns))
+        return np.concatenate(found)
 
     @property
     def stamped(self) -> bool:
@@ -128,8 +134,13 @@ class Recorded:
         return self.table.rate_hz or told or (even_rate_hz(self.table.early[:, 0]) if self.table.stamped else None)
 
 
-def open_recorded(path: Path, options: FileOptions | None = None) -> list[Recorded]:
-    """The signals of a file, in any format that `rig import` reads, or of a recording.
+def open_recorded(path: Path, options: FileOptions | None = None, remarks: list[str] | None = None) -> list[Recorded]:
+    """Return the signals of a file, in any format that `rig import` reads, or of a recording.
+
+    Args:
+        path: The file. The last row of a text without a line end is left out: its last number may be cut.
+        options: How a text file is read.
+        remarks: Takes lines about what was left out.
 
     Raises:
         InputError: It cannot be read, or has no signals.
@@ -137,6 +148,11 @@ def open_recorded(path: Path, options: FileOptions | None = None) -> list[Record
     if path.suffix == ".mcap":
         return _of_recording(path)
     source, tables = open_source(path, options or FileOptions()), dict[tuple[str, int], list[Entry]]()
+    told = [] if remarks is None else remarks
+    told += [remark for remark in source.remarks if "is cut" in remark]
+    if source.format == "text" and not told and not _ends_with_line_end(path):
+        told.append("the last line has no line end: its row is left out, as its last number may be cut")
+        source = replace(source, entries=tuple(replace(each, rows=each.rows - 1) for each in source.entries))
     for entry in source.entries:
         tables.setdefault((entry.group, entry.rows), []).append(entry)
     known = {key: Table(key[1], len(entries), _reading(source, entries)) for key, entries in tables.items()}
@@ -147,6 +163,12 @@ def open_recorded(path: Path, options: FileOptions | None = None) -> list[Record
         )
         for entry in source.entries
     ]  # fmt: skip
+
+
+def _ends_with_line_end(path: Path) -> bool:
+    with path.open("rb") as file:
+        file.seek(-1, 2)
+        return file.read(1) in (b"\n", b"\r", b"\0")  # UTF-16 ends with the line end's upper byte
 
 
 def _reading(source: Source, entries: Sequence[Entry]) -> Pieces:

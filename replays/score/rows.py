@@ -106,6 +106,7 @@ class Followed:
     Attributes:
         sent: Number of rows that were sent.
         recorded: Number of rows that were recorded.
+        last_row: Number of the last recorded row that is one of those sent; -1 if none is.
         first, last: The earliest and the latest row that came, by its place among those sent; -1 if none did.
         doubled: Places of rows that came once more, and numbers of the recorded rows, int64, shape (n, 2).
         swapped: Places of rows that came behind later ones, and numbers of the recorded rows, shape (n, 2).
@@ -116,6 +117,7 @@ class Followed:
 
     sent: int = 0
     recorded: int = 0
+    last_row: int = -1
     first: int = -1
     last: int = -1
     doubled: np.ndarray = field(default_factory=lambda: np.empty((0, 2), dtype=np.int64))
@@ -171,7 +173,7 @@ class _Sent:
 
 
 def follow(
-    sent: Iterable[np.ndarray], recorded: Iterable[np.ndarray], sound: int
+    sent: Iterable[np.ndarray], recorded: Iterable[np.ndarray], sound: int, start: int = 0
 ) -> Iterator[tuple[np.ndarray, Followed]]:
     """Follow recorded rows among those sent.
 
@@ -179,6 +181,7 @@ def follow(
         sent: Counts in chunks, int64, shape (n, channels).
         recorded: The same of the recorded ones; `NO_COUNT` where a value is no count.
         sound: Rows are known by so many of the first channels; the others are compared alone.
+        start: Place at which the first recorded row is due.
 
     Yields:
         Place of each recorded row among those sent, -1 of a foreign one, shape (n,), chunk by chunk; and what has been
@@ -186,7 +189,9 @@ def follow(
     """
     window, found = _Sent(sent, np.arange(sound)), Followed()
     events: dict[str, list[np.ndarray]] = {"doubled": [], "swapped": [], "foreign": []}
-    due, highest = 0, -1
+    due, highest = start, -1
+    for place in range(0, start - _BACK, 1 << 18):
+        window.hold(place, place + (1 << 18))
     for chunk in recorded:
         found.altered = found.altered or [Stretches(_MOST_STRETCHES) for _ in range(chunk.shape[1])]
         before = np.array([each.rows for each in found.altered])
@@ -238,6 +243,8 @@ def _places(window: _Sent, hashes: np.ndarray, due: int, low: int, high: int) ->
     """Place of each row from one to another, and whether it is known by itself; -1 if it is none of them."""
     start = max(window.start, low)
     nearby = window.hashes[start - window.start : high - window.start]
+    if not len(nearby):  # all are due after the last one
+        return np.full(len(hashes), -1, dtype=np.int64), np.zeros(len(hashes), dtype=bool)
     end = start + len(nearby)
     n, rows = len(hashes), np.arange(len(hashes))
     places = np.full(n, -1, dtype=np.int64)
@@ -266,6 +273,8 @@ def _places(window: _Sent, hashes: np.ndarray, due: int, low: int, high: int) ->
         right_one = inside & (nearby[at] == hashes[open_])
         places[open_[right_one]] = guess[right_one]
     left = np.flatnonzero(places[open_] < 0)
+    if window.ended and end == window.end:  # rows that are due after the last one are not those of earlier periods
+        left = left[forward[left] < end]
     if len(left):
         _by_nearest(places, open_[left], forward[left], ranks, start)
     left = np.flatnonzero(places[open_] < 0)
@@ -305,6 +314,7 @@ def _note(
     came, numbers, counts = places[real], numbers[real], counts[real]
     if not len(came):
         return highest
+    found.last_row = int(numbers[-1])
     near, there = came - window.start, window.times
     tops = np.maximum.accumulate(np.concatenate([[highest], came]))
     if (np.diff(tops) > 0).all():  # each later than all before: neither doubled nor swapped

@@ -56,6 +56,7 @@ class Session:
             raise InputError("--against", "a recording with samples", str(self.path))
         self._kept: dict[str, tuple[np.ndarray, float, float]] = {}
         self._blocks: dict[str, np.ndarray] = {}
+        self._stretches: dict[tuple[str, int, int], np.ndarray] = {}
 
     def rate_hz(self, group: str) -> float:
         """Rows a second of a group [Hz]."""
@@ -112,13 +113,24 @@ class Session:
 
     def early(self, group: str) -> tuple[int, np.ndarray]:
         """Number of the first row of a group, and counts of its first seconds, shape (n, channels)."""
-        sent, parts, rows = Sent(self, [group]), [], 0
-        for part in sent:
-            parts.append(part)
-            rows += len(part)
-            if rows >= _EARLY_S * sent.rate_hz:
-                break
-        return int(sent.numbers(np.zeros(1, dtype=np.int64))[0]), np.concatenate(parts)
+        first = next(self.recording.blocks(sensor_key(group))).index
+        return int(first), self.stretch(group, 0, round(_EARLY_S * self.rate_hz(group)))
+
+    def rows(self, group: str) -> int:
+        """Return the number of rows of a group."""
+        return self.recording.streams[sensor_key(group)].rows
+
+    def stretch(self, group: str, place: int, rows: int) -> np.ndarray:
+        """Return counts of some rows of a group from a place on, as far as there are any, shape (n, channels)."""
+        if (group, place, rows) not in self._stretches:
+            found, at = [np.empty((0, len(self.groups[group])), dtype=np.int64)], 0
+            for part in Sent(self, [group]):
+                found.append(part[max(0, place - at) : max(0, place + rows - at)])
+                at += len(part)
+                if at >= place + rows:
+                    break
+            self._stretches = {(group, place, rows): np.concatenate(found)}
+        return self._stretches[group, place, rows]
 
     def whole(self, name: str) -> tuple[np.ndarray, float, float]:
         """All of one channel in its unit, time of the first row [s], and rate [Hz].

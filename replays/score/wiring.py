@@ -159,7 +159,7 @@ def _find(
     for name, here in taken.items():
         length = lengths[len(here)] / math.sqrt(_step(recorded[name][1], rate))
         for apart in (_APART, round(_FAR_S * rate)):
-            first = max(0, lag - apart)
+            first = max(0, min(lag, length.shape[1] - 1) - apart)  # nothing was found, far into the recording
             about = range(first, min(lag + apart + 1, length.shape[1]))
             still = here - here.mean()
             near = np.column_stack([padded[:, at : at + len(here)] @ still for at in about])

@@ -93,3 +93,16 @@ def test_ends_of_a_limit_that_the_channel_table_turns_round_are_refused(tmp_path
     )
     with pytest.raises(InputError, match="limit noise of disk_x must be with low at most high"):
         load_limits(file).bounds("analogue", "noise", PROBES.channels[0])
+
+
+@pytest.mark.parametrize("kept", [1, 12, 20, 60, 75])
+def test_a_text_whose_last_line_is_cut_is_judged_as_far_as_it_is_whole(
+    kept: int, session: Path, counts: np.ndarray, tmp_path: Path
+) -> None:
+    lines = [",".join(map(repr, row)) for row in PROBES.engineering(counts[:2000]).tolist()]
+    heading = ",".join(f"{name} [mm]" for name in PROBES.names)
+    (tmp_path / "daq.csv").write_text("\n".join([heading, *lines[:-1], lines[-1][:kept]]))
+    card = judge(tmp_path / "daq.csv", [session])
+    assert (card.path, card.outcome) == ("digital", "pass"), card.verdict_line
+    assert any("last line" in remark for remark in card.remarks)
+    assert card.row("rows after the last", "probes").value == len(counts) - 1999

@@ -20,6 +20,8 @@ from rig.text import printable
 
 _BLOCK = 1 << 21
 """Bytes that are parsed at a time."""
+_LAST_BYTES = 1 << 16
+"""Bytes at the end of a file among which its last line is looked for."""
 _KEPT = 1 << 24
 """Values of a file that are kept once they are parsed; a longer one is parsed anew each time."""
 
@@ -78,13 +80,16 @@ def look_into(path: Path, options: FileOptions) -> Source:
     def read(entry: Entry) -> FileSignal:
         return signal(columns()[entry.place], times_s())
 
-    dialect = layout.dialect
+    dialect, remarks = layout.dialect, layout.remarks
+    last = dialect.fields(_last_line(path, layout.encoding))
+    if not layout.ragged and len(last) < layout.width:
+        remarks += (f"the last line is cut, and is left out: {len(last)} of {layout.width} columns",)
     told: dict[str, str | int] = {"delimiter": dialect.delimiter, "decimal": dialect.decimal}
     told |= {"thousands": dialect.thousands} if dialect.thousands else {}
     told["first_line"] = layout.first + 1
     if stamps is not None:
         told["time_column"] = names[stamps] or stamps + 1
-    return Source(path, "text", entries, read, pieces, start=start, remarks=layout.remarks, options=told)
+    return Source(path, "text", entries, read, pieces, start=start, remarks=remarks, options=told)
 
 
 def _first_fields(path: Path, layout: Layout) -> list[str]:
@@ -143,13 +148,20 @@ def _parsed(path: Path, layout: Layout, options: FileOptions, stamps: int | None
                 yield columns
     except pyarrow.ArrowInvalid as error:
         raise damaged(path, "text", error) from None
-    if bad:
+    if bad and not (len(bad) == 1 and bad[0].text.strip() == _last_line(path, layout.encoding)):
         row = bad[0]
         line = f"line {row.number + layout.first - skipped}: " if row.number else ""
         raise InputError(
             "file", f"a text file of {layout.width} columns throughout",
             Words(f"{path}, where {len(bad)} lines are not so ({line}{row.actual_columns} columns, {row.text[:40]!r})"),
         )  # fmt: skip
+
+
+def _last_line(path: Path, encoding: str) -> str:
+    """Return the last line of a file that has something in it, without spaces at its ends."""
+    with path.open("rb") as file:
+        file.seek(max(0, path.stat().st_size - _LAST_BYTES))
+        return file.read().decode(encoding, errors="replace").rstrip().rpartition("\n")[2].strip()
 
 
 def _body(path: Path, layout: Layout) -> tuple[Any, int, str]:

@@ -1,0 +1,62 @@
+"""Overlap of a recording with the session by their counts alone, whatever either holds before, after or in its stamps.
+
+Groups of consecutive counts are hashed. The side with fewer rows is held sorted, the other one is read in pieces, so
+that memory does not grow with the length of either.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+
+from replays.score.rows import row_hashes
+
+_GRAM = 16
+"""Consecutive counts that are hashed together: a channel with few levels is then still distinct."""
+_MIN_VOTES = 16
+"""Groups that must agree on where the recording begins; chance agreements are single ones."""
+_MAX_HELD = 1 << 20
+"""Groups of the shorter side that are held; of a longer one every n-th by its hash is taken on both sides."""
+
+
+def find_begin(recorded: Iterable[np.ndarray], sent: Iterable[np.ndarray], step: int, fewest: int) -> int | None:
+    """Return the place among the sent rows of the first recorded row; negative before the session, None if not found.
+
+    Args:
+        recorded: Counts of one channel in pieces, int64, each shape (n,).
+        sent: Counts of the channel in the session in pieces, int64, each shape (m,).
+        step: Sent rows from one recorded row to the next.
+        fewest: Number of rows of the shorter side.
+    """
+    every = np.uint64(max(1, fewest // _MAX_HELD))
+    hashes, rows = (np.concatenate(each) for each in zip(*_groups(recorded, 1, every), strict=True))
+    hashes, first = np.unique(hashes, return_index=True)
+    if len(hashes) < _MIN_VOTES:
+        return None
+    rows, begins = rows[first], []
+    for there, places in _groups(sent, step, every):
+        at = np.minimum(np.searchsorted(hashes, there), len(hashes) - 1)
+        same = hashes[at] == there
+        begins.append(places[same] - step * rows[at[same]])
+    found, votes = np.unique(np.concatenate(begins), return_counts=True)
+    return int(found[np.argmax(votes)]) if len(votes) and votes.max() >= _MIN_VOTES else None
+
+
+def _groups(pieces: Iterable[np.ndarray], step: int, every: np.uint64) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield hashes and first rows of groups of counts that are not all equal; every n-th by its hash."""
+    held, at, reach = np.empty(0, dtype=np.int64), 0, (_GRAM - 1) * step
+    yield np.empty(0, dtype=np.uint64), held
+    for piece in pieces:
+        held = np.concatenate([held, piece])
+        size = len(held) - reach
+        if size < 1:
+            continue
+        single = row_hashes(held[:, None])
+        hashes, moving = np.zeros(size, dtype=np.uint64), np.zeros(size, dtype=bool)
+        for n in range(0, reach + 1, step):
+            hashes = hashes * np.uint64(0x9E3779B97F4A7C15) + single[n : n + size]
+            moving |= single[n : n + size] != single[:size]
+        taken = np.flatnonzero(moving & ((hashes >> np.uint64(20)) % every == 0))
+        yield hashes[taken], at + taken
+        held, at = held[size:], at + size

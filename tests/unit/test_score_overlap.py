@@ -1,0 +1,101 @@
+"""The digital path by counts alone: where a recording lies in the session, small gains, and time stamps of any kind."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from replays.score.judgement import judge
+from replays.score.scorecard import FAIL, Scorecard
+from rig.channels import default_table
+from tests.score_daqs import RATE_HZ, counts_of, write_parquet, write_session
+
+PROBES = default_table().groups["probes"]
+
+
+def red(card: Scorecard) -> set[tuple[str, str]]:
+    return {(row.quantity, row.channel) for row in card.rows if row.verdict == FAIL}
+
+
+def columns_of(counts: np.ndarray) -> dict[str, np.ndarray]:
+    values = PROBES.engineering(counts)
+    return {f"{name} [mm]": values[:, n] for n, name in enumerate(PROBES.names)}
+
+
+@pytest.fixture(scope="module")
+def counts() -> np.ndarray:
+    """One second of noise on the probes."""
+    return counts_of("probes", np.random.default_rng(7).standard_normal((RATE_HZ, 4)), None)
+
+
+@pytest.fixture(scope="module")
+def session(counts: np.ndarray, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_session(tmp_path_factory.mktemp("sent") / "session.mcap", {"probes": counts})
+
+
+@pytest.mark.parametrize("before", ["noise", "silence", "its last second again"])
+def test_a_daq_that_began_a_minute_early_and_ends_late_is_judged_where_both_overlap(
+    before: str, session: Path, counts: np.ndarray, tmp_path: Path
+) -> None:
+    rows = 20 * RATE_HZ
+    ahead = {
+        "noise": counts_of("probes", np.random.default_rng(8).standard_normal((rows, 4)), None),
+        "silence": np.zeros((rows, 4), dtype=np.int64),
+        "its last second again": np.tile(counts[RATE_HZ // 2 :], (40, 1)) + 3,
+    }[before]
+    daq = np.concatenate([ahead, counts, ahead[:700] + 1])
+    card = judge(write_parquet(tmp_path / "daq.parquet", columns_of(daq)), [session])
+    assert (card.path, red(card), card.outcome) == ("digital", set(), "pass"), card.verdict_line
+    told = "\n".join(card.remarks)
+    assert f"the first {rows} rows are not judged" in told
+    assert "the last 700 rows are not judged" in told
+    daq = np.delete(daq, rows + 9000, axis=0)
+    assert red(judge(write_parquet(tmp_path / "daq.parquet", columns_of(daq)), [session])) == {
+        ("missing rows", "probes")
+    }
+
+
+def test_a_daq_that_joins_after_half_a_minute_is_found(tmp_path: Path) -> None:
+    counts = counts_of("probes", np.random.default_rng(9).standard_normal((32 * RATE_HZ, 4)), None)
+    session = write_session(tmp_path / "session.mcap", {"probes": counts}, index=700)
+    daq = np.delete(counts[31 * RATE_HZ :], 5000, axis=0)
+    card = judge(write_parquet(tmp_path / "daq.parquet", columns_of(daq)), [session])
+    assert (card.path, red(card)) == ("digital", {("missing rows", "probes")})
+    assert card.row("missing rows", "probes").note == f"rows {700 + 31 * RATE_HZ + 5000}"
+    assert card.row("rows before the first", "probes").value == 31 * RATE_HZ
+
+
+@pytest.mark.parametrize("ppm", [0.2, 1.0, 10.0, 25.0])
+@pytest.mark.parametrize(("mean", "spread"), [(2.5e6, 2e5), (6e6, 200.0), (0.0, 3e6)])
+def test_a_small_gain_that_changes_counts_fails(
+    ppm: float, mean: float, spread: float, session: Path, counts: np.ndarray, tmp_path: Path
+) -> None:
+    sent = counts.copy()
+    sent[:, 1] = mean + spread * np.clip(np.random.default_rng(3).standard_normal(len(counts)), -2.5, 2.5)
+    session = write_session(tmp_path / "session.mcap", {"probes": sent})
+    columns = columns_of(sent)
+    channel = PROBES.channels[1]
+    columns["disk_y [mm]"] = channel.scale * (1.0 + 1e-6 * ppm) * sent[:, 1] + channel.offset
+    card = judge(write_parquet(tmp_path / "daq.parquet", columns), [session])
+    assert red(card) == {("scale", "disk_y")}, [row.cells() for row in card.rows if row.verdict == FAIL]
+    assert card.row("scale", "disk_y").value == pytest.approx(ppm, rel=1e-3)
+
+
+@pytest.mark.parametrize("off", [0.3, 0.5, 0.6, 3.0])
+def test_an_offset_fails_where_it_changes_counts(off: float, session: Path, counts: np.ndarray, tmp_path: Path) -> None:
+    columns = columns_of(counts)
+    columns["disk_y [mm]"] += off * PROBES.channels[1].scale
+    card = judge(write_parquet(tmp_path / "daq.parquet", columns), [session])
+    assert red(card) == ({("offset", "disk_y")} if off >= 0.5 else set())
+
+
+def test_digits_that_the_file_leaves_out_are_no_gain(session: Path, counts: np.ndarray, tmp_path: Path) -> None:
+    small = counts // 40  # 6 digits are exact to less than half a count
+    session = write_session(tmp_path / "session.mcap", {"probes": small})
+    values = PROBES.engineering(small) - np.array([c.offset for c in PROBES.channels])
+    lines = "".join(",".join(f"{each:.9f}" for each in row) + "\n" for row in values.tolist())
+    (tmp_path / "daq.csv").write_text(",".join(f"{name} [mm]" for name in PROBES.names) + "\n" + lines)
+    card = judge(tmp_path / "daq.csv", [session])
+    assert {quantity for quantity, _ in red(card)} <= {"offset"}
