@@ -34,13 +34,16 @@ def find_begin(recorded: Iterable[np.ndarray], sent: Iterable[np.ndarray], step:
     hashes, first = np.unique(hashes, return_index=True)
     if len(hashes) < _MIN_VOTES:
         return None
-    rows, begins = rows[first], []
+    rows, pairs = rows[first], [np.empty((0, 2), dtype=np.int64)]
     for there, places in _groups(sent, step, every):
         at = np.minimum(np.searchsorted(hashes, there), len(hashes) - 1)
         same = hashes[at] == there
-        begins.append(places[same] - step * rows[at[same]])
-    found, votes = np.unique(np.concatenate(begins), return_counts=True)
-    return int(found[np.argmax(votes)]) if len(votes) and votes.max() >= _MIN_VOTES else None
+        pairs.append(np.column_stack([rows[at[same]], places[same] - step * rows[at[same]]]))
+    at, begins = np.concatenate(pairs).T
+    _, which, votes = np.unique(begins, return_inverse=True, return_counts=True)
+    clear = votes[which] >= max(_MIN_VOTES, 0.01 * votes.max(initial=0))
+    # Each lost row moves what follows: the stretch that comes first in the recording tells where it begins.
+    return int(begins[clear][np.argmin(at[clear])]) if clear.any() else None
 
 
 def _groups(pieces: Iterable[np.ndarray], step: int, every: np.uint64) -> Iterator[tuple[np.ndarray, np.ndarray]]:
