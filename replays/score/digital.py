@@ -124,6 +124,7 @@ def _judge_fit(fitted: Scale, values: np.ndarray, counts: np.ndarray, candidates
     same = fitted.counts(values) == counts
     x, sign = counts[same].astype(float), 1.0 if fitted.each / near.each > 0.0 else -1.0
     off = (sign * values[same] - near.zero) / near.each - x
+    x += near.zero / near.each  # a gain acts on values, which are zero there
     mean, spread = float(x.mean()), float(np.ptp(x))
     slope = float(np.polyfit(x - mean, off, 1)[0]) if spread else 0.0
     alone = float(off @ x / (x @ x)) if x.any() else 0.0
@@ -136,7 +137,12 @@ def _judge_fit(fitted: Scale, values: np.ndarray, counts: np.ndarray, candidates
         return near if sign > 0.0 else Scale(-near.each, -near.zero, f"fitted, beside {near.what}", turned=True)
     each = sign * near.each * (1.0 + gain)
     return Scale(
-        each, sign * (near.zero + zero * near.each), f"fitted, beside {near.what}", 1e6 * gain, zero, sign < 0.0
+        each,
+        sign * ((1.0 + gain) * near.zero + zero * near.each),
+        f"fitted, beside {near.what}",
+        1e6 * gain,
+        zero,
+        sign < 0.0,
     )
 
 
