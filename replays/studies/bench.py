@@ -66,6 +66,13 @@ def _split(tolerance: float, **changes: Any) -> dict[str, Any]:
     return _engine("split", 25, **{"engine.tolerance": tolerance, "engine.companion": False}, **changes)
 
 
+def _faults(kind: str, **numbers: float) -> list[dict[str, Any]]:
+    """Commands of the scene `hammer`, and one fault on each of its channels from the begin on."""
+    pulse = [command.model_dump() for command in load_scene("hammer").commands]
+    names = load_scene("hammer").table.channels
+    return [*pulse, *({"at_s": 0.0, "command": "fault", "channel": one, "kind": kind, **numbers} for one in names)]
+
+
 _SENSORS = {"engine.companion": False}
 SPARSE = {"sensors.rate_hz": 100, "sensors.truth_rate_hz": 100}
 _DIES_OUT = [{"at_s": 0.02, "command": "hammer", "force_n": 100.0, "duration_ms": 2.0}]
@@ -84,6 +91,13 @@ CASES = (
     Case("split, hammer, all sensors at 20 kHz", "hammer", _SENSORS, goal=120, blocks=True),
     Case("the same with its companion", "hammer", {}, blocks=True),
     Case("the same at 51.2 kHz, no companion", "hammer", {**_SENSORS, "sensors.rate_hz": 51_200}, blocks=True),
+    Case(
+        "the same at 20 kHz with its companion, 15 faults",
+        "hammer",
+        {"commands": _faults("gain", factor=1.1)},
+        blocks=True,
+    ),
+    Case("the same with 15 late channels", "hammer", {"commands": _faults("late", late_us=500.0)}, blocks=True),
     Case("split, stable run, all sensors at 20 kHz", "stable-run", {}, blocks=True),
     Case("rk8 25 us, hammer, all sensors at 20 kHz", "hammer", {"engine.name": "rk8"}, blocks=True),
 )
