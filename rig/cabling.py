@@ -11,8 +11,8 @@ from functools import cached_property
 
 import numpy as np
 
-from rig.channels import Channel
-from rig.faults import At, acts, plugged
+from rig.channels import Channel, Group
+from rig.faults import At, NoFilter, Swap, acts, plugged
 from rig.kernels.observe import EDGE, KEYPHASOR_WIDTH
 from rig.kernels.signals import COLUMN, N_ROW
 from rig.sampling import TICKS_HZ
@@ -20,6 +20,35 @@ from rig.sending import Active
 
 NONE = np.empty(0)
 """Angles and rates where a fault acts on samples, which have none."""
+
+
+_AHEAD = ("signal", "volts", "chain", "late_s")
+"""Methods by which a kind acts ahead of the converter; without one, its channel is sound up to there."""
+_PATHS = (Swap, NoFilter)
+"""Kinds that change the path of a signal, by none of the methods of a kind."""
+
+
+class Plan:
+    """What the faults that act at a time change of the channels of one conditioner.
+
+    Attributes:
+        faulty: Faults of each faulty channel.
+        homes: Group of each channel, and its column there.
+        twins: Of these channels, those with a chain of their own: sampled as they are, and late.
+        converters: Faults that act on counts, by channel.
+    """
+
+    def __init__(self, groups: Sequence[Group], active: Sequence[Active]) -> None:
+        self.homes = {name: (group.name, c) for group in groups for c, name in enumerate(group.names)}
+        every = {name: [one for one in active if name in one.names] for name in self.homes}
+        self.faulty = {name: faults for name, faults in every.items() if faults}
+        self.twins: dict[bool, dict[str, list[Active]]] = {False: {}, True: {}}
+        self.converters: dict[str, list[Active]] = {}
+        for name, faults in self.faulty.items():
+            if any(acts(one.what, *_AHEAD) or isinstance(one.what, _PATHS) for one in faults):
+                self.twins[any(acts(one.what, "late_s") for one in faults)][name] = faults
+            if last := [one for one in faults if acts(one.what, "counts")]:
+                self.converters[name] = last
 
 
 def where(
@@ -57,7 +86,7 @@ class Volts:
                 for name in one.names:
                     column = about.places[name]
                     x[:, column] = one.what.signal(x[:, column], self._at(one, name))
-        return np.clip(about.bias_v + about.sensitivity_v * x, about.low_v, about.high_v)
+        return np.minimum(np.maximum(about.bias_v + about.sensitivity_v * x, about.low_v), about.high_v)
 
     def _beyond_bias(self, name: str) -> np.ndarray:
         about = self._scales

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import math
 from bisect import insort
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from rig.cabling import Scales, Volts, no_other, seen_mark, where
+from rig.cabling import Plan, Scales, Volts, no_other, seen_mark, where
 from rig.calibrator import Calibrator, Generated
 from rig.channels import Channel, ChannelTable
 from rig.commands import ClearCommand, FaultCommand
@@ -29,7 +29,6 @@ from rig.faults import (
     OfBlocks,
     Restart,
     Setting,
-    Swap,
     acts,
     channels_of,
     check_draws,
@@ -38,7 +37,7 @@ from rig.faults import (
     stream_of,
 )  # fmt: skip
 from rig.kernels.signals import COLUMN, N_ROW
-from rig.sampling import TICKS_HZ, first_row, lagrange
+from rig.sampling import TICKS_HZ, first_row
 from rig.sending import Active, Sending
 from rig.sensors.conditioning import Conditioner
 from rig.sensors.keyphasor import FRACTIONS, TURN
@@ -52,12 +51,11 @@ _FINE = 8
 """Samples that are taken at times of their own are read off so many between two, ..."""
 _NODES = 6
 """... by the polynomial through so many."""
+_NODE_SCALES = [1.0 / math.prod(node - other for other in range(_NODES) if other != node) for node in range(_NODES)]
 _FINE_BITS = 32
 """Resolution of these samples: finer than that of any converter."""
 _OF_CONVERTER = 1
 """Last part of the key of converter noise, which keeps it apart from a fault's own numbers."""
-_PATHS = (Swap, NoFilter)
-"""Kinds that change the path of a signal, by none of the methods of a kind."""
 _REACH_V = 1e3
 """What a faulty cable carries is limited by the converter alone."""
 
@@ -109,6 +107,7 @@ class Faulty:
         self._held = np.empty(0)
         """Edges that come later than the ones that they stand for [ticks]."""
         self._twins: dict[tuple[int, bool], _Twin] = {}
+        self._planned: tuple[list[int], list[Plan]] = [], [Plan(each.groups, ()) for each in conditioners]
 
     @cached_property
     def scales(self) -> Scales:
@@ -298,32 +297,33 @@ class Faulty:
     def _counts(self, rows: np.ndarray, made: np.ndarray, tick: int) -> dict[str, np.ndarray]:
         """The same of rows between which no fault begins or ends."""
         active = [one for one in self.active if one.begin <= tick < one.end]
+        if (ids := [one.id for one in active]) != self._planned[0]:
+            self._planned = ids, [Plan(conditioner.groups, active) for conditioner in self.conditioners]
         found: dict[str, np.ndarray] = {}
         volts = Volts(self.scales, rows, made, tick, self.row_ticks, active)
-        for place, conditioner in enumerate(self.conditioners):
-            faulty: dict[str, list[Active]] = {
-                channel.name: [] for group in conditioner.groups for channel in group.channels
-            }
-            for one in active:
-                for name in one.names:
-                    if name in faulty:
-                        faulty[name].append(one)
-            faulty = {name: faults for name, faults in faulty.items() if faults}
+        for place, (conditioner, plan) in enumerate(zip(self.conditioners, self._planned[1], strict=True)):
             if isinstance(conditioner, Calibrator):
-                found |= conditioner.counts(rows, made, Generated(conditioner, faulty) if faulty else None)
+                found |= conditioner.counts(rows, made, Generated(conditioner, plan.faulty) if plan.faulty else None)
                 continue
-            if not faulty:
+            if not plan.faulty:
                 self._twins = {key: twin for key, twin in self._twins.items() if key[0] != place}
+                found |= conditioner.counts(rows, made)
+                continue
             # Twins first: they begin from the state that the sound chain has before these rows.
             rate = conditioner.groups[0].rate_hz
             n = np.arange(first_row(tick, rate), first_row(tick + (len(rows) - 1) * self.row_ticks, rate))
-            shown: dict[str, np.ndarray] = self._shown(place, conditioner, faulty, volts, n, tick) if faulty else {}
+            shown = self._shown(place, conditioner, plan, volts, n, tick)
             counts = conditioner.counts(rows, made)
-            for group in conditioner.groups if faulty else ():
-                for c, name in enumerate(group.names):
-                    if name in faulty:
-                        column: np.ndarray = counts[group.name][:, c]
-                        column[:] = self._converted(name, shown.get(name, column), n, faulty[name])
+            for name, values in shown.items():
+                group, c = plan.homes[name]
+                counts[group][:, c] = values
+            for name, faults in plan.converters.items():
+                (group, c), channel = plan.homes[name], self.channels[name]
+                values, t = counts[group][:, c].astype(float), n / rate
+                for one in faults:
+                    values = one.what.counts(values, where(one, channel, n, t))
+                most = 2.0 ** (channel.adc_bits - 1)
+                counts[group][:, c] = np.clip(values, -most, most - 1.0)
             found |= counts
         return found
 
@@ -384,37 +384,20 @@ class Faulty:
         return found[found < end] - tick
 
     def _shown(
-        self, place: int, conditioner: Conditioner, faulty: Mapping[str, list[Active]], volts: Volts, n: np.ndarray,
-        tick: int,
-    ) -> dict[str, np.ndarray]:  # fmt: skip
+        self, place: int, conditioner: Conditioner, plan: Plan, volts: Volts, n: np.ndarray, tick: int
+    ) -> dict[str, np.ndarray]:
         """Return the counts of channels of which something before the converter differs, each shape (samples,)."""
         found: dict[str, np.ndarray] = {}
-        late = {
-            name: any(acts(one.what, "late_s") for one in faults)
-            for name, faults in faulty.items()
-            if any(
-                acts(one.what, "signal", "volts", "chain", "late_s") or isinstance(one.what, _PATHS) for one in faults
-            )
-        }
-        for fine in (False, True):
-            names = [name for name, is_late in late.items() if is_late == fine]
-            twin = self._twin((place, fine), conditioner, {name: faulty[name] for name in names}, tick)
+        for fine, faulty in plan.twins.items():
+            twin = self._twin((place, fine), conditioner, faulty, tick)
             if twin is None:
                 continue
+            names = list(faulty)
             (values,) = twin.conditioner.counts(volts.rows, volts.signals(names)).values()
             if fine:
-                values = self._late(twin, values, n, [faulty[name] for name in names])
+                values = self._late(twin, values, n, list(faulty.values()))
             found |= zip(names, values.T, strict=True)
         return found
-
-    def _converted(self, name: str, counts: np.ndarray, n: np.ndarray, faults: Sequence[Active]) -> np.ndarray:
-        """Return what a channel's converter makes of counts that were sound there, shape (samples,)."""
-        channel = self.channels[name]
-        for one in faults:
-            if acts(one.what, "counts"):
-                counts = one.what.counts(counts.astype(float), where(one, channel, n, n / channel.rate_hz))
-        most = 2.0 ** (channel.adc_bits - 1)
-        return counts if counts.dtype == np.int32 else np.clip(counts, -most, most - 1.0)
 
     def _twin(
         self, key: tuple[int, bool], conditioner: Conditioner, faulty: dict[str, list[Active]], tick: int
@@ -488,11 +471,18 @@ class Faulty:
         wanted = np.maximum(here - late_s * (rate * _FINE), np.minimum(here, twin.first + _NODES - 1))
         known = np.concatenate([twin.past, counts])
         whole = np.floor(wanted).astype(np.int64)
-        weights = lagrange(wanted - whole + _NODES - 1, range(_NODES))
-        places, columns = whole - (_NODES - 1) - twin.at, np.arange(len(channels))
-        values = np.zeros(wanted.shape)
+        part, width = wanted - whole, len(channels)
+        # Places outside of what is known have a weight of 0: there samples are taken where they are.
+        places = (whole - (_NODES - 1) - twin.at) * width + np.arange(width)
+        # Weights of the polynomial through the nodes -5 to 0: products of the distances from all others.
+        apart = [part + (_NODES - 1 - node) for node in range(_NODES)]
+        values, flat = np.zeros(wanted.shape), known.ravel()
         for node in range(_NODES):
-            values += weights[node] * known[np.clip(places + node, 0, len(known) - 1), columns]
+            weight = apart[node - 1] * _NODE_SCALES[node]
+            for other in range(_NODES):
+                if other not in (node, (node - 1) % _NODES):
+                    weight *= apart[other]
+            values += weight * flat.take(places + node * width, mode="clip")
         kept = round(rate * _FINE * 0.0201) + 2 * _NODES
         twin.at, twin.past = twin.at + max(0, len(known) - kept), known[-kept:]
         bits = np.array([channel.adc_bits for channel in channels])
