@@ -99,6 +99,23 @@ COMMANDS: dict[str, type[Command]] = {
 }  # fmt: skip
 
 
+def _bounds(command: type[Command], field: str) -> tuple[float, float]:
+    low, high = (
+        next(getattr(mark, end) for mark in command.model_fields[field].metadata if hasattr(mark, end))
+        for end in ("ge", "le")
+    )
+    return low, high
+
+
+HAMMER_BOUNDS = {field: _bounds(HammerCommand, field) for field in ("force_n", "duration_ms")}
+"""Least and largest peak force [N] and length [ms] of a hammer pulse, by field."""
+
+
+def refusal(command: object) -> InputError:
+    """Return the error for a command of the table that nothing carries out."""
+    return InputError("command", "one that is carried out here", type(command).__name__)
+
+
 class TimedCommand(Written):
     """A command at a fixed time of the scene."""
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ast
 import math
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
@@ -50,6 +51,31 @@ _OPERATORS: dict[type, Callable[..., Any]] = {
 }
 
 Curve = Sequence[tuple[float, float]]
+
+
+def names_in(signal: str) -> set[str]:
+    """Return the names in a channel's signal, be it one of the model's or a formula, with those that places read."""
+    names = set(re.findall(r"[^\W\d]\w*", signal))
+    return names | {PLACES[name] for name in names & PLACES.keys()}
+
+
+def check_computed(needed: Mapping[str, Iterable[str]], row: np.ndarray, *, engine: str) -> tuple[str, ...]:
+    """Return the names of the model's signals that a run computes, and refuse others.
+
+    Args:
+        needed: Names by the field that asks for them; those that are no signals of the model are passed over.
+        row: Observed row at the run's start, shape (N_ROW,): nan where no stage has written.
+        engine: Name of its engine.
+
+    Raises:
+        InputError: A field asks for a signal that is not computed.
+    """
+    missing = {name for name, value in zip(COLUMN, row, strict=True) if math.isnan(value)}
+    for field, names in needed.items():
+        for name in sorted(missing.intersection(names)):
+            must = f"a signal that engine {engine} computes (its line in rig/kernels/observe.py is missing)"
+            raise InputError(field, must, name)
+    return tuple(name for name in COLUMN if name not in missing)
 
 
 class Formulas:

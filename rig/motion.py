@@ -121,7 +121,7 @@ class Motion:
                 ticks = min(stop - tick, row_ticks - beyond)
                 step = math.gcd(ticks, self.step_ticks)
                 stride = steps = ticks // step
-                out = np.empty((2, S.N_ROW))
+                out = np.full((2, S.N_ROW), np.nan)
             engine.advance(constants, inputs, self.y, self.memory, tick, step, steps, stride, out)
             if not whole and not beyond:
                 rows[row] = out[0]

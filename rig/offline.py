@@ -13,6 +13,7 @@ import numpy as np
 
 from rig.channels import ChannelTable
 from rig.errors import InputError, UnknownNameError, Words, whole_file
+from rig.formula import check_computed
 from rig.kernels.signals import COLUMN, N_ROW, ROW
 from rig.motion import DISSIPATED, STORED, SUPPLIED, energy_balance
 from rig.samples import Samples, joined, place
@@ -214,11 +215,14 @@ def simulate(
     scene = load_scene(scene, changes)
     if signals is not None:
         scene.check_physics()
-    kept_by_default = NAMES if scene.generator is None else ()
-    names = kept_by_default if signals is None else _names(signals)
+    names = () if signals is None else _names(signals)
     if duration_s is not None:
         scene = parse_scene({**scene.model_dump(), "duration_s": duration_s})
     simulation = Simulation(scene)
+    if signals is None and scene.generator is None:
+        names = simulation.computed
+    if names:
+        check_computed({"signals": names}, simulation.first_row, engine=scene.engine.name)
     every, end = simulation.kept_every, simulation.end_tick
     n, table = -(-end // (every * simulation.row_ticks)), simulation.table
     columns = slice(None) if names == NAMES else [COLUMN[name] for name in names]

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from rig import wire
 from rig.bounded_queue import BoundedQueue
+from rig.commands import COMMANDS as _COMMANDS
 from rig.desk import Done, Join, Kept, Leave, Note, Pending, Step
 from rig.devices import Devices
 from rig.errors import InputError, Words
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
     from rig.sending import Frame
     from rig.simulation import Simulation
 
-SIMULATION_COMMANDS = ("hammer", "speed", "release", "fault", "clear")
+SIMULATION_COMMANDS = tuple(_COMMANDS)
 """Commands that the simulation itself checks and carries out."""
 COMMANDS = (*SIMULATION_COMMANDS, "stop", "step", "note", "join", "done", "leave")
 REPLAY_COMMANDS = ("pause", "resume", "seek", "rate")

@@ -20,11 +20,12 @@ import numpy as np
 from rig import calibrator
 from rig.accuracy import Accuracy, choose_companion
 from rig.channels import ChannelTable
-from rig.commands import ClearCommand, FaultCommand, HammerCommand, ReleaseCommand, SpeedCommand, check_command
+from rig.commands import ClearCommand, FaultCommand, HammerCommand, ReleaseCommand, SpeedCommand, check_command, refusal
 from rig.engines import ENGINES, load_engine
 from rig.engines.memory import CEILING, CLAMPS, CONTACTS, FLOORED, PEAK_FORCE, STEPS
 from rig.errors import InputError, SimulationError, Words
 from rig.faulty import Faulty
+from rig.formula import check_computed, names_in
 from rig.kernels import signals as S
 from rig.kernels.constants import Inputs
 from rig.kernels.magnet import magnet_force
@@ -153,7 +154,7 @@ class Simulation:
             self._companion = Motion(initial.copy(), self._step_ticks, stride, tolerance)
         clearance = self.model.constants.contact.clearance
         self._accuracy = Accuracy(choice.tolerance, clearance, self.block_ticks / TICK_RATE_HZ)
-        self._rows = np.empty((0, S.N_ROW))
+        self._rows = np.full((0, S.N_ROW), np.nan)
         self._last: np.ndarray | None = None
 
     def __repr__(self) -> str:
@@ -162,12 +163,25 @@ class Simulation:
     @cached_property
     def first_row(self) -> np.ndarray:
         """The observed row at time zero, shape (N_ROW,). The first use starts the engine, which compiles it."""
-        row = np.empty((1, S.N_ROW))
+        row = np.full((1, S.N_ROW), np.nan)
         constants, inputs = self.model.constants, self._inputs()
         for motion, engine in zip(self._motions(), self._engines, strict=True):
             motion.begin(engine, constants, inputs)
         copy.deepcopy(self._motion).run(self._engines[0], constants, inputs, row, self.tick, self.tick, self.tick + 1)
         return row[0]
+
+    @cached_property
+    def computed(self) -> tuple[str, ...]:
+        """Names of the model's signals that a stage of this run computes: those that are a number at time zero.
+
+        Raises:
+            InputError: A channel or a truth table needs another one.
+        """
+        if self.scene.generator is not None:
+            return tuple(COLUMN)
+        needed = {f"channel {name}.signal": names_in(each.signal) for name, each in self.table.channels.items()}
+        needed |= {f"truth table {name}": S.TRUTH[name] for name in self._truth_parts}
+        return check_computed(needed, self.first_row, engine=self.scene.engine.name)
 
     def _motions(self) -> list[Motion]:
         return [self._motion] if self._companion is None else [self._motion, self._companion]
@@ -181,13 +195,13 @@ class Simulation:
         """
         if ticks <= 0 or ticks % self.block_ticks:
             raise InputError("ticks", f"a positive multiple of {self.block_ticks}", ticks)
-        _ = self.first_row  # starts the engine
+        _ = self.computed  # starts the engine
         start, end = self.tick, self.tick + ticks
         n = ticks // self.row_ticks
         if len(self._rows) <= n:
-            self._rows = np.empty((n + 1, S.N_ROW))
+            self._rows = np.full((n + 1, S.N_ROW), np.nan)
         rows, seen = self._rows[: n + 1], 0
-        companion = np.empty((ticks // self.block_ticks, S.N_ROW))
+        companion = np.full((ticks // self.block_ticks, S.N_ROW), np.nan)
         events: list[dict[str, Any]] = []
         counts: list[dict[str, np.ndarray]] = []
         while self.tick < end:
@@ -251,6 +265,8 @@ class Simulation:
             top = self.model.parameters.entries["drive.top_speed"].value
             if not isinstance(top, str) and command.speed_hz > top:
                 raise InputError("speed.speed_hz", f"at most drive.top_speed = {top:g} Hz", command.speed_hz)
+        elif not isinstance(command, ReleaseCommand):
+            raise refusal(command)
         elif not self._engaged or any(isinstance(other, ReleaseCommand) for other in waiting):
             raise InputError("release", "given once (the magnets have let go already)", Words("another release"))
         insort(self._pending, (self.tick, command), key=lambda entry: entry[0])
@@ -395,8 +411,10 @@ class Simulation:
             elif isinstance(command, ClearCommand):
                 events += [event | ended for ended in self._faulty.clear(command, self.tick)]
                 continue
-            else:
+            elif isinstance(command, ReleaseCommand):
                 self._release()
+            else:
+                raise refusal(command)
             events.append(event)
 
     def _ramp_to(self, target: float) -> None:

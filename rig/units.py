@@ -4,17 +4,12 @@ from __future__ import annotations
 
 import math
 import re
+import tomllib
 from dataclasses import dataclass
+from pathlib import Path
 
 from rig.errors import InputError
 from rig.text import nearest
-
-_TURN = 2.0 * math.pi
-_STANDARD_GRAVITY = 9.80665
-_POUND_FORCE = 4.4482216152605
-_INCH, _FOOT = 25.4e-3, 0.3048
-_RANKINE = 1.0 / 1.8
-"""Size of a degree Fahrenheit [K]."""
 
 
 @dataclass(frozen=True)
@@ -32,68 +27,11 @@ class _Unit:
     zero: float = 0.0
 
 
-# Per quantity: the unit's name, its size in SI, and other spellings, with "|" between them. Case, blanks, signs of
-# multiplication and power, and the plural's s are alike to `_key` and `_find`, and are not listed.
-_TABLE: dict[str, tuple[tuple[str, float, str], ...]] = {
-    "length": (
-        ("m", 1.0, "meter|metre"), ("cm", 1e-2, "centimeter|centimetre"), ("mm", 1e-3, "millimeter|millimetre"),
-        ("um", 1e-6, "micron|micrometer|micrometre"), ("nm", 1e-9, "nanometer|nanometre"),
-        ("in", _INCH, 'inch|inches|"'), ("mil", 1e-3 * _INCH, ""), ("thou", 1e-3 * _INCH, ""),
-        ("ft", _FOOT, "foot|feet"),
-    ),
-    "force": (
-        ("N", 1.0, "newton"), ("mN", 1e-3, "millinewton"), ("daN", 10.0, "decanewton"), ("kN", 1e3, "kilonewton"),
-        ("lbf", _POUND_FORCE, "lb|pound-force"), ("kip", 1e3 * _POUND_FORCE, "klbf"),
-        ("kgf", _STANDARD_GRAVITY, "kp|kilopond"),
-    ),
-    "acceleration": (
-        ("m/s^2", 1.0, "ms-2|m/s/s|mps2|m/s\u00c22"), ("mm/s^2", 1e-3, "mms-2|mm/s/s"), ("cm/s^2", 1e-2, "cms-2"),
-        ("um/s^2", 1e-6, "ums-2"), ("g", _STANDARD_GRAVITY, "gn|g0|g's"), ("mg", 1e-3 * _STANDARD_GRAVITY, ""),
-        ("in/s^2", _INCH, "ins-2|ips2|in/s/s"), ("ft/s^2", _FOOT, "fts-2|ft/s/s"),
-    ),
-    "velocity": (
-        ("m/s", 1.0, "ms-1|mps|m/sec"), ("cm/s", 1e-2, "cms-1|cm/sec"), ("mm/s", 1e-3, "mms-1|mm/sec"),
-        ("um/s", 1e-6, "ums-1|um/sec"), ("in/s", _INCH, "ins-1|ips|in/sec|inch/s|inch/sec"),
-        ("mil/s", 1e-3 * _INCH, ""), ("ft/s", _FOOT, "fts-1|fps|ft/sec"),
-    ),
-    # 1 Hz of a rotation is a turn a second.
-    "speed of rotation": (
-        ("Hz", _TURN, "hertz|1/s|s-1|rps|rev/s"), ("kHz", 1e3 * _TURN, "kilohertz"),
-        ("rpm", _TURN / 60.0, "1/min|u/min|min-1|r/min|rev/min|cpm|upm"), ("krpm", 1e3 * _TURN / 60.0, ""),
-        ("rad/s", 1.0, "rads-1|rad/sec"), ("deg/s", _TURN / 360.0, "degs-1|deg/sec"),
-    ),
-    "angle": (
-        ("rad", 1.0, "radian"), ("mrad", 1e-3, "milliradian"), ("deg", _TURN / 360.0, "degree"),
-        ("rev", _TURN, "turn|revolution"),
-    ),
-    "torque": (
-        ("N m", 1.0, "newtonmeter|newtonmetre|n-m"), ("mN m", 1e-3, ""), ("kN m", 1e3, ""), ("N mm", 1e-3, ""),
-        ("daN m", 10.0, ""), ("kgf m", _STANDARD_GRAVITY, "kpm"),
-        ("lbf ft", _FOOT * _POUND_FORCE, "ftlb|ftlbf|lbft|ft-lb|ft-lbf|lb-ft|lbf-ft"),
-        ("lbf in", _INCH * _POUND_FORCE, "inlb|inlbf|lbin|in-lb|in-lbf|lb-in|lbf-in"),
-    ),
-    "pressure": (
-        ("Pa", 1.0, "pascal|n/m2"), ("mPa", 1e-3, ""), ("hPa", 1e2, ""), ("kPa", 1e3, ""), ("MPa", 1e6, "n/mm2"),
-        ("GPa", 1e9, ""), ("bar", 1e5, ""), ("mbar", 1e2, "millibar"),
-        ("psi", _POUND_FORCE / _INCH**2, "lbf/in2|lb/in2"),
-    ),
-    "temperature": (("K", 1.0, "kelvin"), ("degC", 1.0, "celsius|degreec"), ("degF", _RANKINE, "fahrenheit|degreef")),
-    "voltage": (("V", 1.0, "volt|vdc"), ("mV", 1e-3, "millivolt"), ("uV", 1e-6, "microvolt"), ("kV", 1e3, "kilovolt")),
-    "current": (("A", 1.0, "amp|ampere"), ("mA", 1e-3, "milliamp|milliampere"), ("uA", 1e-6, "microamp")),
-    "time": (
-        ("s", 1.0, "sec|second"), ("ms", 1e-3, "msec|millisec|millisecond"), ("us", 1e-6, "usec|microsec|microsecond"),
-        ("ns", 1e-9, "nsec|nanosec|nanosecond"), ("min", 60.0, "minute"), ("h", 3600.0, "hr|hour"),
-        ("d", 86400.0, "day"),
-    ),
-    "number": (("1", 1.0, "|-|none|[-]|v/v"),),
-}  # fmt: skip
-"""Sizes are exact by definition (1 in = 25.4 mm, standard gravity, the international pound)."""
-_ZEROS = {"degC": 273.15, "degF": 459.67 * _RANKINE}
-"""Zero of a scale of temperature [K]."""
+_TABLE = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 _UNITS = {
-    name: _Unit(quantity, size, _ZEROS.get(name, 0.0)) for quantity, rows in _TABLE.items() for name, size, _ in rows
+    name: _Unit(of, row["size"], row.get("zero", 0.0)) for of, rows in _TABLE.items() for name, row in rows.items()
 }
-_SI = {unit.quantity: name for name, unit in reversed(_UNITS.items()) if (unit.size, unit.zero) == (1.0, 0.0)}
+_SI = {quantity: next(iter(rows)) for quantity, rows in _TABLE.items()}
 """SI unit of each quantity."""
 _AMBIGUOUS = {
     "M": ("m", "min"), "MN": ("mN", "meganewton"), "MV": ("mV", "megavolt"), "MG": ("mg", "megagram"),
@@ -122,9 +60,9 @@ def _key(spelling: str) -> str:
 
 _EXACT = {_key(name): name for name in _UNITS}
 _FOLDED: dict[str, set[str]] = {}
-for _quantity_rows in _TABLE.values():
-    for _name, _, _others in _quantity_rows:
-        for _spelling in (_name, *_others.split("|")) if _others else (_name,):
+for _rows in _TABLE.values():
+    for _name, _row in _rows.items():
+        for _spelling in (_name, *_row.get("also", ())):
             _FOLDED.setdefault(_key(_spelling).lower(), set()).add(_name)
 
 
@@ -141,6 +79,10 @@ def _find(spelling: str) -> tuple[str, ...]:
     if folded not in _FOLDED and folded.endswith("s") and (len(folded) > 3 or folded in ("gs", "lbs", "hrs")):
         folded = folded[:-1]
     return tuple(sorted(_FOLDED.get(folded, ())))
+
+
+QUANTITIES = tuple(_TABLE)
+"""What units of the table measure, as `kind` returns it."""
 
 
 def canonical(unit: str) -> str:

@@ -29,6 +29,7 @@ from drivers.can.devices import Said, device_messages, said_in
 from drivers.can.faults import FaultKind, fault_raw, fault_request, fault_signals
 from drivers.can.message import ABSENT, KEY, Message, MessageTable, Samples, Signal, checksum
 from rig.channels import Channel, ChannelTable, default_table
+from rig.commands import HAMMER_BOUNDS
 from rig.errors import InputError
 
 CLASSIC_HZ = 1_000
@@ -125,7 +126,7 @@ _STOP_SIGNALS = (
     Signal("reserved", 16, 32, label="Always 0"),
     *_HEAD,
 )
-LIMITS = {"force_n": (1.0, 1000.0), "duration_ms": (0.5, 50.0)}
+LIMITS = HAMMER_BOUNDS
 """Least and largest value of a command's field that the rig takes [N], [ms]; the drive's top speed is its parameter."""
 _HAMMER, _SPEED, _RELEASE = (int(Kind.HAMMER),), (int(Kind.SPEED),), (int(Kind.RELEASE),)
 

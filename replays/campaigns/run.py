@@ -12,7 +12,7 @@ from replays.campaigns.keeper import KILLED, PATIENCE_S
 from replays.campaigns.measurement import Measurement, Must
 from replays.campaigns.seen import Seen
 from rig import wire
-from rig.commands import ClearCommand, FaultCommand, HammerCommand, SpeedCommand, TimedCommand
+from rig.commands import ClearCommand, FaultCommand, HammerCommand, ReleaseCommand, SpeedCommand, TimedCommand, refusal
 from rig.errors import RefusedError
 
 if TYPE_CHECKING:
@@ -101,8 +101,10 @@ def _send(machine: Rig, step: Step) -> None:
             machine.fault(request.channel, numbers.pop("kind"), for_s=request.for_s, **numbers)
         elif isinstance(request, ClearCommand):
             machine.clear(request.id)
-        else:
+        elif isinstance(request, ReleaseCommand):
             machine.release()
+        else:
+            raise refusal(request)
     except RefusedError as error:
         if wire.ENDED in str(error):
             return  # the verdict is of the run's end

@@ -364,9 +364,12 @@ class Player(ServedRun):
             self._awaited = 0
             self._paused = True
             self._playhead.hold(self._now_ns())
-        elif self._paused:
-            self._cancel_step("a resume")
-            self._resume()
+        elif pending.command == "resume":
+            if self._paused:
+                self._cancel_step("a resume")
+                self._resume()
+        else:
+            raise InputError("command", f"one of {', '.join(_OWN)}", pending.command)
         pending.answer(self._accept(pending, self._tick))
 
     def _seek(self, time_s: float) -> None:

@@ -66,7 +66,9 @@ def writer_for(path: Path, simulation: Simulation, *, force: bool = False) -> Ru
         return _WavRun(path, simulation, force=force)
     if path.suffix == ".parquet":
         return _TableRun(path, simulation, columnar.ParquetRows)
-    return _TableRun(path, simulation, lambda draft, schema: delimited.CsvRows(draft, schema.names))
+    if path.suffix == ".csv":
+        return _TableRun(path, simulation, lambda draft, schema: delimited.CsvRows(draft, schema.names))
+    raise InputError("output", "of a format that has a writer", path.suffix)
 
 
 def write_run(

@@ -16,8 +16,6 @@ from rig.outside import check, read_toml
 
 FOLDER = Path(__file__).parent / "sets"
 DEFAULT = "as-calibrated"
-_KINDS = {units.kind(unit) for unit in ["m", "m/s", "m/s^2", "N", "N*m", "Hz", "V", "s", "K", "Pa", "rad", "1"]} - {""}
-"""Kinds of unit that a limit can be restricted to: those of the SI units."""
 Told = Literal[
     "noise",
     "lsb",
@@ -150,7 +148,7 @@ def load_limits(given: Path | str | None = None) -> Limits:
             where = f"{path.name}: {name}.{quantity}"
             if limit.low is None and limit.high is None:
                 raise InputError(where, "with low or high", None)
-            if limit.measures is not None and limit.measures not in _KINDS:
-                raise UnknownNameError(f"{where}.measures", "a kind of unit", limit.measures, sorted(_KINDS))
+            if limit.measures not in (None, *units.QUANTITIES):
+                raise UnknownNameError(f"{where}.measures", "a kind of unit", limit.measures, units.QUANTITIES)
             _check_order(where, limit.low, limit.high)
     return limits

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from rig import units
 from rig.cli.options import Force
 from rig.cli.tables import Form, echo, echo_json, new_table
 from rig.errors import InputError, Words, check_new_file, check_not_among, whole_file
@@ -134,6 +135,9 @@ def _guess(
         told += f"; {asked} {'line' if asked == 1 else 'lines'} to check" if asked else ""
         echo(f"{path}: {told}")
     if output is not None:
+        for guess in guesses:
+            if "unit" in guess.asks and guess.entry.unit:
+                units.parse(guess.entry.unit, field=f"unit of {guess.entry.name} (--template FILE.toml asks for it)")
         _import(files, text, output, force=force, form=form)
 
 

@@ -196,7 +196,7 @@ def start(constants, inputs, y, memory, step_ticks, tolerance):
     memory[TOLERANCE] = tolerance
     if gap(constants, y)[0] > 0.0:
         dy = np.empty(S.N_VECTOR)
-        out = np.empty(S.N_OBSERVED)
+        out = np.full(S.N_OBSERVED, np.nan)  # a signal that no stage computes stays nan
         rates(constants, inputs, 0, 0.0, memory[ONSET], TOUCHING, False, y, dy, out)
         memory[PHASE] = sliding_phase(constants, out[S.SLIDING_SPEED])
 
@@ -222,7 +222,7 @@ def advance(method, constants, inputs, y, memory, tick, step_ticks, steps, strid
     scratch = np.empty((2, S.N_STATE))
     z = np.empty(S.N_VECTOR)
     end = np.empty(S.N_VECTOR)
-    out = np.empty(S.N_OBSERVED)
+    out = np.full(S.N_OBSERVED, np.nan)  # a signal that no stage computes stays nan
     ticks = float(step_ticks)
     row = 0
     for n in range(steps + 1):

@@ -1,11 +1,14 @@
 """The table of units: every quantity, the spellings that files use, and what is refused instead of assumed."""
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from replays.score.limits import load_limits
 from rig import units
+from rig.channels import default_table
 from rig.errors import InputError
 from rig.samples import Samples
 
@@ -78,6 +81,13 @@ def test_any_unambiguous_spelling_is_the_unit() -> None:
     assert units.canonical("") == "1"
 
 
+def test_every_quantity_has_its_si_unit() -> None:
+    si = {units.kind(name): units.in_si(name) for row in SIZES.values() for name in row}
+    assert all(units.size_si(name) == 1.0 and units.in_si(name) == (name, 1.0, 0.0) for name, _, _ in si.values())
+    assert si["speed of rotation"][0] == "rad/s"
+    assert set(si) == set(units.QUANTITIES) - {"number"}
+
+
 def test_every_unit_of_the_table_is_found_by_its_own_name() -> None:
     for row in SIZES.values():
         assert [units.canonical(name) for name in row] == list(row)
@@ -127,3 +137,21 @@ def test_temperatures_of_another_zero_are_not_scaled() -> None:
     si = rows.to_si()
     assert si.units == ("K", "K", "m")
     np.testing.assert_allclose(si.values, [[373.15, 373.15, 1e-3]], rtol=1e-14)
+
+
+def test_limits_apply_to_a_channel_of_velocity(tmp_path: Path) -> None:
+    velocity = default_table().channels["inner_x"].model_copy(update={"unit": "mm/s"})
+    bounds = load_limits("iso-20816").bounds("analogue", "gain", velocity)
+    assert bounds is not None
+    assert (bounds.low, bounds.high) == (-1e5, 1e5)
+    path = tmp_path / "own.toml"
+    text = 'title = "own"\n[analogue]\n"gain" = {{ high = 5.0, kind = "assumed", source = "own", measures = "{}" }}\n'
+    path.write_text(text.format("velocity"), encoding="utf-8")
+    limits = load_limits(path)
+    expected = {"mm/s": True, "IPS": True, "m s-1": True, "mm": False, "m/s^2": False, "?": False}
+    for unit, applies in expected.items():
+        channel = velocity.model_copy(update={"unit": unit})
+        assert (limits.bounds("analogue", "gain", channel) is not None) == applies, unit
+    path.write_text(text.format("velocty"), encoding="utf-8")
+    with pytest.raises(InputError, match=r"own.toml: analogue.gain.measures must be a kind of unit.* velocity"):
+        load_limits(path)

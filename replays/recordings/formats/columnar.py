@@ -46,10 +46,11 @@ def look_into(path: Path, options: FileOptions) -> Source:
                 yield [batch.column(batch.schema.names.index(name)) for name in wanted]
 
     scale, start, rate, base = 1.0, None, None, 0
-    if stamps is not None:
-        scale = options.time_scale(headings[stamps][1])
+    if stamps is not None and file.metadata.num_rows:
         (first,), last = next(batches([stamps], [0])), None
         start, base = first_instant(first), base_ns(first)
+        if _numeric(schema.field(stamps).type):
+            scale = options.time_in_s(*headings[stamps], float(numbers(first, base)[0]))[1]
         for (last,) in batches([stamps], [file.num_row_groups - 1]):  # noqa: B007
             pass
         ends_s = [numbers(part, base)[at] * scale for part, at in ((first, 0), (last, -1))]
@@ -116,6 +117,14 @@ def numbers(column: Any, base: int = 0) -> np.ndarray:
     if column.null_count or not types.is_integer(column.type):
         return np.array(compute.cast(column, pyarrow.float64()), dtype=float)
     return np.array(column)
+
+
+def joined_instants(dates: Any, times_s: Any) -> Any:
+    """Return a column of instants: dates at midnight, each with a time of day [s]."""
+    import pyarrow
+
+    ns = np.rint(1e9 * np.asarray(times_s, dtype=float)).astype("timedelta64[ns]")
+    return pyarrow.array(np.asarray(dates).astype("datetime64[ns]") + ns, pyarrow.timestamp("ns"))
 
 
 def base_ns(column: Any) -> int:

@@ -22,6 +22,8 @@ _BLOCK = 1 << 21
 """Bytes that are parsed at a time."""
 _LAST_BYTES = 1 << 16
 """Bytes at the end of a file among which its last line is looked for."""
+_BLANKS = [" " * n for n in range(1, 33)]
+"""Fields of blanks only, as fixed columns are padded with them."""
 _KEPT = 1 << 24
 """Values of a file that are kept once they are parsed; a longer one is parsed anew each time."""
 
@@ -42,9 +44,15 @@ def look_into(path: Path, options: FileOptions) -> Source:
     if stamps is None and options.time_column is None and not layout.empty_first:
         stamps = _column_of_instants(path, layout, options)
     start, base, rows, ends_s = layout.start, 0, 0, []
-    scale = 1.0 if stamps is None else options.time_scale(layout.units[stamps])
+    unit, scale = "", 1.0
+    first = _first_fields(path, layout)
+    stamps, date = (None, None) if options.time_column == "none" else _date_and_time(layout, first, stamps)
+    if stamps is not None and layout.dialect.is_number(first[stamps]) and not options.time_format:
+        missing = first[stamps] in ("", *MISSING, *options.missing)
+        number = "nan" if missing else layout.dialect.plain(first[stamps]).replace(layout.dialect.decimal, ".")
+        unit, scale = options.time_in_s(names[stamps], layout.units[stamps], float(number))
     kept: list[list[Any]] | None = []
-    for part in _parsed(path, layout, options, stamps):
+    for part in _parsed(path, layout, options, stamps, date):
         if stamps is not None:
             if not rows:
                 start, base = start or columnar.first_instant(part[stamps]), columnar.base_ns(part[stamps])
@@ -58,10 +66,11 @@ def look_into(path: Path, options: FileOptions) -> Source:
     if not rows:
         raise InputError("file", "a text file with lines of numbers", str(path))
     rate = layout.rate_hz if stamps is None else even_rate_hz(np.array(ends_s), rows)
-    entries = tuple(Entry(name, "", layout.units[c], rows, rate, c) for c, name in enumerate(names) if c != stamps)
+    kept_names = [(c, name) for c, name in enumerate(names) if c not in (stamps, date)]
+    entries = tuple(Entry(name, "", layout.units[c], rows, rate, c) for c, name in kept_names)
 
     def pieces(entries: Sequence[Entry]) -> Iterator[list[FileSignal]]:
-        for part in _parsed(path, layout, options, stamps) if kept is None else kept:
+        for part in _parsed(path, layout, options, stamps, date) if kept is None else kept:
             part_s = None if stamps is None else columnar.numbers(part[stamps], base) * scale
             yield [signal(columnar.numbers(part[entry.place]), part_s) for entry in entries]
 
@@ -70,7 +79,7 @@ def look_into(path: Path, options: FileOptions) -> Source:
 
     @cache
     def columns() -> list[np.ndarray]:
-        parts = zip(*(_parsed(path, layout, options, stamps) if kept is None else kept), strict=True)
+        parts = zip(*(_parsed(path, layout, options, stamps, date) if kept is None else kept), strict=True)
         return [np.concatenate([columnar.numbers(each, base) for each in column]) for column in parts]
 
     @cache
@@ -89,6 +98,8 @@ def look_into(path: Path, options: FileOptions) -> Source:
     told["first_line"] = layout.first + 1
     if stamps is not None:
         told["time_column"] = names[stamps] or stamps + 1
+    if unit not in ("", "s"):
+        told["time_unit"] = unit
     return Source(path, "text", entries, read, pieces, start=start, remarks=remarks, options=told)
 
 
@@ -105,8 +116,20 @@ def _column_of_instants(path: Path, layout: Layout, options: FileOptions) -> int
     return None
 
 
-def _parsed(path: Path, layout: Layout, options: FileOptions, stamps: int | None) -> Iterator[list[Any]]:
-    """The columns in pieces, as pyarrow has them.
+def _date_and_time(layout: Layout, first: Sequence[str], stamps: int | None) -> tuple[int | None, int | None]:
+    """Return the column of times, and that of the dates (ISO 8601) where it has times of day; else None."""
+    texts = list(enumerate(first[: len(layout.names)]))
+    times = [c for c, text in texts if isinstance(instant(text, None), float)]
+    dates = [c for c, text in texts if isinstance(instant(text, "%Y-%m-%d"), datetime)]
+    if not times or not dates or stamps not in (None, *times, *dates):
+        return stamps, None
+    return (stamps if stamps in times else times[0]), dates[0]
+
+
+def _parsed(
+    path: Path, layout: Layout, options: FileOptions, stamps: int | None, date: int | None
+) -> Iterator[list[Any]]:
+    """The columns in pieces, as pyarrow has them; times of day that have a column of dates as instants.
 
     Raises:
         InputError: Lines have more or fewer columns, or something in them cannot be read.
@@ -126,6 +149,8 @@ def _parsed(path: Path, layout: Layout, options: FileOptions, stamps: int | None
     source, skipped, encoding = _body(path, layout)
     if stamps is not None and options.time_unit in (None, "datetime"):
         kinds[kept[stamps]] = _time_kind(_first_fields(path, layout)[stamps], layout, options)
+    if date is not None:
+        kinds[kept[date]] = pyarrow.timestamp("ns")
     try:
         reader = csv.open_csv(
             source,
@@ -137,13 +162,16 @@ def _parsed(path: Path, layout: Layout, options: FileOptions, stamps: int | None
             ),
             convert_options=csv.ConvertOptions(
                 column_types=kinds, include_columns=kept, decimal_point=layout.dialect.decimal,
-                null_values=[*MISSING, *options.missing], strings_can_be_null=True,
+                null_values=[*MISSING, *_BLANKS, *options.missing], strings_can_be_null=True,
             ),
         )  # fmt: skip
         for batch in reader:
             columns = batch.columns
             if stamps is not None and pyarrow.types.is_string(columns[stamps].type):
                 columns[stamps] = _instants(path, columns[stamps], options)
+            if stamps is not None and date is not None:
+                columns[stamps] = columnar.joined_instants(columns[date], columns[stamps])
+                columns[date] = pyarrow.nulls(len(batch), pyarrow.float64())
             if len(batch):
                 yield columns
     except pyarrow.ArrowInvalid as error:

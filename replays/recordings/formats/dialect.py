@@ -223,8 +223,10 @@ def _data_start(lines: list[str], dialect: Dialect, options: FileOptions) -> int
     def width(line: str) -> int:
         fields = dialect.fields(line)
         texts = [text for text in fields if not dialect.is_number(text)]
-        good = len(texts) < sum(map(bool, fields)) and len(texts) <= 1
-        return len(fields) if good and all(instant(text, options.time_format) is not None for text in texts) else 0
+        moments = [instant(text, options.time_format) for text in texts]
+        date_and_time = len(texts) == 2 and {type(each) for each in moments} == {datetime, float}
+        good = len(texts) < sum(map(bool, fields)) and (len(texts) <= 1 or date_and_time)
+        return len(fields) if good and None not in moments else 0
 
     filled = [n for n, line in enumerate(lines) if line.strip()]
     widths = [width(lines[n]) for n in filled]

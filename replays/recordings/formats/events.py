@@ -10,6 +10,7 @@ import numpy as np
 
 from replays.recordings.formats.motion import Impact, Motion, impact, turning
 from rig.channels import ChannelTable, default_table
+from rig.commands import HAMMER_BOUNDS
 from rig.errors import InputError, Words
 
 if TYPE_CHECKING:
@@ -157,10 +158,11 @@ def told_as(hit: Impact) -> str:
     """An impact as a command in TOML, as far as the probes tell it."""
     at_s, force_n, duration_ms, degrees = hit.pulse or (hit.at_s, 100.0, 5.0, 0.0)
     way = f", direction = {round(degrees)}" if abs(degrees) > _ALONG_DEG else ""
-    return (
-        f'{{ at_s = {at_s:.5f}, command = "hammer", force_n = {min(max(force_n, 1.0), 1000.0):.3g}, '
-        f"duration_ms = {min(max(duration_ms, 0.5), 50.0):.3g}{way} }}"
+    force, length = (
+        min(max(value, low), high)
+        for value, (low, high) in zip((force_n, duration_ms), HAMMER_BOUNDS.values(), strict=True)
     )
+    return f'{{ at_s = {at_s:.5f}, command = "hammer", force_n = {force:.3g}, duration_ms = {length:.3g}{way} }}'
 
 
 def _driven(

@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import json
+import re
 from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveFloat, field_validator
 
+from rig import units
 from rig.errors import InputError
 from rig.outside import check, read_toml
 
-_TIME_UNITS = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "\u00b5s": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
+_EPOCH = re.compile(r"\b(unix|epoch|posix|since|from|the|1970(-01-01)?|utc)\b", re.IGNORECASE)
+"""Words about the zero of a time, which its unit does not depend on."""
+_EPOCH_UNITS = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
+"""Least numbers that are no seconds since 1970 of this millennium, and what they are: 1e11 s is the year 5138, and
+1e11 ms, 1e14 us and 1e17 ns are March 1973."""
 
 
 _ONLY_TEXT = (
@@ -44,7 +50,7 @@ class FileOptions(_Section):
     time_column: str | Annotated[int, Field(ge=1)] | None = None
     """Column of times, by name or number from 1; "none": there is none."""
     time_unit: str | None = None
-    """s, ms, us, ns, min, h, or datetime."""
+    """s, ms, us, ns, min, h, d, or datetime."""
     time_format: str | None = None
     """Format of times that are neither numbers, nor ISO 8601, nor h:m:s, as for Python's strptime."""
 
@@ -58,8 +64,8 @@ class FileOptions(_Section):
     @field_validator("time_unit")
     @classmethod
     def _known_unit(cls, unit: str | None) -> str | None:
-        if unit not in (None, "datetime", *_TIME_UNITS):
-            raise ValueError(f"one of {', '.join(_TIME_UNITS)}, datetime")
+        if unit not in (None, "datetime") and units.kind(_EPOCH.sub("", unit)) != "time":
+            raise ValueError("s, ms, us, ns, min, h, d or datetime")
         return unit
 
     def only_for_text(self, path: Path) -> None:
@@ -72,9 +78,28 @@ class FileOptions(_Section):
             if getattr(self, name) is not None:
                 raise InputError(f"file.{name}", f"left out with {path.suffix} files", getattr(self, name))
 
-    def time_scale(self, told: str) -> float:
-        """One unit of a column of times [s]: as given here, else as the file tells, else seconds."""
-        return _TIME_UNITS.get(self.time_unit or told.strip(), 1.0)
+    def time_in_s(self, name: str, told: str, first: float) -> tuple[str, float]:
+        """Return the unit of a column of times that are numbers, and its size [s].
+
+        It is as given here, else as the heading has it ("Time [ms]", "time_ms"), else seconds, but for numbers that
+        can only be a time since 1970 in ms, us or ns.
+
+        Args:
+            name: Name of the column.
+            told: Its unit by the file; empty where it has none.
+            first: Its first number.
+
+        Raises:
+            InputError: The file's unit is none of a time, or ambiguous.
+        """
+        words = re.split(r"[ _]+", name.strip())
+        named = words[1] if len(words) == 2 and units.kind(words[1]) == "time" else ""
+        unit = _EPOCH.sub("", (self.time_unit if self.time_unit != "datetime" else None) or told or named).strip()
+        unit = unit or next((each for least, each in _EPOCH_UNITS if least <= first), "s")
+        if units.kind(unit) != "time":
+            must = "given (s, ms, us, ns, min, h, d), as the unit of the column of times is unknown or ambiguous"
+            raise InputError("file.time_unit", must, told)
+        return units.canonical(unit), units.size_si(unit)
 
 
 class TimeOptions(_Section):

@@ -148,7 +148,7 @@ def turning(motions: Sequence[Motion], *, until_s: float = math.inf) -> tuple[fl
     best: tuple[float, float, float] | None = None
     for place in ("disk", "ring"):
         parts = [named[name].slow() for name in (f"{place}_x", f"{place}_y") if name in named]
-        if not parts or len({len(times) for times, _ in parts}) > 1:
+        if not parts or not len(parts[0][0]) or len({len(times) for times, _ in parts}) > 1:
             continue
         times = parts[0][0]
         rows = (times < until_s) & (times > min(until_s, float(times[-1])) - _LONGEST_S)

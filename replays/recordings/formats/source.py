@@ -20,16 +20,12 @@ from rig.outside import DOCUMENT_BYTES, open_file, read_json, unreadable
 if TYPE_CHECKING:
     from replays.recordings.formats.mapping import FileOptions
 
-_READERS = {
-    ".mf4": "mdf", ".mdf": "mdf", ".dat": "mdf", ".tdms": "tdms", ".uff": "uff", ".unv": "uff", ".csv": "delimited",
-    ".txt": "delimited", ".asc": "delimited", ".tsv": "delimited", ".lvm": "delimited", ".parquet": "columnar",
-    ".wav": "wav",
+FORMATS = {
+    "mdf": ("MDF", ".mf4 .mdf .dat"), "tdms": ("TDMS", ".tdms"), "uff": ("universal (UFF)", ".uff .unv"),
+    "delimited": ("text", ".csv .txt .asc .tsv .lvm"), "columnar": ("Parquet", ".parquet"), "wav": ("WAV", ".wav"),
 }  # fmt: skip
-
-
-_FORMATS = {
-    "mdf": "MDF", "tdms": "TDMS", "uff": "universal (UFF)", "delimited": "text", "columnar": "Parquet", "wav": "WAV",
-}  # fmt: skip
+"""Formats by the module that reads them: their name in words, and the suffixes of their files."""
+_READERS = {suffix: name for name, (_, suffixes) in FORMATS.items() for suffix in suffixes.split()}
 _MOST_ABOUT = 2000
 """Longest text that is taken over of what a file tells of itself [characters]; longer ones are documents."""
 DOCUMENTS = ("catalogue.json", "parameters.json", "scene.json")
@@ -141,12 +137,14 @@ def open_source(path: Path, options: FileOptions) -> Source:
         raise InputError("file", "a file with something in it", str(path))
     if name != "delimited":
         options.only_for_text(path)
-    what = _FORMATS[name]
+    what = FORMATS[name][0]
     module = importlib.import_module(f"replays.recordings.formats.{name}")
     with _parsing(path, what):
         source: Source = module.look_into(path, options)
     if not source.entries:
         raise InputError("file", "a file with signals in it", str(path))
+    if not any(entry.rows for entry in source.entries):
+        raise InputError("file", "a file with rows of values", Words(f"{path}, which has columns without a row"))
 
     def read(entry: Entry) -> FileSignal:
         where = f"{what} (signal {entry.name})"

@@ -14,7 +14,7 @@ from replays.recordings.experiment import Experiment
 from replays.recordings.prediction import Measured, measured
 from replays.recordings.sensitivity import ANGLE, CLOCK, STATE, scale_of, value_of, with_values
 from rig.channels import Channel
-from rig.commands import COMMANDS, HammerCommand
+from rig.commands import COMMANDS, HAMMER_BOUNDS, HammerCommand
 from rig.errors import InputError
 from rig.parameters import load_parameters
 from rig.scenes import Scene
@@ -30,7 +30,7 @@ _SCENE_KEYS = ("drive.speed_hz", "initial.x_mm", "initial.y_mm")
 """Of a scene, what was done to the rig; the rest is how it is simulated."""
 _QUIET_S = 0.5
 """The window begins this long before the first command: enough to see where the shaft runs."""
-_COMMAND_BOUNDS = {"force_n": (1.0, 1000.0), "duration_ms": (0.5, 50.0), "direction": (-360.0, 360.0)}
+_COMMAND_BOUNDS = {**HAMMER_BOUNDS, "direction": (-360.0, 360.0)}
 _COMMAND_UNITS = {"force_n": "N", "duration_ms": "ms", "direction": "degrees", "at_s": "s", "speed_hz": "Hz"}
 
 

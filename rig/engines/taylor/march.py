@@ -107,7 +107,7 @@ def room_in(memory):
         _aligned(1, LANES)[0],
         np.zeros(ROOT + 1),
         np.empty(S.N_VECTOR),
-        np.empty(S.N_OBSERVED),
+        np.full(S.N_OBSERVED, np.nan),  # a signal that no stage computes stays nan
     )
 
 

@@ -1,0 +1,182 @@
+"""Closed sets: a member that only one of its tables has is refused; it neither acts nor shows a number."""
+
+import ast
+import importlib
+import os
+import pkgutil
+import subprocess
+import sys
+import textwrap
+from collections.abc import Iterator
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Literal, get_args
+
+import pytest
+
+import rig
+from drivers.can.faults import FaultKind
+from drivers.can.signals import LIMITS, EventKind, Kind
+from drivers.console import Console
+from recorder.trigger import EVENT_NAMES
+from replays.campaigns.expectation import EventName
+from replays.recordings import export
+from replays.recordings.formats.events import told_as
+from replays.recordings.formats.motion import Impact
+from replays.recordings.formats.source import FORMATS
+from rig import commands, faults, service, wire
+from rig.cli import app
+from rig.commands import TimedCommand
+from rig.errors import InputError
+from rig.outside import Written
+from rig.scenes import load_scene
+
+UNCOMPUTED = textwrap.dedent(
+    """
+    import importlib.util, sys
+    import rig.kernels  # not yet the table of signals
+    spec = importlib.util.find_spec("rig.kernels.signals")
+    source = open(spec.origin).read()
+    marks = 'OBSERVED = tuple(_observed.signals)'
+    assert marks in source and spec.name not in sys.modules
+    added = '_observed("outer_vx_seen", "m/s", "no stage writes it")' + chr(10)
+    module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
+    exec(compile(source.replace(marks, added + marks), spec.origin, "exec"), module.__dict__)
+
+    import tempfile, pathlib
+    import numpy as np
+    import rig
+    for engine in ("taylor", "rk4"):
+        changes = {"engine.name": engine, "engine.companion": False}
+        run = rig.simulate("stable-run", changes, duration_s=0.002)
+        assert len(run.names) == 66 and np.isfinite(run.signals).all(), run.names
+
+    def line(call):
+        try:
+            call()
+        except rig.InputError as error:
+            return str(error)
+        raise AssertionError("nothing refused")
+
+    print(line(lambda: run["outer_vx_seen"]))
+    print(line(lambda: rig.simulate("stable-run", changes, duration_s=0.002, signals=["outer_vx_seen"])))
+    for signal in ("outer_vx_seen", "2 * disk_x + abs(outer_vx_seen)"):
+        file = pathlib.Path(tempfile.mkdtemp(), "channels.toml")
+        file.write_text('[channels.disk_x]' + chr(10) + f'signal = "{signal}"' + chr(10))
+        print(line(lambda: rig.simulate("stable-run", {**changes, "channels": str(file)}, duration_s=0.002)))
+    """
+)
+
+
+def test_a_signal_that_no_stage_computes_is_refused_by_name() -> None:
+    run = subprocess.run(
+        [sys.executable, "-c", UNCOMPUTED], env={**os.environ, "NUMBA_DISABLE_JIT": "1"}, text=True,
+        capture_output=True, check=False,
+    )  # fmt: skip
+    assert not run.returncode, run.stderr
+    of_run, asked, channel, formula = run.stdout.splitlines()
+    assert "one of the signals it keeps" in of_run
+    computed = "must be a signal that engine rk4 computes"
+    assert asked.startswith(f"signals {computed}")
+    assert channel.startswith(f"channel disk_x.signal {computed}")
+    assert formula.startswith(f"channel disk_x.signal {computed}")
+    assert all("'outer_vx_seen'" in line for line in (of_run, asked, channel, formula))
+
+
+class Siren(Written):
+    """A command that stands in the table only."""
+
+    command: Literal["siren"] = "siren"
+
+
+def test_a_command_of_the_table_only_is_refused_and_releases_no_magnets(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(commands.COMMANDS, "siren", Siren)
+    simulation = rig.Simulation("stable-run")
+    with pytest.raises(InputError, match=r"command must be one that is carried out here; .* 'Siren'"):
+        simulation.submit("siren", {})
+    timed = TimedCommand.model_construct(at_s=0.0, request=Siren())
+    simulation = rig.Simulation(load_scene("stable-run").model_copy(update={"commands": (timed,)}))
+    with pytest.raises(InputError, match="command must be one that is carried out here"):
+        simulation.advance(simulation.block_ticks)
+
+
+def test_a_format_without_a_writer_is_refused_and_not_written_as_csv(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(export, "SUFFIXES", (*export.SUFFIXES, ".xyz"))
+    with pytest.raises(InputError, match=r"output must be of a format that has a writer; .* '.xyz'"):
+        export.writer_for(tmp_path / "run.xyz", rig.Simulation("stable-run"))
+    assert not list(tmp_path.iterdir())
+
+
+def test_no_choice_between_commands_ends_in_an_else_that_acts() -> None:
+    """Every if-chain over two or more commands' classes has no else, or one that raises."""
+    classes = {each.__name__ for each in commands.COMMANDS.values()}
+    chains, acting = 0, []
+    for path in (path for folder in ("rig", "recorder", "replays", "drivers") for path in Path(folder).rglob("*.py")):
+        text = path.read_text(encoding="utf-8")
+        if sum(name in text for name in classes) < 2:
+            continue
+        for node in ast.walk(ast.parse(text)):
+            tests, last = 0, node
+            while isinstance(last, ast.If) and "isinstance(" in ast.unparse(last.test):
+                tests += any(name in ast.unparse(last.test) for name in classes)
+                if len(last.orelse) != 1 or not isinstance(last.orelse[0], ast.If):
+                    break
+                last = last.orelse[0]
+            if tests > 1 and isinstance(last, ast.If):
+                chains += 1
+                if last.orelse and not isinstance(last.orelse[-1], ast.Raise):
+                    acting.append(f"{path}:{last.orelse[-1].lineno}")
+    assert chains >= 3
+    assert not acting
+
+
+def test_a_command_of_the_rig_is_in_every_registry_of_commands() -> None:
+    """A command that one of them lacks is refused there, or has no event, no name on a bus, no place in a campaign."""
+    names = set(commands.COMMANDS)
+    events = set(wire.EVENT_KINDS)
+    assert names == set(service.SIMULATION_COMMANDS) <= set(service.COMMANDS)
+    assert names <= events
+    assert not [name for name in (*service.COMMANDS, *service.REPLAY_COMMANDS) if not hasattr(Console, name)]
+    assert names <= {name for group in app.COMMANDS.values() for name in group} | {"clear"}  # rig fault --clear
+    assert names | {"stop"} == {kind.name.lower() for kind in (*Kind, *FaultKind)}
+    assert names <= {kind.name.lower() for kind in EventKind}
+    assert {kind.name.lower() for kind in EventKind} - {"other"} == events - {"note"}
+    assert names - {"clear"} <= set(EVENT_NAMES)  # the end of a fault triggers no recording
+    assert names <= set(get_args(EventName))
+    assert set(get_args(EventName)) == {*events, *service.REPLAY_COMMANDS}
+
+
+def test_the_bounds_of_a_hammer_pulse_are_those_of_its_command() -> None:
+    assert commands.HAMMER_BOUNDS == {"force_n": (1.0, 1000.0), "duration_ms": (0.5, 50.0)}
+    assert LIMITS is commands.HAMMER_BOUNDS
+    for field, (low, high) in commands.HAMMER_BOUNDS.items():
+        for value, good in ((low, True), (high, True), (low - 0.01, False), (high + 0.01, False)):
+            with nullcontext() if good else pytest.raises(InputError, match=f"hammer.{field}"):
+                commands.check_command("hammer", {field: value})
+    hit = Impact(0.5, ("disk_x",), (0.5, 1e6, 1e-6, 0.0))
+    assert "force_n = 1e+03, duration_ms = 0.5" in told_as(hit)
+
+
+def test_every_format_has_its_reader() -> None:
+    for name, (words, suffixes) in FORMATS.items():
+        assert callable(importlib.import_module(f"replays.recordings.formats.{name}").look_into)
+        assert words
+        assert all(each.startswith(".") for each in suffixes.split())
+
+
+def test_every_class_of_a_fault_is_in_the_union_and_in_every_table_of_kinds() -> None:
+    """A class outside the union has tests of its own and can be given nowhere."""
+
+    def concrete(cls: type[faults.Kind]) -> Iterator[type[faults.Kind]]:
+        for each in cls.__subclasses__():
+            yield from concrete(each)
+            if "kind" in each.model_fields:
+                yield each
+
+    for module in pkgutil.iter_modules(faults.__path__, "rig.faults."):
+        importlib.import_module(module.name)
+    classes = {each for each in concrete(faults.Kind) if each.__module__.startswith("rig.faults")}
+    assert classes == set(get_args(faults.AnyKind)) == set(faults.KINDS.values())
+    assert set(faults.KINDS) == {kind.name() for kind in classes}

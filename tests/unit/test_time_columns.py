@@ -1,0 +1,114 @@
+"""Columns of times in every unit and form, and fields and units that are refused instead of assumed."""
+
+from datetime import datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from replays.recordings.formats.mapping import FileOptions, parse_mapping
+from replays.recordings.formats.source import Source, open_source
+from rig import units
+from rig.errors import InputError
+from tests.commands import said
+
+STEP_S = 1e-3
+EPOCH_S = 1764075600
+
+
+def log(folder: Path, heading: str, times: list[str], column: str = "P_E [N]") -> Path:
+    path = folder / "log.csv"
+    rows = [f"{heading},{column}", *(f"{time},{n % 7}.5" for n, time in enumerate(times))]
+    path.write_text("\n".join(rows) + "\n", encoding="utf-8")
+    return path
+
+
+def stamps(source: Source) -> np.ndarray:
+    times_s = source.read(source.entries[0]).times_s
+    assert times_s is not None
+    return times_s
+
+
+@pytest.mark.parametrize(
+    ("heading", "each_s"),
+    [
+        ("time [s]", 1.0), ("time", 1.0), ("Time (minutes)", 60.0), ("Time [MIN]", 60.0), ("time [msec]", 1e-3),
+        ("t [µs]", 1e-6), ("t [ns]", 1e-9), ("Time [d]", 86400.0), ("time [hours]", 3600.0), ("time_ms", 1e-3),
+        ("Time us", 1e-6),        ("time [MS]", 1e-3), ("timestamp [unix ms]", 1e-3), ("time [ms since epoch]", 1e-3),
+        ("seconds", 1.0),
+    ],
+)  # fmt: skip
+def test_a_column_of_times_has_the_unit_of_its_heading(tmp_path: Path, heading: str, each_s: float) -> None:
+    source = open_source(log(tmp_path, heading, [f"{n * STEP_S / each_s:.12g}" for n in range(20)]), FileOptions())
+    assert [entry.name for entry in source.entries] == ["P_E"]
+    np.testing.assert_allclose(stamps(source), STEP_S * np.arange(20), rtol=1e-9, atol=1e-12)
+    if each_s != 1.0:  # a mapping that is made of the file says so
+        assert units.size_si(str(source.options["time_unit"])) == each_s
+
+
+@pytest.mark.parametrize(("unit", "per_s"), [("s", 1), ("ms", 1000), ("us", 10**6), ("ns", 10**9)])
+def test_a_time_since_1970_without_a_unit_is_known_by_its_size(tmp_path: Path, unit: str, per_s: int) -> None:
+    texts = [str(EPOCH_S * per_s + n * per_s // 1000) if per_s > 1 else str(EPOCH_S + n) for n in range(20)]
+    times_s = stamps(open_source(log(tmp_path, "timestamp", texts), FileOptions()))
+    step_s = STEP_S if per_s > 1 else 1.0
+    np.testing.assert_allclose(times_s - EPOCH_S, step_s * np.arange(20), atol=1e-6)
+
+
+@pytest.mark.parametrize("unit", ["M", "bananas", "mm", "weeks"])
+def test_a_column_of_times_in_an_unknown_unit_is_asked_for(tmp_path: Path, unit: str) -> None:
+    path = log(tmp_path, f"time [{unit}]", [str(n) for n in range(20)])
+    with pytest.raises(InputError, match=rf"file.time_unit must be given .*instead received '{unit}'"):
+        open_source(path, FileOptions())
+    times_s = stamps(open_source(path, FileOptions(time_unit="min")))
+    np.testing.assert_allclose(times_s, 60.0 * np.arange(20))
+
+
+def test_a_mapping_takes_any_spelling_of_a_unit_of_time_and_no_other_unit() -> None:
+    channels = {"P_E": {"source": "P_E", "unit": "N"}}
+    for unit in ("s", "sec", "ms", "us", "\u00b5s", "ns", "min", "h", "datetime", "Minutes", "d", "epoch ms"):
+        parse_mapping({"file": {"time_unit": unit}, "channels": channels}, name="m")
+    for unit in ("mm", "M", "fortnight"):
+        with pytest.raises(InputError, match=r"m: file.time_unit must be s, ms, us, ns, min, h, d or datetime"):
+            parse_mapping({"file": {"time_unit": unit}, "channels": channels}, name="m")
+
+
+@pytest.mark.parametrize("headings", ["Date,Time", "Day,Clock", "Time,Date"])
+def test_a_date_and_a_time_of_day_in_two_columns_are_one_instant(tmp_path: Path, headings: str) -> None:
+    moments = [("2026-11-25", f"23:59:59.{990 + n:03d}") for n in range(10)]
+    moments += [("2026-11-26", f"00:00:00.{n:03d}") for n in range(10)]  # over midnight
+    swap = -1 if headings == "Time,Date" else 1
+    source = open_source(log(tmp_path, headings, [",".join(pair[::swap]) for pair in moments]), FileOptions())
+    assert [entry.name for entry in source.entries] == ["P_E"]
+    assert source.start == datetime(2026, 11, 25, 23, 59, 59)
+    np.testing.assert_allclose(stamps(source), 0.99 + STEP_S * np.arange(20), atol=1e-9)
+
+
+def test_fields_of_blanks_are_missing_values(tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    rows = [f"{n / 10},{n if n % 2 else ' '},{'     ' if n % 2 else n}\n" for n in range(20)]
+    path.write_text("timestamp,A,B\n" + "".join(rows), encoding="utf-8")
+    source = open_source(path, FileOptions())
+    first, second = (source.read(entry).values for entry in source.entries)
+    np.testing.assert_array_equal(np.isnan(first), np.arange(20) % 2 == 0)
+    np.testing.assert_array_equal(np.isnan(second), np.arange(20) % 2 == 1)
+
+
+def test_a_file_without_a_row_is_refused_in_one_line(tmp_path: Path) -> None:
+    import pyarrow
+    from pyarrow import parquet
+
+    for names in (("time [s]", "P_E [N]"), ("P_E [N]", "disk_x [mm]")):
+        path = tmp_path / "empty.parquet"
+        parquet.write_table(pyarrow.table({name: pyarrow.array([], pyarrow.float64()) for name in names}), path)
+        with pytest.raises(InputError, match="file must be a file with rows of values"):
+            open_source(path, FileOptions())
+
+
+def test_an_import_by_guess_refuses_an_unknown_unit(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for unit, must in (("um pk-pk", "detector"), ("M", "unambiguous: m or min"), ("furlong", "a known unit")):
+        path = log(tmp_path, "time [s]", [f"{n * STEP_S:g}" for n in range(300)], column=f"disk_x [{unit}]")
+        status, _, line = said(capsys, "import", path, "-o", tmp_path / "out.mcap")
+        assert status == 2
+        assert must in line
+        assert "unit of disk_x" in line
+    assert not (tmp_path / "out.mcap").exists()
