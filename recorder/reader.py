@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Container, Iterator
 from copy import copy
 from dataclasses import replace
@@ -65,7 +66,7 @@ class Recording:
         self.attachments = dict(first.attachments)
         self.catalogue, self.table = first.catalogue, first.table
         self.parameters, self.scene = first.parameters, first.scene
-        self._surveys = surveys
+        self._surveys, self.in_part = surveys, False
         self.true = False
         """Blocks are as the rig made them: see `truly`."""
         self.hears = True
@@ -190,6 +191,8 @@ class Recording:
 
     def _said(self, what: Callable[[Survey], tuple[str, ...]]) -> tuple[str, ...]:
         """Lines about each file, with its name where there are several."""
+        if self.in_part:
+            return ()
         names = [""] if len(self.parts) == 1 else [f"{part.path.name}: " for part in self.parts]
         found = zip(names, self._surveyed(), strict=True)
         return tuple(name + text for name, survey in found for text in what(survey))
@@ -284,6 +287,17 @@ class Recording:
         found.true = FAULTS in self.messages
         return found
 
+    def between(self, from_s: float, to_s: float) -> Self:
+        """Return the recording as a reader of the rows between two times [s] needs it; see `RecordingFile.between`.
+
+        Its `streams` are those of the rows near these times; `short` and `doubts` are empty, as the rest is not read.
+        """
+        if math.isinf(from_s) and math.isinf(to_s):
+            return self
+        found = type(self)(tuple(part.between(from_s, to_s) for part in self.parts))
+        found.true, found.hears, found.in_part = self.true, self.hears, True
+        return found
+
     def untold(self) -> Self:
         """The same for one who knows nothing of what the rig told of faults: only `doubts` and `streams` differ."""
         found = copy(self)
@@ -291,9 +305,13 @@ class Recording:
         found.forget()
         return found
 
-    def everything(self) -> Iterator[Message]:
-        """Every message in file order: topic, simulated time [ns], wall time of arrival [unix ns] and payload."""
-        yield from self._stamped(None)
+    def everything(self, topics: Container[str] | None = None) -> Iterator[Message]:
+        """Every message in file order: topic, simulated time [ns], wall time of arrival [unix ns] and payload.
+
+        Args:
+            topics: Only messages on these.
+        """
+        yield from self._stamped(topics)
 
     def read(self, chunk: Chunk) -> Iterator[Message]:
         """The messages of one of its chunks, as `everything` gives them.
@@ -323,16 +341,17 @@ class Recording:
                 yield time_ns, document
 
 
-def join(paths: list[Path]) -> Recording:
+def join(paths: list[Path], *, in_part: bool = False) -> Recording:
     """Open one file, or several of one run as one recording, whatever their order.
 
     Args:
         paths: The files.
+        in_part: Hold them against their checksums only where they are read; see `Recording.between`.
 
     Raises:
         InputError: A file cannot be read, or they are not of one run or not behind each other.
     """
-    parts = [RecordingFile(path) for path in paths]
+    parts = [RecordingFile(path, in_part=in_part) for path in paths]
     if len(parts) == 1:
         return Recording((parts[0],))
     series = {part.metadata.get("series", {}).get("id") for part in parts}

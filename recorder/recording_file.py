@@ -5,9 +5,10 @@ from __future__ import annotations
 import contextlib
 import struct
 from collections.abc import Container, Iterable, Iterator
+from copy import copy
 from functools import cached_property
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, Self
 
 from mcap.exceptions import McapError
 
@@ -18,9 +19,11 @@ from recorder.records import COPY, MAGIC, read_contents
 from rig import intake
 from rig.errors import InputError, Words
 from rig.outside import open_file, read_json, unreadable
-from rig.wire import Block
+from rig.wire import EVENTS, FAULTS, Block
 
 _OURS = "a recording made by `rig record`"
+_REACH_S = 0.25
+"""Longest block that is found where blocks are not in order in the file [s]; a rig's have some milliseconds."""
 Message = tuple[str, int, int, bytes]
 """Topic, simulated time [ns], wall time of arrival [unix ns] and payload of a message."""
 
@@ -44,15 +47,17 @@ class RecordingFile:
         messages: Number of messages by topic.
         chunks: Where its messages are, in file order.
         stated_rows: Rows by key, as the file itself says at its end.
+        near: Offsets of the chunks that are read; None for all; see `between`.
         stated_begin_s: Simulated time of the first row, likewise [s].
     """
 
-    def __init__(self, path: Path, *, salvage: bool = False) -> None:
+    def __init__(self, path: Path, *, salvage: bool = False, in_part: bool = False) -> None:
         """Look through the records of a file.
 
         Args:
             path: The file.
             salvage: Take what can be read of a finished file, too, where it is damaged.
+            in_part: Hold it against its checksums only where it is read; see `between`.
 
         Raises:
             InputError: The file cannot be read, or is no recording.
@@ -61,11 +66,12 @@ class RecordingFile:
         with self._open() as file:
             if file.read(len(MAGIC)) != MAGIC:
                 raise InputError("file", _OURS, Words(f"{path}, which is no MCAP file"))
-            found = read_contents(file, path.stat().st_size, salvage=salvage)
+            found = read_contents(file, path.stat().st_size, salvage=salvage, in_part=in_part)
             self._take_metadata(found.metadata, found.attachments.get(COPY), salvage=salvage)
         self.complete, self.unchecked = found.complete, found.unchecked
         self.damaged += found.damaged
         self.attachments, self.chunks, self._topics = found.attachments, tuple(found.chunks), found.topics
+        self.near: frozenset[int] | None = None
         self.about, self.stated_rows, self.stated_begin_s = found.about, dict[str, int](), None
         with contextlib.suppress(InputError):
             stated = found.metadata.get("end", {}) if found.finished else {}  # one that was cut off lacks what it lacks
@@ -137,6 +143,30 @@ class RecordingFile:
         """What the catalogue promises of each stream, by key."""
         return self._catalogue.promises()
 
+    def between(self, from_s: float, to_s: float) -> Self:
+        """Return the file as a reader of the rows between two times [s] needs it: these rows, and all events and gaps.
+
+        What lies outside is left out chunk by chunk, by the index. A file with faults of blocks is read as a whole, as
+        their times are known from all of their documents.
+        """
+        found = copy(self)
+        if FAULTS in self.messages:
+            return found
+        begin_ns, end_ns = (from_s - _REACH_S) * 1e9, to_s * 1e9
+        near = {each for each in self.chunks if each.end_ns >= begin_ns and each.begin_ns <= end_ns}
+        latest: dict[int, Chunk] = {}  # a long block may reach into the time from further back
+        for chunk in sorted(set(self.chunks) - near, key=lambda each: each.begin_ns):
+            latest |= dict.fromkeys(chunk.channels or () if chunk.begin_ns < from_s * 1e9 else (), chunk)
+        found.near = frozenset(each.offset for each in near | set(latest.values()))
+        return found
+
+    def _topics_in(self, chunk: Chunk, wanted: dict[int, str]) -> dict[int, str]:
+        """Return the wanted topics that are read in a chunk."""
+        if self.near is None or chunk.offset in self.near:
+            return wanted
+        outside = (EVENTS, schemas.GAPS, schemas.CLOCK)[: 3 if chunk == self.chunks[0] else 2]
+        return {number: topic for number, topic in wanted.items() if topic in outside}
+
     def block(self, key: str, payload: bytes) -> Block | None:
         """The block in a payload; None where it is none, or does not fit the catalogue."""
         try:
@@ -162,11 +192,12 @@ class RecordingFile:
             return
         with self._open() as file:
             for chunk in self.chunks if chunks is None else chunks:
-                if chunk.channels is not None and chunk.channels.isdisjoint(wanted):
+                here = self._topics_in(chunk, wanted)
+                if not here or (chunk.channels is not None and chunk.channels.isdisjoint(here)):
                     continue
                 for number, log_time, publish_time, payload in messages(unpack(file, chunk), cut=chunk.cut):
-                    if number in wanted:
-                        yield wanted[number], log_time, publish_time, payload
+                    if number in here:
+                        yield here[number], log_time, publish_time, payload
 
     @contextlib.contextmanager
     def _open(self) -> Iterator[BinaryIO]:

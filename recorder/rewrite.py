@@ -188,6 +188,7 @@ def cut(
     if only not in (None, "sensors", "truth"):
         raise InputError("only", "sensors or truth", only)
     check_not_among([part.path for part in recording.parts], output)
+    recording = recording.between(from_s, to_s)
     catalogue, columns = _narrowed(recording, channels, only)
     tick_rate_hz = recording.catalogue["tick_rate_hz"]
     from_tick, to_tick = (at_s if math.isinf(at_s) else float(round(at_s * tick_rate_hz)) for at_s in (from_s, to_s))
@@ -227,9 +228,7 @@ def cut(
         "only": only or "",
         "channels": json.dumps(channels),
     }
-    streams = [stream for key, stream in recording.streams.items() if key in columns and stream.rows]
-    first_s = min((stream.first_time_s for stream in streams), default=0.0)
-    last_s = max((stream.last_time_s for stream in streams), default=0.0)
+    first_s, last_s = recording.span_s or (0.0, 0.0)
     must = f"times that the recording holds rows of, {first_s:g} to {last_s:g} s"
     counts = _write(
         recording,
@@ -284,10 +283,10 @@ def _write(
         )
         stack.callback(writer.abandon)  # nothing half-written stays; does nothing once it is finished
         step = _progress(recording, on_progress)
-        for key, _, wall_ns, data in recording.everything():
+        derived = (schemas.VIEW + "/", schemas.CLOCK)
+        topics = {key for key in recording.messages if not key.startswith(derived)}
+        for key, _, wall_ns, data in recording.everything(topics):
             step()
-            if key.startswith(schemas.VIEW + "/") or key == schemas.CLOCK:
-                continue
             if key == schemas.GAPS:
                 with contextlib.suppress(InputError):
                     gap, _ = documents.read(documents.Gap, data, field=key)

@@ -39,7 +39,7 @@ def cut(
     check_destination(output, force=force)
     with reporting() as report:
         made = cut_recording(
-            join(files),
+            join(files, in_part=from_s is not None or to_s is not None),
             output,
             from_s=-math.inf if from_s is None else from_s,
             to_s=math.inf if to_s is None else to_s,

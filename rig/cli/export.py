@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated
 
@@ -52,7 +53,8 @@ def export(
     if method not in ("polyphase", "linear"):
         raise InputError("--method", "polyphase or linear", method)
     check_output(output, force=force)
-    recording = join(files)
+    bounds = -math.inf if from_s is None else from_s, math.inf if to_s is None else to_s
+    recording = join(files, in_part=bounds != (-math.inf, math.inf)).between(*bounds)
     selection = select(
         recording, channels=names_of(channels), truth=truth, unit=unit, from_s=from_s, to_s=to_s, merged=merged(output)
     )
