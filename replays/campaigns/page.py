@@ -7,14 +7,13 @@ from pathlib import Path
 from typing import Any
 
 from replays.campaigns.measurement import with_unit
-from replays.report import Mark, Report, Row
+from replays.report import OUTCOME_MARKS, Mark, Report, Row
 from replays.report.document import Picture
 
 Document = Mapping[str, Any]
 _MARKS: dict[str, Mark] = {
     "failed": "bad", "error": "bad", "inconclusive": "open", "interrupted": "open", "skipped": "open", "passed": "good",
 }  # fmt: skip
-_OUTCOMES: dict[str, Mark] = {"pass": "good", "fail": "bad", "inconclusive": "open"}
 _SMALL = 1e-9
 """Part of a margin that is no change."""
 
@@ -94,7 +93,7 @@ def _measurements(report: Report, results: Document, case: Document) -> None:
             each["name"], _number(each["value"], each["unit"], "nothing"), _limit(each),
             "" if each["margin"] is None else _number(each["margin"], each["unit"]), each["source"], each["note"],
             each["outcome"],
-        ), _OUTCOMES[each["outcome"]])
+        ), OUTCOME_MARKS[each["outcome"]])
         for each in case["measurements"]
     ]  # fmt: skip
     headings = ("measurement", "value", "must be", "margin", "source", "note", "verdict")

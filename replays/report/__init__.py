@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from replays.report.document import Mark, Report, Row, check_report
+from replays.report.document import OUTCOME_MARKS, Mark, Report, Row, check_report
 
-__all__ = ["Mark", "Report", "Row", "check_report"]
+__all__ = ["OUTCOME_MARKS", "Mark", "Report", "Row", "check_report"]

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Literal
 
 from replays.report.canvas import DPI, png
 from rig.errors import InputError, check_new_file, whole_file
+from rig.outcome import Outcome
 from rig.text import printable
 
 if TYPE_CHECKING:
@@ -19,6 +20,7 @@ SUFFIXES = (".html", ".pdf")
 
 Mark = Literal["good", "bad", "open", "plain"]
 """What a row of a table says: as it must be, not so, undecided, or nothing to be judged."""
+OUTCOME_MARKS: dict[str, Mark] = {Outcome.PASS: "good", Outcome.FAIL: "bad", Outcome.INCONCLUSIVE: "open"}
 _NUMBER = re.compile(r"[<>≤≥~±+− -]*\d")
 _WORD = re.compile(r"[^\W\d_]{4}")
 _SET = re.compile(r"`([^`]+)`|_\{([^}]+)\}|\^\{([^}]+)\}")

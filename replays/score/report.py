@@ -7,16 +7,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from replays.report import Mark, Report, Row
+from replays.report import OUTCOME_MARKS, Mark, Report, Row
 from replays.report.canvas import BLUE, ORANGE, RED, draw_signals, house_style, label_of, new_figure
 from replays.score.analogue import Fitted
 from replays.score.scorecard import FAIL, INCONCLUSIVE, NO_LIMIT, PASS, Scorecard, Verdict
-from rig.outcome import Outcome
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_OUTCOMES: dict[Outcome, Mark] = {Outcome.FAIL: "bad", Outcome.INCONCLUSIVE: "open", Outcome.PASS: "good"}
 _MARKS: dict[Verdict, Mark] = {FAIL: "bad", INCONCLUSIVE: "open", PASS: "good", NO_LIMIT: "plain"}
 _STRETCHES = 100
 """Parts of a record of which the lateness is shown."""
@@ -31,7 +29,10 @@ def make_report(card: Scorecard, *, origin: Mapping[str, str] | None = None) -> 
     """
     verdict = card.verdict_line
     report = Report(
-        f"Scorecard of {card.title}", f"{verdict[0].upper()}{verdict[1:]}.", origin=origin, mark=_OUTCOMES[card.outcome]
+        f"Scorecard of {card.title}",
+        f"{verdict[0].upper()}{verdict[1:]}.",
+        origin=origin,
+        mark=OUTCOME_MARKS[card.outcome],
     )
     for line in (*card.doubts, *card.remarks):
         report.text(line)

@@ -12,6 +12,7 @@ import typer
 from rig.cli.options import RecordingFiles
 from rig.cli.progress import reporting
 from rig.cli.tables import Form, Table, echo_json, facts, new_table, shown
+from rig.outcome import Outcome
 from rig.text import finite
 
 if TYPE_CHECKING:
@@ -29,7 +30,12 @@ def info(
     quick: Annotated[bool, typer.Option("--quick", help="Without reading the samples.")] = False,
     form: Form,
 ) -> None:
-    """Show what a recording holds: calibration, gaps, health, events, notes and end; several files count as one."""
+    """Show what a recording holds: calibration, gaps, health, events, notes and end; several files count as one.
+
+    Exit status: 0 pass, 1 fail (it is not complete, rows are lost, or it contradicts itself), 2 wrong input,
+    3 inconclusive (the rig warned, or bytes could not be checked). Doubts in channels are reasons to look and do not
+    count. With --quick there is no verdict.
+    """
     from recorder.reader import join
 
     with reporting() as reporter:
@@ -40,6 +46,8 @@ def info(
         echo_json(document)
     else:
         _print(recording, shown(document), form.console())
+    if not quick and (status := Outcome(document["outcome"]).exit_status):
+        raise typer.Exit(status)
 
 
 def describe(
@@ -84,7 +92,22 @@ def describe(
             for key, stream in recording.streams.items()
         }
         document["health"] = health
+        failures, doubts = _reasons(document)
+        document["outcome"] = Outcome.of(failed=bool(failures), shown=not doubts).value
+        document["reasons"] = failures + doubts
     return finite(document)
+
+
+def _reasons(document: dict[str, Any]) -> tuple[list[str], list[str]]:
+    """Return the reasons why a recording fails, and those why it is inconclusive otherwise."""
+    health = document["health"]
+    failures = [] if document["complete"] else ["the recording is not complete"]
+    failures += _lost_rows(document)
+    failures += [f"{count} blocks of {key} are misplaced" for key, count in health["misplaced"].items()]
+    failures += health["findings"]
+    doubts = [f"not checked: {text}" for part in document["parts"] for text in part["unchecked"]]
+    doubts += [] if any(stream["rows"] for stream in document["streams"].values()) else ["there are no samples"]
+    return failures, doubts + health["warnings"]
 
 
 def _print(recording: Recording, document: dict[str, Any], console: Console) -> None:
@@ -143,24 +166,33 @@ def _print(recording: Recording, document: dict[str, Any], console: Console) -> 
 
 
 def _verdict(document: dict[str, Any]) -> list[tuple[str, str]]:
-    """What is lost and what is in doubt, in a line each."""
-    streams = document["streams"]
-    noted = bool(document["gaps"])  # what is missing and not noted is told once
-    lost = sum(_lost(each) - (0 if noted else min(_lost(each), each["missing"])) for each in streams.values())
-    declared = sum(each["declared"] for each in streams.values())
+    """Return the verdict, and what is lost and what is in doubt, in a line each."""
+    reasons = document["reasons"]
+    more = f", and {len(reasons) - 1} more" if reasons[1:] else ""
+    outcome = document["outcome"] + (f": {reasons[0]}{more}" if reasons else "")
+    declared = sum(each["declared"] for each in document["streams"].values())
     health = document["health"]
     doubtful = [channel["name"] for channel in health["channels"] if channel["findings"]]
     doubts = len(health["findings"]) + len(health["warnings"])
     found = [f"doubts in {', '.join(doubtful)}"] if doubtful else []
     found += [f"{doubts} {'doubt' if doubts == 1 else 'doubts'} on the whole"] if doubts else []
-    gone = [f"{lost} rows in {len(document['gaps'])} gaps"] if lost or (document["gaps"] and not declared) else []
-    missing = {key: stream["missing"] for key, stream in streams.items() if stream["missing"]}
-    gone += [f"{rows} rows of {key} are missing" for key, rows in missing.items()]
     return [
-        ("lost", "; ".join(gone) or "nothing"),
+        ("verdict", outcome),
+        ("lost", "; ".join(_lost_rows(document)) or "nothing"),
         *([("taken", f"{declared} rows by faults, or late by them, as the rig told")] if declared else []),
         ("health", "; ".join(found) or f"{len(health['channels'])} channels without a doubt"),
     ]
+
+
+def _lost_rows(document: dict[str, Any]) -> list[str]:
+    """Return what is lost, in words; empty where nothing is."""
+    streams = document["streams"]
+    noted = bool(document["gaps"])  # what is missing and not noted is told once
+    lost = sum(_lost(each) - (0 if noted else min(_lost(each), each["missing"])) for each in streams.values())
+    declared = sum(each["declared"] for each in streams.values())
+    gone = [f"{lost} rows in {len(document['gaps'])} gaps"] if lost or (document["gaps"] and not declared) else []
+    missing = {key: stream["missing"] for key, stream in streams.items() if stream["missing"]}
+    return gone + [f"{rows} rows of {key} are missing" for key, rows in missing.items()]
 
 
 def _lost(stream: dict[str, Any]) -> int:

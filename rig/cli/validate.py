@@ -48,6 +48,7 @@ def validate(
     """Do a recording again and hold it against the model: bit by bit, then by declared criteria.
 
     Where a criterion fails, it says what explains the difference: a sensor, the time, or which number of the model.
+    Exit status: 0 pass, 1 fail, 2 wrong input, 3 inconclusive.
     """
     from recorder.reader import join
     from replays.recordings.validation import load_criteria
@@ -74,8 +75,8 @@ def validate(
         _show(found, form.console())
         if report is not None:
             echo(f"report  {report}")
-    if not found.good:
-        raise typer.Exit(1)
+    if found.outcome.exit_status:
+        raise typer.Exit(found.outcome.exit_status)
 
 
 def _show(found: Validation, console: Console) -> None:

@@ -21,6 +21,7 @@ from replays.recordings.validation.criteria import DEFAULT
 from replays.recordings.validation.phases import View, find_phases, quantities, spectrum_distance
 from rig.errors import InputError
 from rig.offline import frames
+from rig.outcome import Outcome
 from rig.scenes import load_scene
 from rig.simulation import Simulation
 from rig.wire import EDGES, EVENTS, encode_block, encode_document, sensor_key, truth_key
@@ -141,6 +142,23 @@ def test_the_same_build_gives_the_same_bits(hammer: Recording) -> None:
     assert found.good
     assert len(found.bits) == 9  # five groups, four truth tables; no edge in so short a time
     assert sum(stream.rows for stream in found.bits.values()) == 5 * 120 + 4 * 6
+
+
+def test_a_pass_needs_rows_or_criteria_that_were_judged(hammer: Recording) -> None:
+    found = validate(hammer)
+    rows = sum(one.rows for one in found.bits.values())
+    nothing = {key: replace(one, rows=0) for key, one in found.bits.items()}
+    outcomes = {
+        Outcome.PASS: [found, replace(found, skipped=rows // 100)],
+        Outcome.INCONCLUSIVE: [
+            replace(found, skipped=rows // 50), replace(found, bits=nothing),
+            replace(found, bit_exact=False, residuals=(), statistics=(), truth=()),
+        ],
+        Outcome.FAIL: [replace(found, skipped=rows // 50, doubts=("it contradicts itself",))],
+    }  # fmt: skip
+    for expected, cases in outcomes.items():
+        assert [each.outcome for each in cases] == [expected] * len(cases)
+    assert outcomes[Outcome.INCONCLUSIVE][0].verdict_line.startswith(f"inconclusive: {rows // 50} of ")
 
 
 def test_one_count_is_found_with_its_time(hammer: Recording, monkeypatch: pytest.MonkeyPatch) -> None:

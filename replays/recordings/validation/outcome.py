@@ -16,7 +16,11 @@ from replays.recordings.validation.bits import StreamBits
 from replays.recordings.validation.phases import SPECTRA, Phase
 from replays.recordings.validation.signals import SignalFault
 from replays.recordings.validation.trajectory import ChannelResidual
+from rig.outcome import Outcome
 from rig.wire import TRUTH as TRUTH_KEY
+
+_MIN_JUDGED = 0.99
+"""Part of a recording's rows that must have been compared for a pass."""
 
 
 @dataclass(frozen=True)
@@ -154,11 +158,32 @@ class Validation:
     due_s: float | None = None
 
     @property
+    def outcome(self) -> Outcome:
+        """Pass where the recording is bit-exact, or within every criterion, and enough of it was compared."""
+        held = (self.bit_exact and not self.declared) or not self.failures
+        failed = bool(self.doubts or self.faults or self.beyond) or not held
+        return Outcome.of(failed=failed, shown=not self.unjudged)
+
+    @property
     def good(self) -> bool:
-        """Bit-exact, or within every criterion, and all of it is there."""
-        return not (self.doubts or self.faults or self.beyond) and (
-            (self.bit_exact and not self.declared) or not self.failures
-        )
+        """Whether nothing in it is wrong; `outcome` asks whether enough was compared, too."""
+        return self.outcome is not Outcome.FAIL
+
+    @property
+    def unjudged(self) -> str:
+        """Return the reason why too little was compared for a pass; empty where enough was."""
+        if self.bit_exact and not self.declared:
+            rows = sum(one.rows for one in self.bits.values())
+            if rows < _MIN_JUDGED * (rows + self.skipped):
+                return f"{self.skipped} of {rows + self.skipped} rows are lost and were not compared"
+            return "" if rows else "no row was compared"
+        return "" if self.judged else "no criterion was applied"
+
+    @property
+    def judged(self) -> int:
+        """Number of criteria that were applied."""
+        asked = sum(one.good is not None for one in (*self.residuals, *self.statistics)) + len(self.truth)
+        return asked + (self.due_s is not None)
 
     @property
     def beyond(self) -> list[str]:
@@ -226,7 +251,9 @@ class Validation:
     @property
     def verdict_line(self) -> str:
         """The outcome in one line."""
-        if self.good:
+        if self.outcome is Outcome.INCONCLUSIVE:
+            return f"inconclusive: {self.unjudged}"
+        if self.outcome is Outcome.PASS:
             basis = "bit by bit" if self.bit_exact and not self.declared else f"by the criteria: {self.criteria}"
             unseen = "; no contact was compared sample by sample" if self.contact_s is not None else ""
             return f"good, {basis}{unseen}"
@@ -247,9 +274,7 @@ class Validation:
             parts.append(
                 "quantities: " + ", ".join(f"{phases.count(name)} of {name}" for name in dict.fromkeys(phases))
             )
-        asked = sum(one.good is not None for one in (*self.residuals, *self.statistics)) + len(self.truth)
-        asked += self.due_s is not None
-        return f"FAILS {len(self.failures)} of {asked} criteria: {'; '.join(parts)}"
+        return f"FAILS {len(self.failures)} of {self.judged} criteria: {'; '.join(parts)}"
 
     def document(self) -> dict[str, Any]:
         """All of it but the samples, as a JSON document."""
@@ -259,7 +284,8 @@ class Validation:
                 "scene": self.scene,
                 "criteria": self.criteria,
                 "changes": self.changes,
-                "good": self.good,
+                "outcome": self.outcome.value,
+                "good": self.outcome is Outcome.PASS,
                 "bit_exact": self.bit_exact,
                 "bits": {key: {**asdict(one), "equal": one.equal} for key, one in self.bits.items()},
                 "rows_lost": self.skipped,

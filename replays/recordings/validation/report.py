@@ -11,7 +11,7 @@ import numpy as np
 from replays.recordings.prediction import Measured
 from replays.recordings.validation.outcome import Validation
 from replays.recordings.validation.phases import PHASES
-from replays.report import Mark, Report, Row
+from replays.report import OUTCOME_MARKS, Mark, Report, Row
 from replays.report.canvas import BLUE, ORANGE, RED, draw_signals, house_style, label_of, legend_below, new_figure
 from rig.orbit import full_spectrum
 
@@ -35,7 +35,10 @@ def make_report(found: Validation, *, origin: Mapping[str, str] | None = None) -
         origin: What the report is made by, each by name.
     """
     report = Report(
-        f"Validation of {found.title}", f"{_sentence(found.verdict_line)}.", origin=origin, mark=_MARKS[found.good]
+        f"Validation of {found.title}",
+        f"{_sentence(found.verdict_line)}.",
+        origin=origin,
+        mark=OUTCOME_MARKS[found.outcome],
     )
     if found.parts and found.nominal is not None:
         report.picture(
