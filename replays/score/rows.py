@@ -229,12 +229,16 @@ def follow(
 
 
 def _look_up(window: _Sent, hashes: np.ndarray, due: int, low: int) -> np.ndarray:
-    """Places of rows; looks farther ahead as long as hardly one of the last is found."""
+    """Return places of rows; search farther ahead where few of the last are found, or some may lie beyond."""
     ahead = _AHEAD
     while True:
-        window.hold(low, due + len(hashes) + ahead)
-        places, known = _places(window, hashes, due, max(low, due - _BACK), due + len(hashes) + ahead)
-        if known[-len(hashes) // 2 :].mean() > 0.5 or window.ended or ahead >= _MOST_AHEAD:
+        high = due + len(hashes) + ahead
+        window.hold(low, high)
+        places, known = _places(window, hashes, due, max(low, due - _BACK), high)
+        found = np.flatnonzero(places >= 0)
+        inside = len(found) and places[found[-1]] + len(hashes) - found[-1] <= high
+        ended = window.ended and high >= window.end
+        if (inside and known[-len(hashes) // 2 :].mean() > 0.5) or ended or ahead >= _MOST_AHEAD:
             return places
         ahead *= 8
 
@@ -276,6 +280,9 @@ def _places(window: _Sent, hashes: np.ndarray, due: int, low: int, high: int) ->
     if window.ended and end == window.end:  # rows that are due after the last one are not those of earlier periods
         left = left[forward[left] < end]
     if len(left):
+        if not known.any():  # of a periodic signal: all follow the first one
+            _by_nearest(places, open_[left[:1]], forward[left[:1]], ranks, start)
+            forward[left] += max(0, places[open_[left[0]]] - forward[left[0]])
         _by_nearest(places, open_[left], forward[left], ranks, start)
     left = np.flatnonzero(places[open_] < 0)
     # What is none of the rows near by and stands where one is due is that one, altered.

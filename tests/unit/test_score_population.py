@@ -26,7 +26,7 @@ def test_a_perfect_daq_passes(number: int, folder: Path) -> None:
     assert (line["outcome"], line["red"]) == ("pass", [])
 
 
-@pytest.mark.parametrize("number", [0, 4, 20])
+@pytest.mark.parametrize("number", [0, 4, 6, 20])
 def test_one_defect_turns_its_own_quantity_red(number: int, folder: Path) -> None:
     line = Population("defects", 1, folder).judged(number)
     assert (line["outcome"], line["right"], line["other"]) == ("fail", True, [])
