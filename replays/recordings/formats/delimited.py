@@ -176,7 +176,8 @@ def _parsed(
                 yield columns
     except pyarrow.ArrowInvalid as error:
         raise damaged(path, "text", error) from None
-    if bad and not (len(bad) == 1 and bad[0].text.strip() == _last_line(path, layout.encoding)):
+    cut = len(bad) == 1 and bad[0].actual_columns < layout.width
+    if bad and not (cut and bad[0].text.strip() == _last_line(path, layout.encoding)):
         row = bad[0]
         line = f"line {row.number + layout.first - skipped}: " if row.number else ""
         raise InputError(
