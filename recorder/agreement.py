@@ -22,6 +22,8 @@ from rig.errors import InputError
 from rig.text import printable
 from rig.wire import EDGES, EVENTS, SENSORS, STATUS, TRUTH, Gap
 
+_MAX_FAULT_S = 86_400.0
+"""Longest time of a fault, as `rig.commands.FaultCommand` has it [s]."""
 _SCENE, _PARAMETERS, _CATALOGUE, _OWN_TABLE = "scene.json", "parameters.json", "catalogue.json", "the scene's own table"
 _CALIBRATION = (
     "signal", "unit", "sensitivity_v", "bias_v", "range_v", "bandwidth_hz", "filter_order", "highpass_hz", "noise_v",
@@ -298,14 +300,18 @@ class Agreement:
             for name in ("command", "tick", "request"):
                 self._say(f"{about}: {name}", **{where: one.get(name)})
             given.setdefault(one.get("id"), one)
-        for one in given.values():
+        for number, one in given.items():
             asked.setdefault((one["command"], one["tick"]), []).append(("its command", one["request"]))
+            try:
+                check_command(one["command"], one["request"])
+            except InputError as error:
+                self._doubt(f"command {number}, which no rig takes: {error}")
         met = [(one["event"], one["tick"], one) for one in self._events if isinstance(one.get("tick"), int)]
         effects = {at[:2]: at[2] for at in met}
         # A fault with a time ends by itself, also where it began before this file does.
         begun = [(*at, request) for at, causes in asked.items() for _, request in causes if at not in effects]
         for name, tick, one in [*begun, *met]:
-            if name == "fault" and isinstance(one.get("for_s"), float | int):
+            if name == "fault" and isinstance(one.get("for_s"), float | int) and 0.0 < one["for_s"] <= _MAX_FAULT_S:
                 over = tick + max(1, round(one["for_s"] * self._ticks_hz))
                 known = {"id": one["fault"]} if "fault" in one else None
                 asked.setdefault(("clear", over), []).append(("its end", known))

@@ -101,6 +101,7 @@ class Survey:
         self.streams: dict[str, Stream] = {}
         self._begun: dict[str, tuple[float, int]] = {}
         self._counted: dict[str, int] = {}
+        self._malformed: dict[str, int] = {}
         self._published: dict[str, int] = {}
         self._noted: set[tuple[str, int]] = set()
         self._noted_bytes = 0
@@ -135,6 +136,7 @@ class Survey:
                 found.append(f"{key} has {stream.rows} rows where the file says {stated}")
             if stream.rows and key not in promises:
                 found.append(f"{key} is not in the catalogue")
+        found += [f"messages of {key} that are not what it promises: {n}" for key, n in self._malformed.items()]
         for topic in sorted(set(messages) | set(self._counted)):
             if (is_there := self._counted.get(topic, 0)) != (stated := messages.get(topic, 0)):
                 found.append(f"{is_there} messages of {topic} where the file says {stated}")
@@ -178,7 +180,10 @@ class Survey:
 
     def _take_document(self, key: str, time_ns: int, payload: bytes) -> None:
         """Follow what the rig says of the rows that it published, and the recorder of those that never arrived."""
-        if key not in documents.KINDS or (document := documents.document_in(key, payload)) is None:
+        if key not in documents.KINDS:
+            return
+        if (document := documents.document_in(key, payload)) is None:
+            self._malformed[key] = self._malformed.get(key, 0) + 1
             return
         if key == FAULTS:
             if not self._hears:
