@@ -172,25 +172,6 @@ def _end_s(recording: Recording) -> float:
     return math.floor(max(ends) * TICK_RATE_HZ + 0.5) / TICK_RATE_HZ
 
 
-def parameter_doubts(recording: Recording) -> tuple[str, ...]:
-    """Parameters that differ from a set of the rig's own, of the same source, and that the scene does not change.
-
-    A set that was revised since tells another source; a user's set may be another file by now.
-    """
-    document, name = recording.scene.get("scene"), recording.parameters.get("set")
-    if not isinstance(document, dict) or name not in set_names():
-        return ()
-    now, changes = load_parameters(name).entries, document.get("set", {})
-    return tuple(
-        f"{key}: {entry['value']} in parameters.json but {now[key].value} in the set {name}, of the same source"
-        for key, entry in recording.parameters["values"].items()
-        if key in now
-        and key not in changes
-        and entry["value"] != now[key].value
-        and (entry.get("source"), entry.get("unit")) == (now[key].source, now[key].unit)
-    )
-
-
 def recorded_parameters(parameters: dict[str, Any], document: dict[str, Any]) -> dict[str, Any]:
     """The scene's fields that give the recorded parameters, whatever has become of the files that they were from.
 

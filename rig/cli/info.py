@@ -57,7 +57,7 @@ def describe(
     from dataclasses import asdict
 
     from recorder.health import examine
-    from replays.recordings.experiment import parameter_doubts
+    from replays.recordings.parameters import parameter_doubts
 
     about = recording.metadata["rig"]
     parts = [

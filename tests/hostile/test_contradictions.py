@@ -12,7 +12,7 @@ import pytest
 
 from recorder.reader import Recording
 from recorder.rewrite import cut, recover
-from replays.recordings.experiment import parameter_doubts
+from replays.recordings.parameters import parameter_doubts
 from rig.cli.main import main
 from rig.wire import EVENTS, STATUS, Block, decode_block, encode_block, encode_document, schema_of
 

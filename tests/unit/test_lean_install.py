@@ -94,3 +94,25 @@ def test_a_csv_of_the_lean_install_is_that_of_the_whole_rig(tmp_path: Path) -> N
         assert [[*map(float, line.split(","))] for line in ours[1:]] == [
             [*map(float, line.split(","))] for line in theirs[1:]
         ]
+
+
+OTHER_EXTRAS = {"asammdf", "nptdms", "pyuff", "soundfile", "pytest", "xdist", "mcap_ros2", "hypothesis"}
+PROMISED = {
+    "info": "{rec}", "info --json": "{rec}", "cut": "{rec} --from 0.1 --to 0.2 -o {folder}/cut.mcap",
+    "recover": "{rec} --force -o {folder}/recovered.mcap", "export": "{rec} --to 0.1 -o {folder}/run.csv",
+    "keys init": "{folder}/keys --host 127.0.0.1", "completion": "bash", "hammer": "-h", "speed": "-h", "release": "-h",
+    "fault": "-h", "stop": "-h", "step": "-h", "status": "-h", "note": "-h", "twins": "-h", "record": "-h",
+    "replay": "-h", "pause": "-h", "resume": "-h", "seek": "-h", "rate": "-h",
+}  # fmt: skip
+"""What docs/install.md promises without extras; commands of a running rig are only asked for their help."""
+
+
+def test_each_promised_command_runs_without_any_extra(tmp_path: Path) -> None:
+    given = [[*name.split(), *rest.format(rec=RECORDING, folder=tmp_path).split()] for name, rest in PROMISED.items()]
+    done = lean(
+        f"sys.modules |= dict.fromkeys({OTHER_EXTRAS!r})\nfrom rig.cli.main import main\nfor words in {given!r}:\n"
+        "    try:\n        main(words)\n    except SystemExit as end:\n        print('END', words[0], end.code)"
+    )
+    ends = re.findall("^END (.*)$", done.stdout, re.MULTILINE)
+    assert ends == [f"{words[0]} 0" for words in given], done.stderr
+    assert {each.name for each in tmp_path.iterdir()} >= {"cut.mcap", "recovered.mcap", "run.csv", "keys"}

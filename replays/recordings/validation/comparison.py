@@ -12,9 +12,10 @@ import numpy as np
 
 from recorder.agreement import calibration_off
 from recorder.reader import Recording
-from replays.recordings.experiment import Experiment, is_imported, parameter_doubts
+from replays.recordings.experiment import Experiment, is_imported
 from replays.recordings.identification.nuisance import Tuned, looks_from, tune
 from replays.recordings.identification.question import first_command_s
+from replays.recordings.parameters import parameter_doubts
 from replays.recordings.prediction import Measured, Prediction, bare, measured, predict
 from replays.recordings.sensitivity import with_values
 from replays.recordings.validation.attribution import FEW_CHANNELS, Explained, attribute, explain_log, own_explained
