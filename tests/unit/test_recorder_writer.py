@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import json
 import resource
-from collections import defaultdict
+from collections import Counter, defaultdict
 from pathlib import Path
 
 import numpy as np
@@ -479,3 +479,18 @@ def test_what_a_killed_recording_left_is_replaced_by_a_new_file(tmp_path, items)
     write(path, items, force=True)
     assert Recording.open(path).complete
     assert not left.exists()
+
+
+def test_a_foreign_reader_decodes_a_whole_recording_with_a_decoder_of_json(path):
+    from mcap.reader import make_reader
+    from mcap_ros2.decoder import DecoderFactory
+
+    class JsonDecoder:
+        def decoder_for(self, encoding, schema):
+            return json.loads if encoding == "json" else None
+
+    messages = Recording.open(path).messages
+    with path.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory(), JsonDecoder()])
+        topics = Counter(row.channel.topic for row in reader.iter_decoded_messages())
+    assert topics == {topic: count for topic, count in messages.items() if count}
