@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
@@ -231,37 +231,27 @@ class SeriesPart(_Text):
     number: Count
 
 
-class Kind(NamedTuple):
-    """The documents of a topic: what is read of them, and what the file says of their form."""
-
-    model: type[BaseModel]
-    definition: schemas.Definition
-
-
-KINDS = {
-    EVENTS: Kind(Event, schemas.document_definition("rig.Event", event="string")),
-    FAULTS: Kind(Faults, schemas.document_definition("rig.Faults", event="string")),
-    STATUS: Kind(Status, schemas.document_definition("rig.Status")),
-    schemas.GAPS: Kind(
-        Gap,
-        schemas.document_definition("recorder.Gap", kind="string", key="string", index="integer", size="integer"),
-    ),
-    schemas.CLOCK: Kind(
-        ClockPair, schemas.document_definition("recorder.Clock", tick="integer", time_s="number", wall_s="number")
-    ),
+KINDS: dict[str, type[BaseModel]] = {
+    EVENTS: Event,
+    FAULTS: Faults,
+    STATUS: Status,
+    schemas.GAPS: Gap,
+    schemas.CLOCK: ClockPair,
 }
-"""The documents of a recording, by topic."""
-_ANY = schemas.document_definition("rig.Document")
+"""What is read of the documents of a recording, by topic."""
 METADATA: dict[str, type[BaseModel]] = {"rig": Rig, "end": End, "series": SeriesPart}
 ATTACHED: dict[str, type[BaseModel]] = {"catalogue": Catalogue, "parameters": Parameters, "scene": Scene}
 
 
 def definition_of(key: str) -> schemas.Definition:
-    """The form of the payloads of a key."""
+    """Return the message definition of a key's topic."""
     schema = schema_of(key)
-    if schema is not None:
-        return schemas.BLOCKS[schema]
-    return KINDS[key].definition if key in KINDS else _ANY
+    return schemas.TEXT if schema is None else schemas.BLOCKS[schema]
+
+
+def holds_documents(topic: str) -> bool:
+    """Return whether a topic of a recording holds JSON documents, not blocks or plottable messages."""
+    return schema_of(topic) is None and not topic.startswith(schemas.VIEW + "/")
 
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -283,7 +273,7 @@ def read(model: type[Model], payload: bytes, *, field: str) -> tuple[dict[str, A
 def document_in(topic: str, payload: bytes) -> dict[str, Any] | None:
     """The document in a message of one of the topics `KINDS`; None where it is not what the topic promises."""
     try:
-        document, found = read(KINDS[topic].model, payload, field=topic)
+        document, found = read(KINDS[topic], payload, field=topic)
         if isinstance(found, Event) and found.event == "command":
             read(Command, payload, field=topic)
     except InputError:
@@ -315,10 +305,11 @@ def read_metadata(model: type[Model], entries: dict[str, str], *, field: str) ->
 
 
 def check_version(about: dict[str, str]) -> None:
-    """Refuse what another version of the format holds.
+    """Refuse a version of the format that is not read.
 
     Raises:
         InputError: It is another one.
     """
-    if about.get("version") != schemas.VERSION:
-        raise InputError("file", f"a recording of format version {schemas.VERSION}", about.get("version"))
+    if about.get("version") not in schemas.READ_VERSIONS:
+        must = f"a recording of format version {' or '.join(schemas.READ_VERSIONS)}"
+        raise InputError("file", must, about.get("version"))

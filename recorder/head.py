@@ -201,10 +201,10 @@ rig/sensors/GROUP: rig_msgs/msg/SampleBlock (ROS 2 CDR, its definition is in the
     value = counts * scale + offset, from the channel's metadata (JSON lists in column order) or the table below.
 rig/sensors/keyphasor_edges: rig_msgs/msg/TruthBlock of one column; edges at (`tick` + value) / `tick_rate_hz` seconds.
 rig/truth/TABLE: rig_msgs/msg/TruthBlock, float64 rows of the model's true state; units in the channel's metadata.
-rig/events, rig/status: JSON, as the rig published them.
-recorder/gaps: JSON, what never arrived: `size` rows from number `index` on, or `size` messages (kind "messages").
+rig/events, rig/status: std_msgs/msg/String; `data` is JSON, as the rig published it.
+recorder/gaps: likewise, what never arrived: `size` rows from number `index` on, or `size` messages (kind "messages").
     No message there means that nothing was lost.
-recorder/clock: JSON, pairs of simulated and wall time.
+recorder/clock: likewise, pairs of simulated and wall time.
 view/GROUP+GROUP: sensor_msgs/msg/JointState in engineering units at the viewing rate, every n-th row without a filter:
     for plots only. Lengths stand in `position`, forces in `effort`, all else in `velocity`; nan elsewhere.
 view/events: rcl_interfaces/msg/Log of rig/events.

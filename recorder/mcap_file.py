@@ -15,7 +15,7 @@ from mcap.writer import Writer
 
 from recorder.chunks import CHUNK, RECORD
 from recorder.draft import Draft
-from recorder.schemas import Definition
+from recorder.schemas import TEXT, Definition, wrap_text
 
 _CHUNK_BYTES = 1 << 20
 _CHUNK_LIST = "_Writer__chunk_indices"
@@ -48,11 +48,11 @@ class McapFile:
         self.size_bytes = self.unflushed_bytes = 0
         self._chunks = self._chunk_bytes = 0
         self._schemas: dict[str, int] = {}
-        self._topics: dict[str, tuple[int, Iterator[int]]] = {}
-        """Number of the channel of each topic, and the numbers of its messages."""
+        self._topics: dict[str, tuple[int, Iterator[int], bool]] = {}
+        """Number of the channel of each topic, the numbers of its messages, and whether they are wrapped as text."""
         self.mcap = Writer(draft.file, chunk_size=_CHUNK_BYTES, enable_data_crcs=True)
         setattr(self.mcap, _CHUNK_LIST, _ChunkIndexes(draft.file))
-        self.mcap.start(profile="", library="rotor-stator-rig recorder")
+        self.mcap.start(profile="ros2", library="rotor-stator-rig recorder")
 
     @property
     def index_bytes(self) -> int:
@@ -73,11 +73,16 @@ class McapFile:
             number = self.mcap.register_schema(definition.name, definition.language, definition.text)
             self._schemas[definition.name] = number
         number = self._schemas[definition.name]
-        self._topics[topic] = self.mcap.register_channel(topic, definition.encoding, number, metadata), count()
+        channel = self.mcap.register_channel(topic, definition.encoding, number, metadata)
+        self._topics[topic] = channel, count(), definition == TEXT
 
     def add(self, topic: str, data: bytes, *, time_ns: int, wall_ns: int) -> None:
-        """Write a message of a simulated time [ns], which came at a wall time [unix ns]."""
-        channel, numbers = self._topics[topic]
+        """Write a message of a simulated time [ns], which came at a wall time [unix ns].
+
+        On a topic of documents `data` is the text of a ROS 2 string message.
+        """
+        channel, numbers, wrapped = self._topics[topic]
+        data = wrap_text(data) if wrapped else data
         self.mcap.add_message(channel, time_ns, data, wall_ns, next(numbers) & 0xFFFFFFFF)
         self._chunk_bytes += len(data)
         self.unflushed_bytes += len(data) + _MESSAGE_BYTES

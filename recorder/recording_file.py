@@ -178,7 +178,7 @@ class RecordingFile:
         return block if (columns, block.tick_rate_hz) == (promise.columns, promise.tick_rate_hz) else None
 
     def stamped(self, topics: Container[str] | None, chunks: Iterable[Chunk] | None = None) -> Iterator[Message]:
-        """Its messages on some topics, in file order.
+        """Yield the messages of some topics, in file order; documents without the ROS 2 string message around them.
 
         Args:
             topics: The topics; None for all.
@@ -190,6 +190,7 @@ class RecordingFile:
         wanted = {number: topic for number, topic in self._topics.items() if topics is None or topic in topics}
         if not wanted:
             return
+        texts = {topic for topic in wanted.values() if documents.holds_documents(topic)}
         with self._open() as file:
             for chunk in self.chunks if chunks is None else chunks:
                 here = self._topics_in(chunk, wanted)
@@ -197,7 +198,8 @@ class RecordingFile:
                     continue
                 for number, log_time, publish_time, payload in messages(unpack(file, chunk), cut=chunk.cut):
                     if number in here:
-                        yield here[number], log_time, publish_time, payload
+                        topic = here[number]
+                        yield topic, log_time, publish_time, schemas.unwrap_text(payload) if topic in texts else payload
 
     @contextlib.contextmanager
     def _open(self) -> Iterator[BinaryIO]:

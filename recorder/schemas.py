@@ -15,7 +15,9 @@ import numpy as np
 from rig.wire import SCHEMAS
 
 FORMAT = "rig-recording"
-VERSION = "1"
+VERSION = "2"
+READ_VERSIONS = ("1", VERSION)
+"""Versions that are read. In version 1 documents are plain JSON and not in ROS 2 messages."""
 GAPS = "recorder/gaps"
 CLOCK = "recorder/clock"
 VIEW = "view"
@@ -43,13 +45,6 @@ def _ros2(name: str, text: str) -> Definition:
     return Definition(name, "cdr", "ros2msg", text.encode())
 
 
-def document_definition(name: str, **properties: str) -> Definition:
-    """The form of a JSON document with properties of some types, all of them required."""
-    body = {property_: {"type": kind} for property_, kind in properties.items()}
-    schema = {"title": name, "type": "object", "properties": body, "required": list(body)}
-    return Definition(name, "json", "jsonschema", json.dumps(schema).encode())
-
-
 _SEPARATOR = "=" * 80 + "\n"
 _TIME = _SEPARATOR + "MSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"
 BLOCKS = {name: _ros2(name, text) for name, text in SCHEMAS.items()}
@@ -65,6 +60,8 @@ LOG = _ros2(
     "builtin_interfaces/Time stamp\nuint8 level\nstring name\nstring msg\nstring file\nstring function\nuint32 line\n"
     + _TIME,
 )
+TEXT = _ros2("std_msgs/msg/String", "string data\n")
+"""Definition of the topics of JSON documents: `data` is the document."""
 LOG_INFO, LOG_WARN, LOG_ERROR = 20, 30, 40
 
 _ENCAPSULATION = b"\x00\x01\x00\x00"
@@ -91,6 +88,17 @@ class _Cdr:
 
     def message(self) -> bytes:
         return _ENCAPSULATION + bytes(self.body)
+
+
+def wrap_text(text: bytes) -> bytes:
+    """Return a `std_msgs/msg/String` message with these bytes, whatever they are, as its text."""
+    return _ENCAPSULATION + struct.pack("<I", len(text) + 1) + text + b"\0"
+
+
+def unwrap_text(message: bytes) -> bytes:
+    """Return the text of a `std_msgs/msg/String` message; bytes that are none, such as plain JSON, unchanged."""
+    text = message[len(_ENCAPSULATION) + 4 : -1]
+    return text if message == wrap_text(text) else message
 
 
 SLOTS = ("position", "velocity", "effort")

@@ -43,7 +43,7 @@ class RecordingWriter:
 
     `log_time` of every message is simulated time [ns], so that plots align with the physics and two recordings with
     each other; `publish_time` is the wall time of arrival [unix ns]. Each message is thus a clock pair;
-    `recorder/clock` repeats two a second in plain JSON.
+    `recorder/clock` repeats two a second as JSON.
 
     The file is FILE.mcap.part until `finish`, and is flushed to the disk so often that a kill loses less than 0.5 s.
 

@@ -6,7 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from recorder.documents import holds_documents
 from recorder.reader import Recording
+from recorder.schemas import unwrap_text
 from recorder.writer import RecordingWriter
 from rig.channels import default_table
 from rig.errors import InputError
@@ -173,7 +175,9 @@ def _chunks(path: Path) -> list[tuple[int, dict[str, list[bytes]]]]:
             payloads: dict[str, list[bytes]] = {}
             for record in breakup_chunk(Chunk.read(ReadDataStream(file))):
                 if isinstance(record, Message):
-                    payloads.setdefault(summary.channels[record.channel_id].topic, []).append(record.data)
+                    topic = summary.channels[record.channel_id].topic
+                    data = unwrap_text(record.data) if holds_documents(topic) else record.data
+                    payloads.setdefault(topic, []).append(data)
             chunks.append((index.chunk_start_offset + index.chunk_length, payloads))
     return chunks
 

@@ -2,12 +2,14 @@ from __future__ import annotations
 
 import json
 import resource
-from collections import Counter, defaultdict
+from collections import defaultdict
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from recorder import schemas
+from recorder.documents import document_in
 from recorder.draft import check_destination
 from recorder.head import Beginning
 from recorder.reader import Recording
@@ -481,16 +483,46 @@ def test_what_a_killed_recording_left_is_replaced_by_a_new_file(tmp_path, items)
     assert not left.exists()
 
 
-def test_a_foreign_reader_decodes_a_whole_recording_with_a_decoder_of_json(path):
+@pytest.mark.filterwarnings("ignore:.*mcap_ros1.reader:DeprecationWarning")  # its users still import it
+def test_a_stock_reader_decodes_every_message_of_a_recording(path):
     from mcap.reader import make_reader
+    from mcap_ros2.reader import read_ros2_messages
+
+    recording = Recording.open(path)
+    found = defaultdict(list)
+    for row in read_ros2_messages(path):
+        found[row.channel.topic].append(row.ros_msg)
+    assert {topic: len(rows) for topic, rows in found.items()} == {
+        topic: count for topic, count in recording.messages.items() if count
+    }
+    for topic in (EVENTS, "recorder/clock"):
+        assert [row.data.encode() for row in found[topic]] == [payload for _, payload in recording.payloads(topic)]
+        assert all(json.loads(row.data) for row in found[topic])
+    with path.open("rb") as file:
+        reader = make_reader(file)
+        summary = reader.get_summary()
+        assert reader.get_header().profile == "ros2"  # rosbags refuses another one
+        assert summary is not None
+        assert {channel.message_encoding for channel in summary.channels.values()} == {"cdr"}
+        assert {schema.encoding for schema in summary.schemas.values()} == {"ros2msg"}
+
+
+@pytest.mark.parametrize("text", ['{"a": 1}', "", "\0", "Grüße \ud7ff", '{"a": "\0"}', "x" * 70_000])
+def test_a_document_is_wrapped_as_a_ros2_string_and_unwrapped_byte_for_byte(text):
+    from mcap.records import Schema
     from mcap_ros2.decoder import DecoderFactory
 
-    class JsonDecoder:
-        def decoder_for(self, encoding, schema):
-            return json.loads if encoding == "json" else None
+    wrapped, form = schemas.wrap_text(text.encode()), schemas.TEXT
+    decode = DecoderFactory().decoder_for("cdr", Schema(data=form.text, encoding="ros2msg", id=1, name=form.name))
+    assert decode is not None
+    assert decode(wrapped).data == text
+    assert schemas.unwrap_text(wrapped) == text.encode()
+    assert schemas.unwrap_text(text.encode()) == text.encode()  # plain, as versions up to 0.2 wrote it
 
-    messages = Recording.open(path).messages
-    with path.open("rb") as file:
-        reader = make_reader(file, decoder_factories=[DecoderFactory(), JsonDecoder()])
-        topics = Counter(row.channel.topic for row in reader.iter_decoded_messages())
-    assert topics == {topic: count for topic, count in messages.items() if count}
+
+@pytest.mark.parametrize("spoil", [lambda data: data[:-1], lambda data: data + b"\0", lambda data: b"\1" + data[1:],
+                                   lambda data: data[:4] + b"\xff" + data[5:], lambda data: data[:3]])  # fmt: skip
+def test_a_damaged_string_message_is_no_document(spoil):
+    data = spoil(schemas.wrap_text(b'{"event": "end"}'))
+    assert schemas.unwrap_text(data) == data
+    assert document_in(EVENTS, data) is None
