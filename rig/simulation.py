@@ -162,13 +162,15 @@ class Simulation:
 
     @cached_property
     def first_row(self) -> np.ndarray:
-        """The observed row at time zero, shape (N_ROW,). The first use starts the engine, which compiles it."""
-        row = np.full((1, S.N_ROW), np.nan)
-        constants, inputs = self.model.constants, self._inputs()
+        """Observed row at time zero, shape (N_ROW,). The first use starts the engine, which compiles it."""
+        row, constants, inputs = np.full((1, S.N_ROW), np.nan), self.model.constants, self._inputs()
         for motion, engine in zip(self._motions(), self._engines, strict=True):
             motion.begin(engine, constants, inputs)
-        copy.deepcopy(self._motion).run(self._engines[0], constants, inputs, row, self.tick, self.tick, self.tick + 1)
-        return row[0]
+        moved = copy.deepcopy(self._motion)
+        moved.run(self._engines[0], constants, inputs, row, self.tick, self.tick, self.tick + 1)
+        if np.isfinite(moved.y).all():
+            return row[0]
+        raise SimulationError(f"the state is not finite at its start; {self._method.advice}")
 
     @cached_property
     def computed(self) -> tuple[str, ...]:
@@ -218,9 +220,8 @@ class Simulation:
         rows = rows[:n]
         self._last = rows[-1].copy()
         if not np.isfinite(self._motion.y).all():
-            raise SimulationError(
-                f"the state is no longer finite at {self._lost_s(rows, start):.6f} s; {self._method.advice}"
-            )
+            at_s = self._lost_s(rows, start)
+            raise SimulationError(f"the state is no longer finite at {at_s:.6f} s; {self._method.advice}")
         if self._companion is not None:
             events = sorted(events + self._doubts(rows, companion, start), key=lambda event: event["tick"])
         samples, edges, truth = self._sample(counts, start), self._edges(rows, start), self._truth(rows, start)

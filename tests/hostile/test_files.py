@@ -280,7 +280,7 @@ def test_rows_that_are_gone_or_do_not_fit_are_told_though_every_checksum_holds(
     spoil(changed)
     path = changed.write(tmp_path / "x.mcap")
     assert any(told in line for line in Recording.open(path).doubts)
-    assert _rig("info", str(path)) == 0
+    assert _rig("info", str(path)) == 1
     printed = capsys.readouterr().out
     assert told in printed
     if "missing" in told:
@@ -291,7 +291,7 @@ def test_rows_that_are_gone_or_do_not_fit_are_told_though_every_checksum_holds(
         assert _rig("export", str(path), "-o", str(tmp_path / "y.parquet")) == 0
         assert told in capsys.readouterr().err
     if lie in ("channel", "ticks"):
-        assert _rig("info", "--json", str(path)) == 0
+        assert _rig("info", "--json", str(path)) == 1
         channels = json.loads(capsys.readouterr().out)["health"]["channels"]
         assert next(one for one in channels if one["name"] == "disk_x")["findings"]
 
