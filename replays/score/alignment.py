@@ -25,21 +25,30 @@ _SOUND = 0.5
 _FOLLOWERS = 6
 """Channels by which a record is followed: more cost time, and fewer may all be faulty."""
 _NOISES = 1.5
-"""Noises of the channel within which a record's end counts as idle."""
-_IDLE_ROWS = 200
-"""Rows by which idleness is judged: their variance is known to a tenth."""
+"""Noises of the channel, the DAQ's and the session's together, in a residual that is nothing but noise."""
+_BLOCK_ROWS = 200
+"""Rows of a block by which residuals are compared: their variance is known to a tenth."""
+_LOUD_PART = 0.25
+"""Power of a block over the mean one, from which a begin shows in it."""
+_SAME_BALANCE = 0.98
+"""Part of the most explained rows, from which begins explain as many: a period is cut at the ends."""
+_FOLLOWED = 4
+"""Begins that are followed with all channels: the nearest ones, half a period later among them."""
 _ALIKE = 1.05
 """Residual power over the least one up to which begins are not told from one another, at least."""
 _DEVIATIONS = 6.0
 """Standard deviations of a residual's power within which begins are not told from one another."""
 _MAX_DRIFT = 0.02
 """Clock error of a DAQ, at most: a fit with more of it found something else."""
-_SAME_ROWS = 2.0
-"""Rows within which two begins are one."""
+_SAME_ROWS = 0.5
+"""Rows within which two begins are one: half of a row is a quarter of the shortest period."""
 _WORSE = 4.0
 """Residual power of a stretch over the least one, from which a begin is not followed: the clocks may differ."""
 _MOST, _FINER, _LIKE = 1 << 17, 4, 12
 """Samples by which other beginnings are looked for, places between two of them, and how many are told."""
+
+_EDGE_ROWS = 8
+"""Rows before and after the session at which a begin is looked for, too: a peak needs both its sides."""
 
 
 @dataclass
@@ -88,7 +97,7 @@ class Alignment:
         first_s, rate_hz, rows: Time of the first row [s], rows a second [Hz], and their number.
         upright: Number of signals with a positive gain.
         begin_s: Time by which the begin is later in the session than the wires have it [s].
-        alike: Other begins that explain the record as well.
+        ambiguous: Whether other begins explain the record as well.
     """
 
     names: tuple[str, ...]
@@ -99,7 +108,12 @@ class Alignment:
     rows: int
     upright: int = 0
     begin_s: float = 0.0
-    alike: tuple[Alignment, ...] = ()
+    ambiguous: bool = False
+
+    @property
+    def balance(self) -> int:
+        """Explained rows less those in the session that nothing explains."""
+        return 2 * self.track.explained - (self.track.inside[1] - self.track.inside[0])
 
     def even(self, source: Source) -> tuple[np.ndarray, np.ndarray, tuple[float, float, float]]:
         """Values of a signal at even instants, nan where none is explained.
@@ -117,11 +131,9 @@ class Alignment:
         curve = float(line[0]) + own_s, float(line[1]), float(line[2])
         return values, self.first_s + np.arange(low, high + 1) / self.rate_hz, curve
 
-    def judged(self) -> tuple[float, float, float]:
-        """Part of the rows in the session that are explained; and its least and most over all begins that are alike."""
-        tracks = [self.track, *(each.track for each in self.alike)]
-        parts = [each.explained / max(1, each.inside[1] - each.inside[0]) for each in tracks]
-        return parts[0], min(parts), max(parts)
+    def judged(self) -> float:
+        """Part of the rows in the session that are explained."""
+        return self.track.explained / max(1, self.track.inside[1] - self.track.inside[0])
 
 
 def _busiest(sources: Sequence[Source], within: tuple[int, int], length: int) -> tuple[int, int]:
@@ -172,13 +184,16 @@ def _follow(sources: Sequence[Source], shift_s: float, stretches: Sequence[tuple
     pace = float(np.median([fits[name].drift for name in order[:_FOLLOWERS]]))
     own_s = {name: float(fits[name].late_at(np.array([middle_s]))[0]) for name in order}
     by_name = {each.name: each for each in sources}
-    followers = []
+    followers, rows = [], len(one.values)
     for name in order[:_FOLLOWERS]:
         fit, source = fits[name], by_name[name]
         step = source.channel.lsb_v / abs(source.channel.sensitivity_v)
+        # A slow signal stays on one count for some rows, whose errors are then alike.
+        held_rows = step * one.rate_hz / max(float(np.sqrt(np.mean(fit.slope**2))), 1e-300)
+        alike = step * math.sqrt(min(float(rows), max(0.0, held_rows - 1.0)) / 12.0)
         noise = max(float(np.std(fit.residual)), 0.3 * step, 1e-9 * float(np.std(fit.values)))
+        noise = math.hypot(noise, alike)
         followers.append(Follower(source.values, source.stimulus, own_s[name], fit.gain, fit.offset, noise))
-    rows = len(one.values)
     track = follow_record(followers, one.first_s, 1.0 / one.rate_hz, rows, stretch, pace)
     if not track.runs:
         return None
@@ -186,28 +201,6 @@ def _follow(sources: Sequence[Source], shift_s: float, stretches: Sequence[tuple
         tuple(by_name), track, own_s, one.first_s, one.rate_hz, rows,
         sum(each.gain > 0.0 for each in fits.values()), shift_s,
     )  # fmt: skip
-
-
-def _active(source: Source) -> tuple[int, int]:
-    """First and last row of a signal that is not idle at the record's ends."""
-    parts = len(source.values) // _IDLE_ROWS
-    if not parts:
-        return 0, len(source.values)
-    blocks = np.nan_to_num(source.values[: parts * _IDLE_ROWS]).reshape(parts, -1)
-    quiet = _NOISES * math.hypot(source.channel.noise_v, source.channel.lsb_v) / abs(source.channel.sensitivity_v)
-    busy = np.flatnonzero(blocks.std(axis=1) > quiet)
-    return (int(busy[0]) * _IDLE_ROWS, (int(busy[-1]) + 1) * _IDLE_ROWS) if len(busy) else (0, len(source.values))
-
-
-def _cost(found: Alignment, source: Source, active: tuple[int, int]) -> tuple[float, float]:
-    """Power that a begin leaves, a row that is not idle, and a row that is explained [unit^2]."""
-    values, times_s, curve = found.even(source)
-    fit = fit_waveform(values, times_s, source.stimulus, curve[0], curve=curve)
-    explained, _ = found.track.places(found.rows)
-    rows, held = active[1] - active[0], int(explained[slice(*active)].sum())
-    whole = float(np.nanvar(source.values[slice(*active)]))
-    left = whole if fit is None else float(np.var(fit.residual))
-    return (held * left + (rows - held) * whole) / max(1, rows), left
 
 
 def _beginnings(found: Waveform, stimulus: Stimulus) -> list[float]:
@@ -222,9 +215,10 @@ def _beginnings(found: Waveform, stimulus: Stimulus) -> list[float]:
     rows = math.floor((high - low) / step_s)
     y = found.values[: min(_MOST, rows // 2)]
     n = len(y)
-    curve = np.zeros((rows - n, _FINER))
+    curve = np.zeros((rows - n + 2 * _EDGE_ROWS + 1, _FINER))
     for phase in range(_FINER):
         s, _ = stimulus(low + (np.arange(rows - 1) + phase / _FINER) * step_s)
+        s = np.pad(s, (_EDGE_ROWS, _EDGE_ROWS + 1))  # so that a begin at the session's first row is a peak, too
         sums, squares = (np.cumsum(np.concatenate([[0.0], each])) for each in (s, s**2))
         power = squares[n:] - squares[:-n] - (sums[n:] - sums[:-n]) ** 2 / n
         alike = correlate(s, y - y.mean(), "valid", "fft") / np.sqrt(np.maximum(power, 1e-12 * power.max()))
@@ -235,14 +229,11 @@ def _beginnings(found: Waveform, stimulus: Stimulus) -> list[float]:
     aside = 0.5 * (curve[at - 1] - curve[at + 1]) / bend
     best = np.argsort(-(curve[at] - 0.25 * (curve[at - 1] - curve[at + 1]) * aside))[:_LIKE]
     began_s = found.times_s[0] + float(found.late_at(found.times_s[:1])[0])
-    return (low + (at[best] + aside[best]) * (step_s / _FINER) - began_s).tolist()
+    return (low + ((at[best] + aside[best]) / _FINER - _EDGE_ROWS) * step_s - began_s).tolist()
 
 
 def align(sources: Sequence[Source]) -> Alignment | None:
-    """Align the signals of one table with the session; None where none of them is found in it.
-
-    A begin counts only where all that is not idle lies in the session, if one does.
-    """
+    """Align the signals of one table with the session; None where none of them is found in it."""
     if not sources or len(sources[0].values) < _FEWEST:
         return None
     one = max(sources, key=lambda each: each.wire.likeness)
@@ -252,78 +243,112 @@ def align(sources: Sequence[Source]) -> Alignment | None:
     if within[1] - within[0] < _FEWEST:
         within = [0, rows]
     stretches = [_busiest(sources, (within[0], within[1]), round(each * one.rate_hz)) for each in _STRETCHES_S]
-    first = _follow(sources, 0.0, stretches)
     if not one.wire.others_s:
-        return first
-    begins = _Begins(sources, one, stretches)
-    if first is not None:
-        begins.add(first)
+        return _follow(sources, 0.0, stretches)
+    begins = _Begins(one, stretches)
+    begins.try_all([0.0])
     begins.try_all(begins.repeats())
     begins.try_all([each - one.wire.late_s for each in one.wire.others_s])
     begins.try_all(begins.repeats())
-    return begins.best() or first
+    alike = begins.alike()
+    found = [each for one in alike[:_FOLLOWED] if (each := _follow(sources, one.begin_s, stretches)) is not None]
+    if not found:
+        return _follow(sources, 0.0, stretches)
+    most = max(each.balance for each in found)
+    best = max(found, key=lambda each: (each.balance > _SAME_BALANCE * most, each.upright, -abs(each.begin_s)))
+    return replace(best, ambiguous=len(alike) > 1)
 
 
 class _Begins:
-    """Begins that are tried for a table, by what each leaves of one signal.
+    """Begins that are tried for a table, by the residual power of one signal in blocks of rows.
 
-    Rows outside the session count as unexplained, so that a begin from which the record stays inside is preferred.
+    Rows outside the session are not compared: where a signal repeats, begins that explain the same rows alike are told
+    apart by how many rows lie in the session, explained or not.
     """
 
-    def __init__(self, sources: Sequence[Source], one: Source, stretches: Sequence[tuple[int, int]]) -> None:
-        self._sources, self._one, self._stretches, self._active = sources, one, stretches, _active(one)
-        self._tried: list[tuple[float, float, Alignment]] = []
+    def __init__(self, one: Source, stretches: Sequence[tuple[int, int]]) -> None:
+        self._one, self._stretches = one, stretches
+        self._tried: list[tuple[np.ndarray, Alignment]] = []
         self._shifts: list[float] = []
-        self._left = math.inf
+        self._least = math.inf
+        power = _block_means((one.values - np.nanmean(one.values)) ** 2)
+        self._loud = power > _LOUD_PART * np.nanmean(power)
 
-    def add(self, found: Alignment) -> None:
-        """Add a begin."""
-        self._tried.append((*_cost(found, self._one, self._active), found))
+    def _residual_power(self, found: Alignment) -> np.ndarray:
+        """Residual power by block [unit^2]; that of the signal where nothing explains it, nan outside the session."""
+        one = self._one
+        values, times_s, curve = found.even(one)
+        fit = fit_waveform(values, times_s, one.stimulus, curve)
+        left = np.full(found.rows, np.nan)
+        left[slice(*found.track.inside)] = np.nanvar(one.values)
+        if fit is not None:
+            explained, at = found.track.places(found.rows)
+            row_at = np.zeros(len(values), int)
+            row_at[at - int(at.min())] = np.flatnonzero(explained)
+            left[row_at[np.rint((fit.times_s - times_s[0]) * one.rate_hz).astype(int)]] = fit.residual**2
+        return np.where(self._loud, _block_means(left), np.nan)
 
-    def _alike(self) -> list[Alignment]:
-        least = min((cost for cost, _, _ in self._tried), default=math.inf)
-        limit = max(_ALIKE, 1.0 + _DEVIATIONS * math.sqrt(2.0 / len(self._one.values)))
-        return [found for cost, _, found in self._tried if cost <= limit * least]
+    def _is_worse(self, power: np.ndarray, other: np.ndarray) -> bool:
+        """Whether a begin leaves more than another where both are in the session, by the median block."""
+        both = np.isfinite(power) & np.isfinite(other)
+        limit = max(_ALIKE, 1.0 + _DEVIATIONS * math.sqrt(2.0 / max(1, _BLOCK_ROWS * both.sum())))
+        return bool(both.any()) and float(np.median(power[both])) > limit * float(np.median(other[both]))
+
+    def alike(self) -> list[Alignment]:
+        """Return the begins that none of the others surpasses: with most explained rows first, then the nearest."""
+        kept = [
+            each for power, each in self._tried if not any(self._is_worse(power, other) for other, _ in self._tried)
+        ]
+        if not kept and self._tried:
+            kept = [min(self._tried, key=lambda each: float(np.nanmedian(each[0])))[1]]
+        most = max((each.balance for each in kept), default=0)
+        kept = [each for each in kept if each.balance >= 0.5 * most]
+        return sorted(kept, key=lambda each: (each.balance <= _SAME_BALANCE * most, abs(each.begin_s)))
 
     @property
     def _settled(self) -> bool:
-        """Whether the best begin leaves nothing but noise, the DAQ's and the session's."""
+        """Whether two begins leave nothing but noise, the DAQ's and the session's."""
         noise = 2.0 * _NOISES * self._one.channel.noise_v / self._one.channel.sensitivity_v
-        return bool(self._tried) and min(self._tried, key=lambda each: each[0])[1] < noise**2
-
-    def best(self) -> Alignment | None:
-        """Return that of the alike begins at which most signals are upright, then the nearest."""
-        alike = self._alike()
-        if not alike:
-            return None
-        best = max(alike, key=lambda each: (each.upright, -abs(each.begin_s)))
-        return replace(best, alike=tuple(each for each in alike if each is not best))
+        return self._least < noise**2 and len(self.alike()) > 1
 
     def repeats(self) -> list[float]:
         """Return shifts at which the known signal repeats, from the best begin [s]."""
-        best = self.best()
-        if best is None or (best.alike and self._settled):
+        alike = self.alike()
+        if not alike or self._settled:
             return []
-        values, times_s, curve = best.even(self._one)
+        values, times_s, curve = alike[0].even(self._one)
         rows, held = np.arange(len(values)), np.isfinite(values)
         values = np.interp(rows, rows[held], values[held])
         fit = fit_stretch(values, times_s, self._one.stimulus, curve[0], (0, len(values)))
         shifts = [] if fit is None else _beginnings(fit, self._one.stimulus)
-        return [best.begin_s + sign * each for each in shifts for sign in (1.0, -1.0)]
+        return [alike[0].begin_s + sign * each for each in shifts for sign in (1.0, -1.0)]
 
     def try_all(self, shifts: Sequence[float]) -> None:
         """Try begins until two are alike and leave nothing but noise."""
         one = self._one
+        left = math.inf
         for shift_s in shifts:
-            near = [*self._shifts, *(found.begin_s for _, _, found in self._tried)]
-            if any(abs(shift_s - each) * one.rate_hz < _SAME_ROWS for each in near):
+            if any(abs(shift_s - each) * one.rate_hz < _SAME_ROWS for each in self._shifts):
                 continue
-            if len(self._alike()) > 1 and self._settled:
+            if self._settled:
                 return
             self._shifts.append(shift_s)
             fit = fit_stretch(one.values, one.times_s, one.stimulus, one.late_s + shift_s, self._stretches[0])
-            if fit is None or float(np.var(fit.residual)) > _WORSE * self._left:
+            if fit is None or float(np.var(fit.residual)) > _WORSE * left:
                 continue
-            self._left = min(self._left, float(np.var(fit.residual)))
-            if (found := _follow(self._sources, shift_s, self._stretches)) is not None:
-                self.add(found)
+            left = min(left, float(np.var(fit.residual)))
+            found = _follow([one], shift_s, self._stretches)
+            own_s = found.own_s[one.name] if found else 0.0
+            near = [abs(own_s - each.own_s[one.name]) * one.rate_hz for _, each in self._tried]
+            if found is not None and min(near, default=math.inf) > _SAME_ROWS:
+                power = self._residual_power(found)
+                if np.isfinite(power).any():
+                    self._tried.append((power, found))
+                    self._least = min(self._least, float(np.nanmedian(power)))
+
+
+def _block_means(values: np.ndarray) -> np.ndarray:
+    """Return means over blocks of rows; nan where most of a block is nan."""
+    blocks = values[: len(values) // _BLOCK_ROWS * _BLOCK_ROWS].reshape(-1, _BLOCK_ROWS)
+    count = np.isfinite(blocks).sum(axis=1)
+    return np.where(2 * count >= _BLOCK_ROWS, np.nansum(blocks, axis=1) / np.maximum(count, 1), np.nan)

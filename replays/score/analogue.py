@@ -46,8 +46,6 @@ _SOME = 0.05
 """The same without the filter, for one to be looked for."""
 _OWN_CLOCK = 3.0, 1e-6
 """A clock is a channel's own where it is off the others' by more than so many half intervals, and by so much."""
-_PURER = 1.5
-"""Noises of a channel that what is not the sine in a sine may come to."""
 _SINE = ("SINAD", "ENOB", "THD", "SFDR")
 _SEEN = 4.0
 """Noises of a channel that what is above half of the rate has to come to."""
@@ -62,6 +60,9 @@ _EDGE = 100
 
 _AMBIGUOUS = "what was sent repeats, and other begins explain the record as well"
 _ODD = "behind a low-pass that is none of Butterworth's"
+_OTHER_CORNER = "behind another low-pass, whose delay is known by its order and corner only"
+_SAME_CORNER = 0.1
+"""Part by which corners differ that have one nominal value: capacitors of 5 % in a filter of second order."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +78,7 @@ class Fitted:
         corner_hz: Where it has fallen by 3 dB, with its 95 % interval; None where it does not.
         odd: Whether there is a low-pass that is none of the known ones.
         values: As recorded, in the channel's unit.
-        exact: Whether the known signal has no noise of its own.
+        known_noise: What the known signal has, by the session's noise and converter [unit rms]; 0 by a formula.
         folds: What is left of the signal above half of the rate, over its part below [1]; None where it has nothing.
         alias: The same as recorded [unit], shape (n,).
     """
@@ -90,7 +91,7 @@ class Fitted:
     corner_hz: Interval | None
     odd: bool
     values: np.ndarray
-    exact: bool
+    known_noise: float
     folds: Interval | None
     alias: np.ndarray | float
 
@@ -135,11 +136,13 @@ def fit_channels(
         tables.setdefault(id(signal.table), []).append(source)
     found, alignments = [], []
     for sources in tables.values():
-        alignment = align(sources)
-        alignments += [] if alignment is None else [alignment]
+        if (alignment := align(sources)) is None:
+            continue
+        alignments.append(alignment)
         for source in sources:
-            exact = source.wire.channel in formulas or not session.noisy
-            one = _fit(source, alignment, parts_of[source.name], exact=exact)
+            known_v = math.hypot(source.channel.noise_v * session.noisy, source.channel.lsb_v / math.sqrt(12.0))
+            known = 0.0 if source.wire.channel in formulas else known_v / abs(source.channel.sensitivity_v)
+            one = _fit(source, alignment, parts_of[source.name], known)
             if one is not None and (one.good or source.name == source.wire.channel or not source.wire.rivals):
                 found.append(one)
     return found, alignments
@@ -157,18 +160,11 @@ def in_unit(signal: Recorded, channel: Channel) -> tuple[np.ndarray, bool]:
 
 
 def _fit(
-    source: Source, alignment: Alignment | None, parts: tuple[Sampled, Sampled, Sampled] | None, *, exact: bool
+    source: Source, alignment: Alignment, parts: tuple[Sampled, Sampled, Sampled] | None, known_noise: float
 ) -> Fitted | None:
-    name, channel, stimulus, wire = source.name, source.channel, source.stimulus, source.wire
-    if alignment is None:
-        values, whole = source.values, fit_waveform(
-            source.values, source.times_s, stimulus, source.late_s, within_s=wire.within_s
-        )  # fmt: skip
-    else:
-        values, times_s, curve = alignment.even(source)
-        whole = fit_waveform(
-            values, times_s, stimulus, source.late_s + alignment.begin_s, within_s=wire.within_s, curve=curve
-        )
+    name, channel, stimulus = source.name, source.channel, source.stimulus
+    values, times_s, curve = alignment.even(source)
+    whole = fit_waveform(values, times_s, stimulus, curve)
     if whole is None:
         return None
     shown = response(whole) if whole.likeness >= _SOME else None
@@ -186,7 +182,7 @@ def _fit(
         alias, amounts = _folded(clean, [each(at_s)[0] for each in parts[1:]])
         folds = _scaled(amounts, 1.0 / abs(low.gain))
         clean = replace(clean, residual=clean.residual - alias)
-    return Fitted(name, channel, low, clean, shown, corner_hz, odd, values, exact, folds, alias)
+    return Fitted(name, channel, low, clean, shown, corner_hz, odd, values, known_noise, folds, alias)
 
 
 def _folded(found: Waveform, above: Sequence[np.ndarray]) -> tuple[np.ndarray, tuple[float, float, float]]:
@@ -224,7 +220,7 @@ def score_analogue(
         if name not in fitted:
             note = "nothing that was sent explains it" if wire.channel else "no channel is like it"
             card.add("gain", name, None, note=note)
-    ambiguous = {name for each in alignments if each.alike for name in each.names}
+    ambiguous = {name for each in alignments if each.ambiguous for name in each.names}
     _score_time(card, [one for one in found if one.good], ambiguous)
     _score_wires(card, recorded, wires, found, ambiguous, session)
     sines = []
@@ -248,7 +244,7 @@ def _score_rows(card: Scorecard, alignments: list[Alignment], recorded: Mapping[
     for alignment in alignments:
         name = alignment.names[0] if len(alignments) > 1 else ""
         steps = alignment.track.steps() if len(alignment.track.blocks) else None
-        note = "up to whole periods" if alignment.alike else ""
+        note = "up to whole periods" if alignment.ambiguous else ""
         for quantity, sign in (("lost samples", 1), ("doubled samples", -1)):
             if steps is None:
                 card.add(quantity, name, None, note="the signal is too slow for a step by one sample to show")
@@ -264,10 +260,7 @@ def _score_rows(card: Scorecard, alignments: list[Alignment], recorded: Mapping[
                 quantity, name, (count,) * 3, note="; ".join(each for each in (told, note if here else "") if each)
             )
             card.runs[f"{quantity} {name}".strip()] = [(first, last) for first, last, _ in here]
-        judged = alignment.judged()
-        card.add("judged part", name, judged)
-        if card.rows[-1].verdict == INCONCLUSIVE:
-            card.doubts.append("begins that explain the record alike leave different parts of it unexplained")
+        card.add("judged part", name, (judged := alignment.judged(), judged, judged))
         for rows, what in zip(
             (alignment.track.inside[0], alignment.rows - alignment.track.inside[1]),
             ("before the session's begin", "after the session's end"), strict=True,
@@ -319,11 +312,20 @@ def _score_time(card: Scorecard, found: list[Fitted], ambiguous: set[str]) -> No
             apart = late_s(one) - late_s(reference)
             both = math.hypot(one.low.half[2], low.half[2])
             odd = _ODD if one.odd or reference.odd else ""
-            said = "; ".join(each for each in (f"against {reference.name}", note, odd) if each)
+            filtered = "" if _same_corner(one, reference) else _OTHER_CORNER
+            said = "; ".join(each for each in (f"against {reference.name}", note, odd or filtered) if each)
             skew = None if odd else _about(apart, both, 1e9)
             card.add("skew", one.name, skew, of=one.channel, note=said)
-            if open_ and card.rows[-1].verdict != FAIL:  # a skew that fails does so from each of the begins
+            # A skew that fails does so from each of the begins.
+            if (open_ and card.rows[-1].verdict != FAIL) or (filtered and card.rows[-1].verdict == FAIL):
                 card.rows[-1] = replace(card.rows[-1], verdict=INCONCLUSIVE, run=ANALOGUE["skew"].run)
+
+
+def _same_corner(one: Fitted, other: Fitted) -> bool:
+    """Return whether two channels have low-passes alike, whose delays cancel in their skew, or none."""
+    if one.corner_hz is None or other.corner_hz is None:
+        return one.corner_hz is other.corner_hz
+    return abs(one.corner_hz[0] / other.corner_hz[0] - 1.0) < _SAME_CORNER
 
 
 def _is_loud(session: Session, name: str) -> bool:
@@ -347,11 +349,13 @@ def _score_wires(
         note = f"correlation {wire.likeness:.4f}"
         if not wire.channel and name in session.channels and recorded[name].rows >= _MANY and _is_loud(session, name):
             verdict, note = FAIL, "nothing of what was sent is in it"
+        elif name in fits and name in session.channels and name not in (wire.channel, *wire.rivals):
+            verdict = FAIL
         elif not wire.channel or wire.rivals or name not in fits:
             verdict = INCONCLUSIVE
             note += f"; as like {', '.join(wire.rivals)}" if wire.rivals else ""
         elif name in session.channels:
-            verdict = PASS if wire.channel == name else FAIL
+            verdict = PASS
         rows.append(text_row(card.path, "mapping", name, wire.channel or "-", verdict, note))
         if not wire.channel:
             continue
@@ -377,13 +381,12 @@ def _score_fit(card: Scorecard, one: Fitted) -> None:
     add("gain", None if note else _about(abs(low.gain) - 1.0, low.half[0], 1e6), note)
     add("offset", _about(low.offset, low.half[1]) if one.good else None)
     # Nothing tells whether the rig's own noise, which is in its samples, was in what the DAQ was given.
-    brought = 0.0 if one.exact else channel.noise_v / abs(channel.sensitivity_v)
-    split = split_noise(one.clean, floor=brought)
+    split = split_noise(one.clean, floor=one.known_noise)
     noise = split.noise if one.good else split.left
     add("noise", noise)
     add("jitter", _scaled(split.jitter_s, 1e9) if one.good and split.jitter_s is not None else None)
     full = channel.adc_v / abs(channel.sensitivity_v)
-    left = split_noise(replace(one.clean, residual=one.clean.residual + one.alias), floor=brought).left
+    left = split_noise(replace(one.clean, residual=one.clean.residual + one.alias), floor=one.known_noise).left
     bits = [math.log2(full / max(left[n], 1e-12 * full) / math.sqrt(3.0)) for n in (0, 2, 1)]
     ranges = [20.0 * math.log10(full / max(noise[n], 1e-12 * full) / math.sqrt(2.0)) for n in (0, 2, 1)]
     add("effective bits", (bits[0], bits[1], bits[2]))
@@ -408,15 +411,13 @@ def _score_sine(card: Scorecard, one: Fitted) -> bool:
     gaps = np.flatnonzero(~np.isfinite(np.concatenate([[np.nan], one.values, [np.nan]])))
     at = int(np.argmax(np.diff(gaps)))
     values = one.values[gaps[at] : gaps[at + 1] - 1]
-    noises = 1 if one.exact else 2
-    quiet = _PURER * math.hypot(one.channel.noise_v, one.channel.lsb_v) / abs(one.channel.sensitivity_v)
-    if len(values) < _MANY or not is_sine(one.low.known[:_LONGEST], quiet):
+    # A session's samples that are a sine to their own noise may have harmonics below it.
+    if one.known_noise or len(values) < _MANY or not is_sine(one.low.known[:_LONGEST], 0.0):
         return False
     fit = fit_sine(values)
     told = quality(fit)
     for quantity, estimate in zip(_SINE, (told.sinad_db, told.enob, told.thd_db, told.sfdr_db), strict=True):
-        note = "" if noises == 1 else "of the record as it is: the rig's own noise is in it"
-        card.add(quantity, one.name, estimate, of=one.channel, note=note, amplitude=fit.amplitude[0], noises=noises)
+        card.add(quantity, one.name, estimate, of=one.channel, amplitude=fit.amplitude[0])
     return True
 
 

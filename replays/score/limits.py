@@ -73,7 +73,7 @@ class Limits(BaseModel):
 
     def bounds(
         self, path: Literal["digital", "analogue"], quantity: str, channel: Channel | None = None, *,
-        amplitude: float = math.nan, noises: int = 1,
+        amplitude: float = math.nan,
     ) -> Bounds | None:  # fmt: skip
         """What is asked of a quantity; None: nothing.
 
@@ -82,7 +82,6 @@ class Limits(BaseModel):
             quantity: Its name.
             channel: Whose it is, by the session's table.
             amplitude: Of the sine that it was measured with [unit].
-            noises: How many noises of the channel are in a record: two where what was sent had one, too.
         """
         limit = getattr(self, path).get(quantity)
         if limit is None:
@@ -94,7 +93,7 @@ class Limits(BaseModel):
             if isinstance(bound, _Of):
                 if channel is None:
                     return None
-                ends.append(bound.times * _told(channel, bound.of, amplitude, noises) + bound.plus)
+                ends.append(bound.times * _told(channel, bound.of, amplitude) + bound.plus)
             else:
                 ends.append(none if bound is None else bound)
         if any(map(math.isnan, ends)):
@@ -109,12 +108,11 @@ def _check_order(field: str, low: float | _Of | None, high: float | _Of | None) 
         raise InputError(field, "with low at most high", Words(f"low = {low:g}, high = {high:g}"))
 
 
-def _told(channel: Channel, what: Told, amplitude: float, noises: int) -> float:
+def _told(channel: Channel, what: Told, amplitude: float) -> float:
     """What the table tells of a channel, in its unit."""
     per_volt = 1.0 / abs(channel.sensitivity_v)
     noise_v = math.hypot(channel.noise_v, channel.lsb_v / math.sqrt(12.0))
-    whole_v = noise_v * math.sqrt(noises)
-    sine_db = 20.0 * math.log10(amplitude / math.sqrt(2.0) / (whole_v * per_volt)) if amplitude > 0.0 else math.nan
+    sine_db = 20.0 * math.log10(amplitude / math.sqrt(2.0) / (noise_v * per_volt)) if amplitude > 0.0 else math.nan
     return {
         "noise": noise_v * per_volt,
         "lsb": channel.lsb_v * per_volt,

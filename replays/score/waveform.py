@@ -15,17 +15,9 @@ import numpy as np
 from replays.score.intervals import sandwich, student
 from replays.score.stimulus import Stimulus
 
-_FIRST_S = (0.25, 0.03)
-"""Where the signal is steepest, a stretch this long is fitted first; it is doubled until it is all.
-
-The second where the first finds nothing: over a shorter one clocks may be farther apart.
-"""
-_FOUND = 0.9
-"""Part of the recorded power that has to be explained for the signal to count as found."""
 _ROUNDS, _FINAL = 4, 3
 _SETTLED = 1e-3
 """A step below this part of its standard deviation is the last."""
-_MOST_DRIFT = 0.02
 _LEAST = 400
 """Fewest samples that are fitted."""
 _TAPS = 96
@@ -98,42 +90,18 @@ class Waveform:
 
 
 def fit_waveform(
-    values: np.ndarray, times_s: np.ndarray, stimulus: Stimulus, late_s: float, *,
-    within_s: tuple[float, float] | None = None, curve: tuple[float, float, float] | None = None,
-) -> Waveform | None:  # fmt: skip
+    values: np.ndarray, times_s: np.ndarray, stimulus: Stimulus, curve: tuple[float, float, float]
+) -> Waveform | None:
     """Fit a channel; None where the known signal is not in it, or too little of it.
 
     Args:
         values: Recorded [unit], nan where one is missing, shape (n,).
         times_s: By the clock of the file, even, shape (n,).
         stimulus: The known signal.
-        late_s: Time of the stimulus less time of the file, to a part of a period of the signal [s].
-        within_s: Where in the file that is so [s]; None: anywhere.
-        curve: The same over all of the file, by powers of the time from its middle [s, 1, 1/s]; None: not known.
+        curve: Time of the stimulus less time of the file, to a part of a period of the signal, by powers of the time
+            from the middle of the file [s, 1, 1/s].
     """
-    low, high = stimulus.span_s
-    moved = times_s + late_s
-    inside = np.isfinite(values) & (moved >= low) & (moved <= high)
-    if inside.sum() < _LEAST:
-        return None
-    best = followed = None
-    if curve is not None:
-        followed = _solve(values, times_s, stimulus, curve, slice(0, len(values)), final=True)
-        if followed is not None and followed.likeness > _FOUND:
-            return followed
-    first, last = np.flatnonzero(inside)[[0, -1]]
-    near = (first, last + 1)
-    if within_s is not None:
-        begin, end = np.searchsorted(times_s, within_s)
-        near = max(first, min(begin, last + 1 - _LEAST)), min(last + 1, max(end, first + _LEAST))
-    for first_s in _FIRST_S:
-        stretch = _steepest(values, times_s, *near, first_s)
-        found = _grow(values, times_s, stimulus, late_s, (first, last + 1), stretch, bent=curve is None)
-        if found is not None and (best is None or found.likeness > best.likeness):
-            best = found
-        if best is not None and best.likeness > _FOUND:
-            break
-    return best or followed
+    return _solve(values, times_s, stimulus, curve, slice(0, len(values)), final=True)
 
 
 def fit_stretch(
@@ -143,41 +111,13 @@ def fit_stretch(
     return _solve(values, times_s, stimulus, (late_s, 0.0, 0.0), slice(*stretch), final=False)
 
 
-def _grow(
-    values: np.ndarray, times_s: np.ndarray, stimulus: Stimulus, late_s: float, rows: tuple[int, int],
-    stretch: tuple[int, int], *, bent: bool,
-) -> Waveform | None:  # fmt: skip
-    """The fit of all of some rows, from that of a stretch of them; the clock's drift only if `bent`."""
-    middle, (begin, end), line = 0.5 * (times_s[0] + times_s[-1]), stretch, (late_s, 0.0, 0.0)
-    while True:
-        whole = (begin, end) == rows
-        found = _solve(values, times_s, stimulus, line, slice(begin, end), final=whole, bent=bent)
-        if found is None or abs(found.drift) > _MOST_DRIFT:
-            return None
-        if whole:
-            return found
-        line = (found.late_s + found.drift * (middle - found.middle_s), found.drift, 0.0)
-        wider = end - begin
-        begin, end = max(rows[0], begin - wider // 2), min(rows[1], end + wider - wider // 2)
-
-
-def _steepest(values: np.ndarray, times_s: np.ndarray, first: int, last: int, wanted_s: float) -> tuple[int, int]:
-    rate = (len(times_s) - 1) / (times_s[-1] - times_s[0])
-    length = min(last - first, max(_LEAST, round(wanted_s * rate)))
-    steps = np.nan_to_num(np.diff(values[first:last], append=values[last - 1])) ** 2
-    sums = np.concatenate([[0.0], np.cumsum(steps)])
-    held = sums[length:] - sums[:-length]
-    begin = first + int(np.argmax(held))
-    return begin, begin + length
-
-
 def _solve(
     values: np.ndarray, times_s: np.ndarray, stimulus: Stimulus, curve: tuple[float, float, float], rows: slice, *,
-    final: bool, bent: bool = True,
+    final: bool,
 ) -> Waveform | None:  # fmt: skip
     """Gauss and Newton's steps over some rows, about their own centre; `curve` is about the centre of all.
 
-    The clock's drift is fitted over all rows only, and if `bent`; else it has a standard deviation of 1 /s.
+    The clock's drift is fitted over all rows only; else it has a standard deviation of 1 /s.
     """
     y, t = values[rows], times_s[rows]
     low, high = stimulus.span_s
@@ -188,7 +128,7 @@ def _solve(
     y, t, start_s = y[held], t[held], start_s[held]
     centre, span = 0.5 * (t[0] + t[-1]), 0.5 * max(t[-1] - t[0], 1e-300)
     u = (t - centre) / span
-    shape = np.column_stack([np.ones(len(u)), u, u**2 - 1.0 / 3.0][: 3 if final and bent else 2])
+    shape = np.column_stack([np.ones(len(u)), u, u**2 - 1.0 / 3.0][: 3 if final else 2])
     moved, number = np.zeros(shape.shape[1]), 0
     while True:
         at = t + start_s + shape @ moved

@@ -145,13 +145,14 @@ def _find(
     taken = {name: _even(values, each, rate, taken_s) for name, (values, each) in recorded.items()}
     lengths = {n: _lengths(even, behind, n) for n in {len(here) for here in taken.values()}}
     names, found = list(sent), {}
-    best: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+    best: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
     ends: dict[str, tuple[np.ndarray, np.ndarray]] = {}
     for name, here in taken.items():
         length = lengths[len(here)] / math.sqrt(_step(recorded[name][1], rate))
         curve = _likeness(here, behind, there, length)
         alike = np.abs(curve).max(axis=0)
-        best[name] = alike, np.abs(curve[names.index(name)]) if name in names else alike
+        own = np.abs(curve[names.index(name)]) if name in names else alike
+        best[name] = alike, own, curve.max(axis=0) >= _CLEAR * alike
         ends[name] = curve.min(axis=1), curve.max(axis=1)
     lags = _common_lags(list(best.values()), behind + round(from_s * rate))
     lag = lags[0]
@@ -183,6 +184,13 @@ def _find(
             late_s, (from_s, from_s + taken_s), tuple((each - behind) / rate - from_s for each in lags[1:]),
             late_s if turned else late_s + (first + at - lag) / rate,
         )  # fmt: skip
+    # Of channels that are as alike, a signal is rather one that no other signal has by its name.
+    taken = {name for name, wire in found.items() if wire.channel == name}
+    for name, wire in found.items():
+        free = [each for each in (wire.channel, *wire.rivals) if each not in taken]
+        if wire.channel in taken - {name} and free:
+            rivals = (wire.channel, *(each for each in wire.rivals if each != free[0]))
+            found[name] = replace(wire, channel=free[0], rivals=rivals)
     return found
 
 
@@ -237,17 +245,19 @@ def _likeness(here: np.ndarray, before: int, there: np.ndarray, lengths: np.ndar
     return curve / (lengths * max(float(np.linalg.norm(here)), 1e-150))
 
 
-def _common_lags(curves: list[tuple[np.ndarray, np.ndarray]], zero: int) -> list[int]:
+def _common_lags(curves: list[tuple[np.ndarray, np.ndarray, np.ndarray]], zero: int) -> list[int]:
     """Lags at which all signals of a file may have begun together, the likeliest first.
 
     Of the peaks that are as good as the best, as a sine has one each period, and sequences that begin apart from one
-    another have, that at which most signals are what they are named; of those the nearest to none.
+    another have, that at which most signals are what they are named; of those that at which most have the polarity of
+    the channel that is most alike; of those the nearest to none.
 
     Args:
-        curves: How much each signal is like the channel that is most alike, and like that of its name, by lag.
+        curves: How much each signal is like the channel that is most alike, and like that of its name, and whether it
+            has the polarity of the former, by lag.
         zero: No lag.
     """
-    clear = [alike for alike, _ in curves if alike.max() > _ALIKE]
+    clear = [alike for alike, *_ in curves if alike.max() > _ALIKE]
     if not clear:
         return [zero]
     curve = np.mean(clear, axis=0)
@@ -255,9 +265,10 @@ def _common_lags(curves: list[tuple[np.ndarray, np.ndarray]], zero: int) -> list
     edges = np.flatnonzero(np.diff(np.concatenate([[0], high.astype(np.int8), [0]])))
     peaks = [low + int(np.argmax(curve[low:up])) for low, up in edges.reshape(-1, 2)]
 
-    def rank(at: int) -> tuple[int, bool, int]:
-        named = sum(bool(own[at] >= _CLEAR * alike[at]) for alike, own in curves)
-        return named, bool(curve[at] >= _CLEAR * curve.max()), -abs(at - zero)
+    def rank(at: int) -> tuple[int, int, bool, int]:
+        named = sum(bool(own[at] >= _CLEAR * alike[at]) for alike, own, _ in curves)
+        upright = sum(bool(each[at]) for *_, each in curves)
+        return named, upright, bool(curve[at] >= _CLEAR * curve.max()), -abs(at - zero)
 
     first = max(peaks, key=rank)
     return [first, *sorted(set(peaks) - {first}, key=lambda at: -curve[at])[:_LAGS]]

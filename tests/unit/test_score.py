@@ -275,7 +275,7 @@ def test_intervals_are_as_wide_as_cramer_and_rao_have_it() -> None:
     t = np.arange(int(seconds * RATE_HZ)) / RATE_HZ
     signal = Exact(lambda at: amplitude * np.sin(2.0 * np.pi * hz * at), (-1.0, 11.0), RATE_HZ)
     values = signal(t)[0] + noise * np.random.default_rng(4).standard_normal(len(t))
-    found = fit_waveform(values, t, signal, 0.0)
+    found = fit_waveform(values, t, signal, (0.0, 0.0, 0.0))
     assert found is not None
     one = noise / math.sqrt(len(t))
     floors = [
@@ -293,7 +293,8 @@ def test_jitter_of_five_nanoseconds_is_told_apart_from_noise() -> None:
     generator = np.random.default_rng(5)
     signal = Exact(lambda at: 5.0 * np.sin(2.0 * np.pi * 1000.3 * at), (-1.0, 11.0), RATE_HZ)
     late = 5e-9 * generator.standard_normal(len(t))
-    found = fit_waveform(signal(t + late)[0] + 1e-3 * generator.standard_normal(len(t)), t, signal, 0.0)
+    values = signal(t + late)[0] + 1e-3 * generator.standard_normal(len(t))
+    found = fit_waveform(values, t, signal, (0.0, 0.0, 0.0))
     assert found is not None
     split = split_noise(found)
     assert split.jitter_s is not None
@@ -467,7 +468,8 @@ def test_intervals_hold_as_often_as_they_say() -> None:
             return true[0] * of(at_s + late) + true[1] + noise * generator.standard_normal(rows)  # noqa: B023
 
         known = Exact(signal, (0.0, 1.0), RATE_HZ)
-        found = fit_waveform(record(signal, jitter_s), t, known, true[2] + generator.normal(0.0, 1e-5))
+        begun = true[2] + generator.normal(0.0, 1e-5), 0.0, 0.0
+        found = fit_waveform(record(signal, jitter_s), t, known, begun)
         assert found is not None
         half = student(found.freedom) * found.spread
         got = [found.gain, found.offset, found.late_s, found.drift]
@@ -478,7 +480,8 @@ def test_intervals_hold_as_often_as_they_say() -> None:
         held.setdefault("noise", []).append(split.noise[1] <= noise <= split.noise[2])
         held.setdefault("jitter", []).append(split.jitter_s[1] <= jitter_s <= split.jitter_s[2])
         corner_hz = generator.uniform(900.0, 2000.0)
-        low = fit_waveform(record(signal.behind(corner_hz, 4)), t, known, true[2] - 0.3 / corner_hz)
+        begun = true[2] - 0.3 / corner_hz, 0.0, 0.0
+        low = fit_waveform(record(signal.behind(corner_hz, 4)), t, known, begun)
         shown = None if low is None else response(low)
         if low is not None and shown is not None and shown.corner_hz is not None and order_of(shown) == 4:
             behind = behind_filter(low, known, shown)

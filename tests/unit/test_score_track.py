@@ -11,6 +11,7 @@ from replays.score.judgement import judge
 from replays.score.scorecard import FAIL, INCONCLUSIVE, PASS, Scorecard
 from replays.score.stimulus import Exact
 from replays.score.track import Follower, Track, follow_record
+from replays.score.wiring import find_wires
 from rig.channels import default_table
 from tests.score_daqs import RATE_HZ, Tones, counts_of, write_parquet, write_session
 
@@ -132,3 +133,24 @@ def test_clock_is_the_mean_and_its_drift_fails(session: Path, tmp_path: Path) ->
     assert red(card) == {("clock drift", "")}
     assert card.row("clock").low < 30.0 < card.row("clock").high
     assert card.row("clock drift").value == pytest.approx(120.0, rel=0.01)
+
+
+def test_a_daq_that_waits_for_a_signal_that_repeats_begins_with_the_session(session: Path, tmp_path: Path) -> None:
+    """Later begins explain the same rows; from them the idle rows would lie in the session."""
+    idle = np.full(2000, 0.0125)  # where the signal is zero
+    card = card_of(session, tmp_path / "daq.parquet", np.concatenate([idle, 0.004 + np.arange(8001) / RATE_HZ]))
+    assert red(card) == set()
+    assert card.row("judged part").value == pytest.approx(1.0, abs=0.001)
+
+
+def test_exchanged_signals_a_quarter_turn_apart_are_seen() -> None:
+    """A later begin and another polarity explain one of the two pairs, not both."""
+    t = np.arange(20_000) / RATE_HZ
+    signals = {"disk_x": np.cos, "disk_y": np.sin, "ring_x": np.cos, "ring_y": np.sin}
+    sent = {name: (signal(2.0 * np.pi * 27.0 * t), 20e3) for name, signal in signals.items()}
+    taken = {name: (values[3000:13_000], hz) for name, (values, hz) in sent.items()}
+    wires = find_wires(taken | {"ring_x": taken["ring_y"], "ring_y": taken["ring_x"]}, sent)
+    assert {name: wire.channel for name, wire in wires.items()} == {
+        "disk_x": "disk_x", "disk_y": "disk_y", "ring_x": "ring_y", "ring_y": "ring_x",
+    }  # fmt: skip
+    assert "ring_x" not in wires["ring_x"].rivals
