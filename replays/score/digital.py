@@ -17,24 +17,21 @@ from replays.score.intervals import student
 from replays.score.live import Arrivals
 from replays.score.overlap import find_begin
 from replays.score.recorded import Recorded, Table
-from replays.score.rows import NO_COUNT, Followed, follow, located, stretches
+from replays.score.rows import Followed, follow, located, stretches
+from replays.score.scale import Scale, find_scale, scales
 from replays.score.scorecard import Interval, Scorecard
 from replays.score.sent import Sent, Session
 from replays.score.wiring import Wire
-from rig import units
 from rig.channels import Channel
 
-_NEAR = 0.49
-"""Part of a count by which a recovered one may be off a whole number: rounding of the file."""
-_REFITTED = 8
-"""Stretches on which a scale is fitted although a known one explains others."""
-_PIECE = 512
-"""Most consecutive rows on which a scale is found: a row may be lost before and behind them."""
 _LOOKED = 1 << 16
 """Rows of a recording by which its scale is found."""
+_MOST_ROWS = 0.5
+"""Part of the first rows that must be equal for a begin that stamps or correlation tell."""
+_SAMPLED = 64
+"""Of so many values one is looked at for the bits that a DAQ leaves out."""
 _SEARCHED = 3
 """Signals of a table by which its place in the session is searched over the whole of both."""
-_ENOUGH = 0.99
 _BATCHES, _APART = 256, 32
 """Of stamps that are shown, and that are judged."""
 _MOST_BATCH = 1 << 12
@@ -45,116 +42,6 @@ _BACKLOG_S = 1.0
 """Rows that wait in a pipe have come by then [s]."""
 _NAMED = 5
 """Rows that are named in a line; all stand in the document."""
-
-
-@dataclass(frozen=True)
-class Scale:
-    """How recorded values come from counts: value = each * count + zero.
-
-    Attributes:
-        each, zero: The two, in the unit of the file.
-        what: Counts, the channel's unit, volts, or fitted.
-        gain_ppm, zero_counts: How far off that they are.
-        turned: Whether it has the other sign.
-        known: Whether some rows have shown it; otherwise it is what the file's unit says.
-    """
-
-    each: float
-    zero: float
-    what: str
-    gain_ppm: float = 0.0
-    zero_counts: float = 0.0
-    turned: bool = False
-    known: bool = True
-
-    def counts(self, values: np.ndarray) -> np.ndarray:
-        """The counts of values, int64, shape (n,); `NO_COUNT` where a value is none."""
-        found = (values - self.zero) / self.each
-        whole = np.rint(found)
-        good = np.isfinite(found) & (np.abs(found - whole) <= _NEAR) & (np.abs(whole) < 2.0**53)
-        return np.where(good, np.where(good, whole, 0.0).astype(np.int64), NO_COUNT)
-
-
-def find_scale(values: np.ndarray, unit: str, counts: np.ndarray, channel: Channel) -> Scale | None:
-    """The scale of a channel; None where its counts cannot be told from what the file has.
-
-    Args:
-        values: Recorded [unit of the file], shape (n,).
-        unit: That unit; empty where the file tells none.
-        counts: Of the same rows as far as none is lost, shape (n,).
-        channel: The channel.
-    """
-    size = min(_PIECE, max(8, len(values) // 4))
-    pieces = [slice(n, n + size) for n in range(0, len(values) - size + 1, size)]
-
-    def shows(scale: Scale, p: slice) -> bool:
-        # Rows that are as most are show nothing of a scale.
-        same, moving = scale.counts(values[p]) == counts[p], counts[p] != np.median(counts[p])
-        return bool(moving.any()) and min(same.mean(), same[moving].mean()) >= _ENOUGH
-
-    candidates = _candidates(unit, channel)
-    shown = [[n for n, p in enumerate(pieces) if shows(scale, p)] for scale in candidates]
-    best = max(range(len(candidates)), key=lambda n: len(shown[n]))
-    # A small gain shows where counts are large: the pieces with the largest counts come first.
-    others = [n for n in range(len(pieces)) if n not in shown[best]]
-    others.sort(key=lambda n: -int(np.abs(counts[pieces[n]]).max()))
-    for n in others[: _REFITTED if shown[best] else None]:
-        x, y = counts[pieces[n]].astype(float), values[pieces[n]]
-        if not np.isfinite(y).all() or not np.ptp(x):
-            continue
-        each, zero = map(float, np.polyfit(x - x.mean(), y, 1))
-        fitted = Scale(each, zero - each * float(x.mean()), "fitted")
-        if each and shows(fitted, pieces[n]):
-            return _judge_fit(fitted, values, counts, candidates)
-    if not shown[best]:
-        return None
-    fitted = _judge_fit(candidates[best], values, counts, candidates)
-    ends = np.array([counts.min(), counts.max()])
-    changed = np.abs((fitted.each * ends + fitted.zero - candidates[best].zero) / candidates[best].each - ends)
-    return fitted if changed.max() >= 0.5 else candidates[best]
-
-
-def _judge_fit(fitted: Scale, values: np.ndarray, counts: np.ndarray, candidates: list[Scale]) -> Scale:
-    """Return the scale of all rows that a first one explains, and how far its gain and zero are off the nearest known.
-
-    Either a gain or a zero is taken where it alone leaves as little as both: a channel with little spread about a large
-    mean has its gain from the mean. What the digits of the file leave open is neither.
-    """
-    near = min(candidates, key=lambda one: abs(math.log(abs(fitted.each / one.each))))
-    same = fitted.counts(values) == counts
-    x, sign = counts[same].astype(float), 1.0 if fitted.each / near.each > 0.0 else -1.0
-    off = (sign * values[same] - near.zero) / near.each - x
-    x += near.zero / near.each  # a gain acts on values, which are zero there
-    mean, spread = float(x.mean()), float(np.ptp(x))
-    slope = float(np.polyfit(x - mean, off, 1)[0]) if spread else 0.0
-    alone = float(off @ x / (x @ x)) if x.any() else 0.0
-    forms = ((0.0, 0.0), (alone, 0.0), (0.0, float(off.mean())), (slope, float(off.mean()) - slope * mean))
-    left = [float(np.sqrt(np.mean((off - gain * x - zero) ** 2))) for gain, zero in forms]
-    # Rounding of 64-bit numbers, and a tenth more than the least.
-    enough = max(1.1 * left[-1], 1e-14 * (float(np.abs(x).max()) + abs(near.zero / near.each)))
-    gain, zero = next(form for form, each in zip(forms, left, strict=True) if each <= enough)
-    if (gain, zero) == (0.0, 0.0):
-        return near if sign > 0.0 else Scale(-near.each, -near.zero, f"fitted, beside {near.what}", turned=True)
-    each = sign * near.each * (1.0 + gain)
-    return Scale(
-        each,
-        sign * ((1.0 + gain) * near.zero + zero * near.each),
-        f"fitted, beside {near.what}",
-        1e6 * gain,
-        zero,
-        sign < 0.0,
-    )
-
-
-def _candidates(unit: str, channel: Channel) -> list[Scale]:
-    found = [Scale(1.0, 0.0, "counts")] if units.kind(unit) == "" or unit == channel.unit == "1" else []
-    if not unit or units.kind(unit) == units.kind(channel.unit):
-        size = units.size_si(channel.unit) / units.size_si(unit) if unit else 1.0
-        found.append(Scale(channel.scale * size, channel.offset * size, channel.unit))
-    if not unit or units.kind(unit) == "voltage":
-        size = 1.0 / units.size_si(unit) if unit else 1.0
-        found.append(Scale(channel.lsb_v * size, 0.0, "V"))
-    return found or [Scale(1.0, 0.0, "counts")]
 
 
 @dataclass(frozen=True)
@@ -216,24 +103,28 @@ def settle(
         table = id(signal.table)
         index, counts = held[channel.group]
         late = [round(each * session.rate_hz(channel.group)) for each in (wires[name].late_s, wires[name].own_s)]
+        less_sure = None
         for begin in dict.fromkeys([begins.get(table, late[0]), *late]):
             values, unit, there, _ = tried(name, of, begin)
             if len(values) > 1 and (scale := find_scale(values, unit, there, channel)) is not None:
-                begins[table] = begin
-                return taken(scale, step, begin, index)
-        if table not in begins:
-            there = counts[:, session.place(of)] >> signal.lost_bits << signal.lost_bits
-            for scale in _candidates(signal.unit, channel):
-                begin = located(scale.counts(signal.early[:_LOOKED]), there, step)
-                if begin is not None:
+                same = float(np.mean(scale.counts(values) == scale.sent(there)))
+                if table in begins or (scale.clean and same > _MOST_ROWS):
                     begins[table] = begin
                     return taken(scale, step, begin, index)
-            begin = overlapping(name, of, step)
+                less_sure = less_sure or (scale, begin)
+        if table not in begins:
+            early, there = signal.early[:_LOOKED], counts[:, session.place(of)] >> signal.lost_bits << signal.lost_bits
+            begin, known = overlapping(name, of, step), scales(signal.unit, channel, signal.early, there)
+            placed = (located(scale.counts(early), scale.sent(there), step) for scale in known)
+            begin = next((place for place in placed if place is not None), None) if begin is None else begin
             if begin is not None:
                 values, unit, there, _ = tried(name, of, begin)
                 if len(values) > 1 and (scale := find_scale(values, unit, there, channel)) is not None:
                     begins[table] = begin
                     return taken(scale, step, begin, index)
+        if less_sure is not None:
+            begins[table] = less_sure[1]
+            return taken(less_sure[0], step, less_sure[1], index)
         return None
 
     def overlapping(name: str, of: str, step: int) -> int | None:
@@ -241,14 +132,16 @@ def settle(
         signal, channel = recorded[name], session.channels[of]
         sent, asked = Sent(session, [channel.group]), searched.setdefault(id(signal.table), set())
         rows = session.rows(channel.group)
-        beyond = signal.rows > len(signal.early) or rows > len(held[channel.group][1])
+        beyond = signal.rows > _LOOKED or rows > len(held[channel.group][1])
         if not beyond or name in asked or len(asked) >= _SEARCHED:
             return None
         asked.add(name)
         column, fewest = sent.names.index(of), min(signal.rows, rows // step)
-        for scale in _candidates(signal.unit, channel):
+        some = [_sample(part[:, 1]) for part in signal.table.parts([signal.column])]
+        bits = signal.lost_bits
+        for scale in scales(signal.unit, channel, np.concatenate(some), held[channel.group][1][:, column]):
             here = (scale.counts(part[:, 1]) for part in signal.table.parts([signal.column]))
-            there = (part[:, column] >> signal.lost_bits << signal.lost_bits for part in Sent(session, [channel.group]))
+            there = (scale.sent(part[:, column] >> bits << bits) for part in Sent(session, [channel.group]))
             if (begin := find_begin(here, there, step, fewest)) is not None:
                 return begin
         return None
@@ -278,9 +171,23 @@ def settle(
                 return float(np.nanmedian(np.abs(scale.each * counts + scale.zero - values)) / scale.each)  # noqa: B023
 
             found[name] = replace(wire, channel=named)
-            scale = replace(min(_candidates(unit, channel), key=apart), known=False)
+            scale = replace(min(scales(unit, channel, values[:0], counts), key=apart), known=False)
             settled[name] = taken(scale, step, begin, held[channel.group][0])
+    known = {name: each for name, each in settled.items() if each.scale.known}
+    # Bits are left out by the DAQ's converter, so that no signal has more of them; else they are lost on the way.
+    bits = {name: session.channels[found[name].channel].adc_bits - each.scale.lost_bits for name, each in known.items()}
+    for name, each in known.items():
+        if each.scale.lost_bits and bits[name] < max(bits.values()):
+            size = 2.0**-each.scale.lost_bits
+            scale = Scale(size * each.scale.each, each.scale.zero, each.scale.what, known=False)
+            settled[name] = replace(each, scale=scale)
     return found, settled
+
+
+def _sample(values: np.ndarray) -> np.ndarray:
+    """Return some values, and the least and the largest, of which the bits of a DAQ are found."""
+    good = values[np.isfinite(values)]
+    return np.append(good[::_SAMPLED], [good.min(), good.max()] if len(good) else [])
 
 
 def score_digital(
@@ -290,6 +197,9 @@ def score_digital(
     """Put the rows of the digital path onto a scorecard; latency, too, where it is known when the rows came."""
     for name, each in taken.items():
         _score_scale(card, name, each.scale, session.channels[wires[name].channel])
+    coarse = [each.scale for each in taken.values() if each.scale.rounding]
+    for bits, rounding in dict.fromkeys((scale.bits, scale.rounding) for scale in coarse):
+        card.remarks.append(f"counts of {bits} bits, rounded {rounding}, are compared; lower bits of the rig's are not")
     tables: dict[tuple[float, ...], list[str]] = {}
     for name in sorted(taken, key=lambda each: not taken[each].scale.known):
         rate_hz = session.rate_hz(session.channels[wires[name].channel].group)
@@ -317,8 +227,8 @@ def _score_rows(
     """Follow the rows of signals that are as long as each other, and judge what became of them and of their stamps."""
     groups = list(dict.fromkeys(session.channels[wires[name].channel].group for name in names))
     table = "all groups" if len(groups) == len(session.groups) > 1 else ", ".join(groups)
-    scales, one = {name: taken[name].scale for name in names}, taken[names[0]]
-    sound = sum(scale.known for scale in scales.values())
+    by_name, one = {name: taken[name].scale for name in names}, taken[names[0]]
+    sound = sum(scale.known for scale in by_name.values())
     if not sound:
         for name in names:
             card.add("altered values", name, None, note="no signal beside it shows which row is which")
@@ -340,12 +250,19 @@ def _score_rows(
             parts, left = [part[left:] for part in parts], max(0, left - len(parts[0]))
             stamps.times_s = parts[0][:, 0]
             columns = zip(chain(*tables.values()), chain(*(part.T[1:] for part in parts)), strict=True)
-            found = {name: scales[name].counts(values) for name, values in columns}
+            found = {name: by_name[name].counts(values) for name, values in columns}
             yield np.column_stack([found[name] for name in names])
 
+    def made() -> Iterator[np.ndarray]:
+        """Counts that a DAQ with these converters has of those sent."""
+        for chunk in sent:
+            cut = chunk[:, columns] >> bits << bits
+            yield np.column_stack([by_name[name].sent(cut[:, n]) for n, name in enumerate(names)]) if coarse else cut
+
     bits = np.array([recorded[name].lost_bits for name in names])
+    coarse = any(scale.rounding for scale in by_name.values())
     found, trigger, at = Followed(), None, one.early
-    for places, found in follow((chunk[:, columns] >> bits << bits for chunk in sent), counts(), sound, one.start):  # noqa: B007
+    for places, found in follow(made(), counts(), sound, one.start):  # noqa: B007
         known = np.flatnonzero(places >= 0)
         since_s = sent.since_s(places[known]) if len(known) else np.empty(0)
         stamps.take(sent.first_s, since_s, known, len(places))

@@ -40,9 +40,15 @@ def find_begin(recorded: Iterable[np.ndarray], sent: Iterable[np.ndarray], step:
         same = hashes[at] == there
         pairs.append(np.column_stack([rows[at[same]], places[same] - step * rows[at[same]]]))
     at, begins = np.concatenate(pairs).T
+    if not len(at):
+        return None
     _, which, votes = np.unique(begins, return_inverse=True, return_counts=True)
-    clear = votes[which] >= max(_MIN_VOTES, 0.01 * votes.max(initial=0))
-    # Each lost row moves what follows: the stretch that comes first in the recording tells where it begins.
+    most = which == np.argmax(votes)
+    places, first = begins + step * at, int(np.argmin(np.where(most, at, at.max() + 1)))
+    # Each lost row moves what follows: a stretch ahead of the longest one tells where it begins, unless it has rows
+    # that come again in that one, as what stands before the session may have.
+    clear = votes[which] >= max(_MIN_VOTES, 0.01 * votes.max())
+    clear &= most | ((at < at[first]) & (places < places[first]))
     return int(begins[clear][np.argmin(at[clear])]) if clear.any() else None
 
 

@@ -13,7 +13,7 @@ from replays.score.scorecard import FAIL, PASS, Scorecard
 from rig.channels import default_table
 from rig.errors import InputError
 from tests.commands import said
-from tests.score_daqs import RATE_HZ, counts_of, write_parquet, write_session
+from tests.score_daqs import counts_of, write_parquet, write_session
 
 PROBES = default_table().groups["probes"]
 
@@ -29,8 +29,8 @@ def columns_of(counts: np.ndarray, *names: str) -> dict[str, np.ndarray]:
 
 @pytest.fixture(scope="module")
 def counts() -> np.ndarray:
-    """One second of noise on the probes."""
-    return counts_of("probes", np.random.default_rng(7).standard_normal((RATE_HZ, 4)), None)
+    """Noise on the probes."""
+    return counts_of("probes", np.random.default_rng(7).standard_normal((4000, 4)), None)
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +95,7 @@ def test_ends_of_a_limit_that_the_channel_table_turns_round_are_refused(tmp_path
         load_limits(file).bounds("analogue", "noise", PROBES.channels[0])
 
 
-@pytest.mark.parametrize("kept", [1, 12, 20, 60, 75])
+@pytest.mark.parametrize("kept", [1, 20, 75])
 def test_a_text_whose_last_line_is_cut_is_judged_as_far_as_it_is_whole(
     kept: int, session: Path, counts: np.ndarray, tmp_path: Path
 ) -> None:

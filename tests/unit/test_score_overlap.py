@@ -26,8 +26,8 @@ def columns_of(counts: np.ndarray) -> dict[str, np.ndarray]:
 
 @pytest.fixture(scope="module")
 def counts() -> np.ndarray:
-    """One second of noise on the probes."""
-    return counts_of("probes", np.random.default_rng(7).standard_normal((RATE_HZ, 4)), None)
+    """Noise on the probes."""
+    return counts_of("probes", np.random.default_rng(7).standard_normal((12_000, 4)), None)
 
 
 @pytest.fixture(scope="module")
@@ -35,15 +35,17 @@ def session(counts: np.ndarray, tmp_path_factory: pytest.TempPathFactory) -> Pat
     return write_session(tmp_path_factory.mktemp("sent") / "session.mcap", {"probes": counts})
 
 
-@pytest.mark.parametrize("before", ["noise", "silence", "one row"])
-def test_a_daq_that_began_a_minute_early_and_ends_late_is_judged_where_both_overlap(
+@pytest.mark.parametrize("before", ["noise", "silence", "one row", "its end, 3 counts off", "its end"])
+def test_a_daq_that_began_early_and_ends_late_is_judged_where_both_overlap(
     before: str, session: Path, counts: np.ndarray, tmp_path: Path
 ) -> None:
-    rows = 20 * RATE_HZ
+    rows = 70_000
     ahead = {
         "noise": counts_of("probes", np.random.default_rng(8).standard_normal((rows, 4)), None),
         "silence": np.zeros((rows, 4), dtype=np.int64),
         "one row": np.tile(counts[9:10], (rows, 1)),
+        "its end, 3 counts off": np.tile(counts[-3500:], (20, 1)) + 3,
+        "its end": np.tile(counts[-3500:], (20, 1)),
     }[before]
     daq = np.concatenate([ahead, counts, ahead[:700] + 1])
     card = judge(write_parquet(tmp_path / "daq.parquet", columns_of(daq)), [session])
@@ -58,16 +60,17 @@ def test_a_daq_that_began_a_minute_early_and_ends_late_is_judged_where_both_over
 
 
 def test_a_daq_that_joins_after_half_a_minute_is_found(tmp_path: Path) -> None:
-    counts = counts_of("probes", np.random.default_rng(9).standard_normal((32 * RATE_HZ, 4)), None)
-    session = write_session(tmp_path / "session.mcap", {"probes": counts}, index=700)
-    daq = np.delete(counts[31 * RATE_HZ :], 5000, axis=0)
-    card = judge(write_parquet(tmp_path / "daq.parquet", columns_of(daq)), [session])
-    assert (card.path, red(card)) == ("digital", {("missing rows", "probes")})
-    assert card.row("missing rows", "probes").note == f"rows {700 + 31 * RATE_HZ + 5000}"
-    assert card.row("rows before the first", "probes").value == 31 * RATE_HZ
+    counts = np.random.default_rng(9).integers(-10_000, 10_000, (31 * RATE_HZ, 1))
+    session = write_session(tmp_path / "session.mcap", {"hammer": counts}, index=700)
+    first = 31 * RATE_HZ - 8000
+    daq = np.delete(counts[first:], 5000, axis=0)
+    card = judge(write_parquet(tmp_path / "daq.parquet", {"hammer": daq[:, 0]}), [session])
+    assert (card.path, red(card)) == ("digital", {("missing rows", "hammer")})
+    assert card.row("missing rows", "hammer").note == f"rows {700 + first + 5000}"
+    assert card.row("rows before the first", "hammer").value == first
 
 
-@pytest.mark.parametrize("ppm", [0.2, 1.0, 10.0, 25.0])
+@pytest.mark.parametrize("ppm", [0.2, 25.0])
 @pytest.mark.parametrize(("mean", "spread"), [(2.5e6, 2e5), (6e6, 200.0), (0.0, 3e6)])
 def test_a_small_gain_that_changes_counts_fails(
     ppm: float, mean: float, spread: float, session: Path, counts: np.ndarray, tmp_path: Path
@@ -82,7 +85,7 @@ def test_a_small_gain_that_changes_counts_fails(
     assert card.row("scale", "disk_y").value == pytest.approx(ppm, rel=1e-3)
 
 
-@pytest.mark.parametrize("off", [0.3, 0.5, 0.6, 3.0])
+@pytest.mark.parametrize("off", [0.3, 0.6, 3.0])
 def test_an_offset_fails_where_it_changes_counts(off: float, session: Path, counts: np.ndarray, tmp_path: Path) -> None:
     columns = columns_of(counts)
     columns["disk_y [mm]"] += off * PROBES.channels[1].scale
