@@ -211,8 +211,8 @@ def _about(value: float, half: float, size: float = 1.0) -> Interval:
 def score_analogue(
     card: Scorecard, recorded: Mapping[str, Recorded], wires: Mapping[str, Wire], session: Session,
     formulas: Mapping[str, Formula],
-) -> None:  # fmt: skip
-    """Put the rows of the analogue path onto a scorecard."""
+) -> list[Fitted]:  # fmt: skip
+    """Add the rows of the analogue path to a scorecard, and return the fits of its channels."""
     found, alignments = fit_channels(recorded, wires, session, formulas, card.remarks)
     fitted = {one.name for one in found}
     _score_rows(card, alignments, recorded)
@@ -233,6 +233,7 @@ def score_analogue(
         "trigger row",
     ):  # fmt: skip
         card.add(quantity, "", None)
+    return found
 
 
 def _score_rows(card: Scorecard, alignments: list[Alignment], recorded: Mapping[str, Recorded]) -> None:

@@ -44,3 +44,17 @@ def student(freedom: ArrayLike) -> Any:
     from scipy.stats import t
 
     return t.ppf(0.975, freedom)
+
+
+def simultaneous(values: np.ndarray, spread: np.ndarray, freedom: ArrayLike = math.inf) -> tuple[float, float, float]:
+    """Return the largest of some estimates with a 95 % interval that holds for all of them at once (Bonferroni).
+
+    Args:
+        values: The estimates, shape (n,).
+        spread: Their standard deviations, shape (n,).
+        freedom: Degrees of freedom of these.
+    """
+    from scipy.stats import t
+
+    half = t.ppf(1.0 - 0.025 / len(values), freedom) * spread
+    return float(values.max()), float((values - half).max()), float((values + half).max())

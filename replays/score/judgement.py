@@ -12,6 +12,7 @@ import numpy as np
 from replays.recordings.formats.mapping import FileOptions
 from replays.score.analogue import score_analogue
 from replays.score.can_log import is_can_log, open_can_log
+from replays.score.converter import score_converter
 from replays.score.digital import Taken, score_digital, settle
 from replays.score.limits import Limits, load_limits
 from replays.score.live import Arrivals
@@ -95,7 +96,8 @@ def judge(
             arrivals = replace(arrivals, rows=arrivals.rows - headings)
         score_digital(card, recorded, wires, rows, session, arrivals)
     else:
-        score_analogue(card, recorded, wires, session, {**session.formulas(), **(formulas or {})})
+        fitted = score_analogue(card, recorded, wires, session, {**session.formulas(), **(formulas or {})})
+        score_converter(card, fitted)
     card.doubts += _missing_evidence(card, due)
     return card
 

@@ -44,6 +44,9 @@ _LONGER = "a longer run"
 _RICH = "a signal of many frequencies on every channel (test-prbs, 2 s)"
 _BEYOND = "a signal beyond the corner (test-chirp, test-prbs)"
 _SINE = "a sine near full scale on the channel (test-sine, 10 s)"
+_TONES = "two tones on the channel (test-two-tone, 10 s)"
+_RAMP = "a slow ramp over the whole range (test-ramp, 20 s)"
+_STEPS = "at least 6 steps with plateaus of 100 samples (test-step, 10 s)"
 _DIGITS = "a recording that keeps every digit of the counts"
 _STAMPED = "a recording that keeps time stamps"
 _RECORDED = Quantity(
@@ -102,6 +105,13 @@ ANALOGUE = {
         "dB", f"of all that was sent above half of the rate, {_SANDWICH}",
         "tones above half of the DAQ's rate, from a session at a higher rate",
     ),
+    "IMD": Quantity("dB", "products of second and third order over two tones, least squares, delta method", _TONES),
+    "INL": Quantity("ppm", "transfer curve of 64 straight pieces, simultaneous interval, of the range", _RAMP),
+    "DNL": Quantity("LSB", "code density of a ramp, simultaneous interval", f"{_RAMP}, longer for more samples a code"),
+    "crosstalk": Quantity("dB", f"worst of the other channels, in volts, {_SANDWICH}", _RICH),
+    "rise time": Quantity("s", "10 to 90 % of the mean step response", _STEPS),
+    "overshoot": Quantity("%", "largest value of the mean step response, simultaneous interval", _STEPS),
+    "settling time": Quantity("s", "from 50 % of the mean step response, simultaneous interval", _STEPS),
     "trigger row": DIGITAL["trigger row"],
 }  # fmt: skip
 QUANTITIES = {"digital": DIGITAL, "analogue": ANALOGUE}

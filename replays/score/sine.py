@@ -124,17 +124,17 @@ def quality(fit: SineFit) -> Quality:
     # Variance of one part of a line's amplitude, by what is neither the sine nor a harmonic.
     line = 2.0 * max(nad**2 - 0.5 * power, 1e-6 * nad**2) / n
     half = 1.96 * math.sqrt(sum(4.0 * line * each + 4.0 * line**2 for each in squares))
-    thd = _db(power / amplitude**2, half / amplitude**2)
+    thd = decibels(power / amplitude**2, half / amplitude**2)
     window = np.blackman(n)
     spectrum = (np.abs(np.fft.rfft(fit.residual * window)) * 2.0 / window.sum()) ** 2
     largest = float(spectrum[3:].max()) if n > 8 else 0.0
     # A window widens lines: of a line's noise it lets through 1.73 times as much power as none.
     wide = 1.96 * math.sqrt(4.0 * 1.73 * line * largest)
-    value, low, high = _db(largest / amplitude**2, wide / amplitude**2)
+    value, low, high = decibels(largest / amplitude**2, wide / amplitude**2)
     return Quality(sinad, enob, thd, (-value, -high, -low))
 
 
-def _db(power: float, half: float) -> tuple[float, float, float]:
-    """A ratio of powers and its half interval in dB: value, low, high."""
+def decibels(power: float, half: float) -> tuple[float, float, float]:
+    """Return a ratio of powers and its half interval in dB: value, low, high."""
     least = 1e-30
     return tuple(10.0 * math.log10(max(least, each)) for each in (power, power - half, power + half))  # type: ignore[return-value]

@@ -48,7 +48,7 @@ TABLE = {
     "short": Declared("inner_x", {}, {"mapping"}),
     "intermittent": Declared("inner_y", {"slot_s": 0.002}, LEFT),
     "hum": Declared("outer_x", {"amplitude_v": 0.02}, LEFT),
-    "crosstalk": Declared("P_W", {"source": "disk_x", "db": -30.0}, LEFT),
+    "crosstalk": Declared("P_W", {"source": "disk_x", "db": -30.0}, {"crosstalk", *LEFT}),
     "saturation": Declared("disk_x", {"part": 0.2}, {"gain", *LEFT}),
     "swap": Declared("disk_y", {"other": "ring_x"}, {"mapping"}),
     # The filter was in what was sent: without it, all is earlier, and more of high frequencies.

@@ -1,0 +1,83 @@
+"""Quantities of the analogue path that need a test signal of their own, or several channels."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from replays.score.analogue import Fitted
+from replays.score.crosstalk import find_crosstalk
+from replays.score.nonlinearity import intermodulation, transfer_curve
+from replays.score.scorecard import Interval, Scorecard
+from replays.score.step import BAND, has_steps, step_response
+
+_QUANTITIES = ("IMD", "INL", "DNL", "crosstalk", "rise time", "overshoot", "settling time")
+_MAX_ROWS = 1 << 17
+"""Rows by which crosstalk is judged: more cost time, and 1e5 show -100 dB."""
+
+
+def score_converter(card: Scorecard, found: Sequence[Fitted]) -> None:
+    """Add intermodulation, INL, DNL, crosstalk and step response of the channels whose gain is found."""
+    good = [one for one in found if one.good]
+    for one in good:
+        _score_nonlinearity(card, one)
+        _score_steps(card, one)
+        _score_crosstalk(card, one, [each for each in good if each is not one])
+    shown = {row.quantity for row in card.rows}
+    for quantity in _QUANTITIES:
+        if quantity not in shown:
+            card.add(quantity, "", None)
+
+
+def _score_nonlinearity(card: Scorecard, one: Fitted) -> None:
+    clean, low, channel = one.clean, one.low, one.channel
+    distortion = intermodulation(clean.times_s, clean.known, clean.residual, clean.gain)
+    if distortion is not None:
+        card.add("IMD", one.name, distortion, of=channel)
+    found = transfer_curve(low.times_s, low.known, low.values, 2.0 * channel.adc_v / abs(channel.sensitivity_v))
+    if found is not None:
+        card.add("INL", one.name, found.inl, of=channel, note=f"over {found.coverage:.0%} of the range")
+        card.add("DNL", one.name, found.dnl, of=channel, note=f"{found.code_samples:.3g} samples a code")
+
+
+def _score_steps(card: Scorecard, one: Fitted) -> None:
+    low, channel = one.low, one.channel
+    if not has_steps(low.known):
+        return
+    response = step_response(low.known, low.values)
+    row_s = float(np.median(np.diff(low.times_s)))
+    rise = settling = overshoot = None
+    note = "too few steps with plateaus that are long enough"
+    if response is not None:
+        rise, overshoot = _scaled(response.rise_rows, row_s), response.overshoot
+        settling = None if response.settling_rows is None else _scaled(response.settling_rows, row_s)
+        note = f"of {response.steps} steps"
+    card.add("rise time", one.name, rise, of=channel, note=note)
+    card.add("overshoot", one.name, overshoot, of=channel, note=note)
+    card.add("settling time", one.name, settling, of=channel, note=f"{note}; to {BAND:.0%} of the step")
+
+
+def _score_crosstalk(card: Scorecard, one: Fitted, others: Sequence[Fitted]) -> None:
+    clean, rows = one.clean, slice(_MAX_ROWS)
+    times_s = clean.times_s[rows]
+    sources, names = [], []
+    for other in others:
+        volts = other.low.known * abs(other.channel.sensitivity_v)
+        if np.std(volts) > other.channel.noise_v and np.ptp(other.low.times_s) > 0.5 * np.ptp(times_s):
+            sources.append(np.interp(times_s, other.low.times_s, volts))
+            names.append(other.name)
+    if not sources:
+        return
+    volts = clean.residual[rows] * abs(one.channel.sensitivity_v)
+    worst, part = find_crosstalk(volts, [clean.known[rows], clean.slope[rows]], sources)
+    if part is None:
+        card.add("crosstalk", one.name, None, of=one.channel, note=f"other signals are the same as {names[worst]}'s")
+        return
+    value, low, high = (20.0 * math.log10(max(each, 1e-15)) for each in part)
+    card.add("crosstalk", one.name, (value, low, high), of=one.channel, note=f"from {names[worst]}")
+
+
+def _scaled(estimate: Interval, size: float) -> Interval:
+    return estimate[0] * size, estimate[1] * size, estimate[2] * size

@@ -1,0 +1,45 @@
+"""Crosstalk between the channels of a record: what of the others' known signals is in the residual of one."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from replays.score.intervals import sandwich, simultaneous
+from replays.score.scorecard import Interval
+
+_SEPARATE = 0.01
+"""Part of the power of a source that the other signals must leave: below, none of them can be told from it."""
+_BLOCKS = 64
+"""Blocks of a record of which each has a mean and a slope of its own."""
+
+
+def find_crosstalk(
+    residual: np.ndarray, own: list[np.ndarray], sources: list[np.ndarray]
+) -> tuple[int, Interval | None]:
+    """Return the source of the worst crosstalk, and its part in the residual.
+
+    Args:
+        residual: Of a channel, shape (n,).
+        own: Signals of the channel itself: known signal and slope, each shape (n,).
+        sources: Known signals of the other channels, each of some power, shape (n,).
+
+    Returns:
+        Number of the source, and the absolute part of its signal in the residual with its 95 % interval, simultaneous
+        over the sources; None for it where that source is the same as other signals.
+    """
+    from scipy.signal import detrend
+
+    # A drift is like anything slow: of each block, mean and slope are taken off.
+    blocks = np.linspace(0, len(residual), _BLOCKS + 1).astype(int)[1:-1]
+    left, *columns = (detrend(each, bp=blocks) for each in (residual, *sources, *own))
+    sizes = np.array([max(float(np.std(each)), 1e-300) for each in columns])
+    matrix = np.column_stack([each / size for each, size in zip(columns, sizes, strict=True)])
+    likeness = matrix.T @ matrix / len(matrix)
+    own_part = 1.0 / np.diag(np.linalg.inv(likeness + 1e-9 * np.eye(len(sizes))))[: len(sources)]
+    if own_part.min() < _SEPARATE:
+        return int(own_part.argmin()), None
+    parts = np.linalg.lstsq(matrix, left, rcond=None)[0]
+    covariance, freedom = sandwich(matrix, left - matrix @ parts)
+    held = slice(len(sources))
+    sizes, parts = sizes[held], np.abs(parts[held] / sizes[held])
+    return int(parts.argmax()), simultaneous(parts, np.sqrt(np.diag(covariance)[held]) / sizes, freedom[held])

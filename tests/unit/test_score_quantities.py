@@ -1,0 +1,178 @@
+"""Intermodulation, INL, DNL, crosstalk and step response, by DAQs whose values are known in closed form."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from replays.score.crosstalk import find_crosstalk
+from replays.score.nonlinearity import intermodulation, transfer_curve
+from replays.score.scorecard import Interval
+from replays.score.step import step_response
+
+RATE_HZ, NOISE = 20e3, 1e-3
+SEEDS = 20
+LEAST = 17
+"""Intervals of 95 % that hold of 20, in 99 of 100 cases."""
+
+
+def held(true: float, judged: Callable[[np.random.Generator], Interval | None], width: float) -> None:
+    """Check how many intervals hold a value, and that they are at most so wide."""
+    found = [judged(np.random.default_rng(seed)) for seed in range(SEEDS)]
+    whole = [each for each in found if each is not None]
+    assert len(whole) == SEEDS
+    assert sum(low <= true <= high for _, low, high in whole) >= LEAST, (true, whole)
+    assert np.median([high - low for _, low, high in whole]) < width
+
+
+@pytest.mark.parametrize(("square", "cube"), [(2e-3, 0.0), (1e-3, 2e-3)])
+def test_intermodulation_is_that_of_a_polynomial(square: float, cube: float) -> None:
+    # y = x + a2 x^2 + a3 x^3 of two tones of amplitude A: products of a2 A^2, twice, and of 3/4 a3 A^3, twice.
+    a, t = 2.0, np.arange(3000) / RATE_HZ
+    x = a * (np.sin(2.0 * np.pi * 79.0 * t) + np.sin(2.0 * np.pi * 1999.0 * t + 0.3))
+    bent = square * x**2 + cube * x**3
+    true = 10.0 * math.log10(((square * a**2) ** 2 + (0.75 * cube * a**3) ** 2) / a**2)
+
+    def judged(generator: np.random.Generator) -> Interval | None:
+        known = x + NOISE * generator.standard_normal(len(x))  # a session has noise of its own
+        y = x + bent + NOISE * generator.standard_normal(len(x))
+        matrix = np.column_stack([known, np.ones(len(x))])
+        parts = np.linalg.lstsq(matrix, y, rcond=None)[0]
+        return intermodulation(t, known, y - matrix @ parts, float(parts[0]))
+
+    # The gain of a cube is 1 + 9/4 a3 A^2.
+    held(true - 20.0 * math.log10(1.0 + 2.25 * cube * a**2), judged, 0.5)
+
+
+@pytest.mark.parametrize("kind", ["sine", "noise", "quiet", "chips"])
+def test_what_is_not_two_tones_has_no_intermodulation(kind: str) -> None:
+    t, generator = np.arange(4000) / RATE_HZ, np.random.default_rng(1)
+    known = {
+        "sine": np.sin(2.0 * np.pi * 997.0 * t), "noise": generator.standard_normal(4000), "quiet": np.zeros(4000),
+        "chips": np.repeat(generator.integers(0, 2, 1000) * 2.0 - 1.0, 4),
+    }[kind]  # fmt: skip
+    known = known + 1e-4 * generator.standard_normal(4000)
+    assert intermodulation(t, known, 1e-3 * generator.standard_normal(4000), 1.0) is None
+    assert transfer_curve(t, known, known, 20.0) is None
+
+
+def ramp(rows: int, period: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return times and a ramp from -10 to 10 V."""
+    n = np.arange(rows)
+    return n / RATE_HZ, 20.0 * ((n / period + 0.1) % 1.0) - 10.0
+
+
+@pytest.mark.parametrize(("square", "cube"), [(1e-4, 0.0), (0.0, 4e-5)])
+def test_inl_is_that_of_a_polynomial(square: float, cube: float) -> None:
+    # Off the best line, a2 x^2 on +-h is at most 2/3 a2 h^2, and a3 x^3 is 2/5 a3 h^3, both at the ends.
+    # 80 rows beside the jump, and 4 noises, are left out.
+    t, x = ramp(12_000, 12_000)
+    h = 10.0 - 80 * 20.0 / 12_000 - 4.0 * NOISE
+    true = max(2.0 / 3.0 * square * h**2, 0.4 * cube * h**3) / 20.0 * 1e6
+
+    def judged(generator: np.random.Generator) -> Interval | None:
+        known = x + NOISE * generator.standard_normal(len(x))
+        y = x + square * x**2 + cube * x**3 + NOISE * generator.standard_normal(len(x))
+        found = transfer_curve(t, known, y, 20.0)
+        return None if found is None else found.inl
+
+    held(true, judged, 60.0)
+
+
+@pytest.mark.parametrize("wider", [0.0, 0.7])
+def test_dnl_is_that_of_one_wide_code(wider: float) -> None:
+    # 8 bits: code 100 takes a part of the next one.
+    t, x = ramp(20_000, 20_000)
+    step = 20.0 / 256
+
+    def judged(generator: np.random.Generator) -> Interval | None:
+        y = x + 5.0 * NOISE * generator.standard_normal(len(x))
+        place = y / step + 128.0
+        codes = np.clip(np.floor(place), 0, 255)
+        codes[(codes == 101) & (place < 101.0 + wider)] = 100
+        found = transfer_curve(t, x + NOISE * generator.standard_normal(len(x)), (codes - 127.5) * step, 20.0)
+        assert found is not None
+        assert found.inl is not None
+        return found.dnl
+
+    held(wider, judged, 1.4)
+
+
+def test_too_few_samples_a_code_and_half_a_ramp_show_nothing() -> None:
+    t, x = ramp(20_000, 50_000)
+    y = np.rint(x / 20.0 * 2**16) * 20.0 / 2**16
+    found = transfer_curve(t, x, y, 20.0)
+    assert found is not None
+    assert (found.inl, found.dnl) == (None, None)
+    assert (found.coverage, found.code_samples) == (pytest.approx(0.4, abs=0.02), pytest.approx(0.76, rel=0.02))
+
+
+@pytest.mark.parametrize("parts", [(1e-3, 1e-4, 0.0), (0.0, -3e-4, 2e-4)])
+def test_crosstalk_is_the_worst_entry_of_the_mixing_matrix(parts: tuple[float, ...]) -> None:
+    def judged(generator: np.random.Generator) -> Interval | None:
+        signals = [np.repeat(generator.integers(0, 2, 1500) * 4.0 - 2.0, 4) for _ in range(4)]
+        own, *others = signals
+        residual = np.column_stack(others) @ parts + NOISE * generator.standard_normal(6000)
+        worst, part = find_crosstalk(residual, [own, np.gradient(own)], others)
+        assert worst == np.argmax(np.abs(parts))
+        return part
+
+    held(max(map(abs, parts)), judged, 1e-4)
+
+
+@pytest.mark.parametrize("same", ["own", "another"])
+def test_crosstalk_of_equal_signals_is_inconclusive(same: str) -> None:
+    generator = np.random.default_rng(1)
+    own, first = generator.standard_normal((2, 4000))
+    second = (own if same == "own" else -first) + 1e-3 * generator.standard_normal(4000)
+    assert find_crosstalk(own * 1e-3, [own], [first, second])[1] is None
+
+
+def steps(respond: Callable[[np.ndarray], np.ndarray], generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Return a square wave and what a DAQ makes of it, whose rows lie 0.37 rows after the steps and less each time."""
+    n = np.arange(9700)
+    known, values = np.where(n // 600 % 2, 2.0, -2.0), np.full(len(n), -2.0)
+    for number, edge in enumerate(range(600, len(n), 600)):
+        since = np.maximum(n - edge + 0.37, 0.0)
+        values += (1.0 if number % 2 == 0 else -1.0) * 4.0 * respond(since)
+    return known, values + NOISE * generator.standard_normal(len(n))
+
+
+@pytest.mark.parametrize("quantity", ["rise_rows", "settling_rows"])
+def test_a_low_pass_of_first_order_rises_in_2_2_time_constants(quantity: str) -> None:
+    tau = 12.0
+    true = {"rise_rows": tau * math.log(9.0), "settling_rows": tau * math.log(50.0)}[quantity]
+
+    def judged(generator: np.random.Generator) -> Interval | None:
+        found = step_response(*steps(lambda since: 1.0 - np.exp(-since / tau), generator))
+        return None if found is None else getattr(found, quantity)
+
+    held(true, judged, 0.2 if quantity == "rise_rows" else 4.0)
+
+
+@pytest.mark.parametrize("zeta", [0.3, 0.6])
+def test_overshoot_of_a_second_order_low_pass_is_that_of_its_damping(zeta: float) -> None:
+    w, root = 0.1, math.sqrt(1.0 - zeta**2)
+    true = 100.0 * math.exp(-math.pi * zeta / root)
+
+    def respond(since: np.ndarray) -> np.ndarray:
+        turned = np.cos(root * w * since) + zeta / root * np.sin(root * w * since)
+        return 1.0 - np.exp(-zeta * w * since) * turned
+
+    def judged(generator: np.random.Generator) -> Interval | None:
+        found = step_response(*steps(respond, generator))
+        return None if found is None else found.overshoot
+
+    held(true, judged, 0.2)
+
+
+def test_an_ideal_step_is_within_its_resolution() -> None:
+    found = step_response(*steps(lambda since: (since > 0.0) * 1.0, np.random.default_rng(1)))
+    assert found is not None
+    assert found.rise_rows[1:] == (0.0, pytest.approx(2.0))
+    assert abs(found.overshoot[0]) < 0.1
+    assert found.settling_rows is not None
+    assert found.settling_rows[2] < 3.0
