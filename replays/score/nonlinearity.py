@@ -56,7 +56,7 @@ def _two_tones(n: np.ndarray, known: np.ndarray) -> tuple[list[float], float] | 
     second = fit_sine(first.residual)
     if np.var(second.residual) > _ROUGH * np.var(known):
         return None
-    tones = np.array([first.frequency[0], second.frequency[0]])
+    tones, parts, left = np.array([first.frequency[0], second.frequency[0]]), np.zeros(5), known
     for _ in range(_ROUNDS):
         basis = _basis(n, tones.tolist())
         parts = np.linalg.lstsq(basis, known, rcond=None)[0]
