@@ -10,12 +10,23 @@ import numpy as np
 from replays.report import OUTCOME_MARKS, Mark, Report, Row
 from replays.report.canvas import BLUE, ORANGE, RED, draw_signals, house_style, label_of, new_figure
 from replays.score.analogue import Fitted
-from replays.score.scorecard import FAIL, INCONCLUSIVE, NO_LIMIT, PASS, Scorecard, Verdict
+from replays.score.scorecard import (
+    FAIL,
+    INCONCLUSIVE,
+    MARKS,
+    NO_LIMIT,
+    PASS,
+    Scorecard,
+    Verdict,
+    make_matrix,
+)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _MARKS: dict[Verdict, Mark] = {FAIL: "bad", INCONCLUSIVE: "open", PASS: "good", NO_LIMIT: "plain"}
+_MATRIX_COLUMNS = 8
+"""Channels beside one another in a matrix: more are too wide for a page."""
 _STRETCHES = 100
 """Parts of a record of which the lateness is shown."""
 
@@ -34,6 +45,14 @@ def make_report(card: Scorecard, *, origin: Mapping[str, str] | None = None) -> 
         origin=origin,
         mark=OUTCOME_MARKS[card.outcome],
     )
+    names, lines = make_matrix(card)
+    for first in range(0, len(names) if lines else 0, _MATRIX_COLUMNS):
+        part = slice(1 + first, 1 + first + _MATRIX_COLUMNS)
+        report.table(
+            ("quantity", *names[first : first + _MATRIX_COLUMNS], "worst"),
+            [_matrix_row(line[0], line[part]) for line in lines if any(line[part])],
+            caption="+ pass, X fail, ? inconclusive",
+        )
     for line in (*card.doubts, *card.remarks):
         report.text(line)
     rows = sorted(card.rows, key=lambda row: list(_MARKS).index(row.verdict))
@@ -63,6 +82,11 @@ def make_report(card: Scorecard, *, origin: Mapping[str, str] | None = None) -> 
             report.heading(name)
             report.picture(_stamps(about), "Time stamps less the time of the rows that they stand beside.")
     return report
+
+
+def _matrix_row(quantity: str, marks: tuple[str, ...]) -> Row:
+    worst: Verdict = next(verdict for verdict in _MARKS if MARKS[verdict] in marks and MARKS[verdict])
+    return Row((quantity, *marks, worst), _MARKS[worst])
 
 
 @house_style()

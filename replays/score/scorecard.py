@@ -297,6 +297,24 @@ class Scorecard:
         })  # fmt: skip
 
 
+MARKS: dict[Verdict, str] = {FAIL: "X", INCONCLUSIVE: "?", PASS: "+", NO_LIMIT: ""}
+"""Marks of a matrix, the worst first."""
+
+
+def make_matrix(card: Scorecard) -> tuple[list[str], list[tuple[str, ...]]]:
+    """Return the channels, and of each quantity its name and a mark for each channel; of several the worst.
+
+    Quantities of all channels together are those of the channel "all"; without two channels there is no matrix.
+    """
+    names = dict.fromkeys(row.channel for row in card.rows if row.channel)
+    columns = [*names, *([""] if any(not row.channel for row in card.rows) else [])]
+    lines = []
+    for quantity in dict.fromkeys(row.quantity for row in card.rows) if len(names) > 1 else ():
+        found = [{row.verdict for row in card.rows if (row.quantity, row.channel) == (quantity, c)} for c in columns]
+        lines.append((quantity, *(next((mark for each, mark in MARKS.items() if each in some), "") for some in found)))
+    return [each or "all" for each in columns], lines
+
+
 def write_junit(card: Scorecard, path: Path) -> None:
     """Write a scorecard as JUnit's XML.
 

@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
 _live = panel("Live")
 _FOR_S = 10.0
+_MATRIX_COLUMNS = 28
+"""Channels beside one another in a matrix of 80 columns."""
 
 
 class _Way(StrEnum):
@@ -144,10 +146,20 @@ def _judge_live(
 
 
 def _show(card: Scorecard, console: Console, *, wide: bool) -> None:
-    from replays.score.scorecard import FAIL, INCONCLUSIVE
+    from replays.score.scorecard import FAIL, INCONCLUSIVE, make_matrix
 
     console.print(shown(f"{card.title}, limits {card.limits}"))
     console.print(shown(card.verdict_line))
+    names, lines = make_matrix(card)
+    for first in range(0, len(names) if lines else 0, _MATRIX_COLUMNS):
+        part = names[first : first + _MATRIX_COLUMNS]
+        height = max(map(len, part))  # names stand upright over their marks
+        above = [("", *letters) for letters in zip(*(name.rjust(height) for name in part), strict=True)]
+        for quantity, *marks in (*above, *((line[0], *line[1 + first :][: len(part)]) for line in lines)):
+            cells = "".join(f" {mark:1}" for mark in marks)
+            console.print(shown(f"{quantity:<22}{cells}".rstrip()))
+    if lines:
+        console.print("+ pass, X fail, ? inconclusive\n")
     for line in (*card.doubts[1:], *card.remarks):
         console.print(shown(line))
     table = new_table(

@@ -10,7 +10,7 @@ import pytest
 
 from replays.score.crosstalk import find_crosstalk
 from replays.score.nonlinearity import intermodulation, transfer_curve
-from replays.score.scorecard import Interval
+from replays.score.scorecard import FAIL, INCONCLUSIVE, PASS, Interval, Scorecard, Verdict, make_matrix, text_row
 from replays.score.step import step_response
 
 RATE_HZ, NOISE = 20e3, 1e-3
@@ -176,3 +176,17 @@ def test_an_ideal_step_is_within_its_resolution() -> None:
     assert abs(found.overshoot[0]) < 0.1
     assert found.settling_rows is not None
     assert found.settling_rows[2] < 3.0
+
+
+def test_a_matrix_has_the_worst_verdict_of_each_quantity_and_channel() -> None:
+    card = Scorecard("a DAQ", "analogue", "", lambda *_, **__: None)
+    rows: list[tuple[str, str, Verdict]] = [
+        ("gain", "a", PASS), ("gain", "b", FAIL), ("gain", "b", INCONCLUSIVE), ("clock", "", INCONCLUSIVE),
+        ("noise", "a", INCONCLUSIVE), ("noise", "a", PASS),
+    ]  # fmt: skip
+    card.rows = [text_row("analogue", quantity, channel, "", verdict, "") for quantity, channel, verdict in rows]
+    names, lines = make_matrix(card)
+    assert names == ["a", "b", "all"]
+    assert lines == [("gain", "+", "X", ""), ("clock", "", "", "?"), ("noise", "?", "", "")]
+    card.rows = [row for row in card.rows if row.channel != "b"]
+    assert make_matrix(card)[1] == []
