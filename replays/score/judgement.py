@@ -9,14 +9,15 @@ from typing import Literal
 
 import numpy as np
 
-from replays.recordings.formats.mapping import FileOptions
+from replays.recordings.formats import mapping as formats
 from replays.score.analogue import score_analogue
 from replays.score.can_log import is_can_log, open_can_log
 from replays.score.converter import score_converter
 from replays.score.digital import Taken, score_digital, settle
 from replays.score.limits import Limits, load_limits
 from replays.score.live import Arrivals
-from replays.score.recorded import Recorded, open_recorded
+from replays.score.recorded import Recorded, map_signals, open_recorded
+from replays.score.scale import COUNTS
 from replays.score.scorecard import (
     FAIL,
     INCONCLUSIVE,
@@ -30,6 +31,7 @@ from replays.score.scorecard import (
 )
 from replays.score.sent import Formula, Session
 from replays.score.wiring import Wire, find_wires
+from rig import units
 from rig.errors import InputError, UnknownNameError, Words
 
 _NEAR = 0.01
@@ -41,7 +43,8 @@ _CORE = {"digital": "altered values", "analogue": "gain"}
 def judge(
     file: Path, against: Sequence[Path], *, limits: Limits | None = None,
     path: Literal["digital", "analogue"] | None = None, formulas: Mapping[str, Formula] | None = None,
-    options: FileOptions | None = None, arrivals: Arrivals | None = None, channels: Sequence[str] | None = None,
+    options: formats.FileOptions | None = None, arrivals: Arrivals | None = None,
+    channels: Sequence[str] | None = None, mapping: formats.Mapping | None = None,
 ) -> Scorecard:  # fmt: skip
     """Make the scorecard of a DAQ.
 
@@ -55,6 +58,8 @@ def judge(
         options: How a text file is read, where it does not say so itself.
         arrivals: When the lines of a text file came, headings included, where it was delivered live.
         channels: Channels or groups of the session that were to be recorded; all unless given.
+        mapping: How the file is read, and which of its signals is which channel, in which unit; of its tables only
+            [file] and [channels] are used.
 
     Raises:
         InputError: A file cannot be read, or nothing in it is like what was sent.
@@ -63,7 +68,9 @@ def judge(
     session = Session(against)
     due = _select_channels(session, channels)
     remarks: list[str] = []
+    options = options if mapping is None else mapping.file
     opened = open_can_log(file, session.recording.table) if is_can_log(file) else open_recorded(file, options, remarks)
+    opened = opened if mapping is None else map_signals(opened, mapping.channels, session.channels)
     recorded = _by_name(opened)
     sent = {}
     for group, names in session.groups.items():
@@ -85,6 +92,9 @@ def judge(
         wires = _connect(recorded, whole, rates, whole=True)
     if not any(wire.channel for wire in wires.values()):
         raise InputError("FILE", f"a recording of what {session.path.name} has", Words(f"{file}, of which nothing is"))
+    for name, wire in wires.items():
+        if (wire.channel or name in session.channels) and (unit := recorded[name].unit) not in COUNTS:
+            units.parse(unit, field=f"unit of {name}, or that of -m MAPPING,")
     if path == "digital" and not rows:
         raise InputError("--path", "analogue, as no counts can be told from the values", path)
     card = Scorecard(f"{file.name} against {session.path.name}", path, limits.title, limits.bounds, remarks=remarks)

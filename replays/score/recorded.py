@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 
 from recorder.reader import Recording
-from replays.recordings.formats.mapping import FileOptions
+from replays.recordings.formats.mapping import ChannelMapping, FileOptions
 from replays.recordings.formats.source import Entry, FileSignal, Source, even_rate_hz, open_source
 from rig import units
-from rig.channels import Group
-from rig.errors import InputError
+from rig.channels import Channel, Group
+from rig.errors import InputError, UnknownNameError
 from rig.wire import sensor_key
 
 _PART = 1 << 16
@@ -70,6 +70,16 @@ class Table:
                 break
         return np.concatenate(found)
 
+    def changed(self, by_column: Mapping[int, tuple[float, float]]) -> Table:
+        """Return a table whose values are size * (value - bias), by the column's size and bias."""
+
+        def pieces(columns: Sequence[int]) -> Iterator[np.ndarray]:
+            sizes, biases = np.array([by_column.get(column, (1.0, 0.0)) for column in columns]).reshape(-1, 2).T
+            for piece in self._pieces(columns):
+                yield np.column_stack([piece[:, :1], sizes * (piece[:, 1:] - biases)])
+
+        return Table(self.rows, self._columns, pieces)
+
     @property
     def stamped(self) -> bool:
         """Whether it has time stamps."""
@@ -98,6 +108,7 @@ class Recorded:
         column: Where there.
         told_hz: Rate as the file tells it [Hz]; None where it does not.
         lost_bits: Lowest bits of the counts that it leaves out by its definition.
+        group: Group of the file that it is in.
     """
 
     name: str
@@ -106,6 +117,7 @@ class Recorded:
     column: int
     told_hz: float | None
     lost_bits: int = 0
+    group: str = ""
 
     @property
     def rows(self) -> int:
@@ -159,10 +171,55 @@ def open_recorded(path: Path, options: FileOptions | None = None, remarks: list[
     return [
         Recorded(
             entry.name, units.canonical(entry.unit), known[key := (entry.group, entry.rows)],
-            tables[key].index(entry), entry.rate_hz,
+            tables[key].index(entry), entry.rate_hz, group=entry.group,
         )
         for entry in source.entries
     ]  # fmt: skip
+
+
+def map_signals(
+    signals: Sequence[Recorded], mapping: Mapping[str, ChannelMapping], channels: Mapping[str, Channel]
+) -> list[Recorded]:
+    """Return the signals that a mapping names, as the channels and in the units that it gives.
+
+    Args:
+        signals: Of the file.
+        mapping: Source, unit, bits, sensitivity, sign, factor and bias by channel; those of no channel are left out.
+        channels: Of the session.
+
+    Raises:
+        InputError: A channel or a source is unknown, or two channels have one source.
+    """
+    found, changes = list[Recorded](), dict[int, dict[int, tuple[float, float]]]()
+    for name, wanted in mapping.items():
+        where = f"channels.{name}"
+        if name not in channels:
+            if wanted.to is None:
+                raise UnknownNameError("channels", "channels of the session", name, channels)
+            continue
+        channel, group = channels[name], wanted.group
+        signal = next((s for s in signals if s.name == wanted.source and group in (None, s.group)), None)
+        if signal is None:
+            raise UnknownNameError(f"{where}.source", "a signal of the file", wanted.source, [s.name for s in signals])
+        if wanted.bias == "mean":
+            raise InputError(f"{where}.bias", "a number: `rig score` judges it", wanted.bias)
+        unit, size = wanted.unit or signal.unit, wanted.sign * wanted.factor
+        if wanted.bits is not None:
+            unit, size = "V", size * channel.adc_v / 2.0 ** (wanted.bits - 1)
+        elif unit == "FS":
+            unit, size = "V", size * channel.adc_v
+        if wanted.sensitivity is not None:
+            if units.kind(unit) != "voltage":
+                raise InputError(f"{where}.unit", "V or mV with a sensitivity", unit)
+            per_unit_v = units.sensitivity_v(wanted.sensitivity, channel.unit, field=f"{where}.sensitivity")
+            unit, size = channel.unit, size * units.size_si(unit) / per_unit_v
+        changed = changes.setdefault(id(signal.table), {})
+        if changed.setdefault(signal.column, (size, wanted.bias)) != (size, wanted.bias):
+            raise InputError(f"{where}.source", "of one channel only", wanted.source)
+        unit = units.parse(unit, field=f"{where}.unit") if wanted.unit else unit
+        found.append(replace(signal, name=name, unit=unit))
+    tables = {id(s.table): s.table.changed(changes[id(s.table)]) for s in found}
+    return [replace(signal, table=tables[id(signal.table)]) for signal in found]
 
 
 def _ends_with_line_end(path: Path) -> bool:

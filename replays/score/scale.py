@@ -21,6 +21,8 @@ _ENOUGH = 0.99
 """Part of the rows of such a stretch that a scale must explain."""
 _MIN_BITS = 8
 """Bits of the coarsest DAQ that is judged by its counts."""
+COUNTS = ("count", "counts", "lsb", "LSB", "code", "codes", "raw", "FS")
+"""Units by which files name counts."""
 _BITS_ROWS = 1 << 12
 """Values by which the bits that a DAQ leaves out are found."""
 
@@ -188,7 +190,7 @@ def scales(unit: str, channel: Channel, values: np.ndarray, counts: np.ndarray) 
             near = round(math.log2(float(np.ptp(counts)) / float(np.ptp(values))))
             coarse |= {(n, 1.0) for n in (near, near + 1, near - 1) if 0 < n <= bits - _MIN_BITS}
         ways = [(way, *each) for way in ("down", "nearest", "nearest even") for each in sorted(coarse)]
-        ways += [("full scale", lost, 2.0**lost)] if "fractions" in scale.what else []
+        ways += [("full scale", lost, 2.0**lost)] if scale.what in ("V", "fractions of full scale") else []
         found += [
             replace(
                 scale, each=scale.each * size, what=f"{scale.what}, {bits - n} bits, rounded {way}", bits=bits - n,

@@ -20,6 +20,7 @@ from rig.text import finite
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from replays.recordings.formats.mapping import Mapping
     from replays.score.limits import Limits
     from replays.score.scorecard import Scorecard
 
@@ -65,6 +66,10 @@ def score(
         str | None, typer.Option(metavar="SET", help="as-calibrated, api-670, iso-20816, or a .toml file.")
     ] = None,
     channels: Channels = None,
+    mapping: Annotated[
+        Path | None,
+        typer.Option("--mapping", "-m", metavar="FILE.toml", help="Names, units and bits, as of `rig import`."),
+    ] = None,
     path: Annotated[_Way | None, typer.Option(help="How the DAQ is fed, if not as the file looks.")] = None,
     force: Force = False,
     wide: Wide = False,
@@ -75,6 +80,7 @@ def score(
     signal. Where FILE is -, what comes in is judged against what the rig at --connect sends meanwhile. Exit
     status: 0 pass, 1 fail, 2 wrong input, 3 inconclusive.
     """
+    from replays.recordings.formats.mapping import load_mapping
     from replays.report import check_report
     from replays.score.judgement import judge
     from replays.score.limits import load_limits
@@ -87,6 +93,7 @@ def score(
             check_new_file(made, field=field, suffixes=(suffix,), force=force)
             check_not_among([file, *(against or ())], made, field=field)
     asked = load_limits(limits)
+    mapped = None if mapping is None else load_mapping(mapping)
     due = None if channels is None else names_of(channels)
     way = None if path is None else "digital" if path is _Way.DIGITAL else "analogue"
     live = str(file) == "-"
@@ -96,9 +103,9 @@ def score(
     if for_s is not None and not live:
         raise InputError("--for-s", "left out where a file is judged", for_s)
     if live:
-        card = _judge_live(connection, _FOR_S if for_s is None else for_s, asked, way, due)
+        card = _judge_live(connection, _FOR_S if for_s is None else for_s, asked, way, due, mapped)
     else:
-        card = judge(file, against or [], limits=asked, path=way, channels=due)
+        card = judge(file, against or [], limits=asked, path=way, channels=due, mapping=mapped)
     if output is not None:
         from replays.score.report import make_report
 
@@ -119,7 +126,7 @@ def score(
 
 def _judge_live(
     connection: Connection, for_s: float, limits: Limits, path: Literal["digital", "analogue"] | None,
-    channels: list[str] | None,
+    channels: list[str] | None, mapping: Mapping | None,
 ) -> Scorecard:  # fmt: skip
     """Take down what comes in by standard input, and what the rig sends meanwhile, and judge that."""
     import sys
@@ -139,7 +146,10 @@ def _judge_live(
     with tempfile.TemporaryDirectory(prefix="rig-score-") as folder:
         with connection.client() as client, reporting() as reporter, stopping_on_signals(stopped.set):
             found = collect(client, sys.stdin.fileno(), Path(folder), for_s, stopped=stopped, tell=reporter.part)
-        card = judge(found.file, [found.session], limits=limits, path=path, arrivals=found.arrivals, channels=channels)
+        card = judge(
+            found.file, [found.session], limits=limits, path=path, arrivals=found.arrivals, channels=channels,
+            mapping=mapping,
+        )  # fmt: skip
     card.title = f"what came in, against the rig at {connection.connect}"
     card.remarks[:0] = found.remarks
     return card

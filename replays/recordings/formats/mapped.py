@@ -158,6 +158,8 @@ class Log:
             )
         unit = entry.unit if wanted.unit is None else wanted.unit
         volts = units.size_si(unit) if units.kind(unit) == "voltage" else None
+        if wanted.bits is not None:
+            raise InputError(f"{where}.bits", "left out: only `rig score` takes it", wanted.bits)
         if wanted.sensitivity is not None:
             per_unit_v = units.sensitivity_v(wanted.sensitivity, target.unit, field=f"{where}.sensitivity")
             if volts is None:

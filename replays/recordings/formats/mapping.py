@@ -140,7 +140,9 @@ class ChannelMapping(SignalName):
     """How one signal becomes one channel: value = sign * factor * (source - bias), in the channel's unit."""
 
     unit: str | None = None
-    """Unit of the source; left out: as the file tells."""
+    """Unit of the source; left out: as the file tells. For `rig score` also FS: fractions of the converter's range."""
+    bits: Annotated[int, Field(ge=8, le=32)] | None = None
+    """Of whole numbers that a converter has, in place of a unit; only for `rig score`."""
     sensitivity: str | None = None
     """For a source in volts, such as "7.87 V/mm" or "200 mV/mil"."""
     sign: Literal[1, -1] = 1

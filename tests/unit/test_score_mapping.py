@@ -1,0 +1,113 @@
+"""`rig score -m`: names, units, fractions of full scale, bits and signs by a mapping, and units that it must give."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from replays.recordings.formats.mapping import parse_mapping
+from replays.score.judgement import judge
+from replays.score.scorecard import FAIL
+from rig.channels import default_table
+from rig.errors import InputError
+from tests.commands import said
+from tests.score_daqs import counts_of, write_parquet, write_session
+
+PROBES = default_table().groups["probes"]
+CHANNEL = PROBES.channels[0]
+
+
+@pytest.fixture(scope="module")
+def counts() -> np.ndarray:
+    """Noise on the probes, within the converters' range."""
+    return counts_of("probes", 0.25 * np.random.default_rng(7).standard_normal((4000, 4)), None)
+
+
+@pytest.fixture(scope="module")
+def session(counts: np.ndarray, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_session(tmp_path_factory.mktemp("sent") / "session.mcap", {"probes": counts})
+
+
+def write(path: Path, values: np.ndarray, unit: str = "") -> Path:
+    return write_parquet(path, {f"ai{n}{unit}": values[:, n] for n in range(values.shape[1])})
+
+
+def mapped(numbers: dict[str, Any]) -> Any:
+    channels = {name: {"source": f"ai{n}", **numbers} for n, name in enumerate(PROBES.names)}
+    return parse_mapping({"channels": channels}, name="map.toml")
+
+
+WAYS = {
+    "volts": ({"unit": "V"}, lambda c: c * CHANNEL.lsb_v),
+    "millivolts": ({"unit": "mV"}, lambda c: 1e3 * c * CHANNEL.lsb_v),
+    "fractions": ({"unit": "FS"}, lambda c: c / 2.0**23),
+    "fractions of 16 bits": ({"unit": "FS"}, lambda c: np.rint(c * (32767 / 2.0**23)) / 2.0**15),
+    "16 bits": ({"bits": 16}, lambda c: c >> 8),
+    "turned": ({"unit": "V", "sign": -1, "bias": 0.5, "factor": 0.25}, lambda c: 0.5 - 4.0 * c * CHANNEL.lsb_v),
+    "micrometres": ({"unit": "um"}, lambda c: 1e3 * PROBES.engineering(c)),
+}
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_a_mapping_gives_names_and_units(way: str, session: Path, counts: np.ndarray, tmp_path: Path) -> None:
+    numbers, made = WAYS[way]
+    card = judge(write(tmp_path / "daq.parquet", made(counts[1000:])), [session], mapping=mapped(numbers))
+    assert (card.path, card.outcome) == ("digital", "pass"), card.verdict_line
+
+
+@pytest.mark.parametrize("way", ["fractions", "16 bits", "turned"])
+def test_values_are_those_of_the_mapping_on_the_analogue_path(
+    way: str, session: Path, counts: np.ndarray, tmp_path: Path
+) -> None:
+    gains = []
+    for numbers, made in (({"unit": "mm"}, PROBES.engineering), WAYS[way]):
+        daq = write(tmp_path / "daq.parquet", made(counts[1000:]))
+        gains.append(judge(daq, [session], mapping=mapped(numbers), path="analogue").row("gain", "disk_x").value)
+    assert gains[1] == pytest.approx(gains[0], abs=20.0)
+
+
+def test_a_channel_that_is_mapped_to_anothers_signal_fails(session: Path, counts: np.ndarray, tmp_path: Path) -> None:
+    daq = write(tmp_path / "daq.parquet", counts[:, [1, 0, 2, 3]] * CHANNEL.lsb_v)
+    card = judge(daq, [session], mapping=mapped({"unit": "V"}))
+    assert {(row.quantity, row.channel) for row in card.rows if row.verdict == FAIL} == {
+        ("mapping", "disk_x"), ("mapping", "disk_y"),
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("unit", ["milimetre", "MN", "um pk-pk"])
+def test_a_unit_that_is_unknown_is_asked_for(
+    unit: str, session: Path, counts: np.ndarray, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    columns = {f"{name} [{unit}]": PROBES.engineering(counts)[:, n] for n, name in enumerate(PROBES.names)}
+    daq = write_parquet(tmp_path / "daq.parquet", columns)
+    status, _, err = said(capsys, "score", daq, "--against", str(session))
+    assert (status, err.count("\n")) == (2, 1), err
+    assert "unit of disk_x" in err
+    assert "-m" in err
+    lines = [f'[channels.{name}]\nsource = "{name}"\nunit = "mm"\n' for name in PROBES.names]
+    (tmp_path / "map.toml").write_text("".join(lines))
+    status, out, err = said(capsys, "score", daq, "--against", str(session), "-m", str(tmp_path / "map.toml"))
+    assert (status, err) == (0, ""), out
+
+
+@pytest.mark.parametrize(
+    ("table", "field"),
+    [
+        ({"disk_z": {"source": "ai0"}}, "channels"),
+        ({"disk_x": {"source": "ai9"}}, "channels.disk_x.source"),
+        ({"disk_x": {"source": "ai0", "unit": "MN"}}, "channels.disk_x.unit"),
+        ({"disk_x": {"source": "ai0", "bias": "mean"}}, "channels.disk_x.bias"),
+        ({"disk_x": {"source": "ai0"}, "disk_y": {"source": "ai0", "sign": -1}}, "channels.disk_y.source"),
+        ({"disk_x": {"source": "ai0", "unit": "mm", "sensitivity": "7.87 V/mm"}}, "channels.disk_x.unit"),
+    ],
+)
+def test_what_is_wrong_with_a_mapping_is_named(
+    table: dict[str, Any], field: str, session: Path, counts: np.ndarray, tmp_path: Path
+) -> None:
+    daq = write(tmp_path / "daq.parquet", counts[:100])
+    with pytest.raises(InputError) as error:
+        judge(daq, [session], mapping=parse_mapping({"channels": table}, name="map.toml"))
+    assert error.value.field == field
