@@ -80,9 +80,12 @@ def judge(
     wires: dict[str, Wire] = {}
     rows: dict[str, Taken] = {}
     if path != "analogue":
-        # Rows of counts come as they were sent, whatever their stamps say.
-        wires = _connect(recorded, sent, {name: _near(each.rate_hz or rate, rate) for name, each in recorded.items()})
-        wires, rows = settle(recorded, wires, session)
+        # Rows of counts come as they were sent, whatever their stamps say: at last they are read without any.
+        for trial in (recorded, {name: replace(each, timed=False) for name, each in recorded.items()}):
+            wires = _connect(trial, sent, {name: _near(each.rate_hz or rate, rate) for name, each in trial.items()})
+            wires, rows = settle(trial, wires, session)
+            if 2 * sum(each.scale.known for each in rows.values()) > len(wires):
+                break
     if path is None:
         told = sum(each.scale.known for each in rows.values())
         path = "digital" if 2 * told > len(wires) else "analogue"

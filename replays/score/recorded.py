@@ -94,7 +94,7 @@ class Table:
         steps = np.diff(times_s)
         usual = float(np.median(steps))
         alike = steps[np.abs(steps - usual) < _ALIKE * usual]
-        return len(alike) / float(alike.sum()) if 2.0 * alike.sum() > times_s[-1] - times_s[0] else None
+        return len(alike) / float(alike.sum()) if 2.0 * alike.sum() > max(0.0, times_s[-1] - times_s[0]) else None
 
 
 @dataclass(frozen=True)
@@ -109,6 +109,7 @@ class Recorded:
         told_hz: Rate as the file tells it [Hz]; None where it does not.
         lost_bits: Lowest bits of the counts that it leaves out by its definition.
         group: Group of the file that it is in.
+        timed: Whether its rate is that of the file; else it is not known.
     """
 
     name: str
@@ -118,6 +119,7 @@ class Recorded:
     told_hz: float | None
     lost_bits: int = 0
     group: str = ""
+    timed: bool = True
 
     @property
     def rows(self) -> int:
@@ -141,7 +143,9 @@ class Recorded:
 
     @property
     def rate_hz(self) -> float | None:
-        """Rate by its file [Hz]."""
+        """Rate by its file [Hz]; None where it is not known."""
+        if not self.timed:
+            return None
         told = self.told_hz
         return self.table.rate_hz or told or (even_rate_hz(self.table.early[:, 0]) if self.table.stamped else None)
 
