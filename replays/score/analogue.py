@@ -258,7 +258,10 @@ def _score_rows(card: Scorecard, alignments: list[Alignment], recorded: Mapping[
             told = "; ".join(each for each in (rows, f"and {len(here) - _NAMED} more" * (len(here) > _NAMED)) if each)
             count = float(sum(size for _, _, size in here))
             card.add(
-                quantity, name, (count,) * 3, note="; ".join(each for each in (told, note if here else "") if each)
+                quantity,
+                name,
+                (count, count, count),
+                note="; ".join(each for each in (told, note if here else "") if each),
             )
             card.runs[f"{quantity} {name}".strip()] = [(first, last) for first, last, _ in here]
         card.add("judged part", name, (judged := alignment.judged(), judged, judged))

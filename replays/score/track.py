@@ -201,7 +201,7 @@ class _Walk:
         while row < self._rows:
             count = min(length, self._rows - row)
             y, s, ds = self._evaluate(row - _REACH, row + count + _REACH, line, lag)
-            within = np.isfinite(s[:, _REACH : _REACH + count]).all(axis=0)
+            within = np.asarray(np.isfinite(s[:, _REACH : _REACH + count]).all(axis=0))
             if not within[0]:
                 break
             inside = count if within.all() else int(np.argmin(within))
@@ -213,7 +213,7 @@ class _Walk:
                     length *= 2
                     continue
                 edges.append(inside)
-            step, length = None, _CHUNK
+            step, length, n = None, _CHUNK, 0
             final = inside < count or row + inside == self._rows
             for n, (a, b) in enumerate(pairwise(edges)):
                 part = slice(_REACH + a, _REACH + b)

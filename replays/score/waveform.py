@@ -379,8 +379,8 @@ def _behind(
     span_s = found.times_s[-1] - found.times_s[0]
     places, step_s = _places(found.times_s)
     n = int(places[-1]) + 1
-    if late_s is None:  # by as much as the filter delays low frequencies
-        late_s = 1.0 / (2.0 * math.pi * corner_hz * math.sin(math.pi / (2.0 * order)))
+    # Unless it is given, by as much as the filter delays low frequencies.
+    delay_s = 1.0 / (2.0 * math.pi * corner_hz * math.sin(math.pi / (2.0 * order))) if late_s is None else late_s
     cut = math.ceil(_SETTLING / (corner_hz * step_s))
     # What the ends do to the filter is left out.
     kept = slice(*np.searchsorted(places, (cut, n - cut)))
@@ -398,7 +398,7 @@ def _behind(
     def passed(spectrum: np.ndarray, log_corner: float) -> np.ndarray:
         s = 1j * f / math.exp(log_corner)
         loss = np.prod([1.0 - s / pole for pole in poles], axis=0)
-        return np.fft.irfft(spectrum * np.exp(2j * np.pi * f * late_s) / loss, n)[places[kept]]
+        return np.fft.irfft(spectrum * np.exp(2j * np.pi * f * delay_s) / loss, n)[places[kept]]
 
     u = (2.0 * (found.times_s - found.middle_s) / span_s)[kept]
     ones = np.ones(len(u))
@@ -411,7 +411,7 @@ def _behind(
         sizes = np.maximum(np.sqrt(np.mean(matrix**2, axis=0)), 1e-300)
         jacobian = matrix / sizes
         parts = np.linalg.lstsq(jacobian, y[kept], rcond=None)[0] / sizes
-        late_s, log = late_s + parts[2], log + float(np.clip(parts[5], -0.2, 0.2))
+        delay_s, log = delay_s + parts[2], log + float(np.clip(parts[5], -0.2, 0.2))
         if abs(log - math.log(corner_hz)) > _FAR:
             return None
         solved = s, ds, matrix, jacobian, sizes, parts
@@ -425,7 +425,7 @@ def _behind(
     covariance = covariance / np.outer(sizes, sizes)
     half = float(student(freedom[5])) * math.sqrt(covariance[5, 5])
     fitted = Waveform(
-        float(parts[0]), float(parts[1]), found.late_s + float(late_s or 0.0),
+        float(parts[0]), float(parts[1]), found.late_s + float(delay_s),
         found.drift + float(parts[3]) / (0.5 * span_s), found.bend + float(parts[4]) / (0.125 * span_s**2),
         covariance[:5, :5], freedom[:5], found.middle_s, found.half_s, found.times_s[kept], y[kept], s, ds, residual,
     )  # fmt: skip

@@ -72,7 +72,7 @@ def find_wires(
     long, short = _TAKEN_S
     best: dict[str, Wire] = {}
     length_s = max(len(values) / each for values, each in sent.values())
-    found_s = 0.0
+    found_s, here = 0.0, (0.0, dict(sent))
     for from_s in dict.fromkeys([0.0, _busiest_s(recorded, 0.0, long)]):
         for part_s in np.arange(0.0, max(length_s - long, 1e-9), _PART_S - long):
             rows = {
