@@ -104,7 +104,7 @@ def find_wires(
 
 
 def _likeness_of(wires: Mapping[str, Wire]) -> float:
-    return sum((wire.likeness for wire in wires.values()), -1.0)
+    return float(np.nansum([wire.likeness for wire in wires.values()])) if wires else -1.0
 
 
 def _later(wire: Wire, shift_s: float) -> Wire:

@@ -60,7 +60,9 @@ def score(
     output: Annotated[
         Path | None, typer.Option("--output", "-o", metavar="FILE", help="Report with pictures, .html or .pdf.")
     ] = None,
-    junit: Annotated[Path | None, typer.Option(metavar="FILE.xml", help="JUnit's XML: a case a row.")] = None,
+    junit: Annotated[
+        Path | None, typer.Option(metavar="FILE.xml", help="JUnit's XML, a case for each quantity.")
+    ] = None,
     as_json: Annotated[Path | None, typer.Option("--json", metavar="FILE.json", help="All of it as JSON.")] = None,
     limits: Annotated[
         str | None, typer.Option(metavar="SET", help="as-calibrated, api-670, iso-20816, or a .toml file.")
