@@ -6,6 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
+import numpy as np
+
 from recorder import documents, schemas
 from recorder.agreement import Agreement
 from recorder.recording_file import RecordingFile
@@ -39,7 +41,7 @@ class Stream:
         odd: Number of payloads that are no blocks, or do not fit the catalogue.
         back: Number of blocks that begin before the row that was due.
         off: Number of blocks at another rate than the catalogue says.
-        misplaced: Number of blocks whose time does not fit their row number.
+        misplaced: Number of blocks whose time does not fit their row number, or whose edges do not ascend.
         missing: Rows that the file says it has, or the rig that it made, and that are not there.
     """
 
@@ -131,7 +133,12 @@ class Survey:
             if stream.off:
                 found.append(f"blocks of {key} at another rate than the catalogue says: {stream.off}")
             if stream.misplaced:
-                found.append(f"{stream.misplaced} blocks of {key} have a time that does not fit their row number")
+                wrong = (
+                    "edges no later than the ones before"
+                    if key == EDGES
+                    else "a time that does not fit their row number"
+                )
+                found.append(f"{stream.misplaced} blocks of {key} have {wrong}")
             if stream.rows > (stated := self.file.stated_rows.get(key, stream.rows)):
                 found.append(f"{key} has {stream.rows} rows where the file says {stated}")
             if stream.rows and key not in promises:
@@ -172,7 +179,11 @@ class Survey:
             stray_s = block.start_s - start_s - (block.index - index) / block.rate_hz
             stream.misplaced += abs(stray_s) * block.tick_rate_hz > 0.5
         if len(block.values):
-            first_s, last_s = row_times_s(key, block)[[0, -1]].tolist()
+            times_s = row_times_s(key, block)
+            first_s, last_s = times_s[[0, -1]].tolist()
+            if key == EDGES and (gap is None or gap.size > 0):
+                late = stream.rows > 0 and first_s <= stream.last_time_s
+                stream.misplaced += bool(late or (np.diff(times_s) <= 0.0).any())
             stream.last_time_s = max(stream.last_time_s, last_s)
             stream.first_time_s = stream.first_time_s if stream.rows else first_s
             stream.rows += len(block.values)

@@ -12,7 +12,7 @@ import numpy as np
 
 from recorder.reader import Recording
 from replays.recordings.formats.mapping import ChannelMapping, FileOptions
-from replays.recordings.formats.source import Entry, FileSignal, Source, even_rate_hz, open_source
+from replays.recordings.formats.source import MAX_RATE_HZ, Entry, FileSignal, Source, even_rate_hz, open_source
 from rig import units
 from rig.channels import Channel, Group
 from rig.errors import InputError, UnknownNameError
@@ -87,14 +87,18 @@ class Table:
 
     @cached_property
     def rate_hz(self) -> float | None:
-        """Rate by those steps of its stamps that are alike [Hz], if they are most of it; None where it is not so."""
+        """Rate by those steps of its stamps that are alike [Hz], if they are most of it; None where it is not so.
+
+        None also where the stamps do not ascend on the whole, or faster than a rate can be.
+        """
         times_s = self.early[:, 0]
         if not self.stamped or len(times_s) < 2:
             return None
         steps = np.diff(times_s)
         usual = float(np.median(steps))
         alike = steps[np.abs(steps - usual) < _ALIKE * usual]
-        return len(alike) / float(alike.sum()) if 2.0 * alike.sum() > max(0.0, times_s[-1] - times_s[0]) else None
+        alike_s, span_s = float(alike.sum()), max(0.0, float(times_s[-1] - times_s[0]))
+        return None if 2.0 * alike_s <= span_s or len(alike) > MAX_RATE_HZ * alike_s else len(alike) / alike_s
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,8 @@ from rig.errors import InputError, Words
 
 EVEN = 0.05
 """Part of a sample within which time stamps must lie on their straight line to be even."""
+_MIN_STEP_S = 0.999e-9
+"""Least mean step of time stamps: of those in ns, less rounding [s]."""
 _HALF_TAPS = 48
 """Taps of the interpolation filter on each side, in samples of the slower rate."""
 _CUTOFF, _KAISER = 0.94, 9.0
@@ -81,7 +83,7 @@ def axis_of_stamps(times_s: np.ndarray, *, line: bool, what: str) -> Axis:
         what: Whose they are, for errors.
 
     Raises:
-        InputError: There are fewer than two, or they do not ascend.
+        InputError: There are fewer than two, or they do not ascend, or too slowly for a rate.
     """
     n = len(times_s)
     if n < 2 or not np.isfinite(times_s).all():
@@ -94,6 +96,9 @@ def axis_of_stamps(times_s: np.ndarray, *, line: bool, what: str) -> Axis:
             "time stamps", must, Words(f"{what}, {times_s[at]:g} s after {times_s[at - 1]:g} s (row {at + 1})")
         )
     first_s, step, jitter = _line(times_s, np.arange(n))
+    if not step >= _MIN_STEP_S:
+        must = "ascending by 1 ns a sample or more, on the whole (or time.rate_hz given)"
+        raise InputError("time stamps", must, Words(f"{what}, {step:g} s a sample"))
     even = line or jitter[1] < EVEN * step
     if not even:
         # Samples may be missing from an even axis, as where a network has lost some.

@@ -30,7 +30,8 @@ _MOST_ABOUT = 2000
 """Longest text that is taken over of what a file tells of itself [characters]; longer ones are documents."""
 DOCUMENTS = ("catalogue.json", "parameters.json", "scene.json")
 """What `rig export` attaches."""
-_MOST_HZ = 1e9
+MAX_RATE_HZ = 1e9
+"""Highest sample rate of a file: one by time stamps in ns [Hz]."""
 _MOST_S = 1e12
 
 
@@ -162,7 +163,7 @@ def open_source(path: Path, options: FileOptions) -> Source:
                 yield piece
 
     entries = tuple(
-        entry if entry.rate_hz is None or 0.0 < entry.rate_hz <= _MOST_HZ else replace(entry, rate_hz=None)
+        entry if entry.rate_hz is None or 0.0 < entry.rate_hz <= MAX_RATE_HZ else replace(entry, rate_hz=None)
         for entry in source.entries
     )
     distinct = _distinct(entries)
@@ -211,14 +212,14 @@ def _check(signal: FileSignal) -> None:
     values, times_s = signal.values, signal.times_s
     if values.ndim != 1 or values.dtype.kind not in "iufb":
         raise ValueError(f"values of {values.dtype} in {values.ndim} dimensions")
-    if signal.rate_hz is not None and not 0.0 < signal.rate_hz <= _MOST_HZ:
+    if signal.rate_hz is not None and not 0.0 < signal.rate_hz <= MAX_RATE_HZ:
         raise ValueError(f"a rate of {signal.rate_hz} Hz")
     if not (math.isfinite(signal.scale) and signal.scale and math.isfinite(signal.offset)):
         raise ValueError(f"a scale of {signal.scale}, an offset of {signal.offset}")
     if not abs(signal.first_s) <= _MOST_S:
         raise ValueError(f"a beginning at {signal.first_s} s")
     if times_s is not None and not (times_s.shape == values.shape and bool((np.abs(times_s) <= _MOST_S).all())):
-        raise ValueError("time stamps that are none")
+        raise ValueError(f"time stamps that are no numbers up to {_MOST_S:g} s, one a row")
 
 
 def _distinct(entries: tuple[Entry, ...]) -> tuple[Entry, ...]:
@@ -262,6 +263,12 @@ def damaged(path: Path, what: str, error: Exception | str) -> InputError:
 
 
 def even_rate_hz(times_s: np.ndarray, rows: int | None = None) -> float | None:
-    """Mean rate of time stamps [Hz]; None where there is no span. Of so many rows, if not all of them are given."""
+    """Return the mean rate of time stamps [Hz]; None where they do not ascend, or faster than a rate can be.
+
+    Args:
+        times_s: The stamps, or the first and last of them [s], shape (n,).
+        rows: Number of rows, if not all stamps are given.
+    """
     span = float(times_s[-1] - times_s[0]) if len(times_s) > 1 else 0.0
-    return ((rows or len(times_s)) - 1) / span if span > 0.0 else None
+    steps = (rows or len(times_s)) - 1
+    return steps / span if span > 0.0 and steps <= MAX_RATE_HZ * span else None
