@@ -97,6 +97,8 @@ COMMANDS: dict[str, type[Command]] = {
     "hammer": HammerCommand, "speed": SpeedCommand, "release": ReleaseCommand, "fault": FaultCommand,
     "clear": ClearCommand,
 }  # fmt: skip
+SERVICE_COMMANDS = ("stop", "step", "note", "join", "done", "leave")
+"""Commands that the service carries out, and no simulation."""
 
 
 def _bounds(command: type[Command], field: str) -> tuple[float, float]:

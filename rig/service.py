@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 from rig import wire
 from rig.bounded_queue import BoundedQueue
 from rig.commands import COMMANDS as _COMMANDS
+from rig.commands import SERVICE_COMMANDS
 from rig.desk import Done, Join, Kept, Leave, Note, Pending, Step
 from rig.devices import Devices
 from rig.errors import InputError, Words
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
 
 SIMULATION_COMMANDS = tuple(_COMMANDS)
 """Commands that the simulation itself checks and carries out."""
-COMMANDS = (*SIMULATION_COMMANDS, "stop", "step", "note", "join", "done", "leave")
+COMMANDS = (*SIMULATION_COMMANDS, *SERVICE_COMMANDS)
 REPLAY_COMMANDS = ("pause", "resume", "seek", "rate")
 """Commands that only a replayed recording takes (`replays.player`)."""
 
