@@ -10,11 +10,65 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 _BLOCKS = 64
+_MAX_FOLLOW = 0.8
+"""Correlation of neighbouring blocks, at most: from 64 blocks a larger one is not known."""
+_WANDER_TERMS = 12
+"""Half periods a record, up to which a wander is fitted: noise that correlates over 1/40 of a record is no wander."""
+_MIN_WANDER = 30.0
+"""Power of the 4 slowest terms over that of the next 12 after these 12, from which a residual wanders: noise of first
+order whose correlation time is 1/60 of the record has 2 to 8, a random walk 115."""
+_MAX_SLOW_SIGNAL = 0.5
+"""Part of a fitted column that the terms of a wander may explain: a signal as slow is not told from one."""
+
+
+def wander_columns(residual: np.ndarray, matrix: np.ndarray | None = None) -> np.ndarray:
+    """Return cosines that describe the slow wander of a residual.
+
+    Args:
+        residual: Of a fit, shape (n,).
+        matrix: Of the fit, shape (n, k); None: there is no signal.
+
+    Returns:
+        Cosines without a mean, shape (n, 12), or (n, 0) where the residual does not wander or the signal is as slow.
+    """
+    from scipy.fft import dct
+
+    n = len(residual)
+    power = dct(residual, norm="ortho")[1 : 2 * _WANDER_TERMS + 1] ** 2
+    if power[:4].mean() <= _MIN_WANDER * power[_WANDER_TERMS:].mean():
+        return np.empty((n, 0))
+    columns = np.cos(np.pi / n * np.outer(np.arange(n) + 0.5, np.arange(1, _WANDER_TERMS + 1)))
+    if matrix is not None:
+        explained = 2.0 / n * np.sum((columns.T @ matrix) ** 2, axis=0)
+        if np.any(explained > _MAX_SLOW_SIGNAL * np.sum(matrix**2, axis=0)):
+            return np.empty((n, 0))
+    return columns
+
+
+def refine(matrix: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Fit a wander together with the columns of a linear fit.
+
+    Args:
+        matrix: Of the fit, shape (n, k).
+        residual: Of the fit without a wander, shape (n,).
+
+    Returns:
+        Change of the k parameters, residual with the wander in it, and covariance and degrees of freedom as `sandwich`.
+    """
+    slow, k = wander_columns(residual, matrix), matrix.shape[1]
+    if not slow.shape[1]:
+        return np.zeros(k), residual, *sandwich(matrix, residual)
+    both = np.column_stack([matrix, slow])
+    change = np.linalg.lstsq(both, residual, rcond=None)[0]
+    covariance, freedom = sandwich(both, residual - both @ change)
+    return change[:k], residual - matrix @ change[:k], covariance[:k, :k], freedom[:k]
 
 
 def sandwich(matrix: np.ndarray, residual: np.ndarray, *, even: bool = False) -> tuple[np.ndarray, np.ndarray]:
     """Covariance of a linear fit by blocks, and the degrees of freedom of each variance.
 
+    Noise that correlates from block to block widens a parameter's variance by the correlation of its neighbouring pulls
+    (Andrews & Monahan 1992, Econometrica 60), with as many fewer degrees of freedom.
     A block that has more say in the fit leaves less of its own noise: each is lifted by the root of what it leaves, and
     variances of which few blocks decide have few degrees of freedom (Bell & McCaffrey 2002, Survey Methodology 28).
     """
@@ -36,7 +90,12 @@ def sandwich(matrix: np.ndarray, residual: np.ndarray, *, even: bool = False) ->
     apart *= np.outer(noise, noise) / max(float(noise @ noise), 1e-300)
     squares = np.sum(apart**2, axis=(1, 2))
     freedom = np.trace(apart, axis1=1, axis2=2) ** 2 / np.maximum(squares, 1e-300)
-    return pulls.T @ pulls, np.maximum(1.0, freedom)
+    covariance = pulls.T @ pulls
+    # Of first order from block to block, less the standard deviation that it has without any.
+    follow = np.sum(pulls[1:] * pulls[:-1], axis=0) / np.maximum(np.diag(covariance), 1e-300)
+    follow = np.clip(follow - _BLOCKS**-0.5, 0.0, _MAX_FOLLOW)
+    growth = (1.0 + follow) / (1.0 - follow)
+    return covariance * np.sqrt(np.outer(growth, growth)), np.maximum(1.0, freedom / growth)
 
 
 def student(freedom: ArrayLike) -> Any:

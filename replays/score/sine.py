@@ -13,6 +13,8 @@ import numpy as np
 HARMONICS = 10
 """The highest harmonic that counts for the total distortion."""
 _ROUNDS = 20
+_NEIGHBOURS = 17
+"""Lines by which the noise at a line is known, to a third."""
 
 
 @dataclass(frozen=True)
@@ -101,37 +103,59 @@ class Quality:
 def quality(fit: SineFit) -> Quality:
     """Judge a converter by a sine.
 
-    Intervals: SINAD by chi squared of the residual's power; THD by the noise of the harmonics' fit (delta method, with
-    none the noise's own); SFDR by the noise of one line.
+    Intervals: SINAD by chi squared, with the degrees of freedom of the residual's spectrum; THD and SFDR by the noise
+    around each harmonic, or line (delta method, with none the noise's own).
     """
     from scipy.stats import chi2
 
     n, amplitude, nad = len(fit.residual), fit.amplitude[0], fit.nad
     ratio = 20.0 * math.log10(amplitude / math.sqrt(2.0) / nad)
-    ends = [10.0 * math.log10(chi2.ppf(p, n - 4) / (n - 4)) for p in (0.025, 0.975)]
+    rows, lines = np.arange(n), np.abs(np.fft.rfft(fit.residual)) ** 2 * (2.0 / n**2)
+    floor = _noise_floor(fit.residual)
+    # A line of noise spreads as its own power, and one that stands out by twice the product of its power and the noise.
+    spread = max(float(floor @ (2.0 * lines - floor)), 0.5 * float(floor @ floor))
+    freedom = (1.0 - 4.0 / n) * 2.0 * float(lines.sum()) ** 2 / spread
+    ends = [10.0 * math.log10(chi2.ppf(p, freedom) / freedom) for p in (0.025, 0.975)]
     sinad = (ratio, ratio + ends[0], ratio + ends[1])
     enob = ((sinad[0] - 1.76) / 6.02, (sinad[1] - 1.76) / 6.02, (sinad[2] - 1.76) / 6.02)
-    rows = np.arange(n)
-    squares = []
+    power, variance = 0.0, 0.0
     for harmonic in range(2, HARMONICS + 1):
         folded = abs((harmonic * fit.frequency[0] + 0.5) % 1.0 - 0.5)
         if not 2.0 / n < folded < 0.5 - 2.0 / n or abs(folded - fit.frequency[0]) < 2.0 / n:
             continue
         phase = 2.0 * math.pi * folded * rows
         parts = 2.0 / n * np.array([np.cos(phase) @ fit.residual, np.sin(phase) @ fit.residual])
-        squares.append(float(parts @ parts))
-    power = sum(squares)
-    # Variance of one part of a line's amplitude, by what is neither the sine nor a harmonic.
-    line = 2.0 * max(nad**2 - 0.5 * power, 1e-6 * nad**2) / n
-    half = 1.96 * math.sqrt(sum(4.0 * line * each + 4.0 * line**2 for each in squares))
-    thd = decibels(power / amplitude**2, half / amplitude**2)
+        # Variance of one part of a line's amplitude.
+        line, each = float(floor[round(folded * n)]), float(parts @ parts)
+        power, variance = power + each - 2.0 * line, variance + 4.0 * line * each + 4.0 * line**2
+    thd = decibels(power / amplitude**2, 1.96 * math.sqrt(variance) / amplitude**2)
     window = np.blackman(n)
     spectrum = (np.abs(np.fft.rfft(fit.residual * window)) * 2.0 / window.sum()) ** 2
-    largest = float(spectrum[3:].max()) if n > 8 else 0.0
+    at = 3 + int(np.argmax(spectrum[3:])) if n > 8 else 0
+    largest = _crest(spectrum[at - 1 : at + 2]) if n > 8 else 0.0
     # A window widens lines: of a line's noise it lets through 1.73 times as much power as none.
-    wide = 1.96 * math.sqrt(4.0 * 1.73 * line * largest)
+    wide = 1.96 * math.sqrt(4.0 * 1.73 * float(floor[at]) * largest)
     value, low, high = decibels(largest / amplitude**2, wide / amplitude**2)
     return Quality(sinad, enob, thd, (-value, -high, -low))
+
+
+def _crest(powers: np.ndarray) -> float:
+    """Return the power of a line between those of a window's spectrum, of which the largest is the middle one."""
+    if len(powers) < 3 or not powers.min() > 0.0:
+        return float(powers.max())
+    before, middle, after = np.log(powers)
+    bent = before - 2.0 * middle + after
+    return math.exp(middle - (after - before) ** 2 / (8.0 * bent)) if bent < 0.0 else float(powers[1])
+
+
+def _noise_floor(residual: np.ndarray) -> np.ndarray:
+    """Return the noise's power at each line of a residual's spectrum [unit^2], by the median of its neighbours."""
+    from scipy.ndimage import median_filter
+
+    window = np.hanning(len(residual) + 1)[:-1]  # so that lines that stand out do not leak to their neighbours
+    lines = np.abs(np.fft.rfft(residual * window)) ** 2 * (2.0 / len(residual) / float(window @ window))
+    # The median of chi squared with two degrees of freedom is ln 2 times its mean; the ends are mirrored.
+    return median_filter(lines, size=_NEIGHBOURS, mode="mirror") / math.log(2.0)
 
 
 def decibels(power: float, half: float) -> tuple[float, float, float]:
