@@ -38,7 +38,16 @@ SIGNALS = 12
 LEVEL = 3e-3
 """Noise of each record [mm rms]."""
 FITS, MIN_HELD, MAX_HELD, MAX_WIDTH = 300, 275, 294, 1.5
-KNOWN: dict[tuple[str, str], str] = {}
+KNOWN = {
+    **dict.fromkeys(
+        [("offset", "walk"), ("SINAD", "walk"), ("ENOB", "walk")],
+        "too wide: a walk beyond 12 half periods a record is taken for noise",
+    ),
+    **dict.fromkeys(
+        [("jitter", "rising"), ("effective bits", "rising")],
+        "too wide: the level's rise within the record is taken for chance",
+    ),
+}
 """Cells outside the goal, with the reason."""
 CHANNELS = default_table().groups["probes"].channels[:2]
 FULL_MM = CHANNELS[0].adc_v / abs(CHANNELS[0].sensitivity_v)
@@ -69,7 +78,7 @@ def _coloured(time_rows: float) -> Callable[[np.random.Generator, int], Noise]:
         shocks[0] /= math.sqrt(1.0 - follow**2)
         lags = np.arange(1, rows)
         of_mean = (1.0 + 2.0 * float(np.sum((1.0 - lags / rows) * follow**lags))) / rows
-        return LEVEL * lfilter([1.0], [1.0, -follow], shocks), 0.0, LEVEL * math.sqrt(1.0 - of_mean)
+        return LEVEL * np.asarray(lfilter([1.0], [1.0, -follow], shocks)), 0.0, LEVEL * math.sqrt(1.0 - of_mean)
 
     return noise
 
@@ -179,8 +188,8 @@ def _corner(generator: np.random.Generator, noise: Callable[..., Noise], seed: i
     return {} if behind is None else {"corner": (*behind[1], corner_hz)}
 
 
-def _sine(generator: np.random.Generator, noise: Callable[..., Noise], _: int) -> dict[str, Estimate]:
-    n, (series, _, level) = np.arange(ROWS), noise(generator, ROWS)
+def _sine(generator: np.random.Generator, noise: Callable[..., Noise], seed: int) -> dict[str, Estimate]:
+    n, (series, _mean, level) = np.arange(ROWS), noise(generator, ROWS)
     turn = 2.0 * np.pi * generator.uniform(0.01, 0.045)
     second, third = LEVEL * generator.uniform([1.5, 0.2], [3.0, 0.4])
     values = np.sin(turn * n) + second * np.sin(2.0 * turn * n + 1.0) + third * np.sin(3.0 * turn * n) + series
@@ -238,6 +247,7 @@ def main(words: list[str] | None = None) -> int:
                     done[key] = estimates(key[1], noise, [key[2]])
                     line = {"noise": noise, "seed": key[1], "kind": key[2], "found": done[key]}
                     file.write(json.dumps(line) + "\n")
+                    file.flush()
     good, by_quantity = True, dict[str, dict[str, list[Estimate]]]()
     for (noise, seed, kind), found in done.items():
         if noise in asked.noise and kind in asked.kind and seed < asked.n:

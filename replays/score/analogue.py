@@ -10,6 +10,7 @@ import numpy as np
 
 from replays.score.alignment import Alignment, Source, align
 from replays.score.intervals import sandwich, student
+from replays.score.noise import split_noise
 from replays.score.recorded import Recorded
 from replays.score.scorecard import (
     ANALOGUE,
@@ -31,7 +32,6 @@ from replays.score.waveform import (
     behind_filter,
     fit_waveform,
     response,
-    split_noise,
     through,
 )
 from replays.score.wiring import Wire

@@ -34,7 +34,7 @@ def wander_columns(residual: np.ndarray, matrix: np.ndarray | None = None) -> np
     from scipy.fft import dct
 
     n = len(residual)
-    power = dct(residual, norm="ortho")[1 : 2 * _WANDER_TERMS + 1] ** 2
+    power = np.asarray(dct(residual, norm="ortho"))[1 : 2 * _WANDER_TERMS + 1] ** 2
     if power[:4].mean() <= _MIN_WANDER * power[_WANDER_TERMS:].mean():
         return np.empty((n, 0))
     columns = np.cos(np.pi / n * np.outer(np.arange(n) + 0.5, np.arange(1, _WANDER_TERMS + 1)))

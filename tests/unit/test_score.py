@@ -19,11 +19,12 @@ from replays.recordings.formats.mapping import FileOptions
 from replays.recordings.formats.source import open_source
 from replays.score.judgement import judge
 from replays.score.limits import load_limits
+from replays.score.noise import split_noise
 from replays.score.rows import NO_COUNT, follow
 from replays.score.scorecard import FAIL, INCONCLUSIVE, NO_LIMIT, PASS, QUANTITIES, Scorecard, judge_row, write_junit
 from replays.score.sine import fit_sine, is_sine, quality
 from replays.score.stimulus import EDGE, Exact, Sampled
-from replays.score.waveform import fit_waveform, split_noise, student
+from replays.score.waveform import fit_waveform, student
 from rig.channels import default_table
 from rig.errors import InputError
 from rig.outcome import Outcome

@@ -10,10 +10,11 @@ import pytest
 from replays.score.digital import Stamps
 from replays.score.intervals import refine, sandwich, student
 from replays.score.limits import load_limits
+from replays.score.noise import split_noise
 from replays.score.recorded import Table
 from replays.score.scorecard import FAIL, INCONCLUSIVE, PASS, Bounds, Scorecard, judge_row
 from replays.score.sine import fit_sine, quality
-from replays.score.waveform import Waveform, split_noise
+from replays.score.waveform import Waveform
 from rig.channels import default_table
 from tests.score_coverage import NOISES, ROWS, Estimate, cell, estimates
 
