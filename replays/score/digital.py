@@ -17,7 +17,7 @@ from replays.score.intervals import student
 from replays.score.live import Arrivals
 from replays.score.overlap import find_begin
 from replays.score.recorded import Recorded, Table
-from replays.score.rows import Followed, follow, located, stretches
+from replays.score.rows import Followed, follow, located, repeated_part, stretches
 from replays.score.scale import Scale, find_scale, scales
 from replays.score.scorecard import Interval, Scorecard
 from replays.score.sent import Sent, Session
@@ -42,6 +42,8 @@ _BACKLOG_S = 1.0
 """Rows that wait in a pipe have come by then [s]."""
 _NAMED = 5
 """Rows that are named in a line; all stand in the document."""
+_REPEATING = 0.5
+"""Part of the rows that recur, from which a loss of whole periods is taken for possible."""
 
 
 @dataclass(frozen=True)
@@ -257,11 +259,13 @@ def _score_rows(
         """Counts that a DAQ with these converters has of those sent."""
         for chunk in sent:
             cut = chunk[:, columns] >> bits << bits
+            if not repeats:
+                repeats.append(repeated_part(cut))
             yield np.column_stack([by_name[name].sent(cut[:, n]) for n, name in enumerate(names)]) if coarse else cut
 
     bits = np.array([recorded[name].lost_bits for name in names])
     coarse = any(scale.rounding for scale in by_name.values())
-    found, trigger, at = Followed(), None, one.early
+    found, trigger, at, repeats = Followed(), None, one.early, list[float]()
     for places, found in follow(made(), counts(), sound, one.start):  # noqa: B007
         known = np.flatnonzero(places >= 0)
         since_s = sent.since_s(places[known]) if len(known) else np.empty(0)
@@ -288,6 +292,8 @@ def _score_rows(
             note += f" and {len(told) - _NAMED} more stretches" if len(told) > _NAMED else ""
         card.add(quantity, channel, _exact(np.sum(runs[:, 1] - runs[:, 0] + 1) if rows is None else rows), note=note)
 
+    if repeats and repeats[0] > _REPEATING:
+        card.doubts.append(f"{table}: what was sent repeats row by row, so that a loss of whole periods does not show")
     add("missing rows", table, found.lost)
     for quantity, pairs in (("doubled rows", found.doubled), ("swapped rows", found.swapped)):
         add(quantity, table, stretches(np.unique(pairs[:, 0])), len(pairs))

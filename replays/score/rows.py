@@ -48,6 +48,19 @@ def grams(hashes: np.ndarray, step: int = 1) -> np.ndarray:
     return found
 
 
+def repeated_part(counts: np.ndarray) -> float:
+    """Return the part of rows that recur together with the 63 rows that follow them.
+
+    Args:
+        counts: Of the rows, int64, shape (n, channels).
+    """
+    hashes = row_hashes(counts)
+    for step in (1, _GRAM, _GRAM**2):
+        hashes = grams(hashes, step)
+    _, inverse, times = np.unique(hashes[: -(_GRAM**3)], return_inverse=True, return_counts=True)
+    return float(np.mean(times[inverse] > 1)) if len(inverse) else 0.0
+
+
 def located(counts: np.ndarray, among: np.ndarray, step: int) -> int | None:
     """Where the first of some counts stands among those sent, of which every so many was taken; None if nowhere.
 

@@ -106,3 +106,19 @@ def test_a_text_whose_last_line_is_cut_is_judged_as_far_as_it_is_whole(
     assert (card.path, card.outcome) == ("digital", "pass"), card.verdict_line
     assert any("last line" in remark for remark in card.remarks)
     assert card.row("rows after the last", "probes").value == len(counts) - 1999
+
+
+@pytest.mark.parametrize(
+    ("period", "lost", "outcome"), [(40, 40, "inconclusive"), (40, 1, "fail"), (0, 40, "fail"), (0, 0, "pass")]
+)
+def test_a_loss_of_whole_periods_is_no_pass(period: int, lost: int, outcome: str, tmp_path: Path) -> None:
+    rows = np.arange(6000)
+    counts = np.random.default_rng(1).integers(-2_000_000, 2_000_000, (len(rows), 4))
+    if period:
+        phases = 2.0 * np.pi * (rows[:, None] / period + np.arange(4) / 7.0)
+        counts = np.rint(2e6 * np.sin(phases)).astype(np.int64)
+    session = write_session(tmp_path / "sent.mcap", {"probes": counts})
+    kept = np.delete(counts, slice(3000, 3000 + lost), axis=0)
+    card = judge(write_parquet(tmp_path / "daq.parquet", columns_of(kept)), [session], path="digital")
+    assert card.outcome == outcome, card.verdict_line
+    assert any("whole periods" in each for each in card.doubts) == bool(period)
