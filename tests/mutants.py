@@ -30,6 +30,8 @@ from pathlib import Path
 ROOT = Path(__file__).parent.parent
 CPU_S = 20
 """Processor time of the tests of a mutant [s]."""
+BASELINE_CPU_S = 900
+"""Processor time of the same tests without a mutant, all of them, with compilation [s]."""
 MIN_KILLED = 0.9
 _UNIT = "tests/unit/test_{}.py"
 _FAULTS = ("faults", "channel_faults", "block_faults", "declared_faults")
@@ -252,14 +254,14 @@ def copied(folder: Path) -> Path:
     return tree
 
 
-def run(tree: Path, tests: list[str]) -> tuple[str, float]:
+def run(tree: Path, tests: list[str], limit_s: int = CPU_S) -> tuple[str, float]:
     """Run tests until one fails; returns killed, lived or out of time, and the processor time [s]."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     words = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "-p", "no:randomly", *tests]
     ended = subprocess.run(
         words, cwd=tree, capture_output=True, check=False,
         env={**os.environ, "PYTHONPATH": str(tree), "PYTHONDONTWRITEBYTECODE": "1"},
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_CPU, (CPU_S, CPU_S)),
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_CPU, (limit_s, limit_s)),
     )  # fmt: skip
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     used_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
@@ -289,6 +291,12 @@ def main(words: list[str] | None = None) -> int:
     tree = copied(asked.folder)
     journal = asked.folder / "journal.jsonl"
     known = {line["key"]: line for line in _lines(journal)}
+    for tests in {tuple(tests_of(mutant.file)) for mutant in mutants}:
+        # Where a test fails without a mutant, it kills none; this run compiles what they need, too.
+        result, used_s = run(tree, list(tests), BASELINE_CPU_S)
+        print(f"without a mutant: {result} {used_s:5} s  {' '.join(tests)}", flush=True)
+        if result != "lived":
+            return 2
     results = []
     for number, mutant in enumerate(mutants):
         if asked.only not in (None, number):
