@@ -58,7 +58,7 @@ def test_commands_win_the_bus_and_slow_messages_lose_it() -> None:
     order = [row.name for row in TABLE.messages]
     assert order[:7] == ["Stop", "Command", "Acknowledge", "Fault", "Device", "DeviceState", "Sync"]
     # The end, an event, must not overtake samples.
-    assert order[-6:] == ["Keyphasor", "Event", "Block", "Status", "Heartbeat", "Rates"]
+    assert order[-7:] == ["Keyphasor", "Event", "Block", "Clock", "Status", "Heartbeat", "Rates"]
     assert [row.identifier for row in TABLE.messages] == sorted(row.identifier for row in TABLE.messages)
 
 

@@ -54,12 +54,12 @@ TABLE = {
     # The filter was in what was sent: without it, all is earlier, and more of high frequencies.
     "no-filter": Declared("P_N", {}, {"gain", "skew", *LEFT}),
     # The same of another one in its place.
-    "bandwidth": Declared("P_S", {"corner_hz": 500.0}, {"corner", "skew"}),
+    "bandwidth": Declared("P_S", {"corner_hz": 500.0}, {"corner"}),
     "late": Declared("P_E", {"late_us": 3.0}, {"skew"}),
     "clock": Declared("P_W", {"ppm": 500.0}, {"clock", "skew"}),
     # None can be early, so that the mean of the next two is a delay; what they leave goes with the slope.
     "jitter": Declared("ring_y", {"rms_us": 0.5}, {"jitter", "skew", "effective bits"}),
-    "wander": Declared("inner_y", {"amplitude_us": 1.0, "period_s": 0.1}, {"jitter", "skew", "effective bits"}),
+    "wander": Declared("inner_y", {"amplitude_us": 1.0, "period_s": 0.1}, {"jitter", "effective bits"}),
     "noise": Declared("outer_x", {"factor": 3.0}, LEFT),
     "spikes": Declared("outer_y", {"rate_hz": 50.0, "size_v": 0.5}, LEFT),
     # Rounded down, and set, are on the mean an offset.
@@ -69,7 +69,7 @@ TABLE = {
     "freeze": Declared("P_N", {}, {"mapping"}),
     "miss-pulses": Declared("keyphasor", {"part": 1.0}, {"mapping"}),
     "extra-pulses": Declared("keyphasor", {"part": 1.0}, LEFT),
-    "edge-jitter": Declared("keyphasor", {"rms_us": 300.0}, LEFT),
+    "edge-jitter": Declared("keyphasor", {"rms_us": 300.0}, set()),
 }
 RATE_HZ, ROWS_HZ, SECONDS, TURN_HZ = 20_000, 100_000, 0.5, 15.0
 GROUPS = [default_table().groups[name] for name in ("probes", "forces", "accelerations", "drive")]
