@@ -539,4 +539,6 @@ def test_effective_bits_are_those_of_a_windowed_spectrum(bits: int, noise: float
     assert found.enob[0] == pytest.approx((sinad - 1.76) / 6.02, abs=0.05)
     third = round(3.0 * 0.0498765 * rows)
     thd = 10.0 * math.log10(power[third - 5 : third + 6].sum() / signal)
-    assert found.thd_db[0] == pytest.approx(thd, abs=1.0)
+    # The fit takes the noise at the harmonics off, which a spectrum does not: beside much noise the interval decides.
+    assert noise > 1e-2 or found.thd_db[0] == pytest.approx(thd, abs=1.0)
+    assert found.thd_db[1] <= 20.0 * math.log10(1e-3 / 4.0) <= found.thd_db[2]
