@@ -1,11 +1,12 @@
 """Mutants of what judges: `python -m tests.mutants [-n N] [--seed S] [--folder FOLDER] [--only NUMBER] [--list]`.
 
 Changes one place of the scorecard, the faults, the validation or the table of units in a copy of this tree, and runs
-the tests of that module until one fails, for at most 20 s of processor time. A mutant that no test kills shows what the
-tests do not see. Hand-picked mutants come first; the others are drawn blindly, by a seed, from all places where a
-comparison can be turned, a constant changed, an operand of `and` or `or` dropped, an absolute value dropped, a sign
-turned or a branch swapped. Results stand in a journal, where an interrupted run continues. Status 1 where fewer than 9
-of 10 are killed.
+the tests of that module until one fails, for at most 20 s of processor time. Tests that execute the place come first,
+the cheapest test file first; which these are is measured once and kept in the folder, and a test that fails without a
+mutant ends the program with status 2. A mutant that no test kills shows what the tests do not see. Hand-picked mutants
+come first; the others are drawn blindly, by a seed, from all places where a comparison can be turned, a constant
+changed, an operand of `and` or `or` dropped, an absolute value dropped, a sign turned or a branch swapped. Results
+stand in a journal, where an interrupted run continues. Status 1 where fewer than 9 of 10 are killed.
 
 The copy stays in its folder, so that kernels, none of which is mutated, compile there once.
 """
@@ -27,20 +28,22 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from tests.covering_tests import ORDER, RECORD, TRACED, Record, ordered
+
 ROOT = Path(__file__).parent.parent
 CPU_S = 20
 """Processor time of the tests of a mutant [s]."""
 BASELINE_CPU_S = 900
-"""Processor time of the same tests without a mutant, all of them, with compilation [s]."""
+"""Processor time of a test file without a mutant, traced and with compilation [s]."""
 MIN_KILLED = 0.9
-_UNIT = "tests/unit/test_{}.py"
-_FAULTS = ("faults", "channel_faults", "block_faults", "declared_faults")
+_FAULTS = ("faults", "channel_faults", "block_faults", "fault_sizes", "declared_faults", "blind_faults", "score_faults")
 TESTS = {
-    "replays/score/": ("score_intervals", "score", "score_overlap", "score_population", "score_faults", "score_live"),
-    "rig/faulty.py": _FAULTS, "rig/faults/": _FAULTS, "replays/recordings/validation/": ("validation", "verdict"),
-    "rig/units.py": ("units", "import"), "replays/campaigns/": ("campaign_file", "campaign_results"),
+    "replays/score/": ("score*", "time_order", "outcome"),
+    "rig/faulty.py": _FAULTS, "rig/faults/": _FAULTS,
+    "replays/recordings/validation/": ("validation", "verdict", "outcome", "declared_faults", "blind_faults", "events"),
+    "rig/units.": ("units", "time_columns", "import"),
 }  # fmt: skip
-"""Test files of each folder or module, in the order in which they run; those that exist."""
+"""Test files of each folder or module: patterns of their names."""
 MUTATED = ("replays/score", "rig/faulty.py", "rig/faults", "replays/recordings/validation", "rig/units.py")
 _TURNED = {
     ast.Lt: ">=", ast.LtE: ">", ast.Gt: "<=", ast.GtE: "<", ast.Eq: "!=", ast.NotEq: "==", ast.In: "not in",
@@ -57,11 +60,11 @@ PICKED = (
     ("replays/score/sine.py", "for p in (0.025, 0.975)", "for p in (0.05, 0.95)"),
     ("replays/score/sine.py", "np.hanning(len(values) + 1)[:-1]", "np.hanning(len(values))"),
     ("replays/score/digital.py", "for p in (0.975, 0.025)", "for p in (0.95, 0.05)"),
-    ("replays/score/waveform.py", "half = student(freedom) *", "half = 0.84 * student(freedom) *"),
-    ("replays/score/limits.py", "None if any(map(math.isnan, ends)) else", ""),
-    ("replays/score/limits.py", "whole_v = noise_v * math.sqrt(noises)", "whole_v = noise_v * noises"),
-    ("rig/units.py", '("thou", 1e-3 * _INCH, "")', '("thou", _INCH, "")'),
-    ("rig/units.py", '("mil", 1e-3 * _INCH, "")', '("mil", 1e-6 * _INCH, "")'),
+    ("replays/score/waveform.py", "student(self.freedom) * self.spread", "0.84 * student(self.freedom) * self.spread"),
+    ("replays/score/limits.py", "if any(map(math.isnan, ends)):", "if False:"),
+    ("replays/score/limits.py", "channel.lsb_v / math.sqrt(12.0))\n", "channel.lsb_v)\n"),
+    ("rig/units.toml", "thou = { size = 2.54e-05 }", "thou = { size = 0.0254 }"),
+    ("rig/units.toml", "mil = { size = 2.54e-05 }", "mil = { size = 2.54e-08 }"),
 )  # fmt: skip
 """File, what stands there once, and what takes its place."""
 
@@ -207,12 +210,14 @@ def _parses(text: str) -> bool:
 
 
 def chosen(count: int, seed: int) -> list[Mutant]:
-    """Return so many mutants: the picked ones that still apply, then as many of each module, drawn blindly."""
+    """Return so many mutants: the picked ones, then as many of each module, drawn blindly."""
     found = []
     for file, old, new in PICKED:
         text = (ROOT / file).read_text(encoding="utf-8")
-        if text.count(old) >= 1 and _parses(text.replace(old, new, 1)):
-            found.append(Mutant(file, text.index(old), text.index(old) + len(old), new, "picked"))
+        if text.count(old) != 1:
+            print(f"a picked place must stand once in {file}; received {text.count(old)} times: {old}")
+            sys.exit(2)
+        found.append(Mutant(file, text.index(old), text.index(old) + len(old), new, "picked"))
     draw, stacks = random.Random(seed), []
     for module in MUTATED:
         files = [module] if module.endswith(".py") else [str(p.relative_to(ROOT)) for p in (ROOT / module).glob("*.py")]
@@ -235,9 +240,47 @@ def _in_turn(stacks: list[list[Mutant]]) -> list[Mutant]:
 
 
 def tests_of(file: str) -> list[str]:
-    """Return the test files of a module that exist."""
+    """Return the test files of a module."""
     names = next(names for prefix, names in TESTS.items() if file.startswith(prefix))
-    return [path for name in names if (ROOT / (path := _UNIT.format(name))).exists()]
+    found = {p for name in names for p in (ROOT / "tests/unit").glob(f"test_{name}.py")}
+    return sorted(str(path.relative_to(ROOT)) for path in found)
+
+
+def mutated_files() -> list[str]:
+    """Return all files that have mutants."""
+    folders = [(ROOT / each).glob("*.py") for each in MUTATED if not each.endswith(".py")]
+    found = [each for each in MUTATED if each.endswith(".py")]
+    return sorted(found + [str(path.relative_to(ROOT)) for folder in folders for path in folder])
+
+
+def measured(tree: Path, tests: list[str], known: dict[object, dict[str, object]], journal: Path) -> Record | None:
+    """Return what tests execute, from the journal or measured; None where one fails."""
+    files, record = mutated_files(), Record()
+    own = ("mutants.py", "covering_tests.py")
+    helpers = [str(p.relative_to(ROOT)) for p in sorted((ROOT / "tests").glob("*.py")) if p.name not in own]
+    texts = {path: (ROOT / path).read_text(encoding="utf-8") for path in (*files, *helpers, *tests)}
+    for test in tests:
+        key = _key(*(texts[path] for path in (*files, *helpers, test)))
+        if key not in known:
+            written = tree.parent / "record.json"
+            traced = {RECORD: str(written), TRACED: json.dumps(files)}
+            result, used_s = run(tree, [test], BASELINE_CPU_S, traced)
+            print(f"without a mutant: {result} {used_s:5} s  {test}", flush=True)
+            if result != "lived":
+                return None
+            _keep(journal, known, {"key": key, "record": json.loads(written.read_text(encoding="utf-8"))})
+        record.update(known[key]["record"])  # pyright: ignore[reportArgumentType, reportCallIssue]
+    return record
+
+
+def _key(*texts: str) -> str:
+    return hashlib.sha256("\0".join(texts).encode()).hexdigest()[:16]
+
+
+def _keep(journal: Path, known: dict[object, dict[str, object]], line: dict[str, object]) -> None:
+    known[line["key"]] = line
+    with journal.open("a", encoding="utf-8") as file:
+        file.write(json.dumps(line) + "\n")
 
 
 def copied(folder: Path) -> Path:
@@ -254,13 +297,24 @@ def copied(folder: Path) -> Path:
     return tree
 
 
-def run(tree: Path, tests: list[str], limit_s: int = CPU_S) -> tuple[str, float]:
-    """Run tests until one fails; returns killed, lived or out of time, and the processor time [s]."""
+def run(tree: Path, tests: list[str], limit_s: int, more: dict[str, str]) -> tuple[str, float]:
+    """Run tests until one fails.
+
+    Args:
+        tree: Folder of the copy.
+        tests: Test files.
+        limit_s: Processor time after which the tests are stopped [s].
+        more: Environment variables of the plugin `tests.covering_tests`.
+
+    Returns:
+        "killed", "lived" or "out of time"; the processor time [s].
+    """
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    words = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "-p", "no:randomly", *tests]
+    words = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "-p", "no:randomly"]
+    words += ["-p", "tests.covering_tests", *tests]
     ended = subprocess.run(
         words, cwd=tree, capture_output=True, check=False,
-        env={**os.environ, "PYTHONPATH": str(tree), "PYTHONDONTWRITEBYTECODE": "1"},
+        env={**os.environ, "PYTHONPATH": str(tree), "PYTHONDONTWRITEBYTECODE": "1", **more},
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_CPU, (limit_s, limit_s)),
     )  # fmt: skip
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -291,30 +345,29 @@ def main(words: list[str] | None = None) -> int:
     tree = copied(asked.folder)
     journal = asked.folder / "journal.jsonl"
     known = {line["key"]: line for line in _lines(journal)}
-    for tests in {tuple(tests_of(mutant.file)) for mutant in mutants}:
-        # Where a test fails without a mutant, it kills none; this run compiles what they need, too.
-        result, used_s = run(tree, list(tests), BASELINE_CPU_S)
-        print(f"without a mutant: {result} {used_s:5} s  {' '.join(tests)}", flush=True)
-        if result != "lived":
-            return 2
-    results = []
+    all_tests = sorted({test for mutant in mutants for test in tests_of(mutant.file)})
+    record = measured(tree, all_tests, known, journal)
+    if record is None:
+        return 2
+    sources = {file: (ROOT / file).read_text(encoding="utf-8") for file in mutated_files()}
+    results, order = [], asked.folder / "order.json"
     for number, mutant in enumerate(mutants):
         if asked.only not in (None, number):
             continue
         tests, text = tests_of(mutant.file), texts[mutant.file]
         told = mutant.told(text)
-        whole = told + text + "".join((ROOT / test).read_text(encoding="utf-8") for test in tests)
-        key = hashlib.sha256(whole.encode()).hexdigest()[:16]
+        key = _key(told, text, *((ROOT / test).read_text(encoding="utf-8") for test in tests))
         if key not in known or asked.only is not None:
+            own = {test: ran for test, ran in record.items() if test.partition("::")[0] in tests}
+            first, last = (text.count("\n", 0, place) + 1 for place in (mutant.begin, mutant.end))
+            order.write_text(json.dumps(ordered(own, sources, mutant.file, first, last)), encoding="utf-8")
             target = tree / mutant.file
             try:
                 target.write_text(mutant.applied(text), encoding="utf-8")
-                result, used_s = run(tree, tests)
+                result, used_s = run(tree, tests, CPU_S, {ORDER: str(order)})
             finally:
                 target.write_text(text, encoding="utf-8")
-            known[key] = {"key": key, "mutant": told, "result": result, "cpu_s": used_s}
-            with journal.open("a", encoding="utf-8") as file:
-                file.write(json.dumps(known[key]) + "\n")
+            _keep(journal, known, {"key": key, "mutant": told, "result": result, "cpu_s": used_s})
         results.append(str(known[key]["result"]))
         print(f"{number:3} {results[-1]:12} {known[key]['cpu_s']:5} s  {told}", flush=True)
     killed = results.count("killed")

@@ -13,6 +13,7 @@ from replays.recordings.validation import validate
 from rig.cli import fault as command
 from rig.errors import InputError
 from rig.faults import KINDS
+from rig.faults.kind import Draws
 from rig.scenes import load_scene, parse_scene, scene_document
 from rig.simulation import Simulation
 from tests.physics.test_identification import recorded
@@ -338,3 +339,23 @@ def test_a_swap_that_ends_leaves_the_others_as_if_it_had_never_been() -> None:
     # The filters of those that stay swapped remember it for some samples.
     assert all(first >= 2000 and last < 3100 for first, last in differs(ended, never).values())
     assert all(first >= 3000 for first, _ in differs(ended, all_).values())
+
+
+def test_the_numbers_of_a_random_fault_are_functions_of_its_place() -> None:
+    """A recording's faults are repeated from its seed by later versions, so the numbers themselves are pinned."""
+    places = np.arange(20_000)
+    uniform, normal = Draws(7, 1, 0).uniform(places), Draws(7, 1, 0).normal(places)
+    assert uniform[:2].ravel() == pytest.approx(
+        [0.9930834, 0.9588878, 0.3036319, 0.1622353, 0.5951127, 0.5783910, 0.0525338, 0.7885474], abs=1e-7
+    )
+    radius, turns = np.sqrt(-2.0 * np.log(uniform[:, 0])), uniform[:, 1]
+    np.testing.assert_allclose(normal, radius * np.cos(2.0 * np.pi * turns), rtol=1e-12)
+    draws = Draws(7, 1, 0)
+    for part in (places[:100], places[100:150], places[120:130], places[0:0], places[[500, 502, 503]], places[:3]):
+        np.testing.assert_array_equal(draws.uniform(part), uniform[part])
+    four_sigmas = 4.0 / math.sqrt(len(places))
+    assert abs(normal.mean()) < four_sigmas
+    assert normal.std() == pytest.approx(1.0, abs=four_sigmas / math.sqrt(2.0))
+    others = [Draws(7, 1, 1), Draws(7, 2, 0), Draws(8, 1, 0)]
+    columns = [*uniform.T, normal[np.r_[1 : len(places), 0]], *(other.normal(places) for other in others)]
+    assert np.abs(np.corrcoef(columns) - np.eye(len(columns))).max() < four_sigmas

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import re
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -12,6 +13,8 @@ import pytest
 from rig.channels import Channel
 from rig.errors import InputError
 from rig.faults import KINDS
+from rig.faults.converter import Clock
+from rig.faults.kind import At
 from rig.scenes import load_scene, parse_scene
 from rig.simulation import Simulation
 from tests.unit.test_channel_faults import EXAMPLES, differs, run
@@ -164,3 +167,42 @@ def test_a_fault_that_ends_before_the_next_sample_is_refused(
 
 def test_blocks_held_back_by_nothing_are_refused() -> None:
     assert "delay_s must be" in refused({"channel": "probes", "kind": "late-blocks", "delay_s": 1e-9})
+
+
+@pytest.mark.parametrize("kind", sorted({*TINY} - {"edge-jitter"}))
+def test_the_reach_of_a_fault_has_no_sign(kind: str) -> None:
+    """A sensor that inverts, and a size below zero, are no smaller than others."""
+    table = SCENE.table.channels
+    name, _, field = TINY[kind]
+    inverting = {n: one.model_copy(update={"sensitivity_v": -one.sensitivity_v}) for n, one in table.items()}
+    fault = KINDS[kind].model_validate({"kind": kind, **EXAMPLES[kind]})
+    reach_v = fault.reach_v(table[name], 0.1, table[name])
+    assert reach_v > 0.0
+    assert fault.reach_v(inverting[name], 0.1, inverting[name]) == reach_v
+    if kind in ("offset", "drift"):
+        opposite = fault.model_copy(update={field: -getattr(fault, field)})
+        assert opposite.reach_v(table[name], 0.1, table[name]) == reach_v
+
+
+@pytest.mark.parametrize(("kind", "numbers", "expected_v"), [
+    ("gain", {"factor": 0.9}, 0.8), ("gain", {"factor": 1.1, "ramp_s": 0.4}, 0.2),
+    ("gain", {"factor": -2.0, "ramp_s": 0.05}, 24.0), ("offset", {"value": -0.05}, 0.197),
+    ("offset", {"value": 0.05, "ramp_s": 0.2}, 0.0985), ("drift", {"rate": -5.0}, 1.97),
+    ("drift", {"rate": 5.0, "tau_s": 0.1}, 1.97 * (1.0 - math.exp(-1.0))),
+    ("nonlinear", {"end": 1.0}, 8.0 - 3.94 * math.tanh(8.0 / 3.94)), ("late", {"late_us": 1.0}, 0.08 * math.pi),
+    ("late", {"late_us": 1000.0}, 8.0), ("clock", {"ppm": 10.0}, 0.08 * math.pi),
+])  # fmt: skip
+def test_the_reach_of_a_fault_is_that_of_its_equation(kind: str, numbers: dict[str, float], expected_v: float) -> None:
+    """After 0.1 s, of a probe of 3.94 V/mm and 5 kHz that reaches 8 V to each side."""
+    channel = SCENE.table.channels["disk_x"]
+    fault = KINDS[kind].model_validate({"kind": kind, **numbers})
+    assert fault.reach_v(channel, 0.1, channel) == pytest.approx(expected_v, rel=1e-12)
+
+
+@pytest.mark.parametrize("ppm", [20.0, -20.0, 5e4, -5e4])
+def test_a_clock_takes_samples_at_its_own_rate_until_it_is_ten_milliseconds_off(ppm: float) -> None:
+    t = np.linspace(0.0, 2.0, 401)
+    at = cast(At, SimpleNamespace(t=t))
+    late_s = cast(Clock, KINDS["clock"].model_validate({"kind": "clock", "ppm": ppm})).late_s(at)
+    taken_s = (0.0 if ppm > 0.0 else -0.01) + t / (1.0 + 1e-6 * ppm)  # one that is slow begins late
+    assert t - late_s == pytest.approx(np.clip(taken_s, t - 0.01, t), abs=1e-12)

@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from replays.score.crosstalk import find_crosstalk
+from replays.score.judgement import judge
 from replays.score.nonlinearity import intermodulation, transfer_curve
 from replays.score.scorecard import FAIL, INCONCLUSIVE, PASS, Interval, Scorecard, Verdict, make_matrix, text_row
 from replays.score.step import step_response
+from rig.channels import ChannelTable
+from tests.score_daqs import write_parquet
+from tests.score_sessions import Sent, table_with, write_counts
 
 RATE_HZ, NOISE = 20e3, 1e-3
 SEEDS = 20
@@ -190,3 +195,28 @@ def test_a_matrix_has_the_worst_verdict_of_each_quantity_and_channel() -> None:
     assert lines == [("gain", "+", "X", ""), ("clock", "", "", "?"), ("noise", "?", "", "")]
     card.rows = [row for row in card.rows if row.channel != "b"]
     assert make_matrix(card)[1] == []
+
+
+def test_a_sensor_that_inverts_has_the_scorecard_of_any_other(tmp_path: Path) -> None:
+    document = table_with(16, ["probes"]).model_dump(mode="json")
+    for channel in document["groups"]["probes"]["channels"]:
+        channel["sensitivity_v"] *= -1.0
+    sent = Sent("test-prbs", 1, ChannelTable.model_validate(document), True, tmp_path / "session.mcap", 40_000, 8000)
+    write_counts(sent.path, sent, sent.counts, 40_000)
+    times_s, columns = 2.05 + np.arange(5000) / RATE_HZ + 13e-6, dict[str, np.ndarray]()
+    for n, c in enumerate(sent.channels):
+        volts = sent.volts(c.name, times_s) + c.noise_v * np.random.default_rng(n).standard_normal(len(times_s))
+        columns[f"{c.name} [V]"] = np.rint(volts / c.lsb_v) * c.lsb_v
+    card = judge(write_parquet(tmp_path / "daq.parquet", columns), [sent.path])
+    assert card.path == "analogue"
+    assert {row.quantity for row in card.rows if row.verdict == FAIL} == set()
+    for c in sent.channels:
+        assert card.row("polarity", c.name).verdict == card.row("mapping", c.name).verdict == PASS
+        # Noise and rounding of both, the session and the DAQ.
+        noise_v = math.sqrt(2.0) * math.hypot(c.noise_v, c.lsb_v / math.sqrt(12.0))
+        assert float(card.row("noise", c.name).high) * abs(c.sensitivity_v) == pytest.approx(noise_v, rel=0.3)
+        bits = math.log2(2.0 * c.adc_v / (noise_v * math.sqrt(12.0)))
+        assert card.row("effective bits", c.name).value == pytest.approx(bits, abs=0.3)
+        assert card.row("dynamic range", c.name).value == pytest.approx(
+            20.0 * math.log10(c.adc_v / math.sqrt(2.0) / noise_v), abs=3.0
+        )

@@ -155,3 +155,71 @@ def test_limits_apply_to_a_channel_of_velocity(tmp_path: Path) -> None:
     path.write_text(text.format("velocty"), encoding="utf-8")
     with pytest.raises(InputError, match=r"own.toml: analogue.gain.measures must be a kind of unit.* velocity"):
         load_limits(path)
+
+
+@pytest.mark.parametrize(
+    ("text", "target", "volts"),
+    [("7.87 V/mm", "mm", 7.87), ("200 mV/mil", "mm", 200e-3 / 0.0254), ("-100 mV/g", "m/s^2", -0.1 / 9.80665),
+     ("1e2mV/g", "g", 0.1), ("4 V/(in/s)", "mm/s", 4.0 / 25.4), (" 2.25 mV / N", "kN", 2.25)],
+)  # fmt: skip
+def test_a_sensitivity_is_in_volts_per_unit_of_the_channel(text: str, target: str, volts: float) -> None:
+    assert units.sensitivity_v(text, target, field="x") == pytest.approx(volts, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "7.87",
+        "V/mm",
+        "0 V/mm",
+        "-0.0 mV/mm",
+        "1e999 V/mm",
+        "1e V/mm",
+        "-+ V/mm",
+        "3 mm/V",
+        "2 A/mm",
+        "2 bananas/mm",
+    ],
+)
+def test_what_is_no_sensitivity_is_refused(text: str) -> None:
+    with pytest.raises(InputError, match=r'x must be volts per unit, such as "7.87 V/mm"'):
+        units.sensitivity_v(text, "mm", field="x")
+
+
+def test_a_sensitivity_of_another_quantity_is_refused_with_the_units_that_fit() -> None:
+    for text in ("1 V/N", "1 V/bananas", "1 V/M"):
+        with pytest.raises(InputError, match=r"x must be volts per unit of length \(m, cm, .*thou.*\); instead"):
+            units.sensitivity_v(text, "mm", field="x")
+    with pytest.raises(InputError, match="x must be volts per bananas; instead"):
+        units.sensitivity_v("1 V/mm", "bananas", field="x")
+    with pytest.raises(InputError, match="x must be K, as degF counts from another zero"):
+        units.sensitivity_v("10 mV/degF", "K", field="x")
+
+
+def test_factors_between_units_are_ratios_of_their_sizes() -> None:
+    scaled = {q: row for q, row in SIZES.items() if q != "temperature"}
+    for row in scaled.values():
+        for one, size in row.items():
+            for other, another in row.items():
+                assert units.factor(one, other, field="x") == pytest.approx(size / another, rel=1e-12), (one, other)
+    assert units.factor("bananas", "bananas", field="x") == 1.0
+
+
+def test_a_unit_that_cannot_be_converted_is_refused_with_what_can() -> None:
+    with pytest.raises(InputError, match="x must be bananas, the unit of the channel, which has no conversion"):
+        units.factor("mm", "bananas", field="x")
+    with pytest.raises(InputError, match=r"x must be a unit of length \(m, cm, [^)]*\); instead received 'N'"):
+        units.factor("N", "mm", field="x")
+    with pytest.raises(InputError, match=r"x must be a unit of length \(m, cm, [^)]*\), with a sensitivity; instead"):
+        units.factor("mV", "mm", field="x")
+    with pytest.raises(InputError, match=r"one of m, cm, .*, or V or mV with a sensitivity \(such as thou\)"):
+        units.factor("thou2", "mm", field="x")
+    with pytest.raises(InputError, match=r"or V or mV with a sensitivity; instead received 'bananas'"):
+        units.factor("bananas", "mm", field="x")
+
+
+def test_a_plural_is_the_unit_and_a_letter_s_after_a_symbol_is_none() -> None:
+    plurals = {"mils": "mil", "volts": "V", "Newtons": "N", "gs": "g", "lbs": "lbf", "hrs": "h", "metres": "m"}
+    assert {text: units.canonical(text) for text in plurals} == plurals
+    assert [text for text in ("Vs", "mVs", "as", "Ks", "HRSs") if units.known(text)] == []
