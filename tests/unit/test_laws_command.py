@@ -98,12 +98,11 @@ def test_only_memory_of_v0_and_linear_laws_forget_the_speed() -> None:
     assert constant[0] < 0.7
 
 
-@pytest.mark.parametrize("name", ["laws.png", "laws.svg"])
-def test_picture_is_drawn_the_same_each_time(name: str, tmp_path: Path) -> None:
-    first, second = tmp_path / name, tmp_path / f"again-{name}"
+def test_picture_is_drawn_the_same_each_time(tmp_path: Path) -> None:
+    first, second = tmp_path / "laws.svg", tmp_path / "again-laws.svg"
     draw(DEFAULT, first)
     draw(DEFAULT, second)
-    assert first.read_bytes().startswith(b"\x89PNG" if name.endswith("png") else b"<?xml")
+    assert first.read_bytes().startswith(b"<?xml")
     assert first.read_bytes() == second.read_bytes()
 
 

@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -200,21 +201,21 @@ def test_quick_variant_has_a_number_on_every_line(findings: Findings, told: list
     assert all(len(findings.results[name]) == len(group) for name, group in planned_groups(quick=True).items())
 
 
-@pytest.fixture
-def small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Everything is drawn, but small, and where it comes to lie is not worked out: most of the time goes there."""
+@pytest.fixture(scope="module")
+def report(findings: Findings) -> Iterator[Report]:
+    """Return the report of the quick variant, its pictures small and without automatic layout, which takes long."""
     picture = Report.picture
 
     def small(report: Report, figure: Any, caption: str, *, dpi: int = 25) -> None:
         figure.set_layout_engine("none")
         picture(report, figure, caption, dpi=min(dpi, 25))
 
-    monkeypatch.setattr(Report, "picture", small)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Report, "picture", small)
+        yield write_up(findings, quick=True)
 
 
-@pytest.mark.usefixtures("small_pictures")
-def test_report_backs_every_section_with_a_table(findings: Findings, tmp_path: Path):
-    report = write_up(findings, quick=True)
+def test_report_backs_every_section_with_a_table(report: Report, tmp_path: Path):
     headings = [part.text for part in report.parts if isinstance(part, Heading) and part.level == 1]
     assert headings == [
         "Summary",
@@ -333,9 +334,7 @@ def test_a_folder_for_pictures_is_made_beside_others(findings: Findings, tmp_pat
     assert (tmp_path / "new").is_dir()
 
 
-@pytest.mark.usefixtures("small_pictures")
-def test_what_is_corrected_on_purpose_does_not_differ(findings: Findings):
-    report = write_up(findings, quick=True)
+def test_what_is_corrected_on_purpose_does_not_differ(report: Report):
     table = next(part for part in report.parts if isinstance(part, Table) and part.headings[0] == "symbol")
     kept = load_parameters("corrected")
     for printed, row in zip(printed_values(), table.rows, strict=True):
