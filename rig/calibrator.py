@@ -157,8 +157,7 @@ class Generated:
             return None
         ats, late_s = list(self._ats(name, n)), np.zeros(len(n))
         for what, at in ats:
-            more = what.late_s(at)
-            late_s += 0.0 if more is None else np.minimum(more, at.t)  # nothing from before the fault
+            late_s += np.minimum(what.late_s(at), at.t)  # nothing from before the fault
         source = self._plugs.get(name, name)
         instants = Instants.of_samples(n, self._channels[name].rate_hz).later(late_s)
         volts = self._conditioned(source, instants, ats if source == name else self._ats(source, n))

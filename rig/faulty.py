@@ -342,12 +342,12 @@ class Faulty:
             self._last_edge = float(edges[-1] + tick)
         faults = [(one, mark) for one in self.active for mark in one.names if mark in self._marks]
         faults = [(one, mark) for one, mark in faults if acts(one.what, "edges")]
-        if not faults and not len(self._held):
+        if not faults:
             return edges
         real, end = edges + tick, tick + self.row_ticks * len(rows)
         # What has ended since shows none of them.
         lasts = [(self._held >= one.begin) & (self._held < one.end) for one, _ in faults]
-        self._held = self._held[np.any(lasts, axis=0)] if lasts else np.empty(0)
+        self._held = self._held[np.any(lasts, axis=0)]
         # The rate that edges tell: what rows tell there depends on where a block begins.
         rate = 2e6 * math.pi / np.diff(real, prepend=before)
         # Before the first of all there is none: the row behind it tells, wherever the block begins.
@@ -463,8 +463,7 @@ class Faulty:
         for c, (channel, faults) in enumerate(zip(channels, faulty, strict=True)):
             late = [one for one in faults if acts(one.what, "late_s")]
             for one in late:
-                more = one.what.late_s(where(one, channel, n, n / rate))
-                late_s[:, c] += 0.0 if more is None else more
+                late_s[:, c] += one.what.late_s(where(one, channel, n, n / rate))
             loud[:, c] = late[0].noise[channel.name].standard_normal(len(n))
         # Not from before the fault, and with samples enough to read between.
         here = (n * _FINE)[:, None]

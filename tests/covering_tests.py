@@ -20,6 +20,7 @@ from pathlib import Path
 from types import CodeType
 from typing import Any
 
+import numpy as np
 import pytest
 
 TRACED, RECORD, ORDER = "RIG_TRACED_FILES", "RIG_TRACE_RECORD", "RIG_TEST_ORDER"
@@ -27,6 +28,9 @@ TRACED, RECORD, ORDER = "RIG_TRACED_FILES", "RIG_TRACE_RECORD", "RIG_TEST_ORDER"
 
 _MARK = "rig_executes"
 """Name of the function that a traced module calls for each statement."""
+
+_TURN_S = 2.0
+"""Processor time of the tests of one file before the next file has its turn [s]."""
 
 Record = dict[str, dict[str, Any]]
 """By test id: `cpu_s`, processor time [s], and `lines`: by file, the lines that the test executes."""
@@ -132,7 +136,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def _relevant(text: str, first: int, last: int) -> tuple[set[int], str]:
-    """Return the lines of the function around lines of a file, and the name of the constant that they define.
+    """Return the lines of the function around lines of a file, and the name of the constant or field they define.
 
     Args:
         text: Source of the file.
@@ -145,7 +149,9 @@ def _relevant(text: str, first: int, last: int) -> tuple[set[int], str]:
     for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.FunctionDef) and node.body[0].lineno <= first and last <= (node.end_lineno or 0):
             lines = set(range(node.body[0].lineno, (node.end_lineno or 0) + 1))
-    for node in ast.parse(text).body:
+    tree = ast.parse(text)
+    blocks = [tree.body, *(node.body for node in ast.walk(tree) if isinstance(node, ast.ClassDef))]
+    for node in (node for block in blocks for node in block):
         if isinstance(node, ast.Assign | ast.AnnAssign) and node.lineno <= first and last <= (node.end_lineno or 0):
             targets = node.targets if isinstance(node, ast.Assign) else [node.target]
             name = next((each.id for target in targets for each in ast.walk(target) if isinstance(each, ast.Name)), "")
@@ -173,8 +179,9 @@ def ordered(record: Record, texts: dict[str, str], file: str, first: int, last: 
         first, last: Its lines.
 
     Returns:
-        Ids of those that execute these lines (of a constant: that read it), else the function, else the file, grouped
-        by test file, the one with the cheapest tests first; then the others.
+        Ids of those that execute these lines (of a constant: that read it), else the function, else the file, else none
+        of these. Of each the narrow ones come first, which execute few lines in all: they look most closely. A test
+        file has 2 s of them, before the other files have theirs; then come all the others.
     """
     body, name = _relevant(texts.get(file, ""), first, last)
     wanted = [{file: set(range(first, last + 1))} if not name else {f: _uses(t, name) for f, t in texts.items()}]
@@ -183,12 +190,19 @@ def ordered(record: Record, texts: dict[str, str], file: str, first: int, last: 
         {file: set(range(len(texts.get(file, ""))))},
         {f: set(range(len(t))) for f, t in texts.items()},
     ]
+    widths = {test: sum(map(len, ran["lines"].values())) for test, ran in record.items()}
     ids: dict[str, None] = {}
     for lines in wanted:
         groups: dict[str, list[str]] = {}
         for test, ran in record.items():
             if test not in ids and any(f in lines and lines[f].intersection(n) for f, n in ran["lines"].items()):
                 groups.setdefault(test.partition("::")[0], []).append(test)
-        for group in sorted(groups.values(), key=lambda ids: sum(record[i]["cpu_s"] for i in ids) / len(ids)):
-            ids.update(dict.fromkeys(group))
+        files = [sorted(group, key=lambda test: widths[test]) for group in groups.values()]
+        files.sort(key=lambda group: widths[group[0]])
+        for whole in (False, True):
+            for group in files:
+                costs_s = np.cumsum([record[test]["cpu_s"] for test in group])
+                ids.update(
+                    (test, None) for test, cost_s in zip(group, costs_s, strict=True) if whole or cost_s < _TURN_S
+                )
     return list(ids)

@@ -27,6 +27,7 @@ import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from tests.covering_tests import ORDER, RECORD, TRACED, Record, ordered
 
@@ -36,11 +37,13 @@ CPU_S = 20
 BASELINE_CPU_S = 900
 """Processor time of a test file without a mutant, traced and with compilation [s]."""
 MIN_KILLED = 0.9
-_FAULTS = ("faults", "channel_faults", "block_faults", "fault_sizes", "declared_faults", "blind_faults", "score_faults")
+_FAULTS = ("channel_faults", "block_faults", "fault_sizes", "generated_faults", "declared_faults", "score_faults")
 TESTS = {
     "replays/score/": ("score*", "time_order", "outcome"),
     "rig/faulty.py": _FAULTS, "rig/faults/": _FAULTS,
-    "replays/recordings/validation/": ("validation", "verdict", "outcome", "declared_faults", "blind_faults", "events"),
+    "replays/recordings/validation/": (
+        "faults", "validation", "verdict", "outcome", "declared_faults", "blind_faults", "events",
+    ),
     "rig/units.": ("units", "time_columns", "import"),
 }  # fmt: skip
 """Test files of each folder or module: patterns of their names."""
@@ -253,23 +256,26 @@ def mutated_files() -> list[str]:
     return sorted(found + [str(path.relative_to(ROOT)) for folder in folders for path in folder])
 
 
-def measured(tree: Path, tests: list[str], known: dict[object, dict[str, object]], journal: Path) -> Record | None:
+def measured(tree: Path, tests: list[str], known: dict[str, dict[str, Any]], journal: Path) -> Record | None:
     """Return what tests execute, from the journal or measured; None where one fails."""
     files, record = mutated_files(), Record()
     own = ("mutants.py", "covering_tests.py")
     helpers = [str(p.relative_to(ROOT)) for p in sorted((ROOT / "tests").glob("*.py")) if p.name not in own]
     texts = {path: (ROOT / path).read_text(encoding="utf-8") for path in (*files, *helpers, *tests)}
     for test in tests:
-        key = _key(*(texts[path] for path in (*files, *helpers, test)))
-        if key not in known:
+        key = _key(*(texts[path] for path in (*helpers, test)))
+        # What a test executes stays the same until a file of it changes.
+        if key not in known or any(_key(texts.get(path, "")) != digest for path, digest in known[key]["files"].items()):
             written = tree.parent / "record.json"
             traced = {RECORD: str(written), TRACED: json.dumps(files)}
             result, used_s = run(tree, [test], BASELINE_CPU_S, traced)
             print(f"without a mutant: {result} {used_s:5} s  {test}", flush=True)
             if result != "lived":
                 return None
-            _keep(journal, known, {"key": key, "record": json.loads(written.read_text(encoding="utf-8"))})
-        record.update(known[key]["record"])  # pyright: ignore[reportArgumentType, reportCallIssue]
+            found: Record = json.loads(written.read_text(encoding="utf-8"))
+            executed = sorted({path for ran in found.values() for path in ran["lines"]})
+            _keep(journal, known, {"key": key, "files": {p: _key(texts[p]) for p in executed}, "record": found})
+        record.update(known[key]["record"])
     return record
 
 
@@ -277,7 +283,7 @@ def _key(*texts: str) -> str:
     return hashlib.sha256("\0".join(texts).encode()).hexdigest()[:16]
 
 
-def _keep(journal: Path, known: dict[object, dict[str, object]], line: dict[str, object]) -> None:
+def _keep(journal: Path, known: dict[str, dict[str, Any]], line: dict[str, Any]) -> None:
     known[line["key"]] = line
     with journal.open("a", encoding="utf-8") as file:
         file.write(json.dumps(line) + "\n")
@@ -323,7 +329,7 @@ def run(tree: Path, tests: list[str], limit_s: int, more: dict[str, str]) -> tup
     return {0: "lived", 1: "killed", 2: "killed"}.get(ended.returncode, "out of time"), round(used_s, 1)
 
 
-def _lines(journal: Path) -> Iterator[dict[str, object]]:
+def _lines(journal: Path) -> Iterator[dict[str, Any]]:
     if journal.exists():
         yield from map(json.loads, journal.read_text(encoding="utf-8").splitlines())
 
@@ -356,11 +362,12 @@ def main(words: list[str] | None = None) -> int:
             continue
         tests, text = tests_of(mutant.file), texts[mutant.file]
         told = mutant.told(text)
-        key = _key(told, text, *((ROOT / test).read_text(encoding="utf-8") for test in tests))
+        own = {test: ran for test, ran in record.items() if test.partition("::")[0] in tests}
+        first, last = (text.count("\n", 0, place) + 1 for place in (mutant.begin, mutant.end))
+        ids = json.dumps(ordered(own, sources, mutant.file, first, last))
+        key = _key(told, text, ids, *((ROOT / test).read_text(encoding="utf-8") for test in tests))
         if key not in known or asked.only is not None:
-            own = {test: ran for test, ran in record.items() if test.partition("::")[0] in tests}
-            first, last = (text.count("\n", 0, place) + 1 for place in (mutant.begin, mutant.end))
-            order.write_text(json.dumps(ordered(own, sources, mutant.file, first, last)), encoding="utf-8")
+            order.write_text(ids, encoding="utf-8")
             target = tree / mutant.file
             try:
                 target.write_text(mutant.applied(text), encoding="utf-8")

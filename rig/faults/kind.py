@@ -186,9 +186,9 @@ class Kind(Written):
         """The channel with another filter."""
         return channel
 
-    def late_s(self, at: At) -> np.ndarray | None:
-        """How late samples are taken [s], shape (n,); None where it is not about time."""
-        return None
+    def late_s(self, at: At) -> np.ndarray:
+        """Return how late samples are taken [s], shape (n,)."""
+        return np.zeros(len(at.t))
 
     def counts(self, c: np.ndarray, at: At) -> np.ndarray:
         """What the converter says, before it is limited, shape (n,)."""

@@ -115,7 +115,7 @@ class Nonlinear(Kind):
     end: Positive
 
     def reach_v(self, channel: Channel, lasts_s: float, source: Channel) -> float:
-        end_v = self.end * abs(channel.sensitivity_v)
+        end_v = self.end * channel.sensitivity_v
         return swing_v(channel) - end_v * math.tanh(swing_v(channel) / end_v)
 
     def times(self, factor: float) -> Self:

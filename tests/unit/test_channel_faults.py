@@ -359,3 +359,15 @@ def test_the_numbers_of_a_random_fault_are_functions_of_its_place() -> None:
     others = [Draws(7, 1, 1), Draws(7, 2, 0), Draws(8, 1, 0)]
     columns = [*uniform.T, normal[np.r_[1 : len(places), 0]], *(other.normal(places) for other in others)]
     assert np.abs(np.corrcoef(columns) - np.eye(len(columns))).max() < four_sigmas
+
+
+@pytest.mark.parametrize("quiet", [{"sensors.noise": False}, {"sensors.chain": "ideal"}], ids=["no noise", "ideal"])
+def test_channels_that_are_late_by_one_sample_have_the_counts_of_the_row_before(quiet: dict[str, Any]) -> None:
+    """Probes lie around -10 V of 20 V, and their volts reach to both sides of half of the converter's range."""
+    still = load_scene("stable-run", {"duration_s": 0.05, "sensors.groups": ["probes"], **quiet})
+    sound, _ = run(scene=still)
+    there, _ = run({"channel": "probes", "kind": "late", "late_us": 50.0, "at_s": 0.0}, scene=still)
+    for name, counts in sound.items():
+        if name != "edges":
+            np.testing.assert_allclose(there[name][20:], counts[19:-1], atol=3.0, err_msg=name)
+            assert np.ptp(counts) > 10_000

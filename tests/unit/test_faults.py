@@ -88,6 +88,28 @@ def test_one_that_has_more_beside_the_same_delay_is_told_with_the_other() -> Non
     assert name == "disk_x, disk_y delay"
 
 
+@pytest.mark.parametrize("rms_s", [70e-6, 150e-6])
+def test_samples_at_uneven_times_are_jitter(rms_s: float) -> None:
+    def change(values: np.ndarray, clean: np.ndarray) -> None:
+        taken_s = TIMES - rms_s * np.random.default_rng(5).standard_normal(ROWS)
+        values[:, 2] += np.interp(taken_s, TIMES, clean[:, 2]) - clean[:, 2]
+
+    ((name, value),) = told(change)
+    assert name == "ring_x jitter"
+    assert value == pytest.approx(rms_s, rel=0.08)
+
+
+@pytest.mark.parametrize("factor", [5.0, 20.0])
+def test_white_noise_is_noise_and_no_jitter(factor: float) -> None:
+    def change(values: np.ndarray, clean: np.ndarray) -> None:
+        floor = signals("probes")[0].floor[2]
+        values[:, 2] += factor * floor * np.random.default_rng(5).standard_normal(ROWS)
+
+    ((name, value),) = told(change)
+    assert name == "ring_x noise"
+    assert value == pytest.approx(math.hypot(1.0, factor), rel=0.02)
+
+
 def test_swapped_and_turned() -> None:
     def swap(values: np.ndarray, clean: np.ndarray) -> None:
         values[:, [0, 1]] = values[:, [1, 0]]
@@ -127,3 +149,19 @@ def test_pulses() -> None:
     assert edge_faults(edges_s, 6.0, 6.2) == []
     assert "missing in 1 of" in edge_faults(np.delete(edges_s, 7), 6.0, 6.2)[0].line
     assert "2 pulses a turn" in edge_faults(np.arange(40) / 12.4, 6.0, 6.2)[0].line
+
+
+@pytest.mark.parametrize(("change_s", "line"), [
+    (0.5, "pulses too many in 2 of"), (0.05, "is -8.065 ms long beside the others: samples are missing in it"),
+    (-0.05, "is +8.065 ms long beside the others: its time jumps"),
+])  # fmt: skip
+def test_a_pulse_at_the_wrong_time_has_one_name(change_s: float, line: str) -> None:
+    """A pulse half a turn after another, and all pulses from the 20th on that come some part of a turn too early."""
+    edges_s = np.arange(40) / 6.2
+    if change_s == 0.5:
+        edges_s = np.insert(edges_s, 20, edges_s[19] + 0.5 / 6.2)
+    else:
+        edges_s[20:] -= change_s / 6.2
+    (fault,) = edge_faults(edges_s, 7.0, 6.2)
+    assert line in fault.line
+    assert fault.from_s == pytest.approx(edges_s[19])
