@@ -12,6 +12,7 @@ import json
 import os
 import sys
 import time
+from collections import Counter
 from collections.abc import Generator
 from importlib.abc import MetaPathFinder
 from importlib.machinery import ModuleSpec, SourceFileLoader
@@ -169,6 +170,13 @@ def _uses(text: str, name: str) -> set[int]:
     }
 
 
+def _in_turn(tests: list[str]) -> list[str]:
+    """Return one case of each test function, then the second of each, and so on."""
+    cases = Counter[str]()
+    turns = {test: (cases.update([test.partition("[")[0]]), cases[test.partition("[")[0]])[1] for test in tests}
+    return sorted(tests, key=lambda test: turns[test])
+
+
 def ordered(record: Record, texts: dict[str, str], file: str, first: int, last: int) -> list[str]:
     """Return tests in the order in which a mutant should meet them.
 
@@ -181,7 +189,7 @@ def ordered(record: Record, texts: dict[str, str], file: str, first: int, last: 
     Returns:
         Ids of those that execute these lines (of a constant: that read it), else the function, else the file, else none
         of these. Of each the narrow ones come first, which execute few lines in all: they look most closely. A test
-        file has 2 s of them, before the other files have theirs; then come all the others.
+        file has 2 s of them, one case of each test function before the second of any; then come all the others.
     """
     body, name = _relevant(texts.get(file, ""), first, last)
     wanted = [{file: set(range(first, last + 1))} if not name else {f: _uses(t, name) for f, t in texts.items()}]
@@ -197,7 +205,7 @@ def ordered(record: Record, texts: dict[str, str], file: str, first: int, last: 
         for test, ran in record.items():
             if test not in ids and any(f in lines and lines[f].intersection(n) for f, n in ran["lines"].items()):
                 groups.setdefault(test.partition("::")[0], []).append(test)
-        files = [sorted(group, key=lambda test: widths[test]) for group in groups.values()]
+        files = [_in_turn(sorted(group, key=lambda test: widths[test])) for group in groups.values()]
         files.sort(key=lambda group: widths[group[0]])
         for whole in (False, True):
             for group in files:

@@ -37,7 +37,15 @@ CPU_S = 20
 BASELINE_CPU_S = 900
 """Processor time of a test file without a mutant, traced and with compilation [s]."""
 MIN_KILLED = 0.9
-_FAULTS = ("channel_faults", "block_faults", "fault_sizes", "generated_faults", "declared_faults", "score_faults")
+_FAULTS = (
+    "channel_faults",
+    "block_faults",
+    "fault_sizes",
+    "fault_equations",
+    "generated_faults",
+    "declared_faults",
+    "score_faults",
+)
 TESTS = {
     "replays/score/": ("score*", "time_order", "outcome"),
     "rig/faulty.py": _FAULTS, "rig/faults/": _FAULTS,

@@ -11,7 +11,7 @@ import pytest
 
 from rig.errors import InputError
 from rig.faults import KINDS, Draws, supported
-from rig.faults.blocks import LoseBlocks, ReorderBlocks
+from rig.faults.blocks import DuplicateBlocks, LoseBlocks, ReorderBlocks
 from rig.scenes import load_scene
 from rig.sending import Active, Frame, Sending
 from rig.simulation import Simulation
@@ -143,6 +143,9 @@ def test_random_ones_are_as_often_as_they_say_and_independent(part: float) -> No
     x = came - came.mean()
     assert abs(float(x[1:] @ x[:-1]) / float(x @ x)) < 4.0 / math.sqrt(n)
     assert through(LoseBlocks(part=part), 300) != through(LoseBlocks(part=part), 300, seed=6)
+    twice = through(DuplicateBlocks(part=part), n)
+    assert sorted(set(twice)) == list(range(n))
+    assert abs(len(twice) / n - 1.0 - part) < 4.0 * sigma
     order = through(ReorderBlocks(part=part), n)
     assert sorted(order) == list(range(n))
     # One that waits overtakes nobody who waits too: every change of order is one that waits before one that does not.

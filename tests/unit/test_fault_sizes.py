@@ -191,6 +191,12 @@ def test_the_reach_of_a_fault_has_no_sign(kind: str) -> None:
     ("drift", {"rate": 5.0, "tau_s": 0.1}, 1.97 * (1.0 - math.exp(-1.0))),
     ("nonlinear", {"end": 1.0}, 8.0 - 3.94 * math.tanh(8.0 / 3.94)), ("late", {"late_us": 1.0}, 0.08 * math.pi),
     ("late", {"late_us": 1000.0}, 8.0), ("clock", {"ppm": 10.0}, 0.08 * math.pi),
+    ("hum", {"amplitude_v": 0.2, "third": 0.5, "offset_v": -0.1}, 0.4), ("saturation", {"part": 0.75}, 2.0),
+    ("hum", {"amplitude_v": 0.2, "frequency_hz": 1.0}, 0.2 * math.sin(0.2 * math.pi)),
+    ("crosstalk", {"source": "disk_y", "db": -40.0}, 0.08), ("bandwidth", {"corner_hz": 4000.0}, 6.4),
+    ("jitter", {"rms_us": 0.1}, 0.064 * math.pi), ("noise", {"factor": 1.5}, 2e-3), ("clip", {"part": 0.5}, 8.008),
+    ("wander", {"amplitude_us": 1.0}, 0.08 * math.pi * (1.0 - math.cos(0.2 * math.pi))),
+    ("wander", {"amplitude_us": 1.0, "period_s": 0.05}, 0.16 * math.pi), ("spikes", {"size_v": 0.3}, 0.3),
 ])  # fmt: skip
 def test_the_reach_of_a_fault_is_that_of_its_equation(kind: str, numbers: dict[str, float], expected_v: float) -> None:
     """After 0.1 s, of a probe of 3.94 V/mm and 5 kHz that reaches 8 V to each side."""

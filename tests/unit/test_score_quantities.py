@@ -5,16 +5,20 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
 
+from replays.score.analogue import in_unit
 from replays.score.crosstalk import find_crosstalk
 from replays.score.judgement import judge
 from replays.score.nonlinearity import intermodulation, transfer_curve
+from replays.score.recorded import Recorded
 from replays.score.scorecard import FAIL, INCONCLUSIVE, PASS, Interval, Scorecard, Verdict, make_matrix, text_row
 from replays.score.step import step_response
-from rig.channels import ChannelTable
+from rig.channels import ChannelTable, default_table
 from tests.score_daqs import write_parquet
 from tests.score_sessions import Sent, table_with, write_counts
 
@@ -220,3 +224,21 @@ def test_a_sensor_that_inverts_has_the_scorecard_of_any_other(tmp_path: Path) ->
         assert card.row("dynamic range", c.name).value == pytest.approx(
             20.0 * math.log10(c.adc_v / math.sqrt(2.0) / noise_v), abs=3.0
         )
+
+
+@pytest.mark.parametrize(("unit", "expected"), [
+    ("mm", [1.0, 5.0]), ("um", [1e-3, 5e-3]), ("mils", [0.0254, 0.127]), ("m", [1e3, 5e3]),
+    ("V", [11.0 / 3.94, 15.0 / 3.94]), ("mV", [10.001 / 3.94, 10.005 / 3.94]),
+])  # fmt: skip
+def test_values_of_any_unit_are_those_of_the_channels_unit(unit: str, expected: list[float]) -> None:
+    channel = default_table().channels["disk_x"]
+    found, known = in_unit(cast(Recorded, SimpleNamespace(name="a", unit=unit, values=np.array([1.0, 5.0]))), channel)
+    assert known
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize("unit", ["", "N", "bananas", "m/s", "counts"])
+def test_values_of_a_unit_that_does_not_fit_stay_and_are_not_known(unit: str) -> None:
+    values = np.array([1.0, 5.0])
+    signal = cast(Recorded, SimpleNamespace(name="a", unit=unit, values=values))
+    assert in_unit(signal, default_table().channels["disk_x"]) == (values, False)

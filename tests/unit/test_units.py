@@ -121,7 +121,9 @@ def test_a_detectors_suffix_is_asked_for_and_never_dropped(text: str, unit: str)
         units.factor(text, unit, field="x")
 
 
-@pytest.mark.parametrize("text", ["bananas", "counts", "%", "peak", "_", "*", "x", "kk", "dB"])
+@pytest.mark.parametrize(
+    "text", ["bananas", "counts", "%", "peak", "_", "*", "x", "kk", "dB", "bananas rms", "M pk-pk"]
+)
 def test_an_unknown_unit_is_refused_with_its_spelling(text: str) -> None:
     with pytest.raises(InputError, match=r"x must be a known unit.*instead received"):
         units.parse(text, field="x")
