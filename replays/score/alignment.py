@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import warnings
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -24,14 +26,18 @@ _SOUND = 0.5
 """Part of its power that the known signal explains in a channel by which a record is followed."""
 _FOLLOWERS = 6
 """Channels by which a record is followed: more cost time, and fewer may all be faulty."""
-_NOISES = 1.5
-"""Noises of the channel, the DAQ's and the session's together, in a residual that is nothing but noise."""
+_NOISES = 1.2
+"""Nominal noises that a residual may have, for it to be nothing but noise."""
 _BLOCK_ROWS = 200
 """Rows of a block by which residuals are compared: their variance is known to a tenth."""
 _LOUD_PART = 0.25
 """Power of a block over the mean one, from which a begin shows in it."""
 _SAME_BALANCE = 0.98
 """Part of the most explained rows, from which begins explain as many: a period is cut at the ends."""
+_WHOLE = 0.999
+"""Part of the rows in the session that are explained in a record that lies in it as a whole."""
+_COMPARED = 3
+"""Signals by which begins are compared: each costs a fit."""
 _FOLLOWED = 4
 """Begins that are followed with all channels: the nearest ones, half a period later among them."""
 _ALIKE = 1.05
@@ -42,13 +48,19 @@ _MAX_DRIFT = 0.02
 """Clock error of a DAQ, at most: a fit with more of it found something else."""
 _SAME_ROWS = 0.5
 """Rows within which two begins are one: half of a row is a quarter of the shortest period."""
-_WORSE = 4.0
+_WORSE = 2.0
 """Residual power of a stretch over the least one, from which a begin is not followed: the clocks may differ."""
+_ROUNDS = 3
+"""Searches for begins where the signal repeats, each by the clock that the last one found."""
+_PARTS = 6
+"""Parts of a record, of each of which a stretch is compared before all of it is followed."""
 _MOST, _FINER, _LIKE = 1 << 17, 4, 12
 """Samples by which other beginnings are looked for, places between two of them, and how many are told."""
 
-_EDGE_ROWS = 8
-"""Rows before and after the session at which a begin is looked for, too: a peak needs both its sides."""
+_AS_WELL = 1.3
+"""Residual power over the least one, up to which a begin counts as good as the best."""
+_OVERLAP = 0.2
+"""Part of the shorter of record and session in which both must be for a begin."""
 
 
 @dataclass
@@ -131,6 +143,11 @@ class Alignment:
         curve = float(line[0]) + own_s, float(line[1]), float(line[2])
         return values, self.first_s + np.arange(low, high + 1) / self.rate_hz, curve
 
+    @property
+    def whole(self) -> bool:
+        """Whether nearly all rows in the session are explained."""
+        return self.judged() > _WHOLE
+
     def judged(self) -> float:
         """Part of the rows in the session that are explained."""
         return self.track.explained / max(1, self.track.inside[1] - self.track.inside[0])
@@ -203,33 +220,59 @@ def _follow(sources: Sequence[Source], shift_s: float, stretches: Sequence[tuple
     )  # fmt: skip
 
 
-def _beginnings(found: Waveform, stimulus: Stimulus) -> list[float]:
-    """Shifts of time after which the known signal is as like what was recorded, by the clock of a fit [s].
+def _beginnings(values: np.ndarray, first_s: float, found: Waveform, stimulus: Stimulus) -> list[float]:
+    """Return shifts of time after which the known signal is as like a record, by the clock of a fit [s].
 
-    The likeliest are first. Where a signal nearly repeats, a fit finds its clock from any beginning.
+    Record and session need to overlap in part only. Of the begins that leave as little of the rows in both as the best
+    one, those with most rows are first; then the others, as they leave little.
+
+    Args:
+        values: Of the record, shape (n,).
+        first_s: Time of the first of them by its clock [s].
+        found: A fit of some of them.
+        stimulus: The known signal.
     """
     from scipy.signal import correlate
 
     low, high = stimulus.span_s
-    step_s = (1.0 + found.drift) * (found.times_s[-1] - found.times_s[0]) / (len(found.times_s) - 1)
-    rows = math.floor((high - low) / step_s)
-    y = found.values[: min(_MOST, rows // 2)]
-    n = len(y)
-    curve = np.zeros((rows - n + 2 * _EDGE_ROWS + 1, _FINER))
+    period_s = (found.times_s[-1] - found.times_s[0]) / (len(found.times_s) - 1)
+    step_s = (1.0 + found.drift) * period_s
+    skipped = max(0, min(round((found.times_s[0] - first_s) / period_s), len(values) - _MOST // 2) - _MOST // 2)
+    y = values[skipped : skipped + _MOST] - values.mean()
+    n, rows = len(y), math.floor((high - low) / step_s)
+    lags = np.arange(1 - n, rows - 1)
+    here, there = np.maximum(0, -lags), np.maximum(0, lags)
+    overlap = np.minimum(n - here, rows - 1 - there)
+    taken = slice(*np.flatnonzero(overlap >= max(_FEWEST, _OVERLAP * min(n, rows)))[[0, -1]] + [0, 1])
+    here, there, overlap = here[taken], there[taken], overlap[taken]
+
+    def power(signal: np.ndarray, begin: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        sums, squares = (np.cumsum(np.concatenate([[0.0], each])) for each in (signal, signal**2))
+        total = sums[begin + overlap] - sums[begin]
+        return total, squares[begin + overlap] - squares[begin] - total**2 / overlap
+
+    total, power_y = power(y, here)
+    likeness = np.zeros((len(overlap), _FINER))
     for phase in range(_FINER):
         s, _ = stimulus(low + (np.arange(rows - 1) + phase / _FINER) * step_s)
-        s = np.pad(s, (_EDGE_ROWS, _EDGE_ROWS + 1))  # so that a begin at the session's first row is a peak, too
-        sums, squares = (np.cumsum(np.concatenate([[0.0], each])) for each in (s, s**2))
-        power = squares[n:] - squares[:-n] - (sums[n:] - sums[:-n]) ** 2 / n
-        alike = correlate(s, y - y.mean(), "valid", "fft") / np.sqrt(np.maximum(power, 1e-12 * power.max()))
-        curve[:, phase] = np.abs(alike)
-    curve = curve.ravel()
+        s = s - s.mean()
+        total_s, power_s = power(s, there)
+        alike = correlate(s, y, "full", "fft")[taken] - total * total_s / overlap
+        both = power_y * power_s
+        likeness[:, phase] = alike**2 / np.maximum(both, 1e-12 * both.max())
+    curve = likeness.ravel()
     at = np.flatnonzero((curve[1:-1] > curve[:-2]) & (curve[1:-1] >= curve[2:])) + 1
+    at = at[curve[at] > _SOUND]
     bend = curve[at - 1] - 2.0 * curve[at] + curve[at + 1]
     aside = 0.5 * (curve[at - 1] - curve[at + 1]) / bend
-    best = np.argsort(-(curve[at] - 0.25 * (curve[at - 1] - curve[at + 1]) * aside))[:_LIKE]
-    began_s = found.times_s[0] + float(found.late_at(found.times_s[:1])[0])
-    return (low + ((at[best] + aside[best]) / _FINER - _EDGE_ROWS) * step_s - began_s).tolist()
+    peaks = np.minimum(curve[at] - 0.25 * (curve[at - 1] - curve[at + 1]) * aside, 1.0)
+    # A parabola is off its peak by some part of the square of the peak's bend.
+    left = (1.0 - peaks) * (power_y / overlap)[at // _FINER]
+    alike = left <= _AS_WELL * left.min(initial=math.inf) + 0.1 * bend**2 * (power_y / overlap)[at // _FINER]
+    best = np.lexsort((np.where(alike, -overlap[at // _FINER], left), ~alike))[:_LIKE]
+    began_s = first_s + skipped * period_s
+    began_s += float(found.late_at(np.array([began_s]))[0])
+    return (low + (lags[taken][0] + (at[best] + aside[best]) / _FINER) * step_s - began_s).tolist()
 
 
 def align(sources: Sequence[Source]) -> Alignment | None:
@@ -242,41 +285,69 @@ def align(sources: Sequence[Source]) -> Alignment | None:
     within = [min(rows, max(0, round((each - one.first_s) * one.rate_hz))) for each in within_s]
     if within[1] - within[0] < _FEWEST:
         within = [0, rows]
-    stretches = [_busiest(sources, (within[0], within[1]), round(each * one.rate_hz)) for each in _STRETCHES_S]
+    default = [_busiest(sources, (within[0], within[1]), round(each * one.rate_hz)) for each in _STRETCHES_S]
+
+    def stretches(shift_s: float) -> list[tuple[int, int]]:
+        """Stretches that lie in the session from a begin."""
+        ends_s = [each - one.late_s - shift_s - one.first_s for each in one.stimulus.span_s]
+        first, last = (min(rows, max(0, round(each * one.rate_hz))) for each in ends_s)
+        if last - first < _FEWEST or (first <= default[0][0] and default[0][1] <= last):
+            return default
+        return [_busiest(sources, (first, last), round(each * one.rate_hz)) for each in _STRETCHES_S]
+
     if not one.wire.others_s:
-        return _follow(sources, 0.0, stretches)
-    begins = _Begins(one, stretches)
-    begins.try_all([0.0])
-    begins.try_all(begins.repeats())
-    begins.try_all([each - one.wire.late_s for each in one.wire.others_s])
-    begins.try_all(begins.repeats())
+        return _follow(sources, 0.0, default)
+    begins = _Begins(one, sources, stretches)
+    begins.try_all([0.0, *(each - one.wire.late_s for each in one.wire.others_s)])
+    for _ in range(_ROUNDS):
+        begins.try_all(begins.repeats())
     alike = begins.alike()
-    found = [each for one in alike[:_FOLLOWED] if (each := _follow(sources, one.begin_s, stretches)) is not None]
+    found = [
+        each for one in alike[:_FOLLOWED] if (each := _follow(sources, one.begin_s, stretches(one.begin_s))) is not None
+    ]
     if not found:
-        return _follow(sources, 0.0, stretches)
+        return _follow(sources, 0.0, default)
     most = max(each.balance for each in found)
-    best = max(found, key=lambda each: (each.balance > _SAME_BALANCE * most, each.upright, -abs(each.begin_s)))
+    best = max(
+        found, key=lambda each: (each.balance > _SAME_BALANCE * most, each.whole, each.upright, -abs(each.begin_s))
+    )
     return replace(best, ambiguous=len(alike) > 1)
 
 
 class _Begins:
-    """Begins that are tried for a table, by the residual power of one signal in blocks of rows.
+    """Begins that are tried for a table, by the residual power of some signals in blocks of rows.
 
     Rows outside the session are not compared: where a signal repeats, begins that explain the same rows alike are told
     apart by how many rows lie in the session, explained or not.
     """
 
-    def __init__(self, one: Source, stretches: Sequence[tuple[int, int]]) -> None:
+    def __init__(
+        self, one: Source, sources: Sequence[Source], stretches: Callable[[float], Sequence[tuple[int, int]]]
+    ) -> None:
+        """Follow one signal, and compare others as well: of these the ones that are least like what repeats."""
+        others = sorted((each for each in sources if each is not one), key=lambda each: each.wire.likeness)
         self._one, self._stretches = one, stretches
+        self._compared = [one, *(each for each in others if each.wire.likeness > _SOUND)][:_COMPARED]
         self._tried: list[tuple[np.ndarray, Alignment]] = []
         self._shifts: list[float] = []
+        ends = np.linspace(0, len(one.values), _PARTS + 1).astype(int)
+        length = stretches(0.0)[0][1] - stretches(0.0)[0][0]
+        self._parts = [
+            _busiest([one], (low, high), length) for low, high in pairwise(ends.tolist()) if high - low >= _FEWEST
+        ]
+        loud = _LOUD_PART * float(np.nanvar(one.values[slice(*stretches(0.0)[0])]))
+        self._parts = [each for each in self._parts if np.nanvar(one.values[slice(*each)]) >= loud]
+        self._left: list[np.ndarray] = []
         self._least = math.inf
-        power = _block_means((one.values - np.nanmean(one.values)) ** 2)
-        self._loud = power > _LOUD_PART * np.nanmean(power)
 
-    def _residual_power(self, found: Alignment) -> np.ndarray:
-        """Residual power by block [unit^2]; that of the signal where nothing explains it, nan outside the session."""
+    def _left_of(self, shift_s: float) -> np.ndarray:
+        """Residual power of the stretches from a begin, nan where nothing explains one."""
         one = self._one
+        fits = [fit_stretch(one.values, one.times_s, one.stimulus, one.late_s + shift_s, each) for each in self._parts]
+        return np.array([np.nan if fit is None else max(float(np.var(fit.residual)), 1e-300) for fit in fits])
+
+    def _residual_power(self, found: Alignment, one: Source) -> np.ndarray:
+        """Residual power of a signal by block over that of noise; of all where nothing explains it, nan outside."""
         values, times_s, curve = found.even(one)
         fit = fit_waveform(values, times_s, one.stimulus, curve)
         left = np.full(found.rows, np.nan)
@@ -286,13 +357,23 @@ class _Begins:
             row_at = np.zeros(len(values), int)
             row_at[at - int(at.min())] = np.flatnonzero(explained)
             left[row_at[np.rint((fit.times_s - times_s[0]) * one.rate_hz).astype(int)]] = fit.residual**2
-        return np.where(self._loud, _block_means(left), np.nan)
+        power = _block_means((one.values - np.nanmean(one.values)) ** 2)
+        # The DAQ's and the session's.
+        noise = (
+            _NOISES * math.hypot(one.channel.noise_v, one.channel.lsb_v / math.sqrt(12.0)) / one.channel.sensitivity_v
+        )
+        return np.where(power > _LOUD_PART * np.nanmean(power), _block_means(left), np.nan) / (2.0 * noise**2)
 
     def _is_worse(self, power: np.ndarray, other: np.ndarray) -> bool:
-        """Whether a begin leaves more than another where both are in the session, by the median block."""
+        """Whether a begin leaves more than another where both are in the session, by the median blocks of signals."""
         both = np.isfinite(power) & np.isfinite(other)
+        compared = both.any(axis=1)
         limit = max(_ALIKE, 1.0 + _DEVIATIONS * math.sqrt(2.0 / max(1, _BLOCK_ROWS * both.sum())))
-        return bool(both.any()) and float(np.median(power[both])) > limit * float(np.median(other[both]))
+        ratios = [
+            np.median(here[use]) / max(np.median(there[use]), 1e-300)
+            for here, there, use in zip(power[compared], other[compared], both[compared], strict=True)
+        ]
+        return bool(ratios) and float(np.mean(np.log(np.maximum(ratios, 1e-300)))) > math.log(limit)
 
     def alike(self) -> list[Alignment]:
         """Return the begins that none of the others surpasses: with most explained rows first, then the nearest."""
@@ -300,51 +381,60 @@ class _Begins:
             each for power, each in self._tried if not any(self._is_worse(power, other) for other, _ in self._tried)
         ]
         if not kept and self._tried:
-            kept = [min(self._tried, key=lambda each: float(np.nanmedian(each[0])))[1]]
+            kept = [min(self._tried, key=lambda each: float(np.nanmax(_medians(each[0]))))[1]]
         most = max((each.balance for each in kept), default=0)
         kept = [each for each in kept if each.balance >= 0.5 * most]
-        return sorted(kept, key=lambda each: (each.balance <= _SAME_BALANCE * most, abs(each.begin_s)))
+        return sorted(kept, key=lambda each: (each.balance <= _SAME_BALANCE * most, not each.whole, abs(each.begin_s)))
 
     @property
     def _settled(self) -> bool:
         """Whether two begins leave nothing but noise, the DAQ's and the session's."""
-        noise = 2.0 * _NOISES * self._one.channel.noise_v / self._one.channel.sensitivity_v
-        return self._least < noise**2 and len(self.alike()) > 1
+        return self._least < 1.0 and len(self.alike()) > 1
 
     def repeats(self) -> list[float]:
         """Return shifts at which the known signal repeats, from the best begin [s]."""
         alike = self.alike()
         if not alike or self._settled:
             return []
-        values, times_s, curve = alike[0].even(self._one)
+        one = self._one
+        values, times_s, curve = alike[0].even(one)
         rows, held = np.arange(len(values)), np.isfinite(values)
         values = np.interp(rows, rows[held], values[held])
-        fit = fit_stretch(values, times_s, self._one.stimulus, curve[0], (0, len(values)))
-        shifts = [] if fit is None else _beginnings(fit, self._one.stimulus)
-        return [alike[0].begin_s + sign * each for each in shifts for sign in (1.0, -1.0)]
+        fit = fit_stretch(values, times_s, one.stimulus, curve[0], (0, len(values)))
+        whole = np.nan_to_num(one.values, nan=float(np.nanmean(one.values)))
+        shifts = [] if fit is None else _beginnings(whole, one.first_s, fit, one.stimulus)
+        return [alike[0].begin_s + each for each in shifts]
 
     def try_all(self, shifts: Sequence[float]) -> None:
-        """Try begins until two are alike and leave nothing but noise."""
-        one = self._one
-        left = math.inf
+        """Try begins until two are alike and leave nothing but noise: first those that leave least of stretches."""
+        one, fresh = self._one, list[float]()
         for shift_s in shifts:
-            if any(abs(shift_s - each) * one.rate_hz < _SAME_ROWS for each in self._shifts):
-                continue
-            if self._settled:
+            if all(abs(shift_s - each) * one.rate_hz >= _SAME_ROWS for each in [*self._shifts, *fresh]):
+                fresh.append(shift_s)
+        self._shifts += fresh
+        self._left += [self._left_of(each) for each in fresh]
+        if not fresh:
+            return
+        with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # of stretches that no begin explains
+            worse = np.nanmean(np.log(np.array(self._left) / np.nanmin(self._left, axis=0)), axis=1)[-len(fresh) :]
+        for n in np.argsort(np.floor(worse / math.log(_ALIKE)), kind="stable"):
+            if self._tried and (self._settled or not worse[n] < math.log(_WORSE)):
                 return
-            self._shifts.append(shift_s)
-            fit = fit_stretch(one.values, one.times_s, one.stimulus, one.late_s + shift_s, self._stretches[0])
-            if fit is None or float(np.var(fit.residual)) > _WORSE * left:
-                continue
-            left = min(left, float(np.var(fit.residual)))
-            found = _follow([one], shift_s, self._stretches)
+            shift_s = fresh[n]
+            stretches = self._stretches(shift_s)
+            found = _follow([one], shift_s, stretches)
             own_s = found.own_s[one.name] if found else 0.0
             near = [abs(own_s - each.own_s[one.name]) * one.rate_hz for _, each in self._tried]
             if found is not None and min(near, default=math.inf) > _SAME_ROWS:
-                power = self._residual_power(found)
+                power = np.array([self._residual_power(found, each) for each in self._compared])
                 if np.isfinite(power).any():
                     self._tried.append((power, found))
-                    self._least = min(self._least, float(np.nanmedian(power)))
+                    self._least = min(self._least, float(np.nanmax(_medians(power))))
+
+
+def _medians(power: np.ndarray) -> np.ndarray:
+    """Return the median block of each signal, of those that have any."""
+    return np.nanmedian(power[np.isfinite(power).any(axis=1)], axis=1)
 
 
 def _block_means(values: np.ndarray) -> np.ndarray:

@@ -12,6 +12,7 @@ from replays.score.alignment import Alignment, Source, align
 from replays.score.intervals import sandwich, student
 from replays.score.noise import split_noise
 from replays.score.recorded import Recorded
+from replays.score.rounding import find_step, rounding_errors, widen
 from replays.score.scorecard import (
     ANALOGUE,
     FAIL,
@@ -25,7 +26,7 @@ from replays.score.scorecard import (
 )
 from replays.score.sent import Formula, Session
 from replays.score.sine import fit_sine, is_sine, quality
-from replays.score.stimulus import Exact, Sampled, Stimulus, parted
+from replays.score.stimulus import Exact, Sampled, Stimulus, parted, without_noise
 from replays.score.waveform import (
     Response,
     Waveform,
@@ -81,6 +82,7 @@ class Fitted:
         known_noise: What the known signal has, by the session's noise and converter [unit rms]; 0 by a formula.
         folds: What is left of the signal above half of the rate, over its part below [1]; None where it has nothing.
         alias: The same as recorded [unit], shape (n,).
+        rounding: Errors that steps larger than the noise may have left in `clean` [unit], shape (m, n).
     """
 
     name: str
@@ -94,6 +96,7 @@ class Fitted:
     known_noise: float
     folds: Interval | None
     alias: np.ndarray | float
+    rounding: np.ndarray
 
     @property
     def good(self) -> bool:
@@ -124,7 +127,8 @@ def fit_channels(
             remarks.append(f"{name}: the unit {signal.unit or 'is not told'}; taken for {channel.unit}")
         sent, first_s, sent_hz = session.whole(wire.channel)
         formula, rate_hz = formulas.get(wire.channel), signal.rate_hz or sent_hz
-        stimulus: Stimulus = Sampled(sent, first_s, sent_hz)
+        known_v = math.hypot(channel.noise_v * session.noisy, channel.lsb_v / math.sqrt(12.0))
+        stimulus: Stimulus = Sampled(without_noise(sent, known_v / abs(channel.sensitivity_v)), first_s, sent_hz)
         if formula is not None:
             stimulus = Exact(formula, (first_s, first_s + len(sent) / sent_hz), rate_hz)
         least = _SEEN * math.hypot(channel.noise_v, channel.lsb_v) / abs(channel.sensitivity_v)
@@ -182,7 +186,22 @@ def _fit(
         alias, amounts = _folded(clean, [each(at_s)[0] for each in parts[1:]])
         folds = _scaled(amounts, 1.0 / abs(low.gain))
         clean = replace(clean, residual=clean.residual - alias)
-    return Fitted(name, channel, low, clean, shown, corner_hz, odd, values, known_noise, folds, alias)
+    step = max(find_step(source.values), abs(channel.scale) * (known_noise > 0.0))
+    low = widen(low, rounding_errors(low, step))
+    return Fitted(
+        name,
+        channel,
+        low,
+        clean,
+        shown,
+        corner_hz,
+        odd,
+        values,
+        known_noise,
+        folds,
+        alias,
+        rounding_errors(clean, step),
+    )
 
 
 def _folded(found: Waveform, above: Sequence[np.ndarray]) -> tuple[np.ndarray, tuple[float, float, float]]:
@@ -385,7 +404,7 @@ def _score_fit(card: Scorecard, one: Fitted) -> None:
     add("gain", None if note else _about(abs(low.gain) - 1.0, low.half[0], 1e6), note)
     add("offset", _about(low.offset, low.half[1]) if one.good else None)
     # Nothing tells whether the rig's own noise, which is in its samples, was in what the DAQ was given.
-    split = split_noise(one.clean, floor=one.known_noise)
+    split = split_noise(one.clean, floor=one.known_noise, steps=bool(len(one.rounding)))
     noise = split.noise if one.good else split.left
     add("noise", noise)
     add("jitter", _scaled(split.jitter_s, 1e9) if one.good and split.jitter_s is not None else None)

@@ -71,7 +71,9 @@ def _score_crosstalk(card: Scorecard, one: Fitted, others: Sequence[Fitted]) -> 
     if not sources:
         return
     volts = clean.residual[rows] * abs(one.channel.sensitivity_v)
-    worst, part = find_crosstalk(volts, [clean.known[rows], clean.slope[rows]], sources)
+    size_v = abs(one.channel.sensitivity_v)
+    own = [size_v * clean.known[rows], clean.slope[rows]]
+    worst, part = find_crosstalk(volts, own, sources, size_v * one.known_noise, size_v * one.rounding[:, rows])
     if part is None:
         card.add("crosstalk", one.name, None, of=one.channel, note=f"other signals are the same as {names[worst]}'s")
         return

@@ -14,7 +14,7 @@ _BLOCKS = 64
 
 
 def find_crosstalk(
-    residual: np.ndarray, own: list[np.ndarray], sources: list[np.ndarray]
+    residual: np.ndarray, own: list[np.ndarray], sources: list[np.ndarray], noise: float, errors: np.ndarray
 ) -> tuple[int, Interval | None]:
     """Return the source of the worst crosstalk, and its part in the residual.
 
@@ -22,6 +22,8 @@ def find_crosstalk(
         residual: Of a channel, shape (n,).
         own: Signals of the channel itself: known signal and slope, each shape (n,).
         sources: Known signals of the other channels, each of some power, shape (n,).
+        noise: Of the channel's own known signal, which is in the residual as well, in the unit of that [rms].
+        errors: What rounding may have left in the residual, shape (m, n).
 
     Returns:
         Number of the source, and the absolute part of its signal in the residual with its 95 % interval, simultaneous
@@ -38,8 +40,13 @@ def find_crosstalk(
     own_part = 1.0 / np.diag(np.linalg.inv(likeness + 1e-9 * np.eye(len(sizes))))[: len(sources)]
     if own_part.min() < _SEPARATE:
         return int(own_part.argmin()), None
-    parts = np.linalg.lstsq(matrix, left, rcond=None)[0]
+    parts, *moved = np.linalg.lstsq(matrix, np.column_stack([left, *map(detrend, errors)]), rcond=None)[0].T
     covariance, freedom = sandwich(matrix, left - matrix @ parts)
     held = slice(len(sources))
     sizes, parts = sizes[held], np.abs(parts[held] / sizes[held])
-    return int(parts.argmax()), simultaneous(parts, np.sqrt(np.diag(covariance)[held]) / sizes, freedom[held])
+    value, low, high = simultaneous(parts, np.sqrt(np.diag(covariance)[held]) / sizes, freedom[held])
+    # Noise of the own signal, which is in the residual, is in what of a source is not like that signal, too.
+    likest = np.abs(likeness[held, len(sources)]) * sizes / max(float(np.std(own[0])), 1e-300)
+    wrong = noise**2 * likest / (own_part * sizes**2)
+    wrong += np.max(np.abs(np.reshape(moved, (-1, len(matrix.T)))[:, held]), axis=0, initial=0.0) / sizes
+    return int(parts.argmax()), (value, max(0.0, low - float(wrong.max())), high + float(wrong.max()))

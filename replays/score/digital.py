@@ -17,7 +17,7 @@ from replays.score.intervals import student
 from replays.score.live import Arrivals
 from replays.score.overlap import find_begin
 from replays.score.recorded import Recorded, Table
-from replays.score.rows import Followed, follow, located, repeated_part, stretches
+from replays.score.rows import Followed, follow, repeated_part, stretches
 from replays.score.scale import Scale, find_scale, scales
 from replays.score.scorecard import Interval, Scorecard
 from replays.score.sent import Sent, Session
@@ -55,6 +55,7 @@ class Taken:
         step, phase: Those rows whose number is the phase, modulo the step.
         early: Number of its first rows that stand before the session.
         start: Place among those rows of the session at which the first of the others is due.
+        begin: Place of the first row of all, among all rows of the session that are held; below 0 before these.
     """
 
     scale: Scale
@@ -62,6 +63,7 @@ class Taken:
     phase: int = 0
     early: int = 0
     start: int = 0
+    begin: int = 0
 
 
 def settle(
@@ -97,7 +99,13 @@ def settle(
 
     def taken(scale: Scale, step: int, begin: int, index: int) -> Taken:
         phase = (index + begin) % step
-        return Taken(scale, step, phase, max(0, -(begin // step)), max(0, begin - (phase - index) % step) // step)
+        start = max(0, begin - (phase - index) % step) // step
+        return Taken(scale, step, phase, max(0, -(begin // step)), start, begin)
+
+    def equal(name: str, of: str, begin: int, scale: Scale) -> np.ndarray:
+        """Whether the counts of the first rows are equal."""
+        values, _, there, _ = tried(name, of, begin)
+        return scale.counts(values) == scale.sent(there)
 
     def taken_of(name: str, of: str) -> Taken | None:
         """By where its table begins, as far as that is known; else by where its counts are."""
@@ -105,29 +113,29 @@ def settle(
         table = id(signal.table)
         index, counts = held[channel.group]
         late = [round(each * session.rate_hz(channel.group)) for each in (wires[name].late_s, wires[name].own_s)]
-        less_sure = None
-        for begin in dict.fromkeys([begins.get(table, late[0]), *late]):
+        placed = list[tuple[bool, int, int, Scale]]()
+
+        def try_begin(begin: int) -> bool:
             values, unit, there, _ = tried(name, of, begin)
             if len(values) > 1 and (scale := find_scale(values, unit, there, channel)) is not None:
-                same = float(np.mean(scale.counts(values) == scale.sent(there)))
-                if table in begins or (scale.clean and same > _MOST_ROWS):
-                    begins[table] = begin
-                    return taken(scale, step, begin, index)
-                less_sure = less_sure or (scale, begin)
-        if table not in begins:
+                same = equal(name, of, begin, scale)
+                placed.append((scale.clean and same.mean() > _MOST_ROWS, int(same.sum()), begin, scale))
+                return scale.clean and bool(same.all())
+            return False
+
+        if not any(try_begin(each) for each in dict.fromkeys([begins.get(table, late[0]), *late, *begins.values()])):
             early, there = signal.early[:_LOOKED], counts[:, session.place(of)] >> signal.lost_bits << signal.lost_bits
-            begin, known = overlapping(name, of, step), scales(signal.unit, channel, signal.early, there)
-            placed = (located(scale.counts(early), scale.sent(there), step) for scale in known)
-            begin = next((place for place in placed if place is not None), None) if begin is None else begin
+            begin = overlapping(name, of, step) if not any(clean for clean, *_ in placed) else None
+            fewest, known = min(len(early), len(there) // step), scales(signal.unit, channel, signal.early, there)
+            found = (find_begin([each.counts(early)], [each.sent(there)], step, fewest) for each in known)
+            begin = next((place for place in found if place is not None), None) if begin is None else begin
             if begin is not None:
-                values, unit, there, _ = tried(name, of, begin)
-                if len(values) > 1 and (scale := find_scale(values, unit, there, channel)) is not None:
-                    begins[table] = begin
-                    return taken(scale, step, begin, index)
-        if less_sure is not None:
-            begins[table] = less_sure[1]
-            return taken(less_sure[0], step, less_sure[1], index)
-        return None
+                try_begin(begin)
+        if not placed:
+            return None
+        *_, begin, scale = max(placed, key=lambda each: each[:2])
+        begins.setdefault(table, begin)
+        return taken(scale, step, begin, index)
 
     def overlapping(name: str, of: str, step: int) -> int | None:
         """Where the table begins, by all rows of both; a few of its signals are asked, as each reads both sides."""
@@ -151,11 +159,23 @@ def settle(
     settled, found = dict[str, Taken](), dict(wires)
     for name, wire in wires.items():
         # Counts are sure where stamps, by which signals are likened, are not: those of a rig that waits for steps.
-        for of in dict.fromkeys(each for each in (wire.channel, name) if each in session.channels):
+        for of in dict.fromkeys(each for each in (wire.channel, name, *wire.rivals) if each in session.channels):
             if (one := taken_of(name, of)) is not None:
                 settled[name] = one
                 found[name] = wire if of == wire.channel else replace(wire, channel=of, rivals=())
                 break
+    # Rows of a table begin together: where one signal is alike from several begins, another one decides.
+    for table in {id(recorded[name].table) for name in settled}:
+        names = [name for name in settled if id(recorded[name].table) == table]
+        choices = list(dict.fromkeys(settled[name].begin for name in names))
+
+        def agreed(begin: int) -> int:
+            return sum(int(equal(each, found[each].channel, begin, settled[each].scale).sum()) for each in names)  # noqa: B023
+
+        begins[table] = max(choices, key=agreed) if choices[1:] else choices[0]
+        for name in names:
+            one, group = settled[name], session.channels[found[name].channel].group
+            settled[name] = taken(one.scale, one.step, begins[table], held[group][0])
     if 2 * len(settled) <= len(wires):
         return found, settled
     for name, wire in wires.items():

@@ -29,12 +29,13 @@ class NoiseSplit:
     jitter_s: tuple[float, float, float] | None
 
 
-def split_noise(found: Waveform, *, floor: float = 0.0) -> NoiseSplit:
+def split_noise(found: Waveform, *, floor: float = 0.0, steps: bool = False) -> NoiseSplit:
     """Tell jitter from noise: residual^2 = noise^2 + (gain slope)^2 jitter^2, by least squares with weights.
 
     Args:
         found: A fit.
         floor: Noise that the known signal itself may have brought [unit rms]: widens its interval downward.
+        steps: Whether rounding shows in the residual: its power may go with the slope, as that of jitter does.
     """
     slow = wander_columns(found.residual)
     # A wander is part of the noise, and its power is that of this record.
@@ -46,6 +47,7 @@ def split_noise(found: Waveform, *, floor: float = 0.0) -> NoiseSplit:
         (left,) = _powers(squared, wander, [ones], floor)
         return NoiseSplit(left, left, None)
     noise, late = _powers(squared, wander, [ones, steep / typical], floor)
+    late = (late[0], 0.0, late[2]) if steps else late
     (left,) = _powers(squared, wander + late[0] ** 2 * steep / typical, [ones], floor)
     size = math.sqrt(typical)
     return NoiseSplit(left, noise, (late[0] / size, late[1] / size, late[2] / size))

@@ -22,10 +22,10 @@ _MOST_STRETCHES = 10_000
 """Stretches of altered values that are kept of a channel."""
 _BROKEN = 0.5
 """A channel of whose values more than this part is altered has no say in which row one is."""
-_VOTES = 16
-"""Rows that have to agree on where a recording begins."""
 _GRAM = 4
 """Consecutive rows that are known together where one alone is not."""
+_RUN = 16
+"""Consecutive rows that are doubled behind the last one that was sent: fewer are equal by chance."""
 
 
 def row_hashes(counts: np.ndarray) -> np.ndarray:
@@ -59,22 +59,6 @@ def repeated_part(counts: np.ndarray) -> float:
         hashes = grams(hashes, step)
     _, inverse, times = np.unique(hashes[: -(_GRAM**3)], return_inverse=True, return_counts=True)
     return float(np.mean(times[inverse] > 1)) if len(inverse) else 0.0
-
-
-def located(counts: np.ndarray, among: np.ndarray, step: int) -> int | None:
-    """Where the first of some counts stands among those sent, of which every so many was taken; None if nowhere.
-
-    Args:
-        counts: Of one channel, int64, shape (n,).
-        among: Of the same one, shape (m,).
-        step: From one to the next; the place may be before the first.
-    """
-    if min(len(counts), len(among) // step) < 2 * _VOTES:
-        return None
-    here, there = (grams(row_hashes(each[:, None]), n) for each, n in ((counts, 1), (among, step)))
-    _, at, place = np.intersect1d(here, there, return_indices=True)
-    begins, votes = np.unique(place - at * step, return_counts=True)
-    return int(begins[np.argmax(votes)]) if len(votes) and votes.max() >= _VOTES else None
 
 
 class Stretches:
@@ -276,6 +260,8 @@ def _places(window: _Sent, hashes: np.ndarray, due: int, low: int, high: int) ->
         places[alone] = order[left[alone]] + start
         if not level:
             ranks = {"order": order, "ordered": ordered, "left": left, "right": right}
+    if window.ended and end == window.end:
+        _forget_chance_places(places, due, end)
     known = places >= 0
     open_ = np.flatnonzero(~known)
     if not len(open_):
@@ -303,6 +289,18 @@ def _places(window: _Sent, hashes: np.ndarray, due: int, low: int, high: int) ->
     fits = (forward[left] < stop) & (forward[left] < end)
     places[open_[left[fits]]] = forward[left[fits]]
     return places, known
+
+
+def _forget_chance_places(places: np.ndarray, due: int, end: int) -> None:
+    """Take back places of rows behind the last one that was sent, unless many consecutive rows are known again.
+
+    What follows a session resembles it where its signal repeats, so that single rows are equal by chance.
+    """
+    after = 0 if due >= end else len(places) if (last := np.flatnonzero(places == end - 1)).size == 0 else last[0] + 1
+    rest = places[after:]
+    apart = np.flatnonzero(np.diff(rest, prepend=-3) != 1)
+    lengths = np.diff(np.append(apart, len(rest)))
+    rest[np.repeat(lengths < min(_RUN, len(rest)), lengths)] = -1
 
 
 def _by_nearest(places: np.ndarray, rows: np.ndarray, guess: np.ndarray, ranks: dict, start: int) -> None:

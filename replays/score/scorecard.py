@@ -183,11 +183,22 @@ class ScoreRow:
         )  # fmt: skip
 
 
+def _is_outside(value: float, low: float, high: float, limit: Bounds, *, rms: bool) -> bool:
+    """Return whether an interval that is longer by `_MARGIN` lies outside of a limit as a whole."""
+    power = 2 if rms else 1  # an interval of a variance is even to both sides about the variance
+    high = value**power + _MARGIN * (high**power - value**power)
+    low = value**power - _MARGIN * (value**power - low**power)
+    return high < limit.low or low > limit.high**power
+
+
 def judge_row(
     path: Path_, quantity: str, channel: str, estimate: Interval | None, *, unit: str = "",
     limit: Bounds | None = None, note: str = "",
 ) -> ScoreRow:  # fmt: skip
     """A row with its verdict: the whole interval decides, and one that reaches over a limit shows nothing.
+
+    A card has dozens of rows, of which each twentieth interval misses its value: a row fails where an interval of
+    99.7 % lies outside.
 
     Args:
         path: Which of the two.
@@ -206,7 +217,7 @@ def judge_row(
             verdict = NO_LIMIT
         elif limit.low <= low and high <= limit.high:
             verdict = PASS
-        elif high < limit.low or low > limit.high:
+        elif _is_outside(value, low, high, limit, rms=quantity in _RMS):
             verdict = FAIL
     run = about.run if verdict == INCONCLUSIVE else ""
     return ScoreRow(quantity, channel, value, low, high, about.unit or unit, about.method, limit, verdict, run, note)
@@ -297,6 +308,10 @@ class Scorecard:
         })  # fmt: skip
 
 
+_MARGIN = 1.5
+"""Length of an interval of 99.7 % over that of 95 %, of a normal estimate."""
+_RMS = ("noise", "jitter", "stamp jitter")
+"""Quantities that are roots of variances."""
 MARKS: dict[Verdict, str] = {FAIL: "X", INCONCLUSIVE: "?", PASS: "+", NO_LIMIT: ""}
 """Marks of a matrix, the worst first."""
 

@@ -13,8 +13,8 @@ import numpy as np
 from replays.score.intervals import simultaneous
 from replays.score.scorecard import Interval
 
-_LEVEL_PART, _TWO_LEVELS = 0.1, 0.9
-"""Part of a step within which a row is at a level, and part of the rows that must be, for a signal to be steps."""
+_LEVEL_PART, _BETWEEN_ROWS = 0.1, 3
+"""Part of a step within which a row is at a level, and rows between two levels, at most, of a signal that is steps."""
 _PLATEAU_ROWS, _MAX_ROWS, _STEPS = 100, 4000, 6
 """Rows of a plateau from which a step counts, those that are averaged at most, and steps that must be there."""
 _BEFORE_ROWS = 32
@@ -43,10 +43,16 @@ class StepResponse:
 
 
 def has_steps(known: np.ndarray) -> bool:
-    """Return whether a signal is steps between two levels."""
+    """Return whether a signal is steps between two levels, sharper than a response to them."""
     low, high = np.percentile(known, (5.0, 95.0))
     near = np.minimum(np.abs(known - low), np.abs(known - high)) < _LEVEL_PART * (high - low)
-    return bool(high > low and np.mean(near) > _TWO_LEVELS)
+    return bool(high > low and np.sum(~near) <= _BETWEEN_ROWS * len(_edges(known)))
+
+
+def _edges(known: np.ndarray) -> np.ndarray:
+    """Return the rows after which a signal passes the middle of its levels, shape (n,)."""
+    above = known > 0.5 * np.sum(np.percentile(known, (5.0, 95.0)))
+    return np.flatnonzero(above[1:] != above[:-1])
 
 
 def step_response(known: np.ndarray, values: np.ndarray) -> StepResponse | None:
@@ -59,7 +65,7 @@ def step_response(known: np.ndarray, values: np.ndarray) -> StepResponse | None:
     from scipy.interpolate import PchipInterpolator
 
     middle = known - 0.5 * np.sum(np.percentile(known, (5.0, 95.0)))
-    edges = np.flatnonzero(np.signbit(middle[1:]) != np.signbit(middle[:-1]))
+    edges = _edges(known)
     gaps = np.diff(edges, prepend=-1, append=len(known))
     plateaus = np.minimum(gaps[:-1], gaps[1:])
     held = plateaus > max(_PLATEAU_ROWS, 0.5 * float(np.median(plateaus)) if len(plateaus) else 0.0)

@@ -12,6 +12,8 @@ _HALF_TAPS, _KAISER, _CUTOFF = 64, 10.0, 0.97
 EDGE = _HALF_TAPS + 4
 """Samples at each end between which nothing is told."""
 _CHUNK = 1 << 18
+_SEGMENT, _SIGNAL = 512, 4.0
+"""Samples of a spectrum, and its power over that of noise from which it holds a signal."""
 _NARROWER, _SPLIT_TAPS = 0.9, 513
 """A rate is too near to what was sent for anything to be above half of it from here on; and taps between the two."""
 
@@ -71,6 +73,32 @@ class Sampled:
             finer = upfirdn(taps, self._values[low:high], up=_FINER)[_HALF_TAPS * _FINER : -_HALF_TAPS * _FINER or None]
             self._kept = low, high, make_interp_spline(np.arange(len(finer)), finer, k=5)
         return self._kept[2]
+
+
+def without_noise(values: np.ndarray, noise: float) -> np.ndarray:
+    """Return samples less what of them is white noise: of their short spectra only what stands out of it is kept.
+
+    A fit to noisy samples takes the slope of their noise for that of the signal, and its intervals are too small.
+
+    Args:
+        values: Even samples, shape (n,).
+        noise: Of them [unit rms].
+    """
+    from scipy.ndimage import uniform_filter
+    from scipy.signal import istft, stft
+
+    found = np.array(values, float)
+    told: dict[str, Any] = {"nperseg": _SEGMENT, "noverlap": 3 * _SEGMENT // 4}
+    for begin in range(0, len(values) if len(values) > 2 * _SEGMENT else 0, _CHUNK):
+        low, high = max(0, begin - _SEGMENT), min(len(values), begin + _CHUNK + _SEGMENT)
+        middle = float(np.mean(values[low:high]))
+        _, _, spectra = stft(values[low:high] - middle, boundary="even", **told)
+        # The power of white noise in a line is its variance times the sum of the window's squares over its sum squared.
+        level = noise**2 * 1.5 / _SEGMENT
+        spectra[uniform_filter(np.abs(spectra) ** 2, 3) < _SIGNAL * level] = 0.0
+        part = istft(spectra, **told)[1][begin - low : high - low] + middle
+        found[begin : begin + _CHUNK] = part[: len(found[begin : begin + _CHUNK])]
+    return found
 
 
 def parted(stimulus: Stimulus, rate_hz: float, sent_hz: float, least: float) -> tuple[Sampled, Sampled, Sampled] | None:

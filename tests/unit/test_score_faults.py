@@ -59,7 +59,7 @@ TABLE = {
     "clock": Declared("P_W", {"ppm": 500.0}, {"clock", "skew"}),
     # None can be early, so that the mean of the next two is a delay; what they leave goes with the slope.
     "jitter": Declared("ring_y", {"rms_us": 0.5}, {"jitter", "skew", "effective bits"}),
-    "wander": Declared("inner_y", {"amplitude_us": 1.0, "period_s": 0.1}, {"jitter", "effective bits"}),
+    "wander": Declared("inner_y", {"amplitude_us": 1.0, "period_s": 0.1}, {"effective bits"}),
     "noise": Declared("outer_x", {"factor": 3.0}, LEFT),
     "spikes": Declared("outer_y", {"rate_hz": 50.0, "size_v": 0.5}, LEFT),
     # Rounded down, and set, are on the mean an offset.

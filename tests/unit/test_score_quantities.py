@@ -125,7 +125,7 @@ def test_crosstalk_is_the_worst_entry_of_the_mixing_matrix(parts: tuple[float, .
         signals = [np.repeat(generator.integers(0, 2, 1500) * 4.0 - 2.0, 4) for _ in range(4)]
         own, *others = signals
         residual = np.column_stack(others) @ parts + NOISE * generator.standard_normal(6000)
-        worst, part = find_crosstalk(residual, [own, np.gradient(own)], others)
+        worst, part = find_crosstalk(residual, [own, np.gradient(own)], others, 0.0, np.empty((0, len(own))))
         assert worst == np.argmax(np.abs(parts))
         return part
 
@@ -137,7 +137,7 @@ def test_crosstalk_of_equal_signals_is_inconclusive(same: str) -> None:
     generator = np.random.default_rng(1)
     own, first = generator.standard_normal((2, 4000))
     second = (own if same == "own" else -first) + 1e-3 * generator.standard_normal(4000)
-    assert find_crosstalk(own * 1e-3, [own], [first, second])[1] is None
+    assert find_crosstalk(own * 1e-3, [own], [first, second], 0.0, np.empty((0, len(own))))[1] is None
 
 
 def steps(respond: Callable[[np.ndarray], np.ndarray], generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
