@@ -8,30 +8,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
 from itertools import chain
 
 import numpy as np
 
 from replays.score.intervals import student
 from replays.score.live import Arrivals
-from replays.score.overlap import find_begin
+from replays.score.placing import Taken
 from replays.score.recorded import Recorded, Table
 from replays.score.rows import Followed, follow, repeated_part, stretches
-from replays.score.scale import Scale, find_scale, scales
+from replays.score.scale import Scale
 from replays.score.scorecard import Interval, Scorecard
 from replays.score.sent import Sent, Session
 from replays.score.wiring import Wire
 from rig.channels import Channel
 
-_LOOKED = 1 << 16
-"""Rows of a recording by which its scale is found."""
-_MOST_ROWS = 0.5
-"""Part of the first rows that must be equal for a begin that stamps or correlation tell."""
-_SAMPLED = 64
-"""Of so many values one is looked at for the bits that a DAQ leaves out."""
-_SEARCHED = 3
-"""Signals of a table by which its place in the session is searched over the whole of both."""
 _BATCHES, _APART = 256, 32
 """Of stamps that are shown, and that are judged."""
 _MOST_BATCH = 1 << 12
@@ -44,172 +35,6 @@ _NAMED = 5
 """Rows that are named in a line; all stand in the document."""
 _REPEATING = 0.5
 """Part of the rows that recur, from which a loss of whole periods is taken for possible."""
-
-
-@dataclass(frozen=True)
-class Taken:
-    """What a signal has taken of its channel.
-
-    Attributes:
-        scale: Of its counts.
-        step, phase: Those rows whose number is the phase, modulo the step.
-        early: Number of its first rows that stand before the session.
-        start: Place among those rows of the session at which the first of the others is due.
-        begin: Place of the first row of all, among all rows of the session that are held; below 0 before these.
-    """
-
-    scale: Scale
-    step: int = 1
-    phase: int = 0
-    early: int = 0
-    start: int = 0
-    begin: int = 0
-
-
-def settle(
-    recorded: Mapping[str, Recorded], wires: Mapping[str, Wire], session: Session
-) -> tuple[dict[str, Wire], dict[str, Taken]]:
-    """Which channel each signal has the counts of, how scaled and of which rows, by its name in the file.
-
-    Where most signals show counts, one that does not is looked for in all channels; if it is in none, it is the channel
-    that it is named by, or alone is like, with what its unit says of its scale.
-    """
-    held = {group: session.early(group) for group in session.groups}
-
-    begins: dict[int, int] = {}
-    searched: dict[int, set[str]] = {}
-
-    def tried(name: str, of: str, begin: int) -> tuple[np.ndarray, str, np.ndarray, Channel]:
-        """Values and counts of the same rows: row j of the file was sent `begin` and j steps behind the first one."""
-        channel, signal, step = session.channels[of], recorded[name], step_of(name, of)
-        skipped = max(0, -(begin // step))
-        place, few = begin + skipped * step, _LOOKED
-        values, there = signal.early[skipped:], held[channel.group][1][place:]
-        if skipped and len(values) < min(_LOOKED, signal.rows - skipped):
-            values = signal.table.stretch(skipped, _LOOKED)[:, 1 + signal.column]
-        if place and len(there) < _LOOKED * step:
-            there = session.stretch(channel.group, place, _LOOKED * step)
-        counts = there[::step, session.place(of)]
-        few = min(len(values), len(counts), _LOOKED)
-        return values[:few], signal.unit, counts[:few] >> signal.lost_bits << signal.lost_bits, channel
-
-    def step_of(name: str, of: str) -> int:
-        sent_hz = session.rate_hz(session.channels[of].group)
-        return max(1, round(sent_hz / (recorded[name].rate_hz or sent_hz)))
-
-    def taken(scale: Scale, step: int, begin: int, index: int) -> Taken:
-        phase = (index + begin) % step
-        start = max(0, begin - (phase - index) % step) // step
-        return Taken(scale, step, phase, max(0, -(begin // step)), start, begin)
-
-    def equal(name: str, of: str, begin: int, scale: Scale) -> np.ndarray:
-        """Whether the counts of the first rows are equal."""
-        values, _, there, _ = tried(name, of, begin)
-        return scale.counts(values) == scale.sent(there)
-
-    def taken_of(name: str, of: str) -> Taken | None:
-        """By where its table begins, as far as that is known; else by where its counts are."""
-        signal, channel, step = recorded[name], session.channels[of], step_of(name, of)
-        table = id(signal.table)
-        index, counts = held[channel.group]
-        late = [round(each * session.rate_hz(channel.group)) for each in (wires[name].late_s, wires[name].own_s)]
-        placed = list[tuple[bool, int, int, Scale]]()
-
-        def try_begin(begin: int) -> bool:
-            values, unit, there, _ = tried(name, of, begin)
-            if len(values) > 1 and (scale := find_scale(values, unit, there, channel)) is not None:
-                same = equal(name, of, begin, scale)
-                placed.append((scale.clean and same.mean() > _MOST_ROWS, int(same.sum()), begin, scale))
-                return scale.clean and bool(same.all())
-            return False
-
-        if not any(try_begin(each) for each in dict.fromkeys([begins.get(table, late[0]), *late, *begins.values()])):
-            early, there = signal.early[:_LOOKED], counts[:, session.place(of)] >> signal.lost_bits << signal.lost_bits
-            begin = overlapping(name, of, step) if not any(clean for clean, *_ in placed) else None
-            fewest, known = min(len(early), len(there) // step), scales(signal.unit, channel, signal.early, there)
-            found = (find_begin([each.counts(early)], [each.sent(there)], step, fewest) for each in known)
-            begin = next((place for place in found if place is not None), None) if begin is None else begin
-            if begin is not None:
-                try_begin(begin)
-        if not placed:
-            return None
-        *_, begin, scale = max(placed, key=lambda each: each[:2])
-        begins.setdefault(table, begin)
-        return taken(scale, step, begin, index)
-
-    def overlapping(name: str, of: str, step: int) -> int | None:
-        """Where the table begins, by all rows of both; a few of its signals are asked, as each reads both sides."""
-        signal, channel = recorded[name], session.channels[of]
-        sent, asked = Sent(session, [channel.group]), searched.setdefault(id(signal.table), set())
-        rows = session.rows(channel.group)
-        beyond = signal.rows > _LOOKED or rows > len(held[channel.group][1])
-        if not beyond or name in asked or len(asked) >= _SEARCHED:
-            return None
-        asked.add(name)
-        column, fewest = sent.names.index(of), min(signal.rows, rows // step)
-        some = [_sample(part[:, 1]) for part in signal.table.parts([signal.column])]
-        bits = signal.lost_bits
-        for scale in scales(signal.unit, channel, np.concatenate(some), held[channel.group][1][:, column]):
-            here = (scale.counts(part[:, 1]) for part in signal.table.parts([signal.column]))
-            there = (scale.sent(part[:, column] >> bits << bits) for part in Sent(session, [channel.group]))
-            if (begin := find_begin(here, there, step, fewest)) is not None:
-                return begin
-        return None
-
-    settled, found = dict[str, Taken](), dict(wires)
-    for name, wire in wires.items():
-        # Counts are sure where stamps, by which signals are likened, are not: those of a rig that waits for steps.
-        for of in dict.fromkeys(each for each in (wire.channel, name, *wire.rivals) if each in session.channels):
-            if (one := taken_of(name, of)) is not None:
-                settled[name] = one
-                found[name] = wire if of == wire.channel else replace(wire, channel=of, rivals=())
-                break
-    # Rows of a table begin together: where one signal is alike from several begins, another one decides.
-    for table in {id(recorded[name].table) for name in settled}:
-        names = [name for name in settled if id(recorded[name].table) == table]
-        choices = list(dict.fromkeys(settled[name].begin for name in names))
-
-        def agreed(begin: int) -> int:
-            return sum(int(equal(each, found[each].channel, begin, settled[each].scale).sum()) for each in names)  # noqa: B023
-
-        begins[table] = max(choices, key=agreed) if choices[1:] else choices[0]
-        for name in names:
-            one, group = settled[name], session.channels[found[name].channel].group
-            settled[name] = taken(one.scale, one.step, begins[table], held[group][0])
-    if 2 * len(settled) <= len(wires):
-        return found, settled
-    for name, wire in wires.items():
-        for other in () if name in settled else sorted(session.channels, key=lambda each: each != name):
-            if (one := taken_of(name, other)) is not None:
-                found[name], settled[name] = replace(wire, channel=other, rivals=()), one
-                break
-        named = name if name in session.channels else "" if wire.rivals else wire.channel
-        if name not in settled and named:
-            step = step_of(name, named)
-            begin = begins.get(id(recorded[name].table), 0)
-            values, unit, counts, channel = tried(name, named, begin)
-
-            def apart(scale: Scale) -> float:
-                return float(np.nanmedian(np.abs(scale.each * counts + scale.zero - values)) / scale.each)  # noqa: B023
-
-            found[name] = replace(wire, channel=named)
-            scale = replace(min(scales(unit, channel, values[:0], counts), key=apart), known=False)
-            settled[name] = taken(scale, step, begin, held[channel.group][0])
-    known = {name: each for name, each in settled.items() if each.scale.known}
-    # Bits are left out by the DAQ's converter, so that no signal has more of them; else they are lost on the way.
-    bits = {name: session.channels[found[name].channel].adc_bits - each.scale.lost_bits for name, each in known.items()}
-    for name, each in known.items():
-        if each.scale.lost_bits and bits[name] < max(bits.values()):
-            size = 2.0**-each.scale.lost_bits
-            scale = Scale(size * each.scale.each, each.scale.zero, each.scale.what, known=False)
-            settled[name] = replace(each, scale=scale)
-    return found, settled
-
-
-def _sample(values: np.ndarray) -> np.ndarray:
-    """Return some values, and the least and the largest, of which the bits of a DAQ are found."""
-    good = values[np.isfinite(values)]
-    return np.append(good[::_SAMPLED], [good.min(), good.max()] if len(good) else [])
 
 
 def score_digital(

@@ -13,9 +13,10 @@ from replays.recordings.formats import mapping as formats
 from replays.score.analogue import score_analogue
 from replays.score.can_log import is_can_log, open_can_log
 from replays.score.converter import score_converter
-from replays.score.digital import Taken, score_digital, settle
+from replays.score.digital import score_digital
 from replays.score.limits import Limits, load_limits
 from replays.score.live import Arrivals
+from replays.score.placing import Taken, settle
 from replays.score.recorded import Recorded, map_signals, open_recorded
 from replays.score.scale import COUNTS
 from replays.score.scorecard import (

@@ -1,0 +1,209 @@
+"""Where each signal's rows stand in the session, and how its values come from the rig's counts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from replays.score.overlap import find_begin
+from replays.score.recorded import Recorded
+from replays.score.scale import Scale, find_scale, scales
+from replays.score.sent import Sent, Session
+from replays.score.wiring import Wire
+from rig.channels import Channel
+
+_LOOKED = 1 << 16
+"""Rows of a recording by which its scale is found."""
+_MOST_ROWS = 0.5
+"""Part of the first rows that must be equal for a begin that stamps or correlation tell."""
+_SAMPLED = 64
+"""Of so many values one is looked at for the bits that a DAQ leaves out."""
+_SEARCHED = 3
+"""Signals of a table by which its place in the session is searched over the whole of both."""
+
+
+@dataclass(frozen=True)
+class Taken:
+    """What a signal has taken of its channel.
+
+    Attributes:
+        scale: Of its counts.
+        step, phase: Those rows whose number is the phase, modulo the step.
+        early: Number of its first rows that stand before the session.
+        start: Place among those rows of the session at which the first of the others is due.
+        begin: Place of the first row of all, among all rows of the session that are held; below 0 before these.
+    """
+
+    scale: Scale
+    step: int = 1
+    phase: int = 0
+    early: int = 0
+    start: int = 0
+    begin: int = 0
+
+
+class _Search:
+    """The search for the rows and the scale of signals.
+
+    Attributes:
+        held: Index and counts of the first rows of each group of the session.
+        begins: Place of the first row of each table that is known, by its identity.
+    """
+
+    def __init__(self, recorded: Mapping[str, Recorded], wires: Mapping[str, Wire], session: Session) -> None:
+        self._recorded, self._wires, self._session = recorded, wires, session
+        self.held = {group: session.early(group) for group in session.groups}
+        self.begins: dict[int, int] = {}
+        self._searched: dict[int, set[str]] = {}
+
+    def tried(self, name: str, of: str, begin: int) -> tuple[np.ndarray, str, np.ndarray, Channel]:
+        """Values and counts of the same rows: row j of the file was sent `begin` and j steps behind the first one."""
+        channel, signal, step = self._session.channels[of], self._recorded[name], self.step_of(name, of)
+        skipped = max(0, -(begin // step))
+        place, few = begin + skipped * step, _LOOKED
+        values, there = signal.early[skipped:], self.held[channel.group][1][place:]
+        if skipped and len(values) < min(_LOOKED, signal.rows - skipped):
+            values = signal.table.stretch(skipped, _LOOKED)[:, 1 + signal.column]
+        if place and len(there) < _LOOKED * step:
+            there = self._session.stretch(channel.group, place, _LOOKED * step)
+        counts = there[::step, self._session.place(of)]
+        few = min(len(values), len(counts), _LOOKED)
+        return values[:few], signal.unit, counts[:few] >> signal.lost_bits << signal.lost_bits, channel
+
+    def step_of(self, name: str, of: str) -> int:
+        """Rows of the session from one row of a signal to the next, by its rate."""
+        sent_hz = self._session.rate_hz(self._session.channels[of].group)
+        return max(1, round(sent_hz / (self._recorded[name].rate_hz or sent_hz)))
+
+    def taken(self, scale: Scale, step: int, begin: int, group: str) -> Taken:
+        """What a signal has taken whose first row stands at a place of the session."""
+        index, _ = self.held[group]
+        phase = (index + begin) % step
+        start = max(0, begin - (phase - index) % step) // step
+        return Taken(scale, step, phase, max(0, -(begin // step)), start, begin)
+
+    def equal(self, name: str, of: str, begin: int, scale: Scale) -> np.ndarray:
+        """Whether the counts of the first rows are equal."""
+        values, _, there, _ = self.tried(name, of, begin)
+        return scale.counts(values) == scale.sent(there)
+
+    def taken_of(self, name: str, of: str) -> Taken | None:
+        """By where its table begins, as far as that is known; else by where its counts are."""
+        signal, channel, step = self._recorded[name], self._session.channels[of], self.step_of(name, of)
+        table = id(signal.table)
+        _, counts = self.held[channel.group]
+        late_s = self._wires[name].late_s, self._wires[name].own_s
+        late = [round(each * self._session.rate_hz(channel.group)) for each in late_s]
+        placed, most = list[tuple[bool, int, int, Scale]](), list[bool]()
+
+        def try_begin(begin: int) -> bool:
+            values, unit, there, _ = self.tried(name, of, begin)
+            if len(values) > 1 and (scale := find_scale(values, unit, there, channel)) is not None:
+                same = self.equal(name, of, begin, scale)
+                placed.append((scale.clean, int(same.sum()), begin, scale))
+                most.append(scale.clean and same.mean() > _MOST_ROWS)
+                return scale.clean and bool(same.all())
+            return False
+
+        likely = dict.fromkeys([self.begins.get(table, late[0]), *late, *self.begins.values()])
+        if not any(map(try_begin, likely)):
+            early, bits = signal.early[:_LOOKED], signal.lost_bits
+            there = counts[:, self._session.place(of)] >> bits << bits
+            begin = self._overlapping(name, of, step) if not any(most) else None
+            fewest, known = min(len(early), len(there) // step), scales(signal.unit, channel, signal.early, there)
+            found = (find_begin([each.counts(early)], [each.sent(there)], step, fewest) for each in known)
+            begin = next((place for place in found if place is not None), None) if begin is None else begin
+            if begin is not None:
+                try_begin(begin)
+        if not placed:
+            return None
+        *_, begin, scale = max(placed, key=lambda each: each[:2])
+        self.begins.setdefault(table, begin)
+        return self.taken(scale, step, begin, channel.group)
+
+    def _overlapping(self, name: str, of: str, step: int) -> int | None:
+        """Where the table begins, by all rows of both; a few of its signals are asked, as each reads both sides."""
+        signal, channel = self._recorded[name], self._session.channels[of]
+        sent, asked = Sent(self._session, [channel.group]), self._searched.setdefault(id(signal.table), set())
+        rows = self._session.rows(channel.group)
+        beyond = signal.rows > _LOOKED or rows > len(self.held[channel.group][1])
+        if not beyond or name in asked or len(asked) >= _SEARCHED:
+            return None
+        asked.add(name)
+        column, fewest = sent.names.index(of), min(signal.rows, rows // step)
+        some = [_sample(part[:, 1]) for part in signal.table.parts([signal.column])]
+        bits = signal.lost_bits
+        for scale in scales(signal.unit, channel, np.concatenate(some), self.held[channel.group][1][:, column]):
+            here = (scale.counts(part[:, 1]) for part in signal.table.parts([signal.column]))
+            there = (scale.sent(part[:, column] >> bits << bits) for part in Sent(self._session, [channel.group]))
+            if (begin := find_begin(here, there, step, fewest)) is not None:
+                return begin
+        return None
+
+
+def settle(
+    recorded: Mapping[str, Recorded], wires: Mapping[str, Wire], session: Session
+) -> tuple[dict[str, Wire], dict[str, Taken]]:
+    """Which channel each signal has the counts of, how scaled and of which rows, by its name in the file.
+
+    Where most signals show counts, one that does not is looked for in all channels; if it is in none, it is the channel
+    that it is named by, or alone is like, with what its unit says of its scale.
+    """
+    search, settled, found = _Search(recorded, wires, session), dict[str, Taken](), dict(wires)
+    for name, wire in wires.items():
+        # Counts are sure where stamps, by which signals are likened, are not: those of a rig that waits for steps.
+        for of in dict.fromkeys(each for each in (wire.channel, name, *wire.rivals) if each in session.channels):
+            if (one := search.taken_of(name, of)) is not None:
+                settled[name] = one
+                found[name] = wire if of == wire.channel else replace(wire, channel=of, rivals=())
+                break
+    # Rows of a table begin together: where one signal is alike from several begins, another one decides.
+    for table in {id(recorded[name].table) for name in settled}:
+        names = [name for name in settled if id(recorded[name].table) == table]
+        choices = list(dict.fromkeys(settled[name].begin for name in names))
+
+        def agreed(begin: int) -> int:
+            signals = [(each, found[each].channel, begin, settled[each].scale) for each in names]  # noqa: B023
+            return sum(int(search.equal(*signal).sum()) for signal in signals)
+
+        search.begins[table] = max(choices, key=agreed) if choices[1:] else choices[0]
+        for name in names:
+            one, group = settled[name], session.channels[found[name].channel].group
+            settled[name] = search.taken(one.scale, one.step, search.begins[table], group)
+    if 2 * len(settled) <= len(wires):
+        return found, settled
+    for name, wire in wires.items():
+        for other in () if name in settled else sorted(session.channels, key=lambda each: each != name):
+            if (one := search.taken_of(name, other)) is not None:
+                found[name], settled[name] = replace(wire, channel=other, rivals=()), one
+                break
+        named = name if name in session.channels else "" if wire.rivals else wire.channel
+        if name not in settled and named:
+            step = search.step_of(name, named)
+            begin = search.begins.get(id(recorded[name].table), 0)
+            values, unit, counts, channel = search.tried(name, named, begin)
+
+            def apart(scale: Scale) -> float:
+                return float(np.nanmedian(np.abs(scale.each * counts + scale.zero - values)) / scale.each)  # noqa: B023
+
+            found[name] = replace(wire, channel=named)
+            scale = replace(min(scales(unit, channel, values[:0], counts), key=apart), known=False)
+            settled[name] = search.taken(scale, step, begin, channel.group)
+    known = {name: each for name, each in settled.items() if each.scale.known}
+    # Bits are left out by the DAQ's converter, so that no signal has more of them; else they are lost on the way.
+    adc_bits = {name: session.channels[found[name].channel].adc_bits for name in known}
+    bits = {name: adc_bits[name] - each.scale.lost_bits for name, each in known.items()}
+    for name, each in known.items():
+        if each.scale.lost_bits and bits[name] < max(bits.values()):
+            size = 2.0**-each.scale.lost_bits
+            scale = Scale(size * each.scale.each, each.scale.zero, each.scale.what, known=False)
+            settled[name] = replace(each, scale=scale)
+    return found, settled
+
+
+def _sample(values: np.ndarray) -> np.ndarray:
+    """Return some values, and the least and the largest, of which the bits of a DAQ are found."""
+    good = values[np.isfinite(values)]
+    return np.append(good[::_SAMPLED], [good.min(), good.max()] if len(good) else [])
