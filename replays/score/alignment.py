@@ -144,6 +144,12 @@ class Alignment:
         return values, self.first_s + np.arange(low, high + 1) / self.rate_hz, curve
 
     @property
+    def inside_s(self) -> tuple[float, float]:
+        """Times of the session at the first and the last row in it [s]."""
+        own_s = self.first_s + next(iter(self.own_s.values()))
+        return own_s + self.track.inside[0] / self.rate_hz, own_s + self.track.inside[1] / self.rate_hz
+
+    @property
     def whole(self) -> bool:
         """Whether nearly all rows in the session are explained."""
         return self.judged() > _WHOLE

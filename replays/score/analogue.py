@@ -241,7 +241,7 @@ def score_analogue(
             card.add("gain", name, None, note=note)
     ambiguous = {name for each in alignments if each.ambiguous for name in each.names}
     _score_time(card, [one for one in found if one.good], ambiguous)
-    _score_wires(card, recorded, wires, found, ambiguous, session)
+    _score_wires(card, recorded, wires, found, ambiguous, session, alignments)
     sines = []
     for one in found:
         _score_fit(card, one)
@@ -351,15 +351,18 @@ def _same_corner(one: Fitted, other: Fitted) -> bool:
     return abs(one.corner_hz[0] / other.corner_hz[0] - 1.0) < _SAME_CORNER
 
 
-def _is_loud(session: Session, name: str) -> bool:
-    """Return whether a channel's signal is well above its noise."""
-    channel = session.channels[name]
-    return float(np.std(session.whole(name)[0])) > _LOUD * channel.noise_v / abs(channel.sensitivity_v)
+def _is_loud(session: Session, name: str, alignments: Sequence[Alignment]) -> bool:
+    """Return whether a channel's signal is well above its noise in the part of the session that was recorded."""
+    channel, (sent, first_s, rate_hz) = session.channels[name], session.whole(name)
+    ends_s = [end for each in alignments for end in each.inside_s]
+    rows = [round((each - first_s) * rate_hz) for each in (min(ends_s, default=first_s), max(ends_s, default=first_s))]
+    part = sent[max(0, rows[0]) : max(0, rows[1])] if ends_s else sent
+    return len(part) > 1 and float(np.std(part)) > _LOUD * channel.noise_v / abs(channel.sensitivity_v)
 
 
 def _score_wires(
     card: Scorecard, recorded: Mapping[str, Recorded], wires: Mapping[str, Wire], found: list[Fitted],
-    ambiguous: set[str], session: Session,
+    ambiguous: set[str], session: Session, alignments: Sequence[Alignment],
 ) -> None:  # fmt: skip
     """Mapping and polarity of the signals whose gain is found; a name of the rig's has to be that channel."""
     fits = {one.name: one for one in found if one.good}
@@ -370,7 +373,8 @@ def _score_wires(
     for name, wire in wires.items():
         verdict: Verdict = NO_LIMIT
         note = f"correlation {wire.likeness:.4f}"
-        if not wire.channel and name in session.channels and recorded[name].rows >= _MANY and _is_loud(session, name):
+        absent = not wire.channel and name in session.channels and recorded[name].rows >= _MANY
+        if absent and _is_loud(session, name, alignments):
             verdict, note = FAIL, "nothing of what was sent is in it"
         elif name in fits and name in session.channels and name not in (wire.channel, *wire.rivals):
             verdict = FAIL

@@ -34,7 +34,7 @@ def split_noise(found: Waveform, *, floor: float = 0.0, steps: bool = False) -> 
 
     Args:
         found: A fit.
-        floor: Noise that the known signal itself may have brought [unit rms]: widens its interval downward.
+        floor: Noise that the known signal itself may have brought [unit rms]: widens both intervals downward.
         steps: Whether rounding shows in the residual: its power may go with the slope, as that of jitter does.
     """
     slow = wander_columns(found.residual)
@@ -47,7 +47,9 @@ def split_noise(found: Waveform, *, floor: float = 0.0, steps: bool = False) -> 
         (left,) = _powers(squared, wander, [ones], floor)
         return NoiseSplit(left, left, None)
     noise, late = _powers(squared, wander, [ones, steep / typical], floor)
-    late = (late[0], 0.0, late[2]) if steps else late
+    # What was kept of the known signal, or taken off it, is below twice its noise, and may be where that is steep.
+    known = 2.0 * floor * typical / math.sqrt(float(np.mean(steep**2)))
+    late = late[0], 0.0 if steps else math.sqrt(max(0.0, late[1] ** 2 - known**2)), late[2]
     (left,) = _powers(squared, wander + late[0] ** 2 * steep / typical, [ones], floor)
     size = math.sqrt(typical)
     return NoiseSplit(left, noise, (late[0] / size, late[1] / size, late[2] / size))
