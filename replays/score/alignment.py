@@ -423,7 +423,7 @@ class _Begins:
             return
         with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # of stretches that no begin explains
             worse = np.nanmean(np.log(np.array(self._left) / np.nanmin(self._left, axis=0)), axis=1)[-len(fresh) :]
-        for n in np.argsort(np.floor(worse / math.log(_ALIKE)), kind="stable"):
+        for n in np.argsort(np.floor(worse / math.log(_ALIKE)), kind="stable")[:_FOLLOWED]:
             if self._tried and (self._settled or not worse[n] < math.log(_WORSE)):
                 return
             shift_s = fresh[n]
