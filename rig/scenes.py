@@ -8,7 +8,7 @@ from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
-from pydantic import Field, FiniteFloat, field_validator, model_validator
+from pydantic import Field, FiniteFloat, ValidationInfo, field_validator, model_validator
 
 from rig.channel_file import check_table, read_channels
 from rig.channels import ChannelTable, check_signals, default_table
@@ -51,6 +51,8 @@ class EngineChoice(Written):
     """Scaled error: of the whole run with split, of a step with another adaptive engine; left out: the engine's own."""
     companion: bool = False
     """A second run at a sixteenth of the tolerance estimates the error; left out: with split only."""
+    rolling: Literal["series", "collocation"] = "series"
+    """Method of split for rolling contact: series as for other motion, or long steps of a whirl turn (experimental)."""
 
     @field_validator("name")
     @classmethod
@@ -65,6 +67,13 @@ class EngineChoice(Written):
         if 0.0 < tolerance < 1e-30:
             raise ValueError("at least 1e-30, far below rounding; 0 is the engine's own")
         return tolerance
+
+    @field_validator("rolling")
+    @classmethod
+    def _of_split(cls, rolling: str, info: ValidationInfo) -> str:
+        if rolling == "collocation" and (name := info.data.get("name")) != "split":
+            raise ValueError(f"series with engine {name}")
+        return rolling
 
     @model_validator(mode="before")
     @classmethod

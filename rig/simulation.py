@@ -86,7 +86,7 @@ class Simulation:
         self.tick_rate_hz = TICK_RATE_HZ
         self._warm = False
         self.model = build_model(scene.load_parameters(), scene.model)
-        self._engines = [calibrator.STILL if scene.generator is not None else load_engine(scene.engine.name)]
+        self._engines = [calibrator.STILL if scene.generator else load_engine(scene.engine.name, scene.engine.rolling)]
         self._method = ENGINES[scene.engine.name]
         sensors, self.row_ticks = scene.sensors, scene.row_ticks
         # Steps are as long as may be of those that end on the rows.
@@ -143,13 +143,13 @@ class Simulation:
         )
         self._faulty.check_all(self._pending)
         choice, initial = scene.engine, initial_state(self.model, scene.initial, begin, spin=self._speed())
-        self._motion = Motion(initial, self._step_ticks, self._stride, choice.tolerance)
+        memory = np.zeros(self._engines[0].memory_size)
+        self._motion = Motion(initial, self._step_ticks, self._stride, choice.tolerance, memory)
         self._companion: Motion | None = None
         if choice.companion:
             name, tolerance = choose_companion(choice.name, choice.tolerance, scene.model.friction)
-            self._engines.append(
-                load_engine(name) if name != choice.name and scene.generator is None else self._engines[0]
-            )
+            same = scene.generator is not None or (name, "series") == (choice.name, choice.rolling)
+            self._engines.append(self._engines[0] if same else load_engine(name))
             stride = self.block_ticks // self._step_ticks
             self._companion = Motion(initial.copy(), self._step_ticks, stride, tolerance)
         clearance = self.model.constants.contact.clearance

@@ -31,7 +31,7 @@ SCENE_KEYS = (
     *("duration_s", "seed", "parameters", "channels", "fidelity"),
     *("initial.position", "initial.x_mm", "initial.y_mm", "initial.magnets"),
     *("drive.mode", "drive.speed_hz", "drive.profile"),
-    *("engine.name", "engine.step_us", "engine.tolerance", "engine.companion"),
+    *("engine.name", "engine.step_us", "engine.tolerance", "engine.companion", "engine.rolling"),
     *("model.magnet", "model.shaft", "model.stator", "model.contact", "model.friction"),
     *("sensors.groups", "sensors.rate_hz", "sensors.truth_rate_hz", "sensors.noise", "sensors.chain"),
     *("generator.kind", "generator.amplitude", "generator.amplitude_v", "generator.offset", "generator.offset_v"),

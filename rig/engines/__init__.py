@@ -16,6 +16,7 @@ from functools import partial
 from importlib import import_module
 from typing import Any, NamedTuple
 
+from rig.engines.memory import MEMORY
 from rig.kernels.constants import Constants, Inputs
 
 
@@ -69,13 +70,20 @@ class Engine(NamedTuple):
     start: Callable[..., None]
     advance: Callable[..., None]
     order: int
+    memory_size: int = MEMORY
 
 
-def load_engine(name: str) -> Engine:
-    """The engine of one of those names (imported only now): a module of its own, or a one-step method for the march."""
+def load_engine(name: str, rolling: str = "series") -> Engine:
+    """The engine of one of those names (imported only now): a module of its own, or a one-step method for the march.
+
+    Args:
+        name: Key of `ENGINES`.
+        rolling: `engine.rolling` of a scene; "collocation" loads and compiles kernels that no other run needs.
+    """
     from rig.kernels.records import packed
 
-    module: Any = import_module(f"rig.engines.{name.replace('-', '_')}")
+    place = "split.collocation" if rolling == "collocation" else name.replace("-", "_")
+    module: Any = import_module(f"rig.engines.{place}")
     if hasattr(module, "METHOD"):
         march: Any = import_module("rig.engines.march")
         start, advance = march.start, partial(march.advance, module.METHOD)
@@ -85,4 +93,5 @@ def load_engine(name: str) -> Engine:
     def on_records(kernel: Callable[..., None], constants: Constants, inputs: Inputs, *others: Any) -> None:
         kernel(packed(constants), packed(inputs), *others)
 
-    return Engine(partial(on_records, start), partial(on_records, advance), module.ORDER)
+    size = getattr(module, "MEMORY", MEMORY)
+    return Engine(partial(on_records, start), partial(on_records, advance), module.ORDER, size)

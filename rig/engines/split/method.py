@@ -21,19 +21,19 @@ from rig.engines.taylor.place import END_FRACTION, END_TICK, EVENT, FRACTION, OR
 from rig.kernels.contact import FLIGHT
 from rig.kernels.stage import kernel
 
-__all__ = ["ORDER", "advance", "start"]
+__all__ = ["ORDER", "SHARE", "advance", "go_on", "start"]
 
-_SHARE = 1e-4
+SHARE = 1e-4
 """Part of the tolerance that one step of the series may err by."""
 
 
 def start(constants, inputs, y, memory, step_ticks, tolerance):
     """Prepare the memory for a state."""
-    series.start(constants, inputs, y, memory, step_ticks, _SHARE * tolerance if tolerance > 0.0 else 1e-9)
+    series.start(constants, inputs, y, memory, step_ticks, SHARE * tolerance if tolerance > 0.0 else 1e-9)
 
 
 @kernel
-def _go_on(constants, inputs, plant, memory, room, y):
+def go_on(constants, inputs, plant, memory, room, y):
     """Over what ends a series to the next one; returns whether the numbers are finite."""
     bounced = lasts = False
     ends = memory[SPAN] >= 0.0 and memory[EVENT] == FIRST and memory[PHASE] == FLIGHT
@@ -63,6 +63,6 @@ def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)
         series.begin_series(constants, inputs, memory, room, y, tick, 0.0, False)
     grid, count = (tick, stride * step_ticks, tick + steps * step_ticks), (steps + stride - 1) // stride
     row = series.write_rows(constants, inputs, memory, room.Y, room.dy, room.out, y, grid, 0, rows)
-    while row <= count and _go_on(constants, inputs, plant, memory, room, y):
+    while row <= count and go_on(constants, inputs, plant, memory, room, y):
         row = series.write_rows(constants, inputs, memory, room.Y, room.dy, room.out, y, grid, row, rows)
     rows[row:].fill(np.nan)
