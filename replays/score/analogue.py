@@ -357,7 +357,8 @@ def _is_loud(session: Session, name: str, alignments: Sequence[Alignment]) -> bo
     ends_s = [end for each in alignments for end in each.inside_s]
     rows = [round((each - first_s) * rate_hz) for each in (min(ends_s, default=first_s), max(ends_s, default=first_s))]
     part = sent[max(0, rows[0]) : max(0, rows[1])] if ends_s else sent
-    return len(part) > 1 and float(np.std(part)) > _LOUD * channel.noise_v / abs(channel.sensitivity_v)
+    least = _LOUD * math.hypot(channel.noise_v, channel.lsb_v) / abs(channel.sensitivity_v)
+    return len(part) > 1 and float(np.std(part)) > least
 
 
 def _score_wires(

@@ -16,12 +16,16 @@ _GRAM = 16
 """Consecutive counts that are hashed together: a channel with few levels is then still distinct."""
 _MIN_VOTES = 16
 """Groups that must agree on where the recording begins; chance agreements are single ones."""
+_CANDIDATES, _RIVAL = 8, 0.25
+"""Places that are told, at most, and part of the most votes that each must have."""
 _MAX_HELD = 1 << 20
 """Groups of the shorter side that are held; of a longer one every n-th by its hash is taken on both sides."""
 
 
-def find_begin(recorded: Iterable[np.ndarray], sent: Iterable[np.ndarray], step: int, fewest: int) -> int | None:
-    """Return the place among the sent rows of the first recorded row; negative before the session, None if not found.
+def find_begins(recorded: Iterable[np.ndarray], sent: Iterable[np.ndarray], step: int, fewest: int) -> list[int]:
+    """Return places among the sent rows at which the first recorded row may stand; negative ones before the session.
+
+    The likeliest is first. Where a signal repeats, one that has most rows in common is not always the right one.
 
     Args:
         recorded: Counts of one channel in pieces, int64, each shape (n,).
@@ -33,7 +37,7 @@ def find_begin(recorded: Iterable[np.ndarray], sent: Iterable[np.ndarray], step:
     hashes, rows = (np.concatenate(each) for each in zip(*_groups(recorded, 1, every), strict=True))
     hashes, first = np.unique(hashes, return_index=True)
     if len(hashes) < _MIN_VOTES:
-        return None
+        return []
     rows, pairs = rows[first], [np.empty((0, 2), dtype=np.int64)]
     for there, places in _groups(sent, step, every):
         at = np.minimum(np.searchsorted(hashes, there), len(hashes) - 1)
@@ -41,15 +45,18 @@ def find_begin(recorded: Iterable[np.ndarray], sent: Iterable[np.ndarray], step:
         pairs.append(np.column_stack([rows[at[same]], places[same] - step * rows[at[same]]]))
     at, begins = np.concatenate(pairs).T
     if not len(at):
-        return None
-    _, which, votes = np.unique(begins, return_inverse=True, return_counts=True)
+        return []
+    values, which, votes = np.unique(begins, return_inverse=True, return_counts=True)
     most = which == np.argmax(votes)
     places, first = begins + step * at, int(np.argmin(np.where(most, at, at.max() + 1)))
     # Each lost row moves what follows: a stretch ahead of the longest one tells where it begins, unless it has rows
     # that come again in that one, as what stands before the session may have.
     clear = votes[which] >= max(_MIN_VOTES, 0.01 * votes.max())
     clear &= most | ((at < at[first]) & (places < places[first]))
-    return int(begins[clear][np.argmin(at[clear])]) if clear.any() else None
+    likeliest = begins[clear][np.argmin(at[clear])][None] if clear.any() else begins[:0]
+    others = values[np.argsort(-votes)][: _CANDIDATES if votes.max() >= _MIN_VOTES else 0]
+    others = others[votes[np.searchsorted(values, others)] >= _RIVAL * votes.max()]
+    return list(dict.fromkeys([*likeliest.tolist(), *others.tolist()]))
 
 
 def _groups(pieces: Iterable[np.ndarray], step: int, every: np.uint64) -> Iterator[tuple[np.ndarray, np.ndarray]]:

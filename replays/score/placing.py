@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from replays.score.overlap import find_begin
+from replays.score.overlap import find_begins
 from replays.score.recorded import Recorded
 from replays.score.scale import Scale, find_scale, scales
 from replays.score.sent import Sent, Session
@@ -84,10 +84,13 @@ class _Search:
         start = max(0, begin - (phase - index) % step) // step
         return Taken(scale, step, phase, max(0, -(begin // step)), start, begin)
 
-    def equal(self, name: str, of: str, begin: int, scale: Scale) -> np.ndarray:
-        """Whether the counts of the first rows are equal."""
+    def agreement(self, name: str, of: str, begin: int, scale: Scale) -> tuple[int, float]:
+        """Longest run of the first rows whose counts are equal, without those that stand still, and part of all."""
         values, _, there, _ = self.tried(name, of, begin)
-        return scale.counts(values) == scale.sent(there)
+        same = scale.counts(values) == scale.sent(there)
+        moving = np.concatenate([[0], np.cumsum(np.append(True, np.diff(there) != 0)[: len(there)])])
+        ends = np.concatenate([[-1], np.flatnonzero(~same), [len(same)]])
+        return int((moving[ends[1:]] - moving[ends[:-1] + 1]).max()), float(same.mean()) if len(same) else 0.0
 
     def taken_of(self, name: str, of: str) -> Taken | None:
         """By where its table begins, as far as that is known; else by where its counts are."""
@@ -101,36 +104,34 @@ class _Search:
         def try_begin(begin: int) -> bool:
             values, unit, there, _ = self.tried(name, of, begin)
             if len(values) > 1 and (scale := find_scale(values, unit, there, channel)) is not None:
-                same = self.equal(name, of, begin, scale)
-                placed.append((scale.clean, int(same.sum()), begin, scale))
-                most.append(scale.clean and same.mean() > _MOST_ROWS)
-                return scale.clean and bool(same.all())
+                longest, part = self.agreement(name, of, begin, scale)
+                placed.append((scale.clean, longest, begin, scale))
+                most.append(scale.clean and part > _MOST_ROWS)
+                return scale.clean and part == 1.0
             return False
 
         likely = dict.fromkeys([self.begins.get(table, late[0]), *late, *self.begins.values()])
         if not any(map(try_begin, likely)):
             early, bits = signal.early[:_LOOKED], signal.lost_bits
             there = counts[:, self._session.place(of)] >> bits << bits
-            begin = self._overlapping(name, of, step) if not any(most) else None
+            likely = self._overlapping(name, of, step) if not any(most) else []
             fewest, known = min(len(early), len(there) // step), scales(signal.unit, channel, signal.early, there)
-            found = (find_begin([each.counts(early)], [each.sent(there)], step, fewest) for each in known)
-            begin = next((place for place in found if place is not None), None) if begin is None else begin
-            if begin is not None:
-                try_begin(begin)
+            found = (find_begins([each.counts(early)], [each.sent(there)], step, fewest) for each in known)
+            any(map(try_begin, likely or next((places for places in found if places), [])))
         if not placed:
             return None
         *_, begin, scale = max(placed, key=lambda each: each[:2])
         self.begins.setdefault(table, begin)
         return self.taken(scale, step, begin, channel.group)
 
-    def _overlapping(self, name: str, of: str, step: int) -> int | None:
-        """Where the table begins, by all rows of both; a few of its signals are asked, as each reads both sides."""
+    def _overlapping(self, name: str, of: str, step: int) -> list[int]:
+        """Where the table may begin, by all rows of both; a few of its signals are asked, as each reads both sides."""
         signal, channel = self._recorded[name], self._session.channels[of]
         sent, asked = Sent(self._session, [channel.group]), self._searched.setdefault(id(signal.table), set())
         rows = self._session.rows(channel.group)
         beyond = signal.rows > _LOOKED or rows > len(self.held[channel.group][1])
         if not beyond or name in asked or len(asked) >= _SEARCHED:
-            return None
+            return []
         asked.add(name)
         column, fewest = sent.names.index(of), min(signal.rows, rows // step)
         some = [_sample(part[:, 1]) for part in signal.table.parts([signal.column])]
@@ -138,9 +139,9 @@ class _Search:
         for scale in scales(signal.unit, channel, np.concatenate(some), self.held[channel.group][1][:, column]):
             here = (scale.counts(part[:, 1]) for part in signal.table.parts([signal.column]))
             there = (scale.sent(part[:, column] >> bits << bits) for part in Sent(self._session, [channel.group]))
-            if (begin := find_begin(here, there, step, fewest)) is not None:
-                return begin
-        return None
+            if places := find_begins(here, there, step, fewest):
+                return places
+        return []
 
 
 def settle(
@@ -154,10 +155,15 @@ def settle(
     search, settled, found = _Search(recorded, wires, session), dict[str, Taken](), dict(wires)
     for name, wire in wires.items():
         # Counts are sure where stamps, by which signals are likened, are not: those of a rig that waits for steps.
+        best = -1
         for of in dict.fromkeys(each for each in (wire.channel, name, *wire.rivals) if each in session.channels):
-            if (one := search.taken_of(name, of)) is not None:
-                settled[name] = one
+            if (one := search.taken_of(name, of)) is None:
+                continue
+            longest, part = search.agreement(name, of, one.begin, one.scale)
+            if longest > best or part == 1.0:
+                best, settled[name] = longest, one
                 found[name] = wire if of == wire.channel else replace(wire, channel=of, rivals=())
+            if part == 1.0:
                 break
     # Rows of a table begin together: where one signal is alike from several begins, another one decides.
     for table in {id(recorded[name].table) for name in settled}:
@@ -166,7 +172,7 @@ def settle(
 
         def agreed(begin: int) -> int:
             signals = [(each, found[each].channel, begin, settled[each].scale) for each in names]  # noqa: B023
-            return sum(int(search.equal(*signal).sum()) for signal in signals)
+            return sum(search.agreement(*signal)[0] for signal in signals)
 
         search.begins[table] = max(choices, key=agreed) if choices[1:] else choices[0]
         for name in names:

@@ -292,15 +292,15 @@ def _places(window: _Sent, hashes: np.ndarray, due: int, low: int, high: int) ->
 
 
 def _forget_chance_places(places: np.ndarray, due: int, end: int) -> None:
-    """Take back places of rows behind the last one that was sent, unless many consecutive rows are known again.
+    """Take back places of rows behind the last one that was sent, unless all of them follow earlier rows in long runs.
 
-    What follows a session resembles it where its signal repeats, so that single rows are equal by chance.
+    What follows a session resembles it where its signal repeats, so that many rows are equal by chance.
     """
     after = 0 if due >= end else len(places) if (last := np.flatnonzero(places == end - 1)).size == 0 else last[0] + 1
     rest = places[after:]
-    apart = np.flatnonzero(np.diff(rest, prepend=-3) != 1)
-    lengths = np.diff(np.append(apart, len(rest)))
-    rest[np.repeat(lengths < min(_RUN, len(rest)), lengths)] = -1
+    begins = np.flatnonzero(np.diff(rest, prepend=-3) != 1)
+    if len(rest) and np.diff(np.append(begins, len(rest))).min() < min(_RUN, len(rest)):
+        rest[:] = -1
 
 
 def _by_nearest(places: np.ndarray, rows: np.ndarray, guess: np.ndarray, ranks: dict, start: int) -> None:
