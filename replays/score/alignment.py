@@ -18,6 +18,8 @@ from rig.channels import Channel
 
 _STRETCHES_S = (0.25, 0.03)
 """Lengths of the stretch that is fitted first; the second where clocks are apart, or samples lost, in the first [s]."""
+_NEAR_S = 5e-4
+"""Time about a begin in which a stretch is looked for: correlation with clocks apart is off by so much."""
 _FEWEST = 400
 """Rows of a stretch, at least."""
 _SHARPER = 0.7
@@ -54,7 +56,7 @@ _ROUNDS = 3
 """Searches for begins where the signal repeats, each by the clock that the last one found."""
 _PARTS = 6
 """Parts of a record, of each of which a stretch is compared before all of it is followed."""
-_MOST, _FINER, _LIKE = 1 << 17, 4, 12
+_MOST, _FINER, _LIKE = 1 << 20, 4, 12
 """Samples by which other beginnings are looked for, places between two of them, and how many are told."""
 
 _AS_WELL = 1.3
@@ -182,11 +184,32 @@ def _begin_fits(sources: Sequence[Source], shift_s: float, stretch: tuple[int, i
     return found
 
 
+def _refined_s(one: Source, shift_s: float, stretch: tuple[int, int]) -> float:
+    """Return the begin near another one from which a stretch is explained best [s]."""
+    y, period_s = np.nan_to_num(one.values[slice(*stretch)]), 1.0 / one.rate_hz
+    reach, n = math.ceil(_NEAR_S * one.rate_hz * _FINER), len(y)
+    first_s = one.first_s + stretch[0] * period_s + one.late_s + shift_s
+    grid_s = first_s + np.arange(-reach, _FINER * (n - 1) + reach + 1) * (period_s / _FINER)
+    if grid_s[0] < one.stimulus.span_s[0] or grid_s[-1] > one.stimulus.span_s[1]:
+        return shift_s
+    known, _ = one.stimulus(grid_s)
+    windows = np.lib.stride_tricks.sliding_window_view(known, _FINER * (n - 1) + 1)[:, ::_FINER]
+    spread = np.maximum(windows.std(axis=1), 1e-12 * max(1e-300, float(known.std())))
+    alike = np.abs(windows @ (y - y.mean())) / spread
+    at = np.flatnonzero((alike[1:-1] >= alike[:-2]) & (alike[1:-1] > alike[2:])) + 1
+    at = at[np.argsort(-alike[at])][:_FOLLOWED]
+    shifts = [shift_s, *(shift_s + (at - reach) * period_s / _FINER)]
+    fits = [fit_stretch(one.values, one.times_s, one.stimulus, one.late_s + each, stretch) for each in shifts]
+    left = [math.inf if fit is None else float(np.var(fit.residual)) for fit in fits]
+    return float(shifts[int(np.argmin(left))])
+
+
 def _follow(sources: Sequence[Source], shift_s: float, stretches: Sequence[tuple[int, int]]) -> Alignment | None:
     """The record from one begin."""
     best: tuple[float, tuple[int, int], dict[str, Waveform]] | None = None
-    for stretch in stretches:
-        fits = _begin_fits(sources, shift_s, stretch)
+    near_s = _refined_s(sources[0], shift_s, stretches[0])
+    for stretch, at_s in ((stretches[0], near_s), (stretches[1], shift_s)):
+        fits = _begin_fits(sources, at_s, stretch)
         if fits:
             left = float(
                 np.median([np.std(each.residual) / abs(each.gain) / np.std(each.known) for each in fits.values()])
@@ -227,7 +250,7 @@ def _follow(sources: Sequence[Source], shift_s: float, stretches: Sequence[tuple
 
 
 def _beginnings(values: np.ndarray, first_s: float, found: Waveform, stimulus: Stimulus) -> list[float]:
-    """Return shifts of time after which the known signal is as like a record, by the clock of a fit [s].
+    """Return session less file times at which the known signal is like a record, by the clock of a fit [s].
 
     Record and session need to overlap in part only. Of the begins that leave as little of the rows in both as the best
     one, those with most rows are first; then the others, as they leave little.
@@ -272,13 +295,14 @@ def _beginnings(values: np.ndarray, first_s: float, found: Waveform, stimulus: S
     bend = curve[at - 1] - 2.0 * curve[at] + curve[at + 1]
     aside = 0.5 * (curve[at - 1] - curve[at + 1]) / bend
     peaks = np.minimum(curve[at] - 0.25 * (curve[at - 1] - curve[at + 1]) * aside, 1.0)
-    # A parabola is off its peak by some part of the square of the peak's bend.
+    # A parabola is off its peak by a hundredth of the square of its bend.
     left = (1.0 - peaks) * (power_y / overlap)[at // _FINER]
-    alike = left <= _AS_WELL * left.min(initial=math.inf) + 0.1 * bend**2 * (power_y / overlap)[at // _FINER]
+    alike = left <= _AS_WELL * left.min(initial=math.inf) + 0.01 * bend**2 * (power_y / overlap)[at // _FINER]
     best = np.lexsort((np.where(alike, -overlap[at // _FINER], left), ~alike))[:_LIKE]
-    began_s = first_s + skipped * period_s
-    began_s += float(found.late_at(np.array([began_s]))[0])
-    return (low + (lags[taken][0] + (at[best] + aside[best]) / _FINER) * step_s - began_s).tolist()
+    # Session less file time in the middle of the rows in both, as the clocks are apart.
+    middle = (here + 0.5 * overlap)[at[best] // _FINER]
+    place = middle + lags[taken][0] + (at[best] + aside[best]) / _FINER
+    return (low + place * step_s - first_s - (skipped + middle) * period_s).tolist()
 
 
 def align(sources: Sequence[Source]) -> Alignment | None:
@@ -408,8 +432,8 @@ class _Begins:
         values = np.interp(rows, rows[held], values[held])
         fit = fit_stretch(values, times_s, one.stimulus, curve[0], (0, len(values)))
         whole = np.nan_to_num(one.values, nan=float(np.nanmean(one.values)))
-        shifts = [] if fit is None else _beginnings(whole, one.first_s, fit, one.stimulus)
-        return [alike[0].begin_s + each for each in shifts]
+        late_s = [] if fit is None else _beginnings(whole, one.first_s, fit, one.stimulus)
+        return [each - one.late_s for each in late_s]
 
     def try_all(self, shifts: Sequence[float]) -> None:
         """Try begins until two are alike and leave nothing but noise: first those that leave least of stretches."""
