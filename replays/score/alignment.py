@@ -54,6 +54,8 @@ _WORSE = 2.0
 """Residual power of a stretch over the least one, from which a begin is not followed: the clocks may differ."""
 _ROUNDS = 3
 """Searches for begins where the signal repeats, each by the clock that the last one found."""
+_SOUND_PARTS = 0.25
+"""Quantile of the stretches by which begins are compared: behind a lost sample, the right one explains none."""
 _PARTS = 6
 """Parts of a record, of each of which a stretch is compared before all of it is followed."""
 _MOST, _FINER, _LIKE = 1 << 20, 4, 12
@@ -295,9 +297,9 @@ def _beginnings(values: np.ndarray, first_s: float, found: Waveform, stimulus: S
     bend = curve[at - 1] - 2.0 * curve[at] + curve[at + 1]
     aside = 0.5 * (curve[at - 1] - curve[at + 1]) / bend
     peaks = np.minimum(curve[at] - 0.25 * (curve[at - 1] - curve[at + 1]) * aside, 1.0)
-    # A parabola is off its peak by a hundredth of the square of its bend.
+    # A parabola is off its peak by some part of the square of its bend.
     left = (1.0 - peaks) * (power_y / overlap)[at // _FINER]
-    alike = left <= _AS_WELL * left.min(initial=math.inf) + 0.01 * bend**2 * (power_y / overlap)[at // _FINER]
+    alike = left <= _AS_WELL * left.min(initial=math.inf) + 0.1 * bend**2 * (power_y / overlap)[at // _FINER]
     best = np.lexsort((np.where(alike, -overlap[at // _FINER], left), ~alike))[:_LIKE]
     # Session less file time in the middle of the rows in both, as the clocks are apart.
     middle = (here + 0.5 * overlap)[at[best] // _FINER]
@@ -418,8 +420,9 @@ class _Begins:
 
     @property
     def _settled(self) -> bool:
-        """Whether two begins leave nothing but noise, the DAQ's and the session's."""
-        return self._least < 1.0 and len(self.alike()) > 1
+        """Whether two begins leave nothing but noise, the DAQ's and the session's, and one of them no row unexplained."""
+        alike = self.alike() if self._least < 1.0 else []
+        return len(alike) > 1 and any(each.whole for each in alike)
 
     def repeats(self) -> list[float]:
         """Return shifts at which the known signal repeats, from the best begin [s]."""
@@ -446,7 +449,8 @@ class _Begins:
         if not fresh:
             return
         with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # of stretches that no begin explains
-            worse = np.nanmean(np.log(np.array(self._left) / np.nanmin(self._left, axis=0)), axis=1)[-len(fresh) :]
+            apart = np.log(np.array(self._left[-len(fresh) :]) / np.nanmin(self._left, axis=0))
+            worse = np.nanquantile(apart, _SOUND_PARTS, axis=1)
         for n in np.argsort(np.floor(worse / math.log(_ALIKE)), kind="stable")[:_FOLLOWED]:
             if self._tried and (self._settled or not worse[n] < math.log(_WORSE)):
                 return

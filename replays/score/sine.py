@@ -12,6 +12,8 @@ import numpy as np
 
 HARMONICS = 10
 """The highest harmonic that counts for the total distortion."""
+_PURE = 3e-5
+"""Rest of a formula over its amplitude up to which it is a sine: a fitted clock bends it by 1e-6 and more."""
 _ROUNDS = 20
 _NEIGHBOURS = 17
 """Lines by which the noise at a line is known, to a third."""
@@ -79,7 +81,7 @@ def is_sine(values: np.ndarray, noise: float) -> bool:
     if len(values) < 64 or not spread > 0.0:
         return False
     fit = fit_sine(values)
-    pure = fit.nad < max(noise, 1e-6 * fit.amplitude[0])
+    pure = fit.nad < max(noise, _PURE * fit.amplitude[0])
     return pure and fit.amplitude[0] > fit.nad and 2.0 / len(values) < fit.frequency[0] < 0.49
 
 
