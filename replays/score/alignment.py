@@ -420,7 +420,7 @@ class _Begins:
 
     @property
     def _settled(self) -> bool:
-        """Whether two begins leave nothing but noise, the DAQ's and the session's, and one of them no row unexplained."""
+        """Whether two begins leave nothing but the noise of DAQ and session, and one of them no row unexplained."""
         alike = self.alike() if self._least < 1.0 else []
         return len(alike) > 1 and any(each.whole for each in alike)
 
