@@ -451,7 +451,9 @@ class _Begins:
         with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # of stretches that no begin explains
             apart = np.log(np.array(self._left[-len(fresh) :]) / np.nanmin(self._left, axis=0))
             worse = np.nanquantile(apart, _SOUND_PARTS, axis=1)
-        for n in np.argsort(np.floor(worse / math.log(_ALIKE)), kind="stable")[:_FOLLOWED]:
+        order = np.argsort(np.floor(worse / math.log(_ALIKE)), kind="stable")[:_FOLLOWED].tolist()
+        # The first of all is what the whole record is most like, with the most rows in the session.
+        for n in order if self._tried else [0, *(each for each in order if each)]:
             if self._tried and (self._settled or not worse[n] < math.log(_WORSE)):
                 return
             shift_s = fresh[n]
