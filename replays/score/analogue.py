@@ -127,9 +127,10 @@ def fit_channels(
             remarks.append(f"{name}: the unit {signal.unit or 'is not told'}; taken for {channel.unit}")
         sent, first_s, sent_hz = session.whole(wire.channel)
         formula, rate_hz = formulas.get(wire.channel), signal.rate_hz or sent_hz
-        known_v = math.hypot(channel.noise_v * session.noisy, channel.lsb_v / math.sqrt(12.0))
-        stimulus: Stimulus = Sampled(without_noise(sent, known_v / abs(channel.sensitivity_v)), first_s, sent_hz)
-        if formula is not None:
+        if formula is None:
+            cleaned = without_noise(sent, _known_noise(session, channel))
+            stimulus: Stimulus = Sampled(cleaned, first_s, sent_hz)
+        else:
             stimulus = Exact(formula, (first_s, first_s + len(sent) / sent_hz), rate_hz)
         least = _SEEN * math.hypot(channel.noise_v, channel.lsb_v) / abs(channel.sensitivity_v)
         parts = parts_of[name] = parted(stimulus, rate_hz, sent_hz, least)
@@ -144,12 +145,16 @@ def fit_channels(
             continue
         alignments.append(alignment)
         for source in sources:
-            known_v = math.hypot(source.channel.noise_v * session.noisy, source.channel.lsb_v / math.sqrt(12.0))
-            known = 0.0 if source.wire.channel in formulas else known_v / abs(source.channel.sensitivity_v)
+            known = 0.0 if source.wire.channel in formulas else _known_noise(session, source.channel)
             one = _fit(source, alignment, parts_of[source.name], known)
             if one is not None and (one.good or source.name == source.wire.channel or not source.wire.rivals):
                 found.append(one)
     return found, alignments
+
+
+def _known_noise(session: Session, channel: Channel) -> float:
+    """Return the noise that a channel's samples in the session have, converter included [unit rms]."""
+    return math.hypot(channel.noise_v * session.noisy, channel.lsb_v / math.sqrt(12.0)) / abs(channel.sensitivity_v)
 
 
 def in_unit(signal: Recorded, channel: Channel) -> tuple[np.ndarray, bool]:
