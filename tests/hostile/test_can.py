@@ -404,15 +404,23 @@ class Flood:
             assert time.monotonic() < deadline, "hangs"
             readable, writable, _ = select.select([self._descriptor], [self._descriptor], [], 1.0)
             if readable:
-                self.seen += len(os.read(self._descriptor, 1 << 16))
+                self.seen += len(self._read())
             if writable:
-                rest = rest[os.write(self._descriptor, rest) :]
+                with contextlib.suppress(BlockingIOError):
+                    rest = rest[os.write(self._descriptor, rest) :]
+
+    def _read(self) -> bytes:
+        # A port that gives up what waited throws it away between `select` and here.
+        try:
+            return os.read(self._descriptor, 1 << 16)
+        except BlockingIOError:
+            return b""
 
     def quiet(self, timeout_s: float = 0.3) -> bytes:
         """The last that comes."""
         last = b""
         while select.select([self._descriptor], [], [], timeout_s)[0]:
-            last = (last + os.read(self._descriptor, 1 << 16))[-1000:]
+            last = (last + self._read())[-1000:]
         return last
 
 
