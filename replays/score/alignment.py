@@ -10,6 +10,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from replays.score.repeats import find_repeats
 from replays.score.stimulus import Stimulus
 from replays.score.track import Follower, Track, follow_record
 from replays.score.waveform import Waveform, fit_stretch, fit_waveform
@@ -40,6 +41,8 @@ _WHOLE = 0.999
 """Part of the rows in the session that are explained in a record that lies in it as a whole."""
 _COMPARED = 3
 """Signals by which begins are compared: each costs a fit."""
+_SEARCHED = 2
+"""Of these, signals by which a begin is chosen before its record is followed."""
 _FOLLOWED = 4
 """Begins that are followed with all channels: the nearest ones, half a period later among them."""
 _ALIKE = 1.05
@@ -58,13 +61,8 @@ _SOUND_PARTS = 0.25
 """Quantile of the stretches by which begins are compared: behind a lost sample, the right one explains none."""
 _PARTS = 6
 """Parts of a record, of each of which a stretch is compared before all of it is followed."""
-_MOST, _FINER, _LIKE = 1 << 20, 4, 12
-"""Samples by which other beginnings are looked for, places between two of them, and how many are told."""
-
-_AS_WELL = 1.3
-"""Residual power over the least one, up to which a begin counts as good as the best."""
-_OVERLAP = 0.2
-"""Part of the shorter of record and session in which both must be for a begin."""
+_FINER = 8
+"""Places between two samples at which the begin of a stretch is looked for."""
 
 
 @dataclass
@@ -251,62 +249,6 @@ def _follow(sources: Sequence[Source], shift_s: float, stretches: Sequence[tuple
     )  # fmt: skip
 
 
-def _beginnings(values: np.ndarray, first_s: float, found: Waveform, stimulus: Stimulus) -> list[float]:
-    """Return session less file times at which the known signal is like a record, by the clock of a fit [s].
-
-    Record and session need to overlap in part only. Of the begins that leave as little of the rows in both as the best
-    one, those with most rows are first; then the others, as they leave little.
-
-    Args:
-        values: Of the record, shape (n,).
-        first_s: Time of the first of them by its clock [s].
-        found: A fit of some of them.
-        stimulus: The known signal.
-    """
-    from scipy.signal import correlate
-
-    low, high = stimulus.span_s
-    period_s = (found.times_s[-1] - found.times_s[0]) / (len(found.times_s) - 1)
-    step_s = (1.0 + found.drift) * period_s
-    skipped = max(0, min(round((found.times_s[0] - first_s) / period_s), len(values) - _MOST // 2) - _MOST // 2)
-    y = values[skipped : skipped + _MOST] - values.mean()
-    n, rows = len(y), math.floor((high - low) / step_s)
-    lags = np.arange(1 - n, rows - 1)
-    here, there = np.maximum(0, -lags), np.maximum(0, lags)
-    overlap = np.minimum(n - here, rows - 1 - there)
-    taken = slice(*np.flatnonzero(overlap >= max(_FEWEST, _OVERLAP * min(n, rows)))[[0, -1]] + [0, 1])
-    here, there, overlap = here[taken], there[taken], overlap[taken]
-
-    def power(signal: np.ndarray, begin: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        sums, squares = (np.cumsum(np.concatenate([[0.0], each])) for each in (signal, signal**2))
-        total = sums[begin + overlap] - sums[begin]
-        return total, squares[begin + overlap] - squares[begin] - total**2 / overlap
-
-    total, power_y = power(y, here)
-    likeness = np.zeros((len(overlap), _FINER))
-    for phase in range(_FINER):
-        s, _ = stimulus(low + (np.arange(rows - 1) + phase / _FINER) * step_s)
-        s = s - s.mean()
-        total_s, power_s = power(s, there)
-        alike = correlate(s, y, "full", "fft")[taken] - total * total_s / overlap
-        both = power_y * power_s
-        likeness[:, phase] = alike**2 / np.maximum(both, 1e-12 * both.max())
-    curve = likeness.ravel()
-    at = np.flatnonzero((curve[1:-1] > curve[:-2]) & (curve[1:-1] >= curve[2:])) + 1
-    at = at[curve[at] > _SOUND]
-    bend = curve[at - 1] - 2.0 * curve[at] + curve[at + 1]
-    aside = 0.5 * (curve[at - 1] - curve[at + 1]) / bend
-    peaks = np.minimum(curve[at] - 0.25 * (curve[at - 1] - curve[at + 1]) * aside, 1.0)
-    # A parabola is off its peak by some part of the square of its bend.
-    left = (1.0 - peaks) * (power_y / overlap)[at // _FINER]
-    alike = left <= _AS_WELL * left.min(initial=math.inf) + 0.1 * bend**2 * (power_y / overlap)[at // _FINER]
-    best = np.lexsort((np.where(alike, -overlap[at // _FINER], left), ~alike))[:_LIKE]
-    # Session less file time in the middle of the rows in both, as the clocks are apart.
-    middle = (here + 0.5 * overlap)[at[best] // _FINER]
-    place = middle + lags[taken][0] + (at[best] + aside[best]) / _FINER
-    return (low + place * step_s - first_s - (skipped + middle) * period_s).tolist()
-
-
 def align(sources: Sequence[Source]) -> Alignment | None:
     """Align the signals of one table with the session; None where none of them is found in it."""
     if not sources or len(sources[0].values) < _FEWEST:
@@ -373,10 +315,14 @@ class _Begins:
         self._least = math.inf
 
     def _left_of(self, shift_s: float) -> np.ndarray:
-        """Residual power of the stretches from a begin, nan where nothing explains one."""
-        one = self._one
-        fits = [fit_stretch(one.values, one.times_s, one.stimulus, one.late_s + shift_s, each) for each in self._parts]
-        return np.array([np.nan if fit is None else max(float(np.var(fit.residual)), 1e-300) for fit in fits])
+        """Residual power of the stretches of signals from a begin, nan where nothing explains one, shape (k, n)."""
+        found = np.full((min(_SEARCHED, len(self._compared)), len(self._parts)), np.nan)
+        for n, part in np.ndindex(found.shape):
+            one = self._compared[n]
+            fit = fit_stretch(one.values, one.times_s, one.stimulus, one.late_s + shift_s, self._parts[part])
+            if fit is not None:
+                found[n, part] = max(float(np.var(fit.residual)), 1e-300)
+        return found
 
     def _residual_power(self, found: Alignment, one: Source) -> np.ndarray:
         """Residual power of a signal by block over that of noise; of all where nothing explains it, nan outside."""
@@ -422,10 +368,21 @@ class _Begins:
     def _settled(self) -> bool:
         """Whether two begins leave nothing but the noise of DAQ and session, and one of them no row unexplained."""
         alike = self.alike() if self._least < 1.0 else []
-        return len(alike) > 1 and any(each.whole for each in alike)
+        return len(alike) > 1 and any(each.whole and not self._goes_on(each) for each in alike)
+
+    def _goes_on(self, found: Alignment) -> bool:
+        """Return whether rows before or behind the session, from a begin, are as loud as those in it."""
+        first, last = found.track.inside
+        loud = _LOUD_PART * float(np.nanvar(self._one.values[first:last]))
+        parts = [self._one.values[:first], self._one.values[last:]]
+        return any(len(part) >= _FEWEST and np.nanvar(part) >= loud for part in parts)
 
     def repeats(self) -> list[float]:
-        """Return shifts at which the known signal repeats, from the best begin [s]."""
+        """Return shifts at which the known signal repeats, by all rows and by those that the best begin explains [s].
+
+        A lost sample spoils the likeness of all rows, and the begin that then explains its rows best may leave those
+        before the lost sample outside the session.
+        """
         alike = self.alike()
         if not alike or self._settled:
             return []
@@ -435,7 +392,13 @@ class _Begins:
         values = np.interp(rows, rows[held], values[held])
         fit = fit_stretch(values, times_s, one.stimulus, curve[0], (0, len(values)))
         whole = np.nan_to_num(one.values, nan=float(np.nanmean(one.values)))
-        late_s = [] if fit is None else _beginnings(whole, one.first_s, fit, one.stimulus)
+        if fit is None:
+            return []
+        late_s = [
+            each
+            for first, last in [(0, len(whole)), *([alike[0].track.inside] if self._goes_on(alike[0]) else [])]
+            for each in find_repeats(whole[first:last], one.first_s + first / one.rate_hz, fit, one.stimulus)
+        ]
         return [each - one.late_s for each in late_s]
 
     def try_all(self, shifts: Sequence[float]) -> None:
@@ -450,7 +413,7 @@ class _Begins:
             return
         with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # of stretches that no begin explains
             apart = np.log(np.array(self._left[-len(fresh) :]) / np.nanmin(self._left, axis=0))
-            worse = np.nanquantile(apart, _SOUND_PARTS, axis=1)
+            worse = np.nanmean(np.nanquantile(apart, _SOUND_PARTS, axis=2), axis=1)
         order = np.argsort(np.floor(worse / math.log(_ALIKE)), kind="stable")[:_FOLLOWED].tolist()
         # The first of all is what the whole record is most like, with the most rows in the session.
         for n in order if self._tried else [0, *(each for each in order if each)]:

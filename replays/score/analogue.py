@@ -12,7 +12,7 @@ from replays.score.alignment import Alignment, Source, align
 from replays.score.intervals import sandwich, student
 from replays.score.noise import split_noise
 from replays.score.recorded import Recorded
-from replays.score.rounding import find_step, rounding_errors, widen
+from replays.score.rounding import Converter, find_step, undithered, widen
 from replays.score.scorecard import (
     ANALOGUE,
     FAIL,
@@ -82,7 +82,7 @@ class Fitted:
         known_noise: What the known signal has, by the session's noise and converter [unit rms]; 0 by a formula.
         folds: What is left of the signal above half of the rate, over its part below [1]; None where it has nothing.
         alias: The same as recorded [unit], shape (n,).
-        rounding: Errors that steps larger than the noise may have left in `clean` [unit], shape (m, n).
+        rounding: Converters whose steps the noise does not hide.
     """
 
     name: str
@@ -96,12 +96,17 @@ class Fitted:
     known_noise: float
     folds: Interval | None
     alias: np.ndarray | float
-    rounding: np.ndarray
+    rounding: tuple[Converter, ...]
 
     @property
     def good(self) -> bool:
         """Whether the known signal explains enough of the record."""
         return self.clean.likeness >= _GOOD
+
+    @property
+    def rounded(self) -> str:
+        """A note on rounding that does not average out, if there is any."""
+        return "steps of a converter are larger than its noise" if self.rounding else ""
 
 
 def fit_channels(
@@ -128,7 +133,7 @@ def fit_channels(
         sent, first_s, sent_hz = session.whole(wire.channel)
         formula, rate_hz = formulas.get(wire.channel), signal.rate_hz or sent_hz
         if formula is None:
-            cleaned = without_noise(sent, _known_noise(session, channel))
+            cleaned = without_noise(sent, _converter(session, channel).error)
             stimulus: Stimulus = Sampled(cleaned, first_s, sent_hz)
         else:
             stimulus = Exact(formula, (first_s, first_s + len(sent) / sent_hz), rate_hz)
@@ -145,16 +150,16 @@ def fit_channels(
             continue
         alignments.append(alignment)
         for source in sources:
-            known = 0.0 if source.wire.channel in formulas else _known_noise(session, source.channel)
+            known = None if source.wire.channel in formulas else _converter(session, source.channel)
             one = _fit(source, alignment, parts_of[source.name], known)
             if one is not None and (one.good or source.name == source.wire.channel or not source.wire.rivals):
                 found.append(one)
     return found, alignments
 
 
-def _known_noise(session: Session, channel: Channel) -> float:
-    """Return the noise that a channel's samples in the session have, converter included [unit rms]."""
-    return math.hypot(channel.noise_v * session.noisy, channel.lsb_v / math.sqrt(12.0)) / abs(channel.sensitivity_v)
+def _converter(session: Session, channel: Channel) -> Converter:
+    """Return the converter that a channel's samples in the session went through."""
+    return Converter(abs(channel.scale), channel.noise_v * session.noisy / abs(channel.sensitivity_v))
 
 
 def in_unit(signal: Recorded, channel: Channel) -> tuple[np.ndarray, bool]:
@@ -169,7 +174,7 @@ def in_unit(signal: Recorded, channel: Channel) -> tuple[np.ndarray, bool]:
 
 
 def _fit(
-    source: Source, alignment: Alignment, parts: tuple[Sampled, Sampled, Sampled] | None, known_noise: float
+    source: Source, alignment: Alignment, parts: tuple[Sampled, Sampled, Sampled] | None, known: Converter | None
 ) -> Fitted | None:
     name, channel, stimulus = source.name, source.channel, source.stimulus
     values, times_s, curve = alignment.even(source)
@@ -191,8 +196,10 @@ def _fit(
         alias, amounts = _folded(clean, [each(at_s)[0] for each in parts[1:]])
         folds = _scaled(amounts, 1.0 / abs(low.gain))
         clean = replace(clean, residual=clean.residual - alias)
-    step = max(find_step(source.values), abs(channel.scale) * (known_noise > 0.0))
-    low = widen(low, rounding_errors(low, step))
+    if known and isinstance(stimulus, Sampled):
+        known = replace(known, values=stimulus.nearest(clean.times_s + low.late_at(clean.times_s)))
+    rounding = undithered(clean, find_step(source.values), known)
+    low = widen(low, rounding)
     return Fitted(
         name,
         channel,
@@ -202,10 +209,10 @@ def _fit(
         corner_hz,
         odd,
         values,
-        known_noise,
+        known.error if known else 0.0,
         folds,
         alias,
-        rounding_errors(clean, step),
+        rounding,
     )
 
 
@@ -411,10 +418,10 @@ def _score_fit(card: Scorecard, one: Fitted) -> None:
         card.add(quantity, one.name, estimate, of=channel, unit=channel.unit, note=note)
 
     note = _ODD if one.odd else "" if one.good else f"what was sent explains {max(0.0, one.clean.likeness):.1%} of it"
-    add("gain", None if note else _about(abs(low.gain) - 1.0, low.half[0], 1e6), note)
-    add("offset", _about(low.offset, low.half[1]) if one.good else None)
+    add("gain", None if note else _about(abs(low.gain) - 1.0, low.half[0], 1e6), note or one.rounded)
+    add("offset", _about(low.offset, low.half[1]) if one.good else None, one.rounded)
     # Nothing tells whether the rig's own noise, which is in its samples, was in what the DAQ was given.
-    split = split_noise(one.clean, floor=one.known_noise, steps=bool(len(one.rounding)))
+    split = split_noise(one.clean, floor=one.known_noise, steps=bool(one.rounding))
     noise = split.noise if one.good else split.left
     add("noise", noise)
     add("jitter", _scaled(split.jitter_s, 1e9) if one.good and split.jitter_s is not None else None)

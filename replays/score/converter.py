@@ -10,6 +10,7 @@ import numpy as np
 from replays.score.analogue import Fitted
 from replays.score.crosstalk import find_crosstalk
 from replays.score.nonlinearity import intermodulation, transfer_curve
+from replays.score.rounding import rounding_errors
 from replays.score.scorecard import Interval, Scorecard
 from replays.score.step import BAND, has_steps, step_response
 
@@ -73,7 +74,8 @@ def _score_crosstalk(card: Scorecard, one: Fitted, others: Sequence[Fitted]) -> 
     volts = clean.residual[rows] * abs(one.channel.sensitivity_v)
     size_v = abs(one.channel.sensitivity_v)
     own = [size_v * clean.known[rows], clean.slope[rows]]
-    worst, part = find_crosstalk(volts, own, sources, size_v * one.known_noise, size_v * one.rounding[:, rows])
+    errors = size_v * rounding_errors(clean, one.rounding, rows)
+    worst, part = find_crosstalk(volts, own, sources, size_v * one.known_noise, errors)
     if part is None:
         card.add("crosstalk", one.name, None, of=one.channel, note=f"other signals are the same as {names[worst]}'s")
         return

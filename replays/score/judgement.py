@@ -33,10 +33,13 @@ from replays.score.scorecard import (
 from replays.score.sent import Formula, Session
 from replays.score.wiring import Wire, find_wires
 from rig import units
+from rig.channels import Channel
 from rig.errors import InputError, UnknownNameError, Words
 
 _NEAR = 0.01
 """Part by which the rate of a DAQ that took rows may be off by its stamps."""
+_CLEAR = 0.7
+"""Likeness from which a signal may be of a channel with another kind of unit."""
 _CORE = {"digital": "altered values", "analogue": "gain"}
 """Quantity without which nothing is known of a channel."""
 
@@ -83,7 +86,9 @@ def judge(
     if path != "analogue":
         # Rows of counts come as they were sent, whatever their stamps say: at last they are read without any.
         for trial in (recorded, {name: replace(each, timed=False) for name, each in recorded.items()}):
-            wires = _connect(trial, sent, {name: _near(each.rate_hz or rate, rate) for name, each in trial.items()})
+            wires = _connect(
+                trial, sent, session.channels, {name: _near(each.rate_hz or rate, rate) for name, each in trial.items()}
+            )
             wires, rows = settle(trial, wires, session)
             if 2 * sum(each.scale.known for each in rows.values()) > len(wires):
                 break
@@ -93,7 +98,7 @@ def judge(
     if path == "analogue":
         whole = {name: (values, hz) for name in session.channels for values, _, hz in [session.whole(name)]}
         rates = {name: each.rate_hz or rate for name, each in recorded.items()}
-        wires = _connect(recorded, whole, rates, whole=True)
+        wires = _connect(recorded, whole, session.channels, rates, whole=True)
     if not any(wire.channel for wire in wires.values()):
         raise InputError("FILE", f"a recording of what {session.path.name} has", Words(f"{file}, of which nothing is"))
     for name, wire in wires.items():
@@ -140,12 +145,13 @@ def _near(rate_hz: float, sent_hz: float) -> float:
 
 
 def _connect(
-    recorded: Mapping[str, Recorded], sent: Mapping[str, tuple[np.ndarray, float]], rates: Mapping[str, float],
-    *, whole: bool = False,
+    recorded: Mapping[str, Recorded], sent: Mapping[str, tuple[np.ndarray, float]], channels: Mapping[str, Channel],
+    rates: Mapping[str, float], *, whole: bool = False,
 ) -> dict[str, Wire]:  # fmt: skip
     """Wires of all signals that have values; those that have stamps of their own need not begin with the others.
 
-    The whole record is searched, or its first rows.
+    The whole record is searched, or its first rows. A signal in a unit of another kind than a channel's is of that
+    channel only where it is clearly like it.
     """
     tables: dict[int, dict[str, tuple[np.ndarray, float]]] = {}
     for name, signal in recorded.items():
@@ -153,6 +159,11 @@ def _connect(
             own = id(signal.table) if signal.table.stamped else 0
             tables.setdefault(own, {})[name] = signal.values if whole else signal.early, rates[name]
     wires = {name: wire for part in tables.values() for name, wire in find_wires(part, sent).items()}
+    for name, wire in wires.items():
+        kind = units.kind(recorded[name].unit)
+        other = wire.channel and kind not in ("", "voltage", "number", units.kind(channels[wire.channel].unit))
+        if other and wire.likeness < _CLEAR:
+            wires[name] = replace(wire, channel="", rivals=())
     return {name: wires[name] for name in recorded if name in wires}
 
 

@@ -6,19 +6,25 @@ Where noise is larger than half a step, rounding is white noise (Widrow & Kollar
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 
 from replays.score.intervals import student
 from replays.score.waveform import Waveform
 
-_PHASES = 4
+_PHASES = 8
 """Places of the steps against the signal that are tried: the true one is not known to a part of a step."""
+_TURNS = (0.0, 0.25)
+"""Parts of a step by which the signal's peak is moved as well: two levels need not stand alike in their steps."""
 _HARMONICS = 8
 _DITHERED = 0.5
 """Noise over a step from which the error of rounding is noise: what is left of it is below 1 % of a step."""
 _LOOKED = 1 << 14
+_MOST_ROWS = 1 << 16
+"""Rows by which errors of parameters are estimated."""
 _WHOLE = 1e-3
 """Part of a step by which differences of values may be off whole numbers of it: rounding of the file."""
 
@@ -34,42 +40,81 @@ def find_step(values: np.ndarray) -> float:
     return step if np.abs(apart / step - np.rint(apart / step)).max() < _WHOLE * len(found) ** 0.5 else 0.0
 
 
-def rounding_errors(found: Waveform, step: float) -> np.ndarray:
+@dataclass(frozen=True)
+class Converter:
+    """What is known of a converter whose rounding may show.
+
+    Attributes:
+        step: Of its counts [unit].
+        noise: At its input [unit rms].
+        values: What it made of its input next to the rows of a fit [unit], shape (n,); None of the record's own.
+    """
+
+    step: float
+    noise: float
+    values: np.ndarray | None = None
+
+    @property
+    def error(self) -> float:
+        """Noise and rounding of what came out of it [unit rms]."""
+        return math.hypot(self.noise, self.step / math.sqrt(12.0))
+
+
+def undithered(found: Waveform, step: float, session: Converter | None) -> tuple[Converter, ...]:
+    """Return the converters whose rounding the noise does not hide.
+
+    Args:
+        found: A fit.
+        step: Of the DAQ's converter [unit]; 0 if it has none.
+        session: What the known signal went through; None for one that is known by its formula.
+    """
+    # The sensor's noise is at the input of the DAQ as it was at that of the session's converter.
+    rounding = (step**2 + (session.step**2 if session else 0.0)) / 12.0
+    noise = math.sqrt(max(0.0, float(np.mean(found.residual**2)) - rounding))
+    both = (Converter(step, noise), *((session,) if session else ()))
+    return tuple(each for each in both if each.step > 0.0 and each.noise <= _DITHERED * each.step)
+
+
+def rounding_errors(found: Waveform, converters: Sequence[Converter], rows: slice | np.ndarray) -> np.ndarray:
     """Return the errors that rounding may have left beside the noise of a fit [unit].
 
     Args:
         found: A fit.
-        step: Of the converter [unit]; of the larger one of the DAQ's and the session's.
+        converters: That may have left them.
+        rows: Of the fit.
 
     Returns:
-        Expected error for each of some places of the steps, shape (4, n); (0, n) where noise hides the steps.
+        Expected error for each of some places of the steps, shape (m, n); (0, n) without converters.
     """
-    noise = math.sqrt(max(0.0, float(np.mean(found.residual**2)) - step**2 / 12.0))
-    if step <= 0.0 or noise > _DITHERED * step:
-        return np.empty((0, len(found.residual)))
-    angle = 2.0 * np.pi / step * (found.values - found.residual)
-    errors = np.zeros((_PHASES, len(angle)))
-    for k in range(1, _HARMONICS + 1):
-        size = (-1) ** k * step / (math.pi * k) * math.exp(-2.0 * (math.pi * k * noise / step) ** 2)
-        sine, cosine = np.sin(k * angle), np.cos(k * angle)
-        for n in range(_PHASES):
-            turn = 2.0 * math.pi * k * n / _PHASES
-            errors[n] += size * (sine * math.cos(turn) - cosine * math.sin(turn))
-    return errors
+    fitted = found.values[rows] - found.residual[rows]
+    errors = np.zeros((len(_TURNS) if converters else 0, _PHASES, len(fitted)))
+    for one, (turn, each) in product(converters, zip(_TURNS, errors, strict=False)):
+        values = fitted if one.values is None else one.values[rows]
+        around = values - values.mean()
+        angle = 2.0 * np.pi * (values / one.step + turn * around / max(float(np.abs(around).max()), 1e-300))
+        for k in range(1, _HARMONICS + 1):
+            size = (-1) ** k * one.step / (math.pi * k) * math.exp(-2.0 * (math.pi * k * one.noise / one.step) ** 2)
+            sine, cosine = np.sin(k * angle), np.cos(k * angle)
+            for n in range(_PHASES):
+                shift = 2.0 * math.pi * k * n / _PHASES
+                each[n] += size * (sine * math.cos(shift) - cosine * math.sin(shift))
+    return errors.reshape(-1, len(fitted))
 
 
-def widen(found: Waveform, errors: np.ndarray) -> Waveform:
+def widen(found: Waveform, converters: Sequence[Converter]) -> Waveform:
     """Return a fit whose intervals hold what errors of rounding may have done to its five parameters.
 
     Args:
         found: A fit.
-        errors: That rounding may have left, shape (m, n).
+        converters: Whose rounding may have left errors.
     """
-    if not len(errors):
+    if not converters:
         return found
-    since = found.times_s - found.middle_s
-    late = [found.slope, found.slope * since, found.slope * 0.5 * (since**2 - found.half_s**2 / 3.0)]
-    columns = np.column_stack([found.known, np.ones(len(since)), *(found.gain * each for each in late)])
+    rows = np.unique(np.linspace(0, len(found.residual) - 1, _MOST_ROWS).astype(int))
+    errors = rounding_errors(found, converters, rows)
+    known, slope, since = found.known[rows], found.slope[rows], found.times_s[rows] - found.middle_s
+    late = [slope, slope * since, slope * 0.5 * (since**2 - found.half_s**2 / 3.0)]
+    columns = np.column_stack([known, np.ones(len(since)), *(found.gain * each for each in late)])
     sizes = np.maximum(np.sqrt(np.mean(columns**2, axis=0)), 1e-300)
     moved = np.linalg.lstsq(columns / sizes, errors.T, rcond=None)[0] / sizes[:, None]
     return replace(

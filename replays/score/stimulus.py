@@ -62,6 +62,11 @@ class Sampled:
             slopes[part] = spline(place, nu=1) * (_FINER * self._rate_hz)
         return values, slopes
 
+    def nearest(self, times_s: np.ndarray) -> np.ndarray:
+        """Return the sample next to each of some times [s], shape (n,)."""
+        at = np.rint((times_s - self._first_s) * self._rate_hz).astype(int)
+        return self._values[np.clip(at, 0, len(self._values) - 1)]
+
     def _spline(self, low: int, high: int) -> Any:
         """Of some of the samples, by their place at four times the rate; the last one is kept."""
         from scipy.interpolate import make_interp_spline

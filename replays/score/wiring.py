@@ -14,6 +14,9 @@ _DISTINCT = 0.95
 """What correlates by more than this part of the best is not told from it."""
 _CLEAR = 0.98
 """From which it needs no second look."""
+_QUIET = 1e-4
+"""Power of a stretch over that of the loudest one, from which it is compared in full: behind a hit, what rings on has
+less than a hundredth."""
 _APART, _FAR_S = 3, 5e-3
 """Samples that a signal may be off the others; and where nothing is much like it there, so long [s]."""
 _LAGS = 12
@@ -97,10 +100,16 @@ def find_wires(
     more = {name: _later(wire, here[0]) for name, wire in more.items()}
     alike = [sum(wire.likeness for wire in found.values()) for found in (wires, more)]
     first, second = (more, wires) if alike[1] > alike[0] else (wires, more)
-    return {
-        name: replace(wire, others_s=(second[name].late_s, *second[name].others_s, *wire.others_s))
-        for name, wire in first.items()
-    }
+    found = {}
+    for name, wire in first.items():
+        other = second[name]
+        # Clocks that are apart blur what is fast in the long stretch, and the slower channel beside it is more like it.
+        of = max(wire, other, key=lambda each: each.likeness)
+        found[name] = replace(
+            of, late_s=wire.late_s, own_s=wire.own_s, within_s=wire.within_s,
+            others_s=(other.late_s, *other.others_s, *wire.others_s),
+        )  # fmt: skip
+    return found
 
 
 def _likeness_of(wires: Mapping[str, Wire]) -> float:
@@ -233,7 +242,7 @@ def _lengths(sent: np.ndarray, before: int, n: int) -> np.ndarray:
     power = squares[:, n:] - squares[:, :-n] - (sums[:, n:] - sums[:, :-n]) ** 2 / n
     power = power[:, : before + sent.shape[1]]
     # Where next to nothing was sent, nothing is alike.
-    return np.sqrt(np.maximum(power, np.maximum(1e-2 * power.max(axis=1, keepdims=True), 1e-300)))
+    return np.sqrt(np.maximum(power, np.maximum(_QUIET * power.max(axis=1, keepdims=True), 1e-300)))
 
 
 def _likeness(here: np.ndarray, before: int, there: np.ndarray, lengths: np.ndarray) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from replays.score.intervals import refine, sandwich, student
 from replays.score.limits import load_limits
 from replays.score.noise import split_noise
 from replays.score.recorded import Table
+from replays.score.rounding import Converter, undithered, widen
 from replays.score.scorecard import FAIL, INCONCLUSIVE, PASS, Bounds, Scorecard, judge_row
 from replays.score.sine import fit_sine, quality
 from replays.score.waveform import Waveform
@@ -43,6 +45,31 @@ def _fit(noise: float, jitter_s: float, generator: np.random.Generator, n: int =
         gain=1.0, offset=0.0, late_s=0.0, drift=0.0, bend=0.0, covariance=np.eye(5), freedom=np.ones(5), middle_s=0.0,
         half_s=0.5 * n / 20e3, times_s=times_s, values=residual, known=slope / 6283.0, slope=slope, residual=residual,
     )  # fmt: skip
+
+
+def _two_levels(gain: float, noise: float) -> Waveform:
+    """Return a fit of a square wave of 205 counts whose residual is noise and rounding [count]."""
+    fit = _fit(math.hypot(noise, math.sqrt(1.0 / 12.0)), 0.0, np.random.default_rng(3))
+    known = np.where(np.arange(len(fit.values)) // 37 % 2, 205.0, -205.0)
+    covariance = np.diag([1e-12, 1e-6, 1e-18, 1e-18, 1e-18])
+    return replace(
+        fit, gain=gain, known=known, values=gain * known + fit.residual, slope=0.0 * known + 1.0,
+        covariance=covariance, freedom=np.full(5, 1e4),
+    )  # fmt: skip
+
+
+def test_two_levels_that_a_session_rounded_leave_the_gain_open() -> None:
+    # 204.8 counts, rounded to 205 with noise of a tenth of a step: off by 976 ppm, and by up to 0.4 / 205 from others.
+    fit = _two_levels(204.8 / 205.0, 0.1)
+    session = Converter(1.0, 0.1, values=fit.known)
+    half = widen(fit, undithered(fit, 0.0, session)).half[0]
+    assert 976e-6 < half < 0.5 / 205.0
+
+
+def test_noise_of_a_step_leaves_no_rounding() -> None:
+    fit = _two_levels(1.0, 1.0)
+    assert undithered(fit, 1.0, Converter(1.0, 1.0, values=fit.known)) == ()
+    assert widen(fit, ()) is fit
 
 
 def test_intervals_of_noise_and_jitter_are_two_standard_deviations_to_each_side() -> None:

@@ -26,9 +26,11 @@ def test_a_perfect_daq_passes(number: int, folder: Path) -> None:
     assert (line["outcome"], line["red"]) == ("pass", [])
 
 
-@pytest.mark.parametrize("number", [0, 4, 6, 20])
-def test_one_defect_turns_its_own_quantity_red(number: int, folder: Path) -> None:
-    line = Population("defects", 1, folder).judged(number)
+@pytest.mark.parametrize(
+    ("seed", "number"), [(1, 0), (1, 4), (1, 6), pytest.param(11, 47, id="a doubled sample in a signal that repeats")]
+)
+def test_one_defect_turns_its_own_quantity_red(seed: int, number: int, folder: Path) -> None:
+    line = Population("defects", seed, folder).judged(number)
     assert (line["outcome"], line["right"], line["other"]) == ("fail", True, [])
 
 

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 from replays.score.judgement import judge
+from replays.score.repeats import find_repeats
 from replays.score.scorecard import FAIL, INCONCLUSIVE, PASS, Scorecard
 from replays.score.stimulus import Exact
 from replays.score.track import Follower, Track, follow_record
+from replays.score.waveform import fit_stretch
 from replays.score.wiring import find_wires
 from rig.channels import default_table
 from tests.score_daqs import RATE_HZ, Tones, counts_of, write_parquet, write_session
@@ -166,3 +168,27 @@ def test_exchanged_signals_a_quarter_turn_apart_are_seen() -> None:
         "disk_x": "disk_x", "disk_y": "disk_y", "ring_x": "ring_y", "ring_y": "ring_x",
     }  # fmt: skip
     assert "ring_x" not in wires["ring_x"].rivals
+
+
+def test_what_rings_on_behind_a_hit_is_told_from_a_channel_that_is_nearly_like_it() -> None:
+    time_s = np.arange(20_000) / RATE_HZ
+    ringing = TONES(time_s)
+    hit = np.where((time_s > 0.05) & (time_s < 0.06), 30.0 * np.ptp(ringing), 0.0)
+    near = ringing + 0.3 * np.std(ringing) * np.random.default_rng(4).standard_normal(len(time_s))
+    sent = {"near": (near, RATE_HZ), "struck": (ringing + hit, RATE_HZ)}
+    wire = find_wires({"struck": (ringing[6000:], RATE_HZ)}, sent)["struck"]
+    assert (wire.channel, wire.rivals) == ("struck", ("near",))
+
+
+def test_times_at_which_a_signal_nearly_repeats_come_behind_those_at_which_it_does() -> None:
+    def tones(t: np.ndarray) -> np.ndarray:
+        return np.sin(2.0 * np.pi * 79.0 * t) + np.sin(2.0 * np.pi * 1999.0 * t)
+
+    known, rows = Exact(tones, (0.0, 2.0), RATE_HZ), np.arange(15_000)
+    begin_s = 0.2
+    values = tones(begin_s + rows / RATE_HZ)
+    fit = fit_stretch(values, rows / RATE_HZ, known, begin_s, (5000, 10_000))
+    assert fit is not None
+    found = np.array(find_repeats(values, 0.0, fit, known)[:3])
+    # Half a second later both tones have gone through an odd number of half periods.
+    assert np.sort(found) == pytest.approx([0.2, 0.7, 1.2], abs=1e-5)
