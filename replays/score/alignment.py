@@ -42,7 +42,7 @@ _WHOLE = 0.999
 _COMPARED = 3
 """Signals by which begins are compared: each costs a fit."""
 _SEARCHED = 2
-"""Of these, signals by which a begin is chosen before its record is followed."""
+"""Number of these signals by which a begin is chosen before its record is followed."""
 _FOLLOWED = 4
 """Begins that are followed with all channels: the nearest ones, half a period later among them."""
 _ALIKE = 1.05
@@ -380,7 +380,7 @@ class _Begins:
     def repeats(self) -> list[float]:
         """Return shifts at which the known signal repeats, by all rows and by those that the best begin explains [s].
 
-        A lost sample spoils the likeness of all rows, and the begin that then explains its rows best may leave those
+        A lost sample spoils the correlation of all rows, and the begin that then explains its rows best may leave those
         before the lost sample outside the session.
         """
         alike = self.alike()

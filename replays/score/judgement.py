@@ -39,7 +39,7 @@ from rig.errors import InputError, UnknownNameError, Words
 _NEAR = 0.01
 """Part by which the rate of a DAQ that took rows may be off by its stamps."""
 _CLEAR = 0.7
-"""Likeness from which a signal may be of a channel with another kind of unit."""
+"""Correlation from which a signal may be of a channel with another kind of unit."""
 _CORE = {"digital": "altered values", "analogue": "gain"}
 """Quantity without which nothing is known of a channel."""
 

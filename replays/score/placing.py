@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -153,10 +153,12 @@ def settle(
     that it is named by, or alone is like, with what its unit says of its scale.
     """
     search, settled, found = _Search(recorded, wires, session), dict[str, Taken](), dict(wires)
-    for name, wire in wires.items():
+    asked = list[str]()
+
+    def look(name: str, likely: Iterable[str]) -> None:
         # Counts are sure where stamps, by which signals are likened, are not: those of a rig that waits for steps.
-        best = -1
-        for of in dict.fromkeys(each for each in (wire.channel, name, *wire.rivals) if each in session.channels):
+        best, wire = -1, wires[name]
+        for of in dict.fromkeys(each for each in likely if each in session.channels):
             if (one := search.taken_of(name, of)) is None:
                 continue
             longest, part = search.agreement(name, of, one.begin, one.scale)
@@ -165,6 +167,14 @@ def settle(
                 found[name] = wire if of == wire.channel else replace(wire, channel=of, rivals=())
             if part == 1.0:
                 break
+
+    for name, wire in wires.items():
+        look(name, (wire.channel, name, *wire.rivals))
+    # In a whirl, signals correlate as well with the channels that are a quarter of a turn behind their own.
+    for name in () if settled else list(wires):
+        if settled or len(asked) < _SEARCHED:
+            asked.append(name)
+            look(name, session.channels)
     # Rows of a table begin together: where one signal is alike from several begins, another one decides.
     for table in {id(recorded[name].table) for name in settled}:
         names = [name for name in settled if id(recorded[name].table) == table]

@@ -10,7 +10,7 @@ from replays.score.stimulus import Stimulus
 from replays.score.waveform import Waveform
 
 _MOST, _FINER, _TOLD = 1 << 20, 8, 12
-"""Samples of a record that are compared, places between two of them, and how many times are told."""
+"""Samples of a record that are compared, places between two of them, and how many times are returned."""
 _AS_WELL = 1.3
 """Residual power over the least one, up to which a time counts as good as the best."""
 _OVERLAP, _FEWEST_ROWS = 0.2, 400

@@ -18,7 +18,7 @@ from replays.score.waveform import Waveform
 _PHASES = 8
 """Places of the steps against the signal that are tried: the true one is not known to a part of a step."""
 _TURNS = (0.0, 0.25)
-"""Parts of a step by which the signal's peak is moved as well: two levels need not stand alike in their steps."""
+"""Parts of a step by which the signal's peak is moved as well: two levels may stand differently in their steps."""
 _HARMONICS = 8
 _DITHERED = 0.5
 """Noise over a step from which the error of rounding is noise: what is left of it is below 1 % of a step."""
@@ -42,7 +42,7 @@ def find_step(values: np.ndarray) -> float:
 
 @dataclass(frozen=True)
 class Converter:
-    """What is known of a converter whose rounding may show.
+    """A converter whose rounding may show.
 
     Attributes:
         step: Of its counts [unit].

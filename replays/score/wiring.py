@@ -103,7 +103,7 @@ def find_wires(
     found = {}
     for name, wire in first.items():
         other = second[name]
-        # Clocks that are apart blur what is fast in the long stretch, and the slower channel beside it is more like it.
+        # Clocks that are apart blur fast signals over the long stretch, and a slower channel then correlates better.
         of = max(wire, other, key=lambda each: each.likeness)
         found[name] = replace(
             of, late_s=wire.late_s, own_s=wire.own_s, within_s=wire.within_s,
