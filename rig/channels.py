@@ -113,7 +113,9 @@ class Group(BaseModel, frozen=True, extra="forbid"):
         """
         scale = np.array([channel.scale for channel in self.channels])
         offset = np.array([channel.offset for channel in self.channels])
-        return counts * scale + offset
+        values = counts * scale
+        values += offset
+        return values
 
 
 class ChannelTable(BaseModel, frozen=True, extra="forbid"):

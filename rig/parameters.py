@@ -7,7 +7,8 @@ names a `base` and the values in which it differs. A user's own file works the s
 from __future__ import annotations
 
 import math
-from functools import cache
+from collections.abc import Mapping
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -149,7 +150,13 @@ class ParameterSet:
 
 def set_names() -> list[str]:
     """Names of the sets that come with the rig, the default first."""
-    return sorted((path.stem for path in SETS.glob("*.toml")), key=lambda name: (name != DEFAULT_SET, name))
+    return list(_own_names())
+
+
+@cache
+def _own_names() -> tuple[str, ...]:
+    # Asked for several times by each simulation that is set up, and the files are part of the package.
+    return tuple(sorted((path.stem for path in SETS.glob("*.toml")), key=lambda name: (name != DEFAULT_SET, name)))
 
 
 def load_parameters(name_or_path: str = DEFAULT_SET) -> ParameterSet:
@@ -169,9 +176,31 @@ def load_parameters(name_or_path: str = DEFAULT_SET) -> ParameterSet:
     return _load(name_or_path, "parameters", ())
 
 
+def with_changes(parameters: ParameterSet, changes: Mapping[str, Any], *, source: str) -> ParameterSet:
+    """Return `parameters.override(changes)`, the same object for the same changes of the same set.
+
+    A simulation that is set up asks for its parameters several times.
+
+    Args:
+        parameters: The set.
+        changes: New values by dotted key, as in `ParameterSet.override`.
+        source: Source recorded for the changed values.
+
+    Raises:
+        InputError: Unknown key, or a value outside what the parameter accepts.
+    """
+    # 1, 1.0 and true are equal, and must not be taken for each other.
+    return _overridden(parameters, tuple((key, type(value), value) for key, value in changes.items()), source)
+
+
+@lru_cache(maxsize=16)
+def _overridden(parameters: ParameterSet, changes: tuple[tuple[str, type, Any], ...], source: str) -> ParameterSet:
+    return parameters.override({key: value for key, _, value in changes}, source=source)
+
+
 def _load(name: Any, field: str, loading: tuple[str, ...]) -> ParameterSet:
     """Load a set for a field that names it; `loading` are the files that stand on it."""
-    if isinstance(name, str) and name in set_names():
+    if isinstance(name, str) and name in _own_names():
         return _own_set(name)
     path = Path(name) if isinstance(name, str) else None
     if path is None or path.suffix != ".toml" or not path.is_file():

@@ -113,6 +113,11 @@ def first_row(tick: int, rate_hz: int) -> int:
 
 def lagrange(places: np.ndarray, nodes: Sequence[int] | np.ndarray) -> np.ndarray:
     """Weights of the polynomial through nodes, at places, shape (nodes, places)."""
-    return np.array(
-        [math.prod((places - other) / (node - other) for other in nodes if other != node) for node in nodes]
-    )
+    apart = [places - node for node in nodes]
+    found = np.ones((len(apart), *np.shape(places)))
+    for weight, node in zip(found, nodes, strict=True):
+        for other, distance in zip(nodes, apart, strict=True):
+            if other != node:
+                weight *= distance
+        weight /= math.prod(node - other for other in nodes if other != node)
+    return found

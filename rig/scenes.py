@@ -21,7 +21,7 @@ from rig.generators import Generator, Source, sources
 from rig.kernels.signals import COLUMN
 from rig.levels import ModelLevels
 from rig.outside import Written, check, parse_toml, read_toml, table_in
-from rig.parameters import DEFAULT_SET, ParameterSet, load_parameters
+from rig.parameters import DEFAULT_SET, ParameterSet, load_parameters, with_changes
 from rig.pick import Pick, digest, equations_digest
 from rig.sampling import SensorChoice, check_rates, row_ticks
 from rig.speed_target import Drive
@@ -304,7 +304,7 @@ class Scene(Written):
     def load_parameters(self) -> ParameterSet:
         """The scene's parameters with its own changes applied."""
         parameters = load_parameters(self.parameters)
-        return parameters.override(dict(self.set), source=f"scene {self.name}") if self.set else parameters
+        return with_changes(parameters, self.set, source=f"scene {self.name}") if self.set else parameters
 
 
 def scene_names() -> list[str]:

@@ -257,7 +257,7 @@ def sampled(values: np.ndarray, places: np.ndarray) -> np.ndarray:
     weights = lagrange(np.clip(places, 0.0, len(values) - 1.0) - first, taps)
     found = np.zeros((len(places), values.shape[1]))
     for tap, weight in zip(taps, weights, strict=True):
-        found += weight[:, None] * values[first + tap]
+        found += weight[:, None] * values.take(first + tap, axis=0)
     return found
 
 
@@ -297,6 +297,8 @@ class LeadIns:
         """
         ticks = [round(command.at_s * TICK_RATE_HZ) for command in experiment.scene.commands]
         until = min([until, *ticks, *(command.tick for command in experiment.commands)])
+        if until < simulation.tick + chunk_s * TICK_RATE_HZ:
+            return {}
         alone = experiment.scene.model_copy(update={"commands": ()})
         key = (alone.model_dump_json(), experiment.begin, chunk_s, until)
         if key not in self._kept:
@@ -310,12 +312,11 @@ class LeadIns:
 
 def _lead_in(simulation: Simulation, *, chunk_s: float, until: int) -> tuple[Snapshot, dict[str, list[np.ndarray]]]:
     truth: dict[str, list[np.ndarray]] = {}
-    if until >= simulation.tick + chunk_s * TICK_RATE_HZ:
-        for frame in frames(simulation, chunk_s=chunk_s):
-            for name, block in frame.truth.items():
-                truth.setdefault(name, []).append(block.values)
-            if simulation.tick + frame.ticks > until:
-                break
+    for frame in frames(simulation, chunk_s=chunk_s):
+        for name, block in frame.truth.items():
+            truth.setdefault(name, []).append(block.values)
+        if simulation.tick + frame.ticks > until:
+            break
     return simulation.snapshot(), truth
 
 

@@ -264,7 +264,7 @@ def test_messages_and_requests_to_the_hub_stop_nobody_and_forge_nothing() -> Non
         for example in examples[1:3]:
             example["endpoint"] = sender.name
         secret = bytes.fromhex(villain.secret or "")
-        requests = documents(random, inputs(1500), examples)
+        requests = documents(random, inputs(500), examples)
         got: list[int] = []
         strangers = sent = 0
 

@@ -91,8 +91,12 @@ def test_every_kind_is_looked_at() -> None:
 def test_a_fault_has_its_name(kind: str, numbers: dict[str, Any], tmp_path: Path) -> None:
     channel = SIZES[kind][0]
     pulse = {"at_s": 0.02, "command": "hammer", "force_n": 120.0, "duration_ms": 5.0, "direction": "x"}
-    fault = {"at_s": 0.05, "command": "fault", "channel": channel, "kind": kind, "for_s": 0.4, **numbers}
-    recording = recorded(tmp_path / "a.mcap", "hammer", duration_s=0.6, drive__speed_hz=12.0, commands=[pulse, fault])
+    lasts_s = 0.4 if channel == "keyphasor" else 0.2  # a pulse comes once a turn
+    fault = {"at_s": 0.05, "command": "fault", "channel": channel, "kind": kind, "for_s": lasts_s, **numbers}
+    duration_s = 0.6 if channel == "keyphasor" else 0.3
+    recording = recorded(
+        tmp_path / "a.mcap", "hammer", duration_s=duration_s, drive__speed_hz=12.0, commands=[pulse, fault]
+    )
     told, differ = found_in(recording)
     assert right(told, channel, kind), [(one.name, one.change, one.left) for one in told]
     assert differ == {channel, *([numbers["other"]] if kind == "swap" else [])}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import io
 import os
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from replays.report.canvas import DPI, WIDTH, check_suffix, draw_signals, house_style, new_figure, save
+from replays.report.canvas import DPI, WIDTH, check_suffix, draw_signals, house_style, new_figure, png, save
 from rig.errors import DiskError, InputError
 
 if TYPE_CHECKING:
@@ -47,6 +48,25 @@ def test_pictures_are_as_wide_as_all_with_a_palette(tmp_path: Path) -> None:
         colours = image.getcolors()
         assert colours is not None
         assert 2 <= len(colours) <= 256
+
+
+def test_a_palette_keeps_tints_and_steps_of_a_scale() -> None:
+    from PIL import Image
+
+    figure = new_figure(2.0, "tints")
+    axes = figure.subplots()
+    axes.imshow(np.linspace(0.0, 1.0, 600).reshape(20, 30), cmap="viridis")
+    axes.axvspan(10.0, 20.0, color="#FFF7E6")
+    whole, few = io.BytesIO(), io.BytesIO(png(figure, dpi=60))
+    figure.savefig(whole, format="png", dpi=60)
+    with Image.open(whole) as right, Image.open(few) as found:
+        assert len(found.getcolors() or []) <= 256
+        apart = np.asarray(found.convert("RGB"), int) - np.asarray(right.convert("RGB"), int)
+    assert np.abs(apart).max() <= 24
+    assert np.abs(apart).mean() < 0.5
+    tint = np.all(np.asarray(right.convert("RGB")) == (0xFF, 0xF7, 0xE6), axis=2)
+    assert tint.sum() > 1000
+    assert not apart[tint].any()
 
 
 def test_the_style_is_left_behind() -> None:

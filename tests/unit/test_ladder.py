@@ -246,7 +246,7 @@ def test_a_pick_meets_its_tolerance_as_it_will_run(found: Ladder) -> None:
 
 
 def test_errors_are_the_same_each_time(found: Ladder) -> None:
-    again = search(found.scene, found.tolerances, runs=2)
+    again = search(found.scene, found.tolerances, runs=1)  # how often it is timed changes no error
     single = [[(s.label, s.errors.model, s.passes) for s in ladder.steps if s.stage == "single"]
               for ladder in (found, again)]  # fmt: skip
     assert single[0] == single[1]

@@ -82,9 +82,8 @@ def test_tight_magnets_are_compared_over_the_room_they_leave(capsys: pytest.Capt
     assert found["displacement_mm"][-1] == pytest.approx(found["reach_mm"])
 
 
-@pytest.mark.parametrize("suffix", [".png", ".svg"])
-def test_picture_is_drawn_the_same_each_time(capsys: pytest.CaptureFixture[str], tmp_path: Path, suffix: str) -> None:
-    one, other = tmp_path / f"one{suffix}", tmp_path / f"other{suffix}"
+def test_picture_is_drawn_the_same_each_time(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    one, other = tmp_path / "one.svg", tmp_path / "other.svg"
     assert f"picture  {one}" in run(capsys, "magnets", "--plot", str(one))
     draw(build_model(load_parameters()), other)
     assert one.read_bytes() == other.read_bytes()

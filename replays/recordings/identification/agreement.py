@@ -56,11 +56,16 @@ def by_agreement(
         side = sum(one / scale**2 for one, scale in zip(sides, scales, strict=True))
         if held is not None:
             square, side = square + np.diag(held[1] ** -2.0), side + held[0] * held[1] ** -2.0
-        # In units in which each is 1 of its own: sizes differ by a million.
-        size = 1.0 / np.sqrt(np.maximum(np.diag(square), 1e-300))
-        found = size * np.linalg.lstsq(square * np.outer(size, size), side * size, rcond=1e-14)[0]
+        found = _solve(np.asarray(square), np.asarray(side))
         scales = [max(1.0, rms(z - a @ found)) for z, a in zip(target, columns, strict=True)]
     return found
+
+
+def _solve(square: np.ndarray, side: np.ndarray) -> np.ndarray:
+    """Solve the normal equations `square` x = `side`, shapes (unknowns, unknowns) and (unknowns,)."""
+    # In units in which each is 1 of its own: sizes differ by a million.
+    size: np.ndarray = 1.0 / np.sqrt(np.maximum(np.diag(square), 1e-300))
+    return size * np.linalg.lstsq(square * np.outer(size, size), side * size, rcond=1e-14)[0]
 
 
 def signals_of(parts: Mapping[str, Measured]) -> list[float]:
@@ -217,9 +222,7 @@ def jackknife(
     def step(place: int, one: int) -> np.ndarray:
         kept = [piece for piece in pieces if piece[place] != one]
         square = np.diag(priors**-2.0) + sum(piece[2] for piece in kept)
-        size = 1.0 / np.sqrt(np.diag(square))
-        side = sum(piece[3] for piece in kept)
-        return size * np.linalg.lstsq(square * np.outer(size, size), side * size, rcond=1e-14)[0]
+        return _solve(square, np.asarray(sum(piece[3] for piece in kept)))
 
     return np.max(
         [without_each(np.array([step(place, one) for one in {piece[place] for piece in pieces}])) for place in (0, 1)],
