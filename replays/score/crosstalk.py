@@ -9,6 +9,8 @@ from replays.score.scorecard import Interval
 
 _SEPARATE = 0.01
 """Part of the power of a source that the other signals must leave: below, none of them can be told from it."""
+_NOISE_DOUBT = 2.0
+"""Factor up to which the power of that noise may be larger than its nominal value, as rounding without noise is."""
 _BLOCKS = 64
 """Blocks of a record of which each has a mean and a slope of its own."""
 
@@ -47,6 +49,6 @@ def find_crosstalk(
     value, low, high = simultaneous(parts, np.sqrt(np.diag(covariance)[held]) / sizes, freedom[held])
     # Noise of the own signal, which is in the residual, is in what of a source is not like that signal, too.
     likest = np.abs(likeness[held, len(sources)]) * sizes / max(float(np.std(own[0])), 1e-300)
-    wrong = noise**2 * likest / (own_part * sizes**2)
+    wrong = _NOISE_DOUBT * noise**2 * likest / (own_part * sizes**2)
     wrong += np.max(np.abs(np.reshape(moved, (-1, len(matrix.T)))[:, held]), axis=0, initial=0.0) / sizes
     return int(parts.argmax()), (value, max(0.0, low - float(wrong.max())), high + float(wrong.max()))

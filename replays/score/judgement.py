@@ -133,7 +133,8 @@ def _missing_evidence(card: Scorecard, due: Sequence[str]) -> list[str]:
     for channel in (name for name in due if name not in absent):
         rows = [row for row in card.rows if (row.quantity, row.channel) == (core, signals.get(channel))]
         if not any(row.verdict != INCONCLUSIVE for row in rows):
-            note = next((row.note for row in rows if row.note), "")
+            notes = (row.note or ("its interval crosses the limit" if row.is_known else "") for row in rows)
+            note = next(filter(None, notes), "")
             found.append(f"{channel}: {core} is inconclusive{': ' if note else ''}{note}")
     return found
 

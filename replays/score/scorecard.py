@@ -167,9 +167,14 @@ class ScoreRow:
     run: str = ""
     note: str = ""
 
+    @property
+    def is_known(self) -> bool:
+        """Whether there is a value."""
+        return isinstance(self.value, str) or math.isfinite(self.value)
+
     def cells(self) -> tuple[str, ...]:
         """Quantity, channel, value, interval, unit, limit, verdict."""
-        known = isinstance(self.value, str) or math.isfinite(self.value)
+        known = self.is_known
         exact = self.low == self.high or not known
         digits = 6
         if not exact and math.isfinite(self.high - self.low):  # so many that the two ends differ
