@@ -208,6 +208,13 @@ def test_plan_gives_a_method_only_what_it_takes() -> None:
     assert len(set(tasks)) == len(tasks)
 
 
+@pytest.fixture
+def no_png(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Write an empty file for each PNG: what is drawn is read off the SVG beside it."""
+    monkeypatch.setattr("replays.report.canvas.png", lambda _figure: b"")
+
+
+@pytest.mark.usefixtures("no_png")
 def test_failures_are_drawn_not_dropped(tmp_path: Path) -> None:
     stamp = {"commit": "abc", "date": "2026-01-01", "machine": "m", "versions": "v"}
     blank = {name: None for name in COLUMNS if name not in KEY and name not in ("title", "family")}
@@ -232,6 +239,7 @@ def test_failures_are_drawn_not_dropped(tmp_path: Path) -> None:
     assert "rig chart --somehow" in drawn
 
 
+@pytest.mark.usefixtures("no_png")
 def test_a_bound_is_drawn_and_named_beside_the_method_it_bounds(tmp_path: Path) -> None:
     stamp = {"commit": "abc", "date": "2026-01-01", "machine": "m", "versions": "v"}
     blank = {name: None for name in COLUMNS if name not in KEY and name not in ("title", "family")}
@@ -272,7 +280,9 @@ def test_a_small_chart_end_to_end_resumes_and_says_what_is_missing(
         if len(stopped) == 3:  # after the reference and the first point
             raise KeyboardInterrupt
 
-    first = chart(progress=session.Progress(step=stop))
+    with monkeypatch.context() as patch:
+        patch.setattr(figure, "draw", lambda *_arguments, **_options: [])
+        first = chart(progress=session.Progress(step=stop))
     assert (first.interrupted, first.measured) == (True, 1)
     second = chart()
     assert not second.interrupted
