@@ -28,16 +28,25 @@ COMPILING = "tests/parity/test_compiling.py"
 TOOLS = "tests/house/test_tools.py"
 LONGEST = (
     "tests/unit/test_nuisance.py",
-    "tests/physics/test_identification.py",
+    "tests/unit/test_score.py",
+    "tests/unit/test_score_faults.py",
     "tests/unit/test_paper.py",
-    "tests/unit/test_chart.py",
-    "tests/physics/test_stability.py",
-    "tests/unit/test_laws_command.py",
-    "tests/unit/test_ladder.py",
-    "tests/unit/test_identification.py",
-    "tests/unit/test_validation.py",
-    "tests/hostile/test_files.py",
+    "tests/unit/test_blind_faults.py",
+    "tests/physics/test_identification.py",
     "tests/parity/test_kernels.py",
+    "tests/physics/test_stability.py",
+    "tests/unit/test_identification.py",
+    "tests/unit/test_ladder.py",
+    "tests/unit/test_chart.py",
+    "tests/unit/test_validation.py",
+    "tests/unit/test_channel_faults.py",
+    "tests/physics/test_sweep.py",
+    "tests/hostile/test_files.py",
+    "tests/unit/test_score_population.py",
+    "tests/unit/test_laws_command.py",
+    "tests/physics/test_sessions.py",
+    "tests/unit/test_score_overlap.py",
+    "tests/unit/test_score_bits.py",
 )
 """Modules that take more than 8 s, for which nobody is to wait at the end."""
 _CLOCK = re.compile(r"^pytestmark = .*\bwallclock\b", re.MULTILINE)
