@@ -22,6 +22,8 @@ _TURNS = (0.0, 0.25)
 _HARMONICS = 8
 _DITHERED = 0.5
 """Noise over a step from which the error of rounding is noise: what is left of it is below 1 % of a step."""
+_SMALLEST = 0.05
+"""Step over all that a fit leaves, below which rounding is nothing beside the rest."""
 _LOOKED = 1 << 14
 _MOST_ROWS = 1 << 16
 """Rows by which errors of parameters are estimated."""
@@ -72,7 +74,8 @@ def undithered(found: Waveform, step: float, session: Converter | None) -> tuple
     rounding = (step**2 + (session.step**2 if session else 0.0)) / 12.0
     noise = math.sqrt(max(0.0, float(np.mean(found.residual**2)) - rounding))
     both = (Converter(step, noise), *((session,) if session else ()))
-    return tuple(each for each in both if each.step > 0.0 and each.noise <= _DITHERED * each.step)
+    least = _SMALLEST * float(np.std(found.residual))
+    return tuple(each for each in both if each.step > least and each.noise <= _DITHERED * each.step)
 
 
 def rounding_errors(found: Waveform, converters: Sequence[Converter], rows: slice | np.ndarray) -> np.ndarray:
