@@ -1,4 +1,5 @@
-"""Coverage of the analogue scorecard's intervals: `python -m tests.score_coverage [-n FITS] [--noise NAME ...]`.
+"""Coverage of the analogue scorecard's intervals: `python -m tests.score_coverage [-n FITS] [--first SEED]
+[--noise NAME ...]`.
 
 Fits synthetic DAQs of known gain, offset, clock and so on, whose noise is white, coloured or drifts, and counts the
 95 % intervals that hold the true value. Each fit is a line of a journal, where an interrupted run continues. It prints
@@ -234,15 +235,17 @@ def main(words: list[str] | None = None) -> int:
     """Print the table of coverage; return 1 where the goal is missed."""
     parser = argparse.ArgumentParser(prog="python -m tests.score_coverage", description=(__doc__ or "").split("\n")[0])
     parser.add_argument("-n", type=int, default=FITS, help="fits for each noise")
+    parser.add_argument("--first", type=int, default=0, help="seed of the first fit")
     parser.add_argument("--noise", nargs="*", choices=list(NOISES), default=list(NOISES))
     parser.add_argument("--kind", nargs="*", choices=list(KINDS), default=list(KINDS))
     parser.add_argument("--journal", type=Path, default=Path(tempfile.gettempdir()) / "rig-score-coverage.jsonl")
     asked = parser.parse_args(words)
+    seeds = range(asked.first, asked.first + asked.n)
     lines = asked.journal.read_text(encoding="utf-8").splitlines() if asked.journal.exists() else []
     done = {(line["noise"], line["seed"], line["kind"]): line["found"] for line in map(json.loads, lines)}
     with asked.journal.open("a", encoding="utf-8") as file:
         for noise in asked.noise:
-            for key in [(noise, seed, kind) for seed in range(asked.n) for kind in asked.kind]:
+            for key in [(noise, seed, kind) for seed in seeds for kind in asked.kind]:
                 if key not in done:
                     done[key] = estimates(key[1], noise, [key[2]])
                     line = {"noise": noise, "seed": key[1], "kind": key[2], "found": done[key]}
@@ -250,7 +253,7 @@ def main(words: list[str] | None = None) -> int:
                     file.flush()
     good, by_quantity = True, dict[str, dict[str, list[Estimate]]]()
     for (noise, seed, kind), found in done.items():
-        if noise in asked.noise and kind in asked.kind and seed < asked.n:
+        if noise in asked.noise and kind in asked.kind and seed in seeds:
             for quantity, estimate in found.items():
                 by_quantity.setdefault(quantity, {}).setdefault(noise, []).append(cast(Estimate, tuple(estimate)))
     print(f"{'':16}" + "".join(f"{noise:>14}" for noise in asked.noise))
