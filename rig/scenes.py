@@ -52,7 +52,7 @@ class EngineChoice(Written):
     companion: bool = False
     """A second run at a sixteenth of the tolerance estimates the error; left out: with split only."""
     rolling: Literal["series", "collocation"] = "series"
-    """Method of split for rolling contact: series as for other motion, or long steps of a whirl turn (experimental)."""
+    """Method for rolling contact: long steps of a whirl turn (with split only; its own), or as for other motion."""
 
     @field_validator("name")
     @classmethod
@@ -81,7 +81,7 @@ class EngineChoice(Written):
         name = data.get("name", next(iter(ENGINES))) if isinstance(data, dict) else None
         if not isinstance(name, str) or (method := ENGINES.get(name)) is None:
             return data
-        own = {"step_us": method.step_us, "companion": method.companion, **data}
+        own = {"step_us": method.step_us, "companion": method.companion, "rolling": method.rolling, **data}
         return {**own, "tolerance": data.get("tolerance") or method.tolerance}  # 0 is what recordings of 0.1 say
 
 

@@ -22,7 +22,7 @@ from rig.accuracy import Accuracy, choose_companion
 from rig.channels import ChannelTable
 from rig.commands import ClearCommand, FaultCommand, HammerCommand, ReleaseCommand, SpeedCommand, check_command, refusal
 from rig.engines import ENGINES, load_engine
-from rig.engines.memory import CEILING, CLAMPS, CONTACTS, FLOORED, PEAK_FORCE, STEPS
+from rig.engines.memory import CEILING, CLAMPS, CONTACTS, FLOORED, MEMORY, PEAK_FORCE, ROLLED_S, STEPS
 from rig.errors import InputError, SimulationError, Words
 from rig.faulty import Faulty
 from rig.formula import check_computed, names_in
@@ -86,7 +86,7 @@ class Simulation:
         self.tick_rate_hz = TICK_RATE_HZ
         self._warm = False
         self.model = build_model(scene.load_parameters(), scene.model)
-        self._engines = [calibrator.STILL if scene.generator else load_engine(scene.engine.name, scene.engine.rolling)]
+        self._engines = [calibrator.STILL if scene.generator else load_engine(scene.engine.name)]
         self._method = ENGINES[scene.engine.name]
         sensors, self.row_ticks = scene.sensors, scene.row_ticks
         # Steps are as long as may be of those that end on the rows.
@@ -143,12 +143,12 @@ class Simulation:
         )
         self._faulty.check_all(self._pending)
         choice, initial = scene.engine, initial_state(self.model, scene.initial, begin, spin=self._speed())
-        memory = np.zeros(self._engines[0].memory_size)
+        memory = np.zeros(self._engines[0].memory_size if choice.rolling == "collocation" else MEMORY)
         self._motion = Motion(initial, self._step_ticks, self._stride, choice.tolerance, memory)
         self._companion: Motion | None = None
         if choice.companion:
             name, tolerance = choose_companion(choice.name, choice.tolerance, scene.model.friction)
-            same = scene.generator is not None or (name, "series") == (choice.name, choice.rolling)
+            same = scene.generator is not None or name == choice.name
             self._engines.append(self._engines[0] if same else load_engine(name))
             stride = self.block_ticks // self._step_ticks
             self._companion = Motion(initial.copy(), self._step_ticks, stride, tolerance)
@@ -299,6 +299,7 @@ class Simulation:
         residual, dissipated = float(balance["residual"][0]), float(balance["dissipated"][0])
         memory, warnings = self._motion.memory, list[str]()
         choice = {**self.scene.engine.model_dump(), "step_us": self._step_ticks}
+        rolled = memory[ROLLED_S] * TICK_RATE_HZ / max(self.tick - self._start, 1)
         accuracy = self._accuracy.completed()
         if text := accuracy.warning():
             warnings.append(text)
@@ -329,7 +330,11 @@ class Simulation:
                 "alarm_share": self._method.energy,
             },
             "accuracy": None if self._companion is None else accuracy.document(),
-            "engine": {**choice, "levels": self.scene.model.model_dump()},
+            "engine": {
+                **choice,
+                "rolling_share": min(float(rolled), 1.0),
+                "levels": self.scene.model.model_dump(),
+            },
             "contacts": int(memory[CONTACTS]),
             "peak_normal_force_n": float(memory[PEAK_FORCE]),
             "steps": int(memory[STEPS]),

@@ -18,6 +18,7 @@ from rig.errors import InputError, Words
 from rig.faults import channels_of
 from rig.motion import Begin
 from rig.offline import Run, SentCommand, frames, simulate
+from rig.outside import table_in
 from rig.parameters import DEFAULT_SET, load_parameters, set_names
 from rig.scenes import Scene, change_scene, parse_scene
 from rig.simulation import TICK_RATE_HZ, Frame, Simulation
@@ -63,14 +64,7 @@ class Experiment:
         if not isinstance(document, dict) or not streams:
             raise InputError("file", "a recording of this rig, with the scene it ran and samples", str(recording.path))
         duration_s = max(_end_s(recording), 1.0 / TICK_RATE_HZ)
-        scene = parse_scene(
-            {
-                **document,
-                **recorded_parameters(recording.parameters, document),
-                "duration_s": duration_s,
-                "fidelity": "given",
-            }
-        )
+        scene = parse_scene({**recorded_scene(recording.parameters, document), "duration_s": duration_s})
         sent = [
             SentCommand(one["tick"], one["command"], dict(one["request"]))
             for one in recording.commands
@@ -172,7 +166,19 @@ def _end_s(recording: Recording) -> float:
     return math.floor(max(ends) * TICK_RATE_HZ + 0.5) / TICK_RATE_HZ
 
 
-def recorded_parameters(parameters: dict[str, Any], document: dict[str, Any]) -> dict[str, Any]:
+def recorded_scene(parameters: dict[str, Any], document: dict[str, Any]) -> dict[str, Any]:
+    """Return the document of the scene that made a recording, with the recorded parameters.
+
+    An engine without `rolling` is of a version in which it integrated rolling contact by series.
+
+    Raises:
+        InputError: This version does not know a parameter, or `engine` is not a table.
+    """
+    engine = {"rolling": "series", **table_in(document, "engine")}
+    return {**document, **_recorded_parameters(parameters, document), "engine": engine, "fidelity": "given"}
+
+
+def _recorded_parameters(parameters: dict[str, Any], document: dict[str, Any]) -> dict[str, Any]:
     """The scene's fields that give the recorded parameters, whatever has become of the files that they were from.
 
     Raises:

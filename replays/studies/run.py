@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rig.engines import ENGINES, load_engine
-from rig.engines.memory import MEMORY
 from rig.errors import SimulationError
 from rig.kernels.constants import Constants, Inputs
 from rig.kernels.signals import N_VECTOR
@@ -26,7 +25,7 @@ class Course:
 
     Attributes:
         y: State and integrals now, shape (N_VECTOR,).
-        memory: The engine's memory now, shape (MEMORY,).
+        memory: The engine's memory now, shape (memory_size,).
         tick: Present time, in ticks of the inputs.
         step: Ticks a step.
     """
@@ -54,7 +53,7 @@ class Course:
         method = ENGINES[engine]
         self._engine, self._constants, self._inputs = load_engine(engine), constants, inputs
         self.step, self.tick = step or method.step_us, 0
-        self.y, self.memory = np.zeros(N_VECTOR), np.zeros(MEMORY)
+        self.y, self.memory = np.zeros(N_VECTOR), np.zeros(self._engine.memory_size)
         self.y[: len(y0)] = y0
         tolerance = tolerance or method.tolerance
         self._engine.start(constants, inputs, self.y, self.memory, float(self.step), tolerance)

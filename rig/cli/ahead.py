@@ -32,15 +32,16 @@ def _end(child: subprocess.Popen[bytes]) -> None:
 
 
 def compile_last() -> None:
-    """Compile the series, then the sensors, by calling them as a run does."""
+    """Compile the series, the sensors and rolling by collocation, by calling them as a run does."""
     import numpy as np
 
-    from rig.engines.memory import MEMORY
+    from rig.engines.split.layout import MEMORY
+    from rig.engines.split.rolling import roll
     from rig.engines.taylor.march import room_in
     from rig.engines.taylor.series import rolling, sliding
     from rig.kernels.constants import Inputs
     from rig.kernels.records import packed
-    from rig.kernels.signals import N_ROW
+    from rig.kernels.signals import N_ROW, N_VECTOR
     from rig.sensors.conditioning import Conditioner
     from rig.simulation import Simulation
 
@@ -53,6 +54,8 @@ def compile_last() -> None:
         series(constants, inputs, memory, 0.0, 0.0, 0.0, 0.0, room.Y, room.A, room.B, room.D, room.acc)
     groups, rows = tuple(simulation.table.groups.values()), np.zeros((1000, N_ROW))
     Conditioner(groups, row_rate_hz=40_000, seed=1, noise=True, ideal=False).counts(rows)
+    # With other inputs than the memory holds, it returns at once.
+    roll(packed(simulation.model.constants), packed(quiet), np.zeros(N_VECTOR), memory, (0, 1, 1), 0, rows)
 
 
 def _end_with(parent: int) -> None:

@@ -285,9 +285,11 @@ def _health(health: dict[str, Any]) -> list[tuple[str, str]]:
     figures = [f"{name} {late[name]:.3f}" for name in ("p50", "p99", "max") if isinstance(late.get(name), float | int)]
     if figures:
         rows.append(("lateness", f"the rig's, in ms: {', '.join(figures)}; overruns {status.get('overruns', '?')}"))
-    if isinstance(accuracy := status.get("accuracy"), dict):
-        from rig.cli.status import accuracy_text
+    from rig.cli.status import accuracy_text, engine_text
 
+    if isinstance(engine := status.get("engine"), dict):
+        rows.append(("engine", engine_text(engine)))
+    if isinstance(accuracy := status.get("accuracy"), dict):
         rows.append(("error estimate", f"the rig's: {accuracy_text(accuracy)}"))
     rows += [("doubt", text) for text in health["findings"]]
     return rows + [("doubt", f"the rig warned: {text}") for text in health["warnings"]]

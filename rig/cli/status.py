@@ -123,7 +123,7 @@ def status_table(document: dict[str, Any]) -> Table:
         rows.append(("energy", f"residual {residual}, dissipated {dissipated}"))
     engine, share = document.get("engine") or {}, energy.get("residual_share")
     if engine and share is not None:
-        rows.append(("engine", f"{engine['name']}, {engine['step_us']} us"))
+        rows.append(("engine", engine_text(engine)))
         if accuracy := document.get("accuracy"):
             rows.append(("error estimate", accuracy_text(accuracy)))
         # Reference-free: what the method makes or loses of the energy that it should account for.
@@ -154,6 +154,13 @@ def status_table(document: dict[str, Any]) -> Table:
     for text in document["warnings"]:
         rows.append(("warning", text))
     return facts(f"rig: {document['scene']}, {document['state']}", rows, warning="yellow")
+
+
+def engine_text(engine: dict[str, Any]) -> str:
+    """Return name and step of an engine, and the part of the time in which it rolled by collocation."""
+    share = engine.get("rolling_share")
+    rolled = f", {share:.0%} of the time rolling by collocation" if isinstance(share, float) and share else ""
+    return f"{engine.get('name', '?')}, {engine.get('step_us', '?')} us{rolled}"
 
 
 def accuracy_text(accuracy: dict[str, Any]) -> str:

@@ -35,6 +35,8 @@ class Method(NamedTuple):
     """Share of what was dissipated up to which its ledger may be open."""
     companion: bool = False
     """Whether a run has, unless asked otherwise, a companion that tells its error."""
+    rolling: str = "series"
+    """Method for rolling contact unless asked otherwise."""
 
     @property
     def advice(self) -> str:
@@ -52,6 +54,7 @@ ENGINES = {
         ("none", "smoothed", "exact"),
         ("impact", "compliant"),
         companion=True,
+        rolling="collocation",
     ),
     "rk8": Method("Dormand-Prince 8(5,3), events located", 25, 1e-8, (*_BY_STATE, "exact")),
     "taylor": Method("Taylor series of order 16, events as roots", 25, 1e-9, ("none", "smoothed", "exact")),
@@ -71,19 +74,18 @@ class Engine(NamedTuple):
     advance: Callable[..., None]
     order: int
     memory_size: int = MEMORY
+    """Of `split` with room for rolling by collocation; in one of size MEMORY it rolls by series."""
 
 
-def load_engine(name: str, rolling: str = "series") -> Engine:
+def load_engine(name: str) -> Engine:
     """The engine of one of those names (imported only now): a module of its own, or a one-step method for the march.
 
     Args:
         name: Key of `ENGINES`.
-        rolling: `engine.rolling` of a scene; "collocation" loads and compiles kernels that no other run needs.
     """
     from rig.kernels.records import packed
 
-    place = "split.collocation" if rolling == "collocation" else name.replace("-", "_")
-    module: Any = import_module(f"rig.engines.{place}")
+    module: Any = import_module(f"rig.engines.{name.replace('-', '_')}")
     if hasattr(module, "METHOD"):
         march: Any = import_module("rig.engines.march")
         start, advance = march.start, partial(march.advance, module.METHOD)

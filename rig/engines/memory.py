@@ -18,6 +18,8 @@ TOLERANCE, SIZE = 11, 12
 """Scaled error a step that is asked for; length proposed for the next part [ticks]."""
 BEFORE, BEFORE_SPAN, LAST = 13, 14, 15
 """Normal force before the last [N], time between both [ticks], last normal force [N]."""
-OWN = 16
+ROLLED_S = 16
+"""Time in which contact that rolls was integrated by collocation [s]."""
+OWN = 17
 """From here on an engine's own."""
 MEMORY = 1280

@@ -13,13 +13,13 @@ import pytest
 
 from recorder.reader import Recording
 from recorder.session import RecordingSession
-from replays.recordings.experiment import Experiment
+from replays.recordings.experiment import Experiment, recorded_scene
 from replays.recordings.export import write_run
 from rig import wire
 from rig.errors import InputError
 from rig.offline import SentCommand, frames
 from rig.pacing import Lockstep
-from rig.scenes import load_scene
+from rig.scenes import load_scene, parse_scene
 from rig.service import Service
 from rig.simulation import Simulation
 from rig.transport.memory import MemoryClient, MemoryServer
@@ -72,6 +72,20 @@ def test_a_set_of_the_rigs_own_is_named_as_it_was(tmp_path: Path) -> None:
     recording = _record(tmp_path / "a.mcap", "drop", {"parameters": "as-printed", "duration_s": 0.05})
     scene = Experiment.of(recording).scene
     assert (scene.parameters, scene.set) == ("as-printed", {})
+
+
+def test_a_recording_without_a_method_for_rolling_was_made_by_series() -> None:
+    simulation = Simulation(load_scene("hammer"))
+    parameters, document = simulation.parameters_document(), simulation.scene_document()["scene"]
+
+    def rolling(engine: Any) -> str:
+        return parse_scene(recorded_scene(parameters, {**document, "engine": engine})).engine.rolling
+
+    now = document["engine"]
+    before = {key: value for key, value in now.items() if key != "rolling"}
+    assert (rolling(now), rolling(before), rolling({"name": "rk8"})) == ("collocation", "series", "series")
+    with pytest.raises(InputError, match=r"engine must be a table of named fields; instead received 'split'"):
+        rolling("split")
 
 
 def test_changes_are_of_the_scene_or_its_parameters(tmp_path: Path) -> None:

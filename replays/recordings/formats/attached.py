@@ -8,7 +8,7 @@ from datetime import datetime
 from typing import Any, NamedTuple
 
 from recorder import documents
-from replays.recordings.experiment import recorded_parameters
+from replays.recordings.experiment import recorded_scene
 from replays.recordings.formats.source import DOCUMENTS, Source
 from rig.channels import Channel
 from rig.commands import COMMANDS, check_command
@@ -57,7 +57,7 @@ def attached(source: Source) -> Attached:
 def _experiment(told: dict[str, Any], recorded: dict[str, Any], source: Source) -> list[str]:
     if (document := told.get("scene")) is None:
         return []
-    scene = parse_scene({**document, **recorded_parameters(recorded, document), "fidelity": "given"})
+    scene = parse_scene(recorded_scene(recorded, document))
     name = scene.name if scene.name in scene_names() else _OTHERWISE
     base = load_scene(name)
     lines = [f"scene = {_toml(name)}"]

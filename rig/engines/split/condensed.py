@@ -29,7 +29,7 @@ _ITERATIONS = 8
 """Most iterations; three are usual."""
 _SLOW = 0.4
 """Least contraction with an inverse that was made for an earlier step."""
-_FORCE_FLOOR_N = 100.0
+FORCE_FLOOR_N = 100.0
 """Least force that errors of the force are compared with, as in `rig.accuracy`."""
 _MAX_UNLOADING = 0.9
 """Part of the preload that nodes may take off a transducer: it may be more between them."""
@@ -81,7 +81,6 @@ def rolling_in(memory):
     )
 
 
-@kernel
 def body_matrices(constants, inputs):
     """Return matrices of shaft x, shaft y and spin, shape (3, 2, 2), and of housings x and y, shape (2, 4, 4)."""
     levels, shaft, magnet, house = constants.levels, constants.shaft, constants.magnet, constants.house
@@ -108,15 +107,14 @@ def body_matrices(constants, inputs):
     return shafts, houses
 
 
-@kernel
-def set_step(constants, inputs, rolling, h):
-    """Responses of the linear bodies over steps of a length [s]."""
+def set_step(constants, inputs, memory):
+    """Make the responses of the linear bodies over steps of the length in the memory."""
     shafts, houses = body_matrices(constants, inputs)
-    per_inner = 1.0 / constants.house.inner_mass if constants.levels.inner_house else 0.0
-    for body in range(3):
-        collocate(shafts[body], 1, 1.0, h, rolling.shaft_free[body], rolling.shaft_forced[body])
-    for i in range(2):
-        collocate(houses[i], 2, -per_inner, h, rolling.house_free[i], rolling.house_forced[i])
+    per_inner, h = 1.0 / constants.house.inner_mass if constants.levels.inner_house else 0.0, memory[layout.STEP_S]
+    responses = [collocate(Z, 1, 1.0, h) for Z in shafts], [collocate(Z, 2, -per_inner, h) for Z in houses]
+    parts = [part.ravel() for bodies in responses for kind in zip(*bodies, strict=True) for part in kind]
+    memory[layout.SHAFT_FREE : layout.INVERSES] = np.concatenate(parts)
+    memory[layout.WAITS] = 0.0
 
 
 @kernel
@@ -185,7 +183,7 @@ def _state_at(m, i):
 
 
 @stage
-def _root_of_law(load, guess, exponent):
+def root_of_law(load, guess, exponent):
     """Penetration^exponent = load, by Halley's steps from a guess where the exponent is 1.5."""
     if load <= 0.0:
         return 0.0
@@ -225,12 +223,19 @@ def _evaluate_node(constants, inputs, m, h, i):
 
 
 @stage
+def linear_part(constants, inputs):
+    """Return stiffness [1/s^2] and damping x, y [1/s] of the shaft's linear bodies, and the spin's damping [1/s]."""
+    shaft, magnet = constants.shaft, constants.magnet
+    lever = shaft.arm_magnet * shaft.arm_magnet / shaft.transverse_inertia if inputs.magnet_engaged else 0.0
+    gain = 0.0 if inputs.ideal_drive else constants.torque_gain / shaft.polar_inertia
+    return magnet.stiffness * lever, magnet.damping_x * lever, magnet.damping_y * lever, gain
+
+
+@stage
 def _evaluate_nodes(constants, inputs, m, h):
     """Residuals at the nodes, and what the used accelerations lack; returns whether all are finite."""
-    shaft, magnet, contact = constants.shaft, constants.magnet, constants.contact
-    lever = shaft.arm_magnet * shaft.arm_magnet / shaft.transverse_inertia if inputs.magnet_engaged else 0.0
-    stiffness, damping_x, damping_y = magnet.stiffness * lever, magnet.damping_x * lever, magnet.damping_y * lever
-    gain = 0.0 if inputs.ideal_drive else constants.torque_gain / shaft.polar_inertia
+    shaft, contact = constants.shaft, constants.contact
+    stiffness, damping_x, damping_y, gain = linear_part(constants, inputs)
     known = 0.0
     for i in range(STAGES):
         state, _, _, _, _, motion = _evaluate_node(constants, inputs, m, h, i)
@@ -240,7 +245,7 @@ def _evaluate_nodes(constants, inputs, m, h):
         m[_RHO_S + i] = motion.ddth + gain * state.dth - m[_AS + i]
         slope = contact.damping_factor / m[ONSET]
         ratio, load = 1.0 + slope * rate, m[FN + i] - contact.viscous_damping * rate
-        z = _root_of_law(load / (contact.stiffness * ratio), m[_Z + i], contact.exponent)
+        z = root_of_law(load / (contact.stiffness * ratio), m[_Z + i], contact.exponent)
         m[_Z + i] = z
         by_force = z / (contact.exponent * load)
         m[_BY_FORCE + i] = by_force
@@ -282,7 +287,7 @@ def _make_inverse(constants, inputs, m, rolling, h, inverse):
     arm = shaft.arm_ring * shaft.arm_ring / shaft.transverse_inertia
     both = constants.contact.gap_counts_outer
     spin = 0.0 if inputs.ideal_drive else shaft.radius * shaft.radius / shaft.polar_inertia
-    turned, J = np.zeros((n, 2 * n)), np.zeros((2 * n, 2 * n))
+    turned, J = np.zeros(2 * n * n).reshape((n, 2 * n)), np.zeros(4 * n * n).reshape((2 * n, 2 * n))
     for direction in range(2):
         shaft_q, shaft_v = rolling.shaft_forced[direction, 0], rolling.shaft_forced[direction, 1]
         house = rolling.house_forced[direction]
@@ -423,12 +428,16 @@ def _tail(m, row):
 
 @kernel
 def estimate(m):
-    """Error of a solved step: what the last polynomials add to the force, over the largest, and to the inner house."""
-    force = _FORCE_FLOOR_N
+    """Error of a solved step: what the last polynomials add to the force [N]; the same over the largest force [1].
+
+    The second is that of the inner house's speed where that is larger.
+    """
+    force = FORCE_FLOOR_N
     for i in range(STAGES):
         force = max(force, abs(m[FN + i]))
     house = max(_tail(m, _VXI), _tail(m, _VYI)) / S.STATE_SCALE[S.VX_IH]
-    return max(max(_tail(m, FN), _tail(m, FT)) / force, house)
+    added = max(_tail(m, FN), _tail(m, FT))
+    return added, max(added / force, house)
 
 
 @stage

@@ -19,12 +19,14 @@ NORMAL_X, NORMAL_Y = HARDEST + 8, HARDEST + 9
 """Contact normal at the start of the turn."""
 LAST_UNKNOWNS = HARDEST + 10
 """Unknowns at the end of the last step, by the contact normal there, shape (6,)."""
-ROLLING_STEPS, ROLLING_S = HARDEST + 16, HARDEST + 17
-"""Steps of rolling by collocation, and the time that they cover [s]."""
+ROLLING_STEPS, WAITS = HARDEST + 16, HARDEST + 17
+"""Steps of rolling by collocation; whether the responses over a step of another length are to be made."""
 
 MAX_PLACES = 48
 """Most steps a turn: over-damped contacts need them from a first guess."""
-NODE_VALUES = HARDEST + 18
+START_FORCE = HARDEST + 18
+"""Normal force at the start of the step [N]."""
+NODE_VALUES = HARDEST + 19
 """State and integrals at the start of the step and at its nodes, shape (STAGES + 1, N_VECTOR)."""
 SHAFT_FREE = NODE_VALUES + (STAGES + 1) * S.N_VECTOR
 SHAFT_FORCED = SHAFT_FREE + 3 * 4 * STAGES

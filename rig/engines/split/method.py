@@ -3,6 +3,8 @@
 A step of theirs may err by a ten-thousandth of `engine.tolerance`: impacts make small errors a thousand times larger.
 Through flight they last for milliseconds, through an impact there are some eleven of them.
 
+Rolling that lasts goes over to collocation (`rig.engines.split.rolling`), whose kernels compile when it first does.
+
 A rigid contact is a chain of impacts, one by one where the gap closes (`rig.engines.split.rigid`); where it lasts, it
 is the compliant one.
 """
@@ -13,27 +15,28 @@ import numpy as np
 from numba import njit
 
 from rig.engines.memory import ONSET, PHASE
-from rig.engines.split.place import HARDEST
+from rig.engines.split.layout import MEMORY, PLACES, READY_TICK
+from rig.engines.split.place import HARDEST, SHARE
 from rig.engines.split.rigid import bounce, plant_of
+from rig.engines.split.rolling import may_roll, roll, watch_for_rolling
 from rig.engines.taylor import march as series
 from rig.engines.taylor.events import FIRST
 from rig.engines.taylor.place import END_FRACTION, END_TICK, EVENT, FRACTION, ORDER, SPAN, TICK
 from rig.kernels.contact import FLIGHT
 from rig.kernels.stage import kernel
 
-__all__ = ["ORDER", "SHARE", "advance", "go_on", "start"]
-
-SHARE = 1e-4
-"""Part of the tolerance that one step of the series may err by."""
+__all__ = ["MEMORY", "ORDER", "advance", "start"]
 
 
 def start(constants, inputs, y, memory, step_ticks, tolerance):
     """Prepare the memory for a state."""
     series.start(constants, inputs, y, memory, step_ticks, SHARE * tolerance if tolerance > 0.0 else 1e-9)
+    if len(memory) == MEMORY:
+        memory[READY_TICK] = -1.0
 
 
 @kernel
-def go_on(constants, inputs, plant, memory, room, y):
+def _go_on(constants, inputs, plant, memory, room, y):
     """Over what ends a series to the next one; returns whether the numbers are finite."""
     bounced = lasts = False
     ends = memory[SPAN] >= 0.0 and memory[EVENT] == FIRST and memory[PHASE] == FLIGHT
@@ -55,14 +58,42 @@ def go_on(constants, inputs, plant, memory, room, y):
 
 
 @njit(cache=True, error_model="numpy", fastmath=False, nogil=True)
-def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows):
-    """See `rig.engines`."""
+def _march(constants, inputs, y, memory, tick, fraction, grid, row, rows):
+    """Take series up to the end of the grid, or up to where rolling may go over to collocation.
+
+    Where none is at hand, the first begins from the state y at a whole tick and the ticks beyond it.
+
+    Returns:
+        Number of the next row: behind the end, unless the state y is one to roll on from.
+    """
     constants, inputs = constants[0], inputs[0]
-    plant, room = plant_of(constants, inputs), series.room_in(memory)
+    plant, room, collocates = plant_of(constants, inputs), series.room_in(memory), len(memory) == MEMORY
     if not series.same_inputs(inputs, memory) or memory[SPAN] < 0.0:
-        series.begin_series(constants, inputs, memory, room, y, tick, 0.0, False)
-    grid, count = (tick, stride * step_ticks, tick + steps * step_ticks), (steps + stride - 1) // stride
-    row = series.write_rows(constants, inputs, memory, room.Y, room.dy, room.out, y, grid, 0, rows)
-    while row <= count and go_on(constants, inputs, plant, memory, room, y):
+        series.begin_series(constants, inputs, memory, room, y, tick, fraction, False)
+    first, every, end = grid
+    count = (end - first + every - 1) // every
+    while True:
         row = series.write_rows(constants, inputs, memory, room.Y, room.dy, room.out, y, grid, row, rows)
-    rows[row:].fill(np.nan)
+        if row > count:
+            return row
+        if collocates and may_roll(memory):
+            series.read_off(memory, room.Y, y, memory[END_TICK], memory[END_FRACTION])
+            series.begin_series(constants, inputs, memory, room, y, int(memory[END_TICK]), memory[END_FRACTION], False)
+            return row
+        if not _go_on(constants, inputs, plant, memory, room, y):
+            rows[row:].fill(np.nan)
+            return count + 1
+        if collocates:
+            watch_for_rolling(constants, memory, room.Y[0])
+
+
+def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows):
+    """See `rig.engines`: rolling by collocation where the memory has room for it, else by series."""
+    grid, count = (tick, stride * step_ticks, tick + steps * step_ticks), -(-steps // stride)
+    rolls = len(memory) == MEMORY and memory[PLACES] > 0.0
+    row = roll(constants, inputs, y, memory, grid, 0, rows) if rolls else 0
+    while row <= count:
+        at = (int(memory[END_TICK]), memory[END_FRACTION]) if row else (tick, 0.0)
+        row = _march(constants, inputs, y, memory, *at, grid, row, rows)
+        if row <= count:
+            row = roll(constants, inputs, y, memory, grid, row, rows)

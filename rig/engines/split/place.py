@@ -6,3 +6,6 @@ from rig.engines.taylor.place import SERIES_END
 
 HARDEST = SERIES_END
 """Speed of the hardest rigid impact so far [m/s]."""
+
+SHARE = 1e-4
+"""Part of the tolerance that one step of the series may err by."""

@@ -84,13 +84,13 @@ def invert(matrix, n):
     Returns:
         False where it has none.
     """
-    order = np.empty(n, np.int64)
+    order = np.empty(n)
     for k in range(n):
         pivot = k
         for i in range(k + 1, n):
             if abs(matrix[i, k]) > abs(matrix[pivot, k]):
                 pivot = i
-        order[k] = pivot
+        order[k] = float(pivot)
         value = matrix[pivot, k]
         if not abs(value) > 0.0:
             return False
@@ -107,45 +107,28 @@ def invert(matrix, n):
                 for j in range(n):
                     matrix[i, j] -= factor * matrix[k, j]
     for k in range(n - 1, -1, -1):
-        pivot = order[k]
+        pivot = int(order[k])
         if pivot != k:
             for i in range(n):
                 matrix[i, k], matrix[i, pivot] = matrix[i, pivot], matrix[i, k]
     return True
 
 
-@kernel
-def collocate(Z, driven, gain, h, free, forced):
-    """Responses of a linear body over a step.
+def collocate(Z, driven, gain, h):
+    """Return the responses of a linear body over a step, sums in the order of the loops: the same bits everywhere.
 
     Args:
         Z: Matrix of the body, shape (n, n).
         driven: Component whose rate u drives.
         gain: Rate of that component per u.
         h: Length of the step [s].
-        free: Node values per initial component, out, shape (n, n, STAGES): component, initial component, node.
-        forced: Node values per u at a node, out, shape (n, STAGES, STAGES): component, node of u, node.
+
+    Returns:
+        Node values per initial component, shape (n, n, STAGES): component, initial component, node; node values per u
+        at a node, shape (n, STAGES, STAGES): component, node of u, node.
     """
     n = len(Z)
-    size = n * STAGES
-    K = np.zeros((size, size))
-    for c in range(n):
-        for i in range(STAGES):
-            K[c * STAGES + i, c * STAGES + i] = 1.0
-            for d in range(n):
-                for j in range(STAGES):
-                    K[c * STAGES + i, d * STAGES + j] -= h * INTEGRALS[i, j] * Z[c, d]
-    invert(K, size)
-    for c in range(n):
-        for i in range(STAGES):
-            row = c * STAGES + i
-            for d in range(n):
-                total = 0.0
-                for j in range(STAGES):
-                    total += K[row, d * STAGES + j]
-                free[c, d, i] = total
-            for j in range(STAGES):
-                total = 0.0
-                for k in range(STAGES):
-                    total += K[row, driven * STAGES + k] * INTEGRALS[k, j]
-                forced[c, j, i] = gain * h * total
+    K = np.eye(n * STAGES) - h * np.kron(Z, INTEGRALS)
+    invert(K, len(K))
+    K = K.reshape((n, STAGES, n, STAGES))
+    return np.einsum("cidj->cdi", K), gain * h * np.einsum("cik,kj->cji", K[:, :, driven], INTEGRALS)

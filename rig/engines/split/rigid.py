@@ -42,6 +42,7 @@ class Motion(NamedTuple):
     ny: float
     rate: float  # of the penetration [m/s]
     sliding: float  # speed of the shaft's surface across [m/s]
+    distance: float  # between both centres [m]
 
 
 class Plant(NamedTuple):
@@ -110,7 +111,7 @@ def motion_of(constants, axis, w, y):
     nx, ny = ex * per_distance, ey * per_distance
     vx = lA * axis.px - y[S.VX_IH] - both * y[S.VX_OH]
     vy = lA * axis.py - y[S.VY_IH] - both * y[S.VY_OH]
-    return Motion(nx, ny, vx * nx + vy * ny, vy * nx - vx * ny + constants.shaft.radius * w)
+    return Motion(nx, ny, vx * nx + vy * ny, vy * nx - vx * ny + constants.shaft.radius * w, distance)
 
 
 @kernel
@@ -125,7 +126,7 @@ def mobility_of(plant, euler, axis, nx, ny):
 
 
 @kernel
-def _strike(constants, inputs, plant, y, axis, w, motion, m, jn, jt):
+def strike(constants, inputs, plant, y, axis, w, motion, m, jn, jt):
     """Impulses jn, normal, and jt, across [N s], on the state y and in its integrals."""
     shaft, euler = constants.shaft, constants.levels.euler
     uz, share = upright(euler, axis)
@@ -193,5 +194,5 @@ def bounce(constants, inputs, plant, memory, room, y):
         way = mu if motion.sliding > 0.0 else -mu
         jn = change / (m.nn + way * m.nt)
         jt = way * jn
-    _strike(constants, inputs, plant, y, axis, w, motion, m, jn, jt)
+    strike(constants, inputs, plant, y, axis, w, motion, m, jn, jt)
     return True

@@ -14,18 +14,22 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numba import njit
 
 from rig.engines.events import note_force
-from rig.engines.memory import CONTACT_STEPS, EVALUATIONS, ONSET, PHASE, STEPS, TOLERANCE
+from rig.engines.memory import CONTACT_STEPS, EVALUATIONS, ONSET, PEAK_FORCE, PHASE, ROLLED_S, STEPS, TOLERANCE
 from rig.engines.method import fill, rates
 from rig.engines.split.condensed import (
     FN,
+    FORCE_FLOOR_N,
     FT,
     FX,
     N_UNKNOWNS,
-    body_matrices,
     estimate,
     keeps_rolling,
+    linear_part,
+    rolling_in,
+    root_of_law,
     set_step,
     solve_step,
     write_nodes,
@@ -38,18 +42,19 @@ from rig.engines.split.layout import (
     PLACE,
     PLACES,
     READY_TICK,
-    ROLLING_S,
     ROLLING_STEPS,
+    START_FORCE,
     STEP_S,
     TURNS,
+    WAITS,
     WHIRL_RATE,
     WORST,
 )
-from rig.engines.split.method import SHARE
+from rig.engines.split.place import SHARE
 from rig.engines.split.radau import NODES, STAGES, interpolation
-from rig.engines.split.rigid import axis_at, motion_of
+from rig.engines.split.rigid import axis_at, mobility_of, motion_of, plant_of, strike
 from rig.engines.taylor.events import NOTHING
-from rig.engines.taylor.march import holds
+from rig.engines.taylor.march import holds, same_inputs, write_row
 from rig.engines.taylor.place import EAST, END_FRACTION, END_TICK, EVENT, FRACTION, INPUTS, NORTH, SPAN, TICK
 from rig.kernels import signals as S
 from rig.kernels.contact import ROLLING
@@ -59,15 +64,15 @@ _LADDER = (2, 3, 4, 6, 8, 12, 16, 24, MAX_PLACES)
 """Steps a turn."""
 _LONGEST_TURN_S = 0.1
 """A contact that takes longer to go round does not whirl."""
-_ORDER = 4.5
-"""Power of the step that the estimate is proportional to, as measured in settled whirl: a sum over harmonics."""
+_ORDER = 7.0
+"""Power of the step that the estimate is proportional to: 4.5 to 8, as measured in settled whirl."""
 _SPARE = 0.3
 """Part of the limit that the estimate may come to with fewer steps."""
 _ITERATED = 0.02
 """Change of the force, over the largest, at which iterations stop, over the tolerance."""
-_REJECTED = 10.0
+_REJECTED = 2.0
 """Estimate over its limit from which a step is taken again, shorter."""
-_STATE_GAIN = 10.0
+_STATE_GAIN = 15.0
 """Scaled state error over the square of the relative force estimate, as measured in settled whirl."""
 
 
@@ -90,11 +95,11 @@ def _hammer_within(inputs, tick, fraction, ticks):
 
 
 @kernel
-def _set_places(constants, inputs, memory, rolling, places, turns):
+def _set_places(memory, places, turns):
     """Take `places` steps a turn from now on."""
     memory[PLACES], memory[PLACE], memory[TURNS], memory[WORST] = places, 0.0, turns, 0.0
     memory[STEP_S] = 2.0 * math.pi / abs(memory[WHIRL_RATE]) / places
-    set_step(constants, inputs, rolling, memory[STEP_S])
+    memory[WAITS] = 1.0
 
 
 @kernel
@@ -128,24 +133,24 @@ def may_roll(memory):
 
 
 @kernel
-def enter_rolling(constants, inputs, memory, rolling, room, y):
+def _enter(constants, inputs, memory, rolling, dy, out, y):
     """Prepare rolling by collocation from the state y at the end of a series; returns whether it can be tried."""
     nx, ny, rate = _normal_and_rate(constants, y)
     if not abs(rate) > 2.0 * math.pi / _LONGEST_TURN_S:
         _wait(constants, memory, y, memory[END_TICK])
         return False
-    dy, out, tick, phase = room.dy, room.out, int(memory[END_TICK]), int(memory[PHASE])
+    tick, phase = int(memory[END_TICK]), int(memory[PHASE])
     rates(constants, inputs, tick, memory[END_FRACTION], memory[ONSET], phase, True, y, dy, out)
-    shafts, _ = body_matrices(constants, inputs)
-    ax = dy[S.BETA_RATE] - shafts[0, 1, 0] * y[S.BETA] - shafts[0, 1, 1] * y[S.BETA_RATE]
-    ay = -(dy[S.GAMMA_RATE] - shafts[1, 1, 0] * y[S.GAMMA] - shafts[1, 1, 1] * y[S.GAMMA_RATE])
+    stiffness, damping_x, damping_y, gain = linear_part(constants, inputs)
+    ax = dy[S.BETA_RATE] + stiffness * y[S.BETA] + damping_x * y[S.BETA_RATE]
+    ay = -(dy[S.GAMMA_RATE] + stiffness * y[S.GAMMA] + damping_y * y[S.GAMMA_RATE])
     last = memory[LAST_UNKNOWNS : LAST_UNKNOWNS + N_UNKNOWNS]
     last[0], last[1] = -out[S.NORMAL_FORCE], -out[S.FRICTION_FORCE]
     last[2], last[3] = ax * nx + ay * ny, ay * nx - ax * ny
-    last[4] = dy[S.THETA_RATE] - shafts[2, 1, 1] * y[S.THETA_RATE]
+    last[4] = dy[S.THETA_RATE] + gain * y[S.THETA_RATE]
     last[5] = out[S.PENETRATION]
     memory[WHIRL_RATE] = rate
-    _set_places(constants, inputs, memory, rolling, MAX_PLACES, 0)
+    _set_places(memory, float(MAX_PLACES), 0.0)
     fill(rolling.Y[STAGES], y)
     return True
 
@@ -189,9 +194,10 @@ def _keep(m, rolling, nx, ny):
     """Keep the unknowns of a step, as seen from the contact normal at its start, and those of its last node."""
     place, last = int(m[PLACE]), STAGES - 1
     _turn_unknowns(m, nx, -ny)
-    rolling.history[2, place] = rolling.history[1, place]
-    rolling.history[1, place] = rolling.history[0, place]
-    rolling.history[0, place] = m[FX : FX + N_UNKNOWNS * STAGES].reshape((N_UNKNOWNS, STAGES))
+    first, second, third = rolling.history[0, place], rolling.history[1, place], rolling.history[2, place]
+    for p in range(N_UNKNOWNS):
+        for i in range(STAGES):
+            third[p, i], second[p, i], first[p, i] = second[p, i], first[p, i], m[FX + p * STAGES + i]
     # From the normal at the start to that at the end.
     Fx, Fy = m[FX + last], m[FX + STAGES + last]
     Fn, Ft = m[FN + last], m[FT + last]
@@ -204,13 +210,15 @@ def _keep(m, rolling, nx, ny):
 
 
 @kernel
-def _coarsen(constants, inputs, memory, rolling, places):
+def _coarsen(memory, rolling, places):
     """Go over to fewer steps a turn; predictions by the polynomials of the last turn."""
     before, h = int(memory[PLACES]), memory[STEP_S]
     old = rolling.history[1]
-    old[:before] = rolling.history[0, :before]
+    for place in range(before):
+        for p in range(N_UNKNOWNS):
+            fill(old[place, p], rolling.history[0, place, p])
     # The turn as the contact has really taken.
-    _set_places(constants, inputs, memory, rolling, places, 1)
+    _set_places(memory, float(places), 1.0)
     ratio, rate, weights = before / places, memory[WHIRL_RATE], np.empty(STAGES + 1)
     for place in range(places):
         for i in range(STAGES):
@@ -230,67 +238,78 @@ def _coarsen(constants, inputs, memory, rolling, places):
 
 
 @kernel
-def _choose_places(constants, inputs, memory, rolling):
+def _choose_places(memory, rolling):
     """At the end of a turn, as many steps for the next as its estimate asks for; returns whether there are as many."""
     places, worst, wanted = memory[PLACES], memory[WORST], memory[PLACES]
     if worst > 1.0:
-        return _refine(constants, inputs, memory, rolling)
+        return _refine(memory)
     for fewer in _LADDER:
         if 0.5 * places <= fewer < wanted and worst * (places / fewer) ** _ORDER < _SPARE:
             wanted = fewer
     if wanted < places:
-        _coarsen(constants, inputs, memory, rolling, int(wanted))
+        _coarsen(memory, rolling, int(wanted))
     memory[WORST] = 0.0
     return True
 
 
 @kernel
-def _refine(constants, inputs, memory, rolling):
+def _refine(memory):
     """Go over to more steps a turn; returns False where there are no more."""
     for places in _LADDER:
         if places > memory[PLACES]:
-            _set_places(constants, inputs, memory, rolling, places, 0)
+            _set_places(memory, float(places), 0.0)
             return True
     return False
 
 
 @kernel
-def next_step(constants, inputs, memory, rolling):
-    """Take the next step of rolling by collocation, from the last node on.
-
-    Returns:
-        False where none is taken: a series has to continue from the state in the first row of Y.
-    """
-    Y, tolerance, tick_s = rolling.Y, memory[TOLERANCE] / SHARE, memory[INPUTS]
+def _begin_step(constants, memory, rolling):
+    """Go over to the next step, from the last node on; returns False where a turn asks for too many steps."""
+    Y = rolling.Y
     fill(Y[0], Y[STAGES])
     memory[TICK], memory[FRACTION] = memory[END_TICK], memory[END_FRACTION]
+    if memory[PLACE] > 0.0:
+        return True
     nx, ny, _ = _normal_and_rate(constants, Y[0])
-    if memory[PLACE] == 0.0:
-        if memory[TURNS] > 0.0:
-            # The turn as the contact takes it.
-            behind = math.atan2(
-                ny * memory[NORMAL_X] - nx * memory[NORMAL_Y], nx * memory[NORMAL_X] + ny * memory[NORMAL_Y]
-            )
-            turn_s = memory[PLACES] * memory[STEP_S]
-            memory[WHIRL_RATE] = (math.copysign(2.0 * math.pi, memory[WHIRL_RATE]) + behind) / turn_s
-            if not _choose_places(constants, inputs, memory, rolling):
-                return False
-        memory[NORMAL_X], memory[NORMAL_Y] = nx, ny
+    if memory[TURNS] > 0.0:
+        # The turn as the contact takes it.
+        behind = math.atan2(
+            ny * memory[NORMAL_X] - nx * memory[NORMAL_Y], nx * memory[NORMAL_X] + ny * memory[NORMAL_Y]
+        )
+        turn_s = memory[PLACES] * memory[STEP_S]
+        memory[WHIRL_RATE] = (math.copysign(2.0 * math.pi, memory[WHIRL_RATE]) + behind) / turn_s
+        if not _choose_places(memory, rolling):
+            return False
+    memory[NORMAL_X], memory[NORMAL_Y] = nx, ny
+    return True
+
+
+@kernel
+def _take_step(constants, inputs, memory, rolling):
+    """Take the step that has begun.
+
+    Returns:
+        False where it is not taken: a series has to continue from its start, unless responses are waited for.
+    """
+    tolerance, tick_s = memory[TOLERANCE] / SHARE, memory[INPUTS]
+    nx, ny, _ = _normal_and_rate(constants, rolling.Y[0])
     goal = min(max(_ITERATED * tolerance, 1e-10), 1e-5)
     limit = math.sqrt(tolerance / _STATE_GAIN)
     while True:
         h = memory[STEP_S]
-        if _hammer_within(inputs, memory[TICK], memory[FRACTION], h / tick_s):
+        if memory[WAITS] > 0.0 or _hammer_within(inputs, memory[TICK], memory[FRACTION], h / tick_s):
             return False
         _predict(memory, rolling, nx, ny)
         place, made = int(memory[PLACE]), memory[TURNS] > 0.0
         iterations = solve_step(constants, inputs, memory, rolling, h, place, made, goal)
         memory[EVALUATIONS] += STAGES * max(iterations, 1)
         if iterations > 0:
-            worst = estimate(memory) / limit
+            force, relative = estimate(memory)
+            # Rows between the nodes hold what the polynomial of the force says.
+            worst = max(relative / limit, force / (tolerance * max(memory[PEAK_FORCE], FORCE_FLOOR_N)))
             if worst < _REJECTED:
                 break
-        if not _refine(constants, inputs, memory, rolling):
+        if not _refine(memory):
             return False
         memory[NORMAL_X], memory[NORMAL_Y] = nx, ny
     if memory[PLACES] == MAX_PLACES and worst > 1.0:
@@ -299,6 +318,7 @@ def next_step(constants, inputs, memory, rolling):
     if not keeps_rolling(constants, memory):
         return False
     memory[WORST] = max(memory[WORST], worst)
+    memory[START_FORCE] = -memory[LAST_UNKNOWNS]
     _keep(memory, rolling, nx, ny)
     _finish(memory, h)
     return True
@@ -314,7 +334,7 @@ def _finish(memory, h):
     memory[STEPS] += 1.0
     memory[CONTACT_STEPS] += 1.0
     memory[ROLLING_STEPS] += 1.0
-    memory[ROLLING_S] += h
+    memory[ROLLED_S] += h
     memory[PLACE] += 1.0
     if memory[PLACE] == memory[PLACES]:
         memory[PLACE], memory[TURNS] = 0.0, min(memory[TURNS] + 1.0, 3.0)
@@ -324,33 +344,95 @@ def _finish(memory, h):
 
 
 @kernel
-def leave_rolling(constants, memory, rolling, y):
-    """Leave collocation: the state that a series has to continue from, into y."""
-    memory[PLACES], memory[SPAN] = 0.0, -1.0
-    fill(y, rolling.Y[0])
-    _wait(constants, memory, y, memory[END_TICK])
+def _match_force(constants, memory, y, force):
+    """Move the shaft of the state y to where the normal law gives the force that is interpolated itself.
+
+    The law makes newtons of the hundredth of a micrometre by which the polynomials of the motion err between nodes.
+    """
+    contact, shaft = constants.contact, constants.shaft
+    axis, w = axis_at(constants, y)
+    motion = motion_of(constants, axis, w, y)
+    gap = motion.distance - contact.clearance
+    ratio = 1.0 + contact.damping_factor / memory[ONSET] * motion.rate
+    load = force - contact.viscous_damping * motion.rate
+    closer = (gap - root_of_law(load / (contact.stiffness * ratio), gap, contact.exponent)) / shaft.arm_ring
+    y[S.BETA] -= closer * motion.nx
+    y[S.GAMMA] += closer * motion.ny
 
 
 @kernel
-def write_rolling_rows(constants, inputs, memory, Y, dy, out, y, grid, row, rows):
+def _write_rows(constants, inputs, memory, Y, dy, out, y, grid, row, rows):
     """As `rig.engines.taylor.march.write_rows`, of the step at hand."""
     first, every, end = grid
     now, weights = min(first + row * every, end), np.empty(STAGES + 1)
-    phase = int(memory[PHASE])
     while holds(memory, now, 0.0):
         part = ((now - memory[TICK]) - memory[FRACTION]) * memory[INPUTS] / memory[SPAN]
         interpolation(True, min(max(part, 0.0), 1.0), weights)
-        y[: S.N_VECTOR] = 0.0
-        for i in range(STAGES + 1):
-            weight = weights[i]
-            for k in range(S.N_VECTOR):
-                y[k] += weight * Y[i, k]
-        if row < len(rows):
-            rates(constants, inputs, now, 0.0, memory[ONSET], phase, True, y, dy, out)
-            fill(rows[row, : S.N_VECTOR], y)
-            fill(rows[row, S.N_VECTOR :], out)
+        force = weights[0] * memory[START_FORCE]
+        for i in range(STAGES):
+            force += weights[i + 1] * memory[FN + i]
+        for k in range(S.N_VECTOR):
+            y[k] = 0.0
+            for i in range(STAGES + 1):
+                y[k] += weights[i] * Y[i, k]
+        _match_force(constants, memory, y, force)
+        write_row(constants, inputs, memory, now, dy, out, y, row, rows)
         row += 1
         if now == end:
             break
         now = min(first + row * every, end)
+    return row
+
+
+@kernel
+def _leave(constants, inputs, memory, y):
+    """Leave collocation at the state y, from which a series has to continue.
+
+    A series keeps the sliding speed that it begins with. Newton's method and the polynomials between nodes leave some,
+    which an impulse takes away.
+    """
+    memory[PLACES], memory[SPAN] = 0.0, -1.0
+    plant, (axis, w) = plant_of(constants, inputs), axis_at(constants, y)
+    motion = motion_of(constants, axis, w, y)
+    mobility = mobility_of(plant, constants.levels.euler, axis, motion.nx, motion.ny)
+    strike(constants, inputs, plant, y, axis, w, motion, mobility, 0.0, motion.sliding / mobility.tt)
+
+
+@njit(cache=True, error_model="numpy", fastmath=False, nogil=True)
+def _roll(constants, inputs, y, memory, grid, row, rows, begun):
+    """As `roll`, up to where responses are waited for; `begun`: they have been, in the step at hand."""
+    constants, inputs = constants[0], inputs[0]
+    rolling, dy, out = rolling_in(memory), np.empty(S.N_VECTOR), np.full(S.N_OBSERVED, np.nan)
+    if not same_inputs(inputs, memory):
+        _leave(constants, inputs, memory, y)
+        return row
+    if memory[PLACES] == 0.0 and not _enter(constants, inputs, memory, rolling, dy, out, y):
+        return row
+    first, every, end = grid
+    count = (end - first + every - 1) // every
+    while True:
+        if memory[SPAN] >= 0.0 and not begun:
+            row = _write_rows(constants, inputs, memory, rolling.Y, dy, out, y, grid, row, rows)
+            if row > count:
+                return row
+        taken = (begun or _begin_step(constants, memory, rolling)) and _take_step(constants, inputs, memory, rolling)
+        begun = False
+        if not taken:
+            if memory[WAITS] == 0.0:
+                fill(y, rolling.Y[0])
+                _leave(constants, inputs, memory, y)
+                _wait(constants, memory, y, memory[END_TICK])
+            return row
+
+
+def roll(constants, inputs, y, memory, grid, row, rows):
+    """Roll on by collocation, from the step at hand or from the state y at the end of a series.
+
+    Returns:
+        Number of the next row: behind the end, unless a series has to continue from the state y.
+    """
+    row = _roll(constants, inputs, y, memory, grid, row, rows, False)
+    while memory[WAITS] > 0.0:
+        set_step(constants[0], inputs[0], memory)
+        row = _roll(constants, inputs, y, memory, grid, row, rows, True)
     return row

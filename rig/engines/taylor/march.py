@@ -368,6 +368,15 @@ def begin_series(constants, inputs, memory, room, y, tick, fraction, leaves):
 
 
 @kernel
+def write_row(constants, inputs, memory, now, dy, out, y, row, rows):
+    """Write the row of the state y at a tick, where `rows` has room for it."""
+    if row < len(rows):
+        rates(constants, inputs, now, 0.0, memory[ONSET], int(memory[PHASE]), True, y, dy, out)
+        fill(rows[row, : S.N_VECTOR], y)
+        fill(rows[row, S.N_VECTOR :], out)
+
+
+@kernel
 def write_rows(constants, inputs, memory, Y, dy, out, y, grid, row, rows):
     """The rows that lie on the series at hand, and the state at the last of them into y.
 
@@ -392,11 +401,7 @@ def write_rows(constants, inputs, memory, Y, dy, out, y, grid, row, rows):
     now = min(first + row * every, end)
     while holds(memory, now, 0.0):
         read_off(memory, Y, y, now, 0.0)
-        if row < len(rows):
-            phase = int(memory[PHASE])
-            rates(constants, inputs, now, 0.0, memory[ONSET], phase, True, y, dy, out)
-            fill(rows[row, : S.N_VECTOR], y)
-            fill(rows[row, S.N_VECTOR :], out)
+        write_row(constants, inputs, memory, now, dy, out, y, row, rows)
         row += 1
         if now == end:
             break

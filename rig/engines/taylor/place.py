@@ -16,7 +16,7 @@ KNOWN = OWN + 10
 NORTH, EAST = OWN + 13, OWN + 14
 """Which transducer of a pair has lost its preload: 0, or the sign of the displacement."""
 INPUTS = OWN + 15
-SERIES = OWN + 32
+SERIES = OWN + 31
 
 ORDER = 16
 """Of every series. From 12 to 18 the speed at equal error is the same within a tenth, through impacts and whirl; an
