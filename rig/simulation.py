@@ -148,8 +148,7 @@ class Simulation:
         self._companion: Motion | None = None
         if choice.companion:
             name, tolerance = choose_companion(choice.name, choice.tolerance, scene.model.friction)
-            same = scene.generator is not None or name == choice.name
-            self._engines.append(self._engines[0] if same else load_engine(name))
+            self._engines.append(self._engines[0] if scene.generator or name == choice.name else load_engine(name))
             stride = self.block_ticks // self._step_ticks
             self._companion = Motion(initial.copy(), self._step_ticks, stride, tolerance)
         clearance = self.model.constants.contact.clearance
@@ -298,8 +297,8 @@ class Simulation:
         balance = energy_balance(last[None, :], first)
         residual, dissipated = float(balance["residual"][0]), float(balance["dissipated"][0])
         memory, warnings = self._motion.memory, list[str]()
-        choice = {**self.scene.engine.model_dump(), "step_us": self._step_ticks}
-        rolled = memory[ROLLED_S] * TICK_RATE_HZ / max(self.tick - self._start, 1)
+        share = min(float(memory[ROLLED_S]) * TICK_RATE_HZ / max(self.tick - self._start, 1), 1.0)
+        choice = {**self.scene.engine.model_dump(), "step_us": self._step_ticks, "rolling_share": share}
         accuracy = self._accuracy.completed()
         if text := accuracy.warning():
             warnings.append(text)
@@ -330,11 +329,7 @@ class Simulation:
                 "alarm_share": self._method.energy,
             },
             "accuracy": None if self._companion is None else accuracy.document(),
-            "engine": {
-                **choice,
-                "rolling_share": min(float(rolled), 1.0),
-                "levels": self.scene.model.model_dump(),
-            },
+            "engine": {**choice, "levels": self.scene.model.model_dump()},
             "contacts": int(memory[CONTACTS]),
             "peak_normal_force_n": float(memory[PEAK_FORCE]),
             "steps": int(memory[STEPS]),
