@@ -68,7 +68,7 @@ def demo(
     console.print(verdict_table(verdict))
     if verdict.remark:
         console.print(Text(verdict.remark, "yellow"))
-    say(f"verdict: {'good' if verdict.good else 'NOT GOOD'}")
+    say(f"verdict: {'pass' if verdict.good else 'fail'}")
     echo(f"\nrecording   {file}\npicture     {picture}\nlook at it  rig view {file}   (or: rerun {file})")
     if not verdict.good:
         raise typer.Exit(1)
@@ -175,7 +175,7 @@ def verdict_table(verdict: Verdict) -> Table:
 
     texts = ("quantity", "measured", "expected")
     table = new_table("Verdict, from the recorded samples", *texts, "verdict", wrapped=texts)
-    marks = {True: Text("good", "green"), False: Text("NOT GOOD", "bold red"), None: ""}
+    marks = {True: Text("pass", "green"), False: Text("FAIL", "bold red"), None: ""}
     for row in verdict.rows:
         table.add_row(row.quantity, row.measured, row.expected, marks[row.good])
     return table

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from replays.recordings.validation import Validation
     from replays.recordings.validation.attribution import Explained, Explanation
 
-_SAID = {True: "good", False: "FAILS", None: ""}
+_SAID = {True: "pass", False: "FAIL", None: ""}
 _TELLING = 0.01
 """What explains less than this part of the difference is not worth a line."""
 

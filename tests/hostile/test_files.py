@@ -305,7 +305,7 @@ def test_a_validation_of_what_is_not_all_there_is_not_good(tmp_path: Path) -> No
     _without(changed, {_of(changed)[-1]})
     found = validate(Recording.open(changed.write(tmp_path / "x.mcap")))
     assert not found.good
-    assert re.search(r"NOT GOOD.* rows of rig/sensors/probes are missing", found.verdict_line)
+    assert re.search(r"fail, .* rows of rig/sensors/probes are missing", found.verdict_line)
 
 
 def test_a_chunk_that_the_index_leaves_out_is_told_and_statistics_may_be_missing(path: Path, tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ def test_a_fresh_recording_is_bit_exact(recording: Path, capsys: pytest.CaptureF
     code, out, _ = said(capsys, "validate", str(recording))
     assert code == 0
     assert "bit-exact" in out
-    assert "good, bit by bit" in out
+    assert "pass, bit by bit" in out
 
 
 def test_a_failure_ends_in_1_and_a_report_names_the_cause(
@@ -35,12 +35,12 @@ def test_a_failure_ends_in_1_and_a_report_names_the_cause(
     assert code == 1
     assert "contact.restitution +2.27 %" in out
     lines = out.splitlines()
-    assert lines[1].startswith("FAILS ")  # what comes out of it, before any table
+    assert lines[1].startswith("fail, ")  # what comes out of it, before any table
     assert "contact.restitution +2.27 %" in lines[2]
     page = report.read_text(encoding="utf-8")
     assert "Contact.restitution" in page or "contact.restitution +2.27 %" in page
     assert page.count("data:image/png") == 7  # all at a glance, five groups, orbits and spectra
-    assert page.index("FAILS") < page.index("data:image/png") < page.index("<table>")
+    assert page.index("Fail, ") < page.index("data:image/png") < page.index("<table>")
     head = page[: page.index("data:image/png")]
     for told in (recording.name, "--set contact.restitution=0.88", "corrected", "<dt>seed</dt>", "<dt>made</dt>"):
         assert told in head
@@ -81,7 +81,7 @@ def test_several_files_are_taken_as_one(recording: Path, tmp_path: Path, capsys:
     code, out, _ = said(capsys, "validate", str(second), str(first))
     assert code == 0
     assert out.startswith("a.mcap and 1 more")
-    assert "good, bit by bit" in out
+    assert "pass, bit by bit" in out
 
 
 def test_a_new_folder_is_made_for_sessions(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -239,7 +239,7 @@ def test_few_channels_and_no_truth_are_enough(tmp_path: Path) -> None:
     assert not wrong.good
     assert wrong.explained is not None
     assert wrong.explained.best == ("contact.friction",)
-    assert wrong.verdict_line.startswith(f"FAILS {len(wrong.failures)} of ")
+    assert wrong.verdict_line.startswith(f"fail, {len(wrong.failures)} of ")
     assert len(wrong.verdict_line) < 200
     assert all(one.limit and one.line for one in wrong.failures)
 

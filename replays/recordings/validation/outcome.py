@@ -256,14 +256,14 @@ class Validation:
         if self.outcome is Outcome.PASS:
             basis = "bit by bit" if self.bit_exact and not self.declared else f"by the criteria: {self.criteria}"
             unseen = "; no contact was compared sample by sample" if self.contact_s is not None else ""
-            return f"good, {basis}{unseen}"
+            return f"pass, {basis}{unseen}"
         if self.doubts:
             more = f", and {len(self.doubts) - 1} more" if self.doubts[1:] else ""
-            return f"NOT GOOD, the recording does not fit together: {self.doubts[0]}{more}"
+            return f"fail, the recording does not fit together: {self.doubts[0]}{more}"
         if self.faults and not self.failures:
-            return f"NOT GOOD, a signal shows a fault: {'; '.join(one.line for one in self.faults)}"
+            return f"fail, a signal shows a fault: {'; '.join(one.line for one in self.faults)}"
         if self.beyond and not self.failures:
-            return f"NOT GOOD, beyond what is known of it: {'; '.join(self.beyond)}"
+            return f"fail, beyond what is known of it: {'; '.join(self.beyond)}"
         channels = [one.channel for one in self.residuals if one.good is False]
         tables = [one.table for one in self.truth if not one.good]
         phases = [one.phase for one in self.statistics if one.good is False]
@@ -274,7 +274,7 @@ class Validation:
             parts.append(
                 "quantities: " + ", ".join(f"{phases.count(name)} of {name}" for name in dict.fromkeys(phases))
             )
-        return f"FAILS {len(self.failures)} of {self.judged} criteria: {'; '.join(parts)}"
+        return f"fail, {len(self.failures)} of {self.judged} criteria: {'; '.join(parts)}"
 
     def document(self) -> dict[str, Any]:
         """All of it but the samples, as a JSON document."""

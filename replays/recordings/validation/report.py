@@ -24,7 +24,7 @@ _STRETCHES = 160
 _BEFORE_S, _AFTER_S = 5e-3, 60e-3
 """A closer look begins and ends so long before and behind what is of interest."""
 _MARKS: dict[bool | None, Mark] = {True: "good", False: "bad", None: "plain"}
-_WORDS = {True: "good", False: "fails", None: "not asked"}
+_WORDS = {True: "pass", False: "fail", None: "not asked"}
 
 
 def make_report(found: Validation, *, origin: Mapping[str, str] | None = None) -> Report:
@@ -71,7 +71,7 @@ def _conclusion(report: Report, found: Validation) -> None:
         report.heading("Criteria that fail")
         report.table(
             ("criterion", "recorded", "predicted", "limit", "verdict"),
-            [Row((f.criterion, f.recorded, f.foretold, f.limit, "fails"), "bad") for f in found.failures],
+            [Row((f.criterion, f.recorded, f.foretold, f.limit, "fail"), "bad") for f in found.failures],
             caption="Of a residual the first measure beyond its limit; ± is the largest difference.",
         )
     if one is None or not one.ranked:
