@@ -35,7 +35,7 @@ def compile_last() -> None:
     """Compile the series, the sensors and rolling by collocation, by calling them as a run does."""
     import numpy as np
 
-    from rig.engines.split.layout import MEMORY
+    from rig.engines.split.layout import MEMORY, STEP_S, WAITS
     from rig.engines.split.rolling import roll
     from rig.engines.taylor.march import room_in
     from rig.engines.taylor.series import rolling, sliding
@@ -55,6 +55,7 @@ def compile_last() -> None:
     groups, rows = tuple(simulation.table.groups.values()), np.zeros((1000, N_ROW))
     Conditioner(groups, row_rate_hz=40_000, seed=1, noise=True, ideal=False).counts(rows)
     # With other inputs than the memory holds, it returns at once.
+    memory[STEP_S], memory[WAITS] = 1e-3, 1.0
     roll(packed(simulation.model.constants), packed(quiet), np.zeros(N_VECTOR), memory, (0, 1, 1), 0, rows)
 
 

@@ -86,10 +86,11 @@ def test_linear_bodies_respond_as_in_closed_form(parameters: str, monkeypatch: p
 
     monkeypatch.setattr("rig.engines.split.radau.invert", in_python(invert))
     scene, power = load_scene("hammer", {"parameters": parameters}), 3
-    shafts, houses = body_matrices(build_model(scene.load_parameters(), scene.model).constants, INPUTS)
+    shafts, houses = in_python(body_matrices)(build_model(scene.load_parameters(), scene.model).constants, INPUTS)
     for Z in (*shafts, *houses):
         n, h = len(Z), 0.5 / np.abs(np.linalg.eigvals(Z)).max()
-        free, forced = collocate(Z, n // 2, -2.0, h)
+        free, forced = np.empty((n, n, STAGES)), np.empty((n, STAGES, STAGES))
+        in_python(collocate)(Z, n // 2, -2.0, h, free, forced)
         # z' = Z z - 2 u on the driven component, u = (t/h)^3: u and its derivatives are states too.
         whole = np.zeros((n + power + 1, n + power + 1))
         whole[:n, :n], whole[n // 2, n] = Z, -2.0

@@ -81,10 +81,11 @@ def rolling_in(memory):
     )
 
 
+@kernel
 def body_matrices(constants, inputs):
     """Return matrices of shaft x, shaft y and spin, shape (3, 2, 2), and of housings x and y, shape (2, 4, 4)."""
     levels, shaft, magnet, house = constants.levels, constants.shaft, constants.magnet, constants.house
-    shafts, houses = np.zeros((3, 2, 2)), np.zeros((2, 4, 4))
+    shafts, houses = np.zeros(12).reshape((3, 2, 2)), np.zeros(32).reshape((2, 4, 4))
     lever = shaft.arm_magnet * shaft.arm_magnet / shaft.transverse_inertia if inputs.magnet_engaged else 0.0
     for body in range(3):
         shafts[body, 0, 1] = 1.0
@@ -107,13 +108,20 @@ def body_matrices(constants, inputs):
     return shafts, houses
 
 
+@kernel
 def set_step(constants, inputs, memory):
-    """Make the responses of the linear bodies over steps of the length in the memory."""
+    """Make the responses of the linear bodies over steps of the length in the memory.
+
+    Called from Python, since each compiled caller would compile all of it again.
+    """
+    constants, inputs = constants[0], inputs[0]
     shafts, houses = body_matrices(constants, inputs)
-    per_inner, h = 1.0 / constants.house.inner_mass if constants.levels.inner_house else 0.0, memory[layout.STEP_S]
-    responses = [collocate(Z, 1, 1.0, h) for Z in shafts], [collocate(Z, 2, -per_inner, h) for Z in houses]
-    parts = [part.ravel() for bodies in responses for kind in zip(*bodies, strict=True) for part in kind]
-    memory[layout.SHAFT_FREE : layout.INVERSES] = np.concatenate(parts)
+    per_inner = 1.0 / constants.house.inner_mass if constants.levels.inner_house else 0.0
+    rolling, h = rolling_in(memory), memory[layout.STEP_S]
+    for body in range(3):
+        collocate(shafts[body], 1, 1.0, h, rolling.shaft_free[body], rolling.shaft_forced[body])
+    for i in range(2):
+        collocate(houses[i], 2, -per_inner, h, rolling.house_free[i], rolling.house_forced[i])
     memory[layout.WAITS] = 0.0
 
 

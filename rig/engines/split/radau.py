@@ -114,21 +114,38 @@ def invert(matrix, n):
     return True
 
 
-def collocate(Z, driven, gain, h):
-    """Return the responses of a linear body over a step, sums in the order of the loops: the same bits everywhere.
+@kernel
+def collocate(Z, driven, gain, h, free, forced):
+    """Responses of a linear body over a step.
 
     Args:
         Z: Matrix of the body, shape (n, n).
         driven: Component whose rate u drives.
         gain: Rate of that component per u.
         h: Length of the step [s].
-
-    Returns:
-        Node values per initial component, shape (n, n, STAGES): component, initial component, node; node values per u
-        at a node, shape (n, STAGES, STAGES): component, node of u, node.
+        free: Node values per initial component, out, shape (n, n, STAGES): component, initial component, node.
+        forced: Node values per u at a node, out, shape (n, STAGES, STAGES): component, node of u, node.
     """
     n = len(Z)
-    K = np.eye(n * STAGES) - h * np.kron(Z, INTEGRALS)
-    invert(K, len(K))
-    K = K.reshape((n, STAGES, n, STAGES))
-    return np.einsum("cidj->cdi", K), gain * h * np.einsum("cik,kj->cji", K[:, :, driven], INTEGRALS)
+    size = n * STAGES
+    K = np.zeros(size * size).reshape((size, size))
+    for c in range(n):
+        for i in range(STAGES):
+            K[c * STAGES + i, c * STAGES + i] = 1.0
+            for d in range(n):
+                for j in range(STAGES):
+                    K[c * STAGES + i, d * STAGES + j] -= h * INTEGRALS[i, j] * Z[c, d]
+    invert(K, size)
+    for c in range(n):
+        for i in range(STAGES):
+            row = c * STAGES + i
+            for d in range(n):
+                total = 0.0
+                for j in range(STAGES):
+                    total += K[row, d * STAGES + j]
+                free[c, d, i] = total
+            for j in range(STAGES):
+                total = 0.0
+                for k in range(STAGES):
+                    total += K[row, driven * STAGES + k] * INTEGRALS[k, j]
+                forced[c, j, i] = gain * h * total

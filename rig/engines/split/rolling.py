@@ -64,8 +64,8 @@ _LADDER = (2, 3, 4, 6, 8, 12, 16, 24, MAX_PLACES)
 """Steps a turn."""
 _LONGEST_TURN_S = 0.1
 """A contact that takes longer to go round does not whirl."""
-_ORDER = 7.0
-"""Power of the step that the estimate is proportional to: 4.5 to 8, as measured in settled whirl."""
+_ORDER, _ORDER_OF_LAST = 4.5, 8.0
+"""Power of the step that the estimate is proportional to, as measured in settled whirl; that with 2 or 3 steps."""
 _SPARE = 0.3
 """Part of the limit that the estimate may come to with fewer steps."""
 _ITERATED = 0.02
@@ -244,7 +244,8 @@ def _choose_places(memory, rolling):
     if worst > 1.0:
         return _refine(memory)
     for fewer in _LADDER:
-        if 0.5 * places <= fewer < wanted and worst * (places / fewer) ** _ORDER < _SPARE:
+        order = _ORDER if fewer > 3 else _ORDER_OF_LAST
+        if 0.5 * places <= fewer < wanted and worst * (places / fewer) ** order < _SPARE:
             wanted = fewer
     if wanted < places:
         _coarsen(memory, rolling, int(wanted))
@@ -433,6 +434,6 @@ def roll(constants, inputs, y, memory, grid, row, rows):
     """
     row = _roll(constants, inputs, y, memory, grid, row, rows, False)
     while memory[WAITS] > 0.0:
-        set_step(constants[0], inputs[0], memory)
+        set_step(constants, inputs, memory)
         row = _roll(constants, inputs, y, memory, grid, row, rows, True)
     return row
