@@ -129,10 +129,13 @@ def _busiest_s(recorded: Mapping[str, tuple[np.ndarray, float]], from_s: float, 
     total: np.ndarray | None = None
     for values, each in recorded.values():
         part = np.nan_to_num(values[round(from_s * each) : round(min(from_s + within_s, 1e9) * each)])
+        if len(part) < 2:  # a stamp far from the others makes a rate of less than a row in the stretch
+            continue
         steps = np.add.reduceat(np.diff(part) ** 2, range(0, max(1, len(part) - 1), max(1, round(_GRID_S * each))))
         power = steps / max(float(steps.sum()), 1e-300)
         total = power if total is None else total[: len(power)] + power[: len(total)]
-    assert total is not None
+    if total is None:
+        return from_s
     size = max(1, round(taken_s / _GRID_S))
     sums = np.cumsum(np.concatenate([[0.0], total]))
     begin = int(np.argmax(sums[size:] - sums[:-size])) if len(total) > size else 0

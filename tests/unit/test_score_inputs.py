@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from replays.score.limits import load_limits
 from replays.score.scorecard import FAIL, PASS, Scorecard
 from rig.channels import default_table
 from rig.errors import InputError
+from rig.outcome import Outcome
 from tests.commands import said
 from tests.score_daqs import counts_of, write_parquet, write_session
 
@@ -51,6 +53,16 @@ def test_a_channel_that_is_absent_fails_unless_fewer_were_to_be_recorded(
     assert card.row("recorded", "disk_x").verdict == PASS
     assert ("recorded", "disk_y") in red(judge(daq, [session], path=path, channels=["disk_x", "disk_y"]))
     assert ("recorded", "disk_y") in red(judge(daq, [session], path=path, channels=["probes"]))
+
+
+@pytest.mark.parametrize(("at", "gap_s"), [(1, 3600.0), (100, 3600.0), (399, 86400.0)])
+def test_a_clock_that_was_set_gives_no_traceback(at: int, gap_s: float, session: Path, tmp_path: Path) -> None:
+    stamps = np.arange(400) * 1e-3
+    stamps[at:] += gap_s
+    columns = {"time [s]": stamps, "disk_x [mm]": np.sin(0.04 * np.arange(400))}
+    daq = write_parquet(tmp_path / "daq.parquet", columns)
+    with suppress(InputError):  # a rate that no record can have is refused in a line
+        assert judge(daq, [session]).outcome != Outcome.PASS
 
 
 def test_a_column_without_a_value_is_absent(session: Path, counts: np.ndarray, tmp_path: Path) -> None:
