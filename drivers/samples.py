@@ -34,9 +34,9 @@ class Samples(Columns):
     tick: int
     rate_hz: float
     tick_rate_hz: float
-    names: tuple[str, ...]
-    units: tuple[str, ...]
-    values: np.ndarray
+    names: tuple[str, ...]  # pyrefly: ignore[bad-override]
+    units: tuple[str, ...]  # pyrefly: ignore[bad-override]
+    values: np.ndarray  # pyrefly: ignore[bad-override]
     gap: int = 0
 
     def __repr__(self) -> str:

@@ -31,7 +31,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, ConfigDict, Field
 
 from rig.channels import TABLE, Channel, ChannelTable, raw_groups, table_of
 from rig.errors import InputError, UnknownNameError, Words
@@ -63,7 +63,7 @@ _Name = Annotated[str, AfterValidator(_identifier)]
 class _Row(Written):
     """A new channel; numbers are checked where the whole table is."""
 
-    model_config = Written.model_config | {"extra": "allow"}
+    model_config = ConfigDict(extra="allow")
 
     name: _Name
 

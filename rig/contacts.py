@@ -507,7 +507,7 @@ def free_impact(law: NormalLaw, *, mass: float, speed: float, speed_floor: float
         # Without D the force comes down to 0 with the penetration, and does not cross it.
         return float(force(y)) if d > 0.0 else y[0]
 
-    apart.terminal, apart.direction = True, -1.0  # pyright: ignore[reportFunctionMemberAccess]
+    apart.terminal, apart.direction = True, -1.0  # pyrefly: ignore[missing-attribute]
     path = solve_ivp(
         motion, (0.0, 1e6), [0.0, 1.0], method="DOP853", events=apart, dense_output=True, rtol=1e-10, atol=1e-12
     )

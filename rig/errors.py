@@ -75,7 +75,8 @@ class RefusedError(InputError):
 
     def __init__(self, line: str) -> None:
         """Keep the whole line."""
-        self.field, self.must, self.received = "request", "one that the rig accepts", None
+        self.field, self.must = "request", "one that the rig accepts"
+        self.received: object = None
         ValueError.__init__(self, printable(line))
 
 

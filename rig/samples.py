@@ -118,9 +118,9 @@ class Samples(Columns):
     name: str
     times_s: np.ndarray
     index: np.ndarray
-    values: np.ndarray
-    names: tuple[str, ...]
-    units: tuple[str, ...]
+    values: np.ndarray  # pyrefly: ignore[bad-override]
+    names: tuple[str, ...]  # pyrefly: ignore[bad-override]
+    units: tuple[str, ...]  # pyrefly: ignore[bad-override]
     rate_hz: float
 
 

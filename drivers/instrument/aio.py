@@ -6,7 +6,7 @@ import asyncio
 import functools
 from collections.abc import AsyncIterator, Callable, Coroutine
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, ClassVar, Concatenate, Generic, ParamSpec, Self, TypeVar
+from typing import Any, ClassVar, Concatenate, Generic, ParamSpec, Protocol, Self, TypeVar, cast
 
 from drivers.instrument.driver import Instrument, Sampler
 from drivers.link import Link
@@ -16,18 +16,25 @@ D = TypeVar("D", bound=Instrument)
 S = TypeVar("S", bound=Sampler)
 P = ParamSpec("P")
 R = TypeVar("R")
+R_co = TypeVar("R_co", covariant=True)
 
 
-def awaited(
-    method: Callable[Concatenate[Any, P], R],
-) -> Callable[Concatenate[AsyncInstrument[Any], P], Coroutine[Any, Any, R]]:
-    """A method of a driver as a coroutine of its asyncio form."""
+class AsyncMethod(Protocol[P, R_co]):
+    """A method that returns a coroutine, for type checkers: not all of them bind a plain callable to its object."""
+
+    def __get__(self, instance: object, owner: type | None = None, /) -> Callable[P, Coroutine[Any, Any, R_co]]:
+        """Return the method of one object."""
+        ...
+
+
+def awaited(method: Callable[Concatenate[Any, P], R]) -> AsyncMethod[P, R]:
+    """Return a method of a driver as a coroutine method of its asyncio form."""
 
     @functools.wraps(method)
     async def call(self: AsyncInstrument[Any], *args: P.args, **keywords: P.kwargs) -> R:
         return await self._run(functools.partial(method, self.driver, *args, **keywords))
 
-    return call
+    return cast(AsyncMethod[P, R], call)
 
 
 class AsyncInstrument(Generic[D]):
@@ -49,12 +56,12 @@ class AsyncInstrument(Generic[D]):
     @classmethod
     async def open(cls, url: str, *, timeout_s: float = 3.0) -> Self:
         """As `Instrument.open`."""
-        return cls(await asyncio.to_thread(cls.DRIVER.open, url, timeout_s=timeout_s))  # pyright: ignore[reportArgumentType]
+        return cls(await asyncio.to_thread(cls.DRIVER.open, url, timeout_s=timeout_s))
 
     @classmethod
     def on(cls, link: Link, *, timeout_s: float = 3.0) -> Self:
         """The instrument at the end of a link that is open."""
-        return cls(cls.DRIVER(link, timeout_s=timeout_s))  # pyright: ignore[reportArgumentType]
+        return cls(cls.DRIVER(link, timeout_s=timeout_s))
 
     identify = awaited(Instrument.identify)
 

@@ -12,7 +12,7 @@ import math
 import struct
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import ClassVar, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 
@@ -277,7 +277,7 @@ class Codec:
         start = HEAD.size + layout.size
         if len(data) < start or (kind.TAIL is None and len(data) != start):
             raise wrong(Reason.LENGTH, f"{kind.__name__} must be of {start} bytes; instead received {len(data)}")
-        values: list[object] = list(layout.unpack_from(data, HEAD.size))
+        values: list[Any] = list(layout.unpack_from(data, HEAD.size))
         if any(isinstance(value, float) and not math.isfinite(value) for value in values):
             raise wrong(Reason.VALUE, f"{kind.__name__} must hold finite numbers; instead received {values}")
         if kind.TAIL == Tail.TEXT:
@@ -286,7 +286,7 @@ class Codec:
             except UnicodeDecodeError:
                 raise wrong(Reason.VALUE, f"text of {kind.__name__} must be UTF-8") from None
         elif kind.TAIL == Tail.COUNTS:
-            columns = int(values[-1])  # pyright: ignore[reportArgumentType]
+            columns = int(values[-1])
             if not columns or (len(data) - start) % (columns * _COUNTS.itemsize):
                 raise wrong(Reason.LENGTH, f"{kind.__name__} must hold whole rows of {columns} values")
             values.append(np.frombuffer(data, _COUNTS, offset=start).reshape(-1, columns))

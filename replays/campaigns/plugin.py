@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from replays.campaigns.trial import Trial
 
 _SUFFIX = ".campaign.toml"
-_TRIAL = pytest.StashKey["Trial"]()
+_TRIAL: pytest.StashKey[Trial] = pytest.StashKey()
 _FAILED = pytest.StashKey[bool]()
 _MARKER = (
     'bench(scene="stable-run", pace="lockstep", block_ms=10, set={}, channels=[], faults=[], commands=[], '

@@ -110,7 +110,7 @@ def with_values(experiment: Experiment, values: Mapping[str, float]) -> Experime
     Raises:
         InputError: An unknown key, or a value that it must not have.
     """
-    placed = {key.split(".")[1]: value * STATE[key][1] for key, value in values.items() if key in STATE}
+    placed: dict[str, Any] = {key.split(".")[1]: value * STATE[key][1] for key, value in values.items() if key in STATE}
     if placed:
         begin = _begin_of(experiment, next(key for key in values if key in STATE))
         experiment = replace(experiment, begin=begin._replace(**placed))

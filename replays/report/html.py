@@ -38,6 +38,10 @@ def _marked(text: str) -> Markup:
     )
 
 
+def _base64(data: bytes) -> str:
+    return base64.b64encode(data).decode()
+
+
 @cache
 def _template() -> jinja2.Template:
     import jinja2
@@ -49,6 +53,6 @@ def _template() -> jinja2.Template:
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
-    environment.filters["base64"] = lambda data: base64.b64encode(data).decode()
+    environment.filters["base64"] = _base64
     environment.filters["marked"] = _marked
     return environment.from_string(files("replays.report").joinpath("page.html").read_text(encoding="utf-8"))

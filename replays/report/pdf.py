@@ -54,7 +54,8 @@ def render(report: Report) -> bytes:
         pdf.set_text_color(*colour)
         for piece, style in fragments(text):
             code = style == "code"
-            pdf.set_font(_CODE if code else _FONT, style="B" if bold else "", size=0.93 * size if code else size)
+            # Here and below: fpdf2 takes fractions of points and mm, though its signatures read as whole numbers.
+            pdf.set_font(_CODE if code else _FONT, style="B" if bold else "", size=0.93 * size if code else size)  # pyrefly: ignore[bad-argument-type]
             pdf.char_vpos = _PLACES.get(style, "LINE")
             pdf.write(size * 0.5, piece)
         pdf.char_vpos = "LINE"
@@ -97,19 +98,20 @@ def _room(pdf: FPDF, parts: list[ReportPart]) -> float:
 def _table(pdf: FPDF, table: Table) -> None:
     from fpdf.fonts import FontFace
 
-    pdf.set_font(_FONT, size=_CELL_SIZE)
+    pdf.set_font(_FONT, size=_CELL_SIZE)  # pyrefly: ignore[bad-argument-type]
     pdf.set_text_color(*_INK)
     pdf.set_draw_color(221, 221, 221)
     widths = _widths(pdf, table)
     with pdf.table(
-        col_widths=widths,
-        width=min(sum(widths), pdf.epw),  # a sum that is the page's width may be rounded above it
+        col_widths=widths,  # pyrefly: ignore[bad-argument-type]
+        # A sum that is the page's width may be rounded above it.
+        width=min(sum(widths), pdf.epw),  # pyrefly: ignore[bad-argument-type]
         align="L",
         text_align=tuple("RIGHT" if numeric else "LEFT" for numeric in table.numeric),
         line_height=4,
         borders_layout="HORIZONTAL_LINES",
         headings_style=FontFace(emphasis="BOLD"),
-        padding=(0.6, _APART, 0.6, 0.6),
+        padding=(0.6, _APART, 0.6, 0.6),  # pyrefly: ignore[bad-argument-type]
     ) as grid:
         grid.row([unset(heading) for heading in table.headings])
         for row, cells in zip(table.rows, _cells(table), strict=True):
@@ -134,14 +136,14 @@ def _widths(pdf: FPDF, table: Table) -> tuple[float, ...]:
         lines, words = 0.0, 0.0
         # Bold is wider: measured by its own letters.
         for style, texts in (("B", [unset(heading)]), ("", [row[column] for row in rows])):
-            pdf.set_font(_FONT, style=style, size=_CELL_SIZE)
+            pdf.set_font(_FONT, style=style, size=_CELL_SIZE)  # pyrefly: ignore[bad-argument-type]
             whole = table.numeric[column] and not style  # a number and its spread are not broken
             lines = max([lines, *map(pdf.get_string_width, texts)])
             pieces = texts if whole else [word for text in texts for word in text.split()]
             words = max([words, *map(pdf.get_string_width, pieces)])
         natural.append(lines + 2.4 + _APART)
         least.append(words + 2.4 + _APART)
-    pdf.set_font(_FONT, size=_CELL_SIZE)
+    pdf.set_font(_FONT, size=_CELL_SIZE)  # pyrefly: ignore[bad-argument-type]
     spare = pdf.epw - sum(least)
     wanted = sum(natural) - sum(least)
     if wanted <= spare:

@@ -328,7 +328,7 @@ def make_matrix(card: Scorecard) -> tuple[list[str], list[tuple[str, ...]]]:
     """
     names = dict.fromkeys(row.channel for row in card.rows if row.channel)
     columns = [*names, *([""] if any(not row.channel for row in card.rows) else [])]
-    lines = []
+    lines: list[tuple[str, ...]] = []
     for quantity in dict.fromkeys(row.quantity for row in card.rows) if len(names) > 1 else ():
         found = [{row.verdict for row in card.rows if (row.quantity, row.channel) == (quantity, c)} for c in columns]
         lines.append((quantity, *(next((mark for each, mark in MARKS.items() if each in some), "") for some in found)))

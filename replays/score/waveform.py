@@ -242,7 +242,7 @@ def _corner(f: np.ndarray, log: np.ndarray, spread: np.ndarray) -> tuple[float, 
     roots = [r.real for r in np.roots(parts - [0.0, 0.0, level]) if abs(r.imag) < 1e-9]
     if not roots:
         return None
-    root = min(roots, key=abs)
+    root = roots[int(np.argmin(np.abs(roots)))]
     row = np.array([root**2, root, 1.0])
     # Lines of a Hann window are not independent: 1.9 of them are one.
     half = 1.96 * math.sqrt(1.9 * float(row @ inverse @ row)) / max(abs(parts[1] + 2.0 * parts[0] * root), 1e-300)
@@ -267,7 +267,7 @@ def through(found: Waveform) -> Waveform:
     auto = correlate(x, x, method="fft")[n - 1 :][:_TAPS]
     cross = correlate(y, x, method="fft")[n - 1 - half :][:_TAPS]
     auto[0] *= 1.0 + 1e-9
-    taps = solve_toeplitz(auto, cross)
+    taps = np.asarray(solve_toeplitz(auto, cross))
     known = np.convolve(x, taps)[half : half + n]
     slope = np.convolve(found.slope, taps)[half : half + n]
     places, _ = _places(found.times_s)

@@ -98,7 +98,7 @@ def _draw(dice: _Dice, name: str) -> Scene:
     own = load_parameters(parameters)
     for key, (low, high) in _SHAFT.items():
         if dice.often(0.12):
-            changes[key] = float(f"{own.entries[key].value * dice.wide(low, high):.4g}")  # pyright: ignore[reportOperatorIssue]
+            changes[key] = float(f"{float(own.entries[key].value) * dice.wide(low, high):.4g}")
     clearance = changes.get("ring.clearance", 0.926)
     magnets = not dice.often(0.1)
     position = dice.of({"equilibrium": 8.0 * magnets, "given": 1.5, "top": 1.0, "bottom": 1.0})

@@ -34,7 +34,7 @@ def grouped(command: Callable[..., None]) -> Callable[..., None]:
         built = {name: _build(group, options) for name, group in groups.items()}
         command(*arguments, **options, **built)
 
-    del call.__wrapped__
+    del call.__wrapped__  # pyrefly: ignore[missing-attribute]
     call.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     call.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     return call

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -105,7 +105,8 @@ class Triggers:
         if given and not triggers:
             name, value = next(iter(given.items()))
             raise InputError("trigger_count" if name == "count" else name, "used with --trigger", value)
-        return Capture(triggers, **{"pre_s": _PRE_S, "post_s": _POST_S, **given}) if triggers else None
+        settings: dict[str, Any] = {"pre_s": _PRE_S, "post_s": _POST_S, **given}
+        return Capture(triggers, **settings) if triggers else None
 
 
 @dataclass(frozen=True)

@@ -283,11 +283,12 @@ def table_console(*, wide: bool = False, stderr: bool = False) -> Console:
         """Markup is off for every kind of string, no text leaves unescaped, and none is cropped."""
 
         def print(self, *objects: Any, **options: Any) -> None:
-            super().print(*objects, **{"crop": False, **options})
+            options.setdefault("crop", False)
+            super().print(*objects, **options)
 
         def render_str(self, text: str, **options: Any) -> Any:
-            kept = _kept(_lines(text))
-            return super().render_str(kept, **{**options, "markup": False, "emoji": False})
+            options.update(markup=False, emoji=False)
+            return super().render_str(_kept(_lines(text)), **options)
 
         def render(self, renderable: Any, options: Any = None) -> Any:
             for segment in super().render(renderable, options):

@@ -113,7 +113,7 @@ def described(table: ChannelTable, setting: Setting = Setting()) -> list[tuple[s
         table: The channels that there are.
         setting: What else decides.
     """
-    found = []
+    found: list[tuple[str, ...]] = []
     for name, kind in KINDS.items():
         numbers = [
             key + ("" if field.is_required() else f" ({'none' if field.default is None else _plain(field.default)})")

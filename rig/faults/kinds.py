@@ -181,7 +181,7 @@ class Open(Kind):
 class Short(Open):
     """A short circuit: v' = 0."""
 
-    kind: Literal["short"] = "short"  # pyright: ignore[reportIncompatibleVariableOverride]
+    kind: Literal["short"] = "short"  # pyrefly: ignore[bad-override]
     level_v: Annotated[FiniteFloat, Field(ge=0.0, le=0.0)] = 0.0
 
 
@@ -189,7 +189,7 @@ class Intermittent(Open):
     """A loose contact: v' = level_v in those slots of slot_s whose u(slot) < part."""
 
     first = ("part",)
-    kind: Literal["intermittent"] = "intermittent"  # pyright: ignore[reportIncompatibleVariableOverride]
+    kind: Literal["intermittent"] = "intermittent"  # pyrefly: ignore[bad-override]
     part: Part = 0.2
     slot_s: Annotated[FiniteFloat, Field(ge=1e-4, le=100.0)] = 0.01
 
@@ -318,7 +318,7 @@ class NoFilter(Kind):
 class Bandwidth(NoFilter):
     """Another corner of the low-pass [Hz]; its order stays."""
 
-    kind: Literal["bandwidth"] = "bandwidth"  # pyright: ignore[reportIncompatibleVariableOverride]
+    kind: Literal["bandwidth"] = "bandwidth"  # pyrefly: ignore[bad-override]
     corner_hz: Annotated[FiniteFloat, Field(ge=1.0, le=1e6)]
 
     def refuse(self, channel: Channel) -> None:

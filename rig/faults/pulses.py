@@ -36,7 +36,7 @@ class MissPulses(Kind):
 class ExtraPulses(MissPulses):
     """A pulse half a turn behind that of turns whose u(turn) < part."""
 
-    kind: Literal["extra-pulses"] = "extra-pulses"  # pyright: ignore[reportIncompatibleVariableOverride]
+    kind: Literal["extra-pulses"] = "extra-pulses"  # pyrefly: ignore[bad-override]
 
     def signal(self, x: np.ndarray, at: At) -> np.ndarray:
         return np.maximum(x, np.where(_picked(at, self.part), at.mark(at.angle - math.pi), 0.0))

@@ -448,8 +448,8 @@ class ZenohClient(Closing):
             if asked and not asked & self._linked():
                 raise NoReplyError(f"the rig at {self.endpoint} has gone, and has not answered {key}")
             # Without a rig the reply is empty at once: it may be about to start. So it is where the rig denies this.
-            role, most_s = self._holder and self._holder.name, timeout_s if self._linked() else min(timeout_s, _BACK_S)
-            late = time.monotonic() + 0.05 >= begun + most_s
+            late = time.monotonic() + 0.05 >= begun + (timeout_s if self._linked() else min(timeout_s, _BACK_S))
+            role = None if self._holder is None else self._holder.name
             denied = not allows(role, Verb.ASK, key)
             if (late or denied) and self.tokens(wire.ALIVE):
                 what = f"denies {key} to {role or 'everybody'}" if denied else f"does not answer {key}"

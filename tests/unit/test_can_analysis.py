@@ -101,7 +101,7 @@ Releases = list[list[tuple[int, int]]]
 
 def run(rate: str, contents: list[Frame], releases: Releases, **faults: float) -> list[float]:
     """Longest time from event to the end of the intermission, for each message [s]; on three nodes."""
-    bus = BusModel(rate, **faults)  # pyright: ignore[reportArgumentType]
+    bus = BusModel(rate, **faults)
     nodes = [bus.attach(queue=1000) for _ in range(3)]
     events: dict[int, list[int]] = {}
     for index, (frame, rows) in enumerate(zip(contents, releases, strict=True)):

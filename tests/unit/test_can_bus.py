@@ -28,7 +28,7 @@ def duration_us(frame: Frame) -> int:
 
 
 def pair(rate: str = "1M", **options: object) -> tuple[BusModel, int, int]:
-    bus = BusModel(rate, **options)  # pyright: ignore[reportArgumentType]
+    bus = BusModel(rate, **options)
     return bus, bus.attach("a"), bus.attach("b")
 
 

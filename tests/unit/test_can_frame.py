@@ -378,7 +378,7 @@ def test_bit_rates():
 )
 def test_nonsense_bit_rates(text: object):
     with pytest.raises(InputError):
-        speed(text)  # pyright: ignore[reportArgumentType]
+        speed(text)
 
 
 _PARITY = """

@@ -116,7 +116,7 @@ def test_nobody_reports_under_the_name_of_another(clients: Clients, time_: Time)
         def report(self, key: str, payload: bytes) -> None:
             clients.take(key, payload)
 
-    recorder = Reporter(Rig(), "recorder")  # pyright: ignore[reportArgumentType]
+    recorder = Reporter(Rig(), "recorder")
     recorder.tell(500, lost=0)
     time_.now_s = 3.5
     for forged in ({"received_index": 2**62 - 1, "lost": 7}, {"received_index": 1, "done": True}):
@@ -162,7 +162,7 @@ def settle_s(
     monkeypatch.setattr("rig.transport.clients.time.sleep", sleep)
     monkeypatch.setattr("rig.transport.clients.time.monotonic", time_)
     begin = time_.now_s
-    clients.settle(Links(clients, time_, **counts), 1000, patience_s=10.0)  # pyright: ignore[reportArgumentType]
+    clients.settle(Links(clients, time_, **counts), 1000, patience_s=10.0)
     return time_.now_s - begin
 
 

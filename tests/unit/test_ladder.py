@@ -97,7 +97,7 @@ def test_quantities_read_closed_forms() -> None:
     assert (ending(standing).word, ending(standing).rolling_share) == ("resting", 1.0)
     apart = trace(penetration=-np.ones(100), ring_x=np.ones(100))
     assert QUANTITIES["outcome"].read(apart) == "no contact"
-    assert math.isnan(QUANTITIES["whirl_frequency"].read(apart))  # pyright: ignore[reportArgumentType]
+    assert math.isnan(QUANTITIES["whirl_frequency"].read(apart))
 
 
 def test_errors_are_parts_of_the_value_and_a_wrong_outcome_is_infinite() -> None:

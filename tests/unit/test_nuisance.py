@@ -272,7 +272,7 @@ def damping_factor(restitution: float) -> float:
 
     e = restitution
     found = brentq(lambda c: c * (1.0 + e) - math.log((1.0 + c) / (1.0 - c * e)), 1e-6, 1.0 / e - 1e-6)
-    return float(found)  # pyright: ignore[reportArgumentType]
+    return float(found)
 
 
 FIVE = (

@@ -158,7 +158,7 @@ T, X, Y = (part.tolist() for part in orbit(200.0, n=40))
             "y must be finite numbers; instead received 1 that are not",
         ),
         (lambda: full_spectrum(X, Y, 0), "rate_hz must be a number greater than 0; instead received 0"),
-        (lambda: full_spectrum(X, Y, T), "rate_hz must be a number greater than 0"),  # type: ignore[arg-type]
+        (lambda: full_spectrum(X, Y, T), "rate_hz must be a number greater than 0"),
         (lambda: full_spectrum(X, Y, 4e3, lines=8), "lines must be a whole number of at least the 40 samples"),
         (lambda: waterfall(X, Y, 4e3, T[1:]), "times_s must be as long as x, 40; instead received 39"),
         (lambda: waterfall(X, Y, 4e3, T, hop_s=-1.0), "hop_s must be a number greater than 0; instead received -1.0"),

@@ -72,7 +72,7 @@ def test_numbers_stand_right_code_as_code_and_the_origin_in_the_head(tmp_path: P
     report.table(("name", "value", "words", "limit", "note"), rows, caption="`left` is what remains")
     report.write(path)
     page = path.read_text(encoding="utf-8")
-    assert report.parts[0].numeric == (False, True, False, True, False)  # pyright: ignore[reportAttributeAccessIssue]
+    assert report.parts[0].numeric == (False, True, False, True, False)
     assert '<td class="number">-2e-05 m/s²</td>' in page
     assert page.count('class="number"') == 2 * (1 + len(rows))
     assert "<caption><code>left</code> is what remains</caption>" in page

@@ -284,7 +284,7 @@ def test_the_drives_limit_itself_is_a_good_speed() -> None:
 
 @given(direction=st.sampled_from(["x", "y", "-x", "-y"]) | numbers(-360.0, 360.0))
 def test_direction_of_a_blow_is_a_unit_vector(direction: str | float) -> None:
-    assert math.hypot(*HammerCommand(direction=direction).cosines) == pytest.approx(1.0, abs=1e-15)  # pyright: ignore
+    assert math.hypot(*HammerCommand(direction=direction).cosines) == pytest.approx(1.0, abs=1e-15)
 
 
 @pytest.mark.parametrize(
@@ -328,5 +328,5 @@ def test_a_request_cannot_become_another_command() -> None:
 def test_scenes_are_frozen() -> None:
     scene = load_scene("hammer")
     with pytest.raises(ValueError, match="frozen"):
-        scene.seed = 2  # pyright: ignore[reportAttributeAccessIssue]
+        scene.seed = 2
     assert Scene() == Scene()

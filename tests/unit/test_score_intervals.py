@@ -176,7 +176,7 @@ def test_limits_made_of_the_table_are_closed_forms() -> None:
     limits = load_limits()
 
     def ends(quantity: str, **told: float) -> tuple[float, float] | None:
-        found = limits.bounds("analogue", quantity, PROBE, **told)  # type: ignore[arg-type]
+        found = limits.bounds("analogue", quantity, PROBE, **told)
         return None if found is None else (found.low, found.high)
 
     noise_mm = NOISE_V / 3.94

@@ -220,17 +220,19 @@ class SlcanPort(Outlet):
 
     def _is_rate(self, command: str, rest: str) -> bool:
         """Whether a command asks for the rate that the bus has."""
+        speed = self._speed
         if command == "S" and re.fullmatch(r"[0-8]", rest):
-            asked, given = _RATES[int(rest)], self._speed and self._speed.nominal_bit_s
+            asked, given = _RATES[int(rest)], None if speed is None else speed.nominal_bit_s
         elif command == "Y" and re.fullmatch(r"[1-9]", rest):
-            if self._speed is not None and not self._speed.fd:
+            if speed is not None and not speed.fd:
                 return False
-            asked, given = 1e6 * int(rest), self._speed and self._speed.data_bit_s
+            asked, given = 1e6 * int(rest), None if speed is None else speed.data_bit_s
         elif command == "s" and re.fullmatch(r"[0-9A-Fa-f]{4}", rest):
             # Bus timing registers 0 and 1 of the SJA1000.
             first, second = bytes.fromhex(rest)
             quanta = 1 + (second & 15) + 1 + (second >> 4 & 7) + 1
-            asked, given = _CLOCK_HZ / (((first & 63) + 1) * quanta), self._speed and self._speed.nominal_bit_s
+            asked = _CLOCK_HZ / (((first & 63) + 1) * quanta)
+            given = None if speed is None else speed.nominal_bit_s
         else:
             return False
         return given is None or abs(asked - given) < 1e-3 * given

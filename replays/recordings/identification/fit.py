@@ -343,7 +343,7 @@ class _Search:
         solved = least_squares(
             residuals,
             begin,
-            jac=jacobian,  # pyright: ignore[reportArgumentType]
+            jac=jacobian,
             bounds=(low, high),
             method="trf",
             x_scale="jac",
@@ -351,7 +351,7 @@ class _Search:
             f_scale=3.0 if robust else 1.0,
             xtol=1e-11,
             ftol=1e-9,
-            gtol=None,  # pyright: ignore[reportArgumentType]
+            gtol=None,
             max_nfev=25,
         )
         self.state = replace(self.state, z=solved.x)

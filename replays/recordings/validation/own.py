@@ -173,7 +173,7 @@ def as_faults(own: Sequence[Explanation]) -> tuple[SignalFault, ...]:
     """What channels have by themselves, as faults that signals show."""
     found = []
     for one in own:
-        names, what = _NAMES.fullmatch(one.name).groups()  # pyright: ignore[reportOptionalMemberAccess]
+        names, what = _NAMES.fullmatch(one.name).groups()  # pyrefly: ignore[missing-attribute]
         text = one.change if one.sure else f"by no law that has a name here; nearest is {what} {one.change}"
         what, text = (what if one.sure else "differs", f"{text}, ") if what else (one.change, "")
         text += f"from {one.from_s:.4f} to {one.to_s:.4f} s"

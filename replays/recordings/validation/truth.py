@@ -63,13 +63,13 @@ def energy_change(
 ) -> tuple[float, float]:
     """Recorded and predicted change of a sum of integrals over a phase [J]."""
     index, values = table
-    picked = [TRUTH["energy"].index(column) for column in columns]
+    picked = np.array([TRUTH["energy"].index(column) for column in columns])
     rate = prediction.truth_rate_hz
     rows = np.flatnonzero((index >= phase.from_s * rate) & (index < phase.to_s * rate))
     rows = rows[index[rows] < len(prediction.truth["energy"])]
     if len(rows) < 2:
         return 0.0, 0.0
-    ends = [rows[0], rows[-1]]
+    ends = rows[[0, -1]]
     recorded = values[np.ix_(ends, picked)].sum(axis=1)
     predicted = prediction.truth["energy"][np.ix_(index[ends], picked)].sum(axis=1)
     return float(recorded[1] - recorded[0]), float(predicted[1] - predicted[0])

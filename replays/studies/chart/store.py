@@ -111,7 +111,7 @@ def read_table(folder: Path) -> list[Row]:
     try:
         with path.open(encoding="utf-8", newline="") as file:
             return [
-                {name: row[name] if name in _TEXT else float(row[name]) if row[name] else None for name in COLUMNS}
+                {key: row[key] if key in _TEXT else float(value) if (value := row[key]) else None for key in COLUMNS}
                 for row in ({**dict.fromkeys(_LATER), **row} for row in csv.DictReader(file))
             ]
     except (OSError, KeyError, ValueError, TypeError, csv.Error):

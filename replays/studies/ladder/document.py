@@ -74,8 +74,8 @@ def pick_of(ladder: Ladder) -> Pick:
     found = versions()
     return Pick(
         **candidate.levels.model_dump(),
-        drive=candidate.drive,  # pyright: ignore[reportArgumentType]
-        sensors=ladder.sensors,  # pyright: ignore[reportArgumentType]
+        drive=candidate.drive,  # pyrefly: ignore[bad-argument-type]
+        sensors=ladder.sensors,  # pyrefly: ignore[bad-argument-type]
         engine=candidate.engine,
         step_us=candidate.step_us,
         engine_tolerance=candidate.tolerance,

@@ -60,7 +60,8 @@ class Candidate:
     def with_model(self, **levels: str) -> Candidate:
         """The same with some levels changed."""
         drive = levels.pop("drive", self.drive)
-        return replace(self, levels=ModelLevels(**{**self.levels.model_dump(), **levels}), drive=drive)  # pyright: ignore[reportArgumentType]
+        changed = ModelLevels.model_validate({**self.levels.model_dump(), **levels})
+        return replace(self, levels=changed, drive=drive)
 
     def with_engine(self, engine: str, step_us: int, tolerance: float) -> Candidate:
         """The same on another engine, without a companion."""

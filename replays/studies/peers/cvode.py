@@ -351,7 +351,7 @@ def _solve_plain(problem: Problem, *, setting: Setting, budget_s: float, method:
     def gap(t: float, y: np.ndarray, g: np.ndarray) -> None:
         g[0] = law.switching(t, y)[0]
 
-    gap.direction = [-1]  # pyright: ignore[reportFunctionMemberAccess]
+    gap.direction = [-1]  # pyrefly: ignore[missing-attribute]
     atol = setting.tolerance * STATE_SCALE if setting.absolute is None else setting.absolute
     solution = Solution(problem.times, budget_s)
     solution.states[0] = y = problem.y0.copy()

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 from llvmlite import ir
-from numba import carray, cfunc, extending, from_dtype, njit, types  # pyright: ignore[reportPrivateImportUsage]
+from numba import carray, cfunc, extending, from_dtype, njit, types
 from numba.core import cgutils
 
 from replays.studies.peers.problem import Problem
@@ -279,6 +279,5 @@ def vector_callbacks() -> tuple[Any, Any, Any]:
     The first call compiles them, or loads them from numba's cache.
     """
     c_function = types.intc(types.double, types.voidptr, types.voidptr, types.voidptr)
-    return tuple(
-        cfunc(c_function, cache=True)(function) for function in (_vector_rates, _vector_switches, _vector_rates_by_sign)
-    )  # pyright: ignore[reportReturnType]
+    compiled = cfunc(c_function, cache=True)
+    return compiled(_vector_rates), compiled(_vector_switches), compiled(_vector_rates_by_sign)

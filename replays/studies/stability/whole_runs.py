@@ -21,7 +21,8 @@ def engine_scene(name: str, **choice: float) -> Scene:
     """The hammer's scene for an engine at its own step and tolerance unless given others, with bare sensors."""
     scene = load_scene("hammer")
     method = ENGINES[name]
-    engine = EngineChoice(**{"name": name, "step_us": method.step_us, "tolerance": method.tolerance, **choice})  # pyright: ignore[reportArgumentType]
+    settings = {"name": name, "step_us": method.step_us, "tolerance": method.tolerance, **choice}
+    engine = EngineChoice.model_validate(settings)
     levels = scene.model.model_copy(update={"friction": friction_of(name)})
     sensors = scene.sensors.model_copy(update={**bare_sensors(), "groups": ("hammer",)})
     return scene.model_copy(update={"engine": engine, "model": levels, "sensors": sensors})
