@@ -161,12 +161,13 @@ def test_split_is_right_where_it_is_hard_and_its_estimate_says_how_far(name: str
 
 
 def test_a_minute_of_whirl_is_right_for_as_long_as_its_growth_allows() -> None:
-    # What whirls grows small differences by 0.3 a second: 20 s make 400 of one, and the ledger closes all the same.
+    # What whirls grows small differences by 0.3 a second: 20 s make 400 of one, and the ledger closes all the same, to
+    # far less than the tolerance of the motion (3e-4), by which rolling takes its steps.
     bare = {"sensors.chain": "ideal", "sensors.rate_hz": 100, "sensors.truth_rate_hz": 100}
     run = simulate("hammer", bare, duration_s=20.0)
     health = run.simulation.health()
     assert health["accuracy"]["doubted_s"] is None
-    assert abs(health["energy"]["residual_share"]) < 1e-7
+    assert abs(health["energy"]["residual_share"]) < 1e-6
 
 
 @pytest.mark.parametrize("engine", ["rk8", "tsit5", "taylor"])
