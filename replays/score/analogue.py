@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from replays.score.alignment import Alignment, Source, align
+from replays.score.alignment import align
+from replays.score.following import Alignment, Source
 from replays.score.intervals import sandwich, student
 from replays.score.noise import split_noise
 from replays.score.recorded import Recorded

@@ -133,17 +133,15 @@ def parted(stimulus: Stimulus, rate_hz: float, sent_hz: float, least: float) -> 
 
 
 class Exact:
-    """A formula of time, whose slope is taken over five points."""
+    """A formula of time, whose slope is a central difference: off by 2e-6 of it at half of the rate."""
 
     def __init__(
         self, formula: Callable[[np.ndarray], np.ndarray], span_s: tuple[float, float], rate_hz: float
     ) -> None:
         """Take a formula [unit] of times [s], when it holds, and the rate at which it is recorded [Hz]."""
-        self._formula, self.span_s, self._step_s = formula, span_s, 0.01 / rate_hz
+        self._formula, self.span_s, self._step_s = formula, span_s, 0.001 / rate_hz
 
     def __call__(self, times_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """As `Stimulus`."""
         f, h = self._formula, self._step_s
-        one = f(times_s + h) - f(times_s - h)
-        two = f(times_s + 2.0 * h) - f(times_s - 2.0 * h)
-        return f(times_s), (8.0 * one - two) / (12.0 * h)
+        return f(times_s), (f(times_s + h) - f(times_s - h)) / (2.0 * h)

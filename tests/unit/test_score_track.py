@@ -15,7 +15,10 @@ from replays.score.track import Follower, Track, follow_record
 from replays.score.waveform import fit_stretch
 from replays.score.wiring import find_wires
 from rig.channels import default_table
+from tests.score_cases import Converter, as_columns
 from tests.score_daqs import RATE_HZ, Tones, counts_of, write_parquet, write_session
+from tests.score_files import write_values
+from tests.score_sessions import Sessions
 
 ROWS = np.arange(14_000)
 TONES = Tones(1, 0.5, high_hz=6000.0, tones=6)
@@ -134,6 +137,18 @@ def test_a_lost_sample_of_a_signal_that_repeats_fails(session: Path, tmp_path: P
     assert card.runs["lost samples"] == [(5000, 5000)]
     assert card.row("start", next(r.channel for r in card.rows if r.quantity == "start")).verdict == INCONCLUSIVE
     assert card.row("gain", "disk_x").verdict == PASS
+
+
+def test_rows_before_a_channel_freezes_do_not_stand_outside_the_session(tmp_path: Path) -> None:
+    """A fault of 10 ms of one channel spoils no fit of the rest of a sine, and hides no rows."""
+    sent = Sessions(tmp_path / "sessions").get("test-sine")
+    volts = Converter(2.05, 24_000).volts(sent, np.random.default_rng(9))
+    volts[9000:9200, 1] = volts[9000, 1]
+    columns = as_columns(sent, volts, "unit")
+    file = write_values("parquet", tmp_path / "daq", columns, np.arange(len(volts)) / RATE_HZ, RATE_HZ)
+    card = judge(file, [sent.path], path="analogue")
+    assert {channel for _, channel in red(card)} == {sent.channels[1].name}
+    assert not card.remarks
 
 
 def test_one_turned_channel_of_a_signal_that_repeats_fails(session: Path, tmp_path: Path) -> None:
