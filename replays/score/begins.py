@@ -30,9 +30,9 @@ _SEARCHED = 2
 FOLLOWED = 4
 """Begins that are followed with all channels: the nearest ones, half a period later among them."""
 _ALIKE = 1.05
-"""Residual power over the least one up to which begins are not told from one another, at least."""
+"""Residual power over the least one up to which begins are not distinguished, at least."""
 _DEVIATIONS = 6.0
-"""Standard deviations of a residual's power within which begins are not told from one another."""
+"""Standard deviations of a residual's power within which begins are not distinguished."""
 _SAME_ROWS = 0.5
 """Rows within which two begins are one: half of a row is a quarter of the shortest period."""
 _WORSE = 2.0
@@ -42,7 +42,7 @@ _EDGE_ROWS = 20
 _FAR, _FEW = 10.0, 0.2
 """Residual over the median one from which a row is faulty, and the part of the rows that may be."""
 _SOUND_PARTS = 0.25
-"""Quantile of the stretches by which begins are compared: behind a lost sample, the right one explains none."""
+"""Quantile of the stretches by which begins are compared: after a lost sample, the right one explains none."""
 _PARTS = 6
 """Parts of a record, of each of which a stretch is compared before all of it is followed."""
 
@@ -97,10 +97,7 @@ class Begins:
         left = np.full(found.rows, np.nan)
         left[slice(*found.track.inside)] = np.nanvar(one.values)
         if fit is not None:
-            explained, at = found.track.places(found.rows)
-            row_at = np.zeros(len(values), int)
-            row_at[at - int(at.min())] = np.flatnonzero(explained)
-            left[row_at[np.rint((fit.times_s - times_s[0]) * one.rate_hz).astype(int)]] = fit.residual**2
+            left[found.rows_at(fit.times_s)] = fit.residual**2
         power = _block_means((one.values - np.nanmean(one.values)) ** 2)
         # The DAQ's and the session's.
         noise = (
@@ -109,7 +106,7 @@ class Begins:
         return np.where(power > _LOUD_PART * np.nanmean(power), _block_means(left), np.nan) / (2.0 * noise**2)
 
     def _is_worse(self, power: np.ndarray, other: np.ndarray) -> bool:
-        """Whether a begin leaves more than another where both are in the session, by the median blocks of signals."""
+        """Return whether a begin leaves more than another, by the median blocks of signals that both explain."""
         both = np.isfinite(power) & np.isfinite(other)
         compared = both.any(axis=1)
         limit = max(_ALIKE, 1.0 + _DEVIATIONS * math.sqrt(2.0 / max(1, _BLOCK_ROWS * both.sum())))
@@ -136,7 +133,7 @@ class Begins:
 
     @property
     def _settled(self) -> bool:
-        """Whether two begins leave nothing but the noise of DAQ and session, and one of them no row unexplained."""
+        """Return whether two begins leave nothing but noise of DAQ and session, and one of them no row unexplained."""
         alike = self.alike() if self._least < 1.0 else []
         return len(alike) > 1 and any(each.whole and not self.outside(each) for each in alike)
 
@@ -240,10 +237,7 @@ def trimmed(found: Alignment, one: Source) -> Alignment:
     fit = fit_waveform(values, times_s, one.stimulus, curve)
     if fit is None:
         return found
-    explained, at = found.track.places(found.rows)
-    row_at = np.zeros(len(values), int)
-    row_at[at - int(at.min())] = np.flatnonzero(explained)
-    odd = row_at[np.rint((fit.times_s[_outlying(fit)] - times_s[0]) * one.rate_hz).astype(int)]
+    odd = found.rows_at(fit.times_s[_outlying(fit)])
     runs, (first, last) = list(found.track.runs), found.track.inside
     loud = _LOUD_PART * float(np.nanvar(one.values[first:last]))
     begin = int(odd[odd < runs[0].begin + _BLOCK_ROWS].max(initial=runs[0].begin - 1)) + 1

@@ -114,6 +114,14 @@ class Alignment:
         curve = float(line[0]) + own_s, float(line[1]), float(line[2])
         return values, self.first_s + np.arange(low, high + 1) / self.rate_hz, curve
 
+    def rows_at(self, times_s: np.ndarray) -> np.ndarray:
+        """Return the rows of the record at some of the times of `even` at which there are values, shape (n,)."""
+        explained, at = self.track.places(self.rows)
+        low = int(at.min())
+        rows = np.zeros(int(at.max()) - low + 1, int)
+        rows[at - low] = np.flatnonzero(explained)
+        return rows[np.rint((times_s - self.first_s) * self.rate_hz).astype(int) - low]
+
     @property
     def inside_s(self) -> tuple[float, float]:
         """Times of the session at the first and the last row in it [s]."""
@@ -122,7 +130,7 @@ class Alignment:
 
     @property
     def whole(self) -> bool:
-        """Whether nearly all rows in the session are explained."""
+        """Return whether nearly all rows in the session are explained."""
         return self.judged() > _WHOLE
 
     def judged(self) -> float:
