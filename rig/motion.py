@@ -93,6 +93,11 @@ class Motion:
         """Start the engine on this state."""
         engine.start(constants, inputs, self.y, self.memory, float(self.step_ticks), self.tolerance)
 
+    def warm_up(self, engine: Engine, constants: Constants, inputs: Inputs) -> None:
+        """Compile what the engine may call later than in its first steps."""
+        if engine.warm_up is not None and len(self.memory) == engine.memory_size:
+            engine.warm_up(constants, inputs)
+
     def run(
         self, engine: Engine, constants: Constants, inputs: Inputs, rows: np.ndarray, start: int, tick: int, stop: int
     ) -> None:

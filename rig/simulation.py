@@ -138,9 +138,8 @@ class Simulation:
         self._segments = segments(scene.drive.profile or ((0.0, scene.drive.speed_hz),), TICK_RATE_HZ)
         self._engaged = scene.initial.magnets
         self._pulse: tuple[HammerCommand, int, int] | None = None
-        self._pending = sorted(
-            ((round(timed.at_s * TICK_RATE_HZ), timed.request) for timed in scene.commands), key=lambda entry: entry[0]
-        )
+        given = ((round(timed.at_s * TICK_RATE_HZ), timed.request) for timed in scene.commands)
+        self._pending = sorted(given, key=lambda entry: entry[0])
         self._faulty.check_all(self._pending)
         choice, initial = scene.engine, initial_state(self.model, scene.initial, begin, spin=self._speed())
         memory = np.zeros(self._engines[0].memory_size if choice.rolling == "collocation" else MEMORY)
@@ -286,6 +285,7 @@ class Simulation:
         if not self._warm:
             twin = Simulation(self.scene, begin=self.begin)
             twin.advance(twin.block_ticks)
+            twin._motion.warm_up(twin._engines[0], twin.model.constants, twin._inputs())
             self._warm = True
 
     def health(self) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """Half of a first start's compiling, in a process of its own beside it: `python -m rig.cli.ahead`.
 
-Most of it are the series of flight, rolling and sliding, one after the other. On a second core the last of them are
-ready when their turn comes, and found in the cache.
+Both need about the same time: one compiles the march of the engine, with the series of flight and rolling; this one
+those of sliding, rolling by collocation and the sensors, which the other then finds in the cache.
 """
 
 from __future__ import annotations
@@ -15,15 +15,20 @@ from threading import Thread
 
 SERIES = ("rig.engines.split", "rig.engines.taylor")
 """Engines that are made of series."""
+MARCH = "rig.engines.split.method"
+"""What compiles last before rolling by collocation does."""
 
 
-def start_beside() -> None:
+def start_beside() -> subprocess.Popen[bytes] | None:
     """Start it where there is a core for it. It ends by itself, or with this process."""
     cores = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else range(os.cpu_count() or 1)
-    if len(cores) > 1:
-        quiet = subprocess.DEVNULL
-        child = subprocess.Popen([sys.executable, "-m", __name__], stdin=quiet, stdout=quiet, stderr=quiet)
-        atexit.register(_end, child)
+    if len(cores) < 2:
+        return None
+    # -P: the same files as here, whatever lies in the working directory.
+    command, quiet = [sys.executable, "-P", "-m", __name__], subprocess.DEVNULL
+    child = subprocess.Popen(command, stdin=quiet, stdout=quiet, stderr=quiet)
+    atexit.register(_end, child)
+    return child
 
 
 def _end(child: subprocess.Popen[bytes]) -> None:
@@ -32,31 +37,27 @@ def _end(child: subprocess.Popen[bytes]) -> None:
 
 
 def compile_last() -> None:
-    """Compile the series, the sensors and rolling by collocation, by calling them as a run does."""
+    """Compile the series of sliding, the sensors and rolling by collocation, by calling them as a run does."""
     import numpy as np
 
-    from rig.engines.split.layout import MEMORY, STEP_S, WAITS
-    from rig.engines.split.rolling import roll
+    from rig.engines.split import method
     from rig.engines.taylor.march import room_in
-    from rig.engines.taylor.series import rolling, sliding
+    from rig.engines.taylor.series import sliding
     from rig.kernels.constants import Inputs
     from rig.kernels.records import packed
-    from rig.kernels.signals import N_ROW, N_VECTOR
+    from rig.kernels.signals import N_ROW
     from rig.sensors.conditioning import Conditioner
     from rig.simulation import Simulation
 
     simulation = Simulation("hammer")
     quiet = Inputs(1e-6, 0.0, 1.0, 0.0, 0, 0, 0.0, 0.0, 0, ideal_drive=False, magnet_engaged=True)
-    constants, inputs = packed(simulation.model.constants)[0], packed(quiet)[0]
-    memory = np.zeros(MEMORY)
+    constants, inputs = packed(simulation.model.constants), packed(quiet)
+    memory = np.zeros(method.MEMORY)
     room = room_in(memory)
-    for series in (sliding, rolling):
-        series(constants, inputs, memory, 0.0, 0.0, 0.0, 0.0, room.Y, room.A, room.B, room.D, room.acc)
+    sliding(constants[0], inputs[0], memory, 0.0, 0.0, 0.0, 0.0, room.Y, room.A, room.B, room.D, room.acc)
+    method.warm_up(constants, inputs)
     groups, rows = tuple(simulation.table.groups.values()), np.zeros((1000, N_ROW))
     Conditioner(groups, row_rate_hz=40_000, seed=1, noise=True, ideal=False).counts(rows)
-    # With other inputs than the memory holds, it returns at once.
-    memory[STEP_S], memory[WAITS] = 1e-3, 1.0
-    roll(packed(simulation.model.constants), packed(quiet), np.zeros(N_VECTOR), memory, (0, 1, 1), 0, rows)
 
 
 def _end_with(parent: int) -> None:

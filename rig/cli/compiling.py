@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import subprocess
 import time
 from collections.abc import Callable
 from typing import Any
 
 from numba.core.event import Listener
 
-from rig.cli.ahead import SERIES, start_beside
+from rig.cli.ahead import MARCH, SERIES, start_beside
 
-_ENGINE_S = 45
+_ENGINE_S = 40
 """Processor time that an engine takes, with the kernels that it calls, on a usual machine [s]."""
 
 
@@ -29,7 +30,8 @@ class Compiling(Listener):
         self._begun, self._going_on = begun, going_on
         self._under_way: list[str] = []
         """Modules of the functions, each on the way of the one before."""
-        self._told = self._beside = False
+        self._told = self._began = False
+        self._beside: subprocess.Popen[bytes] | None = None
         self._spent_s, self._since_s = 0.0, 0.0
 
     def on_start(self, event: Any) -> None:
@@ -41,9 +43,8 @@ class Compiling(Listener):
         ours = [module for module in self._under_way if module.startswith(("rig.", "drivers."))]
         if not ours:
             return
-        if ours[0].startswith(SERIES) and not self._beside:
-            self._beside = True
-            start_beside()
+        if ours[0].startswith(SERIES) and not self._began:
+            self._began, self._beside = True, start_beside()
         name, spent_s = ".".join(ours[-1].split(".")[-2:]), self._spent_s + now_s - self._since_s
         text = f"compiling {name} ({spent_s:.0f} s of CPU; some {_ENGINE_S} s an engine)"
         if self._told:
@@ -54,8 +55,12 @@ class Compiling(Listener):
 
     def on_end(self, event: Any) -> None:
         """A function is compiled."""
-        self._under_way.pop()
+        module = self._under_way.pop()
         if not self._under_way:
+            if module == MARCH and self._beside is not None:
+                # The rest would be compiled here a second time.
+                self._going_on("compiling in a second process")
+                self._beside.wait()
             self._spent_s += time.process_time() - self._since_s
             if self._told:
                 self._going_on("")

@@ -75,6 +75,8 @@ class Engine(NamedTuple):
     order: int
     memory_size: int = MEMORY
     """Of `split` with room for rolling by collocation; in one of size MEMORY it rolls by series."""
+    warm_up: Callable[[Constants, Inputs], None] | None = None
+    """Compiles what `advance` may call later than in its first steps, if there is any."""
 
 
 def load_engine(name: str) -> Engine:
@@ -96,4 +98,5 @@ def load_engine(name: str) -> Engine:
         kernel(packed(constants), packed(inputs), *others)
 
     size = getattr(module, "MEMORY", MEMORY)
-    return Engine(partial(on_records, start), partial(on_records, advance), module.ORDER, size)
+    warm_up = partial(on_records, module.warm_up) if hasattr(module, "warm_up") else None
+    return Engine(partial(on_records, start), partial(on_records, advance), module.ORDER, size, warm_up)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any, Final
+
 from numba import njit
 
-stage = njit(cache=True, error_model="numpy", fastmath=False, forceinline=True)  # pyright: ignore[reportCallIssue]
+STAGE: Final[dict[str, Any]] = {"cache": True, "error_model": "numpy", "fastmath": False, "forceinline": True}
+stage = njit(**STAGE)
 """Put in place by the compiler wherever it is called: a stage and its tuples cost nothing over the same lines in one
 long function. IEEE 754 as it stands, no reordering: a stage gives the same bits wherever it is called."""
 

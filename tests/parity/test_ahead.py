@@ -1,16 +1,63 @@
-"""What is compiled ahead, in another process, is what a run would compile."""
+"""What is compiled ahead, in another process or before a run, is what a run would compile."""
 
 from __future__ import annotations
 
-from rig.cli.ahead import compile_last
-from rig.engines.taylor.series import rolling, sliding
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from numba.core.dispatcher import Dispatcher
+
+from rig.cli import ahead
+from rig.engines.split.condensed import set_step
+from rig.engines.taylor.series import sliding
 from rig.simulation import Simulation
+
+LATE = """
+import gc
+from numba.core.dispatcher import Dispatcher
+from rig.simulation import Simulation
+
+def known():
+    return {each: len(each.signatures) for each in gc.get_objects() if isinstance(each, Dispatcher)}
+
+simulation = Simulation("hammer")
+simulation.warm_up()
+before = known()
+while simulation.tick < 500_000:
+    frame = simulation.advance(simulation.block_ticks)
+assert simulation.health()["engine"]["rolling_share"] > 0.3, "no whirl, in which much is called for the first time"
+print(*(each.py_func.__qualname__ for each, count in known().items() if count > before.get(each, 0)))
+"""
 
 
 def test_a_run_compiles_nothing_of_it_again() -> None:
-    compile_last()
-    ahead = {kernel: list(kernel.signatures) for kernel in (rolling, sliding)}
-    assert all(len(signatures) == 1 for signatures in ahead.values())
+    ahead.compile_last()
+    compiled: dict[Dispatcher, list[object]] = {each: list(each.signatures) for each in (sliding, set_step)}
+    assert all(len(signatures) == 1 for signatures in compiled.values())
     simulation = Simulation("hammer")
     simulation.advance(simulation.block_ticks)
-    assert {kernel: list(kernel.signatures) for kernel in ahead} == ahead
+    assert {kernel: list(kernel.signatures) for kernel in compiled} == compiled
+
+
+def test_nothing_is_compiled_late() -> None:
+    """A live rig would stand still for it."""
+    done = subprocess.run([sys.executable, "-c", LATE], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout.strip()) == (0, ""), done.stderr
+
+
+def test_the_second_process_takes_no_code_of_the_working_directory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The cache is found by the files' place: what it compiles of other files is compiled for nothing."""
+    package = tmp_path / "rig"
+    package.mkdir()
+    (package / "__init__.py").write_text("raise SystemExit(7)")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("PYTHONPATH", raising=False)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1}, raising=False)
+    child = ahead.start_beside()
+    assert child is not None
+    assert child.wait() == 0

@@ -233,7 +233,16 @@ def test_compiling_is_told_as_long_as_it_lasts(monkeypatch: pytest.MonkeyPatch) 
     from rig.cli.compiling import Compiling
 
     beside: list[str] = []
-    monkeypatch.setattr(compiling, "start_beside", lambda: beside.append("started"))
+
+    class Process:
+        def wait(self) -> None:
+            beside.append("waited for")
+
+    def start() -> Process:
+        beside.append("started")
+        return Process()
+
+    monkeypatch.setattr(compiling, "start_beside", start)
     begun: list[str] = []
     told: list[str] = []
     listener = Compiling(begun.append, told.append)
@@ -246,11 +255,13 @@ def test_compiling_is_told_as_long_as_it_lasts(monkeypatch: pytest.MonkeyPatch) 
             listener.on_start(event(module))
         for module in modules:
             listener.on_end(event(module))
-    assert [text.partition(" (")[0] for text in told] == ["compiling split.method", "", "compiling kernels.contact", ""]
+    assert [text.partition(" (")[0] for text in told] == [
+        "compiling split.method", "compiling in a second process", "", "compiling kernels.contact", "",
+    ]  # fmt: skip
     (first,) = begun
     assert first.startswith("compiling split.method (0 s of CPU; ")
     assert first.endswith("), once on this machine")
-    assert beside == ["started"]
+    assert beside == ["started", "waited for"]
 
 
 def test_every_command_with_tables_has_the_same_options(capsys: pytest.CaptureFixture[str]) -> None:

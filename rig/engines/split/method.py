@@ -3,7 +3,8 @@
 A step of theirs may err by a ten-thousandth of `engine.tolerance`: impacts make small errors a thousand times larger.
 Through flight they last for milliseconds, through an impact there are some eleven of them.
 
-Rolling that lasts goes over to collocation (`rig.engines.split.rolling`), whose kernels compile when it first does.
+Rolling that lasts goes over to collocation (`rig.engines.split.rolling`), whose kernels compile when it first does, or
+before by `warm_up`.
 
 A rigid contact is a chain of impacts, one by one where the gap closes (`rig.engines.split.rigid`); where it lasts, it
 is the compliant one.
@@ -15,7 +16,7 @@ import numpy as np
 from numba import njit
 
 from rig.engines.memory import ONSET, PHASE
-from rig.engines.split.layout import MEMORY, PLACES, READY_TICK
+from rig.engines.split.layout import MEMORY, PLACES, READY_TICK, STEP_S, WAITS
 from rig.engines.split.place import HARDEST, SHARE
 from rig.engines.split.rigid import bounce, plant_of
 from rig.engines.split.rolling import may_roll, roll, watch_for_rolling
@@ -23,9 +24,10 @@ from rig.engines.taylor import march as series
 from rig.engines.taylor.events import FIRST
 from rig.engines.taylor.place import END_FRACTION, END_TICK, EVENT, FRACTION, ORDER, SPAN, TICK
 from rig.kernels.contact import FLIGHT
+from rig.kernels.signals import N_ROW, N_VECTOR
 from rig.kernels.stage import kernel
 
-__all__ = ["MEMORY", "ORDER", "advance", "start"]
+__all__ = ["MEMORY", "ORDER", "advance", "start", "warm_up"]
 
 
 def start(constants, inputs, y, memory, step_ticks, tolerance):
@@ -97,3 +99,10 @@ def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)
         row = _march(constants, inputs, y, memory, *at, grid, row, rows)
         if row <= count:
             row = roll(constants, inputs, y, memory, grid, row, rows)
+
+
+def warm_up(constants, inputs):
+    """Compile rolling by collocation, by a call that returns at once: the memory is of other inputs."""
+    memory = np.zeros(MEMORY)
+    memory[STEP_S], memory[WAITS] = 1e-3, 1.0
+    roll(constants, inputs, np.zeros(N_VECTOR), memory, (0, 1, 1), 0, np.zeros((1, N_ROW)))

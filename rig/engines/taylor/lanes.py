@@ -6,9 +6,13 @@ lanes at once. `later` is 0 for k = 0, else 1.
 
 from __future__ import annotations
 
+from numba import float64, int64, njit
+
 from rig.kernels.contact import SMOOTHED
 from rig.kernels.magnet import RIPPLED
-from rig.kernels.stage import stage
+from rig.kernels.stage import STAGE, stage
+
+_FACTORS, _SUMS = float64[:, ::1], float64[::1]
 
 
 @stage
@@ -23,7 +27,7 @@ def is_wide(constants, inputs):
     )
 
 
-@stage
+@njit((_FACTORS, _FACTORS, _SUMS, int64, int64), **STAGE)
 def sum_below(A, B, acc, k, lanes):
     """What the coefficients below the k-th give to the products of so many lanes."""
     for p in range(lanes):
@@ -33,14 +37,16 @@ def sum_below(A, B, acc, k, lanes):
             acc[p] += A[j, p] * B[k - j, p]
 
 
-@stage
+# Named types: each lane's number is a constant, which the compiler takes for a type of its own, and it would compile
+# the function once a lane.
+@njit(float64(_FACTORS, _FACTORS, _SUMS, int64, float64, int64, float64, float64), **STAGE)
 def product(A, B, acc, k, later, p, left, right):
     """The k-th coefficient of a product, whose factors go into lane p."""
     A[k, p], B[k, p] = left, right
     return acc[p] + A[0, p] * right + left * (later * B[0, p])
 
 
-@stage
+@njit(float64(_FACTORS, _FACTORS, _SUMS, int64, float64, int64, float64, float64, float64), **STAGE)
 def quotient(A, B, acc, k, later, p, divisor, dividend, inverse):
     """The k-th coefficient of a quotient, by the inverse of the divisor's first; both go into lane p, as factors."""
     A[k, p], B[k, p] = divisor, (dividend - acc[p] - divisor * (later * B[0, p])) * inverse
