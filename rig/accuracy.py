@@ -44,6 +44,8 @@ _MIN_FIT_ROWS = 30
 _MIN_WHIRL_RADIUS = 0.5
 """Part of the clearance above which an orbit has a whirl angle."""
 _COLUMNS = [*range(S.N_STATE), COLUMN["ring_x"], COLUMN["ring_y"], COLUMN["normal_force"]]
+_MOVING = [2 + k for k in range(S.N_STATE) if k != S.THETA]
+"""Columns of a window's differences that are states, without the spin angle; before them are radius and force."""
 _FIRST, _LOST = 1e-9, 0.1
 """Growth is measured from the first distance above rounding, up to where two runs no longer have to do with each
 other."""
@@ -91,7 +93,7 @@ class Accuracy:
     peak_force: float = 0.0
     _first: tuple[float, float] | None = None
     _window: np.ndarray = field(default_factory=lambda: np.empty((0, 1 + 2 * len(_COLUMNS))))
-    _waiting: np.ndarray = field(default_factory=lambda: np.empty((0, 1 + 2 * len(_COLUMNS))))
+    _waiting: list[np.ndarray] = field(default_factory=lambda: [])
 
     def compare(self, rows: np.ndarray, companion: np.ndarray, times_s: np.ndarray) -> list[tuple[float, str]]:
         """Add samples of both runs.
@@ -104,13 +106,16 @@ class Accuracy:
         Returns:
             Time [s] and text of a warning for each window in which another quantity exceeded its tolerance.
         """
-        added = np.column_stack([times_s, rows[:, _COLUMNS], companion[:, _COLUMNS]])
-        self._waiting = np.concatenate([self._waiting, added])
+        self._waiting.append(np.concatenate([times_s[:, None], rows[:, _COLUMNS], companion[:, _COLUMNS]], axis=1))
         size, warnings = max(_WINDOW_ROWS, math.ceil(_WINDOW_S / self.block_s)), []
-        while len(self._waiting) >= size:
-            self._window, self._waiting = self._waiting[:size], self._waiting[size:]
+        if sum(map(len, self._waiting)) < size:
+            return warnings
+        waiting = np.concatenate(self._waiting)
+        while len(waiting) >= size:
+            self._window, waiting = waiting[:size], waiting[size:]
             if self._add_window(self._window):
                 warnings.append((float(self._window[-1, 0]), self.warning()))
+        self._waiting = [waiting]
         return warnings
 
     def completed(self) -> Accuracy:
@@ -121,10 +126,8 @@ class Accuracy:
 
     def complete(self) -> None:
         """Add the samples of the window that is not full yet, filled up by those before them."""
-        if len(self._waiting):
-            self._add_window(
-                np.concatenate([self._window, self._waiting])[-max(len(self._window), len(self._waiting)) :]
-            )
+        if count := sum(map(len, self._waiting)):
+            self._add_window(np.concatenate([self._window, *self._waiting])[-max(len(self._window), count) :])
 
     def document(self) -> dict[str, Any]:
         """Return the estimate as JSON: each quantity's largest error and tolerance in its unit, and since when."""
@@ -167,38 +170,28 @@ class Accuracy:
 
     def _add_window(self, window: np.ndarray) -> bool:
         """Update all estimates by one window; return whether another quantity exceeds its tolerance."""
-        times_s, (own, other) = window[:, 0], np.split(window[:, 1:], 2, axis=1)
-        away = np.nan_to_num((own - other)[:, : S.N_STATE] / S.STATE_SCALE, nan=math.inf)
-        for time, distance in zip(times_s.tolist(), np.sqrt(np.mean(away**2, axis=1)).tolist(), strict=True):
-            self.estimate = max(self.estimate, distance)
-            if self._first is None and distance > _FIRST:
-                self._first = time, distance
-            elif self._first is not None and self._first[1] < distance < _LOST:
-                self.grown_per_s = math.log(distance / self._first[1]) / (time - self._first[0])
-        self.peak_force = max(self.peak_force, float(own[:, -1].max()))
-        orbit, orbit_other = (part[:, -3] + 1j * part[:, -2] for part in (own, other))
-        values, values_other = (
-            np.column_stack([np.abs(z), part[:, -1], part[:, : S.N_STATE] / S.STATE_SCALE])
-            for z, part in ((orbit, own), (orbit_other, other))
-        )
-        turned = np.unwrap(np.angle(orbit * np.conj(orbit_other)))
-        whirls = np.minimum(np.abs(orbit), np.abs(orbit_other)) > _MIN_WHIRL_RADIUS * self.clearance
-        apart = np.nan_to_num(np.abs(values - values_other), nan=math.inf)
-        theta = 2 + S.THETA
-        errors = self._at_instant(apart, theta)
+        times_s, both = window[:, 0], window[:, 1:].reshape(len(window), 2, len(_COLUMNS))
+        orbit, force = both[..., -3] + 1j * both[..., -2], both[..., -1:]
+        radius = np.abs(orbit)
+        values = np.concatenate([radius[..., None], force, both[..., : S.N_STATE] / S.STATE_SCALE], axis=-1)
+        apart = np.abs(values[:, 0] - values[:, 1])
+        apart[np.isnan(apart)] = math.inf
+        self._note_growth(times_s, np.sqrt(np.mean(apart[:, 2:] ** 2, axis=1)))
+        self.peak_force = max(self.peak_force, float(force[:, 0].max()))
+        between = np.angle(orbit[:, 0] * np.conj(orbit[:, 1]))
+        whirls = radius.min(axis=1) > _MIN_WHIRL_RADIUS * self.clearance
+        errors = self._at_instant(apart)
         if len(window) >= _MIN_FIT_ROWS and np.isfinite(apart).all() and (errors > self.errors[[0, 1, 3]]).any():
-            phase, phase_other = (
-                np.column_stack([np.angle(z), part[:, S.THETA]]) for z, part in ((orbit, own), (orbit_other, other))
-            )
-            same_angle = _apart_at_same_angle(values, values_other, phase, phase_other, times_s)
-            errors = self._at_instant(np.minimum(apart, same_angle), theta)
-        radius, force, state = errors
+            phases = np.stack([np.angle(orbit), both[..., S.THETA]], axis=-1)
+            same_angle = _apart_at_same_angle(*values.swapaxes(0, 1), *phases.swapaxes(0, 1), times_s)
+            errors = self._at_instant(np.minimum(apart, same_angle))
         span_s = times_s[-1] - times_s[0]
         frequency = 0.0
         if whirls.all() and span_s >= 0.5 * _WINDOW_S:
+            turned = np.unwrap(between)
             frequency = abs(turned[-1] - turned[0]) / (2.0 * math.pi * span_s)
-        angle = np.abs(np.angle(np.exp(1j * turned[whirls]))).max(initial=0.0)
-        found = np.array([radius, force, frequency, state, angle, apart[:, theta].max()])
+        angle = np.abs(between[whirls]).max(initial=0.0)
+        found = np.array([errors[0], errors[1], frequency, errors[2], angle, apart[:, 2 + S.THETA].max()])
         self.errors = np.maximum(self.errors, found)
         exceeded = [
             name
@@ -208,11 +201,22 @@ class Accuracy:
         self.since_s |= dict.fromkeys(exceeded, float(times_s[0]))
         return bool(exceeded)
 
+    def _note_growth(self, times_s: np.ndarray, distances: np.ndarray) -> None:
+        """Update the largest distance of all states and its growth, by distances at some instants, shape (n,)."""
+        self.estimate, begin = max(self.estimate, float(distances.max())), 0
+        if self._first is None and (above := distances > _FIRST).any():
+            begin = int(np.argmax(above)) + 1
+            self._first = float(times_s[begin - 1]), float(distances[begin - 1])
+        if self._first is not None:
+            grown = np.flatnonzero((distances[begin:] > self._first[1]) & (distances[begin:] < _LOST))
+            if len(grown):
+                last = begin + int(grown[-1])
+                self.grown_per_s = math.log(distances[last] / self._first[1]) / float(times_s[last] - self._first[0])
+
     @staticmethod
-    def _at_instant(apart: np.ndarray, theta: int) -> np.ndarray:
+    def _at_instant(apart: np.ndarray) -> np.ndarray:
         """Largest radius [m], force [N] and scaled state (without the spin angle) error, shape (3,)."""
-        state = np.delete(apart, [0, 1, theta], axis=1)
-        rms = np.sqrt(np.sum(state**2, axis=1) / S.N_STATE)
+        rms = np.sqrt(np.sum(apart[:, _MOVING] ** 2, axis=1) / S.N_STATE)
         return np.array([apart[:, 0].max(), apart[:, 1].max(), rms.max()])
 
 

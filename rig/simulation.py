@@ -146,10 +146,10 @@ class Simulation:
         self._motion = Motion(initial, self._step_ticks, self._stride, choice.tolerance, memory)
         self._companion: Motion | None = None
         if choice.companion:
-            name, tolerance = choose_companion(choice.name, choice.tolerance, scene.model.friction)
+            name, finer = choose_companion(choice.name, choice.tolerance, scene.model.friction)
             self._engines.append(self._engines[0] if scene.generator or name == choice.name else load_engine(name))
             stride = self.block_ticks // self._step_ticks
-            self._companion = Motion(initial.copy(), self._step_ticks, stride, tolerance)
+            self._companion = Motion(initial.copy(), self._step_ticks, stride, finer, np.zeros_like(memory))
         clearance = self.model.constants.contact.clearance
         self._accuracy = Accuracy(choice.tolerance, clearance, self.block_ticks / TICK_RATE_HZ)
         self._rows = np.full((0, S.N_ROW), np.nan)

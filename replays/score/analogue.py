@@ -293,7 +293,7 @@ def _score_rows(card: Scorecard, alignments: list[Alignment], recorded: Mapping[
                 quantity,
                 name,
                 (count, count, count),
-                note="; ".join(each for each in (told, note if here else "") if each),
+                note="; ".join(each for each in (told, note) if each),
             )
             card.runs[f"{quantity} {name}".strip()] = [(first, last) for first, last, _ in here]
         card.add("judged part", name, (judged := alignment.judged(), judged, judged))

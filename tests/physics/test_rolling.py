@@ -6,6 +6,7 @@
 | responses of a linear body        | the matrix exponential, for a force that is a power    |
 | matrices of the linear bodies     | the kernels' rates, by the change of one state         |
 | settled whirl over 0.2 s          | `taylor` from the same state, at each tolerance        |
+| the companion's estimate          | the distance from `taylor`                             |
 | energy residual                   | 0, within the tolerance                                |
 | rows                              | the same bits, however the run is cut into calls       |
 | contact that slips                | `taylor`, after the exit to a series                   |
@@ -158,6 +159,20 @@ def test_settled_whirl_is_that_of_the_series(tolerance: float, error: float) -> 
     assert memory[CEILING] == 0.0
     ledger = energy_balance(rows, first)
     assert np.abs(ledger["residual"]).max() < 0.1 * tolerance * ledger["dissipated"].max() + 1e-6
+
+
+@pytest.mark.parametrize("tolerance", [1e-2, 3e-4])
+def test_the_companion_rolls_too_and_tells_the_error(tolerance: float) -> None:
+    """Its steps are shorter: else it would share the error, as it takes the same constraint."""
+    exact = ready("taylor", 1e-11).advance(600_000).rows
+    run = ready("split", tolerance, engine__companion=True)
+    rows = run.advance(600_000).rows
+    own, finer = (run.snapshot().changing[name].memory for name in ("_motion", "_companion"))
+    assert finer[ROLLED_S] > 0.4
+    assert finer[layout.ROLLING_STEPS] > own[layout.ROLLING_STEPS]
+    away = (rows[:, : S.N_STATE] - exact[:, : S.N_STATE]) / S.STATE_SCALE
+    error = float(np.sqrt(np.mean(away**2, axis=1)).max())
+    assert 0.3 * error < run.health()["accuracy"]["estimate"] < 3.0 * error
 
 
 def test_bits_do_not_depend_on_calls() -> None:

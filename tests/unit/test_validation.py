@@ -162,6 +162,18 @@ def test_a_pass_needs_rows_or_criteria_that_were_judged(hammer: Recording) -> No
     assert outcomes[Outcome.INCONCLUSIVE][0].verdict_line.startswith(f"inconclusive: {rows // 50} of ")
 
 
+def test_a_recording_that_was_cut_off_is_inconclusive(hammer: Recording, tmp_path: Path) -> None:
+    """Every count that is there holds, and nobody knows how many are not."""
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(hammer.path.read_bytes()[:-100])  # all samples are there, as it is short
+    found = validate(Recording.open(cut))
+    assert found.bit_exact
+    assert found.outcome is Outcome.INCONCLUSIVE
+    assert found.verdict_line.startswith("inconclusive: the recording is not complete")
+    wrong = validate(Recording.open(cut), changes={"contact.friction": 0.2})
+    assert wrong.outcome is Outcome.FAIL
+
+
 def test_one_count_is_found_with_its_time(hammer: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
     blocks = Recording.blocks
 

@@ -94,7 +94,7 @@ def validate(
         or sum(stream.lost - stream.declared for stream in recording.streams.values()),
         explained=None, fitted=again.tuned.fitted if again.tuned is not None else (),
         parts=again.parts, nominal=again.nominal, files=len(recording.parts), **_contact(again, phases, end),
-        doubts=tuple(doubts), faults=again.faults,
+        doubts=tuple(doubts), faults=again.faults, complete=recording.complete,
     )  # fmt: skip
     firsts = [one.first_s for one in trajectory if one.first_s is not None]
     # Without the truth a number of the model may be it, where that is off from the beginning on.

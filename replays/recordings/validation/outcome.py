@@ -128,6 +128,7 @@ class Validation:
         files: Number of files that the recording was in.
         faults: What signals of a log show by themselves to be wrong.
         doubts: What in the recording does not fit the rest of it: then nothing that is left of it is good.
+        complete: The recording was finished.
         contact_s: First contact of a log that the trajectory does not reach [s]; None where it does, or there is none.
         due_s: The same where the trajectory would have reached it, had the model explained what is there.
     """
@@ -156,6 +157,7 @@ class Validation:
     doubts: tuple[str, ...] = ()
     contact_s: float | None = None
     due_s: float | None = None
+    complete: bool = True
 
     @property
     def outcome(self) -> Outcome:
@@ -172,6 +174,8 @@ class Validation:
     @property
     def unjudged(self) -> str:
         """Return the reason why too little was compared for a pass; empty where enough was."""
+        if not self.complete:
+            return "the recording is not complete, and how much of it is missing is not known; what is there holds"
         if self.bit_exact and not self.declared:
             rows = sum(one.rows for one in self.bits.values())
             if rows < _MIN_JUDGED * (rows + self.skipped):
