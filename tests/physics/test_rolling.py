@@ -113,9 +113,10 @@ def test_it_is_the_default_of_split_alone() -> None:
         InputError, match=r"engine.rolling must be series with engine rk8; instead received 'collocation'"
     ):
         load_scene("hammer", {"engine.name": "rk8", "engine.rolling": "collocation"})
-    simulation = Simulation(load_scene("hammer"))
-    changing = [getattr(simulation, name) for name in ("_motion", "_companion")]  # before the engine starts
-    assert [len(motion.memory) for motion in changing] == [layout.MEMORY, MEMORY], "the companion has series alone"
+    for rolling, size in (("collocation", layout.MEMORY), ("series", MEMORY)):
+        simulation = Simulation(load_scene("hammer", {"engine.rolling": rolling}))
+        changing = [getattr(simulation, name) for name in ("_motion", "_companion")]  # before the engine starts
+        assert [len(motion.memory) for motion in changing] == [size, size]
     assert load_engine("split").memory_size == layout.MEMORY
     assert load_scene("hammer", {"engine.name": "rk8"}).engine.rolling == "series"
 
