@@ -21,6 +21,24 @@ from rig.kernels.signals import COLUMN, N_ROW
 _LONGEST = 500
 _DEEPEST = 30
 
+_Part = Callable[[np.ndarray], Any] | float
+"""Part of a formula: its values at rows, or a number."""
+
+
+def _apply(act: Callable[..., Any], *parts: _Part) -> _Part:
+    """Return a function of parts as a part; it is computed once, now, if each of them is a number."""
+    if not any(map(callable, parts)):
+        with np.errstate(all="ignore"):
+            return act(*parts)
+    return lambda rows: act(*[part(rows) if callable(part) else part for part in parts])
+
+
+def _along(x: _Part, y: _Part, degrees: _Part) -> _Part:
+    """Return what a sensor at an angle measures of a horizontal and a vertical signal."""
+    angle = _apply(np.radians, degrees)
+    return _apply(np.add, _apply(np.multiply, x, _apply(np.cos, angle)), _apply(np.multiply, y, _apply(np.sin, angle)))
+
+
 FUNCTIONS: dict[str, tuple[int, Callable[..., Any]]] = {
     "abs": (1, np.abs),
     "atan2": (2, np.arctan2),
@@ -32,10 +50,9 @@ FUNCTIONS: dict[str, tuple[int, Callable[..., Any]]] = {
     "sign": (1, np.sign),
     "sin": (1, np.sin),
     "sqrt": (1, np.sqrt),
-    "along": (3, lambda x, y, degrees: x * np.cos(np.radians(degrees)) + y * np.sin(np.radians(degrees))),
+    "along": (3, _along),
 }
-"""Functions of a formula: how many arguments they take, and what they do. `along` is what a sensor at an angle feels of
-a horizontal and a vertical signal."""
+"""Functions of a formula: how many arguments they take, and what they do; `along` takes and returns parts."""
 PLACES = {"shaft_x": "disk_x", "shaft_y": "disk_y"}
 """The shaft at a distance from the pivot [m]: it is rigid, so `shaft_x(arm)` is the disk's by the ratio of the arms."""
 _FARTHEST = 2.0
@@ -96,7 +113,7 @@ class Formulas:
             if name in {*FUNCTIONS, *PLACES, *COLUMN, "pi"}:
                 raise InputError(f"curves.{name}", "of a name that no signal and no function has", name)
         self._curves = {name: np.array(points, float).T for name, points in (curves or {}).items()}
-        self._made: list[Callable[[np.ndarray], Any]] = []
+        self._made: list[_Part] = []
 
     def column(self, channel: str, signal: str) -> int:
         """Column of a signal: the model's, or that of a formula behind those.
@@ -143,13 +160,13 @@ class Formulas:
         found = np.empty((len(rows), len(self._made)))
         if self._made:
             with np.errstate(all="ignore"):
-                for n, make in enumerate(self._made):
-                    found[:, n] = make(rows)
+                for n, part in enumerate(self._made):
+                    found[:, n] = part(rows) if callable(part) else part
             found[~np.isfinite(found)] = 0.0
         return found
 
-    def _read(self, node: ast.AST, field: str, signal: str, depth: int) -> Callable[[np.ndarray], Any]:
-        def inner(each: ast.AST) -> Callable[[np.ndarray], Any]:
+    def _read(self, node: ast.AST, field: str, signal: str, depth: int) -> _Part:
+        def inner(each: ast.AST) -> _Part:
             return self._read(each, field, signal, depth + 1)
 
         if depth > _DEEPEST:
@@ -158,32 +175,28 @@ class Formulas:
             case ast.Constant(value=bool()):
                 pass
             case ast.Constant(value=int() | float() as value) if abs(value) < 1e300:
-                number = np.float64(value)
-                return lambda rows: number
+                return np.float64(value)
             case ast.Name(id=name) if name in COLUMN:
                 column = COLUMN[name]
                 return lambda rows: rows[:, column]
             case ast.Name(id="pi"):
-                return lambda rows: math.pi
+                return math.pi
             case ast.Name(id=name):
                 raise UnknownNameError(field, "made of the model's signals", name, [*COLUMN, *FUNCTIONS, *PLACES])
             case ast.Attribute(value=ast.Name(id=table), attr=key):
                 name = f"{table}.{key}"
                 if name not in self._parameters:
                     raise UnknownNameError(field, "made of the parameters that are numbers", name, self._parameters)
-                value = np.float64(self._parameters[name])
-                return lambda rows: value
+                return np.float64(self._parameters[name])
             case ast.UnaryOp(op=op, operand=operand) if type(op) in _OPERATORS:
-                of, act = inner(operand), _OPERATORS[type(op)]
-                return lambda rows: act(of(rows))
+                return _apply(_OPERATORS[type(op)], inner(operand))
             case ast.BinOp(left=left, op=op, right=right) if type(op) in _OPERATORS:
-                one, other, act = inner(left), inner(right), _OPERATORS[type(op)]
-                return lambda rows: act(one(rows), other(rows))
+                return _apply(_OPERATORS[type(op)], inner(left), inner(right))
             case ast.Call(func=ast.Name(id=name), args=args, keywords=[]):
                 return self._call(name, [inner(each) for each in args], field)
         raise InputError(field, "made of numbers, signals, parameters, + - * / ** and functions", signal[:60])
 
-    def _call(self, name: str, of: list[Callable[[np.ndarray], Any]], field: str) -> Callable[[np.ndarray], Any]:
+    def _call(self, name: str, of: list[_Part], field: str) -> _Part:
         known = {**{key: count for key, (count, _) in FUNCTIONS.items()}, **dict.fromkeys([*PLACES, *self._curves], 1)}
         if name not in known:
             raise UnknownNameError(field, "made of the functions", name, known)
@@ -191,12 +204,25 @@ class Formulas:
             raise InputError(field, f"{name} of {known[name]} argument{'s' * (known[name] > 1)}", len(of))
         if name in FUNCTIONS:
             act = FUNCTIONS[name][1]
-            return lambda rows: act(*(each(rows) for each in of))
+            return act(*of) if act is _along else _apply(act, *of)
         if name in PLACES:
             column, arm = COLUMN[PLACES[name]], self._parameters["shaft.arm_disk"]
-            place = float(np.ravel(of[0](np.zeros((1, len(COLUMN)))))[0])
+            distance = of[0](np.zeros((1, len(COLUMN)))) if callable(of[0]) else of[0]
+            place = float(np.ravel(distance)[0])
             if not abs(place) <= _FARTHEST * arm:  # so are millimetres told from metres
                 raise InputError(field, f"{name} of a distance from the pivot within {_FARTHEST * arm:.3g} m", place)
-            return lambda rows: of[0](rows) / arm * rows[:, column]
-        degrees, values = self._curves[name]
-        return lambda rows: np.interp(np.degrees(of[0](rows)), degrees, values, period=360.0)
+            return _apply(np.multiply, _apply(np.divide, of[0], arm), lambda rows: rows[:, column])
+        return _apply(_periodic(self._curves[name]), _apply(np.degrees, of[0]))
+
+
+def _periodic(curve: np.ndarray) -> Callable[[Any], Any]:
+    """Return the straight lines through points (degrees, value), shape (2, n), periodic in a turn.
+
+    The result is that of numpy.interp with a period, which sorts the points in every call.
+    """
+    degrees, values = curve[0] % 360.0, curve[1]
+    order = np.argsort(degrees)
+    degrees, values = degrees[order], values[order]
+    degrees = np.concatenate([degrees[-1:] - 360.0, degrees, degrees[:1] + 360.0])
+    values = np.concatenate([values[-1:], values, values[:1]])
+    return lambda angle: np.interp(angle % 360.0, degrees, values)

@@ -201,13 +201,15 @@ class Simulation:
         if len(self._rows) <= n:
             self._rows = np.full((n + 1, S.N_ROW), np.nan)
         rows, seen = self._rows[: n + 1], 0
-        companion = np.full((ticks // self.block_ticks, S.N_ROW), np.nan)
+        made = [rows]
+        if self._companion is not None:
+            made.append(np.full((ticks // self.block_ticks, S.N_ROW), np.nan))
         events: list[dict[str, Any]] = []
         counts: list[dict[str, np.ndarray]] = []
         while self.tick < end:
             self._take_effect(events)
             stop, inputs = min(end, self._next_change()), self._inputs()
-            for motion, engine, out in zip(self._motions(), self._engines, (rows, companion), strict=False):
+            for motion, engine, out in zip(self._motions(), self._engines, made, strict=True):
                 motion.run(engine, self.model.constants, inputs, out, start, self.tick, stop)
             self.tick = stop
             # What changes on a row changes behind it: sensors see the row before the change, then that after it.
@@ -217,11 +219,11 @@ class Simulation:
                 seen = row
         rows = rows[:n]
         self._last = rows[-1].copy()
-        if not np.isfinite(self._motion.y).all():
+        if not all(map(math.isfinite, self._motion.y.tolist())):
             at_s = self._lost_s(rows, start)
             raise SimulationError(f"the state is no longer finite at {at_s:.6f} s; {self._method.advice}")
         if self._companion is not None:
-            events = sorted(events + self._doubts(rows, companion, start), key=lambda event: event["tick"])
+            events = sorted(events + self._doubts(rows, made[1], start), key=lambda event: event["tick"])
         samples, edges, truth = self._sample(counts, start), self._edges(rows, start), self._truth(rows, start)
         frame = Frame(start, ticks, samples, edges, truth, events, rows)
         return self._faulty.sending.pass_on(frame, last=self.tick >= self.end_tick)
@@ -383,9 +385,7 @@ class Simulation:
         return {"name": self.scene.name, "seed": self.scene.seed, "scene": scene_document(self.scene)}
 
     def _segment(self) -> Segment:
-        return max(
-            (segment for segment in self._segments if segment.tick <= self.tick), key=lambda segment: segment.tick
-        )
+        return next(segment for segment in reversed(self._segments) if segment.tick <= self.tick)
 
     def _speed(self) -> float:
         """What the drive aims at now [rad/s]."""
@@ -473,13 +473,11 @@ class Simulation:
     def _sample(self, counts: list[dict[str, np.ndarray]], start: int) -> dict[str, Block]:
         found = {}
         for name, group in self.table.groups.items():
-            parts = [part[name] for part in counts]
+            values = counts[0][name] if len(counts) == 1 else np.concatenate([part[name] for part in counts])
             # The first sample at or behind the start, to the nearest tick.
             index = -(-start * group.rate_hz // TICK_RATE_HZ)
             tick = round(index * TICK_RATE_HZ / group.rate_hz)
-            found[name] = self._block(
-                tick, index, group.rate_hz, parts[0] if len(parts) == 1 else np.concatenate(parts)
-            )
+            found[name] = self._block(tick, index, group.rate_hz, values)
         return found
 
     def _edges(self, rows: np.ndarray, start: int) -> Block | None:
@@ -497,4 +495,4 @@ class Simulation:
         return {name: self._block(start, index, rate, kept[:, part]) for name, part in self._truth_parts.items()}
 
     def _block(self, tick: int, index: int, rate_hz: int, values: np.ndarray) -> Block:
-        return Block(tick=tick, index=index, rate_hz=float(rate_hz), tick_rate_hz=float(TICK_RATE_HZ), values=values)
+        return Block(tick, index, float(rate_hz), float(TICK_RATE_HZ), values)

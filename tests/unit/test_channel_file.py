@@ -136,6 +136,26 @@ def test_formulas_are_what_they_read() -> None:
         np.testing.assert_allclose(made, expected, rtol=1e-12, atol=1e-15)
 
 
+def test_formulas_have_the_bits_of_numpy_wherever_their_numbers_are_computed() -> None:
+    rows = np.random.default_rng(2).normal(size=(40, N_ROW)) * 10
+    x, y, angle = (rows[:, COLUMN[name]] for name in ("disk_x", "disk_y", "theta"))
+    curves = {"late": ((400.0, 1.0), (30.0, 2.0), (-90.0, -4.0)), "one": ((5.0, 2.0),)}
+    cosine, sine = np.cos(np.radians(30.0)), np.sin(np.radians(30.0))
+    cases = {
+        "along(disk_x, disk_y, 15 * 2)": x * cosine + y * sine,
+        "along(disk_x, disk_y, theta)": x * np.cos(np.radians(angle)) + y * np.sin(np.radians(angle)),
+        "along(1, 2, 30) + 0 * disk_x": np.full(40, 1.0 * cosine + 2.0 * sine) + 0.0 * x,
+        "late(theta - pi / 4)": np.interp(np.degrees(angle - math.pi / 4), [400, 30, -90], [1, 2, -4], period=360.0),
+        "one(theta) * late(-pi)": 2.0 * np.interp(np.full(40, -180.0), [400, 30, -90], [1, 2, -4], period=360.0),
+        "shaft_x(0.1 + 0.05) - 1 / 8": (0.1 + 0.05) / 0.36 * x - 0.125,
+    }
+    formulas = Formulas({"shaft.arm_disk": 0.36}, curves)
+    for name, signal in enumerate(cases):
+        formulas.column(str(name), signal)
+    for signal, made in zip(cases, formulas.values(rows).T, strict=True):
+        assert made.tobytes() == cases[signal].tobytes(), signal
+
+
 def test_messages_follow_the_table(tmp_path: Path) -> None:
     assert messages_for(default_table()) is default_messages()
     assert messages_for(default_table().only(("forces",), 5_000)) is default_messages()
