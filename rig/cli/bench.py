@@ -37,7 +37,8 @@ def bench(
     for name, frame in (report["frame"] or {}).items():
         console.print(
             f"frame of 1 ms, {name}: median {frame['median_us']:.0f} us, 99.9 % {frame['p999_us']:.0f} us, "
-            f"worst of {frame['frames']}: {frame['worst_us']:.0f} us"
+            f"worst of {frame['frames']}: {frame['worst_us']:.0f} us; "
+            f"goal: 99.9 % within {frame['goal_us']:.0f} us, {'reached' if frame['reached'] else 'NOT reached'}"
         )
     console.print(
         f"kernels ready after {report['ready_s']:.1f} s ({'from the cache' if report['cached'] else 'compiled'})"

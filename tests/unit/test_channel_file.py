@@ -11,6 +11,7 @@ import pytest
 import rig
 from drivers.can.dbc import database
 from drivers.can.signals import default_messages, messages_for
+from replays.studies.bench import CASES
 from rig.channel_file import read_channels
 from rig.channels import default_table
 from rig.errors import InputError
@@ -154,6 +155,17 @@ def test_formulas_have_the_bits_of_numpy_wherever_their_numbers_are_computed() -
         formulas.column(str(name), signal)
     for signal, made in zip(cases, formulas.values(rows).T, strict=True):
         assert made.tobytes() == cases[signal].tobytes(), signal
+
+
+def test_the_bench_times_a_laboratory_of_24_channels() -> None:
+    case = next(case for case in CASES if case.name.startswith("24 channels"))
+    table, shipped = (
+        load_scene(case.scene, case.changes).table,
+        read_channels(Path(__file__).parents[2] / "docs/daq24.toml"),
+    )
+    kinds = [sorted(each.signal not in COLUMN for each in one.channels.values()) for one in (table, shipped)]
+    assert kinds[0] == kinds[1], "as many formulas"
+    assert (len(table.channels), {each.rate_hz for each in table.channels.values()}) == (24, {51_200})
 
 
 def test_messages_follow_the_table(tmp_path: Path) -> None:
