@@ -165,8 +165,24 @@ class HubBus(NodeBus):
     def _ask(self, name: str, document: dict[str, Any]) -> dict[str, Any]:
         return self._hub.answer(name, {"endpoint": self.name, **document})
 
-    def _offer(self, secret: str, records: np.ndarray) -> None:
-        self._hub.offer_records(self.name, secret, records)
+    def _offer(self, secret: str, records: np.ndarray, due_ns: np.ndarray | None = None) -> None:
+        self._hub.offer_records(self.name, secret, records, due_ns)
+
+    def schedule_records(self, records: np.ndarray, due_ns: np.ndarray, timeout: float | None = None) -> None:
+        """Hand frames to the hub before they are due, so that nobody has to wake up for each.
+
+        Args:
+            records: As for `send_records`, at most a transmit queue of them.
+            due_ns: When the controller gets each by the hub's clock, usually `time.monotonic_ns` [ns], shape of
+                `records`; a time that has passed is now.
+            timeout: How long to wait for room in the transmit queue, which frames that are not due take as well [s].
+
+        Raises:
+            CanOperationError: As `send_records`.
+        """
+        self._check_open()
+        self._reserve(len(records), timeout)
+        self._offer(self.secret or "", records, due_ns)
 
     def _leave(self) -> None:
         self._hub.disconnect(self.name)

@@ -107,6 +107,10 @@ class Endpoints:
     def __iter__(self) -> Iterator[Endpoint]:
         return iter(list(self._by_name.values()))
 
+    def __len__(self) -> int:
+        """Return how many endpoints have joined and are not forgotten."""
+        return len(self._by_name)
+
     # Who is there.
 
     def connect(self, name: str, take: Callable[[codec.Said], None], lost: Callable[[], None]) -> str:
@@ -246,18 +250,22 @@ class Endpoints:
             return None
         return endpoint
 
-    def offer(self, endpoint: Endpoint, records: np.ndarray, now_ns: int) -> bool:
+    def offer(self, endpoint: Endpoint, records: np.ndarray, now_ns: int, due_ns: np.ndarray | None = None) -> bool:
         """Hand frames to an endpoint's controller; returns whether some were dropped.
 
         Args:
             endpoint: Whose.
             records: Array of one of the `RECORDS` layouts.
             now_ns: Time of the bus [ns].
+            due_ns: Time of the bus at which the controller gets each frame [ns], shape of `records`; None: now.
         """
-        good = records[sendable(records, fd=self._model.speed.fd)]
+        fit = sendable(records, fd=self._model.speed.fd)
+        good = records[fit]
         room = 0 if endpoint.listen_only else max(0, WINDOW - (endpoint.offered - endpoint.done))
         taken = resized(good[:room])
         taken["node"], taken["time_ns"] = endpoint.node, now_ns
+        if due_ns is not None:
+            taken["time_ns"] = np.maximum(due_ns[fit][:room], now_ns)
         if len(taken):
             self._model.take(taken)
         endpoint.offered += len(records)

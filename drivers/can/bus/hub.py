@@ -20,7 +20,7 @@ import numpy as np
 
 from drivers.can.bus import codec
 from drivers.can.bus.endpoints import WINDOW, Endpoints
-from drivers.can.bus.frame import CLASSIC_WIDTH, FD_WIDTH, packed, resized
+from drivers.can.bus.frame import CLASSIC_WIDTH, FD_WIDTH, joined, packed, resized
 from drivers.can.bus.model import BusModel, warm_up
 from drivers.can.bus.results import OUTCOMES
 from drivers.health import Guard, Rising
@@ -35,6 +35,8 @@ if TYPE_CHECKING:
 
 _TICK_NS = 1_000_000
 """How long frames of a busy bus wait for others to travel with."""
+_ALONE_TICK_NS = 10_000_000
+"""The same where one endpoint alone is there, which learns nothing but that its frames were sent: 512 may wait."""
 _MESSAGES_A_SECOND = 5000
 _BURST = 50
 """Frames that may travel alone on a bus that is idle in between; beyond, they wait for the tick as well."""
@@ -94,6 +96,8 @@ class Hub(Closing):
         """Wall time at bus time 0 since the Unix epoch [ns]."""
         self._lock = threading.Lock()
         self._wake = threading.Event()
+        self._resting = False
+        """Whether a frame that is offered now changes nothing before the hub looks again."""
         self._stopping = False
         self._counts: Counter[str] = Counter()
         self.endpoints = Endpoints(model, self._counts, lambda: self._advance(self._now()))
@@ -173,17 +177,28 @@ class Hub(Closing):
                 records = codec.decode(payload[codec.SECRET_BYTES :])
         self.offer_records(name, payload[: codec.SECRET_BYTES].hex(), records)
 
-    def offer_records(self, name: str, secret: str, records: codec.Said | None) -> None:
-        """`offer` within this process: an array of one of the `RECORDS` layouts, which is not kept."""
+    def offer_records(
+        self, name: str, secret: str, records: codec.Said | None, due_ns: np.ndarray | None = None
+    ) -> None:
+        """`offer` within this process.
+
+        Args:
+            name: Name of the endpoint.
+            secret: Its secret.
+            records: Array of one of the `RECORDS` layouts, which is not kept; anything else is malformed.
+            due_ns: When the controller gets each frame by the hub's clock [ns], shape of `records`; None: now.
+        """
         with self._lock:
             endpoint = self.endpoints.owner(name, secret)
             if endpoint is None:
                 return
             if isinstance(records, np.ndarray):
-                self._report_due |= self.endpoints.offer(endpoint, records, self._now())
+                due_ns = None if due_ns is None else due_ns - self._start_ns
+                self._report_due |= self.endpoints.offer(endpoint, records, self._now(), due_ns)
             else:
                 self._counts["malformed"] += 1
-        self._wake.set()
+            if self._report_due or not self._resting:
+                self._wake.set()
 
     def answer(self, name: str, document: dict[str, Any] | bytes) -> dict[str, Any]:
         """Answer a request: `join`, `set`, `flush`, `status`.
@@ -199,6 +214,8 @@ class Hub(Closing):
         if isinstance(request, codec.Joining):
             with self._lock:
                 endpoint = self.endpoints.join(request)
+                # Frames wait no longer than a listener may expect.
+                self._wake.set()
                 bus = {"window": WINDOW, **self._bus(), "epoch_ns": self.epoch_ns}
                 return {"node": endpoint.number, "secret": endpoint.secret, **bus}
         if not isinstance(request, codec.Flushing):
@@ -242,28 +259,30 @@ class Hub(Closing):
 
     def _turn(self) -> bool:
         """One step of the bus, and the wait for the next."""
-        self._wake.clear()
         with self._lock:
+            self._wake.clear()
             now = self._now()
-            said, wake_ns, busy = self._step(now)
+            said, wake_ns, self._resting = self._step(now)
         for each in said:
             self._publish(each)
         left_s = (wake_ns - self._now()) * 1e-9
         if left_s > 0:
-            if busy:
-                # Nothing that is offered meanwhile can end earlier.
-                time.sleep(left_s)
-            else:
-                self._wake.wait(left_s)
+            self._wake.wait(left_s)
         return True
 
     def _step(self, now: int) -> tuple[list[codec.Said], int, bool]:
-        """Let the bus run until now: what to say, when to come back, and whether only then."""
+        """Let the bus run until now.
+
+        Returns:
+            What to say, when to look again [ns], and whether frames that are offered meanwhile can wait until then.
+        """
         self._advance(now)
         next_ns = self._model.next_ns()
         waiting, may_send = self.endpoints.waiting, self._messages.left(now * 1e-9) >= 1.0
+        alone, idle = len(self.endpoints) < 2, self._model.idle
+        tick_ns = _ALONE_TICK_NS if alone else _TICK_NS
         said: list[codec.Said] = []
-        if self._outbox and (now >= self._published_ns + _TICK_NS or (next_ns is None and may_send and not waiting)):
+        if self._outbox and (now >= self._published_ns + tick_ns or (may_send and (not waiting if alone else idle))):
             self._messages.take()
             self._published_ns = now
             said += self._empty_outbox()
@@ -276,14 +295,16 @@ class Hub(Closing):
             self._last_report_ns = now
             self._next_report_ns = now + _REPORT_NS
         wake_ns = self._last_report_ns + _HASTE_NS if self._report_due else self._next_report_ns
-        tick_ns = self._published_ns + _TICK_NS
+        tick_ns += self._published_ns
         if next_ns is not None:
-            next_ns = max(next_ns, now + _GAP_NS)
+            # A frame that comes later cannot end before that.
+            next_ns = max(next_ns, now) + _GAP_NS if idle else max(next_ns, now + _GAP_NS)
             # More than this one: they travel together.
             wake_ns = max(next_ns, tick_ns) if waiting > 1 or self._messages.left(now * 1e-9) < 1.0 else next_ns
         if self._outbox:
             wake_ns = min(wake_ns, tick_ns)
-        return said, wake_ns, next_ns is not None or bool(self._outbox)
+        # Nothing that is offered can end before a frame that is on the wire, nor is missed by one that is alone.
+        return said, wake_ns, not idle or bool(self._outbox) or (alone and next_ns is not None)
 
     def _advance(self, now: int) -> None:
         # One more: what was offered by now must have begun.
@@ -327,7 +348,7 @@ class Hub(Closing):
     def _empty_outbox(self) -> list[np.ndarray]:
         if not self._outbox:
             return []
-        records = self._outbox[0] if len(self._outbox) == 1 else np.concatenate(self._outbox)
+        records = self._outbox[0] if len(self._outbox) == 1 else joined(self._outbox)
         self._outbox.clear()
         if records["length"].max() <= CLASSIC_WIDTH:
             records = resized(records, CLASSIC_WIDTH)

@@ -218,6 +218,12 @@ class BusModel:
             return int(self._bus.slots[self._bus.arrivals[cells[kernels.NEXT]], kernels.AT])
         return None
 
+    @property
+    def idle(self) -> bool:
+        """Whether nothing is on the wire or queued; frames that are offered for later may still come."""
+        bus = self._bus
+        return not (bus.cells[kernels.SENDERS] or self._offers or bus.nodes[:, kernels.COUNT].any())
+
     def disturb(self, node: int, *, count: int = 1, bit: int = 24) -> None:
         """Spoil the next frames that a node sends, each with one bit error.
 
@@ -269,7 +275,7 @@ class BusModel:
         """Move what was offered since the last step into slots."""
         if not self._offers:
             return
-        batch = np.concatenate(self._offers)
+        batch = frames.joined(self._offers)
         self._offers.clear()
         cells = self._bus.cells
         missing = len(batch) - int(cells[kernels.FREE_SLOTS])

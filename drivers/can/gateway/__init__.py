@@ -1,9 +1,10 @@
 """The rig as a node of a CAN bus: samples, events and status go out, commands come in.
 
 A gateway is a client of the rig like any other; it may run in the rig's process or in another one. Threads: the rig's
-publisher leaves blocks in a bounded queue; the sender packs them and hands frames to the bus once a millisecond, each
-when its last sample is due; the receiver checks commands; a worker asks the rig and acknowledges. None of them can hold
-up the simulation: what does not fit is dropped, oldest first, and counted.
+publisher leaves blocks in a bounded queue; the sender packs them and hands frames to the bus, each when its last
+sample is due, or those of a block at once to a bus that holds them until then; the receiver checks commands; a worker
+asks the rig and acknowledges. None of them can hold up the simulation: what does not fit is dropped, oldest first, and
+counted.
 """
 
 from __future__ import annotations
@@ -224,7 +225,7 @@ class Gateway(Closing):
                 self._queue.popleft()
                 self.blocks_dropped += 1
             self._queue.append((key, payload))
-            if not self._paced:
+            if not self._paced or len(self._queue) == 1:
                 self._changed.notify_all()
 
     # On the sender's thread.
@@ -261,11 +262,15 @@ class Gateway(Closing):
                 if now >= self._end_s or not self.outbox.stuck:
                     self.outbox.drop_all()
                     return True
-            rest = _IDLE_S
-            if self._paced and (self._queue or self.outbox.undue or self.outbox.stuck):
-                # On a grid of slots: a block that comes in between waits for the next one.
-                rest = SLOT_S - self._now() % SLOT_S
-            self._changed.wait(rest)
+            if not self._paced:
+                self._changed.wait(_IDLE_S)
+                return False
+            if not self._queue and not self.outbox.stuck:
+                next_s = min(self.outbox.next_s, self._next_status_s, self._next_heartbeat_s)
+                self._changed.wait(min(max(next_s - self._now(), 0.0), _IDLE_S))
+            if (self._queue or self.outbox.stuck) and not self._stopping:
+                # On a grid of slots: what comes with the first part of a block is taken with it.
+                self._changed.wait(SLOT_S - self._now() % SLOT_S)
         return False
 
     def unpack(self, key: str, payload: bytes) -> None:

@@ -6,12 +6,12 @@ import math
 import threading
 from collections import deque
 from collections.abc import Callable
-from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from drivers.can.bus import codec
+from drivers.can.bus.frame import FD_WIDTH, RECORDS, joined
 from drivers.can.gateway.samples import records_of
 from drivers.can.message import Message
 from drivers.can.schedule import SLOT_S
@@ -26,6 +26,12 @@ _ANSWERS = 16
 """Answers that may wait for the bus."""
 _PORTION = 64
 """Frames that the bus gets in one go."""
+_AHEAD_SLOTS = 12
+"""How long before they are due a bus gets frames that it can hold until then: a block of usual length at once."""
+_AHEAD_FRAMES = 128
+"""How many frames it gets before they are due: a quarter of a transmit queue, so that late ones find room."""
+_MARGIN_SLOTS = 2
+"""How long before the next frame is due it gets more of them."""
 
 
 class Outbox:
@@ -33,7 +39,7 @@ class Outbox:
 
     Args:
         bus: Any bus of python-can. Where it has `send_records` (a node of the virtual CAN), frames go there many at a
-            time.
+            time; where it has `schedule_records` (one whose hub is in this process), also before they are due.
         room: Frames that may wait for room on the bus; beyond, the oldest are dropped.
         paced: Send each frame when it is due; False: at once, and wait for room.
         now: Clock [s].
@@ -42,15 +48,22 @@ class Outbox:
     def __init__(self, bus: can.BusABC, *, room: int, paced: bool, now: Callable[[], float]) -> None:
         self._bus = bus
         self._send_records = getattr(bus, "send_records", None)
+        self._schedule_records = getattr(bus, "schedule_records", None) if paced else None
+        self._ahead = 0 if self._schedule_records is None else _AHEAD_SLOTS
+        self._last_handed_s = -math.inf
+        """When the last frame that the bus has got is due, by the clock."""
         self._room = room
         self._paced = paced
         self._now = now
         self._sending = threading.Lock()
-        self._slots: dict[int, list[np.ndarray]] = {}
-        """Frames that are not due yet, by number of the slot on the clock."""
+        self._undue: tuple[np.ndarray, np.ndarray] = (np.zeros(0, np.int64), np.zeros(0, RECORDS[FD_WIDTH]))
+        """Frames that are not due yet: numbers of their slots on the clock, ascending, and the frames."""
+        self._added: list[tuple[np.ndarray, np.ndarray]] = []
+        """The same of frames that are not in their place there yet."""
         self._last_slot: dict[int, int] = {}
         self._answers: deque[np.ndarray] = deque()
-        self._waiting: deque[np.ndarray] = deque()
+        self._waiting: deque[tuple[np.ndarray, np.ndarray]] = deque()
+        """Frames that wait for room, and when each is due by the clock [s]."""
         self._origin_s: float | None = None
         """What time of the clock simulated time 0 is at: the earliest by which a block ever came."""
         self.latency_s = 0.0
@@ -64,13 +77,23 @@ class Outbox:
 
     @property
     def undue(self) -> bool:
-        """Whether frames wait for their slot."""
-        return bool(self._slots)
+        """Whether frames wait for their slot, here or at the bus."""
+        return len(self._undue[0]) > 0 or bool(self._added) or self._now() < self._last_handed_s
 
     @property
     def stuck(self) -> bool:
         """Whether frames wait for room."""
         return bool(self._waiting or self._answers)
+
+    @property
+    def next_s(self) -> float:
+        """When `send_due` has something to do again by the clock [s]; infinite where nothing waits for its slot."""
+        if self._added:
+            return -math.inf
+        slots = self._undue[0]
+        if not len(slots):
+            return self._last_handed_s if self._now() < self._last_handed_s else math.inf
+        return (int(slots[0]) - min(self._ahead, _MARGIN_SLOTS)) * SLOT_S
 
     def follow(self, block: wire.Block) -> None:
         """Learn from a block what time on the clock a simulated time is due at."""
@@ -91,15 +114,13 @@ class Outbox:
         """
         records = records_of(message, data)
         if not self._paced or self._origin_s is None:
-            self._slots.setdefault(0, []).append(records)
+            self._added.append((np.zeros(len(records), np.int64), records))
             return
         due = np.ceil((times_s + (self._origin_s + self.latency_s)) / SLOT_S).astype(np.int64)
         # Where the origin has moved, frames must not overtake those of the same message before them.
         np.maximum(due, self._last_slot.get(message.identifier, 0), out=due)
         self._last_slot[message.identifier] = int(due[-1])
-        edges = [0, *(np.flatnonzero(np.diff(due)) + 1).tolist(), len(due)]
-        for low, high in pairwise(edges):
-            self._slots.setdefault(int(due[low]), []).append(records[low:high])
+        self._added.append((due, records))
 
     def put_one(self, message: Message, time_s: float, **raw: int) -> None:
         """Keep one frame with these raw values until its slot."""
@@ -114,15 +135,27 @@ class Outbox:
         self.send()
 
     def send_due(self) -> None:
-        """Send what is due by now."""
+        """Send what is due by now, or soon where the bus can hold it until then."""
         slot = math.floor(self._now() / SLOT_S) if self._paced else 0
-        for number in sorted(number for number in self._slots if number <= slot or not number):
-            parts = self._slots.pop(number)
-            records = parts[0] if len(parts) == 1 else np.concatenate(parts)
+        if self._added:
+            parts = [self._undue, *self._added]
+            self._added.clear()
+            slots = np.concatenate([each for each, _ in parts])
+            # Those of a slot in the order in which they came.
+            order = np.argsort(slots, kind="stable")
+            self._undue = slots[order], joined([each for _, each in parts])[order]
+        slots, records = self._undue
+        count = int(np.searchsorted(slots, slot, side="right"))
+        if self._ahead:
+            soon, later = np.searchsorted(slots, (slot + _MARGIN_SLOTS, slot + self._ahead), side="right").tolist()
+            count = max(soon, min(later, _AHEAD_FRAMES))
+        if count:
+            self._undue = slots[count:], records[count:]
             with self._sending:
-                self._waiting.append(records)
-                self.waiting += len(records)
-            self.send()
+                self._waiting.append((records[:count], slots[:count] * SLOT_S))
+                self.waiting += count
+                if slots[count - 1] > slot:
+                    self._last_handed_s = int(slots[count - 1]) * SLOT_S
         self.send()
 
     def send(self) -> None:
@@ -132,33 +165,39 @@ class Outbox:
             while self._answers and self._give(self._answers[0]):
                 self._answers.popleft()
             while self._waiting and not self._answers:
-                portion = self._waiting[0][:_PORTION]
-                given = self._give(portion)
-                self.waiting -= given
-                if given < len(self._waiting[0]):
-                    self._waiting[0] = self._waiting[0][given:]
-                else:
-                    self._waiting.popleft()
-                if given < len(portion):
+                records, due_s = self._waiting[0]
+                given = self._give(records[:_PORTION], due_s[:_PORTION])
+                self._forget_oldest(given)
+                if given < min(len(records), _PORTION):
                     break
             while self.waiting > self._room:
-                oldest = self._waiting.popleft()
-                self.waiting -= len(oldest)
-                self.dropped += len(oldest)
+                surplus = min(self.waiting - self._room, len(self._waiting[0][0]))
+                self._forget_oldest(surplus)
+                self.dropped += surplus
+
+    def _forget_oldest(self, count: int) -> None:
+        """Remove the oldest waiting frames, at most as many as were added at once."""
+        records, due_s = self._waiting.popleft()
+        self.waiting -= count
+        if count < len(records):
+            self._waiting.appendleft((records[count:], due_s[count:]))
 
     def drop_all(self) -> None:
         """Give up what waits for room."""
         self.dropped += self.waiting + len(self._answers)
 
-    def _give(self, records: np.ndarray) -> int:
-        """How many of some frames the bus has taken, from the first on."""
+    def _give(self, records: np.ndarray, due_s: np.ndarray | None = None) -> int:
+        """How many of some frames the bus has taken, from the first on; those without a time are due now."""
         import can
 
         # Nothing waits here where the rig runs by the clock; else the bus has a second.
         timeout = 0.0 if self._paced else 1.0
         given = 0
         try:
-            if self._send_records is not None:
+            if self._schedule_records is not None and due_s is not None:
+                self._schedule_records(records, (1e9 * due_s).astype(np.int64), timeout)
+                given = len(records)
+            elif self._send_records is not None:
                 self._send_records(records, timeout)
                 given = len(records)
             else:
