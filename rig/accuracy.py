@@ -183,7 +183,8 @@ class Accuracy:
         errors = self._at_instant(apart)
         if len(window) >= _MIN_FIT_ROWS and np.isfinite(apart).all() and (errors > self.errors[[0, 1, 3]]).any():
             phases = np.stack([np.angle(orbit), both[..., S.THETA]], axis=-1)
-            same_angle = _apart_at_same_angle(*values.swapaxes(0, 1), *phases.swapaxes(0, 1), times_s)
+            (own, other), (phase, phase_other) = values.swapaxes(0, 1), phases.swapaxes(0, 1)
+            same_angle = _apart_at_same_angle(own, other, phase, phase_other, times_s)
             errors = self._at_instant(np.minimum(apart, same_angle))
         span_s = times_s[-1] - times_s[0]
         frequency = 0.0
