@@ -98,14 +98,20 @@ def find_scale(values: np.ndarray, unit: str, counts: np.ndarray, channel: Chann
 def _fit_scale(values: np.ndarray, counts: np.ndarray, candidates: list[Scale]) -> Scale | None:
     """Return the scale by which values come from the DAQ's counts, of candidates for these; None if there is none."""
     size = min(_PIECE, max(8, len(values) // 4))
-    pieces = [slice(n, n + size) for n in range(0, len(values) - size + 1, size)]
+    whole = len(values) // size * size
+    pieces = [slice(n, n + size) for n in range(0, whole, size)]
+    # Rows that are as most are show nothing of a scale.
+    there = counts[:whole].reshape(-1, size)
+    moving = there != np.median(there, axis=1, keepdims=True) if whole else np.zeros(there.shape, bool)
+    movable = moving.sum(axis=1)
 
-    def shows(scale: Scale, p: slice) -> bool:
-        # Rows that are as most are show nothing of a scale.
-        same, moving = scale.counts(values[p]) == counts[p], counts[p] != np.median(counts[p])
-        return bool(moving.any()) and min(same.mean(), same[moving].mean()) >= _ENOUGH
+    def show(scale: Scale, some: slice) -> np.ndarray:
+        """Return which of some pieces a scale explains, shape (pieces,)."""
+        same = scale.counts(values[:whole].reshape(-1, size)[some]) == there[some]
+        part = (same & moving[some]).sum(axis=1) / np.maximum(movable[some], 1)
+        return np.minimum(same.mean(axis=1), part) >= _ENOUGH
 
-    shown = [[n for n, p in enumerate(pieces) if shows(scale, p)] for scale in candidates]
+    shown = [np.flatnonzero(show(scale, slice(None))).tolist() for scale in candidates]
     best = max(range(len(candidates)), key=lambda n: len(shown[n]))
     # A small gain shows where counts are large: the pieces with the largest counts come first.
     others = [n for n in range(len(pieces)) if n not in shown[best]]
@@ -114,9 +120,11 @@ def _fit_scale(values: np.ndarray, counts: np.ndarray, candidates: list[Scale]) 
         x, y = counts[pieces[n]].astype(float), values[pieces[n]]
         if not np.isfinite(y).all() or not np.ptp(x):
             continue
-        each, zero = map(float, np.polyfit(x - x.mean(), y, 1))
-        fitted = Scale(each, zero - each * float(x.mean()), "fitted")
-        if each and shows(fitted, pieces[n]):
+        # The line of least squares.
+        off, mean = x - x.mean(), float(y.mean())
+        each = float(off @ (y - mean) / (off @ off))
+        fitted = Scale(each, mean - each * float(x.mean()), "fitted")
+        if each and show(fitted, slice(n, n + 1)).all():
             return _judge_fit(fitted, values, counts, candidates)
     if not shown[best]:
         return None

@@ -57,10 +57,18 @@ class Session:
         self._kept: dict[str, tuple[np.ndarray, float, float]] = {}
         self._blocks: dict[str, np.ndarray] = {}
         self._stretches: dict[tuple[str, int, int], np.ndarray] = {}
+        self._firsts: dict[str, tuple[int, float]] = {}
+
+    def _first(self, group: str) -> tuple[int, float]:
+        """Return the number of a group's first row and its rate [Hz], which are asked for at each trial."""
+        if group not in self._firsts:
+            block = next(self.recording.blocks(sensor_key(group)))
+            self._firsts[group] = int(block.index), block.rate_hz
+        return self._firsts[group]
 
     def rate_hz(self, group: str) -> float:
         """Rows a second of a group [Hz]."""
-        return next(self.recording.blocks(sensor_key(group))).rate_hz
+        return self._first(group)[1]
 
     @cached_property
     def scene(self) -> Scene | None:
@@ -113,8 +121,7 @@ class Session:
 
     def early(self, group: str) -> tuple[int, np.ndarray]:
         """Number of the first row of a group, and counts of its first seconds, shape (n, channels)."""
-        first = next(self.recording.blocks(sensor_key(group))).index
-        return int(first), self.stretch(group, 0, round(_EARLY_S * self.rate_hz(group)))
+        return self._first(group)[0], self.stretch(group, 0, round(_EARLY_S * self.rate_hz(group)))
 
     def rows(self, group: str) -> int:
         """Return the number of rows of a group."""
