@@ -28,7 +28,7 @@ QUANTITIES = {
     "angle": ("whirl angle", "deg", math.degrees(1.0)),
     "spin_angle": ("spin angle", "deg", math.degrees(1.0)),
 }
-"""Label, unit and units per SI unit of each quantity; the two angles have no tolerance and never warn."""
+"""Label, unit and units per SI unit of each quantity; the two angles have no tolerance unless a limit is given."""
 STATE_FACTOR = 10.0
 """Tolerance of the scaled state over engine.tolerance: the warning level of version 0.1."""
 FORCE_FLOOR_N = 100.0
@@ -76,6 +76,7 @@ class Accuracy:
         tolerance: engine.tolerance [1].
         clearance: Radial clearance of the ring [m].
         block_s: Time between compared samples [s].
+        limits: Limits that replace tolerances, by quantity, each in the quantity's unit.
         estimate: Largest distance of all states at the same instant, RMS of the scaled states (`STATE_SCALE`) [1].
         grown_per_s: Mean growth rate of a small distance [1/s].
         errors: Largest error of each of `QUANTITIES` [SI], shape (6,).
@@ -86,6 +87,7 @@ class Accuracy:
     tolerance: float
     clearance: float
     block_s: float
+    limits: dict[str, float] = field(default_factory=dict)
     estimate: float = 0.0
     grown_per_s: float = 0.0
     errors: np.ndarray = field(default_factory=lambda: np.zeros(len(QUANTITIES)))
@@ -131,7 +133,7 @@ class Accuracy:
 
     def document(self) -> dict[str, Any]:
         """Return the estimate as JSON: each quantity's largest error and tolerance in its unit, and since when."""
-        tolerances = [*self._tolerances().tolist(), None, None]
+        tolerances = self._tolerances()
         return {
             "estimate": self.estimate,
             "growth_per_s": self.grown_per_s,
@@ -141,21 +143,20 @@ class Accuracy:
                     "label": label,
                     "unit": unit,
                     "error": error * per_si,
-                    "tolerance": None if tolerance is None else tolerance * per_si,
+                    "tolerance": self.limits.get(name, tolerances[name] * per_si if name in tolerances else None),
                     "exceeded_s": self.since_s.get(name),
                 }
-                for (name, (label, unit, per_si)), error, tolerance in zip(
-                    QUANTITIES.items(), self.errors.tolist(), tolerances, strict=True
-                )
+                for (name, (label, unit, per_si)), error in zip(QUANTITIES.items(), self.errors.tolist(), strict=True)
             },
         }
 
     def warning(self) -> str:
         """Return a sentence that names each quantity above its tolerance; empty if there is none."""
         parts = [
-            f"{one['label']} off by {one['error']:.2g} {one['unit']} (tolerance {one['tolerance']:.2g}) "
+            f"{one['label']} off by {one['error']:.2g} {one['unit']} "
+            f"({'limit' if name in self.limits else 'tolerance'} {one['tolerance']:.2g}) "
             f"since {one['exceeded_s']:.3f} s"
-            for one in self.document()["quantities"].values()
+            for name, one in self.document()["quantities"].items()
             if one["exceeded_s"] is not None
         ]
         advice = (
@@ -163,10 +164,11 @@ class Accuracy:
         )
         return f"accuracy: {'; '.join(parts)}; {advice}, or use statistics only" if parts else ""
 
-    def _tolerances(self) -> np.ndarray:
-        """Tolerances of all quantities but the angles [SI], shape (4,)."""
-        force = max(self.peak_force, FORCE_FLOOR_N)
-        return self.tolerance * np.array([self.clearance, force, FREQUENCY_SCALE_HZ, STATE_FACTOR])
+    def _tolerances(self) -> dict[str, float]:
+        """Return the tolerance of each quantity that has one [SI]."""
+        scales = self.clearance, max(self.peak_force, FORCE_FLOOR_N), FREQUENCY_SCALE_HZ, STATE_FACTOR
+        given = {name: limit / QUANTITIES[name][2] for name, limit in self.limits.items()}
+        return {name: self.tolerance * scale for name, scale in zip(QUANTITIES, scales, strict=False)} | given
 
     def _add_window(self, window: np.ndarray) -> bool:
         """Update all estimates by one window; return whether another quantity exceeds its tolerance."""
@@ -194,10 +196,11 @@ class Accuracy:
         angle = np.abs(between[whirls]).max(initial=0.0)
         found = np.array([errors[0], errors[1], frequency, errors[2], angle, apart[:, 2 + S.THETA].max()])
         self.errors = np.maximum(self.errors, found)
+        errors_by_name, tolerances = dict(zip(QUANTITIES, self.errors, strict=True)), self._tolerances()
         exceeded = [
             name
-            for name, error, tolerance in zip(QUANTITIES, self.errors, self._tolerances(), strict=False)
-            if error > tolerance and name not in self.since_s
+            for name, tolerance in tolerances.items()
+            if errors_by_name[name] > tolerance and name not in self.since_s
         ]
         self.since_s |= dict.fromkeys(exceeded, float(times_s[0]))
         return bool(exceeded)

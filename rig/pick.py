@@ -78,10 +78,13 @@ class Pick(Written):
         engine: dict[str, Any] = {"name": self.engine, "step_us": self.step_us, "tolerance": self.engine_tolerance}
         if self.companion is not None:
             engine["companion"] = self.companion
+        given = dict(table_in(data, "engine"))
+        if self.companion is False:
+            given.pop("limits", None)  # without a companion there is no estimate to hold against them
         return {
             **data,
             "model": levels,
-            "engine": {**table_in(data, "engine"), **engine},
+            "engine": {**given, **engine},
             "drive": {**table_in(data, "drive"), "mode": self.drive},
             "sensors": {**table_in(data, "sensors"), "chain": self.sensors},
         }

@@ -8,11 +8,12 @@ from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
-from pydantic import Field, FiniteFloat, ValidationInfo, field_validator, model_validator
+from pydantic import Field, FiniteFloat, field_validator, model_validator
 
 from rig.channel_file import check_table, read_channels
 from rig.channels import ChannelTable, check_signals, default_table
 from rig.commands import HammerCommand, ReleaseCommand, SpeedCommand, TimedCommand, with_faults
+from rig.engine_choice import EngineChoice
 from rig.engines import ENGINES
 from rig.errors import InputError, Words, such_as
 from rig.faults import Setting
@@ -39,50 +40,6 @@ class Initial(Written):
     """Shaft in the ring, for position "given" [mm]."""
     magnets: bool = True
     """False: the magnets have let go already."""
-
-
-class EngineChoice(Written):
-    """How the equations are integrated."""
-
-    name: str = next(iter(ENGINES))
-    step_us: Annotated[int, Field(ge=1, le=1000)] = 0
-    """Longest step [us]: steps end on the rows that sensors see, 25 us apart or closer; left out: the engine's own."""
-    tolerance: Annotated[FiniteFloat, Field(ge=0.0, le=0.1)] = 0.0
-    """Scaled error: of the whole run with split, of a step with another adaptive engine; left out: the engine's own."""
-    companion: bool = False
-    """A second run at a sixteenth of the tolerance estimates the error; left out: with split only."""
-    rolling: Literal["series", "collocation"] = "series"
-    """Method for rolling contact: long steps of a whirl turn (with split only; its own), or as for other motion."""
-
-    @field_validator("name")
-    @classmethod
-    def _known(cls, name: str) -> str:
-        if name not in ENGINES:
-            raise ValueError(f"one of {', '.join(ENGINES)}")
-        return name
-
-    @field_validator("tolerance")
-    @classmethod
-    def _above_rounding(cls, tolerance: float) -> float:
-        if 0.0 < tolerance < 1e-30:
-            raise ValueError("at least 1e-30, far below rounding; 0 is the engine's own")
-        return tolerance
-
-    @field_validator("rolling")
-    @classmethod
-    def _of_split(cls, rolling: str, info: ValidationInfo) -> str:
-        if rolling == "collocation" and (name := info.data.get("name")) != "split":
-            raise ValueError(f"series with engine {name}")
-        return rolling
-
-    @model_validator(mode="before")
-    @classmethod
-    def _own_step(cls, data: Any) -> Any:
-        name = data.get("name", next(iter(ENGINES))) if isinstance(data, dict) else None
-        if not isinstance(name, str) or (method := ENGINES.get(name)) is None:
-            return data
-        own = {"step_us": method.step_us, "companion": method.companion, "rolling": method.rolling, **data}
-        return {**own, "tolerance": data.get("tolerance") or method.tolerance}  # 0 is what recordings of 0.1 say
 
 
 @cache
@@ -166,6 +123,10 @@ class Scene(Written):
             raise InputError("engine.tolerance", must, self.engine.tolerance)
         if self.engine.companion and not self.engine.tolerance:
             raise InputError("engine.companion", "false without an engine.tolerance", True)
+        for name, limit in self.engine.limits.given().items():
+            if not self.engine.companion:
+                must = "left out without engine.companion = true, whose estimate it limits"
+                raise InputError(f"engine.limits.{name}", must, limit)
         return self
 
     @field_validator("channels", mode="before")
@@ -210,7 +171,9 @@ class Scene(Written):
     def _possible_generator(self) -> Scene:
         if self.generator is not None:
             commands = [one for one in self.commands if one.request.command not in ("fault", "clear")]
-            for name, given in (("commands", commands), ("drive.profile", self.drive.profile)):
+            limits = self.engine.limits.given()
+            fields = {"commands": commands, "drive.profile": self.drive.profile, "engine.limits": limits}
+            for name, given in fields.items():
                 if given:
                     raise InputError(name, "left out with a [generator], which stands for the physics", Words("some"))
             if self.fidelity == "auto":
@@ -386,7 +349,10 @@ def _checked(data: dict[str, Any], overrides: list[str]) -> Scene:
 
 
 def change_scene(scene: Scene, changes: dict[str, Any]) -> Scene:
-    """A loaded scene with other values, by dotted key as in `load_scene`; another engine comes with its own step.
+    """A loaded scene with other values, by dotted key as in `load_scene`.
+
+    Another engine comes with its own step, tolerance and companion, and without limits. Other limits choose
+    engine.tolerance again, unless that was given.
 
     Raises:
         InputError: The one thing that is wrong, with its field.
@@ -395,6 +361,8 @@ def change_scene(scene: Scene, changes: dict[str, Any]) -> Scene:
     named = _keyed(changes)
     if "engine.name" in changes:
         data["engine"] = {}
+    elif any(key.startswith("engine.limits") for key in changes) and scene.engine.tolerance_by_limits:
+        data["engine"]["tolerance"] = 0.0
     for key, value in named:
         _override(data, key, value)
     return parse_scene(data)
@@ -465,10 +433,10 @@ def _override(data: dict[str, Any], key: str, value: Any) -> None:
         place.pop("profile", None)
 
 
-def _scene_keys() -> list[str]:
+def _scene_keys(table: Any = Scene) -> list[str]:
     keys = []
-    for name, field in Scene.model_fields.items():
-        inner = _inner(field.annotation)
+    for name, field in _inner(table).items():
+        inner = _scene_keys(field.annotation)
         keys += [f"{name}.{part}" for part in inner] if inner else [name]
     return keys
 

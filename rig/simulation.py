@@ -151,7 +151,8 @@ class Simulation:
             stride = self.block_ticks // self._step_ticks
             self._companion = Motion(initial.copy(), self._step_ticks, stride, finer, np.zeros_like(memory))
         clearance = self.model.constants.contact.clearance
-        self._accuracy = Accuracy(choice.tolerance, clearance, self.block_ticks / TICK_RATE_HZ)
+        block_s, limits = self.block_ticks / TICK_RATE_HZ, choice.limits.by_quantity()
+        self._accuracy = Accuracy(choice.tolerance, clearance, block_s, limits)
         self._rows = np.full((0, S.N_ROW), np.nan)
         self._last: np.ndarray | None = None
 

@@ -409,6 +409,8 @@ def bare(experiment: Experiment) -> Experiment:
     return experiment.without_faults().changed(
         {
             "engine.companion": False,
+            "engine.limits": {},
+            "engine.tolerance": experiment.scene.engine.tolerance,
             "sensors.groups": [fewest.name],
             "sensors.chain": "ideal",
             "sensors.rate_hz": TICK_RATE_HZ // experiment.simulation().row_ticks,

@@ -32,6 +32,8 @@ SCENE_KEYS = (
     *("initial.position", "initial.x_mm", "initial.y_mm", "initial.magnets"),
     *("drive.mode", "drive.speed_hz", "drive.profile"),
     *("engine.name", "engine.step_us", "engine.tolerance", "engine.companion", "engine.rolling"),
+    *("engine.limits.radius_um", "engine.limits.force_n", "engine.limits.frequency_hz"),
+    *("engine.limits.angle_deg", "engine.limits.spin_angle_deg"),
     *("model.magnet", "model.shaft", "model.stator", "model.contact", "model.friction"),
     *("sensors.groups", "sensors.rate_hz", "sensors.truth_rate_hz", "sensors.noise", "sensors.chain"),
     *("generator.kind", "generator.amplitude", "generator.amplitude_v", "generator.offset", "generator.offset_v"),

@@ -1,6 +1,7 @@
 """The error estimate of a run: which quantity is off, in its unit, and what is only an angle."""
 
 import copy
+import re
 from pathlib import Path
 from typing import Any
 
@@ -33,8 +34,8 @@ def whirl(n: int, *, angle: float = 0.0, radius: float = 0.0, force: float = 0.0
     return rows
 
 
-def compared(**off: float) -> tuple[Accuracy, list[tuple[float, str]]]:
-    accuracy = Accuracy(3e-4, CLEARANCE, 1e-3)
+def compared(limits: dict[str, float] | None = None, **off: float) -> tuple[Accuracy, list[tuple[float, str]]]:
+    accuracy = Accuracy(3e-4, CLEARANCE, 1e-3, limits or {})
     return accuracy, accuracy.compare(whirl(256), whirl(256, **off), 1e-3 * np.arange(256))
 
 
@@ -58,6 +59,40 @@ def test_an_error_is_of_its_quantity(off: dict[str, float], exceeded: list[str],
     assert quantities[name]["error"] == pytest.approx(size, rel=0.02)
     assert (len(warnings), bool(accuracy.warning())) == (len(exceeded) > 0, len(exceeded) > 0)
     assert all(text.startswith("accuracy: ") and "tolerance" in text for _, text in warnings)
+
+
+@pytest.mark.parametrize(
+    ("off", "limits", "text"),
+    [
+        ({"angle": 0.02}, {}, None),
+        ({"angle": 0.02}, {"angle": 2.0}, None),
+        ({"angle": 0.02}, {"angle": 0.5}, "whirl angle off by 1.1 deg (limit 0.5) since 0.000 s;"),
+        ({"radius": 0.2e-6}, {"radius": 0.1}, "whirl radius off by 0.2 um (limit 0.1) since"),
+        ({"radius": 0.4e-6}, {"radius": 0.5}, None),
+        ({"radius": 0.4e-6}, {"angle": 0.5}, "whirl radius off by 0.4 um (tolerance 0.28) since"),
+        ({"force": 0.05}, {"force": 0.01}, "contact force off by 0.05 N (limit 0.01) since"),
+        ({"hz": 0.02}, {"frequency": 0.01}, "whirl frequency off by 0.02 Hz (limit 0.01) since"),
+    ],
+)
+def test_a_limit_replaces_the_tolerance_of_its_quantity(
+    off: dict[str, float], limits: dict[str, float], text: str | None
+) -> None:
+    accuracy, warnings = compared(limits, **off)
+    assert [warning.partition("accuracy: ")[2].startswith(text or "?") for _, warning in warnings] == [True] * bool(
+        text
+    )
+    quantities = accuracy.document()["quantities"]
+    assert {name: quantities[name]["tolerance"] for name in limits} == limits
+    assert "state" in quantities, "the other quantities are there as before"
+
+
+def test_a_limit_of_the_spin_angle_is_in_degrees() -> None:
+    turned = whirl(256)
+    turned[:, COLUMN["theta"]] += np.radians(0.3)
+    for limit, warned in ((0.2, True), (0.4, False)):
+        accuracy = Accuracy(3e-4, CLEARANCE, 1e-3, {"spin_angle": limit})
+        accuracy.compare(whirl(256), turned, 1e-3 * np.arange(256))
+        assert (f"spin angle off by 0.3 deg (limit {limit})" in accuracy.warning()) == warned
 
 
 def test_impacts_that_differ_are_not_explained_by_an_angle() -> None:
@@ -97,7 +132,7 @@ def held_against_taylor(scene: str, changes: dict[str, Any], duration_s: float) 
     given = {**BARE, **changes}
     exact = simulate(
         scene,
-        {**given, "engine.name": "taylor", "engine.tolerance": 1e-12, "engine.companion": False},
+        {**given, "engine.name": "taylor", "engine.tolerance": 1e-12, "engine.companion": False, "engine.limits": {}},
         duration_s=duration_s,
     )
     run = simulate(scene, given, duration_s=duration_s)
@@ -125,6 +160,35 @@ def test_what_is_off_in_radius_or_force_warns(name: str) -> None:
     assert radius * 1e6 > found["radius"]["tolerance"] or force > found["force"]["tolerance"]
     assert found["radius"]["exceeded_s"] is not None or found["force"]["exceeded_s"] is not None
     assert any(text.startswith("accuracy: ") for text in simulation.health()["warnings"])
+
+
+def test_a_run_beyond_its_angle_limit_warns_and_the_same_without_it_does_not() -> None:
+    changes = {**BARE, "engine.tolerance": 3e-3}
+    plain = simulate("hammer", changes, duration_s=0.3)
+    limited = simulate("hammer", {**changes, "engine.limits.angle_deg": 1e-5}, duration_s=0.3)
+    assert plain.simulation.health()["warnings"] == []
+    assert [event["event"] for event in plain.events] == ["hammer"]
+    assert np.array_equal(plain["ring_x"], limited["ring_x"]), "engine.tolerance is given, so the run is the same"
+    (warning,) = (event["text"] for event in limited.events if event["event"] == "warning")
+    for text in (warning, *limited.simulation.health()["warnings"]):
+        assert re.search(r"whirl angle off by \S+ deg \(limit 1e-05\) since 0\.\d+ s", text)
+    angle = limited.simulation.health()["accuracy"]["quantities"]["angle"]
+    assert angle["error"] > angle["tolerance"] == 1e-5
+    assert "whirl angle" in accuracy_text(limited.simulation.health()["accuracy"])
+    assert "deg (tolerance 1e-05)" in accuracy_text(limited.simulation.health()["accuracy"])
+
+
+def test_a_tighter_limit_makes_the_run_finer() -> None:
+    found = [
+        held_against_taylor("hammer", {"engine.limits.radius_um": limit} if limit else {}, 0.2)
+        for limit in (None, 0.03, 0.001)
+    ]
+    tolerances = [simulation.scene.engine.tolerance for *_, simulation in found]
+    assert tolerances == pytest.approx([3e-4, 0.03 / 900.0, 0.001 / 900.0])
+    radii = [radius for radius, *_ in found]
+    assert radii[0] > 3.0 * radii[1] > 9.0 * radii[2] > 0.0
+    assert all(not simulation.health()["warnings"] for *_, simulation in found)
+    assert radii[2] * 1e6 < 0.001
 
 
 def test_settled_whirl_is_off_in_angle_only() -> None:

@@ -17,6 +17,7 @@ from rig.cli.app import COMMANDS, GROUPS, rig
 from rig.cli.command import Group
 from rig.cli.completion import SCENE_KEYS, complete
 from rig.cli.options import names_of, pairs
+from rig.engine_choice import Limits
 from rig.engines import ENGINES
 from rig.errors import InputError
 from rig.generators import Generator
@@ -184,6 +185,7 @@ def test_keys_of_a_scene_that_are_completed_are_those_that_it_has() -> None:
     inner = {name: getattr(table, "model_fields", None) for name, table in tables.items()}
     keys = {f"{name}.{part}" for name, parts in inner.items() for part in parts or ()} | set(inner)
     others = {*("name", "title", "set", "commands", "pick"), *(name for name, parts in inner.items() if parts)}
+    keys = keys - {"engine.limits"} | {f"engine.limits.{part}" for part in Limits.model_fields}
     assert set(SCENE_KEYS) == {key for key in keys - others if not key.startswith("pick.")}
 
 

@@ -110,4 +110,4 @@ def _table(values: dict[str, Any]) -> str:
 
 def _toml(value: Any) -> str:
     # JSON's texts, numbers, booleans and lists are TOML's too.
-    return json.dumps(value, ensure_ascii=False)
+    return _table(value) if isinstance(value, dict) else json.dumps(value, ensure_ascii=False)

@@ -11,9 +11,10 @@ import numpy as np
 from replays.studies.engines import friction_of, is_adaptive, traits
 from replays.studies.run import bare_sensors
 from replays.studies.stability.cell import Cell
+from rig.engine_choice import EngineChoice
 from rig.engines import ENGINES
 from rig.errors import SimulationError
-from rig.scenes import EngineChoice, Scene, load_scene
+from rig.scenes import Scene, load_scene
 from rig.simulation import Simulation
 
 
