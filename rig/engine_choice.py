@@ -1,6 +1,6 @@
 """Choice of an engine in a scene: method, step, tolerance, and limits of a run's error by quantity.
 
-The companion's estimate is held against the limits (`rig.accuracy`). They are no promise: a run that exceeds one warns.
+`rig.accuracy` compares the companion's estimate with the limits. A run may exceed a limit; it then warns.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ class Limits(BaseModel, frozen=True, extra="forbid"):
 
 
 class EngineChoice(Written):
-    """How the equations are integrated."""
+    """Settings of the integration: engine, step, tolerance, limits of the error, companion."""
 
     name: str = next(iter(ENGINES))
     step_us: Annotated[int, Field(ge=1, le=1000)] = 0
