@@ -151,12 +151,13 @@ def check_suffix(path: Path, *, field: str = "picture") -> None:
         raise InputError(field, "a .png or .svg file", str(path))
 
 
-def save(figure: Figure, *paths: Path) -> list[Path]:
+def save(figure: Figure, *paths: Path, source: str = "") -> list[Path]:
     """Write a figure to files that are whole or not there: the same numbers give the same bytes.
 
     Args:
         figure: The figure.
         paths: Each .png or .svg.
+        source: What its numbers come from, for the files' metadata.
 
     Returns:
         The files.
@@ -168,25 +169,31 @@ def save(figure: Figure, *paths: Path) -> list[Path]:
     for path in paths:
         check_suffix(path)
     for path in paths:
-        data = _svg(figure) if path.suffix == ".svg" else png(figure)
+        data = _svg(figure, source) if path.suffix == ".svg" else png(figure, source=source)
         with whole_file(path) as draft:
             draft.write_bytes(data)
     return list(paths)
 
 
-def png(figure: Figure, *, dpi: int = DPI) -> bytes:
+def png(figure: Figure, *, dpi: int = DPI, source: str = "") -> bytes:
     """A figure as PNG with a palette: a line drawing looks the same in a third of the size.
 
     Args:
         figure: The figure.
         dpi: Dots an inch.
+        source: What its numbers come from, for the field Source of its metadata.
     """
     from PIL import Image
+    from PIL.PngImagePlugin import PngInfo
+
+    about = PngInfo()
+    if source:
+        about.add_text("Source", source)
 
     buffer, small = io.BytesIO(), io.BytesIO()
     figure.savefig(buffer, format="png", dpi=dpi)
     with Image.open(buffer) as image:
-        _with_palette(image.convert("RGB")).save(small, format="png", optimize=True)
+        _with_palette(image.convert("RGB")).save(small, format="png", optimize=True, pnginfo=about)
     return small.getvalue()
 
 
@@ -227,8 +234,8 @@ def _nearest(colours: np.ndarray, means: np.ndarray) -> np.ndarray:
 
 
 @house_style()
-def _svg(figure: Figure) -> bytes:
+def _svg(figure: Figure, source: str) -> bytes:
     buffer = io.BytesIO()
     # Without a date and with fixed names, the same numbers give the same file.
-    figure.savefig(buffer, format="svg", dpi=DPI, metadata={"Date": None})
+    figure.savefig(buffer, format="svg", dpi=DPI, metadata={"Date": None, "Source": source or None})
     return buffer.getvalue()

@@ -63,7 +63,7 @@ _SHORTENS = (True, "error control shortens the steps")
 _FEW_STEPS = "no error control, an impact of 0.32 ms in a few steps; measured: "
 _ROWS = {
     "split": Traits(
-        RED, "o", _tolerances(25, 2, 3, 4, 5, 6), _tolerances(25, 3, 4, 5),
+        RED, "o", _tolerances(25, 1, 2, 3, 4, 5, 6), _tolerances(25, 1, 2, 3, 5),
         oscillator_limit=math.inf, coarse_bounce=(True, "series take the impact, and do not follow the grid"),
     ),
     "rk8": Traits(

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import ast
+import hashlib
 import platform
 import subprocess
+from collections.abc import Iterable
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -14,6 +17,37 @@ RIG = "rotor-stator-rig"
 def today() -> str:
     """The date in UTC."""
     return datetime.now(UTC).strftime("%Y-%m-%d")
+
+
+def digest(sources: Iterable[Path]) -> str:
+    """Digest of what Python files do: of their syntax trees, without docstrings, comments, places and names of files.
+
+    Args:
+        sources: Files, in any order.
+    """
+    trees = []
+    for path in sources:
+        tree = ast.parse(path.read_bytes())
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ImportFrom):
+                node.module, node.level = None, 0  # what is imported counts, and not where from
+            elif isinstance(node, ast.Module | ast.FunctionDef | ast.ClassDef):
+                # A text that stands alone says something of what is before it.
+                node.body = [each for each in node.body if not _is_text(each)] or [ast.Pass()]
+        trees.append(hashlib.sha256(repr(_fields(tree)).encode()).digest())
+    return hashlib.sha256(b"".join(sorted(trees))).hexdigest()[:16]
+
+
+def _fields(node: object) -> object:
+    """A syntax tree as tuples, without empty fields: `ast.dump` differs from one version of Python to the next."""
+    if isinstance(node, ast.AST):
+        found = ((name, _fields(value)) for name, value in ast.iter_fields(node) if value not in (None, []))
+        return (type(node).__name__, *found)
+    return tuple(map(_fields, node)) if isinstance(node, list) else node
+
+
+def _is_text(node: ast.stmt) -> bool:
+    return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
 
 
 def commit() -> str:

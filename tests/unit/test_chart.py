@@ -211,7 +211,7 @@ def test_plan_gives_a_method_only_what_it_takes() -> None:
 @pytest.fixture
 def no_png(monkeypatch: pytest.MonkeyPatch) -> None:
     """Write an empty file for each PNG: what is drawn is read off the SVG beside it."""
-    monkeypatch.setattr("replays.report.canvas.png", lambda _figure: b"")
+    monkeypatch.setattr("replays.report.canvas.png", lambda _figure, **_about: b"")
 
 
 @pytest.mark.usefixtures("no_png")

@@ -58,7 +58,8 @@ def draw(rows: list[Row], folder: Path, panels: list[str], *, command: str, note
         figure = new_figure(layout=None)
         said = make(figure, rows)
         _caption(figure, rows, said, command, note)
-        files += save(figure, folder / f"{stem}.png", folder / f"{stem}.svg")
+        source = ", ".join(sorted({f"code {row.get('code')}" for row in points}))
+        files += save(figure, folder / f"{stem}.png", folder / f"{stem}.svg", source=source)
     return files
 
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import csv
-import hashlib
 import math
 import platform
 from pathlib import Path
 from typing import Any
 
+import rig
 from replays.studies import provenance
 from replays.studies.journal import Journal
 from rig.errors import InputError
@@ -118,19 +118,19 @@ def read_table(folder: Path) -> list[Row]:
         raise InputError("output", f"a folder with {path.name} of an earlier chart", str(folder)) from None
 
 
+def code_digest() -> str:
+    """Digest of the engines, kernels and peers' drivers that a chart measures, and of how it does."""
+    here, simulator = Path(__file__).parent, Path(str(rig.__file__)).parent
+    folders = (simulator / "engines", simulator / "kernels", here.parent / "peers")
+    sources = [path for folder in folders for path in folder.rglob("*.py")]
+    return provenance.digest([*sources, *(here / name for name in _MEASURING)])
+
+
 def stamp() -> dict[str, str]:
     """What a point is measured with: code, commit, date, machine, versions of libraries."""
-    from rig.kernels import source_digest
-
-    # Of the peers' drivers and of how a point is measured, too: a point of other code is measured anew.
-    here = Path(__file__).parent
-    sources = [*here.parent.joinpath("peers").glob("*.py"), *(here / name for name in _MEASURING)]
-    code = hashlib.sha256(source_digest().encode())
-    for path in sorted(sources):
-        code.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
     found = {"Python": platform.python_version(), **provenance.versions(*_LIBRARIES)}
     return {
-        "code": code.hexdigest()[:16],
+        "code": code_digest(),
         "commit": provenance.commit(),
         "date": provenance.today(),
         "machine": provenance.machine(),
