@@ -291,6 +291,20 @@ def test_what_the_bus_refuses_is_counted() -> None:
     assert 12_500 * 0.6 + 6 + 2 <= setup.gateway.dropped <= 12_500 * 0.6 + 30
 
 
+@pytest.mark.parametrize("refuse", [False, True])
+def test_frames_of_a_time_that_never_comes_do_not_keep_a_gateway_busy_that_was_closed(refuse: bool) -> None:
+    before = set(threading.enumerate())
+    with rig(Fake(duration_s=None), paced=True, bus=Stubborn(refuse=refuse)) as setup:
+        for index in (0, 10**9):
+            # The number of its first row says when it is due, in 14 hours.
+            block = wire.Block(50 * (index % 1000), index, 20_000.0, 1e6, np.zeros((200, 4), np.int32))
+            setup.gateway.unpack(wire.sensor_key("probes"), wire.encode_block(block))
+        setup.gateway.close()
+        until(lambda: not any(each.name == "can gateway sends" for each in set(threading.enumerate()) - before))
+        # At least 20 frames of each block.
+        assert setup.gateway.outbox.dropped >= (40 if refuse else 20)
+
+
 def test_what_finds_no_room_for_a_moment_is_sent_afterwards_in_its_order() -> None:
     bus = Stubborn(refuse=True)
     with rig(Fake(duration_s=0.5), paced=True, bus=bus, schedule=Schedule(None, 10_000)) as setup:

@@ -44,6 +44,8 @@ _WAIT_S = 0.25
 """Samples that may wait for room on the bus, after the machine had been held up [s]."""
 _FAREWELL_S = 0.5
 """How long a bus without room is waited for at the end [s]."""
+_LONGEST_LATENCY_S = 1.0
+"""How long frames that are not due are waited for at the end, besides [s]: the rig waits 2 s for the gateway."""
 _WORD_32 = 0xFFFFFFFF
 _WORDS = (wire.EVENTS, wire.STATUS, wire.FAULTS, wire.BLOCK)
 """Keys of documents, which are few, and never dropped."""
@@ -257,9 +259,10 @@ class Gateway(Closing):
         with self._changed:
             if self._queue and not self._paced:
                 return False
-            if self._stopping and not self._queue and not self.outbox.undue:
-                self._end_s = min(self._end_s, now + _FAREWELL_S)
-                if now >= self._end_s or not self.outbox.stuck:
+            if self._stopping and not self._queue:
+                # A block of a lying time is due when nobody waits for it.
+                self._end_s = min(self._end_s, now + min(self.outbox.latency_s, _LONGEST_LATENCY_S) + _FAREWELL_S)
+                if now >= self._end_s or not (self.outbox.undue or self.outbox.stuck):
                     self.outbox.drop_all()
                     return True
             if not self._paced:
@@ -268,7 +271,7 @@ class Gateway(Closing):
             if not self._queue and not self.outbox.stuck:
                 next_s = min(self.outbox.next_s, self._next_status_s, self._next_heartbeat_s)
                 self._changed.wait(min(max(next_s - self._now(), 0.0), _IDLE_S))
-            if (self._queue or self.outbox.stuck) and not self._stopping:
+            if self._queue or self.outbox.stuck:
                 # On a grid of slots: what comes with the first part of a block is taken with it.
                 self._changed.wait(SLOT_S - self._now() % SLOT_S)
         return False

@@ -183,8 +183,9 @@ class Outbox:
             self._waiting.appendleft((records[count:], due_s[count:]))
 
     def drop_all(self) -> None:
-        """Give up what waits for room."""
-        self.dropped += self.waiting + len(self._answers)
+        """Give up what waits for its slot or for room."""
+        undue = len(self._undue[0]) + sum(len(slots) for slots, _ in self._added)
+        self.dropped += self.waiting + len(self._answers) + undue
 
     def _give(self, records: np.ndarray, due_s: np.ndarray | None = None) -> int:
         """How many of some frames the bus has taken, from the first on; those without a time are due now."""
