@@ -27,14 +27,27 @@ def chart(
     ] = None,
     no_peers: Annotated[bool, typer.Option("--no-peers", help="Our engines only.")] = False,
     fresh: Annotated[bool, typer.Option("--fresh", help="Start over instead of going on where a run ended.")] = False,
+    add: Annotated[
+        list[Path] | None,
+        typer.Option("--add", metavar="FILE.csv", help="Add a solver by its results; may be repeated."),
+    ] = None,
+    problem: Annotated[
+        str | None, typer.Option("--problem", metavar="PHASE", help="Write a phase's problem for a solver of yours.")
+    ] = None,
     draw: Annotated[bool, typer.Option("--draw", help="Draw chart.csv of the folder again; measure nothing.")] = False,
 ) -> None:
     """Chart speed against error: our engines against other solvers, by phase of the motion and by contact law."""
-    from replays.studies.chart.session import Progress, draw_again, make_chart
+    from replays.studies.chart.session import Progress, add_solvers, draw_again, make_chart
+    from replays.studies.chart.submission import write_problem
     from rig.errors import InputError, Words
 
     if quick and full:
         raise InputError("--quick, --full", "one of the two", Words("both"))
+    if sum((bool(add), problem is not None, any((quick, full, only, panel, no_peers, fresh, draw)))) > 1:
+        raise InputError("--add or --problem", "the only option besides --output", Words("more options"))
+    if problem is not None:
+        echo(str(write_problem(problem, output)))
+        return
     if draw:
         for path in draw_again(output, only=only, panels=panel).files:
             echo(str(path))
@@ -42,16 +55,14 @@ def chart(
     mode = "full" if full else "quick"
     with reporting(compiles=True) as reporter:
         reporter.show("references")
-        outcome = make_chart(
-            output,
-            mode=mode,
-            only=only,
-            panels=panel,
-            peers=not no_peers,
-            fresh=fresh,
-            command="rig chart --full" if full else "rig chart",
-            progress=Progress(begin=reporter.begin, step=reporter.step),
-        )
+        progress = Progress(begin=reporter.begin, step=reporter.step)
+        if add:
+            outcome = add_solvers(output, add, progress=progress)
+        else:
+            outcome = make_chart(
+                output, mode=mode, only=only, panels=panel, peers=not no_peers, fresh=fresh,
+                command="rig chart --full" if full else "rig chart", progress=progress,
+            )  # fmt: skip
     if outcome.missing:
         missing = ", ".join(outcome.missing)
         echo(f"not installed: {missing} (pip install 'rotor-stator-rig[peers]'); charted without", err=True)

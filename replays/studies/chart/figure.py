@@ -12,7 +12,7 @@ import numpy as np
 
 from replays.report.canvas import WIDTH, house_style, new_figure, save
 from replays.studies.chart.look import ALARM, INK, QUIET, Row, draw_legend, look
-from replays.studies.chart.methods import OURS
+from replays.studies.chart.methods import ADDED, OURS
 from replays.studies.chart.panel import (
     draw_energy,
     draw_frames,
@@ -94,11 +94,13 @@ _HOW = (
 
 
 def _led(rows: list[Row], panel: str) -> str:
-    """What must be said where a Python loop drives a library."""
+    """Remarks on points whose time is not measured as the others' is: added by file, or driven by a Python loop."""
+    added = {row["title"] for row in rows if row["panel"] == panel and row["family"] == ADDED}
+    stated = " Solvers added by file: time and number of contacts as their authors' files state." if added else ""
     led = sorted({row["method"] for row in rows if row["panel"] == panel and row["own_cpu_s"]})
     if not led:
-        return ""
-    return f" Hollow or dotted: {' and '.join(led)} alone, without the time of our Python loop that drives it."
+        return stated
+    return f"{stated} Hollow or dotted: {' and '.join(led)} alone, without the time of our Python loop that drives it."
 
 
 def _select(rows: list[Row], panel: str, phase: str, cases: tuple[str, ...] = ()) -> list[Row]:

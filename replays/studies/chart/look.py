@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from replays.studies.chart.methods import OURS
+from replays.studies.chart.methods import ADDED, OURS
 from replays.studies.chart.phases import SMOOTHING
 from replays.studies.engines import traits
 from rig.engines import ENGINES
@@ -13,7 +13,7 @@ Row = dict[str, Any]
 
 # Peers stand in quiet tones by family, behind the strong colours of our engines.
 _FAMILIES = {"heyoka": ("#111111", "*"), "SUNDIALS": ("#6e6e6e", "s"), "scipy": ("#a98a66", "o"),
-             "MuJoCo": ("#a08cc0", "X")}  # fmt: skip
+             "MuJoCo": ("#a08cc0", "X"), ADDED: ("#7a8500", "P")}  # fmt: skip
 _DASHES: tuple[Any, ...] = ("-", (0, (5, 1.6)), (0, (1.4, 1.2)), (0, (6, 1.5, 1.4, 1.5)), (0, (2.5, 1)), (0, (8, 3)),
                             (0, (1, 3)), (0, (9, 2, 3, 2)))  # fmt: skip
 FAILURES = {
@@ -37,8 +37,9 @@ def look(row: Row, rows: list[Row]) -> dict[str, Any]:
     color, marker = _FAMILIES.get(row["family"], ("#999999", "d"))
     family = list(dict.fromkeys(other["method"] for other in rows if other["family"] == row["family"]))
     dash = _DASHES[family.index(row["method"]) % len(_DASHES)]
-    return {"color": color, "marker": marker, "ls": dash, "lw": 1.0, "ms": 7.5 if marker == "*" else 4.0, "mec": color,
-            "mew": 0.5, "zorder": 5 if marker == "*" else 4}  # fmt: skip
+    strong = row["family"] in ("heyoka", ADDED)
+    return {"color": color, "marker": marker, "ls": dash, "lw": 1.0, "ms": 7.5 if strong else 4.0, "mec": color,
+            "mew": 0.5, "zorder": 5 if strong else 4}  # fmt: skip
 
 
 def look_of_bound(row: Row, rows: list[Row]) -> dict[str, Any]:
@@ -62,7 +63,7 @@ def draw_legend(
 
     entries: list[tuple[Any, Any]] = []
     shown = {row["method"]: row for row in rows if row["panel"] in panels and row["family"] != "reference"}
-    order = [OURS, "heyoka", "SUNDIALS", "scipy", "MuJoCo"]
+    order = [OURS, ADDED, "heyoka", "SUNDIALS", "scipy", "MuJoCo"]
     blank = Line2D([], [], ls="none")
     headings = {OURS: "engines of the rig"}
     for family in [*order, *sorted({row["family"] for row in shown.values()} - set(order))]:

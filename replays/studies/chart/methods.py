@@ -10,6 +10,8 @@ from rig.engines import ENGINES
 
 OURS = "rig"
 """Family of our own engines."""
+ADDED = "added by file"
+"""Family of solvers that are not part of the project, as `rig chart --add` adds them."""
 
 
 @dataclass(frozen=True)

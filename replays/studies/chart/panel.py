@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from replays.studies.chart.look import ALARM, FAILURES, Row, look, look_of_bound
-from replays.studies.chart.methods import OURS
+from replays.studies.chart.methods import ADDED, OURS
 from replays.studies.chart.profile import TARGET, shares
 
 _RIGHT, _EDGE = 2.0, 60.0
@@ -138,7 +138,7 @@ def mark_better(axes: Any) -> None:
 def label_lines(axes: Any, rows: list[Row], all_rows: list[Row]) -> None:
     """Names beside the true end of each line of ours, and of the best peers, kept apart."""
     ends: list[tuple[float, float, str, str]] = []
-    for method in dict.fromkeys(row["method"] for row in rows if row["family"] in (OURS, "heyoka")):
+    for method in dict.fromkeys(row["method"] for row in rows if row["family"] in (OURS, ADDED, "heyoka")):
         line = [row for row in rows if row["method"] == method and row["case"] == "" and row["error"]]
         line = [row for row in line if row["failure"] in ("", "contacts")]
         if line:

@@ -12,6 +12,7 @@ from replays.studies.chart import profile
 from replays.studies.chart.measure import Budget, point, run_engine, statistics_point
 from replays.studies.chart.methods import OURS, Competitor, competitors, missing_peers
 from replays.studies.chart.phases import (
+    PANELS,
     PHASES,
     RUB,
     SMOOTHED_SPEEDS,
@@ -24,10 +25,11 @@ from replays.studies.chart.phases import (
     select,
 )
 from replays.studies.chart.store import Row, Store, read_table
+from replays.studies.chart.submission import PANEL, read_submission
 from replays.studies.peers import PEERS, Setting
 from replays.studies.peers.problem import Problem, scaled_error
 from replays.studies.peers.reference import Reference, find_reference
-from rig.errors import InputError
+from rig.errors import InputError, SimulationError
 
 TOTAL_S = {"quick": 95.0, "full": 3300.0}
 """Wall time for all points, compile time apart [s]; what does not fit is left to the next run."""
@@ -133,9 +135,49 @@ def draw_again(folder: Path, *, only: str | None = None, panels: list[str] | Non
     rows = read_table(folder)
     if not rows:
         raise InputError("output", "a folder with points in chart.csv", str(folder))
-    command = "rig chart --full" if rows[0]["mode"] == "full" else "rig chart"
-    files = draw(rows, folder, chosen, command=command)
+    files = draw(rows, folder, chosen, command=_command(rows[0]["mode"]))
     return Outcome(files=files, resumed=len(rows), failures=sum(bool(row["failure"]) for row in rows))
+
+
+def add_solvers(folder: Path, paths: list[Path], *, progress: Progress | None = None) -> Outcome:
+    """Add solvers that are not part of the project to a chart by their results, and draw; measure nothing else.
+
+    Args:
+        folder: Folder of the chart; a new one gets a chart of these solvers alone.
+        paths: Files of results, one a solver, setting and phase; the same three replace an earlier file's.
+        progress: Told what is under way.
+
+    Raises:
+        InputError: A wrong file, or a chart that other code has measured.
+        SimulationError: No two codes solved the problem, so there is no reference.
+    """
+    from replays.studies.chart.figure import draw
+
+    progress = progress or Progress()
+    added = [read_submission(path) for path in paths]
+    charted = read_table(folder) if (folder / "chart.csv").exists() else []
+    store = Store(folder)
+    if not all(store.has(row) for row in charted):
+        raise InputError("output", "a folder with a chart by this code, with its journal, or a new one", str(folder))
+    mode: Mode = "full" if charted and charted[0]["mode"] == "full" else "quick"
+    work = _Work(store, {}, mode, None)
+    progress.begin(2 * len(added))
+    for each in added:
+        progress.step(f"reference of {each.phase}")
+        _references(work, PANEL, each.phase, "")
+        reference = work.reference(PANEL, each.phase, "")
+        if reference is None:
+            raise SimulationError(f"no two codes solved {each.phase}, so it has no reference")
+        progress.step(f"{each.phase}: {each.contender.title}")
+        base = work.base(PANEL, each.phase, "", each.contender, each.contender.settings[0])
+        work.keep({**base, "friction": "exact"}, each.point(reference))
+    rows = store.rows(mode)
+    files = store.write(mode) + draw(rows, folder, list(PANELS), command=_command(mode))
+    return Outcome(files=files, measured=len(added), failures=sum(bool(row["failure"]) for row in rows))
+
+
+def _command(mode: str) -> str:
+    return "rig chart --full" if mode == "full" else "rig chart"
 
 
 def own_reference(problem: Problem) -> Reference | None:

@@ -1,0 +1,183 @@
+"""A solver that is not part of the project: the problem that its author gets, and the results that come back.
+
+`docs/charts.md` describes both files. The solver itself is not run here, so its processor time and its number of
+contacts are those that its file states.
+"""
+
+from __future__ import annotations
+
+import inspect
+import json
+import re
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from replays.studies.chart.measure import Budget, point
+from replays.studies.chart.methods import ADDED, Competitor
+from replays.studies.chart.phases import PHASES, RUB, problem_of
+from replays.studies.peers import PEERS, Library, Peer, Setting
+from replays.studies.peers.problem import ERROR_COLUMNS, Problem
+from replays.studies.peers.reference import Reference
+from replays.studies.peers.solution import Solution
+from rig.engines import ENGINES
+from rig.errors import InputError, UnknownNameError, Words, whole_file
+from rig.kernels.signals import STATE
+from rig.outside import open_file, unreadable
+
+PANEL = "exact"
+"""Panel of the problems: total error against exact Coulomb friction."""
+_PHASES = tuple(name for name in PHASES if name != RUB)
+"""Phases with an error at each instant; the chaotic rub has statistics only."""
+_KEYS = ("solver", "phase", "setting", "cpu_s", "contacts")
+_COLUMNS = ("time [s]", *(f"{STATE[column].name} [{STATE[column].unit}]" for column in ERROR_COLUMNS))
+_MAX_BYTES = 1 << 24
+"""Many times the longest phase at full precision; what follows is not read."""
+_INSTANT_TOLERANCE_S = 1e-9
+"""A thousandth of the model's tick: instants may be rounded in text."""
+_LARGEST = 1e9
+"""No state in SI units and no processor time [s] reaches it."""
+_LABEL = re.compile(r"[A-Za-z0-9][ -#%-~]{0,39}")
+"""A name that fits into a legend; between dollar signs, matplotlib would read a formula."""
+_UNIT = re.compile(r"^    (\w+): \w+  # .*?\[(.+?)\]", re.MULTILINE)
+"""Name and unit of a field of `rig.kernels.constants`, whose comments hold the unit in brackets."""
+
+
+def write_problem(phase: str, folder: Path) -> Path:
+    """Write a problem as FOLDER/problem-PHASE.json, without anything of its solution, and return the path.
+
+    Args:
+        phase: One of `_PHASES`.
+        folder: Made where it is missing.
+
+    Raises:
+        InputError: Any other phase, or a folder that cannot be made.
+        DiskError: The file could not be written.
+    """
+    problem = _exact_problem(phase)
+    groups: dict[str, Any] = {**problem.constants._asdict(), "inputs": problem.inputs}
+    del groups["levels"]  # the full model and exact friction, as the page states them
+    sources = {name: inspect.getsource(type(group)) for name, group in groups.items() if isinstance(group, tuple)}
+    document = {
+        "phase": phase,
+        "title": PHASES[phase].title,
+        **{name: group._asdict() if isinstance(group, tuple) else group for name, group in groups.items()},
+        "initial_state": {signal.name: float(value) for signal, value in zip(STATE, problem.y0, strict=True)},
+        "corners_s": problem.corners,
+        "instants_s": problem.times.tolist(),
+        "scales": {signal.name: signal.scale for signal in STATE},
+        "units": {name: dict(_UNIT.findall(source)) for name, source in sources.items()}
+        | {"initial_state": {signal.name: signal.unit for signal in STATE}, "torque_gain": "N m s"},
+    }
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError("output", "a folder that can be made", Words(f"{folder} ({error.strerror})")) from None
+    path = folder / f"problem-{phase}.json"
+    with whole_file(path) as draft:
+        draft.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+    return path
+
+
+class Submission(NamedTuple):
+    """One solver at one setting on one phase, with the states, contacts and processor time of its file."""
+
+    contender: Competitor
+    phase: str
+    problem: Problem
+    solution: Solution
+
+    def point(self, reference: Reference) -> dict[str, Any]:
+        """Return the columns of the point, judged as any peer's.
+
+        Args:
+            reference: Reference of the problem.
+        """
+        name, settings = self.contender.name, self.contender.settings
+        PEERS[name] = _RecordedPeer(name, name, Library(ADDED, ""), settings, {"solution": self.solution})
+        try:
+            return point(self.contender, settings[0], self.problem, reference, Budget(np.inf, 1))
+        finally:
+            del PEERS[name]
+
+
+class _RecordedPeer(Peer):
+    """A peer whose solution is on file."""
+
+    def solve(self, problem: Problem, setting: Setting | None = None, *, budget_s: float = 60.0) -> Solution:
+        """Return the solution of the file."""
+        return self.options["solution"]
+
+
+def read_submission(path: Path) -> Submission:
+    """Read a file of a solver's results.
+
+    Args:
+        path: Comment lines `# KEY: VALUE`, a line of column names with units, a row at each instant of the problem.
+
+    Raises:
+        InputError: The file cannot be read, or a key, a column or a row is missing or wrong.
+    """
+    try:
+        with open_file(path) as file:
+            lines = file.read(_MAX_BYTES).decode("utf-8-sig", "replace").splitlines()
+    except OSError as error:
+        raise unreadable(path, error) from None
+    comments = [line[1:].partition(":") for line in lines if line.startswith("#")]
+    names = [name.strip() for name, _, _ in comments]
+    for key in _KEYS:
+        if names.count(key) != 1:
+            raise InputError(
+                key, f"in one line `# {key}: VALUE` of {path.name}", Words(f"{names.count(key)} such lines")
+            )
+    keys = dict(zip(names, (value.strip() for _, _, value in comments), strict=True))
+    problem, solver, label = _exact_problem(keys["phase"]), keys["solver"], keys["setting"]
+    for key in ("solver", "setting"):
+        if not _LABEL.fullmatch(keys[key]) or keys[key] in {*ENGINES, *PEERS, "reference"}:
+            must = "of 1 to 40 ASCII characters without $, a letter or digit first, and no name that the chart has"
+            raise InputError(key, must, keys[key])
+    solution = Solution(problem.times, np.inf)
+    solution.cpu_s = _number("cpu_s", keys, 1e-9, _LARGEST)
+    if not re.fullmatch(r"\d{1,5}", keys["contacts"]):
+        raise InputError("contacts", "a whole number from 0 to 99999", keys["contacts"])
+    solution.onsets = [(np.nan, np.nan)] * int(keys["contacts"])
+    solution.states[:] = 0.0
+    solution.states[:, ERROR_COLUMNS] = _states(
+        [line for line in lines if line.strip() and not line.startswith("#")], problem.times
+    )
+    tolerance = float(label) if re.fullmatch(r"\d+(\.\d+)?(e-?\d+)?", label) else 0.0
+    setting = (Setting(label, tolerance),)
+    return Submission(Competitor(solver, solver, ADDED, setting, setting), keys["phase"], problem, solution)
+
+
+def _exact_problem(phase: str) -> Problem:
+    if phase not in _PHASES:
+        raise UnknownNameError("phase", f"one of {', '.join(_PHASES)}", phase, _PHASES)
+    return problem_of(PANEL, phase, "")
+
+
+def _number(key: str, texts: dict[str, str], least: float, most: float, place: str = "") -> float:
+    try:
+        value = float(texts.get(key, ""))
+    except ValueError:
+        value = np.nan
+    if not least <= value <= most:
+        raise InputError(key + place, f"a number from {least:g} to {most:g}", texts.get(key, Words("nothing")))
+    return value
+
+
+def _states(lines: list[str], times: np.ndarray) -> np.ndarray:
+    """States by their columns' names at the problem's instants, shape (n, 7)."""
+    headings = [name.strip(' "') for name in lines[0].split(",")] if lines else []
+    if any(headings.count(name) != 1 for name in _COLUMNS):
+        raise InputError("columns", f"{', '.join(_COLUMNS)}, each once", Words(", ".join(headings)))
+    if len(lines) != len(times) + 1:
+        raise InputError("rows", f"{len(times)}, one at each instant of the problem", len(lines) - 1)
+    values = np.empty((len(times), len(_COLUMNS)))
+    for i, time_s in enumerate(times.tolist()):
+        fields, place = dict(zip(headings, lines[i + 1].split(","), strict=False)), f" in row {i + 1}"
+        values[i] = [_number(name, fields, -_LARGEST, _LARGEST, place) for name in _COLUMNS]
+        if abs(values[i, 0] - time_s) > _INSTANT_TOLERANCE_S:
+            raise InputError(_COLUMNS[0] + place, f"{time_s:.9g}, as in the problem", float(values[i, 0]))
+    return values[:, 1:]
