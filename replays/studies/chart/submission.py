@@ -56,18 +56,19 @@ def write_problem(phase: str, folder: Path) -> Path:
         DiskError: The file could not be written.
     """
     problem = _exact_problem(phase)
-    groups: dict[str, Any] = {**problem.constants._asdict(), "inputs": problem.inputs}
-    del groups["levels"]  # the full model and exact friction, as the page states them
-    sources = {name: inspect.getsource(type(group)) for name, group in groups.items() if isinstance(group, tuple)}
+    constants = problem.constants
+    groups = {name: getattr(constants, name) for name in ("shaft", "magnet", "contact", "house")}
+    groups["inputs"] = problem.inputs
     document = {
         "phase": phase,
         "title": PHASES[phase].title,
-        **{name: group._asdict() if isinstance(group, tuple) else group for name, group in groups.items()},
+        **{name: group._asdict() for name, group in groups.items()},
+        "torque_gain": constants.torque_gain,
         "initial_state": {signal.name: float(value) for signal, value in zip(STATE, problem.y0, strict=True)},
         "corners_s": problem.corners,
         "instants_s": problem.times.tolist(),
         "scales": {signal.name: signal.scale for signal in STATE},
-        "units": {name: dict(_UNIT.findall(source)) for name, source in sources.items()}
+        "units": {name: dict(_UNIT.findall(inspect.getsource(type(group)))) for name, group in groups.items()}
         | {"initial_state": {signal.name: signal.unit for signal in STATE}, "torque_gain": "N m s"},
     }
     try:
