@@ -10,6 +10,22 @@ from typing import Any
 from rig.errors import InputError, Words
 
 
+def prepare_folder(folder: Path) -> None:
+    """Make a folder where it is missing.
+
+    Raises:
+        InputError: It cannot be made or written, or is a file.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise InputError("output", "a folder", Words(f"{folder}, which is a file"))
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError("output", "a folder that can be made", Words(f"{folder} ({error.strerror})")) from None
+    if not os.access(folder, os.W_OK):
+        raise InputError("output", "a folder that can be written", str(folder))
+
+
 class Journal:
     """A file of JSON lines in a folder, of which those count that the same code has measured.
 
@@ -30,14 +46,7 @@ class Journal:
         Raises:
             InputError: It cannot be written, or is a file.
         """
-        if folder.exists() and not folder.is_dir():
-            raise InputError("output", "a folder", Words(f"{folder}, which is a file"))
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError("output", "a folder that can be made", Words(f"{folder} ({error.strerror})")) from None
-        if not os.access(folder, os.W_OK):
-            raise InputError("output", "a folder that can be written", str(folder))
+        prepare_folder(folder)
         self.path = folder / name
         self.rows: list[dict[str, Any]] = []
         self.outdated = 0

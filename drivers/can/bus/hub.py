@@ -97,7 +97,7 @@ class Hub(Closing):
         self._lock = threading.Lock()
         self._wake = threading.Event()
         self._resting = False
-        """Whether a frame that is offered now changes nothing before the hub looks again."""
+        """A frame that is offered now changes nothing before the hub looks again."""
         self._stopping = False
         self._counts: Counter[str] = Counter()
         self.endpoints = Endpoints(model, self._counts, lambda: self._advance(self._now()))
@@ -274,7 +274,7 @@ class Hub(Closing):
         """Let the bus run until now.
 
         Returns:
-            What to say, when to look again [ns], and whether frames that are offered meanwhile can wait until then.
+            Messages to publish, time of the next look [ns], and whether frames that are offered meanwhile can wait.
         """
         self._advance(now)
         next_ns = self._model.next_ns()

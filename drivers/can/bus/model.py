@@ -220,7 +220,7 @@ class BusModel:
 
     @property
     def idle(self) -> bool:
-        """Whether nothing is on the wire or queued; frames that are offered for later may still come."""
+        """Return whether nothing is on the wire or queued; frames that are offered for later may still come."""
         bus = self._bus
         return not (bus.cells[kernels.SENDERS] or self._offers or bus.nodes[:, kernels.COUNT].any())
 

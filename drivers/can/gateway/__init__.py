@@ -45,7 +45,7 @@ _WAIT_S = 0.25
 _FAREWELL_S = 0.5
 """How long a bus without room is waited for at the end [s]."""
 _LONGEST_LATENCY_S = 1.0
-"""How long frames that are not due are waited for at the end, besides [s]: the rig waits 2 s for the gateway."""
+"""Longest further wait at the end for frames that are not due [s]: the rig waits 2 s for the gateway."""
 _WORD_32 = 0xFFFFFFFF
 _WORDS = (wire.EVENTS, wire.STATUS, wire.FAULTS, wire.BLOCK)
 """Keys of documents, which are few, and never dropped."""

@@ -27,11 +27,11 @@ _ANSWERS = 16
 _PORTION = 64
 """Frames that the bus gets in one go."""
 _AHEAD_SLOTS = 12
-"""How long before they are due a bus gets frames that it can hold until then: a block of usual length at once."""
+"""Slots ahead for which a bus gets frames that it can hold until they are due: a usual block at once."""
 _AHEAD_FRAMES = 128
-"""How many frames it gets before they are due: a quarter of a transmit queue, so that late ones find room."""
+"""Most frames that it gets before they are due: a quarter of a transmit queue, so that late ones find room."""
 _MARGIN_SLOTS = 2
-"""How long before the next frame is due it gets more of them."""
+"""Slots before the next frame is due at which it gets more of them."""
 
 
 class Outbox:
@@ -77,7 +77,7 @@ class Outbox:
 
     @property
     def undue(self) -> bool:
-        """Whether frames wait for their slot, here or at the bus."""
+        """Return whether frames wait for their slot, here or at the bus."""
         return len(self._undue[0]) > 0 or bool(self._added) or self._now() < self._last_handed_s
 
     @property
@@ -188,7 +188,7 @@ class Outbox:
         self.dropped += self.waiting + len(self._answers) + undue
 
     def _give(self, records: np.ndarray, due_s: np.ndarray | None = None) -> int:
-        """How many of some frames the bus has taken, from the first on; those without a time are due now."""
+        """Return the number of frames that the bus has taken, from the first on; those without a time are due now."""
         import can
 
         # Nothing waits here where the rig runs by the clock; else the bus has a second.

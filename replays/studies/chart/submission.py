@@ -17,6 +17,7 @@ import numpy as np
 from replays.studies.chart.measure import Budget, point
 from replays.studies.chart.methods import ADDED, Competitor
 from replays.studies.chart.phases import PHASES, RUB, problem_of
+from replays.studies.journal import prepare_folder
 from replays.studies.peers import PEERS, Library, Peer, Setting
 from replays.studies.peers.problem import ERROR_COLUMNS, Problem
 from replays.studies.peers.reference import Reference
@@ -52,7 +53,7 @@ def write_problem(phase: str, folder: Path) -> Path:
         folder: Made where it is missing.
 
     Raises:
-        InputError: Any other phase, or a folder that cannot be made.
+        InputError: Any other phase, or a folder that cannot be made or written.
         DiskError: The file could not be written.
     """
     problem = _exact_problem(phase)
@@ -71,10 +72,7 @@ def write_problem(phase: str, folder: Path) -> Path:
         "units": {name: dict(_UNIT.findall(inspect.getsource(type(group)))) for name, group in groups.items()}
         | {"initial_state": {signal.name: signal.unit for signal in STATE}, "torque_gain": "N m s"},
     }
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError("output", "a folder that can be made", Words(f"{folder} ({error.strerror})")) from None
+    prepare_folder(folder)
     path = folder / f"problem-{phase}.json"
     with whole_file(path) as draft:
         draft.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
