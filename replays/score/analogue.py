@@ -296,6 +296,8 @@ def _score_rows(card: Scorecard, alignments: list[Alignment], recorded: Mapping[
                 note="; ".join(each for each in (told, note) if each),
             )
             card.runs[f"{quantity} {name}".strip()] = [(first, last) for first, last, _ in here]
+        for channel, lost in _rows_without_value(alignment, recorded).items():
+            card.add("lost samples", channel, (lost, lost, lost), note="rows without a value")
         card.add("judged part", name, (judged := alignment.judged(), judged, judged))
         for rows, what in zip(
             (alignment.track.inside[0], alignment.rows - alignment.track.inside[1]),
@@ -303,6 +305,27 @@ def _score_rows(card: Scorecard, alignments: list[Alignment], recorded: Mapping[
         ):  # fmt: skip
             if rows > _EDGE:
                 card.remarks.append(f"{rows / alignment.rate_hz:.6g} s of the record lie {what} and are not judged")
+
+
+def _rows_without_value(alignment: Alignment, recorded: Mapping[str, Recorded]) -> dict[str, float]:
+    """Return the number of rows in the session without a value, of the signals that lack some.
+
+    A signal with a value in every n-th row, of a lower rate than the table, lacks none; nor is a row lost that comes
+    before the first value of all signals or after the last one.
+    """
+    inside = slice(*alignment.track.inside)
+    held = {name: np.isfinite(recorded[name].values[inside]) for name in alignment.names}
+    rows, lost = np.flatnonzero(np.any(list(held.values()), axis=0)), dict[str, float]()
+    for name, has in held.items():
+        places = np.flatnonzero(has)
+        if len(places) < 2:
+            continue
+        usual = float(np.median(np.diff(places)))
+        gaps = np.diff([rows[0] - usual, *places, rows[-1] + usual]) / usual
+        gaps[[0, -1]] = np.floor(gaps[[0, -1]])
+        if count := float(np.maximum(np.rint(gaps) - 1.0, 0.0).sum()):
+            lost[name] = count
+    return lost
 
 
 def _score_time(card: Scorecard, found: list[Fitted], ambiguous: set[str]) -> None:

@@ -123,6 +123,13 @@ class Begins:
         ]
         if not kept and self._tried:
             kept = [min(self._tried, key=lambda each: float(np.nanmax(_medians(each[0]))))[1]]
+        # A fault of some rows spoils the residual of all: a begin must not win by leaving these outside the session.
+        least, excess = min(map(self.unaccounted, kept), default=0), self._stretch_excess()
+        kept += [
+            each for _, each in self._tried
+            if excess[self._shifts.index(each.begin_s)] < math.log(_ALIKE)
+            and self.unaccounted(each) + FEWEST // _EDGE_ROWS < least
+        ]  # fmt: skip
         most = max((each.balance for each in kept), default=0)
         kept = [each for each in kept if each.balance >= 0.5 * most]
 
@@ -191,6 +198,12 @@ class Begins:
         places = [(each - one.late_s - shift_s - one.first_s) * one.rate_hz for each in one.stimulus.span_s]
         return round(min(len(one.values), places[1]) - max(0.0, places[0]))
 
+    def _stretch_excess(self) -> np.ndarray:
+        """Return the logarithm of each begin's residual power over the least, by its soundest stretches."""
+        with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # of stretches that no begin explains
+            apart = np.log(np.array(self._left) / np.nanmin(self._left, axis=0))
+            return np.nanmean(np.nanquantile(apart, _SOUND_PARTS, axis=2), axis=1)
+
     def try_all(self, shifts: Sequence[float]) -> None:
         """Follow begins until two are alike and leave nothing but noise.
 
@@ -202,10 +215,8 @@ class Begins:
             if all(abs(shift_s - each) * one.rate_hz >= _SAME_ROWS for each in self._shifts):
                 self._shifts.append(shift_s)
                 self._left.append(self._left_of(shift_s))
-        with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # of stretches that no begin explains
-            apart = np.log(np.array(self._left) / np.nanmin(self._left, axis=0))
-            worse = np.nanmean(np.nanquantile(apart, _SOUND_PARTS, axis=2), axis=1)
-        rows = [-self._rows_inside(each) for each in self._shifts]
+        worse = self._stretch_excess()
+        rows = np.array([-self._rows_inside(each) for each in self._shifts])
         order = np.lexsort((rows, np.floor(worse / math.log(_ALIKE))))
         order = [n for n in order.tolist() if n not in self._followed][:FOLLOWED]
         # The first of all is what the whole record is most like, with the most rows in the session.

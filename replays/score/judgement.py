@@ -209,10 +209,13 @@ def _select_channels(session: Session, channels: Sequence[str] | None) -> list[s
     """Return the names of the channels that were to be recorded.
 
     Raises:
+        InputError: There are no names.
         UnknownNameError: A name is neither a channel nor a group of the session.
     """
     if channels is None:
         return list(session.channels)
+    if not channels:
+        raise InputError("--channels", "names of channels or groups, or left out for all", "")
     for name in channels:
         if name not in session.channels and name not in session.groups:
             known = (*session.channels, *session.groups)

@@ -25,6 +25,9 @@ _MOST = 1e30
 """Values that a measurement can have, in any unit."""
 _ALIKE = 0.2
 """Part by which steps of time stamps that are alike may differ."""
+_REGULAR, _ROUNDED = 0.9, 1.1
+"""Part of the steps that are alike where stamps are not rounded to a coarse resolution, and deviation of such stamps
+from a line, peak to peak, over their largest step, at most."""
 Pieces = Callable[[Sequence[int]], Iterable[np.ndarray]]
 
 
@@ -97,6 +100,12 @@ class Table:
         steps = np.diff(times_s)
         usual = float(np.median(steps))
         alike = steps[np.abs(steps - usual) < _ALIKE * usual]
+        if steps.min() >= 0.0 and len(alike) < _REGULAR * len(steps):
+            # Stamps of a coarse resolution: their steps are multiples of it.
+            rows = np.arange(len(times_s))
+            line = np.polynomial.Polynomial.fit(rows, times_s, 1)
+            if 0.0 < np.ptp(times_s - line(rows)) <= _ROUNDED * steps.max():
+                return 1.0 / float(line.convert().coef[1])
         alike_s, span_s = float(alike.sum()), max(0.0, float(times_s[-1] - times_s[0]))
         return None if 2.0 * alike_s <= span_s or len(alike) > MAX_RATE_HZ * alike_s else len(alike) / alike_s
 
@@ -203,7 +212,7 @@ def map_signals(
         where = f"channels.{name}"
         if name not in channels:
             if wanted.to is None:
-                raise UnknownNameError("channels", "channels of the session", name, channels)
+                raise UnknownNameError(where, "named as a channel of the session", name, channels)
             continue
         channel, group = channels[name], wanted.group
         signal = next((s for s in signals if s.name == wanted.source and group in (None, s.group)), None)

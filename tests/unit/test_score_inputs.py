@@ -80,6 +80,27 @@ def test_a_channel_that_the_session_lacks_is_one_line(
     assert "disk_z" in err
 
 
+@pytest.mark.parametrize("channels", ["", ",", " , "])
+def test_no_channel_at_all_is_refused(
+    channels: str, session: Path, counts: np.ndarray, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of an empty variable of a shell: no channel would be judged, and each record would pass."""
+    daq = write_parquet(tmp_path / "daq.parquet", columns_of(counts))
+    status, _, err = said(capsys, "score", daq, "--against", str(session), "--channels", channels)
+    assert (status, err.count("\n")) == (2, 1), err
+    assert "--channels must be names of channels or groups" in err
+
+
+def test_a_channel_of_a_mapping_that_the_session_lacks_is_named_where_it_is(
+    session: Path, counts: np.ndarray, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    daq, mapping = write_parquet(tmp_path / "daq.parquet", columns_of(counts)), tmp_path / "m.toml"
+    mapping.write_text('[channels.disk_z]\nsource = "disk_x"\n', encoding="utf-8")
+    status, _, err = said(capsys, "score", daq, "--against", str(session), "-m", str(mapping))
+    assert (status, err.count("\n")) == (2, 1), err
+    assert "channels.disk_z must be named as a channel" in err
+
+
 @pytest.mark.parametrize(
     ("ends", "told"),
     [

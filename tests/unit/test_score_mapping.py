@@ -96,7 +96,7 @@ def test_a_unit_that_is_unknown_is_asked_for(
 @pytest.mark.parametrize(
     ("table", "field"),
     [
-        ({"disk_z": {"source": "ai0"}}, "channels"),
+        ({"disk_z": {"source": "ai0"}}, "channels.disk_z"),
         ({"disk_x": {"source": "ai9"}}, "channels.disk_x.source"),
         ({"disk_x": {"source": "ai0", "unit": "MN"}}, "channels.disk_x.unit"),
         ({"disk_x": {"source": "ai0", "bias": "mean"}}, "channels.disk_x.bias"),

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from replays.score.judgement import judge
+from replays.score.recorded import Table
 from replays.score.scorecard import FAIL
 from rig.channels import default_table
 from tests.score_daqs import RATE_HZ, counts_of, write_parquet, write_session
@@ -47,6 +48,18 @@ STAMPS: dict[str, tuple[Callable[[np.ndarray], np.ndarray], set[str]]] = {
     "10 % fast": (lambda t: 1.1 * t, {"stamp rate"}),
     "random": (lambda t: np.random.default_rng(1).uniform(0.0, 1.0, len(t)), {"stamps that go back"}),
 }
+
+
+@pytest.mark.parametrize("resolution_s", [1e-3, 1e-4, 4e-5, 3e-5])
+@pytest.mark.parametrize("rate_hz", [20_000.0, 20_006.0])
+def test_stamps_of_a_coarse_resolution_tell_the_rate(resolution_s: float, rate_hz: float) -> None:
+    stamps = np.floor(np.arange(20_000) / rate_hz / resolution_s + 1e-6) * resolution_s
+    assert Table(len(stamps), 0, lambda _: [stamps[:, None]]).rate_hz == pytest.approx(rate_hz, rel=20e-6)
+
+
+def test_lost_rows_do_not_change_the_rate_that_stamps_tell() -> None:
+    stamps = np.delete(np.arange(20_000) / RATE_HZ, [3000, 3001, 9000])
+    assert Table(len(stamps), 0, lambda _: [stamps[:, None]]).rate_hz == pytest.approx(RATE_HZ, rel=1e-9)
 
 
 @pytest.mark.parametrize("kind", STAMPS)

@@ -113,7 +113,9 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_session(tmp_path_factory.mktemp("sent") / "session.mcap", {"probes": counts})
 
 
-def card_of(session: Path, file: Path, true_s: np.ndarray, *, turned: int = -1) -> Scorecard:
+def card_of(
+    session: Path, file: Path, true_s: np.ndarray, *, turned: int = -1, blank: dict[int, slice] | None = None
+) -> Scorecard:
     generator = np.random.default_rng(4)
     columns = {"time [s]": np.arange(len(true_s)) / RATE_HZ}
     for n, channel in enumerate(PROBES):
@@ -121,7 +123,9 @@ def card_of(session: Path, file: Path, true_s: np.ndarray, *, turned: int = -1) 
         volts = (
             channel.bias_v + channel.sensitivity_v * value + channel.noise_v * generator.standard_normal(len(true_s))
         )
-        columns[f"{channel.name} [V]"] = np.rint(volts / channel.lsb_v) * channel.lsb_v
+        volts = np.rint(volts / channel.lsb_v) * channel.lsb_v
+        volts[(blank or {}).get(n, slice(0))] = np.nan
+        columns[f"{channel.name} [V]"] = volts
     known = {channel.name: (lambda t, n=n: two_tones(t + 0.001 * n)) for n, channel in enumerate(PROBES)}
     names = [channel.name for channel in PROBES]
     return judge(write_parquet(file, columns), [session], path="analogue", formulas=known, channels=names)
@@ -149,6 +153,42 @@ def test_rows_before_a_channel_freezes_do_not_stand_outside_the_session(tmp_path
     card = judge(file, [sent.path], path="analogue")
     assert {channel for _, channel in red(card)} == {sent.channels[1].name}
     assert not card.remarks
+
+
+@pytest.mark.parametrize(("at", "names"), [(8000, 4), (10_000, 2)])
+def test_a_block_in_place_of_another_does_not_move_the_record_out_of_the_session(
+    at: int, names: int, tmp_path: Path
+) -> None:
+    """A begin from which rows are judged up to the fault only leaves less than the right one."""
+    sent = Sessions(tmp_path / "sessions").get("test-two-tone", first_s=61.0)
+    volts = Converter(61.2, 20_000).volts(sent, np.random.default_rng(3))
+    volts[at : at + 200] = volts[at - 200 : at]
+    columns = dict(list(as_columns(sent, volts, "unit").items())[:names])
+    file = write_values("parquet", tmp_path / "daq", columns, np.arange(len(volts)) / RATE_HZ, RATE_HZ)
+    card = judge(file, [sent.path], path="analogue", channels=list(columns))
+    assert card.outcome == "fail"
+    assert {quantity for quantity, _ in red(card)}.isdisjoint({"polarity", "gain", "offset"})
+    assert not card.remarks
+
+
+@pytest.mark.parametrize(
+    ("blank", "lost"),
+    [
+        ({1: slice(5000, 5001)}, {1: 1}),
+        (dict.fromkeys(range(3), slice(5000, 5100)), {0: 100, 1: 100, 2: 100}),
+        ({0: slice(0, 4000)}, {0: 4000}),
+        ({2: slice(1, None, 2)}, {}),
+        (dict.fromkeys(range(3), slice(0, 300)), {}),
+    ],
+    ids=["one value", "all of a stretch", "half a channel", "every other row", "begins later"],
+)
+def test_rows_without_a_value_are_lost(
+    blank: dict[int, slice], lost: dict[int, int], session: Path, tmp_path: Path
+) -> None:
+    card = card_of(session, tmp_path / "daq.parquet", TRUE_S, blank=blank)
+    assert red(card) == {("lost samples", PROBES[n].name) for n in lost}
+    for n, count in lost.items():
+        assert card.row("lost samples", PROBES[n].name).value == count
 
 
 def test_one_turned_channel_of_a_signal_that_repeats_fails(session: Path, tmp_path: Path) -> None:
