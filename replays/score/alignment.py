@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
+
+import numpy as np
 
 from replays.score.begins import FOLLOWED, SAME_BALANCE, Begins, trimmed
 from replays.score.following import FEWEST, Alignment, Source, busiest, follow
@@ -12,6 +15,9 @@ _STRETCHES_S = (0.25, 0.03)
 """Lengths of the stretch that is fitted first; the second where clocks are apart, or samples lost, in the first [s]."""
 _ROUNDS = 3
 """Searches for begins where the signal repeats, each by the clock that the last one found."""
+
+_MAX_LOG_APART = math.log(2.0)
+"""Logarithms of residual power, summed over signals, within which begins explain all signals alike."""
 
 
 def align(sources: Sequence[Source]) -> Alignment | None:
@@ -45,9 +51,30 @@ def align(sources: Sequence[Source]) -> Alignment | None:
     if not found:
         return follow(sources, 0.0, default)
     most = max(each.balance for each in found)
+    left = [_log_residual_power(each, sources) if found[1:] else 0.0 for each in found]
 
-    def rank(each: Alignment) -> tuple[bool, int, int, float]:
-        return each.balance > SAME_BALANCE * most, -begins.unaccounted(each), each.upright, -abs(each.begin_s)
+    def rank(n: int) -> tuple[bool, int, bool, int, float]:
+        each, alike_in_all = found[n], left[n] <= min(left) + _MAX_LOG_APART
+        balanced = each.balance > SAME_BALANCE * most
+        return balanced, -begins.unaccounted(each), alike_in_all, each.upright, -abs(each.begin_s)
 
-    best = max(found, key=rank)
+    best = found[max(range(len(found)), key=rank)]
     return replace(trimmed(best, one), ambiguous=len(alike) > 1)
+
+
+def _log_residual_power(found: Alignment, sources: Sequence[Source]) -> float:
+    """Return the logarithm of the part of each signal's power that one common begin leaves, summed over the signals.
+
+    Each signal fits a repeated begin at a time of its own, as a keyphasor whose pulses come at another part of a whirl.
+    """
+    common_s, total = float(np.median(list(found.own_s.values()))), 0.0
+    for one in sources:
+        values, times_s, (late_s, pace, bend) = found.even(one)
+        since_s = times_s - 0.5 * (times_s[0] + times_s[-1])
+        own_s = found.own_s.get(one.name, one.late_s + found.begin_s)
+        at_s = times_s + late_s - own_s + common_s + since_s * (pace + bend * since_s)
+        held = np.isfinite(values) & (at_s >= one.stimulus.span_s[0]) & (at_s <= one.stimulus.span_s[1])
+        known = one.stimulus(at_s[held])[0]
+        if np.std(known) and np.std(values[held]):
+            total += math.log(max(1e-12, 1.0 - float(np.corrcoef(known, values[held])[0, 1]) ** 2))
+    return total

@@ -99,11 +99,12 @@ class Begins:
         if fit is not None:
             left[found.rows_at(fit.times_s)] = fit.residual**2
         power = _block_means((one.values - np.nanmean(one.values)) ** 2)
-        # The DAQ's and the session's.
+        # The DAQ's, and the session's where its samples are the known signal.
+        sources = 1.0 if isinstance(one.stimulus, Exact) else 2.0
         noise = (
             _NOISES * math.hypot(one.channel.noise_v, one.channel.lsb_v / math.sqrt(12.0)) / one.channel.sensitivity_v
         )
-        return np.where(power > _LOUD_PART * np.nanmean(power), _block_means(left), np.nan) / (2.0 * noise**2)
+        return np.where(power > _LOUD_PART * np.nanmean(power), _block_means(left), np.nan) / (sources * noise**2)
 
     def _is_worse(self, power: np.ndarray, other: np.ndarray) -> bool:
         """Return whether a begin leaves more than another, by the median blocks of signals that both explain."""

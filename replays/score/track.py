@@ -35,6 +35,10 @@ _HALF = 0.5
 """Part of a block's power that must then be explained."""
 _CERTAIN = 15.0
 """Half of the likelihood ratio by which a row of a step is told from its neighbour: four standard deviations."""
+_MIN_END_ROWS = 8
+"""Fewest rows between a step and an end of the record: fewer may agree with another part of the signal by chance."""
+_MAX_END_PART = 0.01
+"""Part of the residual power up to an end that a step there may leave, where that is more than the usual noise."""
 _SEARCHED = 4096
 """Rows that are searched for in the whole session."""
 _MAX_SEARCHES = 24
@@ -227,6 +231,10 @@ class _Walk:
                     if step is not None and self._steps < _MAX_STEPS:
                         break
                     step = None
+                if final and n == len(edges) - 2 and self._steps < _MAX_STEPS:
+                    step = self._end_step(y, s, ds, _REACH + a, _REACH + b, row)
+                    if step is not None:
+                        break
                 if not good:
                     self._close(begin, row + a, lag, doubt)
                     begin, doubt = row + b, (row + b, row + b)
@@ -265,8 +273,54 @@ class _Walk:
             if moved == 0:
                 return None
             if moved is not None:
-                return moved, row + edges[n]
+                return moved, row + edges[n + 1]
         return None
+
+    def _end_step(
+        self, y: np.ndarray, s: np.ndarray, ds: np.ndarray, first: int, last: int, row: int
+    ) -> tuple[int, int] | None:
+        """Return the smallest step within the last block that explains the rows from it to the end, or None.
+
+        Args:
+            y: Rows over noise, shape (followers, n).
+            s: The known signal over noise, shape (followers, n).
+            ds: Its slope a sample, shape (followers, n).
+            first: Column of the first row of the block, at least `_REACH`.
+            last: Column after its last row, at most n - `_REACH`.
+            row: Row of column `_REACH`.
+
+        Returns:
+            Samples of the step and the row after the last, or None.
+        """
+        first = max(first, last - _CHUNK)
+        values, counted = y[:, first:last], int(np.isfinite(y[:, first:last]).any(axis=1).sum())
+
+        def to_end(moved: int) -> np.ndarray:
+            """Return residual power from each row to the last, with a small time error of these, shape (rows,)."""
+            part = slice(first + moved, last + moved)
+            missing = np.isnan(s[:, part]) & np.isfinite(values)
+            r, slope = (
+                np.nan_to_num(values - s[:, part]),
+                np.where(np.isfinite(values), np.nan_to_num(ds[:, part]), 0.0),
+            )
+            sums = [(1e6 * missing + r**2), r * slope, slope**2]
+            left, pull, known = (np.cumsum(each.sum(axis=0)[::-1])[::-1][: 1 - _MIN_END_ROWS] for each in sums)
+            error = np.clip(pull / np.maximum(known, 1e-300), -_STEP, _STEP)
+            return left - error * (2.0 * pull - error * known)
+
+        usual = counted * np.arange(last - first, 0, -1.0)[: 1 - _MIN_END_ROWS]
+        unmoved, least = to_end(0), 2.0 * self._certain
+        if not len(usual) or (unmoved - usual).max() < least:
+            return None
+        found: list[tuple[int, float, bool]] = []
+        for moved in sorted(set(range(-_REACH, _REACH + 1)) - {0}, key=abs):
+            left = to_end(moved)
+            at = int((unmoved - left).argmax())
+            good = left[at] <= max(_UNEXPLAINED * usual[at], _MAX_END_PART * unmoved[at])
+            found.append((moved, float(unmoved[at] - left[at]), bool(good)))
+        most = max(gained for _, gained, _ in found)
+        moved, gained, good = next(each for each in found if each[1] >= most - least)
+        return (moved, row + last - _REACH) if gained > least and good else None
 
     @property
     def _certain(self) -> float:

@@ -7,13 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from replays.score.alignment import align
+from replays.score.following import Source
 from replays.score.judgement import judge
 from replays.score.repeats import find_repeats
 from replays.score.scorecard import FAIL, INCONCLUSIVE, PASS, Scorecard
 from replays.score.stimulus import Exact
 from replays.score.track import Follower, Track, follow_record
 from replays.score.waveform import fit_stretch
-from replays.score.wiring import find_wires
+from replays.score.wiring import Wire, find_wires
 from rig.channels import default_table
 from tests.score_cases import Converter, as_columns
 from tests.score_daqs import RATE_HZ, Tones, counts_of, write_parquet, write_session
@@ -64,6 +66,36 @@ def test_a_step_by_whole_samples_is_found_at_its_row(
     assert found.explained == len(kept)
 
 
+def tone(t: np.ndarray) -> np.ndarray:
+    return 0.5 * np.sin(2.0 * np.pi * 1234.5 * t)
+
+
+@pytest.mark.parametrize("signal", [TONES, tone], ids=["tones", "tone"])
+@pytest.mark.parametrize("row", [8, 100, -190, -12])
+@pytest.mark.parametrize("size", [3, 1, -1], ids=["three lost", "lost", "doubled"])
+def test_a_step_near_an_end_is_found_at_its_row(signal: object, row: int, size: int) -> None:
+    row %= len(ROWS)
+    kept = np.delete(ROWS, np.arange(row, row + size)) if size > 0 else np.insert(ROWS, row, row)
+    found = track(signal, kept)
+    ((first, last, moved),) = found.steps()
+    assert moved == size
+    assert first <= (row if size > 0 else row + 1) <= last <= first + 10
+    assert found.explained == len(kept)
+
+
+@pytest.mark.parametrize("row", [3, -4])
+def test_a_step_within_eight_rows_of_an_end_is_not_told_from_a_late_begin(row: int) -> None:
+    assert track(TONES, np.delete(ROWS, row)).steps() == []
+
+
+def test_a_disturbed_end_is_no_step() -> None:
+    """The last rows are explained by no other part of the session."""
+    values = np.concatenate([ROWS[:-100], np.random.default_rng(3).permutation(ROWS[-100:])])
+    found = track(TONES, values)
+    assert found.steps() == []
+    assert 100 <= len(ROWS) - found.explained < 600
+
+
 def test_a_step_is_found_at_its_row_by_a_clock_that_is_far_off() -> None:
     """From the stretch to the ends of the record its time is off by up to 30 samples."""
     for row in (300, 12_000):
@@ -98,6 +130,27 @@ def test_a_clock_that_drifts_is_followed() -> None:
     found = track(TONES, ROWS, ppm_s=60.0)
     assert found.steps() == []
     assert 2.0 * RATE_HZ * found.line(2500.0)[2] == pytest.approx(-60e-6, rel=0.01)
+
+
+def test_the_begin_that_explains_all_signals_is_taken_where_one_signal_repeats() -> None:
+    """A keyphasor's pulse is a millisecond off at the begin at which the probes show the same whirl."""
+
+    def pulse(t: np.ndarray) -> np.ndarray:
+        return 1.0 / (1.0 + np.exp(-200.0 * (np.sin(2.0 * np.pi * 46.1 * t) - 0.9)))
+
+    begin_s, repeat_s, generator = 0.65, 0.5, np.random.default_rng(6)
+    table = default_table().channels
+    sources = []
+    for name, signal, likeness in (("disk_x", two_tones, 1.0), ("keyphasor", pulse, 0.9)):
+        values = signal(begin_s + ROWS / RATE_HZ) + 1e-4 * generator.standard_normal(len(ROWS))
+        wrong_s = begin_s - repeat_s
+        wire = Wire(name, 1, likeness, (), False, wrong_s, (0.0, 0.7), (begin_s,), wrong_s)
+        sources.append(Source(name, table[name], wire, values, 0.0, RATE_HZ, Exact(signal, (0.0, 2.0), RATE_HZ), 0.0))
+    found = align(sources)
+    assert found is not None
+    assert found.ambiguous
+    assert found.begin_s == pytest.approx(repeat_s, abs=1e-6)
+    assert found.own_s["keyphasor"] == pytest.approx(found.own_s["disk_x"], abs=1e-6)
 
 
 # Through the scorecard: three probes of repeating tones.
