@@ -133,6 +133,15 @@ def may_roll(memory):
 
 
 @kernel
+def _first_places(tolerance):
+    """Return the steps a turn to begin with: twelve suit a tolerance of 0.01, and more are taken where they fail."""
+    for places in _LADDER:
+        if places >= 12.0 * (0.01 / tolerance) ** (0.5 / _ORDER):
+            return float(places)
+    return float(MAX_PLACES)
+
+
+@kernel
 def _enter(constants, inputs, memory, rolling, dy, out, y):
     """Prepare rolling by collocation from the state y at the end of a series; returns whether it can be tried."""
     nx, ny, rate = _normal_and_rate(constants, y)
@@ -150,7 +159,7 @@ def _enter(constants, inputs, memory, rolling, dy, out, y):
     last[4] = dy[S.THETA_RATE] + gain * y[S.THETA_RATE]
     last[5] = out[S.PENETRATION]
     memory[WHIRL_RATE] = rate
-    _set_places(memory, float(MAX_PLACES), 0.0)
+    _set_places(memory, _first_places(memory[TOLERANCE] / SHARE), 0.0)
     fill(rolling.Y[STAGES], y)
     return True
 

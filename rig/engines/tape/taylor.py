@@ -42,7 +42,7 @@ import math
 
 from rig.engines.memory import ONSET, PHASE
 from rig.engines.taylor.lanes import complex_power, is_wide, product, quotient, sum_below
-from rig.engines.taylor.place import EAST, NORTH, ORDER, SLACK
+from rig.engines.taylor.place import EAST, NORTH, SLACK
 from rig.kernels.contact import BACKWARD, EXACT, FLIGHT, FORWARD, NO_FRICTION, ROLLING, SMOOTHED, TOUCHING  # noqa: F401
 from rig.kernels.geometry import sines_of
 from rig.kernels.magnet import LINEAR, RADIAL, RIPPLED  # noqa: F401
@@ -97,7 +97,7 @@ class _Code:
             "    levels, shaft, magnet = constants.levels, constants.shaft, constants.magnet",
             "    contact, house = constants.contact, constants.house",
             "    phase, onset, slack = int(memory[PHASE]), memory[ONSET], memory[SLACK] != 0.0",
-            "    north, east = memory[NORTH], memory[EAST]",
+            "    north, east, order = memory[NORTH], memory[EAST], len(Y) - 1",
             *(f"    {name} = {text}" for text, name in self._constants.items()),
             *(f"    {line}" for line in self._begin),
             f"    Y[0, {S.N_VECTOR}] = 0.0",
@@ -112,7 +112,7 @@ class _Code:
             f"    for p in range({wide}):",
             "        A[0, p] = B[0, p] = 0.0",
             "    z, later = 1.0, 0.0",
-            "    for k in range(ORDER):",
+            "    for k in range(order):",
             "        if wide:",
             f"            sum_below(A, B, acc, k, {wide})",
             "        else:",
@@ -133,7 +133,7 @@ class _Code:
         else:
             lines += [f"        for i in range({ROOT}):", "            Y[k + 1, i] = D[k, i] * portion"]
             lines += [f"        Y[k + 1, {ROOT}] = 0.0"]
-        lines += ["        z, later = 0.0, 1.0", f"    for i in range({FORCE}, {WIDTH}):", "        Y[ORDER, i] = 0.0"]
+        lines += ["        z, later = 0.0, 1.0", f"    for i in range({FORCE}, {WIDTH}):", "        Y[order, i] = 0.0"]
         return "\n".join(lines)
 
     def _outputs(self) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from rig.engines.events import latch_onset, sliding_phase
 from rig.engines.memory import CLAMPS, EVALUATIONS, ONSET, PHASE
 from rig.engines.method import fill, rates
 from rig.engines.tape.columns import EVENTS, FORCE, ROOT
-from rig.engines.taylor.place import EAST, EVENT, FRACTION, KNOWN, NORTH, ORDER, SLACK, SPAN, TICK
+from rig.engines.taylor.place import EAST, EVENT, FRACTION, KNOWN, NORTH, SLACK, SPAN, TICK
 from rig.engines.taylor.polynomial import first_zero
 from rig.kernels import signals as S
 from rig.kernels.contact import (
@@ -74,16 +74,16 @@ def _holds_at_rest(constants):
 def enter_events(constants, memory, Y):
     """Functions that fall through 0 where an event happens, of what the series has in their columns."""
     contact, phase = constants.contact, int(memory[PHASE])
-    first, second, third = Y[:, EVENTS], Y[:, EVENTS + 1], Y[:, EVENTS + 2]
+    first, second, third, order = Y[:, EVENTS], Y[:, EVENTS + 1], Y[:, EVENTS + 2], len(Y) - 1
     if phase == FLIGHT:
-        for k in range(ORDER):
+        for k in range(order):
             first[k] = -first[k]
             second[k] = third[k] = 0.0
         first[0] += contact.clearance * contact.clearance
         second[0] = third[0] = 1.0
         return
     if phase == ROLLING:
-        for k in range(ORDER):
+        for k in range(order):
             # The depth that short time ahead.
             first[k] += _FRICTIONLESS_S * (k + 1.0) * first[k + 1]
             friction, limit = second[k], contact.friction * Y[k, FORCE]
@@ -96,12 +96,12 @@ def enter_events(constants, memory, Y):
     elif _holds_at_rest(constants):
         sign = 1.0 if phase == FORWARD else -1.0
     away = memory[SLACK] != 0.0
-    for k in range(ORDER):
+    for k in range(order):
         first[k] = Y[k, ROOT]
         second[k] = sign * second[k]
         if away:
             third[k] = -third[k]
-    first[ORDER] = Y[ORDER, ROOT]
+    first[order] = Y[order, ROOT]
     if away or sign == 0.0:
         second[:] = 0.0
         second[0] = 1.0
@@ -110,7 +110,7 @@ def enter_events(constants, memory, Y):
         second[0] = 0.5 * abs(speed)
     if phase == TOUCHING and _holds_at_rest(constants) and Y[1, ROOT] > 0.0:
         # Frictionless up to the depth of that time, on the way in: s' = delta'/2.
-        for k in range(ORDER + 1):
+        for k in range(order + 1):
             second[k] = -Y[k, ROOT]
         least = 2.0 * math.sqrt(_LEAST_DEPTH * contact.clearance)  # so slow a contact begins at half of it
         second[0] += max(least, math.sqrt(_FRICTIONLESS_S * 2.0 * Y[1, ROOT]))
@@ -204,7 +204,7 @@ def preload_end(constants, memory, Y, h):
         lost = memory[NORTH + pair]
         # Bounds on the displacement by its coefficients.
         middle, swing, power = 0.0, 0.0, 1.0
-        for k in range(ORDER + 1):
+        for k in range(len(Y)):
             value = Y[k, S.Y_IH] - Y[k, S.Y_OH] if pair == 0 else Y[k, S.X_OH]
             if k == 0:
                 middle = value
@@ -218,7 +218,7 @@ def preload_end(constants, memory, Y, h):
             sign = lost if lost != 0.0 else (1.0 if side == 0 else -1.0)
             way = 1.0 if lost != 0.0 else -1.0
             # Above 0 while nothing changes; in the last column, which events no longer need.
-            for k in range(ORDER + 1):
+            for k in range(len(Y)):
                 value = Y[k, S.Y_IH] - Y[k, S.Y_OH] if pair == 0 else Y[k, S.X_OH]
                 Y[k, EVENTS + 2] = way * sign * value / limit
             Y[0, EVENTS + 2] -= way

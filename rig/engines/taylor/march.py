@@ -53,6 +53,7 @@ from rig.engines.taylor.place import (
     LENGTH,
     ORDER,
     SERIES,
+    SERIES_ORDER,
     SPAN,
     STALLED,
     TICK,
@@ -78,10 +79,10 @@ _SCALE_T, _SCALE_ROOT = 1e-4, 3e-3
 class Room(NamedTuple):
     """Arrays that the series are worked out in."""
 
-    Y: np.ndarray  # the series at hand, shape (ORDER + 1, WIDTH): in the memory, so that it outlives the call
-    A: np.ndarray  # factors of products, shape (ORDER + 1, LANES)
+    Y: np.ndarray  # the series at hand, shape (order + 1, WIDTH): in the memory, so that it outlives the call
+    A: np.ndarray  # factors of products, shape (order + 1, LANES)
     B: np.ndarray
-    D: np.ndarray  # rates, shape (ORDER + 1, WIDTH)
+    D: np.ndarray  # rates, shape (order + 1, WIDTH)
     acc: np.ndarray  # sums over lanes, shape (LANES,)
     x: np.ndarray  # state, integrals and the columns up to the root, shape (ROOT + 1,)
     dy: np.ndarray  # shape (N_VECTOR,)
@@ -99,11 +100,12 @@ def _aligned(rows, columns):
 @kernel
 def room_in(memory):
     """Room for a call."""
+    rows = int(memory[SERIES_ORDER]) + 1
     return Room(
-        memory[SERIES : SERIES + (ORDER + 1) * WIDTH].reshape((ORDER + 1, WIDTH)),
-        _aligned(ORDER + 1, LANES),
-        _aligned(ORDER + 1, LANES),
-        _aligned(ORDER + 1, WIDTH),
+        memory[SERIES : SERIES + rows * WIDTH].reshape((rows, WIDTH)),
+        _aligned(rows, LANES),
+        _aligned(rows, LANES),
+        _aligned(rows, WIDTH),
         _aligned(1, LANES)[0],
         np.zeros(ROOT + 1),
         np.empty(S.N_VECTOR),
@@ -118,7 +120,7 @@ def start(constants, inputs, y, memory, step_ticks, tolerance):
     memory[:] = 0.0
     memory[ONSET] = held_speed(0.0, constants.contact)
     memory[TOLERANCE] = tolerance
-    memory[SPAN] = -1.0
+    memory[SPAN], memory[SERIES_ORDER] = -1.0, ORDER
     ring, _ = ring_at(constants, inputs, y)
     if ring.delta > 0.0:
         memory[PHASE] = sliding_phase(constants, ring.sliding)
@@ -153,30 +155,30 @@ def _make_series(constants, inputs, memory, room):
 @kernel
 def _length(memory, Y, slowed):
     """How far a series holds: its last two terms stay within the tolerance."""
-    tolerance = memory[TOLERANCE]
+    tolerance, order = memory[TOLERANCE], len(Y) - 1
     last = before = known = 0.0
     for i in range(S.N_STATE):
-        known += Y[ORDER, i]
-        last = max(last, abs(Y[ORDER, i]) * PER_SCALE[i])
-        before = max(before, abs(Y[ORDER - 1, i]) * PER_SCALE[i])
+        known += Y[order, i]
+        last = max(last, abs(Y[order, i]) * PER_SCALE[i])
+        before = max(before, abs(Y[order - 1, i]) * PER_SCALE[i])
     if slowed:
-        last = max(last, abs(Y[ORDER, TIME]) / _SCALE_T, abs(Y[ORDER, ROOT]) / _SCALE_ROOT)
-        before = max(before, abs(Y[ORDER - 1, TIME]) / _SCALE_T, abs(Y[ORDER - 1, ROOT]) / _SCALE_ROOT)
+        last = max(last, abs(Y[order, TIME]) / _SCALE_T, abs(Y[order, ROOT]) / _SCALE_ROOT)
+        before = max(before, abs(Y[order - 1, TIME]) / _SCALE_T, abs(Y[order - 1, ROOT]) / _SCALE_ROOT)
     if not math.isfinite(known):  # max leaves out what is none
         return math.nan
     return _SAFETY * min(
-        (tolerance / max(last, 1e-200)) ** (1.0 / ORDER), (tolerance / max(before, 1e-200)) ** (1.0 / (ORDER - 1.0))
+        (tolerance / max(last, 1e-200)) ** (1.0 / order), (tolerance / max(before, 1e-200)) ** (1.0 / (order - 1.0))
     )
 
 
 @kernel
 def _law_length(memory, Y):
     """How far the normal law and its losses hold in a series."""
-    tolerance, law, loss = memory[TOLERANCE], EVENTS + 2, S.CONTACT_LOSS
+    tolerance, law, loss, order = memory[TOLERANCE], EVENTS + 2, S.CONTACT_LOSS, len(Y) - 1
     most = tolerance * max(1.0, abs(Y[0, law]))
-    last = max(abs(Y[ORDER - 1, law]) / most, abs(Y[ORDER - 1, loss]) / tolerance)
-    before = max(abs(Y[ORDER - 2, law]) / most, abs(Y[ORDER - 2, loss]) / tolerance)
-    return _SAFETY * min(max(last, 1e-200) ** (-1.0 / (ORDER - 1.0)), max(before, 1e-200) ** (-1.0 / (ORDER - 2.0)))
+    last = max(abs(Y[order - 1, law]) / most, abs(Y[order - 1, loss]) / tolerance)
+    before = max(abs(Y[order - 2, law]) / most, abs(Y[order - 2, loss]) / tolerance)
+    return _SAFETY * min(max(last, 1e-200) ** (-1.0 / (order - 1.0)), max(before, 1e-200) ** (-1.0 / (order - 2.0)))
 
 
 @kernel
@@ -192,7 +194,7 @@ def _note_peak(constants, inputs, memory, Y, x):
     """The largest normal force within a series; x is room for a state."""
     h = memory[LENGTH]
     most, power = Y[0, FORCE], 1.0
-    for k in range(1, ORDER):
+    for k in range(1, len(Y) - 1):
         power *= h
         most += max(0.0, Y[k, FORCE] * power)
     if not most > memory[PEAK_FORCE]:
@@ -239,7 +241,7 @@ def _next_series(constants, inputs, memory, room, y):
             Y[0, i] = 0.0
     slowed = _make_series(constants, inputs, memory, room)
     memory[STEPS] += 1.0
-    memory[EVALUATIONS] += ORDER
+    memory[EVALUATIONS] += memory[SERIES_ORDER]
     if memory[PHASE] != FLIGHT:
         memory[CONTACT_STEPS] += 1.0
     if memory[TOLERANCE] < _ROUNDING:

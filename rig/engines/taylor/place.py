@@ -15,11 +15,11 @@ KNOWN = OWN + 10
 """Leading coefficients of each event's function that are 0 at the start of the series, by what was before."""
 NORTH, EAST = OWN + 13, OWN + 14
 """Which transducer of a pair has lost its preload: 0, or the sign of the displacement."""
-INPUTS = OWN + 15
+INPUTS, SERIES_ORDER = OWN + 15, OWN + 26
+"""Inputs that the series is of, 11 numbers; its order."""
 SERIES = OWN + 31
 
 ORDER = 16
-"""Of every series. From 12 to 18 the speed at equal error is the same within a tenth, through impacts and whirl; an
-order that follows the tolerance makes the error a rough function of it."""
+"""Highest order of a series."""
 SERIES_END = SERIES + (ORDER + 1) * WIDTH
 """Behind the series."""

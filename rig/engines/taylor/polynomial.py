@@ -1,19 +1,19 @@
-"""Values and zeros of the columns of a series, shape (ORDER + 1, columns)."""
+"""Values and zeros of the columns of a series, shape (order + 1, columns)."""
 
 from __future__ import annotations
 
 import math
 
-from rig.engines.taylor.place import ORDER
 from rig.kernels.stage import kernel
 
 
 @kernel
 def series_at(Y, s, x):
     """The first columns at s into x: state and integrals, and what follows up to where x ends."""
+    order = len(Y) - 1
     for i in range(len(x)):
-        value = Y[ORDER, i]
-        for k in range(ORDER - 1, -1, -1):
+        value = Y[order, i]
+        for k in range(order - 1, -1, -1):
             value = value * s + Y[k, i]
         x[i] = value
 
@@ -22,7 +22,7 @@ def series_at(Y, s, x):
 def column_at(Y, column, shift, s):
     """One column at s without its first `shift` coefficients, over s**shift, and its slope."""
     value = slope = 0.0
-    for k in range(ORDER, shift - 1, -1):
+    for k in range(len(Y) - 1, shift - 1, -1):
         slope = slope * s + value
         value = value * s + Y[k, column]
     return value, slope
@@ -61,7 +61,7 @@ def first_zero(Y, column, shift, h):
     if first <= 0.0:
         return 0.0
     least, power = first, 1.0
-    for k in range(shift + 1, ORDER + 1):
+    for k in range(shift + 1, len(Y)):
         power *= h
         least += min(0.0, Y[k, column] * power)
     if least > 0.0:

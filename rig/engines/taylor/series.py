@@ -11,7 +11,7 @@ import math
 
 from rig.engines.memory import ONSET, PHASE
 from rig.engines.taylor.lanes import complex_power, is_wide, product, quotient, sum_below
-from rig.engines.taylor.place import EAST, NORTH, ORDER, SLACK
+from rig.engines.taylor.place import EAST, NORTH, SLACK
 from rig.kernels.contact import BACKWARD, EXACT, FLIGHT, FORWARD, NO_FRICTION, ROLLING, SMOOTHED, TOUCHING  # noqa: F401
 from rig.kernels.geometry import sines_of
 from rig.kernels.magnet import LINEAR, RADIAL, RIPPLED  # noqa: F401
@@ -27,7 +27,7 @@ def flight(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B, 
     levels, shaft, magnet = constants.levels, constants.shaft, constants.magnet
     contact, house = constants.contact, constants.house
     phase, onset, slack = int(memory[PHASE]), memory[ONSET], memory[SLACK] != 0.0
-    north, east = memory[NORTH], memory[EAST]
+    north, east, order = memory[NORTH], memory[EAST], len(Y) - 1
     c0 = (1.0 if levels.euler else 0.0)
     c1 = shaft.arm_magnet * shaft.arm_magnet
     c2 = 2.0 * magnet.growth * magnet.ripple * magnet.stiffness
@@ -55,7 +55,7 @@ def flight(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B, 
     for p in range(96):
         A[0, p] = B[0, p] = 0.0
     z, later = 1.0, 0.0
-    for k in range(ORDER):
+    for k in range(order):
         if wide:
             sum_below(A, B, acc, k, 96)
         else:
@@ -236,7 +236,7 @@ def flight(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B, 
         Y[k + 1, 38] = 0.0
         z, later = 0.0, 1.0
     for i in range(39, 43):
-        Y[ORDER, i] = 0.0
+        Y[order, i] = 0.0
 
 
 @kernel
@@ -245,7 +245,7 @@ def sliding(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B,
     levels, shaft, magnet = constants.levels, constants.shaft, constants.magnet
     contact, house = constants.contact, constants.house
     phase, onset, slack = int(memory[PHASE]), memory[ONSET], memory[SLACK] != 0.0
-    north, east = memory[NORTH], memory[EAST]
+    north, east, order = memory[NORTH], memory[EAST], len(Y) - 1
     c0 = (1.0 if levels.euler else 0.0)
     c1 = shaft.arm_magnet * shaft.arm_magnet
     c2 = 2.0 * magnet.growth * magnet.ripple * magnet.stiffness
@@ -278,7 +278,7 @@ def sliding(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B,
     for p in range(120):
         A[0, p] = B[0, p] = 0.0
     z, later = 1.0, 0.0
-    for k in range(ORDER):
+    for k in range(order):
         if wide:
             sum_below(A, B, acc, k, 120)
         else:
@@ -515,7 +515,7 @@ def sliding(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B,
         Y[k + 1, 38] = 0.5 * v71 * portion
         z, later = 0.0, 1.0
     for i in range(39, 43):
-        Y[ORDER, i] = 0.0
+        Y[order, i] = 0.0
 
 
 @kernel
@@ -524,7 +524,7 @@ def rolling(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B,
     levels, shaft, magnet = constants.levels, constants.shaft, constants.magnet
     contact, house = constants.contact, constants.house
     phase, onset, slack = int(memory[PHASE]), memory[ONSET], memory[SLACK] != 0.0
-    north, east = memory[NORTH], memory[EAST]
+    north, east, order = memory[NORTH], memory[EAST], len(Y) - 1
     c0 = (1.0 if levels.euler else 0.0)
     c1 = contact.damping_factor / onset
     c2 = shaft.arm_magnet * shaft.arm_magnet
@@ -556,7 +556,7 @@ def rolling(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B,
     for p in range(128):
         A[0, p] = B[0, p] = 0.0
     z, later = 1.0, 0.0
-    for k in range(ORDER):
+    for k in range(order):
         if wide:
             sum_below(A, B, acc, k, 128)
         else:
@@ -830,4 +830,4 @@ def rolling(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B,
         Y[k + 1, 38] = 0.0
         z, later = 0.0, 1.0
     for i in range(39, 43):
-        Y[ORDER, i] = 0.0
+        Y[order, i] = 0.0
