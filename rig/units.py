@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 import tomllib
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -96,30 +97,31 @@ def known(unit: str) -> bool:
     return canonical(unit) in _UNITS
 
 
-def _unknown(unit: str) -> str:
-    """Return why a spelling is not a known unit, with what to give instead."""
+def _unknown(unit: str, also: Iterable[str] = ()) -> str:
+    """Return why a spelling is not a known unit, with a unit or another accepted name to give instead."""
     found = _find(unit)
     if len(found) > 1:
         return f"unambiguous: {' or '.join(found)}"
     if (split := _DETECTOR.fullmatch(unit.strip())) and known(split[1]):
         name = canonical(split[1])
         return f"a unit of samples, such as {name} ({split[2]} is the reading of a detector; give {name} if it is not)"
-    close = nearest(canonical(unit), _UNITS, most=1)
-    return f"a known unit{f', such as {close[0]}' if close else ''}"
+    close = nearest(canonical(unit), (*_UNITS, *_FOLDED, *also), most=1)
+    return f"a known unit{f', such as {canonical(close[0])}' if close else ''}"
 
 
-def parse(unit: str, *, field: str) -> str:
+def parse(unit: str, *, field: str, also: Iterable[str] = ()) -> str:
     """Return a unit as this project spells it.
 
     Args:
         unit: As a file or a person spells it; empty, "-" and "none" are the number 1.
         field: Field that named the unit, for errors.
+        also: Other names that the field accepts, which an error can propose.
 
     Raises:
         InputError: It is unknown, ambiguous, or has a detector's suffix (rms, pk, pk-pk).
     """
     if not known(unit):
-        raise InputError(field, _unknown(unit), unit)
+        raise InputError(field, _unknown(unit, also), unit)
     return canonical(unit)
 
 

@@ -103,7 +103,7 @@ def judge(
         raise InputError("FILE", f"a recording of what {session.path.name} has", Words(f"{file}, of which nothing is"))
     for name, wire in wires.items():
         if (wire.channel or name in session.channels) and (unit := recorded[name].unit) not in COUNTS:
-            units.parse(unit, field=f"unit of {name}, or that of -m MAPPING,")
+            units.parse(unit, field=f"unit of {name}, or that of -m MAPPING,", also=COUNTS)
     if path == "digital" and not rows:
         raise InputError("--path", "analogue, as no counts can be told from the values", path)
     card = Scorecard(f"{file.name} against {session.path.name}", path, limits.title, limits.bounds, remarks=remarks)

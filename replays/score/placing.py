@@ -149,8 +149,9 @@ def settle(
 ) -> tuple[dict[str, Wire], dict[str, Taken]]:
     """Which channel each signal has the counts of, how scaled and of which rows, by its name in the file.
 
-    Where most signals show counts, one that does not is looked for in all channels; if it is in none, it is the channel
-    that it is named by, or alone is like, with what its unit says of its scale.
+    Where most signals show counts, or one has most rows as they were sent, a signal that shows none is looked for in
+    all channels; if it is in none, it is the channel that it is named by, or alone is like, with what its unit says of
+    its scale.
     """
     search, settled, found = _Search(recorded, wires, session), dict[str, Taken](), dict(wires)
     asked = list[str]()
@@ -188,10 +189,17 @@ def settle(
         for name in names:
             one, group = settled[name], session.channels[found[name].channel].group
             settled[name] = search.taken(one.scale, one.step, search.begins[table], group)
-    if 2 * len(settled) <= len(wires):
+
+    def is_shown(name: str) -> bool:
+        one = settled[name]
+        return one.scale.clean and search.agreement(name, found[name].channel, one.begin, one.scale)[1] > _MOST_ROWS
+
+    # Channels of noise alone correlate with none: their counts are found from the begin that another signal shows.
+    if 2 * len(settled) <= len(wires) and not any(map(is_shown, settled)):
         return found, settled
     for name, wire in wires.items():
-        for other in () if name in settled else sorted(session.channels, key=lambda each: each != name):
+        used = {found[each].channel for each in settled}
+        for other in () if name in settled else sorted(session.channels, key=lambda each: (each != name, each in used)):
             if (one := search.taken_of(name, other)) is not None:
                 found[name], settled[name] = replace(wire, channel=other, rivals=()), one
                 break

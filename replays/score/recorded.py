@@ -13,6 +13,7 @@ import numpy as np
 from recorder.reader import Recording
 from replays.recordings.formats.mapping import ChannelMapping, FileOptions
 from replays.recordings.formats.source import MAX_RATE_HZ, Entry, FileSignal, Source, even_rate_hz, open_source
+from replays.score.scale import COUNTS
 from rig import units
 from rig.channels import Channel, Group
 from rig.errors import InputError, UnknownNameError
@@ -233,7 +234,8 @@ def map_signals(
         changed = changes.setdefault(id(signal.table), {})
         if changed.setdefault(signal.column, (size, wanted.bias)) != (size, wanted.bias):
             raise InputError(f"{where}.source", "of one channel only", wanted.source)
-        unit = units.parse(unit, field=f"{where}.unit") if wanted.unit else unit
+        if wanted.unit and unit not in COUNTS:
+            unit = units.parse(unit, field=f"{where}.unit", also=COUNTS)
         found.append(replace(signal, name=name, unit=unit))
     tables = {id(s.table): s.table.changed(changes[id(s.table)]) for s in found}
     return [replace(signal, table=tables[id(signal.table)]) for signal in found]

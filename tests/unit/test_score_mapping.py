@@ -94,6 +94,25 @@ def test_a_unit_that_is_unknown_is_asked_for(
 
 
 @pytest.mark.parametrize(
+    ("unit", "meant"), [("conuts", "counts"), ("LSBs", "LSB"), ("cods", "codes"), ("micorn", "um"), ("milimetre", "mm")]
+)
+def test_a_misspelt_name_of_counts_is_proposed(
+    unit: str, meant: str, session: Path, counts: np.ndarray, tmp_path: Path
+) -> None:
+    daq = write_parquet(tmp_path / "daq.parquet", {f"{c.name} [{unit}]": counts[:, 0] for c in PROBES.channels[:1]})
+    wanted = {"disk_x": {"source": "disk_x", "unit": unit}}
+    for mapping in (None, parse_mapping({"channels": wanted}, name="map.toml")):
+        with pytest.raises(InputError, match=f"a known unit, such as {meant};"):
+            judge(daq, [session], mapping=mapping)
+
+
+@pytest.mark.parametrize("unit", ["counts", "raw", "LSB"])
+def test_a_mapping_takes_counts(unit: str, session: Path, counts: np.ndarray, tmp_path: Path) -> None:
+    card = judge(write(tmp_path / "daq.parquet", counts[1000:]), [session], mapping=mapped({"unit": unit}))
+    assert (card.path, card.outcome) == ("digital", "pass"), card.verdict_line
+
+
+@pytest.mark.parametrize(
     ("table", "field"),
     [
         ({"disk_z": {"source": "ai0"}}, "channels.disk_z"),

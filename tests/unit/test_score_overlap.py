@@ -101,3 +101,32 @@ def test_digits_that_the_file_leaves_out_are_no_gain(session: Path, counts: np.n
     (tmp_path / "daq.csv").write_text(",".join(f"{name} [mm]" for name in PROBES.names) + "\n" + lines)
     card = judge(tmp_path / "daq.csv", [session])
     assert {quantity for quantity, _ in red(card)} <= {"offset"}
+
+
+QUIET = {
+    "four of eight": (["probes", "forces"], 4, False),
+    "five of eight, reversed": (["probes", "forces"], 3, True),
+    "two of four": (["probes"], 2, True),
+}
+"""Groups, channels that whirl, and whether the others stand in reverse order; these have noise and a level alone."""
+
+
+@pytest.mark.parametrize("which", QUIET)
+def test_channels_of_noise_are_found_by_the_begin_that_others_show(which: str, tmp_path: Path) -> None:
+    groups, moving, reverse = QUIET[which]
+    g, channels = np.random.default_rng(3), [c for group in groups for c in default_table().groups[group].channels]
+    counts = np.rint(g.standard_normal((9000, len(channels))) * [c.noise_v / c.lsb_v for c in channels]).astype(
+        np.int64
+    )
+    turn = 2.0 * np.pi * np.arange(8000) / 700.0
+    for n in range(len(channels)):
+        counts[1000:, n] += (
+            np.rint(15.0 * np.arange(8000) * np.sin(turn + n)).astype(np.int64) if n < moving else 300_000
+        )
+    parts = dict(zip(groups, np.split(counts[1000:], len(groups), axis=1), strict=True))
+    session = write_session(tmp_path / "session.mcap", parts)
+    order = [*range(moving), *range(moving, len(channels))[:: -1 if reverse else 1]]
+    columns = {f"channel {n + 1}": counts[:, c] * channels[c].lsb_v for n, c in enumerate(order)}
+    card = judge(write_parquet(tmp_path / "daq.parquet", columns), [session])
+    assert (card.path, red(card), card.outcome) == ("digital", set(), "pass"), card.verdict_line
+    assert [card.row("mapping", name).value for name in columns] == [channels[c].name for c in order]
