@@ -23,8 +23,9 @@ from replays.studies.chart.panel import (
     own_speed,
     window,
 )
-from replays.studies.chart.phases import MEMORY_CASES, PHASES, RUB, SMOOTHING
+from replays.studies.chart.phases import MEMORY_CASES, PHASES, RUB, SCENE_TARGETS, SMOOTHING
 from replays.studies.chart.profile import TARGET
+from replays.studies.chart.scene_panel import draw_markers, draw_scenes
 
 
 @house_style()
@@ -48,6 +49,7 @@ def draw(rows: list[Row], folder: Path, panels: list[str], *, command: str, note
         "chart-memory": ("memory", _memory),
         "chart-rub": (RUB, _rub),
         "chart-profile": ("profile", _profile_figure),
+        "chart-scenes": ("scenes", _scenes),
         "chart-work": ("exact", _work),
     }
     files: list[Path] = []
@@ -188,6 +190,21 @@ def _profile_figure(figure: Any, rows: list[Row]) -> str:
         f"Each method walks down its ladder to the first setting that comes within {TARGET:g} of the scene's own "
         "reference, exact Coulomb, 0.15 s, and is timed there; curves that end below 100 % did not get "
         f"there.{chaos}{_led(rows, 'profile')}"
+    )
+
+
+def _scenes(figure: Any, rows: list[Row]) -> str:
+    points = [row for row in rows if row["panel"] == "scenes"]
+    grid = _grid(figure, 11.4, "Twelve scenes: speed of each method at a given error", down=2, across=1, left=1.6)
+    grid.set_width_ratios((1.0, 0.3))
+    grid.update(wspace=0.3, top=0.88, bottom=0.11, hspace=0.38)
+    for i, target in enumerate(SCENE_TARGETS):
+        draw_scenes(figure.add_subplot(grid[i, 0]), points, f"{target:g}")
+    draw_markers(figure.add_subplot(grid[:, 1]), points)
+    short = " A quick chart leaves out scipy's methods." if points[0]["mode"] == "quick" else ""
+    return (
+        "Each method is timed at its coarsest setting whose error against the scene's own reference is below the "
+        f"target.{short}{_led(rows, 'scenes')}"
     )
 
 

@@ -9,6 +9,7 @@ from replays.studies.chart.methods import Competitor
 from replays.studies.peers import Setting
 from replays.studies.peers.problem import Problem
 from replays.studies.peers.window import cut_window
+from replays.studies.twelve_scenes import TWELVE_SCENES
 from rig.errors import InputError
 from rig.scenes import load_scene, parse_scene
 
@@ -55,6 +56,7 @@ PANELS = {
     "memory": "Lankarani-Nikravesh contact with its memory of the impact speed, and without; no friction",
     RUB: "chaotic partial rub: statistics only",
     "profile": "performance profile over random scenes",
+    "scenes": "cheapest setting within 1e-2 and 1e-4 over twelve scenes",
 }
 _WINDOWS = ("whirl", "transient", "first-impacts", "drop")
 _PANEL_PHASES = {
@@ -63,8 +65,11 @@ _PANEL_PHASES = {
     "memory": ("first-impacts",),
     RUB: (RUB,),
     "profile": (),
+    "scenes": (),
 }
 MEMORY_CASES = ("memory", "no memory")
+SCENE_TARGETS = (1e-2, 1e-4)
+"""Scaled errors to be reached in the twelve scenes, the largest first."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +108,7 @@ def select(only: str | None, panels: list[str] | None) -> tuple[list[str], str |
 
 
 def plan(contenders: dict[str, Competitor], *, mode: Mode, panels: list[str], only: str | None = None) -> list[Task]:
-    """All points of a chart but the profile's, those that tell most for their time first."""
+    """Points of a chart, without the profile's and the twelve scenes', those that tell most for their time first."""
     tasks: list[tuple[int, Task]] = []
     for panel in panels:
         for turn, phase in enumerate(_PANEL_PHASES[panel]):
@@ -168,3 +173,15 @@ def problem_of(
         smoothing_speed=smoothing_speed,
         **{"damping_factor": 0.0} if case == "no memory" else {},
     )
+
+
+def scene_problem(name: str, *, end_s: float | None = None) -> Problem:
+    """Return the window of one of the twelve scenes, with its own friction law.
+
+    Args:
+        name: Name of the scene.
+        end_s: Earlier end of the window [s]; None for its own.
+    """
+    study = TWELVE_SCENES[name]
+    end_s = study.window_s if end_s is None else min(end_s, study.window_s)
+    return cut_window(study.load(), end_s=end_s, sample_s=FRAME_S)

@@ -6,6 +6,7 @@ within a factor tau of the cheapest method.
 
 from __future__ import annotations
 
+from itertools import dropwhile
 from typing import Any
 
 import numpy as np
@@ -56,27 +57,44 @@ def draw_problem(seed: int) -> Problem:
     return cut_window(draw_scene(seed), sample_s=FRAME_S, friction="exact")
 
 
-def cheapest(contender: Competitor, problem: Problem, reference: Reference, budget: Budget) -> dict[str, Any]:
+def cheapest(
+    contender: Competitor,
+    problem: Problem,
+    reference: Reference | None,
+    budget: Budget,
+    target: float,
+    start: str = "",
+) -> dict[str, Any]:
     """Walk down a method's ladder until the target is reached.
 
+    Args:
+        contender: The method.
+        problem: The problem.
+        reference: Its reference, or None where there is none.
+        budget: Budget of each run.
+        target: Scaled error to be reached.
+        start: Label of the setting to begin at, such as the cheapest within a larger target; empty for the first.
+
     Returns:
-        Columns of that setting's point; where none reaches it, of the last one tried, with failure "target".
+        Columns of that setting's point. Where no setting reaches the target, of the last one tried, with failure
+        "target"; failure "law" where the method cannot run the friction law, and "reference" where the reference is
+        not sharp enough, as in chaotic motion: such a problem counts for nobody.
     """
-    columns: dict[str, Any] = {}
-    for setting in contender.settings:
-        try:
-            columns = point(contender, setting, problem, reference, budget._replace(runs=1, single_s=0.0))
-        except NotImplementedError as error:
-            columns = {"failure": "error", "message": str(error)}
-            break
+    friction = "exact" if problem.exact_friction else "smoothed"
+    columns: dict[str, Any] = {"friction": friction, "reference_error": reference.error if reference else None}
+    if not contender.takes(friction):
+        return columns | {"failure": "law", "message": f"cannot run {friction} friction"}
+    if reference is None or reference.error > SHARP * target:
+        return columns | {"failure": "reference", "message": "no reference sharp enough: chaotic motion"}
+    for setting in dropwhile(lambda setting: start and setting.label != start, contender.settings):
+        columns |= point(contender, setting, problem, reference, budget._replace(runs=1, single_s=0.0))
         columns |= {"rung": setting.label, "step_us": setting.step_us, "tolerance": setting.tolerance}
         error = columns["error"]
-        if error is not None and error <= TARGET and not columns["failure"]:
-            again = point(contender, setting, problem, reference, budget)
-            return {**columns, **again}
+        if error is not None and error <= target and not columns["failure"]:
+            return columns | point(contender, setting, problem, reference, budget)
         if columns["failure"] == "budget":
             return columns
-    return {**columns, "failure": columns.get("failure") or "target"}
+    return columns | {"failure": columns["failure"] or "target"}
 
 
 def shares(rows: list[dict[str, Any]], column: str = "cpu_s") -> dict[str, tuple[np.ndarray, np.ndarray]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from replays.studies.chart.phases import (
     PANELS,
     PHASES,
     RUB,
+    SCENE_TARGETS,
     SMOOTHED_SPEEDS,
     SMOOTHING,
     Mode,
@@ -22,6 +24,7 @@ from replays.studies.chart.phases import (
     friction_of,
     plan,
     problem_of,
+    scene_problem,
     select,
 )
 from replays.studies.chart.store import Row, Store, read_table
@@ -29,13 +32,14 @@ from replays.studies.chart.submission import PANEL, read_submission
 from replays.studies.peers import PEERS, Setting
 from replays.studies.peers.problem import Problem, scaled_error
 from replays.studies.peers.reference import Reference, find_reference
+from replays.studies.twelve_scenes import TWELVE_SCENES
 from rig.errors import InputError, SimulationError
 
 TOTAL_S = {"quick": 95.0, "full": 3300.0}
 """Wall time for all points, compile time apart [s]; what does not fit is left to the next run."""
 BUDGETS = {"quick": Budget(2.0, 3, 0.4), "full": Budget(20.0, 3)}
-_PROFILE_SHARE = 0.35
-"""Share of the time that the profile may take where other panels are made as well."""
+_WALK_SHARE = 0.3
+"""Share of the time that the profile, and the twelve scenes, may each take where other panels are made as well."""
 _RUB_S = {"quick": 12.0, "full": 60.0}
 """Simulated time of the chaotic rub [s]."""
 _RUB_BUDGET_S = {"quick": 4.0, "full": 120.0}
@@ -257,11 +261,11 @@ class _Work:
 
 def _measure(work: _Work, panels: list[str], only: str | None, outcome: Outcome, progress: Progress) -> None:
     tasks = plan(work.contenders, mode=work.mode, panels=panels, only=only)
-    scenes = profile.SCENES[work.mode] if "profile" in panels and only is None else 0
+    walks = {} if only else {panel: len(walk[0]) for panel, walk in _walks(work).items() if panel in panels}
     windows = {(task.panel, task.phase, task.case) for task in tasks if task.panel != RUB}
-    progress.begin(len(tasks) + len(windows) + scenes)
+    progress.begin(len(tasks) + len(windows) + sum(walks.values()))
     total = TOTAL_S[work.mode]
-    # The profile is one of several panels: it has its share of the time, and stands before the slow peers.
+    # The profile and the twelve scenes have their share of the time, and stand before the slow peers.
     early = [task for task in tasks if work.contenders[task.method].ours]
     late = [task for task in tasks if not work.contenders[task.method].ours]
     for panel, phase, case in sorted(windows):
@@ -271,8 +275,9 @@ def _measure(work: _Work, panels: list[str], only: str | None, outcome: Outcome,
     clock = time.perf_counter() - work.compile_s
     for task in early:
         _point(work, task, outcome, progress, clock + total)
-    share = total * (_PROFILE_SHARE if tasks else 1.0)
-    _profile(work, scenes, outcome, progress, time.perf_counter() - work.compile_s + share)
+    for panel in walks:
+        share = total * (_WALK_SHARE if tasks else 1.0 / len(walks))
+        _walk_ladders(work, panel, outcome, progress, time.perf_counter() - work.compile_s + share)
     for task in late:
         _point(work, task, outcome, progress, clock + total)
 
@@ -332,33 +337,40 @@ def _point(work: _Work, task: Task, outcome: Outcome, progress: Progress, deadli
     outcome.measured += 1
 
 
-def _profile(work: _Work, scenes: int, outcome: Outcome, progress: Progress, deadline: float) -> None:
-    rivals = [one for one in work.contenders.values() if not one.known_failure and one.takes("exact")]
-    rivals = [one for one in rivals if not (work.mode == "quick" and one.name in ("scipy-radau", "scipy-bdf"))]
+def _walks(work: _Work) -> dict[str, tuple[dict[str, Callable[[], Problem]], tuple[float, ...]]]:
+    """Return problems by phase, and targets, of each panel whose methods walk down their ladders."""
+    draws = {f"scene-{seed:03d}": partial(profile.draw_problem, seed) for seed in range(profile.SCENES[work.mode])}
+    scenes = {name: partial(scene_problem, name, end_s=work.end_s) for name in TWELVE_SCENES}
+    return {"profile": (draws, (profile.TARGET,)), "scenes": (scenes, SCENE_TARGETS)}
+
+
+def _walk_ladders(work: _Work, panel: str, outcome: Outcome, progress: Progress, deadline: float) -> None:
+    problems, targets = _walks(work)[panel]
+    rivals = [one for one in work.contenders.values() if not one.known_failure]
+    if panel == "profile":
+        rivals = [one for one in rivals if one.takes("exact")]
+    if work.mode == "quick":
+        # A quick chart has no time for scipy's steps in Python over a whole scene.
+        slow = ("scipy-radau", "scipy-bdf") if panel == "profile" else ("scipy",)
+        rivals = [one for one in rivals if one.name not in slow and one.family not in slow]
     budget = BUDGETS[work.mode]._replace(solve_s=1.0 if work.mode == "quick" else 5.0)
-    for seed in range(scenes):
-        progress.step(f"profile, scene {seed + 1} of {scenes}")
-        scene = f"scene-{seed:03d}"
-        # The setting found is no part of the key: a scene and a method are one point.
-        own = {"friction": "exact", "rung": "cheapest"}
-        rows = [(one, work.base("profile", scene, "", one, None) | own) for one in rivals]
-        waiting = [(one, row) for one, row in rows if not work.store.has(row)]
+    for phase, make in problems.items():
+        progress.step(f"{panel}, {phase}")
+        # The setting found is no part of the key: a scene, a target and a method are one point.
+        cases = {"" if panel == "profile" else f"{target:g}": target for target in targets}
+        rows = [(one, case, work.base(panel, phase, case, one, None)) for one in rivals for case in cases]
+        waiting = [(one, case, row) for one, case, row in rows if not work.store.has(row | {"rung": "cheapest"})]
         if not waiting:
             outcome.resumed += 1
             continue
         if time.perf_counter() > deadline + work.compile_s:
             outcome.left += 1
             continue
-        problem = profile.draw_problem(seed)
-        reference = work.solve(problem)
-        # A chaotic draw has no pointwise reference: its row says so, and it counts for nobody.
-        blunt = reference is None or reference.error > profile.SHARP * profile.TARGET
-        for one, row in waiting:
-            if reference is None or blunt:
-                columns: Row = {"failure": "reference", "message": "no reference sharp enough: a chaotic draw",
-                                "reference_error": None if reference is None else reference.error}  # fmt: skip
-            else:
-                columns = profile.cheapest(one, problem, reference, budget)
+        problem = make()
+        reference, reached = work.solve(problem), dict[str, str]()
+        for one, case, row in waiting:
+            columns = profile.cheapest(one, problem, reference, budget, cases[case], reached.get(one.name, ""))
+            reached[one.name] = columns.get("rung", "")
             message = columns.get("message") or f"cheapest setting {columns.get('rung', '')}"
             work.keep(row, {**columns, "rung": "cheapest", "message": message})
             outcome.measured += 1

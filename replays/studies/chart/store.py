@@ -123,7 +123,8 @@ def code_digest() -> str:
     here, simulator = Path(__file__).parent, Path(str(rig.__file__)).parent
     folders = (simulator / "engines", simulator / "kernels", here.parent / "peers")
     sources = [path for folder in folders for path in folder.rglob("*.py")]
-    return provenance.digest([*sources, *(here / name for name in _MEASURING)])
+    scenes = here.parent / "twelve_scenes.py"
+    return provenance.digest([*sources, scenes, *(here / name for name in _MEASURING)])
 
 
 def stamp() -> dict[str, str]:
