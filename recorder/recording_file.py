@@ -111,8 +111,8 @@ class RecordingFile:
             for payload, (kind, model) in zip(payloads, documents.ATTACHED.items(), strict=True)
         )
         if self.damaged and not salvage:
-            must = "an intact recording (`rig recover` passes over what is damaged)"
-            raise InputError("file", must, Words(f"{self.path}, with {self.damaged} damaged records"))
+            must, several = "an intact recording (`rig recover` passes over what is damaged)", "s" * (self.damaged > 1)
+            raise InputError("file", must, Words(f"{self.path}, with {self.damaged} damaged record{several}"))
         self._catalogue = intake.Catalogue.read(self.catalogue)
         self.table = self._catalogue.table
 

@@ -70,7 +70,7 @@ PICKED = (
     ("replays/score/intervals.py", "t.ppf(0.975, freedom)", "t.ppf(0.95, freedom)"),
     ("replays/score/sine.py", "for p in (0.025, 0.975)", "for p in (0.05, 0.95)"),
     ("replays/score/sine.py", "np.hanning(len(values) + 1)[:-1]", "np.hanning(len(values))"),
-    ("replays/score/digital.py", "for p in (0.975, 0.025)", "for p in (0.95, 0.05)"),
+    ("replays/score/stamps.py", "for p in (0.975, 0.025)", "for p in (0.95, 0.05)"),
     ("replays/score/waveform.py", "student(self.freedom) * self.spread", "0.84 * student(self.freedom) * self.spread"),
     ("replays/score/limits.py", "if any(map(math.isnan, ends)):", "if False:"),
     ("replays/score/limits.py", "channel.lsb_v / math.sqrt(12.0))\n", "channel.lsb_v)\n"),

@@ -27,6 +27,7 @@ from replays.score.scorecard import (
 )
 from replays.score.sent import Formula, Session
 from replays.score.sine import fit_sine, is_sine, quality
+from replays.score.stamps import Stamps
 from replays.score.stimulus import Exact, Sampled, Stimulus, parted, without_noise
 from replays.score.waveform import (
     Response,
@@ -127,10 +128,11 @@ def fit_channels(
             continue
         channel = session.channels[wire.channel]
         if signal.rate_hz is None:
-            remarks.append(f"{name}: the file tells no rate; taken for the session's, {channel.rate_hz:g} Hz")
+            remarks.append(f"{name}: the file gives no sample rate; the session's, {channel.rate_hz:g} Hz, is assumed")
         values, told = in_unit(signal, channel)
         if not told:
-            remarks.append(f"{name}: the unit {signal.unit or 'is not told'}; taken for {channel.unit}")
+            given = "no unit" if signal.unit in ("", "1") else f"the unit {signal.unit}"
+            remarks.append(f"{name}: the file gives {given}; {channel.unit} is assumed")
         sent, first_s, sent_hz = session.whole(wire.channel)
         formula, rate_hz = formulas.get(wire.channel), signal.rate_hz or sent_hz
         if formula is None:
@@ -298,7 +300,19 @@ def _score_rows(card: Scorecard, alignments: list[Alignment], recorded: Mapping[
             card.runs[f"{quantity} {name}".strip()] = [(first, last) for first, last, _ in here]
         for channel, lost in _rows_without_value(alignment, recorded).items():
             card.add("lost samples", channel, (lost, lost, lost), note="rows without a value")
+        # At an end of the record such rows are in the judged part only: a DAQ may start before its input is connected.
+        foreign = alignment.track.foreign
+        count, rows = float(sum(b - a + 1 for a, b in foreign)), ", ".join(f"{a} to {b}" for a, b in foreign[:_NAMED])
+        card.add("foreign rows", name, (count, count, count), note=f"rows {rows}" if foreign else "")
+        card.runs[f"foreign rows {name}".strip()] = foreign
         card.add("judged part", name, (judged := alignment.judged(), judged, judged))
+        one = recorded[alignment.names[0]]
+        stamps, (explained, at) = Stamps(one.table), alignment.track.places(alignment.rows)
+        stamps.times_s = np.concatenate([part[:, 0] for part in one.table.parts([one.column])])
+        stamps.take(0.0, at / alignment.rate_hz, np.flatnonzero(explained), alignment.rows)
+        estimates = stamps.judged(None)
+        for quantity in ("stamp rate", "stamp jitter", "stamps that go back"):
+            card.add(quantity, name, estimates[quantity])
         for rows, what in zip(
             (alignment.track.inside[0], alignment.rows - alignment.track.inside[1]),
             ("before the session's begin", "after the session's end"), strict=True,
@@ -310,22 +324,13 @@ def _score_rows(card: Scorecard, alignments: list[Alignment], recorded: Mapping[
 def _rows_without_value(alignment: Alignment, recorded: Mapping[str, Recorded]) -> dict[str, float]:
     """Return the number of rows in the session without a value, of the signals that lack some.
 
-    A signal with a value in every n-th row, of a lower rate than the table, lacks none; nor is a row lost that comes
-    before the first value of all signals or after the last one.
+    A row before the first value of all signals, or after the last one, is not lost.
     """
     inside = slice(*alignment.track.inside)
     held = {name: np.isfinite(recorded[name].values[inside]) for name in alignment.names}
-    rows, lost = np.flatnonzero(np.any(list(held.values()), axis=0)), dict[str, float]()
-    for name, has in held.items():
-        places = np.flatnonzero(has)
-        if len(places) < 2:
-            continue
-        usual = float(np.median(np.diff(places)))
-        gaps = np.diff([rows[0] - usual, *places, rows[-1] + usual]) / usual
-        gaps[[0, -1]] = np.floor(gaps[[0, -1]])
-        if count := float(np.maximum(np.rint(gaps) - 1.0, 0.0).sum()):
-            lost[name] = count
-    return lost
+    rows = np.flatnonzero(np.any(list(held.values()), axis=0))
+    lost = {name: float((~has[rows[0] : rows[-1] + 1]).sum()) for name, has in held.items() if len(rows)}
+    return {name: count for name, count in lost.items() if count}
 
 
 def _score_time(card: Scorecard, found: list[Fitted], ambiguous: set[str]) -> None:

@@ -69,7 +69,9 @@ class Begins:
         ends = np.linspace(0, len(one.values), _PARTS + 1).astype(int)
         length = stretches(0.0)[0][1] - stretches(0.0)[0][0]
         self._parts = [
-            busiest([one], (low, high), length) for low, high in pairwise(ends.tolist()) if high - low >= FEWEST
+            busiest([one], (low, high), length)
+            for low, high in pairwise(ends.tolist())
+            if high - low >= FEWEST and np.isfinite(one.values[low:high]).any()
         ]
         loud = _LOUD_PART * float(np.nanvar(one.values[slice(*stretches(0.0)[0])]))
         self._parts = [each for each in self._parts if np.nanvar(one.values[slice(*each)]) >= loud]

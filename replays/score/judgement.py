@@ -17,7 +17,7 @@ from replays.score.digital import score_digital
 from replays.score.limits import Limits, load_limits
 from replays.score.live import Arrivals
 from replays.score.placing import Taken, settle
-from replays.score.recorded import Recorded, map_signals, open_recorded
+from replays.score.recorded import Recorded, map_signals, open_recorded, separate_rates
 from replays.score.scale import COUNTS
 from replays.score.scorecard import (
     FAIL,
@@ -75,12 +75,12 @@ def judge(
     options = options if mapping is None else mapping.file
     opened = open_can_log(file, session.recording.table) if is_can_log(file) else open_recorded(file, options, remarks)
     opened = opened if mapping is None else map_signals(opened, mapping.channels, session.channels)
-    recorded = _by_name(opened)
     sent = {}
     for group, names in session.groups.items():
         _, early = session.early(group)
         sent |= {name: (early[:, n], session.rate_hz(group)) for n, name in enumerate(names)}
     rate = max(each for _, each in sent.values())
+    recorded = _by_name(separate_rates(opened, rate))
     wires: dict[str, Wire] = {}
     rows: dict[str, Taken] = {}
     if path != "analogue":
@@ -99,7 +99,7 @@ def judge(
         whole = {name: (values, hz) for name in session.channels for values, _, hz in [session.whole(name)]}
         rates = {name: each.rate_hz or rate for name, each in recorded.items()}
         wires = _connect(recorded, whole, session.channels, rates, whole=True)
-    if not any(wire.channel for wire in wires.values()):
+    if not any(wire.channel for wire in wires.values()) and recorded.keys().isdisjoint(session.channels):
         raise InputError("FILE", f"a recording of what {session.path.name} has", Words(f"{file}, of which nothing is"))
     for name, wire in wires.items():
         if (wire.channel or name in session.channels) and (unit := recorded[name].unit) not in COUNTS:

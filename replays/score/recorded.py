@@ -84,6 +84,19 @@ class Table:
 
         return Table(self.rows, self._columns, pieces)
 
+    def select_rows(self, column: int, step: int, first: int) -> Table:
+        """Return a table of every `step`-th row from a row on, or for step 1 of the rows with a value in a column."""
+
+        def pieces(columns: Sequence[int]) -> Iterator[np.ndarray]:
+            at = 0
+            for part in self.parts([column, *columns]):
+                rows = np.arange(at, at + len(part))
+                at += len(part)
+                yield np.delete(part[rows % step == first if step > 1 else np.isfinite(part[:, 1])], 1, axis=1)
+
+        rows = len(range(first, self.rows, step)) if step > 1 else sum(map(len, pieces([])))
+        return Table(rows, self._columns, pieces)
+
     @property
     def stamped(self) -> bool:
         """Whether it has time stamps."""
@@ -239,6 +252,33 @@ def map_signals(
         found.append(replace(signal, name=name, unit=unit))
     tables = {id(s.table): s.table.changed(changes[id(s.table)]) for s in found}
     return [replace(signal, table=tables[id(signal.table)]) for signal in found]
+
+
+def separate_rates(signals: Sequence[Recorded], rate_hz: float) -> list[Recorded]:
+    """Return signals of which those that have values at a lower, even rate are in tables of their own.
+
+    A text of several rates has blank cells where a signal has no value.
+
+    Args:
+        signals: Of a file.
+        rate_hz: Of the rows of a table that gives no rate [Hz].
+    """
+    tables, found = dict[tuple[int, int, int, bytes], Table](), list[Recorded]()
+    for signal in signals:
+        rows, step = np.flatnonzero(np.isfinite(signal.early)), 1
+        if len(rows) > 2 and (rows[-1] - rows[0]) >= len(rows):
+            step = round(float(np.median(np.diff(rows))))
+            first = int(np.bincount(rows % step).argmax())
+            steps_s = np.diff(signal.table.early[rows, 0])
+            if np.mean(rows % step == first) < _REGULAR or (first and not signal.table.stamped):
+                step = 1
+            if step > 1 or np.all(np.abs(steps_s - np.median(steps_s)) < _ALIKE * np.median(steps_s)):
+                key = id(signal.table), step, first, b"" if step > 1 else rows.tobytes()
+                if key not in tables:
+                    tables[key] = signal.table.select_rows(signal.column, step, first)
+                signal = replace(signal, table=tables[key], told_hz=(signal.rate_hz or rate_hz) / step)
+        found.append(signal)
+    return found
 
 
 def _ends_with_line_end(path: Path) -> bool:

@@ -104,6 +104,11 @@ class Track:
         """Number of rows that the known signal explains."""
         return sum(run.end - run.begin for run in self.runs)
 
+    @property
+    def foreign(self) -> list[tuple[int, int]]:
+        """First and last row of each stretch that nothing explains, between rows of the same lag."""
+        return [(a.end, b.begin - 1) for a, b in pairwise(self.runs) if a.end < b.begin and a.lag == b.lag]
+
     def steps(self) -> list[tuple[int, int, int]]:
         """Steps as first and last row where one may be, and its samples: above 0 lost, below 0 doubled."""
         return [

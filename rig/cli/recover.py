@@ -67,9 +67,9 @@ def _recover(file: Path, new: Path, *, force: bool) -> bool:
     echo(
         f"{new}: {(counts.first_time_ns or 0) / 1e9:.3f} s to {counts.last_time_ns / 1e9:.3f} s, "
         f"{sum(counts.rows.values())} rows, {new.stat().st_size / 1e6:.1f} MB"
-        + (f"; {made.damaged} damaged records passed over" if made.damaged else "")
+        + (f"; {made.damaged} damaged record{'s' * (made.damaged > 1)} skipped" if made.damaged else "")
         + "".join(f"; {text}: no checksum covers them" for text in made.unchecked)
-        + (f"; {lost} rows are missing in it" if lost else "")
+        + (f"; {lost} {'row is' if lost == 1 else 'rows are'} missing in it" if lost else "")
         + "".join(f"; {text}" for text in made.short)
     )
     return not (made.damaged or lost or made.short)

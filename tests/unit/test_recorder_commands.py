@@ -123,7 +123,7 @@ def test_a_finished_file_with_a_damaged_chunk_is_not_whole(path, tmp_path, capsy
     data[chunk.offset + chunk.length // 2] ^= 0xFF
     source.write_bytes(data)
     assert run("recover", source) == 1
-    assert "1 damaged records" in capsys.readouterr().out
+    assert "1 damaged record skipped" in capsys.readouterr().out
     # A .part that was finished but not yet renamed is still to become a recording.
     part = tmp_path / "other.mcap.part"
     part.write_bytes(path.read_bytes())
@@ -271,7 +271,7 @@ def test_recover_ends_with_1_and_info_counts_each_row_that_is_lost(
     }[which]  # fmt: skip
     source, made = _damaged(in_chunks, tmp_path / "x.mcap", hit), tmp_path / "made.mcap"
     assert run("recover", source, "-o", made) == 1
-    assert f"{len(hit)} damaged records passed over" in capsys.readouterr().out
+    assert f"{len(hit)} damaged record{'s' * (len(hit) > 1)} skipped" in capsys.readouterr().out
     whole, kept = recording.streams, Recording.open(made).streams
     assert run("info", "--json", made) == 1
     streams = json.loads(capsys.readouterr().out)["streams"]

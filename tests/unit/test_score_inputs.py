@@ -80,6 +80,27 @@ def test_a_channel_that_the_session_lacks_is_one_line(
     assert "disk_z" in err
 
 
+@pytest.mark.parametrize("value", [0.0, 1.5, np.nan])
+@pytest.mark.parametrize("unit", ["mm", "V"])
+def test_channels_that_are_all_dead_fail_and_have_a_junit_file(
+    value: float, unit: str, session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    columns = {f"{name} [{unit}]": np.full(4000, value) for name in PROBES.names}
+    daq, report = write_parquet(tmp_path / "daq.parquet", columns), tmp_path / "score.xml"
+    status, _, _ = said(capsys, "score", daq, "--against", str(session), "--junit", str(report))
+    assert status == 1
+    assert report.read_text().count("<failure") >= len(PROBES.names)
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_stretch_without_values_gives_no_warning(session: Path, counts: np.ndarray, tmp_path: Path) -> None:
+    columns = columns_of(counts)
+    for values in columns.values():
+        values[1300:2700] = np.nan
+    card = judge(write_parquet(tmp_path / "daq.parquet", columns), [session], path="analogue")
+    assert card.outcome == "fail"
+
+
 @pytest.mark.parametrize("channels", ["", ",", " , "])
 def test_no_channel_at_all_is_refused(
     channels: str, session: Path, counts: np.ndarray, tmp_path: Path, capsys: pytest.CaptureFixture[str]

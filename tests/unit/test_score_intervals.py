@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from replays.score.digital import Stamps
 from replays.score.intervals import refine, sandwich, student
 from replays.score.limits import load_limits
 from replays.score.noise import split_noise
@@ -16,6 +15,7 @@ from replays.score.recorded import Table
 from replays.score.rounding import Converter, undithered, widen
 from replays.score.scorecard import FAIL, INCONCLUSIVE, PASS, Bounds, Scorecard, judge_row
 from replays.score.sine import fit_sine, quality
+from replays.score.stamps import Stamps
 from replays.score.waveform import Waveform
 from rig.channels import default_table
 from tests.score_coverage import NOISES, ROWS, Estimate, cell, estimates

@@ -167,10 +167,11 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def card_of(
-    session: Path, file: Path, true_s: np.ndarray, *, turned: int = -1, blank: dict[int, slice] | None = None
-) -> Scorecard:
+    session: Path, file: Path, true_s: np.ndarray, *, turned: int = -1, blank: dict[int, slice] | None = None,
+    replaced: dict[int, slice] | None = None, stamps_s: np.ndarray | None = None,
+) -> Scorecard:  # fmt: skip
     generator = np.random.default_rng(4)
-    columns = {"time [s]": np.arange(len(true_s)) / RATE_HZ}
+    columns = {"time [s]": np.arange(len(true_s)) / RATE_HZ if stamps_s is None else stamps_s}
     for n, channel in enumerate(PROBES):
         value = two_tones(true_s + 0.001 * n) * (-1.0 if n == turned else 1.0)
         volts = (
@@ -178,6 +179,7 @@ def card_of(
         )
         volts = np.rint(volts / channel.lsb_v) * channel.lsb_v
         volts[(blank or {}).get(n, slice(0))] = np.nan
+        volts[(replaced or {}).get(n, slice(0))] = 0.0
         columns[f"{channel.name} [V]"] = volts
     known = {channel.name: (lambda t, n=n: two_tones(t + 0.001 * n)) for n, channel in enumerate(PROBES)}
     names = [channel.name for channel in PROBES]
@@ -242,6 +244,59 @@ def test_rows_without_a_value_are_lost(
     assert red(card) == {("lost samples", PROBES[n].name) for n in lost}
     for n, count in lost.items():
         assert card.row("lost samples", PROBES[n].name).value == count
+
+
+OWN_S = np.arange(len(TRUE_S)) / RATE_HZ
+UNEVEN = np.arange(len(TRUE_S)) % 7 == 5
+
+
+@pytest.mark.parametrize(("held", "phase"), [(8, 0), (8, 5), (4, 1), (2, 1), (0, 0)])
+def test_a_channel_of_a_lower_rate_in_one_table_is_judged_by_its_own_rows(
+    held: int, phase: int, session: Path, tmp_path: Path
+) -> None:
+    """Of two rates that no rows have in common, as programs merge files, the time stamps are uneven."""
+    rows = np.arange(len(TRUE_S))
+    if held:
+        blank, true_s, stamps_s = {1: rows % held != phase}, TRUE_S, OWN_S
+    else:
+        blank, shift = {0: UNEVEN, 1: ~UNEVEN, 2: UNEVEN}, np.where(UNEVEN, 0.5, 0.0)
+        own = np.cumsum(np.where(UNEVEN, 0, 1)) - 1 + shift
+        stamps_s, true_s = own / RATE_HZ, 0.05 + own / RATE_HZ * (1.0 - 30e-6)
+    card = card_of(session, tmp_path / "daq.parquet", true_s, blank=blank, stamps_s=stamps_s)  # type: ignore[arg-type]
+    assert red(card) == set(), card.verdict_line
+    assert card.row("gain", PROBES[1].name).verdict == PASS
+    assert card.row("clock").value == pytest.approx(30.0, abs=1.0)
+
+
+@pytest.mark.parametrize(
+    ("stamps_s", "quantity"),
+    [
+        (np.where(np.arange(len(TRUE_S)) == 4000, OWN_S - 1e-4, OWN_S), "stamps that go back"),
+        (np.where(np.arange(len(TRUE_S)) < 4000, OWN_S, OWN_S - 2e-3), "stamps that go back"),
+        (np.where(np.arange(len(TRUE_S)) < 4000, OWN_S, OWN_S + 2e-3), "stamp rate"),
+        (np.zeros(len(TRUE_S)), "stamp rate"),
+        (OWN_S[::-1].copy(), "stamps that go back"),
+    ],
+    ids=["one back", "back from a row on", "ahead from a row on", "constant", "reversed"],
+)
+def test_bad_time_stamps_fail_on_the_analogue_path(
+    stamps_s: np.ndarray, quantity: str, session: Path, tmp_path: Path
+) -> None:
+    card = card_of(session, tmp_path / "daq.parquet", TRUE_S, stamps_s=stamps_s)
+    assert (quantity, "") in red(card)
+    assert {name for name, _ in red(card)} <= {"stamps that go back", "stamp rate"}
+
+
+@pytest.mark.parametrize(("begin", "rows"), [(4000, 100), (2000, 200), (6000, 100)])
+def test_a_few_rows_in_place_of_others_fail_although_the_judged_part_is_within_its_limit(
+    begin: int, rows: int, session: Path, tmp_path: Path
+) -> None:
+    zeros = slice(begin, begin + rows)
+    card = card_of(session, tmp_path / "daq.parquet", TRUE_S, replaced=dict.fromkeys(range(3), zeros))
+    assert ("foreign rows", "") in red(card)
+    ((first, last), *_) = card.runs["foreign rows"]
+    assert first <= begin
+    assert begin + rows <= last + 30
 
 
 def test_one_turned_channel_of_a_signal_that_repeats_fails(session: Path, tmp_path: Path) -> None:
