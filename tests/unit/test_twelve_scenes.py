@@ -117,6 +117,8 @@ def test_figure_states_ratios_failures_and_median(tmp_path: Path, monkeypatch: p
     assert "split at 2 times the speed of the best peer (median)," in drawn
     assert "0.5 times by its library's own time; slower in 1 of 3 scenes" in drawn
     assert "no peer" in drawn
+    assert "no reference sharp enough" in drawn
+    assert 'id="failure-split-stable-run"' not in drawn
     for method, scene in (("semi-implicit-euler", "drop"), ("scipy-lsoda", "drop"), ("split", "run-up")):
         assert f'id="failure-{method}-{scene}"' in drawn
     assert 'id="heyoka-drop"' in drawn

@@ -195,9 +195,9 @@ def _profile_figure(figure: Any, rows: list[Row]) -> str:
 
 def _scenes(figure: Any, rows: list[Row]) -> str:
     points = [row for row in rows if row["panel"] == "scenes"]
-    grid = _grid(figure, 11.4, "Twelve scenes: speed of each method at a given error", down=2, across=1, left=1.6)
+    grid = _grid(figure, 11.7, "Twelve scenes: speed of each method at a given error", down=2, across=1, left=1.6)
     grid.set_width_ratios((1.0, 0.3))
-    grid.update(wspace=0.3, top=0.88, bottom=0.11, hspace=0.38)
+    grid.update(wspace=0.3, top=0.88, bottom=0.135, hspace=0.38)
     for i, target in enumerate(SCENE_TARGETS):
         draw_scenes(figure.add_subplot(grid[i, 0]), points, f"{target:g}")
     draw_markers(figure.add_subplot(grid[:, 1]), points)

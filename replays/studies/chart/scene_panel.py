@@ -84,7 +84,9 @@ def draw_scenes(axes: Any, rows: list[Row], case: str) -> None:
     axes.axvspan(left, low, color="#f4ecec", zorder=0, lw=0)
     for place, scene in enumerate(scenes):
         here = [row for row in points if row["phase"] == scene]
-        failed = [row for row in here if row["failure"]]
+        failed = [row for row in here if row["failure"] not in ("", "reference")]
+        if any(row["failure"] == "reference" for row in here):
+            axes.text(low, place, "  no reference sharp enough", va="center", fontsize=9, color=QUIET)
         slots = np.geomspace(left, low, max(len(failed), _SLOTS) + 2)[1:]
         for slot, row in zip(slots, failed, strict=False):
             color = QUIET if row["failure"] == "law" else ALARM
