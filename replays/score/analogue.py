@@ -402,6 +402,11 @@ def _is_loud(session: Session, name: str, alignments: Sequence[Alignment]) -> bo
     return len(part) > 1 and float(np.std(part)) > least
 
 
+def _is_biased(signal: Recorded, channel: Channel) -> bool:
+    """Return whether an inverted signal would show in its offset: it is in volts, and the channel has a bias."""
+    return units.kind(signal.unit) == "voltage" and abs(channel.bias_v) > _LOUD * channel.noise_v
+
+
 def _score_wires(
     card: Scorecard, recorded: Mapping[str, Recorded], wires: Mapping[str, Wire], found: list[Fitted],
     ambiguous: set[str], session: Session, alignments: Sequence[Alignment],
@@ -409,8 +414,15 @@ def _score_wires(
     """Mapping and polarity of the signals whose gain is found; a name of the rig's has to be that channel."""
     fits = {one.name: one for one in found if one.good}
     signs = {name: one.low.gain > 0.0 for name, one in fits.items()}
-    open_ = {name for name in fits if name in ambiguous and wires[name].turned}
+    # A begin half a period later turns all channels of a table: one whose sign is known fixes those of the others.
+    fixed = {
+        name for each in alignments for name in each.names
+        if any(not wires[n].turned or _is_biased(recorded[n], fits[n].channel) for n in each.names if n in fits)
+    }  # fmt: skip
+    open_ = {name for name in fits if name in ambiguous and wires[name].turned and name not in fixed}
     mixed = len({signs[name] for name in open_}) > 1
+    if open_ and not mixed:
+        card.doubts.append(f"the polarity of {', '.join(sorted(open_))} is open: half a period later it is inverted")
     rows = []
     for name, wire in wires.items():
         verdict: Verdict = NO_LIMIT
