@@ -14,7 +14,7 @@ from replays.studies.peers.right_hand_side import derivative, jacobian, pack, sw
 from replays.studies.peers.solution import MISSED_HAMMER
 from replays.studies.peers.window import cut_window
 from rig.errors import InputError
-from rig.kernels.contact import FLIGHT, FORWARD, ROLLING, TOUCHING
+from rig.kernels.contact import BACKWARD, FLIGHT, FORWARD, ROLLING, TOUCHING
 from rig.kernels.signals import STATE_SCALE
 from rig.scenes import load_scene
 from rig.simulation import Simulation
@@ -111,6 +111,27 @@ def test_heyoka_has_the_same_equations(changes: dict, phase: int) -> None:
         np.testing.assert_allclose(found, wanted, atol=1e-8 * np.max(np.abs(wanted)))
 
 
+@pytest.mark.parametrize("phase", [FLIGHT, BACKWARD, ROLLING])
+def test_diffrax_has_the_equations_of_heyoka(phase: int) -> None:
+    jax = pytest.importorskip("jax", reason="needs the extra `peers`")
+    hy = pytest.importorskip("heyoka", reason="needs the extra `peers`")
+    from replays.studies.peers import taylor_equations as taylor
+    from replays.studies.peers.diffrax_solver import evaluate
+
+    given = replace(problem(0.03), phase=phase, onset_speed=0.1)
+    kind = taylor.kind_of(given, phase, hit=True)._replace(exact=True)
+    variables, rates, _ = taylor.equations(kind)
+    function = hy.cfunc(rates, vars=variables)
+    numbers = taylor.numbers_of(given)
+    values = np.array([numbers[name] for name in taylor.PARAMETERS])
+    for y in states_in_contact(given, count=2):
+        scaled = taylor.to_series(y, ideal_drive=False)
+        wanted = function(scaled, pars=values[: function.nparams], time=0.0213)
+        with jax.enable_x64(True):
+            found = np.array(evaluate(kind, 0.0213, scaled, values)[0])
+        np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-12 * np.max(np.abs(wanted)))
+
+
 @pytest.mark.parametrize(("friction", "contact"), [("smoothed", {}), ("exact", {"damping_factor": 0.0})])
 @pytest.mark.parametrize(("name", "tolerance", "within"), [("heyoka", 1e-15, 1e-8), ("cvode-adams", 1e-13, 2e-7)])
 def test_tight_solvers_agree(name: str, tolerance: float, within: float, friction: str, contact: dict) -> None:
@@ -173,6 +194,8 @@ def test_a_drop_meets_the_ring_after_the_time_of_a_pendulum() -> None:
 
 @pytest.mark.parametrize("name", PEERS)
 def test_every_peer_flies(name: str) -> None:
+    if not PEERS[name].quick:
+        pytest.skip("compiles for a minute; its equations are compared by themselves")
     given = problem(0.004, friction=None if PEERS[name].exact_friction else "smoothed")
     wanted = solve("scipy-dop853", given, 1e-12)
     if LIBRARY[name]:

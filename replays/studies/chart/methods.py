@@ -68,6 +68,6 @@ def _peer(name: str) -> Competitor:
     peer = PEERS[name]
     # The coarsest, one in the middle, and the finest that is worth its time.
     picks = sorted({0, len(peer.ladder) // 2, max(len(peer.ladder) - 2, 0)})
-    quick = tuple(peer.ladder[i] for i in picks[:_QUICK_PEERS])
+    quick = tuple(peer.ladder[i] for i in picks[:_QUICK_PEERS]) if peer.quick else ()
     title = peer.title.replace(", plain Python", ", as installed")
     return Competitor(name, title, peer.family, peer.ladder, quick, peer.known_failure)

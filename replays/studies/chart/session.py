@@ -352,7 +352,7 @@ def _walk_ladders(work: _Work, panel: str, outcome: Outcome, progress: Progress,
     if work.mode == "quick":
         # A quick chart has no time for scipy's steps in Python over a whole scene.
         slow = ("scipy-radau", "scipy-bdf") if panel == "profile" else ("scipy",)
-        rivals = [one for one in rivals if one.name not in slow and one.family not in slow]
+        rivals = [one for one in rivals if one.quick and one.name not in slow and one.family not in slow]
     budget = BUDGETS[work.mode]._replace(solve_s=1.0 if work.mode == "quick" else 5.0)
     for phase, make in problems.items():
         progress.step(f"{panel}, {phase}")

@@ -29,7 +29,7 @@ _LATER = {"own_cpu_s"}
 """Columns that tables of earlier versions lack."""
 _TEXT = {*KEY, "title", "family", "known_failure", "friction", "reference", "failure", "message", "code", "commit",
          "date", "machine", "versions"}  # fmt: skip
-_LIBRARIES = (provenance.RIG, "numba", "numpy", "scipy", "heyoka", "scikit-sundae", "mujoco")
+_LIBRARIES = (provenance.RIG, "numba", "numpy", "scipy", "heyoka", "scikit-sundae", "mujoco", "diffrax")
 _MEASURING = ("measure.py", "phases.py", "profile.py")
 
 Row = dict[str, Any]

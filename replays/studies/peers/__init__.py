@@ -9,6 +9,11 @@ is MultibodyPlant's: point contact is linear in the penetration (1, 10 and 100 N
 constant dissipation, so it has neither K delta^1.5 nor a c/v0 that is latched at each onset, and the hollow ring would
 be a polygon, as it is for MuJoCo. Our law could be put in as a system of external forces in Python, at 15 us and more a
 step, which leaves out just what CENIC is for.
+
+Siconos is not on the Python package index; its time stepping has rigid contacts. SciML's solvers need Julia beside
+Python, and may be added to a chart by their results (`rig chart --add`). IDA, SUNDIALS' solver of algebraic equations,
+was not tried: rolling is solved for its friction, so that each phase is an ordinary equation, and IDA's method is that
+of CVODE's BDF. `pychrono` on that index is another thing than Chrono.
 """
 
 from __future__ import annotations
@@ -64,6 +69,7 @@ class Peer:
         options: What the driving module's `solve` is given beside the problem and its manner.
         manner: How it is driven.
         model_failure: Why its very model is expected to mislead; empty for a peer that has the rig's.
+        quick: Whether a quick chart has it: not where compiling alone takes longer than that may.
     """
 
     name: str
@@ -73,6 +79,7 @@ class Peer:
     options: dict[str, Any] = field(default_factory=dict)
     manner: Manner = PROPER
     model_failure: str = ""
+    quick: bool = True
 
     @property
     def family(self) -> str:
@@ -135,6 +142,7 @@ _PLAIN, _UNSTOPPED, _EVENTLESS = Manner(plain=True), Manner(stops=False), Manner
 _SCIPY, _SUNDIALS = Library("scipy", "scipy_solvers"), Library("SUNDIALS", "cvode", "sksundae")
 _BDF, _DOP853 = {"method": "BDF"}, {"method": "DOP853"}
 _CVODE_ADAMS, _CVODE_BDF = {"method": 1}, {"method": 2}
+_JAX = Library("diffrax", "diffrax_solver", "diffrax")
 _MUJOCO = "another contact law and a polygon for the ring: the error is the model's"
 
 _ALL = (
@@ -162,6 +170,9 @@ _ALL = (
     Peer(
         "heyoka", "heyoka, Taylor series", Library("heyoka", "taylor", "heyoka"),
         _ladder(1e-3, 1e-4, 1e-5, 1e-6, 1e-8, 1e-10, 1e-12, 1e-15),
+    ),
+    Peer(
+        "diffrax", "diffrax Dopri8, on JAX", _JAX, _ladder(1e-3, 1e-5, 1e-6, 1e-8, 1e-10), quick=False,
     ),
     Peer(
         "mujoco", "MuJoCo, closest model", Library("MuJoCo", "mujoco_engine", "mujoco"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -76,10 +77,13 @@ class Solution:
     failure: str | None = None
     own_s: float | None = None
     cpu_s: float = math.nan
+    clock: Callable[[], float] = time.thread_time
+    """Of processor time: the calling thread's, or the process's for a library that works in threads of its own."""
     _begin: float = field(default_factory=time.perf_counter)
-    _cpu_begin: float = field(default_factory=time.thread_time)
+    _cpu_begin: float = field(init=False)
 
     def __post_init__(self) -> None:
+        self._cpu_begin = self.clock()
         self.states = np.full((len(self.times), N_STATE), np.nan)
 
     @property
@@ -99,7 +103,7 @@ class Solution:
 
     def close(self) -> Solution:
         """The same, with the time that it took."""
-        self.cpu_s = time.thread_time() - self._cpu_begin
+        self.cpu_s = self.clock() - self._cpu_begin
         if self.failure is None and not np.isfinite(self.states).all():
             self.failure = "the state is not finite"
         return self

@@ -28,6 +28,7 @@ from __future__ import annotations
 
 import functools
 import time
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -57,7 +58,7 @@ _STEPS = 200_000
 """Steps between two of them."""
 
 
-class _System(NamedTuple):
+class System(NamedTuple):
     """A compiled system and what its events lead to. The integrator is used again by every solve."""
 
     integrator: Any
@@ -76,6 +77,28 @@ def solve(problem: Problem, *, setting: Setting, budget_s: float) -> Solution:
         setting: Tolerance; an absolute one has no meaning here.
         budget_s: Wall time allowed [s].
     """
+    return solve_by_phases(problem, setting.tolerance, budget_s, _system, _contact_function)
+
+
+def solve_by_phases(
+    problem: Problem,
+    tolerance: float,
+    budget_s: float,
+    make_system: Callable[[Kind, float], System],
+    make_contact: Callable[[Kind], Any],
+    clock: Callable[[], float] = time.thread_time,
+) -> Solution:
+    """Solve a problem phase by phase, each a smooth system of its own.
+
+    Args:
+        problem: The problem.
+        tolerance: Of the integrators.
+        budget_s: Wall time allowed [s].
+        make_system: Makes the integrator of a kind of system, with heyoka's interface, and what its events lead to.
+        make_contact: Makes the function of a state, `pars` and `time` that gives penetration, its rate, sliding speed,
+            normal force and the friction that rolling needs.
+        clock: Of processor time [s].
+    """
     _check(problem)
     # Whatever this problem may meet is compiled before the clock starts.
     begin = time.perf_counter()
@@ -83,10 +106,10 @@ def solve(problem: Problem, *, setting: Setting, budget_s: float) -> Solution:
     first = kind_of(problem, FLIGHT, hit=False)
     for phase in (FLIGHT, *touching, *((SLACK,) if first.damped or first.viscous else ())):
         for hit in {False, problem.pulse is not None}:
-            _system(kind_of(problem, phase, hit=hit), setting.tolerance)
-            _contact_function(kind_of(problem, ROLLING, hit=hit))
-    solution = Solution(problem.times, budget_s, time.perf_counter() - begin)
-    _run(problem, setting.tolerance, solution)
+            make_system(kind_of(problem, phase, hit=hit), tolerance)
+            make_contact(kind_of(problem, ROLLING, hit=hit))
+    solution = Solution(problem.times, budget_s, time.perf_counter() - begin, clock=clock)
+    _run(problem, tolerance, solution, make_system, make_contact)
     house = problem.constants.house
     for stretch, stiffness in (
         (solution.states[:, 4] - solution.states[:, 6], house.pair_stiffness_vertical),
@@ -105,19 +128,25 @@ def _check(problem: Problem) -> None:
         raise NotImplementedError("the series has no switch friction")
 
 
-def _run(problem: Problem, tolerance: float, solution: Solution) -> None:
+def _run(
+    problem: Problem,
+    tolerance: float,
+    solution: Solution,
+    make_system: Callable[[Kind, float], System],
+    make_contact: Callable[[Kind], Any],
+) -> None:
     """Go from phase to phase until the end, into the solution."""
     numbers = numbers_of(problem)
     values = np.array([numbers[name] for name in PARAMETERS])
     margin_at, speed_at = PARAMETERS.index("margin"), PARAMETERS.index("v0")
 
     @functools.cache
-    def system_of(phase: int, hit: bool) -> _System:
-        return _system(kind_of(problem, phase, hit=hit), tolerance)
+    def system_of(phase: int, hit: bool) -> System:
+        return make_system(kind_of(problem, phase, hit=hit), tolerance)
 
     @functools.cache
     def contact_of(hit: bool) -> Any:
-        return _contact_function(kind_of(problem, ROLLING, hit=hit))
+        return make_contact(kind_of(problem, ROLLING, hit=hit))
 
     def look(time_s: float, state: np.ndarray) -> list[float]:
         contact_at = contact_of(hit)
@@ -146,9 +175,9 @@ def _run(problem: Problem, tolerance: float, solution: Solution) -> None:
         wanted = wanted[wanted < corners[0]]
         goal = corners[0] if len(wanted) < _CHUNK else float(wanted[-1])
         grid = np.concatenate(([t], wanted[wanted < goal], [goal]))
-        begin = time.thread_time()
+        begin = solution.clock()
         outcome, _, _, steps, _, reached = series.propagate_grid(grid, max_steps=_STEPS)
-        own_s += time.thread_time() - begin
+        own_s += solution.clock() - begin
         solution.steps += int(steps)
         solution.evaluations += int(steps) * series.order
         # The goal itself is a sample only where it is wanted.
@@ -204,38 +233,40 @@ def _margin(problem: Problem, rate: float, tolerance: float) -> float:
     return max(depth, _LEAST_MARGIN)
 
 
+def events_of(kind: Kind, seen: dict[str, Any], p: dict[str, Any]) -> list[tuple[Any, int, int]]:
+    """Functions that end a phase where they pass 0, the sign of their slope there, and the phase that follows."""
+    sliding = FORWARD if kind.exact else TOUCHING
+    # The gap by its square where it is no part of the motion: heyoka's step suits the motion's series, not that of an
+    # event, and the root has branch points where the shaft passes the ring's middle.
+    inside = seen["square"] - (p["r0"] + (p["margin"] if kind.phase != FLIGHT else 0.0)) ** 2.0
+    if kind.phase == FLIGHT:
+        return [(inside, 1, sliding)]
+    events = [(inside if kind.phase == SLACK else seen["depth"] - p["margin"], -1, FLIGHT)]
+    if kind.damped or kind.viscous:
+        events.append((seen["pull"], 1, sliding) if kind.phase == SLACK else (seen["pull"], -1, SLACK))
+    if kind.phase in (FORWARD, BACKWARD):
+        events.append((seen["sliding"], -1 if kind.phase == FORWARD else 1, _REST))
+    elif kind.phase == ROLLING:
+        events.append((p["mu"] * seen["normal"] - seen["friction"], -1, FORWARD))
+        events.append((p["mu"] * seen["normal"] + seen["friction"], -1, BACKWARD))
+    return events
+
+
 @functools.cache
-def _system(kind: Kind, tolerance: float) -> _System:
+def _system(kind: Kind, tolerance: float) -> System:
     """Compile one phase."""
     hy = heyoka()
     variables, rates, seen = equations(kind)
-    down, up = hy.event_direction.negative, hy.event_direction.positive
-    sliding = FORWARD if kind.exact else TOUCHING
-    watched: list[tuple[Any, Any, int]] = []
-    # The gap by its square where it is no part of the motion: heyoka's step suits the motion's series, not that of an
-    # event, and the root has branch points where the shaft passes the ring's middle.
-    inside = seen["square"] - (parameter("r0") + (parameter("margin") if kind.phase != FLIGHT else 0.0)) ** 2.0
-    if kind.phase == FLIGHT:
-        watched.append((inside, up, sliding))
-    else:
-        watched.append((inside if kind.phase == SLACK else seen["depth"] - parameter("margin"), down, FLIGHT))
-        if kind.damped or kind.viscous:
-            watched.append((seen["pull"], up, sliding) if kind.phase == SLACK else (seen["pull"], down, SLACK))
-    if kind.phase == FORWARD:
-        watched.append((seen["sliding"], down, _REST))
-    elif kind.phase == BACKWARD:
-        watched.append((seen["sliding"], up, _REST))
-    elif kind.phase == ROLLING:
-        watched.append((parameter("mu") * seen["normal"] - seen["friction"], down, FORWARD))
-        watched.append((parameter("mu") * seen["normal"] + seen["friction"], down, BACKWARD))
+    events = events_of(kind, seen, {name: parameter(name) for name in PARAMETERS})
+    ways = {-1: hy.event_direction.negative, 1: hy.event_direction.positive}
     integrator = hy.taylor_adaptive(
         sys=list(zip(variables, rates, strict=True)),
         state=np.zeros(14),
         tol=tolerance,
-        t_events=[hy.t_event(function, direction=way) for function, way, _ in watched],
+        t_events=[hy.t_event(function, direction=ways[way]) for function, way, _ in events],
         fast_math=True,
     )
-    return _System(integrator, tuple(following for _, _, following in watched))
+    return System(integrator, tuple(following for _, _, following in events))
 
 
 @functools.cache

@@ -145,10 +145,22 @@ def equations(kind: Kind) -> tuple[list[Any], list[Any], dict[str, Any]]:
     """Scaled states, their rates, and what the events look at, as heyoka's expressions."""
     hy = heyoka()
     scaled = hy.make_vars(*[f"q{i}" for i in range(14)])
+    rates, seen = rates_of(kind, scaled, {name: parameter(name) for name in PARAMETERS}, hy)
+    return list(scaled), rates, seen
+
+
+def rates_of(kind: Kind, scaled: Any, p: dict[str, Any], hy: Any) -> tuple[list[Any], dict[str, Any]]:
+    """Rates of the scaled states, and what the events look at.
+
+    Args:
+        kind: Form of the system.
+        scaled: The 14 scaled states.
+        p: Numbers of the problem, by name.
+        hy: Library of the functions and of the time: heyoka, or another with the same names.
+    """
     ux, uy, theta, xi, yi, xo, yo, vx, vy, spin, vxi, vyi, vxo, vyo = (
         q * float(scale) for q, scale in zip(scaled, SERIES_SCALE, strict=True)
     )
-    p = {name: parameter(name) for name in PARAMETERS}
     Ixx, Izz, lA, lB, lI, R = (p[name] for name in ("Ixx", "Izz", "lA", "lB", "lI", "R"))
 
     # The axis, and theta' from the spin about it: w = theta' + u_x G', tan G = -u_y/u_z.
@@ -251,7 +263,7 @@ def equations(kind: Kind) -> tuple[list[Any], list[Any], dict[str, Any]]:
         "pull": pull,
         "friction": friction,
     }
-    return list(scaled), [value / float(scale) for value, scale in zip(rates, SERIES_SCALE, strict=True)], seen
+    return [value / float(scale) for value, scale in zip(rates, SERIES_SCALE, strict=True)], seen
 
 
 def _magnet(kind: Kind, p: dict[str, Any], x: Any, y: Any) -> tuple[Any, Any]:

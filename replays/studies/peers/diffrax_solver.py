@@ -1,0 +1,178 @@
+"""diffrax, on JAX: Dormand and Prince's 8(7) pair with a PI controller, on the equations of `taylor_equations`.
+
+Each phase is compiled by XLA, with its events, which bisection on the step's interpolant locates. The Python loop that
+leads from one phase to the next is that of heyoka (`replays.studies.peers.taylor`); what is spent inside the compiled
+phases is the solution's `own_s`. Processor time is that of the process, as XLA works in threads of its own.
+"""
+
+from __future__ import annotations
+
+import functools
+import time
+from importlib import import_module
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from replays.studies.peers.problem import Problem
+from replays.studies.peers.solution import Setting, Solution
+from replays.studies.peers.taylor import System, events_of, solve_by_phases
+from replays.studies.peers.taylor_equations import PARAMETERS, Kind, rates_of
+from rig.kernels.magnet import RIPPLED
+
+_SAMPLES = 501
+"""Instants of one call: its arrays have one shape, so that each phase is compiled once."""
+_STEPS = 4_096
+_FIRST_STEP_S = 1e-6
+"""First step of a phase: a function that is 0 but for rounding at the start shows its sign before it falls again."""
+_TINY = 1e-13
+"""Of the time of an event, part of the step."""
+
+
+def solve(problem: Problem, *, setting: Setting, budget_s: float) -> Solution:
+    """Solve a problem by diffrax.
+
+    Args:
+        problem: The problem.
+        setting: Tolerance, relative and of the scaled states.
+        budget_s: Wall time allowed [s].
+    """
+    import jax
+
+    with jax.enable_x64(True):
+        return solve_by_phases(problem, setting.tolerance, budget_s, _system, _contact_function, time.process_time)
+
+
+def _library(time_s: Any) -> Any:
+    """The functions that the equations are written with."""
+    import jax.numpy as jnp
+
+    def root(x: Any) -> Any:
+        return jnp.sqrt(jnp.maximum(x, 0.0))  # a trial step may leave the contact
+
+    return SimpleNamespace(sqrt=root, sin=jnp.sin, cos=jnp.cos, tanh=jnp.tanh, expression=float, time=time_s)
+
+
+def evaluate(kind: Kind, time_s: Any, state: Any, pars: Any) -> tuple[Any, dict[str, Any], dict[str, Any]]:
+    """Rates, what the events look at, and the numbers by name."""
+    import jax.numpy as jnp
+
+    numbers = dict(zip(PARAMETERS, pars, strict=True))
+    rates, seen = rates_of(kind, list(state), numbers, _library(time_s))
+    return jnp.stack([jnp.asarray(rate, float) for rate in rates]), seen, numbers
+
+
+class _Phase:
+    """One phase with heyoka's interface: `propagate_grid` ends at the grid's end or at an event."""
+
+    order = 13
+    """Stages of a step."""
+
+    def __init__(self, kind: Kind, tolerance: float) -> None:
+        self.time, self.state, self.pars = 0.0, np.full(14, 1e-2), np.ones(len(PARAMETERS))
+        self._tolerance = tolerance
+        self._solve, self.following = _compiled(kind)
+        self._rates = _compiled_rates(kind)
+
+    def reset_cooldowns(self) -> None:
+        """There are none: an event counts only where its function passes 0 in the right direction."""
+
+    def propagate_grid(self, grid: np.ndarray, max_steps: int) -> tuple[int, None, None, int, None, np.ndarray]:
+        """Go on to the end of a grid, or to an event; see heyoka."""
+        wanted = np.full(_SAMPLES, grid[-1])
+        wanted[: len(grid) - 1] = grid[1:]
+        time_s, state, samples, which, steps = self._solve(
+            self.time, grid[-1], wanted, self.state, self.pars, self._tolerance
+        )
+        self.time, self.state = float(time_s), np.array(state)
+        kept = int(np.searchsorted(grid, self.time, side="right"))
+        reached = np.concatenate([self.state[None], np.array(samples)])[: max(kept, 1)]
+        return -1 - int(which), None, None, int(steps), None, reached
+
+    def update_d_output(self, time_s: float) -> np.ndarray:
+        """State a little beyond the end, by one step of the classical Runge-Kutta method."""
+        h, y = time_s - self.time, self.state
+        a = self._rates(self.time, y, self.pars)
+        b = self._rates(self.time + 0.5 * h, y + 0.5 * h * a, self.pars)
+        c = self._rates(self.time + 0.5 * h, y + 0.5 * h * b, self.pars)
+        d = self._rates(self.time + h, y + h * c, self.pars)
+        return np.array(y + h / 6.0 * (a + 2.0 * b + 2.0 * c + d))
+
+
+@functools.cache
+def _system(kind: Kind, tolerance: float) -> System:
+    """One phase, compiled."""
+    if kind.terms == RIPPLED:
+        raise NotImplementedError("the map with ripples needs derivatives of the potential")
+    phase = _Phase(kind, tolerance)
+    phase.propagate_grid(np.array([0.0, 1e-9]), 1)
+    return System(phase, phase.following)
+
+
+@functools.cache
+def _compiled_rates(kind: Kind) -> Any:
+    import jax
+
+    return jax.jit(lambda t, y, pars: evaluate(kind, t, y, pars)[0])
+
+
+@functools.cache
+def _compiled(kind: Kind) -> tuple[Any, tuple[int, ...]]:
+    """Solve a phase over a span; the phases that its events lead to."""
+    import diffrax
+    import jax
+    import jax.numpy as jnp
+
+    optimistix: Any = import_module("optimistix")  # its default arguments are none to a type checker
+
+    def rates(t: Any, y: Any, pars: Any) -> Any:
+        return evaluate(kind, t, y, pars)[0]
+
+    _, seen, numbers = evaluate(kind, 0.0, np.full(14, 1e-2), np.ones(len(PARAMETERS)))
+    events = events_of(kind, seen, numbers)
+
+    def left(t: Any, y: Any, args: Any) -> Any:
+        """The events' functions, each positive within the phase."""
+        _, seen, numbers = evaluate(kind, t, y, args)
+        return jnp.stack([-way * value for value, way, _ in events_of(kind, seen, numbers)])
+
+    # One function for all: diffrax's root finders with a bracket take no more.
+    event = diffrax.Event(
+        lambda t, y, args, **_: jnp.min(left(t, y, args)),
+        root_finder=optimistix.Bisection(rtol=_TINY, atol=_TINY, flip="detect"),
+        direction=False,
+    )
+
+    def solve_span(begin: Any, end: Any, wanted: Any, y: Any, pars: Any, tolerance: Any) -> Any:
+        found = diffrax.diffeqsolve(
+            diffrax.ODETerm(rates), diffrax.Dopri8(), begin, end, _FIRST_STEP_S, y, pars,
+            saveat=diffrax.SaveAt(subs=[diffrax.SubSaveAt(ts=wanted), diffrax.SubSaveAt(t1=True)]),
+            stepsize_controller=diffrax.PIDController(rtol=tolerance, atol=tolerance, pcoeff=0.3, icoeff=0.4),
+            max_steps=_STEPS, event=event, throw=False,
+        )  # fmt: skip
+        time_s, state = found.ts[1][0], found.ys[1][0]
+        which = jnp.where(found.event_mask, jnp.argmin(left(time_s, state, pars)), len(events))
+        return time_s, state, found.ys[0], which, found.stats["num_accepted_steps"]
+
+    return jax.jit(solve_span), tuple(following for _, _, following in events)
+
+
+@functools.cache
+def _contact_function(kind: Kind) -> Any:
+    """As heyoka's, of a scaled state."""
+    import jax
+    import jax.numpy as jnp
+
+    @jax.jit
+    def look(state: Any, pars: Any, time: Any) -> Any:
+        _, seen, _ = evaluate(kind, time, state, pars)
+        return jnp.stack(
+            [jnp.asarray(seen[name], float) for name in ("depth", "rate", "sliding", "normal", "friction")]
+        )
+
+    def contact_at(state: np.ndarray, pars: np.ndarray, time: float) -> np.ndarray:
+        return np.array(look(state, pars, time))
+
+    contact_at.nparams = len(PARAMETERS)  # pyrefly: ignore[missing-attribute]
+    return contact_at
