@@ -422,7 +422,7 @@ def _score_wires(
     open_ = {name for name in fits if name in ambiguous and wires[name].turned and name not in fixed}
     mixed = len({signs[name] for name in open_}) > 1
     if open_ and not mixed:
-        card.doubts.append(f"the polarity of {', '.join(sorted(open_))} is open: half a period later it is inverted")
+        card.remarks.append(f"the polarity of {', '.join(sorted(open_))} is open: half a period later it is inverted")
     rows = []
     for name, wire in wires.items():
         verdict: Verdict = NO_LIMIT
