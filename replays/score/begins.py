@@ -61,8 +61,6 @@ class Begins:
         others = sorted((each for each in sources if each is not one), key=lambda each: each.wire.likeness)
         self._one, self._default = one, stretches
         self._compared = [one, *(each for each in others if each.wire.likeness > SOUND)][:_COMPARED]
-        if isinstance(one.stimulus, Exact):  # of test signals each channel has the same
-            self._compared = [one]
         self._tried: list[tuple[np.ndarray, Alignment]] = []
         self._shifts: list[float] = []
         self._followed = set[int]()
