@@ -122,7 +122,7 @@ def draw_markers(place: Any, rows: list[Row]) -> None:
 
     entries = []
     for row in {row["method"]: row for row in rows}.values():
-        entries.append((Line2D([], [], **_style(row, rows)), row["method"]))
+        entries.append((Line2D([], [], **_style(row, rows)), row["method"].replace("-python", "\n(plain Python)")))
         if any(one["own_cpu_s"] for one in rows if one["method"] == row["method"]):
             entries.append((Line2D([], [], **_style(row, rows) | {"mfc": "white"}), f"{row['method']} alone"))
     for color, text in ((QUIET, "cannot run the\nfriction law"), (ALARM, "failed, or error\nabove the target")):
