@@ -25,7 +25,7 @@ from replays.score.scorecard import (
     Verdict,
     text_row,
 )
-from replays.score.sent import Formula, Session
+from replays.score.sent import LOUD, Formula, Session
 from replays.score.sine import fit_sine, is_sine, quality
 from replays.score.stamps import Stamps
 from replays.score.stimulus import Exact, Sampled, Stimulus, parted, without_noise
@@ -54,8 +54,8 @@ _SEEN = 4.0
 """Noises of a channel that what is above half of the rate has to come to."""
 _LONGEST = 1 << 14
 """Samples by which a signal is told to be a sine."""
-_LOUD, _MANY = 4.0, 1000
-"""Noises of a channel, and rows, from which what was sent must be found."""
+_MANY = 1000
+"""Rows from which what was sent must be found."""
 _NAMED = 5
 """Steps that are named in a note; the JSON has all."""
 _EDGE = 100
@@ -392,19 +392,9 @@ def _same_corner(one: Fitted, other: Fitted) -> bool:
     return abs(one.corner_hz[0] / other.corner_hz[0] - 1.0) < _SAME_CORNER
 
 
-def _is_loud(session: Session, name: str, alignments: Sequence[Alignment]) -> bool:
-    """Return whether a channel's signal is well above its noise in the part of the session that was recorded."""
-    channel, (sent, first_s, rate_hz) = session.channels[name], session.whole(name)
-    ends_s = [end for each in alignments for end in each.inside_s]
-    rows = [round((each - first_s) * rate_hz) for each in (min(ends_s, default=first_s), max(ends_s, default=first_s))]
-    part = sent[max(0, rows[0]) : max(0, rows[1])] if ends_s else sent
-    least = _LOUD * math.hypot(channel.noise_v, channel.lsb_v) / abs(channel.sensitivity_v)
-    return len(part) > 1 and float(np.std(part)) > least
-
-
 def _is_biased(signal: Recorded, channel: Channel) -> bool:
     """Return whether an inverted signal would show in its offset: it is in volts, and the channel has a bias."""
-    return units.kind(signal.unit) == "voltage" and abs(channel.bias_v) > _LOUD * channel.noise_v
+    return units.kind(signal.unit) == "voltage" and abs(channel.bias_v) > LOUD * channel.noise_v
 
 
 def _score_wires(
@@ -428,7 +418,7 @@ def _score_wires(
         verdict: Verdict = NO_LIMIT
         note = f"correlation {wire.likeness:.4f}"
         absent = not wire.channel and name in session.channels and recorded[name].rows >= _MANY
-        if absent and _is_loud(session, name, alignments):
+        if absent and session.is_loud(name, [end for each in alignments for end in each.inside_s]):
             verdict, note = FAIL, "nothing of what was sent is in it"
         elif name in fits and name in session.channels and name not in (wire.channel, *wire.rivals):
             verdict = FAIL

@@ -25,6 +25,8 @@ _PART = 1 << 16
 _TRIGGERS = ("hammer", "speed", "release", "fault")
 _SMOOTH = ("sine", "two-tone", "chirp", "multisine", "quiet", "recorded")
 """Test signals that are known between samples; in the others an instant lies on this or that side of a jump."""
+LOUD = 4.0
+"""Noises of a channel from which its signal must be found."""
 _EARLY_S = 30.0
 """So much of a session is looked through for where a recording begins [s]."""
 
@@ -153,6 +155,14 @@ class Session:
             self._kept = {group: (samples.values, float(samples.times_s[0]), samples.rate_hz)}
         values, first_s, rate_hz = self._kept[group]
         return values[:, self.place(name)], first_s, rate_hz
+
+    def is_loud(self, name: str, ends_s: Sequence[float]) -> bool:
+        """Return whether a channel's signal is well above its noise between two times [s] of the session."""
+        channel, (sent, first_s, rate_hz) = self.channels[name], self.whole(name)
+        rows = [round((each - first_s) * rate_hz) for each in (min(ends_s), max(ends_s))] if ends_s else [0, len(sent)]
+        part = sent[max(0, rows[0]) : max(0, rows[1])]
+        least = LOUD * math.hypot(channel.noise_v, channel.lsb_v) / abs(channel.sensitivity_v)
+        return len(part) > 1 and float(np.std(part)) > least
 
 
 def _formula(source: Source) -> Formula:
