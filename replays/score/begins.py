@@ -73,6 +73,7 @@ class Begins:
         ]
         loud = _LOUD_PART * float(np.nanvar(one.values[slice(*stretches(0.0)[0])]))
         self._parts = [each for each in self._parts if np.nanvar(one.values[slice(*each)]) >= loud]
+        self._busy = _busy_rows(one.values, stretches(0.0)[0])
         self._left: list[np.ndarray] = []
         self._least = math.inf
 
@@ -141,15 +142,18 @@ class Begins:
 
     @property
     def _settled(self) -> bool:
-        """Return whether two begins leave nothing but noise of DAQ and session, and one of them no row unexplained."""
+        """Return whether two begins leave nothing but noise of DAQ and session, and one of them no row unexplained.
+
+        That one is upright: half a period later a signal is inverted.
+        """
         alike = self.alike() if self._least < 1.0 else []
-        return len(alike) > 1 and any(each.whole and not self.outside(each) for each in alike)
+        return len(alike) > 1 and any(each.whole and each.upright and not self.outside(each) for each in alike)
 
     def outside(self, found: Alignment) -> int:
         """Return how many rows before and behind the session, from a begin, are as loud as those in it."""
         first, last = found.track.inside
         loud = _LOUD_PART * float(np.nanvar(self._one.values[first:last]))
-        parts = [self._one.values[:first], self._one.values[last:]]
+        parts = [self._one.values[self._busy[0] : first], self._one.values[last : self._busy[1]]]
         return sum(len(part) for part in parts if len(part) >= _EDGE_ROWS and np.nanvar(part) >= loud)
 
     def unaccounted(self, found: Alignment) -> int:
@@ -194,10 +198,14 @@ class Begins:
         return [*self._default(shift_s), *best]
 
     def _rows_inside(self, shift_s: float) -> int:
-        """Return how many rows of the record lie in the session from a begin."""
+        """Return how many rows lie in the session from a begin; quiet ones at the ends of the record count against it.
+
+        A DAQ that was started before the session, or stopped after it, has such rows.
+        """
         one = self._one
         places = [(each - one.late_s - shift_s - one.first_s) * one.rate_hz for each in one.stimulus.span_s]
-        return round(min(len(one.values), places[1]) - max(0.0, places[0]))
+        inside, busy = (min(b, places[1]) - max(a, places[0]) for a, b in ((0, len(one.values)), self._busy))
+        return round(2.0 * max(0.0, busy) - inside)
 
     def _stretch_excess(self) -> np.ndarray:
         """Return the logarithm of each begin's residual power over the least, by its soundest stretches."""
@@ -234,6 +242,22 @@ class Begins:
                 if np.isfinite(power).any():
                     self._tried.append((power, found))
                     self._least = min(self._least, float(np.nanmax(_medians(power))))
+
+
+def _busy_rows(values: np.ndarray, stretch: tuple[int, int]) -> tuple[int, int]:
+    """Return the rows of a record without quiet ones at its ends: the first one, and the one after the last.
+
+    Args:
+        values: Of the record, shape (n,).
+        stretch: Rows in which the signal changes most: the first one, and the one after the last.
+    """
+    centred = values - np.nanmean(values)
+    power = _block_means(centred**2) - _block_means(centred) ** 2
+    least = _LOUD_PART * float(np.nanvar(centred[slice(*stretch)]))
+    loud = np.flatnonzero(power >= min(least, _LOUD_PART * float(np.nanmax(power, initial=0.0))))
+    first, last = (int(loud[0]), int(loud[-1]) + 1) if len(loud) else (0, len(power))
+    # What is left after the last whole block counts as that block does.
+    return first * _BLOCK_ROWS, len(values) if last == len(power) else last * _BLOCK_ROWS
 
 
 def _outlying(fit: Waveform) -> np.ndarray:

@@ -44,11 +44,11 @@ def find_crosstalk(
         return int(own_part.argmin()), None
     parts, *moved = np.linalg.lstsq(matrix, np.column_stack([left, *map(detrend, errors)]), rcond=None)[0].T
     covariance, freedom = sandwich(matrix, left - matrix @ parts)
-    held = slice(len(sources))
+    held, own_size = slice(len(sources)), sizes[len(sources)]
     sizes, parts = sizes[held], np.abs(parts[held] / sizes[held])
     value, low, high = simultaneous(parts, np.sqrt(np.diag(covariance)[held]) / sizes, freedom[held])
     # Noise of the own signal, which is in the residual, is in what of a source is not like that signal, too.
-    likest = np.abs(likeness[held, len(sources)]) * sizes / max(float(np.std(own[0])), 1e-300)
+    likest = np.abs(likeness[held, len(sources)]) * sizes / own_size
     wrong = _NOISE_DOUBT * noise**2 * likest / (own_part * sizes**2)
     wrong += np.max(np.abs(np.reshape(moved, (-1, len(matrix.T)))[:, held]), axis=0, initial=0.0) / sizes
     return int(parts.argmax()), (value, max(0.0, low - float(wrong.max())), high + float(wrong.max()))

@@ -92,15 +92,19 @@ def intermodulation(times_s: np.ndarray, known: np.ndarray, residual: np.ndarray
     if found is None:
         return None
     (low, high), power = found
-    folded = [abs((a * high + b * low + 0.5) % 1.0 - 0.5) for a, b in _ORDERS]
-    least = 2.0 / len(n)
-    apart = [least < each < 0.5 - least and min(abs(each - low), abs(each - high)) > least for each in folded]
-    turns = [each for each, seen in zip(folded, apart, strict=True) if seen]
-    counted = slice(sum(apart[:_COUNTED]))
+    least, turns, counted = 2.0 / len(n), list[float](), 0
+    for number, (a, b) in enumerate(_ORDERS):
+        # A product beyond half of the rate, or beside a tone or another product, is not known as one of its own.
+        product = abs(a * high + b * low)
+        if product < 0.5 - least and min(abs(product - each) for each in (0.0, low, high, *turns)) > least:
+            turns.append(product)
+            counted += number < _COUNTED
+    if not counted:
+        return None
     basis = _basis(n, turns)
     parts = np.linalg.lstsq(basis, residual, rcond=None)[0]
     line = 2.0 * float(np.var(residual - basis @ parts)) / len(n)  # variance of one part of a line
-    squares = (parts[: len(turns)] ** 2 + parts[len(turns) : -1] ** 2)[counted].tolist()
+    squares = (parts[: len(turns)] ** 2 + parts[len(turns) : -1] ** 2)[:counted].tolist()
     half = 1.96 * math.sqrt(sum(4.0 * line * each + 4.0 * line**2 for each in squares))
     return decibels(0.5 * sum(squares) / (gain**2 * power), 0.5 * half / (gain**2 * power))
 

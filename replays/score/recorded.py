@@ -29,6 +29,9 @@ _ALIKE = 0.2
 _REGULAR, _ROUNDED = 0.9, 1.1
 """Part of the steps that are alike where stamps are not rounded to a coarse resolution, and deviation of such stamps
 from a line, peak to peak, over their largest step, at most."""
+_MAX_SCATTER, _MIN_GAP = 5.0, 3.0
+"""The same over the usual step for stamps of which some go back by jitter, and steps over the usual one from which rows
+are missing: jitter of a quarter of a step, rms, reaches 5 steps peak to peak and steps of 2.5."""
 Pieces = Callable[[Sequence[int]], Iterable[np.ndarray]]
 
 
@@ -114,12 +117,19 @@ class Table:
         steps = np.diff(times_s)
         usual = float(np.median(steps))
         alike = steps[np.abs(steps - usual) < _ALIKE * usual]
-        if steps.min() >= 0.0 and len(alike) < _REGULAR * len(steps):
-            # Stamps of a coarse resolution: their steps are multiples of it.
-            rows = np.arange(len(times_s))
-            line = np.polynomial.Polynomial.fit(rows, times_s, 1)
-            if 0.0 < np.ptp(times_s - line(rows)) <= _ROUNDED * steps.max():
-                return 1.0 / float(line.convert().coef[1])
+        if usual >= 0.0 and len(alike) < _REGULAR * len(steps):
+            # Stamps of a coarse resolution, whose steps are multiples of it, or with jitter: a line shows the rate.
+            most_s = _ROUNDED * steps.max() if steps.min() >= 0.0 else _MAX_SCATTER * usual
+            gaps, counts = (usual > 0.0) & (steps > _MIN_GAP * usual), np.ones(len(steps))
+            late = missing = _fit_line(times_s, counts)
+            period_s = usual
+            for _ in range(2 if gaps.any() else 0):
+                counts[gaps] = np.rint(steps[gaps] / period_s)
+                missing = _fit_line(times_s, counts)
+                period_s = max(missing[1], 1.0 / MAX_RATE_HZ)
+            scatter_s, period_s = min(late, missing)  # a large step is late stamps, or rows are missing there
+            if 0.0 < scatter_s <= most_s and period_s * MAX_RATE_HZ >= 1.0:
+                return 1.0 / period_s
         alike_s, span_s = float(alike.sum()), max(0.0, float(times_s[-1] - times_s[0]))
         return None if 2.0 * alike_s <= span_s or len(alike) > MAX_RATE_HZ * alike_s else len(alike) / alike_s
 
@@ -279,6 +289,18 @@ def separate_rates(signals: Sequence[Recorded], rate_hz: float) -> list[Recorded
                 signal = replace(signal, table=tables[key], told_hz=(signal.rate_hz or rate_hz) / step)
         found.append(signal)
     return found
+
+
+def _fit_line(times_s: np.ndarray, counts: np.ndarray) -> tuple[float, float]:
+    """Return how far stamps scatter about a line, peak to peak, and its time between two rows [s].
+
+    Args:
+        times_s: The stamps [s], shape (n,).
+        counts: Rows from each to the next, shape (n - 1,).
+    """
+    rows = np.append(0.0, np.cumsum(counts))
+    line = np.polynomial.Polynomial.fit(rows, times_s, 1)
+    return float(np.ptp(times_s - line(rows))), float(line(1.0) - line(0.0))
 
 
 def _ends_with_line_end(path: Path) -> bool:

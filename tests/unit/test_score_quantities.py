@@ -56,6 +56,31 @@ def test_intermodulation_is_that_of_a_polynomial(square: float, cube: float) -> 
     held(true - 20.0 * math.log10(1.0 + 2.25 * cube * a**2), judged, 0.5)
 
 
+@pytest.mark.parametrize(
+    ("rate_hz", "low_hz", "high_hz", "rows"),
+    [(4e3, 80.0, 1000.02, 2400), (4e3, 500.0, 1500.02, 4000), (20e3, 300.0, 900.03, 9000)],
+)
+def test_products_that_fold_or_coincide_are_no_intermodulation(
+    rate_hz: float, low_hz: float, high_hz: float, rows: int
+) -> None:
+    t = np.arange(rows) / rate_hz
+    known = 2.0 * (np.sin(2.0 * np.pi * low_hz * t) + np.sin(2.0 * np.pi * high_hz * t + 0.3))
+    for seed in range(4):
+        noise = NOISE * np.random.default_rng(seed).standard_normal(rows)
+        found = intermodulation(t, known, noise, 1.0)
+        assert found is not None
+        assert found[2] < -80.0
+    bent = intermodulation(t, known, 1e-3 * (known**2 - np.mean(known**2)) + noise, 1.0)
+    assert bent is not None
+    assert -61.0 < bent[0] < -53.0  # two lines of a2 A^2 over two tones are -54 dB; one may lie at another one
+
+
+def test_tones_whose_products_are_all_beyond_half_of_the_rate_show_no_intermodulation() -> None:
+    t = np.arange(4000) / 5e3
+    known = np.sin(2.0 * np.pi * 1000.0 * t) + np.sin(2.0 * np.pi * 2000.0 * t + 0.3)
+    assert intermodulation(t, known, NOISE * np.random.default_rng(1).standard_normal(4000), 1.0) is None
+
+
 @pytest.mark.parametrize("kind", ["sine", "noise", "quiet", "chips"])
 def test_what_is_not_two_tones_has_no_intermodulation(kind: str) -> None:
     t, generator = np.arange(4000) / RATE_HZ, np.random.default_rng(1)
@@ -138,6 +163,23 @@ def test_crosstalk_of_equal_signals_is_inconclusive(same: str) -> None:
     own, first = generator.standard_normal((2, 4000))
     second = (own if same == "own" else -first) + 1e-3 * generator.standard_normal(4000)
     assert find_crosstalk(own * 1e-3, [own], [first, second], 0.0, np.empty((0, len(own))))[1] is None
+
+
+@pytest.mark.parametrize(("hz", "amplitude"), [(5.0, 0.3), (8.0, 0.2), (12.0, 0.1)])
+def test_errors_of_a_slow_known_signal_are_no_crosstalk(hz: float, amplitude: float) -> None:
+    from scipy.signal import detrend
+
+    # Without mean and slope of each of 64 blocks, less is left of slow signals than a session's rounding may repeat.
+    t, size = np.arange(24_000) / 48e3, 1.2e-3
+    angle = 2.0 * np.pi * hz * t
+    own = amplitude * np.sin(angle)
+    other = own + 0.3 * amplitude * np.sin(1.7 * angle + 0.4)
+    left = detrend(other, bp=np.linspace(0, len(t), 65).astype(int)[1:-1])
+    error = 0.2 * size * left / np.std(left)
+    known, nothing = own + error, np.empty((0, len(t)))
+    residual = size * np.random.default_rng(1).standard_normal(len(t)) - error
+    part = find_crosstalk(residual, [known, np.gradient(known)], [other], size, nothing)[1]
+    assert part is None or part[1] < 1e-4
 
 
 def steps(respond: Callable[[np.ndarray], np.ndarray], generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:

@@ -62,6 +62,24 @@ def test_lost_rows_do_not_change_the_rate_that_stamps_tell() -> None:
     assert Table(len(stamps), 0, lambda _: [stamps[:, None]]).rate_hz == pytest.approx(RATE_HZ, rel=1e-9)
 
 
+JITTER: dict[str, Callable[[np.ndarray, np.random.Generator], np.ndarray]] = {
+    "10 us, some go back": lambda t, g: t + 1e-5 * g.standard_normal(len(t)),
+    "12.5 us, many go back": lambda t, g: t + 1.25e-5 * g.standard_normal(len(t)),
+    "late by 10 us on average": lambda t, g: t + 1e-5 * g.exponential(1.0, len(t)),
+    "10 us, and 1000 rows are missing": lambda t, g: np.delete(
+        t + 1e-5 * g.uniform(-1.0, 1.0, len(t)), slice(500, 1500)
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", JITTER)
+def test_jitter_does_not_change_the_rate_that_stamps_tell(kind: str) -> None:
+    for seed in range(4):
+        stamps = JITTER[kind](np.arange(12_000) / RATE_HZ, np.random.default_rng(seed))
+        table = Table(len(stamps), 0, lambda _, stamps=stamps: [stamps[:, None]])
+        assert table.rate_hz == pytest.approx(RATE_HZ, rel=3e-6)
+
+
 @pytest.mark.parametrize("kind", STAMPS)
 def test_stamps_do_not_choose_the_path(kind: str, session: Path, counts: np.ndarray, tmp_path: Path) -> None:
     change, right = STAMPS[kind]

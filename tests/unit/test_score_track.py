@@ -348,6 +348,24 @@ def test_a_daq_that_waits_for_a_signal_that_repeats_begins_with_the_session(sess
     assert card.row("judged part").value == pytest.approx(1.0, abs=0.001)
 
 
+@pytest.mark.parametrize(("before_s", "taken_s", "after_s"), [(8.47, 0.8, 0.0), (5.0, 0.55, 0.0), (0.0, 0.8, 7.0)])
+def test_quiet_rows_of_seconds_beside_a_session_that_repeats_are_not_judged(
+    before_s: float, taken_s: float, after_s: float, tmp_path: Path
+) -> None:
+    """Hundreds of begins by whole periods explain the same rows; of these, few leave the quiet rows outside."""
+    sent = Sessions(tmp_path / "sessions").get("test-sine", seed=80, first_s=61.0)
+    begin_s = 61.0 - before_s if before_s else 63.0 - taken_s
+    rows = round((before_s + taken_s + after_s) * RATE_HZ)
+    generator = np.random.default_rng(80)
+    volts = Converter(begin_s, rows, ppm=40.0, idle_s=61.0).volts(sent, generator)
+    for n, channel in enumerate(sent.channels):
+        volts[rows - round(after_s * RATE_HZ) :, n] = channel.bias_v
+    file = write_values("parquet", tmp_path / "daq", as_columns(sent, volts, "V"), np.arange(rows) / RATE_HZ, RATE_HZ)
+    card = judge(file, [sent.path], path="analogue")
+    assert (red(card), card.outcome) == (set(), "pass")
+    assert card.row("judged part").value == pytest.approx(1.0, abs=0.002)
+
+
 def test_exchanged_signals_a_quarter_turn_apart_are_seen() -> None:
     """A later begin and another polarity explain one of the two pairs, not both."""
     t = np.arange(20_000) / RATE_HZ
