@@ -30,6 +30,11 @@ _TINY = 1e-13
 """Of the time of an event, part of the step."""
 
 
+def _module(name: str) -> Any:
+    """A library that may not be installed, imported only now."""
+    return import_module(name)
+
+
 def solve(problem: Problem, *, setting: Setting, budget_s: float) -> Solution:
     """Solve a problem by diffrax.
 
@@ -38,7 +43,7 @@ def solve(problem: Problem, *, setting: Setting, budget_s: float) -> Solution:
         setting: Tolerance, relative and of the scaled states.
         budget_s: Wall time allowed [s].
     """
-    import jax
+    jax = _module("jax")
 
     with jax.enable_x64(True):
         return solve_by_phases(problem, setting.tolerance, budget_s, _system, _contact_function, time.process_time)
@@ -46,7 +51,7 @@ def solve(problem: Problem, *, setting: Setting, budget_s: float) -> Solution:
 
 def _library(time_s: Any) -> Any:
     """The functions that the equations are written with."""
-    import jax.numpy as jnp
+    jnp = _module("jax.numpy")
 
     def root(x: Any) -> Any:
         return jnp.sqrt(jnp.maximum(x, 0.0))  # a trial step may leave the contact
@@ -56,7 +61,7 @@ def _library(time_s: Any) -> Any:
 
 def evaluate(kind: Kind, time_s: Any, state: Any, pars: Any) -> tuple[Any, dict[str, Any], dict[str, Any]]:
     """Rates, what the events look at, and the numbers by name."""
-    import jax.numpy as jnp
+    jnp = _module("jax.numpy")
 
     numbers = dict(zip(PARAMETERS, pars, strict=True))
     rates, seen = rates_of(kind, list(state), numbers, _library(time_s))
@@ -112,7 +117,7 @@ def _system(kind: Kind, tolerance: float) -> System:
 
 @functools.cache
 def _compiled_rates(kind: Kind) -> Any:
-    import jax
+    jax = _module("jax")
 
     return jax.jit(lambda t, y, pars: evaluate(kind, t, y, pars)[0])
 
@@ -120,11 +125,7 @@ def _compiled_rates(kind: Kind) -> Any:
 @functools.cache
 def _compiled(kind: Kind) -> tuple[Any, tuple[int, ...]]:
     """Solve a phase over a span; the phases that its events lead to."""
-    import diffrax
-    import jax
-    import jax.numpy as jnp
-
-    optimistix: Any = import_module("optimistix")  # its default arguments are none to a type checker
+    diffrax, jax, jnp, optimistix = _module("diffrax"), _module("jax"), _module("jax.numpy"), _module("optimistix")
 
     def rates(t: Any, y: Any, pars: Any) -> Any:
         return evaluate(kind, t, y, pars)[0]
@@ -161,8 +162,7 @@ def _compiled(kind: Kind) -> tuple[Any, tuple[int, ...]]:
 @functools.cache
 def _contact_function(kind: Kind) -> Any:
     """As heyoka's, of a scaled state."""
-    import jax
-    import jax.numpy as jnp
+    jax, jnp = _module("jax"), _module("jax.numpy")
 
     @jax.jit
     def look(state: Any, pars: Any, time: Any) -> Any:
