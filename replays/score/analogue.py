@@ -10,7 +10,7 @@ import numpy as np
 
 from replays.score.alignment import align
 from replays.score.following import Alignment, Source
-from replays.score.intervals import sandwich, student
+from replays.score.intervals import about, sandwich, scaled, student
 from replays.score.noise import split_noise
 from replays.score.recorded import Recorded
 from replays.score.rounding import Converter, find_step, undithered, widen
@@ -197,7 +197,7 @@ def _fit(
     if parts is not None:
         at_s = clean.times_s + low.late_at(clean.times_s)
         alias, amounts = _folded(clean, [each(at_s)[0] for each in parts[1:]])
-        folds = _scaled(amounts, 1.0 / abs(low.gain))
+        folds = scaled(amounts, 1.0 / abs(low.gain))
         clean = replace(clean, residual=clean.residual - alias)
     if known and isinstance(stimulus, Sampled):
         known = replace(known, values=stimulus.nearest(clean.times_s + low.late_at(clean.times_s)))
@@ -236,10 +236,6 @@ def _folded(found: Waveform, above: Sequence[np.ndarray]) -> tuple[np.ndarray, t
     way = both / amount / sizes[:2]
     half = float(student(freedom[:2].min())) * math.sqrt(way @ covariance[:2, :2] @ way)
     return matrix @ parts, (amount, max(0.0, amount - half), amount + half)
-
-
-def _about(value: float, half: float, size: float = 1.0) -> Interval:
-    return size * value, size * (value - half), size * (value + half)
 
 
 def score_analogue(
@@ -361,13 +357,13 @@ def _score_time(card: Scorecard, found: list[Fitted], ambiguous: set[str]) -> No
             # Its clock runs fast where the session's time goes slowly over its own.
             note = "off the clock of the others" if name else ""
             slow = value / (1.0 + value) if quantity == "clock" else value
-            card.add(quantity, name, _about(-slow, wide, 1e6), note=note)
+            card.add(quantity, name, about(-slow, wide, 1e6), note=note)
     open_ = reference.name in ambiguous
     note = _AMBIGUOUS if open_ else ""
     # To time zero of the file, at its own clock.
     back = np.array([0.0, 0.0, 1.0, -low.middle_s, 0.5 * low.middle_s**2 - low.half_s**2 / 6.0])
     spread = math.sqrt(back @ low.covariance @ back)
-    start = _about(float(low.late_at(np.zeros(1))[0]), float(student(low.freedom[2:].min())) * spread)
+    start = about(float(low.late_at(np.zeros(1))[0]), float(student(low.freedom[2:].min())) * spread)
     card.add("start", reference.name, start, of=reference.channel, note=note)
     if open_:
         card.rows[-1] = replace(card.rows[-1], verdict=INCONCLUSIVE, run=ANALOGUE["start"].run)
@@ -378,7 +374,7 @@ def _score_time(card: Scorecard, found: list[Fitted], ambiguous: set[str]) -> No
             odd = _ODD if one.odd or reference.odd else ""
             filtered = "" if _same_corner(one, reference) else _OTHER_CORNER
             said = "; ".join(each for each in (f"against {reference.name}", note, odd or filtered) if each)
-            skew = None if odd else _about(apart, both, 1e9)
+            skew = None if odd else about(apart, both, 1e9)
             card.add("skew", one.name, skew, of=one.channel, note=said)
             # A skew that fails does so from each of the begins.
             if (open_ and card.rows[-1].verdict != FAIL) or (filtered and card.rows[-1].verdict == FAIL):
@@ -404,7 +400,7 @@ def _score_wires(
     """Mapping and polarity of the signals whose gain is found; a name of the rig's has to be that channel."""
     fits = {one.name: one for one in found if one.good}
     signs = {name: one.low.gain > 0.0 for name, one in fits.items()}
-    # A begin half a period later turns all channels of a table: one whose sign is known fixes those of the others.
+    # A begin half a period later turns all channels of a table, but no bias: one whose sign is known fixes the others'.
     fixed = {
         name for each in alignments for name in each.names
         if any(not wires[n].turned or _is_biased(recorded[n], fits[n].channel) for n in each.names if n in fits)
@@ -449,13 +445,13 @@ def _score_fit(card: Scorecard, one: Fitted) -> None:
         card.add(quantity, one.name, estimate, of=channel, unit=channel.unit, note=note)
 
     note = _ODD if one.odd else "" if one.good else f"what was sent explains {max(0.0, one.clean.likeness):.1%} of it"
-    add("gain", None if note else _about(abs(low.gain) - 1.0, low.half[0], 1e6), note or one.rounded)
-    add("offset", _about(low.offset, low.half[1]) if one.good else None, one.rounded)
+    add("gain", None if note else about(abs(low.gain) - 1.0, low.half[0], 1e6), note or one.rounded)
+    add("offset", about(low.offset, low.half[1]) if one.good else None, one.rounded)
     # Nothing tells whether the rig's own noise, which is in its samples, was in what the DAQ was given.
     split = split_noise(one.clean, floor=one.known_noise, steps=bool(one.rounding))
     noise = split.noise if one.good else split.left
     add("noise", noise)
-    add("jitter", _scaled(split.jitter_s, 1e9) if one.good and split.jitter_s is not None else None)
+    add("jitter", scaled(split.jitter_s, 1e9) if one.good and split.jitter_s is not None else None)
     full = channel.adc_v / abs(channel.sensitivity_v)
     left = split_noise(replace(one.clean, residual=one.clean.residual + one.alias), floor=one.known_noise).left
     bits = [math.log2(full / max(left[n], 1e-12 * full) / math.sqrt(3.0)) for n in (0, 2, 1)]
@@ -490,7 +486,3 @@ def _score_sine(card: Scorecard, one: Fitted) -> bool:
     for quantity, estimate in zip(_SINE, (told.sinad_db, told.enob, told.thd_db, told.sfdr_db), strict=True):
         card.add(quantity, one.name, estimate, of=one.channel, amplitude=fit.amplitude[0])
     return True
-
-
-def _scaled(estimate: Interval, size: float) -> Interval:
-    return estimate[0] * size, estimate[1] * size, estimate[2] * size

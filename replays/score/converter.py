@@ -9,9 +9,10 @@ import numpy as np
 
 from replays.score.analogue import Fitted
 from replays.score.crosstalk import find_crosstalk
+from replays.score.intervals import scaled
 from replays.score.nonlinearity import intermodulation, transfer_curve
 from replays.score.rounding import rounding_errors
-from replays.score.scorecard import Interval, Scorecard
+from replays.score.scorecard import Scorecard
 from replays.score.step import BAND, has_steps, step_response
 
 _QUANTITIES = ("IMD", "INL", "DNL", "crosstalk", "rise time", "overshoot", "settling time")
@@ -52,8 +53,8 @@ def _score_steps(card: Scorecard, one: Fitted) -> None:
     rise = settling = overshoot = None
     note = "too few steps with plateaus that are long enough"
     if response is not None:
-        rise, overshoot = _scaled(response.rise_rows, row_s), response.overshoot
-        settling = None if response.settling_rows is None else _scaled(response.settling_rows, row_s)
+        rise, overshoot = scaled(response.rise_rows, row_s), response.overshoot
+        settling = None if response.settling_rows is None else scaled(response.settling_rows, row_s)
         note = f"of {response.steps} steps"
     card.add("rise time", one.name, rise, of=channel, note=note)
     card.add("overshoot", one.name, overshoot, of=channel, note=note)
@@ -81,7 +82,3 @@ def _score_crosstalk(card: Scorecard, one: Fitted, others: Sequence[Fitted]) -> 
         return
     value, low, high = (20.0 * math.log10(max(each, 1e-15)) for each in part)
     card.add("crosstalk", one.name, (value, low, high), of=one.channel, note=f"from {names[worst]}")
-
-
-def _scaled(estimate: Interval, size: float) -> Interval:
-    return estimate[0] * size, estimate[1] * size, estimate[2] * size

@@ -119,3 +119,13 @@ def simultaneous(values: np.ndarray, spread: np.ndarray, freedom: ArrayLike = ma
 
     half = t.ppf(1.0 - 0.025 / len(values), freedom) * spread
     return float(values.max()), float((values - half).max()), float((values + half).max())
+
+
+def about(value: float, half: float, size: float = 1.0) -> tuple[float, float, float]:
+    """Return a value and its interval of a half width, in a unit of which they hold `size`."""
+    return size * value, size * (value - half), size * (value + half)
+
+
+def scaled(estimate: tuple[float, float, float], size: float) -> tuple[float, float, float]:
+    """Return a value and its interval in a unit of which they hold `size`."""
+    return estimate[0] * size, estimate[1] * size, estimate[2] * size
