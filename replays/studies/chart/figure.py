@@ -152,7 +152,10 @@ def _smoothed(figure: Any, rows: list[Row]) -> str:
 def _windows(figure: Any, rows: list[Row], panel: str, title: str, *, smoothed: bool = False) -> str:
     phases = _phases(rows, panel)
     down, across = math.ceil(len(phases) / 2), min(2, len(phases))
-    grid = _grid(figure, 3.1 + 3.6 * down + (1.2 if down == 1 else 0.0), title, down=down, across=across)
+    # Beside one row of windows the legend is the taller.
+    grid = _grid(figure, 3.1 + 3.6 * down + (3.4 if down == 1 else 0.0), title, down=down, across=across)
+    if across == 1:
+        grid.set_width_ratios((1.0, 0.45))
     for i, phase in enumerate(phases):
         axes = figure.add_subplot(grid[i // across, i % across])
         window(axes, _select(rows, panel, phase), rows, title=PHASES[phase].title)
@@ -165,7 +168,7 @@ def _windows(figure: Any, rows: list[Row], panel: str, title: str, *, smoothed: 
 
 def _memory(figure: Any, rows: list[Row]) -> str:
     phase = _phases(rows, "memory")[0]
-    grid = _grid(figure, 7.6, f"Memory of the impact speed ({PHASES[phase].title})")
+    grid = _grid(figure, 9.0, f"Memory of the impact speed ({PHASES[phase].title})")
     titles = ("v₀ latched at each onset\n(Lankarani-Nikravesh)", "The same without memory\n(c = 0)")
     for i, case in enumerate(MEMORY_CASES):
         axes = figure.add_subplot(grid[0, i])
@@ -185,7 +188,7 @@ def _profile_figure(figure: Any, rows: list[Row]) -> str:
     grid.set_width_ratios((1.0, 0.4))
     chaotic = draw_profile(figure.add_subplot(grid[0, 0]), rows)
     draw_legend(figure, rows, ("profile",), figure.add_subplot(grid[0, 1]), failures=False)
-    chaos = f" {chaotic} draws without a sharp reference (chaotic) are left out for all." if chaotic else ""
+    chaos = f" Draws without a sharp reference (chaotic), left out for all: {chaotic}." if chaotic else ""
     return (
         f"Each method walks down its ladder to the first setting that comes within {TARGET:g} of the scene's own "
         "reference, exact Coulomb, 0.15 s, and is timed there; curves that end below 100 % did not get "
@@ -231,7 +234,7 @@ def _rub(figure: Any, rows: list[Row]) -> str:
     n = len(points)
     grid = _grid(figure, 3.0 + 0.34 * n, "Chaotic partial rub: trajectories part, statistics stay", across=3, left=2.4)
     grid.set_width_ratios((1.0, 1.0, 1.0, 1.0))
-    grid.update(wspace=0.14)
+    grid.update(wspace=0.14, right=0.975)
     good = [row for row in points if row["rms_force"] is not None]
     # The tightest setting of an unlike code is what the others are held against.
     unlike = [row for row in good if row["family"] != OURS] or good
