@@ -116,7 +116,11 @@ def test_stamps_that_make_no_rate_do_not_change_how_values_are_judged(
         judge(log(tmp_path, times_s, counts), [session], path="analogue")
         for times_s in (TIMES_S, *(STAMPS[name][0] for name in NO_RATE))
     ]
-    right, *others = [[(row.quantity, row.channel, row.verdict) for row in card.rows] for card in cards]
+    # Stamps are judged by quantities of their own.
+    right, *others = [
+        [(row.quantity, row.channel, row.verdict) for row in card.rows if not row.quantity.startswith("stamp")]
+        for card in cards
+    ]
     assert ("polarity", "disk_x", PASS) in right
     assert others == [right] * len(NO_RATE)
 
