@@ -19,6 +19,8 @@ _NOISES = 1.2
 """Nominal noises that a residual may have, for it to be nothing but noise."""
 _BLOCK_ROWS = 200
 """Rows of a block by which residuals are compared: their variance is known to a tenth."""
+_SEVERAL = 4
+"""Begins of which one of two is upright, if a signal is inverted half a period later."""
 _LOUD_PART = 0.25
 """Power of a block over the mean one, from which a begin shows in it."""
 SAME_BALANCE = 0.98
@@ -144,10 +146,13 @@ class Begins:
     def _settled(self) -> bool:
         """Return whether two begins leave nothing but noise of DAQ and session, and one of them no row unexplained.
 
-        That one is upright: half a period later a signal is inverted.
+        That one is upright, as half a period later a signal is inverted; but where none of several is, the DAQ inverts.
         """
         alike = self.alike() if self._least < 1.0 else []
-        return len(alike) > 1 and any(each.whole and each.upright and not self.outside(each) for each in alike)
+        inverts = len(alike) >= _SEVERAL and not any(each.upright for each in alike)
+        return len(alike) > 1 and any(
+            each.whole and (each.upright or inverts) and not self.outside(each) for each in alike
+        )
 
     def outside(self, found: Alignment) -> int:
         """Return how many rows before and behind the session, from a begin, are as loud as those in it."""
