@@ -20,7 +20,7 @@ _NOISES = 1.2
 _BLOCK_ROWS = 200
 """Rows of a block by which residuals are compared: their variance is known to a tenth."""
 _SEVERAL = 4
-"""Begins of which one of two is upright, if a signal is inverted half a period later."""
+"""Number of begins among which some are upright where a signal is inverted half a period later."""
 _LOUD_PART = 0.25
 """Power of a block over the mean one, from which a begin shows in it."""
 SAME_BALANCE = 0.98
@@ -146,7 +146,8 @@ class Begins:
     def _settled(self) -> bool:
         """Return whether two begins leave nothing but noise of DAQ and session, and one of them no row unexplained.
 
-        That one is upright, as half a period later a signal is inverted; but where none of several is, the DAQ inverts.
+        A begin half a period off inverts the signal, so that one must be upright; where none of several is, the DAQ
+        inverts.
         """
         alike = self.alike() if self._least < 1.0 else []
         inverts = len(alike) >= _SEVERAL and not any(each.upright for each in alike)

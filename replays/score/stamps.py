@@ -6,12 +6,12 @@ import math
 
 import numpy as np
 
-from replays.score.intervals import student
+from replays.score.intervals import about, student
 from replays.score.recorded import Table
 from replays.score.scorecard import Interval
 
 _BATCHES, _APART = 256, 32
-"""Of stamps that are shown, and that are judged."""
+"""Batches of stamps that are shown, and that are judged."""
 _MOST_BATCH = 1 << 12
 """Rows of a batch."""
 _SAME_CLOCK_S = 10.0
@@ -73,10 +73,10 @@ class Stamps:
             ("stamp offset", late[0] + offset, half[1], 1.0),
             ("stamp rate", rate, half[0], 1e6),
         ):
-            found[name] = size * at, size * (at - wide), size * (at + wide)
+            found[name] = about(at, wide, size)
         if wall_s is not None and abs(late.mean() - wall_s) < apart_s:
             value, wide = late.mean() - wall_s, student(len(late) - 1) * late.std(ddof=1) / math.sqrt(len(late))
-            found["latency"] = float(value), float(value - wide), float(value + wide)
+            found["latency"] = about(float(value), float(wide))
         ends = [math.sqrt(self._squares / chi2.ppf(p, self._freedom)) for p in (0.975, 0.025)]
         found["stamp jitter"] = math.sqrt(self._squares / self._freedom), ends[0], ends[1]
         return found

@@ -23,7 +23,9 @@ def chart(
     ] = None,
     panel: Annotated[
         list[str] | None,
-        typer.Option("--panel", metavar="PANEL", help="exact, smoothed, memory, rub, profile; may be repeated."),
+        typer.Option(
+            "--panel", metavar="PANEL", help="exact, smoothed, memory, rub, profile, scenes; may be repeated."
+        ),
     ] = None,
     no_peers: Annotated[bool, typer.Option("--no-peers", help="Our engines only.")] = False,
     fresh: Annotated[bool, typer.Option("--fresh", help="Start over instead of going on where a run ended.")] = False,

@@ -24,10 +24,11 @@ from rig.kernels.magnet import RIPPLED
 _SAMPLES = 501
 """Instants of one call: its arrays have one shape, so that each phase is compiled once."""
 _STEPS = 4_096
+"""Most steps of one call."""
 _FIRST_STEP_S = 1e-6
 """First step of a phase: a function that is 0 but for rounding at the start shows its sign before it falls again."""
 _TINY = 1e-13
-"""Of the time of an event, part of the step."""
+"""Tolerance of the time of an event, relative and in seconds."""
 
 
 def _module(name: str) -> Any:
@@ -161,7 +162,7 @@ def _compiled(kind: Kind) -> tuple[Any, tuple[int, ...]]:
 
 @functools.cache
 def _contact_function(kind: Kind) -> Any:
-    """As heyoka's, of a scaled state."""
+    """Return the function of a scaled state that `solve_by_phases` asks for."""
     jax, jnp = _module("jax"), _module("jax.numpy")
 
     @jax.jit

@@ -78,7 +78,7 @@ class Solution:
     own_s: float | None = None
     cpu_s: float = math.nan
     clock: Callable[[], float] = time.thread_time
-    """Of processor time: the calling thread's, or the process's for a library that works in threads of its own."""
+    """Clock of processor time: of the calling thread, or of the process where a library has threads of its own."""
     _begin: float = field(default_factory=time.perf_counter)
     _cpu_begin: float = field(init=False)
 
