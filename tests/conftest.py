@@ -4,7 +4,8 @@ Tests that read the clock or start processes wait most of their time: the module
 queues, each gone through by one worker. Those within a process come at once, the few that run an engine last; those
 that start real rigs come after them, when the engine that they run on is compiled. A second worker compiles all engines
 one after another, for two that compile at the same time both compile what engines share. A third worker has the tools
-meanwhile, which need no engine. All else is taken module by module, the longest first.
+and other modules that need no engine meanwhile, until the usual engine is compiled. All else is taken module by module,
+the longest first.
 """
 
 from __future__ import annotations
@@ -26,7 +27,16 @@ import rig.kernels  # noqa: F401 - names the cache of compiled code
 ROOT = Path(__file__).parents[1]
 COMPILING = "tests/parity/test_compiling.py"
 TOOLS = "tests/house/test_tools.py"
+WITHOUT_ENGINE = (
+    "tests/unit/test_laws_command.py",
+    "tests/unit/test_magnets_command.py",
+    "tests/unit/test_report.py",
+    "tests/house/test_sizes.py",
+    "tests/house/test_contracts.py",
+)
+"""Modules that compile no engine, 28 s of processor time: rigs that started at once would compile theirs, too."""
 LONGEST = (
+    "tests/unit/test_score_track.py",
     "tests/unit/test_nuisance.py",
     "tests/unit/test_score.py",
     "tests/unit/test_score_faults.py",
@@ -41,12 +51,20 @@ LONGEST = (
     "tests/unit/test_validation.py",
     "tests/unit/test_channel_faults.py",
     "tests/physics/test_sweep.py",
-    "tests/hostile/test_files.py",
+    "tests/system/test_client.py",
     "tests/unit/test_score_population.py",
-    "tests/unit/test_laws_command.py",
     "tests/physics/test_sessions.py",
+    "tests/system/test_validate.py",
+    "tests/hostile/test_files.py",
+    "tests/system/test_lockstep.py",
     "tests/unit/test_score_overlap.py",
-    "tests/unit/test_score_bits.py",
+    "tests/unit/test_generators.py",
+    "tests/unit/test_score_quantities.py",
+    "tests/unit/test_recorder_series.py",
+    "tests/unit/test_pick.py",
+    "tests/unit/test_faults.py",
+    "tests/unit/test_lean_install.py",
+    "tests/unit/test_recorder_rewrite.py",
 )
 """Modules that take more than 8 s, for which nobody is to wait at the end."""
 _CLOCK = re.compile(r"^pytestmark = .*\bwallclock\b", re.MULTILINE)
@@ -72,7 +90,7 @@ def _runs_engine(module: str) -> bool:
 
 
 def _place(nodeid: str) -> tuple[int, int]:
-    """Where a test stands in the order: what waits, engines, tools, what starts rigs, what takes long, all others."""
+    """Where a test stands in the order: what waits, engines, what needs none, rigs, what takes long, all others."""
     module = _module(nodeid)
     if _queue(module) == "clock":
         return 0, int(_runs_engine(module))
@@ -80,11 +98,13 @@ def _place(nodeid: str) -> tuple[int, int]:
         return 1, 0
     if module == TOOLS:
         return 2, 0
+    if module in WITHOUT_ENGINE:
+        return 3, WITHOUT_ENGINE.index(module)
     if _queue(module) == "rigs":
-        return 3, 0
+        return 4, 0
     if module in LONGEST:
-        return 4, LONGEST.index(module)
-    return 5, 0
+        return 5, LONGEST.index(module)
+    return 6, 0
 
 
 def pytest_configure(config: pytest.Config) -> None:

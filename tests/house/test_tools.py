@@ -49,7 +49,7 @@ def test_code_is_formatted() -> None:
 @pytest.mark.wallclock
 @pytest.mark.timeout(600)
 def test_types_are_right(pytestconfig: pytest.Config) -> None:
-    # Half a minute of one core, so not again for what was found right before: same files, same packages.
+    # A quarter of a minute of one core, so not again for what was found right before: same files, same packages.
     said = hashlib.sha256((ROOT / "pyproject.toml").read_bytes())
     for package in ("rig", "drivers", "recorder", "replays"):
         for path in sorted((ROOT / package).rglob("*.py")):
