@@ -21,13 +21,23 @@ CHANNELS = ("disk_x", "disk_y", "keyphasor")
 
 
 @contextmanager
-def connected(pace: str = "lockstep", **settings: Any) -> Iterator[Rig]:
+def running(pace: str = "lockstep") -> Iterator[str]:
     changes = ("--pace", pace, "--set", "drive.speed_hz=12", "--set", "commands=[]")
-    with (
-        processes.running_rig("hammer", *changes) as (_, endpoint),
-        rig.connect(f"zenoh:{endpoint}", wait_s=PATIENCE_S, **settings) as machine,
-    ):
+    with processes.running_rig("hammer", *changes) as (_, endpoint):
+        yield f"zenoh:{endpoint}"
+
+
+@contextmanager
+def connected(pace: str = "lockstep", **settings: Any) -> Iterator[Rig]:
+    with running(pace) as url, rig.connect(url, wait_s=PATIENCE_S, **settings) as machine:
         yield machine
+
+
+@pytest.fixture(scope="module")
+def unstepped() -> Iterator[str]:
+    """URL of a rig that no test steps."""
+    with running() as url:
+        yield url
 
 
 def test_a_program_reads_the_same_rows_as_the_model_makes() -> None:
@@ -111,14 +121,17 @@ def test_rows_that_a_fault_takes_end_a_piece_and_the_next_tells_of_the_gap() -> 
     ({"channels": ["disk_x"], "truth": ["contacts"]}, "truth must be one of the rig's tables, such as contact"),
     ({"channels": ["disk_x"], "rate_hz": 3000.0}, "rate_hz must be 20000 divided by a whole number"),
 ])  # fmt: skip
-def test_what_the_rig_does_not_have_is_told(settings: dict[str, Any], says: str) -> None:
-    with pytest.raises((InputError, UnknownNameError)) as caught, connected(**settings):
+def test_what_the_rig_does_not_have_is_told(settings: dict[str, Any], says: str, unstepped: str) -> None:
+    with (
+        pytest.raises((InputError, UnknownNameError)) as caught,
+        rig.connect(unstepped, wait_s=PATIENCE_S, **settings),
+    ):
         pass
     assert says in str(caught.value)
 
 
-def test_a_client_without_channels_says_so() -> None:
-    with connected("free") as machine:
+def test_a_client_without_channels_says_so(unstepped: str) -> None:
+    with rig.connect(unstepped, wait_s=PATIENCE_S) as machine:
         with pytest.raises(InputError, match="channels must be named where the rig is connected to"):
             machine.advance(0.1)
         with pytest.raises(UnknownNameError, match="table must be one that was named"):

@@ -194,10 +194,10 @@ def test_what_several_have_alike_and_what_lacks_truth_is_told(tmp_path: Path) ->
     late = {"at_s": 0.05, "command": "fault", "channel": "forces", "kind": "late", "late_us": 200.0}
     gain = {"at_s": 0.05, "command": "fault", "channel": "disk_x", "kind": "gain", "factor": 1.1}
     pulse = {"at_s": 0.02, "command": "hammer", "force_n": 120.0, "duration_ms": 5.0, "direction": "x"}
-    alike = recorded(tmp_path / "a.mcap", "hammer", duration_s=0.4, commands=[pulse, late, gain])
+    alike = recorded(tmp_path / "a.mcap", "hammer", duration_s=0.2, commands=[pulse, late, gain])
     lines = [one.line.partition(", from")[0] for one in validate(alike, blind=True).faults]
     assert sorted(lines) == ["P_N, P_S, P_E, P_W delay: +200 µs", "disk_x gain: +10 %"]
-    one = recorded(tmp_path / "b.mcap", "hammer", duration_s=0.4, commands=[pulse, gain])
+    one = recorded(tmp_path / "b.mcap", "hammer", duration_s=0.2, commands=[pulse, gain])
     cut(one, tmp_path / "c.mcap", only="sensors")
     found = validate(Recording.open(tmp_path / "c.mcap"), blind=True)
     assert not found.good

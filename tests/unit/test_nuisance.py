@@ -162,10 +162,10 @@ def test_a_channel_that_disagrees_has_no_say() -> None:
 
 
 def test_an_aligned_log_is_good(tmp_path: Path) -> None:
-    motion = second_rig.run(turned=TURNED, before_s=0.4, after_s=0.1, settled_s=2.0)
+    motion = second_rig.run(turned=TURNED, before_s=0.2, after_s=0.1, settled_s=2.0)
     found = validate(whole(tmp_path, motion, seed=8))
     assert found.good, found.verdict_line
-    assert found.window_s[1] > 0.415
+    assert found.window_s[1] > 0.215
 
 
 @pytest.mark.parametrize("number", ["mu = 0.24", pytest.param("e = 0.885", marks=MATRIX)])
@@ -173,7 +173,7 @@ def test_a_log_of_another_contact_is_not_good(number: str, tmp_path: Path) -> No
     """Its phases are within their limits, but no fit goes on through the first contact."""
     name, _, value = number.partition(" = ")
     other = {"c": damping_factor(float(value))} if name == "e" else {name: float(value)}
-    motion = second_rig.run(second_rig.Rig(**other), turned=1.0, before_s=0.4, after_s=0.1)
+    motion = second_rig.run(second_rig.Rig(**other), turned=1.0, before_s=0.2, after_s=0.1)
     found = validate(whole(tmp_path, motion, seed=5))
     assert "ends before the first contact" in found.verdict_line
     assert found.explained is not None
@@ -206,7 +206,7 @@ def test_the_hum_of_the_mains_has_a_name(motion: second_rig.Motion, tmp_path: Pa
 def test_a_log_without_a_pulse_is_taken_up_as_well(name: str, motion: second_rig.Motion, tmp_path: Path) -> None:
     """It is of a shaft that turned before; of one that was in contact already, nobody knows from where it came."""
     own_s, values = second_rig.log(motion, seed=7, rate_hz=10_000.0, bandwidth_hz=4000.0, ppm=PPM)
-    rows = own_s < 0.7 if name == "quiet" else own_s > 1.0
+    rows = own_s < 0.4 if name == "quiet" else own_s > 1.0
     part = {channel: one[rows] for channel, one in values.items()}
     found = validate(imported(tmp_path, {"time": own_s[: rows.sum()], **part}, WHOLE.replace("5000", "4000"), QUIET))
     assert found.good == (name == "quiet")
@@ -253,7 +253,7 @@ PULSE = ("hammer.1.force_n", "hammer.1.duration_ms")
 
 def test_contact_parameters_come_out_of_a_log_from_the_middle_of_a_run(tmp_path: Path) -> None:
     """From a restitution, too, that is too far off for a slope to lead on."""
-    motion = second_rig.run(second_rig.Rig(mu=0.235), turned=1.0, before_s=0.4, after_s=0.06, settled_s=1.5)
+    motion = second_rig.run(second_rig.Rig(mu=0.235), turned=1.0, before_s=0.2, after_s=0.06, settled_s=1.5)
     recording, rules = whole(tmp_path, motion, seed=5), load_criteria().imported
     found = identify_log(
         recording, Experiment.of(recording), tuple(ASKED), variants=[one.set for one in rules.variants],

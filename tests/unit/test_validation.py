@@ -18,7 +18,7 @@ from replays.recordings.prediction import Measured, Prediction, bare, measured, 
 from replays.recordings.validation import load_criteria, outcome, validate
 from replays.recordings.validation.attribution import Explained, Explanation, attribute, conclude
 from replays.recordings.validation.bits import Bits
-from replays.recordings.validation.criteria import DEFAULT
+from replays.recordings.validation.criteria import DEFAULT, Criteria
 from replays.recordings.validation.phases import View, find_phases, quantities, spectrum_distance
 from rig.errors import InputError
 from rig.offline import frames
@@ -56,6 +56,13 @@ def record(
 @pytest.fixture(scope="module")
 def hammer(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     return record(tmp_path_factory.mktemp("validation") / "hammer.mcap")
+
+
+def with_candidates(*names: str) -> Criteria:
+    """Return the usual criteria that look for a cause among these parameters alone."""
+    criteria = load_criteria()
+    few = tuple(one for one in criteria.attribution.candidates if one.name in names)
+    return criteria.model_copy(update={"attribution": criteria.attribution.model_copy(update={"candidates": few})})
 
 
 # Criteria.
@@ -170,7 +177,7 @@ def test_a_recording_that_was_cut_off_is_inconclusive(hammer: Recording, tmp_pat
     assert found.bit_exact
     assert found.outcome is Outcome.INCONCLUSIVE
     assert found.verdict_line.startswith("inconclusive: the recording is not complete")
-    wrong = validate(Recording.open(cut), changes={"contact.friction": 0.2})
+    wrong = validate(Recording.open(cut), criteria=with_candidates(), changes={"contact.friction": 0.2})
     assert wrong.outcome is Outcome.FAIL
 
 
@@ -344,11 +351,9 @@ def test_a_second_cause_behind_the_first_is_named_with_it(tmp_path: Path) -> Non
     """Damping is seen before the impacts, friction only in them."""
     both = {"shaft__damping_ratio_x": 0.03, "contact__friction": 0.24}
     recording = record(tmp_path / "two.mcap", sensors__rate_hz=20_000, duration_s=0.045, **both)
-    criteria = load_criteria()
-    few = [one for one in criteria.attribution.candidates if one.name in ("contact.friction", "shaft.damping_ratio_x")]
-    rules = criteria.attribution.model_copy(update={"candidates": tuple(few)})
+    criteria = with_candidates("contact.friction", "shaft.damping_ratio_x")
     right = {"shaft.damping_ratio_x": 0.016, "contact.friction": 0.25}
-    found = validate(recording, criteria=criteria.model_copy(update={"attribution": rules}), changes=right).explained
+    found = validate(recording, criteria=criteria, changes=right).explained
     assert found is not None
     assert found.best[0] == "shaft.damping_ratio_x"
     assert re.search(r"of the difference to 0\.02\d s", found.conclusion)
@@ -370,7 +375,8 @@ def test_the_nearest_candidate_is_no_explanation_where_more_than_noise_is_left(l
 def test_a_document_is_json_throughout(hammer: Recording) -> None:
     import json
 
-    found = validate(hammer, changes={"contact.restitution": 0.85}, declared=True)
+    criteria = with_candidates("contact.restitution", "contact.friction")
+    found = validate(hammer, criteria=criteria, changes={"contact.restitution": 0.85}, declared=True)
     document = json.loads(json.dumps(found.document(), allow_nan=False))
     assert document["good"] is False
     assert document["explained"]["best"] == ["contact.restitution"]
