@@ -46,20 +46,51 @@ def align(sources: Sequence[Source]) -> Alignment | None:
     begins.try_all([0.0, *(each - one.wire.late_s for each in one.wire.others_s)])
     for _ in range(_ROUNDS):
         begins.try_all(begins.repeats())
-    alike = begins.alike()
-    found = [each for one in alike[:FOLLOWED] if (each := follow(sources, one.begin_s, begins.stretches(one.begin_s)))]
+    alike, found = _follow_alike(begins, sources)
+    if found and all(each.track.steps() for each in found):
+        begins.search_all()
+        alike, found = _follow_alike(begins, sources)
     if not found:
         return follow(sources, 0.0, default)
     most = max(each.balance for each in found)
     left = [_log_residual_power(each, sources) if found[1:] else 0.0 for each in found]
 
-    def rank(n: int) -> tuple[bool, int, bool, int, float]:
+    def rank(n: int) -> tuple[bool, bool, int, bool, int, float]:
         each, alike_in_all = found[n], left[n] <= min(left) + _MAX_LOG_APART
+        contradicted = any(left[m] < left[n] and _contradicts(other, each) for m, other in enumerate(found))
         balanced = each.balance > SAME_BALANCE * most
-        return balanced, -begins.unaccounted(each), alike_in_all, each.upright, -abs(each.begin_s)
+        return not contradicted, balanced, -begins.unaccounted(each), alike_in_all, each.upright, -abs(each.begin_s)
 
     best = found[max(range(len(found)), key=rank)]
-    return replace(trimmed(best, one), ambiguous=len(alike) > 1)
+    steps = len(best.track.steps())
+    if best.whole and not best.upright:
+        # Half a period later the signal is inverted: more rows in the session are no reason for an inverted record.
+        upright = [
+            n for n, each in enumerate(found) if each.upright and each.whole and len(each.track.steps()) == steps
+        ]
+        best = found[max(upright, key=rank)] if upright else best
+    doubted = any(each.track.explained > best.track.explained and _contradicts(best, each) for each in found)
+    return replace(trimmed(best, one), ambiguous=len(alike) > 1, steps_doubted=doubted)
+
+
+def _follow_alike(begins: Begins, sources: Sequence[Source]) -> tuple[list[Alignment], list[Alignment]]:
+    """Return the begins that none surpasses, by some signals, and the first of them followed by all signals."""
+    alike = begins.alike()
+    shifts_s = [each.begin_s for each in alike[:FOLLOWED]]
+    return alike, [each for s in shifts_s if (each := follow(sources, s, begins.stretches(s)))]
+
+
+def _contradicts(other: Alignment, found: Alignment) -> bool:
+    """Return whether an alignment explains the rows about a step of another one without a step.
+
+    A lost sample is lost from whichever begin. Where a signal nearly repeats, a wrong begin may need steps in place of
+    the difference, and explain rows after the session's end for these.
+    """
+    return any(
+        run.begin <= max(0, first - FEWEST) and min(found.rows, last + FEWEST) <= run.end
+        for first, last, _ in found.track.steps()
+        for run in other.track.runs
+    )
 
 
 def _log_residual_power(found: Alignment, sources: Sequence[Source]) -> float:

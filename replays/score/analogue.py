@@ -287,12 +287,11 @@ def _score_rows(card: Scorecard, alignments: list[Alignment], recorded: Mapping[
             )
             told = "; ".join(each for each in (rows, f"and {len(here) - _NAMED} more" * (len(here) > _NAMED)) if each)
             count = float(sum(size for _, _, size in here))
-            card.add(
-                quantity,
-                name,
-                (count, count, count),
-                note="; ".join(each for each in (told, note) if each),
-            )
+            said = "; ".join(each for each in (told, note) if each)
+            card.add(quantity, name, (count, count, count), note=said)
+            if alignment.steps_doubted and not count:
+                about, why = ANALOGUE[quantity], "from another begin, which explains more rows, there are some"
+                card.rows[-1] = replace(card.rows[-1], verdict=INCONCLUSIVE, run=about.run, note=why)
             card.runs[f"{quantity} {name}".strip()] = [(first, last) for first, last, _ in here]
         for channel, lost in _rows_without_value(alignment, recorded).items():
             card.add("lost samples", channel, (lost, lost, lost), note="rows without a value")

@@ -63,6 +63,7 @@ class Begins:
         others = sorted((each for each in sources if each is not one), key=lambda each: each.wire.likeness)
         self._one, self._default = one, stretches
         self._compared = [one, *(each for each in others if each.wire.likeness > SOUND)][:_COMPARED]
+        self._searched = self._compared[:1]
         self._tried: list[tuple[np.ndarray, Alignment]] = []
         self._shifts: list[float] = []
         self._followed = set[int]()
@@ -155,6 +156,11 @@ class Begins:
             each.whole and (each.upright or inverts) and not self.outside(each) for each in alike
         )
 
+    def search_all(self) -> None:
+        """Search begins by other signals as well: the first one may repeat where these do not."""
+        self._searched, self._least = self._compared, math.inf
+        self.try_all(self.repeats())
+
     def outside(self, found: Alignment) -> int:
         """Return how many rows before and behind the session, from a begin, are as loud as those in it."""
         first, last = found.track.inside
@@ -179,8 +185,14 @@ class Begins:
         alike = self.alike()
         if not alike or self._settled:
             return []
-        one = self._one
-        values, times_s, curve = alike[0].even(one)
+        parts = [(0, len(self._one.values))]
+        if self.outside(alike[0]) >= FEWEST:
+            parts.append(alike[0].track.inside)
+        return [each for one in self._searched for each in self._repeats_of(one, alike[0], parts)]
+
+    def _repeats_of(self, one: Source, best: Alignment, parts: Sequence[tuple[int, int]]) -> list[float]:
+        """Return shifts at which a signal is like some parts of its record, by the clock of the best begin [s]."""
+        values, times_s, curve = best.even(one)
         rows, held = np.arange(len(values)), np.isfinite(values)
         values = np.interp(rows, rows[held], values[held])
         fit = fit_stretch(values, times_s, one.stimulus, curve[0], (0, len(values)))
@@ -189,10 +201,7 @@ class Begins:
             return []
         late_s = [
             each
-            for first, last in [
-                (0, len(whole)),
-                *([alike[0].track.inside] if self.outside(alike[0]) >= FEWEST else []),
-            ]
+            for first, last in parts
             for each in find_repeats(whole[first:last], one.first_s + first / one.rate_hz, fit, one.stimulus)
         ]
         return [each - one.late_s for each in late_s]

@@ -81,6 +81,7 @@ class Alignment:
         upright: Number of signals with a positive gain.
         begin_s: Time by which the begin is later in the session than the wires have it [s].
         ambiguous: Whether other begins explain the record as well.
+        steps_doubted: Whether another begin explains more rows, with steps that this one does not need.
     """
 
     names: tuple[str, ...]
@@ -92,6 +93,7 @@ class Alignment:
     upright: int = 0
     begin_s: float = 0.0
     ambiguous: bool = False
+    steps_doubted: bool = False
 
     @property
     def balance(self) -> int:

@@ -238,6 +238,9 @@ class _Walk:
                     step = None
                 if final and n == len(edges) - 2 and self._steps < _MAX_STEPS:
                     step = self._end_step(y, s, ds, _REACH + a, _REACH + b, row)
+                    if step is not None and inside < count and _is_period(y, s, ds, _REACH + a, step[0]):
+                        # The last rows of a session are not known as well as those of a period earlier.
+                        step = self._end_step(y, s, ds, _REACH + a, _REACH + b, row, abs(step[0]) // 2)
                     if step is not None:
                         break
                 if not good:
@@ -282,7 +285,7 @@ class _Walk:
         return None
 
     def _end_step(
-        self, y: np.ndarray, s: np.ndarray, ds: np.ndarray, first: int, last: int, row: int
+        self, y: np.ndarray, s: np.ndarray, ds: np.ndarray, first: int, last: int, row: int, reach: int = _REACH
     ) -> tuple[int, int] | None:
         """Return the smallest step within the last block that explains the rows from it to the end, or None.
 
@@ -293,6 +296,7 @@ class _Walk:
             first: Column of the first row of the block, at least `_REACH`.
             last: Column after its last row, at most n - `_REACH`.
             row: Row of column `_REACH`.
+            reach: Largest step that is tried [samples].
 
         Returns:
             Samples of the step and the row after the last, or None.
@@ -318,7 +322,7 @@ class _Walk:
         if not len(usual) or (unmoved - usual).max() < least:
             return None
         found: list[tuple[int, float, bool]] = []
-        for moved in sorted(set(range(-_REACH, _REACH + 1)) - {0}, key=abs):
+        for moved in sorted(set(range(-reach, reach + 1)) - {0}, key=abs):
             left = to_end(moved)
             at = int((unmoved - left).argmax())
             good = left[at] <= max(_UNEXPLAINED * usual[at], _MAX_END_PART * unmoved[at])
@@ -388,6 +392,24 @@ def _fit(y: np.ndarray, s: np.ndarray, ds: np.ndarray, least: float = _HALF) -> 
     left = np.sum(r**2, axis=1)
     good = ((left <= _UNEXPLAINED * rows) | (left <= least * whole))[rows > 0]
     return error, bool(2 * good.sum() >= len(good)), known
+
+
+def _is_period(y: np.ndarray, s: np.ndarray, ds: np.ndarray, last: int, moved: int) -> bool:
+    """Return whether a step explains the rows before it as well, and half of the step does not.
+
+    Args:
+        y: Rows over noise, shape (followers, n).
+        s: The known signal over noise, shape (followers, n).
+        ds: Its slope a sample, shape (followers, n).
+        last: Column after the last row before the step.
+        moved: Samples of the step.
+    """
+    first = max(0, -moved)
+    whole, half = (
+        _fit(y[:, first:last], s[:, first + each : last + each], ds[:, first + each : last + each], 0.0)[1]
+        for each in (moved, moved // 2)
+    )
+    return whole and not half
 
 
 def _best_step(y: np.ndarray, s: np.ndarray, ds: np.ndarray, certain: float) -> int | None:

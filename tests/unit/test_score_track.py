@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -120,6 +122,24 @@ def test_rows_that_nothing_explains_are_not_judged() -> None:
     assert track(TONES, order).explained == pytest.approx(5000, abs=300)
 
 
+@pytest.mark.parametrize("doubled", [None, 9900])
+def test_a_record_is_not_followed_round_and_round_at_an_end_of_a_session(doubled: int | None) -> None:
+    """The last rows of a session are less well known than those a period earlier, which explain what comes after."""
+
+    def whirl(t: np.ndarray) -> np.ndarray:
+        return np.sin(2.0 * np.pi * RATE_HZ / 245.1 * t)
+
+    def known(t: np.ndarray) -> np.ndarray:
+        return whirl(t) + 1e-3 * np.sin(2.0 * np.pi * 700.0 * t) * ((t < 0.06) | (t > 0.39))
+
+    values = whirl(ROWS / RATE_HZ - 0.1) + 1e-3 * np.random.default_rng(1).standard_normal(len(ROWS))
+    values = values if doubled is None else np.insert(values, doubled, values[doubled])
+    follower = Follower(values, Exact(known, (0.05, 0.4), RATE_HZ), -0.1, 1.0, 0.0, 1e-3)
+    found = follow_record([follower], 0.0, 1.0 / RATE_HZ, len(values), (4000, 6000), 0.0)
+    assert found.inside == (3000, 10_001 + (doubled is not None))
+    assert [size for _, _, size in found.steps()] == [-1] * (doubled is not None)
+
+
 def test_rows_outside_the_session_are_outside() -> None:
     found = track(TONES, ROWS, span_s=(0.1, 0.5))
     assert found.inside == (1001, 9001)
@@ -151,6 +171,63 @@ def test_the_begin_that_explains_all_signals_is_taken_where_one_signal_repeats()
     assert not found.ambiguous  # the pulse comes at another part of the whirl at each of the other begins
     assert found.begin_s == pytest.approx(repeat_s, abs=1e-6)
     assert found.own_s["keyphasor"] == pytest.approx(found.own_s["disk_x"], abs=1e-6)
+
+
+SLOW_RATE_HZ = 3e3
+"""Rate of records of slow signals, which keeps tests of several turns short [Hz]."""
+
+
+def slow_sources(
+    signals: Sequence[Callable[[np.ndarray], np.ndarray]], kept: np.ndarray, *, begin_s: float, found_s: float,
+    end_s: float, noise: float,
+) -> list[Source]:  # fmt: skip
+    """Return probes that were recorded from a begin on, and were first found at another one."""
+    generator, table = np.random.default_rng(0), list(default_table().channels.values())
+    wire = Wire("", 1, 1.0, (), False, found_s, (0.0, 0.7), (begin_s,), found_s)
+    return [
+        Source(
+            channel.name, channel, replace(wire, channel=channel.name, likeness=1.0 - 0.1 * n),
+            signal(begin_s + kept / SLOW_RATE_HZ) + noise * generator.standard_normal(len(kept)),
+            0.0, SLOW_RATE_HZ, Exact(signal, (0.0, end_s), SLOW_RATE_HZ), 0.0,
+        )
+        for n, (channel, signal) in enumerate(zip(table, signals, strict=False))
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("lost", [None, 1000])
+def test_a_begin_that_needs_steps_where_another_one_does_not_is_not_taken(lost: int | None) -> None:
+    """Turns of a rotor differ by some samples: early begins explain rows after the session, by steps."""
+
+    def angle(t: np.ndarray) -> np.ndarray:
+        return 2.0 * np.pi * 5.0 * (t + 7e-4 * np.sin(2.0 * np.pi * (t + 0.6 * t**2)))
+
+    kept = np.arange(4400) if lost is None else np.delete(np.arange(4401), lost)
+    signals = [lambda t: np.cos(angle(t)), lambda t: np.sin(angle(t))]
+    found = align(slow_sources(signals, kept, begin_s=1.3, found_s=1.1, end_s=2.0, noise=6e-3))
+    assert found is not None
+    assert found.begin_s == pytest.approx(0.2, abs=2e-5)
+    if lost is None:
+        assert found.track.steps() == []
+        assert found.steps_doubted
+    else:
+        ((first, last, size),) = found.track.steps()
+        assert first <= lost <= last
+        assert size == 1
+
+
+@pytest.mark.parametrize("begin_s", [0.4, -0.5])
+def test_more_rows_in_the_session_are_no_reason_for_an_inverted_begin(begin_s: float) -> None:
+    """Two tones of odd frequencies are inverted half a second later, where all of the session is in the record."""
+
+    def tones_of(phase: float) -> Callable[[np.ndarray], np.ndarray]:
+        return lambda t: np.sin(2.0 * np.pi * 79.0 * t + phase) + 0.5 * np.sin(2.0 * np.pi * 101.0 * t)
+
+    found_s = begin_s - 0.5 if begin_s > 0.0 else begin_s + 0.5
+    signals = [tones_of(0.0), tones_of(1.0)]
+    sources = slow_sources(signals, np.arange(3900), begin_s=begin_s, found_s=found_s, end_s=1.0, noise=1e-3)
+    found = align(sources)
+    assert found is not None
+    assert found.upright == len(sources)
 
 
 # Through the scorecard: three probes of repeating tones.
