@@ -10,7 +10,7 @@ import numpy as np
 
 from replays.score.alignment import align
 from replays.score.following import Alignment, Source
-from replays.score.intervals import about, sandwich, scaled, student
+from replays.score.intervals import about, pooled, sandwich, scaled, student
 from replays.score.noise import split_noise
 from replays.score.recorded import Recorded
 from replays.score.rounding import Converter, find_step, undithered, widen
@@ -350,7 +350,7 @@ def _score_time(card: Scorecard, found: list[Fitted], ambiguous: set[str]) -> No
     bends = np.array([one.low.bend for one in found])
     for quantity, values, half, others in (("clock", drifts, halves, own), ("clock drift", bends, bend_halves, own)):
         weights = np.where(others, 0.0, half**-2.0)
-        told = [("", float(weights @ values / weights.sum()), float(weights.sum() ** -0.5))]
+        told = [("", *pooled(values, weights, alike=any(one.rounding for one in found)))]
         told += [(found[n].name, values[n], half[n]) for n in np.flatnonzero(others) if quantity == "clock"]
         for name, value, wide in told:
             # Its clock runs fast where the session's time goes slowly over its own.

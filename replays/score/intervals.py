@@ -129,3 +129,16 @@ def about(value: float, half: float, size: float = 1.0) -> tuple[float, float, f
 def scaled(estimate: tuple[float, float, float], size: float) -> tuple[float, float, float]:
     """Return a value and its interval in a unit of which they hold `size`."""
     return estimate[0] * size, estimate[1] * size, estimate[2] * size
+
+
+def pooled(values: np.ndarray, weights: np.ndarray, *, alike: bool) -> tuple[float, float]:
+    """Return the weighted mean of estimates and half of its 95 % interval.
+
+    Args:
+        values: The estimates, shape (n,).
+        weights: One over the square of half of each one's interval, or 0, shape (n,).
+        alike: Whether their errors may be alike, as those of rounding are: these do not average out.
+    """
+    whole = weights.sum()
+    half = np.sqrt(weights).sum() / whole if alike else whole**-0.5
+    return float(weights @ values / whole), float(half)

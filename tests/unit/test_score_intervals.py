@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from replays.score.intervals import refine, sandwich, student
+from replays.score.intervals import pooled, refine, sandwich, student
 from replays.score.limits import load_limits
 from replays.score.noise import split_noise
 from replays.score.recorded import Table
@@ -192,3 +192,11 @@ def test_limits_made_of_the_table_are_closed_forms() -> None:
     assert ends("ENOB", amplitude=1.0) == pytest.approx(((sine_db - 1.76) / 6.02 - 0.14, math.inf))
     # Without an amplitude nothing is asked.
     assert ends("SINAD") is None
+
+
+@pytest.mark.parametrize(("alike", "expected"), [(False, 1.0), (True, 2.0)])
+def test_errors_of_rounding_do_not_average_out_over_channels(alike: bool, expected: float) -> None:
+    """Channels of one rotor are rounded alike: a 14-bit stable run had its clock drift red by a mean of four."""
+    value, half = pooled(np.array([-3.0, -1.0, -3.0, -1.0]), np.full(4, 0.25), alike=alike)
+    assert value == pytest.approx(-2.0)
+    assert half == pytest.approx(expected)
