@@ -6,6 +6,7 @@
 | responses of a linear body        | the matrix exponential, for a force that is a power    |
 | matrices of the linear bodies     | the kernels' rates, by the change of one state         |
 | settled whirl over 0.2 s          | `taylor` from the same state, at each tolerance        |
+| whirl that creeps                 | the same with smoothed friction, wide and narrow       |
 | the companion's estimate          | the distance from `taylor`                             |
 | energy residual                   | 0, within the tolerance                                |
 | rows                              | the same bits, however the run is cut into calls       |
@@ -160,6 +161,23 @@ def test_settled_whirl_is_that_of_the_series(tolerance: float, error: float) -> 
     assert memory[CEILING] == 0.0
     ledger = energy_balance(rows, first)
     assert np.abs(ledger["residual"]).max() < 0.1 * tolerance * ledger["dissipated"].max() + 1e-6
+
+
+@pytest.mark.parametrize("smoothing_speed", [5.0, 0.5])
+def test_smoothed_friction_creeps_by_collocation(smoothing_speed: float) -> None:
+    changes = {"model__friction": "smoothed", "contact__smoothing_speed": smoothing_speed}
+    exact = ready("taylor", 1e-11, **changes).advance(250_000).rows
+    run = ready("split", 1e-4, **changes)
+    first = run.first_row.copy()
+    rows = run.advance(250_000).rows
+    assert memory_of(run)[ROLLED_S] > 0.1
+    assert scaled_error(rows, exact) < 1e-4
+    creep, friction = (S.COLUMN[name] for name in ("sliding_speed", "friction_force"))
+    assert np.abs(exact[-20:, creep]).max() > 1e-3 * smoothing_speed * 1e-3
+    # Between nodes, too: the law makes newtons of a few micrometres per second.
+    assert np.abs(rows - exact)[100:, friction].max() < 1e-3 * np.abs(exact[100:, friction]).max()
+    ledger = energy_balance(rows, first)
+    assert np.abs(ledger["residual"]).max() < 1e-5 * ledger["dissipated"].max() + 1e-6
 
 
 @pytest.mark.parametrize("tolerance", [1e-2, 3e-4])

@@ -2,7 +2,8 @@
 
 Shaft, spin and housings are linear bodies (`rig.engines.split.radau`), driven by the ring's force F and the nonlinear
 part of their accelerations. Two conditions hold at each node: the penetration is the one at which the normal law gives
-F_n, and the sliding speed is 0. The law is inverted because Newton's method on K delta^1.5 does not converge from afar.
+F_n, and the sliding speed is 0, or that at which smoothed friction gives F_t. The laws are inverted because Newton's
+method on K delta^1.5 does not converge from afar.
 Newton's method solves for F alone, shape (2, STAGES): the other unknowns follow from F, or change little and slowly.
 """
 
@@ -18,7 +19,7 @@ from rig.engines.split import layout
 from rig.engines.split.radau import INTEGRALS, NODES, STAGES, TAIL, collocate, invert
 from rig.engines.taylor.place import FRACTION, TICK
 from rig.kernels import signals as S
-from rig.kernels.contact import RingForce
+from rig.kernels.contact import SMOOTHED, RingForce
 from rig.kernels.dynamics import accelerations
 from rig.kernels.forces import disk_forces, drive_torque, magnets_on, passed_on, stator_of, torques
 from rig.kernels.geometry import State, eccentricity_of, pose_of
@@ -39,7 +40,9 @@ FX, _FY, _AX, _AY, _AS, _Z = (layout.UNKNOWNS + row * STAGES for row in range(6)
 """Unknowns: ring's force [N]; accelerations but for their linear part; penetration [m]."""
 N_UNKNOWNS = 6
 _NX, _NY, _DISTANCE, _RATE, _ALONG, FN, FT, _BY_RATE, _BY_FORCE = (layout.AT_NODES + row * STAGES for row in range(9))
-"""Contact at the nodes: normal, distance [m], velocities [m/s], forces [N], derivatives of the penetration."""
+_SLIP_BY_FORCE = layout.AT_NODES + 18 * STAGES
+"""Contact at the nodes: normal, distance [m], velocities [m/s], forces [N], derivatives of the penetration and of the
+sliding speed that the friction law asks for, by the friction force [m/s/N]."""
 _RHO_X, _RHO_Y, _RHO_S, _EX, _EY, _VX, _VY, _SPIN, _ROTATION = (layout.AT_NODES + row * STAGES for row in range(9, 18))
 """Accelerations at the nodes less the unknown; eccentricity, velocity and spin that these add; rotation [rad/s]."""
 _R1, _R2 = layout.RESIDUALS, layout.RESIDUALS + STAGES
@@ -211,6 +214,12 @@ def root_of_law(load, guess, exponent):
 
 
 @stage
+def slip_of_law(contact, friction, share):
+    """Sliding speed [m/s] at which a friction law gives a share of mu F_n: 0 unless it is smoothed."""
+    return contact.smoothing_speed * math.atanh(share) if friction == SMOOTHED else 0.0
+
+
+@stage
 def _evaluate_node(constants, inputs, m, h, i):
     """Contact and motion at a node: geometry and force components into the memory, the rest returned."""
     state = _state_at(m, i)
@@ -244,6 +253,8 @@ def _evaluate_nodes(constants, inputs, m, h):
     """Residuals at the nodes, and what the used accelerations lack; returns whether all are finite."""
     shaft, contact = constants.shaft, constants.contact
     stiffness, damping_x, damping_y, gain = linear_part(constants, inputs)
+    friction = constants.levels.friction
+    creeps = friction == SMOOTHED
     known = 0.0
     for i in range(STAGES):
         state, _, _, _, _, motion = _evaluate_node(constants, inputs, m, h, i)
@@ -259,7 +270,12 @@ def _evaluate_nodes(constants, inputs, m, h):
         m[_BY_FORCE + i] = by_force
         m[_BY_RATE + i] = -contact.viscous_damping * by_force - z / contact.exponent * slope / ratio
         m[_R1 + i] = (m[_DISTANCE + i] - contact.clearance - z) / h
-        m[_R2 + i] = m[_ALONG + i] + shaft.radius * m[_ROTATION + i]
+        most = contact.friction * m[FN + i]
+        slip = slip_of_law(contact, friction, m[FT + i] / most)
+        m[_SLIP_BY_FORCE + i] = (
+            contact.smoothing_speed * most / (most * most - m[FT + i] * m[FT + i]) if creeps else 0.0
+        )
+        m[_R2 + i] = m[_ALONG + i] + shaft.radius * m[_ROTATION + i] - slip
         known += m[_R1 + i] + m[_R2 + i] + m[_RHO_X + i] + m[_RHO_Y + i] + m[_RHO_S + i]
     return math.isfinite(known)
 
@@ -285,7 +301,8 @@ def _follow_rho(constants, inputs, m, h):
         nv, tv = lA * (m[_VX + i] * nx + m[_VY + i] * ny), lA * (m[_VY + i] * nx - m[_VX + i] * ny)
         change = ne - m[_BY_RATE + i] * (nv + m[_ALONG + i] * per * te) - m[_BY_FORCE + i] * m[FT + i] * per * te
         m[_R1 + i] += change / h
-        m[_R2 + i] += tv - m[_RATE + i] * per * te + shaft.radius * m[_SPIN + i]
+        friction = (m[FN + i] + m[FT + i] * m[FT + i] / m[FN + i]) * per * te
+        m[_R2 + i] += tv - m[_RATE + i] * per * te + shaft.radius * m[_SPIN + i] + m[_SLIP_BY_FORCE + i] * friction
 
 
 @kernel
@@ -310,8 +327,9 @@ def _make_inverse(constants, inputs, m, rolling, h, inverse):
                 by_rate = m[_BY_RATE + i] * (along_n * v + m[_ALONG + i] * per * te)
                 by_force = m[_BY_FORCE + i] * (same * along_n - m[FT + i] * per * te)
                 J[i, column] = (along_n * e - by_rate + by_force) / h
-                J[n + i, column] = along_t * v - m[_RATE + i] * per * te
                 turned[i, column] = same * along_t + m[FN + i] * per * te
+                friction = turned[i, column] - m[FT + i] / m[FN + i] * (same * along_n - m[FT + i] * per * te)
+                J[n + i, column] = along_t * v - m[_RATE + i] * per * te + m[_SLIP_BY_FORCE + i] * friction
     spun = rolling.shaft_forced[2, 1]
     for i in range(n):
         for k in range(n):

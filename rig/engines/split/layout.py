@@ -24,9 +24,9 @@ ROLLING_STEPS, WAITS = HARDEST + 16, HARDEST + 17
 
 MAX_PLACES = 48
 """Most steps a turn: over-damped contacts need them from a first guess."""
-START_FORCE = HARDEST + 18
-"""Normal force at the start of the step [N]."""
-NODE_VALUES = HARDEST + 19
+START_FORCE, START_FRICTION = HARDEST + 18, HARDEST + 19
+"""Normal and friction force at the start of the step [N]."""
+NODE_VALUES = HARDEST + 20
 """State and integrals at the start of the step and at its nodes, shape (STAGES + 1, N_VECTOR)."""
 SHAFT_FREE = NODE_VALUES + (STAGES + 1) * S.N_VECTOR
 SHAFT_FORCED = SHAFT_FREE + 3 * 4 * STAGES
@@ -38,7 +38,7 @@ UNKNOWNS = HISTORY + 3 * MAX_PLACES * 6 * STAGES
 NODE_STATES = UNKNOWNS + 6 * STAGES
 UNDRIVEN = NODE_STATES + 14 * STAGES
 AT_NODES = UNDRIVEN + 14 * STAGES
-POWERS = AT_NODES + 20 * STAGES
+POWERS = AT_NODES + 19 * STAGES
 RESIDUALS = POWERS + 15 * STAGES
 CHANGES = RESIDUALS + 2 * STAGES
 MEMORY = CHANGES + 2 * STAGES

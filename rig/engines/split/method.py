@@ -16,6 +16,7 @@ import numpy as np
 from numba import njit
 
 from rig.engines.memory import ONSET, PHASE
+from rig.engines.split.condensed import body_matrices
 from rig.engines.split.layout import MEMORY, PLACES, READY_TICK, STEP_S, WAITS
 from rig.engines.split.place import HARDEST, SHARE
 from rig.engines.split.rigid import bounce, plant_of
@@ -23,6 +24,7 @@ from rig.engines.split.rolling import may_roll, roll, watch_for_rolling
 from rig.engines.taylor import march as series
 from rig.engines.taylor.events import FIRST
 from rig.engines.taylor.place import END_FRACTION, END_TICK, EVENT, FRACTION, ORDER, SERIES_ORDER, SPAN, TICK
+from rig.engines.taylor.ringing import set_modes
 from rig.kernels.contact import FLIGHT
 from rig.kernels.signals import N_ROW, N_VECTOR
 from rig.kernels.stage import kernel
@@ -38,6 +40,9 @@ def start(constants, inputs, y, memory, step_ticks, tolerance):
     series.start(constants, inputs, y, memory, step_ticks, SHARE * tolerance if tolerance > 0.0 else 1e-9)
     if len(memory) == MEMORY:
         memory[READY_TICK] = -1.0
+        if constants[0].levels.inner_house:
+            matrices = getattr(body_matrices, "py_func", body_matrices)(constants[0], inputs[0])[1]
+            set_modes(constants[0].house, matrices, memory)
         if tolerance >= _COARSE:
             memory[SERIES_ORDER] = _COARSE_ORDER
 
@@ -83,7 +88,7 @@ def _march(constants, inputs, y, memory, tick, fraction, grid, row, rows):
         row = series.write_rows(constants, inputs, memory, room.Y, room.dy, room.out, y, grid, row, rows)
         if row > count:
             return row
-        if collocates and may_roll(memory):
+        if collocates and may_roll(constants, memory):
             series.read_off(memory, room.Y, y, memory[END_TICK], memory[END_FRACTION])
             series.begin_series(constants, inputs, memory, room, y, int(memory[END_TICK]), memory[END_FRACTION], False)
             return row

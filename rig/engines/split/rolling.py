@@ -31,6 +31,7 @@ from rig.engines.split.condensed import (
     rolling_in,
     root_of_law,
     set_step,
+    slip_of_law,
     solve_step,
     write_nodes,
 )
@@ -44,6 +45,7 @@ from rig.engines.split.layout import (
     READY_TICK,
     ROLLING_STEPS,
     START_FORCE,
+    START_FRICTION,
     STEP_S,
     TURNS,
     WAITS,
@@ -55,9 +57,20 @@ from rig.engines.split.radau import NODES, STAGES, interpolation
 from rig.engines.split.rigid import axis_at, mobility_of, motion_of, plant_of, strike
 from rig.engines.taylor.events import NOTHING
 from rig.engines.taylor.march import holds, same_inputs, write_row
-from rig.engines.taylor.place import EAST, END_FRACTION, END_TICK, EVENT, FRACTION, INPUTS, NORTH, SPAN, TICK
+from rig.engines.taylor.place import (
+    EAST,
+    END_FRACTION,
+    END_TICK,
+    EVENT,
+    FRACTION,
+    INPUTS,
+    NORTH,
+    SLACK,
+    SPAN,
+    TICK,
+)
 from rig.kernels import signals as S
-from rig.kernels.contact import ROLLING
+from rig.kernels.contact import ROLLING, SMOOTHED, TOUCHING
 from rig.kernels.stage import kernel
 
 _LADDER = (2, 3, 4, 6, 8, 12, 16, 24, MAX_PLACES)
@@ -103,9 +116,17 @@ def _set_places(memory, places, turns):
 
 
 @kernel
+def _rolls(constants, memory):
+    """Return whether the series at hand rolls, or creeps with smoothed friction."""
+    smoothed = constants.levels.friction == SMOOTHED and constants.contact.friction > 0.0
+    creeps = smoothed and memory[PHASE] == TOUCHING and memory[SLACK] == 0.0
+    return memory[PHASE] == ROLLING or creeps
+
+
+@kernel
 def watch_for_rolling(constants, memory, y):
     """Wait one turn from the start of rolling in a series; y is its first state."""
-    if memory[PHASE] != ROLLING:
+    if not _rolls(constants, memory):
         memory[READY_TICK] = -1.0
     elif memory[READY_TICK] < 0.0:
         _wait(constants, memory, y, memory[TICK])
@@ -120,11 +141,11 @@ def _wait(constants, memory, y, tick):
 
 
 @kernel
-def may_roll(memory):
+def may_roll(constants, memory):
     """Return whether collocation may replace the current series at its end."""
     return (
         memory[SPAN] >= 0.0
-        and memory[PHASE] == ROLLING
+        and _rolls(constants, memory)
         and memory[EVENT] == NOTHING
         and 0.0 <= memory[READY_TICK] <= memory[END_TICK]
         and memory[NORTH] == 0.0
@@ -328,7 +349,7 @@ def _take_step(constants, inputs, memory, rolling):
     if not keeps_rolling(constants, memory):
         return False
     memory[WORST] = max(memory[WORST], worst)
-    memory[START_FORCE] = -memory[LAST_UNKNOWNS]
+    memory[START_FORCE], memory[START_FRICTION] = -memory[LAST_UNKNOWNS], -memory[LAST_UNKNOWNS + 1]
     _keep(memory, rolling, nx, ny)
     _finish(memory, h)
     return True
@@ -354,10 +375,10 @@ def _finish(memory, h):
 
 
 @kernel
-def _match_force(constants, memory, y, force):
-    """Move the shaft of the state y to where the normal law gives the force that is interpolated itself.
+def _match_force(constants, memory, y, force, friction):
+    """Move the shaft of the state y to where the laws give the forces that are interpolated themselves.
 
-    The law makes newtons of the hundredth of a micrometre by which the polynomials of the motion err between nodes.
+    They make newtons of the hundredth of a micrometre by which the polynomials of the motion err between nodes.
     """
     contact, shaft = constants.contact, constants.shaft
     axis, w = axis_at(constants, y)
@@ -368,6 +389,11 @@ def _match_force(constants, memory, y, force):
     closer = (gap - root_of_law(load / (contact.stiffness * ratio), gap, contact.exponent)) / shaft.arm_ring
     y[S.BETA] -= closer * motion.nx
     y[S.GAMMA] += closer * motion.ny
+    if constants.levels.friction == SMOOTHED:
+        slip = slip_of_law(contact, SMOOTHED, friction / (contact.friction * force))
+        faster = (slip - motion.sliding) / shaft.arm_ring
+        y[S.BETA_RATE] -= faster * motion.ny
+        y[S.GAMMA_RATE] -= faster * motion.nx
 
 
 @kernel
@@ -378,14 +404,15 @@ def _write_rows(constants, inputs, memory, Y, dy, out, y, grid, row, rows):
     while holds(memory, now, 0.0):
         part = ((now - memory[TICK]) - memory[FRACTION]) * memory[INPUTS] / memory[SPAN]
         interpolation(True, min(max(part, 0.0), 1.0), weights)
-        force = weights[0] * memory[START_FORCE]
+        force, friction = weights[0] * memory[START_FORCE], weights[0] * memory[START_FRICTION]
         for i in range(STAGES):
             force += weights[i + 1] * memory[FN + i]
+            friction += weights[i + 1] * memory[FT + i]
         for k in range(S.N_VECTOR):
             y[k] = 0.0
             for i in range(STAGES + 1):
                 y[k] += weights[i] * Y[i, k]
-        _match_force(constants, memory, y, force)
+        _match_force(constants, memory, y, force, friction)
         write_row(constants, inputs, memory, now, dy, out, y, row, rows)
         row += 1
         if now == end:
@@ -402,6 +429,8 @@ def _leave(constants, inputs, memory, y):
     which an impulse takes away.
     """
     memory[PLACES], memory[SPAN] = 0.0, -1.0
+    if constants.levels.friction == SMOOTHED:
+        return
     plant, (axis, w) = plant_of(constants, inputs), axis_at(constants, y)
     motion = motion_of(constants, axis, w, y)
     mobility = mobility_of(plant, constants.levels.euler, axis, motion.nx, motion.ny)

@@ -44,6 +44,7 @@ from rig.engines.method import PER_SCALE, fill, rates
 from rig.engines.tape.columns import EVENTS, FORCE, ROOT, TIME, WIDTH
 from rig.engines.taylor.events import FIRST, NOTHING, change_phase, enter_events, preload_end, ring_at
 from rig.engines.taylor.place import (
+    EAST,
     END_FRACTION,
     END_TICK,
     EVENT,
@@ -51,7 +52,9 @@ from rig.engines.taylor.place import (
     INPUTS,
     KNOWN,
     LENGTH,
+    NORTH,
     ORDER,
+    RINGING,
     SERIES,
     SERIES_ORDER,
     SPAN,
@@ -59,6 +62,7 @@ from rig.engines.taylor.place import (
     TICK,
 )
 from rig.engines.taylor.polynomial import column_at, first_zero, refine, series_at
+from rig.engines.taylor.ringing import RINGS, add_ringing, keep_clear, let_ring
 from rig.engines.taylor.series import LANES, flight, rolling, sliding
 from rig.kernels import signals as S
 from rig.kernels.contact import FLIGHT, ROLLING, TOUCHING, held_speed, normal_force
@@ -221,6 +225,27 @@ def _note_peak(constants, inputs, memory, Y, x):
 
 
 @kernel
+def _state_at(memory, Y, s, x):
+    """State and integrals at s of the series at hand into x."""
+    series_at(Y, s, x)
+    if memory[RINGING] != 0.0:
+        add_ringing(memory, s, x)
+
+
+@kernel
+def _rings(constants, inputs, memory, x, y):
+    """Take the housings out of the state x in flight where they ring by themselves; y is room for a state."""
+    memory[RINGING] = 0.0
+    if memory[RINGS] == 0.0 or memory[PHASE] != FLIGHT or memory[NORTH] != 0.0 or memory[EAST] != 0.0:
+        return False
+    fill(y[: S.N_VECTOR], x)
+    for row in range(S.X_IH, S.Y_OH + 1):
+        y[row] = y[row + S.VX_IH - S.X_IH] = 0.0
+    ring, _ = ring_at(constants, inputs, y)
+    return let_ring(constants, memory, x, ring.delta, ring.rate)
+
+
+@kernel
 def _next_series(constants, inputs, memory, room, y):
     """From the end of one series to the next; y is room for a state.
 
@@ -231,9 +256,10 @@ def _next_series(constants, inputs, memory, room, y):
     if memory[SPAN] >= 0.0:
         if memory[PHASE] != FLIGHT:
             _note_peak(constants, inputs, memory, Y, x)
-        series_at(Y, memory[LENGTH], x)
+        _state_at(memory, Y, memory[LENGTH], x)
         memory[TICK], memory[FRACTION] = memory[END_TICK], memory[END_FRACTION]
     change_phase(constants, inputs, memory, x, y, room.dy, room.out)
+    rings = _rings(constants, inputs, memory, x, y)
     fill(Y[0, : ROOT + 1], x)
     for i in range(S.N_STATE):
         # At rest, rates decay to where a processor takes a hundred times as long for a product.
@@ -274,14 +300,20 @@ def _next_series(constants, inputs, memory, room, y):
         h = limit
         at_corner = limit < _LONGEST_S
     event = NOTHING
-    for i in range(3):
-        shift = int(memory[KNOWN + i])
-        zero = first_zero(Y, EVENTS + i, shift, h)
+    if rings:
+        keep_clear(constants, memory, Y, EVENTS)
+        zero = first_zero(Y, EVENTS, 0, h)
         if zero <= h:
-            h, event, at_corner = zero, FIRST + i, False
-    zero, which = preload_end(constants, memory, Y, h)
-    if zero <= h:
-        h, event, at_corner = zero, which, False
+            h, at_corner = zero, False
+    else:
+        for i in range(3):
+            shift = int(memory[KNOWN + i])
+            zero = first_zero(Y, EVENTS + i, shift, h)
+            if zero <= h:
+                h, event, at_corner = zero, FIRST + i, False
+        zero, which = preload_end(constants, memory, Y, h)
+        if zero <= h:
+            h, event, at_corner = zero, which, False
     span = column_at(Y, TIME, 0, h)[0] if slowed else h
     memory[STALLED] = memory[STALLED] + 1.0 if span < 1e-13 else 0.0
     memory[LENGTH], memory[SPAN], memory[EVENT] = h, span, event
@@ -324,7 +356,7 @@ def read_off(memory, Y, y, tick, fraction):
         s = memory[LENGTH]
     elif time > 0.0 and memory[PHASE] != FLIGHT and memory[PHASE] != ROLLING:
         s = refine(Y, TIME, 0, time, 0.0, memory[LENGTH])
-    series_at(Y, s, y[: S.N_VECTOR])
+    _state_at(memory, Y, s, y[: S.N_VECTOR])
 
 
 @kernel

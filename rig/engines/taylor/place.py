@@ -21,5 +21,7 @@ SERIES = OWN + 31
 
 ORDER = 16
 """Highest order of a series."""
-SERIES_END = SERIES + (ORDER + 1) * WIDTH
-"""Behind the series."""
+RINGING = SERIES + (ORDER + 1) * WIDTH
+"""A mark that the series is of the shaft alone, and the housings ring by their modes, whose numbers follow."""
+SERIES_END = RINGING + 225
+"""Behind both."""

@@ -1,0 +1,61 @@
+"""The cheapest sufficient model of twelve scenes for three questions, each pick checked against `taylor`.
+
+Run `python -m tests.physics.ladder_runs [SCENE ...]`; each search takes 20 to 60 s of processor time, all some 25
+minutes. Rows of the table in docs/engines.md come out as they are found. The last column is the picked run's error
+against the full model by `taylor` at 1e-11, of which the search knows nothing; a pick whose error there is more than
+twice what was asked for is marked, and the status is 1.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+
+from replays.studies.ladder.measurement import Candidate, measure
+from replays.studies.ladder.quantity import QUANTITIES
+from replays.studies.ladder.search import Ladder, search
+from replays.studies.twelve_scenes import TWELVE_SCENES, StudyScene
+from rig.errors import InputError
+
+QUESTIONS = ("whirl_frequency", "reaction_amplitude", "time_to_roll")
+ASKED, BUDGET_S = 0.01, 60.0
+
+
+def exact(found: Ladder) -> Candidate:
+    """Return the full model by `taylor`."""
+    return found.reference.candidate.with_engine("taylor", 25, 1e-11)
+
+
+def row(study: StudyScene, name: str) -> tuple[str, bool]:
+    """Return a row of the table, and whether the pick holds what was asked for."""
+    scene = study.load().model_copy(update={"duration_s": study.window_s})
+    try:
+        found = search(scene, {name: ASKED}, budget_s=BUDGET_S)
+    except InputError as error:
+        return f"| {study.title} | {name} | none: {error} | | | |", True
+    picked, full = found.picked, found.full
+    checked = measure(scene, exact(found), (name,), runs=1)
+    error = QUANTITIES[name].error(picked.values[name], checked.values[name])
+    left_out = ", ".join(f"{level} {part:.0%}" for level, part in found.savings.items()) or "nothing"
+    holds = math.isfinite(error) and error <= 2.0 * ASKED
+    given = picked.cpu_s / found.given.cpu_s
+    cells = study.title, name, picked.candidate.label, left_out, f"{given:.2f}", f"{picked.cpu_s / full.cpu_s:.2f}"
+    return f"| {' | '.join(cells)} | {error:.1e}{'' if holds else ' MISSED'} |", holds
+
+
+def main() -> int:
+    """Print the table; 1 where a pick errs by more than twice what was asked for."""
+    print(
+        "| scene | question | pick | saved | of the scene as given | of the full model | error |\n" + "|---" * 7 + "|"
+    )
+    every = True
+    for name in sys.argv[1:] or TWELVE_SCENES:
+        for question in QUESTIONS:
+            text, holds = row(TWELVE_SCENES[name], question)
+            every = every and holds
+            print(text, flush=True)
+    return 0 if every else 1
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
