@@ -18,6 +18,8 @@ _MIN_VOTES = 16
 """Groups that must agree on where the recording begins; chance agreements are single ones."""
 _CANDIDATES, _RIVAL = 8, 0.25
 """Places that are told, at most, and part of the most votes that each must have."""
+_EXACT = 2
+"""Further places that are returned, at most, where all groups agree; chance ones have fewer votes."""
 _MAX_HELD = 1 << 20
 """Groups of the shorter side that are held; of a longer one every n-th by its hash is taken on both sides."""
 
@@ -38,11 +40,12 @@ def find_begins(recorded: Iterable[np.ndarray], sent: Iterable[np.ndarray], step
     hashes, first = np.unique(hashes, return_index=True)
     if len(hashes) < _MIN_VOTES:
         return []
-    rows, pairs = rows[first], [np.empty((0, 2), dtype=np.int64)]
+    rows, pairs, last = rows[first], [np.empty((0, 2), dtype=np.int64)], -1
     for there, places in _groups(sent, step, every):
         at = np.minimum(np.searchsorted(hashes, there), len(hashes) - 1)
         same = hashes[at] == there
         pairs.append(np.column_stack([rows[at[same]], places[same] - step * rows[at[same]]]))
+        last = int(places[-1]) if len(places) else last
     at, begins = np.concatenate(pairs).T
     if not len(at):
         return []
@@ -54,9 +57,12 @@ def find_begins(recorded: Iterable[np.ndarray], sent: Iterable[np.ndarray], step
     clear = votes[which] >= max(_MIN_VOTES, 0.01 * votes.max())
     clear &= most | ((at < at[first]) & (places < places[first]))
     likeliest = begins[clear][np.argmin(at[clear])][None] if clear.any() else begins[:0]
-    others = values[np.argsort(-votes)][: _CANDIDATES if votes.max() >= _MIN_VOTES else 0]
-    others = others[votes[np.searchsorted(values, others)] >= _RIVAL * votes.max()]
-    return list(dict.fromkeys([*likeliest.tolist(), *others.tolist()]))
+    # Where a signal nearly repeats, most begins have some unequal rows: one that has none may have few in the session.
+    held, ranked = np.sort(rows), np.argsort(-votes)[: len(votes) if votes.max() >= _MIN_VOTES else 0]
+    inside = np.searchsorted(held, (last - values) // step, side="right") - np.searchsorted(held, -(values // step))
+    exact = (votes >= _MIN_VOTES) & (votes == inside)
+    others = [*ranked[votes[ranked] >= _RIVAL * votes.max()][:_CANDIDATES], *ranked[exact[ranked]][:_EXACT]]
+    return list(dict.fromkeys([*likeliest.tolist(), *values[others].tolist()]))
 
 
 def _groups(pieces: Iterable[np.ndarray], step: int, every: np.uint64) -> Iterator[tuple[np.ndarray, np.ndarray]]:

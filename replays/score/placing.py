@@ -22,6 +22,10 @@ _SAMPLED = 64
 """Of so many values one is looked at for the bits that a DAQ leaves out."""
 _SEARCHED = 3
 """Signals of a table by which its place in the session is searched over the whole of both."""
+_MIN_MOVING = 64
+"""Equal rows that move, from which a begin is shown: fewer are equal by chance at an end of the session."""
+_MAX_UNEQUAL = 16
+"""Unequal values of nearly repeating signals that may stand together by chance."""
 
 
 @dataclass(frozen=True)
@@ -84,13 +88,44 @@ class _Search:
         start = max(0, begin - (phase - index) % step) // step
         return Taken(scale, step, phase, max(0, -(begin // step)), start, begin)
 
-    def agreement(self, name: str, of: str, begin: int, scale: Scale) -> tuple[int, float]:
-        """Longest run of the first rows whose counts are equal, without those that stand still, and part of all."""
+    def is_better(self, begin: int, other: int, signals: Iterable[tuple[str, str, Scale]], *, known: bool) -> bool:
+        """Return whether all rows in the session are equal from a begin, and some of these are not from another one.
+
+        Where a signal nearly repeats, other begins have more rows in the session, of which nearly all are equal. Those
+        that are not stand everywhere; where they stand together, these rows are stale ones.
+
+        Args:
+            begin: Place of the first row in the session, or below 0.
+            other: Another such place.
+            signals: Signals of one table: name, channel and scale.
+            known: Whether another table of the file has this begin. Any unequal row from the other one counts then;
+                otherwise only those that stand in the session from both.
+        """
+        moving, unequal, expected = 0, 0, 0.0
+        for name, of, scale in signals:
+            longest, part, same = self.agreement(name, of, begin, scale)
+            if part < 1.0:
+                return False
+            wrong, step = ~self.agreement(name, of, other, scale)[2], self.step_of(name, of)
+            first = max(0, -(begin // step)) - max(0, -(other // step))
+            both = wrong if known else wrong[max(0, first) : max(0, first + len(same))]
+            moving, unequal = moving + longest, unequal + int(both.sum())
+            expected += len(both) * float(wrong.mean()) if len(wrong) else 0.0
+        return moving >= _MIN_MOVING and 0 < unequal <= _MAX_UNEQUAL + 1.5 * expected
+
+    def agreement(self, name: str, of: str, begin: int, scale: Scale) -> tuple[int, float, np.ndarray]:
+        """Return how the counts of the first rows in the session agree.
+
+        Returns:
+            Length of the longest run of equal rows, without those that stand still; part of the rows that are equal;
+            whether each is, shape (n,).
+        """
         values, _, there, _ = self.tried(name, of, begin)
         same = scale.counts(values) == scale.sent(there)
         moving = np.concatenate([[0], np.cumsum(np.append(True, np.diff(there) != 0)[: len(there)])])
         ends = np.concatenate([[-1], np.flatnonzero(~same), [len(same)]])
-        return int((moving[ends[1:]] - moving[ends[:-1] + 1]).max()), float(same.mean()) if len(same) else 0.0
+        longest = int((moving[ends[1:]] - moving[ends[:-1] + 1]).max())
+        return longest, float(same.mean()) if len(same) else 0.0, same
 
     def taken_of(self, name: str, of: str) -> Taken | None:
         """By where its table begins, as far as that is known; else by where its counts are."""
@@ -104,7 +139,7 @@ class _Search:
         def try_begin(begin: int) -> bool:
             values, unit, there, _ = self.tried(name, of, begin)
             if len(values) > 1 and (scale := find_scale(values, unit, there, channel)) is not None:
-                longest, part = self.agreement(name, of, begin, scale)
+                longest, part, _ = self.agreement(name, of, begin, scale)
                 placed.append((scale.clean, longest, begin, scale))
                 most.append(scale.clean and part > _MOST_ROWS)
                 return scale.clean and part == 1.0
@@ -121,6 +156,9 @@ class _Search:
         if not placed:
             return None
         *_, begin, scale = max(placed, key=lambda each: each[:2])
+        for _, _, other, its in placed:
+            if its.clean and self.is_better(other, begin, [(name, of, its)], known=False):
+                begin, scale = other, its
         self.begins.setdefault(table, begin)
         return self.taken(scale, step, begin, channel.group)
 
@@ -162,7 +200,7 @@ def settle(
         for of in dict.fromkeys(each for each in likely if each in session.channels):
             if (one := search.taken_of(name, of)) is None:
                 continue
-            longest, part = search.agreement(name, of, one.begin, one.scale)
+            longest, part, _ = search.agreement(name, of, one.begin, one.scale)
             if longest > best or part == 1.0:
                 best, settled[name] = longest, one
                 found[name] = wire if of == wire.channel else replace(wire, channel=of, rivals=())
@@ -185,7 +223,11 @@ def settle(
             signals = [(each, found[each].channel, begin, settled[each].scale) for each in names]  # noqa: B023
             return sum(search.agreement(*signal)[0] for signal in signals)
 
-        search.begins[table] = max(choices, key=agreed) if choices[1:] else choices[0]
+        best = max(choices, key=agreed) if choices[1:] else choices[0]
+        signals = [(each, found[each].channel, settled[each].scale) for each in names]
+        for other in dict.fromkeys([*choices, *search.begins.values()]):
+            best = other if search.is_better(other, best, signals, known=other not in choices) else best
+        search.begins[table] = best
         for name in names:
             one, group = settled[name], session.channels[found[name].channel].group
             settled[name] = search.taken(one.scale, one.step, search.begins[table], group)

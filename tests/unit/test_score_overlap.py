@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from replays.score.judgement import judge
+from replays.score.overlap import find_begins
 from replays.score.scorecard import FAIL, Scorecard
 from rig.channels import default_table
 from tests.score_daqs import RATE_HZ, counts_of, write_parquet, write_session
@@ -130,3 +131,37 @@ def test_channels_of_noise_are_found_by_the_begin_that_others_show(which: str, t
     card = judge(write_parquet(tmp_path / "daq.parquet", columns), [session])
     assert (card.path, red(card), card.outcome) == ("digital", set(), "pass"), card.verdict_line
     assert [card.row("mapping", name).value for name in columns] == [channels[c].name for c in order]
+
+
+PERIOD = 1500
+
+
+def repeating(rows: int, channels: int, generator: np.random.Generator) -> np.ndarray:
+    """Return counts of a signal that repeats, with noise below one count: a few in 10,000 are off by one."""
+    counts = generator.integers(-50, 50, (PERIOD, channels))[np.arange(rows) % PERIOD]
+    return counts + (generator.random(counts.shape) < 3e-4)
+
+
+@pytest.mark.parametrize(("first", "last"), [(7200, 11_000), (0, 3800)], ids=["after", "before"])
+def test_rows_beyond_a_session_are_not_those_of_another_period(first: int, last: int, tmp_path: Path) -> None:
+    """Nearly all of them are equal a period away, and more rows of the record are in the session there."""
+    whole = repeating(11_000, 4, np.random.default_rng(0))
+    session = write_session(tmp_path / "session.mcap", {"probes": whole[2700:8700]})
+    card = judge(write_parquet(tmp_path / "daq.parquet", columns_of(whole[first:last])), [session])
+    assert (card.path, red(card), card.outcome) == ("digital", set(), "pass"), card.verdict_line
+    assert card.row("rows before the first", "probes").value == max(0, first - 2700)
+    assert f"{max(2700 - first, last - 8700)} rows are not judged" in card.remarks[0]
+
+
+def test_the_sessions_last_rows_in_place_of_others_are_no_begin(tmp_path: Path) -> None:
+    whole = repeating(6000, 4, np.random.default_rng(0))
+    session = write_session(tmp_path / "session.mcap", {"probes": whole})
+    daq = np.concatenate([whole[5700:], whole[1300:5300]])
+    card = judge(write_parquet(tmp_path / "daq.parquet", columns_of(daq)), [session])
+    assert {"doubled rows", "swapped rows"} & {quantity for quantity, _ in red(card)}
+
+
+def test_a_begin_without_unequal_rows_is_found_though_others_have_more_rows() -> None:
+    whole = repeating(40_000, 1, np.random.default_rng(1))[:, 0]
+    places = find_begins([whole[29_500:]], [whole[:30_000]], 1, 500)
+    assert 29_500 in places
