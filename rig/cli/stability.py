@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.text import Text
 
+    from replays.studies.scene_atlas import Outcome
     from replays.studies.stability.cell import Cell
 
 
@@ -23,7 +24,9 @@ def stability(
     *,
     only: Annotated[
         str | None,
-        typer.Option("--only", metavar="T3,T7", help="Only these trials; pictures stay whole. With --random: scenes."),
+        typer.Option(
+            "--only", metavar="T3,T7", help="Only these trials; pictures stay whole. With --random or --scenes: scenes."
+        ),
     ] = None,
     engines: Annotated[str | None, typer.Option("--engines", metavar="ENGINE,...", help="Only these engines.")] = None,
     full: Annotated[
@@ -34,6 +37,10 @@ def stability(
         typer.Option("--random", metavar="N", min=1, help="Random scenes 0 to N-1 instead, against accurate runs."),
     ] = None,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Of the random scenes.")] = 1,
+    scenes: Annotated[
+        bool,
+        typer.Option("--scenes", help="The chart's twelve scenes instead, at every setting of each engine and peer."),
+    ] = False,
     output: Annotated[
         Path | None,
         typer.Option(
@@ -48,11 +55,16 @@ def stability(
     """Test where integration methods fail; exit status 1 if any does not do what theory expects.
 
     With --random, every engine runs random scenes, wide over all parameters, laws and levels, against two accurate
-    engines that agree: exit status 1 if the first engine is wrong without a warning, or fails.
+    engines that agree: exit status 1 if the first engine is wrong without a warning, or fails. With --scenes, the same
+    in twelve scenes, from coarse settings to fine ones, peers that are installed included unless --engines leaves
+    them out; ten to twenty minutes.
     """
     from replays.studies.stability.table import chosen_engines, chosen_trials, run_trials
 
     names = chosen_engines(engines)
+    if scenes:
+        _twelve(only, None if engines is None else names, output, form)
+        return
     if random is not None:
         _sweep(random, seed, only, names, output, form)
         return
@@ -117,6 +129,42 @@ def _sweep(count: int, seed: int, only: str | None, engines: list[str], folder: 
     own = found["engines"][engines[0]]
     if any(own[kind] for kind in ("silent", "crashes", "hangs", "absurd")):
         raise typer.Exit(1)
+
+
+def _twelve(only: str | None, engines: list[str] | None, folder: Path | None, form: Form) -> None:
+    from replays.studies.journal import prepare_folder
+    from replays.studies.scene_atlas import Outcome, chosen_scenes, draw_scene_atlas, is_silent, outcomes
+
+    names, found = chosen_scenes(only), list[Outcome]()
+    if folder is not None:
+        prepare_folder(folder)
+    with reporting(compiles=True) as reporter:
+        for one in outcomes(names, engines, peers=engines is None):
+            found.append(one)
+            reporter.step(f"{one.scene}, {one.method} {one.setting}: {one.kind}")
+    pictures = [] if folder is None else draw_scene_atlas(folder, found)
+    if form.as_json:
+        echo_json({"outcomes": [one.document() for one in found], "pictures": [str(path) for path in pictures]})
+    else:
+        form.console().print(scenes_table(found))
+        for path in pictures:
+            echo(f"picture  {path}")
+    if any(is_silent(one) for one in found if one.method == found[0].method):
+        raise typer.Exit(1)
+
+
+def scenes_table(found: list[Outcome]) -> Table:
+    """How often each method came to each outcome."""
+    from replays.studies.scene_atlas import OUTCOMES
+
+    scenes = len({one.scene for one in found})
+    table = new_table(
+        f"{scenes} scenes, each method at its settings: number of runs", "method", *(f">{k}" for k in OUTCOMES)
+    )
+    for method in dict.fromkeys(one.method for one in found):
+        kinds = [one.kind for one in found if one.method == method]
+        table.add_row(method, *(str(kinds.count(kind) or "-") for kind in OUTCOMES))
+    return table
 
 
 def sweep_table(found: dict[str, Any], seed: int) -> Table:

@@ -42,6 +42,8 @@ class Task(NamedTuple):
     """By how many clearances the shaft starts farther along x."""
     limit_s: float = 20.0
     """Processor time it may take [s]."""
+    step_us: int = 0
+    """Of the engine's steps or grid; 0: its own."""
 
 
 @dataclass
@@ -69,9 +71,10 @@ def run_task(task: Task, begun: Callable[[], None] = lambda: None) -> Run:
         begun: Called where its first step is due, the engine being compiled.
     """
     done, kept = Run(), []
+    asked = {"name": task.engine, "tolerance": task.tolerance, "step_us": task.step_us}
     try:
         changes: dict[str, Any] = {f"sensors.{key}": value for key, value in bare_sensors(RATE_HZ).items()}
-        changes |= {"engine.name": task.engine} | ({"engine.tolerance": task.tolerance} if task.tolerance else {})
+        changes |= {f"engine.{key}": value for key, value in asked.items() if value}
         scene = change_scene(task.scene, changes)
         simulation = Simulation(nudged(scene, task.nudge) if task.nudge else scene)
         _ = simulation.first_row  # compiles
