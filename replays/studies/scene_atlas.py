@@ -17,6 +17,7 @@ from replays.report.canvas import GREEN, RED, house_style, new_figure, save
 from replays.studies.chart.measure import Budget, run_peer
 from replays.studies.chart.methods import Competitor, competitors
 from replays.studies.chart.phases import scene_problem
+from replays.studies.chart.store import code_digest
 from replays.studies.peers import Setting
 from replays.studies.peers.problem import scaled_error
 from replays.studies.stability.truth import AGREE, WRONG, doubted
@@ -168,4 +169,5 @@ def draw_scene_atlas(folder: Path, found: list[Outcome]) -> list[Path]:
     for kind, (colour, title) in OUTCOMES.items():
         axes.bar(0, 0, color=colour, hatch=_HATCHES.get(kind, ""), edgecolor="white", lw=0.0, label=title)
     figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False, fontsize=9)
-    return save(figure, *(folder / f"stability-scenes{suffix}" for suffix in (".png", ".svg")))
+    paths = (folder / f"stability-scenes{suffix}" for suffix in (".png", ".svg"))
+    return save(figure, *paths, source=f"code {code_digest()}")

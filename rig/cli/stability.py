@@ -57,7 +57,7 @@ def stability(
     With --random, every engine runs random scenes, wide over all parameters, laws and levels, against two accurate
     engines that agree: exit status 1 if the first engine is wrong without a warning, or fails. With --scenes, the same
     in twelve scenes, from coarse settings to fine ones, peers that are installed included unless --engines leaves
-    them out; ten to twenty minutes.
+    them out; twelve minutes.
     """
     from replays.studies.stability.table import chosen_engines, chosen_trials, run_trials
 

@@ -52,3 +52,9 @@ def test_the_chart_is_of_these_engines() -> None:
     for path in sorted(FIGURES.glob("chart*.png")):
         with Image.open(path) as image:
             assert image.info.get("Source") == f"code {code}", f"{path.name} is of another table: {cure}"
+
+
+def test_the_atlas_is_of_these_engines() -> None:
+    cure = "`rig stability --scenes -o FOLDER` (twelve minutes) makes it: copy stability-scenes.png"
+    with Image.open(FIGURES / "stability-scenes.png") as image:
+        assert image.info.get("Source") == f"code {code_digest()}", f"it is of other engines or peers: {cure}"
