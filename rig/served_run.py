@@ -138,6 +138,7 @@ class ServedRun(ABC):
                 "spin_hz": health.get("spin_hz"),
                 "energy": health.get("energy", {}),
                 "engine": health.get("engine", {}),
+                "accuracy": health.get("accuracy"),
                 "warnings": warnings + self._desk.warnings(),
                 "samples_published": self.published,
                 "commands": self._accepted,

@@ -211,7 +211,11 @@ class Service(ServedRun):
         self._queue.push(_Entry([self._event("start", simulation.tick, **start)]))
         self._publisher.start()
         self._clock.start(simulation.tick, self._rate)
-        return self._advance_all()
+        reason = self._advance_all()
+        # A recording keeps the last status: it has to be of the end, whatever the time since the one before.
+        self._next_health_s = 0.0
+        self._refresh_health()
+        return reason
 
     def _advance_all(self) -> str:
         """The loop; returns why it ended."""

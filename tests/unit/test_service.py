@@ -12,6 +12,7 @@ import pytest
 
 from drivers.console import Accepted, Console
 from rig import wire
+from rig.cli.status import accuracy_text
 from rig.errors import InputError, RefusedError
 from rig.pacing import Clock, FreeRun, Lockstep, RealTime, StepTimeoutError
 from rig.service import Service
@@ -140,6 +141,21 @@ def test_documents_are_answered() -> None:
         status = wire.decode_document(client.request(wire.STATUS))
         assert status["state"] == "running"
         assert status["energy"]["residual_j"] is None, "a number that JSON cannot carry"
+
+
+def test_the_last_status_has_the_error_estimate_energy_and_warnings_of_the_end() -> None:
+    class Estimating(FakeSimulation):
+        def health(self) -> dict[str, Any]:
+            radius = {"label": "whirl radius", "unit": "um", "error": 1e-6 * self.tick, "tolerance": 0.28}
+            return {**super().health(), "energy": {"residual_j": self.tick}, "accuracy": {"quantities": {"r": radius}}}
+
+    simulation = Estimating(duration_s=0.1)
+    simulation.warn_at_tick = 100_000
+    _, listener = run(simulation, status_period_s=60.0)
+    told = listener.statuses[-1]
+    assert accuracy_text(told["accuracy"]) == "whirl radius 0.1 um (tolerance 0.28)"
+    assert told["energy"]["residual_j"] == 100_000
+    assert [event["text"] for event in listener.named("warning")] == told["warnings"] == ["energy does not close"]
 
 
 def test_a_command_is_answered_with_its_tick_and_becomes_an_event() -> None:
