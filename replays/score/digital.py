@@ -13,9 +13,10 @@ from itertools import chain
 import numpy as np
 
 from replays.score.live import Arrivals
+from replays.score.overlap import holds_session_rows
 from replays.score.placing import Taken
 from replays.score.recorded import Recorded, Table
-from replays.score.rows import Followed, follow, repeated_part, stretches
+from replays.score.rows import Followed, follow, repeated_part, row_hashes, stretches, take_rows
 from replays.score.scale import Scale
 from replays.score.scorecard import Interval, Scorecard
 from replays.score.sent import Sent, Session
@@ -29,6 +30,8 @@ _NAMED = 5
 """Rows that are named in a line; all stand in the document."""
 _REPEATING = 0.5
 """Part of the rows that recur, from which a loss of whole periods is taken for possible."""
+_BESIDE = 1 << 17
+"""Rows on each side of an end of the session that are compared with all of the session."""
 
 
 def score_digital(
@@ -83,18 +86,16 @@ def _score_rows(
     beside = recorded[names[0]].table
     stamps, delays, longest_s = Stamps(beside), Stamps(beside, shown=True), -math.inf
 
-    def counts() -> Iterator[np.ndarray]:
-        left = one.early
-        for parts in zip(
-            *(each.parts([recorded[name].column for name in inside]) for each, inside in tables.items()), strict=True
-        ):
+    def counts(left: int) -> Iterator[np.ndarray]:
+        all_parts = (each.parts([recorded[name].column for name in inside]) for each, inside in tables.items())
+        for parts in zip(*all_parts, strict=True):
             parts, left = [part[left:] for part in parts], max(0, left - len(parts[0]))
             stamps.times_s = parts[0][:, 0]
             columns = zip(chain(*tables.values()), chain(*(part.T[1:] for part in parts)), strict=True)
             found = {name: by_name[name].counts(values) for name, values in columns}
             yield np.column_stack([found[name] for name in names])
 
-    def made() -> Iterator[np.ndarray]:
+    def made(sent: Sent) -> Iterator[np.ndarray]:
         """Counts that a DAQ with these converters has of those sent."""
         for chunk in sent:
             cut = chunk[:, columns] >> bits << bits
@@ -105,7 +106,7 @@ def _score_rows(
     bits = np.array([recorded[name].lost_bits for name in names])
     coarse = any(scale.rounding for scale in by_name.values())
     found, trigger, at, repeats = Followed(), None, one.early, list[float]()
-    for places, found in follow(made(), counts(), sound, one.start):  # noqa: B007
+    for places, found in follow(made(sent), counts(one.early), sound, one.start):  # noqa: B007
         known = np.flatnonzero(places >= 0)
         since_s = sent.since_s(places[known]) if len(known) else np.empty(0)
         stamps.take(sent.first_s, since_s, known, len(places))
@@ -136,16 +137,23 @@ def _score_rows(
     add("missing rows", table, found.lost)
     for quantity, pairs in (("doubled rows", found.doubled), ("swapped rows", found.swapped)):
         add(quantity, table, stretches(np.unique(pairs[:, 0])), len(pairs))
+
+    def hashes() -> Iterator[np.ndarray]:
+        return (row_hashes(each[:, :sound]).view(np.int64) for each in made(Sent(session, groups, one.step, one.phase)))
+
     foreign, early = found.foreign, one.early
-    if early:  # to some rows, where some are lost
-        first = int(np.sum(foreign == np.arange(len(foreign))))
-        foreign, early = foreign[first:], early + first
-        card.remarks.append(f"{table}: the first {early} rows are not judged: they stand before the session's first")
-    after = foreign[foreign + found.last - found.last_row >= found.sent]
-    after = after[after > found.last_row]
-    if len(after):
-        foreign = foreign[: -len(after)]
-        card.remarks.append(f"{table}: the last {len(after)} rows are not judged: they stand after the session's last")
+    early += int(np.sum(foreign == np.arange(len(foreign)))) if early else 0  # to some rows, where some are lost
+    after = foreign[(foreign + found.last - found.last_row >= found.sent) & (foreign > found.last_row)]
+    foreign = foreign[early - one.early : len(foreign) - len(after)]
+    # Rows ahead of a session may be equal to some of it that are judged, as those that a DAQ had recorded before.
+    ends = ((early, early, "first", "before"), (len(after), at - len(after), "last", "after"))
+    for rows, edge, which, side in (each for each in ends if each[0]):
+        card.remarks.append(f"{table}: the {which} {rows} rows are not judged: they stand {side} the session's {which}")
+        first, judged = max(0, edge - _BESIDE), range(found.first, found.last + 1) if which == "first" else range(0)
+        near = row_hashes(take_rows(counts(first), 0, 2 * _BESIDE, len(names))[:, :sound]).view(np.int64)
+        outside = (np.arange(len(near)) < edge - first) == (which == "first")
+        if holds_session_rows(near, outside, judged, hashes):
+            card.doubts.append(f"{table}: unjudged rows {side} the session equal a run of rows in it")
     add("foreign rows", table, stretches(foreign + one.early), numbered=False)
     for name, altered in zip(names, found.altered, strict=True):
         add("altered values", name, altered.pairs(), altered.rows)

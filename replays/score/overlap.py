@@ -6,11 +6,12 @@ that memory does not grow with the length of either.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+import math
+from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
 
-from replays.score.rows import row_hashes
+from replays.score.rows import row_hashes, stretches
 
 _GRAM = 16
 """Consecutive counts that are hashed together: a channel with few levels is then still distinct."""
@@ -22,6 +23,10 @@ _EXACT = 2
 """Further places that are returned, at most, where all groups agree; chance ones have fewer votes."""
 _MAX_HELD = 1 << 20
 """Groups of the shorter side that are held; of a longer one every n-th by its hash is taken on both sides."""
+_MIN_UNEQUAL, _MAX_PART_UNEQUAL = 7.0, 0.2
+"""Unequal rows that a run of equal ones would have if the signal only repeats: a chance of 0.1 %; and their part."""
+
+_Pieces = Callable[[], Iterable[np.ndarray]]
 
 
 def find_begins(recorded: Iterable[np.ndarray], sent: Iterable[np.ndarray], step: int, fewest: int) -> list[int]:
@@ -63,6 +68,32 @@ def find_begins(recorded: Iterable[np.ndarray], sent: Iterable[np.ndarray], step
     exact = (votes >= _MIN_VOTES) & (votes == inside)
     others = [*ranked[votes[ranked] >= _RIVAL * votes.max()][:_CANDIDATES], *ranked[exact[ranked]][:_EXACT]]
     return list(dict.fromkeys([*likeliest.tolist(), *values[others].tolist()]))
+
+
+def holds_session_rows(rows: np.ndarray, outside: np.ndarray, judged: range, sent: _Pieces) -> bool:
+    """Return whether rows recorded outside the session equal rows in it over a longer run than by repetition alone.
+
+    A signal that repeats does so within the session, too. Unequal rows between the session's rows at its end and those
+    that stand as far before them give the rate at which a continued signal would differ.
+
+    Args:
+        rows: Hashes of consecutive recorded rows on both sides of an end of the session, int64, shape (n,).
+        outside: Whether each stands outside the session, shape (n,).
+        judged: Places in the session of rows that are not looked for.
+        sent: Function that returns the hashes of the session's rows in pieces, int64, each shape (m,).
+    """
+    begins = np.array(find_begins([rows[outside]], sent(), 1, int(outside.sum())), dtype=np.int64)[:, None]
+    places, at = begins - np.argmax(outside) + np.arange(len(rows)), 0
+    there = np.zeros_like(places)
+    for piece in sent():
+        inside = (places >= at) & (places < at + len(piece))
+        there[inside], at = piece[places[inside] - at], at + len(piece)
+    equal, beside = there == rows, (there != 0) & ~outside
+    part = np.min((1 + (beside & ~equal).sum(1)) / (1 + beside.sum(1)), initial=_MAX_PART_UNEQUAL)
+    equal &= outside & ((places < judged.start) | (places >= judged.stop))
+    moving = np.cumsum(np.tile(np.diff(rows, append=rows[-1:]) != 0, len(begins)))
+    longest = np.diff(moving[stretches(np.flatnonzero(equal))]).max(initial=0)  # without rows that stand still
+    return bool(part * longest > _MIN_UNEQUAL + math.log(1.0 + part * len(rows)))
 
 
 def _groups(pieces: Iterable[np.ndarray], step: int, every: np.uint64) -> Iterator[tuple[np.ndarray, np.ndarray]]:

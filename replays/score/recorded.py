@@ -13,6 +13,7 @@ import numpy as np
 from recorder.reader import Recording
 from replays.recordings.formats.mapping import ChannelMapping, FileOptions
 from replays.recordings.formats.source import MAX_RATE_HZ, Entry, FileSignal, Source, even_rate_hz, open_source
+from replays.score.rows import take_rows
 from replays.score.scale import COUNTS
 from rig import units
 from rig.channels import Channel, Group
@@ -69,13 +70,7 @@ class Table:
 
     def stretch(self, row: int, rows: int) -> np.ndarray:
         """Return stamps and all columns of some rows from a row on, as far as there are any, shape (n, 1 + columns)."""
-        found, at = [np.empty((0, 1 + self._columns))], 0
-        for part in self.parts(range(self._columns)):
-            found.append(part[max(0, row - at) : max(0, row + rows - at)])
-            at += len(part)
-            if at >= row + rows:
-                break
-        return np.concatenate(found)
+        return take_rows(self.parts(range(self._columns)), row, rows, 1 + self._columns)
 
     def changed(self, by_column: Mapping[int, tuple[float, float]]) -> Table:
         """Return a table whose values are size * (value - bias), by the column's size and bias."""

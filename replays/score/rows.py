@@ -61,6 +61,24 @@ def repeated_part(counts: np.ndarray) -> float:
     return float(np.mean(times[inverse] > 1)) if len(inverse) else 0.0
 
 
+def take_rows(pieces: Iterable[np.ndarray], first: int, rows: int, columns: int) -> np.ndarray:
+    """Return some rows of a table that comes in pieces, as far as there are any, shape (n, columns).
+
+    Args:
+        pieces: Rows in order, each shape (m, columns).
+        first: Number of the first row that is taken.
+        rows: Number of rows that are taken, at most.
+        columns: Number of columns.
+    """
+    found, at = [np.empty((0, columns), dtype=np.int64)], 0
+    for piece in pieces:
+        found.append(piece[max(0, first - at) : max(0, first + rows - at)])
+        at += len(piece)
+        if at >= first + rows:
+            break
+    return np.concatenate(found)
+
+
 class Stretches:
     """Rows of which some may be too many to keep: how many they are, and the first stretches of them.
 
@@ -83,11 +101,9 @@ class Stretches:
 
     def pairs(self) -> np.ndarray:
         """First and last row of each stretch, shape (n, 2)."""
-        if not self._parts:
-            return stretches(np.empty(0, dtype=np.int64))
-        found = np.concatenate(self._parts)
-        begins = np.append(True, found[1:, 0] != found[:-1, 1] + 1)
-        return np.column_stack([found[begins, 0], found[np.append(begins[1:], True), 1]])
+        found = np.concatenate([*self._parts, np.empty((0, 2), dtype=np.int64)])
+        begins = np.append(True, found[1:, 0] != found[:-1, 1] + 1)[: len(found)]
+        return np.column_stack([found[begins, 0], found[np.append(begins[1:], True)[: len(found)], 1]])
 
 
 def stretches(places: np.ndarray) -> np.ndarray:
@@ -122,11 +138,6 @@ class Followed:
     altered: list[Stretches] = field(default_factory=list)
     foreign: np.ndarray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     lost: np.ndarray = field(default_factory=lambda: np.empty((0, 2), dtype=np.int64))
-
-    @property
-    def missing(self) -> np.ndarray:
-        """Places of the rows in these stretches, shape (n,)."""
-        return np.concatenate([np.arange(a, b + 1) for a, b in self.lost] or [np.empty(0, dtype=np.int64)])
 
 
 class _Sent:
@@ -264,8 +275,6 @@ def _places(window: _Sent, hashes: np.ndarray, due: int, low: int, high: int) ->
         _forget_chance_places(places, due, end)
     known = places >= 0
     open_ = np.flatnonzero(~known)
-    if not len(open_):
-        return places, known
     behind = np.maximum.accumulate(np.where(known, rows, -1))[open_]
     next_ = np.minimum.accumulate(np.where(known, rows, n)[::-1])[::-1][open_]
     forward = np.where(behind >= 0, places[behind] + open_ - behind, due + open_)

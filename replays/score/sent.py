@@ -12,6 +12,7 @@ import numpy as np
 from drivers.daq import Aligner
 from drivers.samples import Samples
 from recorder.reader import join
+from replays.score.rows import take_rows
 from rig.channels import Channel
 from rig.errors import InputError, Words
 from rig.generators import Source
@@ -132,13 +133,8 @@ class Session:
     def stretch(self, group: str, place: int, rows: int) -> np.ndarray:
         """Return counts of some rows of a group from a place on, as far as there are any, shape (n, channels)."""
         if (group, place, rows) not in self._stretches:
-            found, at = [np.empty((0, len(self.groups[group])), dtype=np.int64)], 0
-            for part in Sent(self, [group]):
-                found.append(part[max(0, place - at) : max(0, place + rows - at)])
-                at += len(part)
-                if at >= place + rows:
-                    break
-            self._stretches = {(group, place, rows): np.concatenate(found)}
+            parts = Sent(self, [group])
+            self._stretches = {(group, place, rows): take_rows(parts, place, rows, len(parts.names))}
         return self._stretches[group, place, rows]
 
     def whole(self, name: str) -> tuple[np.ndarray, float, float]:

@@ -20,7 +20,7 @@ from replays.recordings.formats.source import open_source
 from replays.score.judgement import judge
 from replays.score.limits import load_limits
 from replays.score.noise import split_noise
-from replays.score.rows import NO_COUNT, follow
+from replays.score.rows import NO_COUNT, follow, stretches
 from replays.score.scorecard import FAIL, INCONCLUSIVE, NO_LIMIT, PASS, QUANTITIES, Scorecard, judge_row, write_junit
 from replays.score.sine import fit_sine, is_sine, quality
 from replays.score.stimulus import EDGE, Exact, Sampled
@@ -154,7 +154,7 @@ def test_every_event_in_many_rows_is_found(levels: int) -> None:
         places.append(place)
     assert found is not None
     assert np.array_equal(np.concatenate(places), order)
-    assert np.array_equal(found.missing, np.sort(lost))
+    assert np.array_equal(found.lost, stretches(np.sort(lost)))
     assert np.array_equal(found.doubled[:, 0], np.sort(again))
     assert np.array_equal(found.swapped[:, 0], np.sort(late))
     assert not sum(each.rows for each in found.altered)
@@ -171,7 +171,7 @@ def test_a_block_that_comes_late_and_rows_that_are_none_are_told() -> None:
     assert np.array_equal(found.swapped[:, 0], np.arange(1000, 2000))
     assert [each.pairs().tolist() for each in found.altered] == [[[4500, 4500]]] * 2
     assert found.foreign.tolist() == [5000]
-    assert not len(found.missing)
+    assert not len(found.lost)
 
 
 def test_a_channel_that_is_broken_has_no_say_in_which_row_is_which() -> None:
@@ -181,7 +181,8 @@ def test_a_channel_that_is_broken_has_no_say_in_which_row_is_which() -> None:
     order = np.insert(np.delete(np.arange(len(daq)), [150_000, 150_700]), 160_000, 160_001)
     chunks = [daq[order[n : n + 30_000]] for n in range(0, len(order), 30_000)]
     *_, (_, found) = follow([counts], chunks, 3)
-    assert (found.missing.tolist(), found.doubled[:, 0].tolist()) == ([150_000, 150_700], [160_001])
+    assert found.lost.tolist() == [[150_000, 150_000], [150_700, 150_700]]
+    assert found.doubled[:, 0].tolist() == [160_001]
     assert [each.pairs().tolist() for each in found.altered] == [
         [],
         [[70_000, 149_999], [150_001, 150_699], [150_701, 199_999]],

@@ -161,6 +161,37 @@ def test_the_sessions_last_rows_in_place_of_others_are_no_begin(tmp_path: Path) 
     assert {"doubled rows", "swapped rows"} & {quantity for quantity, _ in red(card)}
 
 
+STALE = {
+    "the end first": [(15_000, 20_000), (3000, 8600)],
+    "the end first, a row lost after it": [(15_000, 20_000), (3000, 5000), (5001, 8600)],
+    "the begin last": [(3000, 14_000), (0, 7000)],
+}
+"""Rows of the session that a record has, in its order."""
+
+
+@pytest.mark.parametrize(("which", "repeats"), [*((which, False) for which in STALE), ("the end first", True)])
+def test_rows_of_the_session_are_not_those_beyond_it(which: str, repeats: bool, tmp_path: Path) -> None:
+    g = np.random.default_rng(0)
+    whole = repeating(20_000, 4, g) if repeats else g.integers(-50, 50, (20_000, 4))
+    session = write_session(tmp_path / "session.mcap", {"probes": whole})
+    daq = np.concatenate([whole[first:last] for first, last in STALE[which]])
+    card = judge(write_parquet(tmp_path / "daq.parquet", columns_of(daq)), [session])
+    assert card.outcome != "pass", card.remarks
+    told = "\n".join(card.doubts)
+    assert "equal a run of rows in it" in told or {"doubled rows", "swapped rows"} & {row for row, _ in red(card)}
+
+
+def test_stale_rows_in_one_table_of_several_do_not_pass(tmp_path: Path) -> None:
+    g = np.random.default_rng(0)
+    whole = {name: g.integers(-50, 50, (20_000, columns)) for name, columns in {"probes": 4, "hammer": 1}.items()}
+    session = write_session(tmp_path / "session.mcap", whole)
+    probes = np.concatenate([whole["probes"][15_000:], whole["probes"][3000:9000]])
+    daq = write_session(tmp_path / "daq.mcap", {"probes": probes, "hammer": whole["hammer"][3000:9000]})
+    card = judge(daq, [session])
+    assert (card.path, card.outcome) == ("digital", "inconclusive"), card.verdict_line
+    assert "probes: unjudged rows after the session equal a run of rows in it" in card.doubts
+
+
 def test_a_begin_without_unequal_rows_is_found_though_others_have_more_rows() -> None:
     whole = repeating(40_000, 1, np.random.default_rng(1))[:, 0]
     places = find_begins([whole[29_500:]], [whole[:30_000]], 1, 500)

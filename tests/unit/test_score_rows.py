@@ -20,8 +20,9 @@ def followed(sent: np.ndarray, recorded: np.ndarray, start: int = 0, pieces: int
 
 def wrong(found: Followed) -> list[int]:
     """Return the numbers of missing, foreign, doubled, swapped and altered rows."""
-    events = found.missing, found.foreign, found.doubled, found.swapped
-    return [*map(len, events), sum(each.rows for each in found.altered)]
+    events = found.foreign, found.doubled, found.swapped
+    missing = int(np.sum(found.lost[:, 1] - found.lost[:, 0] + 1))
+    return [missing, *map(len, events), sum(each.rows for each in found.altered)]
 
 
 @pytest.mark.parametrize("pieces", [1, 9])
