@@ -137,3 +137,14 @@ def test_flight_takes_fewer_steps_and_the_same_bits_in_any_calls() -> None:
     simulation = Simulation(load_scene("partial-rub", {**QUIET, "engine.companion": False}))
     parts = [simulation.advance(1000 * count).rows.copy() for count in (1, 66, 3, 150, 80)]
     assert np.array_equal(whole, np.concatenate(parts))
+
+
+@pytest.mark.parametrize("preload", [1e-9, 1e-3, 0.1])
+def test_a_small_preload_is_nearly_none(preload: float) -> None:
+    def states(newtons: float) -> np.ndarray:
+        engine = {"engine.name": "taylor", "engine.tolerance": 1e-9, "engine.companion": False}
+        simulation = Simulation(load_scene("hammer", {**QUIET, **engine, "duration_s": 0.05, "house.preload": newtons}))
+        return simulation.advance(simulation.end_tick).rows[:, : S.N_STATE].copy()
+
+    difference = np.abs(states(preload) - states(0.0)) / S.STATE_SCALE
+    assert difference.max() < 0.3 * preload + 1e-6, "a transducer is lost and found at one and the same force"

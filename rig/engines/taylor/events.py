@@ -42,6 +42,15 @@ _LEAST_DEPTH = 1e-11
 _TOLD_DEPTH = 1e-10
 """Depth over the clearance from which on a difference of distances tells it."""
 
+_ROUNDING_M = 1e-20
+"""Rounding of a housing's displacement [m]."""
+
+
+@kernel
+def _edge(stiffness, preload):
+    """Force [N] to which it is known whether a transducer has its preload; one for state and series."""
+    return max(1e-12 * preload, _ROUNDING_M * stiffness)
+
 
 @kernel
 def _loses(displacement, rate, stiffness, preload):
@@ -49,7 +58,7 @@ def _loses(displacement, rate, stiffness, preload):
     change = 0.5 * stiffness * displacement
     sign = 1.0 if change > 0.0 else -1.0
     over = sign * change - preload
-    edge = 1e-12 * preload
+    edge = _edge(stiffness, preload)
     return sign if over > edge or (over > -edge and sign * rate > 0.0) else 0.0
 
 
@@ -222,7 +231,7 @@ def preload_end(constants, memory, Y, h):
                 value = Y[k, S.Y_IH] - Y[k, S.Y_OH] if pair == 0 else Y[k, S.X_OH]
                 Y[k, EVENTS + 2] = way * sign * value / limit
             Y[0, EVENTS + 2] -= way
-            shift = 1 if abs(Y[0, EVENTS + 2]) < 1e-11 else 0
+            shift = 1 if abs(Y[0, EVENTS + 2]) * house.preload < _edge(stiffness, house.preload) else 0
             zero = first_zero(Y, EVENTS + 2, shift, h)
             if zero < nearest and not (shift == 1 and zero == 0.0):
                 nearest, which = zero, _HOUSE_NS + pair
