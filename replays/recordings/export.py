@@ -30,6 +30,7 @@ from rig.errors import PART_SUFFIX, InputError, Words, whole_file
 from rig.kernels.signals import ROW
 from rig.offline import frames
 from rig.simulation import Frame, Simulation
+from rig.text import finite
 
 SUFFIXES = (".mcap", ".parquet", ".csv", ".wav")
 
@@ -261,6 +262,7 @@ class McapRun:
             self._background.finish()
             if kind is None and not self._writer.closed:
                 self._event({"event": "end", "reason": "completed"})
+                self._tell_health()
                 self._writer.finish("completed")
                 whole = True
         finally:
@@ -280,6 +282,20 @@ class McapRun:
             if "zenoh" in message.doors:
                 self._writer.write(message.key, wire.encode_block(message.block), self._wall(frame.tick))
                 self._rows.follow(message.key, message.row, len(message.block.values), late_rows=math.inf)
+
+    def _tell_health(self) -> None:
+        """Write the status that a live run would end with, as far as a run without a clock has one."""
+        simulation, told = self.simulation, ("spin_hz", "energy", "engine", "accuracy", "warnings")
+        health = simulation.health()
+        status = {
+            "scene": simulation.scene.name,
+            "tick": simulation.tick,
+            "time_s": simulation.tick / simulation.tick_rate_hz,
+            "state": "ended",
+            "pace": "none",
+            **{name: health[name] for name in told if name in health},
+        }
+        self._writer.write(wire.STATUS, wire.encode_document(finite(status)), self._wall(simulation.tick))
 
     def _event(self, event: dict[str, Any]) -> None:
         tick = int(event.get("tick", self.simulation.tick))  # a frame's own: the simulation is further on by now

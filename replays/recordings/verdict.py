@@ -170,22 +170,24 @@ def _spin_row(figures: WhirlFigures, *, before_hz: float, lowest_hz: float) -> V
 
 
 def _status_rows(status: dict[str, Any]) -> list[VerdictRow]:
-    """What the service said of itself, in its last status of the recording."""
-    late, block_ms, factor = status["lateness_ms"], status["block_ms"], status["real_time_factor"]
+    """What the rig said of itself, in its last status of the recording; of a run without a clock only its energy."""
+    if not status.get("energy"):
+        return []  # signals of a generator have none
     residual_j, dissipated_j = status["energy"]["residual_j"], status["energy"]["dissipated_j"]
-    lateness = f"{late['p50']:.3f} / {late['p99']:.3f} / {late['max']:.3f} ms"
     ledger = f"{residual_j:.1e} J of {dissipated_j:.2f} J"
     alarm = status["energy"].get("alarm_share", 1e-3)  # as older recordings have it
     closed = abs(residual_j) < alarm * max(dissipated_j, 1e-6)
+    rows = [_judged("energy residual", ledger, f"below {alarm:g} of what was dissipated", closed)]
+    if "lateness_ms" not in status:
+        return rows
+    late, block_ms, factor = status["lateness_ms"], status["block_ms"], status["real_time_factor"]
+    lateness = f"{late['p50']:.3f} / {late['p99']:.3f} / {late['max']:.3f} ms"
     paced = _judged("real-time factor", f"{factor:.4f}", "1.000", abs(factor - 1.0) < 2e-3)
     if _is_late(status) and factor < 1.0:  # it could not keep up
         paced = _stated(paced.quantity, paced.measured, paced.expected)
-    return [
-        _stated("lateness p50 / p99 / max", lateness, f"p99 below a block of {block_ms:g} ms, if the machine is free"),
-        paced,
-        _judged("energy residual", ledger, f"below {alarm:g} of what was dissipated", closed),
-    ]
+    expected = f"p99 below a block of {block_ms:g} ms, if the machine is free"
+    return [_stated("lateness p50 / p99 / max", lateness, expected), paced, *rows]
 
 
 def _is_late(status: dict[str, Any]) -> bool:
-    return status["lateness_ms"]["p99"] >= status["block_ms"]
+    return "lateness_ms" in status and status["lateness_ms"]["p99"] >= status["block_ms"]

@@ -11,6 +11,7 @@ import pytest
 
 from recorder.reader import Recording
 from replays.recordings.export import SUFFIXES, check_run_output, table_columns, writer_for
+from replays.recordings.verdict import stream_rows
 from rig.cli.main import main
 from rig.errors import DiskError, InputError
 from rig.kernels.signals import ROW, TRUTH
@@ -105,6 +106,15 @@ def test_mcap_holds_events_parameters_and_scene(folder: Path, run: Run) -> None:
     assert (friction["value"], friction["kind"]) == (0.3, "assumed")
     assert recording.scene["seed"] == 5
     assert recording.scene["scene"]["drive"]["speed_hz"] == 7.0
+
+
+def test_mcap_ends_with_the_energy_the_engine_and_the_error_estimate(folder: Path, run: Run) -> None:
+    status, health = Recording.open(folder / "run.mcap").last_status, run.simulation.health()
+    assert status is not None
+    for name in ("energy", "engine", "accuracy", "warnings"):
+        assert status[name] == json.loads(json.dumps(health[name])), name
+    assert (status["time_s"], status["state"], status["pace"]) == (DURATION_S, "ended", "none")
+    assert [row.quantity for row in stream_rows(Recording.open(folder / "run.mcap"))][-1] == "energy residual"
 
 
 def test_scene_of_a_recording_runs_again_to_the_same_bits(folder: Path, run: Run) -> None:
