@@ -172,6 +172,8 @@ class Accuracy:
 
     def _add_window(self, window: np.ndarray) -> bool:
         """Update all estimates by one window; return whether another quantity exceeds its tolerance."""
+        # Sums along rows differ in their last bit by the order in memory, which goes by how the run was cut.
+        window = np.ascontiguousarray(window)
         times_s, both = window[:, 0], window[:, 1:].reshape(len(window), 2, len(_COLUMNS))
         orbit, force = both[..., -3] + 1j * both[..., -2], both[..., -1:]
         radius = np.abs(orbit)
