@@ -32,12 +32,12 @@ OUTCOMES = {
     "told": ("#F0C000", "wrong, and warns"),
     "silent": (RED, "wrong without a warning"),
     "gained": ("#7A0177", "wrong without a warning, and energy gained"),
-    "ended": ("0.45", "gives up, or takes more than 20 s"),
+    "ended": ("0.1", "gives up, or takes more than 20 s"),
     "refused": ("0.88", "cannot take the friction law"),
 }
 """Kinds of outcome with a colour and what they are."""
-_HATCHES = {"told": "..", "silent": "///", "gained": "xxx"}
-"""What tells wrong runs in grey."""
+HATCHES = {"told": "..", "silent": "///", "gained": "xxx"}
+"""Hatches that mark wrong runs in grey."""
 _LIMIT_S = 20.0
 """Processor time of a run [s]."""
 _GAINED = 0.01
@@ -61,16 +61,18 @@ class Outcome(NamedTuple):
 
 
 def chosen_scenes(only: str | None) -> list[str]:
-    """Scenes by names joined by commas; None for all.
+    """Return scenes by names joined by commas, each once, in the order of the study; None for all.
 
     Raises:
-        InputError: There is no such scene.
+        InputError: There is no such scene, or no name.
     """
-    names = list(TWELVE_SCENES) if only is None else [name.strip() for name in only.split(",")]
-    for name in names:
-        if name not in TWELVE_SCENES:
+    if only is None:
+        return list(TWELVE_SCENES)
+    names = [name.strip() for name in only.split(",") if name.strip()]
+    for name in names or [only]:
+        if name.lower() not in TWELVE_SCENES:
             raise InputError("--only", f"one or more of {', '.join(TWELVE_SCENES)}", name)
-    return names
+    return [name for name in TWELVE_SCENES if name in map(str.lower, names)]
 
 
 def is_silent(one: Outcome) -> bool:
@@ -158,7 +160,7 @@ def draw_scene_atlas(folder: Path, found: list[Outcome]) -> list[Path]:
             cell = [one for one in found if (one.scene, one.method) == (scene, method)]
             for place, one in enumerate(cell):
                 width, colour = 0.86 / len(cell), OUTCOMES[one.kind][0]
-                left, hatch = x - 0.43 + place * width, _HATCHES.get(one.kind, "")
+                left, hatch = x - 0.43 + place * width, HATCHES.get(one.kind, "")
                 axes.barh(y, 0.9 * width, 0.7, left, color=colour, hatch=hatch, edgecolor="white", lw=0.0)
     axes.set_yticks(range(len(methods)), methods)
     axes.set_xticks(range(len(scenes)), [TWELVE_SCENES[scene].title.replace(" of ", "\nof ") for scene in scenes])
@@ -167,7 +169,7 @@ def draw_scene_atlas(folder: Path, found: list[Outcome]) -> list[Path]:
     axes.grid(visible=False)
     axes.set(xlim=(-0.5, len(scenes) - 0.5), ylim=(len(methods) - 0.5, -0.5))
     for kind, (colour, title) in OUTCOMES.items():
-        axes.bar(0, 0, color=colour, hatch=_HATCHES.get(kind, ""), edgecolor="white", lw=0.0, label=title)
+        axes.bar(0, 0, color=colour, hatch=HATCHES.get(kind, ""), edgecolor="white", lw=0.0, label=title)
     figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False, fontsize=9)
     paths = (folder / f"stability-scenes{suffix}" for suffix in (".png", ".svg"))
     return save(figure, *paths, source=f"code {code_digest()}")

@@ -11,6 +11,7 @@ import typer
 
 from rig.cli.progress import reporting
 from rig.cli.tables import Form, Table, echo, echo_json, new_table
+from rig.errors import InputError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -61,6 +62,8 @@ def stability(
     """
     from replays.studies.stability.table import chosen_engines, chosen_trials, run_trials
 
+    if scenes and (full or random is not None):
+        raise InputError("--scenes", "given without --full and --random", "--full" if full else f"--random {random}")
     names = chosen_engines(engines)
     if scenes:
         _twelve(only, None if engines is None else names, output, form)
@@ -135,20 +138,26 @@ def _twelve(only: str | None, engines: list[str] | None, folder: Path | None, fo
     from replays.studies.journal import prepare_folder
     from replays.studies.scene_atlas import Outcome, chosen_scenes, draw_scene_atlas, is_silent, outcomes
 
-    names, found = chosen_scenes(only), list[Outcome]()
+    names, found, interrupted = chosen_scenes(only), list[Outcome](), False
     if folder is not None:
         prepare_folder(folder)
     with reporting(compiles=True) as reporter:
-        for one in outcomes(names, engines, peers=engines is None):
-            found.append(one)
-            reporter.step(f"{one.scene}, {one.method} {one.setting}: {one.kind}")
-    pictures = [] if folder is None else draw_scene_atlas(folder, found)
+        try:
+            for one in outcomes(names, engines, peers=engines is None):
+                found.append(one)
+                reporter.step(f"{one.scene}, {one.method} {one.setting}: {one.kind}")
+        except KeyboardInterrupt:
+            interrupted = True
+    pictures = [] if folder is None or interrupted else draw_scene_atlas(folder, found)
     if form.as_json:
         echo_json({"outcomes": [one.document() for one in found], "pictures": [str(path) for path in pictures]})
     else:
         form.console().print(scenes_table(found))
         for path in pictures:
             echo(f"picture  {path}")
+    if interrupted:
+        echo("stopped; only the runs shown were measured, and no picture was drawn", err=True)
+        raise typer.Exit(130)
     if any(is_silent(one) for one in found if one.method == found[0].method):
         raise typer.Exit(1)
 

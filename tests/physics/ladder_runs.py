@@ -32,7 +32,7 @@ def row(study: StudyScene, name: str) -> tuple[str, bool]:
     try:
         found = search(scene, {name: ASKED}, budget_s=BUDGET_S)
     except InputError as error:
-        return f"| {study.title} | {name} | none: {error} | | | |", True
+        return f"| {study.title} | {name} | none: {error} | | | | |", True
     picked, full = found.picked, found.full
     checked = measure(scene, exact(found), (name,), runs=1)
     error = QUANTITIES[name].error(picked.values[name], checked.values[name])
@@ -44,12 +44,16 @@ def row(study: StudyScene, name: str) -> tuple[str, bool]:
 
 
 def main() -> int:
-    """Print the table; 1 where a pick errs by more than twice what was asked for."""
+    """Print the table; 1 where a pick errs by more than twice what was asked for, 2 where a scene is unknown."""
+    names = sys.argv[1:] or list(TWELVE_SCENES)
+    if unknown := [name for name in names if name not in TWELVE_SCENES]:
+        print(f"SCENE must be one or more of {', '.join(TWELVE_SCENES)}; received {unknown[0]!r}", file=sys.stderr)
+        return 2
     print(
         "| scene | question | pick | saved | of the scene as given | of the full model | error |\n" + "|---" * 7 + "|"
     )
     every = True
-    for name in sys.argv[1:] or TWELVE_SCENES:
+    for name in names:
         for question in QUESTIONS:
             text, holds = row(TWELVE_SCENES[name], question)
             every = every and holds

@@ -11,11 +11,17 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from replays.studies import scene_atlas
 from replays.studies.scene_atlas import (
+    HATCHES,
     OUTCOMES,
     Outcome,
     chosen_scenes,
@@ -25,6 +31,8 @@ from replays.studies.scene_atlas import (
 )
 from replays.studies.twelve_scenes import TWELVE_SCENES
 from rig.errors import InputError
+from tests.commands import said
+from tests.physics import ladder_runs
 
 ENGINES = ["split", "verlet", "semi-implicit-euler"]
 
@@ -66,5 +74,59 @@ def test_each_outcome_is_drawn(found: list[Outcome], tmp_path: Path) -> None:
 
 def test_a_scene_that_is_not_there_is_refused() -> None:
     assert chosen_scenes(None) == list(TWELVE_SCENES)
+    assert chosen_scenes("run-up, Drop,drop,") == ["drop", "run-up"]
     with pytest.raises(InputError, match=r"--only must be one or more of hammer-3.2, .*; instead received 'hamer'"):
         chosen_scenes("drop,hamer")
+    with pytest.raises(InputError, match=r"--only must be one or more of .*; instead received ','"):
+        chosen_scenes(",")
+
+
+@pytest.mark.parametrize("more", [["--full"], ["--random", "3"]])
+def test_an_option_of_another_study_is_refused(more: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    status, _, error = said(capsys, "stability", "--scenes", *more)
+    assert status == 2
+    assert "--scenes must be given without --full and --random; instead received" in error
+
+
+def test_a_stopped_atlas_shows_what_was_measured(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def stopped(*_: object, **__: object) -> Iterator[Outcome]:
+        yield Outcome("drop", "split", "1e-2", "right", 1e-3)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(scene_atlas, "outcomes", stopped)
+    status, shown, error = said(capsys, "stability", "--scenes", "--json", "-o", tmp_path)
+    assert (status, "no picture was drawn" in error) == (130, True)
+    assert [one["kind"] for one in json.loads(shown)["outcomes"]] == ["right"]
+    assert not list(tmp_path.iterdir())
+
+
+def test_kinds_of_outcome_differ_in_grey() -> None:
+    plain = sorted(mean_grey(colour) for kind, (colour, _) in OUTCOMES.items() if kind not in HATCHES)
+    assert min(high - low for low, high in pairwise(plain)) > 0.1
+
+
+def mean_grey(colour: str) -> float:
+    """Return the luma of a colour, 0 black to 1 white."""
+    from matplotlib.colors import to_rgb
+
+    return float(np.dot(to_rgb(colour), (0.299, 0.587, 0.114)))
+
+
+def test_a_ladder_of_an_unknown_scene_is_refused(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sys.argv", ["ladder_runs", "drop", "hamer"])
+    assert ladder_runs.main() == 2
+    assert "must be one or more of hammer-3.2," in capsys.readouterr().err
+
+
+def test_a_row_without_a_pick_has_each_column(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise InputError("--quantity", "one that the scene has", "reaction_amplitude")
+
+    monkeypatch.setattr(ladder_runs, "search", refuse)
+    text, holds = ladder_runs.row(TWELVE_SCENES["drop"], "reaction_amplitude")
+    assert holds
+    assert text.count("|") == 8
