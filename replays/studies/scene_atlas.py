@@ -20,10 +20,11 @@ from replays.studies.chart.phases import scene_problem
 from replays.studies.chart.store import code_digest
 from replays.studies.peers import Setting
 from replays.studies.peers.problem import scaled_error
+from replays.studies.stability.table import choose_names
 from replays.studies.stability.truth import AGREE, WRONG, doubted
 from replays.studies.stability.worker import Task, run_task
 from replays.studies.twelve_scenes import TWELVE_SCENES
-from rig.errors import InputError, SimulationError
+from rig.errors import SimulationError
 from rig.scenes import Scene
 
 OUTCOMES = {
@@ -66,13 +67,7 @@ def chosen_scenes(only: str | None) -> list[str]:
     Raises:
         InputError: There is no such scene, or no name.
     """
-    if only is None:
-        return list(TWELVE_SCENES)
-    names = [name.strip() for name in only.split(",") if name.strip()]
-    for name in names or [only]:
-        if name.lower() not in TWELVE_SCENES:
-            raise InputError("--only", f"one or more of {', '.join(TWELVE_SCENES)}", name)
-    return [name for name in TWELVE_SCENES if name in map(str.lower, names)]
+    return choose_names("--only", only, list(TWELVE_SCENES))
 
 
 def is_silent(one: Outcome) -> bool:

@@ -17,7 +17,7 @@ def chosen_trials(only: str | None) -> list[str]:
     Raises:
         InputError: There is no such trial.
     """
-    return _chosen("--only", only, list(TRIALS))
+    return choose_names("--only", only, list(TRIALS))
 
 
 def chosen_engines(names: str | None) -> list[str]:
@@ -26,7 +26,7 @@ def chosen_engines(names: str | None) -> list[str]:
     Raises:
         InputError: There is no such engine.
     """
-    return _chosen("--engines", names, list(ENGINES))
+    return choose_names("--engines", names, list(ENGINES))
 
 
 def run_trials(trials: list[str], engines: list[str], *, quick: bool) -> Iterator[Cell]:
@@ -37,7 +37,12 @@ def run_trials(trials: list[str], engines: list[str], *, quick: bool) -> Iterato
         yield from peer_cells(trial)
 
 
-def _chosen(field: str, names: str | None, known: list[str]) -> list[str]:
+def choose_names(field: str, names: str | None, known: list[str]) -> list[str]:
+    """Return the known names that are joined by commas, in their own order; None for all.
+
+    Raises:
+        InputError: There is no such name, or none is given.
+    """
     if names is None:
         return known
     asked = [name.strip() for name in names.split(",") if name.strip()]
