@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import gc
 import json
 import os
 import subprocess
@@ -216,6 +217,25 @@ def test_mdf_by_asammdf(recording: Recording, tmp_path: Path) -> None:
         force = mdf.get("truth.contact.normal_force")
         np.testing.assert_array_equal(force.samples, recording.truth("contact")["normal_force"])
         assert (force.unit, len(force.timestamps)) == ("N", round(DURATION_S * 2000))
+
+
+def test_an_mdf_file_that_is_let_go_leaves_nothing_open(
+    recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from asammdf import MDF
+    from asammdf.blocks import mdf_v4
+
+    path = tmp_path / "x.mf4"
+    written(recording, path)
+    made, make = [], mdf_v4.NamedTemporaryFile
+    monkeypatch.setattr(mdf_v4, "NamedTemporaryFile", lambda **options: made.append(make(**options)) or made[-1])
+    for owner in (MDF, mdf_v4.MDF4):  # the collector may come to the temporary file before it comes to them
+        monkeypatch.delattr(owner, "__del__")
+    source = open_source(path, FileOptions())
+    assert [file.closed for file in made] == [False]
+    del source
+    gc.collect()
+    assert made[0].closed
 
 
 def test_tdms_by_nptdms(recording: Recording, tmp_path: Path) -> None:

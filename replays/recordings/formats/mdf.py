@@ -113,6 +113,8 @@ def _open(path: Path) -> Any:
             mdf = asammdf.MDF(file if finished else path)
             mdf.configure(read_fragment_size=_PIECE)
             finalize(mdf, file.close)
+            # It stands in a cycle, which the collector may take apart at its temporary file first.
+            finalize(mdf, mdf._mdf._tempfile.close)
             return mdf
     except Exception as error:
         file.close()
