@@ -114,7 +114,7 @@ def _open(path: Path) -> Any:
             mdf.configure(read_fragment_size=_PIECE)
             finalize(mdf, file.close)
             # It stands in a cycle, which the collector may take apart at its temporary file first.
-            finalize(mdf, mdf._mdf._tempfile.close)
+            finalize(mdf, mdf._mdf._tempfile.close)  # noqa: SLF001 - its own ways to close it wait for the collector
             return mdf
     except Exception as error:
         file.close()
