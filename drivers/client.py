@@ -29,14 +29,14 @@ from drivers.console import Console
 from drivers.daq import Daq
 from drivers.link import LinkTimeoutError
 from drivers.lockstep import LOST_S, Blocks
-from drivers.samples import Samples, StreamEndedError
 from drivers.sources import Source
 from drivers.sources.rig import RigSource
-from drivers.turns import HALF, Turn, edges, joined, turn_in
-from rig import wire
-from rig.errors import InputError, RefusedError, UnknownNameError, Words
-from rig.intake import Catalogue, event_in
-from rig.transport import DEFAULT_ENDPOINT, Client
+from drivers.sources.samples import Samples, StreamEndedError
+from drivers.sources.turns import HALF, Turn, edges, joined, turn_in
+from rig.base import wire
+from rig.base.errors import InputError, RefusedError, UnknownNameError, Words
+from rig.serve.intake import Catalogue, event_in
+from rig.serve.transport import DEFAULT_ENDPOINT, Client
 
 _PATIENCE_S = 10.0
 """How long a rig that runs may send nothing [s]."""
@@ -166,7 +166,7 @@ class Rig(Console):
             client = CanClient(url.removeprefix("can:"), wait_s=wait_s)
             given |= {"name": f"CAN {client.node}", "source": client.source}
         else:
-            from rig.transport.zenoh import client_of
+            from rig.serve.transport.zenoh import client_of
 
             client = client_of(url, wait_s=wait_s)
             given |= {"name": name, "truth": truth}
@@ -495,6 +495,6 @@ def connect(
 
         >>> connect("can:zenoh:can0", truth=["contact"])
         Traceback (most recent call last):
-        rig.errors.InputError: truth must be left out over CAN: a bus carries none; instead received ['contact']
+        rig.base.errors.InputError: truth must be left out over CAN: a bus carries none; instead received ['contact']
     """
     return Rig.open(url, channels=channels, wait_s=wait_s, **settings)

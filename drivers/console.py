@@ -9,10 +9,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Self
 
-from rig import wire
-from rig.closing import Closing
-from rig.errors import InputError, RefusedError
-from rig.transport import DEFAULT_ENDPOINT, Client, NoReplyError
+from rig.base import wire
+from rig.base.closing import Closing
+from rig.base.errors import InputError, RefusedError
+from rig.serve.transport import DEFAULT_ENDPOINT, Client, NoReplyError
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +77,7 @@ class Console(Closing):
         Accepted(command='hammer', id=1, tick=2500, time_s=0.0025)
         >>> console.speed(float("nan"))
         Traceback (most recent call last):
-        rig.errors.InputError: speed_hz must be a finite number; instead received nan
+        rig.base.errors.InputError: speed_hz must be a finite number; instead received nan
     """
 
     def __init__(self, client: Client, *, name: str | None = None, timeout_s: float = 5.0) -> None:
@@ -93,7 +93,7 @@ class Console(Closing):
             InputError: The URL is malformed.
             ConnectionError: Nothing is there.
         """
-        from rig.transport.zenoh import client_of
+        from rig.serve.transport.zenoh import client_of
 
         return cls(client_of(url, wait_s=wait_s), name=name)
 

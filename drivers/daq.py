@@ -19,11 +19,11 @@ from typing import Self
 import numpy as np
 
 from drivers.link import LinkTimeoutError
-from drivers.samples import Pile, Samples, StreamEndedError, follow
 from drivers.sources import Source, open_source
-from rig.closing import Closing
-from rig.errors import InputError, UnknownNameError, Words
-from rig.wire import Continuity, Gap
+from drivers.sources.samples import Pile, Samples, StreamEndedError, follow
+from rig.base.closing import Closing
+from rig.base.errors import InputError, UnknownNameError, Words
+from rig.base.wire import Continuity, Gap
 
 _GAPS = 1000
 """Gaps that are remembered; all are counted."""

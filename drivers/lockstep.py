@@ -9,12 +9,12 @@ from collections.abc import Iterator
 
 from drivers.daq import Daq
 from drivers.link import LinkTimeoutError
-from drivers.samples import Samples, StreamEndedError
-from drivers.turns import joined
-from rig import wire
-from rig.errors import RefusedError
-from rig.intake import BlockEnd, block_end_in, event_in
-from rig.transport import Client
+from drivers.sources.samples import Samples, StreamEndedError
+from drivers.sources.turns import joined
+from rig.base import wire
+from rig.base.errors import RefusedError
+from rig.serve.intake import BlockEnd, block_end_in, event_in
+from rig.serve.transport import Client
 
 LOST_S = 2.0
 """Rows of a block that is over are there, or lost [s]."""

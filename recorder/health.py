@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from recorder.contents.samples import row_times_s
 from recorder.reader import Recording
-from recorder.samples import row_times_s
-from rig.channels import Channel, Group
-from rig.wire import EDGES, Block, schema_of, sensor_key
+from rig.base.wire import EDGES, Block, schema_of, sensor_key
+from rig.channels.table import Channel, Group
 
 WINDOW_S = 2.0
 """Length of a window; its spectrum resolves 0.5 Hz."""

@@ -13,15 +13,16 @@ from typing import Any, Self
 
 import numpy as np
 
-from recorder import documents, schemas
-from recorder.chunks import Chunk
-from recorder.recording_file import Message, RecordingFile
-from recorder.samples import row_times_s, samples_of
-from recorder.survey import OnBlock, Stream, Survey
-from rig.declared import Declared, in_order
-from rig.errors import InputError, UnknownNameError, Words
-from rig.samples import Samples, joined
-from rig.wire import EDGES, EVENTS, FAULTS, STATUS, Block, Gap, schema_of, sensor_key, truth_key
+from recorder.contents import documents
+from recorder.contents.recording_file import Message, RecordingFile
+from recorder.contents.samples import row_times_s, samples_of
+from recorder.contents.survey import OnBlock, Stream, Survey
+from recorder.files import schemas
+from recorder.files.chunks import Chunk
+from rig.base.errors import InputError, UnknownNameError, Words
+from rig.base.samples import Samples, joined
+from rig.base.wire import EDGES, EVENTS, FAULTS, STATUS, Block, Gap, schema_of, sensor_key, truth_key
+from rig.channels.faults.declared import Declared, in_order
 
 
 class Recording:

@@ -18,18 +18,19 @@ from typing import Any, Literal
 
 import numpy as np
 
-from recorder import documents, schemas
-from recorder.counts import Counts
-from recorder.draft import check_destination
-from recorder.head import Beginning, Commands
-from recorder.payload import Payload, tick_in
+from recorder.contents import documents
+from recorder.contents.counts import Counts
+from recorder.contents.head import Beginning, Commands
+from recorder.files import schemas
+from recorder.files.draft import check_destination
+from recorder.files.payload import Payload, tick_in
+from recorder.files.records import COPY
 from recorder.reader import Recording
-from recorder.records import COPY
 from recorder.writer import RecordingWriter
-from rig.declared import Declared
-from rig.errors import PART_SUFFIX, InputError, Words, check_not_among
-from rig.outside import open_file, unreadable
-from rig.wire import EDGES, FAULTS, SENSORS, TRUTH, Block, encode_block, schema_of
+from rig.base.errors import PART_SUFFIX, InputError, Words, check_not_among
+from rig.base.outside import open_file, unreadable
+from rig.base.wire import EDGES, FAULTS, SENSORS, TRUTH, Block, encode_block, schema_of
+from rig.channels.faults.declared import Declared
 
 _TELL_EVERY = 5000
 """Messages between two reports of progress."""

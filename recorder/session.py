@@ -10,23 +10,23 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from recorder.captures import Captures, capture_path, check_captures
-from recorder.counts import NS, Counts
-from recorder.head import Beginning
-from recorder.payload import Payload
-from recorder.room import Limits
-from recorder.series import Series, check_series, part_path
-from recorder.sink import Needs, Sink
-from recorder.summary import Progress, Summary
-from recorder.trigger import Capture
+from recorder.contents.counts import NS, Counts
+from recorder.contents.head import Beginning
+from recorder.contents.summary import Progress, Summary
+from recorder.files.payload import Payload
+from recorder.output.captures import Captures, capture_path, check_captures
+from recorder.output.room import Limits
+from recorder.output.series import Series, check_series, part_path
+from recorder.output.sink import Needs, Sink
+from recorder.output.trigger import Capture
 from recorder.writer import RecordingError, RecordingWriter, check_view_rate
-from rig import wire
-from rig.bounded_queue import BoundedQueue
-from rig.errors import InputError
-from rig.intake import Catalogue, Intake
-from rig.text import printable
-from rig.transport import Client
-from rig.transport.clients import Reporter
+from rig.base import wire
+from rig.base.errors import InputError
+from rig.base.text import printable
+from rig.serve.bounded_queue import BoundedQueue
+from rig.serve.intake import Catalogue, Intake
+from rig.serve.transport import Client
+from rig.serve.transport.clients import Reporter
 
 Document = dict[str, Any]
 RIG_LOST = "rig lost"

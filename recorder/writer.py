@@ -9,16 +9,16 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Self
 
-from recorder import schemas
-from recorder.counts import NS, Counts, Tally
-from recorder.documents import definition_of
-from recorder.draft import Draft
-from recorder.head import Beginning, Head, about_view, instant
-from recorder.mcap_file import McapFile
-from recorder.payload import Payload
-from recorder.views import Messages, View, Views
-from rig.errors import DiskError, InputError
-from rig.wire import EDGES, EVENTS, Gap, encode_document
+from recorder.contents.counts import NS, Counts, Tally
+from recorder.contents.documents import definition_of
+from recorder.contents.head import Beginning, Head, about_view, instant
+from recorder.contents.views import Messages, View, Views
+from recorder.files import schemas
+from recorder.files.draft import Draft
+from recorder.files.mcap_file import McapFile
+from recorder.files.payload import Payload
+from rig.base.errors import DiskError, InputError
+from rig.base.wire import EDGES, EVENTS, Gap, encode_document
 
 _SET_BACK_NS = 60 * NS
 """Step back of the wall clock after which clock pairs begin anew; smaller ones are of streams that came in turn."""

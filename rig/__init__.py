@@ -23,14 +23,16 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from rig.base.old_paths import serve_old_paths
+
 if TYPE_CHECKING:
-    from rig.errors import InputError, UnknownNameError
-    from rig.offline import Run, simulate
-    from rig.orbit import full_spectrum, synchronous, waterfall, whirl_frequency
-    from rig.parameters import ParameterSet, load_parameters
-    from rig.samples import Samples
-    from rig.scenes import Scene, load_scene
-    from rig.simulation import Simulation
+    from rig.base.errors import InputError, UnknownNameError
+    from rig.base.samples import Samples
+    from rig.channels.orbit import full_spectrum, synchronous, waterfall, whirl_frequency
+    from rig.physics.parameters import ParameterSet, load_parameters
+    from rig.run.offline import Run, simulate
+    from rig.run.scenes import Scene, load_scene
+    from rig.run.simulation import Simulation
 
     def connect(url: str = "", **settings: Any) -> Any:
         """`drivers.client.connect`, which must not be imported from below."""
@@ -41,14 +43,15 @@ __all__ = [
     "full_spectrum", "load_parameters", "load_scene", "simulate", "synchronous", "waterfall", "whirl_frequency",
 ]  # fmt: skip
 
+serve_old_paths()
 _HOMES = {
-    "errors": ("InputError", "UnknownNameError"),
-    "offline": ("Run", "simulate"),
-    "orbit": ("full_spectrum", "synchronous", "waterfall", "whirl_frequency"),
-    "parameters": ("ParameterSet", "load_parameters"),
-    "samples": ("Samples",),
-    "scenes": ("Scene", "load_scene"),
-    "simulation": ("Simulation",),
+    "base.errors": ("InputError", "UnknownNameError"),
+    "run.offline": ("Run", "simulate"),
+    "channels.orbit": ("full_spectrum", "synchronous", "waterfall", "whirl_frequency"),
+    "physics.parameters": ("ParameterSet", "load_parameters"),
+    "base.samples": ("Samples",),
+    "run.scenes": ("Scene", "load_scene"),
+    "run.simulation": ("Simulation",),
 }
 
 if not TYPE_CHECKING:  # a type checker knows all names by the imports above
@@ -67,7 +70,7 @@ if not TYPE_CHECKING:  # a type checker knows all names by the imports above
         try:
             return getattr(import_module(f"rig.{home}"), name)
         except ModuleNotFoundError as error:
-            from rig.errors import need_of_full
+            from rig.base.errors import need_of_full
 
             if need := need_of_full(error):
                 error.add_note(f"rig.{name} {need}")

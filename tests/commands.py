@@ -10,7 +10,7 @@ import pytest
 from rich.cells import cell_len
 
 from rig.cli.main import main
-from rig.cli.tables import Table, table_console
+from rig.cli.output.tables import Table, table_console
 
 TERMINAL = 80
 

@@ -22,7 +22,7 @@ from typing import Any
 import numba
 import pytest
 
-import rig.kernels  # noqa: F401 - names the cache of compiled code
+import rig.physics.kernels  # noqa: F401 - names the cache of compiled code
 
 ROOT = Path(__file__).parents[1]
 COMPILING = "tests/parity/test_compiling.py"

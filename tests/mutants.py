@@ -48,14 +48,14 @@ _FAULTS = (
 )
 TESTS = {
     "replays/score/": ("score*", "time_order", "outcome"),
-    "rig/faulty.py": _FAULTS, "rig/faults/": _FAULTS,
+    "rig/run/faulty.py": _FAULTS, "rig/channels/faults/": _FAULTS,
     "replays/recordings/validation/": (
         "faults", "validation", "verdict", "outcome", "declared_faults", "blind_faults", "events",
     ),
     "rig/units.": ("units", "time_columns", "import"),
 }  # fmt: skip
 """Test files of each folder or module: patterns of their names."""
-MUTATED = ("replays/score", "rig/faulty.py", "rig/faults", "replays/recordings/validation", "rig/units.py")
+MUTATED = ("replays/score", "rig/run/faulty.py", "rig/faults", "replays/recordings/validation", "rig/base/units.py")
 _TURNED = {
     ast.Lt: ">=", ast.LtE: ">", ast.Gt: "<=", ast.GtE: "<", ast.Eq: "!=", ast.NotEq: "==", ast.In: "not in",
     ast.NotIn: "in", ast.Is: "is not", ast.IsNot: "is",
@@ -63,19 +63,22 @@ _TURNED = {
 _SHOWN = ("__repr__", "__str__", "picture", "verdict_line", "describe")
 """Functions whose places are left out: what they return is only shown."""
 PICKED = (
-    ("replays/score/scorecard.py", "shown=PASS in verdicts and not self.doubts", "shown=not self.doubts"),
-    ("replays/score/scorecard.py", "shown=PASS in verdicts and not self.doubts", "shown=PASS in verdicts"),
-    ("replays/score/scorecard.py", "limit.low <= low and high <= limit.high", "limit.low <= value <= limit.high"),
-    ("replays/score/scorecard.py", "high < limit.low or low > limit.high", "low < limit.low or high > limit.high"),
-    ("replays/score/intervals.py", "t.ppf(0.975, freedom)", "t.ppf(0.95, freedom)"),
-    ("replays/score/sine.py", "for p in (0.025, 0.975)", "for p in (0.05, 0.95)"),
-    ("replays/score/sine.py", "np.hanning(len(values) + 1)[:-1]", "np.hanning(len(values))"),
-    ("replays/score/stamps.py", "for p in (0.975, 0.025)", "for p in (0.95, 0.05)"),
-    ("replays/score/waveform.py", "student(self.freedom) * self.spread", "0.84 * student(self.freedom) * self.spread"),
-    ("replays/score/limits.py", "if any(map(math.isnan, ends)):", "if False:"),
-    ("replays/score/limits.py", "channel.lsb_v / math.sqrt(12.0))\n", "channel.lsb_v)\n"),
-    ("rig/units.toml", "thou = { size = 2.54e-05 }", "thou = { size = 0.0254 }"),
-    ("rig/units.toml", "mil = { size = 2.54e-05 }", "mil = { size = 2.54e-08 }"),
+    ("replays/score/card/scorecard.py", "shown=PASS in verdicts and not self.doubts", "shown=not self.doubts"),
+    ("replays/score/card/scorecard.py", "shown=PASS in verdicts and not self.doubts", "shown=PASS in verdicts"),
+    ("replays/score/card/scorecard.py", "limit.low <= low and high <= limit.high", "limit.low <= value <= limit.high"),
+    ("replays/score/card/scorecard.py", "high < limit.low or low > limit.high", "low < limit.low or high > limit.high"),
+    ("replays/score/fits/intervals.py", "t.ppf(0.975, freedom)", "t.ppf(0.95, freedom)"),
+    ("replays/score/fits/sine.py", "for p in (0.025, 0.975)", "for p in (0.05, 0.95)"),
+    ("replays/score/fits/sine.py", "np.hanning(len(values) + 1)[:-1]", "np.hanning(len(values))"),
+    ("replays/score/alignment/stamps.py", "for p in (0.975, 0.025)", "for p in (0.95, 0.05)"),
+    (
+        "replays/score/fits/waveform.py",
+        "student(self.freedom) * self.spread", "0.84 * student(self.freedom) * self.spread",
+    ),
+    ("replays/score/card/limits.py", "if any(map(math.isnan, ends)):", "if False:"),
+    ("replays/score/card/limits.py", "channel.lsb_v / math.sqrt(12.0))\n", "channel.lsb_v)\n"),
+    ("rig/base/units.toml", "thou = { size = 2.54e-05 }", "thou = { size = 0.0254 }"),
+    ("rig/base/units.toml", "mil = { size = 2.54e-05 }", "mil = { size = 2.54e-08 }"),
 )  # fmt: skip
 """File, what stands there once, and what takes its place."""
 

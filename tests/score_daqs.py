@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from recorder.writer import RecordingWriter
-from rig.channels import default_table
-from rig.wire import CATALOGUE, PARAMETERS, SCENE, Block, encode_block, sensor_key
+from rig.base.wire import CATALOGUE, PARAMETERS, SCENE, Block, encode_block, sensor_key
+from rig.channels.table import default_table
 from tests.unit.recorder_stream import TICK_RATE_HZ, documents
 
 RATE_HZ = 20_000

@@ -24,9 +24,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from replays.score.card.scorecard import FAIL, Scorecard
 from replays.score.judgement import judge
-from replays.score.scorecard import FAIL, Scorecard
-from rig.errors import InputError
+from rig.base.errors import InputError
 from tests.score_cases import Case, foreign, perfect
 from tests.score_defects import defect
 from tests.score_sessions import Sessions

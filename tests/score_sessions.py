@@ -11,10 +11,10 @@ import numpy as np
 
 import rig
 from recorder.writer import RecordingWriter
-from rig.channels import Channel, ChannelTable, default_table
-from rig.generators import Source
-from rig.scenes import Scene, load_scene, scene_document
-from rig.wire import CATALOGUE, PARAMETERS, SCENE, Block, encode_block, sensor_key
+from rig.base.wire import CATALOGUE, PARAMETERS, SCENE, Block, encode_block, sensor_key
+from rig.channels.generators import Source
+from rig.channels.table import Channel, ChannelTable, default_table
+from rig.run.scenes import Scene, load_scene, scene_document
 from tests.unit.recorder_stream import TICK_RATE_HZ, documents
 
 RATE_HZ = 20_000
@@ -145,7 +145,7 @@ class Sent:
         column = [c.name for c in self.channels].index(name)
         rows = self.clean(low, int(place.max()) + _HALF_TAPS + 2 - low)[:, column]
         if self.kind.endswith("prbs"):  # its jumps have much above 97 % of half of the rate, which a rebuilt one lacks
-            from replays.score.stimulus import EDGE, Sampled
+            from replays.score.records.stimulus import EDGE, Sampled
 
             wide = self.clean(low - EDGE, len(rows) + 2 * EDGE)[:, column]
             return Sampled(wide, (low - EDGE) / RATE_HZ, RATE_HZ)(times_s)[0]

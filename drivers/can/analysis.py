@@ -23,7 +23,7 @@ import numpy as np
 
 from drivers.can.bus import frame as frames
 from drivers.can.bus.timing import Speed, speed
-from rig.errors import InputError
+from rig.base.errors import InputError
 
 if TYPE_CHECKING:
     import can
@@ -46,7 +46,7 @@ class Message(NamedTuple):
         fd: Whether it is a CAN FD frame.
         brs: Whether its data phase has the higher bit rate.
         bits: Nominal and fast bits with the intermission where the content is known, as
-            `drivers.can.bus.frame.frame_bits` counts them; none: the most that any content can make.
+            `drivers.can.bus.timing.frame_bits` counts them; none: the most that any content can make.
     """
 
     identifier: int

@@ -13,7 +13,7 @@ from enum import IntEnum
 from typing import Any
 
 from drivers.can.message import KEY, Message, Signal, checksum
-from rig.errors import InputError
+from rig.base.errors import InputError
 
 _NAME = re.compile(r"CAN (\d{1,3})")
 _WORD_32 = 0xFFFFFFFF

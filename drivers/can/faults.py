@@ -6,9 +6,9 @@ from enum import IntEnum
 from typing import Any
 
 from drivers.can.message import Message, Signal
-from rig.channels import ChannelTable
-from rig.errors import InputError, UnknownNameError
-from rig.faults import KINDS
+from rig.base.errors import InputError, UnknownNameError
+from rig.channels.faults import KINDS
+from rig.channels.table import ChannelTable
 
 
 class FaultKind(IntEnum):

@@ -14,9 +14,9 @@ import numpy as np
 
 from drivers.can.bus import codec
 from drivers.can.bus.node import NodeBus
-from rig.errors import InputError, RefusedError
-from rig.outside import read_json
-from rig.transport.endpoint import parse_loopback
+from rig.base.errors import InputError, RefusedError
+from rig.base.outside import read_json
+from rig.serve.transport.endpoint import parse_loopback
 
 if TYPE_CHECKING:
     from can.typechecking import AutoDetectedConfig
@@ -55,8 +55,8 @@ class ZenohBus(NodeBus):
         self.channel_info = f"zenoh {self.channel} at {self._address}"
 
     def _connect(self) -> None:
-        from rig.transport import NoReplyError
-        from rig.transport.zenoh import ZenohClient
+        from rig.serve.transport import NoReplyError
+        from rig.serve.transport.zenoh import ZenohClient
 
         try:
             parse_loopback(self._address, field="endpoint")
@@ -86,7 +86,7 @@ class ZenohBus(NodeBus):
         return f"the hub of CAN channel {self.channel} at {self._address}"
 
     def _ask(self, name: str, document: dict[str, Any]) -> dict[str, Any]:
-        from rig.transport import NoReplyError
+        from rig.serve.transport import NoReplyError
 
         payload = json.dumps({"endpoint": self.name, **document}).encode()
         try:
@@ -132,8 +132,8 @@ class ZenohBus(NodeBus):
     @staticmethod
     def _detect_available_configs() -> Sequence[AutoDetectedConfig]:
         """Channels of the hub at the default endpoint; none where no hub runs."""
-        from rig.transport import NoReplyError
-        from rig.transport.zenoh import ZenohClient
+        from rig.serve.transport import NoReplyError
+        from rig.serve.transport.zenoh import ZenohClient
 
         try:
             with ZenohClient(codec.DEFAULT_ENDPOINT, wait_s=0.2) as client:

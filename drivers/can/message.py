@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from rig.channels import Channel
+from rig.channels.table import Channel
 
 KEY = 0x9D
 """What every command carries."""

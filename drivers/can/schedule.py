@@ -8,7 +8,7 @@ from drivers.can import analysis
 from drivers.can.bus.timing import Speed
 from drivers.can.message import Message, MessageTable
 from drivers.can.signals import CLASSIC_HZ, CLASSIC_SHARE, FD_HZ, default_messages
-from rig.errors import InputError, Words
+from rig.base.errors import InputError, Words
 
 SLOT_S = 1e-3
 """The gateway hands over frames once in this time: that much later than due they may be queued [s]."""

@@ -28,9 +28,9 @@ from drivers.can.bus.frame import FD_LENGTHS
 from drivers.can.devices import Said, device_messages, said_in
 from drivers.can.faults import FaultKind, fault_raw, fault_request, fault_signals
 from drivers.can.message import ABSENT, KEY, Message, MessageTable, Samples, Signal, checksum
-from rig.channels import Channel, ChannelTable, default_table
-from rig.commands import HAMMER_BOUNDS
-from rig.errors import InputError
+from rig.base.errors import InputError
+from rig.channels.table import Channel, ChannelTable, default_table
+from rig.run.commands import HAMMER_BOUNDS
 
 CLASSIC_HZ = 1_000
 FD_HZ = 10_000
@@ -365,7 +365,7 @@ class Command:
         kind: What to do.
         counter: 0 to 255.
         values: Values in the units of the rig's own commands: `force_n` [N], `duration_ms` [ms], `direction` [degrees],
-            `speed_hz` [Hz]; of a fault the fields of `rig.commands.FaultCommand`, with its kind's main number.
+            `speed_hz` [Hz]; of a fault the fields of `rig.run.commands.FaultCommand`, with its kind's main number.
     """
 
     kind: Kind | FaultKind

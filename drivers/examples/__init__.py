@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
-from rig.errors import InputError
+from rig.base.errors import InputError
 
 
 def run(main: Callable[..., Any], most: int = 1) -> None:

@@ -4,7 +4,7 @@ import asyncio
 
 from drivers.daq import Daq
 from drivers.examples import run
-from drivers.force.driver import AsyncForce
+from drivers.instruments.force.driver import AsyncForce
 
 
 async def main(rig: str = "zenoh:127.0.0.1:7460", instruments: str = "zenoh:127.0.0.1:7462") -> float:

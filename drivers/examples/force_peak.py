@@ -1,7 +1,7 @@
 """Calibrated peak of each force transducer in a second, with what the amplifier says about its calibration."""
 
 from drivers.examples import run
-from drivers.force.driver import Force
+from drivers.instruments.force.driver import Force
 
 
 def main(url: str = "zenoh:127.0.0.1:7462", seconds: float = 1.0) -> dict[str, tuple[float, float]]:

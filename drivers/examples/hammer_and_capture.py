@@ -4,8 +4,8 @@ import numpy as np
 
 from drivers.daq import Daq
 from drivers.examples import run
-from drivers.hammer.driver import Hammer
-from drivers.samples import Samples
+from drivers.instruments.hammer.driver import Hammer
+from drivers.sources.samples import Samples
 
 
 def main(rig: str = "zenoh:127.0.0.1:7460", instruments: str = "zenoh:127.0.0.1:7462") -> list[Samples]:

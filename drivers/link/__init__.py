@@ -1,7 +1,7 @@
 """What carries an instrument's messages: a link at the host's end, a port at the instrument's, one module a transport.
 
 A message is whole or lost, never cut: what is made of bytes (a serial line) or of short frames (CAN) is put together
-below. No module here looks inside a message; those are `drivers.instrument.protocol`'s.
+below. No module here looks inside a message; those are `drivers.instruments.common.protocol`'s.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
-from rig.errors import InputError
+from rig.base.errors import InputError
 
 DEFAULT_ENDPOINT = "127.0.0.1:7462"
 """Where instruments on zenoh listen unless told otherwise."""

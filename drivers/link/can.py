@@ -16,9 +16,9 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from drivers.link import FORMS, ROOM, Address, LinkClosedError, LinkTimeoutError
-from rig.bounded_queue import BoundedQueue
-from rig.desk import one_line
-from rig.errors import InputError
+from rig.base.errors import InputError
+from rig.serve.bounded_queue import BoundedQueue
+from rig.serve.desk import one_line
 
 if TYPE_CHECKING:
     import can

@@ -1,4 +1,4 @@
-"""A serial line, real or a pseudo-terminal: frames of `drivers.link.frames` in a raw stream of bytes (POSIX)."""
+"""A serial line, real or a pseudo-terminal: frames of `drivers.link.frames` in a stream of bytes (POSIX)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pathlib import Path
 
 from drivers.link import FORMS, LinkClosedError, LinkTimeoutError
 from drivers.link.frames import Deframer, frame
-from rig.errors import InputError
+from rig.base.errors import InputError
 
 _MAX_BYTES = 1 << 16
 _PORTION = 1 << 16

@@ -7,8 +7,8 @@ from collections.abc import Callable
 
 from drivers.link import ROOM, Address, LinkClosedError, LinkTimeoutError
 from drivers.link.port import Outbox, OutboxPort
-from rig.bounded_queue import BoundedQueue, take_first
-from rig.transport import NoReplyError, Server
+from rig.serve.bounded_queue import BoundedQueue, take_first
+from rig.serve.transport import NoReplyError, Server
 
 _ROOT = "rig/instruments"
 _MAX_BYTES = 1 << 16
@@ -38,8 +38,8 @@ class ZenohLink:
     """
 
     def __init__(self, endpoint: str, address: Address, *, wait_s: float = 1.0) -> None:
-        from rig.transport.endpoint import parse_endpoint
-        from rig.transport.zenoh import ZenohClient
+        from rig.serve.transport.endpoint import parse_endpoint
+        from rig.serve.transport.zenoh import ZenohClient
 
         parse_endpoint(endpoint, field="zenoh")
         self._name = address.name

@@ -13,9 +13,9 @@ from typing import Any, Literal, get_args, get_origin
 
 from drivers.protection.monitor import Action, Protection
 from drivers.protection.settings import Settings
-from rig.errors import InputError
-from rig.outside import check
-from rig.transport import DEFAULT_ENDPOINT
+from rig.base.errors import InputError
+from rig.base.outside import check
+from rig.serve.transport import DEFAULT_ENDPOINT
 
 
 def protect(machine: Any, protection: Protection, show: Callable[[str], object] = print) -> None:

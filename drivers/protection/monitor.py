@@ -20,10 +20,10 @@ from itertools import accumulate
 import numpy as np
 
 from drivers.protection.settings import Settings
-from drivers.samples import Samples, follow
-from rig.errors import InputError
-from rig.units import factor
-from rig.wire import Continuity, row_tick, row_times_s
+from drivers.sources.samples import Samples, follow
+from rig.base.errors import InputError
+from rig.base.units import factor
+from rig.base.wire import Continuity, row_tick, row_times_s
 
 Alarm = tuple[str, str]
 """Its kind, and its channel."""

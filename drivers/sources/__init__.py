@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol
 
-from drivers.samples import Samples
-from rig.errors import InputError
+from drivers.sources.samples import Samples
+from rig.base.errors import InputError
 
 FORMS = "zenoh:HOST:PORT[?tls=DIR], the name of a rig, can:INTERFACE:CHANNEL[?NAME=VALUE&...]"
 
@@ -72,7 +72,7 @@ def open_source(url: str, *, wait_s: float = 3.0) -> Source:
     kind, colon, rest = url.partition(":")
     if (kind == "zenoh" and rest) or (url and not colon):
         from drivers.sources.rig import RigSource
-        from rig.transport.zenoh import client_of
+        from rig.serve.transport.zenoh import client_of
 
         client = client_of(url, wait_s=wait_s)
         return RigSource(client, close=client.close)

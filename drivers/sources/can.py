@@ -19,11 +19,11 @@ import numpy as np
 from drivers.can.message import Message, MessageTable
 from drivers.can.signals import State, default_messages, messages_for
 from drivers.link import LinkTimeoutError
-from drivers.samples import Samples
-from drivers.stream import RIG_GONE, whole_step
-from rig.channel_file import read_channels
-from rig.channels import default_table
-from rig.errors import InputError
+from drivers.sources.samples import Samples
+from drivers.sources.stream import RIG_GONE, whole_step
+from rig.base.errors import InputError
+from rig.channels.channel_file import read_channels
+from rig.channels.table import default_table
 
 _PATIENCE_S = 3.0
 """A bus that is silent for so long has no rig any more, whose heart beats once a second."""

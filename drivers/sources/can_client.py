@@ -15,10 +15,10 @@ from typing import Any
 from drivers.can.devices import DeviceKind, Standing, device_frame, name_of
 from drivers.can.signals import EventKind, Field, Kind, Result, State, clear_frame, command_frame, fault_frame
 from drivers.sources.can import CanSource
-from rig import wire
-from rig.closing import Closing
-from rig.errors import InputError, Words
-from rig.transport import NoReplyError
+from rig.base import wire
+from rig.base.closing import Closing
+from rig.base.errors import InputError, Words
+from rig.serve.transport import NoReplyError
 
 _US = 1e-6
 _WRAP = 1 << 32

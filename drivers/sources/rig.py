@@ -7,12 +7,12 @@ import threading
 from collections.abc import Callable, Sequence
 from itertools import count
 
-from drivers.samples import Samples
-from drivers.stream import RigStream, thin, whole_step
-from rig import wire
-from rig.channels import Group
-from rig.transport import Client
-from rig.transport.clients import Reporter
+from drivers.sources.samples import Samples
+from drivers.sources.stream import RigStream, thin, whole_step
+from rig.base import wire
+from rig.channels.table import Group
+from rig.serve.transport import Client
+from rig.serve.transport.clients import Reporter
 
 _REPORT_S = 0.4
 _numbers = count(1)

@@ -7,9 +7,10 @@ from collections.abc import Sequence
 import rerun as rr
 import rerun.blueprint as rrb
 
-from recorder.viewer import canvas, contact, marks, orbit, painter, scene3d, series, spectrum
-from recorder.viewer.geometry import Geometry
-from rig.channels import ChannelTable
+from recorder.viewer import canvas, painter
+from recorder.viewer.drawings import contact, marks, orbit, scene3d, series, spectrum
+from recorder.viewer.drawings.geometry import Geometry
+from rig.channels.table import ChannelTable
 
 LIVE_S = 10.0
 """Time series of a live view show this much of the past [s]."""

@@ -8,10 +8,10 @@ from itertools import pairwise
 
 import numpy as np
 
+from recorder.contents.samples import Samples
 from recorder.reader import Recording
-from recorder.samples import Samples
 from recorder.viewer.canvas import Canvas
-from recorder.viewer.geometry import Geometry
+from recorder.viewer.drawings.geometry import Geometry
 from recorder.viewer.painter import FRAME_S, Painter
 
 MOST_ROWS_PER_S = 2000.0

@@ -12,15 +12,15 @@ from itertools import groupby
 import numpy as np
 
 from recorder.viewer.canvas import Canvas
-from recorder.viewer.geometry import Geometry
+from recorder.viewer.drawings.geometry import Geometry
 from recorder.viewer.pace import CURVES_S, FASTEST_S, POINTS, Pace
 from recorder.viewer.painter import Painter
-from rig import wire
-from rig.channels import ChannelTable
-from rig.intake import Catalogue, Intake, event_in
-from rig.text import printable
-from rig.transport import Client
-from rig.transport.clients import Reporter
+from rig.base import wire
+from rig.base.text import printable
+from rig.channels.table import ChannelTable
+from rig.serve.intake import Catalogue, Intake, event_in
+from rig.serve.transport import Client
+from rig.serve.transport.clients import Reporter
 
 NAME = "viewer"
 ROWS_PER_S = 500.0

@@ -9,17 +9,17 @@ from typing import Any
 import numpy as np
 import rerun as rr
 
-from recorder import schemas
-from recorder.viewer import contact, orbit
+from recorder.files import schemas
 from recorder.viewer.canvas import Canvas
-from recorder.viewer.contact import ContactPlot, Touch
-from recorder.viewer.geometry import Geometry
-from recorder.viewer.marks import Marks
-from recorder.viewer.orbit import OrbitPlot
-from recorder.viewer.scene3d import Scene3D
-from recorder.viewer.series import REACTIONS, SeriesPlot, Span, reaction_of
-from recorder.viewer.spectrum import SpectrumPlot
-from rig.channels import ChannelTable, Group
+from recorder.viewer.drawings import contact, orbit
+from recorder.viewer.drawings.contact import ContactPlot, Touch
+from recorder.viewer.drawings.geometry import Geometry
+from recorder.viewer.drawings.marks import Marks
+from recorder.viewer.drawings.orbit import OrbitPlot
+from recorder.viewer.drawings.scene3d import Scene3D
+from recorder.viewer.drawings.series import REACTIONS, SeriesPlot, Span, reaction_of
+from recorder.viewer.drawings.spectrum import SpectrumPlot
+from rig.channels.table import ChannelTable, Group
 
 EVENTS = "/events"
 FRAME_S = 0.04

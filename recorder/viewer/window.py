@@ -23,8 +23,8 @@ from rerun.experimental import ViewerClient, ViewerState
 
 from recorder.viewer.canvas import PICTURE, SIMULATED
 from recorder.viewer.page import Page
-from rig.closing import Closing
-from rig.errors import InputError, Words
+from rig.base.closing import Closing
+from rig.base.errors import InputError, Words
 
 Kind = Literal["native", "web", "headless"]
 _Answer = TypeVar("_Answer")

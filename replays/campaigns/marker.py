@@ -7,10 +7,10 @@ from typing import Annotated, Any
 
 from pydantic import Field, FiniteFloat
 
-from replays.campaigns.bench import BenchSettings, Pace
-from rig.commands import TimedCommand
-from rig.outside import Written, check
-from rig.scenes import load_scene
+from replays.campaigns.equipment.bench import BenchSettings, Pace
+from rig.base.outside import Written, check
+from rig.run.commands import TimedCommand
+from rig.run.scenes import load_scene
 
 
 class _Marker(Written):

@@ -7,10 +7,10 @@ import re
 from dataclasses import dataclass
 from typing import Any
 
-from rig import units
-from rig.errors import InputError, Words
-from rig.outcome import Outcome
-from rig.text import finite
+from rig.base import units
+from rig.base.errors import InputError, Words
+from rig.base.outcome import Outcome
+from rig.base.text import finite
 
 OPERATORS = ("<=", "<", ">=", ">", "==", "!=", "between")
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"

@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from rig.outcome import InconclusiveError, Outcome
+from rig.base.outcome import InconclusiveError, Outcome
 
 if TYPE_CHECKING:
-    from replays.campaigns.bench import Bench
-    from replays.campaigns.campaign import Case
-    from replays.campaigns.device import Device
-    from replays.campaigns.record import Record
+    from replays.campaigns.equipment.bench import Bench
+    from replays.campaigns.equipment.device import Device
+    from replays.campaigns.equipment.record import Record
+    from replays.campaigns.files.campaign import Case
     from replays.campaigns.trial import Trial
 
 _SUFFIX = ".campaign.toml"
@@ -44,9 +44,9 @@ def pytest_configure(config: pytest.Config) -> None:
     folder, against, replay = config.option.rig_results, config.option.rig_against, config.option.rig_replay
     if hasattr(config, "workerinput") or not (folder or replay):
         return
-    from replays.campaigns.bench import check_replay
-    from replays.campaigns.results import Results
-    from rig.errors import DiskError, InputError
+    from replays.campaigns.equipment.bench import check_replay
+    from replays.campaigns.reporting.results import Results
+    from rig.base.errors import DiskError, InputError
 
     try:
         if replay:
@@ -68,8 +68,8 @@ class CampaignFile(pytest.File):
 
     def collect(self) -> Iterator[pytest.Item]:
         """Its cases."""
-        from replays.campaigns.campaign import load_campaign
-        from rig.errors import InputError
+        from replays.campaigns.files.campaign import load_campaign
+        from rig.base.errors import InputError
 
         try:
             campaign = load_campaign(self.path)
@@ -92,8 +92,8 @@ class CampaignItem(pytest.Item):
 
     def runtest(self) -> None:
         """Run it."""
-        from replays.campaigns.bench import NotThereError
-        from replays.campaigns.run import run_case
+        from replays.campaigns.equipment.bench import NotThereError
+        from replays.campaigns.files.run import run_case
 
         trial = self.stash[_TRIAL]
         try:
@@ -111,9 +111,9 @@ class CampaignItem(pytest.Item):
 
     def repr_failure(self, excinfo: pytest.ExceptionInfo[BaseException], style: Any = None) -> Any:
         """A line for each value that is not as it must be, or the one of what failed."""
-        from replays.campaigns.bench import BenchError
+        from replays.campaigns.equipment.bench import BenchError
         from replays.campaigns.trial import MeasurementError
-        from rig.errors import DiskError, InputError
+        from rig.base.errors import DiskError, InputError
 
         if isinstance(excinfo.value, BenchError | InputError | DiskError | ConnectionError | TimeoutError):
             return self.stash[_TRIAL].lasting(str(excinfo.value))
@@ -160,7 +160,7 @@ def pytest_report_teststatus(report: pytest.TestReport | pytest.CollectReport) -
 
 
 def _trial_of(item: pytest.Item) -> Trial:
-    from replays.campaigns.bench import Target
+    from replays.campaigns.equipment.bench import Target
     from replays.campaigns.trial import Trial
 
     options = item.config.option
@@ -181,7 +181,7 @@ def rig_trial(request: pytest.FixtureRequest) -> Iterator[Trial]:
 @pytest.fixture
 def bench(request: pytest.FixtureRequest, rig_trial: Trial) -> Bench:
     """A rig of the test's own, in lockstep unless `@pytest.mark.bench(...)` says else: `bench.connect(...)`."""
-    from replays.campaigns.bench import NotThereError
+    from replays.campaigns.equipment.bench import NotThereError
     from replays.campaigns.marker import settings_of
 
     marker = request.node.get_closest_marker("bench")

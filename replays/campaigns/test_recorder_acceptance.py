@@ -11,13 +11,13 @@ from collections.abc import Callable, Sequence
 
 import pytest
 
-from replays.campaigns.bench import Bench
-from replays.campaigns.device import Device
-from replays.campaigns.process import Program
-from replays.campaigns.record import Record
+from replays.campaigns.equipment.bench import Bench
+from replays.campaigns.equipment.device import Device
+from replays.campaigns.equipment.process import Program
+from replays.campaigns.equipment.record import Record
+from replays.score.card.scorecard import FAIL
 from replays.score.judgement import judge
-from replays.score.scorecard import FAIL
-from rig.errors import InputError
+from rig.base.errors import InputError
 
 RECORDER = "python -m rig record --connect {url} --history -o {folder}/daq.mcap"
 RECOVER = "python -m rig recover {folder}/daq.mcap.part"

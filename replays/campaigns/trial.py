@@ -12,15 +12,15 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from replays.campaigns.bench import BehindError, Bench, BenchSettings, Target
-from replays.campaigns.device import Device
+from replays.campaigns.equipment.bench import BehindError, Bench, BenchSettings, Target
+from replays.campaigns.equipment.device import Device
 from replays.campaigns.measurement import Measurement
-from rig.errors import DiskError, InputError
-from rig.outcome import InconclusiveError, Outcome
+from rig.base.errors import DiskError, InputError
+from rig.base.outcome import InconclusiveError, Outcome
 
 if TYPE_CHECKING:
     from recorder.reader import Recording
-    from replays.campaigns.record import Record
+    from replays.campaigns.equipment.record import Record
 
 AROUND_S = 1.0
 """Simulated time that is kept before and after an event [s]."""
@@ -93,7 +93,7 @@ class Trial:
 
     def start_record(self) -> Record:
         """The recording of the bench, begun."""
-        from replays.campaigns.record import Record
+        from replays.campaigns.equipment.record import Record
 
         assert self.bench is not None
         self.record = Record(self.bench, self.folder / "session.mcap")
@@ -162,7 +162,7 @@ class Trial:
     def _cut(self, recording: Recording, folder: Path) -> list[Path]:
         from recorder.reader import Recording
         from recorder.rewrite import cut
-        from replays.campaigns.picture import draw
+        from replays.campaigns.reporting.picture import draw
 
         failed = [each for each in self.measurements if not each.good]
         span = recording.span_s or (0.0, 0.0)

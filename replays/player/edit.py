@@ -9,9 +9,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from rig import wire
-from rig.channels import ChannelTable
-from rig.errors import InputError
+from rig.base import wire
+from rig.base.errors import InputError
+from rig.channels.table import ChannelTable
 
 
 class Edit:

@@ -6,9 +6,9 @@ from typing import Any
 
 from replays.player.edit import Edit, Stamp
 from replays.player.timeline import Item
-from rig import wire
-from rig.text import finite
-from rig.transport import Server
+from rig.base import wire
+from rig.base.text import finite
+from rig.serve.transport import Server
 
 
 class Outlet:

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 from replays.player.playhead import NS
 from replays.player.timeline import Batch, Item, Timeline
-from rig import wire
-from rig.errors import InputError
+from rig.base import wire
+from rig.base.errors import InputError
 
 
 @dataclass(frozen=True)

@@ -20,14 +20,14 @@ from replays.player.playhead import NS, Playhead
 from replays.player.readahead import ReadAhead
 from replays.player.timeline import Batch, By, Timeline
 from replays.player.track import Track
-from rig import wire
-from rig.desk import Pending, Rate, Seek, Step
-from rig.errors import InputError, RefusedError, Words
-from rig.pacing import FreeRun, RealTime
-from rig.served_run import ServedRun
-from rig.service import COMMANDS, REPLAY_COMMANDS
-from rig.text import finite
-from rig.transport import Server
+from rig.base import wire
+from rig.base.errors import InputError, RefusedError, Words
+from rig.base.text import finite
+from rig.serve.desk import Pending, Rate, Seek, Step
+from rig.serve.pacing import FreeRun, RealTime
+from rig.serve.served_run import ServedRun
+from rig.serve.service import COMMANDS, REPLAY_COMMANDS
+from rig.serve.transport import Server
 
 _OWN = (*REPLAY_COMMANDS, "step", "stop")
 _AHEAD_S = 30.0

@@ -5,8 +5,8 @@ from __future__ import annotations
 import time
 from typing import Any
 
-from rig.errors import InputError
-from rig.pacing import Clock
+from rig.base.errors import InputError
+from rig.serve.pacing import Clock
 
 NS = 1_000_000_000
 LEAST_RATE, GREATEST_RATE = 0.01, 1000.0

@@ -9,7 +9,7 @@ from enum import StrEnum
 from itertools import accumulate
 
 from replays.player.track import Message, Track
-from rig import wire
+from rig.base import wire
 
 _NS = 1_000_000_000
 

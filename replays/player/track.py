@@ -6,11 +6,11 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from recorder.chunks import Chunk
+from recorder.files.chunks import Chunk
 from recorder.reader import join
-from rig import wire
-from rig.channels import ChannelTable
-from rig.errors import InputError
+from rig.base import wire
+from rig.base.errors import InputError
+from rig.channels.table import ChannelTable
 
 
 class Message(NamedTuple):

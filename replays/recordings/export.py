@@ -20,17 +20,17 @@ from typing import Any, Protocol, Self
 import numpy as np
 
 from recorder.reader import Recording
-from replays.recordings.background import Background
-from replays.recordings.formats import columnar, delimited
-from replays.recordings.formats.export import check_output, export
-from replays.recordings.formats.selection import select
-from rig import wire
-from rig.commands import FaultCommand
-from rig.errors import PART_SUFFIX, InputError, Words, whole_file
-from rig.kernels.signals import ROW
-from rig.offline import frames
-from rig.simulation import Frame, Simulation
-from rig.text import finite
+from replays.recordings.formats.exporting.export import check_output, export
+from replays.recordings.formats.exporting.selection import select
+from replays.recordings.formats.readers import columnar, delimited
+from replays.recordings.resimulation.background import Background
+from rig.base import wire
+from rig.base.errors import PART_SUFFIX, InputError, Words, whole_file
+from rig.base.text import finite
+from rig.physics.kernels.signals import ROW
+from rig.run.commands import FaultCommand
+from rig.run.offline import frames
+from rig.run.simulation import Frame, Simulation
 
 SUFFIXES = (".mcap", ".parquet", ".csv", ".wav")
 
@@ -233,7 +233,7 @@ class McapRun:
         self._background = Background()
 
     def __enter__(self) -> Self:
-        from recorder.head import Beginning
+        from recorder.contents.head import Beginning
         from recorder.writer import RecordingWriter
 
         epoch_ns = self._epoch_ns

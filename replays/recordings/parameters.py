@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from recorder.reader import Recording
-from rig.parameters import load_parameters, set_names
+from rig.physics.parameters import load_parameters, set_names
 
 
 def parameter_doubts(recording: Recording) -> tuple[str, ...]:

@@ -12,7 +12,7 @@ from recorder.reader import Recording
 from replays.recordings.verdict import hammer_time_s
 from replays.recordings.whirl import parameter_si, reactions, whirl_figures
 from replays.report.canvas import BLACK, BLUE, GREEN, RED, draw_signals, house_style, new_figure, save
-from rig.orbit import SPECTRUM_HZ, full_spectrum, waterfall
+from rig.channels.orbit import SPECTRUM_HZ, full_spectrum, waterfall
 
 _BEFORE, _IMPACTS, _WHIRL = GREEN, RED, BLUE
 _X, _Y = BLUE, RED

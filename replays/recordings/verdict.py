@@ -9,7 +9,7 @@ import numpy as np
 
 from recorder.reader import Recording
 from replays.recordings.whirl import WhirlFigures, parameter_si, reactions, whirl_figures
-from rig.errors import InputError
+from rig.base.errors import InputError
 
 PAPER_WHIRL_HZ = 83.7
 """The paper's Fig. 14, at 6.2 Hz."""

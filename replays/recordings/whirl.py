@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from recorder.contents.samples import Samples
 from recorder.reader import Recording
-from recorder.samples import Samples
-from rig.errors import InputError, Words
-from rig.orbit import whirl_frequency
+from rig.base.errors import InputError, Words
+from rig.channels.orbit import whirl_frequency
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ def reactions(forces: Samples) -> tuple[np.ndarray, np.ndarray]:
 
 def parameter_si(recording: Recording, key: str) -> float:
     """A parameter of the recorded rig in SI."""
-    from rig.parameters import SI
+    from rig.physics.parameters import SI
 
     entry = recording.parameters["values"][key]
     return float(entry.get("resolved", entry["value"])) * SI[entry["unit"]]

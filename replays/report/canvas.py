@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from rig.errors import InputError, whole_file
+from rig.base.errors import InputError, whole_file
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -5,18 +5,15 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from replays.report.canvas import DPI, png
-from rig.errors import InputError, check_new_file, whole_file
-from rig.outcome import Outcome
-from rig.text import printable
+from rig.base.outcome import Outcome
+from rig.base.text import printable
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-SUFFIXES = (".html", ".pdf")
 
 Mark = Literal["good", "bad", "open", "plain"]
 """What a row of a table says: as it must be, not so, undecided, or nothing to be judged."""
@@ -165,38 +162,3 @@ class Report:
     def picture(self, figure: Figure, caption: str, *, dpi: int = DPI) -> None:
         """Add a figure of matplotlib as a picture."""
         self.parts.append(Picture(png(figure, dpi=dpi), printable(caption)))
-
-    def write(self, path: Path) -> None:
-        """Write the report to a file that is whole or not there; the same report gives the same bytes.
-
-        Raises:
-            InputError: The file is neither .html nor .pdf.
-            DiskError: The disk refused; what stood in the file before stands there still.
-        """
-        check_suffix(path)
-        if path.suffix == ".html":
-            from replays.report.html import render
-        else:
-            from replays.report.pdf import render
-        data = render(self)
-        with whole_file(path) as draft:
-            draft.write_bytes(data)
-
-
-def check_suffix(path: Path) -> None:
-    """Refuse a file that no report is written to.
-
-    Raises:
-        InputError: It is neither .html nor .pdf.
-    """
-    if path.suffix not in SUFFIXES:
-        raise InputError("report", f"a file name that ends in {' or '.join(SUFFIXES)}", str(path))
-
-
-def check_report(path: Path, *, force: bool, field: str = "report") -> None:
-    """Refuse a file that no report can be written to, before anything is computed.
-
-    Raises:
-        InputError: Another suffix, a folder that is missing or read-only, or an existing file.
-    """
-    check_new_file(path, field=field, suffixes=SUFFIXES, force=force)

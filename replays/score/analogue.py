@@ -8,13 +8,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from replays.score.alignment import align
-from replays.score.following import Alignment, Source
-from replays.score.intervals import about, pooled, sandwich, scaled, student
-from replays.score.noise import split_noise
-from replays.score.recorded import Recorded
-from replays.score.rounding import Converter, find_step, undithered, widen
-from replays.score.scorecard import (
+from replays.score.alignment.alignment import align
+from replays.score.alignment.following import Alignment, Source
+from replays.score.alignment.stamps import Stamps
+from replays.score.card.scorecard import (
     ANALOGUE,
     FAIL,
     INCONCLUSIVE,
@@ -25,11 +22,9 @@ from replays.score.scorecard import (
     Verdict,
     text_row,
 )
-from replays.score.sent import LOUD, Formula, Session
-from replays.score.sine import fit_sine, is_sine, quality
-from replays.score.stamps import Stamps
-from replays.score.stimulus import Exact, Sampled, Stimulus, parted, without_noise
-from replays.score.waveform import (
+from replays.score.fits.intervals import about, pooled, sandwich, scaled, student
+from replays.score.fits.sine import fit_sine, is_sine, quality
+from replays.score.fits.waveform import (
     Response,
     Waveform,
     behind_filter,
@@ -37,9 +32,14 @@ from replays.score.waveform import (
     response,
     through,
 )
-from replays.score.wiring import Wire
-from rig import units
-from rig.channels import Channel
+from replays.score.quantities.noise import split_noise
+from replays.score.quantities.rounding import Converter, find_step, undithered, widen
+from replays.score.records.recorded import Recorded
+from replays.score.records.sent import LOUD, Formula, Session
+from replays.score.records.stimulus import Exact, Sampled, Stimulus, parted, without_noise
+from replays.score.records.wiring import Wire
+from rig.base import units
+from rig.channels.table import Channel
 
 _AS_WELL = 1.1
 """A low-pass of Butterworth's is taken where it leaves at most this much of what any linear response leaves."""

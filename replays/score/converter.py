@@ -8,12 +8,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from replays.score.analogue import Fitted
-from replays.score.crosstalk import find_crosstalk
-from replays.score.intervals import scaled
-from replays.score.nonlinearity import intermodulation, transfer_curve
-from replays.score.rounding import rounding_errors
-from replays.score.scorecard import Scorecard
-from replays.score.step import BAND, has_steps, step_response
+from replays.score.card.scorecard import Scorecard
+from replays.score.fits.intervals import scaled
+from replays.score.quantities.crosstalk import find_crosstalk
+from replays.score.quantities.nonlinearity import intermodulation, transfer_curve
+from replays.score.quantities.rounding import rounding_errors
+from replays.score.quantities.step import BAND, has_steps, step_response
 
 _QUANTITIES = ("IMD", "INL", "DNL", "crosstalk", "rise time", "overshoot", "settling time")
 _MAX_ROWS = 1 << 17

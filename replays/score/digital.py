@@ -12,17 +12,17 @@ from itertools import chain
 
 import numpy as np
 
-from replays.score.live import Arrivals
-from replays.score.overlap import holds_session_rows
-from replays.score.placing import Taken
-from replays.score.recorded import Recorded, Table
-from replays.score.rows import Followed, follow, repeated_part, row_hashes, stretches, take_rows
-from replays.score.scale import Scale
-from replays.score.scorecard import Interval, Scorecard
-from replays.score.sent import Sent, Session
-from replays.score.stamps import Stamps
-from replays.score.wiring import Wire
-from rig.channels import Channel
+from replays.score.alignment.overlap import holds_session_rows
+from replays.score.alignment.placing import Taken
+from replays.score.alignment.stamps import Stamps
+from replays.score.card.scorecard import Interval, Scorecard
+from replays.score.records.live import Arrivals
+from replays.score.records.recorded import Recorded, Table
+from replays.score.records.rows import Followed, follow, repeated_part, row_hashes, stretches, take_rows
+from replays.score.records.scale import Scale
+from replays.score.records.sent import Sent, Session
+from replays.score.records.wiring import Wire
+from rig.channels.table import Channel
 
 _BACKLOG_S = 1.0
 """Rows that wait in a pipe have come by then [s]."""

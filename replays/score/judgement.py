@@ -10,16 +10,10 @@ from typing import Literal
 import numpy as np
 
 from replays.recordings.formats import mapping as formats
+from replays.score.alignment.placing import Taken, settle
 from replays.score.analogue import score_analogue
-from replays.score.can_log import is_can_log, open_can_log
-from replays.score.converter import score_converter
-from replays.score.digital import score_digital
-from replays.score.limits import Limits, load_limits
-from replays.score.live import Arrivals
-from replays.score.placing import Taken, settle
-from replays.score.recorded import Recorded, map_signals, open_recorded, separate_rates
-from replays.score.scale import COUNTS
-from replays.score.scorecard import (
+from replays.score.card.limits import Limits, load_limits
+from replays.score.card.scorecard import (
     FAIL,
     INCONCLUSIVE,
     NO_LIMIT,
@@ -30,11 +24,17 @@ from replays.score.scorecard import (
     Verdict,
     text_row,
 )
-from replays.score.sent import Formula, Session
-from replays.score.wiring import Wire, find_wires
-from rig import units
-from rig.channels import Channel
-from rig.errors import InputError, UnknownNameError, Words
+from replays.score.converter import score_converter
+from replays.score.digital import score_digital
+from replays.score.records.can_log import is_can_log, open_can_log
+from replays.score.records.live import Arrivals
+from replays.score.records.recorded import Recorded, map_signals, open_recorded, separate_rates
+from replays.score.records.scale import COUNTS
+from replays.score.records.sent import Formula, Session
+from replays.score.records.wiring import Wire, find_wires
+from rig.base import units
+from rig.base.errors import InputError, UnknownNameError, Words
+from rig.channels.table import Channel
 
 _NEAR = 0.01
 """Part by which the rate of a DAQ that took rows may be off by its stamps."""

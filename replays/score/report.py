@@ -10,7 +10,7 @@ import numpy as np
 from replays.report import OUTCOME_MARKS, Mark, Report, Row
 from replays.report.canvas import BLUE, ORANGE, RED, draw_signals, house_style, label_of, new_figure
 from replays.score.analogue import Fitted
-from replays.score.scorecard import (
+from replays.score.card.scorecard import (
     FAIL,
     INCONCLUSIVE,
     MARKS,

@@ -15,10 +15,10 @@ from recorder.reader import Recording
 from replays.recordings.export import McapRun
 from replays.recordings.validation import validate
 from replays.recordings.validation.outcome import Validation
-from rig.errors import whole_file
-from rig.offline import frames
-from rig.scenes import load_scene
-from rig.simulation import Simulation
+from rig.base.errors import whole_file
+from rig.run.offline import frames
+from rig.run.scenes import load_scene
+from rig.run.simulation import Simulation
 
 FOLDER = Path(__file__).parent
 COMMAND = "rig sessions -o replays/sessions --force"

@@ -18,17 +18,17 @@ from typing import Any
 
 import numpy as np
 
-from replays.studies import provenance
+from replays.studies.common import provenance
+from replays.studies.common.run import bare_sensors, run_scene
 from replays.studies.peers import PEERS, Problem, Setting, scaled_error
-from replays.studies.peers.reference import find_reference
-from replays.studies.peers.window import cut_window
-from replays.studies.run import bare_sensors, run_scene
-from rig.channels import ChannelTable, default_table
-from rig.kernels import compiled_before
-from rig.kernels.signals import COLUMN, N_STATE
-from rig.pacing import short_collections
-from rig.scenes import Scene, load_scene
-from rig.simulation import Simulation
+from replays.studies.peers.common.reference import find_reference
+from replays.studies.peers.common.window import cut_window
+from rig.channels.table import ChannelTable, default_table
+from rig.physics.kernels import compiled_before
+from rig.physics.kernels.signals import COLUMN, N_STATE
+from rig.run.scenes import Scene, load_scene
+from rig.run.simulation import Simulation
+from rig.serve.pacing import short_collections
 
 ALONE = {**{f"sensors.{name}": value for name, value in bare_sensors().items()}, "model.friction": "exact"}
 """The engine alone: a row every 1 ms, no sensor chain to speak of."""

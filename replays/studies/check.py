@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from replays.studies.peers.problem import scaled_error
-from replays.studies.run import bare_sensors, run_scene
-from rig.engines import ENGINES
-from rig.errors import InputError
-from rig.kernels.signals import N_STATE
-from rig.scenes import Scene, parse_scene
-from rig.simulation import Simulation
+from replays.studies.common.run import bare_sensors, run_scene
+from replays.studies.peers.common.problem import scaled_error
+from rig.base.errors import InputError
+from rig.physics.engines import ENGINES
+from rig.physics.kernels.signals import N_STATE
+from rig.run.scenes import Scene, parse_scene
+from rig.run.simulation import Simulation
 
 ANOTHER_BRANCH = 0.1
 """Scaled error from which the two runs are no longer the same motion."""

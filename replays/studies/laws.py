@@ -21,7 +21,8 @@ from replays.report.canvas import (
     new_figure,
     save,
 )
-from rig.contacts import (
+from rig.base.errors import InputError
+from rig.physics.contacts import (
     DAMPING,
     KELVIN_VOIGT,
     LAW,
@@ -36,9 +37,8 @@ from rig.contacts import (
     returned_restitution,
     same_depth,
 )
-from rig.errors import InputError
-from rig.model import contact_pair, normal_law, reference_impact
-from rig.parameters import ParameterSet
+from rig.physics.model import contact_pair, normal_law, reference_impact
+from rig.physics.parameters import ParameterSet
 
 LEAST = 0.05
 """Smallest restitution compared, the smallest that `contact.restitution` takes."""

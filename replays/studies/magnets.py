@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from replays.report.canvas import BLACK, BLUE, GREEN, ORANGE, RED, SKY, check_suffix, house_style, new_figure, save
-from rig.magnets import (
+from rig.physics.magnets import (
     MagnetGeometry,
     MagnetMap,
     cylinder_force,
@@ -23,7 +23,7 @@ from rig.magnets import (
     model_errors,
     quadrature_error,
 )
-from rig.model import Model
+from rig.physics.model import Model
 
 FRACTIONS = (0.1, 0.2, 0.4, 0.6, 0.8, 1.0)
 """Displacements compared, of the reach."""

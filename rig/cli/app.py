@@ -9,10 +9,10 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
-from rig.cli import origin
+from rig.base.errors import WHOLE_RIG, DiskError, InputError, SimulationError, lacks_full, need_of_full
 from rig.cli.command import Group, load_command, make_group, usage_error
-from rig.cli.tables import echo
-from rig.errors import WHOLE_RIG, DiskError, InputError, SimulationError, lacks_full, need_of_full
+from rig.cli.output import origin
+from rig.cli.output.tables import echo
 
 # Wrong options and arguments; typer names only these two of its own exceptions, which have moved between its versions.
 _UsageError: Any = typer.BadParameter.__base__
@@ -115,7 +115,7 @@ def _load(name: str) -> Any:
         return load_command("requests" if name in REQUESTS else name, name)
     from importlib import import_module
 
-    function = getattr(import_module(f"rig.cli.{name}"), name)
+    function = getattr(import_module(f"rig.cli.commands.{name}"), name)
     return make_group(name, {"Commands": GROUPS[name]}, partial(load_command, name), function)
 
 
@@ -135,7 +135,7 @@ def _rig(
 def start(arguments: list[str] | None = None) -> None:
     """Run the command and end the process with its exit status."""
     if arguments is None and sys.argv[1:2] == ["__complete"] and len(sys.argv) == 4:
-        from rig.cli.completion import complete
+        from rig.cli.commands.completion import complete
 
         sys.stdout.write("".join(f"{line}\n" for line in complete(rig(), *sys.argv[2:])))
         return

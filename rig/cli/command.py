@@ -17,8 +17,8 @@ from typing import Any, get_args
 import typer
 from typer.core import TyperCommand, TyperGroup
 
+from rig.base.errors import InputError, RefusedError, UnknownNameError, Words
 from rig.cli.groups import grouped
-from rig.errors import InputError, RefusedError, UnknownNameError, Words
 
 _PLAIN: dict[str, Any] = {"add_completion": False, "rich_markup_mode": None}
 _SETTINGS = {"help_option_names": ["-h", "--help"]}
@@ -167,7 +167,7 @@ class Group(_Page, TyperGroup):
 def load_command(module: str, name: str) -> Any:
     """The command that is the function of its name in a module, behind which an underscore stands if need be."""
     name, shown = name + "_" * iskeyword(name), name
-    function = grouped(getattr(import_module(f"rig.cli.{module}{'_' * iskeyword(module)}"), name))
+    function = grouped(getattr(import_module(f"rig.cli.commands.{module}{'_' * iskeyword(module)}"), name))
     app = typer.Typer(**_PLAIN)
     app.command(shown, cls=_Command, context_settings=_SETTINGS)(function)
     command = typer.main.get_command(app)

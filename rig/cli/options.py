@@ -8,11 +8,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rig.errors import InputError
+from rig.base.errors import InputError
+
+if TYPE_CHECKING:
+    from rig.physics.parameters import ParameterSet
 
 SceneName = Annotated[str, typer.Argument(metavar="SCENE", help="Name of a scene, or the path of a scene file.")]
 SetName = Annotated[str, typer.Argument(metavar="[SET]", help="A parameter set, by name or path.")]
@@ -95,3 +98,21 @@ def pairs(option: str, texts: list[str] | None, form: str) -> dict[str, str]:
             raise InputError(option, f"given once for {left}", text)
         found[left] = right
     return found
+
+
+def changed_parameters(name: str, changes: list[str] | None, also: dict[str, Any] | None = None) -> ParameterSet:
+    """A parameter set with changes from the command line.
+
+    Args:
+        name: Name or path of the set.
+        changes: Values of `--set`, each KEY=VALUE.
+        also: Values by key from options of their own; they come last.
+
+    Raises:
+        InputError: No such set or key, or a value that the model does not take.
+    """
+    from rig.physics.parameters import load_parameters
+    from rig.run.scenes import read_value
+
+    values = {key: read_value(text) for key, text in SceneChanges(changes=changes).overrides().items()}
+    return load_parameters(name).override(values | (also or {}), source="--set")

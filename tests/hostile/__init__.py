@@ -10,7 +10,7 @@ import traceback
 from collections.abc import Iterator
 from typing import Any
 
-from rig.errors import DiskError, InputError
+from rig.base.errors import DiskError, InputError
 
 LONGEST_S = 20.0
 

@@ -15,10 +15,10 @@ import numpy as np
 import typer
 
 import replays
-from recorder.head import Beginning
+from recorder.contents.head import Beginning
 from recorder.reader import Recording
 from recorder.writer import RecordingWriter
-from rig.wire import CATALOGUE, PARAMETERS, SCENE, Block, encode_block, encode_document, sensor_key
+from rig.base.wire import CATALOGUE, PARAMETERS, SCENE, Block, encode_block, encode_document, sensor_key
 from tests.unit.recorder_stream import documents, stream
 
 SESSIONS = Path(replays.__file__).with_name("sessions")
@@ -293,11 +293,11 @@ def uses() -> dict[str, Use]:
     from recorder.rewrite import cut, recover
     from replays.player.timeline import By, Timeline
     from replays.player.track import Track
-    from replays.recordings.experiment import Experiment
-    from replays.recordings.formats.export import export, merged
-    from replays.recordings.formats.selection import select
-    from rig.cli import info
-    from rig.cli.tables import Form
+    from replays.recordings.formats.exporting.export import export, merged
+    from replays.recordings.formats.exporting.selection import select
+    from replays.recordings.resimulation.experiment import Experiment
+    from rig.cli.commands import info
+    from rig.cli.output.tables import Form
 
     def told(path: Path, _: Path) -> object:
         recording = join([path])

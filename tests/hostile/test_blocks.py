@@ -20,20 +20,20 @@ import pytest
 import recorder.session
 from drivers.daq import Daq
 from drivers.link import LinkTimeoutError
-from drivers.samples import Samples, StreamEndedError
 from drivers.sources.rig import RigSource
+from drivers.sources.samples import Samples, StreamEndedError
+from recorder.contents.summary import Summary
+from recorder.output.room import Limits
+from recorder.output.trigger import Capture, Trigger
 from recorder.reader import Recording, join
-from recorder.room import Limits
 from recorder.session import RecordingSession
-from recorder.summary import Summary
-from recorder.trigger import Capture, Trigger
 from recorder.viewer import live
-from rig import wire
-from rig.channels import default_table
-from rig.errors import InputError
-from rig.intake import Catalogue, Intake
-from rig.transport.memory import MemoryClient, MemoryServer
-from rig.transport.zenoh import ZenohClient, ZenohServer
+from rig.base import wire
+from rig.base.errors import InputError
+from rig.channels.table import default_table
+from rig.serve.intake import Catalogue, Intake
+from rig.serve.transport.memory import MemoryClient, MemoryServer
+from rig.serve.transport.zenoh import ZenohClient, ZenohServer
 from tests.hostile import inputs
 from tests.processes import free_endpoint
 from tests.unit.recorder_stream import TRUTH_COLUMNS, ScriptedClient, block_of, documents
@@ -380,7 +380,7 @@ def test_what_another_session_publishes_is_left_out_and_counted(monkeypatch: pyt
     import zenoh
 
     # Where access control stops it, as it does by default, there is nothing to leave out.
-    monkeypatch.setattr("rig.transport.zenoh.rules", lambda: {"enabled": False, "default_permission": "allow"})
+    monkeypatch.setattr("rig.serve.transport.zenoh.rules", lambda: {"enabled": False, "default_permission": "allow"})
     endpoint, truth = free_endpoint(), Truth()
     with ZenohServer(endpoint) as server:
         server.publish(PROBES, truth.payload(PROBES, 0))

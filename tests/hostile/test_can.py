@@ -22,25 +22,26 @@ import can  # noqa: TID253 - the subject
 import numpy as np
 import pytest
 
-from drivers.can.bus import codec, endpoints, slcan, socketcand
+from drivers.can.bus import codec, endpoints
 from drivers.can.bus.frame import fault_of, packed
 from drivers.can.bus.hub import Hub
 from drivers.can.bus.model import BusModel
-from drivers.can.bus.slcan import SlcanPort
-from drivers.can.bus.socketcand import SocketcandServer
+from drivers.can.bus.outlets import slcan, socketcand
+from drivers.can.bus.outlets.slcan import SlcanPort
+from drivers.can.bus.outlets.socketcand import SocketcandServer
 from drivers.can.gateway import Gateway
 from drivers.can.interface import HubBus
 from drivers.can.schedule import Schedule
 from drivers.can.signals import AHEAD, KEY, Kind, checksum, command_frame, default_messages
-from drivers.instrument.protocol import Codec, ProtocolError
+from drivers.instruments.common.protocol import Codec, ProtocolError
+from drivers.instruments.twins import TWINS, Twins
 from drivers.link.can import TO_INSTRUMENT, CanLink, CanNode
 from drivers.link.frames import Deframer, frame, unstuff
 from drivers.link.port import MessagePort
 from drivers.sources.can import CanSource
-from drivers.twins import TWINS, Twins
-from rig import wire
-from rig.channels import default_table
-from rig.transport.memory import MemoryClient, MemoryServer
+from rig.base import wire
+from rig.channels.table import default_table
+from rig.serve.transport.memory import MemoryClient, MemoryServer
 from tests.hostile import inputs
 from tests.hostile.documents import documents
 from tests.unit import link_memory as memory
@@ -539,21 +540,21 @@ def test_requests_to_instruments_are_answered_and_only_exact_ones_carried_out() 
         served = [twins.serve(kind, MessagePort(memory.pair()[0], "memory:")) for kind in TWINS]
         for number in range(inputs(3000)):
             twin = served[random.integers(len(served))]
-            request, before = a_request(random, twin.CODEC), len(rig.commands)
+            request, before = a_request(random, twin.CODEC), len(rig.run.commands)
             _, reply = twin.CODEC.decode(twin.answer(request))
             try:
                 sequence, message = twin.CODEC.decode(request)
             except ProtocolError:
                 assert type(reply).__name__ == "Refused"
-                assert len(rig.commands) == before
+                assert len(rig.run.commands) == before
             else:
                 # What is read is what stands there, to the byte.
                 assert twin.CODEC.encode(message, sequence) == request
-                assert len(rig.commands) == before + (type(reply).__name__ == "Done")
+                assert len(rig.run.commands) == before + (type(reply).__name__ == "Done")
             if number % 500 == 0:
                 rig.publish("probes", "forces", "accelerations", "drive", "hammer")
-        assert len(rig.commands) > 10
-        rig.commands.clear()
+        assert len(rig.run.commands) > 10
+        rig.run.commands.clear()
     for kind in TWINS:
         with pytest.raises(ProtocolError):
             kind.CODEC.decode(b"")
@@ -612,7 +613,7 @@ def test_transport_frames_of_instruments_on_a_bus_leave_them_answering() -> None
                 time.sleep(0.02)
             while villain.recv(0) is not None:
                 pass
-        assert len(rig.commands) == 0
+        assert len(rig.run.commands) == 0
         codec = TWINS[0].CODEC
         link = CanLink(f"virtual:{channel}", codec.address)
         try:

@@ -10,12 +10,12 @@ from typing import Any
 
 import pytest
 
-from recorder.head import Head
+from recorder.contents.head import Head
 from recorder.reader import Recording
 from recorder.rewrite import cut, recover
 from replays.recordings.parameters import parameter_doubts
+from rig.base.wire import EVENTS, STATUS, Block, decode_block, encode_block, encode_document, schema_of
 from rig.cli.main import main
-from rig.wire import EVENTS, STATUS, Block, decode_block, encode_block, encode_document, schema_of
 
 from .files import PROBES, SESSIONS, Layout
 

@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rig import wire
-from rig.commands import COMMANDS as DONE_TO_THE_RIG
-from rig.commands import check_command
-from rig.desk import REQUESTS
-from rig.pacing import Lockstep
-from rig.service import COMMANDS, Service
-from rig.transport.limit import CommandLimit
-from rig.transport.memory import MemoryClient, MemoryServer
+from rig.base import wire
+from rig.run.commands import COMMANDS as DONE_TO_THE_RIG
+from rig.run.commands import check_command
+from rig.serve.desk import REQUESTS
+from rig.serve.pacing import Lockstep
+from rig.serve.service import COMMANDS, Service
+from rig.serve.transport.limit import CommandLimit
+from rig.serve.transport.memory import MemoryClient, MemoryServer
 from tests.hostile import inputs
 from tests.hostile.documents import documents
 from tests.unit.service_fake import FakeSimulation

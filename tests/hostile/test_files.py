@@ -21,11 +21,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from recorder.files.records import MAGIC
 from recorder.reader import Recording, join
-from recorder.records import MAGIC
 from recorder.rewrite import is_whole, recover
+from rig.base.errors import InputError
 from rig.cli.main import main
-from rig.errors import InputError
 from tests.hostile import Door, inputs, tell
 from tests.hostile.files import PROBES, SESSIONS, Layout, attachments_of, contents, far_block, spoil_bytes, uses, write
 

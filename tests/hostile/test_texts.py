@@ -24,19 +24,19 @@ import pytest
 import rig.cli
 from recorder.reader import Recording
 from replays.recordings.formats.conversion import convert, write_recording
-from replays.recordings.formats.export import export
+from replays.recordings.formats.exporting.export import export
+from replays.recordings.formats.exporting.selection import select
+from replays.recordings.formats.guessing.template import example
 from replays.recordings.formats.mapping import FileOptions, Mapping, load_mapping
-from replays.recordings.formats.selection import select
 from replays.recordings.formats.source import open_source
-from replays.recordings.formats.template import example
 from replays.recordings.validation.criteria import DEFAULT, Criteria, load_criteria
-from rig.channels import TABLE, parse_table
-from rig.cli import tables
+from rig.base.errors import InputError
+from rig.base.outside import check, read_toml
+from rig.channels.table import TABLE, parse_table
 from rig.cli.main import main
-from rig.errors import InputError
-from rig.outside import check, read_toml
-from rig.parameters import SETS, load_parameters
-from rig.scenes import SCENES, load_scene, parse_scene, read_value, scene_document, scene_names
+from rig.cli.output import tables
+from rig.physics.parameters import SETS, load_parameters
+from rig.run.scenes import SCENES, load_scene, parse_scene, read_value, scene_document, scene_names
 from tests.hostile import Door, inputs, tell
 from tests.hostile.files import Layout, Rng, spoil_bytes, spoil_document, write
 
@@ -310,7 +310,7 @@ def test_names_do_not_change_the_form_of_what_is_exported(name: str, tmp_path: P
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_status_and_a_validation_print_them_too(name: str, capsys: pytest.CaptureFixture[str]) -> None:
-    from rig.cli.status import status_table
+    from rig.cli.commands.status import status_table
 
     document = {
         "scene": name, "state": "running", "end_s": None, "time_s": 1.0, "tick": 5, "pace": name, "block_ms": 1.0,
@@ -363,7 +363,7 @@ def test_paths_with_such_names_end_no_command(
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_recording_to_such_a_path_is_made(name: str, capsys: pytest.CaptureFixture[str]) -> None:
-    from rig.cli.record import run_session
+    from rig.cli.commands.record import run_session
 
     progress = SimpleNamespace(
         time_s=1.0, rows=5, lost=3, size_bytes=10, files=0, backlog_bytes=0, remarks=(name.replace("\n", " "),)

@@ -1,24 +1,23 @@
 """Draws who imports whom, for the README: `python -m tests.house.architecture`.
 
-Boxes and rows are the layers that the import contracts prescribe (pyproject.toml), so a row may import what stands in
-rows below it; arrows between boxes are those of the import graph.
+Boxes are rooms and rows are floors, counted on the imports (`tests.house.layout`): a box may import what stands in rows
+below it. Arrows between packages are those of the import graph.
 """
 
 from __future__ import annotations
 
 import itertools
-import tomllib
 from dataclasses import dataclass, field
 from html import escape
 from math import fsum
 from pathlib import Path
-from typing import Any
 
 import grimp
 
+from tests.house.layout import ROOTS, build, floors
+
 ROOT = Path(__file__).parents[2]
 PICTURE = ROOT / "replays/figures/architecture.svg"
-ROOTS = ("rig", "drivers", "recorder", "replays")
 OPENED = ("replays.recordings", "replays.studies")
 """Packages whose inside is drawn as well."""
 COMMANDS = "rig.cli"
@@ -33,8 +32,7 @@ TITLES = {
 }
 FILL = {"rig": "#dfe9f5", "drivers": "#e3f1e1", "recorder": "#fbeedb", "replays": "#eee4f3"}
 STROKE = {"rig": "#3d6a9e", "drivers": "#4a8a44", "recorder": "#b9781f", "replays": "#7d559c"}
-CHARACTER, LINE, PAD, GAP = 7.3, 26, 12, 8
-WIDTH = 1180
+CHARACTER, LINE, PAD, GAP, GUTTER, STEP = 7.3, 26, 12, 8, 70.0, 46.0
 
 
 @dataclass
@@ -94,31 +92,16 @@ class Box:
         return [shape, text, *itertools.chain(*(box.drawn() for box in itertools.chain(*self.rows)))]
 
 
-def layers() -> dict[str, list[list[str]]]:
-    """Rows of names by package, from the contracts about its inside."""
-    contracts: list[dict[str, Any]] = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"][
-        "importlinter"
-    ]["contracts"]
-    return {
-        container: [[name.strip(" ()") for name in row.replace(":", "|").split("|")] for row in contract["layers"]]
-        for contract in contracts
-        for container in contract.get("containers", ())
-    }
-
-
-def box_of(name: str, rows: dict[str, list[list[str]]], graph: grimp.ImportGraph) -> Box:
-    """A package with its layers, those below opened where they are to be."""
+def box_of(name: str, graph: grimp.ImportGraph) -> Box:
+    """A package with its rooms, those below opened where they are to be; of the rig's, their own rooms are named."""
+    title = name.rpartition(".")[2] + ("/" if graph.find_children(name) else "")
     if name in ROOTS or name in OPENED:
-        inside = [
-            [
-                box_of(f"{name}.{part}", rows, graph)
-                for part in row
-                if f"{name}.{part}" in graph.modules and f"{name}.{part}" != COMMANDS
-            ]
-            for row in rows[name]
-        ]
-        return Box(name, f"{name.rpartition('.')[2]}/: {TITLES[name]}", [row for row in inside if row])
-    return Box(name, name.rpartition(".")[2] + ("/" if graph.find_children(name) else ""))
+        rows = [[box_of(room, graph) for room in floor if room != COMMANDS] for floor in floors(graph, name)]
+        return Box(name, f"{title}: {TITLES[name]}", [row for row in rows if row])
+    if name.startswith("rig."):
+        inside = sorted(room.rpartition(".")[2] for room in graph.find_children(name) if "__" not in room)
+        title += f": {', '.join(inside)}"
+    return Box(name, title)
 
 
 def imports(graph: grimp.ImportGraph, importer: str, imported: str) -> bool:
@@ -137,25 +120,25 @@ def arrow(*points: tuple[float, float], root: str) -> str:
 
 def picture() -> str:
     """The whole as SVG."""
-    graph = grimp.build_graph(*ROOTS, cache_dir=None)
-    rows = layers()
+    graph = build()
     commands = Box(COMMANDS, f"rig/cli/: {TITLES[COMMANDS]}")
-    boxes = {name: box_of(name, rows, graph) for name in ROOTS}
-    gutter, step = 70.0, 46.0
-    full = WIDTH - 2 * gutter
-    for name, least in (("replays", full), ("drivers", 0.0), ("rig", full)):
-        boxes[name].measure(least)
+    boxes = {name: box_of(name, graph) for name in ROOTS}
+    for box in boxes.values():
+        box.measure()
+    full = max(boxes["replays"].width, boxes["rig"].width, boxes["recorder"].width + boxes["drivers"].width + 2 * GAP)
+    for box in (commands, boxes["replays"], boxes["rig"]):
+        box.measure(full)
     boxes["recorder"].measure(full - boxes["drivers"].width - 2 * GAP)
-    commands.measure(full)
-    commands.place(gutter, 10)
-    boxes["replays"].place(gutter, commands.top + commands.height + step)
-    middle = boxes["replays"].top + boxes["replays"].height + step
-    boxes["recorder"].place(gutter, middle)
-    boxes["drivers"].place(gutter + full - boxes["drivers"].width, middle)
-    boxes["rig"].place(gutter, middle + max(boxes["recorder"].height, boxes["drivers"].height) + step)
+    commands.place(GUTTER, 10)
+    boxes["replays"].place(GUTTER, commands.top + commands.height + STEP)
+    middle = boxes["replays"].top + boxes["replays"].height + STEP
+    boxes["recorder"].place(GUTTER, middle)
+    boxes["drivers"].place(GUTTER + full - boxes["drivers"].width, middle)
+    boxes["rig"].place(GUTTER, middle + max(boxes["recorder"].height, boxes["drivers"].height) + STEP)
+    width = full + 2 * GUTTER
     height = boxes["rig"].top + boxes["rig"].height + 12
     return "\n".join([
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {height:.0f}" width="{WIDTH}"'
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width:.0f} {height:.0f}" width="{width:.0f}"'
         f' height="{height:.0f}" font-family="Helvetica, Arial, DejaVu Sans, sans-serif"'
         ' font-size="12.5" text-anchor="middle">',
         "<!-- Generated by `python -m tests.house.architecture`; tests/house/test_architecture.py compares it. -->",
@@ -166,7 +149,7 @@ def picture() -> str:
             for root, color in STROKE.items()
         ),
         "</defs>",
-        f'<rect width="{WIDTH}" height="{height:.0f}" fill="#ffffff"/>',
+        f'<rect width="{width:.0f}" height="{height:.0f}" fill="#ffffff"/>',
         *commands.drawn(),
         *itertools.chain(*(box.drawn() for box in boxes.values())),
         *arrows(graph, commands, boxes),
@@ -199,7 +182,7 @@ def arrows(graph: grimp.ImportGraph, commands: Box, boxes: dict[str, Box]) -> li
     around(commands, recorder, 46, replays.left, 40)
     around(commands, rig, 16, replays.left, 60)
     around(replays, rig, 31, replays.left, 40)
-    around(commands, drivers, WIDTH - 46, right, 40)
+    around(commands, drivers, right + GUTTER - 46, right, 40)
     return drawn
 
 

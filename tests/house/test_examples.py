@@ -14,7 +14,7 @@ import rig
 from drivers.console import Console
 from drivers.daq import Daq
 from recorder.reader import Recording
-from rig import contacts, magnets
+from rig.physics import contacts, magnets
 
 ROOT = Path(__file__).parents[2]
 MODULES = (
@@ -23,16 +23,16 @@ MODULES = (
     "drivers.daq",
     "recorder.reader",
     "replays.recordings.export",
-    "rig.contacts",
-    "rig.errors",
-    "rig.magnets",
-    "rig.offline",
-    "rig.orbit",
-    "rig.parameters",
-    "rig.samples",
-    "rig.scenes",
-    "rig.simulation",
-    "rig.text",
+    "rig.physics.contacts",
+    "rig.base.errors",
+    "rig.physics.magnets",
+    "rig.run.offline",
+    "rig.channels.orbit",
+    "rig.physics.parameters",
+    "rig.base.samples",
+    "rig.run.scenes",
+    "rig.run.simulation",
+    "rig.base.text",
 )
 CALLED = (
     *(getattr(rig, name) for name in rig.__all__), contacts.restitution_factor, contacts.returned_restitution,

@@ -9,7 +9,7 @@ from PIL import Image
 
 from replays.studies.chart import store
 from replays.studies.chart.store import code_digest, read_table
-from replays.studies.provenance import digest
+from replays.studies.common.provenance import digest
 
 FIGURES = Path(store.__file__).parents[2] / "figures"
 MODULE = '''"""About it."""

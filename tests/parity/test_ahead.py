@@ -10,15 +10,15 @@ from pathlib import Path
 import pytest
 from numba.core.dispatcher import Dispatcher
 
-from rig.cli import ahead
-from rig.engines.split.condensed import set_step
-from rig.engines.taylor.series import sliding
-from rig.simulation import Simulation
+from rig.cli.output import ahead
+from rig.physics.engines.split.condensed import set_step
+from rig.physics.engines.taylor.series import sliding
+from rig.run.simulation import Simulation
 
 LATE = """
 import gc
 from numba.core.dispatcher import Dispatcher
-from rig.simulation import Simulation
+from rig.run.simulation import Simulation
 
 def known():
     return {each: len(each.signatures) for each in gc.get_objects() if isinstance(each, Dispatcher)}

@@ -11,10 +11,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rig.engines import ENGINES
-from rig.kernels.signals import COLUMN
-from rig.scenes import load_scene
-from rig.simulation import Simulation
+from rig.physics.engines import ENGINES
+from rig.physics.kernels.signals import COLUMN
+from rig.run.scenes import load_scene
+from rig.run.simulation import Simulation
 
 END = 600_000
 COMMANDS: dict[int, list[tuple[str, dict[str, Any]]]] = {

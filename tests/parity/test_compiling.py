@@ -9,17 +9,21 @@ import numba
 import pytest
 from numba.core.dispatcher import Dispatcher
 
-from rig.engines import ENGINES
-from rig.kernels import compiled_before
-from rig.scenes import load_scene
-from rig.simulation import Simulation
+from rig.physics.engines import ENGINES
+from rig.physics.kernels import compiled_before
+from rig.run.scenes import load_scene
+from rig.run.simulation import Simulation
 
 pytestmark = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="this process is plain Python")
 
 
 def compiled() -> dict[str, int]:
     """How many kinds of arguments each kernel of this process is compiled for. (The cache is other workers' too.)"""
-    modules = [module for name, module in sys.modules.items() if name.startswith(("rig.kernels", "rig.engines"))]
+    modules = [
+        module
+        for name, module in sys.modules.items()
+        if name.startswith(("rig.physics.kernels", "rig.physics.engines"))
+    ]
     kernels = [each for module in modules for each in vars(module).values() if isinstance(each, Dispatcher)]
     return {f"{each.__module__}.{each.__name__}": len(each.signatures) for each in kernels}
 

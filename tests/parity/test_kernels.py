@@ -16,13 +16,13 @@ import pytest
 from numba.core.dispatcher import Dispatcher
 
 import rig
-from rig.engines import ENGINES, load_engine
-from rig.kernels import signals as S
-from rig.kernels.contact import BACKWARD, FLIGHT, FORWARD, ROLLING, TOUCHING
-from rig.kernels.dynamics import evaluate
-from rig.scenes import load_scene
-from rig.sensors import conditioning
-from rig.simulation import Simulation
+from rig.channels.sensors import conditioning
+from rig.physics.engines import ENGINES, load_engine
+from rig.physics.kernels import signals as S
+from rig.physics.kernels.dynamics import evaluate
+from rig.physics.kernels.laws.contact import BACKWARD, FLIGHT, FORWARD, ROLLING, TOUCHING
+from rig.run.scenes import load_scene
+from rig.run.simulation import Simulation
 
 PACKAGE = Path(rig.__file__).parent
 FRICTION = {name: "exact" if "exact" in method.frictions else "smoothed" for name, method in ENGINES.items()}
@@ -33,8 +33,8 @@ PAIRS = [*FRICTION.items(), ("rosenbrock", "switch"), ("verlet", "smoothed"), ("
 JIT_RUN = """
 import sys
 import numpy as np
-from rig.scenes import load_scene
-from rig.simulation import Simulation
+from rig.run.scenes import load_scene
+from rig.run.simulation import Simulation
 
 def run(engine, friction):
     # A hair off the ring, hit hard toward it: flight, onset, contact and flight again within 2 ms.
@@ -71,7 +71,7 @@ def python_runs(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, str
     folder = tmp_path_factory.mktemp("python")
     code = JIT_RUN + (
         "import types\n"
-        "from rig.kernels.dynamics import evaluate\n"
+        "from rig.physics.kernels.dynamics import evaluate\n"
         "assert isinstance(evaluate, types.FunctionType), 'not plain Python'\n"
         f"for engine, friction in {PAIRS!r}:\n"
         f"    np.savez({str(folder)!r} + f'/{{engine}}-{{friction}}.npz', **run(engine, friction))\n"
@@ -194,11 +194,11 @@ DIGESTS = """
 import json
 from pathlib import Path
 import rig
-from rig.kernels import source_digest
+from rig.physics.kernels import source_digest
 
 def compiled(path):
     text = path.read_text()
-    return "njit" in text or "@kernel" in text or path.parent.name == "kernels"
+    return "njit" in text or "@kernel" in text or "kernels" in path.parts
 
 package = Path(rig.__file__).parent
 assert package.parent.samefile("."), "the copy, never the package itself"
@@ -217,13 +217,16 @@ print(json.dumps(digests))
 def test_a_changed_byte_of_any_kernel_file_changes_the_digest(copied: Path) -> None:
     digests = json.loads(process(DIGESTS, place=copied))
     assert digests.pop("again") == digests[""]
-    assert {"kernels/dynamics.py", "kernels/__init__.py", "engines/march.py", "sensors/noise.py"} <= set(digests)
+    assert {
+        *("physics/kernels/dynamics.py", "physics/kernels/__init__.py", "physics/engines/common/march.py"),
+        "channels/sensors/noise.py",
+    } <= set(digests)
     assert len(set(digests.values())) == len(digests)
 
 
 CACHE = """
 import numba
-from rig.kernels import compiled_before, source_digest
+from rig.physics.kernels import compiled_before, source_digest
 print(numba.config.CACHE_DIR, source_digest(), compiled_before())
 """
 
@@ -238,8 +241,8 @@ def test_cache_folder_is_named_by_the_digest_unless_the_user_names_one(tmp_path:
 
 GAP = """
 import numpy as np
-from rig.kernels.constants import Constants, Contact, House, Levels, Magnet, Shaft
-from rig.kernels.geometry import gap
+from rig.physics.kernels.constants import Constants, Contact, House, Levels, Magnet, Shaft
+from rig.physics.kernels.frames.geometry import gap
 parts = [part(*np.ones(len(part._fields))) for part in (Shaft, Magnet, Contact, House)]
 print(repr(gap(Constants(Levels(True, True, True, True, 1), *parts, 1.0), np.full(14, 0.01))))
 """
@@ -248,7 +251,7 @@ print(repr(gap(Constants(Levels(True, True, True, True, 1), *parts, 1.0), np.ful
 def test_a_change_in_a_file_that_a_kernel_calls_reaches_it(copied: Path) -> None:
     # numba alone looks only at the file of `gap`, and would load its old machine code.
     cache = copied / "cache"
-    angles = copied / "rig" / "kernels" / "angles.py"
+    angles = copied / "rig" / "physics" / "kernels" / "frames" / "angles.py"
     text = angles.read_text()
     before = process(GAP, place=copied, XDG_CACHE_HOME=str(cache))
     assert list(cache.rglob("*.nbc")), "the machine code was kept"

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rig.offline import simulate
-from rig.orbit import whirl_frequency
+from rig.channels.orbit import whirl_frequency
+from rig.run.offline import simulate
 
 BARE = {"sensors.chain": "ideal", "sensors.rate_hz": 1000, "sensors.truth_rate_hz": 1000}
 EXACT = {"engine.name": "taylor", "engine.companion": False}

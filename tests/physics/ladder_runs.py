@@ -11,11 +11,11 @@ from __future__ import annotations
 import math
 import sys
 
+from replays.studies.common.twelve_scenes import TWELVE_SCENES, StudyScene
 from replays.studies.ladder.measurement import Candidate, measure
 from replays.studies.ladder.quantity import QUANTITIES
 from replays.studies.ladder.search import Ladder, search
-from replays.studies.twelve_scenes import TWELVE_SCENES, StudyScene
-from rig.errors import InputError
+from rig.base.errors import InputError
 
 QUESTIONS = ("whirl_frequency", "reaction_amplitude", "time_to_roll")
 ASKED, BUDGET_S = 0.01, 300.0

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from recorder.reader import join
-from rig.accuracy import Accuracy, choose_companion
-from rig.cli.info import describe
-from rig.cli.status import accuracy_text
-from rig.kernels import signals as S
-from rig.kernels.signals import COLUMN
-from rig.offline import simulate
-from rig.simulation import Simulation
+from rig.cli.commands.info import describe
+from rig.cli.output.display import accuracy_text
+from rig.physics.accuracy import Accuracy, choose_companion
+from rig.physics.kernels import signals as S
+from rig.physics.kernels.signals import COLUMN
+from rig.run.offline import simulate
+from rig.run.simulation import Simulation
 
 BARE = {"sensors.chain": "ideal", "sensors.rate_hz": 1000, "sensors.truth_rate_hz": 1000}
 EXACT = {"engine.name": "taylor", "engine.tolerance": 1e-12, "engine.companion": False}

@@ -22,15 +22,15 @@ import numpy as np
 import pytest
 
 from replays.studies.peers import Setting, scipy_solvers
-from replays.studies.peers.solution import Manner
-from replays.studies.peers.window import cut_window
+from replays.studies.peers.common.solution import Manner
+from replays.studies.peers.common.window import cut_window
 from rig import Run, load_parameters, load_scene, simulate
-from rig.kernels import signals as S
-from rig.kernels.contact import FORWARD, SMOOTHED, TOUCHING, ring_force
-from rig.model import build_model
-from rig.motion import DISSIPATED
-from rig.offline import frames
-from rig.simulation import Simulation
+from rig.physics.kernels import signals as S
+from rig.physics.kernels.laws.contact import FORWARD, SMOOTHED, TOUCHING, ring_force
+from rig.physics.model import build_model
+from rig.run.motion import DISSIPATED
+from rig.run.offline import frames
+from rig.run.simulation import Simulation
 
 
 @pytest.fixture(scope="module")

@@ -8,12 +8,12 @@ from typing import Any
 import pytest
 
 from replays.studies.check import Check, check
-from replays.studies.peers.problem import scaled_error
+from replays.studies.peers.common.problem import scaled_error
+from rig.base.errors import InputError
 from rig.cli.main import main
-from rig.errors import InputError
-from rig.kernels.signals import N_STATE
-from rig.offline import simulate
-from rig.scenes import load_scene
+from rig.physics.kernels.signals import N_STATE
+from rig.run.offline import simulate
+from rig.run.scenes import load_scene
 
 
 def states(changes: dict[str, Any]) -> Any:

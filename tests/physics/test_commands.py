@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rig.kernels.signals import N_STATE, STATE_SCALE
-from rig.offline import Run, simulate
-from rig.scenes import load_scene
+from rig.physics.kernels.signals import N_STATE, STATE_SCALE
+from rig.run.offline import Run, simulate
+from rig.run.scenes import load_scene
 
 HAMMER = {"command": "hammer", "force_n": 100.0, "duration_ms": 0.5}
 SPEED = {"command": "speed", "speed_hz": 6.3}

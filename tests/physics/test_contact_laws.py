@@ -25,7 +25,7 @@ import numpy as np
 import pytest
 
 from rig import InputError, load_parameters
-from rig.contacts import (
+from rig.physics.contacts import (
     DAMPING,
     KELVIN_VOIGT,
     LAW,
@@ -42,8 +42,8 @@ from rig.contacts import (
     returned_restitution,
     same_depth,
 )
-from rig.kernels.contact import normal_force
-from rig.model import build_model, contact_pair, normal_law, reference_impact
+from rig.physics.kernels.laws.contact import normal_force
+from rig.physics.model import build_model, contact_pair, normal_law, reference_impact
 
 DEFAULT = load_parameters()
 PAIR = contact_pair(DEFAULT)

@@ -18,12 +18,12 @@ from pathlib import Path
 import pytest
 
 from recorder.reader import Recording
-from replays.recordings.experiment import Experiment
 from replays.recordings.export import write_run
 from replays.recordings.identification import ask, identify
-from replays.recordings.sensitivity import value_of
-from rig.scenes import load_scene
-from rig.simulation import Simulation
+from replays.recordings.resimulation.experiment import Experiment
+from replays.recordings.resimulation.sensitivity import value_of
+from rig.run.scenes import load_scene
+from rig.run.simulation import Simulation
 
 SEEDS = int(os.environ.get("RIG_COVERAGE_SEEDS", "0"))
 KEYS = (

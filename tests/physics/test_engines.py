@@ -23,11 +23,11 @@ import numpy as np
 import pytest
 
 from rig import InputError, load_scene, simulate
-from rig.engines import ENGINES, load_engine
-from rig.engines.memory import CEILING, CONTACTS, EVALUATIONS, MEMORY, PHASE, STEPS
-from rig.kernels import signals as S
-from rig.kernels.contact import ROLLING
-from rig.simulation import Simulation
+from rig.physics.engines import ENGINES, load_engine
+from rig.physics.engines.common.memory import CEILING, CONTACTS, EVALUATIONS, MEMORY, PHASE, STEPS
+from rig.physics.kernels import signals as S
+from rig.physics.kernels.laws.contact import ROLLING
+from rig.run.simulation import Simulation
 from tests.scenes import QUIET
 
 _MEASURED = [0, 1, 3, 4, 7, 8, 9]
@@ -82,7 +82,7 @@ SMOOTH_STEPS = {
 def test_order_on_the_smooth_problem(engine: str, monkeypatch: pytest.MonkeyPatch) -> None:
     # The order of the plain method: no error estimate may shorten a step.
     for name in ("rk8", engine):
-        module = import_module(f"rig.engines.{name.replace('-', '_')}")
+        module = import_module(f"rig.physics.engines.{name.replace('-', '_')}")
         if hasattr(module, "METHOD"):
             monkeypatch.setattr(module, "METHOD", module.METHOD._replace(order=0.0))
 

@@ -22,12 +22,12 @@ import numpy as np
 import pytest
 
 from replays.studies.peers import Problem
-from replays.studies.peers.right_hand_side import derivative, pack
-from replays.studies.stability.motion import Motion, base_model, move, pivoted_mass, quiet_inputs, state
-from rig.kernels.constants import Constants, Inputs
-from rig.kernels.contact import FLIGHT, TOUCHING
-from rig.levels import ModelLevels
-from rig.motion import STORED
+from replays.studies.peers.common.right_hand_side import derivative, pack
+from replays.studies.stability.trials.motion import Motion, base_model, move, pivoted_mass, quiet_inputs, state
+from rig.physics.kernels.constants import Constants, Inputs
+from rig.physics.kernels.laws.contact import FLIGHT, TOUCHING
+from rig.physics.levels import ModelLevels
+from rig.run.motion import STORED
 
 SPIN = 2 * math.pi * 6.2
 FREE = {"gravity": 0.0, "unbalance": 0.0}

@@ -19,12 +19,12 @@ import numpy as np
 import pytest
 
 from recorder.reader import Recording
-from replays.recordings.experiment import Experiment
 from replays.recordings.export import write_run
 from replays.recordings.identification import Identification, ask, identify
-from replays.recordings.sensitivity import value_of
-from rig.scenes import load_scene
-from rig.simulation import Simulation
+from replays.recordings.resimulation.experiment import Experiment
+from replays.recordings.resimulation.sensitivity import value_of
+from rig.run.scenes import load_scene
+from rig.run.simulation import Simulation
 
 KEYS = ("magnet.stiffness", "contact.friction", "contact.stiffness", "ring.offset_x", "ring.offset_y")
 

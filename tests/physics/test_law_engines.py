@@ -18,9 +18,9 @@ import numpy as np
 import pytest
 
 from rig import InputError
-from rig.contacts import DAMPING, STIFFNESS
-from rig.engines import ENGINES, load_engine
-from rig.simulation import Simulation
+from rig.physics.contacts import DAMPING, STIFFNESS
+from rig.physics.engines import ENGINES, load_engine
+from rig.run.simulation import Simulation
 
 from .test_engines import distance, motion, ready
 

@@ -22,11 +22,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rig.engines import ENGINES
-from rig.kernels.signals import COLUMN
-from rig.motion import energy_balance
-from rig.scenes import load_scene
-from rig.simulation import Simulation
+from rig.physics.engines import ENGINES
+from rig.physics.kernels.signals import COLUMN
+from rig.run.motion import energy_balance
+from rig.run.scenes import load_scene
+from rig.run.simulation import Simulation
 
 BARE: dict[str, Any] = {
     "sensors.chain": "ideal", "sensors.groups": ["hammer"], "sensors.rate_hz": 1000, "sensors.truth_rate_hz": 1000,

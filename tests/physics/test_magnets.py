@@ -28,10 +28,10 @@ import numpy as np
 import pytest
 
 from rig import InputError, load_parameters, load_scene, simulate
-from rig.kernels import signals as S
-from rig.kernels.magnet import LINEAR, RADIAL, RIPPLED, magnet_force
-from rig.levels import ModelLevels
-from rig.magnets import (
+from rig.physics.kernels import signals as S
+from rig.physics.kernels.laws.magnet import LINEAR, RADIAL, RIPPLED, magnet_force
+from rig.physics.levels import ModelLevels
+from rig.physics.magnets import (
     MU_0,
     REACH,
     MagnetGeometry,
@@ -49,9 +49,9 @@ from rig.magnets import (
     quadrature_error,
     radial_field,
 )
-from rig.model import Model, build_model, describe
-from rig.motion import energy_balance
-from rig.simulation import Simulation
+from rig.physics.model import Model, build_model, describe
+from rig.run.motion import energy_balance
+from rig.run.simulation import Simulation
 
 S_MAGNET = S.COLUMN["magnet_energy"]
 TABLE_1 = MagnetGeometry(8, 16.9e-3, 6e-3, 8e-3, 25e-3, 705e3)

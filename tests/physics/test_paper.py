@@ -26,16 +26,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from replays.studies.paper import condition
 from replays.studies.paper.findings import conditions
-from replays.studies.paper.pulse import Outcome, Pulse, outcome
 from replays.studies.paper.question import fall, weight_at_ring
 from replays.studies.paper.reproduction import drop_impact, drop_impulse
-from replays.studies.stability.motion import base_model, move, quiet_inputs, state
-from rig.levels import ModelLevels
-from rig.offline import Run, simulate
-from rig.parameters import load_parameters
-from rig.scenes import load_scene
+from replays.studies.paper.scans import condition
+from replays.studies.paper.scans.pulse import Outcome, Pulse, outcome
+from replays.studies.stability.trials.motion import base_model, move, quiet_inputs, state
+from rig.physics.levels import ModelLevels
+from rig.physics.parameters import load_parameters
+from rig.run.offline import Run, simulate
+from rig.run.scenes import load_scene
 
 P = load_parameters("corrected")
 MASS = P["shaft.transverse_inertia"] / P["shaft.arm_ring"] ** 2

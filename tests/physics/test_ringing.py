@@ -18,16 +18,16 @@ import numpy as np
 import pytest
 
 from rig import load_scene
-from rig.engines.memory import CONTACTS, PEAK_FORCE, STEPS
-from rig.engines.split.condensed import body_matrices
-from rig.engines.split.layout import MEMORY
-from rig.engines.taylor.place import RINGING
-from rig.engines.taylor.ringing import RINGS, add_ringing, let_ring, set_modes
-from rig.kernels import signals as S
-from rig.kernels.constants import Constants, Inputs
-from rig.kernels.records import packed
-from rig.model import build_model
-from rig.simulation import Simulation
+from rig.physics.engines.common.memory import CONTACTS, PEAK_FORCE, STEPS
+from rig.physics.engines.split.condensed import body_matrices
+from rig.physics.engines.split.layout import MEMORY
+from rig.physics.engines.taylor.place import RINGING
+from rig.physics.engines.taylor.ringing import RINGS, add_ringing, let_ring, set_modes
+from rig.physics.kernels import signals as S
+from rig.physics.kernels.constants import Constants, Inputs
+from rig.physics.kernels.records import packed
+from rig.physics.model import build_model
+from rig.run.simulation import Simulation
 from tests.scenes import QUIET
 
 ROWS = ((S.X_IH, S.X_OH, S.VX_IH, S.VX_OH), (S.Y_IH, S.Y_OH, S.VY_IH, S.VY_OH))

@@ -23,20 +23,20 @@ import numpy as np
 import pytest
 
 from rig import load_scene
-from rig.engines import load_engine
-from rig.engines.memory import CEILING, MEMORY, PHASE, ROLLED_S
-from rig.engines.split import layout
-from rig.engines.split.condensed import ROWS_OF_STATE, SIGN_OF_STATE, body_matrices
-from rig.engines.split.radau import INTEGRALS, NODES, STAGES, collocate, interpolation, invert
-from rig.errors import InputError
-from rig.kernels import signals as S
-from rig.kernels.constants import Inputs
-from rig.kernels.contact import FLIGHT, ROLLING
-from rig.kernels.dynamics import evaluate
-from rig.kernels.records import packed
-from rig.model import build_model
-from rig.motion import energy_balance
-from rig.simulation import Simulation
+from rig.base.errors import InputError
+from rig.physics.engines import load_engine
+from rig.physics.engines.common.memory import CEILING, MEMORY, PHASE, ROLLED_S
+from rig.physics.engines.split import layout
+from rig.physics.engines.split.condensed import ROWS_OF_STATE, SIGN_OF_STATE, body_matrices
+from rig.physics.engines.split.radau import INTEGRALS, NODES, STAGES, collocate, interpolation, invert
+from rig.physics.kernels import signals as S
+from rig.physics.kernels.constants import Inputs
+from rig.physics.kernels.dynamics import evaluate
+from rig.physics.kernels.laws.contact import FLIGHT, ROLLING
+from rig.physics.kernels.records import packed
+from rig.physics.model import build_model
+from rig.run.motion import energy_balance
+from rig.run.simulation import Simulation
 from tests.scenes import QUIET
 
 
@@ -86,7 +86,7 @@ def test_interpolation_is_exact_for_polynomials(with_start: bool, part: float) -
 def test_linear_bodies_respond_as_in_closed_form(parameters: str, monkeypatch: pytest.MonkeyPatch) -> None:
     from scipy.linalg import expm
 
-    monkeypatch.setattr("rig.engines.split.radau.invert", in_python(invert))
+    monkeypatch.setattr("rig.physics.engines.split.radau.invert", in_python(invert))
     scene, power = load_scene("hammer", {"parameters": parameters}), 3
     shafts, houses = in_python(body_matrices)(build_model(scene.load_parameters(), scene.model).constants, INPUTS)
     for Z in (*shafts, *houses):

@@ -19,8 +19,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from replays.studies import scene_atlas
-from replays.studies.scene_atlas import (
+from replays.studies.common.twelve_scenes import TWELVE_SCENES
+from replays.studies.stability.scenes import scene_atlas
+from replays.studies.stability.scenes.scene_atlas import (
     HATCHES,
     OUTCOMES,
     Outcome,
@@ -29,8 +30,7 @@ from replays.studies.scene_atlas import (
     is_silent,
     outcomes,
 )
-from replays.studies.twelve_scenes import TWELVE_SCENES
-from rig.errors import InputError
+from rig.base.errors import InputError
 from tests.commands import said
 from tests.physics import ladder_runs
 

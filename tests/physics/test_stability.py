@@ -16,15 +16,15 @@ from functools import cache
 import numpy as np
 import pytest
 
-from replays.studies.closed_forms import impact
-from replays.studies.engines import traits
-from replays.studies.stability.atlas import GROWN, contact_ratio, house_ratio
-from replays.studies.stability.cell import Cell
-from replays.studies.stability.motion import bare_shaft, base_model, pivoted_mass
-from replays.studies.stability.trials import TRIALS
-from rig.engines import ENGINES
-from rig.errors import InputError
-from rig.levels import ModelLevels
+from replays.studies.common.closed_forms import impact
+from replays.studies.common.engines import traits
+from replays.studies.stability.maps.atlas import GROWN, contact_ratio, house_ratio
+from replays.studies.stability.trials.cell import Cell
+from replays.studies.stability.trials.motion import bare_shaft, base_model, pivoted_mass
+from replays.studies.stability.trials.trials import TRIALS
+from rig.base.errors import InputError
+from rig.physics.engines import ENGINES
+from rig.physics.levels import ModelLevels
 
 
 @cache

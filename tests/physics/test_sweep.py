@@ -17,20 +17,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from replays.studies.journal import Journal
-from replays.studies.random_scene import draw_scene
-from replays.studies.stability.sweep import NAME, chosen_numbers, summary, sweep
-from replays.studies.stability.truth import CHAOTIC, NUDGE, measure
-from replays.studies.stability.worker import Run, Task, Worker, end_after, nudged, run_task
+from replays.studies.common.journal import Journal
+from replays.studies.common.random_scene import draw_scene
+from replays.studies.stability.scenes.sweep import NAME, chosen_numbers, summary, sweep
+from replays.studies.stability.scenes.truth import CHAOTIC, NUDGE, measure
+from replays.studies.stability.scenes.worker import Run, Task, Worker, end_after, nudged, run_task
+from rig.base.errors import InputError
 from rig.cli.main import main
-from rig.contacts import DAMPING, STIFFNESS
-from rig.engines import ENGINES
-from rig.errors import InputError
-from rig.kernels.signals import N_STATE, STATE_SCALE
-from rig.levels import FRICTION_LAWS
-from rig.parameters import set_names
-from rig.scenes import Scene, change_scene, parse_scene
-from rig.simulation import Simulation
+from rig.physics.contacts import DAMPING, STIFFNESS
+from rig.physics.engines import ENGINES
+from rig.physics.kernels.signals import N_STATE, STATE_SCALE
+from rig.physics.levels import FRICTION_LAWS
+from rig.physics.parameters import set_names
+from rig.run.scenes import Scene, change_scene, parse_scene
+from rig.run.simulation import Simulation
 
 DEFAULT = next(iter(ENGINES))
 SCENE = Scene(duration_s=0.1)

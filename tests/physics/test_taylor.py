@@ -29,24 +29,24 @@ from typing import Any
 import numpy as np
 import pytest
 
+from replays.studies.common.random_scene import draw_scene
 from replays.studies.peers import PEERS, Setting, scaled_error
-from replays.studies.peers.window import cut_window
-from replays.studies.random_scene import draw_scene
-from replays.studies.stability.flight import house_oscillator
-from replays.studies.stability.impacts import first_impact
-from replays.studies.stability.motion import move, quiet_inputs, state
-from replays.studies.stability.worker import Task, run_task
+from replays.studies.peers.common.window import cut_window
+from replays.studies.stability.scenes.worker import Task, run_task
+from replays.studies.stability.trials.flight import house_oscillator
+from replays.studies.stability.trials.impacts import first_impact
+from replays.studies.stability.trials.motion import move, quiet_inputs, state
 from rig import load_scene, simulate
-from rig.engines import load_engine
-from rig.engines.memory import CEILING, CLAMPS, CONTACT_STEPS, CONTACTS, MEMORY, ONSET, PHASE, STEPS
-from rig.engines.tape.columns import EVENTS, ROOT, WIDTH
-from rig.engines.tape.taylor import SERIES as CODE
-from rig.engines.taylor.place import ORDER, SERIES
-from rig.engines.taylor.polynomial import first_zero
-from rig.kernels import signals as S
-from rig.kernels.contact import BACKWARD, FLIGHT, FORWARD, ROLLING
-from rig.kernels.dynamics import evaluate
-from rig.simulation import Simulation
+from rig.physics.engines import load_engine
+from rig.physics.engines.common.memory import CEILING, CLAMPS, CONTACT_STEPS, CONTACTS, MEMORY, ONSET, PHASE, STEPS
+from rig.physics.engines.tape.columns import EVENTS, ROOT, WIDTH
+from rig.physics.engines.tape.taylor import SERIES as CODE
+from rig.physics.engines.taylor.place import ORDER, SERIES
+from rig.physics.engines.taylor.polynomial import first_zero
+from rig.physics.kernels import signals as S
+from rig.physics.kernels.dynamics import evaluate
+from rig.physics.kernels.laws.contact import BACKWARD, FLIGHT, FORWARD, ROLLING
+from rig.run.simulation import Simulation
 from tests.scenes import QUIET
 
 
@@ -135,10 +135,12 @@ def test_first_coefficients_are_the_equations(phase: int, mode: str) -> None:
 
 
 def test_the_code_of_the_series_is_up_to_date() -> None:
-    code = "import sys; from rig.engines.tape.taylor import source; sys.stdout.write(source())"
+    code = "import sys; from rig.physics.engines.tape.taylor import source; sys.stdout.write(source())"
     environment = {**os.environ, "NUMBA_DISABLE_JIT": "1"}
     made = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
-    assert made.stdout == CODE.read_text(), "make it anew: NUMBA_DISABLE_JIT=1 python -m rig.engines.tape.taylor"
+    assert made.stdout == CODE.read_text(), (
+        "make it anew: NUMBA_DISABLE_JIT=1 python -m rig.physics.engines.tape.taylor"
+    )
 
 
 def test_first_zero_of_a_polynomial() -> None:
@@ -185,7 +187,7 @@ def test_first_impacts_agree_with_heyoka() -> None:
 
 def scaled(motion: np.ndarray) -> np.ndarray:
     """States over what counts as 1 in each."""
-    from rig.engines.method import PER_SCALE
+    from rig.physics.engines.common.method import PER_SCALE
 
     return motion * PER_SCALE
 

@@ -14,8 +14,8 @@ import sys
 import time
 
 from drivers.sources.can_client import CanClient
-from rig import wire
-from rig.transport.zenoh import ZenohClient
+from rig.base import wire
+from rig.serve.transport.zenoh import ZenohClient
 from tests.processes import COMPILE_S, free_endpoint, running_rig
 
 HEARTBEAT_S = 1.5

@@ -21,11 +21,11 @@ from cryptography import x509  # noqa: TID253
 from cryptography.hazmat.primitives.asymmetric import ec  # noqa: TID253
 from cryptography.x509.oid import ExtendedKeyUsageOID as Usage  # noqa: TID253
 
-from rig.errors import InputError
-from rig.transport import NoReplyError
-from rig.transport.access import DOORS, PLAIN, ROLES, WITH_TRUTH, Door, Verb, allows, doors_of
-from rig.transport.certificates import SIGNER, Issue, holder_in, make, subject_of, write_holder
-from rig.transport.zenoh import Exposure, ZenohClient, ZenohServer
+from rig.base.errors import InputError
+from rig.serve.transport import NoReplyError
+from rig.serve.transport.exposure.access import DOORS, PLAIN, ROLES, WITH_TRUTH, Door, Verb, allows, doors_of
+from rig.serve.transport.exposure.certificates import SIGNER, Issue, holder_in, make, subject_of, write_holder
+from rig.serve.transport.zenoh import Exposure, ZenohClient, ZenohServer
 from tests.processes import free_endpoint
 from tests.waiting import PATIENCE_S, sooner_than, until
 

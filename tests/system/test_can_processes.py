@@ -17,7 +17,7 @@ import pytest
 from drivers.can.bus import codec
 from drivers.can.interface import ZenohBus
 from rig.cli.main import main
-from rig.transport.zenoh import ZenohClient
+from rig.serve.transport.zenoh import ZenohClient
 from tests.processes import free_endpoint, line_of, python
 from tests.waiting import PATIENCE_S, until
 

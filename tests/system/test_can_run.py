@@ -19,16 +19,16 @@ from drivers.can.signals import Kind, Result, command_frame, default_messages
 from drivers.console import Console
 from recorder.reader import Recording
 from recorder.session import RecordingSession
-from rig import wire
-from rig.channels import default_table
-from rig.errors import InputError
-from rig.pacing import Lockstep
-from rig.scenes import load_scene
-from rig.service import Service
-from rig.simulation import Simulation
-from rig.transport.fanout import Fanout
-from rig.transport.memory import MemoryClient, MemoryServer
-from rig.transport.zenoh import ZenohClient
+from rig.base import wire
+from rig.base.errors import InputError
+from rig.channels.table import default_table
+from rig.run.scenes import load_scene
+from rig.run.simulation import Simulation
+from rig.serve.pacing import Lockstep
+from rig.serve.service import Service
+from rig.serve.transport.fanout import Fanout
+from rig.serve.transport.memory import MemoryClient, MemoryServer
+from rig.serve.transport.zenoh import ZenohClient
 from tests.processes import COMPILE_S, free_endpoint, rig, running_rig
 from tests.waiting import PATIENCE_S, until
 
@@ -244,8 +244,8 @@ def test_rig_run_on_a_virtual_bus_between_processes(tmp_path: Path, options: lis
 
 
 def test_a_schedule_that_the_bus_cannot_carry_is_refused_before_anything_runs() -> None:
+    from rig.cli.commands.run import run as command
     from rig.cli.groups import grouped
-    from rig.cli.run import run as command
 
     run = grouped(command)
 

@@ -12,8 +12,8 @@ import pytest
 
 import rig
 from drivers.client import NotSeenError, Rig
-from drivers.samples import StreamEndedError
-from rig.errors import InputError, UnknownNameError
+from drivers.sources.samples import StreamEndedError
+from rig.base.errors import InputError, UnknownNameError
 from tests import processes
 from tests.waiting import PATIENCE_S
 

@@ -12,8 +12,8 @@ import time
 
 import pytest
 
-from rig import wire
-from rig.transport.zenoh import ZenohClient
+from rig.base import wire
+from rig.serve.transport.zenoh import ZenohClient
 from tests.processes import free_endpoint, line_of, python
 from tests.processes import rig as command
 from tests.waiting import PATIENCE_S, until

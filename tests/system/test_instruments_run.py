@@ -10,18 +10,18 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from drivers.accelerometer.driver import Accelerometer
 from drivers.console import Console
 from drivers.daq import Daq
-from drivers.drive.driver import Drive
-from drivers.force.driver import Force
-from drivers.hammer.driver import Hammer
-from drivers.instrument.driver import Sampler
-from drivers.magnet.driver import Magnet
-from drivers.proximity.driver import Proximity
-from drivers.samples import StreamEndedError
-from rig.errors import RefusedError
-from rig.transport.zenoh import ZenohClient
+from drivers.instruments.accelerometer.driver import Accelerometer
+from drivers.instruments.common.driver import Sampler
+from drivers.instruments.drive.driver import Drive
+from drivers.instruments.force.driver import Force
+from drivers.instruments.hammer.driver import Hammer
+from drivers.instruments.magnet.driver import Magnet
+from drivers.instruments.proximity.driver import Proximity
+from drivers.sources.samples import StreamEndedError
+from rig.base.errors import RefusedError
+from rig.serve.transport.zenoh import ZenohClient
 from tests.processes import free_endpoint, running_rig
 from tests.processes import rig as command
 from tests.waiting import PATIENCE_S

@@ -13,8 +13,8 @@ import pytest
 import rig
 from drivers.client import Rig
 from drivers.console import AcceptedStep
-from rig.errors import InputError, RefusedError
-from rig.transport import NoReplyError
+from rig.base.errors import InputError, RefusedError
+from rig.serve.transport import NoReplyError
 from tests import processes
 from tests.waiting import PATIENCE_S
 

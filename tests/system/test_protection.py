@@ -9,7 +9,7 @@ import numpy as np
 import rig
 from drivers.protection import Protection
 from drivers.protection.__main__ import parse
-from drivers.samples import Samples
+from drivers.sources.samples import Samples
 from tests import processes
 from tests.waiting import PATIENCE_S
 

@@ -14,8 +14,7 @@ from pathlib import Path
 import pytest
 
 from recorder.reader import Recording, join
-from rig.transport.zenoh import ZenohServer
-from rig.wire import (
+from rig.base.wire import (
     CLIENTS,
     EVENTS,
     Block,
@@ -26,6 +25,7 @@ from rig.wire import (
     schema_of,
     sensor_key,
 )
+from rig.serve.transport.zenoh import ZenohServer
 from tests.processes import free_port, line_of, python
 from tests.waiting import PATIENCE_S, until
 
@@ -123,7 +123,8 @@ def publisher(port: int) -> Iterator[Publisher]:
 def recorder(path: Path, port: int, options: str = "", *, before: str = "") -> Iterator[subprocess.Popen[str]]:
     """`rig record` in a process of its own, ended by its own id whatever happens."""
     code = before + (
-        "import sys; from pathlib import Path; from rig.cli.groups import grouped; from rig.cli.record import record; "
+        "import sys; from pathlib import Path; from rig.cli.groups import grouped; "
+        "from rig.cli.commands.record import record; "
         f"grouped(record)(Path(sys.argv[1]), connect='127.0.0.1:{port}', {options})"
     )
     with python("-c", code, str(path)) as process:
@@ -301,7 +302,7 @@ def test_a_trigger_makes_a_file_of_its_own(tmp_path):
 def test_a_recorder_that_was_stopped_for_longer_than_its_link_lives_goes_on(tmp_path):
     port = free_port()
     path = tmp_path / "run.mcap"
-    code = "import rig.transport.session; rig.transport.session._LEASE_S = 1.0; "
+    code = "import rig.serve.transport.session; rig.serve.transport.session._LEASE_S = 1.0; "
     with publisher(port) as rig, recorder(path, port, before=code) as process:
         until(lambda: received(rig) > 0, of=process)
         links = rig.server.congestion()["links"]
@@ -356,7 +357,7 @@ def test_a_second_recorder_to_the_same_file_is_refused_and_the_first_one_goes_on
 
 
 def test_a_full_disk_ends_the_command_with_what_was_kept_and_recover_finishes_it(tmp_path):
-    from rig.cli.recover import recover
+    from rig.cli.commands.recover import recover
 
     port = free_port()
     path = tmp_path / "run.mcap"

@@ -23,11 +23,11 @@ from recorder.session import RecordingSession
 from replays.player.passes import Part
 from replays.player.player import Player
 from replays.player.track import Track
-from rig import wire
-from rig.cli.can_output import CanMessages, CanOptions, CanOutput
-from rig.errors import RefusedError
-from rig.pacing import FreeRun, RealTime
-from rig.transport.zenoh import ZenohClient, ZenohServer
+from rig.base import wire
+from rig.base.errors import RefusedError
+from rig.cli.connections.can_output import CanMessages, CanOptions, CanOutput
+from rig.serve.pacing import FreeRun, RealTime
+from rig.serve.transport.zenoh import ZenohClient, ZenohServer
 from tests.processes import free_endpoint, line_of
 from tests.processes import rig as command
 from tests.system.test_can_run import check_against_recording

@@ -13,10 +13,10 @@ from typing import Any
 
 import pytest
 
-from rig import wire
+from rig.base import wire
+from rig.base.errors import InputError, RefusedError
 from rig.cli import app
-from rig.errors import InputError, RefusedError
-from rig.transport.zenoh import ZenohClient, ZenohServer
+from rig.serve.transport.zenoh import ZenohClient, ZenohServer
 from tests.processes import free_endpoint, line_of, python
 from tests.waiting import PATIENCE_S, until
 
@@ -115,7 +115,7 @@ def test_a_killed_rig_is_noticed_long_before_the_lease_ends() -> None:
 
 SUBSCRIBER = """
 import sys, time
-from rig.transport.zenoh import ZenohClient
+from rig.serve.transport.zenoh import ZenohClient
 
 endpoint, total = sys.argv[1], int(sys.argv[2])
 numbers, missed = [], []
@@ -183,7 +183,7 @@ def test_what_the_cache_no_longer_holds_is_reported_as_missed() -> None:
 
 def test_a_script_that_never_closes_its_client_still_ends() -> None:
     script = (
-        "import sys; from rig.transport.zenoh import ZenohClient; client = ZenohClient(sys.argv[1], wait_s=10.0);"
+        "import sys; from rig.serve.transport.zenoh import ZenohClient; client = ZenohClient(sys.argv[1], wait_s=10.0);"
         "client.subscribe('rig/**', print); client.subscribe('rig/**', print, lossless=False);"
         "client.watch('rig/alive', print)"
     )

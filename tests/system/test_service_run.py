@@ -10,9 +10,9 @@ from contextlib import contextmanager
 import pytest
 
 from drivers.console import Console
+from rig.base.errors import InputError
 from rig.cli.options import SceneChanges
-from rig.errors import InputError
-from rig.transport.zenoh import ZenohClient
+from rig.serve.transport.zenoh import ZenohClient
 from tests.commands import said
 from tests.processes import COMPILE_S, free_endpoint, line_of, python
 from tests.waiting import PATIENCE_S, until
@@ -20,8 +20,8 @@ from tests.waiting import PATIENCE_S, until
 PROGRAM = """
 import sys, typer
 from rig.cli.groups import grouped
-from rig.cli.run import run
-from rig.errors import InputError
+from rig.cli.commands.run import run
+from rig.base.errors import InputError
 app = typer.Typer(add_completion=False)
 app.command()(grouped(run))
 try:

@@ -52,7 +52,7 @@ def rig(*, duration_s: float) -> Iterator[tuple[subprocess.Popen[str], int]]:
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A recording on disk."""
     from recorder.session import RecordingSession
-    from rig.transport.memory import MemoryClient, MemoryServer
+    from rig.serve.transport.memory import MemoryClient, MemoryServer
 
     recording = Synthetic(duration_s=1.2)
     path = tmp_path_factory.mktemp("recorded") / "whirl.mcap"

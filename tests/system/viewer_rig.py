@@ -6,8 +6,8 @@ import sys
 import threading
 import time
 
-from rig import wire
-from rig.transport.zenoh import ZenohServer
+from rig.base import wire
+from rig.serve.transport.zenoh import ZenohServer
 from tests.unit.viewer_recording import Synthetic, documents_of, stream_of
 
 

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from rig import wire
-from rig.channels import default_table
-from rig.transport import Server
+from rig.base import wire
+from rig.channels.table import default_table
+from rig.serve.transport import Server
 
 RATE_HZ = 20_000
 BLOCK = 200

@@ -7,7 +7,7 @@ from itertools import count
 from pathlib import Path
 
 from recorder.writer import RecordingWriter
-from rig.wire import CATALOGUE, PARAMETERS, SCENE
+from rig.base.wire import CATALOGUE, PARAMETERS, SCENE
 from tests.unit.recorder_stream import documents, stream
 
 BLOCKS = 60

@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 
 from drivers.protection import Action, Protection, Settings
-from drivers.samples import Samples
-from rig.kernels.signals import COLUMN
-from rig.scenes import load_scene
-from rig.simulation import Simulation
-from rig.wire import Block
+from drivers.sources.samples import Samples
+from rig.base.wire import Block
+from rig.physics.kernels.signals import COLUMN
+from rig.run.scenes import load_scene
+from rig.run.simulation import Simulation
 
 ALERT_UM, DANGER_UM = 500.0, 1000.0
 BEGIN_S, END_S = 0.25, 0.75

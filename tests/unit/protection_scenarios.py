@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from drivers.protection import Settings
-from drivers.samples import Samples
+from drivers.sources.samples import Samples
 
 RATE = 1000.0
 SCENARIOS: dict[str, Callable[[Any], None]] = {}

@@ -7,9 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from rig.channels import default_table
-from rig.transport import NoReplyError
-from rig.wire import (
+from rig.base.wire import (
     CATALOGUE,
     EDGES,
     EVENTS,
@@ -22,6 +20,8 @@ from rig.wire import (
     sensor_key,
     truth_key,
 )
+from rig.channels.table import default_table
+from rig.serve.transport import NoReplyError
 
 TICK_RATE_HZ = 1_000_000
 TRUTH_COLUMNS = {"state": 28, "contact": 5}

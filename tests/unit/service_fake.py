@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from rig.errors import InputError
-from rig.simulation import Frame
-from rig.wire import Block
+from rig.base.errors import InputError
+from rig.base.wire import Block
+from rig.run.simulation import Frame
 
 GROUPS = {"probes": 4, "forces": 4, "accelerations": 4, "drive": 2, "hammer": 1}
 TRUTH = {"state": 28, "contact": 6, "energy": 8}
@@ -110,9 +110,9 @@ def main(port: int, pace: str, duration_s: float | None) -> None:
     """Serve until the end and print the summary."""
     import signal
 
-    from rig.pacing import FreeRun, Lockstep, RealTime
-    from rig.service import Service
-    from rig.transport.zenoh import ZenohServer
+    from rig.serve.pacing import FreeRun, Lockstep, RealTime
+    from rig.serve.service import Service
+    from rig.serve.transport.zenoh import ZenohServer
 
     clock = {"real-time": RealTime, "free": FreeRun, "lockstep": Lockstep}[pace]()
     with ZenohServer(f"127.0.0.1:{port}", wait=pace != "real-time") as server:

@@ -12,13 +12,13 @@ import pytest
 
 from recorder.reader import Recording
 from recorder.rewrite import cut
-from replays.recordings.experiment import Experiment
-from replays.recordings.prediction import measured, predict
+from replays.recordings.resimulation.experiment import Experiment
+from replays.recordings.resimulation.prediction import measured, predict
 from replays.recordings.validation import validate
 from replays.recordings.validation.bits import Bits
-from replays.recordings.validation.explanation import Explanation
-from replays.recordings.validation.own import own_faults
-from rig.faults import KINDS
+from replays.recordings.validation.explanations.explanation import Explanation
+from replays.recordings.validation.explanations.own import own_faults
+from rig.channels.faults import KINDS
 from tests.physics.test_identification import recorded
 
 CHANNEL_KINDS = [name for name, kind in KINDS.items() if not kind.of_blocks]

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rig.errors import InputError
-from rig.faults import KINDS, Draws, supported
-from rig.faults.blocks import DuplicateBlocks, LoseBlocks, ReorderBlocks
-from rig.scenes import load_scene
-from rig.sending import Active, Frame, Sending
-from rig.simulation import Simulation
-from rig.wire import Block, sensor_key
+from rig.base.errors import InputError
+from rig.base.wire import Block, sensor_key
+from rig.channels.faults import KINDS, Draws, supported
+from rig.channels.faults.blocks import DuplicateBlocks, LoseBlocks, ReorderBlocks
+from rig.channels.faults.sending import Active, Frame, Sending
+from rig.run.scenes import load_scene
+from rig.run.simulation import Simulation
 from tests.unit.test_channel_faults import BLOCKS, EXAMPLES
 
 SCENE = load_scene("hammer", {"duration_s": 0.4, "sensors.groups": ["probes", "forces"]})

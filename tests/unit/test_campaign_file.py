@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from replays.campaigns.campaign import Campaign, campaign_path, load_campaign, shipped, title_of
-from replays.campaigns.lines import lines_of
-from rig.errors import InputError
+from replays.campaigns.files.campaign import Campaign, campaign_path, load_campaign, shipped, title_of
+from replays.campaigns.files.lines import lines_of
+from rig.base.errors import InputError
 from tests.commands import said
 
 HEAD = 'title = "T"\nscene = "hammer"\n'

@@ -15,22 +15,22 @@ import numpy as np
 import pytest
 
 from recorder.reader import Recording
-from replays.campaigns.bench import Target, check_replay
-from replays.campaigns.campaign import load_campaign, shipped
-from replays.campaigns.expectation import KINDS
+from replays.campaigns.equipment.bench import Target, check_replay
+from replays.campaigns.files.campaign import load_campaign, shipped
+from replays.campaigns.files.expectation import KINDS
+from replays.campaigns.files.run import end_device, measure_end
+from replays.campaigns.files.seen import Seen
 from replays.campaigns.measurement import Measurement, Must, measured
-from replays.campaigns.page import changes, make_page
-from replays.campaigns.picture import draw
-from replays.campaigns.results import Results, load_results, write_junit
-from replays.campaigns.run import end_device, measure_end
-from replays.campaigns.seen import Seen
+from replays.campaigns.reporting.page import changes, make_page
+from replays.campaigns.reporting.picture import draw
+from replays.campaigns.reporting.results import Results, load_results, write_junit
 from replays.campaigns.trial import Trial
-from replays.report import junit
-from rig.channels import default_table
-from rig.errors import InputError
-from rig.orbit import whirl_frequency
-from rig.outcome import Outcome
-from rig.outside import check
+from replays.report import junit, write_report
+from rig.base.errors import InputError
+from rig.base.outcome import Outcome
+from rig.base.outside import check
+from rig.channels.orbit import whirl_frequency
+from rig.channels.table import default_table
 from tests.processes import ROOT
 from tests.score_daqs import counts_of, write_parquet, write_session
 
@@ -307,7 +307,7 @@ def test_the_page_says_first_what_failed_then_what_changed(tmp_path: Path) -> No
     failed = measured("peak", 1.5, "mm", "<=", 1.0, channels=("disk_x",))
     draw(session, folder / "event.png", [failed], origin_s=0.0, channels=["disk_x", "none"], about_s=0.03)
     now["cases"][1]["evidence"] = ["evidence/bad/event.png"]
-    make_page(now, tmp_path, then).write(tmp_path / "index.html")
+    write_report(make_page(now, tmp_path, then), tmp_path / "index.html")
     page = (tmp_path / "index.html").read_text(encoding="utf-8")
     order = (
         "1 failed, 1 error, 1 skipped, 1 passed.", "</a>: no rig</li>", "failed: x.campaign.toml::bad</h2>",

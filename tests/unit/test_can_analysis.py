@@ -9,10 +9,10 @@ from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
 from drivers.can.analysis import Errors, Message, load, worst_bits, worst_case
-from drivers.can.bus.frame import FD_LENGTHS, Frame, frame_bits
+from drivers.can.bus.frame import FD_LENGTHS, Frame
 from drivers.can.bus.model import BusModel
-from drivers.can.bus.timing import speed
-from rig.errors import InputError
+from drivers.can.bus.timing import frame_bits, speed
+from rig.base.errors import InputError
 
 MS = 1_000_000
 

@@ -11,9 +11,10 @@ from hypothesis import strategies as st
 
 from drivers.can.bus import frame as frames
 from drivers.can.bus import kernels
-from drivers.can.bus.frame import Frame, encode, frame_bits, records
+from drivers.can.bus.frame import Frame, records
 from drivers.can.bus.model import OUTCOMES, BusModel, Delivery, warm_up
-from rig.errors import InputError
+from drivers.can.bus.timing import encode, frame_bits
+from rig.base.errors import InputError
 
 US = 1_000
 MS = 1_000_000

@@ -22,10 +22,10 @@ from drivers.can.signals import (
     default_messages,
     parse_command,
 )
-from rig.channel_file import read_channels
-from rig.channels import default_table
-from rig.cli.can_output import CanMessages, CanOptions, CanOutput
-from rig.errors import InputError
+from rig.base.errors import InputError
+from rig.channels.channel_file import read_channels
+from rig.channels.table import default_table
+from rig.cli.connections.can_output import CanMessages, CanOptions, CanOutput
 from tests.commands import said, shown
 
 TABLE = default_messages()

@@ -18,7 +18,7 @@ from drivers.can.bus.model import BusModel
 from drivers.can.gateway.outbox import Outbox
 from drivers.can.interface import HubBus
 from drivers.can.signals import default_messages
-from rig import wire
+from rig.base import wire
 from tests.waiting import until
 
 pytestmark = pytest.mark.wallclock

@@ -22,15 +22,15 @@ from drivers.can.signals import (
     messages_for,
     parse_command,
 )
-from rig.errors import InputError
-from rig.faults import KINDS
-from rig.pacing import FreeRun
-from rig.scenes import load_scene, parse_scene, scene_document
-from rig.service import Service
-from rig.simulation import Simulation
-from rig.transport.fanout import Fanout
-from rig.transport.memory import MemoryClient, MemoryServer
-from rig.wire import SAMPLE_SCHEMA, decode_block, sensor_key
+from rig.base.errors import InputError
+from rig.base.wire import SAMPLE_SCHEMA, decode_block, sensor_key
+from rig.channels.faults import KINDS
+from rig.run.scenes import load_scene, parse_scene, scene_document
+from rig.run.simulation import Simulation
+from rig.serve.pacing import FreeRun
+from rig.serve.service import Service
+from rig.serve.transport.fanout import Fanout
+from rig.serve.transport.memory import MemoryClient, MemoryServer
 from tests.unit.test_can_gateway import rig
 from tests.unit.test_channel_faults import BLOCKS, EXAMPLES
 from tests.waiting import until

@@ -23,9 +23,9 @@ from hypothesis import strategies as st
 
 from drivers.can.analysis import Message, best_bits, worst_bits
 from drivers.can.bus import frame as frames
-from drivers.can.bus.frame import FD_LENGTHS, RECORD, Frame, encode, frame_bits, record_of, records, sendable
-from drivers.can.bus.timing import speed
-from rig.errors import InputError
+from drivers.can.bus.frame import FD_LENGTHS, RECORD, Frame, record_of, records, sendable
+from drivers.can.bus.timing import encode, frame_bits, speed
+from rig.base.errors import InputError
 
 CRC15, CRC17, CRC21 = 0xC599, 0x3685B, 0x302899
 

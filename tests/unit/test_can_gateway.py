@@ -21,15 +21,15 @@ from drivers.can import dbc
 from drivers.can.gateway import Gateway
 from drivers.can.schedule import Schedule
 from drivers.can.signals import ABSENT, LIMITS, Field, Kind, Result, State, command_frame, default_messages
-from drivers.health import Rising
-from rig import wire
-from rig.channels import default_table
-from rig.commands import HammerCommand, SpeedCommand, check_command
-from rig.errors import InputError
-from rig.pacing import FreeRun, RealTime
-from rig.service import Service
-from rig.transport.fanout import Fanout
-from rig.transport.memory import MemoryClient, MemoryServer
+from rig.base import wire
+from rig.base.errors import InputError
+from rig.channels.table import default_table
+from rig.run.commands import HammerCommand, SpeedCommand, check_command
+from rig.serve.health import Rising
+from rig.serve.pacing import FreeRun, RealTime
+from rig.serve.service import Service
+from rig.serve.transport.fanout import Fanout
+from rig.serve.transport.memory import MemoryClient, MemoryServer
 from tests.unit.service_fake import GROUPS, FakeSimulation
 from tests.waiting import until
 

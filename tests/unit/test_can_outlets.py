@@ -22,22 +22,23 @@ from can.bus import BusState  # noqa: TID253
 from can.interfaces.slcan import slcanBus  # noqa: TID253
 from can.interfaces.socketcand.socketcand import SocketCanDaemonBus  # noqa: TID253
 
-from drivers.can.bus import codec, slcan, socketcand
+from drivers.can.bus import codec
 from drivers.can.bus.codec import CodecError
 from drivers.can.bus.hub import Hub
 from drivers.can.bus.model import BusModel
-from drivers.can.bus.outlet import Outlet
-from drivers.can.bus.slcan import Lines, SlcanPort
-from drivers.can.bus.socketcand import SocketcandServer, Splitter
+from drivers.can.bus.outlets import slcan, socketcand
+from drivers.can.bus.outlets.outlet import Outlet
+from drivers.can.bus.outlets.slcan import Lines, SlcanPort
+from drivers.can.bus.outlets.socketcand import SocketcandServer, Splitter
 from drivers.can.bus.timing import speed
 from drivers.can.interface import HubBus
-from drivers.twins import Twins
-from rig.cli.can_outlets import CanOutlets
-from rig.cli.can_output import CanOptions, CanOutput
+from drivers.instruments.twins import Twins
+from rig.base.errors import InputError
+from rig.cli.commands.run import run
+from rig.cli.connections.can_outlets import CanOutlets
+from rig.cli.connections.can_output import CanOptions, CanOutput
 from rig.cli.groups import grouped
-from rig.cli.run import run
-from rig.errors import InputError
-from rig.transport.memory import MemoryClient, MemoryServer
+from rig.serve.transport.memory import MemoryClient, MemoryServer
 from tests.processes import free_endpoint
 from tests.waiting import until
 
@@ -431,7 +432,7 @@ def test_a_server_keeps_to_this_machine() -> None:
 
 @pytest.mark.parametrize("place", ["0.0.0.0:29536", "192.0.2.1:29536", "[::]:29536", "example.org:29536"])
 def test_no_door_of_the_bus_is_open_to_other_machines_whatever_is_asked(place: str) -> None:
-    from rig.cli.can import hub
+    from rig.cli.commands.can import hub
 
     loopback = (
         r"must be on 127\.0\.0\.1, since there is no password; from another machine: ssh -L 29536:127.0.0.1:29536 "

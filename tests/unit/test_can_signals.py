@@ -28,8 +28,8 @@ from drivers.can.signals import (
     make_table,
     parse_command,
 )
-from rig.channels import ChannelTable, default_table
-from rig.errors import InputError
+from rig.base.errors import InputError
+from rig.channels.table import ChannelTable, default_table
 
 TABLE = default_messages()
 SAMPLED = (*TABLE.classic, *TABLE.fd)

@@ -16,9 +16,9 @@ from drivers.can.schedule import Schedule
 from drivers.daq import Daq
 from drivers.sources.can import CanSource, full_index
 from drivers.sources.can_client import CanClient
-from rig import wire
-from rig.channels import default_table
-from rig.transport.memory import MemoryClient, MemoryServer
+from rig.base import wire
+from rig.channels.table import default_table
+from rig.serve.transport.memory import MemoryClient, MemoryServer
 from tests.unit.instruments_fake import FakeRig
 from tests.waiting import until
 

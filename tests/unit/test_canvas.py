@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from replays.report.canvas import DPI, WIDTH, check_suffix, draw_signals, house_style, new_figure, png, save
-from rig.errors import DiskError, InputError
+from rig.base.errors import DiskError, InputError
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -9,11 +9,11 @@ from types import SimpleNamespace
 import pytest
 
 from drivers.sources import open_source
-from rig.cli.connection import Serving, tell_where
+from rig.base.errors import InputError
+from rig.cli.connections.connection import Serving, tell_where
 from rig.cli.main import main
-from rig.errors import InputError
-from rig.transport.access import ROLES
-from rig.transport.certificates import HOLDERS, SERVER, holder_in, make
+from rig.serve.transport.exposure.access import ROLES
+from rig.serve.transport.exposure.certificates import HOLDERS, SERVER, holder_in, make
 
 
 def files(folder: Path) -> dict[str, bytes]:

@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from replays.recordings.experiment import Experiment
+from replays.recordings.resimulation.experiment import Experiment
 from replays.recordings.validation import validate
-from rig.cli import fault as command
-from rig.errors import InputError
-from rig.faults import KINDS
-from rig.faults.kind import Draws
-from rig.scenes import load_scene, parse_scene, scene_document
-from rig.simulation import Simulation
+from rig.base.errors import InputError
+from rig.channels.faults import KINDS
+from rig.channels.faults.kind import Draws
+from rig.cli.commands import fault as command
+from rig.run.scenes import load_scene, parse_scene, scene_document
+from rig.run.simulation import Simulation
 from tests.physics.test_identification import recorded
 
 EXAMPLES: dict[str, dict[str, Any]] = {

@@ -12,15 +12,15 @@ import rig
 from drivers.can.dbc import database
 from drivers.can.signals import default_messages, messages_for
 from replays.studies.bench import CASES
-from rig.channel_file import read_channels
-from rig.channels import default_table
-from rig.errors import InputError
-from rig.formula import Formulas
-from rig.kernels.signals import COLUMN, N_ROW
-from rig.scenes import load_scene
-from rig.sensors.filters import channel_poles
-from rig.simulation import Simulation
-from rig.wire import row_tick
+from rig.base.errors import InputError
+from rig.base.wire import row_tick
+from rig.channels.channel_file import read_channels
+from rig.channels.formula import Formulas
+from rig.channels.sensors.filters import channel_poles
+from rig.channels.table import default_table
+from rig.physics.kernels.signals import COLUMN, N_ROW
+from rig.run.scenes import load_scene
+from rig.run.simulation import Simulation
 
 MINE = """
 drop = ["accelerations", "hammer"]

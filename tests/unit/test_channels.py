@@ -13,14 +13,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from rig import channels
-from rig.channels import TABLE, Channel, ChannelTable, default_table, parse_table
+from rig.base.errors import InputError
+from rig.channels import table as channels
+from rig.channels.sensors.conditioning import Conditioner
+from rig.channels.table import TABLE, Channel, ChannelTable, default_table, parse_table
 from rig.cli.app import start
-from rig.commands import HammerCommand
-from rig.errors import InputError
-from rig.kernels.signals import ROW
-from rig.scenes import rig_table
-from rig.sensors.conditioning import Conditioner
+from rig.physics.kernels.signals import ROW
+from rig.run.commands import HammerCommand
+from rig.run.scenes import rig_table
 
 TABLE_TEXT = TABLE.read_text()
 CHANNELS = list(default_table().channels.values())

@@ -18,12 +18,12 @@ from drivers.sources.can import CanSource
 from drivers.sources.rig import RigSource
 from recorder.reader import Recording
 from replays.recordings.validation import validate
-from rig import wire
-from rig.engines import ENGINES
-from rig.errors import InputError
-from rig.scenes import Scene, load_scene
-from rig.simulation import Simulation
-from rig.transport.memory import MemoryClient, MemoryServer
+from rig.base import wire
+from rig.base.errors import InputError
+from rig.physics.engines import ENGINES
+from rig.run.scenes import Scene, load_scene
+from rig.run.simulation import Simulation
+from rig.serve.transport.memory import MemoryClient, MemoryServer
 from tests.commands import shown
 from tests.unit.test_validation import record
 

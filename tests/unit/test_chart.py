@@ -9,22 +9,23 @@ from typing import Any
 import numpy as np
 import pytest
 
-from replays.studies.chart import figure, measure, session
-from replays.studies.chart.figure import draw
+from replays.studies.chart import measure, session
+from replays.studies.chart.drawing import figure
+from replays.studies.chart.drawing.figure import draw
+from replays.studies.chart.drawing.panel import own_speed
 from replays.studies.chart.measure import OFF, Budget, Run, block_statistics, elastic_forces, point, run_engine
 from replays.studies.chart.methods import competitors
-from replays.studies.chart.panel import own_speed
 from replays.studies.chart.phases import PANELS, plan, problem_of
 from replays.studies.chart.profile import draw_scene, shares
 from replays.studies.chart.session import make_chart
 from replays.studies.chart.store import COLUMNS, KEY, Store, read_table
 from replays.studies.peers import PEERS, Setting
-from replays.studies.peers.problem import Problem
-from replays.studies.peers.reference import Reference
-from replays.studies.peers.solution import Solution
+from replays.studies.peers.common.problem import Problem
+from replays.studies.peers.common.reference import Reference
+from replays.studies.peers.common.solution import Solution
+from rig.base.errors import InputError
 from rig.cli.main import main
-from rig.errors import InputError
-from rig.kernels.signals import N_STATE
+from rig.physics.kernels.signals import N_STATE
 
 ONCE = Budget(30.0, 1)
 

@@ -11,19 +11,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from replays.studies.chart import figure, session
+from replays.studies.chart import session
+from replays.studies.chart.drawing import figure
 from replays.studies.chart.measure import Budget, point, run_engine
 from replays.studies.chart.methods import ADDED, competitors
 from replays.studies.chart.phases import problem_of
 from replays.studies.chart.store import Store, read_table
 from replays.studies.chart.submission import write_problem
 from replays.studies.peers import PEERS, Setting
-from replays.studies.peers.problem import ERROR_COLUMNS, Problem
-from replays.studies.peers.reference import Reference
+from replays.studies.peers.common.problem import ERROR_COLUMNS, Problem
+from replays.studies.peers.common.reference import Reference
 from rig.cli.main import main
-from rig.kernels.magnet import RADIAL
-from rig.kernels.signals import STATE
-from rig.levels import FRICTION_LAWS
+from rig.physics.kernels.laws.magnet import RADIAL
+from rig.physics.kernels.signals import STATE
+from rig.physics.levels import FRICTION_LAWS
 
 PHASE = "first-impacts"
 HEADINGS = ["time [s]", *(f"{STATE[column].name} [{STATE[column].unit}]" for column in ERROR_COLUMNS)]

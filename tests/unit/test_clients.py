@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from rig.transport.clients import MOST, SHOWN, Clients, Reporter
+from rig.serve.transport.clients import MOST, SHOWN, Clients, Reporter
 
 
 class Time:
@@ -159,8 +159,8 @@ def settle_s(
         if beat is not None:
             beat()
 
-    monkeypatch.setattr("rig.transport.clients.time.sleep", sleep)
-    monkeypatch.setattr("rig.transport.clients.time.monotonic", time_)
+    monkeypatch.setattr("rig.serve.transport.clients.time.sleep", sleep)
+    monkeypatch.setattr("rig.serve.transport.clients.time.monotonic", time_)
     begin = time_.now_s
     clients.settle(Links(clients, time_, **counts), 1000, patience_s=10.0)
     return time_.now_s - begin

@@ -18,24 +18,24 @@ import numpy as np
 import pytest
 
 import drivers.examples
-from drivers import stream
 from drivers.can.gateway import Gateway
 from drivers.can.schedule import Schedule
 from drivers.can.signals import default_messages
 from drivers.console import Console
 from drivers.daq import Aligner, Daq
-from drivers.force.driver import AsyncForce
+from drivers.instruments.force.driver import AsyncForce
+from drivers.instruments.twins import Twins
 from drivers.link import LinkTimeoutError
-from drivers.samples import Pile, Samples, StreamEndedError, follow
+from drivers.sources import stream
 from drivers.sources.can import CanSource, Layout
 from drivers.sources.rig import RigSource
-from drivers.twins import Twins
-from rig import wire
-from rig.channels import default_table
-from rig.errors import InputError
-from rig.transport.memory import MemoryClient, MemoryServer
-from rig.transport.zenoh import ZenohClient, ZenohServer
-from rig.wire import Continuity
+from drivers.sources.samples import Pile, Samples, StreamEndedError, follow
+from rig.base import wire
+from rig.base.errors import InputError
+from rig.base.wire import Continuity
+from rig.channels.table import default_table
+from rig.serve.transport.memory import MemoryClient, MemoryServer
+from rig.serve.transport.zenoh import ZenohClient, ZenohServer
 from tests.processes import free_endpoint, python
 from tests.unit.instruments_fake import BLOCK, FakeRig, counts_of, values_of
 

@@ -14,19 +14,19 @@ import numpy as np
 import pytest
 
 import recorder.session
+from recorder.contents.summary import Summary
+from recorder.output.room import Limits
+from recorder.output.trigger import Capture, Trigger
 from recorder.reader import Recording, join
 from recorder.rewrite import cut
-from recorder.room import Limits
 from recorder.session import RecordingSession
-from recorder.summary import Summary
-from recorder.trigger import Capture, Trigger
 from replays.recordings.export import write_run
 from replays.recordings.validation import validate
-from rig import wire
-from rig.declared import Declared
-from rig.errors import InputError
-from rig.scenes import load_scene, parse_scene
-from rig.simulation import Simulation
+from rig.base import wire
+from rig.base.errors import InputError
+from rig.channels.faults.declared import Declared
+from rig.run.scenes import load_scene, parse_scene
+from rig.run.simulation import Simulation
 from tests.unit.recorder_stream import ScriptedClient
 from tests.unit.test_channel_faults import BLOCKS
 

@@ -10,15 +10,15 @@ from typing import Any
 import pytest
 
 from recorder.reader import Recording
-from replays.recordings.experiment import Experiment
 from replays.recordings.export import write_run
-from replays.recordings.prediction import bare
-from rig.accuracy import QUANTITIES
-from rig.engine_choice import FINEST_TOLERANCE, SCALES, EngineChoice, Limits
-from rig.errors import InputError
-from rig.pick import Pick
-from rig.scenes import Scene, change_scene, load_scene, parse_scene, scene_document
-from rig.simulation import Simulation
+from replays.recordings.resimulation.experiment import Experiment
+from replays.recordings.resimulation.prediction import bare
+from rig.base.errors import InputError
+from rig.physics.accuracy import QUANTITIES
+from rig.physics.engine_choice import FINEST_TOLERANCE, SCALES, EngineChoice, Limits
+from rig.run.pick import Pick
+from rig.run.scenes import Scene, change_scene, load_scene, parse_scene, scene_document
+from rig.run.simulation import Simulation
 from tests.commands import said, shown
 
 LIMITS = {"engine.limits.radius_um": 0.03, "engine.limits.angle_deg": 0.5}

@@ -15,15 +15,15 @@ from recorder.reader import Recording
 from recorder.session import RecordingSession
 from replays.recordings.export import write_run
 from replays.recordings.validation import validate
-from rig import wire
-from rig.commands import COMMANDS
-from rig.errors import InputError
-from rig.intake import event_in
-from rig.pacing import Lockstep
-from rig.scenes import parse_scene
-from rig.service import Service
-from rig.simulation import Simulation
-from rig.transport.memory import MemoryClient, MemoryServer
+from rig.base import wire
+from rig.base.errors import InputError
+from rig.run.commands import COMMANDS
+from rig.run.scenes import parse_scene
+from rig.run.simulation import Simulation
+from rig.serve.intake import event_in
+from rig.serve.pacing import Lockstep
+from rig.serve.service import Service
+from rig.serve.transport.memory import MemoryClient, MemoryServer
 from tests.waiting import until
 
 SENSORS = {"groups": ["probes", "forces"]}

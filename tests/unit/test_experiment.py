@@ -13,16 +13,16 @@ import pytest
 
 from recorder.reader import Recording
 from recorder.session import RecordingSession
-from replays.recordings.experiment import Experiment, recorded_scene
 from replays.recordings.export import write_run
-from rig import wire
-from rig.errors import InputError
-from rig.offline import SentCommand, frames
-from rig.pacing import Lockstep
-from rig.scenes import load_scene, parse_scene
-from rig.service import Service
-from rig.simulation import Simulation
-from rig.transport.memory import MemoryClient, MemoryServer
+from replays.recordings.resimulation.experiment import Experiment, recorded_scene
+from rig.base import wire
+from rig.base.errors import InputError
+from rig.run.offline import SentCommand, frames
+from rig.run.scenes import load_scene, parse_scene
+from rig.run.simulation import Simulation
+from rig.serve.pacing import Lockstep
+from rig.serve.service import Service
+from rig.serve.transport.memory import MemoryClient, MemoryServer
 
 _SMALL = {"sensors.truth_rate_hz": 500, "sensors.rate_hz": 5000}
 

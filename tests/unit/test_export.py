@@ -12,12 +12,12 @@ import pytest
 from recorder.reader import Recording
 from replays.recordings.export import SUFFIXES, check_run_output, table_columns, writer_for
 from replays.recordings.verdict import stream_rows
+from rig.base.errors import DiskError, InputError
 from rig.cli.main import main
-from rig.errors import DiskError, InputError
-from rig.kernels.signals import ROW, TRUTH
-from rig.offline import Run, frames, simulate
-from rig.scenes import load_scene
-from rig.simulation import Simulation
+from rig.physics.kernels.signals import ROW, TRUTH
+from rig.run.offline import Run, frames, simulate
+from rig.run.scenes import load_scene
+from rig.run.simulation import Simulation
 
 CHANGES = {"drive.speed_hz": 7.0, "contact.friction": 0.3, "seed": 5}
 DURATION_S = 0.15
@@ -118,7 +118,7 @@ def test_mcap_ends_with_the_energy_the_engine_and_the_error_estimate(folder: Pat
 
 
 def test_scene_of_a_recording_runs_again_to_the_same_bits(folder: Path, run: Run) -> None:
-    from rig.scenes import parse_scene
+    from rig.run.scenes import parse_scene
 
     recording = Recording.open(folder / "run.mcap")
     again = simulate(parse_scene(recording.scene["scene"]))

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rig.channels import default_table
-from rig.faults import KINDS
-from rig.faults.kind import At, Draws, Kind
+from rig.channels.faults import KINDS
+from rig.channels.faults.kind import At, Draws, Kind
+from rig.channels.table import default_table
 
 CHANNEL = default_table().channels["disk_x"]
 RATE_HZ, ROWS = 20_000, 6000

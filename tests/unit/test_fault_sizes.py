@@ -10,13 +10,13 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from rig.channels import Channel
-from rig.errors import InputError
-from rig.faults import KINDS
-from rig.faults.converter import Clock
-from rig.faults.kind import At
-from rig.scenes import load_scene, parse_scene
-from rig.simulation import Simulation
+from rig.base.errors import InputError
+from rig.channels.faults import KINDS
+from rig.channels.faults.converter import Clock
+from rig.channels.faults.kind import At
+from rig.channels.table import Channel
+from rig.run.scenes import load_scene, parse_scene
+from rig.run.simulation import Simulation
 from tests.unit.test_channel_faults import EXAMPLES, differs, run
 
 SCENE = load_scene("stable-run", {"duration_s": 0.2, "sensors.groups": ["probes", "forces", "drive"]})

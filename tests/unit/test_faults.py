@@ -9,10 +9,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from replays.recordings.prediction import Measured, Prediction
-from replays.recordings.validation.faults import sensor_faults
-from replays.recordings.validation.signals import edge_faults, signal_faults, steady_rows
-from rig.channels import default_table
+from replays.recordings.resimulation.prediction import Measured, Prediction
+from replays.recordings.validation.explanations.faults import sensor_faults
+from replays.recordings.validation.explanations.signals import edge_faults, signal_faults, steady_rows
+from rig.channels.table import default_table
 
 RATE_HZ, ROWS = 20_000, 6000
 TIMES = np.arange(ROWS) / RATE_HZ

@@ -16,22 +16,22 @@ from typing import Any
 import numpy as np
 import pytest
 
-from recorder.head import Beginning
+from recorder.contents.head import Beginning
 from recorder.reader import Recording
 from recorder.writer import RecordingWriter
-from replays.recordings.experiment import Experiment
 from replays.recordings.export import write_run
 from replays.recordings.formats import clock
-from replays.recordings.formats.export import SUFFIXES, Written, export
+from replays.recordings.formats.exporting.export import SUFFIXES, Written, export
+from replays.recordings.formats.exporting.selection import Selection, Unit, select
 from replays.recordings.formats.mapping import FileOptions
-from replays.recordings.formats.selection import Selection, Unit, select
 from replays.recordings.formats.source import open_source
+from replays.recordings.resimulation.experiment import Experiment
 from replays.recordings.validation.comparison import validate
+from rig.base.errors import InputError
+from rig.base.wire import EVENTS, Block, encode_block, encode_document, sensor_key
 from rig.cli.main import main
-from rig.errors import InputError
-from rig.scenes import load_scene
-from rig.simulation import Simulation
-from rig.wire import EVENTS, Block, encode_block, encode_document, sensor_key
+from rig.run.scenes import load_scene
+from rig.run.simulation import Simulation
 from tests.commands import said
 
 DURATION_S = 0.12
@@ -580,7 +580,7 @@ def test_parts_of_a_rotation_are_exported_as_one(recording: Recording, tmp_path:
 def test_tables_are_made_without_pandas() -> None:
     """Its import takes longer than a table of a second does; in a process of its own, as others import it here."""
     code = (
-        "import sys, numpy as np; from replays.recordings.formats.columnar import arrow_table, float_schema; "
+        "import sys, numpy as np; from replays.recordings.formats.readers.columnar import arrow_table, float_schema; "
         "t = arrow_table([np.arange(3.0), np.arange(6.0)[::2]], float_schema(['a', 'b'])); "
         "print(t.to_pydict(), 'pandas' in sys.modules)"
     )

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rig.errors import InputError
-from rig.scenes import load_scene, parse_scene, scene_document
-from rig.simulation import Simulation
+from rig.base.errors import InputError
+from rig.run.scenes import load_scene, parse_scene, scene_document
+from rig.run.simulation import Simulation
 from tests.unit.test_channel_faults import EXAMPLES, differs, run
 
 SCENE = load_scene(

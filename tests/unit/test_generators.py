@@ -12,13 +12,13 @@ import pytest
 from recorder.reader import Recording
 from replays.recordings.export import write_run
 from replays.recordings.validation import validate
-from rig.errors import InputError
-from rig.generators import KINDS, Instants, chips, multisine_phases
-from rig.kernels.signals import N_ROW
-from rig.offline import simulate
-from rig.scenes import Scene, load_scene, parse_scene, scene_document, scene_names
-from rig.sensors.noise import noise_streams
-from rig.simulation import Simulation
+from rig.base.errors import InputError
+from rig.channels.generators import KINDS, Instants, chips, multisine_phases
+from rig.channels.sensors.noise import noise_streams
+from rig.physics.kernels.signals import N_ROW
+from rig.run.offline import simulate
+from rig.run.scenes import Scene, load_scene, parse_scene, scene_document, scene_names
+from rig.run.simulation import Simulation
 
 SIGNALS: dict[str, dict[str, Any]] = {
     "sine": {"amplitude_v": 4.0, "frequency_hz": 997.3},

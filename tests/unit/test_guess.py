@@ -10,14 +10,15 @@ import numpy as np
 import pytest
 
 from recorder.reader import Recording
-from replays.recordings.formats import clock, noise, overview
+from replays.recordings.formats import clock
 from replays.recordings.formats.conversion import Conversion, block_starts, convert, write_recording
-from replays.recordings.formats.guess import Guess
+from replays.recordings.formats.guessing import noise, overview
+from replays.recordings.formats.guessing.guess import Guess
+from replays.recordings.formats.guessing.naming import read_name
+from replays.recordings.formats.guessing.template import CHECK, guessed
 from replays.recordings.formats.mapping import parse_mapping
-from replays.recordings.formats.naming import read_name
-from replays.recordings.formats.template import CHECK, guessed
-from rig.intake import Catalogue
-from rig.wire import sensor_key
+from rig.base.wire import sensor_key
+from rig.serve.intake import Catalogue
 from tests import foreign
 from tests.commands import said, shown
 

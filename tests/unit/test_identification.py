@@ -12,18 +12,18 @@ import numpy as np
 import pytest
 
 from recorder.reader import Recording
-from replays.recordings.experiment import Experiment
 from replays.recordings.export import write_run
 from replays.recordings.identification import ask, identify
 from replays.recordings.identification.horizon import horizon
 from replays.recordings.identification.judgement import Finding, widened
 from replays.recordings.identification.question import measured_noise
 from replays.recordings.identification.window import Window
+from replays.recordings.resimulation.experiment import Experiment
+from rig.base.errors import InputError
 from rig.cli.main import main
-from rig.errors import InputError
-from rig.parameters import load_parameters
-from rig.scenes import load_scene
-from rig.simulation import Simulation
+from rig.physics.parameters import load_parameters
+from rig.run.scenes import load_scene
+from rig.run.simulation import Simulation
 from tests.commands import run as command
 
 

@@ -16,16 +16,16 @@ import numpy as np
 import pytest
 
 from recorder.reader import Recording
-from replays.recordings.experiment import Experiment
 from replays.recordings.formats import clock
 from replays.recordings.formats import mapping as mappings
 from replays.recordings.formats.conversion import Conversion, convert, write_recording
+from replays.recordings.formats.guessing.template import example, template
 from replays.recordings.formats.mapping import FileOptions
 from replays.recordings.formats.source import open_source
-from replays.recordings.formats.template import example, template
-from rig import units
+from replays.recordings.resimulation.experiment import Experiment
+from rig.base import units
+from rig.base.errors import InputError
 from rig.cli.main import main
-from rig.errors import InputError
 from tests.commands import shown
 
 
@@ -1006,8 +1006,8 @@ def test_a_template_says_what_else_there_is(daq_mdf: Path, tmp_path: Path, capsy
 
 
 def test_a_comment_that_is_json_is_told_by_its_label(tmp_path: Path) -> None:
+    from replays.recordings.formats.guessing.template import label_of
     from replays.recordings.formats.source import Entry
-    from replays.recordings.formats.template import label_of
 
     assert label_of(Entry("x", "", "mm", 1, None, label="{\n  of two lines")) == "{ of two lines"
     assert label_of(Entry("x", "", "mm", 1, None, label="long " * 20)).endswith("...")

@@ -15,30 +15,30 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.accelerometer.driver import Accelerometer, AsyncAccelerometer
 from drivers.can.bus.hub import Hub
 from drivers.can.bus.model import BusModel
 from drivers.daq import Daq
-from drivers.drive.driver import AsyncDrive, Drive
-from drivers.force.driver import AsyncForce, Force
-from drivers.hammer.driver import AsyncHammer, Hammer
-from drivers.instrument import protocol
-from drivers.instrument.aio import AsyncInstrument, AsyncSampler
-from drivers.instrument.driver import Instrument, Sampler
-from drivers.instrument.protocol import ProtocolError
-from drivers.instrument.twin import Twin
+from drivers.instruments.accelerometer.driver import Accelerometer, AsyncAccelerometer
+from drivers.instruments.common import protocol
+from drivers.instruments.common.aio import AsyncInstrument, AsyncSampler
+from drivers.instruments.common.driver import Instrument, Sampler
+from drivers.instruments.common.protocol import ProtocolError
+from drivers.instruments.common.twin import Twin
+from drivers.instruments.drive.driver import AsyncDrive, Drive
+from drivers.instruments.force.driver import AsyncForce, Force
+from drivers.instruments.hammer.driver import AsyncHammer, Hammer
+from drivers.instruments.magnet.driver import AsyncMagnet, Magnet
+from drivers.instruments.proximity.driver import AsyncProximity, Proximity
+from drivers.instruments.twins import TWINS, Twins
 from drivers.link import Address, Link, LinkClosedError, LinkError, LinkTimeoutError, frames, open_link
 from drivers.link.port import MessagePort
 from drivers.link.serial import open_pty, open_serial
-from drivers.magnet.driver import AsyncMagnet, Magnet
-from drivers.proximity.driver import AsyncProximity, Proximity
-from drivers.samples import Samples, StreamEndedError
 from drivers.sources.rig import RigSource
-from drivers.twins import TWINS, Twins
-from rig.channels import default_table
-from rig.errors import InputError, RefusedError
-from rig.transport.memory import MemoryClient, MemoryServer
-from rig.transport.zenoh import ZenohClient, ZenohServer
+from drivers.sources.samples import Samples, StreamEndedError
+from rig.base.errors import InputError, RefusedError
+from rig.channels.table import default_table
+from rig.serve.transport.memory import MemoryClient, MemoryServer
+from rig.serve.transport.zenoh import ZenohClient, ZenohServer
 from tests.processes import free_endpoint
 from tests.unit import link_memory as memory
 from tests.unit.instruments_fake import BLOCK, FakeRig, values_of
@@ -231,12 +231,12 @@ def test_commands_are_acknowledged_with_their_time_or_refused_with_the_rigs_text
     driver = bench.open(name)
     done = act(driver)
     assert (done.id, done.tick, done.time_s) == (1, 1000, 1e-3)
-    assert bench.rig.commands == [request]
+    assert bench.rig.run.commands == [request]
     bench.rig.refusal = "force_n must be from 1 to 1000; instead received 5000"
     with pytest.raises(RefusedError) as caught:
         act(driver)
     assert str(caught.value) == bench.rig.refusal
-    assert len(bench.rig.commands) == 2
+    assert len(bench.rig.run.commands) == 2
 
 
 def test_numbers_that_are_none_never_reach_the_rig(bench: Bench) -> None:
@@ -244,7 +244,7 @@ def test_numbers_that_are_none_never_reach_the_rig(bench: Bench) -> None:
         bench.open("hammer").trigger(force_n=float("nan"))
     with pytest.raises(RefusedError, match="finite"):
         bench.open("drive").set_speed(float("inf"))
-    assert bench.rig.commands == []
+    assert bench.rig.run.commands == []
 
 
 def test_a_command_goes_through_while_data_stream(bench: Bench) -> None:
@@ -481,7 +481,7 @@ def test_random_bytes_crash_nothing(bench: Bench) -> None:
         assert link.receive(timeout_s=2.0) is not None
     assert bench.twin("hammer").refused == 30 or bench.link.startswith("can")
     assert driver.identify().virtual
-    assert bench.rig.commands == []
+    assert bench.rig.run.commands == []
 
 
 @pytest.mark.parametrize("name", DRIVERS)

@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 
 import rig
-from rig import wire
-from rig.channels import default_table
+from rig.base import wire
+from rig.channels.table import default_table
 from rig.cli.main import main
-from rig.commands import COMMANDS
-from rig.interface import page
-from rig.kernels.signals import ROW, TRUTH
+from rig.physics.kernels.signals import ROW, TRUTH
+from rig.run.commands import COMMANDS
+from rig.serve.interface import page
 
 ROWS = page().splitlines()
 

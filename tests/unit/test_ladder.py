@@ -11,21 +11,21 @@ from typing import Any
 import numpy as np
 import pytest
 
+from replays.studies.common.run import Timed, run_scene
 from replays.studies.ladder.chart import draw
 from replays.studies.ladder.document import ladder_document, pick_of
 from replays.studies.ladder.measurement import Candidate, Measurement, measure
 from replays.studies.ladder.pick import with_pick, write_pick
 from replays.studies.ladder.quantity import QUANTITIES, Ending, Trace, ending, parse_quantities
 from replays.studies.ladder.search import LEVELS, WORTH, Ladder, search
-from replays.studies.run import Timed, run_scene
-from rig.cli.ladder import engines_table, levels_table
+from rig.base.errors import InputError
+from rig.cli.commands.ladder import engines_table, levels_table
 from rig.cli.main import main
-from rig.errors import InputError
-from rig.kernels.signals import COLUMN, N_ROW
-from rig.levels import ModelLevels
-from rig.offline import simulate
-from rig.scenes import Scene, load_scene, parse_scene
-from rig.simulation import Simulation
+from rig.physics.kernels.signals import COLUMN, N_ROW
+from rig.physics.levels import ModelLevels
+from rig.run.offline import simulate
+from rig.run.scenes import Scene, load_scene, parse_scene
+from rig.run.simulation import Simulation
 from tests.commands import check_legible
 
 SCENE = """# my own scene
@@ -167,7 +167,7 @@ def test_a_first_run_in_short_blocks_is_no_cost(monkeypatch: pytest.MonkeyPatch)
 
 def test_a_run_is_given_up_by_its_processor_time(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = iter(range(0, 10**9, 1000))
-    monkeypatch.setattr("replays.studies.run.time.perf_counter", lambda: next(clock))  # a machine that is busy
+    monkeypatch.setattr("replays.studies.common.run.time.perf_counter", lambda: next(clock))  # a machine that is busy
     scene = load_scene("hammer", {"duration_s": 0.1})
     candidate = Candidate(ModelLevels(), "torque", "split", 25, 3e-4)
     failures = [measure(scene, candidate, ["spin"], runs=1, limit_s=limit_s).failure for limit_s in (60.0, 0.0)]

@@ -10,8 +10,8 @@ import pytest
 
 from replays.studies.laws import compare, draw, over_speed
 from rig.cli.main import main
-from rig.contacts import DAMPING, KELVIN_VOIGT, STIFFNESS
-from rig.parameters import load_parameters
+from rig.physics.contacts import DAMPING, KELVIN_VOIGT, STIFFNESS
+from rig.physics.parameters import load_parameters
 from tests.commands import shown
 
 DEFAULT = load_parameters()

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from rig.errors import FULL, WHOLE_RIG
+from rig.base.errors import FULL, WHOLE_RIG
 from tests.processes import ROOT
 
 LEAN = """
@@ -21,10 +21,11 @@ sys.modules |= dict.fromkeys({full!r})  # neither imported nor found
 """
 RECORDING = ROOT / "replays/sessions/hammer-5.2.mcap"
 CLIENTS = (
-    "drivers.daq", "drivers.console", "drivers.twins", "drivers.force.driver", "drivers.sources.can",
-    "drivers.can.interface", "recorder.session", "recorder.reader", "recorder.rewrite", "replays.player",
-    "rig.cli.record", "rig.cli.status", "rig.cli.info", "rig.cli.twins", "rig.transport.zenoh",
-    "replays.recordings.formats.delimited",
+    "drivers.daq", "drivers.console", "drivers.instruments.twins", "drivers.instruments.force.driver",
+    "drivers.sources.can", "drivers.can.interface", "recorder.session", "recorder.reader", "recorder.rewrite",
+    "replays.player",
+    "rig.cli.commands.record", "rig.cli.commands.status", "rig.cli.commands.info", "rig.cli.commands.twins",
+    "rig.serve.transport.zenoh",    "replays.recordings.formats.readers.delimited",
 )  # fmt: skip
 
 

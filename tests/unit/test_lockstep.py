@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 
 from drivers.console import AcceptedStep, Console
-from rig import wire
-from rig.errors import RefusedError
-from rig.pacing import FreeRun, Lockstep
-from rig.transport.memory import MemoryClient
+from rig.base import wire
+from rig.base.errors import RefusedError
+from rig.serve.pacing import FreeRun, Lockstep
+from rig.serve.transport.memory import MemoryClient
 from tests.unit.service_fake import FakeSimulation
 from tests.unit.test_service import BLOCK, Running
 from tests.waiting import until
@@ -66,7 +66,7 @@ def test_no_block_is_run_before_all_devices_are_done_and_what_they_sent_before_i
         assert one.hammer().tick == BLOCK
         one.done(BLOCK)
         one.done(BLOCK)  # told twice is told once
-        assert rig.service.status()["tick"] == BLOCK
+        assert rig.serve.service.status()["tick"] == BLOCK
         assert two.speed(3.0).tick == BLOCK
         two.done(BLOCK)
         assert one.wait(2) == 2 * BLOCK

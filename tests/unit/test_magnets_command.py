@@ -10,8 +10,8 @@ import pytest
 
 from replays.studies.magnets import compare, draw
 from rig.cli.main import main
-from rig.model import build_model
-from rig.parameters import load_parameters
+from rig.physics.model import build_model
+from rig.physics.parameters import load_parameters
 from tests.commands import shown as run
 
 FAMILY = ["linear", "far-field map", "far-field sum", "cylinder map", "exact cylinders"]

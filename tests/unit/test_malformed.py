@@ -15,10 +15,10 @@ from typing import Any
 import pytest
 
 import rig
+from rig.base.errors import InputError
 from rig.cli.main import main
-from rig.errors import InputError
-from rig.scenes import load_scene
-from rig.simulation import Simulation
+from rig.run.scenes import load_scene
+from rig.run.simulation import Simulation
 
 HAMMER = '[[commands]]\nat_s = 0.1\ncommand = "hammer"\n'
 SCENE = ("simulate", "scene.toml", "-o", "out.csv")

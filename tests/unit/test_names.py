@@ -11,10 +11,10 @@ import pytest
 
 from drivers.console import Console
 from drivers.daq import Daq
-from rig.errors import InputError
-from rig.transport import names
-from rig.transport.endpoint import parse_loopback
-from rig.transport.zenoh import ZenohServer
+from rig.base.errors import InputError
+from rig.serve.transport import names
+from rig.serve.transport.endpoint import parse_loopback
+from rig.serve.transport.zenoh import ZenohServer
 from tests import processes
 
 
@@ -40,7 +40,7 @@ def test_a_name_is_there_while_it_is_held_and_of_one_only(runtime: Path) -> None
 
 def test_what_a_process_that_was_killed_has_left_is_forgotten(runtime: Path) -> None:
     hold = "with registered('gone', '127.0.0.1:1'): print(1, flush=True); time.sleep(60)"
-    code = f"import time; from rig.transport.names import registered\n{hold}"
+    code = f"import time; from rig.serve.transport.names import registered\n{hold}"
     with processes.python("-c", code) as child:
         assert child.stdout is not None
         assert child.stdout.readline() == "1\n"

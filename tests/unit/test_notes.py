@@ -8,14 +8,14 @@ from pathlib import Path
 import pytest
 
 from drivers.console import Console
+from recorder.files.schemas import event_text
 from recorder.reader import Recording
-from recorder.schemas import event_text
 from recorder.session import RecordingSession
-from rig import wire
-from rig.errors import RefusedError
-from rig.pacing import Lockstep
-from rig.service import Service
-from rig.transport.memory import MemoryClient, MemoryServer
+from rig.base import wire
+from rig.base.errors import RefusedError
+from rig.serve.pacing import Lockstep
+from rig.serve.service import Service
+from rig.serve.transport.memory import MemoryClient, MemoryServer
 from tests.unit.recorder_stream import documents
 from tests.unit.service_fake import FakeSimulation
 

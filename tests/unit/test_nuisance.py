@@ -11,18 +11,18 @@ import numpy as np
 import pytest
 
 from recorder.reader import Recording
-from replays.recordings.experiment import Experiment, is_imported
 from replays.recordings.formats.conversion import convert, write_recording
 from replays.recordings.formats.mapping import load_mapping
 from replays.recordings.identification.agreement import by_agreement
 from replays.recordings.identification.log import identify_log
 from replays.recordings.identification.nuisance import nuisances_of, tune
-from replays.recordings.sensitivity import ANGLE, value_of, with_values
+from replays.recordings.resimulation.experiment import Experiment, is_imported
+from replays.recordings.resimulation.sensitivity import ANGLE, value_of, with_values
 from replays.recordings.validation import load_criteria, validate
-from replays.recordings.validation.signals import edge_faults
-from rig.errors import InputError
-from rig.offline import simulate
-from rig.scenes import load_scene
+from replays.recordings.validation.explanations.signals import edge_faults
+from rig.base.errors import InputError
+from rig.run.offline import simulate
+from rig.run.scenes import load_scene
 from tests import faulty_logs, second_rig
 
 PPM, TURNED = 40.0, 2.1

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 import rig
-from rig.errors import InputError, UnknownNameError
-from rig.kernels.signals import ROW
-from rig.offline import Run, frames, simulate
-from rig.scenes import load_scene
-from rig.simulation import Simulation
+from rig.base.errors import InputError, UnknownNameError
+from rig.physics.kernels.signals import ROW
+from rig.run.offline import Run, frames, simulate
+from rig.run.scenes import load_scene
+from rig.run.simulation import Simulation
 
 
 @pytest.fixture(scope="module")

@@ -13,15 +13,15 @@ from typing import Any
 
 import pytest
 
+from rig.base.errors import InputError
+from rig.channels.generators import Generator
 from rig.cli.app import COMMANDS, GROUPS, rig
 from rig.cli.command import Group
-from rig.cli.completion import SCENE_KEYS, complete
+from rig.cli.commands.completion import SCENE_KEYS, complete
 from rig.cli.options import names_of, pairs
-from rig.engine_choice import Limits
-from rig.engines import ENGINES
-from rig.errors import InputError
-from rig.generators import Generator
-from rig.scenes import Scene
+from rig.physics.engine_choice import Limits
+from rig.physics.engines import ENGINES
+from rig.run.scenes import Scene
 from tests.commands import said, shown
 
 ROOT = Path(__file__).parents[2]

@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rig.errors import InputError
-from rig.orbit import (
+from rig.base.errors import InputError
+from rig.channels.orbit import (
     SPECTRUM_HZ,
     full_spectrum,
     mean_rotation,

@@ -2,7 +2,7 @@
 
 import pytest
 
-from rig.outcome import Outcome
+from rig.base.outcome import Outcome
 
 PASS, FAIL, INCONCLUSIVE = Outcome
 

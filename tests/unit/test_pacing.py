@@ -5,7 +5,7 @@ import threading
 
 import pytest
 
-from rig.pacing import FreeRun, Histogram, Lockstep, RealTime, StepTimeoutError
+from rig.serve.pacing import FreeRun, Histogram, Lockstep, RealTime, StepTimeoutError
 
 TICK_RATE = 1_000_000
 BLOCK = 10_000

@@ -15,13 +15,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from replays.report import write_report
 from replays.report.document import Heading, Paragraph, Picture, Report, Table
 from replays.studies.paper.claim import CORRECTIONS, Bar, bars, claim_groups, correction_keys, toward_measured
 from replays.studies.paper.document import in_print, write_up
-from replays.studies.paper.figure import first_impacts
+from replays.studies.paper.figures.figure import first_impacts
 from replays.studies.paper.findings import Findings, find, planned_groups, steps
-from replays.studies.paper.pulse import PULSE_AT, Outcome, Pulse, outcome, outcomes
-from replays.studies.paper.spread import (
+from replays.studies.paper.scans.pulse import PULSE_AT, Outcome, Pulse, outcome, outcomes
+from replays.studies.paper.scans.spread import (
     assumed_values,
     changes,
     free_values,
@@ -32,7 +33,7 @@ from replays.studies.paper.spread import (
 )
 from replays.studies.paper.statement import SETS, Statement, claims, distribution, number, printed_values, statements
 from rig.cli.main import main
-from rig.parameters import load_parameters
+from rig.physics.parameters import load_parameters
 from tests.commands import shown
 
 BESIDE = {"hammer.duration", "hammer.at", "transducer.bandwidth"}
@@ -245,7 +246,7 @@ def test_report_backs_every_section_with_a_table(report: Report, tmp_path: Path)
         assert isinstance(answer, Paragraph)
         assert re.search(r"\d", answer.text)
     target = tmp_path / "report.html"
-    report.write(target)
+    write_report(report, target)
     text = target.read_text(encoding="utf-8")
     assert "nan" not in re.sub(r"base64,[^\"]*", "", text)
 
@@ -260,7 +261,7 @@ def test_two_processes_give_what_one_gives():
 
 _POOL = """
 import os, signal
-from replays.studies.paper.pulse import Pulse, outcomes
+from replays.studies.paper.scans.pulse import Pulse, outcomes
 pulses = [Pulse(force_n=20.0, duration_s=0.05)] * 400
 for n, _ in enumerate(outcomes(pulses, processes=2)):
     if n == 0:

@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rig.errors import InputError
-from rig.model import build_model
-from rig.parameters import DEFAULT_SET, SETS, SI, ParameterSet, load_parameters, set_names
+from rig.base.errors import InputError
+from rig.physics.model import build_model
+from rig.physics.parameters import DEFAULT_SET, SETS, SI, ParameterSet, load_parameters, set_names
 
 DEFAULT = load_parameters()
 NUMBERS = [key for key, entry in DEFAULT.entries.items() if not isinstance(entry.value, str)]

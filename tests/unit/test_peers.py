@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 
 from replays.studies.peers import ERROR_SCALE, PEERS, Library, Peer, Problem, Setting, scaled_error
+from replays.studies.peers.common.reference import find_reference
+from replays.studies.peers.common.right_hand_side import derivative, jacobian, pack, switching
+from replays.studies.peers.common.solution import MISSED_HAMMER
+from replays.studies.peers.common.window import cut_window
 from replays.studies.peers.plain_python import PlainPython
-from replays.studies.peers.reference import find_reference
-from replays.studies.peers.right_hand_side import derivative, jacobian, pack, switching
-from replays.studies.peers.solution import MISSED_HAMMER
-from replays.studies.peers.window import cut_window
-from rig.errors import InputError
-from rig.kernels.contact import BACKWARD, FLIGHT, FORWARD, ROLLING, TOUCHING
-from rig.kernels.signals import STATE_SCALE
-from rig.scenes import load_scene
-from rig.simulation import Simulation
+from rig.base.errors import InputError
+from rig.physics.kernels.laws.contact import BACKWARD, FLIGHT, FORWARD, ROLLING, TOUCHING
+from rig.physics.kernels.signals import STATE_SCALE
+from rig.run.scenes import load_scene
+from rig.run.simulation import Simulation
 
 LIBRARY = {name: peer.module for name, peer in PEERS.items()}
 

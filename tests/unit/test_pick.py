@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import rig
-from rig.pick import equations_digest
+from rig.run.pick import equations_digest
 
 RIG = Path(rig.__file__).parent
 
@@ -25,7 +25,7 @@ def test_the_digest_is_that_of_the_files_wherever_they_lie(copy: Path) -> None:
     assert equations_digest(copy) == equations_digest(), "line ends differ between systems"
 
 
-@pytest.mark.parametrize("changed", ["model.py", "contacts.py", "magnets.py", "levels.py", "kernels/contact.py"])
+@pytest.mark.parametrize("changed", ["model.py", "contacts.py", "magnets.py", "levels.py", "kernels/laws/contact.py"])
 def test_a_changed_file_of_the_equations_is_seen(copy: Path, changed: str) -> None:
     with (copy / changed).open("a") as file:
         file.write("# changed\n")

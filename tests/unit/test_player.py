@@ -20,13 +20,13 @@ from replays.player.passes import Part
 from replays.player.player import Player
 from replays.player.timeline import By, Timeline
 from replays.player.track import Track
-from rig import wire
-from rig.channels import ChannelTable
-from rig.errors import InputError, RefusedError
-from rig.pacing import FreeRun, RealTime
-from rig.service import REPLAY_COMMANDS, Service
-from rig.transport.clients import Clients
-from rig.transport.memory import MemoryClient, MemoryServer
+from rig.base import wire
+from rig.base.errors import InputError, RefusedError
+from rig.channels.table import ChannelTable
+from rig.serve.pacing import FreeRun, RealTime
+from rig.serve.service import REPLAY_COMMANDS, Service
+from rig.serve.transport.clients import Clients
+from rig.serve.transport.memory import MemoryClient, MemoryServer
 from tests.unit.player_recording import BLOCK_NS, BLOCKS, DURATION_NS, Payloads, by_key, key_by_key, write_recording
 from tests.unit.recorder_stream import documents, stream
 from tests.unit.service_fake import FakeSimulation

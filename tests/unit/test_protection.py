@@ -9,7 +9,7 @@ import pytest
 
 from drivers.protection import Settings
 from drivers.protection.__main__ import parse
-from rig.errors import InputError
+from rig.base.errors import InputError
 from tests.unit import protection_scenarios
 from tests.unit.protection_mutants import MUTANTS, Mutant
 from tests.unit.protection_scenarios import SCENARIOS, sound

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from rig.faults import KINDS
+from rig.channels.faults import KINDS
 from tests.unit import protection_acceptance as table
 from tests.unit.protection_acceptance import monitor, outcome, sine
 

@@ -10,7 +10,7 @@ import pytest
 
 from recorder.reader import Recording
 from recorder.writer import RecordingWriter
-from rig.wire import CATALOGUE, EVENTS, PARAMETERS, SCENE
+from rig.base.wire import CATALOGUE, EVENTS, PARAMETERS, SCENE
 from tests.commands import run
 
 from .recorder_stream import documents, stream

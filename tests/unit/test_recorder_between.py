@@ -8,11 +8,12 @@ from typing import Any
 
 import pytest
 
-from recorder import recording_file, rewrite
+from recorder import rewrite
+from recorder.contents import recording_file
 from recorder.reader import Recording, join
 from recorder.writer import RecordingWriter
-from rig.errors import InputError
-from rig.wire import (
+from rig.base.errors import InputError
+from rig.base.wire import (
     CATALOGUE,
     EVENTS,
     FAULTS,

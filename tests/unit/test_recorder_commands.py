@@ -9,13 +9,13 @@ from typing import Any
 
 import pytest
 
-from recorder.chunks import Chunk
+from recorder.contents.summary import Progress, Summary
+from recorder.files.chunks import Chunk
 from recorder.reader import Recording
-from recorder.summary import Progress, Summary
 from recorder.writer import RecordingWriter
+from rig.base.wire import CATALOGUE, EVENTS, PARAMETERS, SCENE, encode_document, sensor_key
+from rig.cli.commands.record import run_session, tell
 from rig.cli.main import main
-from rig.cli.record import run_session, tell
-from rig.wire import CATALOGUE, EVENTS, PARAMETERS, SCENE, encode_document, sensor_key
 from tests.commands import run
 
 from .recorder_stream import documents, stream

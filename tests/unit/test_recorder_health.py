@@ -13,8 +13,8 @@ import pytest
 from recorder.health import ChannelHealth, Health, examine, pace_of
 from recorder.reader import Recording
 from recorder.writer import RecordingWriter
-from rig.channels import Channel, default_table
-from rig.wire import CATALOGUE, EVENTS, PARAMETERS, SCENE, STATUS, Block, encode_block, encode_document, sensor_key
+from rig.base.wire import CATALOGUE, EVENTS, PARAMETERS, SCENE, STATUS, Block, encode_block, encode_document, sensor_key
+from rig.channels.table import Channel, default_table
 
 from .recorder_stream import TICK_RATE_HZ, documents
 

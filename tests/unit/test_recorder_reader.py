@@ -6,14 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from recorder.documents import holds_documents
+from recorder.contents.documents import holds_documents
+from recorder.files.schemas import unwrap_text
 from recorder.reader import Recording
-from recorder.schemas import unwrap_text
 from recorder.writer import RecordingWriter
-from rig.channels import default_table
-from rig.errors import InputError
-from rig.samples import joined
-from rig.wire import CATALOGUE, EDGES, PARAMETERS, SCENE, STATUS, sensor_key, truth_key
+from rig.base.errors import InputError
+from rig.base.samples import joined
+from rig.base.wire import CATALOGUE, EDGES, PARAMETERS, SCENE, STATUS, sensor_key, truth_key
+from rig.channels.table import default_table
 
 from .recorder_stream import TRUTH_COLUMNS, block_of, documents, stream
 

@@ -17,8 +17,8 @@ from hypothesis import strategies as st
 from recorder.reader import Recording, join
 from recorder.rewrite import cut, recover, recovered_path
 from recorder.writer import RecordingWriter
-from rig.errors import InputError
-from rig.wire import CATALOGUE, EDGES, EVENTS, PARAMETERS, SCENE, STATUS, encode_document, sensor_key, truth_key
+from rig.base.errors import InputError
+from rig.base.wire import CATALOGUE, EDGES, EVENTS, PARAMETERS, SCENE, STATUS, encode_document, sensor_key, truth_key
 
 from .recorder_stream import documents, stream
 

@@ -15,18 +15,28 @@ from typing import Any
 import numpy as np
 import pytest
 
-import recorder.series
-from recorder.head import Beginning
-from recorder.payload import Payload
+import recorder.output.series
+from recorder.contents.head import Beginning
+from recorder.files.payload import Payload
+from recorder.output.room import Limits
+from recorder.output.series import Series, part_path
+from recorder.output.sink import Needs
 from recorder.reader import Recording, join
 from recorder.rewrite import cut, recover
-from recorder.room import Limits
-from recorder.series import Series, part_path
-from recorder.sink import Needs
 from recorder.writer import RecordingError, RecordingWriter
-from rig.channels import default_table
-from rig.errors import InputError
-from rig.wire import CATALOGUE, EVENTS, PARAMETERS, SCENE, Gap, encode_block, encode_document, schema_of, sensor_key
+from rig.base.errors import InputError
+from rig.base.wire import (
+    CATALOGUE,
+    EVENTS,
+    PARAMETERS,
+    SCENE,
+    Gap,
+    encode_block,
+    encode_document,
+    schema_of,
+    sensor_key,
+)
+from rig.channels.table import default_table
 
 from .recorder_stream import TICK_RATE_HZ, block_of, documents, stream
 
@@ -168,7 +178,7 @@ def test_history_that_comes_stream_by_stream_stands_in_the_first_part(tmp_path, 
 
 
 def test_a_stream_that_never_comes_holds_up_no_rotation_for_long(tmp_path, monkeypatch):
-    monkeypatch.setattr(recorder.series, "_CATCH_UP_S", 0.0)
+    monkeypatch.setattr(recorder.output.series, "_CATCH_UP_S", 0.0)
     file = series(tmp_path / "run.mcap", rotate_s=0.1)
     write(file, [(PROBES, encode_block(block_of(PROBES, number))) for number in range(100)])
     assert len(file.files) == 10

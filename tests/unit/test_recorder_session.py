@@ -10,18 +10,15 @@ from pathlib import Path
 import pytest
 
 import recorder.session
-from recorder.payload import Payload
+from recorder.contents.summary import Progress, Summary
+from recorder.files.payload import Payload
+from recorder.output.room import Limits
+from recorder.output.trigger import Capture, Trigger
 from recorder.reader import Recording
-from recorder.room import Limits
 from recorder.session import RIG_LOST, RecordingSession
-from recorder.summary import Progress, Summary
-from recorder.trigger import Capture, Trigger
 from recorder.writer import RecordingWriter
-from rig.channels import default_table
-from rig.errors import InputError
-from rig.transport import NoReplyError
-from rig.transport.memory import MemoryClient, MemoryServer
-from rig.wire import (
+from rig.base.errors import InputError
+from rig.base.wire import (
     ALIVE,
     CATALOGUE,
     CLIENTS,
@@ -35,6 +32,9 @@ from rig.wire import (
     sensor_key,
     truth_key,
 )
+from rig.channels.table import default_table
+from rig.serve.transport import NoReplyError
+from rig.serve.transport.memory import MemoryClient, MemoryServer
 
 from .recorder_stream import ScriptedClient, block_of, documents, stream
 

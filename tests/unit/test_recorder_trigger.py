@@ -10,17 +10,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from recorder.captures import Captures
-from recorder.head import Beginning
-from recorder.payload import Payload
+from recorder.contents.head import Beginning
+from recorder.files.payload import Payload
+from recorder.output.captures import Captures
+from recorder.output.room import Limits
+from recorder.output.sink import Needs
+from recorder.output.trigger import Capture, Trigger
 from recorder.reader import Recording
-from recorder.room import Limits
-from recorder.sink import Needs
-from recorder.trigger import Capture, Trigger
 from recorder.writer import RecordingWriter
-from rig.channels import default_table
-from rig.errors import InputError
-from rig.wire import CATALOGUE, EVENTS, PARAMETERS, SCENE, Block, encode_block, encode_document, sensor_key
+from rig.base.errors import InputError
+from rig.base.wire import CATALOGUE, EVENTS, PARAMETERS, SCENE, Block, encode_block, encode_document, sensor_key
+from rig.channels.table import default_table
 
 from .recorder_stream import TICK_RATE_HZ, block_of, documents
 

@@ -8,16 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from recorder import schemas
-from recorder.documents import document_in
-from recorder.draft import check_destination
-from recorder.head import Beginning
+from recorder.contents.documents import document_in
+from recorder.contents.head import Beginning
+from recorder.contents.views import Views
+from recorder.files import schemas
+from recorder.files.draft import check_destination
 from recorder.reader import Recording
-from recorder.views import Views
 from recorder.writer import RecordingError, RecordingWriter
-from rig.channels import default_table
-from rig.errors import InputError
-from rig.wire import (
+from rig.base.errors import InputError
+from rig.base.wire import (
     CATALOGUE,
     EVENTS,
     PARAMETERS,
@@ -30,6 +29,7 @@ from rig.wire import (
     sensor_key,
     truth_key,
 )
+from rig.channels.table import default_table
 
 from .recorder_stream import block_of, documents, stream
 
@@ -182,8 +182,8 @@ def test_history_that_comes_key_by_key_is_joined(tmp_path, path, items):
 
 
 def test_groups_that_never_come_do_not_hold_up_the_others_for_ever(monkeypatch):
-    monkeypatch.setattr("recorder.views._PATIENCE", 3)
-    monkeypatch.setattr("recorder.views._BATCH", 1)
+    monkeypatch.setattr("recorder.contents.views._PATIENCE", 3)
+    monkeypatch.setattr("recorder.contents.views._BATCH", 1)
     table = default_table()
     views = Views(table, rate_hz=500.0)
     counts = []

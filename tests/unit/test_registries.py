@@ -18,24 +18,27 @@ import rig
 from drivers.can.faults import FaultKind
 from drivers.can.signals import LIMITS, EventKind, Kind
 from drivers.console import Console
-from recorder.trigger import EVENT_NAMES
-from replays.campaigns.expectation import EventName
+from recorder.output.trigger import EVENT_NAMES
+from replays.campaigns.files.expectation import EventName
 from replays.recordings import export
-from replays.recordings.formats.events import told_as
-from replays.recordings.formats.motion import Impact
+from replays.recordings.formats.events.events import told_as
+from replays.recordings.formats.events.motion import Impact
 from replays.recordings.formats.source import FORMATS
-from rig import commands, faults, service, wire
+from rig.base import wire
+from rig.base.errors import InputError
+from rig.base.outside import Written
+from rig.channels import faults
 from rig.cli import app
-from rig.commands import TimedCommand
-from rig.errors import InputError
-from rig.outside import Written
-from rig.scenes import load_scene
+from rig.run import commands
+from rig.run.commands import TimedCommand
+from rig.run.scenes import load_scene
+from rig.serve import service
 
 UNCOMPUTED = textwrap.dedent(
     """
     import importlib.util, sys
-    import rig.kernels  # not yet the table of signals
-    spec = importlib.util.find_spec("rig.kernels.signals")
+    import rig.physics.kernels  # not yet the table of signals
+    spec = importlib.util.find_spec("rig.physics.kernels.signals")
     source = open(spec.origin).read()
     marks = 'OBSERVED = tuple(_observed.signals)'
     assert marks in source and spec.name not in sys.modules
@@ -161,7 +164,7 @@ def test_the_bounds_of_a_hammer_pulse_are_those_of_its_command() -> None:
 
 def test_every_format_has_its_reader() -> None:
     for name, (words, suffixes) in FORMATS.items():
-        assert callable(importlib.import_module(f"replays.recordings.formats.{name}").look_into)
+        assert callable(importlib.import_module(f"replays.recordings.formats.readers.{name}").look_into)
         assert words
         assert all(each.startswith(".") for each in suffixes.split())
 
@@ -175,8 +178,8 @@ def test_every_class_of_a_fault_is_in_the_union_and_in_every_table_of_kinds() ->
             if "kind" in each.model_fields:
                 yield each
 
-    for module in pkgutil.iter_modules(faults.__path__, "rig.faults."):
+    for module in pkgutil.iter_modules(faults.__path__, "rig.channels.faults."):
         importlib.import_module(module.name)
-    classes = {each for each in concrete(faults.Kind) if each.__module__.startswith("rig.faults")}
+    classes = {each for each in concrete(faults.Kind) if each.__module__.startswith("rig.channels.faults")}
     assert classes == set(get_args(faults.AnyKind)) == set(faults.KINDS.values())
     assert set(faults.KINDS) == {kind.name() for kind in classes}

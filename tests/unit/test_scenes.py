@@ -11,10 +11,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rig.channels import default_table
-from rig.commands import COMMANDS, HammerCommand, ReleaseCommand, SpeedCommand, check_command
-from rig.errors import InputError
-from rig.scenes import Scene, load_scene, parse_scene, read_value, scene_document, scene_names
+from rig.base.errors import InputError
+from rig.channels.table import default_table
+from rig.run.commands import COMMANDS, HammerCommand, ReleaseCommand, SpeedCommand, check_command
+from rig.run.scenes import Scene, load_scene, parse_scene, read_value, scene_document, scene_names
 
 PERIODS = [n for n in range(1, 10_001) if 1_000_000 % n == 0]
 """Whole numbers of ticks whose rates are whole as well [us]."""

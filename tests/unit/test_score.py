@@ -14,22 +14,32 @@ import numpy as np
 import pytest
 
 from replays.recordings.export import write_run
-from replays.recordings.formats import columnar, delimited, mdf
 from replays.recordings.formats.mapping import FileOptions
+from replays.recordings.formats.readers import columnar, delimited, mdf
 from replays.recordings.formats.source import open_source
+from replays.report import write_report
+from replays.score.card.limits import load_limits
+from replays.score.card.scorecard import (
+    FAIL,
+    INCONCLUSIVE,
+    NO_LIMIT,
+    PASS,
+    QUANTITIES,
+    Scorecard,
+    judge_row,
+    write_junit,
+)
+from replays.score.fits.sine import fit_sine, is_sine, quality
+from replays.score.fits.waveform import fit_waveform, student
 from replays.score.judgement import judge
-from replays.score.limits import load_limits
-from replays.score.noise import split_noise
-from replays.score.rows import NO_COUNT, follow, stretches
-from replays.score.scorecard import FAIL, INCONCLUSIVE, NO_LIMIT, PASS, QUANTITIES, Scorecard, judge_row, write_junit
-from replays.score.sine import fit_sine, is_sine, quality
-from replays.score.stimulus import EDGE, Exact, Sampled
-from replays.score.waveform import fit_waveform, student
-from rig.channels import default_table
-from rig.errors import InputError
-from rig.outcome import Outcome
-from rig.scenes import load_scene
-from rig.simulation import Simulation
+from replays.score.quantities.noise import split_noise
+from replays.score.records.rows import NO_COUNT, follow, stretches
+from replays.score.records.stimulus import EDGE, Exact, Sampled
+from rig.base.errors import InputError
+from rig.base.outcome import Outcome
+from rig.channels.table import default_table
+from rig.run.scenes import load_scene
+from rig.run.simulation import Simulation
 from tests.commands import said
 from tests.processes import ROOT
 from tests.score_daqs import RATE_HZ, Tones, chips, counts_of, write_parquet, write_session
@@ -251,7 +261,7 @@ def test_without_a_formula_the_sessions_own_noise_leaves_open_what_it_hides(
 
 
 def test_fifteen_channels_are_mapped_by_two_seconds_of_chips() -> None:
-    from replays.score.wiring import find_wires
+    from replays.score.records.wiring import find_wires
 
     generator = np.random.default_rng(8)
     names = list(TABLE.channels)
@@ -417,7 +427,7 @@ def test_the_report_draws_the_channels_of_the_analogue_path(sent: tuple[Path, np
     columns = recorded(np.random.default_rng(3), seconds=0.3)
     card = judge(write_parquet(tmp_path / "daq.parquet", columns), [sent[0]], formulas=SIGNALS)
     card.pictures = {name: card.pictures[name] for name in ("analogue disk_x",)}
-    make_report(card).write(tmp_path / "r.html")
+    write_report(make_report(card), tmp_path / "r.html")
     assert (tmp_path / "r.html").read_text(encoding="utf-8").count("<img") == 1
 
 

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from replays.score.card.scorecard import FAIL, Scorecard
 from replays.score.judgement import judge
-from replays.score.scorecard import FAIL, Scorecard
-from rig.channels import default_table
+from rig.channels.table import default_table
 from tests.score_daqs import RATE_HZ, counts_of, write_parquet, write_session
 
 PROBES = default_table().groups["probes"]

@@ -11,17 +11,17 @@ import pytest
 
 from drivers.can.signals import messages_for
 from recorder.reader import Recording
+from replays.score.card.scorecard import FAIL, Scorecard
 from replays.score.judgement import judge
-from replays.score.scorecard import FAIL, Scorecard
 from replays.sessions.session import FOLDER
-from rig.channels import default_table
-from rig.commands import FaultCommand
-from rig.faults import KINDS
-from rig.faults.kind import Setting
-from rig.faulty import Faulty
-from rig.kernels.observe import EDGE, KEYPHASOR_WIDTH
-from rig.kernels.signals import COLUMN, N_ROW
-from rig.sensors.conditioning import Conditioner
+from rig.channels.faults import KINDS
+from rig.channels.faults.kind import Setting
+from rig.channels.sensors.conditioning import Conditioner
+from rig.channels.table import default_table
+from rig.physics.kernels.observe import EDGE, KEYPHASOR_WIDTH
+from rig.physics.kernels.signals import COLUMN, N_ROW
+from rig.run.commands import FaultCommand
+from rig.run.faulty import Faulty
 from tests.score_daqs import Tones, write_parquet, write_session
 
 LEFT = {"noise", "effective bits", "dynamic range"}

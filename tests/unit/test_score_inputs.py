@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from replays.score.card.limits import load_limits
+from replays.score.card.scorecard import FAIL, PASS, Scorecard
 from replays.score.judgement import judge
-from replays.score.limits import load_limits
-from replays.score.scorecard import FAIL, PASS, Scorecard
-from rig.channels import default_table
-from rig.errors import InputError
-from rig.outcome import Outcome
+from rig.base.errors import InputError
+from rig.base.outcome import Outcome
+from rig.channels.table import default_table
 from tests.commands import said
 from tests.score_daqs import counts_of, write_parquet, write_session
 

@@ -14,14 +14,14 @@ import numpy as np
 import pytest
 
 from recorder.session import RecordingSession
-from replays.score import live
+from replays.score.card.scorecard import FAIL, NO_LIMIT, Scorecard
 from replays.score.judgement import judge
-from replays.score.live import Arrivals, Delivered, collect
-from replays.score.scorecard import FAIL, NO_LIMIT, Scorecard
-from rig.channels import default_table
-from rig.errors import InputError, RefusedError
-from rig.transport import Client
-from rig.wire import STATUS, encode_block, sensor_key
+from replays.score.records import live
+from replays.score.records.live import Arrivals, Delivered, collect
+from rig.base.errors import InputError, RefusedError
+from rig.base.wire import STATUS, encode_block, sensor_key
+from rig.channels.table import default_table
+from rig.serve.transport import Client
 from tests.commands import said
 from tests.score_daqs import RATE_HZ, counts_of, write_session
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from replays.recordings.formats.mapping import parse_mapping
+from replays.score.card.scorecard import FAIL
 from replays.score.judgement import judge
-from replays.score.scorecard import FAIL
-from rig.channels import default_table
-from rig.errors import InputError
+from rig.base.errors import InputError
+from rig.channels.table import default_table
 from tests.commands import said
 from tests.score_daqs import counts_of, write_parquet, write_session
 

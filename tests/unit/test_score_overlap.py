@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from replays.score.alignment.overlap import find_begins
+from replays.score.card.scorecard import FAIL, Scorecard
 from replays.score.judgement import judge
-from replays.score.overlap import find_begins
-from replays.score.scorecard import FAIL, Scorecard
-from rig.channels import default_table
+from rig.channels.table import default_table
 from tests.score_daqs import RATE_HZ, counts_of, write_parquet, write_session
 
 PROBES = default_table().groups["probes"]

@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 
 from replays.score.analogue import in_unit
-from replays.score.crosstalk import find_crosstalk
+from replays.score.card.scorecard import FAIL, INCONCLUSIVE, PASS, Interval, Scorecard, Verdict, make_matrix, text_row
 from replays.score.judgement import judge
-from replays.score.nonlinearity import intermodulation, transfer_curve
-from replays.score.recorded import Recorded
-from replays.score.scorecard import FAIL, INCONCLUSIVE, PASS, Interval, Scorecard, Verdict, make_matrix, text_row
-from replays.score.step import step_response
-from rig.channels import ChannelTable, default_table
+from replays.score.quantities.crosstalk import find_crosstalk
+from replays.score.quantities.nonlinearity import intermodulation, transfer_curve
+from replays.score.quantities.step import step_response
+from replays.score.records.recorded import Recorded
+from rig.channels.table import ChannelTable, default_table
 from tests.score_daqs import write_parquet
 from tests.score_sessions import Sent, table_with, write_counts
 

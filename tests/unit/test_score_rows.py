@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from replays.score.rows import Followed, follow
+from replays.score.records.rows import Followed, follow
 
 _RANDOM = np.random.default_rng(1).integers(-1_000_000, 1_000_000, (40_000, 3))
 OFFSETS = [0, 1, 8192, 8193, 9012, 12_288, 26_000]

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from replays.score.card.scorecard import FAIL
 from replays.score.judgement import judge
-from replays.score.recorded import Table
-from replays.score.scorecard import FAIL
-from rig.channels import default_table
+from replays.score.records.recorded import Table
+from rig.channels.table import default_table
 from tests.score_daqs import RATE_HZ, counts_of, write_parquet, write_session
 
 PROBES = default_table().groups["probes"]

@@ -9,16 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from replays.score.alignment import align
-from replays.score.following import Source
+from replays.score.alignment.alignment import align
+from replays.score.alignment.following import Source
+from replays.score.alignment.repeats import find_repeats
+from replays.score.alignment.track import Follower, Track, follow_record
+from replays.score.card.scorecard import FAIL, INCONCLUSIVE, PASS, Scorecard
+from replays.score.fits.waveform import fit_stretch
 from replays.score.judgement import judge
-from replays.score.repeats import find_repeats
-from replays.score.scorecard import FAIL, INCONCLUSIVE, PASS, Scorecard
-from replays.score.stimulus import Exact
-from replays.score.track import Follower, Track, follow_record
-from replays.score.waveform import fit_stretch
-from replays.score.wiring import Wire, find_wires
-from rig.channels import default_table
+from replays.score.records.stimulus import Exact
+from replays.score.records.wiring import Wire, find_wires
+from rig.channels.table import default_table
 from tests.score_cases import Converter, as_columns
 from tests.score_daqs import RATE_HZ, Tones, counts_of, write_parquet, write_session
 from tests.score_files import write_values

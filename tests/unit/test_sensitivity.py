@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from replays.recordings.experiment import Experiment
-from replays.recordings.prediction import LeadIns, Measured, bare, predict, sampled
-from replays.recordings.sensitivity import Predictor, value_of, with_values
-from rig.channels import Channel, default_table
-from rig.errors import InputError
-from rig.offline import SentCommand, simulate
-from rig.scenes import load_scene
-from rig.simulation import Simulation
+from replays.recordings.resimulation.experiment import Experiment
+from replays.recordings.resimulation.prediction import LeadIns, Measured, bare, predict, sampled
+from replays.recordings.resimulation.sensitivity import Predictor, value_of, with_values
+from rig.base.errors import InputError
+from rig.channels.table import Channel, default_table
+from rig.run.offline import SentCommand, simulate
+from rig.run.scenes import load_scene
+from rig.run.simulation import Simulation
 
 CHANNELS = ("disk_x", "ring_y", "P_E", "inner_x", "speed", "hammer")
 

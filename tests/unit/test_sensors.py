@@ -9,14 +9,14 @@ from itertools import cycle, pairwise
 import numpy as np
 import pytest
 
-from rig.channels import Channel, Group, default_table
-from rig.kernels.signals import COLUMN, N_ROW
-from rig.scenes import load_scene
-from rig.sensors.conditioning import Conditioner
-from rig.sensors.filters import channel_poles
-from rig.sensors.keyphasor import Keyphasor
-from rig.sensors.noise import EDGE, draw, noise_streams
-from rig.simulation import Simulation
+from rig.channels.sensors.conditioning import Conditioner
+from rig.channels.sensors.filters import channel_poles
+from rig.channels.sensors.keyphasor import Keyphasor
+from rig.channels.sensors.noise import EDGE, draw, noise_streams
+from rig.channels.table import Channel, Group, default_table
+from rig.physics.kernels.signals import COLUMN, N_ROW
+from rig.run.scenes import load_scene
+from rig.run.simulation import Simulation
 
 ROW_RATE = 40_000
 """Rows a second of a run at 25 us."""

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 
 from drivers.console import Accepted, Console
-from rig import wire
-from rig.cli.status import accuracy_text
-from rig.errors import InputError, RefusedError
-from rig.pacing import Clock, FreeRun, Lockstep, RealTime, StepTimeoutError
-from rig.service import Service
-from rig.simulation import Frame
-from rig.transport import NoReplyError
-from rig.transport.memory import MemoryClient, MemoryServer
+from rig.base import wire
+from rig.base.errors import InputError, RefusedError
+from rig.cli.output.display import accuracy_text
+from rig.run.simulation import Frame
+from rig.serve.pacing import Clock, FreeRun, Lockstep, RealTime, StepTimeoutError
+from rig.serve.service import Service
+from rig.serve.transport import NoReplyError
+from rig.serve.transport.memory import MemoryClient, MemoryServer
 from tests.unit.service_fake import GROUPS, TRUTH, FakeSimulation
 from tests.waiting import until
 

@@ -15,13 +15,13 @@ import pytest
 
 import rig.cli
 from replays.studies.bench import CASES
-from replays.studies.stability.cell import Cell
-from rig.cli.bench import cases_table
-from rig.cli.display import fitted
-from rig.cli.info import describe, events_table
-from rig.cli.stability import peers_table, trials_table
-from rig.cli.tables import echo_json, facts, new_table
-from rig.engines import ENGINES
+from replays.studies.stability.trials.cell import Cell
+from rig.cli.commands.bench import cases_table
+from rig.cli.commands.info import describe, events_table
+from rig.cli.commands.stability import peers_table, trials_table
+from rig.cli.output.display import fitted
+from rig.cli.output.tables import echo_json, facts, new_table
+from rig.physics.engines import ENGINES
 from tests.commands import check_legible, lines_of, said, shown
 
 SESSIONS = Path(__file__).parents[2] / "replays" / "sessions"
@@ -105,7 +105,7 @@ def test_a_real_terminal_shows_whole_values() -> None:
 
 
 def lines_of_scenes() -> list[str]:
-    from rig.scenes import load_scene, scene_names
+    from rig.run.scenes import load_scene, scene_names
 
     table = new_table("", "scene", ">seconds", "what happens", wrapped=["what happens"])
     for name in scene_names():
@@ -229,8 +229,8 @@ def test_a_command_and_its_effect_are_told_once_and_what_had_none_is_told_too() 
 def test_compiling_is_told_as_long_as_it_lasts(monkeypatch: pytest.MonkeyPatch) -> None:
     from types import SimpleNamespace
 
-    from rig.cli import compiling
-    from rig.cli.compiling import Compiling
+    from rig.cli.output import compiling
+    from rig.cli.output.compiling import Compiling
 
     beside: list[str] = []
 
@@ -250,7 +250,11 @@ def test_compiling_is_told_as_long_as_it_lasts(monkeypatch: pytest.MonkeyPatch) 
     def event(module: str) -> Any:
         return SimpleNamespace(data={"dispatcher": SimpleNamespace(py_func=SimpleNamespace(__module__=module))})
 
-    for modules in (["peers.cvode"], ["rig.engines.split.method", "numba.np.arrayobj"], ["rig.kernels.contact"]):
+    for modules in (
+        ["peers.cvode"],
+        ["rig.physics.engines.split.method", "numba.np.arrayobj"],
+        ["rig.physics.kernels.laws.contact"],
+    ):
         for module in modules:
             listener.on_start(event(module))
         for module in modules:
@@ -267,13 +271,11 @@ def test_compiling_is_told_as_long_as_it_lasts(monkeypatch: pytest.MonkeyPatch) 
 def test_every_command_with_tables_has_the_same_options(capsys: pytest.CaptureFixture[str]) -> None:
     """What prints a table takes --wide and --json, but for what is made of two processes."""
     found = set()
-    for path in sorted(Path(next(iter(rig.cli.__path__))).glob("*.py")):
+    for path in sorted(Path(next(iter(rig.cli.__path__)), "commands").glob("*.py")):
         calls = {ast.unparse(node.func) for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call)}
-        if path.stem != "tables" and calls & {"new_table", "facts"}:
+        if calls & {"new_table", "facts"}:
             found.add(path.stem)
-    commands = {
-        name: ["can", "load"] if name == "can_messages" else [name.rstrip("_")] for name in sorted(found - {"demo"})
-    }
+    commands = {name: ["can", "load"] if name == "can" else [name.rstrip("_")] for name in sorted(found - {"demo"})}
     assert len(commands) >= 14
     for name, command in commands.items():
         _, usage, _ = said(capsys, *command, "--help")

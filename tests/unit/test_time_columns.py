@@ -8,8 +8,8 @@ import pytest
 
 from replays.recordings.formats.mapping import FileOptions, parse_mapping
 from replays.recordings.formats.source import Source, open_source
-from rig import units
-from rig.errors import InputError
+from rig.base import units
+from rig.base.errors import InputError
 from tests.commands import said
 
 STEP_S = 1e-3

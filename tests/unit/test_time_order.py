@@ -12,11 +12,11 @@ import pytest
 
 from recorder.reader import Recording
 from replays.recordings.formats.clock import axis_of_stamps
+from replays.score.card.scorecard import FAIL, PASS
 from replays.score.judgement import judge
-from replays.score.scorecard import FAIL, PASS
-from rig.channels import default_table
-from rig.errors import InputError
-from rig.wire import EDGES, Block, decode_block, encode_block, schema_of
+from rig.base.errors import InputError
+from rig.base.wire import EDGES, Block, decode_block, encode_block, schema_of
+from rig.channels.table import default_table
 from tests.commands import said
 from tests.hostile.files import PROBES, SESSIONS, Layout
 from tests.score_daqs import RATE_HZ, counts_of, write_session

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from rig import wire
-from rig.transport.fanout import Fanout
-from rig.transport.memory import MemoryClient, MemoryServer
+from rig.base import wire
+from rig.serve.transport.fanout import Fanout
+from rig.serve.transport.memory import MemoryClient, MemoryServer
 
 
 class Counting(MemoryServer):

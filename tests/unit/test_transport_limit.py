@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from rig.errors import InputError
-from rig.transport.limit import CommandLimit
+from rig.base.errors import InputError
+from rig.serve.transport.limit import CommandLimit
 
 
 class Clock:

@@ -2,8 +2,8 @@ from __future__ import annotations
 
 import pytest
 
-from rig.transport import NoReplyError
-from rig.transport.memory import MemoryClient, MemoryServer, key_matches
+from rig.serve.transport import NoReplyError
+from rig.serve.transport.memory import MemoryClient, MemoryServer, key_matches
 
 
 @pytest.mark.parametrize(

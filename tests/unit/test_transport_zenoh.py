@@ -15,13 +15,13 @@ from typing import Any
 
 import pytest
 
-from rig.cli.connection import Connection
-from rig.errors import InputError
-from rig.transport import NoReplyError
-from rig.transport.endpoint import backlog_of, parse_endpoint
-from rig.transport.recovery import Recovery
-from rig.transport.zenoh import ZenohClient, ZenohServer
-from rig.wire import ALIVE
+from rig.base.errors import InputError
+from rig.base.wire import ALIVE
+from rig.cli.connections.connection import Connection
+from rig.serve.transport import NoReplyError
+from rig.serve.transport.endpoint import backlog_of, parse_endpoint
+from rig.serve.transport.recovery import Recovery
+from rig.serve.transport.zenoh import ZenohClient, ZenohServer
 from tests.processes import free_endpoint
 from tests.waiting import until
 
@@ -452,8 +452,8 @@ def test_a_callback_that_blocks_holds_up_neither_requests_nor_the_token_nor_its_
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Small channel, fast heartbeats: with one link for everything, this never ended."""
-    monkeypatch.setattr("rig.transport.zenoh._FIFO", 50)
-    monkeypatch.setattr("rig.transport.zenoh._HEARTBEAT_S", 0.01)
+    monkeypatch.setattr("rig.serve.transport.zenoh._FIFO", 50)
+    monkeypatch.setattr("rig.serve.transport.zenoh._HEARTBEAT_S", 0.01)
     keys, messages = [f"rig/sensors/g{n}" for n in range(6)], 2500
     got: dict[str, list[int]] = {key: [] for key in keys}
     seen: list[bool] = []
@@ -481,7 +481,7 @@ def test_a_callback_that_blocks_holds_up_neither_requests_nor_the_token_nor_its_
 
 
 def test_closing_does_not_fail_though_a_callback_never_returns(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rig.transport.zenoh._FIFO", 10)
+    monkeypatch.setattr("rig.serve.transport.zenoh._FIFO", 10)
     never = threading.Event()
 
     entered: list[str] = []
@@ -573,8 +573,8 @@ def test_what_a_slow_plain_subscriber_missed_comes_from_the_cache_as_the_documen
 
     import zenoh
 
-    from rig.interface import page
-    from rig.wire import sensor_key
+    from rig.base.wire import sensor_key
+    from rig.serve.interface import page
 
     key = sensor_key("probes")
     (code,) = re.findall(r"```python\n(.*?)```", page(), re.DOTALL)

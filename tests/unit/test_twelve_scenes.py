@@ -10,18 +10,18 @@ import numpy as np
 import pytest
 
 from replays.studies.chart import session
-from replays.studies.chart.figure import draw
+from replays.studies.chart.drawing.figure import draw
+from replays.studies.chart.drawing.scene_panel import Ratio, compare
 from replays.studies.chart.measure import Budget
 from replays.studies.chart.methods import competitors
 from replays.studies.chart.phases import SCENE_TARGETS, scene_problem
 from replays.studies.chart.profile import cheapest
-from replays.studies.chart.scene_panel import Ratio, compare
 from replays.studies.chart.session import make_chart
 from replays.studies.chart.store import COLUMNS, KEY, read_table
-from replays.studies.run import Course
-from replays.studies.twelve_scenes import TWELVE_SCENES
-from rig.engines.memory import CONTACTS
-from rig.kernels.signals import COLUMN, N_ROW
+from replays.studies.common.run import Course
+from replays.studies.common.twelve_scenes import TWELVE_SCENES
+from rig.physics.engines.common.memory import CONTACTS
+from rig.physics.kernels.signals import COLUMN, N_ROW
 
 _WHIRL_S = 0.1
 """At the end of a window with whirl, contact lasts for at least this long [s]."""

@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from replays.score.limits import load_limits
-from rig import units
-from rig.channels import default_table
-from rig.errors import InputError
-from rig.samples import Samples
+from replays.score.card.limits import load_limits
+from rig.base import units
+from rig.base.errors import InputError
+from rig.base.samples import Samples
+from rig.channels.table import default_table
 
 LB, IN, G = 4.4482216152605, 0.0254, 9.80665
 

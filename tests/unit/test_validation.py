@@ -13,19 +13,19 @@ import pytest
 from recorder.reader import Recording, join
 from recorder.rewrite import cut
 from recorder.writer import RecordingWriter
-from replays.recordings.experiment import Experiment
-from replays.recordings.prediction import Measured, Prediction, bare, measured, predict
+from replays.recordings.resimulation.experiment import Experiment
+from replays.recordings.resimulation.prediction import Measured, Prediction, bare, measured, predict
 from replays.recordings.validation import load_criteria, outcome, validate
-from replays.recordings.validation.attribution import Explained, Explanation, attribute, conclude
 from replays.recordings.validation.bits import Bits
 from replays.recordings.validation.criteria import DEFAULT, Criteria
+from replays.recordings.validation.explanations.attribution import Explained, Explanation, attribute, conclude
 from replays.recordings.validation.phases import View, find_phases, quantities, spectrum_distance
-from rig.errors import InputError
-from rig.offline import frames
-from rig.outcome import Outcome
-from rig.scenes import load_scene
-from rig.simulation import Simulation
-from rig.wire import EDGES, EVENTS, encode_block, encode_document, sensor_key, truth_key
+from rig.base.errors import InputError
+from rig.base.outcome import Outcome
+from rig.base.wire import EDGES, EVENTS, encode_block, encode_document, sensor_key, truth_key
+from rig.run.offline import frames
+from rig.run.scenes import load_scene
+from rig.run.simulation import Simulation
 
 SMALL = {"sensors.rate_hz": 2000, "sensors.truth_rate_hz": 100, "duration_s": 0.06}
 

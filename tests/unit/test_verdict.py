@@ -21,11 +21,11 @@ from replays.recordings.picture import draw
 from replays.recordings.verdict import Verdict, hammer_time_s, judge
 from replays.recordings.whirl import parameter_si, whirl_figures
 from replays.report.canvas import DPI, WIDTH
-from rig import wire
-from rig.cli.demo import verdict_table
-from rig.errors import InputError
-from rig.scenes import load_scene
-from rig.simulation import Simulation
+from rig.base import wire
+from rig.base.errors import InputError
+from rig.cli.commands.demo import verdict_table
+from rig.run.scenes import load_scene
+from rig.run.simulation import Simulation
 from tests.commands import check_legible
 
 Change = Callable[[str, bytes], Iterable[bytes]]

@@ -7,14 +7,14 @@ import math
 import numpy as np
 import pytest
 
-from recorder.viewer import orbit, spectrum
 from recorder.viewer.clock import WallClock
-from recorder.viewer.contact import Touch, resolution_mm
-from recorder.viewer.geometry import Geometry
-from recorder.viewer.history import History
-from recorder.viewer.series import Envelope, paths_of, reaction_of, series_of
-from recorder.viewer.whirl import whirl_of
-from rig.channels import default_table
+from recorder.viewer.drawings import orbit, spectrum
+from recorder.viewer.drawings.contact import Touch, resolution_mm
+from recorder.viewer.drawings.geometry import Geometry
+from recorder.viewer.drawings.history import History
+from recorder.viewer.drawings.series import Envelope, paths_of, reaction_of, series_of
+from recorder.viewer.drawings.whirl import whirl_of
+from rig.channels.table import default_table
 
 RATE_HZ = 20_000
 
@@ -199,7 +199,7 @@ def test_geometry_takes_lengths_in_their_unit_and_names_what_it_assumes() -> Non
 
 
 def test_geometry_knows_the_keys_of_the_parameter_sets() -> None:
-    from rig.parameters import load_parameters
+    from rig.physics.parameters import load_parameters
 
     assert Geometry.from_parameters(load_parameters("corrected").document()).assumed == ()
 

@@ -9,18 +9,19 @@ from typing import Any
 import numpy as np
 import pytest
 
+from recorder.files.schemas import event_text
 from recorder.reader import Recording
-from recorder.schemas import event_text
-from recorder.viewer import blueprint, file, spectrum
+from recorder.viewer import blueprint, file
 from recorder.viewer.canvas import Canvas, new_stream
-from recorder.viewer.geometry import Geometry
+from recorder.viewer.drawings import spectrum
+from recorder.viewer.drawings.geometry import Geometry
 from recorder.viewer.painter import not_drawn
 from replays.recordings.export import write_run
-from rig import wire
-from rig.channels import ChannelTable, default_table
+from rig.base import wire
+from rig.channels.table import ChannelTable, default_table
 from rig.cli.main import main
-from rig.scenes import parse_scene
-from rig.simulation import Simulation
+from rig.run.scenes import parse_scene
+from rig.run.simulation import Simulation
 from tests.unit.player_recording import BLOCKS, write_recording
 from tests.unit.recorder_stream import stream
 from tests.unit.viewer_recording import (

@@ -12,9 +12,9 @@ import pytest
 
 from recorder.viewer import live
 from recorder.viewer.canvas import Canvas, new_stream
-from rig import wire
-from rig.transport import NoReplyError
-from rig.transport.memory import key_matches
+from rig.base import wire
+from rig.serve.transport import NoReplyError
+from rig.serve.transport.memory import key_matches
 from tests.unit.viewer_recording import RADIUS_MM, RATE_HZ, Saved, Synthetic, documents_of, stream_of
 from tests.waiting import PATIENCE_S, sooner_than
 

@@ -8,11 +8,11 @@ from typing import Any
 
 import pytest
 
+from rig.base.errors import DiskError, InputError, check_new_file, check_not_among, whole_file
+from rig.base.outside import read_toml
 from rig.cli.app import start
-from rig.errors import DiskError, InputError, check_new_file, check_not_among, whole_file
-from rig.outside import read_toml
-from rig.scenes import load_scene, parse_scene
-from rig.transport.certificates import holder_in, make
+from rig.run.scenes import load_scene, parse_scene
+from rig.serve.transport.exposure.certificates import holder_in, make
 
 
 @pytest.mark.parametrize("error", [OSError(28, "No space left on device"), RuntimeError("System error."), ValueError()])

@@ -11,8 +11,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from rig import wire
-from rig.wire import (
+from rig.base import wire
+from rig.base.wire import (
     SAMPLE_SCHEMA,
     TRUTH_SCHEMA,
     Block,

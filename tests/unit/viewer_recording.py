@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from recorder.samples import Samples
-from rig import wire
-from rig.channels import Group, default_table
+from recorder.contents.samples import Samples
+from rig.base import wire
+from rig.channels.table import Group, default_table
 
 RATE_HZ = 20_000
 CLEARANCE_MM = 0.926

@@ -19,7 +19,7 @@ from drivers.can.bus import codec
 from drivers.can.bus.frame import resized, sendable
 from drivers.can.bus.model import BusModel
 from drivers.can.bus.results import STATES
-from rig.errors import InputError, Words
+from rig.base.errors import InputError, Words
 
 WINDOW = 512
 """Frames that one endpoint may have waiting; what it offers beyond is dropped and counted."""

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rig.errors import InputError
+from rig.base.errors import InputError
 
 # Flags in the identifier's word, as SocketCAN has them.
 EXTENDED = 1 << 31
@@ -142,25 +142,6 @@ class Frame(NamedTuple):
     esi: bool = False
 
 
-class Encoded(NamedTuple):
-    """A frame as it is on the bus when it is acknowledged, from start of frame to the end of the intermission.
-
-    Attributes:
-        bits: Levels, 0 dominant, 1 recessive, shape (bits,).
-        fast: Which are sent at the data rate, shape (bits,). The bit BRS counts as nominal, the CRC delimiter as fast:
-            each is cut at its sample point, and the two together last just that.
-        stuff: Which are stuff bits by content, shape (bits,).
-        fixed: Which are fixed stuff bits of CAN FD, shape (bits,).
-        crc: CRC sequence, of 15, 17 or 21 bits.
-    """
-
-    bits: np.ndarray
-    fast: np.ndarray
-    stuff: np.ndarray
-    fixed: np.ndarray
-    crc: int
-
-
 def record_of(frame: Frame, *, node: int = 0, time_ns: int = 0) -> Record:
     """A frame as its record.
 
@@ -236,21 +217,3 @@ def resized(array: np.ndarray, width: int = FD_WIDTH) -> np.ndarray:
     narrowest = min(width, array.dtype["data"].itemsize)
     octets(found)[:, :narrowest] = octets(array)[:, :narrowest]
     return found
-
-
-def encode(frame: Frame) -> Encoded:
-    """All bits of a frame on the bus."""
-    from drivers.can.bus import kernels
-
-    work = np.zeros((3, kernels.LONGEST), np.uint8)
-    count, crc = kernels.encode(records([frame])[0], work)
-    bits, kinds = work[:2, :count]
-    return Encoded(bits, kinds & kernels.FAST != 0, kinds & kernels.STUFF != 0, kinds & kernels.FIXED != 0, int(crc))
-
-
-def frame_bits(frame: Frame) -> tuple[int, int]:
-    """Bits of a frame on the bus, with stuffing and intermission: at the nominal rate, and at the data rate."""
-    from drivers.can.bus import kernels
-
-    row, work = records([frame])[0], np.empty((3, kernels.LONGEST), np.uint8)
-    return kernels.count_bits(int(row["identifier"]), int(row["length"]), int(row["flags"]), row["data"], work)

@@ -23,15 +23,15 @@ from drivers.can.bus.endpoints import WINDOW, Endpoints
 from drivers.can.bus.frame import CLASSIC_WIDTH, FD_WIDTH, joined, packed, resized
 from drivers.can.bus.model import BusModel, warm_up
 from drivers.can.bus.results import OUTCOMES
-from drivers.health import Guard, Rising
-from rig import wire
-from rig.closing import Closing
-from rig.errors import InputError
-from rig.outside import check
-from rig.transport.limit import Bucket
+from rig.base import wire
+from rig.base.closing import Closing
+from rig.base.errors import InputError
+from rig.base.outside import check
+from rig.serve.health import Guard, Rising
+from rig.serve.transport.limit import Bucket
 
 if TYPE_CHECKING:
-    from rig.transport.zenoh import ZenohServer
+    from rig.serve.transport.zenoh import ZenohServer
 
 _TICK_NS = 1_000_000
 """How long frames of a busy bus wait for others to travel with."""

@@ -23,7 +23,7 @@ from drivers.can.bus import frame as frames
 from drivers.can.bus import kernels
 from drivers.can.bus.results import OUTCOMES, RESULT, STATES, BusState, Delivery, NodeState
 from drivers.can.bus.timing import Speed, speed
-from rig.errors import InputError, Words
+from rig.base.errors import InputError, Words
 
 if TYPE_CHECKING:
     import can

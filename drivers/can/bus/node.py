@@ -16,8 +16,8 @@ from can.bus import BusState  # noqa: TID253
 
 from drivers.can.bus import codec
 from drivers.can.bus.frame import packed
-from rig.errors import InputError
-from rig.outside import check
+from rig.base.errors import InputError
+from rig.base.outside import check
 
 if TYPE_CHECKING:
     from can.typechecking import CanFilters

@@ -1,12 +1,17 @@
-"""Bit rates of a bus, and how long its frames last."""
+"""Bits of frames on a bus, its bit rates, and how long its frames last.
+
+The compiled part is loaded at the first count: a client that only sends and receives does not wait for it.
+"""
 
 from __future__ import annotations
 
 import re
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
+
 from drivers.can.bus import frame as frames
-from rig.errors import InputError
+from rig.base.errors import InputError
 
 if TYPE_CHECKING:
     import can
@@ -16,6 +21,25 @@ _FASTEST_NOMINAL_BIT_S = 1_000_000
 _FASTEST_DATA_BIT_S = 12_000_000
 _RATE = re.compile(r"\s*([0-9]+(?:\.[0-9]+)?)\s*([kKM]?)\s*(?:bit/s)?\s*")
 _FORM = 'as "500k", "1M", or "1M/5M" for CAN FD'
+
+
+class Encoded(NamedTuple):
+    """A frame as it is on the bus when it is acknowledged, from start of frame to the end of the intermission.
+
+    Attributes:
+        bits: Levels, 0 dominant, 1 recessive, shape (bits,).
+        fast: Which are sent at the data rate, shape (bits,). The bit BRS counts as nominal, the CRC delimiter as fast:
+            each is cut at its sample point, and the two together last just that.
+        stuff: Which are stuff bits by content, shape (bits,).
+        fixed: Which are fixed stuff bits of CAN FD, shape (bits,).
+        crc: CRC sequence, of 15, 17 or 21 bits.
+    """
+
+    bits: np.ndarray
+    fast: np.ndarray
+    stuff: np.ndarray
+    fixed: np.ndarray
+    crc: int
 
 
 class Speed(NamedTuple):
@@ -49,7 +73,7 @@ class Speed(NamedTuple):
 
     def duration(self, frame: frames.Frame) -> float:
         """Time that a frame takes on the bus, with its intermission [s]."""
-        return self.duration_ns(*frames.frame_bits(frame)) * 1e-9
+        return self.duration_ns(*frame_bits(frame)) * 1e-9
 
     def __str__(self) -> str:
         """The text that `speed` reads."""
@@ -105,3 +129,21 @@ def _text(rate: float) -> str:
         if rate >= size:
             return f"{rate / size:g}{letter}"
     return f"{rate:g}"
+
+
+def encode(frame: frames.Frame) -> Encoded:
+    """All bits of a frame on the bus."""
+    from drivers.can.bus import kernels
+
+    work = np.zeros((3, kernels.LONGEST), np.uint8)
+    count, crc = kernels.encode(frames.records([frame])[0], work)
+    bits, kinds = work[:2, :count]
+    return Encoded(bits, kinds & kernels.FAST != 0, kinds & kernels.STUFF != 0, kinds & kernels.FIXED != 0, int(crc))
+
+
+def frame_bits(frame: frames.Frame) -> tuple[int, int]:
+    """Bits of a frame on the bus, with stuffing and intermission: at the nominal rate, and at the data rate."""
+    from drivers.can.bus import kernels
+
+    row, work = frames.records([frame])[0], np.empty((3, kernels.LONGEST), np.uint8)
+    return kernels.count_bits(int(row["identifier"]), int(row["length"]), int(row["flags"]), row["data"], work)

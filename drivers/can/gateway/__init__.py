@@ -25,13 +25,13 @@ from drivers.can.gateway.outbox import Outbox
 from drivers.can.gateway.samples import sample_frames, steps
 from drivers.can.schedule import SLOT_S, Schedule
 from drivers.can.signals import EventKind, State
-from drivers.health import Guard, Rising
-from rig import wire
-from rig.channels import ChannelTable
-from rig.closing import Closing
-from rig.intake import block_end_in
-from rig.outside import DOCUMENT_BYTES, Outside, check, input_error
-from rig.transport import Client
+from rig.base import wire
+from rig.base.closing import Closing
+from rig.base.outside import DOCUMENT_BYTES, Outside, check, input_error
+from rig.channels.table import ChannelTable
+from rig.serve.health import Guard, Rising
+from rig.serve.intake import block_end_in
+from rig.serve.transport import Client
 
 if TYPE_CHECKING:
     import can

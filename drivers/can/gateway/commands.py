@@ -15,11 +15,11 @@ import pydantic
 from drivers.can.devices import Said
 from drivers.can.message import MessageTable
 from drivers.can.signals import FIELDS, LIMITS, Command, Field, Kind, Result, default_messages, parse_command
-from drivers.health import Guard
-from rig import wire
-from rig.outside import DOCUMENT_BYTES, Outside, check
-from rig.transport import Client, NoReplyError
-from rig.transport.limit import Bucket
+from rig.base import wire
+from rig.base.outside import DOCUMENT_BYTES, Outside, check
+from rig.serve.health import Guard
+from rig.serve.transport import Client, NoReplyError
+from rig.serve.transport.limit import Bucket
 
 if TYPE_CHECKING:
     import can

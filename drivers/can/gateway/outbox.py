@@ -15,7 +15,7 @@ from drivers.can.bus.frame import FD_WIDTH, RECORDS, joined
 from drivers.can.gateway.samples import records_of
 from drivers.can.message import Message
 from drivers.can.schedule import SLOT_S
-from rig import wire
+from rig.base import wire
 
 if TYPE_CHECKING:
     import can

@@ -8,9 +8,9 @@ from drivers.can.bus.frame import BRS, FD, FD_WIDTH, RECORDS, octets
 from drivers.can.message import ABSENT, Message
 from drivers.can.schedule import Schedule
 from drivers.can.signals import unlike
-from rig import wire
-from rig.channels import ChannelTable
-from rig.errors import InputError
+from rig.base import wire
+from rig.base.errors import InputError
+from rig.channels.table import ChannelTable
 
 _MOST_KEPT = 50_000
 """Picked samples of a group that wait for those of another: 5 s at the usual rate."""

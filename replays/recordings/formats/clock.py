@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rig.errors import InputError, Words
+from rig.base.errors import InputError, Words
 
 EVEN = 0.05
 """Part of a sample within which time stamps must lie on their straight line to be even."""

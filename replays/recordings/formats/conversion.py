@@ -13,15 +13,16 @@ from typing import Any
 
 import numpy as np
 
-from replays.recordings.formats import clock, events
+from replays.recordings.formats import clock
+from replays.recordings.formats.events import events
+from replays.recordings.formats.events.motion import Motion
+from replays.recordings.formats.events.pulses import HammerPulse, find_pulses
 from replays.recordings.formats.group import ImportedChannel, PlacedGroup, nominal_hz, place, quantise, rotate
 from replays.recordings.formats.mapped import Log, MappedSignal, check_rows, engineering
 from replays.recordings.formats.mapping import Mapping
-from replays.recordings.formats.motion import Motion
-from replays.recordings.formats.pulses import HammerPulse, find_pulses
-from rig import wire
-from rig.channels import ChannelTable, default_table
-from rig.errors import InputError
+from rig.base import wire
+from rig.base.errors import InputError
+from rig.channels.table import ChannelTable, default_table
 
 TICK_RATE_HZ = 1_000_000
 _BLOCK_S = 0.05

@@ -10,14 +10,15 @@ from typing import Any
 
 import numpy as np
 
-from replays.recordings.formats import clock, noise
+from replays.recordings.formats import clock
+from replays.recordings.formats.exporting.selection import NO_VOLTS
+from replays.recordings.formats.guessing import noise
 from replays.recordings.formats.mapped import BITS, MappedSignal
 from replays.recordings.formats.mapping import Mapping
-from replays.recordings.formats.selection import NO_VOLTS
-from rig import units
-from rig.channels import VERSION, Channel, ChannelTable, Group, default_table
-from rig.errors import InputError, Words
-from rig.outside import check
+from rig.base import units
+from rig.base.errors import InputError, Words
+from rig.base.outside import check
+from rig.channels.table import VERSION, Channel, ChannelTable, Group, default_table
 
 _MOST_TIMES, _MOST_ROWS = 1000, 1_000_000
 """So many times the values that a file has, and so many rows more, samples may become at another rate."""

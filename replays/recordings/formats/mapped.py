@@ -13,10 +13,10 @@ import numpy as np
 from replays.recordings.formats import clock
 from replays.recordings.formats.mapping import ChannelMapping, Mapping, SignalName
 from replays.recordings.formats.source import Entry, FileSignal, Source, even_rate_hz, open_source
-from rig import units
-from rig.channels import Channel, default_table
-from rig.errors import InputError, UnknownNameError, Words
-from rig.text import nearest
+from rig.base import units
+from rig.base.errors import InputError, UnknownNameError, Words
+from rig.base.text import nearest
+from rig.channels.table import Channel, default_table
 
 BITS = 32
 """Of the counts of an imported channel."""

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rig.errors import InputError, RefusedError, Words
-from rig.outside import DOCUMENT_BYTES, open_file, read_json, unreadable
+from rig.base.errors import InputError, RefusedError, Words
+from rig.base.outside import DOCUMENT_BYTES, open_file, read_json, unreadable
 
 if TYPE_CHECKING:
     from replays.recordings.formats.mapping import FileOptions
@@ -139,7 +139,7 @@ def open_source(path: Path, options: FileOptions) -> Source:
     if name != "delimited":
         options.only_for_text(path)
     what = FORMATS[name][0]
-    module = importlib.import_module(f"replays.recordings.formats.{name}")
+    module = importlib.import_module(f"replays.recordings.formats.readers.{name}")
     with _parsing(path, what):
         source: Source = module.look_into(path, options)
     if not source.entries:

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from replays.recordings.prediction import Measured
-from replays.recordings.sensitivity import Predictor
-from rig.errors import InputError, SimulationError
+from replays.recordings.resimulation.prediction import Measured
+from replays.recordings.resimulation.sensitivity import Predictor
+from rig.base.errors import InputError, SimulationError
 
 BEYOND = 5.0
 """A value that many standard deviations from what is known of it is a finding, and no fit goes further."""

@@ -9,8 +9,8 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from replays.recordings.identification.fit import Identification
-from rig.errors import check_new_file, whole_file
-from rig.parameters import DEFAULT_SET, Parameter, load_parameters, set_names
+from rig.base.errors import check_new_file, whole_file
+from rig.physics.parameters import DEFAULT_SET, Parameter, load_parameters, set_names
 
 
 def fitted_set(found: Identification, *, recording: str) -> str:

@@ -12,7 +12,7 @@ from replays.recordings.identification.horizon import Horizon, horizon
 from replays.recordings.identification.judgement import Judgement, blind_directions, judge, triangle_of
 from replays.recordings.identification.question import Question
 from replays.recordings.identification.window import Window
-from rig.errors import InputError
+from rig.base.errors import InputError
 
 PRECISION = 1e-4
 """Half of a 95 % interval, as a part of a value's scale, that is fine enough to look no further ahead."""

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from replays.recordings.identification.window import Window
-from rig.errors import InputError, SimulationError
+from rig.base.errors import InputError, SimulationError
 
 BENT = 0.1
 """A response is no longer linear where its bend is above this part of it ..."""

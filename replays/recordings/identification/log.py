@@ -14,14 +14,14 @@ from dataclasses import replace
 import numpy as np
 
 from recorder.reader import Recording
-from replays.recordings.experiment import Experiment
 from replays.recordings.identification.agreement import stretches, without_each
 from replays.recordings.identification.fit import Identification
 from replays.recordings.identification.judgement import Judgement, judge, widened
 from replays.recordings.identification.nuisance import NUISANCES, looks_from, nuisances_of, tune
 from replays.recordings.identification.question import Question, ask, first_command_s
 from replays.recordings.identification.window import Window
-from replays.recordings.prediction import Measured
+from replays.recordings.resimulation.experiment import Experiment
+from replays.recordings.resimulation.prediction import Measured
 
 
 def identify_log(

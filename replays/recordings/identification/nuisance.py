@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 
 from recorder.reader import Recording
-from replays.recordings.experiment import BEFORE_S, Experiment
 from replays.recordings.identification.agreement import (
     BEYOND,
     Here,
@@ -29,10 +28,18 @@ from replays.recordings.identification.agreement import (
     signals_of,
 )
 from replays.recordings.identification.question import first_command_s, observe
-from replays.recordings.prediction import Measured, Prediction
-from replays.recordings.sensitivity import ANGLE, STATE, Predictor, on_the_models_clock, value_of, with_values
-from rig.errors import InputError, Words
-from rig.simulation import TICK_RATE_HZ
+from replays.recordings.resimulation.experiment import BEFORE_S, Experiment
+from replays.recordings.resimulation.prediction import Measured, Prediction
+from replays.recordings.resimulation.sensitivity import (
+    ANGLE,
+    STATE,
+    Predictor,
+    on_the_models_clock,
+    value_of,
+    with_values,
+)
+from rig.base.errors import InputError, Words
+from rig.run.simulation import TICK_RATE_HZ
 
 NUISANCES = (
     "clock.offset_s",

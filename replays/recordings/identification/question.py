@@ -10,17 +10,17 @@ from typing import Literal
 import numpy as np
 
 from recorder.reader import Recording
-from replays.recordings.experiment import Experiment
-from replays.recordings.prediction import Measured, measured
-from replays.recordings.sensitivity import ANGLE, CLOCK, STATE, scale_of, value_of, with_values
-from rig.channels import Channel
-from rig.commands import COMMANDS, HAMMER_BOUNDS, HammerCommand
-from rig.errors import InputError
-from rig.parameters import load_parameters
-from rig.scenes import Scene
-from rig.simulation import TICK_RATE_HZ
-from rig.text import nearest
-from rig.wire import sensor_key
+from replays.recordings.resimulation.experiment import Experiment
+from replays.recordings.resimulation.prediction import Measured, measured
+from replays.recordings.resimulation.sensitivity import ANGLE, CLOCK, STATE, scale_of, value_of, with_values
+from rig.base.errors import InputError
+from rig.base.text import nearest
+from rig.base.wire import sensor_key
+from rig.channels.table import Channel
+from rig.physics.parameters import load_parameters
+from rig.run.commands import COMMANDS, HAMMER_BOUNDS, HammerCommand
+from rig.run.scenes import Scene
+from rig.run.simulation import TICK_RATE_HZ
 
 NOT_FITTED = ("keyphasor",)
 """Pulses say where an edge is, which a difference of samples does not."""

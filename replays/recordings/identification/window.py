@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from replays.recordings.identification.question import Question
-from replays.recordings.sensitivity import Predictor
-from rig.errors import InputError, SimulationError
+from replays.recordings.resimulation.sensitivity import Predictor
+from rig.base.errors import InputError, SimulationError
 
 _STEP_SIGMAS = 0.5
 _LEAST_VARIANCE = 1e-20

@@ -12,9 +12,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from recorder.reader import Recording
-from rig.channels import ChannelTable
-from rig.simulation import TICK_RATE_HZ, Frame
-from rig.wire import EDGES, Block, encode_block, schema_of, sensor_key, truth_key
+from rig.base.wire import EDGES, Block, encode_block, schema_of, sensor_key, truth_key
+from rig.channels.table import ChannelTable
+from rig.run.simulation import TICK_RATE_HZ, Frame
 
 _MOST = 400_000
 """So many rows that differ are looked at."""

@@ -10,28 +10,34 @@ from typing import Any
 
 import numpy as np
 
-from recorder.agreement import calibration_off
+from recorder.contents.agreement import calibration_off
 from recorder.reader import Recording
-from replays.recordings.experiment import Experiment, is_imported
 from replays.recordings.identification.nuisance import Tuned, looks_from, tune
 from replays.recordings.identification.question import first_command_s
 from replays.recordings.parameters import parameter_doubts
-from replays.recordings.prediction import Measured, Prediction, bare, measured, predict
-from replays.recordings.sensitivity import with_values
-from replays.recordings.validation.attribution import FEW_CHANNELS, Explained, attribute, explain_log, own_explained
+from replays.recordings.resimulation.experiment import Experiment, is_imported
+from replays.recordings.resimulation.prediction import Measured, Prediction, bare, measured, predict
+from replays.recordings.resimulation.sensitivity import with_values
 from replays.recordings.validation.bits import Bits, StreamBits, missing_rows
 from replays.recordings.validation.criteria import Criteria, load_criteria
-from replays.recordings.validation.explanation import Explanation
-from replays.recordings.validation.faults import late_together
-from replays.recordings.validation.numbers import changes_of
+from replays.recordings.validation.explanations.attribution import (
+    FEW_CHANNELS,
+    Explained,
+    attribute,
+    explain_log,
+    own_explained,
+)
+from replays.recordings.validation.explanations.explanation import Explanation
+from replays.recordings.validation.explanations.faults import late_together
+from replays.recordings.validation.explanations.numbers import changes_of
+from replays.recordings.validation.explanations.own import as_faults, own_faults
+from replays.recordings.validation.explanations.signals import SignalFault, edge_faults, signal_faults
 from replays.recordings.validation.outcome import Validation
-from replays.recordings.validation.own import as_faults, own_faults
 from replays.recordings.validation.phases import CONTACT, PHASES, Phase
-from replays.recordings.validation.signals import SignalFault, edge_faults, signal_faults
 from replays.recordings.validation.statistics import perturbed, statistics
 from replays.recordings.validation.trajectory import foreseeable_s, residuals
 from replays.recordings.validation.truth import judge_truth, recorded_truth
-from rig.wire import TRUTH
+from rig.base.wire import TRUTH
 
 _MOST_HELD = 3
 """Of numbers of the model that are named, so many are held against the phases."""

@@ -10,73 +10,19 @@ from typing import Any
 import numpy as np
 
 from replays.recordings.identification.nuisance import Fitted
-from replays.recordings.prediction import Measured, Prediction
-from replays.recordings.validation.attribution import Explained
+from replays.recordings.resimulation.prediction import Measured, Prediction
 from replays.recordings.validation.bits import StreamBits
-from replays.recordings.validation.phases import SPECTRA, Phase
-from replays.recordings.validation.signals import SignalFault
+from replays.recordings.validation.explanations.attribution import Explained
+from replays.recordings.validation.explanations.signals import SignalFault
+from replays.recordings.validation.phases import Phase
+from replays.recordings.validation.statistics import StatisticResult
 from replays.recordings.validation.trajectory import ChannelResidual
-from rig.outcome import Outcome
-from rig.wire import TRUTH as TRUTH_KEY
+from replays.recordings.validation.truth import TruthResult
+from rig.base.outcome import Outcome
+from rig.base.wire import TRUTH as TRUTH_KEY
 
 _MIN_JUDGED = 0.99
 """Part of a recording's rows that must have been compared for a pass."""
-
-
-@dataclass(frozen=True)
-class StatisticResult:
-    """One quantity of one phase.
-
-    Attributes:
-        number: Place of the phase among the phases found.
-        phase: The phase's name.
-        quantity: The quantity's name.
-        unit: Its unit.
-        recorded: Read off the recording.
-        foretold: Median over the ensemble.
-        spread: Standard deviation over the ensemble.
-        limit: Largest difference allowed; None where there is no criterion.
-        reason: The criterion's.
-    """
-
-    number: int
-    phase: str
-    quantity: str
-    unit: str
-    recorded: float
-    foretold: float
-    spread: float
-    limit: float | None
-    reason: str
-
-    @property
-    def title(self) -> str:
-        """The quantity with its unit."""
-        return f"{self.quantity} [{self.unit}]" if self.unit else self.quantity
-
-    @property
-    def good(self) -> bool | None:
-        """Within the criterion; None where there is none."""
-        if self.limit is None:
-            return None
-        off = self.recorded - self.foretold
-        # Spectra cannot be too much alike.
-        return bool((off if self.quantity in SPECTRA else abs(off)) <= self.limit)
-
-
-@dataclass(frozen=True)
-class TruthResult:
-    """One truth table inside the window: largest difference as a part of each column's largest value."""
-
-    table: str
-    column: str
-    relative: float
-    limit: float
-
-    @property
-    def good(self) -> bool:
-        """Within the criterion."""
-        return self.relative <= self.limit
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from replays.recordings.prediction import Measured
-from rig.orbit import phase as phase_of
-from rig.orbit import whirl_frequency
+from replays.recordings.resimulation.prediction import Measured
+from rig.channels.orbit import phase as phase_of
+from rig.channels.orbit import whirl_frequency
 
 PHASES = ("free run", "impacts", "whirl", "rest", "decay")
 """Before the first contact; contact that comes and goes; lasting contact that goes round, or does not; after it."""

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from replays.recordings.prediction import Measured
+from replays.recordings.resimulation.prediction import Measured
 from replays.recordings.validation.outcome import Validation
 from replays.recordings.validation.phases import PHASES
 from replays.report import OUTCOME_MARKS, Mark, Report, Row
 from replays.report.canvas import BLUE, ORANGE, RED, draw_signals, house_style, label_of, legend_below, new_figure
-from rig.orbit import full_spectrum
+from rig.channels.orbit import full_spectrum
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
-from replays.recordings.experiment import Experiment
-from replays.recordings.prediction import Measured, Prediction, predict
-from replays.recordings.sensitivity import value_of, with_values
+from replays.recordings.resimulation.experiment import Experiment
+from replays.recordings.resimulation.prediction import Measured, Prediction, predict
+from replays.recordings.resimulation.sensitivity import value_of, with_values
 from replays.recordings.validation.criteria import Criteria
-from replays.recordings.validation.outcome import StatisticResult
 from replays.recordings.validation.phases import (
     QUANTITIES,
     SPECTRA,
@@ -23,12 +23,53 @@ from replays.recordings.validation.phases import (
     view_of,
 )
 from replays.recordings.validation.truth import TruthTables, energy_change
-from rig.kernels.signals import COLUMN
-from rig.model import build_model
-from rig.motion import DISSIPATED
+from rig.physics.kernels.signals import COLUMN
+from rig.physics.model import build_model
+from rig.run.motion import DISSIPATED
 
 _ENERGIES = {"dissipated": DISSIPATED, "drive_work": ("drive_work",)}
 """Columns of the truth that sum up to a quantity."""
+
+
+@dataclass(frozen=True)
+class StatisticResult:
+    """One quantity of one phase.
+
+    Attributes:
+        number: Place of the phase among the phases found.
+        phase: The phase's name.
+        quantity: The quantity's name.
+        unit: Its unit.
+        recorded: Read off the recording.
+        foretold: Median over the ensemble.
+        spread: Standard deviation over the ensemble.
+        limit: Largest difference allowed; None where there is no criterion.
+        reason: The criterion's.
+    """
+
+    number: int
+    phase: str
+    quantity: str
+    unit: str
+    recorded: float
+    foretold: float
+    spread: float
+    limit: float | None
+    reason: str
+
+    @property
+    def title(self) -> str:
+        """The quantity with its unit."""
+        return f"{self.quantity} [{self.unit}]" if self.unit else self.quantity
+
+    @property
+    def good(self) -> bool | None:
+        """Within the criterion; None where there is none."""
+        if self.limit is None:
+            return None
+        off = self.recorded - self.foretold
+        # Spectra cannot be too much alike.
+        return bool((off if self.quantity in SPECTRA else abs(off)) <= self.limit)
 
 
 def perturbed(experiment: Experiment, keys: tuple[str, ...], part: float) -> Experiment:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from replays.recordings.prediction import Measured, Prediction
+from replays.recordings.resimulation.prediction import Measured, Prediction
 from replays.recordings.validation.criteria import Criteria, TrajectoryCriterion
 
 STRETCH = 128

@@ -2,20 +2,36 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from recorder.reader import Recording
-from replays.recordings.prediction import Prediction
+from replays.recordings.resimulation.prediction import Prediction
 from replays.recordings.validation.criteria import Criteria
-from replays.recordings.validation.outcome import TruthResult
 from replays.recordings.validation.phases import Phase
-from rig.kernels.signals import TRUTH
+from rig.physics.kernels.signals import TRUTH
 
 _CENTRE = 0.99
 """Contact truth is compared where the gap is below this part of the clearance."""
 
 TruthTables = dict[str, tuple[np.ndarray, np.ndarray]]
 """Row numbers, shape (n,), and values [SI], shape (n, columns), by the table's name."""
+
+
+@dataclass(frozen=True)
+class TruthResult:
+    """One truth table inside the window: largest difference as a part of each column's largest value."""
+
+    table: str
+    column: str
+    relative: float
+    limit: float
+
+    @property
+    def good(self) -> bool:
+        """Within the criterion."""
+        return self.relative <= self.limit
 
 
 def recorded_truth(recording: Recording, *, longest_s: float) -> TruthTables:

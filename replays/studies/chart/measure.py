@@ -11,16 +11,16 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from replays.studies.chart.methods import Competitor
+from replays.studies.common.run import Course
 from replays.studies.peers import PEERS, Setting
-from replays.studies.peers.problem import Problem, scaled_error
-from replays.studies.peers.reference import Reference
-from replays.studies.peers.solution import MISSED_HAMMER, Solution
-from replays.studies.run import Course
-from rig.engines.memory import CONTACTS, EVALUATIONS, STEPS
-from rig.kernels.contact import normal_force
-from rig.kernels.geometry import gap
-from rig.kernels.signals import N_ROW, N_STATE
-from rig.motion import energy_balance
+from replays.studies.peers.common.problem import Problem, scaled_error
+from replays.studies.peers.common.reference import Reference
+from replays.studies.peers.common.solution import MISSED_HAMMER, Solution
+from rig.physics.engines.common.memory import CONTACTS, EVALUATIONS, STEPS
+from rig.physics.kernels.frames.geometry import gap
+from rig.physics.kernels.laws.contact import normal_force
+from rig.physics.kernels.signals import N_ROW, N_STATE
+from rig.run.motion import energy_balance
 
 OFF = 0.5
 """Scaled error from which a run is on another branch: as far from the reference as the motion is large."""

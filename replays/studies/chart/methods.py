@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from replays.studies.engines import settings as engine_settings
+from replays.studies.common.engines import settings as engine_settings
 from replays.studies.peers import PEERS, Setting
-from rig.engines import ENGINES
+from rig.physics.engines import ENGINES
 
 OURS = "rig"
 """Family of our own engines."""

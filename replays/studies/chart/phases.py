@@ -6,12 +6,12 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from replays.studies.chart.methods import Competitor
+from replays.studies.common.twelve_scenes import TWELVE_SCENES
 from replays.studies.peers import Setting
-from replays.studies.peers.problem import Problem
-from replays.studies.peers.window import cut_window
-from replays.studies.twelve_scenes import TWELVE_SCENES
-from rig.errors import InputError
-from rig.scenes import load_scene, parse_scene
+from replays.studies.peers.common.problem import Problem
+from replays.studies.peers.common.window import cut_window
+from rig.base.errors import InputError
+from rig.run.scenes import load_scene, parse_scene
 
 Mode = Literal["quick", "full"]
 FRAME_S = 1e-3

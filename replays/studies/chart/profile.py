@@ -14,10 +14,10 @@ import numpy as np
 from replays.studies.chart.measure import Budget, point
 from replays.studies.chart.methods import Competitor
 from replays.studies.chart.phases import FRAME_S
-from replays.studies.peers.problem import Problem
-from replays.studies.peers.reference import Reference
-from replays.studies.peers.window import cut_window
-from rig.scenes import Scene, parse_scene
+from replays.studies.peers.common.problem import Problem
+from replays.studies.peers.common.reference import Reference
+from replays.studies.peers.common.window import cut_window
+from rig.run.scenes import Scene, parse_scene
 
 TARGET = 1e-3
 """Scaled error to be reached."""

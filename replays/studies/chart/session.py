@@ -29,11 +29,11 @@ from replays.studies.chart.phases import (
 )
 from replays.studies.chart.store import Row, Store, read_table
 from replays.studies.chart.submission import PANEL, read_submission
+from replays.studies.common.twelve_scenes import TWELVE_SCENES
 from replays.studies.peers import PEERS, Setting
-from replays.studies.peers.problem import Problem, scaled_error
-from replays.studies.peers.reference import Reference, find_reference
-from replays.studies.twelve_scenes import TWELVE_SCENES
-from rig.errors import InputError, SimulationError
+from replays.studies.peers.common.problem import Problem, scaled_error
+from replays.studies.peers.common.reference import Reference, find_reference
+from rig.base.errors import InputError, SimulationError
 
 TOTAL_S = {"quick": 95.0, "full": 3300.0}
 """Wall time for all points, compile time apart [s]; what does not fit is left to the next run."""
@@ -114,7 +114,7 @@ def make_chart(
     rows = store.rows(mode)
     outcome.failures = sum(bool(row["failure"]) for row in rows)
     if rows:
-        from replays.studies.chart.figure import draw
+        from replays.studies.chart.drawing.figure import draw
 
         note = ""
         if not peers:
@@ -133,7 +133,7 @@ def draw_again(folder: Path, *, only: str | None = None, panels: list[str] | Non
     Raises:
         InputError: Wrong choice, or no such table in the folder.
     """
-    from replays.studies.chart.figure import draw
+    from replays.studies.chart.drawing.figure import draw
 
     chosen, _ = select(only, panels)
     rows = read_table(folder)
@@ -155,7 +155,7 @@ def add_solvers(folder: Path, paths: list[Path], *, progress: Progress | None = 
         InputError: A wrong file, or a chart that other code has measured.
         SimulationError: No two codes solved the problem, so there is no reference.
     """
-    from replays.studies.chart.figure import draw
+    from replays.studies.chart.drawing.figure import draw
 
     progress = progress or Progress()
     added = [read_submission(path) for path in paths]

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import rig
-from replays.studies import provenance
-from replays.studies.journal import Journal
-from rig.errors import InputError
+from replays.studies.common import provenance
+from replays.studies.common.journal import Journal
+from rig.base.errors import InputError
 
 KEY = ("mode", "panel", "phase", "case", "method", "rung")
 """Columns that tell one point from another."""
@@ -121,9 +121,9 @@ def read_table(folder: Path) -> list[Row]:
 def code_digest() -> str:
     """Digest of the engines, kernels and peers' drivers that a chart measures, and of how it does."""
     here, simulator = Path(__file__).parent, Path(str(rig.__file__)).parent
-    folders = (simulator / "engines", simulator / "kernels", here.parent / "peers")
+    folders = (simulator / "physics" / "engines", simulator / "physics" / "kernels", here.parent / "peers")
     sources = [path for folder in folders for path in folder.rglob("*.py")]
-    scenes = here.parent / "twelve_scenes.py"
+    scenes = here.parent / "common" / "twelve_scenes.py"
     return provenance.digest([*sources, scenes, *(here / name for name in _MEASURING)])
 
 

@@ -17,15 +17,15 @@ import numpy as np
 from replays.studies.chart.measure import Budget, point
 from replays.studies.chart.methods import ADDED, Competitor
 from replays.studies.chart.phases import PHASES, RUB, problem_of
-from replays.studies.journal import prepare_folder
+from replays.studies.common.journal import prepare_folder
 from replays.studies.peers import PEERS, Library, Peer, Setting
-from replays.studies.peers.problem import ERROR_COLUMNS, Problem
-from replays.studies.peers.reference import Reference
-from replays.studies.peers.solution import Solution
-from rig.engines import ENGINES
-from rig.errors import InputError, UnknownNameError, Words, whole_file
-from rig.kernels.signals import STATE
-from rig.outside import open_file, unreadable
+from replays.studies.peers.common.problem import ERROR_COLUMNS, Problem
+from replays.studies.peers.common.reference import Reference
+from replays.studies.peers.common.solution import Solution
+from rig.base.errors import InputError, UnknownNameError, Words, whole_file
+from rig.base.outside import open_file, unreadable
+from rig.physics.engines import ENGINES
+from rig.physics.kernels.signals import STATE
 
 PANEL = "exact"
 """Panel of the problems: total error against exact Coulomb friction."""
@@ -42,7 +42,7 @@ _LARGEST = 1e9
 _LABEL = re.compile(r"[A-Za-z0-9][ -#%-~]{0,39}")
 """A name that fits into a legend; between dollar signs, matplotlib would read a formula."""
 _UNIT = re.compile(r"^    (\w+): \w+  # .*?\[(.+?)\]", re.MULTILINE)
-"""Name and unit of a field of `rig.kernels.constants`, whose comments hold the unit in brackets."""
+"""Name and unit of a field of `rig.physics.kernels.constants`, whose comments hold the unit in brackets."""
 
 
 def write_problem(phase: str, folder: Path) -> Path:

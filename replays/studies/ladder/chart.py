@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from replays.report.canvas import BLACK, house_style, new_figure, save
-from replays.studies.engines import traits
+from replays.studies.common.engines import traits
 from replays.studies.ladder.document import python_line
 from replays.studies.ladder.quantity import QUANTITIES
 from replays.studies.ladder.search import Ladder, Step

@@ -6,12 +6,12 @@ import math
 import platform
 from typing import Any
 
-from replays.studies import provenance
+from replays.studies.common import provenance
 from replays.studies.ladder.measurement import Measurement
 from replays.studies.ladder.quantity import QUANTITIES, Value
 from replays.studies.ladder.search import Errors, Ladder
-from rig.pick import Pick, PickedQuantity
-from rig.scenes import pick_digests
+from rig.run.pick import Pick, PickedQuantity
+from rig.run.scenes import pick_digests
 
 _PACKAGES = ("numba", "numpy", "scipy")
 

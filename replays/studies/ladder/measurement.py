@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 
+from replays.studies.common.run import Timed, bare_sensors, run_scene
 from replays.studies.ladder.quantity import QUANTITIES, Ending, Trace, Value, ending, slides
-from replays.studies.run import Timed, bare_sensors, run_scene
-from rig.engines import ENGINES
-from rig.errors import InputError, SimulationError
-from rig.kernels.signals import COLUMN
-from rig.levels import ModelLevels
-from rig.scenes import Scene, parse_scene
-from rig.simulation import Simulation
+from rig.base.errors import InputError, SimulationError
+from rig.physics.engines import ENGINES
+from rig.physics.kernels.signals import COLUMN
+from rig.physics.levels import ModelLevels
+from rig.run.scenes import Scene, parse_scene
+from rig.run.simulation import Simulation
 
 GRID_TICKS = 1_000
 """Quantities are read every 1 ms."""

@@ -7,9 +7,9 @@ import re
 import tomllib
 from pathlib import Path
 
-from rig.errors import InputError, Words
-from rig.pick import Pick
-from rig.scenes import Scene, load_scene, pick_digests, scene_path
+from rig.base.errors import InputError, Words
+from rig.run.pick import Pick
+from rig.run.scenes import Scene, load_scene, pick_digests, scene_path
 
 _HEADER = re.compile(r"^\s*\[{1,2}\s*(?P<name>[^\]\[]+?)\s*\]{1,2}\s*(#.*)?$")
 _COMMENT = '# Written by `rig ladder`: what it measured. In force where the scene says fidelity = "auto".'

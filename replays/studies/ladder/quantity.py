@@ -9,10 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rig.errors import InputError
-from rig.kernels.signals import COLUMN
-from rig.motion import DISSIPATED
-from rig.orbit import phase, whirl_frequency
+from rig.base.errors import InputError
+from rig.channels.orbit import phase, whirl_frequency
+from rig.physics.kernels.signals import COLUMN
+from rig.run.motion import DISSIPATED
 
 SETTLED = 0.25
 """The settled phase is this last part of a run."""

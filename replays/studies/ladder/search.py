@@ -17,10 +17,10 @@ from typing import Any, NamedTuple, get_args
 from replays.studies.ladder import settings
 from replays.studies.ladder.measurement import Candidate, Measurement, check_reads, measure, saving
 from replays.studies.ladder.quantity import QUANTITIES, Value
-from rig.engines import ENGINES
-from rig.errors import InputError
-from rig.levels import ModelLevels
-from rig.scenes import Scene
+from rig.base.errors import InputError
+from rig.physics.engines import ENGINES
+from rig.physics.levels import ModelLevels
+from rig.run.scenes import Scene
 
 LEVELS: dict[str, tuple[str, ...]] = {
     **{name: get_args(entry.annotation) for name, entry in ModelLevels.model_fields.items()},

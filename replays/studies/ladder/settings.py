@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from replays.studies.ladder.measurement import Candidate
-from rig.engines import ENGINES
-from rig.errors import InputError
-from rig.scenes import Scene
+from rig.base.errors import InputError
+from rig.physics.engines import ENGINES
+from rig.run.scenes import Scene
 
 REFERENCE = ("rk8", 25, 1e-10)
 UNLIKE = "split"

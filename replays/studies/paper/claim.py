@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from replays.report.canvas import BLACK, BLUE, GREEN, ORANGE, RED, SKY, house_style, legend_below, new_figure
-from replays.studies.paper.pulse import BANDWIDTH, MEASURED_N, Outcome, Pulse
-from replays.studies.paper.spread import column, free_values, one_at_a_time, phases, rank_correlation
-from rig.parameters import load_parameters
+from replays.studies.paper.scans.pulse import BANDWIDTH, MEASURED_N, Outcome, Pulse
+from replays.studies.paper.scans.spread import column, free_values, one_at_a_time, phases, rank_correlation
+from rig.physics.parameters import load_parameters
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -17,8 +17,7 @@ import numpy as np
 
 from replays.report import Report, Row
 from replays.report.canvas import save
-from replays.studies.paper import condition, figure, question
-from replays.studies.paper.chart import draw_conditions, draw_law, draw_verdicts
+from replays.studies.paper import question
 from replays.studies.paper.claim import (
     BANDWIDTHS_HZ,
     LAWS,
@@ -30,12 +29,22 @@ from replays.studies.paper.claim import (
     median,
     toward_measured,
 )
+from replays.studies.paper.figures import figure
+from replays.studies.paper.figures.chart import draw_conditions, draw_law, draw_verdicts
+from replays.studies.paper.figures.table import IDLE_N, TABLES, Content, idle_changes, summary
 from replays.studies.paper.findings import JUDGED_BY, Findings
-from replays.studies.paper.pulse import MEASURED_N
-from replays.studies.paper.spread import assumed_values, column, free_values, percentiles, present, rank_correlation
+from replays.studies.paper.scans import condition
+from replays.studies.paper.scans.pulse import MEASURED_N
+from replays.studies.paper.scans.spread import (
+    assumed_values,
+    column,
+    free_values,
+    percentiles,
+    present,
+    rank_correlation,
+)
 from replays.studies.paper.statement import number
-from replays.studies.paper.table import IDLE_N, TABLES, Content, idle_changes, summary
-from rig.parameters import load_parameters
+from rig.physics.parameters import load_parameters
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -14,18 +14,18 @@ from itertools import pairwise
 import numpy as np
 
 from replays.report import Mark, Row
-from replays.studies.paper import condition
 from replays.studies.paper.claim import ENDS, LAWS, Groups, Results, claim_groups, less_mobile, median
-from replays.studies.paper.condition import Slip, Start, Threshold
-from replays.studies.paper.pulse import HAMMER_MS, Outcome, Pulse, outcomes, pulse_model
 from replays.studies.paper.question import question_groups
 from replays.studies.paper.reproduction import SPEEDS_HZ, Reproduction, drop_spread, pulse_spread, reproduce
-from replays.studies.paper.spread import column, hypercube, phases
+from replays.studies.paper.scans import condition
+from replays.studies.paper.scans.condition import Slip, Start, Threshold
+from replays.studies.paper.scans.pulse import HAMMER_MS, Outcome, Pulse, outcomes, pulse_model
+from replays.studies.paper.scans.spread import column, hypercube, phases
 from replays.studies.paper.statement import SETS, Statement, claims, distribution, statements
-from rig.kernels.constants import Constants
-from rig.levels import ModelLevels
-from rig.model import build_model
-from rig.parameters import load_parameters
+from rig.physics.kernels.constants import Constants
+from rig.physics.levels import ModelLevels
+from rig.physics.model import build_model
+from rig.physics.parameters import load_parameters
 
 MARKS: dict[str, Mark] = {"agrees": "good", "differs": "bad", "cannot be judged": "open"}
 """Verdicts, and how a table shows them."""

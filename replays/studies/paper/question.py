@@ -6,19 +6,19 @@ import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from replays.studies.closed_forms import Impact, impact, stiffest_mode
+from replays.studies.common.closed_forms import Impact, impact, stiffest_mode
 from replays.studies.paper.claim import Groups, Results, median
-from replays.studies.paper.condition import oscillator
-from replays.studies.paper.pulse import Pulse
 from replays.studies.paper.reproduction import G, Reproduction, bare_drop, drop_impact, drop_impulse
-from replays.studies.paper.spread import free_values, phases
+from replays.studies.paper.scans.condition import oscillator
+from replays.studies.paper.scans.pulse import Pulse
+from replays.studies.paper.scans.spread import free_values, phases
 from replays.studies.paper.statement import statements
-from rig.kernels.constants import Constants
-from rig.magnets import cylinder_stiffness, field_sum_stiffness
-from rig.model import magnet_geometry, reference_impact
-from rig.offline import Run, simulate
-from rig.parameters import load_parameters
-from rig.scenes import load_scene
+from rig.physics.kernels.constants import Constants
+from rig.physics.magnets import cylinder_stiffness, field_sum_stiffness
+from rig.physics.model import magnet_geometry, reference_impact
+from rig.physics.parameters import load_parameters
+from rig.run.offline import Run, simulate
+from rig.run.scenes import load_scene
 
 PAPER_DROP_N = 100.0
 OUTER_MASSES_KG = (7.18, 8.88, 10.58)

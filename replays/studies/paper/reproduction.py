@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from replays.studies.paper.pulse import (
+from replays.studies.paper.scans.pulse import (
     BANDWIDTH,
     FORCE_N,
     MEASURED_N,
@@ -20,12 +20,12 @@ from replays.studies.paper.pulse import (
     pulse_scene,
     read,
 )
-from replays.studies.paper.spread import column, hypercube
-from rig.magnets import map_force
-from rig.offline import Run, simulate
-from rig.orbit import full_spectrum, waterfall
-from rig.parameters import load_parameters
-from rig.scenes import load_scene
+from replays.studies.paper.scans.spread import column, hypercube
+from rig.channels.orbit import full_spectrum, waterfall
+from rig.physics.magnets import map_force
+from rig.physics.parameters import load_parameters
+from rig.run.offline import Run, simulate
+from rig.run.scenes import load_scene
 
 SPEEDS_HZ = (3.2, 4.2, 5.2, 6.2)
 """Fig. 17's."""
@@ -217,7 +217,7 @@ def _whirl_numbers(run: Run) -> dict[str, float]:
 
 
 def spectra(run: Run) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Full spectra of the disk's probes over time, as `rig.orbit.waterfall` gives them [mm]."""
+    """Full spectra of the disk's probes over time, as `rig.channels.orbit.waterfall` gives them [mm]."""
     return waterfall(run.samples["disk_x"], run.samples["disk_y"], float(_RATE_HZ), run.times_s)
 
 

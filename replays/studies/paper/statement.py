@@ -11,8 +11,8 @@ from typing import Literal
 import numpy as np
 from pydantic import BaseModel
 
-from replays.studies.paper.spread import percentiles
-from rig.parameters import ParameterSet
+from replays.studies.paper.scans.spread import percentiles
+from rig.physics.parameters import ParameterSet
 
 Verdict = Literal["agrees", "differs", "cannot be judged"]
 SETS = ("as-printed", "corrected")

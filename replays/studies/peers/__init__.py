@@ -25,9 +25,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from replays.studies.peers.problem import ERROR_COLUMNS, ERROR_SCALE, Problem, scaled_error
-from replays.studies.peers.solution import PROPER, Manner, Setting, Solution
-from rig.errors import InputError, Words
+from replays.studies.peers.common.problem import ERROR_COLUMNS, ERROR_SCALE, Problem, scaled_error
+from replays.studies.peers.common.solution import PROPER, Manner, Setting, Solution
+from rig.base.errors import InputError, Words
 
 __all__ = [
     "ERROR_COLUMNS", "ERROR_SCALE", "PEERS", "Library", "Peer", "Problem", "Setting", "Solution", "scaled_error",

@@ -22,9 +22,8 @@ from typing import Any
 
 import numpy as np
 
-from replays.studies.peers.plain_python import PlainPython
-from replays.studies.peers.problem import Problem
-from replays.studies.peers.right_hand_side import (
+from replays.studies.peers.common.problem import Problem
+from replays.studies.peers.common.right_hand_side import (
     N_STATE,
     N_SWITCH,
     PARAMETERS,
@@ -35,8 +34,9 @@ from replays.studies.peers.right_hand_side import (
     take_switch,
     vector_callbacks,
 )
-from replays.studies.peers.solution import MISSED_HAMMER, PROPER, SWITCH_CEILING, Manner, Setting, Solution
-from rig.kernels.signals import STATE_SCALE
+from replays.studies.peers.common.solution import MISSED_HAMMER, PROPER, SWITCH_CEILING, Manner, Setting, Solution
+from replays.studies.peers.plain_python import PlainPython
+from rig.physics.kernels.signals import STATE_SCALE
 
 ADAMS, BDF = 1, 2
 ONE_STEP, ROOT_RETURN = 2, 2

@@ -15,11 +15,11 @@ from typing import Any
 
 import numpy as np
 
-from replays.studies.peers.problem import Problem
-from replays.studies.peers.solution import Setting, Solution
+from replays.studies.peers.common.problem import Problem
+from replays.studies.peers.common.solution import Setting, Solution
 from replays.studies.peers.taylor import System, events_of, solve_by_phases
 from replays.studies.peers.taylor_equations import PARAMETERS, Kind, rates_of
-from rig.kernels.magnet import RIPPLED
+from rig.physics.kernels.laws.magnet import RIPPLED
 
 _SAMPLES = 501
 """Instants of one call: its arrays have one shape, so that each phase is compiled once."""

@@ -21,11 +21,11 @@ from typing import Any
 
 import numpy as np
 
-from replays.studies.peers.problem import Problem
-from replays.studies.peers.solution import Setting, Solution
-from rig.kernels.contact import FLIGHT, NO_FRICTION
-from rig.kernels.geometry import gap
-from rig.kernels.magnet import magnet_force
+from replays.studies.peers.common.problem import Problem
+from replays.studies.peers.common.solution import Setting, Solution
+from rig.physics.kernels.frames.geometry import gap
+from rig.physics.kernels.laws.contact import FLIGHT, NO_FRICTION
+from rig.physics.kernels.laws.magnet import magnet_force
 
 FACETS = 180
 _IMPACT_SPEED = 0.2

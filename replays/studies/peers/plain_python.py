@@ -10,9 +10,9 @@ import math
 
 import numpy as np
 
-from replays.studies.peers.problem import Problem
-from rig.kernels.contact import FLIGHT, NO_FRICTION, SMOOTHED
-from rig.kernels.magnet import RADIAL, RIPPLED
+from replays.studies.peers.common.problem import Problem
+from rig.physics.kernels.laws.contact import FLIGHT, NO_FRICTION, SMOOTHED
+from rig.physics.kernels.laws.magnet import RADIAL, RIPPLED
 
 
 class PlainPython:

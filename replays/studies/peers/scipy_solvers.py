@@ -19,9 +19,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from replays.studies.peers.plain_python import PlainPython
-from replays.studies.peers.problem import Problem
-from replays.studies.peers.right_hand_side import (
+from replays.studies.peers.common.problem import Problem
+from replays.studies.peers.common.right_hand_side import (
     N_SWITCH,
     compile_s,
     derivative,
@@ -32,8 +31,9 @@ from replays.studies.peers.right_hand_side import (
     switching,
     take_switch,
 )
-from replays.studies.peers.solution import MISSED_HAMMER, PROPER, Manner, Setting, Solution
-from rig.kernels.signals import STATE_SCALE
+from replays.studies.peers.common.solution import MISSED_HAMMER, PROPER, Manner, Setting, Solution
+from replays.studies.peers.plain_python import PlainPython
+from rig.physics.kernels.signals import STATE_SCALE
 
 LEAST_TOLERANCE = 2.3e-14
 """scipy takes no relative tolerance below 100 times the rounding unit."""

@@ -33,8 +33,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from replays.studies.peers.problem import Problem
-from replays.studies.peers.solution import Setting, Solution
+from replays.studies.peers.common.problem import Problem
+from replays.studies.peers.common.solution import Setting, Solution
 from replays.studies.peers.taylor_equations import (
     PARAMETERS,
     SLACK,
@@ -47,7 +47,7 @@ from replays.studies.peers.taylor_equations import (
     parameter,
     to_series,
 )
-from rig.kernels.contact import BACKWARD, FLIGHT, FORWARD, ROLLING, SWITCH, TOUCHING
+from rig.physics.kernels.laws.contact import BACKWARD, FLIGHT, FORWARD, ROLLING, SWITCH, TOUCHING
 
 _MARGIN = 1e-4
 _LEAST_MARGIN = 1e-14

@@ -1,7 +1,7 @@
 """The rig's equations written down anew for heyoka's Taylor series: phases, numbers, states and rates.
 
-Nothing of `rig.kernels` is used but the numbers. The shaft is the direction `u` of its axis (a unit vector) instead of
-two angles: with S = sum of arm times lateral force, w the spin about the axis and L = Ixx u x u' + Izz w u,
+Nothing of `rig.physics.kernels` is used but the numbers. The shaft is the direction `u` of its axis (a unit vector)
+instead of two angles: with S = sum of arm times lateral force, w the spin about the axis and L = Ixx u x u' + Izz w u,
 
     Ixx u'' = S - u (u . S) + Izz w (u x u') - Ixx |u'|^2 u
     Izz w'  = T_drive - R_S F_t
@@ -19,10 +19,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from replays.studies.peers.problem import Problem
-from rig.kernels.contact import BACKWARD, FLIGHT, FORWARD, NO_FRICTION, ROLLING, SMOOTHED, TOUCHING
-from rig.kernels.magnet import LINEAR, RIPPLED
-from rig.kernels.signals import STATE_SCALE
+from replays.studies.peers.common.problem import Problem
+from rig.physics.kernels.laws.contact import BACKWARD, FLIGHT, FORWARD, NO_FRICTION, ROLLING, SMOOTHED, TOUCHING
+from rig.physics.kernels.laws.magnet import LINEAR, RIPPLED
+from rig.physics.kernels.signals import STATE_SCALE
 
 SLACK = 5
 """A phase more than the kernels count: touching, while the normal law would have to pull and the force is held at 0."""

@@ -8,13 +8,13 @@ from collections.abc import Iterator
 import numpy as np
 
 from replays.studies.peers import PEERS, Problem, Setting
-from replays.studies.peers.window import cut_window
-from replays.studies.stability.cell import Cell
-from replays.studies.stability.flight import house_energy, house_oscillator
-from replays.studies.stability.motion import quiet_inputs, state
-from rig.kernels.contact import FLIGHT
-from rig.kernels.signals import N_STATE
-from rig.scenes import load_scene
+from replays.studies.peers.common.window import cut_window
+from replays.studies.stability.trials.cell import Cell
+from replays.studies.stability.trials.flight import house_energy, house_oscillator
+from replays.studies.stability.trials.motion import quiet_inputs, state
+from rig.physics.kernels.laws.contact import FLIGHT
+from rig.physics.kernels.signals import N_STATE
+from rig.run.scenes import load_scene
 
 
 def peer_cells(trial: str) -> Iterator[Cell]:

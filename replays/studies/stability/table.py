@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from replays.studies.stability.cell import Cell
 from replays.studies.stability.peers import peer_cells
-from replays.studies.stability.trials import TRIALS
-from rig.engines import ENGINES
-from rig.errors import InputError
+from replays.studies.stability.trials.cell import Cell
+from replays.studies.stability.trials.trials import TRIALS
+from rig.base.errors import InputError
+from rig.physics.engines import ENGINES
 
 
 def chosen_trials(only: str | None) -> list[str]:

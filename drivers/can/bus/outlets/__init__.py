@@ -1,0 +1,1 @@
+"""Ways to the bus for programs that speak in text."""

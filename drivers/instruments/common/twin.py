@@ -1,0 +1,275 @@
+"""The instrument's side: serves the protocol from the sensor blocks of a rig, and passes commands on to its console.
+
+A twin has what an instrument of that kind has: its own channels and its own commands. It cannot see the truth.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import ClassVar
+
+import numpy as np
+
+from drivers.console import Accepted, Console
+from drivers.instruments.common import protocol
+from drivers.instruments.common.datasheet import Datasheet
+from drivers.instruments.common.protocol import Codec, Message, ProtocolError, Reason
+from drivers.link import Port
+from drivers.sources.stream import RigStream, thin, whole_step
+from rig.base import wire
+from rig.base.errors import InputError, Words
+from rig.channels.table import Group
+from rig.serve.desk import one_line
+from rig.serve.transport import NoReplyError
+
+MANUFACTURER = "Virtual rotor-stator rig"
+
+
+@dataclass(slots=True)
+class _Running:
+    """A stream on its way to the host."""
+
+    number: int
+    channels: list[int]
+    step: int
+    """Every so many rows of the rig are taken."""
+    parts: list[np.ndarray] = field(default_factory=list)
+    """Counts that wait until they fill a message or the link is idle; a slow link gets fewer and longer messages."""
+    first: wire.Block | None = None
+    """Where they begin."""
+    messages: int = 0
+    rows: int = 0
+    dropped: int = 0
+
+
+class Twin:
+    """One instrument at one port; it has one state, whoever asks, as the real one would.
+
+    Args:
+        stream: Sensor blocks of the rig.
+        console: Where commands go.
+        port: The instrument's end of a link; closed with the twin.
+    """
+
+    CODEC: ClassVar[Codec]
+    TITLE: ClassVar[str]
+    GROUP: ClassVar[str | None] = None
+    """Group of the channel table that it measures."""
+
+    def __init__(self, stream: RigStream, console: Console, port: Port) -> None:
+        self._stream = stream
+        self._console = console
+        self._port = port
+        self._lock = threading.Lock()
+        self._rate_hz = 0.0
+        self._mask = 0
+        self._streams = 0
+        self._running: _Running | None = None
+        self._listening = False
+        self._leave: Callable[[], None] | None = None
+        self._closed = False
+        self.refused = 0
+        """Requests that were not carried out, or were none."""
+        port.serve(self.answer, self._on_idle)
+
+    @property
+    def running(self) -> bool:
+        """Whether a stream is on its way to the host."""
+        return self._running is not None
+
+    @property
+    def url(self) -> str:
+        """What a host opens."""
+        return self._port.url
+
+    def answer(self, data: bytes) -> bytes:
+        """The reply to a request; never raises."""
+        sequence = 0
+        try:
+            sequence, request = self.CODEC.decode(data)
+            reply = self._carry_out(request)
+        except ProtocolError as error:
+            sequence = error.sequence
+            reply = protocol.Refused(error.reason, one_line(error))
+        except InputError as error:
+            reply = protocol.Refused(Reason.REFUSED, one_line(error))
+        except NoReplyError as error:
+            reply = protocol.Refused(Reason.UNAVAILABLE, one_line(error))
+        self.refused += isinstance(reply, protocol.Refused)
+        return self.CODEC.encode(reply, sequence)
+
+    def act(self, act: protocol.Act) -> Accepted:
+        """Carry out what this instrument can be told to do; the acting ones override it.
+
+        Raises:
+            InputError: The rig refuses.
+            NoReplyError: No rig answers.
+        """
+        raise NotImplementedError
+
+    def _carry_out(self, request: Message) -> Message:
+        if isinstance(request, protocol.Identify):
+            return protocol.Identity(self._datasheet().model_dump_json())
+        if isinstance(request, protocol.Act):
+            accepted = self.act(request)
+            return protocol.Done(id=accepted.id, tick=accepted.tick, time_s=accepted.time_s)
+        if isinstance(request, protocol.Configure):
+            return self._configure(request)
+        if isinstance(request, protocol.Start):
+            return self._start()
+        if isinstance(request, protocol.Stop):
+            return self._stop(request)
+        raise ProtocolError(Reason.KIND, f"kind must be a request; instead received {type(request).__name__}")
+
+    def _datasheet(self) -> Datasheet:
+        name = self.CODEC.address.name
+        group = self._measured() if self.GROUP else None
+        return Datasheet(
+            manufacturer=MANUFACTURER,
+            model=f"{name} (virtual)",
+            serial=f"VIRTUAL-{self.CODEC.address.number:03d}",
+            virtual=True,
+            title=self.TITLE if group is None else group.title,
+            rate_hz=0 if group is None else group.rate_hz,
+            channels=() if group is None else group.channels,
+            acts=tuple(act.__name__ for act in self.CODEC.acts),
+        )
+
+    def _measured(self) -> Group:
+        """The channels as the rig runs them now."""
+        if self.GROUP is None:
+            raise InputError("request", f"one that a {self.CODEC.address.name} has", Words("one for measurements"))
+        return self._stream.group(self.GROUP)
+
+    def _configure(self, request: protocol.Configure) -> protocol.Configured:
+        group = self._measured()
+        every = (1 << len(group.channels)) - 1
+        mask = request.channels or every
+        if mask & ~every:
+            raise InputError("channels", f"bits 0 to {len(group.channels) - 1}", bin(mask))
+        rate = request.rate_hz or float(group.rate_hz)
+        whole_step(group.rate_hz, rate)
+        with self._lock:
+            self._end("configured anew", discard=True)
+            self._mask, self._rate_hz = mask, rate
+        return protocol.Configured(rate_hz=rate, channels=mask)
+
+    def _start(self) -> protocol.Started:
+        group = self._measured()
+        # Both before the lock is taken: the transport may deliver a block from within.
+        if not self._listening:
+            self._listening = True
+            assert self.GROUP is not None
+            self._leave = self._stream.listen(self.GROUP, self.take, self.rig_ended)
+        rate = self._rate_hz or float(group.rate_hz)
+        mask = self._mask or (1 << len(group.channels)) - 1
+        chosen = [n for n in range(len(group.channels)) if mask >> n & 1]
+        step = whole_step(group.rate_hz, rate)
+        if not chosen:
+            raise InputError("channels", "configured anew: this rig has others", bin(mask))
+        with self._lock:
+            self._end("started anew", discard=True)
+            self._streams += 1
+            self._running = _Running(self._streams, chosen, step)
+            return protocol.Started(self._streams)
+
+    def _stop(self, request: protocol.Stop) -> protocol.Stopped:
+        with self._lock:
+            running = self._running
+            if running is None or request.stream not in (0, running.number):
+                return protocol.Stopped(request.stream, 0, 0)
+            self._end("stopped", discard=bool(request.discard))
+            return protocol.Stopped(running.number, running.rows, running.dropped)
+
+    def _end(self, reason: str, *, discard: bool = False) -> None:
+        """End the stream that runs; the lock is held."""
+        running, self._running = self._running, None
+        if running is None:
+            return
+        if discard:
+            self._port.discard()
+        else:
+            self._flush(running, everything=True)
+        self._push(running, protocol.Ended(running.number, reason))
+
+    def _push(self, running: _Running, message: Message) -> bool:
+        running.messages += 1
+        return self._port.push(self.CODEC.encode(message, running.messages))
+
+    def take(self, block: wire.Block) -> None:
+        """Send on what the host has chosen of a block; never waits."""
+        with self._lock:
+            running = self._running
+            if running is None:
+                return
+            if block.values.shape[1] <= max(running.channels):
+                self._end("the rig's channels have changed")
+                return
+            block = thin(block, running.step)
+            if not len(block.values):
+                return
+            first = running.first
+            if first is not None:
+                kept = sum(map(len, running.parts))
+                if block.index != first.index + kept or block.rate_hz != first.rate_hz:
+                    self._flush(running, everything=True)
+            running.first = running.first or block
+            running.parts.append(block.values[:, running.channels])
+            self._flush(running)
+
+    def _on_idle(self) -> None:
+        with self._lock:
+            if self._running is not None:
+                self._flush(self._running)
+
+    def _flush(self, running: _Running, *, everything: bool = False) -> None:
+        """Push what fills messages, and the rest as well where the link is idle; the lock is held."""
+        first = running.first
+        if first is None:
+            return
+        columns = len(running.channels)
+        most = max(1, (self._port.max_bytes - protocol.ROWS_HEAD) // (4 * columns))
+        waiting = sum(map(len, running.parts))
+        if waiting < most and not everything and not self._port.idle:
+            return
+        counts = np.concatenate(running.parts) if len(running.parts) > 1 else running.parts[0]
+        start = 0
+        while start < waiting and (waiting - start >= most or everything or self._port.idle):
+            part = counts[start : start + most]
+            rows = protocol.Rows(
+                stream=running.number,
+                index=first.index + start,
+                tick=wire.row_tick(first.tick, first.rate_hz, first.tick_rate_hz, start),
+                rate_hz=first.rate_hz,
+                tick_rate_hz=first.tick_rate_hz,
+                columns=columns,
+                counts=part,
+            )
+            if self._push(running, rows):
+                running.rows += len(part)
+            else:
+                running.dropped += len(part)
+            start += len(part)
+        running.parts = [counts[start:]] if start < waiting else []
+        running.first = None
+        if start < waiting:
+            tick = wire.row_tick(first.tick, first.rate_hz, first.tick_rate_hz, start)
+            running.first = replace(first, index=first.index + start, tick=tick, values=first.values[:0])
+
+    def rig_ended(self, reason: str) -> None:
+        """The rig publishes nothing more."""
+        with self._lock:
+            self._end(reason)
+
+    def close(self) -> None:
+        """Stop serving; may be called again."""
+        if self._closed:
+            return
+        self._closed = True
+        with self._lock:
+            self._end("the instrument was switched off")
+        if self._leave is not None:
+            self._leave()
+        self._port.close()

@@ -1,0 +1,29 @@
+"""Protocol of a pendulum hammer: it hits, and measures its own force."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from drivers.instruments.common.protocol import Act, Codec, Tail
+from drivers.link import Address
+
+
+@dataclass(frozen=True, slots=True)
+class Hit(Act):
+    """Hit the shaft at the disk.
+
+    Attributes:
+        force_n: Peak force [N].
+        duration_ms: Length of the half sine [ms].
+        direction: `x`, `y`, `-x`, `-y`, or an angle from x towards y [degrees].
+    """
+
+    KIND = 0x40
+    LAYOUT = "<dd"
+    TAIL = Tail.TEXT
+    force_n: float
+    duration_ms: float
+    direction: str
+
+
+CODEC = Codec(Address("hammer", 4), (Hit,))

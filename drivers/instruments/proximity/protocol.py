@@ -1,0 +1,8 @@
+"""Protocol of an eddy-current proximity probe conditioner: it measures, and does nothing else."""
+
+from __future__ import annotations
+
+from drivers.instruments.common.protocol import Codec
+from drivers.link import Address
+
+CODEC = Codec(Address("proximity", 1))

@@ -1,0 +1,1 @@
+"""What a recording holds, checked: documents, channels, counts, and their agreement."""

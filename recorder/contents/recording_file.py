@@ -1,0 +1,219 @@
+"""One file of a recording: finished, or what a kill or a full disk left of it."""
+
+from __future__ import annotations
+
+import contextlib
+import struct
+from collections.abc import Container, Iterable, Iterator
+from copy import copy
+from functools import cached_property
+from pathlib import Path
+from typing import BinaryIO, Self
+
+from mcap.exceptions import McapError
+
+from recorder.contents import documents
+from recorder.files import schemas
+from recorder.files.chunks import Chunk, DamagedError, messages, unpack
+from recorder.files.payload import block_in
+from recorder.files.records import COPY, MAGIC, read_contents
+from rig.base.errors import InputError, Words
+from rig.base.outside import open_file, read_json, unreadable
+from rig.base.wire import EVENTS, FAULTS, Block
+from rig.serve import intake
+
+_OURS = "a recording made by `rig record`"
+_REACH_S = 0.25
+"""Longest block that is found where blocks are not in order in the file [s]; a rig's have some milliseconds."""
+Message = tuple[str, int, int, bytes]
+"""Topic, simulated time [ns], wall time of arrival [unix ns] and payload of a message."""
+
+
+class RecordingFile:
+    """One file, checked when it is opened; its messages are read from the disk.
+
+    Attributes:
+        path: The file.
+        complete: The file was finished; False for a .part file or one that was cut off, of which everything up to the
+            last whole message is read.
+        damaged: Records that are not what was written, and are passed over by whoever salvages; else 0.
+        unchecked: What of it no checksum covers.
+        catalogue: The rig's catalogue document.
+        table: The channel table in it.
+        parameters: The rig's parameter document.
+        scene: The rig's scene document.
+        metadata: Metadata records by name: `rig` (start), `end` (closing counts, only if complete).
+        attachments: All attachments by name; catalogue, parameters and scene are among them.
+        about: What the file says of each topic: names, units and scales of its columns.
+        messages: Number of messages by topic.
+        chunks: Where its messages are, in file order.
+        stated_rows: Rows by key, as the file itself says at its end.
+        near: Offsets of the chunks that are read; None for all; see `between`.
+        stated_begin_s: Simulated time of the first row, likewise [s].
+    """
+
+    def __init__(self, path: Path, *, salvage: bool = False, in_part: bool = False) -> None:
+        """Look through the records of a file.
+
+        Args:
+            path: The file.
+            salvage: Take what can be read of a finished file, too, where it is damaged.
+            in_part: Hold it against its checksums only where it is read; see `between`.
+
+        Raises:
+            InputError: The file cannot be read, or is no recording.
+        """
+        self.path = path
+        with self._open() as file:
+            if file.read(len(MAGIC)) != MAGIC:
+                raise InputError("file", _OURS, Words(f"{path}, which is no MCAP file"))
+            found = read_contents(file, path.stat().st_size, salvage=salvage, in_part=in_part)
+            self._take_metadata(found.metadata, found.attachments.get(COPY), salvage=salvage)
+        self.complete, self.unchecked = found.complete, found.unchecked
+        self.damaged += found.damaged
+        self.attachments, self.chunks, self._topics = found.attachments, tuple(found.chunks), found.topics
+        self.near: frozenset[int] | None = None
+        self.about, self.stated_rows, self.stated_begin_s = found.about, dict[str, int](), None
+        with contextlib.suppress(InputError):
+            stated = found.metadata.get("end", {}) if found.finished else {}  # one that was cut off lacks what it lacks
+            end = documents.read_metadata(documents.End, stated, field="end")
+            self.stated_rows, self.stated_begin_s = read_json(end.rows.encode()), end.first_time_s
+        self.messages = {self._topics[number]: count for number, count in sorted(found.counts.items())}
+        if len(set(self._topics.values())) < len(self._topics):
+            raise InputError("file", "a recording with each channel once", str(path))
+        self._check_documents(salvage=salvage)
+
+    def _take_metadata(self, found: dict[str, dict[str, str]], copy: bytes | None, *, salvage: bool) -> None:
+        """Believe the copy that has a checksum, where a file has one."""
+        self.damaged, self.metadata = 0, found
+        if copy is None:
+            return
+        stated = read_json(copy, field=COPY)
+        if {name: found.get(name) for name in stated} != stated:
+            self.damaged = 1
+        self.metadata = {**({"end": found["end"]} if "end" in found and not salvage else {}), **stated}
+
+    def _check_documents(self, *, salvage: bool) -> None:
+        """Hold metadata and attached documents against what they must be."""
+        about, name = self.metadata.get("rig", {}), self.path.name
+        if about.get("format") != schemas.FORMAT:
+            raise InputError("file", _OURS, str(self.path))
+        documents.check_version(about)
+        for kind, model in documents.METADATA.items():
+            if kind in self.metadata:
+                documents.read_metadata(model, self.metadata[kind], field=f"{name}: {kind}")
+        payloads = [self.attachments.get(f"{kind}.json") for kind in documents.ATTACHED]
+        if None in payloads:
+            # Where it is damaged it is not there either.
+            must = "a recording with its calibration; this one was cut off in it, or damaged"
+            raise InputError("file", must, str(self.path))
+        self.catalogue, self.parameters, self.scene = (
+            documents.read(model, payload or b"", field=f"{name}: {kind}.json")[0]
+            for payload, (kind, model) in zip(payloads, documents.ATTACHED.items(), strict=True)
+        )
+        if self.damaged and not salvage:
+            must, several = "an intact recording (`rig recover` passes over what is damaged)", "s" * (self.damaged > 1)
+            raise InputError("file", must, Words(f"{self.path}, with {self.damaged} damaged record{several}"))
+        self._catalogue = intake.Catalogue.read(self.catalogue)
+        self.table = self._catalogue.table
+
+    @property
+    def end_reason(self) -> str:
+        """Why the recording ended."""
+        if self.complete:
+            return self.metadata.get("end", {}).get("reason", "unknown")
+        return "cut off: the recorder did not finish the file"
+
+    @property
+    def span_s(self) -> tuple[float, float] | None:
+        """Simulated times of the first and the last row, without a look at the samples [s]; None if there is none.
+
+        As the recorder counted them; of a file that it did not finish those of its messages, which is to the block.
+        """
+        if self.complete:
+            end = self.metadata.get("end", {})
+            if not {"first_time_s", "last_time_s"} <= set(end) or end.get("rows", "{}") == "{}":
+                return None
+            return float(end["first_time_s"]), float(end["last_time_s"])
+        if not self.chunks:
+            return None
+        return min(each.begin_ns for each in self.chunks) / 1e9, max(each.end_ns for each in self.chunks) / 1e9
+
+    @cached_property
+    def promises(self) -> dict[str, intake.Promise]:
+        """What the catalogue promises of each stream, by key."""
+        return self._catalogue.promises()
+
+    def between(self, from_s: float, to_s: float) -> Self:
+        """Return the file as a reader of the rows between two times [s] needs it: these rows, and all events and gaps.
+
+        What lies outside is left out chunk by chunk, by the index. A file with faults of blocks is read as a whole, as
+        their times are known from all of their documents.
+        """
+        found = copy(self)
+        if FAULTS in self.messages:
+            return found
+        begin_ns, end_ns = (from_s - _REACH_S) * 1e9, to_s * 1e9
+        near = {each for each in self.chunks if each.end_ns >= begin_ns and each.begin_ns <= end_ns}
+        latest: dict[int, Chunk] = {}  # a long block may reach into the time from further back
+        for chunk in sorted(set(self.chunks) - near, key=lambda each: each.begin_ns):
+            latest |= dict.fromkeys(chunk.channels or () if chunk.begin_ns < from_s * 1e9 else (), chunk)
+        found.near = frozenset(each.offset for each in near | set(latest.values()))
+        return found
+
+    def _topics_in(self, chunk: Chunk, wanted: dict[int, str]) -> dict[int, str]:
+        """Return the wanted topics that are read in a chunk."""
+        if self.near is None or chunk.offset in self.near:
+            return wanted
+        outside = (EVENTS, schemas.GAPS, schemas.CLOCK)[: 3 if chunk == self.chunks[0] else 2]
+        return {number: topic for number, topic in wanted.items() if topic in outside}
+
+    def block(self, key: str, payload: bytes) -> Block | None:
+        """The block in a payload; None where it is none, or does not fit the catalogue."""
+        try:
+            block = block_in(key, payload)
+        except ValueError:
+            return None
+        columns = block.values.shape[1]
+        promise = self.promises.get(key, intake.Promise(columns, 0.0, self._catalogue.tick_rate_hz))
+        return block if (columns, block.tick_rate_hz) == (promise.columns, promise.tick_rate_hz) else None
+
+    def stamped(self, topics: Container[str] | None, chunks: Iterable[Chunk] | None = None) -> Iterator[Message]:
+        """Yield the messages of some topics, in file order; documents without the ROS 2 string message around them.
+
+        Args:
+            topics: The topics; None for all.
+            chunks: Read only these of its chunks.
+
+        Raises:
+            InputError: The file has changed, is damaged, or cannot be read any more.
+        """
+        wanted = {number: topic for number, topic in self._topics.items() if topics is None or topic in topics}
+        if not wanted:
+            return
+        texts = {topic for topic in wanted.values() if documents.holds_documents(topic)}
+        with self._open() as file:
+            for chunk in self.chunks if chunks is None else chunks:
+                here = self._topics_in(chunk, wanted)
+                if not here or (chunk.channels is not None and chunk.channels.isdisjoint(here)):
+                    continue
+                for number, log_time, publish_time, payload in messages(unpack(file, chunk), cut=chunk.cut):
+                    if number in here:
+                        topic = here[number]
+                        yield topic, log_time, publish_time, schemas.unwrap_text(payload) if topic in texts else payload
+
+    @contextlib.contextmanager
+    def _open(self) -> Iterator[BinaryIO]:
+        """The open file; whatever a damaged one makes the parsers raise becomes one clear error."""
+        try:
+            with open_file(self.path) as file:
+                yield file
+        except InputError:
+            raise
+        except OSError as error:
+            raise unreadable(self.path, error) from None
+        except DamagedError as error:
+            must = "an intact recording (`rig recover` passes over what is damaged)"
+            raise InputError("file", must, Words(f"{self.path} ({error})")) from None
+        except (McapError, struct.error, ValueError, MemoryError, OverflowError) as error:
+            raise InputError("file", "an intact recording", Words(f"{self.path} ({error})")) from None

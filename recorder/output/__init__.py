@@ -1,0 +1,1 @@
+"""Where a session writes: one or several files, and the room that they may take."""

@@ -1,0 +1,149 @@
+"""What the files of a recording may take of the disk."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from recorder.files.draft import check_destination, files_like
+from recorder.writer import RecordingWriter
+from rig.base.errors import InputError, Words
+
+MB = 1_000_000
+_PENDING_BYTES = 2 * MB
+"""What may still come to a file at its end, but for its index: a chunk that is not yet on the disk."""
+_NEW_BYTES = 300_000
+"""What a file takes that was only just begun, with its end."""
+_FLUSH_BYTES = MB // 4
+"""At the budget, more than that in memory is flushed, for it is less once it is compressed; less is let go."""
+_CHECK_S = 0.25
+
+
+@dataclass(frozen=True)
+class Limits:
+    """How large files become, and what they may take of the disk; None or 0 where there is no limit.
+
+    Attributes:
+        rotate_mb: About this size of a part [MB].
+        rotate_s: Length of a part [s of simulated time].
+        budget_mb: All parts together [MB].
+        keep_free_mb: Room that is left to others on the disk [MB].
+        when_full: What happens at the budget, or when there is no more room: the recording stops, or its oldest part
+            is removed.
+    """
+
+    rotate_mb: float | None = None
+    rotate_s: float | None = None
+    budget_mb: float | None = None
+    keep_free_mb: float = 0.0
+    when_full: Literal["stop", "remove-oldest"] = "stop"
+
+    def __post_init__(self) -> None:
+        for name, least in (("rotate_mb", 1.0), ("rotate_s", 0.1), ("budget_mb", 5.0)):
+            value = getattr(self, name)
+            if value is not None and not least <= value <= 1e9:
+                raise InputError(name, f"from {least:g} to 1e9", value)
+        if not 0.0 <= self.keep_free_mb <= 1e9:
+            raise InputError("keep_free_mb", "from 0 to 1e9", self.keep_free_mb)
+        if self.when_full not in ("stop", "remove-oldest"):
+            raise InputError("when_full", "stop or remove-oldest", self.when_full)
+        if self.when_full == "remove-oldest" and not self.rotates:
+            raise InputError("when_full", "stop for a recording in one file (--rotate-mb, --rotate-s)", self.when_full)
+        least = 2.0 * (self.rotate_mb or 0.0)
+        if self.when_full == "remove-oldest" and self.budget_mb is not None and self.budget_mb < least:
+            raise InputError("budget_mb", f"at least two files, {least:g}, where the oldest makes room", self.budget_mb)
+
+    @property
+    def rotates(self) -> bool:
+        """Whether there are several files."""
+        return self.rotate_mb is not None or self.rotate_s is not None
+
+
+def check_files(path: Path, first: Iterable[Path], others: str, limits: Limits, *, force: bool) -> None:
+    """Refuse names that cannot become the files of a recording; remove nothing.
+
+    Args:
+        path: Name of the recording.
+        first: Names of the first file, or of what may become it.
+        others: Expression that its numbered files look like (`files_like`); empty if there are none.
+        limits: What they may take of the disk.
+        force: Existing files may be replaced.
+
+    Raises:
+        InputError: As `check_destination`; there are such files; or the disk has too little room to begin with.
+    """
+    for name in first:
+        check_destination(name, force=force)
+    if others and not force and (taken := files_like(path, others)):
+        raise InputError("output", "new files (--force replaces them)", Words(f"{taken[0]}, which exists"))
+    if why := _lack_of_room(path.parent, limits.keep_free_mb):
+        raise InputError("output", f"on a disk with room: {why} (--keep-free-mb)", str(path))
+
+
+def _lack_of_room(folder: Path, keep_free_mb: float, *, index_bytes: int = 0) -> str:
+    """What is wrong if a disk has less room than is to be left on it [MB]; empty if nothing is.
+
+    With nothing to be left there must still be room to end the file well.
+    """
+    try:
+        disk = os.statvfs(folder)
+    except OSError:
+        return ""  # the next write says what is wrong
+    if disk.f_bavail * disk.f_frsize >= keep_free_mb * MB + _PENDING_BYTES + index_bytes:
+        return ""
+    return f"less than {keep_free_mb:g} MB are free on the disk" if keep_free_mb else "the disk is full"
+
+
+class Room:
+    """What the files of a recording may still take of the disk.
+
+    Attributes:
+        finished_bytes: Size of the finished files that are there [bytes].
+    """
+
+    def __init__(self, folder: Path, limits: Limits, *, monotonic_s: Callable[[], float] = time.monotonic) -> None:
+        """Take the folder and its limits.
+
+        Args:
+            folder: Where the files are.
+            limits: What they may take.
+            monotonic_s: Clock that times the looks at the disk [s].
+        """
+        self.finished_bytes = 0
+        self._folder = folder
+        self._limits = limits
+        self._monotonic_s = monotonic_s
+        self._checked_s = -1e9
+        self._unchecked_bytes = 0
+
+    def lack_after(self, payload_bytes: int, writer: RecordingWriter) -> str:
+        """The same as `lack`, after a payload of that size; looks only now and then, and costs next to nothing."""
+        self._unchecked_bytes += payload_bytes
+        due = self._unchecked_bytes >= MB // 2 or self._monotonic_s() - self._checked_s >= _CHECK_S
+        return self.lack(writer) if self._over_budget(writer) or due else ""
+
+    def lack(self, writer: RecordingWriter | None = None) -> str:
+        """What there is no more room for; empty if there is room for all.
+
+        Args:
+            writer: The file that is being written; None for one that is to be begun.
+        """
+        self._checked_s = self._monotonic_s()
+        self._unchecked_bytes = 0
+        if self._over_budget(writer):
+            if writer is not None and writer.file.unflushed_bytes > _FLUSH_BYTES:
+                writer.sync()
+            if self._over_budget(writer):
+                return f"the budget of {self._limits.budget_mb:g} MB is used up"
+        index_bytes = 0 if writer is None else writer.file.index_bytes
+        return _lack_of_room(self._folder, self._limits.keep_free_mb, index_bytes=index_bytes)
+
+    def _over_budget(self, writer: RecordingWriter | None) -> bool:
+        if self._limits.budget_mb is None:
+            return False
+        file_bytes = _NEW_BYTES if writer is None else writer.file.final_bytes
+        return self.finished_bytes + file_bytes > self._limits.budget_mb * MB

@@ -1,0 +1,1 @@
+"""What the viewer shows, a module each, and what they share."""

@@ -1,0 +1,235 @@
+"""Time series: which curves there are, and how many points of them are drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import rerun as rr
+
+from recorder.viewer.canvas import Canvas
+from rig.channels.table import ChannelTable, Group
+
+ROOT = "/sensors"
+REACTION = "/derived/reaction"
+REACTIONS = {"P_N", "P_S", "P_E", "P_W"}
+"""Channels that together give the reaction."""
+_NOT_DRAWN = {"keyphasor"}
+"""A pulse of a fraction of a millisecond, once per turn, is a row of meaningless spikes at a viewing rate."""
+
+_COLORS = {
+    "N": (86, 180, 233),
+    "S": (32, 120, 190),
+    "E": (240, 190, 70),
+    "W": (205, 125, 40),
+    "x": (86, 180, 233),
+    "y": (240, 190, 70),
+}
+_PLAIN = (200, 205, 215)
+_SHADES = {"outer": 0.6}
+"""Curves of the outer house stand in the plot of the inner one."""
+
+Span = tuple[float, float]
+Points = tuple[np.ndarray, np.ndarray]
+"""Times [s] and values, shapes (n,) and (n, curves)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Curves:
+    """Curves that share a plot: one entity with a value per curve.
+
+    Attributes:
+        path: Entity path in the viewer.
+        labels: Legend of each curve, with its unit.
+        colors: RGB of each curve.
+        select: Takes engineering values of the whole group, shape (n, channels), to shape (n, curves).
+    """
+
+    path: str
+    labels: tuple[str, ...]
+    colors: tuple[tuple[int, int, int], ...]
+    select: Callable[[np.ndarray], np.ndarray]
+
+
+def series_of(group: Group) -> list[Curves]:
+    """The curves of one sensor group: channels with a common first part of the name stand together."""
+    planes: dict[str, list[int]] = {}
+    for column, channel in enumerate(group.channels):
+        if channel.name not in _NOT_DRAWN:
+            planes.setdefault(channel.name.split("_")[0], []).append(column)
+    found = [
+        Curves(
+            path=f"{ROOT}/{group.name}/{plane}",
+            labels=tuple(f"{group.channels[column].name} [{group.channels[column].unit}]" for column in columns),
+            colors=tuple(_color_of(group.channels[column].name) for column in columns),
+            select=lambda values, columns=columns: values[:, columns],
+        )
+        for plane, columns in planes.items()
+    ]
+    if set(group.names) >= REACTIONS:
+        found.append(
+            Curves(
+                path=REACTION,
+                labels=("x: P_E - P_W [N]", "y: P_N - P_S [N]"),
+                colors=(_color_of("x"), _color_of("y")),
+                select=reaction_of(group),
+            )
+        )
+    return found
+
+
+def _color_of(name: str) -> tuple[int, int, int]:
+    """The same colour for the same direction in all plots."""
+    red, green, blue = _COLORS.get(name.split("_")[-1], _PLAIN)
+    shade = _SHADES.get(name.split("_")[0], 1.0)
+    return round(shade * red), round(shade * green), round(shade * blue)
+
+
+def paths_of(table: ChannelTable) -> list[str]:
+    """Entity paths of all curves, in table order."""
+    return [series.path for group in table.groups.values() for series in series_of(group)]
+
+
+def reaction_of(group: Group) -> Callable[[np.ndarray], np.ndarray]:
+    """From rows of the force group to the reaction of each direction [N], shape (n, 2): the pairs' differences."""
+    east, west, north, south = (group.names.index(name) for name in ("P_E", "P_W", "P_N", "P_S"))
+    return lambda values: np.stack((values[:, east] - values[:, west], values[:, north] - values[:, south]), axis=1)
+
+
+class Envelope:
+    """Keeps the extremes of each bucket of rows, and every row inside the given windows.
+
+    A bucket of `bucket` rows becomes two: the extreme that came first at the bucket's start, the other at its middle,
+    each curve by itself; so peaks survive at their height and within half a bucket of their time.
+    """
+
+    def __init__(self, *, bucket: int) -> None:
+        self._bucket = max(1, bucket)
+        self._coarse = 1
+        self._times: list[np.ndarray] = []
+        self._values: list[np.ndarray] = []
+        self._points: list[Points] = []
+
+    def add(self, times_s: np.ndarray, values: np.ndarray) -> None:
+        """Take rows, shapes (n,) and (n, curves)."""
+        self._times.append(times_s)
+        self._values.append(values)
+
+    def fold(self, *, until_s: float, windows: list[Span], rest: bool = False, most: int | None = None) -> None:
+        """Turn rows into points, so that what waits to be given is bounded.
+
+        Args:
+            until_s: Of the buckets that end before this time [s].
+            windows: Where every row is kept.
+            rest: Those of the unfinished bucket, too.
+            most: So many points wait outside of the windows; where they would be more, the buckets become larger.
+        """
+        if self._times:
+            times_s, values = np.concatenate(self._times), np.concatenate(self._values)
+            bucket = self._bucket * self._coarse
+            rows = int(np.searchsorted(times_s, until_s)) // bucket * bucket
+            self._points.append(_reduced(times_s[:rows], values[:rows], bucket, windows))
+            if rest and rows < len(times_s):
+                self._points.append(_reduced(times_s[rows:], values[rows:], len(times_s) - rows, windows))
+                rows = len(times_s)
+            self._times, self._values = [times_s[rows:]], [values[rows:]]
+        outside = sum(_outside(at, windows) for at, _ in self._points)
+        while most is not None and outside > most:
+            self._points = [_reduced(*_joined(self._points), 4, windows)]
+            before, outside = outside, _outside(self._points[0][0], windows)
+            if outside > 0.75 * before:  # between windows that are close together little is left to be thinned
+                break
+            self._coarse *= 2
+
+    def take(self, *, until_s: float, windows: list[Span], rest: bool = False, most: int | None = None) -> Points:
+        """Give the points of the buckets that end before `until_s`; as `fold`, whose points are given first."""
+        self.fold(until_s=until_s, windows=windows, rest=rest, most=most)
+        points, self._points, self._coarse = self._points, [], 1
+        return _joined(points) if points else (np.empty(0), np.empty((0, 0)))
+
+
+def _joined(points: list[Points]) -> Points:
+    return np.concatenate([at for at, _ in points]), np.concatenate([values for _, values in points])
+
+
+def _outside(times_s: np.ndarray, windows: list[Span]) -> int:
+    """How many of the times are in no window."""
+    return len(times_s) - int(np.any([(times_s >= start) & (times_s <= end) for start, end in windows], axis=0).sum())
+
+
+def _reduced(times_s: np.ndarray, values: np.ndarray, bucket: int, windows: list[Span]) -> Points:
+    """The extremes of each bucket, every row of the buckets that touch a window, and what is left of the last one."""
+    whole = len(times_s) // bucket
+    rows = whole * bucket
+    points = [(times_s[rows:], values[rows:])]
+    if whole:
+        bucket_times = times_s[:rows].reshape(whole, bucket)
+        bucket_values = values[:rows].reshape(whole, bucket, -1)
+        full = np.zeros(whole, dtype=bool)
+        for start, end in windows:
+            full |= (bucket_times[:, -1] >= start) & (bucket_times[:, 0] <= end)
+        parts = np.split(np.arange(whole), np.flatnonzero(np.diff(full)) + 1)
+        reduces = [_flat if full[part[0]] or bucket <= 2 else _extremes for part in parts]
+        points = [reduce(bucket_times[part], bucket_values[part]) for part, reduce in zip(parts, reduces, strict=True)]
+        points.append((times_s[rows:], values[rows:]))
+    return _joined(points)
+
+
+def _flat(times: np.ndarray, values: np.ndarray) -> Points:
+    return times.reshape(-1), values.reshape(times.size, -1)
+
+
+def _extremes(times: np.ndarray, values: np.ndarray) -> Points:
+    low, high = values.min(axis=1), values.max(axis=1)
+    low_first = values.argmin(axis=1) <= values.argmax(axis=1)
+    first, second = np.where(low_first, low, high), np.where(low_first, high, low)
+    at = np.stack((times[:, 0], times[:, times.shape[1] // 2]), axis=1).reshape(-1)
+    return at, np.stack((first, second), axis=1).reshape(at.size, -1)
+
+
+class SeriesPlot:
+    """The curves of one sensor group on a canvas."""
+
+    def __init__(self, canvas: Canvas, group: Group, *, rows_per_s: float) -> None:
+        self._canvas = canvas
+        self._rate_hz = group.rate_hz
+        self._series = series_of(group)
+        self._bucket = max(1, round(2 * group.rate_hz / rows_per_s))
+        self._envelopes = [Envelope(bucket=self._bucket) for _ in self._series]
+        self.points = 0
+        for series in self._series:
+            canvas.fix(
+                series.path,
+                rr.SeriesLines(
+                    names=series.labels,
+                    colors=series.colors,
+                    widths=[1.2] * len(series.labels),
+                    aggregation_policy="MinMax",
+                ),
+            )
+
+    def add(self, times_s: np.ndarray, values: np.ndarray) -> None:
+        """Take consecutive engineering values of the whole group, shape (n, channels)."""
+        for series, envelope in zip(self._series, self._envelopes, strict=True):
+            envelope.add(times_s, series.select(values))
+
+    def flush(self, *, until_s: float, windows: list[Span], rest: bool = False, most: int | None = None) -> None:
+        """Draw what is complete before `until_s`: `most` points of each curve, and what is in the windows."""
+        for series, envelope in zip(self._series, self._envelopes, strict=True):
+            times, values = envelope.take(until_s=until_s, windows=windows, rest=rest, most=most)
+            if len(times):
+                self._canvas.plot(series.path, times, rr.Scalars.columns(scalars=values))
+                self.points += values.size
+
+    def fold(self, *, until_s: float, windows: list[Span], most: int) -> None:
+        """Thin what is complete before `until_s` and waits to be drawn."""
+        for envelope in self._envelopes:
+            envelope.fold(until_s=until_s, windows=windows, most=most)
+
+    def lift(self, *, at_s: float, windows: list[Span]) -> None:
+        """Draw what is held, then interrupt the curves at `at_s`: rows are missing from here on."""
+        self.flush(until_s=np.inf, windows=windows, rest=True)
+        for series in self._series:
+            hole = np.full((1, len(series.labels)), np.nan)
+            self._canvas.plot(series.path, np.array([at_s]), rr.Scalars.columns(scalars=hole))

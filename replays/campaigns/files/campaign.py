@@ -1,0 +1,459 @@
+"""A campaign's file, `*.campaign.toml`: read, checked down to its signals and units, and multiplied into its cases."""
+
+from __future__ import annotations
+
+import ast
+import itertools
+import re
+import shlex
+import tomllib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import AfterValidator, BeforeValidator, Field, FiniteFloat
+
+from replays.campaigns.equipment.bench import BenchSettings, Pace
+from replays.campaigns.equipment.device import PLACES, check_program
+from replays.campaigns.files.expectation import KINDS, Expect
+from replays.campaigns.files.lines import line_of, lines_of
+from replays.campaigns.files.seen import Time, Units
+from replays.campaigns.measurement import split_quantity
+from rig.base import units
+from rig.base.errors import InputError, UnknownNameError, Words, such_as
+from rig.base.outside import Written, check, open_file, parse_toml, unreadable
+from rig.channels.faults import channels_of, stream_of
+from rig.channels.faults.blocks import OfBlocks
+from rig.physics.kernels import signals
+from rig.run.commands import COMMANDS, FaultCommand, TimedCommand, check_command
+from rig.run.scenes import Scene, load_scene
+
+SUFFIX = ".campaign.toml"
+FOLDER = Path(__file__).parents[1]
+"""Where the campaigns are that come with the rig."""
+_PLACE = re.compile(r"\{(\w+)(?::([^{}]*))?\}")
+_MOST_CASES = 10_000
+_BLOCK_MS = (1.0, 1000.0)
+Line = Annotated[str, Field(min_length=1, max_length=1000)]
+
+
+def _a_name(text: str) -> str:
+    if not re.fullmatch(r"[\w.-]{1,50}", text):
+        raise ValueError("1 to 50 letters, digits, dots, dashes and underscores")
+    return text
+
+
+def _a_quantity(given: Any) -> str:
+    if not isinstance(given, str):
+        raise ValueError("a number with its unit as a text, such as '0.2 mm'")
+    return given
+
+
+Quantity = Annotated[str, BeforeValidator(_a_quantity)]
+
+
+class _Device(Written):
+    command: Line
+    name: Annotated[str, AfterValidator(_a_name)] = "device"
+    joins: bool = True
+    """Whether it takes part in lockstep; without, the rig does not wait for it."""
+    commands: bool = True
+    """Whether it commands the rig, which a recording does not take."""
+
+
+class _Matrix(Written):
+    scene: list[str] = Field(default=[])
+    set: dict[str, Annotated[list[Any], Field(min_length=1)]] = Field(default={})
+    fault: list[dict[str, Any]] = Field(default=[])
+    limits: dict[str, Annotated[list[Quantity], Field(min_length=1)]] = Field(default={})
+    device: dict[str, Annotated[list[str | int | float], Field(min_length=1)]] = Field(default={})
+
+
+class _File(Written):
+    title: Line
+    about: str = ""
+    scene: str = ""
+    pace: Pace = "lockstep"
+    block_ms: Annotated[FiniteFloat, Field(ge=_BLOCK_MS[0], le=_BLOCK_MS[1])] = 10.0
+    duration_s: Annotated[FiniteFloat, Field(gt=0.0, le=86_400.0)] | None = None
+    set: dict[str, Any] = Field(default={})
+    channels: str = ""
+    can: bool = False
+    device: _Device | None = None
+    limits: dict[str, Quantity] = Field(default={})
+    matrix: _Matrix = _Matrix()
+    steps: list[dict[str, Any]] = Field(default=[])
+    expect: Annotated[list[dict[str, Any]], Field(min_length=1)]
+
+
+@dataclass(frozen=True)
+class Step:
+    """What is done at a time of the case.
+
+    Attributes:
+        at_s: When [s].
+        command: A command or a fault; None: a note.
+        note, tags: The note.
+    """
+
+    at_s: float
+    command: TimedCommand | None = None
+    note: str = ""
+    tags: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Case:
+    """One case of a campaign.
+
+    Attributes:
+        id: Its name among them: its values on the matrix's axes.
+        title: Of the campaign.
+        file: The file.
+        bench: What it needs of the bench.
+        duration_s: How long it runs [s].
+        steps: What is done, in order of time.
+        device: The device under test; None: the rig alone.
+        expects: What is expected.
+        axes: Its values on the matrix's axes, by axis.
+    """
+
+    id: str
+    title: str
+    file: Path
+    bench: BenchSettings
+    duration_s: float
+    steps: tuple[Step, ...]
+    device: _Device | None
+    expects: tuple[Expect, ...]
+    axes: Mapping[str, str]
+
+
+@dataclass(frozen=True)
+class Campaign:
+    """A file with its cases."""
+
+    title: str
+    about: str
+    cases: tuple[Case, ...]
+
+
+def shipped() -> dict[str, Path]:
+    """Files of the campaigns that come with the rig, in TOML or for pytest, by name."""
+    found = {file.name.removesuffix(SUFFIX): file for file in FOLDER.glob(f"*{SUFFIX}")}
+    found |= {file.stem.removeprefix("test_").replace("_", "-"): file for file in FOLDER.glob("test_*.py")}
+    return dict(sorted(found.items()))
+
+
+def title_of(path: Path) -> str:
+    """What a campaign that comes with the rig is called."""
+    text = path.read_text("utf-8")
+    if path.suffix == ".toml":
+        return str(tomllib.loads(text)["title"])
+    return (ast.get_docstring(ast.parse(text)) or "").partition("\n")[0].removesuffix(".")
+
+
+def campaign_path(name_or_path: str) -> Path:
+    """The file of a campaign that comes with the rig, by its name, or of a user's own.
+
+    Raises:
+        UnknownNameError: It looks like a name, is none, and no file either.
+    """
+    known, path = shipped(), Path(name_or_path)
+    if name_or_path not in known and re.fullmatch(r"[\w-]+", name_or_path) and not path.exists():
+        raise UnknownNameError("FILE", "a file, or one of the campaigns that ship", name_or_path, known)
+    return known.get(name_or_path, path)
+
+
+def load_campaign(path: Path) -> Campaign:
+    """Read a campaign.
+
+    Raises:
+        InputError: The first thing that is wrong, with the file and the line.
+    """
+    try:
+        with open_file(path) as file:
+            text = file.read().decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise InputError(str(path), "a TOML file", Words("bytes that are no UTF-8")) from None
+    except OSError as error:
+        raise unreadable(path, error) from None
+    try:
+        document = parse_toml(text, field=str(path))
+    except tomllib.TOMLDecodeError as error:
+        says, _, place = str(error).partition(" (at ")
+        line = re.search(r"line (\d+)", place)
+        where = f"{path}:{line[1] if line else text.count(chr(10)) + 1}"
+        raise InputError(f"{where}: the text", "TOML", Words(says)) from None
+    with _located(path, text):
+        file = check(_File, document, field="")
+        cases = tuple(_cases(path, file))
+        seen: set[str] = set()
+        for case in cases:
+            if case.id in seen:
+                raise InputError("matrix", "of cases with different names (an id of a fault's own helps)", case.id)
+            seen.add(case.id)
+    return Campaign(file.title, file.about, cases)
+
+
+@contextmanager
+def _located(path: Path, text: str) -> Iterator[None]:
+    try:
+        yield
+    except InputError as error:
+        lines = lines_of(text)
+        line = line_of(error.field, lines) or 1
+        field = re.sub(r"\.\d+(?=\.|$)", "", error.field)
+        must, received = error.must, error.received
+        raise InputError(f"{path}:{line}: {field}", must, received) from None
+
+
+def _cases(path: Path, file: _File) -> Iterator[Case]:
+    axes = list(_axes(file))
+    count = 1
+    for _, values in axes:
+        count *= len(values)
+    if count > _MOST_CASES:
+        raise InputError("matrix", f"of at most {_MOST_CASES} cases", count)
+    scenes: dict[str, Scene] = {}
+    stem = path.name.removesuffix(SUFFIX)
+    for chosen in itertools.product(*(values for _, values in axes)):
+        picked = {name: value for (name, _), value in zip(axes, chosen, strict=True)}
+        named = {name.rpartition(" ")[2]: label for name, (label, _) in picked.items()}
+        yield _case(path, file, picked, named, ",".join(named.values()) or stem, scenes)
+
+
+_Picked = Mapping[str, tuple[str, Any]]
+
+
+def _axes(file: _File) -> Iterator[tuple[str, list[tuple[str, Any]]]]:
+    """Axes of the matrix, each with its values and how a person names them."""
+    matrix = file.matrix
+    if matrix.scene:
+        yield "scene", [(Path(each).stem, each) for each in matrix.scene]
+    for key, values in matrix.set.items():
+        short = key.rpartition(".")[2]
+        yield f"set {key}", [(f"{short}={_short(value)}", value) for value in values]
+    if matrix.fault:
+        yield "fault", [(_fault_name(each, n), (n, each)) for n, each in enumerate(matrix.fault)]
+    for key, values in matrix.limits.items():
+        yield f"limits {key}", [(f"{key}={_short(value)}", value) for value in values]
+    for key, values in matrix.device.items():
+        yield f"device {key}", [(f"{key}={_short(value)}", value) for value in values]
+
+
+def _short(value: Any) -> str:
+    return re.sub(r"[^\w.+-]+", "", f"{value:g}" if isinstance(value, float) else str(value))[:40] or "empty"
+
+
+def _fault_name(fault: Mapping[str, Any], number: int) -> str:
+    given = fault.get("id", "-".join(str(fault[key]) for key in ("channel", "kind") if key in fault))
+    if not isinstance(given, str) or not re.fullmatch(r"[\w.+-]+", given):
+        raise InputError(f"matrix.fault.{number}.id", "a name of letters, digits, dots and dashes", given or None)
+    return given
+
+
+def _case(
+    path: Path, file: _File, picked: _Picked, named: Mapping[str, str], name: str, scenes: dict[str, Scene]
+) -> Case:  # fmt: skip
+    values = {axis: value for axis, (_, value) in picked.items()}
+    scene_name = values.get("scene", file.scene)
+    if not scene_name:
+        raise InputError("scene", "given, here or in [matrix]", None)
+    beside = path.parent / scene_name
+    scene_name = str(beside) if scene_name.endswith(".toml") and beside.is_file() else scene_name
+    changes = {**file.set, **{axis.partition(" ")[2]: each for axis, each in values.items() if axis.startswith("set ")}}
+    limits = {**file.limits, **{axis[7:]: each for axis, each in values.items() if axis.startswith("limits ")}}
+    knobs = {axis[7:]: str(each) for axis, each in values.items() if axis.startswith("device ")}
+    for key, text in limits.items():
+        split_quantity(text, field=f"limits.{key}")
+    places = {**limits, **knobs}
+    table = None if not file.channels else path.parent / file.channels
+    scene = _scene(file, scene_name, changes, table, scenes)
+    duration_s = file.duration_s or scene.duration_s
+    steps = [_step(one, f"steps.{n}", places, duration_s, scene, file) for n, one in enumerate(file.steps)]
+    number, fault = values.get("fault", (0, {}))
+    if set(fault) - {"id"}:
+        one = {"command": "fault", "at_s": 0.0, **{key: each for key, each in fault.items() if key != "id"}}
+        steps.append(_step(one, f"matrix.fault.{number}", places, duration_s, scene, file))
+    timed = [step.command.model_dump(exclude_none=True) for step in steps if step.command is not None]
+    own = [each.model_dump(exclude_none=True) for each in scene.commands]
+    with _field("steps"):
+        load_scene(scene_name, {**changes, **({"channels": table} if table else {}), "commands": [*own, *timed]})
+    known: Units = {"": {key: each.unit for key, each in scene.table.channels.items()}, **_TRUTH}
+    axes = {axis.rpartition(" ")[2]: [label for label, _ in each] for axis, each in _axes(file)}
+    expects = []
+    for n, one in enumerate(file.expect):
+        expect = _expect(one, f"expect.{n}", places, known, duration_s)
+        _check_when(expect, f"expect.{n}.when", axes)
+        if all(named[axis] in labels for axis, labels in _when(expect)):
+            expects.append(expect)
+    if not expects:
+        raise InputError("expect", "with something for each case", Words(f"nothing for {name}"))
+    device = None if file.device is None else _device(file, places, path)
+    bench = BenchSettings(
+        scene=scene_name, pace=file.pace, block_ms=file.block_ms, set=changes, table=table, can=file.can
+    )
+    ordered = tuple(sorted(steps, key=lambda step: step.at_s))
+    return Case(name, file.title, path, bench, duration_s, ordered, device, tuple(expects), named)
+
+
+_TRUTH: Units = {
+    table: {name: signal.unit for name in columns for signal in signals.ROW if signal.name == name}
+    for table, columns in signals.TRUTH.items()
+}
+
+
+def _scene(
+    file: _File, name: str, changes: Mapping[str, Any], table: Path | None, scenes: dict[str, Scene]
+) -> Scene:  # fmt: skip
+    key = f"{name} {sorted(changes.items())!r}"
+    if key not in scenes:
+        try:
+            scenes[key] = load_scene(name, {**changes, **({"channels": table} if table else {})})
+        except InputError as error:
+            # Whose it is: of the file's own changes, or of the matrix's.
+            place = error.field
+            if place in file.matrix.set:
+                place = f"matrix.set.{place}"
+            elif place in file.set:
+                place = f"set.{place}"
+            elif place == "scene":
+                place = "matrix.scene" if name in file.matrix.scene else "scene"
+            elif table is not None:
+                place = f"channels.{place}"
+            raise InputError(place, error.must, error.received) from None
+    return scenes[key]
+
+
+@contextmanager
+def _field(name: str) -> Iterator[None]:
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{name}.{error.field}", error.must, error.received) from None
+
+
+def _filled(value: Any, places: Mapping[str, str], field: str, kept: tuple[str, ...] = ()) -> Any:
+    """The same with what stands between braces filled in: `{danger}`, or `{danger:um}` as a bare number of um."""
+    if isinstance(value, dict):
+        return {key: _filled(each, places, f"{field}.{key}", kept) for key, each in value.items()}
+    if isinstance(value, list):
+        return [_filled(each, places, f"{field}.{n}", kept) for n, each in enumerate(value)]
+    if not isinstance(value, str):
+        return value
+
+    def fill(match: re.Match[str]) -> str:
+        name, unit = match[1], match[2]
+        if name in kept:
+            return match[0]
+        if name not in places:
+            must = "with names of [limits] or [matrix.device] between braces"
+            raise InputError(field, such_as(must, name, [*places, *kept]), match[0])
+        if unit is None:
+            return places[name]
+        number, own = split_quantity(places[name], field=field)
+        if units.kind(own) != units.kind(unit) or not units.kind(unit):
+            raise InputError(field, f"with {name} in a unit of {units.kind(own) or own}", match[0])
+        return f"{number * units.size_si(own) / units.size_si(unit):.12g}"
+
+    return _PLACE.sub(fill, value)
+
+
+def _step(
+    given: Mapping[str, Any], field: str, places: Mapping[str, str], duration_s: float, scene: Scene, file: _File
+) -> Step:  # fmt: skip
+    one = _filled(dict(given), places, field)
+    if "note" in one:
+        note = check(_Note, one, field=field)
+        step = Step(note.at_s, None, note.note, tuple(note.tags))
+    else:
+        step = Step(check(_At, {"at_s": one.pop("at_s", None)}, field=field).at_s, None)
+        name = one.pop("command", None)
+        if not isinstance(name, str):
+            must = f"given ({', '.join(COMMANDS)}), or a note"
+            raise InputError(f"{field}.command", must, name)
+        try:
+            request = check_command(name, one)
+        except InputError as error:
+            inner = error.field.removeprefix(f"{name}.")
+            raise InputError(f"{field}.{inner}", error.must, error.received) from None
+        if isinstance(request, FaultCommand):
+            _check_fault(request, field, scene, can=file.can)
+        step = replace(step, command=TimedCommand(at_s=step.at_s, request=request))
+    if step.at_s >= duration_s:
+        raise InputError(f"{field}.at_s", f"before the case's end, {duration_s:g} s", step.at_s)
+    return step
+
+
+class _At(Written):
+    at_s: Time
+
+
+class _Note(_At):
+    note: Line
+    tags: list[str] = Field(default=[])
+
+
+def _check_fault(request: FaultCommand, field: str, scene: Scene, *, can: bool) -> None:
+    what, setting = request.what, scene.setting
+    try:
+        if isinstance(what, OfBlocks):
+            stream_of(what, request.channel, scene.table, ("zenoh", "can") if can else ("zenoh",))
+        else:
+            channels_of(
+                what, request.channel, scene.table,
+                ideal=setting.ideal, noisy=setting.noisy, generated=setting.generated,
+            )  # fmt: skip
+    except InputError as error:
+        raise InputError(f"{field}.{error.field.removeprefix('fault.')}", error.must, error.received) from None
+
+
+def _expect(
+    given: Mapping[str, Any], field: str, places: Mapping[str, str], known: Units, duration_s: float
+) -> Expect:  # fmt: skip
+    kinds = [key for key in KINDS if key in given]
+    if len(kinds) != 1:
+        found = Words(" and ".join(kinds) or "none of them")
+        raise InputError(field, f"about one of {', '.join(KINDS)}", found)
+    expect = check(KINDS[kinds[0]], _filled(dict(given), places, field), field=field)
+    expect.check(known, where=field)
+    times = {name: getattr(expect, name, None) for name in ("from_s", "at_s", "to_s")}
+    for name, time_s in times.items():
+        if time_s is not None and time_s > duration_s:
+            raise InputError(f"{field}.{name}", f"within the case, which ends at {duration_s:g} s", time_s)
+    if times["to_s"] is not None and not times["from_s"] < times["to_s"]:
+        raise InputError(f"{field}.to_s", f"behind from_s, {times['from_s']:g} s", times["to_s"])
+    return expect
+
+
+def _when(expect: Expect) -> Iterator[tuple[str, list[str]]]:
+    """Axes that an expectation is kept to, each with its values as cases are named by them."""
+    for axis, given in expect.when.items():
+        labels = [_short(each) for each in (given if isinstance(given, list) else [given])]
+        short = "" if axis in ("scene", "fault") else f"{axis.rpartition('.')[2]}="
+        yield axis, [label if label.startswith(short) else f"{short}{label}" for label in labels]
+
+
+def _check_when(expect: Expect, field: str, axes: Mapping[str, list[str]]) -> None:
+    for axis, labels in _when(expect):
+        if axis not in axes:
+            raise UnknownNameError(f"{field}.{axis}", "an axis of the matrix", axis, axes)
+        for label in labels:
+            if label not in axes[axis]:
+                raise UnknownNameError(f"{field}.{axis}", f"a value of {axis} in the matrix", label, axes[axis])
+
+
+def _device(file: _File, places: Mapping[str, str], path: Path) -> _Device:
+    assert file.device is not None
+    command = _filled(file.device.command, places, "device.command", PLACES)
+    if "{can}" in command and not file.can:
+        raise InputError("device.command", "without {can} unless can = true", command)
+    try:
+        words = shlex.split(command)
+    except ValueError as error:
+        raise InputError("device.command", "a command line", Words(f"{command} ({error})")) from None
+    check_program(words, path.parent, field="device.command")
+    return _Device(**{**file.device.model_dump(), "command": command})

@@ -1,0 +1,337 @@
+"""What a campaign's file expects, and what a recording shows of it: signals, events, order, a scorecard's rows."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from replays.campaigns.files.scored import ExpectScore
+from replays.campaigns.files.seen import Expected, Seen, Time, Units, asked, in_unit
+from replays.campaigns.measurement import Measurement, Must, quantity
+from rig.base.errors import InputError, UnknownNameError, Words
+from rig.base.outside import Written
+from rig.run.commands import COMMANDS
+from rig.serve.service import REPLAY_COMMANDS
+
+Take = Literal[
+    "peak", "max", "min", "mean", "rms", "std", "peak to peak", "value", "first beyond", "last beyond", "time beyond",
+    "whirl frequency",
+]  # fmt: skip
+_TIMES = ("first beyond", "last beyond", "time beyond")
+if TYPE_CHECKING:
+    EventName = str
+else:
+    EventName = Literal["start", "end", "command", "note", "warning", "device", *COMMANDS, *REPLAY_COMMANDS]
+    """What a rig or a replay tells of."""
+
+
+class _Signal(Written):
+    signal: str | list[str] = ""
+    truth: str = ""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return (self.signal,) if isinstance(self.signal, str) else tuple(self.signal)
+
+    def unit(self, units: Units, *, where: str) -> str:
+        """Unit of the signal, or of both of an orbit.
+
+        Raises:
+            InputError: There is no such signal, or the two cannot be of one orbit.
+        """
+        if self.truth and self.truth not in units:
+            tables = [name for name in units if name]
+            raise UnknownNameError(f"{where}.truth", "one of the tables of the truth", self.truth, tables)
+        if len(self.names) not in (1, 2):
+            raise InputError(f"{where}.signal", "a name, or the two of an orbit", list(self.names))
+        known = units[self.truth]
+        for name in self.names:
+            if name not in known:
+                what = f"a column of {self.truth}" if self.truth else "one of the channels"
+                raise UnknownNameError(f"{where}.signal", what, name, known)
+        if len({known[name] for name in self.names}) > 1:
+            found = Words(" and ".join(f"{name} in {known[name]}" for name in self.names))
+            raise InputError(f"{where}.signal", "two of one unit", found)
+        return known[self.names[0]]
+
+    def values(self, seen: Seen) -> tuple[np.ndarray, np.ndarray]:
+        """Times of the case [s] and values, of an orbit its radius, each shape (n,)."""
+        rows = seen.rows(self.truth, self.names)
+        columns = [rows[name] for name in self.names]
+        return rows.times_s - seen.origin_s, columns[0] if len(columns) == 1 else np.hypot(*columns)
+
+
+class EventOf(Written):
+    """An event by its name and by what stands in it: `where` compares fields, and looks into lists."""
+
+    event: EventName
+    where: dict[str, Any] = Field(default={})
+    text: str = ""
+
+    def __str__(self) -> str:
+        about = [f"{name}={value}" for name, value in self.where.items()] + [self.text]
+        return " ".join([self.event, *filter(None, about)])
+
+    def times_s(self, seen: Seen) -> list[float]:
+        """When it came, in time of the case [s]."""
+        return [time_s for time_s, event in seen.events if self._is(event)]
+
+    def _is(self, event: Mapping[str, Any]) -> bool:
+        if event.get("event") != self.event or self.text not in str(event.get("text", "")):
+            return False
+        for name, wanted in self.where.items():
+            place: Any = event
+            for part in name.split("."):
+                place = place.get(part) if isinstance(place, Mapping) else None
+            if place != wanted and not (isinstance(place, list) and wanted in place):
+                return False
+        return True
+
+
+class Since(_Signal):
+    """A moment that times are counted from: one of the case, an event, or the first row beyond a level."""
+
+    at_s: Time | None = None
+    event: EventName | Literal[""] = ""
+    where: dict[str, Any] = Field(default={})
+    text: str = ""
+    beyond: str = ""
+
+    def check(self, units: Units, *, where: str) -> None:
+        """Refuse what names no moment, or more than one.
+
+        Raises:
+            InputError: It does, or its level has no unit or a wrong one.
+        """
+        given = [name for name in ("at_s", "event", "signal") if getattr(self, name) not in (None, "", [])]
+        if len(given) != 1:
+            raise InputError(where, "given by one of at_s, event and signal", Words(" and ".join(given) or "none"))
+        if self.signal:
+            unit = self.unit(units, where=where)
+            quantity(self.beyond, unit, field=f"{where}.beyond", of=_name(self.names))
+
+    def time_s(self, seen: Seen, units: Units, *, from_s: float) -> float:
+        """When it is, in time of the case [s]; nan where it never is."""
+        if self.at_s is not None:
+            return self.at_s
+        if self.event:
+            event = EventOf(event=self.event, where=self.where, text=self.text)
+            return next((each for each in event.times_s(seen) if each >= from_s), math.nan)
+        times_s, values = self.values(seen)
+        level = quantity(self.beyond, self.unit(units, where=""), field="beyond", of="")
+        rows = np.flatnonzero((np.abs(values) > level) & (times_s >= from_s - 1e-9))
+        return float(times_s[rows[0]]) if len(rows) else math.nan
+
+
+class _Within(Expected):
+    from_s: Time = 0.0
+    to_s: Time | None = None
+
+
+class ExpectSignal(_Signal, _Within):
+    """A value taken of a signal between two times."""
+
+    take: Take = "peak"
+    at_s: Time | None = None
+    beyond: str = ""
+    since: Since | None = None
+    must: str
+
+    def check(self, units: Units, *, where: str) -> Must:
+        """What is asked, in the unit of what is taken.
+
+        Raises:
+            InputError: Signal, level or limit cannot be.
+        """
+        unit = self.unit(units, where=where)
+        if (self.take in _TIMES) != bool(self.beyond):
+            must = "given for" if self.take in _TIMES else "left out, but for the times"
+            raise InputError(f"{where}.beyond", f"{must} {', '.join(_TIMES)}", self.beyond or None)
+        if self.beyond:
+            quantity(self.beyond, unit, field=f"{where}.beyond", of=_name(self.names))
+            unit = "s"
+        if (self.take == "value") != (self.at_s is not None):
+            must = "given where take is value" if self.at_s is None else "left out, but where take is value"
+            raise InputError(f"{where}.at_s", must, self.at_s)
+        if self.take == "whirl frequency":
+            if len(self.names) != 2:
+                raise InputError(f"{where}.signal", "the two of an orbit for a whirl frequency", list(self.names))
+            unit = "Hz"
+        if self.since is not None:
+            if self.take not in ("first beyond", "last beyond"):
+                raise InputError(f"{where}.since", "left out, but where take is first beyond or last beyond", self.take)
+            self.since.check(units, where=f"{where}.since")
+        return asked(self.must, unit, where=where, of=self.label)
+
+    @property
+    def label(self) -> str:
+        """What is measured, in words."""
+        level = f" {self.beyond}" if self.beyond else ""
+        at = f" at {self.at_s:g} s" if self.at_s is not None else ""
+        return self.name or f"{self.take}{level} of {_name(self.names)}{at}"
+
+    def measure(self, seen: Seen, units: Units) -> Iterator[Measurement]:
+        """What the recording shows of it."""
+        must = self.check(units, where="expect")
+        value, at_s, note = self._value(seen, units)
+        row_s = 1.0 / seen.rows(self.truth, self.names).rate_hz
+        unit = "s" if self.beyond else "Hz" if self.take == "whirl frequency" else self.unit(units, where="expect")
+        exact = f"1 row, {1e6 * row_s:g} us" if self.beyond else ""
+        channels = () if self.truth else self.names
+        yield Measurement(self.label, in_unit(value, unit, must), must, self.source, exact, note, at_s, channels)
+
+    def _value(self, seen: Seen, units: Units) -> tuple[float, float | None, str]:
+        times_s, values = self.values(seen)
+        if self.at_s is not None:
+            row = int(np.argmin(np.abs(times_s - self.at_s)))
+            return float(values[row]), float(times_s[row]), ""
+        kept = (times_s >= self.from_s - 1e-9) & (times_s < (math.inf if self.to_s is None else self.to_s) - 1e-9)
+        times_s, part = times_s[kept], values[kept]
+        if not len(part):
+            return math.nan, None, "no rows between these times"
+        if self.take == "whirl frequency":
+            from rig.channels.orbit import whirl_frequency
+
+            x, y = (seen.rows(self.truth, self.names)[name][kept] for name in self.names)
+            return whirl_frequency(x, y, times_s), float(times_s[0]), ""
+        if self.beyond:
+            level = quantity(self.beyond, self.unit(units, where=""), field="beyond", of="")
+            rows = np.flatnonzero(np.abs(part) > level)
+            if self.take == "time beyond":
+                rate = seen.rows(self.truth, self.names).rate_hz
+                return len(rows) / rate, float(times_s[rows[0]]) if len(rows) else None, ""
+            if not len(rows):
+                return math.nan, None, f"it never is beyond {self.beyond}"
+            at_s = float(times_s[rows[0] if self.take == "first beyond" else rows[-1]])
+            if self.since is None:
+                return at_s, at_s, ""
+            since_s = self.since.time_s(seen, units, from_s=self.from_s)
+            note = "" if math.isfinite(since_s) else "what it is counted from never came"
+            return at_s - since_s, at_s, note
+        row = {"max": part.argmax, "min": part.argmin}.get(self.take, np.abs(part).argmax)()
+        value = _STATISTICS[self.take](part)
+        return float(value), float(times_s[int(row)]), ""
+
+
+_STATISTICS: dict[str, Callable[[np.ndarray], Any]] = {
+    "peak": lambda values: np.abs(values).max(),
+    "max": np.max,
+    "min": np.min,
+    "mean": np.mean,
+    "rms": lambda values: math.sqrt(float(np.mean(values**2))),
+    "std": np.std,
+    "peak to peak": np.ptp,
+}
+
+
+class ExpectEvent(_Within):
+    """An event that comes, does not come, or comes in time."""
+
+    event: EventName
+    where: dict[str, Any] = Field(default={})
+    text: str = ""
+    appears: bool = True
+    take: Literal["time", "count"] = "time"
+    since: Since | None = None
+    must: str = ""
+
+    def check(self, units: Units, *, where: str) -> Must:
+        """What is asked: of its time, or of how often it comes.
+
+        Raises:
+            InputError: The limit, or what its time is counted from, cannot be.
+        """
+        if self.since is not None:
+            self.since.check(units, where=f"{where}.since")
+        if not self.must:
+            if self.since is not None:
+                raise InputError(f"{where}.since", "left out without must", Words("given"))
+            return Must("==" if not self.appears else ">=", 0.0 if not self.appears else 1.0, "1")
+        if not self.appears:
+            raise InputError(f"{where}.appears", "left out with must", False)
+        return asked(self.must, "1" if self.take == "count" else "s", where=where, of=self.label)
+
+    @property
+    def of(self) -> EventOf:
+        """The event."""
+        return EventOf(event=self.event, where=self.where, text=self.text)
+
+    @property
+    def label(self) -> str:
+        """What is measured, in words."""
+        what = "time" if self.must and self.take == "time" else "number"
+        return self.name or f"{what} of {self.of}"
+
+    def measure(self, seen: Seen, units: Units) -> Iterator[Measurement]:
+        """What the recording shows of it."""
+        must = self.check(units, where="expect")
+        to_s = math.inf if self.to_s is None else self.to_s
+        times_s = [each for each in self.of.times_s(seen) if self.from_s <= each < to_s]
+        if not self.must or self.take == "count":
+            at_s = times_s[0] if times_s else None
+            yield Measurement(self.label, float(len(times_s)), must, self.source, at_s=at_s)
+            return
+        exact = "1 tick, 1 us"
+        since_s = 0.0 if self.since is None else self.since.time_s(seen, units, from_s=self.from_s)
+        # What it is counted from is what makes it come: what was there before that is another one.
+        at_s = next((each for each in times_s if not each < since_s), math.nan)
+        note = "" if math.isfinite(at_s) else f"no {self.of} came"
+        note = "what it is counted from never came" if math.isnan(since_s) else note
+        value = math.nan
+        if math.isfinite(at_s - since_s):
+            value = (seen.tick(at_s) - seen.tick(since_s)) / seen.tick_rate_hz
+        about = at_s if math.isfinite(at_s) else since_s
+        channels = () if self.since is None or self.since.truth or not self.since.signal else self.since.names
+        at_s = about if math.isfinite(about) else None
+        yield Measurement(self.label, in_unit(value, "s", must), must, self.source, exact, note, at_s, channels)
+
+
+class ExpectOrder(_Within):
+    """Events that come one behind the other."""
+
+    order: Annotated[list[EventOf], Field(min_length=2)]
+
+    def check(self, units: Units, *, where: str) -> Must:
+        """All of them, in this order."""
+        return Must("==", float(len(self.order)), "1")
+
+    @property
+    def label(self) -> str:
+        """What is measured, in words."""
+        return self.name or f"events in order: {', then '.join(map(str, self.order))}"
+
+    def measure(self, seen: Seen, units: Units) -> Iterator[Measurement]:
+        """How many of them came in their place."""
+        at_s, count, note = self.from_s, 0, ""
+        to_s = math.inf if self.to_s is None else self.to_s
+        for each in self.order:
+            later = [time_s for time_s in each.times_s(seen) if at_s <= time_s < to_s]
+            if not later:
+                note = f"no {each} came from {at_s:g} s on"
+                break
+            at_s, count = later[0], count + 1
+        yield Measurement(self.label, float(count), self.check(units, where=""), self.source, note=note, at_s=at_s)
+
+
+Expect = ExpectSignal | ExpectEvent | ExpectOrder | ExpectScore
+KINDS: dict[str, type[Expect]] = {
+    "signal": ExpectSignal, "event": ExpectEvent, "order": ExpectOrder, "score": ExpectScore,
+}  # fmt: skip
+"""What an expectation is about, by the key that says so."""
+
+
+def expected_events(expects: Iterable[Expect]) -> Iterator[EventOf]:
+    """Events that are expected, alone or in order."""
+    for expect in expects:
+        if isinstance(expect, ExpectOrder):
+            yield from expect.order
+        elif isinstance(expect, ExpectEvent) and expect.appears:
+            yield expect.of
+
+
+def _name(names: tuple[str, ...]) -> str:
+    return names[0] if len(names) == 1 else f"the orbit of {' and '.join(names)}"

@@ -1,0 +1,168 @@
+"""One case of a campaign's file: its bench, its device, its steps, and what its recording shows."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+from replays.campaigns.equipment.bench import NotThereError
+from replays.campaigns.equipment.keeper import KILLED, PATIENCE_S
+from replays.campaigns.files.expectation import EventOf, expected_events
+from replays.campaigns.files.seen import Seen
+from replays.campaigns.measurement import Measurement, Must
+from rig.base import wire
+from rig.base.errors import RefusedError
+from rig.run.commands import (
+    ClearCommand,
+    FaultCommand,
+    HammerCommand,
+    ReleaseCommand,
+    SpeedCommand,
+    TimedCommand,
+    refusal,
+)
+
+if TYPE_CHECKING:
+    from drivers.client import Rig
+    from replays.campaigns.equipment.device import Device
+    from replays.campaigns.files.campaign import Case, Step
+    from replays.campaigns.trial import Trial
+
+_LAST_S = 5.0
+"""How long a device may take to end behind the run [s]."""
+
+
+def run_case(case: Case, trial: Trial) -> None:
+    """Run a case and judge it; what was measured is in the trial, whatever comes of it.
+
+    In lockstep, commands are given to the rig before it begins, and take effect at their very tick. In real time, and
+    on a rig that is there already, the case begins when its device is there, and commands are sent when they are due.
+
+    Raises:
+        BenchError: Rig, device or recording failed.
+        NotThereError: What the case needs cannot be done on this bench.
+    """
+    settings, live, steps = case.bench, [step for step in case.steps if step.command is None], case.steps
+    timed = tuple(step.command for step in steps if step.command is not None)
+    if trial.target.own and settings.pace == "real-time":
+        from rig.run.scenes import load_scene
+
+        own = load_scene(settings.scene or "", dict(settings.set)).commands
+        live = sorted([*map(_step, own), *steps], key=lambda step: step.at_s)
+        settings = replace(settings, set={**settings.set, "commands": []}, duration_s=None)
+    elif trial.target.url is not None:
+        live = list(steps)
+    else:
+        settings = replace(settings, commands=timed, duration_s=case.duration_s)
+    bench = trial.start_bench(settings)
+    if case.device is not None and trial.target.replay is not None and case.device.commands:
+        raise NotThereError(f"a recording takes no commands of {case.device.name}")
+    record = trial.start_record()
+    record.wait_until_there()
+    device: Device | None = None
+    if case.device is not None:
+        joins = None if case.device.joins else False
+        device = trial.start_device(case.device.command, name=case.device.name, where=case.file.parent, joins=joins)
+    trial.origin_s = bench.begin()
+    with bench.connect(name="campaign", channels=()) as machine:
+        for step in live:
+            bench.advance_to(trial.origin_s + step.at_s)
+            _send(machine, step)
+        bench.advance_to(trial.origin_s + case.duration_s)
+        if trial.target.own:
+            bench.late_blocks()  # while it can be asked
+            _stop(machine)
+            record.wait()
+    trial.recording = record.stop()
+    if device is not None:
+        end_device(device, trial)
+    seen = Seen(trial.recording, trial.folder, trial.origin_s)
+    _measure_device(seen, trial)
+    measure_end(seen, trial, case)
+    for expect in case.expects:
+        for measurement in expect.measure(seen, seen.units):
+            exact = measurement.resolution
+            # Times that a device has a part in are exact to its reaction.
+            told = f"{exact}; {trial.resolution}" if exact and case.device is not None else exact
+            trial.take(replace(measurement, resolution=told))
+
+
+def _step(command: TimedCommand) -> Step:
+    from replays.campaigns.files.campaign import Step
+
+    return Step(command.at_s, command)
+
+
+def _send(machine: Rig, step: Step) -> None:
+    try:
+        if step.command is None:
+            machine.note(step.note, tags=list(step.tags))
+            return
+        request: Any = step.command.request
+        if isinstance(request, HammerCommand):
+            machine.hammer(force_n=request.force_n, duration_ms=request.duration_ms, direction=request.direction)
+        elif isinstance(request, SpeedCommand):
+            machine.speed(request.speed_hz)
+        elif isinstance(request, FaultCommand):
+            numbers = request.what.model_dump(exclude_none=True)
+            machine.fault(request.channel, numbers.pop("kind"), for_s=request.for_s, **numbers)
+        elif isinstance(request, ClearCommand):
+            machine.clear(request.id)
+        elif isinstance(request, ReleaseCommand):
+            machine.release()
+        else:
+            raise refusal(request)
+    except RefusedError as error:
+        if wire.ENDED in str(error):
+            return  # the verdict is of the run's end
+        raise NotThereError(f"the rig refuses a step at {step.at_s:g} s: {error}") from None
+
+
+def _stop(machine: Rig) -> None:
+    try:
+        machine.stop()
+    except (RefusedError, ConnectionError):
+        return  # it has come to its end
+
+
+def end_device(device: Device, trial: Trial) -> None:
+    """Let a device end by itself, as the run has ended, and judge how it did."""
+    deadline = time.monotonic() + _LAST_S
+    while device.program.status is None and time.monotonic() < deadline and trial.target.own:
+        time.sleep(0.02)
+    status = device.program.status
+    device.program.end()
+    note = f"its last line: {device.program.last_line}" if status else ""
+    if status is None and device.program.status == KILLED:
+        status, note = KILLED, f"it had to be killed: it did not end within {PATIENCE_S:g} s of a SIGTERM"
+    if status is not None:
+        must = Must("==", 0.0, "1")
+        trial.take(Measurement(f"exit status of {device.name}", float(status), must, note=note))
+
+
+def measure_end(seen: Seen, trial: Trial, case: Case) -> None:
+    """A run that was stopped before the case was over has shown nothing of the rest, but where that is expected."""
+    ended = next(((at_s, event) for at_s, event in seen.events if event["event"] == "end"), None)
+    if ended is None or ended[1].get("reason") == "completed" or ended[0] >= case.duration_s - 1e-6:
+        return
+    if not any(event.event == "end" or event.where.get("command") == "stop" for event in expected_events(case.expects)):
+        at_s, event = ended
+        by = next((event["from"] for _, event in seen.events if event.get("command") == "stop"), "")
+        note = f"{event.get('reason')}{f' by {by}' if by else ''}, before the case was over"
+        trial.take(Measurement("end of the run", at_s, Must(">=", case.duration_s, "s"), note=note, at_s=at_s))
+
+
+def _measure_device(seen: Seen, trial: Trial) -> None:
+    """A device that hung, died or answered late in lockstep is a verdict, with the rig's reason."""
+    for device in trial.devices:
+        lost = EventOf(event="device", where={"device": device.joined_as, "state": "lost"})
+        times_s = lost.times_s(seen)
+        if trial.bench is not None and trial.bench.pace == "lockstep":
+            reasons = [
+                str(event.get("reason", "")) for _, event in seen.events
+                if (event.get("event"), event.get("device"), event.get("state")) == ("device", device.joined_as, "lost")
+            ]  # fmt: skip
+            at_s = times_s[0] if times_s else None
+            name = f"times that {device.name} was lost"
+            trial.take(Measurement(name, float(len(times_s)), Must("==", 0.0, "1"), note="; ".join(reasons), at_s=at_s))

@@ -1,0 +1,169 @@
+"""What a campaign expects of the scorecard of a DAQ under test: a quantity, or that all is there that was sent."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from pydantic import Field
+
+from replays.campaigns.files.seen import Expected, Seen, Time, Units, asked, in_unit
+from replays.campaigns.measurement import Measurement, Must
+from rig.base.errors import InputError, UnknownNameError
+from rig.base.outcome import Outcome
+from rig.base.wire import sensor_key
+
+if TYPE_CHECKING:
+    from replays.score.card.scorecard import Scorecard, ScoreRow
+
+
+class ExpectScore(Expected):
+    """Rows of the scorecard of what a DAQ under test has written: a quantity, or `all`.
+
+    With `must` a quantity's own value is held against that with its whole interval, and not against limits of the card:
+    also for what none ask about, such as the trigger row, and for rows that have to be missing. `all` asks for every
+    channel and row that was sent, but for what is granted.
+    """
+
+    score: str
+    channel: str | list[str] = ""
+    channels: Annotated[tuple[str, ...], Field(min_length=1)] | None = None
+    """Channels that the device was to record, as `rig score --channels`; all of the session unless given."""
+    file: Annotated[str, Field(min_length=1)]
+    limits: str | None = None
+    path: Literal["digital", "analogue"] | None = None
+    must: str = ""
+    begins_s: Time = 0.0
+    """How much later than the case the DAQ may begin, ..."""
+    ends_s: Time = 0.0
+    """... and how much earlier it may end."""
+    every: Annotated[int, Field(ge=1)] = 1
+    """It takes every so many rows."""
+
+    @property
+    def _channels(self) -> tuple[str, ...]:
+        return (*filter(None, [self.channel]),) if isinstance(self.channel, str) else tuple(self.channel)
+
+    def check(self, units: Units, *, where: str) -> Must:
+        """Nothing fails, or what is asked of the quantity's values.
+
+        Raises:
+            InputError: There is no such quantity, or limits, or it has no values in the unit of what is asked.
+        """
+        from replays.score.card.limits import load_limits
+        from replays.score.card.scorecard import QUANTITIES
+
+        known = {quantity: about for quantities in QUANTITIES.values() for quantity, about in quantities.items()}
+        if self.score not in {*known, "all"}:
+            raise UnknownNameError(f"{where}.score", "a quantity of `rig score`, or all", self.score, sorted(known))
+        load_limits(self.limits)
+        for name, usual in (("begins_s", 0.0), ("ends_s", 0.0), ("every", 1)):
+            if self.score != "all" and getattr(self, name) != usual:
+                raise InputError(f"{where}.{name}", "left out, but where score is all", getattr(self, name))
+        for name in self.channels or ():
+            if name not in units[""]:
+                raise UnknownNameError(f"{where}.channels", "channels that the rig sends", name, units[""])
+        if not self.must:
+            return Must("==", 0.0, "1")
+        if self.score in ("all", "recorded", "mapping", "polarity"):
+            raise InputError(f"{where}.must", f"left out where score is {self.score}", self.must)
+        if not (unit := known[self.score].unit or units[""].get(" ".join(self._channels), "")):
+            what = f"one of the channels with must, as {self.score} is in the unit of its channel"
+            raise UnknownNameError(f"{where}.channel", what, " ".join(self._channels), units[""])
+        return asked(self.must, unit, where=where, of=self.score)
+
+    def measure(self, seen: Seen, units: Units) -> Iterator[Measurement]:
+        """A measurement for each row that is not as asked, or that shows nothing; else one for all of them."""
+        from replays.score.card.scorecard import FAIL, INCONCLUSIVE, PASS
+
+        must = self.check(units, where="expect")
+        what = self.name or " ".join(("failing rows of", self.score, *self._channels))
+        try:
+            card = seen.card(self.file, self.limits, self.path, self.channels)
+        except InputError as error:
+            yield Measurement(what, math.nan, must, self.source, note=str(error))
+            return
+        rows = list(self._about(card, seen))
+        if self.must:
+            yield from self._values(rows, must)
+            return
+        found = list(self._missing(card, rows, seen)) if self.score == "all" else []
+        for row in rows:
+            # One quantity that is asked for must be shown; of all, some never are.
+            if row.verdict == FAIL or (row.verdict == INCONCLUSIVE and self.score != "all"):
+                text = " ".join(filter(None, (*row.cells(), row.note)))
+                found.append((row.channel, text, Outcome(row.verdict)))
+        failing = [(channel, text) for channel, text, outcome in found if outcome is Outcome.FAIL]
+        reasons = [text for _, text, outcome in found if outcome is Outcome.INCONCLUSIVE]
+        reasons += card.doubts if self.score == "all" else []
+        limits = [row.limit.source for row in rows if row.verdict == FAIL and row.limit is not None]
+        shown, hidden = (sum(row.verdict == verdict for row in rows) for verdict in (PASS, INCONCLUSIVE))
+        note = f"{card.path} path, {shown} quantities pass, {hidden} inconclusive"
+        if not shown and not failing and not reasons:
+            reasons.append("no quantity of it has a verdict")
+        yield Measurement(
+            what, float(len(failing)), must, self.source or ", ".join(dict.fromkeys(limits)),
+            note="; ".join([text for _, text in failing][:4]) or note,
+            channels=tuple(channel for channel, _, _ in found if channel)[:2],
+            open_reason="" if failing else "; ".join(reasons[:4]),
+        )  # fmt: skip
+
+    def _about(self, card: Scorecard, seen: Seen) -> Iterator[ScoreRow]:
+        """Rows of the quantity, of the channels, and of groups with them."""
+        groups = _sent(seen)
+        wanted = {name for each in self._channels for name in (each, *groups.get(each, ()))}
+        wires = {row.channel: str(row.value) for row in card.rows if row.quantity == "mapping"}
+        for row in card.rows:
+            tables = groups if row.channel == "all groups" else row.channel.split(", ")
+            own = {row.channel, wires.get(row.channel)}.union(tables, *(groups.get(each, ()) for each in tables))
+            if self.score in ("all", row.quantity) and (not wanted or own & wanted):
+                yield row
+
+    def _missing(self, card: Scorecard, rows: Sequence[ScoreRow], seen: Seen) -> Iterator[tuple[str, str, Outcome]]:
+        """Yield what was sent and is not in the record, or not shown to be: channel if it is of one, text, outcome."""
+        from replays.score.card.scorecard import INCONCLUSIVE, PASS
+
+        groups = _sent(seen)
+        wires = {row.value: row for row in card.rows if row.quantity == "mapping"}
+        found = {row.channel for row in card.rows if row.quantity == "recorded" and row.verdict == PASS}
+        for name in [name for each in self._channels or groups for name in groups.get(each, [each])]:
+            wire = wires.get(name)
+            if wire is None:
+                if name in found:  # otherwise the quantity `recorded` fails, or the channel was not to be recorded
+                    yield name, f"nothing of {name} is found in the file", Outcome.FAIL
+            elif wire.verdict == INCONCLUSIVE:
+                text = f"whether {wire.channel} is {name} is inconclusive; to show it: {wire.run}"
+                yield name, text, Outcome.INCONCLUSIVE
+            elif not any(row.verdict == PASS for row in rows if row.channel == wire.channel and row is not wire):
+                yield name, f"no quantity of {name} has a verdict", Outcome.INCONCLUSIVE
+        granted_s = {"rows before the first": seen.origin_s + self.begins_s, "rows after the last": self.ends_s}
+        for row in rows:
+            about = f"{row.quantity} of {row.channel}: {row.cells()[2]}"
+            if row.quantity == "row step" and row.value != self.every:
+                yield "", f"{about}, not {self.every}", Outcome.FAIL
+            elif row.quantity in granted_s:
+                table = seen.recording.table.groups
+                rate_hz = max(table[name].rate_hz for name in groups if name in row.channel or "all" in row.channel)
+                if float(row.value) * self.every / rate_hz > granted_s[row.quantity] + 1e-9:
+                    yield "", about, Outcome.FAIL
+
+    def _values(self, rows: Sequence[ScoreRow], must: Must) -> Iterator[Measurement]:
+        """Of each row that end of the interval, or the value, which is nearest to what it must not be."""
+        for row in rows:
+            what = self.name or f"{row.quantity} {row.channel}".strip()
+            ends = [in_unit(float(each), row.unit, must) for each in (row.value, row.low, row.high)]
+            value = min(ends, key=must.margin) if all(map(math.isfinite, ends)) else math.nan
+            reason = "" if math.isfinite(value) else row.note or f"this run does not show it; to show it: {row.run}"
+            yield Measurement(
+                what, value, must, self.source, note=row.note, channels=(row.channel,), open_reason=reason
+            )
+        if not rows:
+            what = self.name or " ".join((self.score, *self._channels))
+            yield Measurement(what, math.nan, must, self.source, open_reason="the scorecard has no such quantity")
+
+
+def _sent(seen: Seen) -> dict[str, tuple[str, ...]]:
+    """Channels that were sent, by group."""
+    groups = seen.recording.table.groups
+    return {name: tuple(group.names) for name, group in groups.items() if sensor_key(name) in seen.recording.streams}

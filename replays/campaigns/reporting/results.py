@@ -1,0 +1,233 @@
+"""What is handed in of a campaign: results.json, junit.xml, index.html and the evidence, in one folder.
+
+The same campaign in lockstep gives the same results.json, byte for byte, but for what stands under `wall`.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+import shutil
+import time
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from replays.report import junit, write_report
+from replays.studies.common import provenance
+from rig.base.errors import DiskError, InputError, whole_file
+from rig.base.outside import open_file, read_json, unreadable
+from rig.base.text import finite, printable
+
+if TYPE_CHECKING:
+    import pytest
+
+FORMAT = 1
+OUTCOMES = ("failed", "error", "interrupted", "inconclusive", "skipped", "passed")
+"""What may become of a case, the worst first."""
+_JUNIT: dict[str, junit.Outcome] = {
+    "failed": "failure", "error": "error", "interrupted": "error", "inconclusive": "inconclusive",
+    "skipped": "skipped", "passed": "passed",
+}  # fmt: skip
+_LONGEST = 2000
+_UNFINISHED = "it was ended while it ran"
+
+
+class Results:
+    """Gathers what the tests report, and writes it at the end; a plugin of pytest.
+
+    Args:
+        folder: Where to; made if it is not there.
+        against: Results of an earlier campaign.
+        config: Of the run.
+
+    Raises:
+        InputError: Another campaign writes there, or the results of the earlier one are none.
+        DiskError: The folder cannot be made.
+    """
+
+    def __init__(self, folder: Path, against: Path | None, config: pytest.Config) -> None:
+        self._lock = _locked(folder)
+        self._folder, self._config = folder, config
+        self._earlier = None if against is None else load_results(against)
+        if (folder / "results.json").is_file():  # what is written anew has none of the old evidence
+            shutil.rmtree(folder / "evidence", ignore_errors=True)
+        self._cases: dict[str, dict[str, Any]] = {}
+        self._planned: dict[str, None] = {}
+        self._begun_s = time.time()
+
+    def pytest_collection_finish(self, session: pytest.Session) -> None:
+        """What is to be run."""
+        self._planned |= {item.nodeid: None for item in session.items}
+
+    def pytest_xdist_node_collection_finished(self, node: Any, ids: list[str]) -> None:
+        """The same where several processes run it."""
+        self._planned |= dict.fromkeys(ids)
+
+    def pytest_collectreport(self, report: pytest.CollectReport) -> None:
+        """What could not be collected."""
+        if report.failed:
+            self._case(report.nodeid).update(outcome="error", reason=_line(str(report.longrepr)))
+
+    def pytest_runtest_logstart(self, nodeid: str) -> None:
+        """A test begins."""
+        self._case(nodeid)["reason"] = _UNFINISHED
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        """What came of a phase of a test."""
+        case = self._case(report.nodeid)
+        case["duration_s"] += report.duration
+        case |= getattr(report, "rig", {})
+        if report.failed:
+            outcome = outcome_of(report)
+            case["outcome"] = outcome if case["outcome"] in ("interrupted", "inconclusive") else "error"
+            case["reason"] = reason_of(report) if case["reason"] == _UNFINISHED else case["reason"]
+        elif report.skipped:
+            case |= {"outcome": "skipped", "reason": reason_of(report)}
+        elif report.when == "teardown" and case["outcome"] == "interrupted":
+            case |= {"outcome": "passed", "reason": ""}
+
+    def _case(self, name: str) -> dict[str, Any]:
+        return self._cases.setdefault(name, {
+            "outcome": "interrupted", "reason": "", "duration_s": 0.0, "title": "", "measurements": [],
+            "evidence": [], "bench": None, "resolution": "", "troubles": [], "floor_ms": None,
+        })  # fmt: skip
+
+    def pytest_sessionfinish(self, session: pytest.Session) -> None:
+        """Write all of it."""
+        if hasattr(self._config, "workerinput"):
+            return
+        document = self.document()
+        with whole_file(self._folder / "results.json") as draft:
+            draft.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        write_junit(document, self._folder / "junit.xml")
+        from replays.campaigns.reporting.page import make_page
+
+        write_report(make_page(document, self._folder, self._earlier), self._folder / "index.html")
+        os.close(self._lock)
+
+    def document(self) -> dict[str, Any]:
+        """All of it as a document for JSON."""
+        cases, wall = [], {}
+        # Several at once come in any order; what was planned has one.
+        for name in [*self._planned, *(name for name in self._cases if name not in self._planned)]:
+            if name not in self._cases:
+                self._case(name)["reason"] = "it was not run"
+            case = self._cases[name]
+            told = {key: value for key, value in case.items() if key not in ("duration_s", "floor_ms")}
+            cases.append({"id": name, **told, "repeat": self._repeat(name)})
+            wall[name] = {"duration_s": round(case["duration_s"], 3), "floor_ms": case["floor_ms"]}
+        counts = {outcome: sum(case["outcome"] == outcome for case in cases) for outcome in OUTCOMES}
+        titles = list(dict.fromkeys(case["title"] for case in cases if case["title"]))
+        return finite({
+            "format": FORMAT, "titles": titles, "counts": counts, "cases": cases,
+            "wall": {
+                "begun": datetime.fromtimestamp(self._begun_s, UTC).strftime("%Y-%m-%dT%H:%M:%S"),
+                "duration_s": round(time.time() - self._begun_s, 3), "machine": provenance.machine(),
+                "rig": " ".join(filter(None, (*provenance.versions(provenance.RIG).values(), provenance.commit()))),
+                "cases": wall,
+            },
+        })  # fmt: skip
+
+    def _repeat(self, name: str) -> str:
+        """The command that runs this one case again."""
+        path, colons, rest = name.partition("::")
+        whole = self._config.rootpath / path
+        file = os.path.relpath(whole, self._config.invocation_params.dir)
+        if whole.parent == Path(__file__).parents[1]:  # one that comes with the rig has a name
+            file = whole.name.partition(".")[0]
+        more = [("--url", self._config.getoption("rig_url")), ("--replay", self._config.getoption("rig_replay"))]
+        options = [word for option, value in more if value for word in (option, value)]
+        return shlex.join(["rig", "campaign", f"{file}{colons}{rest}", *options])
+
+
+def _locked(folder: Path) -> int:
+    """A folder, made if it is not there, that nobody else writes to until this is closed."""
+    import fcntl
+
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        handle = os.open(folder, os.O_RDONLY)
+    except OSError as error:
+        raise DiskError(f"{folder}: {error.strerror}") from None
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        os.close(handle)
+        raise InputError("--output", "a folder that no other campaign writes to now", str(folder)) from None
+    return handle
+
+
+def outcome_of(report: Any) -> str:
+    """Return what a failing phase of a test makes of it: failed, error or inconclusive."""
+    if getattr(report, "rig_inconclusive", False):
+        return "inconclusive"
+    return "failed" if report.when == "call" else "error"
+
+
+def reason_of(report: Any) -> str:
+    """Why a phase of a test failed, or was skipped, in a line."""
+    told = report.longrepr
+    if isinstance(told, tuple):  # of a skip: file, line, reason
+        return _line(str(told[2]).removeprefix("Skipped: "))
+    crash = getattr(told, "reprcrash", None)
+    return _line(str(told) if crash is None else crash.message.split(": ", 1)[-1])
+
+
+def _line(text: str) -> str:
+    return printable(next((line for line in text.splitlines() if line.strip()), ""), _LONGEST)
+
+
+def load_results(folder: Path) -> dict[str, Any]:
+    """Results of an earlier campaign, in a folder or in the file itself.
+
+    Raises:
+        InputError: They are none.
+    """
+    path = folder if folder.suffix == ".json" else folder / "results.json"
+    try:
+        with open_file(path) as file:
+            document = read_json(file.read(), field=str(path))
+    except OSError as error:
+        raise unreadable(path, error) from None
+    cases = document.get("cases")
+    good = isinstance(cases, list) and all(
+        isinstance(case, dict) and {"id", "outcome", "measurements"} <= set(case) for case in cases
+    )
+    if document.get("format") != FORMAT or not good:
+        raise InputError(str(path), "results of a campaign by this version of rig", document.get("format"))
+    return document
+
+
+def write_junit(document: dict[str, Any], path: Path) -> None:
+    """Write results as JUnit's XML: a suite a case, as its measurements are properties of a suite.
+
+    Raises:
+        DiskError: The disk refused.
+    """
+    suites = []
+    for case in document["cases"]:
+        file, _, name = case["id"].partition("::")
+        wall = document["wall"]["cases"].get(case["id"], {})
+        lines = [_told(each) for each in case["measurements"]] + [f"repeat: {case['repeat']}"]
+        one = junit.Case(
+            file.replace("/", "."), name or file, _JUNIT[case["outcome"]], case["reason"], "\n".join(lines),
+            wall.get("duration_s", 0.0),
+        )  # fmt: skip
+        suites.append(junit.Suite(case["id"], [one], list(_properties(case)), document["wall"]["begun"]))
+    junit.write_junit(path, suites, name="; ".join(document["titles"]))
+
+
+def _properties(case: dict[str, Any]) -> Any:
+    for each in case["measurements"]:
+        for key in ("value", "unit", "limit", "margin", "source", "resolution", "note"):
+            value = f"{each['op']} {each['limit']}" if key == "limit" else each[key]
+            if value not in ("", None):
+                yield f"{each['name']}.{key}", str(value)
+    for file in case["evidence"]:
+        yield "evidence", file
+
+
+def _told(each: dict[str, Any]) -> str:
+    return f"{each['outcome']}: {each['name']}: {each['value']} {each['unit']}, {each['op']} {each['limit']}"

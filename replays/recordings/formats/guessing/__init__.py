@@ -1,0 +1,1 @@
+"""What a log's signals may be, and a mapping to start from."""

@@ -1,0 +1,227 @@
+"""Parquet, by pyarrow."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator, Sequence
+from datetime import datetime
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from replays.recordings.formats.exporting import export
+from replays.recordings.formats.readers.dialect import parse_heading, time_column
+from replays.recordings.formats.source import Entry, FileSignal, Source, even_rate_hz
+
+_PIECE = 1 << 16
+"""Rows of a piece."""
+
+if TYPE_CHECKING:
+    from replays.recordings.formats.exporting.selection import Column, ExportChunk, ExportTable, Selection
+    from replays.recordings.formats.mapping import FileOptions
+
+
+def look_into(path: Path, options: FileOptions) -> Source:
+    """Look into a Parquet file.
+
+    Raises:
+        InputError: It is none, or has no column of numbers.
+    """
+    from pyarrow import parquet
+
+    file = parquet.ParquetFile(path, buffer_size=1 << 20)
+    schema = file.schema_arrow
+    headings = [parse_heading(field.name) for field in schema]
+    names = [name for name, _ in headings]
+    stamps = time_column(names, options.time_column, path=path)
+    if stamps is None and options.time_column is None:  # as pandas names an index of instants
+        stamps = next((c for c in range(len(names)) if _is_clock(schema.field(c).type)), None)
+
+    def batches(columns: Sequence[int], groups: Iterable[int]) -> Iterator[list[Any]]:
+        wanted = [schema.field(c).name for c in columns]
+        for group in groups:  # of several at once, pyarrow keeps those that it has read
+            for batch in file.iter_batches(_PIECE, row_groups=[group], columns=wanted, use_threads=False):
+                yield [batch.column(batch.schema.names.index(name)) for name in wanted]
+
+    scale, start, rate, base = 1.0, None, None, 0
+    if stamps is not None and file.metadata.num_rows:
+        (first,), last = next(batches([stamps], [0])), None
+        start, base = first_instant(first), base_ns(first)
+        if _numeric(schema.field(stamps).type):
+            scale = options.time_in_s(*headings[stamps], float(numbers(first, base)[0]))[1]
+        for (last,) in batches([stamps], [file.num_row_groups - 1]):  # noqa: B007
+            pass
+        ends_s = [numbers(part, base)[at] * scale for part, at in ((first, 0), (last, -1))]
+        rate = even_rate_hz(np.array(ends_s), file.metadata.num_rows)
+    about = schema.metadata or {}
+    entries = []
+    for c, (name, unit) in enumerate(headings):
+        field = schema.field(c)
+        if c != stamps and _numeric(field.type):
+            told = {key.decode(): text.decode(errors="replace") for key, text in (field.metadata or {}).items()}
+            entries.append(
+                Entry(name, "", unit or told.get("unit", ""), file.metadata.num_rows, rate, c, told.get("label", ""))
+            )
+
+    @cache
+    def times_s() -> np.ndarray | None:
+        return None if stamps is None else whole(stamps) * scale
+
+    def whole(c: int) -> np.ndarray:
+        return numbers(file.read(columns=[schema.field(c).name]).column(0), base)
+
+    def read(entry: Entry) -> FileSignal:
+        return FileSignal(values=whole(entry.place), times_s=times_s())
+
+    def pieces(entries: Sequence[Entry]) -> Iterator[list[FileSignal]]:
+        wanted = [entry.place for entry in entries]
+        for columns in batches(wanted if stamps is None else [*wanted, stamps], range(file.num_row_groups)):
+            found = [numbers(column, base) for column in columns]
+            part_s = None if stamps is None else found.pop() * scale
+            yield [FileSignal(values=values, times_s=part_s) for values in found]
+
+    kept = {key.decode(): text.decode(errors="replace") for key, text in about.items() if key != b"ARROW:schema"}
+    return Source(path, "Parquet", tuple(entries), read, pieces, about=kept, start=start)
+
+
+def _numeric(kind: Any) -> bool:
+    import pyarrow.types as types
+
+    return types.is_integer(kind) or types.is_floating(kind)
+
+
+def _is_clock(kind: Any) -> bool:
+    import pyarrow.types as types
+
+    return types.is_timestamp(kind) or types.is_duration(kind)
+
+
+def numbers(column: Any, base: int = 0) -> np.ndarray:
+    """A column of pyarrow as numbers, integers where they are and none is missing; times in seconds, missing: nan.
+
+    Args:
+        column: The column, or a piece of it.
+        base: From when on instants count [ns], see `base_ns`.
+    """
+    import pyarrow
+    import pyarrow.compute as compute
+    import pyarrow.types as types
+
+    if _is_clock(column.type):
+        zoned = types.is_timestamp(column.type)
+        ns = column.cast(pyarrow.timestamp("ns", tz=column.type.tz) if zoned else pyarrow.duration("ns"))
+        whole = np.array(ns.cast(pyarrow.int64()))
+        return np.asarray(whole, dtype=float) / 1e9 if column.null_count else (whole - base) / 1e9
+    if column.null_count or not types.is_integer(column.type):
+        return np.array(compute.cast(column, pyarrow.float64()), dtype=float)
+    return np.array(column)
+
+
+def joined_instants(dates: Any, times_s: Any) -> Any:
+    """Return a column of instants: dates at midnight, each with a time of day [s]."""
+    import pyarrow
+
+    ns = np.rint(1e9 * np.asarray(times_s, dtype=float)).astype("timedelta64[ns]")
+    return pyarrow.array(np.asarray(dates).astype("datetime64[ns]") + ns, pyarrow.timestamp("ns"))
+
+
+def base_ns(column: Any) -> int:
+    """The second in which a column of instants begins [ns], as `first_instant` tells it; 0 for other columns."""
+    import pyarrow
+    import pyarrow.types as types
+
+    if not types.is_timestamp(column.type) or not len(column) or not column[0].is_valid:
+        return 0  # durations count from their own zero
+    first = column[0].cast(pyarrow.timestamp("ns", tz=column.type.tz)).value
+    return first - first % 1_000_000_000
+
+
+def first_instant(column: Any) -> datetime | None:
+    """The second in which a column of instants begins; None for other columns."""
+    import pyarrow
+    import pyarrow.types as types
+
+    if not types.is_timestamp(column.type) or not len(column):
+        return None
+    told = column[0].cast(pyarrow.timestamp("us", tz=column.type.tz)).as_py()
+    return None if told is None else told.replace(microsecond=0)
+
+
+class ParquetRows:
+    """A Parquet file that grows by rows."""
+
+    def __init__(self, path: Path, schema: Any) -> None:
+        from pyarrow import parquet
+
+        self._schema = schema
+        # Dictionaries would be tried in vain on every column of a continuous quantity.
+        self._writer = parquet.ParquetWriter(path, schema, compression="lz4", use_dictionary=False)
+
+    def write(self, columns: Sequence[np.ndarray]) -> None:
+        """Take rows, column by column, each shape (n,)."""
+        self._writer.write_table(arrow_table(columns, self._schema))
+
+    def close(self) -> None:
+        """Write what is left."""
+        self._writer.close()
+
+
+def float_schema(names: Sequence[str]) -> Any:
+    """Columns of float64."""
+    import pyarrow
+
+    return pyarrow.schema([(name, pyarrow.float64()) for name in names])
+
+
+def arrow_table(columns: Sequence[np.ndarray], schema: Any) -> Any:
+    """Columns as pyarrow has them; nan in a column of integers is null."""
+    import pyarrow
+
+    arrays = []
+    for values, field in zip(columns, schema, strict=True):
+        if field.type == pyarrow.int32():
+            missing = np.isnan(values)
+            array = pyarrow.array(np.where(missing, 0.0, values).astype(np.int32), mask=missing)
+        else:
+            # Not pyarrow.array: it imports pandas to see what it was given, which takes as long as a second's rows.
+            whole = np.ascontiguousarray(values, dtype=float)
+            array = pyarrow.Array.from_buffers(pyarrow.float64(), len(whole), [None, pyarrow.py_buffer(whole)])
+        arrays.append(array)
+    return pyarrow.Table.from_arrays(arrays, schema=schema)
+
+
+class ParquetWriter(export.FormatWriter):
+    """A Parquet file: `time [s]` and a column a channel, their calibration in the columns' metadata.
+
+    What happened, and the rig's documents, are metadata of the file.
+    """
+
+    merged = True
+    sparse = True
+
+    def __init__(self, path: Path, selection: Selection) -> None:
+        import pyarrow
+
+        table = selection.tables[0]
+        kind = pyarrow.int32() if selection.unit == "counts" else pyarrow.float64()
+        fields = [pyarrow.field("time [s]", pyarrow.float64())]
+        for column in table.columns:
+            told = {key: str(value) for key, value in column.metadata.items()}
+            fields.append(pyarrow.field(column.heading, _type(column, kind), metadata=told))
+        events = json.dumps([event.document for event in selection.events])
+        whole = {"rig": json.dumps({**selection.metadata, "rate_hz": table.rate_hz}), "events": events}
+        whole |= selection.documents
+        self._file = ParquetRows(path, pyarrow.schema(fields, metadata=whole))
+
+    def write(self, table: ExportTable, chunk: ExportChunk) -> None:
+        """Take rows; those that no stream has are left out."""
+        values = [table.exported(c, chunk)[chunk.present] for c in range(len(table.columns))]
+        self._file.write([chunk.times_s[chunk.present], *values])
+
+
+def _type(column: Column, kind: Any) -> Any:
+    import pyarrow
+
+    return pyarrow.float64() if column.source is None else kind

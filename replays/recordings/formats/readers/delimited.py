@@ -1,0 +1,301 @@
+"""Text with delimiters: CSV in all its dialects, and LabVIEW's measurement files (.lvm). Parsed by pyarrow."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Collection, Iterator, Sequence
+from datetime import datetime
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from replays.recordings.formats.readers import columnar
+from replays.recordings.formats.readers.dialect import MISSING, Layout, find_layout, instant, time_column
+from replays.recordings.formats.source import Entry, FileSignal, Source, damaged, even_rate_hz
+from replays.recordings.resimulation.background import Background
+from rig.base.errors import InputError, Words
+from rig.base.text import printable
+
+_BLOCK = 1 << 21
+"""Bytes that are parsed at a time."""
+_LAST_BYTES = 1 << 16
+"""Bytes at the end of a file among which its last line is looked for."""
+_BLANKS = [" " * n for n in range(1, 33)]
+"""Fields of blanks only, as fixed columns are padded with them."""
+_KEPT = 1 << 24
+"""Values of a file that are kept once they are parsed; a longer one is parsed anew each time."""
+
+if TYPE_CHECKING:
+    from replays.recordings.formats.exporting.selection import Selection
+    from replays.recordings.formats.mapping import FileOptions
+
+
+def look_into(path: Path, options: FileOptions) -> Source:
+    """Look into a text file and read its columns.
+
+    Raises:
+        InputError: It cannot be understood; the message names what is missing or the line.
+    """
+    layout = find_layout(path, options)
+    names = list(layout.names)
+    stamps = None if layout.empty_first else time_column(names, options.time_column, path=path)
+    if stamps is None and options.time_column is None and not layout.empty_first:
+        stamps = _column_of_instants(path, layout, options)
+    start, base, rows, ends_s = layout.start, 0, 0, []
+    unit, scale = "", 1.0
+    first = _first_fields(path, layout)
+    stamps, date = (None, None) if options.time_column == "none" else _date_and_time(layout, first, stamps)
+    if stamps is not None and layout.dialect.is_number(first[stamps]) and not options.time_format:
+        missing = first[stamps] in ("", *MISSING, *options.missing)
+        number = "nan" if missing else layout.dialect.plain(first[stamps]).replace(layout.dialect.decimal, ".")
+        unit, scale = options.time_in_s(names[stamps], layout.units[stamps], float(number))
+    kept: list[list[Any]] | None = []
+    for part in _parsed(path, layout, options, stamps, date):
+        if stamps is not None:
+            if not rows:
+                start, base = start or columnar.first_instant(part[stamps]), columnar.base_ns(part[stamps])
+            part_s = columnar.numbers(part[stamps], base) * scale
+            if np.isnan(part_s).any():
+                line = layout.first + rows + int(np.argmax(np.isnan(part_s))) + 1
+                raise InputError("file.time_column", "a column without holes", Words(f"{path}, line {line}"))
+            ends_s = [*(ends_s or part_s)[:1], part_s[-1]]
+        rows += len(part[0])
+        kept = None if kept is None or rows * len(names) > _KEPT else [*kept, part]
+    if not rows:
+        raise InputError("file", "a text file with lines of numbers", str(path))
+    rate = layout.rate_hz if stamps is None else even_rate_hz(np.array(ends_s), rows)
+    kept_names = [(c, name) for c, name in enumerate(names) if c not in (stamps, date)]
+    entries = tuple(Entry(name, "", layout.units[c], rows, rate, c) for c, name in kept_names)
+
+    def pieces(entries: Sequence[Entry]) -> Iterator[list[FileSignal]]:
+        for part in _parsed(path, layout, options, stamps, date) if kept is None else kept:
+            part_s = None if stamps is None else columnar.numbers(part[stamps], base) * scale
+            yield [signal(columnar.numbers(part[entry.place]), part_s) for entry in entries]
+
+    def signal(values: np.ndarray, times_s: np.ndarray | None) -> FileSignal:
+        return FileSignal(values, times_s=times_s, rate_hz=layout.rate_hz, first_s=layout.first_s)
+
+    @cache
+    def columns() -> list[np.ndarray]:
+        parts = zip(*(_parsed(path, layout, options, stamps, date) if kept is None else kept), strict=True)
+        return [np.concatenate([columnar.numbers(each, base) for each in column]) for column in parts]
+
+    @cache
+    def times_s() -> np.ndarray | None:
+        return None if stamps is None else columns()[stamps] * scale
+
+    def read(entry: Entry) -> FileSignal:
+        return signal(columns()[entry.place], times_s())
+
+    dialect, remarks = layout.dialect, layout.remarks
+    last = dialect.fields(_last_line(path, layout.encoding))
+    if not layout.ragged and len(last) < layout.width:
+        remarks += (f"the last line is cut, and is left out: {len(last)} of {layout.width} columns",)
+    told: dict[str, str | int] = {"delimiter": dialect.delimiter, "decimal": dialect.decimal}
+    told |= {"thousands": dialect.thousands} if dialect.thousands else {}
+    told["first_line"] = layout.first + 1
+    if stamps is not None:
+        told["time_column"] = names[stamps] or stamps + 1
+    if unit not in ("", "s"):
+        told["time_unit"] = unit
+    return Source(path, "text", entries, read, pieces, start=start, remarks=remarks, options=told)
+
+
+def _first_fields(path: Path, layout: Layout) -> list[str]:
+    with path.open(encoding=layout.encoding) as file:
+        return layout.dialect.fields([file.readline() for _ in range(layout.first + 1)][layout.first])
+
+
+def _column_of_instants(path: Path, layout: Layout, options: FileOptions) -> int | None:
+    """The column that has dates and times instead of numbers, whatever its name."""
+    for c, text in enumerate(_first_fields(path, layout)[: len(layout.names)]):
+        if not layout.dialect.is_number(text) and instant(text, options.time_format) is not None:
+            return c
+    return None
+
+
+def _date_and_time(layout: Layout, first: Sequence[str], stamps: int | None) -> tuple[int | None, int | None]:
+    """Return the column of times, and that of the dates (ISO 8601) where it has times of day; else None."""
+    texts = list(enumerate(first[: len(layout.names)]))
+    times = [c for c, text in texts if isinstance(instant(text, None), float)]
+    dates = [c for c, text in texts if isinstance(instant(text, "%Y-%m-%d"), datetime)]
+    if not times or not dates or stamps not in (None, *times, *dates):
+        return stamps, None
+    return (stamps if stamps in times else times[0]), dates[0]
+
+
+def _parsed(
+    path: Path, layout: Layout, options: FileOptions, stamps: int | None, date: int | None
+) -> Iterator[list[Any]]:
+    """The columns in pieces, as pyarrow has them; times of day that have a column of dates as instants.
+
+    Raises:
+        InputError: Lines have more or fewer columns, or something in them cannot be read.
+    """
+    import pyarrow
+    from pyarrow import csv
+
+    numbered = [f"c{c}" for c in range(layout.width)]
+    kept = numbered[layout.empty_first : layout.empty_first + len(layout.names)]
+    bad: list[Any] = []
+
+    def note(row: Any) -> str:
+        bad.append(row)
+        return "skip"
+
+    kinds: dict[str, Any] = dict.fromkeys(kept, pyarrow.float64())
+    source, skipped, encoding = _body(path, layout)
+    if stamps is not None and options.time_unit in (None, "datetime"):
+        kinds[kept[stamps]] = _time_kind(_first_fields(path, layout)[stamps], layout, options)
+    if date is not None:
+        kinds[kept[date]] = pyarrow.timestamp("ns")
+    try:
+        reader = csv.open_csv(
+            source,
+            read_options=csv.ReadOptions(
+                column_names=numbered, skip_rows=skipped, use_threads=False, encoding=encoding, block_size=_BLOCK
+            ),
+            parse_options=csv.ParseOptions(
+                delimiter=layout.dialect.delimiter, invalid_row_handler=note, ignore_empty_lines=True
+            ),
+            convert_options=csv.ConvertOptions(
+                column_types=kinds, include_columns=kept, decimal_point=layout.dialect.decimal,
+                null_values=[*MISSING, *_BLANKS, *options.missing], strings_can_be_null=True,
+            ),
+        )  # fmt: skip
+        for batch in reader:
+            columns = batch.columns
+            if stamps is not None and pyarrow.types.is_string(columns[stamps].type):
+                columns[stamps] = _instants(path, columns[stamps], options)
+            if stamps is not None and date is not None:
+                columns[stamps] = columnar.joined_instants(columns[date], columns[stamps])
+                columns[date] = pyarrow.nulls(len(batch), pyarrow.float64())
+            if len(batch):
+                yield columns
+    except pyarrow.ArrowInvalid as error:
+        raise damaged(path, "text", error) from None
+    cut = len(bad) == 1 and bad[0].actual_columns < layout.width
+    if bad and not (cut and bad[0].text.strip() == _last_line(path, layout.encoding)):
+        row = bad[0]
+        line = f"line {row.number + layout.first - skipped}: " if row.number else ""
+        raise InputError(
+            "file", f"a text file of {layout.width} columns throughout",
+            Words(f"{path}, where {len(bad)} lines are not so ({line}{row.actual_columns} columns, {row.text[:40]!r})"),
+        )  # fmt: skip
+
+
+def _last_line(path: Path, encoding: str) -> str:
+    """Return the last line of a file that has something in it, without spaces at its ends."""
+    with path.open("rb") as file:
+        file.seek(max(0, path.stat().st_size - _LAST_BYTES))
+        return file.read().decode(encoding, errors="replace").rstrip().rpartition("\n")[2].strip()
+
+
+def _body(path: Path, layout: Layout) -> tuple[Any, int, str]:
+    """What pyarrow parses, how many of its lines to skip, and its encoding: the file, or a copy with lines mended."""
+    dialect = layout.dialect
+    if not (dialect.delimiter == " " or dialect.thousands or layout.encoding == "utf-16" or layout.ragged):
+        return str(path), layout.first, layout.encoding.replace("-sig", "")
+    mended = []
+    for line in path.read_text(encoding=layout.encoding).splitlines()[layout.first :]:
+        fields = [dialect.plain(text) if dialect.is_number(text) else text for text in dialect.fields(line)]
+        if layout.ragged and not any(fields[layout.width :]):
+            fields = (fields + [""] * layout.width)[: layout.width] if any(fields) else fields
+        mended.append(dialect.delimiter.join(fields))
+    return io.BytesIO("\n".join(mended).encode()), 0, "utf8"
+
+
+def _time_kind(text: str, layout: Layout, options: FileOptions) -> Any:
+    """The type as which pyarrow reads a column of times; what it cannot is read as texts."""
+    import pyarrow
+
+    if options.time_format is None and layout.dialect.is_number(text):
+        return pyarrow.float64()
+    found = instant(text, options.time_format)
+    if found is None:
+        must = "given for times that are no numbers (such as %d.%m.%Y %H:%M:%S)"
+        raise InputError("file.time_format", must if options.time_format is None else "that of the times", text)
+    if options.time_format is not None or "," in text or not isinstance(found, datetime):
+        return pyarrow.string()
+    return pyarrow.timestamp("ns", tz=None if found.tzinfo is None else "UTC")
+
+
+def _instants(path: Path, column: Any, options: FileOptions) -> Any:
+    """Texts as instants, or as times of day."""
+    import pyarrow
+
+    found: list[Any] = []
+    for text in column.to_pylist():
+        moment = instant(str(text), options.time_format)
+        if moment is None:
+            raise InputError("file.time_format", f"that of the times in {path.name}", str(text))
+        found.append(moment)
+    kind = pyarrow.float64()
+    if isinstance(found[0], datetime):
+        zoned = getattr(found[0], "tzinfo", None) is not None
+        kind = pyarrow.timestamp("us", tz="UTC" if zoned else None)
+    return pyarrow.array(found, kind)
+
+
+def _quoted(name: str) -> str:
+    return printable(name).replace('"', '""')
+
+
+class CsvRows:
+    """A CSV file that grows by rows: numbers in the fewest digits that give them back, on two threads."""
+
+    def __init__(self, path: Path, names: Sequence[str], *, whole: Collection[str] = ()) -> None:
+        """Write the headings.
+
+        Args:
+            path: The file.
+            names: Headings of the columns.
+            whole: Those of whole numbers, of which a missing one is nan and left empty.
+        """
+        self._whole = [name in whole for name in names]
+        self._file = path.open("wb")
+        self._file.write((",".join(f'"{_quoted(name)}"' for name in names) + "\n").encode())
+        # Formatting a number takes ten times as long as simulating it, and needs no lock.
+        self._background = Background(self._file.write, threads=2)
+
+    def write(self, columns: Sequence[np.ndarray]) -> None:
+        """Take rows, column by column, each shape (n,)."""
+        self._background.call(_lines, columns, self._whole)
+
+    def close(self) -> None:
+        """Write what is left."""
+        try:
+            self._background.finish()
+        finally:
+            self._file.close()
+
+
+def _lines(columns: Sequence[np.ndarray], whole: Sequence[bool]) -> bytes:
+    """Rows as text; without pyarrow, which a lean install lacks, a fifth as fast."""
+    try:
+        import pyarrow
+        from pyarrow import csv
+    except ModuleNotFoundError:
+        texts = [
+            ["" if value != value else f"{value:.0f}" for value in column] if integer else map(repr, column)
+            for column, integer in zip((np.asarray(each).tolist() for each in columns), whole, strict=True)
+        ]
+        return "".join(",".join(row) + "\n" for row in zip(*texts, strict=True)).encode()
+    kinds = [pyarrow.int32() if integer else pyarrow.float64() for integer in whole]
+    schema = pyarrow.schema([(f"{c}", kind) for c, kind in enumerate(kinds)])
+    buffer = io.BytesIO()
+    csv.write_csv(columnar.arrow_table(columns, schema), buffer, csv.WriteOptions(include_header=False))
+    return buffer.getvalue()
+
+
+class CsvWriter(columnar.ParquetWriter):
+    """A CSV file: `time [s]` and a column a channel."""
+
+    sidecar = True
+
+    def __init__(self, path: Path, selection: Selection) -> None:
+        columns = selection.tables[0].columns
+        counts = [column.heading for column in columns if selection.unit == "counts" and column.source is not None]
+        self._file = CsvRows(path, ["time [s]", *(column.heading for column in columns)], whole=counts)

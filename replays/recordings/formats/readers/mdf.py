@@ -1,0 +1,280 @@
+"""MDF4, as measuring systems in vehicles and test rigs write it, by asammdf."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, redirect_stdout, suppress
+from io import StringIO
+from pathlib import Path
+from traceback import walk_tb
+from typing import TYPE_CHECKING, Any
+from weakref import finalize
+
+import numpy as np
+
+from replays.recordings.formats.exporting import export
+from replays.recordings.formats.source import DOCUMENTS, Entry, FileSignal, Source, damaged, even_rate_hz, library
+from rig.base import units
+from rig.base.outside import open_file
+
+if TYPE_CHECKING:
+    from replays.recordings.formats.exporting.history import ExportEvent
+    from replays.recordings.formats.exporting.selection import ExportChunk, ExportTable, Selection
+    from replays.recordings.formats.mapping import FileOptions
+
+_TEXT = re.compile(r"<TX>(.*?)</TX>|<TX/>", re.DOTALL)
+"""The text in a comment that is XML."""
+_SYNC_NONE, _SYNC_TIME = 0, 1
+"""Kinds of master channel in MDF4; 2 is an angle, 3 a length, 4 an index."""
+_PIECE = 1 << 22
+"""Bytes of records that are read at a time."""
+_HEAD, _FLAGS = 64, 4
+"""Bytes of the first block, and those at its end that say what of a file was not finished, in MDF4."""
+_MASTER, _REMOTE_MASTER = 2, 8
+"""Type of a channel of stamps that are recorded, and the flag of a group whose stamps are another's, in MDF4."""
+_MARKER, _BY_TOOL = 6, 2
+"""Type and cause of an event in MDF4."""
+_IDENTITY, _LINEAR = 0, 1
+"""Types of the conversion of a channel in MDF4; no conversion is the identity, too."""
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Deprecations inside asammdf, and of what it calls in numpy and pandas, are not ours to mend.
+
+    Nor are lines on its speed, which it prints where reading takes long.
+    """
+    with warnings.catch_warnings(), redirect_stdout(StringIO()):
+        for category in (DeprecationWarning, FutureWarning, PendingDeprecationWarning):
+            warnings.simplefilter("ignore", category)
+        yield
+
+
+def look_into(path: Path, options: FileOptions) -> Source:
+    """Look into an MDF file (version 3 or 4).
+
+    Raises:
+        InputError: It is none, or asammdf is missing.
+    """
+    mdf = _open(path)
+    with _quiet():
+        entries, texts = _entries(mdf)
+
+    def read(entry: Entry) -> FileSignal:
+        with _quiet():
+            return _signal(mdf, *entry.place)
+
+    def pieces(signals: Sequence[Entry]) -> Iterator[list[FileSignal]]:
+        group = signals[0].group_number
+        if not _plain(mdf, group):
+            yield [read(entry) for entry in signals]
+            return
+        second, master = _second(mdf, group), mdf.masters_db[group]
+        kinds = [_linear(mdf, *entry.place) for entry in signals]
+        columns = [(master, None), *zip((entry.place[1] for entry in signals), kinds, strict=True)]
+        streams: list[Iterator[Any]] = [
+            mdf.iter_get(group=group, index=index, samples_only=True, raw=kind is not None) for index, kind in columns
+        ]
+        while True:
+            with _quiet():
+                found = [next(stream, ()) for stream in streams]
+            if not found[0]:
+                return
+            times_s = None if second is None else np.asarray(found[0][0], dtype=float) * second
+            yield [_of_records(part, kind, times_s) for part, kind in zip(found[1:], kinds, strict=True)]
+
+    remarks = (f"{texts} channels without numbers are passed over",) if texts else ()
+    about = {"version": str(mdf.version), "comment": str(mdf.header.description or ""), **_documents(mdf)}
+    return Source(
+        path, f"MDF {mdf.version}", tuple(entries), read, pieces, start=mdf.header.start_time,
+        about={key: text for key, text in about.items() if text}, remarks=remarks,
+    )  # fmt: skip
+
+
+def _documents(mdf: Any) -> dict[str, str]:
+    """What `rig export` has attached."""
+    found = {}
+    for index, attachment in enumerate(getattr(mdf, "attachments", ())):
+        if attachment.file_name in DOCUMENTS:
+            content, *_ = mdf.extract_attachment(index=index)
+            found[attachment.file_name] = bytes(content).decode(errors="replace")
+    return found
+
+
+def _open(path: Path) -> Any:
+    asammdf = library("MDF", "asammdf")
+    file = open_file(path)
+    finished = file.read(_HEAD)[-_FLAGS:] == bytes(_FLAGS)
+    try:
+        with _quiet():
+            # By its path asammdf maps all of a file into memory, and mends a copy of one that was not finished.
+            mdf = asammdf.MDF(file if finished else path)
+            mdf.configure(read_fragment_size=_PIECE)
+            finalize(mdf, file.close)
+            # It stands in a cycle, which the collector may take apart at its temporary file first.
+            finalize(mdf, mdf._mdf._tempfile.close)  # noqa: SLF001 - its own ways to close it wait for the collector
+            return mdf
+    except Exception as error:
+        file.close()
+        # The half-made object of a file that asammdf cannot open closes itself when it goes, and fails aloud: it has
+        # tried once here, and does not try again.
+        for frame, _ in walk_tb(error.__traceback__):
+            with suppress(Exception):
+                frame.f_locals["self"].close()
+        raise damaged(path, "MDF", error) from None
+
+
+def _entries(mdf: Any) -> tuple[list[Entry], int]:
+    entries, texts = [], 0
+    for number, group in enumerate(mdf.groups):
+        rows = int(group.channel_group.cycles_nr)
+        if not rows:
+            continue
+        name = str(getattr(group.channel_group, "acq_name", "") or f"group {number}")
+        scale = _second(mdf, number)
+        ends = [mdf.get_master(number, record_offset=at, record_count=1) for at in (0, rows - 1)]
+        rate = None if scale is None else even_rate_hz(np.concatenate(ends) * scale, rows)
+        master = mdf.masters_db.get(number)
+        for index, channel in enumerate(group.channels):
+            if index == master:
+                continue
+            if not _numeric(mdf, number, index):
+                texts += 1
+                continue
+            unit = str(channel.unit or getattr(channel.conversion, "unit", "") or "")
+            text = _TEXT.search(str(channel.comment or ""))
+            label = (text[1] or "") if text else str(channel.comment or "")
+            entries.append(Entry(str(channel.name), name, unit, rows, rate, (number, index), label, number))
+    return entries, texts
+
+
+def _second(mdf: Any, group: int) -> float | None:
+    """One unit of a group's master channel [s]; None where it has none, or one of an angle, a length or an index.
+
+    The format asks for seconds; some writers have other units all the same.
+    """
+    index = mdf.masters_db.get(group)
+    if index is None:
+        return None
+    master = mdf.groups[group].channels[index]
+    if getattr(master, "sync_type", _SYNC_TIME) not in (_SYNC_NONE, _SYNC_TIME):
+        return None
+    unit = str(master.unit or getattr(master.conversion, "unit", "") or "")
+    return units.size_si(unit) if units.kind(unit) == "time" else 1.0
+
+
+def _numeric(mdf: Any, group: int, index: int) -> bool:
+    try:
+        few = mdf.get(group=group, index=index, record_offset=0, record_count=2, ignore_invalidation_bits=True).samples
+    except Exception:  # what cannot be decoded is no number for us
+        return False
+    return few.ndim == 1 and few.dtype.kind in "iufb"
+
+
+def _plain(mdf: Any, group: int) -> bool:
+    """Whether the stamps of a group stand in its own records, which can then be read in pieces."""
+    master, told = mdf.masters_db.get(group), mdf.groups[group]
+    own = not getattr(told.channel_group, "flags", 0) & _REMOTE_MASTER
+    return str(mdf.version) >= "4" and master is not None and own and told.channels[master].channel_type == _MASTER
+
+
+def _linear(mdf: Any, group: int, index: int) -> tuple[float, float] | None:
+    """What one and none of a channel's integers are; None where they are not integers, or not linear."""
+    told = {"group": group, "index": index, "record_offset": 0, "record_count": 1}
+    raw = mdf.get(raw=True, ignore_invalidation_bits=True, **told)
+    law = raw.conversion
+    kind = _IDENTITY if law is None else law.conversion_type
+    if raw.samples.dtype.kind not in "iu" or kind not in (_IDENTITY, _LINEAR):
+        return None
+    return (1.0, 0.0) if law is None or kind == _IDENTITY else (float(law.a), float(law.b))
+
+
+def _signal(mdf: Any, group: int, index: int) -> FileSignal:
+    kind, second = _linear(mdf, group, index), _second(mdf, group)
+    found = mdf.get(group=group, index=index, raw=kind is not None, ignore_invalidation_bits=True)
+    times_s = None if second is None else np.asarray(found.timestamps, dtype=float) * second
+    return _of_records((found.samples, found.invalidation_bits), kind, times_s)
+
+
+def _of_records(record: Sequence[Any], linear: tuple[float, float] | None, times_s: np.ndarray | None) -> FileSignal:
+    values, invalid = record
+    if linear is None:
+        values = values.astype(float)
+    if invalid is not None and np.any(invalid):
+        values = values.astype(float)
+        values[np.asarray(invalid, dtype=bool)] = np.nan
+    scale, offset = linear or (1.0, 0.0)
+    return FileSignal(values=values, scale=scale, offset=offset, times_s=times_s)
+
+
+def _event(event: ExportEvent) -> Any:
+    """A marker at a time, to the microsecond of the rig's clock, which holds for all groups."""
+    from asammdf.blocks.v4_blocks import EventBlock
+
+    block = EventBlock(
+        event_type=_MARKER, sync_type=_SYNC_TIME, cause=_BY_TOOL, flags=0, sync_base=round(event.time_s * 1e6),
+        sync_factor=1e-6,
+    )  # fmt: skip
+    block.name, block.comment = event.name, event.text
+    return block
+
+
+class MdfWriter(export.FormatWriter):
+    """An MDF 4.10 file: a channel group a sensor group, integer counts with a linear conversion.
+
+    What happened is events; the rig's documents are attached.
+    """
+
+    sparse = True
+
+    def __init__(self, path: Path, selection: Selection) -> None:
+        asammdf = library("MDF", "asammdf")
+        self._path = path
+        self._selection = selection
+        self._signal = asammdf.Signal
+        self._groups: dict[str, int] = {}
+        with _quiet():
+            self._file = asammdf.MDF(version="4.10")
+            self._file.header.start_time = selection.start
+            self._file.header.description = selection.summary()
+            self._file.header.project, self._file.header.subject = "rotor-stator-rig", selection.metadata["scene"]
+            for name, text in selection.documents.items():
+                self._file.attach(text.encode(), file_name=name, comment="of the rig", mime="application/json")
+            self._file.events.extend(map(_event, selection.events))
+
+    def write(self, table: ExportTable, chunk: ExportChunk) -> None:
+        """Take rows; those that no stream has are left out."""
+        present = chunk.present
+        times_s = chunk.times_s[present]
+        if not len(times_s):
+            return
+        columns: Sequence[np.ndarray] = [table.raw(c, chunk)[present] for c in range(len(table.columns))]
+        with _quiet():
+            if table.name in self._groups:
+                pairs = [(times_s, None), *((values, None) for values in columns)]
+                self._file.extend(self._groups[table.name], pairs)
+                return
+            signals = [
+                self._signal(
+                    samples=values, timestamps=times_s, name=column.name, unit=column.unit,
+                    comment=column.about(table.title),
+                    conversion=None if column.linear is None else dict(zip("ab", column.linear, strict=True)),
+                )
+                for column, values in zip(table.columns, columns, strict=True)
+            ]  # fmt: skip
+            number = self._file.append(signals, acq_name=table.name, comment=table.title, common_timebase=True)
+        self._groups[table.name] = number
+
+    def close(self) -> None:
+        """Write the file."""
+        # Of a path, asammdf would change the suffix.
+        with _quiet(), self._path.open("wb+") as file:
+            self._file.save(file)
+            self._file.close()
+
+    def abandon(self) -> None:
+        """Let go of what it holds."""
+        with _quiet():
+            self._file.close()

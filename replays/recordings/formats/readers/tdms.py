@@ -1,0 +1,176 @@
+"""TDMS, the format of LabVIEW, by npTDMS."""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import UTC
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from replays.recordings.formats.exporting import export
+from replays.recordings.formats.readers.dialect import is_time
+from replays.recordings.formats.source import Entry, FileSignal, Source, damaged, even_rate_hz, library
+
+if TYPE_CHECKING:
+    from replays.recordings.formats.exporting.selection import ExportChunk, ExportTable, Selection
+    from replays.recordings.formats.mapping import FileOptions
+
+_ABOUT = re.compile("sens|bias|gain|coupling|range", re.IGNORECASE)
+"""Properties of a channel that tell of its sensor or amplifier."""
+_RAW_INPUT = 0xFFFFFFFF
+"""Input of the first scale: the raw values."""
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Of a file that is cut off, npTDMS prints a line a read; it is said once, as an error."""
+    handler = logging.getLogger("nptdms.reader").handlers
+    level = [one.level for one in handler]
+    for one in handler:
+        one.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        for one, before in zip(handler, level, strict=True):
+            one.setLevel(before)
+
+
+def look_into(path: Path, options: FileOptions) -> Source:
+    """Look into a TDMS file.
+
+    Raises:
+        InputError: It is none, it is cut off, or npTDMS is missing.
+    """
+    nptdms = library("TDMS", "npTDMS", "nptdms")
+    with _quiet():
+        file = nptdms.TdmsFile.read_metadata(path)
+    groups = [(group.name, group.channels()) for group in file.groups()]
+    starts = [
+        channel.properties["wf_start_time"]
+        for _, channels in groups
+        for channel in channels
+        if len(channel) and "wf_start_time" in channel.properties
+    ]
+    start = min(starts) if starts else None
+    if file.file_status.incomplete_final_segment:
+        raise damaged(path, "TDMS", "it is cut off")
+    entries, texts = [], 0
+    for number, (name, channels) in enumerate(groups):
+        for channel in channels:
+            if not len(channel) or (channel.dtype.kind not in "iuf"):
+                texts += bool(len(channel))
+                continue
+            unit = str(channel.properties.get("unit_string", channel.properties.get("NI_UnitDescription", "")))
+            step = channel.properties.get("wf_increment")
+            label = _label(channel.properties)
+            rate = 1.0 / step if step else None
+            entries.append(Entry(channel.name, name, unit, len(channel), rate, (name, channel.name), label, number))
+
+    def read(entry: Entry) -> FileSignal:
+        with nptdms.TdmsFile.open(path) as opened:
+            return _signal(opened[entry.place[0]], entry.place[1], start)
+
+    remarks = (f"{texts} channels without numbers are passed over",) if texts else ()
+    about = {key: str(value) for key, value in file.properties.items() if isinstance(value, str | int | float)}
+    told = None if start is None or str(start).startswith("1904") else start.astype("datetime64[us]").item()
+    return Source(
+        path=path, format="TDMS", entries=tuple(entries), read=read, about=about, remarks=remarks,
+        start=None if told is None else told.replace(tzinfo=UTC),
+    )  # fmt: skip
+
+
+def _label(properties: dict[str, Any]) -> str:
+    """What the properties of a channel say of it: its description, and what its sensor and amplifier do."""
+    texts = [str(properties.get("description", ""))]
+    for key, value in properties.items():
+        if _ABOUT.search(key) and not key.startswith(("rig_", "NI_")) and not key.endswith("_unit"):
+            texts.append(f"{key} {value} {properties.get(f'{key}_unit', '')}".strip())
+    return "; ".join(filter(None, texts))
+
+
+def _signal(group: Any, name: str, start: Any) -> FileSignal:
+    channel = group[name]
+    properties = channel.properties
+    scale, offset = 1.0, 0.0
+    linear = (
+        properties.get("NI_Number_Of_Scales") == 1
+        and properties.get("NI_Scale[0]_Scale_Type") == "Linear"
+        and properties.get("NI_Scaling_Status", "unscaled") == "unscaled"
+    )
+    if linear and np.dtype(channel.data_type.nptype).kind in "iu":
+        values = np.array(channel.read_data(scaled=False))
+        scale = float(properties["NI_Scale[0]_Linear_Slope"])
+        offset = float(properties["NI_Scale[0]_Linear_Y_Intercept"])
+    else:
+        values = np.array(channel[:])
+        values = values if values.dtype.kind in "iu" else values.astype(float)
+    step = properties.get("wf_increment")
+    if step:
+        began = properties.get("wf_start_time", start)
+        late_s = float((began - start) / np.timedelta64(1, "us")) * 1e-6 if start is not None else 0.0
+        first_s = late_s + float(properties.get("wf_start_offset", 0.0))
+        return FileSignal(values=values, scale=scale, offset=offset, rate_hz=1.0 / step, first_s=first_s)
+    stamps = next((other for other in group.channels() if is_time(other.name) and other.name != name), None)
+    if stamps is None or len(stamps) != len(values):
+        return FileSignal(values=values, scale=scale, offset=offset)
+    times = np.asarray(stamps[:])
+    if times.dtype.kind == "M":
+        times = (times - (times[0] if start is None else start)) / np.timedelta64(1, "us") * 1e-6
+    times_s = None if even_rate_hz(times) is None else times.astype(float)
+    return FileSignal(values=values, scale=scale, offset=offset, times_s=times_s)
+
+
+class TdmsWriter(export.FormatWriter):
+    """A TDMS file: a group a sensor group; counts with a linear scale, which LabVIEW applies on reading.
+
+    What happened, and the rig's documents, are properties of the file.
+    """
+
+    def __init__(self, path: Path, selection: Selection) -> None:
+        nptdms = library("TDMS", "npTDMS", "nptdms")
+        self._api = nptdms
+        self._selection = selection
+        self._file = nptdms.TdmsWriter(path)
+        self._file.open()
+        self._described: set[str] = set()
+        self._start = np.datetime64(selection.start.astimezone(UTC).replace(tzinfo=None), "us")
+
+    def write(self, table: ExportTable, chunk: ExportChunk) -> None:
+        """Take rows; a missing one is nan, for the format has a start and a step and no times."""
+        api, new = self._api, table.name not in self._described
+        about = {key: value for key, value in self._selection.metadata.items() if value != ""}
+        about |= {"description": self._selection.summary(), **self._selection.documents}
+        about["events"] = "\n".join(f"{event.time_s:.6f} s  {event.text}" for event in self._selection.events)
+        objects: list[Any] = [api.RootObject(about if not self._described else {})]
+        objects.append(api.GroupObject(table.name, {"description": table.title} if new else {}))
+        for c, column in enumerate(table.columns):
+            # Whether a row is missing must be known before the first is written: counts have no nan.
+            counts = column.source is not None and self._selection.whole(table)
+            values = table.raw(c, chunk) if counts else table.exported(c, chunk)
+            properties = self._properties(table, c, scaled=counts) if new else {}
+            objects.append(api.ChannelObject(table.name, column.name, values, properties))
+        self._described.add(table.name)
+        self._file.write_segment(objects)
+
+    def _properties(self, table: ExportTable, c: int, *, scaled: bool) -> dict[str, Any]:
+        column = table.columns[c]
+        first = np.timedelta64(round(table.first_s * 1e6), "us")
+        properties: dict[str, Any] = {
+            "unit_string": column.unit, "NI_UnitDescription": column.unit, "description": column.label or column.name,
+            "wf_increment": 1.0 / table.rate_hz, "wf_start_time": self._start + first, "wf_start_offset": 0.0,
+            "wf_xunit_string": "s", "wf_xname": "Time",
+        }  # fmt: skip
+        properties |= {f"rig_{key}": value for key, value in column.metadata.items() if value != ""}
+        if scaled and column.linear is not None:
+            properties |= {
+                "NI_Scaling_Status": "unscaled", "NI_Number_Of_Scales": np.uint32(1),
+                "NI_Scale[0]_Scale_Type": "Linear", "NI_Scale[0]_Linear_Slope": column.linear[0],
+                "NI_Scale[0]_Linear_Y_Intercept": column.linear[1],
+                "NI_Scale[0]_Linear_Input_Source": np.uint32(_RAW_INPUT),
+            }  # fmt: skip
+        return properties

@@ -1,0 +1,198 @@
+"""What was done to the rig in a recording, so that it can be done again: scene, parameters, commands with their times.
+
+On the same build the same experiment gives the same payloads, bit for bit.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Self
+
+import numpy as np
+
+from recorder.reader import Recording
+from rig.base.errors import InputError, Words
+from rig.base.outside import table_in
+from rig.base.wire import EDGES, sensor_key, truth_key
+from rig.channels.faults import channels_of
+from rig.physics.parameters import DEFAULT_SET, load_parameters, set_names
+from rig.run.commands import COMMANDS, ClearCommand, FaultCommand, check_command
+from rig.run.motion import Begin
+from rig.run.offline import Run, SentCommand, frames, simulate
+from rig.run.scenes import Scene, change_scene, parse_scene
+from rig.run.simulation import TICK_RATE_HZ, Frame, Simulation
+
+BEFORE_S = 0.5
+"""A log from the middle of a run is taken up so long before the hammer pulse [s]: a few turns tell where it is."""
+GRID_S = 0.1
+"""A whole number of samples of every rate [s]."""
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """A scene with the commands that were sent to it.
+
+    Attributes:
+        scene: The scene, on the recorded parameters; it ends where the recording does.
+        commands: What was sent to the rig beside the scene's own commands.
+        first_s: Simulated time at which the recording begins [s].
+        begin: Where it is taken up, of a log from the middle of a run; None: at 0, where its scene begins.
+        unsure: Standard deviation of what a log tells less surely than by a channel of its own, by key, in its unit.
+    """
+
+    scene: Scene
+    commands: tuple[SentCommand, ...] = ()
+    first_s: float = 0.0
+    begin: Begin | None = None
+    unsure: Mapping[str, float] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, recording: Recording) -> Self:
+        """Take the experiment from a recording of this rig.
+
+        Raises:
+            InputError: The recording is none of this rig's, or of a version whose scene or parameters mean nothing
+                here.
+        """
+        document = recording.scene.get("scene")
+        streams = [stream for stream in recording.streams.values() if stream.rows]
+        if "import" in recording.scene and not isinstance(document, dict):
+            must = "a recording with the scene it ran: add [experiment] to the mapping, and import it again"
+            raise InputError("file", must, Words(f"{recording.path}, imported without one"))
+        if not isinstance(document, dict) or not streams:
+            raise InputError("file", "a recording of this rig, with the scene it ran and samples", str(recording.path))
+        duration_s = max(_end_s(recording), 1.0 / TICK_RATE_HZ)
+        scene = parse_scene({**recorded_scene(recording.parameters, document), "duration_s": duration_s})
+        sent = [
+            SentCommand(one["tick"], one["command"], dict(one["request"]))
+            for one in recording.commands
+            if one["command"] in COMMANDS
+        ]
+        first_s = min(float(stream.first_time_s) for stream in streams)
+        begin = _taken_up(recording, scene, first_s) if is_from_the_middle(recording) else None
+        unsure = recording.scene.get("import", {}).get("unsure", {})
+        return cls(scene=scene, commands=tuple(sent), first_s=first_s, begin=begin, unsure=unsure)
+
+    def changed(self, changes: dict[str, Any]) -> Experiment:
+        """The same with other values of scene or parameters, by dotted key, each in its own unit.
+
+        Raises:
+            InputError: An unknown key, or a value that it must not have.
+        """
+        return replace(self, scene=change_scene(self.scene, changes))
+
+    def without_faults(self) -> Experiment:
+        """The same with sound sensors: as one who knows nothing of faults has it."""
+        kept = tuple(one for one in self.scene.commands if not isinstance(one.request, FaultCommand | ClearCommand))
+        sent = tuple(one for one in self.commands if one.name not in ("fault", "clear"))
+        return replace(self, scene=self.scene.model_copy(update={"commands": kept}), commands=sent)
+
+    @property
+    def faulty(self) -> set[str]:
+        """Channels that were told to misbehave, some time."""
+        timed = [one.request for one in self.scene.commands] + [
+            check_command(one.name, dict(one.request)) for one in self.commands if one.name == "fault"
+        ]
+        table, sensors = self.scene.table, self.scene.sensors
+        told = [one for one in timed if isinstance(one, FaultCommand)]
+        ideal = sensors.chain == "ideal"
+        return {
+            name for one in told for name in channels_of(one.what, one.channel, table, ideal=ideal, noisy=sensors.noise)
+        }
+
+    def simulation(self) -> Simulation:
+        """A simulation of the scene, at its start; `frames` sends it the commands."""
+        return Simulation(self.scene, begin=self.begin)
+
+    def frames(self, simulation: Simulation, *, chunk_s: float = 0.1) -> Iterator[Frame]:
+        """Do it again on a simulation, chunk by chunk."""
+        return frames(simulation, chunk_s=chunk_s, commands=self.commands)
+
+    def run(self, *, duration_s: float | None = None, progress: Callable[[float], None] | None = None) -> Run:
+        """Do it again, and keep everything.
+
+        Args:
+            duration_s: End at another time [s].
+            progress: Called with the part done, 0 to 1.
+        """
+        return simulate(self.scene, duration_s=duration_s, commands=self.commands, progress=progress)
+
+
+def is_imported(recording: Recording) -> bool:
+    """Whether a recording is a log of another system."""
+    return "import" in recording.scene
+
+
+def is_from_the_middle(recording: Recording) -> bool:
+    """Whether it is one of a rig that ran before: where its shaft was, only its samples tell."""
+    mapped = recording.scene.get("import", {}).get("mapping", {}).get("experiment", {})
+    return mapped.get("commands", "scene") != "scene" and "lead_s" not in mapped
+
+
+def _taken_up(recording: Recording, scene: Scene, first_s: float) -> Begin:
+    """Where such a log is taken up: shortly before the hammer, with the shaft at the angle that the edges tell."""
+    hammer_s = min((timed.at_s for timed in scene.commands), default=first_s)
+    begin_s = math.floor(round(max(first_s, hammer_s - BEFORE_S) / GRID_S, 6)) * GRID_S
+    edges_s = recording.edges()
+    edges_s = edges_s[edges_s < hammer_s] if scene.commands else edges_s  # behind the pulse it slows down
+    if len(edges_s) < 2:
+        turns = (begin_s - edges_s.sum()) * scene.drive.speed_hz if len(edges_s) else 0.0
+        return Begin(round(begin_s * TICK_RATE_HZ), angle=2.0 * math.pi * (turns % 1.0))
+    near = max(0, min(int(np.searchsorted(edges_s, begin_s)) - 1, len(edges_s) - 2))
+    turns = (begin_s - edges_s[near]) / (edges_s[near + 1] - edges_s[near])
+    return Begin(round(begin_s * TICK_RATE_HZ), angle=2.0 * math.pi * (turns % 1.0))
+
+
+def _end_s(recording: Recording) -> float:
+    """Simulated time behind the last row of any stream [s].
+
+    Raises:
+        InputError: The times of a stream do not fit its row numbers: no run ends there.
+    """
+    rates = {sensor_key(name): group.rate_hz for name, group in recording.table.groups.items()}
+    rates |= {truth_key(name): table["rate_hz"] for name, table in recording.catalogue.get("truth", {}).items()}
+    ends = [0.0]
+    for key, stream in recording.streams.items():
+        if key != EDGES and stream.rows > 1:  # edges come once a turn, not at a rate
+            steps = stream.rows + stream.lost - 1
+            period_s = (stream.last_time_s - stream.first_time_s) / steps
+            if key in rates and not 0.5 < period_s * rates[key] < 2.0:
+                raise InputError(
+                    "file", "a recording whose times fit its row numbers", Words(f"{recording.path}, {key}")
+                )
+            ends.append(stream.last_time_s + period_s)
+    return math.floor(max(ends) * TICK_RATE_HZ + 0.5) / TICK_RATE_HZ
+
+
+def recorded_scene(parameters: dict[str, Any], document: dict[str, Any]) -> dict[str, Any]:
+    """Return the document of the scene that made a recording, with the recorded parameters.
+
+    An engine without `rolling` is of a version in which it integrated rolling contact by series.
+
+    Raises:
+        InputError: This version does not know a parameter, or `engine` is not a table.
+    """
+    engine = {"rolling": "series", **table_in(document, "engine")}
+    return {**document, **_recorded_parameters(parameters, document), "engine": engine, "fidelity": "given"}
+
+
+def _recorded_parameters(parameters: dict[str, Any], document: dict[str, Any]) -> dict[str, Any]:
+    """The scene's fields that give the recorded parameters, whatever has become of the files that they were from.
+
+    Raises:
+        InputError: This version does not know one of them.
+    """
+    recorded = {key: entry["value"] for key, entry in parameters["values"].items()}
+    name, changes = document.get("parameters", DEFAULT_SET), document.get("set", {})
+    if name in set_names():
+        now = load_parameters(name).override(changes) if changes else load_parameters(name)
+        if {key: entry.value for key, entry in now.entries.items()} == recorded:
+            return {"parameters": name, "set": changes}
+    base = load_parameters().entries
+    unknown = sorted(set(recorded) - set(base))
+    if unknown:
+        raise InputError("file", "a recording whose parameters this version knows", ", ".join(unknown))
+    different = {key: value for key, value in recorded.items() if base[key].value != value}
+    return {"parameters": DEFAULT_SET, "set": different}

@@ -1,0 +1,364 @@
+"""What the sensors would show without noise, and how that changes with any number of the experiment.
+
+A value goes by its dotted key: a parameter (`contact.friction`, in its own unit), a number of the scene
+(`drive.speed_hz`), one of a command (`hammer.1.force_n`: of the first hammer pulse; `at_s`, `duration_ms` and
+`direction` [degrees from x toward y] likewise), or one of the recording (`clock.offset_s` and `clock.rate_ppm` of its
+clock, `shaft.angle_rad` and `state.ring_x` and others where it begins).
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from replays.recordings.resimulation.experiment import Experiment
+from replays.recordings.resimulation.prediction import LeadIns, Measured, Prediction, bare, predict
+from rig.base.errors import InputError, SimulationError
+from rig.channels.sampling import ROW_TICKS
+from rig.physics.model import build_model
+from rig.physics.parameters import load_parameters
+from rig.run.commands import TimedCommand, check_command
+from rig.run.motion import Begin
+from rig.run.scenes import Scene, change_scene, parse_scene
+from rig.run.simulation import TICK_RATE_HZ
+
+CLOCK = {"clock.offset_s": ("s", 5e-3), "clock.rate_ppm": ("ppm", 1e3)}
+"""How late the recording's clock is where its samples begin, and how much faster it goes: unit, change of size 1."""
+ANGLE = "shaft.angle_rad"
+"""Angle of the shaft where the samples begin, on what the experiment has [rad]: whatever the speed before was."""
+STATE = {f"state.{name}": (unit, si, scale) for name, unit, si, scale in (
+    ("ring_x", "mm", 1e-3, 0.1), ("ring_y", "mm", 1e-3, 0.1), ("vx", "mm/s", 1e-3, 10.0), ("vy", "mm/s", 1e-3, 10.0),
+)}  # fmt: skip
+"""Where the shaft is in the ring, and how fast, where a log from the middle of a run is taken up: unit, that in SI,
+change of size 1."""
+_STEP = 1e-5
+"""Step of a difference quotient, as a part of the value's scale, ..."""
+_LEAST_STEP = 1e-8
+"""... and this is as far as it is shortened where the contacts are not the same ones on both sides."""
+_KEPT = 8
+"""Predictions that are kept."""
+_MARGIN_S = 1e-4
+"""The model is followed so far behind the last row, which may lie between two of its own."""
+_ROWS_HZ = TICK_RATE_HZ // ROW_TICKS
+_COMMAND_KEY = re.compile(r"(hammer|speed|release)\.([1-9][0-9]*)\.(\w+)")
+_TICK_S = 1.0 / TICK_RATE_HZ
+_STEPS = {"at_s": 2.0 * _TICK_S, "duration_ms": 2e3 * _TICK_S}
+"""Steps of difference quotients of what a simulation rounds to ticks, by field of a command, in the field's unit: as
+few ticks as go, as impacts far ahead bend over more."""
+_SCALES = {"at_s": 1e-3, "direction": 10.0}
+"""What counts as a change of size 1 where the value itself may be 0 [s], [degrees]."""
+
+
+@dataclass(frozen=True)
+class Derivatives:
+    """How channels change with values of the experiment.
+
+    Attributes:
+        base: The channels at the values themselves.
+        slopes: d channel / d value, in their units, by group, each shape (rows, channels); one a key.
+        smooth: Whether the contacts were the same ones on both sides, shape (keys,).
+    """
+
+    base: Prediction
+    slopes: tuple[dict[str, np.ndarray], ...]
+    smooth: np.ndarray
+
+
+def value_of(experiment: Experiment, key: str) -> float:
+    """The number that a key stands for, in its own unit; of a rule, what the rule gives.
+
+    Raises:
+        InputError: No such number.
+    """
+    if key in CLOCK or key == ANGLE:
+        return 0.0
+    if key in STATE:
+        return float(getattr(_begin_of(experiment, key), key.split(".")[1])) / STATE[key][1]
+    match = _COMMAND_KEY.fullmatch(key)
+    if match is not None:
+        command = _commands(experiment)[_place(experiment, key)]
+        field = match[3]
+        if field == "at_s":
+            return float(command.at_s)
+        value = getattr(command.request, field, None)
+        if field == "direction":
+            return math.degrees(math.atan2(*reversed(getattr(command.request, "cosines", (1.0, 0.0)))))
+        if isinstance(value, int | float):
+            return float(value)
+        raise InputError(key, f"a number of the command {match[1]}", field)
+    if key in load_parameters().entries:
+        value = experiment.scene.load_parameters().entries[key].value
+        return _resolved(experiment.scene)[key] if isinstance(value, str) else float(value)
+    value: Any = experiment.scene
+    for part in key.split("."):
+        value = getattr(value, part, None)
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        keys = "a parameter, a number of the scene, or of a command such as hammer.1.force_n"
+        raise InputError("key", keys, key)
+    return float(value)
+
+
+def with_values(experiment: Experiment, values: Mapping[str, float]) -> Experiment:
+    """The experiment with other numbers; a rule gives way to the number. Those of the clock are none of the experiment.
+
+    Raises:
+        InputError: An unknown key, or a value that it must not have.
+    """
+    placed: dict[str, Any] = {key.split(".")[1]: value * STATE[key][1] for key, value in values.items() if key in STATE}
+    if placed:
+        begin = _begin_of(experiment, next(key for key in values if key in STATE))
+        experiment = replace(experiment, begin=begin._replace(**placed))
+    values = {key: value for key, value in values.items() if key not in CLOCK and key not in STATE}
+    if ANGLE in values:
+        phase = value_of(experiment, "shaft.unbalance_phase") + values.pop(ANGLE)
+        if experiment.begin is None:
+            ahead = values.get("drive.speed_hz", experiment.scene.drive.speed_hz) - experiment.scene.drive.speed_hz
+            phase -= 2.0 * math.pi * ahead * experiment.first_s
+        values["shaft.unbalance_phase"] = math.remainder(phase, 2.0 * math.pi)
+    changes = {key: value for key, value in values.items() if _COMMAND_KEY.fullmatch(key) is None}
+    scene = change_scene(experiment.scene, changes) if changes else experiment.scene
+    changed = replace(experiment, scene=scene)
+    own = {_place(experiment, key): {} for key in values if key not in changes}
+    for key, value in values.items():
+        if key not in changes:
+            own[_place(experiment, key)][key.split(".")[2]] = value
+    if not own:
+        return changed
+    # A changed command becomes one of the scene, which may come at any row and not only between two blocks.
+    timed, sent = list(scene.commands), list(experiment.commands)
+    commands = _commands(experiment)
+    kept = [command for place, command in enumerate(timed) if place not in own]
+    for place, fields in own.items():
+        command = commands[place]
+        request = command.request.model_dump(exclude={"command"}) | {k: v for k, v in fields.items() if k != "at_s"}
+        if "duration_ms" in fields:
+            # As many ticks as a simulation takes, with the same impulse: nothing jumps as it goes on by one.
+            ticks = max(1, round(fields["duration_ms"] * 1e-3 * TICK_RATE_HZ))
+            request["force_n"] *= fields["duration_ms"] * 1e-3 * TICK_RATE_HZ / ticks
+            request["duration_ms"] = ticks * _TICK_S * 1e3
+        at_s = fields.get("at_s", command.at_s)
+        kept.append(TimedCommand(at_s=at_s, request=check_command(command.request.command, request)))
+    left = tuple(entry for place, entry in enumerate(sent, start=len(timed)) if place not in own)
+    data = scene.model_dump() | {"commands": [entry.model_dump() for entry in kept]}
+    return replace(changed, scene=parse_scene(data), commands=left)
+
+
+def _begin_of(experiment: Experiment, key: str) -> Begin:
+    if experiment.begin is None:
+        raise InputError(key, "asked of a log from the middle of a run", key)
+    return experiment.begin
+
+
+def scale_of(experiment: Experiment, key: str) -> float:
+    """What counts as a change of size 1 in a value, in its unit: the value itself, or a length or time like it."""
+    if key in ("ring.offset_x", "ring.offset_y"):
+        return value_of(experiment, "ring.clearance")
+    if key in ("shaft.unbalance_phase", ANGLE):
+        return 1.0
+    if key in CLOCK:
+        return CLOCK[key][1]
+    if key in STATE:
+        return STATE[key][2]
+    value = abs(value_of(experiment, key))
+    return _SCALES.get(key.split(".")[-1], value if value > 0.0 else 1.0)
+
+
+class Predictor:
+    """The channels of a recording as a function of some values of its experiment.
+
+    Attributes:
+        keys: Keys of the values.
+        start: The values as the experiment has them, shape (keys,).
+        scales: What counts as a change of size 1, shape (keys,).
+        parts: The channels and the rows wanted, by group.
+        runs: How many simulations there have been.
+    """
+
+    def __init__(
+        self,
+        experiment: Experiment,
+        keys: Sequence[str],
+        parts: Mapping[str, Measured],
+        *,
+        about_s: float | None = None,
+    ) -> None:
+        self.keys = tuple(keys)
+        self.parts = dict(parts)
+        self.start = np.array([value_of(experiment, key) for key in self.keys])
+        self.scales = np.array([scale_of(experiment, key) for key in self.keys])
+        self.runs = 0
+        first_s = min(float(part.times_s[0]) for part in self.parts.values())
+        self._about_s = first_s if about_s is None else about_s
+        self._last_s = max(float(part.times_s[-1]) for part in self.parts.values())
+        self._experiment = bare(experiment)
+        self._cache: dict[tuple[float, ...], Prediction] = {}
+        self._lead_ins = LeadIns()
+
+    def predict(self, values: Sequence[float] | np.ndarray) -> Prediction:
+        """The channels at some values, shape (keys,).
+
+        When a command comes is a whole tick to a simulation: between two ticks it is interpolated.
+
+        Raises:
+            InputError: A value that the model does not take.
+            SimulationError: The state became non-finite.
+        """
+        values = tuple(float(value) for value in values)
+        for place, (key, value) in enumerate(zip(self.keys, values, strict=True)):
+            if key.endswith(".at_s") and not self._later(key):
+                below = math.floor(value / _TICK_S + 1e-3)
+                if value - below * _TICK_S > 1e-3 * _TICK_S:
+                    return self._between(values, place, below)
+        if values not in self._cache:
+            if len(self._cache) > _KEPT:
+                self._cache.pop(next(iter(self._cache)))
+            self._cache[values] = self._run(dict(zip(self.keys, values, strict=True)))
+        return self._cache[values]
+
+    def derivatives(self, values: Sequence[float] | np.ndarray) -> Derivatives:
+        """How the channels change with the values, by central differences; one-sided at the edge of what is possible.
+
+        A step over which the number of contacts changes is shortened.
+
+        Args:
+            values: Where, shape (keys,).
+        """
+        values = np.asarray(values, dtype=float)
+        base = self.predict(values)
+        found: list[dict[str, np.ndarray]] = []
+        smooth = np.zeros(len(self.keys), dtype=bool)
+        directions = [self._direction(values, place) for place in range(len(self.keys))]
+        for place, (key, direction) in enumerate(zip(self.keys, directions, strict=True)):
+            grid, scale = _step_of(key), self.scales[place]
+            slope: dict[str, np.ndarray] = {}
+            for step in _shorter(grid or _STEP * scale, grid or _LEAST_STEP * scale):
+                slope, smooth[place] = self._quotient(values, place, step * direction, base)
+                if smooth[place]:
+                    break
+            found.append(slope)
+        for place, (slope, direction) in enumerate(zip(found, directions, strict=True)):
+            for other in np.flatnonzero(direction):  # what went along is no part of the slope
+                if other != place:
+                    slope |= {name: one - direction[other] * found[other][name] for name, one in slope.items()}
+        return Derivatives(base, tuple(found), smooth)
+
+    def _direction(self, values: np.ndarray, place: int) -> np.ndarray:
+        """How values go with one while its difference quotient is taken, shape (keys,).
+
+        With a pulse's length goes its force, so that the impulse stays. The length goes by whole ticks, and through
+        impacts as much impulse is no small step: its quotient would not cancel against that of the force, and what is
+        left would pass for the shape of the pulse, which hardly shows.
+        """
+        direction = np.zeros(len(self.keys))
+        direction[place] = 1.0
+        force = self.keys[place].replace(".duration_ms", ".force_n")
+        if force != self.keys[place] and force in self.keys:
+            other = self.keys.index(force)
+            direction[other] = -values[other] / values[place]
+        return direction
+
+    def _later(self, key: str) -> bool:
+        """Whether a command comes only behind the last row: nothing of it is seen."""
+        kind, number, _ = key.split(".")
+        return value_of(self._experiment, f"{kind}.{number}.at_s") > self._last_s + _MARGIN_S
+
+    def _between(self, values: tuple[float, ...], place: int, below: int) -> Prediction:
+        """The channels where a command lies between two ticks."""
+        # Rounded, so that what was simulated before is found.
+        ends = [round((below + node) * _TICK_S, 9) for node in (0, 1)]
+        first, second = (self.predict((*values[:place], end, *values[place + 1 :])) for end in ends)
+        part = values[place] / _TICK_S - below
+        both = {name: (1.0 - part) * found + part * second.values[name] for name, found in first.values.items()}
+        return replace(first, values=both)
+
+    def _quotient(
+        self, values: np.ndarray, place: int, step: np.ndarray, base: Prediction
+    ) -> tuple[dict[str, np.ndarray], bool]:
+        """A difference quotient, and whether the contacts were the same ones on both sides."""
+        sides: list[tuple[float, Prediction]] = []
+        for sign in (1.0, -1.0):
+            moved = values + sign * step
+            try:
+                sides.append((moved[place], self.predict(moved)))
+            except (InputError, SimulationError):
+                sides.append((values[place], base))
+        (above, up), (below, down) = sides
+        if above == below:
+            raise InputError(self.keys[place], "a value with room for a change on one side", float(values[place]))
+        same = up.contacts == down.contacts == base.contacts
+        return {name: (up.values[name] - down.values[name]) / (above - below) for name in up.values}, same
+
+    def _run(self, values: dict[str, float]) -> Prediction:
+        self.runs += 1
+        parts = on_the_models_clock(self.parts, values, about_s=self._about_s)
+        last_s = max(float(part.times_s[-1]) for part in parts.values())
+        # Nothing behind the window: contacts that begin there are none of it.
+        end_s = math.ceil(round((last_s + _MARGIN_S) * _ROWS_HZ, 6)) / _ROWS_HZ
+        changed = with_values(self._experiment, {**values, "duration_s": end_s})
+        return predict(changed, parts, lead_ins=self._lead_ins)
+
+
+def on_the_models_clock(
+    parts: Mapping[str, Measured], values: Mapping[str, float], *, about_s: float
+) -> dict[str, Measured]:
+    """Channels of a recording whose own clock is off by `clock.offset_s` and `clock.rate_ppm`.
+
+    Args:
+        parts: The channels.
+        values: Values, of which only these two count.
+        about_s: Where both clocks differ by the offset alone [s].
+    """
+    shift, rate = values.get("clock.offset_s", 0.0), values.get("clock.rate_ppm", 0.0) * 1e-6
+    if shift == rate == 0.0:
+        return dict(parts)
+    return {name: part.later(shift, rate, about_s=about_s) for name, part in parts.items()}
+
+
+def _step_of(key: str) -> float | None:
+    return _STEPS.get(key.split(".")[-1]) if _COMMAND_KEY.fullmatch(key) else None
+
+
+def _shorter(step: float, least: float) -> Iterator[float]:
+    yield step
+    while step / 4.0 >= least:
+        step /= 4.0
+        yield step
+
+
+def _commands(experiment: Experiment) -> list[TimedCommand]:
+    """Every command: the scene's own, then those that were sent."""
+    sent = [
+        TimedCommand(at_s=command.tick / TICK_RATE_HZ, request=check_command(command.name, command.request))
+        for command in experiment.commands
+    ]
+    return [*experiment.scene.commands, *sent]
+
+
+def _place(experiment: Experiment, key: str) -> int:
+    """Where in `_commands` the command of a key stands: they are numbered by time, each kind from 1."""
+    kind, number, field = key.split(".")
+    commands = _commands(experiment)
+    places = [place for place, command in enumerate(commands) if command.request.command == kind]
+    places.sort(key=lambda place: commands[place].at_s)
+    if int(number) > len(places):
+        raise InputError(key, f"a command of the experiment, which has {len(places)} of {kind}", int(number))
+    known = ["at_s", *(name for name in type(commands[places[int(number) - 1]].request).model_fields)]
+    if field not in known or field == "command":
+        raise InputError(key, f"a field of {kind}: {', '.join(name for name in known if name != 'command')}", field)
+    return places[int(number) - 1]
+
+
+@cache
+def _resolved_by(scene: str) -> dict[str, float]:
+    whole = Scene.model_validate_json(scene)
+    return build_model(whole.load_parameters(), whole.model).resolved
+
+
+def _resolved(scene: Scene) -> dict[str, float]:
+    return _resolved_by(scene.model_dump_json())

@@ -1,0 +1,123 @@
+"""What one number of the model would explain of a log, beside what its sensors may have."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from replays.recordings.identification.agreement import BEYOND
+from replays.recordings.identification.nuisance import Tuned
+from replays.recordings.identification.question import first_command_s, unit_of
+from replays.recordings.resimulation.experiment import Experiment
+from replays.recordings.resimulation.prediction import Measured, Prediction
+from replays.recordings.resimulation.sensitivity import Predictor, value_of
+from replays.recordings.validation.criteria import Attribution, Candidate
+from replays.recordings.validation.explanations.explanation import Explanation, excess, smooth_columns
+from replays.recordings.validation.trajectory import floors
+from rig.base.errors import InputError
+
+_SOONER = 0.6
+"""Part of what is behind the hammer pulse that is looked at again."""
+
+
+def numbers_of_the_model(
+    parts: dict[str, Measured],
+    nominal: Prediction,
+    others: Sequence[Prediction],
+    tuned: Tuned,
+    rules: Attribution,
+    *,
+    end_s: float,
+    shorten: bool = True,
+) -> list[Explanation]:
+    """What each number of the model explains where all that was fitted moves along with it.
+
+    By slopes at what was fitted: exact for what is small, and near enough to tell what hangs together.
+    Where something was fitted beyond what is known of it, only numbers that bring it back.
+
+    Args:
+        parts: What was recorded, on the model's clock.
+        nominal: What was predicted, on the same rows.
+        others: What might be predicted as well.
+        tuned: What was fitted.
+        rules: The numbers.
+        end_s: How far the model has been followed [s].
+        shorten: If there is none, look again on a shorter part of it.
+    """
+    along = tuple(tuned.values)
+    candidates = [one for one in rules.candidates if _is_in(tuned, one) and not set(one.keys) & set(along)]
+    keys = (*along, *dict.fromkeys(key for one in candidates for key in one.keys))
+    kept = {name: part.until(end_s) for name, part in parts.items()}
+    predictor = Predictor(tuned.begun, keys, kept, about_s=tuned.about_s)
+    # The parts are on the model's clock already.
+    at = [0.0 if key.startswith("clock.") else tuned.values.get(key, value_of(tuned.begun, key)) for key in keys]
+    slopes = predictor.derivatives(at).slopes
+    floor = {
+        name: floors(
+            part, found := nominal.values[name][: len(part.times_s)], [o.values[name][: len(found)] for o in others]
+        )
+        for name, part in kept.items()
+    }
+
+    def over_floors(values: dict[str, np.ndarray]) -> np.ndarray:
+        return np.concatenate(
+            [(values[name][: len(by)] / by)[:, smooth_columns(kept[name])].ravel() for name, by in floor.items()]
+        )
+
+    z = over_floors({name: part.values - nominal.values[name][: len(part.times_s)] for name, part in kept.items()})
+    columns = dict(zip(keys, map(over_floors, slopes), strict=True))
+    known = [one.known or (one.value, predictor.scales[n]) for n, one in enumerate(tuned.fitted)]
+    means, deviations = np.array(known).T
+    off = (np.array(list(tuned.values.values())) - means) / deviations
+    far = np.array([one.beyond for one in tuned.fitted])
+    found, before = [], excess(z) + float(off[far] @ off[far])
+    for one in candidates:
+        relative, sizes = _sizes(tuned.begun, one)
+        column = sum(size * columns[key] for size, key in zip(sizes, one.keys, strict=True))
+        table = np.column_stack([column, *(columns[key] for key in along)])
+        square, side = table.T @ table, table.T @ z
+        place = np.arange(1, len(known) + 1)
+        square[place, place] += deviations**-2.0
+        side[place] -= off / deviations
+        size = 1.0 / np.sqrt(np.maximum(np.diag(square), 1e-300))
+        change = size * np.linalg.lstsq(square * np.outer(size, size), side * size, rcond=1e-14)[0]
+        left, back = z - table @ change, off + change[1:] / deviations
+        if abs(change[0]) > one.largest or (np.abs(back) > BEYOND).any() or before == 0.0:
+            continue
+        unit = "" if relative else one.unit or unit_of(one.keys[0])
+        text = f"{100.0 * change[0]:+.3g} %" if relative else f"{change[0]:+.4g} {unit}"
+        found.append(
+            Explanation.of(
+                left, kind="model", name=one.name, change=text, value=float(change[0]), unit=unit,
+                explained=1.0 - (excess(left) + float(back[far] @ back[far])) / before, to_s=end_s,
+            )
+        )  # fmt: skip
+    hit_s = first_command_s(tuned.begun)
+    if not found and shorten and hit_s < end_s:
+        # Where every number takes what was fitted beyond what is known, impacts have bent what slopes tell.
+        sooner_s = hit_s + _SOONER * (end_s - hit_s)
+        return numbers_of_the_model(parts, nominal, others, tuned, rules, end_s=sooner_s, shorten=False)
+    return found
+
+
+def changes_of(experiment: Experiment, rules: Attribution, one: Explanation) -> dict[str, float]:
+    """The values that a number of the model has by an explanation, by key."""
+    candidate = next(each for each in rules.candidates if each.name == one.name)
+    _, sizes = _sizes(experiment, candidate)
+    pairs = zip(candidate.keys, sizes, strict=True)
+    return {key: value_of(experiment, key) + one.value * size for key, size in pairs}
+
+
+def _sizes(experiment: Experiment, candidate: Candidate) -> tuple[bool, list[float]]:
+    """Whether a number changes its values by a part, and what each changes by with 1."""
+    values = [value_of(experiment, key) for key in candidate.keys]
+    relative = not (candidate.unit or 0.0 in values)
+    return relative, values if relative else [1.0] * len(values)
+
+
+def _is_in(tuned: Tuned, candidate: Candidate) -> bool:
+    try:
+        return all(isinstance(value_of(tuned.begun, key), float) for key in candidate.keys)
+    except InputError:
+        return False

@@ -1,0 +1,181 @@
+"""What single channels have in a recording of this rig, whose counts differ while the motion is the same to the bit."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from replays.recordings.resimulation.prediction import Measured, Prediction
+from replays.recordings.validation.explanations.explanation import Explanation
+from replays.recordings.validation.explanations.faults import SOME, around, beside, channels_in, told_of
+from replays.recordings.validation.explanations.laws import law_of
+from replays.recordings.validation.explanations.shown import FEW, Shown
+from replays.recordings.validation.explanations.signals import SignalFault
+from rig.channels.table import Channel
+
+_HELD_S = 0.011
+"""What comes late holds its first value for so long, ..."""
+_PERIODS = 6.0
+"""... and a filter has forgotten it behind so many periods of its corner."""
+_MOST = 20_000
+"""Rows of a channel that are looked at, at most."""
+_AT_END, _ENOUGH = 1e-3, 0.2
+"""Rows so near to an end of what its conditioner puts out tell nothing, where this part of the rows is not."""
+_NO_FILTER = 1e4
+"""A corner so many times its own is none."""
+_NAMES = re.compile(r"((?:\w+(?:, | and ))*\w+) ?(.*)")
+"""Channels, and what they have."""
+_MOVES = 0.1
+"""Of a turn, by which an edge may move."""
+_EVEN_S = 1e-5
+"""Edges that move by less than this about their mean move alike."""
+
+
+def own_faults(
+    parts: dict[str, Measured], nominal: Prediction, apart: Callable[[str], tuple[np.ndarray, dict[str, np.ndarray]]],
+    recorded_s: np.ndarray, made_s: np.ndarray, again: Callable[[dict[str, Measured]], Prediction],
+    step: Callable[[str], None] = lambda _text: None,
+) -> list[Explanation]:  # fmt: skip
+    """What each channel has whose counts are other than those of the same motion done again, to the bit.
+
+    What a channel shows is taken without its noise: that is the same in both.
+
+    Args:
+        parts: What was recorded.
+        nominal: What was predicted.
+        apart: Of a group, numbers of the rows that differ, shape (n,), and by channel, by how many counts, shape (n,).
+        recorded_s: Edges of the keyphasor [s].
+        made_s: Edges made again [s].
+        again: Predicts other channels of the same motion.
+        step: Told what is being done.
+    """
+    shown, ends = [], dict[str, Callable[[], Shown]]()
+    for name, part in parts.items():
+        index, counts = apart(name)
+        at = np.searchsorted(part.index, index)
+        there = at < len(part.index)
+        there[there] = part.index[at[there]] == index[there]
+        for c, channel in enumerate(part.channels):
+            off = np.zeros(len(part.index))
+            if channel.name in counts:
+                off[at[there]] = counts[channel.name][there]
+            rows = np.flatnonzero(off)
+            if not len(rows):
+                continue
+            lasted_s = float(part.times_s[rows[0]]), float(part.times_s[rows[-1]])
+            fine = round(_PERIODS / channel.bandwidth_hz * channel.rate_hz)
+            skips = (max(fine, round(_HELD_S * channel.rate_hz)), fine, 0)
+            first = next(int(rows[0]) + skip for skip in skips if rows[-1] - rows[0] >= 3 * skip)
+            # What is behind its end is its filter's.
+            last = int(rows[-1]) + 1 - (fine if rows[-1] - first > 3 * fine else 0)
+            foretold, dense = nominal.values[name][:, c], 5 * np.count_nonzero(off[first:last]) > last - first
+            made = partial(_shown, part, channel, foretold, off, lasted_s)
+            few = partial(_bare, part, channel, again), partial(beside, parts, nominal, channel)
+            rows = np.arange(first, min(last, first + _MOST))
+            if len(rows) < (FEW if dense else SOME):
+                rows = np.arange(max(0, first - SOME), min(first + SOME, len(off)))
+            shown.append(made(rows, *few))
+            if last - first > 2 * _MOST:
+                ends[channel.name] = partial(made, np.arange(last - _MOST, last), *few)
+    about = {one.name: one for one in shown}
+    found = []
+    for one in told_of(shown, max((float(one.times_s[-1]) for one in shown), default=0.0), step):
+        its = [about[name] for name in channels_in([one], about)]
+        # Over the noise, not over the steps of the converter.
+        steps = max(each.noise / float(each.floor[0]) for each in its)
+        begin, end = min(each.lasted_s[0] for each in its), max(each.lasted_s[1] for each in its)
+        if one.sure and len(its) == 1 and its[0].name in ends:
+            step(f"what {its[0].name} has at its end")
+            later = law_of(ends[its[0].name]())
+            if one.name != f"{its[0].name} {later.name}":
+                one = replace(one, sure=False, change=f"{one.change}, and at its end {later.name} {later.change}")
+        # So short, what holds its value for a while is much like anything else, but for what fits to the count.
+        one = replace(one, sure=one.sure and (end - begin > _HELD_S or one.squares == 0.0))
+        found.append(replace(one, left=one.left / max(1.0, steps), from_s=begin, to_s=end))
+    # A recording may begin, and end, inside a run.
+    begin_s = min(float(part.times_s[0]) for part in parts.values())
+    end_s = max(float(part.times_s[-1]) for part in parts.values())
+    others = [one for one in found if not one.name.startswith("keyphasor")]
+    late = any("delay" in one.name for one in found if one not in others)
+    edges = _own_edges(*(each[(each > begin_s) & (each < end_s)] for each in (recorded_s, made_s)), late=late)
+    return found if edges is None else [*others, edges]
+
+
+def _shown(
+    part: Measured, channel: Channel, foretold: np.ndarray, off: np.ndarray, lasted_s: tuple[float, float],
+    rows: np.ndarray, bare: Callable[[np.ndarray], np.ndarray], others: Callable[[], Mapping[Channel, Any]],
+) -> Shown:  # fmt: skip
+    """A channel in some rows, of which it is known by how many counts they are off, shape (all rows,)."""
+    volts = channel.bias_v + channel.sensitivity_v * (foretold + channel.scale * off)
+    limits = np.array([*channel.range_v, -channel.adc_v, channel.adc_v])
+    at_end = np.abs(volts[:, None] - limits).min(axis=1) < _AT_END * np.ptp(channel.range_v)
+    within = ~np.convolve(at_end, np.ones(2 * FEW + 1), "same").astype(bool)
+    if within[rows].mean() > _ENOUGH:
+        rows = rows[within[rows]]
+    said = np.rint((part.values[rows, part.names.index(channel.name)] - channel.offset) / channel.scale)
+    return Shown(
+        channel, part.times_s[rows], (foretold + channel.scale * off)[rows], foretold[rows],
+        np.full(len(rows), 0.5 * abs(channel.scale)), channel.noise_v / abs(channel.sensitivity_v),
+        partial(bare, rows), others, np.column_stack([said, said - off[rows]]).astype(np.int64), lasted_s,
+        around(part, foretold, rows[0], rows[-1] + 1),
+    )  # fmt: skip
+
+
+def _bare(
+    part: Measured, channel: Channel, again: Callable[[dict[str, Measured]], Prediction], rows: np.ndarray
+) -> np.ndarray:
+    """What a channel should show in some rows without its low-pass [its unit]."""
+    alone = part.first(int(rows[-1]) + 1).only([channel.name]).filtered(_NO_FILTER)
+    return again({part.group: alone}).values[part.group][rows, 0]
+
+
+def _own_edges(recorded_s: np.ndarray, made_s: np.ndarray, *, late: bool) -> Explanation | None:
+    """What keyphasor edges lack, have too many, or how they move; None where the signal, late or not, tells more."""
+    lacking, more = np.setdiff1d(made_s, recorded_s), np.setdiff1d(recorded_s, made_s)
+    if 1 <= min(len(lacking), len(more)) == max(len(lacking), len(more)) - 1:  # one may have moved over an end
+        most = _MOVES * float(np.diff(made_s).min(initial=math.inf))
+        for part in (slice(1, None), slice(None, -1)):
+            fewer = (lacking[part], more) if len(lacking) > len(more) else (lacking, more[part])
+            if np.abs(fewer[1] - fewer[0]).max() < most:
+                lacking, more = fewer
+                break
+    off = np.sort(np.concatenate([lacking, more]))
+    moved_s = more - lacking if len(more) == len(lacking) else np.empty(0)
+    turns = np.count_nonzero((made_s >= off[0]) & (made_s <= off[-1])) if len(off) else 0
+    if len(moved_s) == 1 and late:  # of one, nobody can tell
+        what, value, unit = "delay or edge-jitter", float(moved_s[0]), "s"
+        change = f"{1e6 * value:+.4g} µs, one edge"
+    elif len(moved_s) > 1 and moved_s.std() > _EVEN_S:
+        what, value, unit = "edge-jitter", float(moved_s.std()), "s"
+        change = f"{1e6 * value:.4g} µs about {1e6 * moved_s.mean():.4g} µs"
+    elif len(moved_s) or not len(off):
+        return None
+    elif len(lacking) < turns and not len(more):
+        what, value, unit, change = "miss-pulses", len(lacking) / turns, "", f"{len(lacking)} of {turns}"
+    elif len(more) > len(lacking):
+        what, value, unit, change = "extra-pulses", len(more) / max(1, turns), "", f"{len(more)} beside {turns}"
+    else:
+        what, value, unit, change = "open, short or miss-pulses", 1.0, "", f"{len(lacking)} of {turns}"
+    found = Explanation.of(
+        np.empty(0), kind="sensor", name=f"keyphasor {what}", change=change, value=value, unit=unit, explained=0.0,
+        to_s=float(off[-1]),
+    )  # fmt: skip
+    return replace(found, from_s=float(off[0]))
+
+
+def as_faults(own: Sequence[Explanation]) -> tuple[SignalFault, ...]:
+    """What channels have by themselves, as faults that signals show."""
+    found = []
+    for one in own:
+        names, what = _NAMES.fullmatch(one.name).groups()  # pyrefly: ignore[missing-attribute]
+        text = one.change if one.sure else f"by no law that has a name here; nearest is {what} {one.change}"
+        what, text = (what if one.sure else "differs", f"{text}, ") if what else (one.change, "")
+        text += f"from {one.from_s:.4f} to {one.to_s:.4f} s"
+        found.append(SignalFault(names, what, one.from_s, one.to_s, text))
+    return tuple(found)

@@ -1,0 +1,241 @@
+"""Laws of a channel that is late, or behind another filter."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from replays.recordings.validation.explanations.shown import FEW, Law, Shown, gain_words, least_at, rms_of
+from rig.channels.sensors.filters import channel_poles
+
+_LATEST_S = 4e-3
+"""How late a channel is looked for [s]."""
+_EARLIEST_S, _HELD_S = -1e-6, 0.011
+"""A log's channel may be early, one of the rig's own may not, as what is not yet cannot be shown; nor so late."""
+_SEGMENTS = 40
+"""Into so many a channel is cut to see how its delay goes."""
+_SETTLED = 5.0
+"""Periods of its corner, behind which a filter has forgotten."""
+_ENDS_S = 1e-3
+"""Before the end of what is known, a filter cannot be taken back."""
+_HARDLY = 0.3
+"""Where this part of what differs is left without the folding, that is looked at too."""
+_SETTLES_S = 0.02
+"""Behind this it is another filter's."""
+_RINGS_HZ, _RINGS = (20.0, 4000.0), 60
+"""Between these resonances are looked for, at so many."""
+_RINGS_LONGEST = 1000.0
+"""A quality that no transducer has."""
+_CLEARLY, _PASSES = 0.97, 0.1
+"""Of what a delay leaves of a log, that a low-pass may leave at most; and of the signal, that it lets pass."""
+_SEEN = 0.3
+"""Of what differs, that must be left where a filter has settled."""
+_SAME = 0.8
+"""Of the noise, below which what is left has none of its own."""
+
+
+def late(one: Shown) -> Iterator[Law]:
+    """A time that is not that of the others."""
+    ones, spline, t = np.ones(len(one.values)), one.foretold_at, one.times_s - one.times_s[0]
+    late_s, delayed, _ = delayed_by(one)
+    if one.counts is not None:
+        (late_s,), _ = one.fitted(lambda p: spline(one.times_s - p[0]), [[late_s]], [1e-6])
+        delayed = spline(one.times_s - late_s)
+    earliest_s, latest_s = (-_LATEST_S, _LATEST_S) if one.counts is None else (_EARLIEST_S, _HELD_S)
+    if earliest_s <= late_s <= latest_s + 2.0 * one.period_s:  # else it is the search's end
+        (shift,), left = one.left([ones], one.values - delayed)
+        change, of = f"{late_s * 1e6:+.4g} µs", {"delay": late_s}
+        yield Law("delay", change, late_s, (one.values - delayed) / one.floor, 1, "s", of)
+        if abs(shift) > one.noise:
+            yield Law("delay and offset", f"{change}, {shift:+.4g} {one.unit}", late_s, left, 2, "s", of)
+        if one.counts is not None and abs(late_s) < -_EARLIEST_S:
+            return  # there is no delay in it
+        for columns in [[delayed], [delayed, ones]][one.counts is not None :]:
+            factors, left = one.left(columns)
+            what, also = gain_words(gain := float(factors[0]))
+            if what == "signal":
+                continue  # what is not there is not late
+            yield Law(f"{what} and delay", f"{also}, {change}", gain - 1.0, left, 1 + len(columns), "", of)
+    if one.counts is None or one.channel.signal == "keyphasor":
+        return  # of a log, the time of all is fitted before; pulses tell by their edges
+    at, delays = _delays(one)
+    if len(at) < 6:
+        return
+    rate, start = np.polyfit(at, delays, 1)
+    (start, rate), left = one.fitted(
+        lambda p: spline(one.times_s - p[0] - p[1] * t), [[start, rate], [0.0, rate]], [1e-6, 1e-6]
+    )
+    if min(start, start + rate * t[-1]) > _EARLIEST_S:
+        yield Law("clock", f"{1e6 * rate:+.5g} ppm", 1e6 * float(rate), left, 2, "ppm")
+    length_s = float(t[-1])
+    starts = []
+    for period_s in 2.0 * length_s / np.arange(1.0, 2.0 * _SEGMENTS / 3.0):
+        turn = 2.0 * math.pi * at / period_s
+        table = np.column_stack([np.ones(len(at)), np.cos(turn), np.sin(turn)])
+        starts.append([*np.linalg.lstsq(table, delays, rcond=None)[0].tolist(), period_s])
+    (mean_s, a, b, period_s), left = one.fitted(
+        lambda p: spline(
+            one.times_s - p[0] - p[1] * np.cos(2.0 * math.pi * t / p[3]) - p[2] * np.sin(2.0 * math.pi * t / p[3])
+        ),
+        starts, [1e-6, 1e-6, 1e-6, length_s],
+    )  # fmt: skip
+    size = math.hypot(a, b)
+    if mean_s - size > _EARLIEST_S:
+        yield Law("wander", f"{1e6 * size:.4g} µs in {abs(period_s):.4g} s", size, left, 4, "s")
+
+
+def _delays(one: Shown) -> tuple[np.ndarray, np.ndarray]:
+    """How the delay goes: middles of pieces behind the first row [s], and how late each is [s]."""
+    spline, t = one.foretold_at, one.times_s - one.times_s[0]
+    slope, at, found = spline.derivative(), [], []
+    pieces = np.array_split(np.arange(len(t)), min(_SEGMENTS, len(t) // FEW))
+    late_s = delayed_by(one.at(one.times_s[: max(FEW, len(t) // 8)]))[0]
+    for rows in pieces:
+        for _ in range(8):
+            places = one.times_s[rows] - late_s
+            falls, off = -slope(places), one.values[rows] - spline(places)
+            weight = float(falls @ falls)
+            step = float(falls @ off) / weight if weight > 0.0 else 0.0
+            late_s = float(np.clip(late_s + np.clip(step, -20.0 * one.period_s, 20.0 * one.period_s), -0.02, 0.02))
+        at.append(float(t[rows].mean()))
+        found.append(late_s)
+    return np.array(at), np.array(found)
+
+
+def delayed_by(one: Shown) -> tuple[float, np.ndarray, np.ndarray]:
+    """By how much a channel is late [s], what it should show then, and the slope of that [its unit/s]."""
+    spline = one.foretold_at
+    slope, period_s = spline.derivative(), one.period_s
+
+    def cost(late_s: float) -> float:
+        shown = spline(one.times_s - late_s)
+        if one.counts is None:
+            return rms_of(one.left([shown, np.ones(len(shown))])[1])
+        return rms_of(one.left([one.level], one.values - shown)[1])
+
+    if one.counts is None:
+        far = np.linspace(-_LATEST_S, _LATEST_S, 81) / period_s
+        rows = np.unique(np.rint(np.concatenate([np.arange(-16, 17), far])))
+    else:
+        rows = np.arange(0.0, _HELD_S / period_s)
+
+    def refined(late_s: float) -> float:
+        for _ in range(6):
+            at = one.times_s - late_s
+            (_, step, _), _ = one.left([spline(at), -slope(at), np.ones(len(at))])
+            late_s = float(np.clip(late_s + np.clip(step, -period_s, period_s), -_HELD_S, _HELD_S))
+        return late_s
+
+    # What rings is about as much alike a period later: between rows, another one may be the best.
+    costs = np.array([cost(late_s) for late_s in rows * period_s])
+    least = np.flatnonzero((costs <= np.r_[np.inf, costs[:-1]]) & (costs <= np.r_[costs[1:], np.inf]))
+    late_s = min((refined(late_s) for late_s in (rows[least] * period_s).tolist()), key=cost)
+    at = one.times_s - late_s
+    return late_s, spline(at), slope(at)
+
+
+def filtered(one: Shown) -> Iterator[Law]:
+    """A low-pass at another corner."""
+    if one.counts is None:
+        slope = one.foretold_at.derivative()(one.times_s)
+        factors, left = one.left([slope, np.gradient(slope, one.times_s)], one.values - one.foretold)
+        lower = "lower" if factors[1] > 0.0 else "higher"
+        yield Law("bandwidth", f"{lower} than told", float(factors[1]), left, 2)
+    channel = one.channel
+    if not one.uniform or not channel.bandwidth_hz:
+        return
+    begin, wave, turn = _waves(one)
+
+    def through(corner_hz: float) -> np.ndarray:
+        poles, residues, direct = channel_poles(
+            channel.model_copy(update={"bandwidth_hz": corner_hz, "highpass_hz": 0.0})
+        )
+        shown = np.full(len(turn), complex(direct))
+        for pole, residue in zip(poles.tolist(), residues.tolist(), strict=True):
+            shown += residue / (turn - pole)
+            if pole.imag:  # one of a pair: their residues are given doubled
+                shown += 0.5 * (residue.conjugate() / (turn - pole.conjugate()) - residue / (turn - pole))
+        return shown
+
+    plain = wave / through(channel.bandwidth_hz)
+    margin = min(len(one.values) // 8, round(_SETTLES_S / one.period_s))
+    if len(one.values) - margin - round(_ENDS_S / one.period_s) < 2 * FEW:
+        return  # too short to tell
+
+    def left_by(other: np.ndarray | float) -> np.ndarray:
+        left = one.values - np.fft.irfft(plain * other)[begin:][: len(one.values)]
+        left = one.left([one.level], left)[1] if channel.highpass_hz and one.counts is not None else left / one.floor
+        known = slice(margin, -round(_ENDS_S / one.period_s))  # how it goes on tells of what is behind a filter
+        left[: known.start] = left[known.stop :] = rms_of(left[known])
+        return left
+
+    def cost(log_hz: float) -> float:
+        settled = min(len(one.values) // 2, round(_SETTLED / math.exp(log_hz) / one.period_s))
+        return rms_of(left_by(through(math.exp(log_hz)))[max(margin, settled) :])
+
+    grid = np.log(np.geomspace(10.0, 0.98 * channel.bandwidth_hz, 40))
+    near, step = min(grid, key=cost), grid[1] - grid[0]
+    corner_hz = math.exp(least_at(cost, near - step, min(near + step, grid[-1])))
+    margin = max(margin, min(len(one.values) // 2, round(_SETTLED / corner_hz / one.period_s)))
+    left, differs = left_by(through(corner_hz)), one.apart[margin : -round(_ENDS_S / one.period_s)]
+    if one.counts is None:
+        delayed = (one.values - delayed_by(one)[1]) / one.floor
+        passed = float((one.values - left * one.floor).std())
+        # Of what is slow beside it, a low-pass makes a delay; and what lets nothing pass is none.
+        if max(1.0, rms_of(left)) < _CLEARLY * rms_of(delayed) and passed > _PASSES * float(one.foretold.std()):
+            yield Law("bandwidth", f"lower than told: {corner_hz:.3g} Hz", corner_hz, left, 1, "Hz")
+        return
+    if rms_of(left) < _SAME * max(1.0, one.noise / float(one.floor[0])):  # else noise of another time is in it
+        seen = rms_of(differs) > _SEEN * rms_of(one.apart)
+        yield Law("bandwidth", f"{corner_hz:.4g} Hz", corner_hz, left, 1, "Hz", sure=seen)
+    if one.bare is not None and (rms_of(left_by(1.0)) < _HARDLY * rms_of(one.apart)):
+        _, left = one.left([one.level] if channel.highpass_hz else [np.zeros(len(one.values))], one.values - one.bare())
+        yield Law("no-filter", "what is above half of the rate folds back", 0.0, left, 1)
+
+
+def _waves(one: Shown) -> tuple[int, np.ndarray, np.ndarray]:
+    """What it should show, from before to behind, there and back: its first row, spectrum, frequencies [2 pi i Hz]."""
+    times_s, e = one.around or (one.times_s, one.foretold)
+    round_trip = np.concatenate([e, e[::-1]])
+    turn = 2j * math.pi * np.fft.rfftfreq(len(round_trip), one.period_s)
+    return int(np.searchsorted(times_s, one.times_s[0])), np.fft.rfft(round_trip), turn
+
+
+def ringing(one: Shown) -> Iterator[Law]:
+    """A transducer with a resonance of its own, which may ring from what was before."""
+    if not one.uniform or not one.moves:
+        return
+    from scipy.interpolate import make_interp_spline
+    from scipy.optimize import minimize
+
+    begin, wave, turn = _waves(one)
+    t = one.times_s - one.times_s[0]
+
+    def left(logs: np.ndarray) -> np.ndarray:
+        w, quality = 2.0 * math.pi * math.exp(logs[0]), 0.5 + math.exp(logs[1])
+        shown = np.fft.irfft(wave * w**2 / (turn**2 + turn * w / quality + w**2))[begin:][: len(t)]
+        fading, angle = np.exp(-0.5 * w / quality * t), w * math.sqrt(1.0 - 0.25 / quality**2) * t
+        return one.left([fading * np.cos(angle), fading * np.sin(angle), one.level], one.values - shown)[1]
+
+    def cost(logs: np.ndarray) -> float:
+        return math.log(rms_of(left(logs)))
+
+    # x'' = w^2 (e - x) - (w / quality) x' has both numbers, though knocks do not make it exact; else one of many.
+    shown = make_interp_spline(t, one.values, k=5)
+    pulls = [one.foretold - one.values, -shown.derivative()(t)]
+    (stiff, damping), _ = one.left(pulls, shown.derivative(2)(t))
+    starts = [
+        np.log([hz, quality - 0.5])
+        for hz in np.geomspace(*_RINGS_HZ, _RINGS)
+        for quality in (1.0, 10.0, 100.0)
+    ]  # fmt: skip
+    if stiff > 0.0 and damping > 0.0 and math.sqrt(stiff) > 0.5 * damping:
+        starts.append(np.log([math.sqrt(stiff) / 2.0 / math.pi, math.sqrt(stiff) / damping - 0.5]))
+    close = {"xatol": 1e-7, "fatol": 1e-3}
+    found: Any = minimize(cost, min(starts, key=cost), method="Nelder-Mead", options=close)
+    hz, quality = math.exp(found.x[0]), 0.5 + math.exp(found.x[1])
+    if 0.5 * _RINGS_HZ[0] < hz < 2.0 * _RINGS_HZ[1] and quality < _RINGS_LONGEST:
+        yield Law("resonance", f"at {hz:.4g} Hz, quality {quality:.3g}", hz, left(found.x), 4, "Hz")

@@ -1,0 +1,1 @@
+"""Where a record's rows are in the session."""

@@ -1,0 +1,86 @@
+"""Time stamps of a record against the times of its rows in the session."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from replays.score.card.scorecard import Interval
+from replays.score.fits.intervals import about, student
+from replays.score.records.recorded import Table
+
+_BATCHES, _APART = 256, 32
+"""Batches of stamps that are shown, and that are judged."""
+_MOST_BATCH = 1 << 12
+"""Rows of a batch."""
+_SAME_CLOCK_S = 10.0
+"""Stamps that are farther from the wall time of the session are of another clock, unless told."""
+
+
+class Stamps:
+    """Time stamps against the times of the rows that they stand beside: offset and rate are two questions.
+
+    Attributes:
+        times_s: Those of the next rows [s], shape (n,).
+    """
+
+    def __init__(self, table: Table, *, shown: bool = False) -> None:
+        """Take what they stand in; or others in their place, which are shown then."""
+        self.times_s = np.empty(0)
+        self._stamped, self._size = shown or table.stamped, max(4, min(table.rows // _BATCHES, _MOST_BATCH))
+        self._back, self._last_s = 0, -math.inf
+        self._means: list[np.ndarray] = []
+        self._squares, self._freedom = 0.0, 0
+
+    def take(self, first_s: float, since_s: np.ndarray, known: np.ndarray, rows: int) -> None:
+        """Take when the first row was sent, how long after it those of the next that are known [s], and which are."""
+        if not self._stamped or not rows:
+            return
+        times_s, size = self.times_s, self._size
+        self._back += int(np.count_nonzero(np.diff(times_s, prepend=self._last_s) < 0.0))
+        self._last_s = float(times_s[-1])
+        apart = times_s[known] - first_s - since_s
+        for begin in range(0, len(apart) - size + 1, size):
+            late = apart[begin : begin + size]
+            self._means.append(np.array([since_s[begin : begin + size].mean(), late.mean()]))
+            self._squares += float(np.sum((late - late.mean()) ** 2))
+            self._freedom += size - 1
+
+    def judged(self, wall_s: float | None, *, apart_s: float = _SAME_CLOCK_S) -> dict[str, Interval | None]:
+        """Offset at the first row [s], rate [ppm], jitter [s], steps back, latency [s], with low and high ends if told.
+
+        Args:
+            wall_s: Wall time at which what was sent at time zero came to who recorded the session [s].
+            apart_s: Stamps that are farther from it are of another clock [s].
+        """
+        names = ("stamp offset", "stamp rate", "stamp jitter", "stamps that go back", "latency")
+        if not self._stamped:
+            return dict.fromkeys(names)
+        found: dict[str, Interval | None] = dict.fromkeys(names)
+        found["stamps that go back"] = (float(self._back),) * 3
+        if len(self._means) < 8:
+            return found
+        from scipy.stats import chi2
+
+        # Rows that came in bursts are not independent: several batches are one here.
+        several = max(1, len(self._means) // _APART)
+        whole = np.array(self._means[: len(self._means) // several * several])
+        since, late = whole.reshape(-1, several, 2).mean(axis=1).T
+        (rate, offset), covariance = np.polyfit(since, late - late[0], 1, cov=True)
+        half = student(len(since) - 2) * np.sqrt(np.diag(covariance))
+        for name, at, wide, size in (
+            ("stamp offset", late[0] + offset, half[1], 1.0),
+            ("stamp rate", rate, half[0], 1e6),
+        ):
+            found[name] = about(at, wide, size)
+        if wall_s is not None and abs(late.mean() - wall_s) < apart_s:
+            value, wide = late.mean() - wall_s, student(len(late) - 1) * late.std(ddof=1) / math.sqrt(len(late))
+            found["latency"] = about(float(value), float(wide))
+        ends = [math.sqrt(self._squares / chi2.ppf(p, self._freedom)) for p in (0.975, 0.025)]
+        found["stamp jitter"] = math.sqrt(self._squares / self._freedom), ends[0], ends[1]
+        return found
+
+    def picture(self) -> np.ndarray:
+        """Time since the first row, and lateness, of each batch [s], shape (n, 2)."""
+        return np.array(self._means).reshape(-1, 2)

@@ -1,0 +1,152 @@
+"""Limits of a scorecard: a TOML file, each limit a number or made of the channel table, with where it is from."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
+
+from replays.score.card.scorecard import ANALOGUE, DIGITAL, Bounds
+from rig.base import units
+from rig.base.errors import InputError, UnknownNameError, Words
+from rig.base.outside import check, read_toml
+from rig.channels.table import Channel
+
+FOLDER = Path(__file__).parent / "sets"
+DEFAULT = "as-calibrated"
+Told = Literal[
+    "noise",
+    "lsb",
+    "full_scale",
+    "bandwidth_hz",
+    "sample_ns",
+    "effective_bits",
+    "dynamic_range_db",
+    "sine_db",
+    "sine_bits",
+]
+
+
+class _Of(BaseModel):
+    """A bound made of what the channel table tells: times it, and plus something."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    of: Told
+    times: FiniteFloat = 1.0
+    plus: FiniteFloat = 0.0
+
+
+class Limit(BaseModel):
+    """One limit."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    low: FiniteFloat | _Of | None = None
+    high: FiniteFloat | _Of | None = None
+    source: Annotated[str, Field(min_length=1)]
+    """Where it is from."""
+    kind: Literal["table", "assumed", "standard", "exact"]
+    edition: str = ""
+    clause: str = ""
+    second_hand: bool = False
+    """It was quoted from others' texts; the standard was not at hand."""
+    measures: str | None = None
+    """Only of channels whose unit is of this kind, such as length."""
+
+    def text(self) -> str:
+        """Where it is from, in words."""
+        parts = [self.source, self.edition, self.clause, "quoted second-hand" if self.second_hand else ""]
+        return ", ".join(part for part in (*parts, "assumed" if self.kind == "assumed" else "") if part)
+
+
+class Limits(BaseModel):
+    """A set of limits by quantity."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    title: str
+    digital: dict[str, Limit] = {}
+    analogue: dict[str, Limit] = {}
+
+    def bounds(
+        self, path: Literal["digital", "analogue"], quantity: str, channel: Channel | None = None, *,
+        amplitude: float = math.nan,
+    ) -> Bounds | None:  # fmt: skip
+        """What is asked of a quantity; None: nothing.
+
+        Args:
+            path: Which of the two.
+            quantity: Its name.
+            channel: Whose it is, by the session's table.
+            amplitude: Of the sine that it was measured with [unit].
+        """
+        limit = getattr(self, path).get(quantity)
+        if limit is None:
+            return None
+        if limit.measures is not None and (channel is None or units.kind(channel.unit) != limit.measures):
+            return None
+        ends = []
+        for bound, none in ((limit.low, -math.inf), (limit.high, math.inf)):
+            if isinstance(bound, _Of):
+                if channel is None:
+                    return None
+                ends.append(bound.times * _told(channel, bound.of, amplitude) + bound.plus)
+            else:
+                ends.append(none if bound is None else bound)
+        if any(map(math.isnan, ends)):
+            return None
+        _check_order(f"limit {quantity}{'' if channel is None else f' of {channel.name}'}", *ends)
+        return Bounds(ends[0], ends[1], limit.text())
+
+
+def _check_order(field: str, low: float | _Of | None, high: float | _Of | None) -> None:
+    """Raise InputError where the low end of a limit lies above its high end; ends from the table are checked later."""
+    if isinstance(low, float) and isinstance(high, float) and low > high:
+        raise InputError(field, "with low at most high", Words(f"low = {low:g}, high = {high:g}"))
+
+
+def _told(channel: Channel, what: Told, amplitude: float) -> float:
+    """What the table tells of a channel, in its unit."""
+    per_volt = 1.0 / abs(channel.sensitivity_v)
+    noise_v = math.hypot(channel.noise_v, channel.lsb_v / math.sqrt(12.0))
+    sine_db = 20.0 * math.log10(amplitude / math.sqrt(2.0) / (noise_v * per_volt)) if amplitude > 0.0 else math.nan
+    return {
+        "noise": noise_v * per_volt,
+        "lsb": channel.lsb_v * per_volt,
+        "full_scale": channel.adc_v * per_volt,
+        "bandwidth_hz": channel.bandwidth_hz,
+        "sample_ns": 1e9 / channel.rate_hz,
+        "effective_bits": math.log2(2.0 * channel.adc_v / (noise_v * math.sqrt(12.0))),
+        "dynamic_range_db": 20.0 * math.log10(channel.adc_v / math.sqrt(2.0) / noise_v),
+        "sine_db": sine_db,
+        "sine_bits": (sine_db - 1.76) / 6.02,
+    }[what]
+
+
+def load_limits(given: Path | str | None = None) -> Limits:
+    """Load limits: a set that comes with the rig by its name, or a file.
+
+    Raises:
+        InputError: There is none, or the first thing that is wrong in it.
+    """
+    path = Path(DEFAULT if given is None else given)
+    shipped = {file.stem: file for file in FOLDER.glob("*.toml")}
+    if path.suffix != ".toml":
+        if str(path) not in shipped:
+            raise UnknownNameError("limits", "a .toml file or a set of the rig's", str(path), sorted(shipped))
+        path = shipped[str(path)]
+    limits = check(Limits, read_toml(path), field=path.name)
+    for name, known in (("digital", DIGITAL), ("analogue", ANALOGUE)):
+        for quantity, limit in getattr(limits, name).items():
+            if quantity not in known:
+                raise UnknownNameError(f"{path.name}: {name}", "a quantity of a scorecard", quantity, known)
+            where = f"{path.name}: {name}.{quantity}"
+            if limit.low is None and limit.high is None:
+                raise InputError(where, "with low or high", None)
+            if limit.measures not in (None, *units.QUANTITIES):
+                raise UnknownNameError(f"{where}.measures", "a kind of unit", limit.measures, units.QUANTITIES)
+            _check_order(where, limit.low, limit.high)
+    return limits

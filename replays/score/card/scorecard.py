@@ -1,0 +1,374 @@
+"""A scorecard: a row for each quantity and channel, with interval, limit and verdict; as a document and as JUnit."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from replays.report import junit
+from rig.base.errors import UnknownNameError
+from rig.base.outcome import Outcome
+from rig.base.text import finite
+
+PASS, FAIL, INCONCLUSIVE, NO_LIMIT = "pass", "fail", "inconclusive", "no limit"
+Verdict = Literal["pass", "fail", "inconclusive", "no limit"]
+Path_ = Literal["digital", "analogue"]
+Interval = tuple[float, float, float]
+"""Value, low and high end."""
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """What is scored.
+
+    Attributes:
+        unit: Its unit; empty: that of the channel.
+        method: How its interval is made.
+        run: What to run so that it is shown.
+    """
+
+    unit: str
+    method: str
+    run: str
+
+
+_EXACT = "exact, row by row"
+_SANDWICH = "least squares, block sandwich of 64 blocks, Student's t"
+_FOLLOWED = "time error of each block, steps by whole samples by likelihood ratio"
+_SPLIT = "weighted least squares of squared residuals on squared slope, block sandwich, Student's t"
+_LONGER = "a longer run"
+_RICH = "a signal of many frequencies on every channel (test-prbs, 2 s)"
+_BEYOND = "a signal beyond the corner (test-chirp, test-prbs)"
+_SINE = "a sine near full scale on the channel (test-sine, 10 s)"
+_TONES = "two tones on the channel (test-two-tone, 10 s)"
+_RAMP = "a slow ramp over the whole range (test-ramp, 20 s)"
+_STEPS = "at least 6 steps with plateaus of 100 samples (test-step, 10 s)"
+_DIGITS = "a recording that keeps every digit of the counts"
+_STAMPED = "a recording that keeps time stamps"
+_RECORDED = Quantity(
+    "1", "by name, equal counts or correlation", "--channels NAME,... where fewer channels were to be recorded"
+)
+DIGITAL = {
+    "recorded": _RECORDED,
+    "mapping": Quantity("1", "cross-correlation, then equal counts", _RICH),
+    "polarity": Quantity("1", "sign of the scale", _RICH),
+    "scale": Quantity("ppm", "least squares, then every count equal", _DIGITS),
+    "offset": Quantity("counts", "least squares, then every count equal", _DIGITS),
+    "altered values": Quantity("1", _EXACT, _LONGER),
+    "missing rows": Quantity("1", _EXACT, _LONGER),
+    "doubled rows": Quantity("1", _EXACT, _LONGER),
+    "swapped rows": Quantity("1", _EXACT, _LONGER),
+    "foreign rows": Quantity("1", _EXACT, _LONGER),
+    "row step": Quantity("1", "by the rate of the stamps, then equal counts", _STAMPED),
+    "rows before the first": Quantity("1", _EXACT, _LONGER),
+    "rows after the last": Quantity("1", _EXACT, _LONGER),
+    "stamp offset": Quantity("s", "straight line through means of batches, Student's t", _STAMPED),
+    "stamp rate": Quantity("ppm", "straight line through means of batches, Student's t", _STAMPED),
+    "stamp jitter": Quantity("s", "rms within batches, chi squared", _STAMPED),
+    "stamps that go back": Quantity("1", _EXACT, _STAMPED),
+    "latency": Quantity(
+        "s",
+        "stamps, or live the rows' arrival, less their arrival at the session's recorder, Student's t",
+        "live, `my-daq | rig score -`; or the DAQ, stamping rows by the computer's clock, beside `rig record`",
+    ),
+    "trigger row": Quantity("1", _EXACT, "a triggered recording of a scene with a hammer or another command"),
+}
+ANALOGUE = {
+    "recorded": _RECORDED,
+    "mapping": Quantity("1", "cross-correlation of all pairs", _RICH),
+    "polarity": Quantity("1", "cross-correlation of all pairs", _RICH),
+    "gain": Quantity("ppm", _SANDWICH, _LONGER),
+    "offset": Quantity("", _SANDWICH, _LONGER),
+    "skew": Quantity("ns", _SANDWICH, _RICH),
+    "start": Quantity("s", _SANDWICH, _RICH),
+    "clock": Quantity("ppm", f"{_SANDWICH}, weighted mean of channels", "a longer run with a signal above 100 Hz"),
+    "clock drift": Quantity(
+        "ppm/s", f"{_SANDWICH}, weighted mean of channels", "a longer run with a signal above 100 Hz"
+    ),
+    "lost samples": Quantity("1", _FOLLOWED, "a signal above 100 Hz on every channel"),
+    "doubled samples": Quantity("1", _FOLLOWED, "a signal above 100 Hz on every channel"),
+    "foreign rows": Quantity("1", "rows between others in blocks that are not explained", _LONGER),
+    "judged part": Quantity("1", "rows explained over rows in the session", "a signal that does not repeat"),
+    **{name: DIGITAL[name] for name in ("stamp rate", "stamp jitter", "stamps that go back")},
+    "noise": Quantity("", _SPLIT, _LONGER),
+    "jitter": Quantity("ns", _SPLIT, "a steep signal (test-sine at 1 kHz or more, or two tones), 10 s"),
+    "effective bits": Quantity("bit", "of the rms of all that is left, log2(range / (rms sqrt 12))", _LONGER),
+    "dynamic range": Quantity("dB", "of the noise, full-scale sine over it", _LONGER),
+    "corner": Quantity("Hz", "least squares behind a Butterworth low-pass, else cross spectra", _BEYOND),
+    "SINAD": Quantity("dB", "IEEE 1057 four-parameter sine fit, chi squared", _SINE),
+    "ENOB": Quantity("bit", "IEEE 1057 four-parameter sine fit, chi squared", _SINE),
+    "THD": Quantity("dB", "harmonics 2 to 10 of the sine fit, delta method", _SINE),
+    "SFDR": Quantity("dB", "largest line of the sine fit's residual, delta method", _SINE),
+    "alias rejection": Quantity(
+        "dB", f"of all that was sent above half of the rate, {_SANDWICH}",
+        "tones above half of the DAQ's rate, from a session at a higher rate",
+    ),
+    "IMD": Quantity("dB", "products of second and third order over two tones, least squares, delta method", _TONES),
+    "INL": Quantity("ppm", "transfer curve of 64 straight pieces, simultaneous interval, of the range", _RAMP),
+    "DNL": Quantity("LSB", "code density of a ramp, simultaneous interval", f"{_RAMP}, longer for more samples a code"),
+    "crosstalk": Quantity("dB", f"worst of the other channels, in volts, {_SANDWICH}", _RICH),
+    "rise time": Quantity("s", "10 to 90 % of the mean step response", _STEPS),
+    "overshoot": Quantity("%", "largest value of the mean step response, simultaneous interval", _STEPS),
+    "settling time": Quantity("s", "from 50 % of the mean step response, simultaneous interval", _STEPS),
+    "trigger row": DIGITAL["trigger row"],
+}  # fmt: skip
+QUANTITIES = {"digital": DIGITAL, "analogue": ANALOGUE}
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """What a quantity must lie between.
+
+    Attributes:
+        low, high: The ends, in its unit.
+        source: Where they are from.
+    """
+
+    low: float
+    high: float
+    source: str
+
+    def __str__(self) -> str:
+        if math.isinf(self.low):
+            return f"<= {self.high:.6g}"
+        if math.isinf(self.high):
+            return f">= {self.low:.6g}"
+        return f"{self.low:.6g} to {self.high:.6g}"
+
+
+@dataclass(frozen=True)
+class ScoreRow:
+    """One row.
+
+    Attributes:
+        quantity: A key of `QUANTITIES`.
+        channel: Whose it is; empty: of all, or of a group.
+        value: What it is; nan where nothing is known, a text where it is no number.
+        low, high: Its 95 % interval; equal where it is exact.
+        unit: Of these.
+        method: How the interval is made.
+        limit: What it must lie between; None: nothing asks.
+        verdict: What comes out.
+        run: What to run to show it.
+        note: What else is to be known, such as which rows.
+    """
+
+    quantity: str
+    channel: str
+    value: float | str
+    low: float
+    high: float
+    unit: str
+    method: str
+    limit: Bounds | None
+    verdict: Verdict
+    run: str = ""
+    note: str = ""
+
+    @property
+    def is_known(self) -> bool:
+        """Whether there is a value."""
+        return isinstance(self.value, str) or math.isfinite(self.value)
+
+    def cells(self) -> tuple[str, ...]:
+        """Quantity, channel, value, interval, unit, limit, verdict."""
+        known = self.is_known
+        exact = self.low == self.high or not known
+        digits = 6
+        if not exact and math.isfinite(self.high - self.low):  # so many that the two ends differ
+            largest = max(abs(self.low), abs(self.high))
+            digits = min(15, max(6, math.ceil(math.log10(largest / (self.high - self.low))) + 2))
+        interval = "" if exact else f"{self.low:.{digits}g} to {self.high:.{digits}g}"
+        value = self.value if isinstance(self.value, str) else f"{self.value:.{digits}g}" if known else ""
+        return (
+            self.quantity, self.channel, value, interval, "" if self.unit == "1" else self.unit,
+            "" if self.limit is None else str(self.limit), self.verdict,
+        )  # fmt: skip
+
+
+def _is_outside(value: float, low: float, high: float, limit: Bounds, *, rms: bool) -> bool:
+    """Return whether an interval that is longer by `_MARGIN` lies outside of a limit as a whole."""
+    power = 2 if rms else 1  # an interval of a variance is even to both sides about the variance
+    high = value**power + _MARGIN * (high**power - value**power)
+    low = value**power - _MARGIN * (value**power - low**power)
+    return high < limit.low or low > limit.high**power
+
+
+def judge_row(
+    path: Path_, quantity: str, channel: str, estimate: Interval | None, *, unit: str = "",
+    limit: Bounds | None = None, note: str = "",
+) -> ScoreRow:  # fmt: skip
+    """A row with its verdict: the whole interval decides, and one that reaches over a limit shows nothing.
+
+    A card has dozens of rows, of which each twentieth interval misses its value: a row fails where an interval of
+    99.7 % lies outside.
+
+    Args:
+        path: Which of the two.
+        quantity: A key of `QUANTITIES`.
+        channel: Whose.
+        estimate: Value, low and high end of the 95 % interval; None: this run does not tell.
+        unit: Of a quantity that has the channel's.
+        limit: What asks.
+        note: What else is to be known.
+    """
+    about = QUANTITIES[path][quantity]
+    value, low, high = (math.nan,) * 3 if estimate is None else estimate
+    verdict: Verdict = INCONCLUSIVE
+    if estimate is not None:
+        if limit is None:
+            verdict = NO_LIMIT
+        elif limit.low <= low and high <= limit.high:
+            verdict = PASS
+        elif _is_outside(value, low, high, limit, rms=quantity in _RMS):
+            verdict = FAIL
+    run = about.run if verdict == INCONCLUSIVE else ""
+    return ScoreRow(quantity, channel, value, low, high, about.unit or unit, about.method, limit, verdict, run, note)
+
+
+def text_row(path: Path_, quantity: str, channel: str, value: str, verdict: Verdict, note: str) -> ScoreRow:
+    """Return a row whose value is a text, with a verdict that is known."""
+    about = QUANTITIES[path][quantity]
+    run = about.run if verdict == INCONCLUSIVE else ""
+    return ScoreRow(quantity, channel, value, 0.0, 0.0, "1", about.method, None, verdict, run, note)
+
+
+@dataclass
+class Scorecard:
+    """All rows of one path.
+
+    Attributes:
+        title: Of what.
+        path: Digital or analogue.
+        limits: Title of the limits.
+        asked: What they ask of a path's quantity, on a channel of the session's table.
+        rows: The rows.
+        remarks: What was assumed.
+        doubts: Reasons why the record shows too little for a pass; without a failing quantity the outcome is
+            inconclusive then.
+        pictures: What pictures are made of, by kind and channel.
+        runs: Numbers of rows by what became of them, as pairs of first and last.
+    """
+
+    title: str
+    path: Path_
+    limits: str
+    asked: Callable[..., Bounds | None]
+    rows: list[ScoreRow] = field(default_factory=list)
+    remarks: list[str] = field(default_factory=list)
+    doubts: list[str] = field(default_factory=list)
+    pictures: dict[str, Any] = field(default_factory=dict)
+    runs: dict[str, list[tuple[int, int]]] = field(default_factory=dict)
+
+    def add(
+        self, quantity: str, channel: str, estimate: Interval | None, *, of: Any = None, unit: str = "", note: str = "",
+        **told: Any,
+    ) -> None:  # fmt: skip
+        """Add a row that is judged by its limit: as `judge_row`, `of` the session's channel, and what a limit needs."""
+        limit = self.asked(self.path, quantity, of, **told)
+        self.rows.append(judge_row(self.path, quantity, channel, estimate, unit=unit, limit=limit, note=note))
+
+    @property
+    def outcome(self) -> Outcome:
+        """Fail where a quantity fails; pass where one passes and there is no doubt; else inconclusive."""
+        verdicts = {row.verdict for row in self.rows}
+        return Outcome.of(failed=FAIL in verdicts, shown=PASS in verdicts and not self.doubts)
+
+    @property
+    def verdict_line(self) -> str:
+        """Path, outcome, number of quantities by verdict, and the first doubt, in one line."""
+        counts = Counter(row.verdict for row in self.rows)
+        failed = list(dict.fromkeys(row.quantity for row in self.rows if row.verdict == FAIL))
+        parts = [f"{counts[PASS]} pass", f"{counts[FAIL]} fail" + (f" ({', '.join(failed)})" if failed else "")]
+        parts += [f"{counts[INCONCLUSIVE]} inconclusive, {counts[NO_LIMIT]} without a limit"]
+        reason = ""
+        if self.outcome is Outcome.INCONCLUSIVE:
+            more = f"; and {len(self.doubts) - 1} more" if self.doubts[1:] else ""
+            reason = f"; {self.doubts[0]}{more}" if self.doubts else "; no quantity passes"
+        return f"{self.path} path: {self.outcome}: {', '.join(parts)}{reason}"
+
+    def row(self, quantity: str, channel: str = "") -> ScoreRow:
+        """One of the rows.
+
+        Raises:
+            UnknownNameError: There is none.
+        """
+        for row in self.rows:
+            if (row.quantity, row.channel) == (quantity, channel):
+                return row
+        names = [f"{row.quantity} {row.channel}".strip() for row in self.rows]
+        raise UnknownNameError("row", "one of the scorecard's", f"{quantity} {channel}".strip(), names)
+
+    def document(self) -> dict[str, Any]:
+        """As a document for JSON."""
+        rows = [{name: each or None for name, each in asdict(row).items()} for row in self.rows]
+        for row, told in zip(self.rows, rows, strict=True):
+            told |= {"value": row.value, "low": row.low, "high": row.high}
+        return finite({
+            "title": self.title, "path": self.path, "outcome": self.outcome.value, "good": self.outcome is Outcome.PASS,
+            "verdict": self.verdict_line, "doubts": self.doubts, "limits": self.limits, "rows": rows,
+            "remarks": self.remarks, "runs": self.runs,
+        })  # fmt: skip
+
+
+_MARGIN = 1.5
+"""Length of an interval of 99.7 % over that of 95 %, of a normal estimate."""
+_RMS = ("noise", "jitter", "stamp jitter")
+"""Quantities that are roots of variances."""
+MARKS: dict[Verdict, str] = {FAIL: "X", INCONCLUSIVE: "?", PASS: "+", NO_LIMIT: ""}
+"""Marks of a matrix, the worst first."""
+
+
+def make_matrix(card: Scorecard) -> tuple[list[str], list[tuple[str, ...]]]:
+    """Return the channels, and of each quantity its name and a mark for each channel; of several the worst.
+
+    Quantities of all channels together are those of the channel "all"; without two channels there is no matrix.
+    """
+    names = dict.fromkeys(row.channel for row in card.rows if row.channel)
+    columns = [*names, *([""] if any(not row.channel for row in card.rows) else [])]
+    lines: list[tuple[str, ...]] = []
+    for quantity in dict.fromkeys(row.quantity for row in card.rows) if len(names) > 1 else ():
+        found = [{row.verdict for row in card.rows if (row.quantity, row.channel) == (quantity, c)} for c in columns]
+        lines.append((quantity, *(next((mark for each, mark in MARKS.items() if each in some), "") for some in found)))
+    return [each or "all" for each in columns], lines
+
+
+def write_junit(card: Scorecard, path: Path) -> None:
+    """Write a scorecard as JUnit's XML.
+
+    The outcome is one case, and each quantity that passes or fails is one; an inconclusive outcome is an error of that
+    type. Quantities without a verdict, on which the outcome does not depend, are properties and never skipped cases.
+
+    Raises:
+        DiskError: The disk refused.
+    """
+    judged = [row for row in card.rows if row.verdict in (PASS, FAIL)]
+    others = [(f"{row.quantity} {row.channel}".strip(), _line(row)) for row in card.rows if row not in judged]
+    cases = [_outcome_case(card), *(_case(card, row) for row in judged)]
+    junit.write_junit(path, [junit.Suite(f"rig score, {card.path}", cases, others)])
+
+
+def _outcome_case(card: Scorecard) -> junit.Case:
+    result: dict[Outcome, junit.Outcome] = {
+        Outcome.PASS: "passed", Outcome.FAIL: "failure", Outcome.INCONCLUSIVE: "inconclusive",
+    }  # fmt: skip
+    lines = "\n".join(card.doubts)
+    return junit.Case(f"score.{card.path}", "outcome", result[card.outcome], card.verdict_line, lines)
+
+
+def _case(card: Scorecard, row: ScoreRow) -> junit.Case:
+    classname, name, line = f"score.{card.path}", f"{row.quantity} {row.channel}".strip(), _line(row)
+    if row.verdict == PASS:
+        return junit.Case(classname, name, text=line)
+    source = "" if row.limit is None else row.limit.source
+    return junit.Case(classname, name, "failure", line, f"{line}\nsource: {source}\n{row.note}")
+
+
+def _line(row: ScoreRow) -> str:
+    _, _, value, interval, unit, limit, verdict = row.cells()
+    run = f"; to show it: {row.run}" if row.run else ""
+    return f"{verdict}: {value} {unit} ({interval or 'exact'}); limit {limit or 'none'}{run}"

@@ -1,0 +1,1 @@
+"""Fits of known signals, and what they are worth."""

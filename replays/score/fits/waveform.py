@@ -1,0 +1,381 @@
+"""Least squares against the known signal: y = gain s(t + late + drift t + bend t^2 / 2) + offset, and its residual.
+
+Intervals of these five are those of the block sandwich: scores of the fit are summed over consecutive blocks, whose
+spread is the covariance, so that noise may have any colour and be larger where the signal is steep. Errors of the known
+signal itself, as of samples between which it is interpolated, are part of what is left, and so of the intervals.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from replays.score.fits.intervals import refine, student
+from replays.score.records.stimulus import Stimulus
+
+_ROUNDS, _FINAL = 4, 3
+_SETTLED = 1e-3
+"""A step below this part of its standard deviation is the last."""
+_LEAST = 400
+"""Fewest samples that are fitted."""
+_TAPS = 96
+_PASSES = 3
+"""Rounds in which a fit behind a filter takes the signal at the times that the last one found."""
+_ORDERS = 8
+"""Of the Butterworth low-passes that are tried."""
+_SETTLING = 8.0
+"""Periods of the corner at each end of a record that are left out, until a filter has forgotten them."""
+_RISE, _FAR = 1e-4, 0.5
+"""Steps of the corner's logarithm: for its slope, and the farthest from where it was seen."""
+_SEEN = 0.8
+"""Coherence from which the response at a frequency counts as shown."""
+
+
+@dataclass(frozen=True)
+class Waveform:
+    """What a fit of one channel comes to.
+
+    Attributes:
+        gain, offset, late_s, drift, bend: The five [1, unit, s, s/s, 1/s], `late_s` and `drift` means over the record.
+        covariance: Of the five, shape (5, 5).
+        freedom: Degrees of freedom of the five variances, shape (5,).
+        middle_s, half_s: The middle of the fitted rows by the clock of the file, and half of their length [s].
+        times_s: Of the rows that were fitted, by the clock of the file, shape (n,).
+        values: As recorded [unit], shape (n,).
+        known, slope: The signal and its slope there, without gain [unit, unit/s], shape (n,).
+        residual: What is left [unit], shape (n,).
+    """
+
+    gain: float
+    offset: float
+    late_s: float
+    drift: float
+    bend: float
+    covariance: np.ndarray
+    freedom: np.ndarray
+    middle_s: float
+    half_s: float
+    times_s: np.ndarray
+    values: np.ndarray
+    known: np.ndarray
+    slope: np.ndarray
+    residual: np.ndarray
+
+    @property
+    def spread(self) -> np.ndarray:
+        """Standard deviation of the five, shape (5,)."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def half(self) -> np.ndarray:
+        """Half of the 95 % interval of the five, shape (5,)."""
+        return student(self.freedom) * self.spread
+
+    def late_at(self, times_s: np.ndarray) -> np.ndarray:
+        """Time of the stimulus less time of the record, at times of the record [s], shape (n,)."""
+        return np.polynomial.polynomial.polyval(times_s - self.middle_s, self.curve)
+
+    @property
+    def curve(self) -> tuple[float, float, float]:
+        """The same by powers of the time from the middle [s, 1, 1/s]."""
+        return self.late_s - self.bend * self.half_s**2 / 6.0, self.drift, 0.5 * self.bend
+
+    @property
+    def likeness(self) -> float:
+        """Part of the recorded power that the known signal explains."""
+        whole = float(np.var(self.values))
+        return 1.0 - float(np.var(self.residual)) / whole if whole else 0.0
+
+
+def fit_waveform(
+    values: np.ndarray, times_s: np.ndarray, stimulus: Stimulus, curve: tuple[float, float, float]
+) -> Waveform | None:
+    """Fit a channel; None where the known signal is not in it, or too little of it.
+
+    Args:
+        values: Recorded [unit], nan where one is missing, shape (n,).
+        times_s: By the clock of the file, even, shape (n,).
+        stimulus: The known signal.
+        curve: Time of the stimulus less time of the file, to a part of a period of the signal, by powers of the time
+            from the middle of the file [s, 1, 1/s].
+    """
+    return _solve(values, times_s, stimulus, curve, slice(0, len(values)), final=True)
+
+
+def fit_stretch(
+    values: np.ndarray, times_s: np.ndarray, stimulus: Stimulus, late_s: float, stretch: tuple[int, int]
+) -> Waveform | None:
+    """Fit a channel over a stretch of its rows only, as `fit_waveform`, without intervals."""
+    return _solve(values, times_s, stimulus, (late_s, 0.0, 0.0), slice(*stretch), final=False)
+
+
+def _solve(
+    values: np.ndarray, times_s: np.ndarray, stimulus: Stimulus, curve: tuple[float, float, float], rows: slice, *,
+    final: bool,
+) -> Waveform | None:  # fmt: skip
+    """Gauss and Newton's steps over some rows, about their own centre; `curve` is about the centre of all.
+
+    The clock's drift is fitted over all rows only; else it has a standard deviation of 1 /s.
+    """
+    y, t = values[rows], times_s[rows]
+    low, high = stimulus.span_s
+    start_s = np.polynomial.polynomial.polyval(t - 0.5 * (times_s[0] + times_s[-1]), curve)
+    held = np.isfinite(y) & (t + start_s >= low) & (t + start_s <= high)
+    if held.sum() < _LEAST:
+        return None
+    y, t, start_s = y[held], t[held], start_s[held]
+    centre, span = 0.5 * (t[0] + t[-1]), 0.5 * max(t[-1] - t[0], 1e-300)
+    u = (t - centre) / span
+    shape = np.column_stack([np.ones(len(u)), u, u**2 - 1.0 / 3.0][: 3 if final else 2])
+    moved, number = np.zeros(shape.shape[1]), 0
+    while True:
+        at = t + start_s + shape @ moved
+        use = (at >= low) & (at <= high)
+        if use.sum() < _LEAST:
+            return None
+        s, ds = stimulus(at[use])
+        scale = max(float(np.std(s)), 1e-300)
+        steep = max(float(np.sqrt(np.mean(ds**2))), 1e-300)
+        ones = np.ones(len(s))
+        # Gain and offset follow linearly; the step of time is taken about them.
+        gain, offset = np.linalg.lstsq(np.column_stack([s / scale, ones]), y[use], rcond=None)[0]
+        gain /= scale
+        if not gain:
+            return None
+        jacobian = np.column_stack([s / scale, ones, (ds / steep)[:, None] * shape[use]])
+        residual = y[use] - gain * s - offset
+        inverse = np.linalg.pinv(jacobian.T @ jacobian)
+        step = inverse @ (jacobian.T @ residual)
+        moved = moved + step[2:] / (gain * steep)
+        small = (
+            np.abs(step[2:])
+            < (_SETTLED if final else 0.1) * np.sqrt(np.diag(inverse)[2:] * np.mean(residual**2)) + 1e-300
+        )
+        number += 1
+        if number > 1 and (small.all() or number >= _ROUNDS + (_FINAL if final else 0)):
+            break
+    # The curve that the fit began with, about this centre, is part of what was found.
+    begun = np.linalg.lstsq(np.column_stack([np.ones(len(u)), u, u**2 - 1.0 / 3.0]), start_s, rcond=None)[0]
+    begun[: len(moved)] += moved
+    residual = residual - jacobian @ step
+    units = np.array([scale, 1.0, gain * steep, gain * steep * span, 0.5 * gain * steep * span**2])
+    units = np.where(np.abs(units) > 1e-140, units, 1e-140)
+    covariance, freedom = np.diag([0.0, 0.0, 0.0, 0.0, units[4] ** 2]), np.ones(5)
+    if final:
+        fitted = slice(jacobian.shape[1])
+        change, residual, covariance[fitted, fitted], freedom[fitted] = refine(jacobian, residual)
+        step = step + change
+        begun[: len(moved)] += change[2:] / (gain * steep)
+    return Waveform(
+        float(gain + step[0] / scale), float(offset + step[1]), float(begun[0]), float(begun[1] / span),
+        float(2.0 * begun[2] / span**2), covariance / np.outer(units, units), freedom, centre, span,
+        t[use], y[use], s, ds, residual,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Response:
+    """Frequency response of a channel where the signal shows it.
+
+    Attributes:
+        frequency_hz: Shape (n,).
+        gain: Amount over the gain of the lowest frequencies, shape (n,).
+        spread: Standard deviation of its logarithm, shape (n,).
+        corner_hz: Where it has fallen by 3 dB, with its 95 % interval; None where it does not.
+    """
+
+    frequency_hz: np.ndarray
+    gain: np.ndarray
+    spread: np.ndarray
+    corner_hz: tuple[float, float, float] | None
+
+
+def response(found: Waveform) -> Response | None:
+    """The response, by Welch's cross spectra; None where the signal is at hardly a frequency.
+
+    Spread: sqrt((1 - coherence) / (2 coherence segments)) (Bendat & Piersol, Random Data, table 9.6). The corner is
+    where a parabola through the logarithms about it passes -3 dB.
+    """
+    from scipy.signal import csd, welch
+
+    n = len(found.known)
+    rate = (n - 1) / (found.times_s[-1] - found.times_s[0])
+    length = int(min(2048, n // 16))
+    x, y = found.known, found.values
+    told = {"fs": rate, "nperseg": length, "window": "hann", "detrend": "constant"}
+    f, sxx = welch(x, **told)
+    _, syy = welch(y, **told)
+    _, sxy = csd(x, y, **told)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        coherence = np.minimum(1.0, np.abs(sxy) ** 2 / (sxx * syy))
+        gain = np.abs(sxy) / sxx / abs(found.gain)
+    shown = (coherence > _SEEN) & (sxx > 1e-5 * sxx.max()) & (f > 0.0)
+    if shown.sum() < 16:
+        return None
+    f, gain, coherence = f[shown], gain[shown], coherence[shown]
+    segments = 2.0 * n / length * 0.9
+    spread = np.sqrt((1.0 - coherence) / (2.0 * coherence * segments)) + 1e-9
+    lowest = f <= max(f[7], 0.1 * f[-1])
+    weight = spread**-2.0
+    base = math.exp(float(np.sum(weight[lowest] * np.log(gain[lowest])) / np.sum(weight[lowest])))
+    gain = gain / base
+    return Response(f, gain, spread, _corner(f, np.log(gain), spread))
+
+
+def _corner(f: np.ndarray, log: np.ndarray, spread: np.ndarray) -> tuple[float, float, float] | None:
+    level = -0.5 * math.log(2.0)
+    below = log < level
+    # Where it stays below: single lines in the noise do not count.
+    runs = np.convolve(below, np.ones(5), mode="valid") >= 5
+    if not runs.any() or not runs.argmax():
+        return None
+    at = f[int(runs.argmax())]
+    near = (f > 0.7 * at) & (f < 1.4 * at)
+    if near.sum() < 8:
+        return None
+    x, weights = np.log(f[near] / at), 1.0 / spread[near]
+    parts, inverse = np.polyfit(x, log[near], 2, w=weights, cov="unscaled")
+    left = weights * (log[near] - np.polyval(parts, x))
+    inverse *= max(1.0, float(left @ left) / (len(x) - 3))
+    roots = [r.real for r in np.roots(parts - [0.0, 0.0, level]) if abs(r.imag) < 1e-9]
+    if not roots:
+        return None
+    root = roots[int(np.argmin(np.abs(roots)))]
+    row = np.array([root**2, root, 1.0])
+    # Lines of a Hann window are not independent: 1.9 of them are one.
+    half = 1.96 * math.sqrt(1.9 * float(row @ inverse @ row)) / max(abs(parts[1] + 2.0 * parts[0] * root), 1e-300)
+    return at * math.exp(root), at * math.exp(root - half), at * math.exp(root + half)
+
+
+def _places(times_s: np.ndarray) -> tuple[np.ndarray, float]:
+    """Numbers of rows on an even grid, of which some may be missing, shape (n,), and its step [s]."""
+    step_s = float(np.median(np.diff(times_s)))
+    places = np.rint((times_s - times_s[0]) / step_s).astype(int)
+    return places, (times_s[-1] - times_s[0]) / max(1, int(places[-1]))
+
+
+def through(found: Waveform) -> Waveform:
+    """The fit behind the linear response of the channel: 96 taps by least squares, so that what is left is noise."""
+    from scipy.linalg import solve_toeplitz
+    from scipy.signal import correlate
+
+    x = found.known - found.known.mean()
+    y = found.values - found.values.mean()
+    n, half = len(x), _TAPS // 2
+    auto = correlate(x, x, method="fft")[n - 1 :][:_TAPS]
+    cross = correlate(y, x, method="fft")[n - 1 - half :][:_TAPS]
+    auto[0] *= 1.0 + 1e-9
+    taps = np.asarray(solve_toeplitz(auto, cross))
+    known = np.convolve(x, taps)[half : half + n]
+    slope = np.convolve(found.slope, taps)[half : half + n]
+    places, _ = _places(found.times_s)
+    kept = np.zeros(n, bool)  # where the taps meet no lost sample
+    kept[_TAPS:-_TAPS] = places[_TAPS + half : n - half] - places[half : n - _TAPS - half] == _TAPS
+    left = (y - known)[kept]
+    return replace(
+        found, gain=1.0, times_s=found.times_s[kept], values=y[kept], known=known[kept], slope=slope[kept],
+        residual=left - left.mean(),
+    )  # fmt: skip
+
+
+def order_of(shown: Response) -> int:
+    """The order of the Butterworth low-pass that is most like a response with a corner."""
+    assert shown.corner_hz is not None
+    log, weights = np.log(shown.gain), np.maximum(shown.spread, 0.01) ** -2.0
+    # The corner may be off by a little, and more where the order is another.
+    ratios = shown.frequency_hz[:, None] / (shown.corner_hz[0] * np.linspace(0.9, 1.1, 41))
+    left = [np.min(weights @ (log[:, None] + 0.5 * np.log1p(ratios ** (2 * n))) ** 2) for n in range(1, _ORDERS + 1)]
+    return int(np.argmin(left)) + 1
+
+
+Corner = tuple[float, float, float]
+
+
+def behind_filter(found: Waveform, stimulus: Stimulus, shown: Response) -> tuple[Waveform, Corner] | None:
+    """The fit anew with a Butterworth low-pass between signal and record, and its corner with its interval.
+
+    Gain is then that at low frequencies, time without the filter's delay. None where no corner fits.
+
+    Args:
+        found: The fit without it.
+        stimulus: The known signal.
+        shown: The response by that fit, with a corner.
+    """
+    assert shown.corner_hz is not None
+    order, corner_hz, near, late_s = order_of(shown), shown.corner_hz[0], found, None
+    better = None
+    for _ in range(_PASSES):
+        better = _behind(near, stimulus, corner_hz, order, late_s)
+        if better is None:
+            return None
+        # Once more, with the signal at the times that are known now.
+        fit, (corner_hz, _, _) = better
+        known, slope = stimulus(found.times_s + fit.late_at(found.times_s))
+        near, late_s = replace(fit, times_s=found.times_s, values=found.values, known=known, slope=slope), 0.0
+    assert better is not None
+    fit, (corner_hz, low, high) = better
+    true = 1.0 / (1.0 + fit.drift)  # seconds of the file are not those of the session
+    return fit, (true * corner_hz, true * low, true * high)
+
+
+def _behind(
+    found: Waveform, stimulus: Stimulus, corner_hz: float, order: int, late_s: float | None
+) -> tuple[Waveform, Corner] | None:
+    """The same about a corner and a delay that are nearly known; without a delay, about that of low frequencies."""
+    span_s = found.times_s[-1] - found.times_s[0]
+    places, step_s = _places(found.times_s)
+    n = int(places[-1]) + 1
+    # Unless it is given, by as much as the filter delays low frequencies.
+    delay_s = 1.0 / (2.0 * math.pi * corner_hz * math.sin(math.pi / (2.0 * order))) if late_s is None else late_s
+    cut = math.ceil(_SETTLING / (corner_hz * step_s))
+    # What the ends do to the filter is left out.
+    kept = slice(*np.searchsorted(places, (cut, n - cut)))
+    if n < 8 * cut + _LEAST or kept.stop - kept.start < _LEAST:
+        return None
+    y, known, slope = found.values, found.known, found.slope
+    if n > len(places):  # the filter needs the instants of lost samples, too
+        even_s = found.times_s[0] + step_s * np.arange(n)
+        known, slope = stimulus(even_s + found.late_at(even_s))
+    spectra = [np.fft.rfft(values) for values in (known, slope)]
+    f = np.fft.rfftfreq(n, step_s)
+    poles = np.exp(1j * np.pi * (2.0 * np.arange(1, order + 1) + order - 1.0) / (2.0 * order))
+    log = math.log(corner_hz)
+
+    def passed(spectrum: np.ndarray, log_corner: float) -> np.ndarray:
+        s = 1j * f / math.exp(log_corner)
+        loss = np.prod([1.0 - s / pole for pole in poles], axis=0)
+        return np.fft.irfft(spectrum * np.exp(2j * np.pi * f * delay_s) / loss, n)[places[kept]]
+
+    u = (2.0 * (found.times_s - found.middle_s) / span_s)[kept]
+    ones = np.ones(len(u))
+    solved = None
+    for _ in range(2 * _ROUNDS):
+        s, ds = (passed(spectrum, log) for spectrum in spectra)
+        moved = (passed(spectra[0], log + _RISE) - passed(spectra[0], log - _RISE)) / (2.0 * _RISE)
+        gain = float(np.linalg.lstsq(np.column_stack([s, ones]), y[kept], rcond=None)[0][0])
+        matrix = np.column_stack([s, ones, gain * ds, gain * ds * u, gain * ds * (u**2 - 1.0 / 3.0), gain * moved])
+        sizes = np.maximum(np.sqrt(np.mean(matrix**2, axis=0)), 1e-300)
+        jacobian = matrix / sizes
+        parts = np.linalg.lstsq(jacobian, y[kept], rcond=None)[0] / sizes
+        delay_s, log = delay_s + parts[2], log + float(np.clip(parts[5], -0.2, 0.2))
+        if abs(log - math.log(corner_hz)) > _FAR:
+            return None
+        solved = s, ds, matrix, jacobian, sizes, parts
+        if abs(parts[5]) < 1e-9 and abs(parts[2]) < 1e-13:
+            break
+    assert solved is not None
+    s, ds, matrix, jacobian, sizes, parts = solved
+    change, residual, covariance, freedom = refine(jacobian, y[kept] - matrix @ parts)
+    parts = parts + change / sizes
+    delay_s, log = delay_s + float(change[2] / sizes[2]), log + float(change[5] / sizes[5])
+    sizes = sizes * np.array([1.0, 1.0, 1.0, 0.5 * span_s, 0.125 * span_s**2, 1.0])
+    covariance = covariance / np.outer(sizes, sizes)
+    half = float(student(freedom[5])) * math.sqrt(covariance[5, 5])
+    fitted = Waveform(
+        float(parts[0]), float(parts[1]), found.late_s + float(delay_s),
+        found.drift + float(parts[3]) / (0.5 * span_s), found.bend + float(parts[4]) / (0.125 * span_s**2),
+        covariance[:5, :5], freedom[:5], found.middle_s, found.half_s, found.times_s[kept], y[kept], s, ds, residual,
+    )  # fmt: skip
+    return fitted, (math.exp(log), math.exp(log - half), math.exp(log + half))

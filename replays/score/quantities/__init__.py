@@ -1,0 +1,1 @@
+"""Quantities of the analogue path, a module each."""

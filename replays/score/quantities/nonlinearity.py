@@ -1,0 +1,209 @@
+"""Nonlinearity of a converter: intermodulation of two tones, and INL and DNL by a ramp.
+
+Definitions are those of IEEE Std 1241-2010 as papers and tutorials give them; the standard itself was not at hand.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from replays.score.card.scorecard import Interval
+from replays.score.fits.intervals import simultaneous
+from replays.score.fits.sine import decibels, fit_sine
+
+_PURITY = 1e-4
+"""Part of its power that a signal of two tones may have besides them: session noise is 1e-6 of it."""
+_ROUGH = 0.05
+"""The same where the tones are fitted one after the other."""
+_TONE_RATIO = 400.0
+"""Power of one tone over the other, at most (26 dB)."""
+_SEARCH_ROWS = 1 << 14
+"""Rows by which the two tones are found; their frequencies are then refined over all."""
+_ROUNDS, _SETTLED = 8, 1e-9
+_ORDERS = (1, -1), (1, 1), (2, -1), (-1, 2), (2, 1), (1, 2), (2, 0), (0, 2), (3, 0), (0, 3)
+"""Multiples of the two tones that are fitted: products of second and third order, and harmonics."""
+_COUNTED = 4
+"""Of these, the first ones count: second order, and third order near the tones (IEEE 1241)."""
+_JUMP, _STRAIGHT = 0.05, 2e-3
+"""Parts of the full scale by which a ramp jumps back at least, and by which it departs from a line at most, rms."""
+_RING_ROWS, _SEGMENT_ROWS = 80, 1000
+"""Rows beside a jump that are left out, as the band-limited known signal rings there; rows of a ramp at least."""
+_KNOTS = 64
+"""Knots of the transfer curve over the converter's range."""
+_COVERAGE, _SLOW = 0.9, 0.01
+"""Part of the range that a ramp must cover; a signal that covers less than the second is none."""
+_CODE_SAMPLES = 16.0
+"""Samples a code from which code widths are judged."""
+_NOISES = 4.0
+"""Noises from the ends of the ramp within which the converter may limit."""
+
+
+def _basis(n: np.ndarray, turns: list[float]) -> np.ndarray:
+    """Cosine and sine of each frequency [cycles a row] at rows, and a constant, shape (n, 2 frequencies + 1)."""
+    phases = 2.0 * math.pi * np.outer(n, turns)
+    return np.column_stack([np.cos(phases), np.sin(phases), np.ones(len(n))])
+
+
+def _two_tones(n: np.ndarray, known: np.ndarray) -> tuple[list[float], float] | None:
+    """Frequencies [cycles a row] and power [unit^2] of two tones; None where the signal is none of two tones."""
+    if len(known) < _SEGMENT_ROWS or not np.var(known):
+        return None
+    first = fit_sine(known[:_SEARCH_ROWS])
+    second = fit_sine(first.residual)
+    if np.var(second.residual) > _ROUGH * np.var(known):
+        return None
+    tones, parts, left = np.array([first.frequency[0], second.frequency[0]]), np.zeros(5), known
+    for _ in range(_ROUNDS):
+        basis = _basis(n, tones.tolist())
+        parts = np.linalg.lstsq(basis, known, rcond=None)[0]
+        slopes = 2.0 * math.pi * n[:, None] * (basis[:, :2] * parts[2:4] - basis[:, 2:4] * parts[:2])
+        left = known - basis @ parts
+        if not np.isfinite(slopes).all() or not slopes.any():
+            return None
+        moved = np.linalg.lstsq(np.column_stack([slopes, basis]), left, rcond=None)[0][:2]
+        tones = tones + moved
+        if np.abs(moved).max() * len(n) < _SETTLED:
+            break
+    powers = 0.5 * (parts[:2] ** 2 + parts[2:4] ** 2)
+    if np.var(left) > _PURITY * np.var(known) or powers.max() > _TONE_RATIO * powers.min():
+        return None
+    return sorted(tones.tolist()), float(powers.sum())
+
+
+def intermodulation(times_s: np.ndarray, known: np.ndarray, residual: np.ndarray, gain: float) -> Interval | None:
+    """Return the intermodulation distortion [dB]: products of second and third order over the two tones, rms.
+
+    Args:
+        times_s: Of the rows, even but for lost ones [s], shape (n,).
+        known: The known signal, shape (n,).
+        residual: What is left of the record [unit], shape (n,).
+        gain: Of the record.
+
+    Returns:
+        Value and 95 % interval (delta method), or None where the known signal is not of two tones.
+    """
+    n = np.rint((times_s - times_s[0]) / np.median(np.diff(times_s)))
+    n -= 0.5 * n[-1]
+    found = _two_tones(n, known)
+    if found is None:
+        return None
+    (low, high), power = found
+    least, turns, counted = 2.0 / len(n), list[float](), 0
+    for number, (a, b) in enumerate(_ORDERS):
+        # A product beyond half of the rate, or beside a tone or another product, is not known as one of its own.
+        product = abs(a * high + b * low)
+        if product < 0.5 - least and min(abs(product - each) for each in (0.0, low, high, *turns)) > least:
+            turns.append(product)
+            counted += number < _COUNTED
+    if not counted:
+        return None
+    basis = _basis(n, turns)
+    parts = np.linalg.lstsq(basis, residual, rcond=None)[0]
+    line = 2.0 * float(np.var(residual - basis @ parts)) / len(n)  # variance of one part of a line
+    squares = (parts[: len(turns)] ** 2 + parts[len(turns) : -1] ** 2)[:counted].tolist()
+    half = 1.96 * math.sqrt(sum(4.0 * line * each + 4.0 * line**2 for each in squares))
+    return decibels(0.5 * sum(squares) / (gain**2 * power), 0.5 * half / (gain**2 * power))
+
+
+@dataclass(frozen=True)
+class Transfer:
+    """A converter's transfer curve by a ramp.
+
+    Attributes:
+        inl: Largest deviation of the curve from the fitted line [ppm of the range]; None where the ramp is too short.
+        dnl: Largest deviation of a code's width from the mean [LSB]; None where there are too few samples a code.
+        coverage: Part of the converter's range that the ramp covers.
+        code_samples: Mean samples a code.
+    """
+
+    inl: Interval | None
+    dnl: Interval | None
+    coverage: float
+    code_samples: float
+
+
+def _ramp(times_s: np.ndarray, known: np.ndarray, span: float) -> np.ndarray | None:
+    """A ramp's lines through the known signal, nan beside its jumps, shape (n,); None where it is none."""
+    edges = [0, *(np.flatnonzero(np.abs(np.diff(known)) > _JUMP * span) + 1), len(known)]
+    ramp = np.full(len(known), np.nan)
+    for a, b in pairwise(edges):
+        if b - a > _SEGMENT_ROWS + 2 * _RING_ROWS:
+            part = slice(a + _RING_ROWS, b - _RING_ROWS)
+            line = np.polynomial.Polynomial.fit(times_s[part], known[part], 1)
+            ramp[part] = line(times_s[part])
+            if np.std(known[part] - ramp[part]) > _STRAIGHT * span:
+                return None
+    held = np.isfinite(ramp)
+    return ramp if held.any() and np.ptp(ramp[held]) > _SLOW * span else None
+
+
+def transfer_curve(times_s: np.ndarray, known: np.ndarray, values: np.ndarray, span: float) -> Transfer | None:
+    """Return INL and DNL by a slow ramp; None where the known signal is none.
+
+    The transfer curve is a spline of straight pieces between 64 knots; intervals are simultaneous over knots and codes.
+
+    Args:
+        times_s: Of the rows [s], shape (n,).
+        known: The known signal, without gain [unit], shape (n,).
+        values: As recorded [unit], shape (n,).
+        span: The converter's range, from end to end [unit].
+    """
+    from scipy.sparse import csr_array
+
+    ramp = _ramp(times_s, known, span)
+    if ramp is None:
+        return None
+    low, high = np.nanmin(ramp), np.nanmax(ramp)
+    held = np.isfinite(ramp)
+    line = np.polynomial.Polynomial.fit(ramp[held], values[held], 1)
+    edge = _NOISES * float(np.std(np.diff(values[held] - line(ramp[held])))) / math.sqrt(2.0)
+    held[held] = (ramp[held] > low + edge) & (ramp[held] < high - edge)
+    if held.sum() < _SEGMENT_ROWS:
+        return None
+    x, y = ramp[held], values[held]
+    line = np.polynomial.Polynomial.fit(x, y, 1)
+    place = (x - x.min()) / (np.ptp(x) / _KNOTS)
+    knot = np.minimum(place.astype(int), _KNOTS - 1)
+    part, row = place - knot, np.arange(len(x))
+    entries = np.concatenate([1.0 - part, part]), (np.tile(row, 2), np.concatenate([knot, knot + 1]))
+    hats = csr_array(entries, shape=(len(x), _KNOTS + 1))
+    inverse = np.linalg.pinv((hats.T @ hats).toarray())
+    residual = y - line(x)
+    curve = inverse @ (hats.T @ residual)
+    left = residual - hats @ curve
+    block = max(1, len(x) // (8 * _KNOTS))  # noise of a colour has means of blocks that spread more
+    means = left[: len(x) // block * block].reshape(-1, block).mean(axis=1)
+    variance = max(float(np.var(left)), block * float(np.var(means)))
+    inl = simultaneous(np.abs(curve), np.sqrt(np.diag(inverse) * variance))
+    coverage = float(high - low) / span
+    dnl, samples = _code_widths(y, line(x), float(np.std(left)))
+    size = 1e6 / span
+    judged = (inl[0] * size, inl[1] * size, inl[2] * size) if coverage > _COVERAGE else None
+    return Transfer(judged, dnl, coverage, samples)
+
+
+def _code_widths(values: np.ndarray, line: np.ndarray, noise: float) -> tuple[Interval | None, float]:
+    """DNL [LSB] by the code density of a ramp, and the mean samples a code."""
+    codes = np.unique(values)
+    steps = np.diff(codes)
+    steps = steps[steps > 1e-9 * np.ptp(codes)]
+    if len(steps) < 8:
+        return None, math.inf
+    count = round(np.ptp(codes) / float(np.median(steps)))
+    step, samples = np.ptp(codes) / count, len(values) / count
+    if samples < _CODE_SAMPLES:
+        return None, samples
+    there, due = (
+        np.bincount(np.clip(np.rint((each - codes[0]) / step), 0, count).astype(int), minlength=count + 1)[2:-2]
+        for each in (values, line)
+    )
+    full = due > 0.5 * samples
+    there, due = there[full], due[full]
+    # A transition in noise moves the count by 0.564 noise a sample (IEEE 1241, ramp); two bound a code.
+    spread = np.sqrt(2.0 * 0.564 * noise / step / due)
+    value, low, high = simultaneous(np.abs(there / due - 1.0), spread)
+    return (value, max(0.0, low - 1.0 / samples), high + 1.0 / samples), samples

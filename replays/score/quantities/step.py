@@ -1,0 +1,114 @@
+"""The step response of a channel: rise time, overshoot and settling time.
+
+Definitions are those of IEEE Std 1057-2017 as papers and tutorials give them; the standard itself was not at hand.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from replays.score.card.scorecard import Interval
+from replays.score.fits.intervals import simultaneous
+
+_LEVEL_PART, _BETWEEN_ROWS = 0.1, 3
+"""Part of a step within which a row is at a level, and rows between two levels, at most, of a signal that is steps."""
+_PLATEAU_ROWS, _MAX_ROWS, _STEPS = 100, 4000, 6
+"""Rows of a plateau from which a step counts, those that are averaged at most, and steps that must be there."""
+_BEFORE_ROWS = 32
+"""Rows before a step that are averaged."""
+_RESOLVED_ROWS = 3.0
+"""Rows of a rise from which it is resolved: below, only its upper end is known."""
+BAND = 0.01
+"""Part of the step within which a response has settled."""
+
+
+@dataclass(frozen=True)
+class StepResponse:
+    """A step response, each value with its 95 % interval.
+
+    Attributes:
+        rise_rows: From 10 % to 90 % of the step [rows].
+        overshoot: Beyond the final level, over the step [%].
+        settling_rows: From 50 % of the step until it stays within the band [rows]; None where it does not.
+        steps: Number of averaged steps.
+    """
+
+    rise_rows: Interval
+    overshoot: Interval
+    settling_rows: Interval | None
+    steps: int
+
+
+def has_steps(known: np.ndarray) -> bool:
+    """Return whether a signal is steps between two levels, sharper than a response to them."""
+    low, high = np.percentile(known, (5.0, 95.0))
+    near = np.minimum(np.abs(known - low), np.abs(known - high)) < _LEVEL_PART * (high - low)
+    return bool(high > low and np.sum(~near) <= _BETWEEN_ROWS * len(_edges(known)))
+
+
+def _edges(known: np.ndarray) -> np.ndarray:
+    """Return the rows after which a signal passes the middle of its levels, shape (n,)."""
+    above = known > 0.5 * np.sum(np.percentile(known, (5.0, 95.0)))
+    return np.flatnonzero(above[1:] != above[:-1])
+
+
+def step_response(known: np.ndarray, values: np.ndarray) -> StepResponse | None:
+    """Return the mean response to all steps whose plateaus are long enough; None where these are too few.
+
+    Args:
+        known: The known signal, shape (n,).
+        values: As recorded, shape (n,).
+    """
+    from scipy.interpolate import PchipInterpolator
+
+    middle = known - 0.5 * np.sum(np.percentile(known, (5.0, 95.0)))
+    edges = _edges(known)
+    gaps = np.diff(edges, prepend=-1, append=len(known))
+    plateaus = np.minimum(gaps[:-1], gaps[1:])
+    held = plateaus > max(_PLATEAU_ROWS, 0.5 * float(np.median(plateaus)) if len(plateaus) else 0.0)
+    if held.sum() < _STEPS:
+        return None
+    rows = min(_MAX_ROWS, int(plateaus[held].min()) - 2)
+    places_of = edges + middle[edges] / (middle[edges] - middle[edges + 1])
+    # Where all steps lie alike between two rows, so does the grid, and nothing is interpolated.
+    grid = np.arange(-_BEFORE_ROWS, rows) - float(np.median((places_of - edges)[held]))
+    responses = []
+    for edge, at in zip(edges[held], places_of[held], strict=True):
+        part = values[edge + 1 - min(rows, edge + 1) : edge + 1]
+        base, top = part[len(part) // 2 : -_BEFORE_ROWS].mean(), values[edge + rows // 2 : edge + rows].mean()
+        first = edge - _BEFORE_ROWS - 1
+        near = values[first : edge + rows + 2]
+        places = np.arange(first, first + len(near)) - at
+        responses.append(np.interp(grid, places, (near - base) / (top - base)))
+    mean, count = np.mean(responses, axis=0), len(responses)
+    apart = np.var(responses, axis=0, ddof=1)
+    spread = np.sqrt(np.maximum(apart, np.median(apart)) / count)
+    after = slice(_BEFORE_ROWS - 1, None)
+    over = simultaneous(mean[after] - 1.0, spread[after])
+    before, peak, behind = mean[np.clip(np.argmax(mean), 1, len(mean) - 2) + np.arange(-1, 2)]
+    between = 0.125 * (behind - before) ** 2 / max(2.0 * peak - before - behind, 1e-300)  # of a parabola, at its top
+    overshoot = 100.0 * (over[0] + between), 100.0 * over[1], 100.0 * (over[2] + 2.0 * between)
+    curve, fine = PchipInterpolator(grid, mean), np.arange(grid[0], grid[-1], 1.0 / 64.0)
+
+    def crossing(level: float) -> tuple[float, float]:
+        """Row at which the response first passes a level, and the half width of its interval."""
+        n = int(np.argmax(mean >= level))
+        linear = grid[n] - (mean[n] - level) / max(mean[n] - mean[n - 1], 1e-300)
+        k = int(np.argmax(curve(fine) >= level))
+        half = 1.96 * float(spread[n]) / max(mean[n] - mean[n - 1], 1e-300) + abs(fine[k] - linear) + 1.0 / 64.0
+        return float(fine[k]), half
+
+    (low, low_half), (middle_row, _), (high, high_half) = (crossing(level) for level in (0.1, 0.5, 0.9))
+    rise, half = high - low, math.hypot(low_half, high_half)
+    resolved = rise >= _RESOLVED_ROWS
+    rise_rows = rise, rise - half if resolved else 0.0, rise + half if resolved else max(1.0, rise) + 1.0
+    limits = [0.0, *(simultaneous(np.zeros(rows), spread[_BEFORE_ROWS:])[2] * sign for sign in (-1.0, 1.0))]
+    ends = []
+    for limit in limits:
+        out = np.flatnonzero(np.abs(mean - 1.0) + limit > BAND)
+        ends.append(float(grid[out[-1]]) - middle_row if len(out) else 0.0)
+    settled = max(0.0, ends[0] + 0.5), max(0.0, ends[1] - 0.5), max(0.0, ends[2]) + 1.5
+    return StepResponse(rise_rows, overshoot, settled if settled[2] < 0.9 * rows else None, count)

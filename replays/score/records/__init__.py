@@ -1,0 +1,1 @@
+"""What was sent, what was recorded, and how the two are wired."""

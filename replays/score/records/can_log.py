@@ -1,0 +1,85 @@
+"""What a DAQ on a CAN bus logged, in python-can's formats: the rig's sample messages as signals."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from replays.score.records.recorded import Pieces, Recorded, Table
+from rig.base.errors import InputError, Words
+from rig.base.outside import unreadable
+from rig.channels.table import ChannelTable
+
+_SUFFIXES = (".log", ".asc", ".blf", ".trc")
+
+
+def is_can_log(path: Path) -> bool:
+    """Whether a file is a log of a CAN bus by its name; an .asc by its first word."""
+    if path.suffix.lower() not in _SUFFIXES:
+        return False
+    if path.suffix.lower() != ".asc":
+        return True
+    try:
+        with path.open("rb") as file:
+            return file.read(5).lower() == b"date "
+    except OSError as error:
+        raise unreadable(path, error) from None
+
+
+def open_can_log(path: Path, table: ChannelTable) -> list[Recorded]:
+    """Signals of a log: of messages with samples, in the FD layout where it is in it; others are passed over.
+
+    Args:
+        path: The log: candump, ASC or BLF, or TRC.
+        table: Channels of the rig that sent.
+
+    Raises:
+        InputError: It cannot be read, or has none of the rig's samples.
+    """
+    import can
+
+    from drivers.can.signals import messages_for
+    from drivers.sources.can import Layout
+
+    messages = messages_for(table)
+    frames: dict[str, tuple[list[bytes], list[float]]] = {}
+    rates = {"rate": next(iter(table.channels.values())).rate_hz}
+    try:
+        with can.LogReader(path) as reader:
+            for frame in reader:
+                message = messages.by_identifier.get(frame.arbitration_id)
+                if message is None or frame.is_extended_id or frame.is_error_frame or frame.is_remote_frame:
+                    continue
+                if message.name == "Rates" and len(frame.data) == message.length:
+                    rates = message.decode(bytes(frame.data))
+                elif message.samples is not None and len(frame.data) == message.length:
+                    data, times_s = frames.setdefault(message.name, ([], []))
+                    data.append(bytes(frame.data))
+                    times_s.append(frame.timestamp)
+    except Exception as error:  # whatever python-can raises on a log that it cannot read
+        told = unreadable(path, error) if isinstance(error, OSError) else None
+        raise told or InputError("FILE", "an intact CAN log", Words(f"{path} ({type(error).__name__})")) from None
+    fd = any(messages.by_name[name].fd for name in frames)
+    found = []
+    for name, (data, stamps) in frames.items():
+        message = messages.by_name[name]
+        form = message.samples
+        if message.fd is not fd or form is None:
+            continue
+        step = rates.get(f"{'fd' if fd else 'classic'}_step") or round(rates["rate"] * message.period_s / form.rows)
+        parts = Layout({name: message}).decode(name, data, rates["rate"], step, 0)
+        values = np.concatenate([part.values for part in parts])
+        times_s = np.repeat(stamps, form.rows)
+        # Its stamps are those of frames: when they came, not how often samples were taken.
+        whole = Table(len(values), values.shape[1], _reading(values, times_s))
+        for column, (channel, bits) in enumerate(zip(form.channels, form.shifts.tolist(), strict=True)):
+            if not np.isnan(values[:, column]).all():
+                found.append(Recorded(channel.name, channel.unit, whole, column, rates["rate"] / step, bits))
+    if not found:
+        raise InputError("FILE", "a CAN log with samples of the rig", str(path))
+    return found
+
+
+def _reading(values: np.ndarray, times_s: np.ndarray) -> Pieces:
+    return lambda columns: [np.column_stack([times_s, values[:, columns]])]

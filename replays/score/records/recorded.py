@@ -1,0 +1,361 @@
+"""What the DAQ under test recorded: the signals of a file, whatever its format, that need not fit into memory."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from recorder.reader import Recording
+from replays.recordings.formats.mapping import ChannelMapping, FileOptions
+from replays.recordings.formats.source import MAX_RATE_HZ, Entry, FileSignal, Source, even_rate_hz, open_source
+from replays.score.records.rows import take_rows
+from replays.score.records.scale import COUNTS
+from rig.base import units
+from rig.base.errors import InputError, UnknownNameError
+from rig.base.wire import sensor_key
+from rig.channels.table import Channel, Group
+
+_PART = 1 << 16
+_EARLY = 1 << 18
+"""Rows by which signals are found, and their scales."""
+_MOST = 1e30
+"""Values that a measurement can have, in any unit."""
+_ALIKE = 0.2
+"""Part by which steps of time stamps that are alike may differ."""
+_REGULAR, _ROUNDED = 0.9, 1.1
+"""Part of the steps that are alike where stamps are not rounded to a coarse resolution, and deviation of such stamps
+from a line, peak to peak, over their largest step, at most."""
+_MAX_SCATTER, _MIN_GAP = 5.0, 3.0
+"""The same over the usual step for stamps of which some go back by jitter, and steps over the usual one from which rows
+are missing: jitter of a quarter of a step, rms, reaches 5 steps peak to peak and steps of 2.5."""
+Pieces = Callable[[Sequence[int]], Iterable[np.ndarray]]
+
+
+class Table:
+    """Signals of a file that have the same time stamps.
+
+    Attributes:
+        rows: Number of values of each.
+        stamped: Whether there are stamps.
+    """
+
+    def __init__(self, rows: int, columns: int, pieces: Pieces) -> None:
+        """Take what gives stamps [s], nan where there are none, and some columns, in pieces, each shape (n, 1 + k)."""
+        self.rows, self._columns, self._pieces = rows, columns, pieces
+
+    def parts(self, columns: Sequence[int]) -> Iterator[np.ndarray]:
+        """Stamps [s] and columns, nan where there is no value that a measurement can have, in parts of one length."""
+        held, left = list[np.ndarray](), self.rows
+        for piece in self._pieces(columns):
+            piece, left = piece[:left], left - len(piece[:left])
+            with np.errstate(invalid="ignore"):
+                piece[:, 1:][~(np.abs(piece[:, 1:]) <= _MOST)] = np.nan
+            held.append(piece)
+            if (rows := sum(map(len, held))) >= _PART:
+                whole, cut = np.concatenate(held), rows // _PART * _PART
+                yield from np.split(whole[:cut], cut // _PART)
+                held = [whole[cut:].copy()]
+        if held and len(rest := np.concatenate(held)):
+            yield rest
+
+    @cached_property
+    def early(self) -> np.ndarray:
+        """Stamps and all columns of its first rows, shape (n, 1 + columns)."""
+        return self.stretch(0, _EARLY)
+
+    def stretch(self, row: int, rows: int) -> np.ndarray:
+        """Return stamps and all columns of some rows from a row on, as far as there are any, shape (n, 1 + columns)."""
+        return take_rows(self.parts(range(self._columns)), row, rows, 1 + self._columns)
+
+    def changed(self, by_column: Mapping[int, tuple[float, float]]) -> Table:
+        """Return a table whose values are size * (value - bias), by the column's size and bias."""
+
+        def pieces(columns: Sequence[int]) -> Iterator[np.ndarray]:
+            sizes, biases = np.array([by_column.get(column, (1.0, 0.0)) for column in columns]).reshape(-1, 2).T
+            for piece in self._pieces(columns):
+                yield np.column_stack([piece[:, :1], sizes * (piece[:, 1:] - biases)])
+
+        return Table(self.rows, self._columns, pieces)
+
+    def select_rows(self, column: int, step: int, first: int) -> Table:
+        """Return a table of every `step`-th row from a row on, or for step 1 of the rows with a value in a column."""
+
+        def pieces(columns: Sequence[int]) -> Iterator[np.ndarray]:
+            at = 0
+            for part in self.parts([column, *columns]):
+                rows = np.arange(at, at + len(part))
+                at += len(part)
+                yield np.delete(part[rows % step == first if step > 1 else np.isfinite(part[:, 1])], 1, axis=1)
+
+        rows = len(range(first, self.rows, step)) if step > 1 else sum(map(len, pieces([])))
+        return Table(rows, self._columns, pieces)
+
+    @property
+    def stamped(self) -> bool:
+        """Whether it has time stamps."""
+        return not np.isnan(self.early[:1, 0]).any()
+
+    @cached_property
+    def rate_hz(self) -> float | None:
+        """Rate by those steps of its stamps that are alike [Hz], if they are most of it; None where it is not so.
+
+        None also where the stamps do not ascend on the whole, or faster than a rate can be.
+        """
+        times_s = self.early[:, 0]
+        if not self.stamped or len(times_s) < 2:
+            return None
+        steps = np.diff(times_s)
+        usual = float(np.median(steps))
+        alike = steps[np.abs(steps - usual) < _ALIKE * usual]
+        if usual >= 0.0 and len(alike) < _REGULAR * len(steps):
+            # Stamps of a coarse resolution, whose steps are multiples of it, or with jitter: a line shows the rate.
+            most_s = _ROUNDED * steps.max() if steps.min() >= 0.0 else _MAX_SCATTER * usual
+            gaps, counts = (usual > 0.0) & (steps > _MIN_GAP * usual), np.ones(len(steps))
+            late = missing = _fit_line(times_s, counts)
+            period_s = usual
+            for _ in range(2 if gaps.any() else 0):
+                counts[gaps] = np.rint(steps[gaps] / period_s)
+                missing = _fit_line(times_s, counts)
+                period_s = max(missing[1], 1.0 / MAX_RATE_HZ)
+            scatter_s, period_s = min(late, missing)  # a large step is late stamps, or rows are missing there
+            if 0.0 < scatter_s <= most_s and period_s * MAX_RATE_HZ >= 1.0:
+                return 1.0 / period_s
+        alike_s, span_s = float(alike.sum()), max(0.0, float(times_s[-1] - times_s[0]))
+        return None if 2.0 * alike_s <= span_s or len(alike) > MAX_RATE_HZ * alike_s else len(alike) / alike_s
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """One signal that the DAQ under test recorded.
+
+    Attributes:
+        name: Its name in the file.
+        unit: As the file spells it; empty where it tells none.
+        table: What it stands in.
+        column: Where there.
+        told_hz: Rate as the file tells it [Hz]; None where it does not.
+        lost_bits: Lowest bits of the counts that it leaves out by its definition.
+        group: Group of the file that it is in.
+        timed: Whether its rate is that of the file; else it is not known.
+    """
+
+    name: str
+    unit: str
+    table: Table
+    column: int
+    told_hz: float | None
+    lost_bits: int = 0
+    group: str = ""
+    timed: bool = True
+
+    @property
+    def rows(self) -> int:
+        """Number of its values."""
+        return self.table.rows
+
+    @property
+    def early(self) -> np.ndarray:
+        """Its first values, shape (n,)."""
+        return self.table.early[:, 1 + self.column]
+
+    @property
+    def first_s(self) -> float | None:
+        """Time stamp of the first value [s]; None where there are none."""
+        return float(self.table.early[0, 0]) if self.table.stamped and self.rows else None
+
+    @cached_property
+    def values(self) -> np.ndarray:
+        """All values in its unit, nan where there is none that a measurement can have, shape (rows,)."""
+        return np.concatenate([part[:, 1] for part in self.table.parts([self.column])])
+
+    @property
+    def rate_hz(self) -> float | None:
+        """Rate by its file [Hz]; None where it is not known."""
+        if not self.timed:
+            return None
+        told = self.told_hz
+        return self.table.rate_hz or told or (even_rate_hz(self.table.early[:, 0]) if self.table.stamped else None)
+
+
+def open_recorded(path: Path, options: FileOptions | None = None, remarks: list[str] | None = None) -> list[Recorded]:
+    """Return the signals of a file, in any format that `rig import` reads, or of a recording.
+
+    Args:
+        path: The file. The last row of a text without a line end is left out: its last number may be cut.
+        options: How a text file is read.
+        remarks: Takes lines about what was left out.
+
+    Raises:
+        InputError: It cannot be read, or has no signals.
+    """
+    if path.suffix == ".mcap":
+        return _of_recording(path)
+    source, tables = open_source(path, options or FileOptions()), dict[tuple[str, int], list[Entry]]()
+    told = [] if remarks is None else remarks
+    told += [remark for remark in source.remarks if "is cut" in remark]
+    if source.format == "text" and not told and not _ends_with_line_end(path):
+        told.append("the last line has no line end: its row is left out, as its last number may be cut")
+        source = replace(source, entries=tuple(replace(each, rows=each.rows - 1) for each in source.entries))
+    for entry in source.entries:
+        tables.setdefault((entry.group, entry.rows), []).append(entry)
+    known = {key: Table(key[1], len(entries), _reading(source, entries)) for key, entries in tables.items()}
+    return [
+        Recorded(
+            entry.name, units.canonical(entry.unit), known[key := (entry.group, entry.rows)],
+            tables[key].index(entry), entry.rate_hz, group=entry.group,
+        )
+        for entry in source.entries
+    ]  # fmt: skip
+
+
+def map_signals(
+    signals: Sequence[Recorded], mapping: Mapping[str, ChannelMapping], channels: Mapping[str, Channel]
+) -> list[Recorded]:
+    """Return the signals that a mapping names, as the channels and in the units that it gives.
+
+    Args:
+        signals: Of the file.
+        mapping: Source, unit, bits, sensitivity, sign, factor and bias by channel; those of no channel are left out.
+        channels: Of the session.
+
+    Raises:
+        InputError: A channel or a source is unknown, or two channels have one source.
+    """
+    found, changes = list[Recorded](), dict[int, dict[int, tuple[float, float]]]()
+    for name, wanted in mapping.items():
+        where = f"channels.{name}"
+        if name not in channels:
+            if wanted.to is None:
+                raise UnknownNameError(where, "named as a channel of the session", name, channels)
+            continue
+        channel, group = channels[name], wanted.group
+        signal = next((s for s in signals if s.name == wanted.source and group in (None, s.group)), None)
+        if signal is None:
+            raise UnknownNameError(f"{where}.source", "a signal of the file", wanted.source, [s.name for s in signals])
+        if wanted.bias == "mean":
+            raise InputError(f"{where}.bias", "a number: `rig score` judges it", wanted.bias)
+        unit, size = wanted.unit or signal.unit, wanted.sign * wanted.factor
+        if wanted.bits is not None:
+            unit, size = "V", size * channel.adc_v / 2.0 ** (wanted.bits - 1)
+        elif unit == "FS":
+            unit, size = "V", size * channel.adc_v
+        if wanted.sensitivity is not None:
+            if units.kind(unit) != "voltage":
+                raise InputError(f"{where}.unit", "V or mV with a sensitivity", unit)
+            per_unit_v = units.sensitivity_v(wanted.sensitivity, channel.unit, field=f"{where}.sensitivity")
+            unit, size = channel.unit, size * units.size_si(unit) / per_unit_v
+        changed = changes.setdefault(id(signal.table), {})
+        if changed.setdefault(signal.column, (size, wanted.bias)) != (size, wanted.bias):
+            raise InputError(f"{where}.source", "of one channel only", wanted.source)
+        if wanted.unit and unit not in COUNTS:
+            unit = units.parse(unit, field=f"{where}.unit", also=COUNTS)
+        found.append(replace(signal, name=name, unit=unit))
+    tables = {id(s.table): s.table.changed(changes[id(s.table)]) for s in found}
+    return [replace(signal, table=tables[id(signal.table)]) for signal in found]
+
+
+def separate_rates(signals: Sequence[Recorded], rate_hz: float) -> list[Recorded]:
+    """Return signals of which those that have values at a lower, even rate are in tables of their own.
+
+    A text of several rates has blank cells where a signal has no value.
+
+    Args:
+        signals: Of a file.
+        rate_hz: Of the rows of a table that gives no rate [Hz].
+    """
+    tables, found = dict[tuple[int, int, int, bytes], Table](), list[Recorded]()
+    for signal in signals:
+        rows, step = np.flatnonzero(np.isfinite(signal.early)), 1
+        if len(rows) > 2 and (rows[-1] - rows[0]) >= len(rows):
+            step = round(float(np.median(np.diff(rows))))
+            first = int(np.bincount(rows % step).argmax())
+            steps_s = np.diff(signal.table.early[rows, 0])
+            if np.mean(rows % step == first) < _REGULAR or (first and not signal.table.stamped):
+                step = 1
+            if step > 1 or np.all(np.abs(steps_s - np.median(steps_s)) < _ALIKE * np.median(steps_s)):
+                key = id(signal.table), step, first, b"" if step > 1 else rows.tobytes()
+                if key not in tables:
+                    tables[key] = signal.table.select_rows(signal.column, step, first)
+                signal = replace(signal, table=tables[key], told_hz=(signal.rate_hz or rate_hz) / step)
+        found.append(signal)
+    return found
+
+
+def _fit_line(times_s: np.ndarray, counts: np.ndarray) -> tuple[float, float]:
+    """Return how far stamps scatter about a line, peak to peak, and its time between two rows [s].
+
+    Args:
+        times_s: The stamps [s], shape (n,).
+        counts: Rows from each to the next, shape (n - 1,).
+    """
+    rows = np.append(0.0, np.cumsum(counts))
+    line = np.polynomial.Polynomial.fit(rows, times_s, 1)
+    return float(np.ptp(times_s - line(rows))), float(line(1.0) - line(0.0))
+
+
+def _ends_with_line_end(path: Path) -> bool:
+    with path.open("rb") as file:
+        file.seek(-1, 2)
+        return file.read(1) in (b"\n", b"\r", b"\0")  # UTF-16 ends with the line end's upper byte
+
+
+def _reading(source: Source, entries: Sequence[Entry]) -> Pieces:
+    kept: dict[int, list[np.ndarray]] = {}
+
+    def whole(column: int) -> list[np.ndarray]:
+        """Stamps and values of one signal, from the disk where there are many."""
+        if column not in kept:
+            kept[column] = [_spooled(each) for each in _columns([source.read(entries[column])]).T]
+        return kept[column]
+
+    def pieces(columns: Sequence[int]) -> Iterator[np.ndarray]:
+        if source.pieces is not None:
+            yield from map(_columns, source.pieces([entries[column] for column in columns]))
+            return
+        found = [whole(columns[0])[0], *(whole(column)[1] for column in columns)]
+        for begin in range(0, len(found[0]), _PART):
+            yield np.column_stack([each[begin : begin + _PART] for each in found])
+
+    return pieces
+
+
+def _columns(signals: Sequence[FileSignal]) -> np.ndarray:
+    times_s = signals[0].times_s
+    stamps = np.full(len(signals[0].values), np.nan) if times_s is None else times_s
+    return np.column_stack([stamps, *(signal.physical for signal in signals)])
+
+
+def _spooled(values: np.ndarray) -> np.ndarray:
+    """The same values, on the disk where there are many."""
+    if len(values) <= _EARLY:
+        return values
+    with tempfile.TemporaryFile() as file:
+        np.ascontiguousarray(values).tofile(file)
+        return np.memmap(file, values.dtype, "r", shape=values.shape)
+
+
+def _of_recording(path: Path) -> list[Recorded]:
+    recording, found = Recording.open(path), list[Recorded]()
+    for group in recording.table.groups.values():
+        stream = recording.streams.get(sensor_key(group.name))
+        if stream is not None and stream.rows:
+            rate_hz = next(recording.blocks(sensor_key(group.name))).rate_hz
+            table = Table(stream.rows, len(group.channels), _recalling(recording, group))
+            found += [Recorded(each.name, each.unit, table, n, rate_hz) for n, each in enumerate(group.channels)]
+    if not found:
+        raise InputError("FILE", "a recording with samples", str(path))
+    return found
+
+
+def _recalling(recording: Recording, group: Group) -> Pieces:
+    def pieces(columns: Sequence[int]) -> Iterator[np.ndarray]:
+        scales, offsets = np.array([(group.channels[c].scale, group.channels[c].offset) for c in columns]).T
+        for block in recording.blocks(sensor_key(group.name)):
+            yield np.column_stack([block.times_s, block.values[:, columns] * scales + offsets])
+
+    return pieces

@@ -1,0 +1,1 @@
+"""Scans over pulses, conditions and assumed values."""

@@ -1,0 +1,401 @@
+"""When the shaft whirls backward, and how fast: closed forms, and the rig beside them.
+
+A point mass m on an orbit of radius r that touches the ring, at the whirl frequency w, on a spring K and a damper D:
+radially N = m r (w^2 - w_n^2), so that w must be above w_n (the paper's eq. 42); along the ring friction drives with at
+most mu N and damping brakes with D r w. So whirl is kept up, and a sliding whirl gains speed, where
+mu (w^2 - w_n^2) >= 2 zeta w_n w, that is |w| >= w_n [zeta/mu + sqrt(1 + (zeta/mu)^2)]. This is eq. 43, whose "<=" is
+of two negative frequencies (the sentence after it speaks of the sign), with the ratio zeta for its D, which has a unit.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+
+from replays.studies.ladder.quantity import rolls_from
+from replays.studies.paper.scans.pulse import Outcome, Pulse
+from replays.studies.stability.trials.boundary import NAMES, ROLLING, whirl_class
+from replays.studies.stability.trials.motion import base_model, move, pivoted_mass, quiet_inputs, state
+from rig.channels.orbit import phase, whirl_frequency
+from rig.physics.kernels.constants import Constants
+from rig.physics.levels import ModelLevels
+
+ENGINE = "split"
+FRICTIONS = (0.05, 0.08, 0.12, 0.18, 0.25, 0.35)
+"""Frictions at which the slowest whirl that gains speed is looked for."""
+SPINS_HZ = (3.2, 6.2, 9.0)
+"""Spins at which the least friction that keeps up whirl is looked for [Hz]."""
+_TICKS_S = 1e6
+_SLOWER = 1e-3
+"""Part by which the whirl frequency may fall in half a second and still be steady."""
+_NONE = (math.nan, math.nan)
+
+
+class Oscillator(NamedTuple):
+    """The shaft at the ring as a mass on a spring and a damper."""
+
+    mass: float
+    """m = I_xx / l_0A^2 [kg]."""
+    natural: float
+    """w_n [rad/s]."""
+    ratio: float
+    """zeta [1]."""
+
+
+def oscillator(constants: Constants) -> Oscillator:
+    """The shaft referred to the ring; damping is the mean of both directions.
+
+    On a circle the damper of x and that of y brake in turn, so the mean over a turn is that of their mean.
+    """
+    shaft, magnet = constants.shaft, constants.magnet
+    mass = pivoted_mass(constants)
+    lever = (shaft.arm_magnet / shaft.arm_ring) ** 2
+    natural = math.sqrt(magnet.stiffness * lever / mass)
+    damping = 0.5 * (magnet.damping_x + magnet.damping_y) * lever
+    return Oscillator(mass, natural, damping / (2.0 * mass * natural))
+
+
+def critical_whirl(own: Oscillator, friction: float) -> float:
+    """Slowest whirl that friction keeps up against damping [rad/s], eq. 43."""
+    share = own.ratio / friction
+    return own.natural * (share + math.sqrt(1.0 + share * share))
+
+
+def least_friction(own: Oscillator, whirl: float) -> float:
+    """Least friction that keeps up a whirl [1]: eq. 43 solved for mu; infinite below the natural frequency."""
+    excess = whirl * whirl - own.natural**2
+    return 2.0 * own.ratio * own.natural * whirl / excess if excess > 0.0 else math.inf
+
+
+def friction_with_houses(constants: Constants, spin: float) -> float:
+    """Least friction that keeps up whirl where the houses' beams dissipate as well [1].
+
+    The normal force turns with the whirl and shakes inner and outer house, two masses on a line in x and in y (eqs.
+    22-25), each at its amplitude of forced vibration; what their dampers take on the mean, friction must bring.
+    """
+    own = oscillator(constants)
+    whirl, radius = rolling_circle(constants, spin)
+    whirl = -whirl
+    force = normal_force(own, whirl, radius)
+    power = -0.5 * whirl * force * sum(amplitude.imag for amplitude in _ring_motion(constants, whirl, force))
+    return least_friction(own, whirl) + power / (radius * whirl * force)
+
+
+def _ring_motion(constants: Constants, whirl: float, force: float) -> tuple[complex, complex]:
+    """Complex amplitudes of the ring's centre in x and in y under a force that turns [m]."""
+    house = constants.house
+    lines = (
+        (house.inner_beam_stiffness + 1j * whirl * house.inner_beam_damping, complex(house.pair_stiffness_horizontal)),
+        (complex(house.pair_stiffness_vertical), house.outer_beam_stiffness + 1j * whirl * house.outer_beam_damping),
+    )
+    found = []
+    for link, support in lines:
+        matrix = np.array(
+            [
+                [link - house.inner_mass * whirl**2, -link],
+                [-link, link + support - house.outer_mass * whirl**2],
+            ]
+        )
+        found.append(complex(np.linalg.solve(matrix, np.array([force, 0.0]))[0]))
+    return found[0], found[1]
+
+
+def friction_swing(constants: Constants, spin: float) -> float:
+    """Amplitude of the friction, about its mean, that a rolling whirl in moving houses takes [N].
+
+    They give way more across than up, so the ring's centre goes on an ellipse with half axes X and Y: a circle along
+    with the whirl, and one of radius |X - Y|/2 against it. Seen from the shaft the latter turns at twice the whirl
+    frequency and so hurries and brakes it along the ring, by m w^2 |X - Y| / 2.
+    """
+    own = oscillator(constants)
+    whirl, radius = rolling_circle(constants, spin)
+    force = normal_force(own, whirl, radius)
+    across, up = _ring_motion(constants, -whirl, force)
+    return 0.5 * own.mass * whirl**2 * abs(across - up)
+
+
+def normal_force(own: Oscillator, whirl: float, radius: float) -> float:
+    """Force on the ring in a circular whirl [N]: m r (w^2 - w_n^2)."""
+    return own.mass * radius * (whirl * whirl - own.natural**2)
+
+
+def rolling_whirl(constants: Constants, spin: float) -> tuple[float, float]:
+    """Whirl frequency of rolling [rad/s, negative] and penetration [m]: w = -spin R_S / (r0 + delta).
+
+    delta is Hertz's at the force of the circular whirl; a fixed point, contracting by about delta/r0.
+    """
+    own, contact = oscillator(constants), constants.contact
+    depth = 0.0
+    for _ in range(50):
+        radius = contact.clearance + depth
+        whirl = spin * constants.shaft.radius / radius
+        depth = (max(0.0, normal_force(own, whirl, radius)) / contact.stiffness) ** (1.0 / contact.exponent)
+    return -spin * constants.shaft.radius / (contact.clearance + depth), depth
+
+
+def rolling_circle(constants: Constants, spin: float) -> tuple[float, float]:
+    """Whirl frequency [rad/s] and radius [m] of rolling at a spin [rad/s]."""
+    whirl, depth = rolling_whirl(constants, spin)
+    return whirl, constants.contact.clearance + depth
+
+
+def bare_rig(friction: float) -> Constants:
+    """The system of the closed forms: a mass on linear magnets in a rigid, centred ring, damped alike both ways."""
+    constants = base_model(ModelLevels(magnet="linear", shaft="planar", stator="rigid")).constants
+    damping = 0.5 * (constants.magnet.damping_x + constants.magnet.damping_y)
+    return constants._replace(
+        shaft=constants.shaft._replace(unbalance=0.0, gravity=0.0),
+        magnet=constants.magnet._replace(damping_x=damping, damping_y=damping),
+        contact=constants.contact._replace(offset_x=0.0, offset_y=0.0, friction=friction),
+    )
+
+
+def _whirling(constants: Constants, whirl: float, spin: float) -> np.ndarray:
+    """On the ring to the EAST of its centre, whirling backward [rad/s, taken as positive]."""
+    arm = constants.shaft.arm_ring
+    radius = constants.contact.clearance
+    # y = -arm Gamma: Gamma' > 0 moves down, which at EAST is backward.
+    return state(
+        beta=(radius + constants.contact.offset_x) / arm,
+        Gamma=-constants.contact.offset_y / arm,
+        Gamma_rate=whirl * radius / arm,
+        theta_rate=spin,
+    )
+
+
+def gains_speed(constants: Constants, whirl: float) -> bool:
+    """Whether a sliding whirl gets faster, on a spin above that of rolling."""
+    # Three times what rolling needs: far more, and the gyroscopic moment that the closed form leaves out would show.
+    spin = 3.0 * whirl * constants.contact.clearance / constants.shaft.radius
+    motion = move(
+        ENGINE,
+        constants,
+        quiet_inputs(spin=spin, magnets=True, ideal=True),
+        _whirling(constants, whirl, spin),
+        ticks=round(0.4 * _TICKS_S),
+        every=500,
+    )
+    last = motion.times > 0.35
+    touching = motion.column("penetration")[last] > 0.0
+    angle = phase(motion.column("ring_x")[last], motion.column("ring_y")[last])
+    passed_s = float(motion.times[last][-1] - motion.times[last][0])
+    return bool(touching.all()) and float(angle[0] - angle[-1]) > whirl * passed_s
+
+
+def keeps_whirling(constants: Constants, y0: np.ndarray, spin: float) -> bool:
+    """Whether a whirl touches the ring throughout 1 s at a held spin, and is no slower at its end than in its middle.
+
+    It may slip for part of each turn, and then is a little slower than one that rolls, and steady.
+    """
+    inputs = quiet_inputs(spin=spin, magnets=True, ideal=True)
+    motion = move(ENGINE, constants, inputs, y0, ticks=round(1.0 * _TICKS_S), every=500)
+    if not (motion.column("penetration") > 0.0).all():
+        return False
+    x, y = motion.column("ring_x"), motion.column("ring_y")
+
+    def whirl_hz(begin_s: float) -> float:
+        part = (motion.times > begin_s) & (motion.times <= begin_s + 0.1)
+        return whirl_frequency(x[part], y[part], motion.times[part], about=0.0)
+
+    return whirl_hz(0.9) < (1.0 - _SLOWER) * whirl_hz(0.4)  # both are negative
+
+
+def bisect(holds: Callable[[float], bool], low: float, high: float) -> float:
+    """Where a test turns from false (at `low`) to true (at `high`), between logarithms; nan where it does not."""
+    if holds(low) or not holds(high):
+        return math.nan
+    for _ in range(10):
+        middle = math.sqrt(low * high)
+        low, high = (low, middle) if holds(middle) else (middle, high)
+    return math.sqrt(low * high)
+
+
+class Threshold(NamedTuple):
+    """One threshold, simulated and by closed form."""
+
+    friction: float
+    spin_hz: float
+    closed: float
+    bare: float
+    full: float
+    with_houses: float
+    used: tuple[float, float]
+    """Friction over normal force in the full rig at mu = 0.25, where it rolls: mean, and highest."""
+
+    @property
+    def error(self) -> float:
+        """Of the bare rig against the closed form."""
+        return self.bare / self.closed - 1.0
+
+
+def start_thresholds(frictions: tuple[float, ...] = FRICTIONS) -> list[Threshold]:
+    """Slowest sliding whirl that gains speed [Hz], over friction; `full` is nan, the rig's magnets are no spring."""
+    found = []
+    for mu in frictions:
+        constants = bare_rig(mu)
+        closed = critical_whirl(oscillator(constants), mu)
+        bare = bisect(partial(gains_speed, constants), 0.6 * closed, 2.0 * closed)
+        found.append(Threshold(mu, math.nan, closed / (2 * math.pi), bare / (2 * math.pi), math.nan, math.nan, _NONE))
+    return found
+
+
+def sustain_thresholds(spins_hz: tuple[float, ...] = SPINS_HZ) -> list[Threshold]:
+    """Least friction that keeps up whirl, over spin: a rolling whirl, and the friction lowered under it."""
+    found = []
+    for spin_hz in spins_hz:
+        spin = 2.0 * math.pi * spin_hz
+        bare = bare_rig(0.25)
+        whirl, _ = rolling_whirl(bare, spin)
+        closed = least_friction(oscillator(bare), -whirl)
+        full = base_model(ModelLevels()).constants
+        bare_mu, full_mu = (bisect(_holder(each, spin), 0.3 * closed, 6.0 * closed) for each in (bare, full))
+        with_houses, used = friction_with_houses(full, spin), friction_used(full, spin)
+        found.append(Threshold(math.nan, spin_hz, closed, bare_mu, full_mu, with_houses, used))
+    return found
+
+
+class Slip(NamedTuple):
+    """A sliding whirl that friction turns into rolling, on the bare rig without damping or drive."""
+
+    whirl_hz: float
+    """With what it begins [Hz]."""
+    kept: float
+    """Spin after over spin before [1]."""
+    kept_closed: float
+    time_s: float
+    time_closed_s: float
+
+
+def spin_kept(constants: Constants) -> float:
+    """Part of its spin that a shaft keeps which slips from rest on the ring until it rolls [1], on a rigid ring.
+
+    Friction's impulse J gives m v = J along the ring and takes R_S J = I_zz (spin before - after); it rolls when
+    v = R_S spin.
+    """
+    shaft = constants.shaft
+    return shaft.polar_inertia / (shaft.polar_inertia + pivoted_mass(constants) * shaft.radius**2)
+
+
+def slips_to_rolling() -> list[Slip]:
+    """From a sliding whirl to rolling: simulated, and by closed form.
+
+    m r w' = mu N with N = m r (w^2 - w_n^2), so the time is an integral of dw / (mu (w^2 - w_n^2)), elementary; the
+    ring is taken as rigid in the contact too, so that r = r0.
+    """
+    constants = bare_rig(0.25)
+    constants = constants._replace(magnet=constants.magnet._replace(damping_x=0.0, damping_y=0.0), torque_gain=0.0)
+    own, r0, radius = oscillator(constants), constants.contact.clearance, constants.shaft.radius
+    spin, kept, mu = 2.0 * math.pi * 6.2, spin_kept(constants), constants.contact.friction
+    found = []
+    for whirl_hz in (12.0, 20.0, 40.0):
+        begin = 2.0 * math.pi * whirl_hz
+        # Its whirl adds to what friction gives: I_zz spin + m R_S v is kept.
+        after = kept + (1.0 - kept) * r0 * begin / (radius * spin)
+        high, low = (math.log((w - own.natural) / (w + own.natural)) for w in (after * spin * radius / r0, begin))
+        inputs = quiet_inputs(spin=spin, magnets=True)
+        motion = move(
+            ENGINE, constants, inputs, _whirling(constants, begin, spin), ticks=round(0.5 * _TICKS_S), every=50
+        )
+        rolls_s = rolls_from(motion.times, motion.rows, radius)
+        spin_end = float(motion.column("theta_rate")[motion.times >= rolls_s].mean())
+        found.append(Slip(whirl_hz, spin_end / spin, after, rolls_s, (high - low) / (2.0 * mu * own.natural)))
+    return found
+
+
+def friction_used(constants: Constants, spin: float) -> tuple[float, float]:
+    """Friction over normal force in a rolling whirl: mean, and highest [1]."""
+    inputs = quiet_inputs(spin=spin, magnets=True, ideal=True)
+    motion = move(ENGINE, constants, inputs, rolled(constants, spin), ticks=round(0.5 * _TICKS_S), every=100)
+    normal, friction = (motion.column(name)[1000:] for name in ("normal_force", "friction_force"))
+    there = normal > 0.0
+    return abs(float(friction.mean() / normal.mean())), float(np.max(np.abs(friction[there] / normal[there])))
+
+
+def _holder(constants: Constants, spin: float) -> Callable[[float], bool]:
+    """Whether a rolling whirl goes on at a friction."""
+    begun = rolled(constants, spin)
+
+    def holds(mu: float) -> bool:
+        changed = constants._replace(contact=constants.contact._replace(friction=mu))
+        return keeps_whirling(changed, begun, spin)
+
+    return holds
+
+
+def rolled(constants: Constants, spin: float) -> np.ndarray:
+    """A settled rolling whirl of a rig, as state and integrals."""
+    whirl, _ = rolling_whirl(constants, spin)
+    inputs = quiet_inputs(spin=spin, magnets=True, ideal=True)
+    y0 = _whirling(constants, -whirl, spin)
+    return move(ENGINE, constants, inputs, y0, ticks=round(0.5 * _TICKS_S), every=10_000).end
+
+
+@dataclass(frozen=True)
+class Start:
+    """What becomes of one pulse over friction.
+
+    Attributes:
+        force_n: Peak of the pulse [N].
+        frictions: Shape (n,).
+        classes: Of `replays.studies.stability.trials.boundary`, shape (n,).
+    """
+
+    force_n: float
+    frictions: np.ndarray
+    classes: np.ndarray
+
+    @property
+    def first(self) -> float:
+        """Least friction scanned that ends in a rolling whirl; nan where none does."""
+        rolls = np.flatnonzero(self.classes == ROLLING)
+        return float(self.frictions[rolls[0]]) if len(rolls) else math.nan
+
+    @property
+    def always(self) -> float:
+        """Least friction scanned above which all do; nan where the highest does not."""
+        other = np.flatnonzero(self.classes != ROLLING)
+        after = int(other[-1]) + 1 if len(other) else 0
+        return float(self.frictions[after]) if after < len(self.frictions) else math.nan
+
+    @property
+    def words(self) -> str:
+        """How many end how."""
+        return ", ".join(f"{n} {NAMES[k]}" for k in range(len(NAMES)) if (n := int(np.sum(self.classes == k))))
+
+
+def start_by_pulse(force_n: float, *, points: int) -> Start:
+    """Scan friction for one pulse of 5 ms at 6.2 Hz."""
+    frictions = np.linspace(0.02, 0.40, points)
+    classes = np.array([whirl_class(ENGINE, float(mu), force_n) for mu in frictions])
+    return Start(force_n, frictions, classes)
+
+
+def pulse_whirl(constants: Constants, *, force_n: float, duration_s: float) -> float:
+    """Whirl frequency if all of a half-sine pulse at the disk became motion along the ring [rad/s]."""
+    shaft = constants.shaft
+    impulse = force_n * duration_s * 2.0 / math.pi
+    speed = impulse * shaft.arm_disk * shaft.arm_ring / shaft.transverse_inertia
+    return speed / constants.contact.clearance
+
+
+def sweep_pulses(speeds_hz: tuple[float, ...]) -> list[Pulse]:
+    """A pulse at each speed, on a drive that holds it: what the whirl frequency law is held against."""
+    pulse = Pulse(changes={"drive.mode": "ideal"}, force_n=150.0)
+    return [replace(pulse, label=f"{speed:g} Hz", speed_hz=speed) for speed in speeds_hz]
+
+
+def law_hz(speed_hz: float) -> tuple[float, float]:
+    """Whirl frequency of rolling in the corrected rig [Hz], and of a rigid ring."""
+    constants = base_model(ModelLevels()).constants
+    whirl, _ = rolling_whirl(constants, 2.0 * math.pi * speed_hz)
+    return whirl / (2.0 * math.pi), -speed_hz * constants.shaft.radius / constants.contact.clearance
+
+
+def law_error(result: Outcome, speed_hz: float) -> float:
+    """Of the simulated whirl frequency against the closed form."""
+    return result.whirl_hz / law_hz(speed_hz)[0] - 1.0

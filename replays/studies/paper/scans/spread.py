@@ -1,0 +1,144 @@
+"""How far the assumed values may be off together: a Latin hypercube over all of them, and what comes of it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import cache
+from importlib.resources import files
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel, Field
+
+from replays.studies.paper.scans.pulse import PULSE_AT, Outcome, Pulse
+from rig.physics.parameters import DEFAULT_SET, load_parameters
+
+SEED = 2013
+
+
+class Assumed(BaseModel, frozen=True, extra="forbid"):
+    """One assumed value and the range that it may be in, assumed as well."""
+
+    key: str
+    called: str
+    """In words, as pictures and tables have it."""
+    name: str = Field(default="", alias="as")
+    """What a pulse takes it by, where that is not the key."""
+    low: float = math.nan
+    high: float = math.nan
+    log: bool = False
+    whole: bool = False
+    tied: str = ""
+    """Follows another value."""
+    ratio: float = 1.0
+    """That value over this one."""
+    unit: str = ""
+    value: float | None = None
+    """What the report takes elsewhere, where no parameter set says it."""
+    why: str
+
+    @property
+    def taken_as(self) -> str:
+        """The name in a pulse's changes."""
+        return self.name or self.key
+
+    def at(self, part: float) -> float:
+        """The value at a part of the range, 0 to 1."""
+        if self.log:
+            return float(self.low * (self.high / self.low) ** part)
+        value = self.low + part * (self.high - self.low)
+        return float(min(self.high, math.floor(self.low + part * (self.high - self.low + 1)))) if self.whole else value
+
+
+@cache
+def assumed_values() -> tuple[Assumed, ...]:
+    """All of them, from the data file."""
+    import tomllib
+
+    document = tomllib.loads(files("replays.studies.paper").joinpath("spread.toml").read_text(encoding="utf-8"))
+    return tuple(Assumed.model_validate(entry) for entry in document["value"])
+
+
+def free_values() -> tuple[Assumed, ...]:
+    """Those that no other ties."""
+    return tuple(entry for entry in assumed_values() if not entry.tied)
+
+
+def present(entry: Assumed) -> str:
+    """What the default set, or this report, takes, with its unit."""
+    known = load_parameters(DEFAULT_SET).entries.get(entry.key)
+    value = known.value if known else entry.value
+    unit = known.unit if known and not entry.unit else entry.unit
+    return f"{value:g} {unit}".strip() if isinstance(value, float | int) else str(value)
+
+
+def changes(values: dict[str, float]) -> dict[str, Any]:
+    """The changes of a pulse for free values by key, the tied ones with them."""
+    found: dict[str, Any] = {}
+    for entry in assumed_values():
+        if entry.tied and entry.tied in values:
+            found[entry.taken_as] = values[entry.tied] / entry.ratio
+        elif entry.key in values:
+            found[entry.taken_as] = values[entry.key]
+    return found
+
+
+def one_at_a_time() -> list[tuple[Assumed, Pulse, Pulse]]:
+    """Each value at both ends of its range, the others as they are."""
+    return [
+        (
+            entry,
+            Pulse(label=f"{entry.key} low", changes=changes({entry.key: entry.at(0.0)})),
+            Pulse(label=f"{entry.key} high", changes=changes({entry.key: entry.at(1.0)})),
+        )
+        for entry in free_values()
+    ]
+
+
+def hypercube(samples: int, *, parameters: str = DEFAULT_SET) -> tuple[np.ndarray, list[Pulse]]:
+    """Latin hypercube over all free values: parts of their ranges, shape (samples, values), and the pulses."""
+    from scipy.stats import qmc
+
+    entries = free_values()
+    parts = qmc.LatinHypercube(d=len(entries), rng=np.random.default_rng(SEED)).random(samples)
+    pulses = [
+        Pulse(
+            label=f"spread {number}",
+            parameters=parameters,
+            changes=changes({entry.key: entry.at(float(part)) for entry, part in zip(entries, row, strict=True)}),
+        )
+        for number, row in enumerate(parts, 1)
+    ]
+    return parts, pulses
+
+
+def phases(pulse: Pulse, count: int) -> list[Pulse]:
+    """The same pulse at `count` places of the shaft's turn: impacts are chaotic, one run of them says little."""
+    at_s = [round(0.02 + k / count / pulse.speed_hz, 4) for k in range(count)]
+    return [replace(pulse, changes={**pulse.changes, PULSE_AT: each}) for each in at_s]
+
+
+def column(results: list[Outcome], name: str) -> np.ndarray:
+    """One number of many outcomes, nan where they have none, shape (n,)."""
+    return np.array([float(getattr(result, name)) for result in results])
+
+
+def rank_correlation(parts: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Spearman's rank correlation of each input with a number, over the runs that have one, shape (inputs,)."""
+    from scipy.stats import spearmanr
+
+    there = np.isfinite(values)
+    if there.sum() < 4 or np.ptp(values[there]) == 0.0:
+        return np.full(parts.shape[1], math.nan)
+    found: list[Any] = [spearmanr(parts[there, k], values[there]) for k in range(parts.shape[1])]
+    return np.array([float(each.statistic) for each in found])
+
+
+def percentiles(values: np.ndarray) -> tuple[float, float, float]:
+    """5, 50 and 95 % of the finite values, nan where there are none."""
+    there = values[np.isfinite(values)]
+    if not len(there):
+        return math.nan, math.nan, math.nan
+    low, middle, high = np.percentile(there, [5, 50, 95])
+    return float(low), float(middle), float(high)

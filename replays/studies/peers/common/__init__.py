@@ -1,0 +1,1 @@
+"""What peers share: the problem, its right-hand side, the solution."""

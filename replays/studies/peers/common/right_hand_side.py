@@ -1,0 +1,283 @@
+"""The rig's own right-hand side as other people's solvers can call it: compiled, its numbers in one C struct.
+
+`rig.physics.kernels.dynamics.evaluate` is called for the 14 states alone; its ledger goes to the stack, where the
+compiler drops most of it. Beside the rates stand the switching functions: what a solver's event location has to watch,
+and what a change of phase does. Everything that holds machine code of the kernels is in this one file, because numba's
+cache looks at no other.
+"""
+
+from __future__ import annotations
+
+import functools
+import time
+from typing import Any
+
+import numpy as np
+from llvmlite import ir
+from numba import carray, cfunc, extending, from_dtype, njit, types
+from numba.core import cgutils
+
+from replays.studies.peers.common.problem import Problem
+from rig.physics.kernels import signals as S
+from rig.physics.kernels.constants import Constants, Inputs
+from rig.physics.kernels.dynamics import evaluate
+from rig.physics.kernels.frames.geometry import gap
+from rig.physics.kernels.laws.contact import BACKWARD, EXACT, FLIGHT, FORWARD, ROLLING, TOUCHING, held_speed
+from rig.physics.kernels.records import layout, plain
+
+N_STATE, N_VECTOR, N_OBSERVED = S.N_STATE, S.N_VECTOR, S.N_OBSERVED
+N_SWITCH = 2
+"""Switching functions: the gap, and the friction's (v_t while sliding, what is left of mu F_n while rolling)."""
+STATE_SCALE = S.STATE_SCALE
+_DIFFERENCE = 1.5e-8
+"""Relative step of differences: the root of the rounding unit."""
+
+PARAMETERS = np.dtype(
+    [
+        ("constants", layout(Constants)),
+        ("inputs", layout(Inputs)),
+        ("phase", np.int64),
+        ("onset_speed", np.float64),
+        ("evaluations", np.int64),
+        # Where CVODE's vectors keep the address of their numbers, in words of 8 bytes.
+        ("vector_word", np.int64),
+    ],
+    align=True,
+)
+"""The struct: the problem's numbers and, at the end, what changes during a solve."""
+
+
+def pack(problem: Problem) -> np.ndarray:
+    """The struct of a problem, shape (1,), of its own for each solve: the phase changes in place."""
+    parameters = np.zeros(1, PARAMETERS)
+    parameters[0] = (plain(problem.constants), plain(problem.inputs), problem.phase, problem.onset_speed, 0, 0)
+    return parameters
+
+
+def _stack_code(context, count):
+    """Room for `count` floats on the stack: an array that is never allocated can be optimised away."""
+    if not isinstance(count, types.IntegerLiteral):
+        return None  # numba then tries the literal
+    size = count.literal_value
+
+    def code(context, builder, signature, arguments):
+        return cgutils.alloca_once(builder, ir.DoubleType(), size=size)
+
+    return types.CPointer(types.float64)(count), code
+
+
+def _pointer_code(context, address):
+    """The floats at an address."""
+
+    def code(context, builder, signature, arguments):
+        return builder.inttoptr(arguments[0], ir.DoubleType().as_pointer())
+
+    return types.CPointer(types.float64)(address), code
+
+
+def _word_code(context, address, index):
+    """The word of 8 bytes at an address, `index` words on."""
+
+    def code(context, builder, signature, arguments):
+        words = builder.inttoptr(arguments[0], ir.IntType(64).as_pointer())
+        return builder.load(builder.gep(words, [arguments[1]]))
+
+    return types.int64(address, index), code
+
+
+# What the type checker takes for the code generators is called by numba with values.
+_stack: Any = extending.intrinsic(_stack_code)
+_pointer: Any = extending.intrinsic(_pointer_code)
+_word: Any = extending.intrinsic(_word_code)
+
+
+@njit(cache=True, forceinline=True)
+def _rates(t, y, p, f):
+    p.evaluations += 1
+    dy = carray(_stack(N_VECTOR), (N_VECTOR,))
+    out = carray(_stack(N_OBSERVED), (N_OBSERVED,))
+    evaluate(p.constants, p.inputs, 0, t / p.inputs.tick_s, p.onset_speed, p.phase, False, y, dy, out)
+    for i in range(N_STATE):
+        f[i] = dy[i]
+
+
+@njit(cache=True, forceinline=True)
+def _rates_by_sign(t, y, p, f):
+    phase = p.phase
+    p.phase = TOUCHING if gap(p.constants, y)[0] > 0.0 else FLIGHT
+    _rates(t, y, p, f)
+    p.phase = phase
+
+
+@njit(cache=True)
+def contact_at(t, y, p, phase):
+    """Penetration [m], its rate, sliding speed [m/s], normal and friction force [N] under a phase."""
+    dy = carray(_stack(N_VECTOR), (N_VECTOR,))
+    out = carray(_stack(N_OBSERVED), (N_OBSERVED,))
+    evaluate(p.constants, p.inputs, 0, t / p.inputs.tick_s, p.onset_speed, phase, False, y, dy, out)
+    return (
+        out[S.PENETRATION],
+        out[S.PENETRATION_RATE],
+        out[S.SLIDING_SPEED],
+        out[S.NORMAL_FORCE],
+        out[S.FRICTION_FORCE],
+    )
+
+
+@njit(cache=True, forceinline=True)
+def _switches(t, y, p, g):
+    g[1] = 1.0
+    if p.phase == FLIGHT:
+        g[0] = -gap(p.constants, y)[0]
+    elif p.phase == TOUCHING:
+        g[0] = gap(p.constants, y)[0]
+    else:
+        penetration, _, sliding, normal, tangential = contact_at(t, y, p, p.phase)
+        g[0] = penetration
+        if p.phase == FORWARD:
+            g[1] = sliding
+        elif p.phase == BACKWARD:
+            g[1] = -sliding
+        else:
+            g[1] = p.constants.contact.friction * normal - abs(tangential)
+
+
+@njit(cache=True)
+def derivative(t, y, parameters):
+    """Rates of the 14 states at `t` [s] from the window's start; the struct tells the phase."""
+    f = np.empty(N_STATE)
+    _rates(t, y, parameters[0], f)
+    return f
+
+
+@njit(cache=True)
+def jacobian(t, y, parameters):
+    """Slopes of the rates by the states, by differences, shape (14, 14)."""
+    slopes = np.empty((N_STATE, N_STATE))
+    here, moved = derivative(t, y, parameters), y.copy()
+    for i in range(N_STATE):
+        moved[i] = y[i] + _DIFFERENCE * max(abs(y[i]), STATE_SCALE[i])
+        slopes[:, i] = (derivative(t, moved, parameters) - here) / (moved[i] - y[i])
+        moved[i] = y[i]
+    return slopes
+
+
+@njit(cache=True)
+def derivative_by_sign(t, y, parameters):
+    """The same for solvers without events: the right-hand side itself asks for the gap's sign."""
+    f = np.empty(N_STATE)
+    _rates_by_sign(t, y, parameters[0], f)
+    return f
+
+
+@njit(cache=True)
+def switching(t, y, parameters):
+    """Switching functions, shape (N_SWITCH,): positive inside the phase, and it ends where one falls to 0."""
+    g = np.empty(N_SWITCH)
+    _switches(t, y, parameters[0], g)
+    return g
+
+
+@njit(cache=True)
+def follow_sign(t, y, parameters):
+    """For solvers without events: the phase is what the gap's sign says now, v0 the rate where it has just turned.
+
+    The known trap: v0 is latched at a step's end, not where the contact began.
+
+    Returns:
+        Whether a contact began since the last call.
+    """
+    p = parameters[0]
+    depth, rate = gap(p.constants, y)
+    began = depth > 0.0 and p.phase == FLIGHT
+    if began:
+        p.onset_speed = held_speed(rate, p.constants.contact)
+        p.phase = TOUCHING
+    elif depth <= 0.0:
+        p.phase = FLIGHT
+    return began
+
+
+@njit(cache=True)
+def take_switch(t, y, parameters, which):
+    """Change the phase where a switching function has met 0; an onset latches v0 at the located crossing.
+
+    Returns:
+        Whether a contact began.
+    """
+    p = parameters[0]
+    before = p.phase
+    if which == 0 and before != FLIGHT:
+        p.phase = FLIGHT
+        return False
+    if which == 0:
+        _, rate, sliding, _, _ = contact_at(t, y, p, FLIGHT)
+        p.onset_speed = held_speed(rate, p.constants.contact)
+        p.phase = TOUCHING
+        if p.constants.levels.friction == EXACT:
+            if sliding == 0.0:
+                # No sliding to tell the direction by: where it is going to slide, if it is.
+                needed = contact_at(t, y, p, ROLLING)[4]
+                p.phase = ROLLING if needed == 0.0 else FORWARD if needed > 0.0 else BACKWARD
+            else:
+                p.phase = FORWARD if sliding > 0.0 else BACKWARD
+        return True
+    # Sliding has stopped, or rolling asks for more friction than there is.
+    _, _, _, normal, needed = contact_at(t, y, p, ROLLING)
+    if before != ROLLING and abs(needed) <= p.constants.contact.friction * normal:
+        p.phase = ROLLING
+    else:
+        p.phase = FORWARD if needed > 0.0 else BACKWARD
+    return False
+
+
+def _vector_rates(t, y, ydot, user_data):
+    """Right-hand side by CVODE's signature: CVRhsFn(t, y, ydot, user_data) -> 0."""
+    p = carray(user_data, (1,), PARAMETERS)[0]
+    _rates(t, _numbers(y, p.vector_word), p, _numbers(ydot, p.vector_word))
+    return 0
+
+
+def _vector_rates_by_sign(t, y, ydot, user_data):
+    p = carray(user_data, (1,), PARAMETERS)[0]
+    _rates_by_sign(t, _numbers(y, p.vector_word), p, _numbers(ydot, p.vector_word))
+    return 0
+
+
+def _vector_switches(t, y, g, user_data):
+    """Switching functions by CVODE's signature: CVRootFn(t, y, gout, user_data) -> 0."""
+    p = carray(user_data, (1,), PARAMETERS)[0]
+    _switches(t, _numbers(y, p.vector_word), p, carray(g, (N_SWITCH,), np.float64))
+    return 0
+
+
+@njit(cache=True, forceinline=True)
+def _numbers(vector, word):
+    # N_Vector -> its content -> {length, own_data, data}.
+    content = carray(vector, (1,), np.int64)[0]
+    data = _word(content, word)
+    return carray(_pointer(data), (N_STATE,))
+
+
+@functools.cache
+def compile_s() -> float:
+    """Compile what Python calls, or load it from numba's cache; how long the first call took [s]."""
+    begin = time.perf_counter()
+    vector, struct = types.float64[::1], from_dtype(PARAMETERS)[::1]
+    state_only: list[Any] = [derivative, jacobian, derivative_by_sign, switching, follow_sign]
+    for function in state_only:
+        function.compile((types.float64, vector, struct))
+    take: Any = take_switch
+    take.compile((types.float64, vector, struct, types.int64))
+    return time.perf_counter() - begin
+
+
+@functools.cache
+def vector_callbacks() -> tuple[Any, Any, Any]:
+    """Rates, switching functions, and rates by the gap's sign, as C functions for CVODE; `.address` is where.
+
+    The first call compiles them, or loads them from numba's cache.
+    """
+    c_function = types.intc(types.double, types.voidptr, types.voidptr, types.voidptr)
+    compiled = cfunc(c_function, cache=True)
+    return compiled(_vector_rates), compiled(_vector_switches), compiled(_vector_rates_by_sign)

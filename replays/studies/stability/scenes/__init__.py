@@ -1,0 +1,1 @@
+"""Whole scenes: random ones by number, and the twelve."""

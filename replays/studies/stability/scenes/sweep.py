@@ -1,0 +1,154 @@
+"""The truth sweep: random scenes by number, each measured once and kept, and what they show of every engine."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from replays.studies.common.journal import Journal
+from replays.studies.common.provenance import commit, machine
+from replays.studies.common.random_scene import draw_scene
+from replays.studies.stability.scenes.truth import CHAOTIC, WRONG, measure
+from replays.studies.stability.scenes.worker import Run, Task, Worker
+from rig.base.errors import InputError
+from rig.physics.kernels import source_digest
+
+Row = dict[str, Any]
+QUANTILES = (0.10, 0.25, 0.50, 0.75, 0.90, 0.95)
+NAME = "sweep.jsonl"
+_WITHIN = 10.0
+"""An error is kept within so many times what was asked for."""
+_LIMIT_S = 20.0
+"""Processor time of one run [s]."""
+
+
+def chosen_numbers(only: str | None, count: int) -> list[int]:
+    """Numbers joined by commas; None for all from 0.
+
+    Raises:
+        InputError: No whole numbers from 0.
+    """
+    if only is None:
+        return list(range(count))
+    parts = [part.strip() for part in only.split(",")]
+    if not all(part.isdecimal() for part in parts):
+        raise InputError("--only", "numbers of scenes joined by commas", only)
+    return [int(part) for part in parts]
+
+
+def sweep(
+    numbers: list[int],
+    *,
+    seed: int,
+    engines: list[str],
+    folder: Path | None = None,
+    run: Callable[[Task], Run] | None = None,
+) -> Iterator[Row]:
+    """Scenes as they are measured, those that are in the folder's journal first.
+
+    Args:
+        numbers: Of the scenes.
+        seed: Of the scenes.
+        engines: Engines under test.
+        folder: Where the journal is kept; None for none.
+        run: Does a run; None for a process of its own.
+
+    Raises:
+        InputError: The folder cannot be written.
+    """
+    code = source_digest()
+    journal = None if folder is None else Journal(folder, NAME, code)
+    wanted, kept = set(numbers), {}
+    for row in journal.rows if journal else []:
+        if row["seed"] == seed and row["number"] in wanted and {one["engine"] for one in row["tested"]} >= set(engines):
+            kept[row["number"]] = row
+    yield from kept.values()
+    missing = [number for number in numbers if number not in kept]
+    if not missing:
+        return
+    stamp = {"code": code, "commit": commit(), "machine": machine()}
+    with Worker() as worker:
+        for number in missing:
+            found = measure(draw_scene(seed, number), engines, run or worker.run, limit_s=_LIMIT_S)
+            row = {"seed": seed, "number": number, **found, **stamp}
+            if journal is not None:
+                journal.add(row)
+            yield row
+
+
+def summary(rows: list[Row], engines: list[str]) -> Row:
+    """What the scenes show.
+
+    Returns:
+        `scenes`: how many of each status; `undecided`: those that accurate runs tell differently though they are not
+        chaotic; `distance` of the accurate runs; `engines`: of each, and of the accurate ones as "NAME (accurate)".
+    """
+    statuses = [row["status"] for row in rows]
+    by_name = {name: [(row, one) for row in rows for one in row["tested"] if one["engine"] == name] for name in engines}
+    for name in dict.fromkeys(one["engine"] for row in rows for one in row["accurate"]):
+        by_name[f"{name} (accurate)"] = [(row, one) for row in rows for one in row["accurate"] if one["engine"] == name]
+    return {
+        "scenes": {
+            status: statuses.count(status) for status in ("decided", "chaotic", "undecided", "untold", "unbounded")
+        },
+        "undecided": [
+            {name: row[name] for name in ("number", "distance", "odd", "growth", "growth_per_s")}
+            for row in rows
+            if row["status"] == "undecided"
+        ],
+        "distance": _quantiles([row["distance"] for row in rows if row["status"] == "decided"]),
+        "engines": {name: _engine(runs) for name, runs in by_name.items()},
+    }
+
+
+def silent(one: Row) -> bool:
+    """Whether a run is wrong and says nothing of it."""
+    return one["error"] is not None and one["error"] > WRONG and not one["doubted"]
+
+
+def false_alarm(one: Row) -> bool:
+    """Whether a run doubts itself and has kept what was asked for."""
+    return bool(one["error"] is not None and one["doubted"] and one["error"] < _WITHIN * one["asked"])
+
+
+def _engine(runs: list[tuple[Row, Row]]) -> Row:
+    """One engine over all scenes; a list of scenes is one of their numbers."""
+
+    def scenes(kind: Callable[[Row], bool]) -> list[int]:
+        return [row["number"] for row, one in runs if kind(one) and row["status"] != "unbounded"]
+
+    ran = [(row, one) for row, one in runs if one["failure"] != "refused"]
+    told = [(row, one) for row, one in ran if one["error"] is not None]
+    calm = [one for row, one in told if not (row["growth"] and row["growth"] >= CHAOTIC)]
+    speeds = [one["speed"] for _, one in ran if one["speed"]]
+    refused: dict[str, int] = {}
+    for _, one in runs:
+        if one["failure"] == "refused":
+            refused[one["message"]] = refused.get(one["message"], 0) + 1
+    return {
+        "runs": len(ran),
+        "told": len(told),
+        "asked": max((one["asked"] for _, one in runs), default=None),
+        "error": _quantiles([one["error"] for _, one in told]),
+        "calm": len(calm),
+        "within": sum(one["error"] <= _WITHIN * one["asked"] for one in calm) / len(calm) if calm else None,
+        "wrong": scenes(lambda one: one["error"] is not None and one["error"] > WRONG),
+        "silent": scenes(silent),
+        "false_alarms": scenes(false_alarm),
+        "crashes": scenes(lambda one: one["failure"] == "crash"),
+        "hangs": scenes(lambda one: one["failure"] == "hang"),
+        "absurd": scenes(lambda one: bool(one["absurd"])),
+        "slowest": min(speeds, default=None),
+        "slowest_scene": min(((one["speed"], row["number"]) for row, one in ran if one["speed"]), default=(None, None))[
+            1
+        ],
+        "median_speed": float(np.median(speeds)) if speeds else None,
+        "refused": refused,
+    }
+
+
+def _quantiles(values: list[float]) -> list[float] | None:
+    return [float(value) for value in np.quantile(values, QUANTILES)] if values else None

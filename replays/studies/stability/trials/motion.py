@@ -1,0 +1,165 @@
+"""One engine on one small system: what a trial sets going and reads off, without scenes, sensors or commands."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+
+from replays.studies.common.run import Course
+from rig.physics.engines.common.memory import CONTACTS, PEAK_FORCE
+from rig.physics.kernels.constants import Constants, Inputs
+from rig.physics.kernels.signals import COLUMN, N_ROW, N_STATE, N_VECTOR
+from rig.physics.levels import ModelLevels
+from rig.physics.model import Model, build_model
+from rig.physics.parameters import load_parameters
+
+TICK_S = 1e-6
+"""Length of a tick [s], unless a trial says otherwise."""
+
+
+@cache
+def base_model(levels: ModelLevels) -> Model:
+    """The default parameters on a level of the model; a fit of the magnets' map is made once."""
+    return build_model(load_parameters(), levels)
+
+
+def quiet_inputs(
+    *,
+    tick_s: float = TICK_S,
+    spin: float = 0.0,
+    magnets: bool = False,
+    ideal: bool = False,
+    pulse: tuple[float, int, int] = (0.0, 0, 0),
+) -> Inputs:
+    """Nothing happens but, perhaps, one pulse along x.
+
+    Args:
+        tick_s: Length of a tick [s].
+        spin: What the drive aims at [rad/s].
+        magnets: Whether they hold.
+        ideal: The drive prescribes the spin instead of a torque.
+        pulse: Peak force [N], first tick and end of the pulse.
+    """
+    return Inputs(
+        tick_s=tick_s, hammer_force=pulse[0], hammer_x=1.0, hammer_y=0.0, hammer_start=pulse[1], hammer_end=pulse[2],
+        speed=spin, speed_slope=0.0, speed_tick=0, ideal_drive=ideal, magnet_engaged=magnets,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Motion:
+    """What an engine made of a system.
+
+    Attributes:
+        times: Instants of the rows [s], shape (n,).
+        rows: Observed rows, shape (n, N_ROW); the end has none.
+        end: State and integrals at the end, shape (N_VECTOR,).
+        memory: The engine's memory at the end, shape (MEMORY,).
+    """
+
+    times: np.ndarray
+    rows: np.ndarray
+    end: np.ndarray
+    memory: np.ndarray
+
+    @property
+    def states(self) -> np.ndarray:
+        """States at the rows and at the end, shape (n + 1, 14)."""
+        return np.vstack([self.rows[:, :N_STATE], self.end[None, :N_STATE]])
+
+    def column(self, name: str) -> np.ndarray:
+        """One column of the rows, shape (n,)."""
+        return self.rows[:, COLUMN[name]]
+
+    def end_of(self, name: str) -> float:
+        """One state or integral at the end."""
+        return float(self.end[COLUMN[name]])
+
+    @property
+    def contacts(self) -> int:
+        """Contacts begun."""
+        return int(self.memory[CONTACTS])
+
+    @property
+    def peak_force(self) -> float:
+        """Largest normal force by the engine's own steps [N]."""
+        return float(self.memory[PEAK_FORCE])
+
+
+def move(
+    engine: str,
+    constants: Constants,
+    inputs: Inputs,
+    y0: np.ndarray,
+    *,
+    ticks: int,
+    step: int = 0,
+    every: int = 0,
+    tolerance: float = 0.0,
+) -> Motion:
+    """Let an engine loose on a system.
+
+    Args:
+        engine: Its name.
+        constants: The model.
+        inputs: What acts on it.
+        y0: State and integrals at the start, shape (N_VECTOR,).
+        ticks: How long, in ticks of `inputs`; cut to whole rows.
+        step: Ticks a step; 0 for the engine's own (in ticks of 1 us).
+        every: Ticks between rows, at least one step; 0 for one row only.
+        tolerance: Of an adaptive engine; 0 for its own.
+    """
+    course = Course(engine, constants, inputs, y0, step=step, tolerance=tolerance)
+    stride = max(1, (every or ticks) // course.step)
+    steps = max(1, ticks // (stride * course.step)) * stride
+    rows = np.empty((steps // stride, N_ROW))
+    course.advance(steps, stride, rows)
+    times = np.arange(len(rows)) * stride * course.step * inputs.tick_s
+    return Motion(times=times, rows=rows, end=course.y, memory=course.memory)
+
+
+def state(**values: float) -> np.ndarray:
+    """State and integrals, 0 but for the columns named, shape (N_VECTOR,)."""
+    y = np.zeros(N_VECTOR)
+    for name, value in values.items():
+        y[COLUMN[name]] = value
+    return y
+
+
+def pivoted_mass(constants: Constants) -> float:
+    """Effective mass of the shaft at the ring [kg]."""
+    return constants.shaft.transverse_inertia / constants.shaft.arm_ring**2
+
+
+def bare_shaft(*, gravity: bool = False, **contact: float) -> Constants:
+    """Planar shaft in a rigid, centred, frictionless ring: along x it is a mass on one line.
+
+    Args:
+        gravity: Whether there is any.
+        contact: What the contact has otherwise than the rig's with Hertz's exponent, by field.
+    """
+    levels = ModelLevels(magnet="linear", shaft="planar", stator="rigid", friction="none")
+    own = base_model(levels).constants
+    centred = {"offset_x": 0.0, "offset_y": 0.0, "exponent": 1.5, "viscous_damping": 0.0}
+    return own._replace(
+        contact=own.contact._replace(**{**centred, **contact}),
+        shaft=own.shaft._replace(unbalance=0.0, gravity=own.shaft.gravity if gravity else 0.0),
+        magnet=own.magnet._replace(damping_x=0.0, damping_y=0.0),
+    )
+
+
+def hammer_run(law: str, *, force_n: float = 100.0, **contact: float) -> tuple[Constants, Inputs, np.ndarray]:
+    """The full rig running at 6.2 Hz, hit for 5 ms along x at 20 ms: the scene `hammer` under a friction law.
+
+    Args:
+        law: Of friction.
+        force_n: Peak of the pulse [N].
+        contact: What the contact has otherwise than the rig's, by field.
+    """
+    model = base_model(ModelLevels.model_validate({"friction": law}))
+    spin = 2.0 * np.pi * 6.2
+    inputs = quiet_inputs(spin=spin, magnets=True, pulse=(force_n, 20_000, 25_000))
+    changed = model.constants.contact._replace(**contact)
+    return model.constants._replace(contact=changed), inputs, model.state(spin=spin)

@@ -1,0 +1,100 @@
+"""Trials of whole simulations (T12, T13): a run does not depend on how it is cut, and says what goes wrong in it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from replays.studies.common.engines import friction_of, is_adaptive, traits
+from replays.studies.common.run import bare_sensors
+from replays.studies.stability.trials.cell import Cell
+from rig.base.errors import SimulationError
+from rig.physics.engine_choice import EngineChoice
+from rig.physics.engines import ENGINES
+from rig.run.scenes import Scene, load_scene
+from rig.run.simulation import Simulation
+
+
+def engine_scene(name: str, **choice: float) -> Scene:
+    """The hammer's scene for an engine at its own step and tolerance unless given others, with bare sensors."""
+    scene = load_scene("hammer")
+    method = ENGINES[name]
+    settings = {"name": name, "step_us": method.step_us, "tolerance": method.tolerance, **choice}
+    engine = EngineChoice.model_validate(settings)
+    levels = scene.model.model_copy(update={"friction": friction_of(name)})
+    sensors = scene.sensors.model_copy(update={**bare_sensors(), "groups": ("hammer",)})
+    return scene.model_copy(update={"engine": engine, "model": levels, "sensors": sensors})
+
+
+def bit_cases(engine: str, quick: bool) -> Iterator[Cell]:
+    """T12: the same bits however a run is cut, and after a restart."""
+    scene = engine_scene(engine)
+    total = 200 if quick else 1000
+    whole = Simulation(scene).advance(total * 1000).rows
+    cut = Simulation(scene)
+    parts = np.vstack([cut.advance(1000).rows.copy() for _ in range(total)])
+    yield Cell("frames of 1 ms against one run", float(np.sum(parts != whole)), 0.0,
+               "a call's length is none of the engine's business", unit="numbers differ")  # fmt: skip
+    first, second = Simulation(scene), Simulation(scene)
+    first.advance(total * 500)
+    kept = first.snapshot()
+    first.advance(total * 500)
+    second.restore(kept)
+    again = second.advance(total * 500).rows
+    yield Cell("restart from a snapshot", float(np.sum(again != whole[total // 2 :])), 0.0,
+               "a snapshot holds all that changes", unit="numbers differ")  # fmt: skip
+
+
+def _is_poisoned(engine: str) -> bool:
+    """Whether a force law that turns to nan ends the run with an error."""
+    simulation = Simulation(engine_scene(engine))
+    constants = simulation.model.constants
+    shaft = constants.shaft._replace(gravity=math.nan)
+    simulation.model = replace(simulation.model, constants=constants._replace(shaft=shaft))
+    try:
+        with np.errstate(all="ignore"):
+            simulation.advance(10_000)
+    except SimulationError:
+        return True
+    return False
+
+
+def warnings_of(scene: Scene, ticks: int) -> list[str]:
+    """What the health of a run warns of at its end, or the error that ended it."""
+    simulation = Simulation(scene)
+    try:
+        # By the millisecond: what is not finite ends the run where it happens.
+        with np.errstate(all="ignore"):
+            for _ in range(ticks // 1000):
+                simulation.advance(1000)
+    except SimulationError as error:
+        return [str(error)]
+    return simulation.health()["warnings"]
+
+
+def _silent(warnings: list[str], *words: str) -> float:
+    """0 where a warning has one of the words, 1 for silence."""
+    return float(not any(word in warning for warning in warnings for word in words))
+
+
+def warning_cases(engine: str, quick: bool) -> Iterator[Cell]:
+    """T13: a run says what goes wrong in it."""
+    yield Cell("nan", float(not _is_poisoned(engine)), 0.0, "the state is checked", unit="silent")
+    # A step of 1 ms is far too long for anything but error control; with that, a tolerance that cannot be met.
+    if is_adaptive(engine):
+        warnings = warnings_of(engine_scene(engine, step_us=500, tolerance=1e-30), 1000)
+        yield Cell("tolerance out of reach", _silent(warnings, "engine.tolerance"), 0.0,
+                   "the step's ceiling is counted", unit="silent")  # fmt: skip
+    else:
+        for case, step in (("step of 100 us", 100), ("step of 1 ms", 1000)):
+            warnings = warnings_of(engine_scene(engine, step_us=step), traits(engine).warned_within_ticks)
+            silent, because = _silent(warnings, "energy residual ", "finite"), "the ledger sees it"
+            yield Cell(case, silent, 0.0, because, unit="silent")
+    base = engine_scene(engine)
+    for case, word, floor_mm_s in (("v0 at its floor", "speed_floor", 50.0), ("law that would pull", "pulled", 1.0)):
+        drop = load_scene("drop", {"contact.damping_factor": 1.4328, "contact.speed_floor": floor_mm_s})
+        drop = drop.model_copy(update={"engine": base.engine, "model": base.model, "sensors": base.sensors})
+        yield Cell(case, _silent(warnings_of(drop, 500_000), word), 0.0, "counted", unit="silent")

@@ -1,0 +1,334 @@
+"""What comes from outside, a client, a file or a bus, is read and checked here, once, at the door it comes in by.
+
+A document has a bounded size and depth, plain numbers and each key once; a model that derives from `Outside` has typed
+fields with ranges and no others. What has passed is believed behind the door, and what has not raises `InputError`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import json
+import math
+import os
+import re
+import stat
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, BinaryIO, TypeVar, get_args
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from rig.base.errors import InputError, Words, such_as
+from rig.base.text import nearest, printable
+
+DOCUMENT_BYTES = 16 << 20
+"""Largest document that a rig or a recording may hold."""
+TOML_BYTES = 1 << 20
+"""Largest file that a person writes."""
+DEPTH = 32
+"""Deepest nesting of a document."""
+LARGEST = 2**63 - 1
+"""Largest whole number: what a tick, a row number and a seed fit into."""
+
+Count = Annotated[int, Field(ge=0, lt=2**62)]
+"""A number of rows, messages or ticks; sums of two still fit into 64 bits."""
+
+
+class Outside(BaseModel):
+    """A document, or part of one, from outside: `"100"` and true are no numbers, and there are no further fields."""
+
+    model_config = ConfigDict(strict=True, extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class Written(BaseModel):
+    """A table that a person writes, into a scene or another file; further fields are refused."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _no_truth_for_a_number(cls, data: Any) -> Any:
+        # Python takes true for 1; a file that says so means something else.
+        for name, value in data.items() if isinstance(data, dict) else ():
+            kind = cls.model_fields[name].annotation if name in cls.model_fields else bool
+            if isinstance(value, bool) and bool not in (kind, *get_args(kind)):
+                raise InputError(name, "something else than true or false", value)
+            if (
+                isinstance(value, str)
+                and value[:1].isdigit()
+                and not cls.model_config.get("strict")
+                and name in cls.model_fields
+                and cls.model_fields[name].annotation in (int, float)
+            ):
+                raise InputError(name, "a number", value)
+        return data
+
+
+def a_line(most: int) -> AfterValidator:
+    """Text of 1 to so many characters, not all blank, without line breaks or anything that a terminal would act on."""
+
+    def check_line(text: str) -> str:
+        if not text.isprintable() or not text.strip() or len(text) > most:
+            raise ValueError(f"a line of 1 to {most} printable characters, not all blank")
+        return text
+
+    return AfterValidator(check_line)
+
+
+Name = Annotated[str, a_line(100)]
+"""What a client calls itself."""
+
+
+def read_json(payload: bytes, *, field: str = "payload", most_bytes: int = DOCUMENT_BYTES) -> dict[str, Any]:
+    """The JSON object in a payload.
+
+    Args:
+        payload: UTF-8.
+        field: What errors call it.
+        most_bytes: Largest payload.
+
+    Raises:
+        InputError: Too large, no UTF-8, no JSON object, nested too deep, a key twice, or a number that no double or
+            64-bit integer holds.
+    """
+    if len(payload) > most_bytes:
+        raise InputError(field, f"at most {most_bytes} bytes", len(payload))
+    try:
+        text = payload.decode("utf-8")
+        document = json.loads(
+            text, object_pairs_hook=_once, parse_int=_whole, parse_float=_finite, parse_constant=_finite
+        )
+        if "\\u" in text:
+            # An escaped half of a surrogate pair is a string that cannot be written anywhere.
+            json.dumps(document, ensure_ascii=False).encode("utf-8")
+    except RecursionError:
+        raise InputError(field, f"nested at most {DEPTH} deep", Words("a document nested deeper")) from None
+    except InputError as error:
+        raise InputError(field, error.must, error.received) from None
+    except ValueError as error:
+        raise InputError(field, f"a JSON object in UTF-8 ({printable(str(error), 200)})", payload[:60]) from None
+    if not isinstance(document, dict):
+        raise InputError(field, "a JSON object", document)
+    if text.count("[") + text.count("{") > DEPTH:
+        check_depth(document, field=field)
+    return document
+
+
+def open_file(path: Path) -> BinaryIO:
+    """Open a regular file to read it; a pipe or a device, which may never end or never begin, is none.
+
+    Raises:
+        OSError: It cannot be read, or is something else.
+    """
+
+    def opener(name: str, flags: int) -> int:
+        number = os.open(name, flags | getattr(os, "O_NONBLOCK", 0))
+        if not stat.S_ISREG(os.fstat(number).st_mode):
+            os.close(number)
+            raise OSError(errno.EINVAL, "not a regular file", name)
+        return number
+
+    return open(path, "rb", opener=opener)
+
+
+def unreadable(path: Path, error: OSError) -> InputError:
+    """Why a file cannot be read, with those beside it that could have been meant, such as what was not finished."""
+    names: list[str] = []
+    if isinstance(error, FileNotFoundError):
+        with contextlib.suppress(OSError):
+            names = sorted(each.name for each in path.parent.iterdir() if path.suffix in each.name)
+    names = [name for name in names if name.startswith(f"{path.stem}.")][:3] or nearest(path.name, names)
+    such = f", such as {', '.join(str(path.with_name(name)) for name in names)}" if names else ""
+    return InputError("file", f"a file that can be read{such}", Words(f"{path} ({error.strerror})"))
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Read a TOML file that somebody wrote: a scene, a set, a mapping, criteria, a channel table.
+
+    Raises:
+        InputError: The file cannot be read, is not TOML, or is out of bounds (see `parse_toml`).
+    """
+    try:
+        with open_file(path) as file:
+            data = file.read(TOML_BYTES + 1)
+        return parse_toml(data.decode("utf-8-sig"), field=str(path))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(str(path), "a TOML file", Words(printable(str(error), 200))) from None
+    except OSError as error:
+        raise InputError(str(path), "a readable file", Words(error.strerror)) from None
+
+
+def parse_toml(text: str, *, field: str) -> dict[str, Any]:
+    """The document in a TOML text.
+
+    Args:
+        text: The text.
+        field: What errors call it.
+
+    Raises:
+        tomllib.TOMLDecodeError: It is not TOML.
+        InputError: It is too large, nested too deep, or has a whole number that 64 bits do not hold.
+    """
+    if len(text) > TOML_BYTES:
+        raise InputError(field, f"at most {TOML_BYTES} bytes", Words("a longer text"))
+    # The parser takes the square of the parts of a dotted key.
+    if max(map(len, map(_DOTTED.findall, re.split(r"[,=\n]", text)))) > DEPTH:
+        raise InputError(field, f"keys of at most {DEPTH} parts", Words("a longer one"))
+    try:
+        document = tomllib.loads(text)
+    except RecursionError:
+        raise InputError(field, f"nested at most {DEPTH} deep", Words("a document nested deeper")) from None
+    except tomllib.TOMLDecodeError:
+        raise
+    except ValueError as error:  # digits beyond Python's own limit
+        number = _LONG_NUMBER.search(text)
+        if number is not None and "\n" in text:
+            field += f", line {text.count(chr(10), 0, number.start()) + 1}"
+        received = Words(printable(str(error), 100) if number is None else "one of thousands of digits")
+        raise InputError(field, f"without whole numbers beyond +-{LARGEST}", received) from None
+    check_depth(document, field=field)
+    return document
+
+
+def check_depth(document: Any, *, field: str) -> None:
+    """Refuse what is nested deeper than `DEPTH`, or has a whole number beyond `LARGEST`, in whatever format it came.
+
+    Raises:
+        InputError: It is, or has.
+    """
+    level = [document]
+    for _ in range(DEPTH + 1):
+        for item in level:
+            if isinstance(item, int) and abs(item) > LARGEST:
+                raise InputError(field, f"without whole numbers beyond +-{LARGEST}", item)
+        level = [
+            item
+            for each in level
+            if isinstance(each, dict | list)
+            for item in (each.values() if isinstance(each, dict) else each)
+        ]
+        if not level:
+            return
+    raise InputError(field, f"nested at most {DEPTH} deep", Words("a document nested deeper"))
+
+
+def table_in(data: Mapping[str, Any], name: str) -> dict[str, Any]:
+    """A table in a document; an empty one where there is none.
+
+    Raises:
+        InputError: It is something else.
+    """
+    table = data.get(name, {})
+    if not isinstance(table, dict):
+        raise InputError(name, "a table of named fields", table)
+    return table
+
+
+_LONG_NUMBER = re.compile(r"\d[\d_]{4000,}")
+_DOTTED = re.compile(r"\.[ \t]*[\w\"'-]")
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    document = dict(pairs)
+    if len(document) < len(pairs):
+        names = [name for name, _ in pairs]
+        raise InputError("", "without a key that comes twice", next(name for name in names if names.count(name) > 1))
+    return document
+
+
+def _whole(digits: str) -> int:
+    # Long before Python's own limit of 4300 digits, beyond which it raises.
+    if len(digits) > len(str(-LARGEST)) or not -LARGEST - 1 <= (number := int(digits)) <= LARGEST:
+        raise InputError("", f"without whole numbers beyond +-{LARGEST}", printable(digits, 60))
+    return number
+
+
+def _finite(digits: str) -> float:
+    if not math.isfinite(number := float(digits)):
+        raise InputError("", "without numbers that are not finite", printable(digits, 60))
+    return number
+
+
+Model = TypeVar("Model", bound=BaseModel)
+
+
+def check(model: type[Model], document: Any, *, field: str, most_bytes: int = 10_000) -> Model:
+    """A document as its model.
+
+    Args:
+        model: What it has to be.
+        document: Read already, or its payload.
+        field: What errors call it; fields in it are named behind a dot.
+        most_bytes: Largest payload.
+
+    Raises:
+        InputError: It is none; the message names the first field that is wrong.
+    """
+    if isinstance(document, bytes):
+        document = read_json(document, field=field, most_bytes=most_bytes)
+    if not isinstance(document, Mapping) or not all(isinstance(name, str) for name in document):
+        raise InputError(field or "document", "a set of named fields", document)
+    try:
+        return model.model_validate(document)
+    except ValidationError as error:
+        raise input_error(error, field, model) from None
+
+
+# What pydantic puts into the place of an error beside the names that stand in the file: branches of a union.
+_BRANCH = re.compile(r"(function-\w+|tuple|list|dict|set|literal|nullable|chain)\[.*\]|constrained-\w+", re.DOTALL)
+_PLAIN_BRANCH = {"float": ("float", "finite", "greater", "less"), "int": ("int", "greater", "less"), "str": ("string",)}
+
+
+def _place(parts: tuple[str | int, ...], kind: str) -> list[str]:
+    """The names that stand in the file, of the place of an error of that kind."""
+    named = kind in ("extra_forbidden", "missing")
+    found = []
+    for number, part in enumerate(parts):
+        name, last = str(part), number == len(parts) - 1
+        branch = _BRANCH.fullmatch(name) or (last and kind.startswith(_PLAIN_BRANCH.get(name, ("\0",))))
+        # A timed command's own fields stand beside its time.
+        inner = name == "request" and number > 0 and isinstance(parts[number - 1], int)
+        if (last and named) or not (branch or inner):
+            found.append(printable(name, 100) or '""')
+    return found
+
+
+def _fields(models: list[type[BaseModel]], parts: tuple[str | int, ...]) -> list[str]:
+    """Names of the fields at a place in documents of some models; all of them where several could stand there."""
+    for part in parts:
+        fields = [field for each in models for name, field in each.model_fields.items() if name == part]
+        models = [inner for field in fields for inner in _models(field.annotation)] or models
+        # The one of a union that its tag names.
+        tagged = (each for each in models if get_args(next(iter(each.model_fields.values())).annotation) == (part,))
+        models = list(tagged) or models
+    return [name for each in models for name in each.model_fields]
+
+
+def _models(annotation: Any) -> list[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [inner for part in get_args(annotation) for inner in _models(part)]
+
+
+def input_error(error: ValidationError, where: str, model: type[BaseModel]) -> InputError:
+    """The first complaint of a validation as the one line that users see."""
+    first = error.errors()[0]
+    cause = first.get("ctx", {}).get("error")
+    if isinstance(cause, InputError):  # a rule over several fields names its own
+        return cause
+    field = ".".join(part for part in (where, *_place(first["loc"], first["type"])) if part)
+    message = first["msg"].removeprefix("Value error, ").removeprefix("Input should be ").partition(", unable")[0]
+    message = re.sub(r"^\w+ should have ", "a value of ", message).replace("a valid tuple", "a list")
+    message = message.partition(" after validation, not ")[0]
+    if first["type"] == "union_tag_invalid":
+        context = first.get("ctx", {})
+        name = str(context.get("discriminator")).strip("'")
+        return InputError(f"{field}.{name}", f"one of {context.get('expected_tags')}", context.get("tag"))
+    if first["type"] == "extra_forbidden":
+        known = _fields([model], first["loc"][:-1])
+        message = such_as("a field that there is", first["loc"][-1], known) if known else "left out (it has no fields)"
+    elif first["type"] == "missing":
+        message = "given"
+    return InputError(field, message, None if first["type"] == "missing" else first["input"])

@@ -1,0 +1,150 @@
+"""Columns of numbers, each with its name and unit: what a run, a recording and the DAQ client hand out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import reduce
+from itertools import groupby
+from typing import Any, Self, cast
+
+import numpy as np
+
+from rig.base import units
+from rig.base.errors import InputError, UnknownNameError
+
+_SAME_S = 1e-6
+"""Instants that are closer are the same [s]."""
+
+
+def place(name: str, names: Sequence[str], *, must: str = "one of those that there are") -> int:
+    """Where a name stands.
+
+    Raises:
+        UnknownNameError: Nowhere.
+    """
+    if name not in names:
+        raise UnknownNameError("name", must, name, names)
+    return names.index(name)
+
+
+class Columns:
+    """Rows of named columns: `rows["disk_x"]`, its `rows.unit("disk_x")`, and `rows.to_si()` for all of them in SI.
+
+    Attributes:
+        names: Column names.
+        units: Column units.
+        values: Shape (rows, columns).
+    """
+
+    __slots__ = ()
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    values: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.names)
+
+    def keys(self) -> tuple[str, ...]:
+        """Column names, as of a dictionary: `dict(rows)` has an array a column."""
+        return self.names
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        """Values of one column [its unit], shape (rows,).
+
+        Raises:
+            UnknownNameError: There is no such column; it is a KeyError.
+        """
+        return self.values[:, place(name, self.names)]
+
+    def unit(self, name: str) -> str:
+        """Unit of one column.
+
+        Raises:
+            UnknownNameError: There is no such column.
+        """
+        return self.units[place(name, self.names)]
+
+    def only(self, *names: str) -> Self:
+        """Some of the columns, in this order.
+
+        Raises:
+            UnknownNameError: There is no such column.
+        """
+        places = [place(name, self.names) for name in names]
+        chosen = tuple(self.units[each] for each in places)
+        return cast(Self, replace(cast(Any, self), names=names, units=chosen, values=self.values[:, places]))
+
+    def to_si(self) -> Self:
+        """The same rows in SI: mm become m, Hz of a speed rad/s. A unit that is not known stays."""
+        names, sizes, zeros = zip(*map(units.in_si, self.units), strict=True) if self.units else ((), (), ())
+        return cast(Self, replace(cast(Any, self), units=names, values=self.values * np.array(sizes) + np.array(zeros)))
+
+    def __repr__(self) -> str:
+        pairs = zip(self.units, self.names, strict=True)
+        shown = [(", ".join(name for _, name in alike), unit) for unit, alike in groupby(pairs, lambda pair: pair[0])]
+        of = cast(Any, self)
+        span = f", {of.times_s[0]:.6g} to {of.times_s[-1]:.6g} s" if len(self) else ""
+        columns = ", ".join(f"{names} [{unit}]" for names, unit in shown)
+        return f"{type(self).__name__}({columns}; {len(self)} rows at {of.rate_hz:g} Hz{span})"
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class Samples(Columns):
+    """Sensors or truth as columns, each in its own unit.
+
+    Attributes:
+        name: Name of the sensor group or truth table; empty of several.
+        times_s: Simulated time of each row [s], shape (n,).
+        index: Number of each row since the start of the stream, int64, shape (n,); a step other than 1 is a gap.
+        values: Engineering values, shape (n, columns).
+        names: Column names.
+        units: Column units.
+        rate_hz: Rows per simulated second [Hz].
+
+    Example:
+        >>> import rig
+        >>> samples = rig.simulate("hammer", duration_s=0.05).samples
+        >>> samples["disk_x"].shape, samples.unit("disk_x"), samples.to_si().unit("disk_x")
+        ((1000,), 'mm', 'm')
+        >>> samples["disk_z"]
+        Traceback (most recent call last):
+        rig.base.errors.UnknownNameError: name must be one of those that there are, such as disk_y, ...
+    """
+
+    name: str
+    times_s: np.ndarray
+    index: np.ndarray
+    values: np.ndarray  # pyrefly: ignore[bad-override]
+    names: tuple[str, ...]  # pyrefly: ignore[bad-override]
+    units: tuple[str, ...]  # pyrefly: ignore[bad-override]
+    rate_hz: float
+
+
+def joined(parts: Sequence[Samples]) -> Samples:
+    """Columns of several as one, row by row where all have a row of that number; one alone as it is.
+
+    Raises:
+        InputError: There are none, or they were not taken at the same instants.
+    """
+    if len(parts) == 1:
+        return parts[0]
+    index = reduce(np.intersect1d, [part.index for part in parts]) if parts else np.empty(0)
+    rows = [np.intersect1d(part.index, index, return_indices=True)[1] for part in parts]
+    times = [part.times_s[chosen] for part, chosen in zip(parts, rows, strict=True)]
+    alike = len({part.rate_hz for part in parts}) == 1  # else a stretch may have no number in common, and all be well
+    if not alike or any(np.abs(each - times[0]).max(initial=0.0) > _SAME_S for each in times):
+        rates = ", ".join(f"{part.name} at {part.rate_hz:g} Hz" for part in parts)
+        raise InputError("groups", "sampled at the same instants", rates or None)
+    return Samples(
+        name="",
+        times_s=times[0],
+        index=index,
+        values=np.hstack([part.values[chosen] for part, chosen in zip(parts, rows, strict=True)]),
+        names=tuple(name for part in parts for name in part.names),
+        units=tuple(unit for part in parts for unit in part.units),
+        rate_hz=parts[0].rate_hz,
+    )

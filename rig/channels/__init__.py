@@ -1,0 +1,1 @@
+"""Channels: their table, formulas, generators and the sensors' chain."""

@@ -1,0 +1,140 @@
+"""Faults of channels and of blocks, and where they make sense: what is listed here is what is refused by."""
+
+from __future__ import annotations
+
+from rig.base.errors import InputError, UnknownNameError
+from rig.channels.faults.blocks import DOORS, Message, OfBlocks, Restart
+from rig.channels.faults.effect import check_draws, check_size, check_time
+from rig.channels.faults.kind import At, Draws, Kind, Setting, acts
+from rig.channels.faults.kinds import KINDS, AnyKind, NoFilter, Swap, plugged
+from rig.channels.table import ChannelTable
+
+__all__ = [
+    "DOORS", "KINDS", "AnyKind", "At", "Draws", "Kind", "Message", "NoFilter", "OfBlocks", "Restart", "Setting",
+    "Swap", "acts", "channels_of", "check_draws",
+    "check_size", "check_time", "described", "plugged", "stream_of", "supported",
+]  # fmt: skip
+
+
+def supported(kind: type[Kind], table: ChannelTable, setting: Setting = Setting()) -> dict[str, str]:  # noqa: B008
+    """Where a kind makes sense whatever its numbers are.
+
+    Args:
+        kind: The kind.
+        table: The channels that there are.
+        setting: What else decides.
+
+    Returns:
+        By the name of every channel, or of every group of a kind that is about blocks, what would have to be given in
+        its place; empty where it makes sense.
+    """
+    if kind.of_blocks:
+        return dict.fromkeys(table.groups, "")
+    wanted = kind.channel_only
+    marks = [name for name, channel in table.channels.items() if channel.signal == wanted]
+    away = f"{' or '.join(marks) or 'a keyphasor'} for {kind.name()}, which is about its pulses"
+    return {
+        name: kind.needs(channel, setting) or (away if wanted and name not in marks else "")
+        for name, channel in table.channels.items()
+    }
+
+
+def channels_of(
+    what: Kind, target: str, table: ChannelTable, *, ideal: bool, noisy: bool, generated: bool = False
+) -> tuple[str, ...]:
+    """Channels whose counts a fault changes: none of those that are about blocks.
+
+    Args:
+        what: The fault.
+        target: A channel, or a group for all of its channels.
+        table: The channels that there are.
+        ideal: Whether the scene leaves filters and noise out.
+        noisy: Whether its sensors are noisy.
+        generated: Whether generators stand for its physics.
+
+    Raises:
+        InputError: There is no such channel, or the fault makes no sense on it; the message says what would.
+    """
+    if isinstance(what, OfBlocks):
+        return ()
+    known = table.channels
+    if target not in {*known, *table.groups}:
+        must = "one of the channels, or of their groups"
+        raise UnknownNameError("fault.channel", must, target, [*known, *table.groups])
+    names = table.groups[target].names if target in table.groups else (target,)
+    for other in what.reads:
+        if other not in known or other in names:
+            raise UnknownNameError(
+                f"fault.{what.name()}", "with another channel", other, [n for n in known if n not in names]
+            )
+    refused = supported(type(what), table, Setting(ideal, noisy, generated))
+    if what.channel_only:
+        names = tuple(name for name in names if not refused[name]) or names[:1]
+    names = what.on(names)
+    if isinstance(what, Swap) and len(names) != 2:
+        raise InputError("fault.channel", "one channel for swap", target)
+    for name in names:
+        if must := refused[name]:
+            pulses = must.endswith("pulses")
+            raise InputError("fault.channel" if pulses else "kind", must, target if pulses else what.name())
+        what.refuse(known[name])
+    return names
+
+
+def stream_of(what: OfBlocks, target: str, table: ChannelTable, doors: tuple[str, ...]) -> str:
+    """Group whose blocks a fault is about.
+
+    Args:
+        what: The fault.
+        target: A group.
+        table: The channels that there are.
+        doors: Where blocks leave the rig.
+
+    Raises:
+        InputError: There is no such group, or no such door; the message says what there is.
+    """
+    known = supported(type(what), table)
+    if target in table.channels and target not in known:
+        must = f"a group for {what.name()}, as a block is of all its channels, such as {table.channels[target].group}"
+        raise InputError("fault.channel", must, target)
+    if target not in known:
+        raise UnknownNameError("fault.channel", f"one of the groups for {what.name()}", target, known)
+    if not set(what.doors) & set(doors):
+        raise InputError("door", f"one that this rig has: {', '.join(doors)} (a CAN bus: rig run --can)", what.door)
+    if must := what.needs_at(what.door, target, tuple(known)):
+        raise InputError("fault.channel", must, target)
+    return target
+
+
+def described(table: ChannelTable, setting: Setting = Setting()) -> list[tuple[str, ...]]:  # noqa: B008
+    """Of each kind its name, stage, equation, numbers with defaults, where it makes sense, and at which doors.
+
+    Args:
+        table: The channels that there are.
+        setting: What else decides.
+    """
+    found: list[tuple[str, ...]] = []
+    for name, kind in KINDS.items():
+        numbers = [
+            key + ("" if field.is_required() else f" ({'none' if field.default is None else _plain(field.default)})")
+            for key, field in kind.model_fields.items()
+            if key != "kind"
+        ]
+        places = supported(kind, table, setting)
+        on = [place for place, must in places.items() if not must]
+        many = "groups" if kind.of_blocks else "channels"
+        where = f"all {len(on)} {many}" if len(on) == len(places) else ", ".join(on) or "none"
+        doc = " ".join((kind.__doc__ or "").split())
+        doors = ", ".join(DOORS)
+        if issubclass(kind, OfBlocks):
+            groups = tuple(table.groups)
+            some = {door: [one for one in groups if not kind.needs_at(door, one, groups)] for door in DOORS}
+            doors += ", or one" + "".join(
+                f" ({door} alone: {', '.join(there)})" for door, there in some.items() if len(there) < len(groups)
+            )
+        found.append((name, kind.stage, doc, ", ".join(numbers) or "none", where, doors))
+    return found
+
+
+def _plain(value: object) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)

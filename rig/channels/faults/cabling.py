@@ -1,0 +1,131 @@
+"""Signals between transducer and converter, with the faults that act there.
+
+All channels are computed side by side, as a block has few rows: time goes into calls, not into numbers.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
+
+import numpy as np
+
+from rig.channels.faults import At, NoFilter, Swap, acts, plugged
+from rig.channels.faults.sending import Active
+from rig.channels.sampling import TICKS_HZ
+from rig.channels.table import Channel, Group
+from rig.physics.kernels.observe import EDGE, KEYPHASOR_WIDTH
+from rig.physics.kernels.signals import COLUMN, N_ROW
+
+NONE = np.empty(0)
+"""Angles and rates where a fault acts on samples, which have none."""
+
+
+_AHEAD = ("signal", "volts", "chain", "late_s")
+"""Methods by which a kind acts ahead of the converter; without one, its channel is sound up to there."""
+_PATHS = (Swap, NoFilter)
+"""Kinds that change the path of a signal, by none of the methods of a kind."""
+
+
+class Plan:
+    """What the faults that act at a time change of the channels of one conditioner.
+
+    Attributes:
+        faulty: Faults of each faulty channel.
+        homes: Group of each channel, and its column there.
+        twins: Of these channels, those with a chain of their own: sampled as they are, and late.
+        converters: Faults that act on counts, by channel.
+    """
+
+    def __init__(self, groups: Sequence[Group], active: Sequence[Active]) -> None:
+        self.homes = {name: (group.name, c) for group in groups for c, name in enumerate(group.names)}
+        every = {name: [one for one in active if name in one.names] for name in self.homes}
+        self.faulty = {name: faults for name, faults in every.items() if faults}
+        self.twins: dict[bool, dict[str, list[Active]]] = {False: {}, True: {}}
+        self.converters: dict[str, list[Active]] = {}
+        for name, faults in self.faulty.items():
+            if any(acts(one.what, *_AHEAD) or isinstance(one.what, _PATHS) for one in faults):
+                self.twins[any(acts(one.what, "late_s") for one in faults)][name] = faults
+            if last := [one for one in faults if acts(one.what, "counts")]:
+                self.converters[name] = last
+
+
+def where(
+    one: Active, channel: Channel, n: np.ndarray, times_s: np.ndarray,
+    other: Callable[[str], np.ndarray] | None = None, angle: np.ndarray = NONE, rate: np.ndarray = NONE,
+) -> At:  # fmt: skip
+    """Return where a fault acts on a channel: rows or samples of these numbers and times, shape (n,)."""
+    t = times_s - one.begin / TICKS_HZ
+    return At(t, n, channel, one.draws[channel.name], one.kept, other or no_other, angle, rate, seen_mark)
+
+
+class Volts:
+    """What faulty channels feel, in SI, over some rows: signal faults, range, and faults of cables."""
+
+    def __init__(
+        self, scales: Scales, rows: np.ndarray, made: np.ndarray, tick: int, row_ticks: int, active: Sequence[Active]
+    ) -> None:
+        self.rows, self._made, self._active, self._scales = rows, made, active, scales
+        self._times_s = (tick + row_ticks * np.arange(len(rows))) / TICKS_HZ
+        self._n = tick // row_ticks + np.arange(len(rows))
+
+    def _at(self, one: Active, name: str) -> At:
+        angle, rate = self.rows[:, COLUMN["theta"]], self.rows[:, COLUMN["theta_rate"]]
+        channel = self._scales.channels[name]
+        return where(one, channel, self._n, self._times_s, self._beyond_bias, angle, rate)
+
+    @cached_property
+    def _conditioned(self) -> np.ndarray:
+        """What all conditioners put out, with the faults of transducers [V], shape (rows, channels)."""
+        about = self._scales
+        source = self.rows if about.columns.max(initial=0) < N_ROW else np.hstack([self.rows, self._made])
+        x = np.asfortranarray(source[:, about.columns] / about.si)
+        for one in self._active:
+            if acts(one.what, "signal"):
+                for name in one.names:
+                    column = about.places[name]
+                    x[:, column] = one.what.signal(x[:, column], self._at(one, name))
+        return np.minimum(np.maximum(about.bias_v + about.sensitivity_v * x, about.low_v), about.high_v)
+
+    def _beyond_bias(self, name: str) -> np.ndarray:
+        about = self._scales
+        return self._conditioned[:, about.places[name]] - about.bias_v[about.places[name]]
+
+    def signals(self, names: Sequence[str]) -> np.ndarray:
+        """Return the signals [SI] that give what arrives at the converters' filters, shape (rows, channels)."""
+        about, plugs = self._scales, plugged(self._active)
+        volts = self._conditioned[:, [about.places[plugs.get(name, name)] for name in names]]
+        for one in self._active:
+            if acts(one.what, "volts"):
+                for name in one.names:
+                    if name in names:
+                        column = names.index(name)
+                        volts[:, column] = one.what.volts(volts[:, column], self._at(one, name))
+        own = [about.places[name] for name in names]
+        return (volts - about.bias_v[own]) / about.sensitivity_v[own] * about.si[own]
+
+
+class Scales:
+    """From signals to volts, of all channels of a table, each an array of shape (channels,)."""
+
+    def __init__(self, channels: Mapping[str, Channel], columns: Mapping[str, int]) -> None:
+        self.channels = channels
+        self.places = {name: place for place, name in enumerate(channels)}
+        self.columns = np.array([columns.get(name, 0) for name in channels], dtype=np.int64)
+        fields = ("si", "bias_v", "sensitivity_v")
+        self.si, self.bias_v, self.sensitivity_v = (
+            np.array([getattr(channel, field) for channel in channels.values()]) for field in fields
+        )
+        self.low_v, self.high_v = np.array([channel.range_v for channel in channels.values()]).T
+
+
+def seen_mark(angle: np.ndarray) -> np.ndarray:
+    """What the keyphasor sees of its mark, as rows have it (`rig.physics.kernels.observe`), shape (n,)."""
+    ahead = (angle + math.pi) % (2.0 * math.pi) - math.pi
+    return np.clip(0.5 + np.minimum(ahead, KEYPHASOR_WIDTH - ahead) / EDGE, 0.0, 1.0)
+
+
+def no_other(_: str) -> np.ndarray:
+    """Return nothing: a fault of samples reads no other channel."""
+    return NONE

@@ -1,0 +1,115 @@
+"""Whether a fault can change a count at all: its size against a converter's step, its time against samples.
+
+What is refused could change nothing whatever the signal is. What is taken may still find a signal that does not move.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from rig.base.errors import InputError
+from rig.channels.faults.blocks import StaleStamps
+from rig.channels.faults.kind import Draws, Kind
+from rig.channels.sampling import TICKS_HZ, first_row
+
+if TYPE_CHECKING:
+    from rig.channels.table import Channel
+
+_LONGEST_S = 86_400.0
+"""How long a fault lasts that has no end: the longest `for_s`."""
+_MAX_PLACES = 200_000
+"""Draws of a random fault that are looked at: 10 s of samples at 20 kHz."""
+_ROUNDED = 1.05
+"""The smallest size is rounded to as few digits as keep its effect below so many steps."""
+_MAX_FACTOR = 1e40
+"""Largest factor by which a size is raised in search of one that is enough."""
+
+
+def check_time(what: Kind, rate_hz: int, tick: int, row_ticks: int, for_s: float | None) -> None:
+    """Refuse a fault that ends before the first sample that it would change.
+
+    Args:
+        what: The fault.
+        rate_hz: Samples a second.
+        tick: Tick of the command.
+        row_ticks: Ticks between rows of the model, on which faults begin and end.
+        for_s: How long it lasts [s]; None: until it is cleared.
+
+    Raises:
+        InputError: It ends too soon; the message has the shortest time.
+    """
+    if for_s is None:
+        return
+    begin = -(-tick // row_ticks) * row_ticks
+    sample = -(-first_row(begin, rate_hz) * TICKS_HZ // rate_hz)
+    if isinstance(what, StaleStamps):  # its first block has the right time
+        sample = begin + what.ticks
+    needed = sample // row_ticks * row_ticks + 1 - tick
+    if max(1, round(for_s * TICKS_HZ)) < needed:
+        raise InputError("for_s", f"at least {needed / TICKS_HZ:g}, to reach a sample at {rate_hz} Hz", for_s)
+
+
+def check_size(what: Kind, channel: Channel, source: Channel | None, for_s: float | None) -> None:
+    """Refuse a fault whose largest effect stays below one step of a channel's converter.
+
+    Args:
+        what: The fault.
+        channel: The channel.
+        source: The channel that it takes a signal of.
+        for_s: How long it lasts [s]; None: until it is cleared.
+
+    Raises:
+        InputError: It is too small; the message has the smallest size that is enough.
+    """
+    lasts_s = _LONGEST_S if for_s is None else for_s
+
+    def reach(other: Kind) -> float:
+        """Largest change [steps of the converter]."""
+        return other.reach_v(channel, lasts_s, source or channel) / channel.lsb_v
+
+    if reach(what) >= 1.0:
+        return
+    low, high = 0.0, math.log(_MAX_FACTOR)
+    for _ in range(80):
+        middle = 0.5 * (low + high)
+        low, high = (low, middle) if reach(what.times(math.exp(middle))) >= 1.0 else (middle, high)
+    name = what.sized or what.main()
+    size = getattr(what.times(math.exp(high)), name)
+    rounded = (float(f"{size:.{digits}g}") for digits in range(1, 17))
+    size = next((one for one in rounded if 1.0 <= reach(what.model_copy(update={name: one})) < _ROUNDED), size)
+    bound = f"{size!r} to change a count of {channel.name}, whose converter's step is {channel.lsb_v:.3g} V"
+    raise InputError(name, f"at {'least' if size > getattr(what, name) else 'most'} {bound}", getattr(what, name))
+
+
+def check_draws(what: Kind, rate_hz: int, row: int, tick: int, for_s: float | None, draws: Draws) -> None:
+    """Refuse a random fault none of whose draws would meet a sample, slot, block or turn.
+
+    Args:
+        what: The fault.
+        rate_hz: Samples a second.
+        row: Number of its first sample.
+        tick: Tick of the command.
+        for_s: How long it lasts [s]; None: until it is cleared.
+        draws: Its numbers.
+
+    Raises:
+        InputError: None is met; the message has the number above which one is.
+    """
+    if (chance := what.chance(rate_hz)) is None:
+        return
+    field, per_unit, every_s = chance
+    lasts_s = _LONGEST_S if for_s is None else for_s
+    # Turns are counted from the begin of the run.
+    first, lasts_s = (
+        (0, lasts_s + tick / TICKS_HZ) if what.channel_only else (row if field == "rate_hz" else 0, lasts_s)
+    )
+    places = first + np.arange(min(_MAX_PLACES, math.ceil(lasts_s / every_s) + 1))
+    value = getattr(what, field)
+    for some in (places[:1000], places):
+        least = float(draws.uniform(some)[:, 0].min()) / per_unit
+        if least < value:
+            return
+    raise InputError(field, f"above {least:.3g} to happen once in the {len(places)} places that were drawn", value)

@@ -1,0 +1,459 @@
+"""Test signals: what a scene's `[generator]` puts on the channels in place of the physics.
+
+A generator is a calibrator at the converter's input: its volts are worked out at the very instants of the samples,
+without rows of the model, sensor, range, anti-alias filter or AC coupling. The channel's noise (where the scene has
+noise on) is added, and its converter rounds and limits. Volts of a channel are
+
+    v(t) = bias_v + offset + amplitude w(t - delay)
+
+with `w` of one of the `KINDS` below, at most 1 in size; amplitude and offset in volts (`amplitude_v`, `offset_v`) or
+in the channel's own unit. Channels differ by `[generator.channels.NAME]`. Time is split into whole seconds and the
+rest, and frequencies are taken as the decimal fractions that they are written as: phases are as exact after hours as
+at the start, and depend on the instant alone. What jumps has jumped at an instant that is within 1e-9 of its period.
+
+Where the scene has a `drive.speed_hz`, the shaft's nominal turns are told by the exact edges and by the channels that
+feel `keyphasor` (a pulse over the first 10 degrees) and `spin_rate`; without, these channels are as all others.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from functools import cache
+from pathlib import Path
+from typing import Annotated, Any, Literal, NamedTuple
+
+import numpy as np
+from pydantic import Field, field_validator
+
+from rig.base.errors import InputError, UnknownNameError, Words
+from rig.base.outside import Written
+from rig.channels.table import Channel, ChannelTable
+from rig.channels.waveform import Waveform, exact, read_waveform
+
+_WRAP = 1e-11
+"""Parts of a period that a phase may lack of the whole by rounding."""
+_EDGE = 1e-9
+"""Parts of a step or chip by which an instant may lie before an edge and still be behind it."""
+_TURNED = Fraction(10, 360)
+"""Part of a period that a pulse lasts: as the mark of the keyphasor."""
+_MOST_TONES, _FINEST = 256, 4096
+"""Most tones, and how far the highest may be above what all are multiples of."""
+
+_Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+_Hz = Annotated[_Number, Field(ge=1e-6, le=1e6)]
+_Kind = Literal["sine", "two-tone", "chirp", "step", "pulse", "prbs", "multisine", "ramp", "quiet", "recorded"]
+
+
+class Instants(NamedTuple):
+    """Instants as whole seconds, int64, and the rest, from 0 to 1 s, both shape (n,)."""
+
+    whole: np.ndarray
+    rest: np.ndarray
+
+    @classmethod
+    def of_samples(cls, index: np.ndarray, rate_hz: int) -> Instants:
+        """Those of the samples of a rate, by their number."""
+        whole, rest = np.divmod(index, rate_hz)
+        return cls(whole, rest / rate_hz)
+
+    @classmethod
+    def of_times(cls, times_s: np.ndarray) -> Instants:
+        """Any [s]."""
+        whole = np.floor(times_s)
+        return cls(whole.astype(np.int64), times_s - whole)
+
+    def later(self, delay_s: float | np.ndarray) -> Instants:
+        """The same of a clock that is behind by so much, each by its own where it is an array, shape (n,)."""
+        rest = self.rest - delay_s
+        carry = np.floor(rest)
+        return Instants(self.whole + carry.astype(np.int64), rest - carry)
+
+    def cycles(self, frequency: Fraction, ahead: float = 0.0) -> np.ndarray:
+        """Parts of a period since the last whole one, from 0 to 1, shape (n,).
+
+        Args:
+            frequency: Periods a second [Hz].
+            ahead: At time zero.
+        """
+        if not len(self.whole):
+            return np.empty(0)
+        first = int(self.whole.min())
+        begun = np.array([float(frequency * second % 1) for second in range(first, int(self.whole.max()) + 1)])
+        turns = begun[self.whole - first] + float(frequency) * self.rest + ahead
+        turns -= np.floor(turns)
+        turns[turns > 1.0 - _WRAP] = 0.0
+        return turns
+
+
+class Signal(Written):
+    """What a generator makes; of a channel, what is different there. What is left out is the kind's own, or 0."""
+
+    kind: _Kind | None = None
+    amplitude: Annotated[_Number, Field(ge=-1e9, le=1e9)] | None = None
+    """Peak, in the channel's unit."""
+    amplitude_v: Annotated[_Number, Field(ge=-1e3, le=1e3)] | None = None
+    """Peak [V]; of a ramp, left out, up to the ends of the converter."""
+    offset: Annotated[_Number, Field(ge=-1e9, le=1e9)] | None = None
+    """Middle, in the channel's unit, from the value that the channel has at its bias: zero."""
+    offset_v: Annotated[_Number, Field(ge=-1e3, le=1e3)] | None = None
+    """The same [V], from the bias."""
+    phase_deg: Annotated[_Number, Field(ge=-360.0, le=360.0)] | None = None
+    """Ahead by so much of a period, a sweep or a sequence (of a PRBS, to the next whole chip) [degrees]."""
+    delay_us: Annotated[_Number, Field(ge=-1e6, le=1e6)] | None = None
+    """Later by so much [us]."""
+    frequency_hz: _Hz | None = None
+    """Of a sine or pulses; chips a second of a PRBS [Hz]."""
+    frequencies: Annotated[tuple[_Hz, ...], Field(min_length=2, max_length=_MOST_TONES)] | None = None
+    """Of the tones; from where to where a chirp goes [Hz]."""
+    period_s: Annotated[_Number, Field(ge=1e-5, le=1000.0)] | None = None
+    """Of steps up and down, of a ramp, of a sweep [s]."""
+    order: Annotated[int, Field(ge=3, le=20)] | None = None
+    """Length of the shift register: a PRBS has 2^order - 1 chips."""
+    seed: Annotated[int, Field(ge=1, lt=2**20)] | None = None
+    """What the shift register starts from."""
+    crest: Annotated[_Number, Field(ge=1.0, le=30.0)] | None = None
+    """Peak over RMS; left out, that of Schroeder's phases."""
+
+
+class Generator(Signal):
+    """The signal of all channels, and what is different of some."""
+
+    apart: bool = False
+    """Channels begin evenly spread over a period, so that each is told from the others."""
+    file: Waveform | None = None
+    """CSV file as `rig export` writes it, of kind recorded."""
+    channels: dict[str, Signal] = Field(default={})
+
+    @field_validator("file", mode="before")
+    @classmethod
+    def _read(cls, file: Any) -> Any:
+        return read_waveform(Path(file)) if isinstance(file, str | Path) else file
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """What stands at the converter of one channel.
+
+    Attributes:
+        channel: The channel.
+        signal: With all that its kind takes.
+        amplitude_v: Peak [V].
+        middle_v: Bias and offset [V].
+        ahead: At time zero, in periods.
+        waveform: What is played, in the channel's unit; None but for kind recorded.
+    """
+
+    channel: Channel
+    signal: Signal
+    amplitude_v: float
+    middle_v: float
+    ahead: float
+    waveform: tuple[Fraction, np.ndarray] | None = None
+
+    @property
+    def largest_v(self) -> float:
+        """How far it goes from 0 V [V]."""
+        top = 1.0 if self.waveform is None else max(map(abs, self.waveform[1][3].tolist()))
+        return abs(self.middle_v) + abs(self.amplitude_v) * (top if self.signal.kind != "quiet" else 0.0)
+
+    @property
+    def wave(self) -> tuple[Any, ...]:
+        """What is alike where the wave is."""
+        signal = self.signal
+        differing = {"amplitude", "amplitude_v", "offset", "offset_v", "phase_deg", "delay_us"}
+        shape = () if self.waveform is None else (self.channel.name,)
+        return (signal.model_dump_json(exclude=differing), signal.delay_us, self.ahead, *shape)
+
+    def shape(self, instants: Instants) -> np.ndarray:
+        """The wave w, shape (n,)."""
+        signal = self.signal
+        return KINDS[signal.kind or "quiet"].wave(self, instants.later((signal.delay_us or 0.0) * 1e-6))
+
+    def volts(self, times_s: np.ndarray) -> np.ndarray:
+        """At the converter, before noise, and beyond its limits too [V], shape (n,).
+
+        Args:
+            times_s: Instants [s], shape (n,).
+        """
+        return self.at(self.shape(Instants.of_times(np.asarray(times_s, float))))
+
+    def at(self, shape: np.ndarray) -> np.ndarray:
+        """Volts of a wave [V]."""
+        return self.middle_v + self.amplitude_v * shape
+
+
+def _sine(source: Source, instants: Instants) -> np.ndarray:
+    """Sine: w = sin(2 pi (f t + phase/360))."""
+    return np.sin(2.0 * np.pi * instants.cycles(_frequency(source), source.ahead))
+
+
+def _two_tone(source: Source, instants: Instants) -> np.ndarray:
+    """Two tones: w = (sin(2 pi (f1 t + phase/360)) + sin(2 pi (f2 t + phase/360))) / 2, 1 at most."""
+    tones = [instants.cycles(exact(hz), source.ahead) for hz in source.signal.frequencies or ()]
+    return np.sum([0.5 * np.sin(2.0 * np.pi * turns) for turns in tones], axis=0)
+
+
+def _chirp(source: Source, instants: Instants) -> np.ndarray:
+    """Chirp: w = sin(2 pi (f1 s + (f2 - f1) s^2 / (2 T))), s = t mod T: linear from f1 to f2, again and again."""
+    low, high = source.signal.frequencies or (0.0, 0.0)
+    part, period_s = instants.cycles(1 / _period(source), source.ahead), float(_period(source))
+    turns = period_s * part * (low + 0.5 * (high - low) * part)
+    return np.sin(2.0 * np.pi * (turns - np.floor(turns)))
+
+
+def _step(source: Source, instants: Instants) -> np.ndarray:
+    """Steps: w = -1 in the first half of each period, 1 in the second."""
+    return np.where(np.floor(2.0 * instants.cycles(1 / _period(source), source.ahead) + _EDGE) == 1.0, 1.0, -1.0)
+
+
+def _pulse(source: Source, instants: Instants) -> np.ndarray:
+    """Pulses: w = 1 in the first 10/360 of each period, else 0."""
+    return np.where(instants.cycles(_frequency(source), source.ahead) + _EDGE < float(_TURNED), 1.0, 0.0)
+
+
+def _prbs(source: Source, instants: Instants) -> np.ndarray:
+    """Pseudo-random binary sequence: w = 1 or -1, chip floor(f t) of 2^order - 1, again and again (see `chips`)."""
+    sequence = chips(source.signal.order or 0, source.signal.seed or 1)
+    length = len(sequence)
+    turns = instants.cycles(_frequency(source) / length, round(source.ahead * length) / length)
+    return sequence[np.floor(turns * length + _EDGE).astype(np.int64) % length]
+
+
+def _multisine(source: Source, instants: Instants) -> np.ndarray:
+    """Multisine: w = sum cos(2 pi (f_k t + phase/360) - s pi k^2 / N) / peak, k = 0..N-1, s by the crest factor."""
+    frequencies = source.signal.frequencies or ()
+    phases, peak = multisine_phases(frequencies, source.signal.crest)
+    total = np.zeros(len(instants.whole))
+    for hz, phase in zip(frequencies, phases.tolist(), strict=True):
+        total += np.cos(2.0 * np.pi * instants.cycles(exact(hz), source.ahead) + phase)
+    return total / peak
+
+
+def _ramp(source: Source, instants: Instants) -> np.ndarray:
+    """Ramp: w = 2 ((t/T) mod 1) - 1: every code of the converter in turn, where no amplitude is given."""
+    return 2.0 * instants.cycles(1 / _period(source), source.ahead) - 1.0
+
+
+def _quiet(source: Source, instants: Instants) -> np.ndarray:
+    """Nothing: w = 0: bias, offset and noise alone."""
+    return np.zeros(len(instants.whole))
+
+
+def _recorded(source: Source, instants: Instants) -> np.ndarray:
+    """Recording: w = periodic cubic spline through the waveform's values, in the channel's unit, again and again."""
+    assert source.waveform is not None
+    period, pieces = source.waveform
+    rows = pieces.shape[1]
+    place = instants.cycles(1 / period, source.ahead) * rows
+    piece = np.minimum(place.astype(np.int64), rows - 1)
+    past, (a, b, c, d) = place - piece, pieces[:, piece]
+    return ((a * past + b) * past + c) * past + d
+
+
+class Kind(NamedTuple):
+    """One kind of signal: its wave, what it needs, and what it takes beside phase, delay and offset."""
+
+    wave: Callable[[Source, Instants], np.ndarray]
+    needs: tuple[str, ...] = ()
+    takes: tuple[str, ...] = ()
+    amplitude: bool | None = True
+    """Has to be given; None: may be; False: must not be."""
+
+
+KINDS: dict[str, Kind] = {
+    "sine": Kind(_sine, ("frequency_hz",)),
+    "two-tone": Kind(_two_tone, ("frequencies",)),
+    "chirp": Kind(_chirp, ("frequencies", "period_s")),
+    "step": Kind(_step, ("period_s",)),
+    "pulse": Kind(_pulse, ("frequency_hz",)),
+    "prbs": Kind(_prbs, ("frequency_hz", "order"), ("seed",)),
+    "multisine": Kind(_multisine, ("frequencies",), ("crest",)),
+    "ramp": Kind(_ramp, ("period_s",), amplitude=None),
+    "quiet": Kind(_quiet, amplitude=False),
+    "recorded": Kind(_recorded, amplitude=False),
+}
+"""All kinds by name: the equation of each is that of its wave."""
+_OFFSETS, _AMPLITUDES, _SHIFTS = ("offset", "offset_v"), ("amplitude", "amplitude_v"), ("phase_deg", "delay_us")
+
+
+def sources(generator: Generator, table: ChannelTable, speed_hz: float = 0.0) -> dict[str, Source]:
+    """What stands at the converter of every channel.
+
+    Args:
+        generator: Of the scene.
+        table: All its channels.
+        speed_hz: Nominal speed [Hz]; 0: none is told.
+
+    Raises:
+        InputError: The first thing that is wrong in the generator.
+    """
+    for name in generator.channels:
+        if name not in table.channels:
+            raise UnknownNameError("generator.channels", "names of channels", name, table.channels)
+    recorded = "recorded" in (generator.kind, *(own.kind for own in generator.channels.values()))
+    if (generator.file is not None) != recorded:
+        received = None if recorded else Words(f"one with kind {generator.kind}")
+        raise InputError("generator.file", "given with kind recorded, and with no other", received)
+    return {
+        name: _source(generator, channel, number / len(table.channels), speed_hz)
+        for number, (name, channel) in enumerate(table.channels.items())
+    }
+
+
+def _source(generator: Generator, channel: Channel, place: float, speed_hz: float) -> Source:
+    own = generator.channels.get(channel.name)
+    if own is None and speed_hz > 0.0:
+        if channel.signal == "keyphasor":
+            generator = Generator(kind="pulse", frequency_hz=speed_hz, amplitude=1.0 / channel.si)
+        elif channel.signal == "spin_rate":
+            generator = Generator(kind="quiet", offset=2.0 * math.pi * speed_hz / channel.si)
+    signal = _checked(generator, {}, generator.kind, "generator")
+    if own is not None:
+        signal = _checked(own, signal, own.kind or generator.kind, f"generator.channels.{channel.name}")
+    made = Signal(**signal)
+    field = "generator" if own is None else f"generator.channels.{channel.name}"
+    _check_rate(made, channel, field)
+    gain, ahead = channel.sensitivity_v, (made.phase_deg or 0.0) / 360.0 + (place if generator.apart else 0.0)
+    offset_v = made.offset_v if made.offset_v is not None else (made.offset or 0.0) * gain
+    peak_v = made.amplitude_v if made.amplitude_v is not None else (made.amplitude or 0.0) * gain
+    found = Source(channel, made, peak_v, channel.bias_v + offset_v, ahead)
+    if made.kind == "ramp" and not {*_AMPLITUDES} & {*signal}:
+        found = replace(found, amplitude_v=channel.adc_v, middle_v=offset_v)
+    if made.kind == "recorded":
+        file = generator.file
+        if file is None or file.units.get(channel.name) != channel.unit:
+            must = f"with a column `{channel.name} [{channel.unit}]` (or another kind for this channel)"
+            raise InputError("generator.file", must, sorted(file.values) if file else None)
+        found = replace(found, amplitude_v=gain, waveform=(file.period, file.spline(channel.name)))
+    return found
+
+
+def _checked(given: Signal, base: dict[str, Any], kind: str | None, field: str) -> dict[str, Any]:
+    """The fields of a signal over those of another: of this, what the kind takes.
+
+    Raises:
+        InputError: A field that the kind does not take, or lacks, or one told twice.
+    """
+    if kind is None:
+        raise InputError(f"{field}.kind", f"one of {', '.join(KINDS)}", None)
+    rule = KINDS[kind]
+    takes = {*rule.needs, *rule.takes, *_OFFSETS, *(_AMPLITUDES if rule.amplitude is not False else ())}
+    takes |= {*_SHIFTS} if kind != "quiet" else set()
+    own = {name: value for name in Signal.model_fields if (value := getattr(given, name)) is not None}
+    for name in own:
+        if name != "kind" and name not in takes:
+            raise InputError(f"{field}.{name}", f"left out with kind {kind}", own[name])
+    for pair in (_OFFSETS, _AMPLITUDES):
+        if {*pair} <= {*own}:
+            raise InputError(f"{field}.{pair[0]}", f"left out where {pair[1]} is given", own[pair[0]])
+    told_anew = {name for pair in (_OFFSETS, _AMPLITUDES) if {*pair} & {*own} for name in pair}
+    found = {name: value for name, value in base.items() if name in takes - told_anew} | own | {"kind": kind}
+    for name in (*rule.needs, *(("amplitude_v",) if rule.amplitude and not {*_AMPLITUDES} & {*found} else ())):
+        if name not in found:
+            raise InputError(f"{field}.{name}", f"given with kind {kind}", None)
+    if kind in ("two-tone", "chirp") and len(found["frequencies"]) != 2:
+        raise InputError(f"{field}.frequencies", f"two with kind {kind}", list(found["frequencies"]))
+    if kind == "multisine":
+        try:
+            multisine_phases(found["frequencies"], found.get("crest"))
+        except InputError as error:
+            raise InputError(f"{field}.{error.field}", error.must, error.received) from None
+    return found
+
+
+def _check_rate(signal: Signal, channel: Channel, field: str) -> None:
+    """Refuse what the channel's rate cannot show: no filter stands before the converter."""
+    for name in ("frequency_hz", "frequencies", "period_s"):
+        value = getattr(signal, name)
+        if value is None:
+            continue
+        highest = 1.0 / value if name == "period_s" else max(value if isinstance(value, tuple) else (value,))
+        # Chips are as long as a sample at the least.
+        most = channel.rate_hz / (1.0 if signal.kind == "prbs" else 2.0)
+        if highest > most or (highest == most and signal.kind != "prbs"):
+            must = f"at most {most:g} Hz" if signal.kind == "prbs" else f"below {most:g} Hz, half of the rate"
+            raise InputError(f"{field}.{name}", f"{must} of {channel.name}, before whose converter is no filter", value)
+
+
+def _frequency(source: Source) -> Fraction:
+    return exact(source.signal.frequency_hz or 1.0)
+
+
+def _period(source: Source) -> Fraction:
+    return exact(source.signal.period_s or 1.0)
+
+
+_TAPS = {
+    3: 2, 4: 3, 5: 3, 6: 5, 7: 6, 8: (6, 5, 4), 9: 5, 10: 7, 11: 9, 12: (11, 10, 4), 13: (12, 11, 8),
+    14: (13, 12, 2), 15: 14, 16: (15, 13, 4), 17: 14, 18: 11, 19: (18, 17, 14), 20: 17,
+}  # fmt: skip
+"""Taps beside the last one: primitive polynomials (P. Alfke, Xilinx XAPP052, 1996, and older tables)."""
+
+
+@cache
+def chips(order: int, seed: int) -> np.ndarray:
+    """One period of the sequence of a shift register: 1 and -1, shape (2^order - 1,).
+
+    The register starts as the seed's lowest bits (1 where these are all zero); each chip is its last bit, and what is
+    shifted in is the sum modulo 2 of its taps.
+    """
+    length, taps = 2**order - 1, _TAPS[order]
+    taken = [order, *(taps if isinstance(taps, tuple) else (taps,))]
+    register, found = seed & length or 1, np.empty(length)
+    for n in range(length):
+        found[n] = 2 * (register >> (order - 1)) - 1
+        bit = 0
+        for tap in taken:
+            bit ^= register >> (tap - 1)
+        register = (register << 1 | bit & 1) & length
+    found.flags.writeable = False
+    return found
+
+
+@cache
+def multisine_phases(frequencies: tuple[float, ...], crest: float | None) -> tuple[np.ndarray, float]:
+    """Phases of cosines of one size that together have a crest factor, and the peak of their sum.
+
+    Schroeder's phases (IEEE Trans. Inf. Theory 16(1), 1970) times s: from s = 1 to s = 0, where all cosines are 1
+    together, the crest factor goes from about 1.7 to sqrt(2 N); by halving, s is found.
+
+    Args:
+        frequencies: [Hz]
+        crest: Asked for; None: that of Schroeder's phases.
+
+    Raises:
+        InputError: No s has that crest factor, or the frequencies have no common measure that is near them.
+    """
+    exactly = [exact(hz) for hz in frequencies]
+    scale = math.lcm(*(hz.denominator for hz in exactly))
+    base = Fraction(math.gcd(*(int(hz * scale) for hz in exactly)), scale)
+    lines = [int(hz / base) for hz in exactly]
+    if len(set(lines)) < len(lines) or max(lines) > _FINEST:
+        must = f"different multiples of one that the highest has at most {_FINEST} of"
+        raise InputError("frequencies", must, list(frequencies))
+    n = len(lines)
+    schroeder = -math.pi * np.arange(n) ** 2 / n
+    points = 1 << (64 * max(lines)).bit_length()
+
+    def peak(s: float) -> float:
+        spectrum = np.zeros(points // 2 + 1, complex)
+        spectrum[lines] = 0.5 * points * np.exp(1j * s * schroeder)
+        size = np.abs(np.fft.irfft(spectrum))
+        top = int(np.argmax(size))
+        before, at, behind = size[top - 1], size[top], size[(top + 1) % points]
+        bend = before - 2.0 * at + behind  # the parabola through the three highest points
+        return float(at - (behind - before) ** 2 / (8.0 * bend)) if bend else float(at)
+
+    rms = math.sqrt(0.5 * n)
+    s, least, most = 1.0, peak(1.0) / rms, math.sqrt(2.0 * n)
+    if crest is not None:
+        if not least * (1.0 - 1e-6) <= crest <= most * (1.0 + 1e-6):
+            raise InputError("crest", f"from {least:.4g} to {most:.4g} with these frequencies", crest)
+        low, high = 0.0, 1.0
+        for _ in range(40):
+            s = 0.5 * (low + high)
+            low, high = (s, high) if peak(s) / rms > crest else (low, s)
+    return s * schroeder, peak(s)

@@ -1,0 +1,240 @@
+"""Figures of an orbit, read off samples of it: how often it goes round, in which sense, and its two-sided spectrum.
+
+One definition of each, for recordings and simulations, predictions and live views. An orbit is z = x + j y; forward is
+with the spin, from x to y, and positive; backward is negative. Lengths keep the unit of x and y. Samples come first,
+then when they were: `rate_hz`, `times_s`, `edges_s`, in this order.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rig.base.errors import InputError, Words
+
+SPECTRUM_HZ = 200.0
+"""Spectra are shown up to this frequency, to both sides: the rig whirls below 130 Hz."""
+_LAG_S = 1e-3
+_TURN_SAMPLES = 8
+_TURN_HOLE = 0.25
+"""Part of a turn without samples from which on nothing is fitted to it."""
+_INSTANTS = ("times_s", "edges_s")
+
+
+def phase(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Angle of x + j y about the origin, without jumps [rad], shape (n,)."""
+    return np.unwrap(np.arctan2(y, x))
+
+
+def whirl_frequency(x: ArrayLike, y: ArrayLike, times_s: ArrayLike, *, about: complex | None = None) -> float:
+    """Slope of the phase of x + j y about a centre [Hz]; forward is positive.
+
+    Unlike the bin of a spectrum this has no resolution limit; the orbit must go round the centre.
+
+    Args:
+        x: Horizontal, shape (n,).
+        y: Vertical, shape (n,).
+        times_s: Times [s], ascending, shape (n,).
+        about: The centre, in the unit of x; None: the orbit's own mean.
+
+    Raises:
+        InputError: These are no rows of numbers of one length, with two samples at least.
+
+    Example:
+        >>> times_s = np.arange(2000) / 20_000.0
+        >>> angle = -2.0 * np.pi * 81.7 * times_s
+        >>> round(whirl_frequency(np.cos(angle), np.sin(angle), times_s), 1)  # backward
+        -81.7
+    """
+    x, y, times_s = _rows(x=x, y=y, times_s=times_s, at_least=2)
+    centre = complex(x.mean(), y.mean()) if about is None else about
+    angle = phase(x - centre.real, y - centre.imag)
+    return float(np.polyfit(times_s - times_s[0], angle, 1)[0] / (2.0 * math.pi))
+
+
+def mean_rotation(x: np.ndarray, y: np.ndarray, rate_hz: float) -> float:
+    """Mean rotation of x + j y about its mean [Hz], weighted by the square of the radius; 0 of less than 2 ms.
+
+    For an orbit that may be as small as the probes' noise, where a phase would jump. The phase is advanced over 1 ms:
+    short against any whirl of the rig (unambiguous to +-500 Hz), long against the correlation time of that noise, which
+    would otherwise pull the slope of a small orbit towards zero.
+
+    Args:
+        x: Horizontal, shape (n,).
+        y: Vertical, shape (n,).
+        rate_hz: Samples per second [Hz].
+    """
+    lag = max(1, round(_LAG_S * rate_hz))
+    if len(x) < 2 * lag:
+        return 0.0
+    turning = _centred(x, y)
+    advance = np.vdot(turning[:-lag], turning[lag:])
+    return math.atan2(advance.imag, advance.real) * rate_hz / (2.0 * math.pi * lag)
+
+
+def rms_radius(x: np.ndarray, y: np.ndarray) -> float:
+    """Root mean square distance of the orbit from its own mean, in the unit of x."""
+    return float(np.sqrt(np.mean(np.abs(_centred(x, y)) ** 2)))
+
+
+def full_spectrum(
+    x: ArrayLike, y: ArrayLike, rate_hz: float, *, lines: int | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Two-sided spectrum: the amplitude of each circular component of x + j y about its centre.
+
+    Hann window over all samples, scaled so that a steady whirl of radius r has its peak at r.
+
+    Args:
+        x: Horizontal, shape (n,).
+        y: Vertical, shape (n,).
+        rate_hz: Sample rate [Hz].
+        lines: Number of lines, at least n: the samples are padded with zeros, so that lines stand closer. None: n.
+
+    Returns:
+        Frequencies [Hz], ascending, and amplitudes in the unit of x, each shape (lines,).
+
+    Raises:
+        InputError: These are no rows of numbers of one length, or the rate or the lines are none.
+
+    Example:
+        >>> angle = -2.0 * np.pi * 80.0 * np.arange(2000) / 20_000.0
+        >>> frequency, amplitude = full_spectrum(0.9 * np.cos(angle), 0.9 * np.sin(angle), 20_000.0)
+        >>> f"{amplitude.max():.2f} at {frequency[amplitude.argmax()]:.0f} Hz"
+        '0.90 at -80 Hz'
+    """
+    x, y = _rows(x=x, y=y)
+    _check_positive(rate_hz=rate_hz)
+    count = len(x) if lines is None else lines
+    if not isinstance(count, int | np.integer) or count < len(x):
+        raise InputError("lines", f"a whole number of at least the {len(x)} samples", lines)
+    orbit = x + 1j * y
+    # Without its zeros at both ends, which would leave two samples out.
+    window = np.hanning(len(orbit) + 2)[1:-1]
+    total = window.sum()
+    # The plain mean of an unfinished revolution is not zero: taking it off would put a line at 0 Hz.
+    centre = np.dot(window, orbit) / total
+    amplitude = np.abs(np.fft.fftshift(np.fft.fft((orbit - centre) * window, n=count))) / total
+    return np.fft.fftshift(np.fft.fftfreq(count, 1.0 / rate_hz)), amplitude
+
+
+def waterfall(
+    x: ArrayLike, y: ArrayLike, rate_hz: float, times_s: ArrayLike, *, window_s: float = 0.5, hop_s: float = 0.1
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Full spectra over time, up to `SPECTRUM_HZ`.
+
+    Args:
+        x: Horizontal, shape (n,).
+        y: Vertical, shape (n,).
+        rate_hz: Sample rate [Hz].
+        times_s: Times [s], ascending, shape (n,).
+        window_s: Length of a window [s].
+        hop_s: From one window to the next [s].
+
+    Returns:
+        Times of the windows' centres [s], shape (t,); frequencies [Hz], shape (f,); amplitudes in the unit of x, shape
+        (t, f).
+
+    Raises:
+        InputError: As of `full_spectrum`.
+
+    Example:
+        >>> times_s = np.arange(4000) / 2000.0
+        >>> angle = 2.0 * np.pi * 10.0 * times_s * times_s  # from standstill to 40 Hz, forward
+        >>> at_s, frequency, amplitude = waterfall(np.cos(angle), np.sin(angle), 2000.0, times_s)
+        >>> [f"{at:.2f} s: {frequency[row.argmax()]:.0f} Hz" for at, row in zip(at_s, amplitude)][::7]
+        ['0.25 s: 4 Hz', '0.95 s: 18 Hz', '1.65 s: 32 Hz']
+    """
+    x, y, times_s = _rows(x=x, y=y, times_s=times_s)
+    _check_positive(rate_hz=rate_hz, window_s=window_s, hop_s=hop_s)
+    size, hop = (max(1, round(each * rate_hz)) for each in (window_s, hop_s))
+    starts = range(0, max(1, len(x) - size + 1), hop)
+    spectra = [full_spectrum(x[s : s + size], y[s : s + size], rate_hz) for s in starts]
+    frequency = spectra[0][0]
+    near = np.abs(frequency) <= SPECTRUM_HZ
+    centres = np.array([times_s[min(s + size // 2, len(x) - 1)] for s in starts])
+    return centres, frequency[near], np.array([amplitude[near] for _, amplitude in spectra])
+
+
+def synchronous(values: ArrayLike, times_s: ArrayLike, edges_s: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    """What of a signal goes once around with the shaft, turn by turn: what a Bode plot of a run-up shows.
+
+    Fitted to each turn with its mean, so that a turn of no whole number of samples does as well.
+
+    Args:
+        values: A signal, such as one probe, shape (n,).
+        times_s: Times [s], ascending, shape (n,).
+        edges_s: Keyphasor edges [s], ascending, shape (edges,).
+
+    Returns:
+        Speed of each turn between two edges [Hz], and as one complex number the signal's amplitude in it (`np.abs`, in
+        the unit of the values) with its phase from the edge on (`np.angle` [rad]; negative lags), each shape (turns,);
+        turns with fewer than 8 samples, or with none in a quarter of it, are left out.
+
+    Raises:
+        InputError: These are no rows of numbers, or values and times of different lengths.
+
+    Example:
+        >>> times_s = np.arange(4000) / 2000.0
+        >>> lags = 1.5 + 0.3 * np.cos(2.0 * np.pi * 8.0 * times_s - 0.5)
+        >>> speed_hz, vector = synchronous(lags, times_s, np.arange(0.0, 2.0, 0.125))
+        >>> f"{speed_hz[0]:.1f} Hz: {abs(vector[0]):.3f} at {np.angle(vector[0]):.3f} rad"
+        '8.0 Hz: 0.300 at -0.500 rad'
+    """
+    values, times_s = _rows(values=values, times_s=times_s)
+    (edges_s,) = _rows(edges_s=edges_s, at_least=0)
+    places = np.searchsorted(times_s, edges_s)
+    speeds, vectors = [], []
+    for first, last, begin_s, end_s in zip(places, places[1:], edges_s, edges_s[1:], strict=False):
+        turns = (times_s[first:last] - begin_s) / (end_s - begin_s)
+        if len(turns) >= _TURN_SAMPLES and np.diff(turns, append=turns[0] + 1.0).max() < _TURN_HOLE:
+            angle = 2.0 * math.pi * turns
+            parts = np.stack([np.cos(angle), np.sin(angle), np.ones_like(angle)], axis=1)
+            (cosine, sine, _), *_ = np.linalg.lstsq(parts, values[first:last])
+            speeds.append(1.0 / (end_s - begin_s))
+            vectors.append(complex(cosine, -sine))
+    return np.array(speeds), np.array(vectors, dtype=complex)
+
+
+def _rows(*, at_least: int = 1, **given: ArrayLike) -> list[np.ndarray]:
+    """Rows of finite numbers of one length as float64, each shape (n,), instants ascending.
+
+    Raises:
+        InputError: They are not.
+    """
+    rows: list[np.ndarray] = []
+    for name, values in given.items():
+        try:
+            row = np.asarray(values)
+        except ValueError:  # lists of unlike lengths
+            raise InputError(name, "one row of numbers", Words("rows of unlike lengths")) from None
+        if row.ndim != 1 or row.dtype.kind not in "iuf":
+            raise InputError(name, "one row of numbers", Words(f"{row.dtype} of shape {row.shape}"))
+        if len(row) < at_least:
+            raise InputError(name, f"a row of at least {at_least}", Words(f"{len(row)}"))
+        if not np.isfinite(row).all():
+            raise InputError(name, "finite numbers", Words(f"{np.sum(~np.isfinite(row))} that are not"))
+        if rows and len(row) != len(rows[0]):
+            raise InputError(name, f"as long as {next(iter(given))}, {len(rows[0])}", Words(f"{len(row)}"))
+        if name in _INSTANTS and (np.diff(row) <= 0.0).any():
+            raise InputError(name, "ascending", Words("instants that are not"))
+        rows.append(row.astype(float))
+    return rows
+
+
+def _check_positive(**given: float) -> None:
+    """See that each is a number greater than 0.
+
+    Raises:
+        InputError: It is not.
+    """
+    for name, value in given.items():
+        if not isinstance(value, int | float | np.integer | np.floating) or not 0.0 < value < math.inf:
+            raise InputError(name, "a number greater than 0", value)
+
+
+def _centred(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """X + j y about its mean, complex, shape (n,)."""
+    orbit = x + 1j * y
+    return orbit - orbit.mean()

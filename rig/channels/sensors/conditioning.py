@@ -1,0 +1,367 @@
+"""Signal conditioning of all sensors: sensitivity, range, anti-alias filter and AC coupling, noise, converter.
+
+A channel is a chain in continuous time (`rig.channels.sensors.filters`), and so its samples lie where its rate puts
+them.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from rig.channels.sampling import between
+from rig.channels.sensors.filters import POLE, channel_poles, coefficients, digital_coefficients
+from rig.channels.sensors.noise import draw, noise_streams
+from rig.channels.table import Channel, Group, check_signals
+from rig.physics.kernels.signals import COLUMN
+from rig.physics.kernels.stage import kernel
+
+_LANES = 16
+"""Channels that one pass takes, side by side."""
+_SOMETHING = 1e-25
+"""Added to all volts: filters of silent channels else decay to where a processor takes a hundred times as long."""
+_CHUNK = 64
+"""Rows that are filtered at a time."""
+
+_GAIN, _BIAS, _LOW, _HIGH, _NOISE, _LSB, _LIMIT = range(7)
+"""Rows of the table of channels: volts per SI unit; volts at zero; output limits [V]; noise [V]; converter step [V];
+largest count."""
+
+
+@kernel
+def _filter(step, wave, phases, volts, rows, late, apart, parts, out):
+    """Step the filters from row to row, and read off every sample on the way, for `_LANES` channels.
+
+    Every number of a channel stands at a fixed distance from the next one: only so can the compiler see that the
+    channels may go side by side.
+
+    Args:
+        step: Of the poles, shape (poles * POLE * _LANES,).
+        wave: Their states, in and out, shape (poles * 2 * _LANES,).
+        phases: What a sample is made of, by its place, shape (parts * (4 + 2 * poles) * _LANES,).
+        volts: Two rows before the first, the first, and `rows` more, shape ((rows + 3) * _LANES,).
+        rows: How many to step on.
+        late: Place of the next sample behind the first row, in parts of a row.
+        apart: From sample to sample, in such parts.
+        parts: Of a row.
+        out: Out, shape (samples * _LANES,).
+
+    Returns:
+        Place of the next sample behind the last row.
+    """
+    poles = len(step) // (POLE * _LANES)
+    sample = 0
+    for n in range(rows):
+        at = n * _LANES
+        if late == 0:
+            # On the row itself, a sample is what goes straight through, and the poles' states.
+            for c in range(_LANES):
+                out[sample + c] = phases[_LANES + c] * volts[at + 2 * _LANES + c]
+            for pole in range(poles):
+                for c in range(_LANES):
+                    out[sample + c] += wave[2 * pole * _LANES + c]
+            sample += _LANES
+            late = apart
+        while late < parts:
+            phase = late * (4 + 2 * poles) * _LANES
+            for c in range(_LANES):
+                out[sample + c] = (
+                    phases[phase + c] * volts[at + 3 * _LANES + c]
+                    + phases[phase + _LANES + c] * volts[at + 2 * _LANES + c]
+                    + phases[phase + 2 * _LANES + c] * volts[at + _LANES + c]
+                    + phases[phase + 3 * _LANES + c] * volts[at + c]
+                )
+            for pole in range(poles):
+                real, of = 2 * pole * _LANES, phase + (4 + 2 * pole) * _LANES
+                for c in range(_LANES):
+                    out[sample + c] += (
+                        phases[of + c] * wave[real + c] - phases[of + _LANES + c] * wave[real + _LANES + c]
+                    )
+            sample += _LANES
+            late += apart
+        late -= parts
+        for pole in range(poles):
+            real, of = 2 * pole * _LANES, pole * POLE * _LANES
+            for c in range(_LANES):
+                a, b = wave[real + c], wave[real + _LANES + c]
+                before, now = volts[at + _LANES + c], volts[at + 2 * _LANES + c]
+                first, last = volts[at + c], volts[at + 3 * _LANES + c]
+                wave[real + c] = (step[of + c] * a - step[of + _LANES + c] * b) + (
+                    (step[of + 2 * _LANES + c] * last + step[of + 3 * _LANES + c] * now)
+                    + (step[of + 4 * _LANES + c] * before + step[of + 5 * _LANES + c] * first)
+                )
+                wave[real + _LANES + c] = (step[of + c] * b + step[of + _LANES + c] * a) + (
+                    (step[of + 6 * _LANES + c] * last + step[of + 7 * _LANES + c] * now)
+                    + (step[of + 8 * _LANES + c] * before + step[of + 9 * _LANES + c] * first)
+                )
+    return late
+
+
+@kernel
+def _limited(scale, volts):
+    """From signals to volts within the conditioner's range, in place, shape (rows * _LANES,)."""
+    for n in range(0, len(volts), _LANES):
+        for c in range(_LANES):
+            v = scale[c + _BIAS * _LANES] + scale[c + _GAIN * _LANES] * volts[n + c] + _SOMETHING
+            volts[n + c] = min(max(v, scale[c + _LOW * _LANES]), scale[c + _HIGH * _LANES])
+
+
+@kernel
+def _convert(scale, volts, noise):
+    """From volts to counts, still as floats, in place.
+
+    Args:
+        scale: As above.
+        volts: In and out, shape (samples * _LANES,).
+        noise: Of each sample, shape (samples, _LANES).
+    """
+    for n in range(len(noise)):
+        row = volts[n * _LANES : (n + 1) * _LANES]
+        loud = noise[n]
+        # A length that the compiler knew would be unrolled, one channel after the other.
+        for c in range(len(row)):
+            count = np.rint((row[c] + loud[c] * scale[c + _NOISE * _LANES]) / scale[c + _LSB * _LANES])
+            limit = scale[c + _LIMIT * _LANES]
+            row[c] = min(max(count, -limit - 1.0), limit)
+
+
+@njit(cache=True, error_model="numpy", fastmath=False, nogil=True)
+def _condition(rows, made, late, apart, parts, columns, places, scales, past, waves, steps, phases, streams, counts):
+    """Filter from the first row to the last, and convert the samples that lie before that.
+
+    Args:
+        rows: Observed rows, shape (n, N_ROW).
+        made: Signals by formulas at the same instants, shape (n, formulas).
+        late: Place of the first sample behind the first row, in parts of a row.
+        apart: From sample to sample, in such parts.
+        parts: Of a row.
+        columns: Column of each channel, those of `made` behind those of `rows`, shape (c,).
+        places: Where its counts go: channels in the groups before its own, channels in its group, place in it,
+            shape (c, 3).
+        scales: Of the channels by sixteen, shape (sets, 7, _LANES).
+        past: Their volts at the two rows before the first, in and out, shape (sets, 2 * _LANES).
+        waves: States of their poles, in and out, shape (sets, poles * 2 * _LANES).
+        steps: Steps of their poles, shape (sets, poles * POLE * _LANES).
+        phases: Samples, shape (sets, parts * (4 + 2 * poles) * _LANES).
+        streams: Of their noise, in and out, shape (c, 4); (0, 4): no noise.
+        counts: Out, one group behind the other, each (samples, channels).
+    """
+    samples = len(counts) // len(columns)
+    volts = np.zeros((_CHUNK + 3) * _LANES)
+    most = _CHUNK * parts // apart + 2
+    out = np.zeros(most * _LANES)
+    noise = np.zeros((most, _LANES))
+    for part in range(len(scales)):
+        scale = scales[part].reshape(7 * _LANES)
+        at = part * _LANES
+        lanes = min(_LANES, len(columns) - at)
+        sample, due = 0, late
+        for n in range(2 * _LANES):
+            volts[n] = past[part, n]
+        for begin in range(0, len(rows) - 1, _CHUNK):
+            length = min(_CHUNK, len(rows) - 1 - begin)
+            for c in range(lanes):
+                column = columns[at + c]
+                if column < rows.shape[1]:
+                    for n in range(length + 1):
+                        volts[(n + 2) * _LANES + c] = rows[begin + n, column]
+                else:
+                    for n in range(length + 1):
+                        volts[(n + 2) * _LANES + c] = made[begin + n, column - rows.shape[1]]
+            _limited(scale, volts[2 * _LANES : (length + 3) * _LANES])
+            here = max(0, -((due - length * parts) // apart))
+            if len(streams) > 0:
+                draw(streams[at : at + lanes], noise[:here])
+            due = _filter(steps[part], waves[part], phases[part], volts, length, due, apart, parts, out)
+            for n in range(2 * _LANES):
+                volts[n] = volts[length * _LANES + n]
+            _convert(scale, out, noise[:here])
+            for c in range(lanes):
+                before, width, place = places[at + c]
+                to = before * samples + sample * width + place
+                for n in range(here):
+                    counts[to + n * width] = np.int32(out[n * _LANES + c])
+            sample += here
+        for n in range(2 * _LANES):
+            past[part, n] = volts[n]
+
+
+class Conditioner:
+    """Turns rows into counts, block by block; cutting a run into blocks in another way changes no bit.
+
+    An ideal one has range and converter only: no filter, no coupling, no noise.
+
+    Each channel draws its noise from a stream of its own, keyed by seed and name: leaving a channel out does not
+    change the others.
+
+    Args:
+        groups: Groups of one rate.
+        row_rate_hz: Rows a second.
+        seed: Of the noise.
+        noise: Whether there is any.
+        ideal: Leave everything out but range and converter.
+        digital: Filters as tables of version 1 have them: by the bilinear transform, at the rate of the rows.
+        columns: Of each channel's signal in the rows, or behind them; the model's own unless given.
+    """
+
+    def __init__(
+        self,
+        groups: Sequence[Group],
+        *,
+        row_rate_hz: int,
+        seed: int,
+        noise: bool,
+        ideal: bool = False,
+        digital: bool = False,
+        columns: Sequence[int] | None = None,
+    ) -> None:
+        self.groups = tuple(groups)
+        self._apart, self._parts = between(self.groups[0].rate_hz, row_rate_hz)
+        self._late = 0
+        channels = [channel for group in self.groups for channel in group.channels]
+        if columns is None:
+            check_signals(channels, COLUMN)
+            columns = [COLUMN[channel.signal] for channel in channels]
+        self._columns = np.array(columns)
+        self._spans: list[tuple[str, int, int]] = []
+        for group in self.groups:
+            self._spans.append((group.name, sum(width for _, _, width in self._spans), len(group.channels)))
+        self._places = np.array([(before, width, c) for _, before, width in self._spans for c in range(width)])
+        none = np.zeros(0, complex), np.zeros(0, complex), 1.0
+        filters = [
+            none if ideal or math.isinf(channel.bandwidth_hz) else channel_poles(channel, row_rate_hz)
+            for channel in channels
+        ]
+        most = max(len(poles) for poles, _, _ in filters)
+        sets = -(-len(channels) // _LANES)
+        # Lanes without a channel make zeros.
+        self._scales = np.zeros((sets, 7, _LANES))
+        self._scales[:, _LSB] = 1.0
+        steps, self._settling = np.zeros((sets, most, POLE, _LANES)), np.zeros((sets, most, 2, _LANES))
+        phases = np.zeros((sets, self._parts, 4 + 2 * most, _LANES))
+        for c, (channel, (poles, residues, direct)) in enumerate(zip(channels, filters, strict=True)):
+            of, lane = divmod(c, _LANES)
+            self._scales[of, :, lane] = (
+                channel.sensitivity_v / channel.si,
+                channel.bias_v,
+                *channel.range_v,
+                channel.noise_v,
+                channel.lsb_v,
+                2.0 ** (channel.adc_bits - 1) - 1.0,
+            )
+            if digital and len(poles):
+                step, settling, phase = digital_coefficients(channel, row_rate_hz)
+            else:
+                inside = (tuple((each / row_rate_hz).tolist()) for each in (poles, residues))
+                step, settling, phase = coefficients(*inside, direct, self._parts)
+            steps[of, : len(poles), :, lane], self._settling[of, : len(poles), :, lane] = step, settling
+            phases[of, :, : phase.shape[1], lane] = phase
+        self._steps, self._phases = steps.reshape(sets, -1), phases.reshape(sets, -1)
+        self._waves = np.zeros((sets, most * 2 * _LANES))
+        self._past: np.ndarray | None = None
+        self._row_rate_hz, self._noise, self._ideal = row_rate_hz, noise, ideal
+        self._lanes = {channel.name: divmod(c, _LANES) for c, channel in enumerate(channels)}
+        self._inherited: list[tuple[str, np.ndarray, np.ndarray]] = []
+        """Of a twin that has not begun: channels, with the states of their poles and their volts before."""
+        self._streams = noise_streams([channel.name for channel in channels] if noise and not ideal else [], seed)
+
+    @property
+    def columns(self) -> np.ndarray:
+        """Column of each channel's signal in the rows, or behind them, shape (channels,)."""
+        return self._columns
+
+    def twin(self, channels: Mapping[str, Channel], *, rate_hz: int, first: int, row: int, columns: int) -> Conditioner:
+        """Another chain of some of the channels, which goes on from where this one is.
+
+        Args:
+            channels: The channels by name; one with another filter begins in the steady state of its first row.
+            rate_hz: Samples a second.
+            first: Number of its first sample.
+            row: Number of its first row.
+            columns: From which on its signals are, one behind the other.
+        """
+        # Not checked: no table has channels without a range, or without a filter.
+        group = Group.model_construct(name="twin", title="", rate_hz=rate_hz, channels=tuple(channels.values()))
+        other = Conditioner(
+            [group], row_rate_hz=self._row_rate_hz, seed=0, noise=self._noise, ideal=self._ideal,
+            columns=range(columns, columns + len(channels)),
+        )  # fmt: skip
+        other._late = first * other._apart - row * other._parts
+        other.take_over(self, list(channels))
+        return other
+
+    def take_over(self, other: Conditioner, names: Sequence[str]) -> None:
+        """Go on from another's noise, and where they have the same filters, from their states."""
+        mine = {channel.name: channel for group in self.groups for channel in group.channels}
+        theirs = {channel.name: channel for group in other.groups for channel in group.channels}
+        for name in names:
+            at = list(mine).index(name), list(theirs).index(name)
+            if len(self._streams) and len(other._streams):
+                self._streams[at[0]] = other._streams[at[1]]
+            filters = [(one.bandwidth_hz, one.filter_order, one.highpass_hz) for one in (mine[name], theirs[name])]
+            if filters[0] == filters[1] and other._past is not None:
+                part, lane = other._lanes[name]
+                waves = other._waves[part].reshape(-1, _LANES)[:, lane].copy()
+                self._inherited.append((name, waves, other._past[part].reshape(2, _LANES)[:, lane].copy()))
+
+    def _go_on(self) -> None:
+        """Begin with what was taken over, once the rest is settled."""
+        assert self._past is not None
+        for name, waves, past in self._inherited:
+            part, lane = self._lanes[name]
+            own = self._waves[part].reshape(-1, _LANES)
+            own[: len(waves), lane] = waves[: len(own)]
+            self._past[part].reshape(2, _LANES)[:, lane] = past
+        self._inherited = []
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Conditioner:
+        """With states of its own; what does not change is shared."""
+        other = copy.copy(self)
+        for name in ("_waves", "_past", "_streams", "_inherited"):
+            setattr(other, name, copy.copy(getattr(self, name)))
+        return other
+
+    def counts(self, rows: np.ndarray, made: np.ndarray | None = None) -> dict[str, np.ndarray]:
+        """Samples from the first of these rows on that lie before the last one.
+
+        Args:
+            rows: Observed rows from the last one of the call before on, shape (n, N_ROW).
+            made: More signals at the same instants, whose columns are behind those of the rows, shape (n, m).
+
+        Returns:
+            ADC counts by group, int32, shape (samples, channels).
+        """
+        if made is None:
+            made = np.empty((len(rows), 0))
+        if self._past is None:
+            self._past = self._settle(rows, made)
+        if self._inherited:
+            self._go_on()
+        span = (len(rows) - 1) * self._parts
+        samples = max(0, -((self._late - span) // self._apart))
+        counts = np.empty(samples * len(self._columns), dtype=np.int32)
+        # Sums of unsigned integers wrap, of which numpy would warn where nothing is compiled.
+        with np.errstate(over="ignore"):
+            _condition(
+                rows, made, self._late, self._apart, self._parts, self._columns, self._places, self._scales, self._past,
+                self._waves, self._steps, self._phases, self._streams, counts,
+            )  # fmt: skip
+        self._late += samples * self._apart - span
+        return {
+            name: counts[samples * before : samples * (before + width)].reshape(samples, width)
+            for name, before, width in self._spans
+        }
+
+    def _settle(self, rows: np.ndarray, made: np.ndarray) -> np.ndarray:
+        """Filters in the steady state of the first row, as the instruments have been on for long; its volts, twice."""
+        first = np.zeros(len(self._scales) * _LANES)
+        first[: len(self._columns)] = np.concatenate([rows[0], made[0]])[self._columns]
+        volts = self._scales[:, _BIAS] + self._scales[:, _GAIN] * first.reshape(-1, _LANES)
+        volts = np.clip(volts, self._scales[:, _LOW], self._scales[:, _HIGH])
+        self._waves[:] = (self._settling * volts[:, None, None, :]).reshape(self._waves.shape)
+        return np.hstack([volts, volts])

@@ -1,0 +1,230 @@
+"""The channel table: what the rig measures, and how counts become volts and engineering values.
+
+Everything outside the physics (wire, drivers, recorder, viewer, exports) knows the rig through this table alone.
+"""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from collections.abc import Collection, Iterable
+from functools import cache
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import BaseModel, Field, FiniteFloat, PositiveFloat, PositiveInt, model_validator
+
+from rig.base.errors import InputError, UnknownNameError, Words
+from rig.base.outside import check, parse_toml
+
+VERSION = 2
+"""Of tables that are made now: another one whenever the rig's own changes, as recordings are held against it."""
+TABLE = Path(__file__).with_name("channels.toml")
+
+
+class Channel(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
+    """One measured channel with its complete calibration; half a scale is refused on load."""
+
+    name: Annotated[str, Field(min_length=1)]
+    label: str
+    group: str
+    signal: str
+    """Ideal signal of the model that the sensor feels (see `rig.physics.kernels.signals`)."""
+    unit: str
+    si: PositiveFloat
+    """One engineering unit in SI."""
+    sensitivity_v: float
+    """[V per engineering unit]"""
+    bias_v: float
+    """Output at value zero [V]."""
+    range_v: tuple[float, float]
+    """Output limits of the conditioner [V]."""
+    bandwidth_hz: PositiveFloat
+    """-3 dB corner of the anti-alias low-pass [Hz]."""
+    filter_order: Annotated[int, Field(ge=1, le=8)] = 4
+    """Order of that Butterworth low-pass."""
+    highpass_hz: Annotated[float, Field(ge=0)]
+    """AC coupling [Hz]; 0 is DC-coupled."""
+    noise_v: Annotated[float, Field(ge=0)]
+    """White noise [V rms] at the converter."""
+    adc_v: PositiveFloat
+    """Converter range is +-adc_v [V]."""
+    adc_bits: Annotated[int, Field(ge=8, le=32)]
+    rate_hz: PositiveInt
+    """Sample rate [Hz]."""
+    kind: str
+    """Provenance of the values, as for parameters."""
+
+    @model_validator(mode="after")
+    def _whole_scale(self) -> Channel:
+        if self.sensitivity_v == 0.0:
+            raise InputError(f"channel {self.name}.sensitivity_v", "non-zero", self.sensitivity_v)
+        low, high = self.range_v
+        if not -self.adc_v <= low < high <= self.adc_v:
+            must = f"two ascending values inside +-adc_v ({self.adc_v:g} V)"
+            raise InputError(f"channel {self.name}.range_v", must, self.range_v)
+        if not (math.isfinite(self.scale) and self.scale and math.isfinite(self.offset)):
+            raise InputError(f"channel {self.name}.sensitivity_v", "one that gives a finite scale", self.sensitivity_v)
+        return self
+
+    @property
+    def has_range(self) -> bool:
+        """Whether its range is one; of an imported channel of which none is told, it is the ends of its counts."""
+        return not self.kind.startswith("imported") or self.range_v != (-self.adc_v, self.adc_v)
+
+    @property
+    def lsb_v(self) -> float:
+        """Converter step [V]."""
+        return 2.0 * self.adc_v / 2**self.adc_bits
+
+    @property
+    def scale(self) -> float:
+        """Engineering units per count."""
+        return self.lsb_v / self.sensitivity_v
+
+    @property
+    def offset(self) -> float:
+        """Engineering value at count zero."""
+        return -self.bias_v / self.sensitivity_v
+
+
+class Group(BaseModel, frozen=True, extra="forbid"):
+    """Channels that share a connector: one key, one block, one rate."""
+
+    name: str
+    title: str
+    rate_hz: Annotated[int, Field(ge=1, le=1_000_000_000)]
+    channels: Annotated[tuple[Channel, ...], Field(min_length=1)]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Channel names in column order."""
+        return tuple(channel.name for channel in self.channels)
+
+    def engineering(self, counts: np.ndarray) -> np.ndarray:
+        """Convert ADC counts to engineering values.
+
+        Args:
+            counts: Integer counts, shape (n, channels).
+
+        Returns:
+            Values in each channel's unit, float64, shape (n, channels).
+        """
+        scale = np.array([channel.scale for channel in self.channels])
+        offset = np.array([channel.offset for channel in self.channels])
+        values = counts * scale
+        values += offset
+        return values
+
+
+class ChannelTable(BaseModel, frozen=True, extra="forbid"):
+    """All groups, by name."""
+
+    groups: dict[str, Group]
+    version: Annotated[int, Field(ge=1, le=2)] = 1
+    """How to read the table: 1 is of recordings before 0.2, whose filters were digital ones on rows of 25 us."""
+    curves: dict[str, tuple[tuple[FiniteFloat, FiniteFloat], ...]] = {}
+    """What formulas may use of an angle: points (degrees, value), periodic in a turn."""
+
+    def __repr__(self) -> str:
+        groups = [f"{name}: {', '.join(group.names)}" for name, group in self.groups.items()]
+        return f"ChannelTable({'; '.join(groups)})"
+
+    __str__ = __repr__
+
+    @model_validator(mode="after")
+    def _names_once(self) -> ChannelTable:
+        names = [channel.name for group in self.groups.values() for channel in group.channels]
+        if len(set(names)) < len(names):
+            name = next(name for name in names if names.count(name) > 1)
+            raise InputError(f"channel {name}", "in the table once", names.count(name))
+        if any(name != group.name or not name for name, group in self.groups.items()):
+            raise ValueError("each group must stand under its own name")
+        return self
+
+    @property
+    def channels(self) -> dict[str, Channel]:
+        """All channels by name, in table order."""
+        return {channel.name: channel for group in self.groups.values() for channel in group.channels}
+
+    def only(self, names: tuple[str, ...], rate_hz: int | None = None) -> ChannelTable:
+        """The table with only the named groups, all where none is named, and another sample rate where one is given."""
+        kept = {}
+        for name in names or self.groups:
+            group = self.groups[name]
+            if rate_hz is not None:
+                # A slower channel needs its anti-alias filter at a quarter of its own rate.
+                rows = tuple(
+                    channel.model_copy(
+                        update={"rate_hz": rate_hz, "bandwidth_hz": min(channel.bandwidth_hz, rate_hz / 4.0)}
+                    )
+                    for channel in group.channels
+                )
+                group = group.model_copy(update={"rate_hz": rate_hz, "channels": rows})
+            kept[name] = group
+        return self.model_copy(update={"groups": kept})
+
+
+def parse_table(text: str) -> ChannelTable:
+    """Parse a channel table from TOML text (group defaults merged into each row).
+
+    Raises:
+        InputError: It is no TOML, or the first thing that is missing or wrong in it.
+    """
+    try:
+        return table_of(raw_groups(text))
+    except KeyError as error:
+        raise InputError(f"channel table: {error.args[0]}", "given", None) from None
+    except (TypeError, AttributeError):
+        raise InputError("channel table", "[groups.NAME] with title, rate_hz, kind and channels", text[:80]) from None
+    except tomllib.TOMLDecodeError as error:
+        raise InputError("channel table", "a TOML file", Words(error)) from None
+
+
+def raw_groups(text: str) -> dict[str, Any]:
+    """The groups of a TOML text as they stand there, with the group's own kind and defaults merged into each row."""
+    groups = parse_toml(text, field="channel table")["groups"]
+    for body in groups.values():
+        shared = {**body.pop("defaults", {}), "kind": body["kind"]}
+        body["channels"] = [{**shared, **row} for row in body["channels"]]
+    return groups
+
+
+def table_of(groups: dict[str, Any], curves: dict[str, Any] | None = None) -> ChannelTable:
+    """The table of groups with whole rows, and of curves.
+
+    Raises:
+        InputError: The first thing that is missing or wrong.
+    """
+    made = {}
+    for name, body in groups.items():
+        own = {"group": name, "rate_hz": body["rate_hz"]}
+        rows = [
+            check(Channel, {**row, **own}, field=f"channel {row.get('name', number)}")
+            for number, row in enumerate(body["channels"], 1)
+        ]
+        made[name] = {"name": name, "title": body["title"], "rate_hz": body["rate_hz"], "channels": tuple(rows)}
+    table = {"groups": made, "version": VERSION, "curves": curves or {}}
+    return check(ChannelTable, table, field="channel table")
+
+
+def check_signals(channels: Iterable[Channel], known: Collection[str]) -> None:
+    """Refuse channels that feel a signal that the model does not have.
+
+    Args:
+        channels: The channels.
+        known: Names of the model's signals.
+
+    Raises:
+        InputError: The first of them.
+    """
+    for channel in channels:
+        if channel.signal not in known:
+            raise UnknownNameError(f"channel {channel.name}.signal", "one of the model's", channel.signal, known)
+
+
+@cache
+def default_table() -> ChannelTable:
+    """The rig's own channel table."""
+    return parse_table(TABLE.read_text())

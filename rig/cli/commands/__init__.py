@@ -1,0 +1,1 @@
+"""The subcommands of `rig`, a module each."""

@@ -1,0 +1,71 @@
+"""`rig bench`: how fast the rig is on this machine, and how accurate at that speed."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import typer
+
+from rig.cli.output.progress import reporting
+from rig.cli.output.tables import Form, Table, echo_json, new_table
+
+
+def bench(
+    *,
+    form: Form,
+    runs: Annotated[int, typer.Option(min=1, max=100, help="Runs of each case.")] = 5,
+    peers: Annotated[
+        bool, typer.Option(help="Time CVODE and heyoka in the same rounds, where they are installed.")
+    ] = True,
+    frames: Annotated[int, typer.Option(min=0, max=1_000_000, help="Single frames of 1 ms to time.")] = 10_000,
+) -> None:
+    """Measure simulated over processor time with the error beside it; medians of several runs, compile time apart."""
+    from replays.studies.bench import measure
+
+    with reporting(compiles=True, live=False) as reporter:  # a live line would take of the time that is measured
+        report = measure(runs=runs, peers=peers, frames=frames, progress=reporter.say)
+    if form.as_json:
+        echo_json(report)
+        return
+    console = form.console()
+    console.print(cases_table(report, runs=runs))
+    if report["missing_peers"]:
+        console.print(f"not timed: {', '.join(report['missing_peers'])} (pip install 'rotor-stator-rig[peers]')")
+    known = report["reference"]
+    doubt = "" if known["error"] is None else f", which agree to {known['error']:.0e}"
+    console.print(f"error: RMS of 7 scaled states over 1 s against exact Coulomb by {known['of']}{doubt}")
+    for name, frame in (report["frame"] or {}).items():
+        console.print(
+            f"frame of 1 ms, {name}: median {frame['median_us']:.0f} us, 99.9 % {frame['p999_us']:.0f} us, "
+            f"worst of {frame['frames']}: {frame['worst_us']:.0f} us; "
+            f"goal: 99.9 % within {frame['goal_us']:.0f} us, {'reached' if frame['reached'] else 'NOT reached'}"
+        )
+    console.print(
+        f"kernels ready after {report['ready_s']:.1f} s ({'from the cache' if report['cached'] else 'compiled'})"
+    )
+
+
+def cases_table(report: dict[str, Any], *, runs: int) -> Table:
+    """What was timed, with its error and its goal."""
+    table = new_table(
+        f"times real time, {runs} runs",
+        *("case", ">median", ">min", ">max", ">of the first", ">error", ">energy residual", ">goal", "reached"),
+        wrapped=["case"],
+        spare=("min", "max", "of the first"),
+    )
+    for case in report["cases"]:
+        goal = "" if case["goal"] is None else f"{case['goal']:g}"
+        if case["error_goal"] is not None:
+            goal += f" at {case['error_goal']:.1e}"
+        verdict = {True: "yes", False: "NO", None: ""}[case["reached"]]
+        table.add_row(
+            case["name"], f"{case['median']:.1f}", f"{case['min']:.1f}", f"{case['max']:.1f}", f"{case['ratio']:.2f}",
+            "" if case["error"] is None else f"{case['error']:.1e}", f"{case['residual_share']:.0e}",
+            goal.strip(), verdict,
+        )  # fmt: skip
+    for peer in report["peers"]:
+        table.add_row(
+            peer["name"], f"{peer['median']:.1f}", f"{peer['min']:.1f}", f"{peer['max']:.1f}", f"{peer['ratio']:.2f}",
+            f"{peer['error']:.1e}", "", "", "",
+        )  # fmt: skip
+    return table

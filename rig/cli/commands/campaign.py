@@ -1,0 +1,144 @@
+"""`rig campaign`: scripted tests of a device in the loop, for whoever does not know pytest, which runs them."""
+
+from __future__ import annotations
+
+import importlib.util
+import textwrap
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rig.base.errors import InputError, UnknownNameError, Words
+from rig.base.outcome import Outcome
+from rig.cli.output.folder import check_folder
+from rig.cli.output.tables import echo, progress_bar
+
+_INTERRUPTED = 130
+_EXTRA = "installed with its extra: pip install 'rotor-stator-rig[campaigns]'"
+
+
+def campaign(
+    files: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[FILE...]",
+            help="A *.campaign.toml, one of the rig's by name (hammer), or tests of pytest; FILE::CASE for one case. "
+            "Without: list the rig's.",
+        ),
+    ] = None,
+    *,
+    keyword: Annotated[
+        str | None, typer.Option("--keyword", "-k", metavar="WORDS", help="Only cases with these words in their names.")
+    ] = None,
+    jobs: Annotated[int, typer.Option("--jobs", "-j", metavar="N", min=1, help="So many cases at a time.")] = 1,
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", metavar="FOLDER", help="For results.json, junit.xml, index.html and evidence/."),
+    ] = None,
+    against: Annotated[
+        Path | None, typer.Option("--against", metavar="FOLDER", help="Results of an earlier campaign to compare with.")
+    ] = None,
+    url: Annotated[
+        str | None, typer.Option(metavar="URL", help="Run on the rig there; what cannot be done there is skipped.")
+    ] = None,
+    replay: Annotated[
+        Path | None, typer.Option(metavar="FILE.mcap", help="Run on a recording that is played, likewise.")
+    ] = None,
+) -> None:
+    """Run scripted tests of a device in the loop, and judge them.
+
+    Exit status: 0 pass, 1 a case failed, 2 wrong input or nothing to run, 3 inconclusive: no case failed, and one is
+    inconclusive, or all were skipped. Ctrl-C leaves nothing running, and the results of what was done.
+    """
+    if not files:
+        _list()
+        return
+    if importlib.util.find_spec("pytest") is None:
+        raise InputError("rig campaign", _EXTRA, Words("without pytest"))
+    if jobs > 1 and importlib.util.find_spec("xdist") is None:
+        raise InputError("--jobs", f"1, or {_EXTRA}", jobs)
+    if url is not None and replay is not None:
+        raise InputError("--url", "left out with --replay", url)
+    if url is not None and jobs > 1:
+        raise InputError("--jobs", "1 with --url, as the cases share one rig", jobs)
+    if output is not None:
+        check_folder(output, field="--output")
+    files = _checked(files, against, replay)
+    told = {"--rig-results": output, "--rig-against": against, "--rig-url": url, "--rig-replay": replay}
+    options = [word for name, value in told.items() if value is not None for word in (name, str(value))]
+    options += ["-k", keyword] if keyword is not None else []
+    options += ["-n", str(jobs)] if jobs > 1 else ["-n", "0"] if importlib.util.find_spec("xdist") else []
+    status = _run(files, options, output)
+    if status:
+        raise typer.Exit(status)
+
+
+def _list() -> None:
+    from replays.campaigns.files.campaign import FOLDER, shipped, title_of
+
+    for name, path in shipped().items():
+        echo(textwrap.fill(f"{name}: {title_of(path)}", 80, subsequent_indent="  "))
+    echo(f"files in {FOLDER}")
+
+
+def _checked(files: list[str], against: Path | None, replay: Path | None) -> list[str]:
+    """The files by their paths; what is wrong with them is refused before anything runs."""
+    from replays.campaigns.files.campaign import SUFFIX, campaign_path, load_campaign
+    from replays.campaigns.reporting.results import load_results
+
+    paths = []
+    for file in files:
+        name, colons, case = file.partition("::")
+        name = str(campaign_path(name))
+        paths.append(f"{name}{colons}{case}")
+        if name.endswith(SUFFIX):
+            known = [each.id for each in load_campaign(Path(name)).cases]
+            if colons and case not in known:
+                raise UnknownNameError("FILE", f"one of the cases of {name}", case, known)
+        elif not Path(name).exists():
+            raise InputError("FILE", f"a *{SUFFIX} file, or tests of pytest, that exists", name)
+        elif Path(name).is_file() and not name.endswith(".py"):
+            raise InputError("FILE", f"a file that ends in {SUFFIX} or .py, or a folder", name)
+    if against is not None:
+        load_results(against)
+    if replay is not None:
+        from replays.campaigns.equipment.bench import check_replay
+
+        check_replay(replay)
+    return paths
+
+
+def _run(files: list[str], options: list[str], output: Path | None) -> int:
+    """Run the tests; returns the exit status."""
+    # Installed, the plugin is there by its entry point; out of a checkout, it is named.
+    from importlib.metadata import entry_points
+
+    import pytest
+
+    from rig.cli.output.campaign_progress import WORDS, Progress, beside_pytest
+
+    module = "replays.campaigns.plugin"
+    there = any(each.value == module for each in entry_points(group="pytest11"))
+    plugins = ["-p", "no:cacheprovider", *([] if there else ["-p", module])]
+    # This runs before pytest does: asserts in what is imported already are not told in pieces, and need not be.
+    plugins += ["-W", "ignore::pytest.PytestAssertRewriteWarning"]
+    with beside_pytest(progress_bar(transient=True)) as bar:
+        progress = Progress(bar)
+        status = pytest.main([*plugins, *options, *files], plugins=[progress])
+    if progress.unheard:
+        raise BrokenPipeError
+    if status == pytest.ExitCode.INTERNAL_ERROR:
+        echo(progress.said.getvalue().strip(), err=True)
+    counts = progress.counts
+    told = ", ".join(f"{counts[outcome]} {outcome}" for outcome in WORDS if counts[outcome]) or "nothing was run"
+    left = len(progress.planned) - sum(counts.values())
+    echo(f"{told}{f', {left} not run' if left > 0 else ''}")
+    if output is not None and (output / "index.html").is_file():
+        echo(f"written  {output / 'index.html'}, results.json, junit.xml")
+    if status == pytest.ExitCode.INTERRUPTED and not progress.collecting_failed:
+        return _INTERRUPTED
+    if status in (pytest.ExitCode.OK, pytest.ExitCode.TESTS_FAILED):
+        failed = bool(counts["failed"] or counts["error"])
+        return Outcome.of(failed=failed, shown=bool(counts["passed"]) and not counts["inconclusive"]).exit_status
+    return 2

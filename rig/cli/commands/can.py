@@ -1,0 +1,178 @@
+"""`rig can`: the virtual CAN bus."""
+
+from __future__ import annotations
+
+import threading
+from contextlib import ExitStack
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from rig.base.errors import InputError, check_new_file, whole_file
+from rig.cli.connections.can_output import CanMessages, bit_rates
+from rig.cli.options import ChannelFile
+from rig.cli.output.progress import reporting
+from rig.cli.output.tables import Form, echo, echo_document, echo_json, new_table
+from rig.cli.signals import stopping_on_signals
+
+if TYPE_CHECKING:
+    from drivers.can.bus.timing import Speed
+    from drivers.can.schedule import Schedule
+    from rig.channels.table import ChannelTable
+
+LISTEN = "127.0.0.1:7461"
+_SPEED = "1M/8M"
+
+
+def can(context: typer.Context) -> None:
+    """Run virtual CAN buses, and show what the rig sends on one."""
+    if context.invoked_subcommand is None:
+        echo(context.get_help())
+
+
+def hub(
+    channels: Annotated[list[str], typer.Argument(metavar="CHANNEL...", help="Names of the buses, such as can0.")],
+    *,
+    speed: Annotated[
+        str, typer.Option(metavar="RATE[/RATE]", help="Bit rate, and that of the data phase of CAN FD: 500k, 1M/8M.")
+    ] = _SPEED,
+    listen: Annotated[str, typer.Option(metavar="HOST:PORT", help="Where to listen.")] = LISTEN,
+    socketcand: Annotated[
+        str | None,
+        typer.Option(
+            metavar="HOST:PORT", help="Also serve socketcand clients (classic frames), usually at 127.0.0.1:29536."
+        ),
+    ] = None,
+    slcan: Annotated[
+        bool, typer.Option("--slcan", help="Also play an SLCAN adapter on a port of its own for each bus.")
+    ] = False,
+    acknowledge: Annotated[
+        bool, typer.Option(help="Acknowledge frames, so that an only node on the bus can send.")
+    ] = True,
+    error_rate: Annotated[float, typer.Option(metavar="SHARE", help="Share of bits that arrive wrong.")] = 0.0,
+    seed: Annotated[int, typer.Option(help="Seed of the wrong bits.")] = 0,
+) -> None:
+    """Run virtual CAN buses of their own, without a rig, until Ctrl-C.
+
+    Programs reach one by python-can: can.Bus(interface="zenoh", channel="can0"), or can_logger -i zenoh -c can0.
+    """
+    from drivers.can.bus.hub import Hub
+    from drivers.can.bus.model import BusModel
+    from drivers.can.interface import HubBus
+    from rig.cli.connections.can_outlets import CanOutlets
+    from rig.serve.transport.endpoint import parse_loopback
+    from rig.serve.transport.zenoh import ZenohServer
+
+    parse_loopback(listen, field="--listen")
+    if len(set(channels)) < len(channels):
+        raise InputError("CHANNEL", "named once each", " ".join(channels))
+    rates = bit_rates(speed, field="--speed")
+    models = [BusModel(rates, error_rate=error_rate, seed=seed + number) for number in range(len(channels))]
+    with ZenohServer(listen) as server, ExitStack() as stack:
+        hubs = [Hub(model, name, server, acknowledge=acknowledge) for model, name in zip(models, channels, strict=True)]
+        stopped = threading.Event()
+        with stopping_on_signals(stopped.set):
+            with reporting(compiles=True):
+                for one in hubs:
+                    stack.enter_context(one)
+            buses = {one.channel: partial(HubBus, one) for one in hubs}
+            outlets = stack.enter_context(CanOutlets(buses, rates, socketcand=socketcand, slcan=slcan))
+            for line in outlets.lines():
+                echo(f"rig: {line}", err=True)
+            echo(f"rig: CAN {', '.join(channels)} at {rates} on {listen}; Ctrl-C ends it", err=True)
+            while not stopped.wait(5.0):
+                for one in hubs:
+                    echo(_line(one.status()), err=True)
+                for text in (text for part in (*hubs, outlets) for text in part.warnings()):
+                    echo(f"rig: warning: {text}", err=True)
+        for line in (*(_line(one.status()) for one in hubs), *outlets.summary()):
+            echo(line)
+
+
+def _line(status: dict[str, Any]) -> str:
+    counts = status["counts"]
+    lost = "  ".join(f"{name} {counts[name]}" for name in counts if name != "frames" and counts[name])
+    line = f"{status['channel']}  {status['time_s']:.1f} s  nodes {len(status['nodes'])}  frames {counts['frames']}"
+    return f"{line}  {lost}".rstrip()
+
+
+def dbc(
+    *,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", metavar="FILE.dbc", help="Write it to this file.")
+    ] = None,
+    channels: ChannelFile = None,
+) -> None:
+    """Show the DBC of the rig's messages, made from the channel table, or write it to a file."""
+    from drivers.can.dbc import text
+
+    if output is not None:
+        check_new_file(output, field="--output", suffixes=(".dbc",), force=True)
+    schedule, speed = CanMessages(can_classic=True).plan(_table(channels))
+    _warn(schedule, speed)
+    if output is None:
+        echo_document(text(schedule.table))
+        return
+    with whole_file(output) as draft:
+        draft.write_text(text(schedule.table), encoding="cp1252")
+    echo(f"{output} written")
+
+
+def _table(channels: Path | None) -> ChannelTable:
+    from rig.channels.channel_file import read_channels
+    from rig.run.scenes import rig_table
+
+    return rig_table() if channels is None else read_channels(channels)
+
+
+def load(*, messages: CanMessages, channels: ChannelFile = None, form: Form) -> None:
+    """Show every message of the rig with its period, share of the bus and longest response time."""
+    from drivers.can.gateway.samples import steps
+
+    table = _table(channels)
+    schedule, speed = messages.plan(table)
+    steps(table, schedule)
+    messages_found = [
+        {
+            "id": message.identifier,
+            "message": message.name,
+            "from": message.sender,
+            "bytes": message.length,
+            "fd": message.fd,
+            "periodic": message.periodic,
+            "period_s": row.message.period_s,
+            "transmission_s": row.transmission_s,
+            "load": row.transmission_s / row.message.period_s,
+            "worst_response_s": row.worst_s,
+            "in_time": row.schedulable,
+        }
+        for message, row in schedule.response_times(speed)
+    ]
+    if form.as_json:
+        echo_json({"speed": str(speed), "load": schedule.load(speed), "messages": messages_found})
+    else:
+        numbers = (">bytes", ">every [ms]", ">frame [us]", ">load [%]", ">worst response [ms]", ">in time")
+        table = new_table(f"CAN at {speed}, every frame at its longest", ">id", "message", "from", *numbers)
+        for row in messages_found:
+            table.add_row(
+                f"{row['id']:#05x}",
+                row["message"],
+                row["from"],
+                f"{row['bytes']}{' FD' if row['fd'] else ''}",
+                f"{'' if row['periodic'] else '>= '}{1e3 * row['period_s']:g}",
+                f"{1e6 * row['transmission_s']:.1f}",
+                f"{100 * row['load']:.2f}",
+                f"{1e3 * row['worst_response_s']:.3f}",
+                "yes" if row["in_time"] else "no",
+            )
+        console = form.console()
+        console.print(table)
+        console.print(f"load: at most {100 * schedule.load(speed):.1f} % of the bus")
+    _warn(schedule, speed)
+
+
+def _warn(schedule: Schedule, speed: Speed) -> None:
+    for warning in schedule.warnings(speed):
+        echo(f"rig: warning: {warning}", err=True)

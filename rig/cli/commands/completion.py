@@ -1,0 +1,232 @@
+"""`rig completion`: a shell completes commands, options, names of scenes and engines, keys of --set, and files.
+
+The shell hands `rig __complete` the line up to the cursor and gets a line for each word that may stand there: the word,
+a tab, and what it means. A line that begins with a tab asks for files, with those endings if there are any, or for
+folders where it is a slash. Nothing is parsed as the command would parse it: only the command's own module is imported.
+"""
+
+from __future__ import annotations
+
+import inspect
+import os
+import re
+import shlex
+import tomllib
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Annotated, Any, get_args
+
+import typer
+
+from rig.base.errors import InputError
+from rig.base.text import printable
+from rig.cli.command import Group
+from rig.cli.output.tables import echo, echo_document
+
+_SHELLS = ("bash", "zsh", "fish")
+"""Each has a script beside this module."""
+_RIG = Path(__file__).parents[2]
+_ENDING = re.compile(r"(?<![\w.])\.[a-z][a-z0-9]+\b")
+SCENE_KEYS = (
+    *("duration_s", "seed", "parameters", "channels", "fidelity"),
+    *("initial.position", "initial.x_mm", "initial.y_mm", "initial.magnets"),
+    *("drive.mode", "drive.speed_hz", "drive.profile"),
+    *("engine.name", "engine.step_us", "engine.tolerance", "engine.companion", "engine.rolling"),
+    *("engine.limits.radius_um", "engine.limits.force_n", "engine.limits.frequency_hz"),
+    *("engine.limits.angle_deg", "engine.limits.spin_angle_deg"),
+    *("model.magnet", "model.shaft", "model.stator", "model.contact", "model.friction"),
+    *("sensors.groups", "sensors.rate_hz", "sensors.truth_rate_hz", "sensors.noise", "sensors.chain"),
+    *("generator.kind", "generator.amplitude", "generator.amplitude_v", "generator.offset", "generator.offset_v"),
+    *("generator.phase_deg", "generator.delay_us", "generator.frequency_hz", "generator.frequencies"),
+    *("generator.period_s", "generator.order", "generator.seed", "generator.crest", "generator.apart"),
+    *("generator.file", "generator.channels"),
+)
+"""Fields of a scene that `--set` is for: the scene's own module would take half a second to tell them."""
+
+Choices = Iterable[tuple[str, str]]
+
+
+def completion(
+    shell: Annotated[str | None, typer.Argument(metavar="[bash|zsh|fish]", help="By default that of $SHELL.")] = None,
+    *,
+    install: Annotated[bool, typer.Option("--install", help="Set it up for every new shell of this user.")] = False,
+) -> None:
+    """Complete commands, options and names in a shell, by Tab: `rig completion --install`, then open a new shell.
+
+    Without --install it prints the script, for `source <(rig completion bash)` or a place of your own.
+    """
+    shell = shell or Path(os.environ.get("SHELL", "")).name
+    if shell not in _SHELLS:
+        raise InputError("shell", "bash, zsh or fish", shell)
+    script = Path(__file__).with_suffix(f".{shell}").read_text(encoding="utf-8")
+    if not install:
+        echo_document(script)
+        return
+    for path in _install(shell, script):
+        echo(f"{path} written")
+    echo(f"in a new {shell}, Tab completes what begins with rig")
+
+
+def _install(shell: str, script: str) -> list[Path]:
+    """Write the script, and a line that reads it to what the shell reads at its start; gives what was written."""
+    home = Path.home()
+    if shell == "fish":
+        file = Path(os.environ.get("XDG_CONFIG_HOME") or home / ".config") / "fish/completions/rig.fish"
+        begin = None
+    else:
+        file = Path(os.environ.get("XDG_DATA_HOME") or home / ".local/share") / f"rig/completion.{shell}"
+        begin = home / ".bashrc" if shell == "bash" else Path(os.environ.get("ZDOTDIR") or home) / ".zshrc"
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(script, encoding="utf-8")
+    line = f"[ -r {shlex.quote(str(file))} ] && . {shlex.quote(str(file))}  # rig completion --install"
+    if begin is None or (begin.exists() and line in begin.read_text("utf-8", errors="replace")):
+        return [file]
+    with begin.open("a", encoding="utf-8") as out:
+        out.write(f"\n{line}\n")
+    return [file, begin]
+
+
+def complete(root: Group, shell: str, line: str) -> list[str]:
+    """What may stand at the end of a line, as the shell's script takes it.
+
+    Args:
+        root: The command line.
+        shell: Its name.
+        line: The line up to the cursor, the program's name first.
+    """
+    *before, start = _words(line)
+    command, option, place = _reached(root, before[1:])
+    if command is None:
+        return []
+    name, equals, value = start.partition("=")
+    head = ""
+    if option is None and start.startswith("--") and equals:
+        option, start, head = _options(command).get(name), value, name + "="
+    if option is None and start.startswith("-"):
+        found = [(name, param.help or "") for name, param in _options(command).items() if name.startswith("--")]
+    elif option is None and isinstance(command, Group):
+        found = [each for commands in command.sections.values() for each in commands.items()]
+    else:
+        arguments = [param for param in command.params if param.param_type_name == "argument"]
+        if arguments and arguments[-1].nargs == -1:
+            place = min(place, len(arguments) - 1)
+        param = option or next(iter(arguments[place:]), None)
+        found = [] if param is None else list(_values(command, param, start))
+    # Of a word with = or : in it, bash replaces only what is behind the last one.
+    cut = max(start.rfind("="), start.rfind(":")) + 1 if shell == "bash" else 0
+    head = "" if shell == "bash" else head
+    fit = [each for each in found if not each[0] or each[0].startswith(start)]
+    fit = [] if [word for word, _ in fit] == [start] != [""] else fit  # it is complete
+    return [f"{word and head + word[cut:]}\t{printable(says)}" for word, says in fit]
+
+
+def _reached(root: Group, words: list[str]) -> tuple[Any, Any, int]:
+    """The command that words lead to, the option of it that waits for its value, and how many arguments it has."""
+    command, option, place = root, None, 0
+    for word in words:
+        if option is not None:
+            option = None
+        elif word.startswith("-") and word != "-":
+            named = _options(command).get(word.partition("=")[0])
+            option = None if named is None or named.is_flag or "=" in word else named
+        elif not isinstance(command, Group):
+            place += 1
+        elif word in command.list_commands(None):
+            command = command.get_command(None, word)
+        else:
+            return None, None, 0
+    return command, option, place
+
+
+def _words(line: str) -> list[str]:
+    """Choices of a line that may end in the middle of one; the last is what is to be completed."""
+    reader = shlex.shlex(line, posix=True)
+    reader.whitespace_split, reader.commenters = True, ""
+    words: list[str] = []
+    try:
+        words += reader
+    except ValueError:  # it ends between quotes
+        return [*words, reader.token]
+    return words if line[-1:].strip() else [*words, ""]
+
+
+def _options(command: Any) -> dict[str, Any]:
+    params = [*command.params, command.get_help_option(typer.Context(command, help_option_names=["--help", "-h"]))]
+    return {name: param for param in params for name in (*param.opts, *param.secondary_opts) if name.startswith("-")}
+
+
+def _values(command: Any, param: Any, start: str) -> Choices:
+    """The values that a parameter takes, each with its meaning; for files, no value and their endings."""
+    metavar = param.metavar or ""
+    kind = metavar.strip("[]").rstrip(".")
+    if "|" in kind:
+        return [(word, "") for word in kind.split("|") if not word.isupper()]
+    if kind in _NAMES:
+        names = list(_NAMES[kind](start))
+        own_file = kind in ("SCENE", "SET") and not any(name.startswith(start) for name, _ in names)
+        return [("", ".toml")] if own_file else names
+    hint = str(get_args(inspect.signature(command.callback).parameters[param.name].annotation)[0])
+    if "pathlib.Path" in hint:
+        return [("", "/" if kind in ("DIR", "FOLDER") else " ".join(_ENDING.findall(f"{metavar} {param.help}")))]
+    return [(item.value, "") for item in param.shell_complete(typer.Context(command), "")]
+
+
+def _titled(folder: str) -> Callable[[str], Choices]:
+    def names(start: str) -> Choices:
+        for path in sorted((_RIG / folder).glob("*.toml")):
+            yield path.stem, tomllib.loads(path.read_text("utf-8"))["title"]
+
+    return names
+
+
+def _engines(start: str) -> Choices:
+    from rig.physics.engines import ENGINES
+
+    return [(name, method.title) for name, method in ENGINES.items()]
+
+
+def _keys(start: str) -> Choices:
+    document = tomllib.loads((_RIG / "physics/sets/corrected.toml").read_text("utf-8"))
+    parameters = {
+        f"{part}.{name}": entry
+        for part, entries in document.items()
+        if isinstance(entries, dict)
+        for name, entry in entries.items()
+    }
+    key = start.partition("=")[0]
+    if key == "engine.name":
+        return [(f"{key}={name}", says) for name, says in _engines(start)]
+    if key in parameters:
+        return [(f"{key}={rule}", "") for rule in parameters[key].get("rules", ())]
+    return [
+        *((f"{name}=", f"{entry['unit']}, {entry['source']}") for name, entry in parameters.items()),
+        *((f"{name}=", "of the scene") for name in SCENE_KEYS),
+    ]
+
+
+def _channels(start: str) -> Choices:
+    document = tomllib.loads((_RIG / "channels/channels.toml").read_text("utf-8"))
+    return [(each["name"], each["label"]) for group in document["groups"].values() for each in group["channels"]]
+
+
+def _list_of(names: Callable[[str], Choices]) -> Callable[[str], Choices]:
+    """The same names in a list that is joined by commas."""
+
+    def joined(start: str) -> Choices:
+        head = start[: start.rfind(",") + 1]
+        taken = head.split(",")
+        return [(head + name, says) for name, says in names(start) if name not in taken]
+
+    return joined
+
+
+_NAMES: dict[str, Callable[[str], Choices]] = {
+    "SCENE": _titled("run/scenes"),
+    "SET": _titled("physics/sets"),
+    "ENGINE": _engines,
+    "ENGINE,": _list_of(_engines),
+    "KEY=VALUE": _keys,
+    "KEY,": _list_of(lambda start: [(name.rstrip("="), says) for name, says in _keys("")]),
+    "NAME,": _list_of(_channels),
+}
+"""Names by how the help calls them."""

@@ -1,0 +1,57 @@
+"""`rig cut`: a part of a recording, or the parts of one joined, to a new file."""
+
+from __future__ import annotations
+
+import math
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rig.cli.options import Channels, Force, FromS, RecordingFiles, ToS, names_of
+from rig.cli.output.progress import reporting
+from rig.cli.output.tables import echo
+
+
+class Only(StrEnum):
+    """Which streams are kept."""
+
+    SENSORS = "sensors"
+    TRUTH = "truth"
+
+
+def cut(
+    files: RecordingFiles,
+    *,
+    output: Annotated[Path, typer.Option("--output", "-o", help="The new file, ends in .mcap.")],
+    from_s: FromS = None,
+    to_s: ToS = None,
+    only: Annotated[Only | None, typer.Option(help="Leave the others out.")] = None,
+    channels: Channels = None,
+    force: Force = False,
+) -> None:
+    """Cut a recording, or join several files of one run; what is kept is kept byte for byte, trimmed at the edges."""
+    from recorder.files.draft import check_destination
+    from recorder.reader import join
+    from recorder.rewrite import cut as cut_recording
+
+    check_destination(output, force=force)
+    with reporting() as report:
+        made = cut_recording(
+            join(files, in_part=from_s is not None or to_s is not None),
+            output,
+            from_s=-math.inf if from_s is None else from_s,
+            to_s=math.inf if to_s is None else to_s,
+            only=None if only is None else Only(only).value,
+            channels=tuple(names_of(channels)),
+            force=force,
+            on_progress=lambda done: report.part(done, f"writing {output}"),
+        )
+    for line in made.short:
+        echo(f"rig: {line}", err=True)
+    counts = made.counts
+    echo(
+        f"{output}: {(counts.first_time_ns or 0) / 1e9:.4f} s to {counts.last_time_ns / 1e9:.4f} s, "
+        f"{sum(counts.rows.values())} rows in {len(counts.rows)} streams, {output.stat().st_size / 1e6:.1f} MB"
+    )

@@ -1,0 +1,77 @@
+"""`rig export`: a recording in other tools' formats."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rig.base.errors import InputError
+from rig.cli.options import Force, FromS, RecordingFiles, ToS, names_of
+from rig.cli.output.tables import echo
+
+
+def export(
+    files: RecordingFiles,
+    *,
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="File to write: .mf4, .tdms, .uff, .csv, .parquet or .wav.")
+    ],
+    channels: Annotated[
+        str | None,
+        typer.Option("--channels", metavar="NAME,...", help="Only these channels, groups, or truth.TABLE[.COLUMN]."),
+    ] = None,
+    truth: Annotated[bool, typer.Option("--truth", help="The model's true state as well.")] = False,
+    unit: Annotated[
+        str, typer.Option(metavar="engineering|volts|counts", help="What the numbers are.")
+    ] = "engineering",
+    from_s: FromS = None,
+    to_s: ToS = None,
+    rate_hz: Annotated[float | None, typer.Option(help="Bring all channels to this rate, in Hz.")] = None,
+    method: Annotated[
+        str, typer.Option(metavar="polyphase|linear", help="How that is done: polyphase is band-limited.")
+    ] = "polyphase",
+    force: Force = False,
+) -> None:
+    """Write a recording as MDF4, TDMS, UFF58b, CSV, Parquet or WAV, or its parts as one, with units and calibration.
+
+    Impacts, commands, notes, parameters and scene go with it: in MDF4 as events and attachments, in FILE.json beside
+    CSV and WAV; UFF58 leaves them out. CSV, Parquet and WAV hold one rate: channels of several make as many files, or
+    --rate-hz brings them to one.
+    """
+    from recorder.reader import join
+    from replays.recordings.formats.exporting.export import check_output, merged
+    from replays.recordings.formats.exporting.export import export as write
+    from replays.recordings.formats.exporting.selection import select
+    from rig.base.wire import EDGES
+    from rig.cli.output.progress import reporting
+
+    if unit not in ("engineering", "volts", "counts"):
+        raise InputError("--unit", "engineering, volts or counts", unit)
+    if method not in ("polyphase", "linear"):
+        raise InputError("--method", "polyphase or linear", method)
+    check_output(output, force=force)
+    bounds = -math.inf if from_s is None else from_s, math.inf if to_s is None else to_s
+    recording = join(files, in_part=bounds != (-math.inf, math.inf)).between(*bounds)
+    selection = select(
+        recording, channels=names_of(channels), truth=truth, unit=unit, from_s=from_s, to_s=to_s, merged=merged(output)
+    )
+    with reporting() as reporter:
+
+        def tell(part: float) -> None:
+            reporter.part(part, f"exporting {recording.path.name}")
+
+        written = write(selection, output, rate_hz=rate_hz, method=method, force=force, progress=tell)
+    for line in recording.doubts:  # what is exported is not all, or not sure
+        echo(f"rig: {line}", err=True)
+    for made in written:
+        size = made.path.stat().st_size / 1e6
+        echo(f"{made.path}: {made.columns} columns, {size:.1f} MB, {unit}")
+        for name, rate, rows, missing in made.tables:
+            lost = f", {missing} missing" if missing else ""
+            echo(f"  {name}: {rows} rows at {rate:g} Hz{lost}")
+        echo(f"  {made.documents}")
+    if EDGES in recording.streams:
+        echo("left out: the exact times of the keyphasor's edges (the channel keyphasor has the pulses)")

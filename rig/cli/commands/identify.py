@@ -1,0 +1,247 @@
+"""`rig identify`: numbers of the rig from a recording, with intervals, and with what cannot be told."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from rig.cli.options import (
+    Channels,
+    Engine,
+    Force,
+    FromS,
+    Parameters,
+    RecordingFiles,
+    ReportFile,
+    ToS,
+    names_of,
+    pairs,
+)
+from rig.cli.output.origin import of_recording
+from rig.cli.output.progress import reporting
+from rig.cli.output.tables import Form, echo, echo_json, new_table
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from rich.console import Console
+
+    from recorder.reader import Recording
+    from replays.recordings.identification import Identification
+    from replays.recordings.resimulation.experiment import Experiment
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What is asked of a recording."""
+
+    fit: Annotated[
+        list[str],
+        typer.Option(
+            metavar="KEY,...",
+            help="What is asked for: a parameter, a number of the scene, or of an impact (hammer.1.force_n).",
+        ),
+    ]
+    start: Annotated[
+        list[str] | None, typer.Option(metavar="KEY=VALUE", help="Where the search begins; else as recorded.")
+    ] = None
+    bounds: Annotated[list[str] | None, typer.Option(metavar="KEY=LOW:HIGH", help="Least and largest value.")] = None
+    prior: Annotated[
+        list[str] | None,
+        typer.Option(metavar="KEY=VALUE+-SIGMA", help="What is known from elsewhere: mean and standard deviation."),
+    ] = None
+    from_s: FromS = None
+    to_s: ToS = None
+    channels: Channels = None
+    parameters: Parameters = None
+    scene: Annotated[
+        str | None, typer.Option(metavar="SCENE", help="What was done, where the recording does not tell.")
+    ] = None
+    engine: Engine = None
+
+    def found(
+        self, recording: Recording, search: Search, *, exact: bool, progress: Callable[[str], None]
+    ) -> tuple[Identification, list[str]]:
+        """The fit, and what was fitted along because an imported log does not tell it.
+
+        Raises:
+            InputError: The recording, its scene or the model has no such thing.
+        """
+        from replays.recordings.identification import ask
+        from replays.recordings.identification import identify as run
+        from replays.recordings.identification.log import identify_log
+        from replays.recordings.identification.nuisance import asked_along, turned
+        from replays.recordings.identification.question import first_command_s
+        from replays.recordings.resimulation.experiment import is_imported
+        from replays.recordings.validation import load_criteria
+
+        keys = [key for part in self.fit for key in names_of(part)]
+        experiment, along = self._experiment(recording), dict[str, tuple[float, float] | None]()
+        known = pairs("--prior", self.prior, "KEY=VALUE+-SIGMA")
+        priors = {key: _two("prior", text, "+-") for key, text in known.items()}
+        starts = {key: _number("start", text) for key, text in pairs("--start", self.start, "KEY=VALUE").items()}
+        bounds = {
+            key: _two("bounds", text, ":") for key, text in pairs("--bounds", self.bounds, "KEY=LOW:HIGH").items()
+        }
+        given: dict[str, Any] = {"start": starts, "bounds": bounds, "channels": names_of(self.channels) or None}
+        if is_imported(recording) and not exact:
+            if first_command_s(experiment) > 0.0:
+                search.left_out(from_s=self.from_s)
+                rules = load_criteria().imported
+                found = identify_log(
+                    recording, experiment, keys, **given, priors=priors, to_s=self.to_s, bandwidth=rules.bandwidth,
+                    variants=[one.set for one in rules.variants], progress=progress,
+                )  # fmt: skip
+                return found, [one.key for one in found.question.unknowns if one.along]
+            experiment = turned(recording, experiment)
+            along = asked_along(experiment, keys)
+            priors = {key: told for key, told in along.items() if told is not None} | priors
+        question = ask(
+            recording, experiment, [*keys, *along], **given, priors=priors, along=along, window=(self.from_s, self.to_s)
+        )
+        return run(question, **asdict(search), progress=progress), list(along)
+
+    def _experiment(self, recording: Recording) -> Experiment:
+        from replays.recordings.resimulation.experiment import Experiment
+        from rig.run.scenes import load_scene
+
+        experiment = Experiment.of(recording) if self.scene is None else Experiment(scene=load_scene(self.scene))
+        experiment.scene.check_physics()
+        if self.parameters is not None:
+            experiment = experiment.changed({"parameters": self.parameters, "set": {}})
+        return experiment if self.engine is None else experiment.changed({"engine.name": self.engine})
+
+
+@dataclass(frozen=True)
+class Search:
+    """How the numbers are looked for."""
+
+    precision: Annotated[
+        float, typer.Option(min=1e-9, help="Relative half width of the intervals that is fine enough.")
+    ] = 1e-4
+    spread: Annotated[float, typer.Option(min=1e-6, max=1.0, help="How far off the start may be, relatively.")] = 0.1
+    robust: Annotated[bool, typer.Option("--robust", help="Let single samples that are far off count less.")] = False
+    whole: Annotated[
+        bool, typer.Option("--whole", help="Go on as far as the model stays linear, even if it no longer fits.")
+    ] = False
+
+    def left_out(self, *, from_s: float | None) -> None:
+        """Refuse what a search in a log of another system does not have.
+
+        Raises:
+            InputError: The first such option.
+        """
+        from rig.base.errors import InputError
+
+        given = {"--from": from_s, **{f"--{name}": value for name, value in asdict(self).items()}}
+        usual = {"--from": None, **{f"--{name}": value for name, value in asdict(Search()).items()}}
+        for option, value in given.items():
+            if value != usual[option]:
+                raise InputError(
+                    option, "left out for a log of another system: it is fitted from its hammer pulse on", value
+                )
+
+
+def identify(
+    files: RecordingFiles,
+    *,
+    asked: Asked,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", metavar="FILE.toml", help="Write the fitted parameter set.")
+    ] = None,
+    report: ReportFile = None,
+    search: Search,
+    exact: Annotated[
+        bool,
+        typer.Option(
+            "--exact", help="Of an imported log: take its clock, the shaft's angle and the impact as it tells them."
+        ),
+    ] = False,
+    form: Form,
+    force: Force = False,
+) -> None:
+    """Fit numbers of the rig to a recording: values, 95 % intervals, and what the recording cannot tell.
+
+    Ends with 1, and writes no set, where the model does not explain the recording: then no value is a result.
+    """
+    from recorder.reader import join
+    from replays.recordings.identification.document import check_set, fitted_set, identification_document, write_set
+    from replays.recordings.identification.summary import report_of
+    from replays.report import check_report, write_report
+
+    if output is not None:
+        check_set(output, force=force)
+    if report is not None:
+        check_report(report, force=force)
+    recording = join(files)
+    name = files[0].name if len(files) == 1 else f"{files[0].name} and {len(files) - 1} more"
+    with reporting(compiles=True) as reporter:
+        found, along = asked.found(recording, search, exact=exact, progress=reporter.step)
+    fits = found.judgement.fits
+    if output is not None and fits:
+        write_set(fitted_set(found, recording=name), output)
+    if report is not None:
+        write_report(report_of(found, recording=name, origin=of_recording(name, recording)), report)
+    if form.as_json:
+        echo_json(identification_document(found, recording=name))
+    else:
+        _show(found, name, form.console())
+        _tell(along, output if fits else None, report)
+    if not fits:
+        if output is not None:
+            echo(f"not written  {output}: the model does not explain the recording", err=True)
+        raise typer.Exit(1)
+
+
+def _tell(along: list[str], output: Path | None, report: Path | None) -> None:
+    if along:
+        echo(f"fitted along, as an imported log does not tell it exactly: {', '.join(along)}")
+    if output is not None:
+        echo(f"written  {output}: a parameter set, as in `rig run hammer --parameters {output}`")
+    if report is not None:
+        echo(f"written  {report}")
+
+
+def _number(option: str, text: str) -> float:
+    from rig.base.errors import InputError
+
+    try:
+        return float(text)
+    except ValueError:
+        raise InputError(option, "a number", text) from None
+
+
+def _two(option: str, text: str, between: str) -> tuple[float, float]:
+    from rig.base.errors import InputError
+
+    first, sign, second = text.partition(between)
+    if not sign:
+        raise InputError(option, f"two numbers with {between} between them", text)
+    return _number(option, first), _number(option, second)
+
+
+def _show(found: Identification, name: str, console: Console) -> None:
+    from replays.recordings.identification.summary import HEADINGS, cells, fit_line, spread_line, window_line
+
+    numbers = ("start", "result", "95 % interval")
+    headings = (f">{heading}" if heading in numbers else heading for heading in HEADINGS)
+    table = new_table(f"{name}: what it tells", *headings, wrapped=HEADINGS[-1:])
+    for finding in found.judgement.findings:
+        table.add_row(*cells(finding), style="" if finding.standing == "identified" else "yellow")
+    console.print(table)
+    asked = [place for place, unknown in enumerate(found.question.unknowns) if not unknown.along]
+    keys = [found.question.keys[place] for place in asked]
+    if len(keys) > 1:
+        table = new_table("correlation", "", *(f">{key}" for key in keys))
+        for key, row in zip(keys, found.judgement.correlation[asked][:, asked], strict=True):
+            table.add_row(key, *("-" if value != value else f"{value:+.4f}" for value in row))
+        console.print()
+        console.print(table)
+    console.print()
+    console.print(window_line(found))
+    console.print(fit_line(found))
+    if found.narrowed:
+        console.print(spread_line(found))

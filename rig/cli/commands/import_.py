@@ -1,0 +1,250 @@
+"""`rig import`: logs of other measuring systems as recordings."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from rig.base import units
+from rig.base.errors import InputError, Words, check_new_file, check_not_among, whole_file
+from rig.cli.options import Force
+from rig.cli.output.tables import Form, echo, echo_json, new_table
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from replays.recordings.formats.conversion import Conversion
+    from replays.recordings.formats.guessing.guess import Guess
+
+
+def import_(
+    files: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            metavar="FILE...", help=".mf4, .tdms, .uff, .csv, .txt, .lvm, .parquet or .wav; several to align."
+        ),
+    ] = None,
+    *,
+    mapping: Annotated[Path | None, typer.Option("--mapping", "-m", help="Which signal becomes which channel.")] = None,
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="Recording to write, ends in .mcap.")] = None,
+    template: Annotated[
+        Path | None,
+        typer.Option(
+            "--template",
+            metavar="FILE.toml",
+            help="Write a starting mapping instead; without logs, an example with every option.",
+        ),
+    ] = None,
+    picture: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Draw the signals of the logs as well, to a .png or .svg file.")
+    ] = None,
+    force: Force = False,
+    form: Form,
+) -> None:
+    """Turn logs of a real rig into a recording that `rig info`, `view`, `replay`, `validate` and `identify` read.
+
+    Without --mapping, each signal is guessed by its name, unit and numbers, and told with the reason; with -o it is
+    imported so. --template writes the guess as a mapping, to be corrected. What was done to the samples is printed, and
+    stands in the recording.
+    """
+    if template is not None and mapping is not None:
+        raise InputError("import", "given either --mapping or --template", Words("both"))
+    if mapping is not None and output is None:
+        raise InputError("--output", "given: a recording to write, such as -o log.mcap", None)
+    if template is not None and output is not None:
+        raise InputError("--output", "left out with --template", str(output))
+    if not files and (template is None or picture is not None):
+        raise InputError("FILE", "given: the logs to import", None)
+    from rig.run.scenes import rig_table
+
+    rig_table()
+    if mapping is not None:
+        if picture is not None:
+            raise InputError("--picture", "left out with --mapping: `rig view` shows the recording", str(picture))
+        assert output is not None
+        _import(files or [], mapping, output, force=force, form=form)
+        return
+    _guess(files or [], template, output, picture, force=force, form=form)
+
+
+def _import(files: list[Path], mapping: Path | str, output: Path, *, force: bool, form: Form) -> None:
+    """Import by a mapping in a file, or by the text of one that was guessed."""
+    from recorder.files.draft import check_destination
+    from replays.recordings.formats.conversion import convert, write_recording
+    from replays.recordings.formats.mapping import Mapping, load_mapping, parse_mapping
+    from rig.cli.output.progress import reporting
+
+    check_destination(output, force=force)
+    check_not_among(files if isinstance(mapping, str) else [*files, mapping], output)
+    name = "the guess (--template writes it)" if isinstance(mapping, str) else mapping.name
+    checked = parse_mapping(tomllib.loads(mapping), name=name) if isinstance(mapping, str) else load_mapping(mapping)
+    with reporting() as reporter:
+        try:
+            doubts = (
+                [f"guessed and not told: {question}" for question in _asked(mapping)]
+                if isinstance(mapping, str)
+                else []
+            )
+            conversion = convert(files, checked, doubts=doubts, say=reporter.step)
+        except InputError as error:
+            # What is wrong with a file is no fault of the mapping, whose table [file] has other fields.
+            if error.field == "file" or error.field.split(".")[0] not in Mapping.model_fields:
+                raise
+            raise InputError(f"{name}: {error.field}", error.must, error.received) from None
+
+        def tell(part: float) -> None:
+            reporter.part(part, "writing")
+
+        write_recording(conversion, output, force=force, progress=tell)
+    if form.as_json:
+        echo_json(conversion.document)
+    else:
+        _tell(conversion, output, form.console())
+        if isinstance(mapping, str):
+            echo("imported as guessed: --template FILE.toml writes the guess, to be corrected and given with --mapping")
+
+
+def _guess(
+    files: list[Path], path: Path | None, output: Path | None, picture: Path | None, *, force: bool, form: Form
+) -> None:
+    """Guess what is in the logs, tell it, and write it as a mapping, as a picture, or import by it."""
+    from replays.recordings.formats.guessing.template import example, guessed
+
+    for wanted, field, suffixes in ((path, "--template", (".toml",)), (picture, "--picture", (".png", ".svg"))):
+        if wanted is not None:
+            check_new_file(wanted, field=field, suffixes=suffixes, force=force)
+            check_not_among(files, wanted, field=field)
+    text, guesses = guessed(files) if files else (example(), [])
+    if path is not None:
+        with whole_file(path) as draft:
+            draft.write_text(text, encoding="utf-8")
+    if picture is not None:
+        from replays.recordings.formats.guessing.overview import draw
+
+        draw(guesses, picture)
+    if form.as_json and output is None:
+        echo_json([_document(guess) for guess in guesses])
+    elif guesses and not form.as_json:
+        _tell_guesses(guesses, text, form.console())
+    if path is not None and not form.as_json:
+        asked = len(_asked(text))
+        told = "a mapping to start from" if files else "an example with every option"
+        told += f"; {asked} {'line' if asked == 1 else 'lines'} to check" if asked else ""
+        echo(f"{path}: {told}")
+    if output is not None:
+        for guess in guesses:
+            if "unit" in guess.asks and guess.entry.unit:
+                units.parse(guess.entry.unit, field=f"unit of {guess.entry.name} (--template FILE.toml asks for it)")
+        _import(files, text, output, force=force, form=form)
+
+
+def _asked(text: str) -> list[str]:
+    """Lines of a mapping that ask something, each with the table that it stands in."""
+    from replays.recordings.formats.guessing.template import CHECK
+
+    found, table = [], ""
+    for line in text.splitlines():
+        if (bare := line.removeprefix("# ")).startswith("["):
+            table = bare.partition("#")[0].strip()
+        if CHECK in line:
+            held, _, question = line.partition(f"# {CHECK}: ")
+            held = held.strip().removeprefix("# ")
+            about = f"{table} {'' if held == table else held}".strip()
+            found.append(f"{about}: {question.partition(' (')[0]}")
+    return found
+
+
+_SPARK = 12
+"""Width of a signal's course in a table."""
+
+
+def _tell_guesses(guesses: list[Guess], text: str, console: Console) -> None:
+    table = new_table("", "signal", "course", "becomes", "sure", "why", wrapped=("signal", "why"), spare=("course",))
+    for guess in guesses:
+        unit = f" [{guess.entry.unit}]" if guess.entry.unit else ""
+        where = f"{guess.entry.group} " if len({each.entry.group for each in guesses}) > 1 else ""
+        why = guess.why if guess.channel else "none of the rig's: a channel of its own"
+        course = guess.look.sparkline(_SPARK)
+        style = "" if guess.channel and guess.sure != "ask" else "yellow"
+        table.add_row(
+            f"{where}{guess.entry.name}{unit}",
+            course,
+            guess.channel or "-",
+            guess.sure if guess.channel else "-",
+            why,
+            style=style,
+        )
+    console.print(table)
+    if questions := _asked(text):
+        echo("What the logs do not tell:")
+        for question in questions:
+            echo(f"  {question}")
+
+
+def _document(guess: Guess) -> dict[str, Any]:
+    return {
+        "file": guess.source.path.name, "group": guess.entry.group, "signal": guess.entry.name,
+        "unit": guess.entry.unit, "channel": guess.channel or None, "sure": guess.sure if guess.channel else None,
+        "why": guess.why, "asks": guess.asks, "mean": guess.look.mean, "low": guess.look.extent[0],
+        "high": guess.look.extent[1], "rate_hz": guess.look.axis.rate_hz if guess.look.timed else None,
+    }  # fmt: skip
+
+
+_JITTER_US, _DRIFT_PPM, _DUST = 1e-3, 1e-2, 1e-6
+"""Less than this is rounding: of time stamps, of clocks, and beside a channel's largest value."""
+
+
+def _tell(conversion: Conversion, output: Path, console: Console) -> None:
+    size = output.stat().st_size / 1e6
+    seconds = conversion.end_tick / 1e6
+    console.print(f"{output}: {len(conversion.channels)} channels, {seconds:.6g} s, {size:.1f} MB, from "
+                  f"{conversion.start.isoformat()}")  # fmt: skip
+    columns = _columns(conversion)
+    words = ("channel", "source", "value", "unit")
+    headings = (heading if heading in words else f">{heading}" for heading in columns)
+    table = new_table("", *headings, wrapped=("source", "value"), spare=("clock [ppm]", "jitter [us]"))
+    for row, channel in zip(zip(*columns.values(), strict=True), conversion.channels, strict=True):
+        trouble = channel.missing or channel.overrange
+        table.add_row(*row, style="yellow" if trouble else "")
+    console.print(table)
+    for line in _in_common(conversion):
+        console.print(line)
+    for remark in conversion.remarks:
+        console.print(remark)
+    if conversion.experiment is None:
+        console.print("no scene: it cannot be simulated again until the mapping has an [experiment]")
+
+
+def _columns(conversion: Conversion) -> dict[str, list[str]]:
+    """The table's columns by heading; those in which nothing stands are left out."""
+    channels, files = conversion.channels, conversion.document["files"]
+    only = f"{files[0]['name']} " if len(files) == 1 else ""
+    ends = [max(abs(channel.low), abs(channel.high)) * _DUST for channel in channels]
+    columns = {
+        "channel": [channel.name for channel in channels],
+        "source": [channel.source.removeprefix(only) for channel in channels],
+        "value": [channel.formula for channel in channels],
+        "low": [f"{c.low if abs(c.low) > dust else 0.0:.4g}" for c, dust in zip(channels, ends, strict=True)],
+        "high": [f"{c.high if abs(c.high) > dust else 0.0:.4g}" for c, dust in zip(channels, ends, strict=True)],
+        "unit": ["" if channel.unit == "1" else channel.unit for channel in channels],
+        "missing": [f"{channel.missing or ''}" for channel in channels],
+        "overrange": [f"{channel.overrange or ''}" for channel in channels],
+        "jitter [us]": [f"{c.jitter_us:.2g}" if c.jitter_us >= _JITTER_US else "" for c in channels],
+        "clock [ppm]": [f"{c.drift_ppm:+.2g}" if abs(c.drift_ppm) >= _DRIFT_PPM else "" for c in channels],
+    }
+    return {heading: cells for heading, cells in columns.items() if any(cells)}
+
+
+def _in_common(conversion: Conversion) -> list[str]:
+    """What was done to the samples, each thing once, with the channels that it was done to."""
+    done: dict[str, list[str]] = {}
+    for channel in conversion.channels:
+        # A count of the source's own differs from channel to channel, and stands in the recording.
+        rule = channel.counts.split(",")[0] if "," in channel.counts else "a power of two of the unit"
+        for text in (f"{channel.rate_hz:.9g} Hz, {channel.time}", f"one count: {rule}"):
+            done.setdefault(text, []).append(channel.name)
+    whole = len(conversion.channels)
+    return [f"{'all' if len(names) == whole else ', '.join(names)}: {text}" for text, names in done.items()]

@@ -1,0 +1,184 @@
+"""`rig ladder`: the cheapest model, engine and step that give the quantities asked for within a tolerance."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from rig.base.errors import whole_file
+from rig.cli.options import Changes, SceneChanges, SceneName
+from rig.cli.output.folder import check_folder
+from rig.cli.output.progress import reporting
+from rig.cli.output.tables import Form, Table, echo, echo_json, new_table
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+
+_COUNTS = (
+    "What counts, such as whirl_frequency, mean_normal_force or outcome (any other word lists all); may be repeated."
+)
+
+
+def ladder(
+    scene: SceneName,
+    *,
+    quantity: Annotated[list[str], typer.Option("--quantity", "-q", metavar="QUANTITY", help=_COUNTS)],
+    tolerance: Annotated[
+        list[float],
+        typer.Option("--tolerance", "-t", metavar="PART", help="Error allowed, as a part: one for all, or each."),
+    ],
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", metavar="FOLDER", help="For ladder.png, .svg and .json.")
+    ] = None,
+    write: Annotated[
+        Path | None, typer.Option(metavar="FILE.toml", help="Store the pick in this scene file, as [pick].")
+    ] = None,
+    keep: Annotated[
+        list[str] | None, typer.Option(metavar="LEVEL", help="A level that stays as full as it is; may be repeated.")
+    ] = None,
+    changes: Changes = None,
+    runs: Annotated[int, typer.Option(min=1, help="Timed runs of each candidate.")] = 5,
+    budget_s: Annotated[float, typer.Option(min=1.0, help="Wall time allowed, in s.")] = 300.0,
+    form: Form,
+) -> None:
+    """Find the cheapest model, engine and step that are good enough: what does each cost, and what does it err by?"""
+    import json
+
+    from replays.studies.ladder.chart import draw
+    from replays.studies.ladder.document import ladder_document, pick_of
+    from replays.studies.ladder.pick import check_target, write_pick
+    from replays.studies.ladder.quantity import parse_quantities
+    from replays.studies.ladder.search import search
+    from rig.run.scenes import load_scene
+
+    tolerances = parse_quantities(quantity, tolerance)
+    if output is not None:
+        check_folder(output, field="--output")
+    # A pick is made anew from what the scene is without one.
+    loaded = load_scene(scene, {**SceneChanges(changes=changes).overrides(), "fidelity": "given"})
+    loaded.check_physics()
+    if write is not None:
+        check_target(write, scene, loaded)
+    with reporting(compiles=True) as reporter:
+        found = search(
+            loaded,
+            tolerances,
+            keep=tuple(keep or ()),
+            runs=runs,
+            budget_s=budget_s,
+            progress=reporter.step,
+        )
+    document = ladder_document(found)
+    paths: list[Path] = []
+    if output is not None:
+        paths = draw(found, output)
+        paths.append(output / "ladder.json")
+        with whole_file(paths[-1]) as draft:
+            draft.write_text(json.dumps(document, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    if write is not None:
+        write_pick(write, scene, pick_of(found))
+    if form.as_json:
+        echo_json(document)
+        return
+    _show(document, form.console())
+    for path in paths:
+        echo(f"written  {path}")
+    if write is not None:
+        echo(f'written  {write}: [pick], in force with fidelity = "auto" at the head of the file')
+
+
+def _show(document: dict[str, Any], console: Console) -> None:
+    console.print(levels_table(document))
+    console.print()
+    console.print(engines_table(document))
+    pick, names = document["pick"], [entry["name"] for entry in document["quantities"]]
+    levels = ", ".join(f"{level} {pick[level]}" for level in ("magnet", "shaft", "stator", "contact", "friction"))
+    echo(f"\npick: {levels}, drive {pick['drive']}, sensors {pick['sensors']}; {document['picked']['engine']}")
+    for entry in pick["quantities"]:
+        echo(
+            f"  {entry['quantity']} = {entry['value']} {entry['unit']} against {entry['reference']}: "
+            f"model {entry['model_error']:.1e}, numerical {entry['numerical_error']:.1e}, "
+            f"total {entry['total_error']:.1e} of {entry['tolerance']:g} allowed "
+            f"(the reference's own {entry['reference_error']:.1e})"
+        )
+    own = ", ".join(f"{entry['as_given_error']:.1e}" if entry["as_given_error"] is not None else "infinite"
+                    for entry in document["quantities"])  # fmt: skip
+    saved = ", ".join(f"{level} {pick[level]} saves {part:.0%}" for level, part in document["savings"].items())
+    picked, given = document["picked"], document["given"]
+    same = (picked["engine"], picked["model"]) == (given["engine"], given["model"])
+    none = "the scene as it is given" if same else "nothing is left out"
+    echo(f"  {saved or none}; outcome {picked['outcome']} as of the full model")
+    echo(
+        f"  a simulated second takes {pick['cpu_s'] * 1e3:.3g} ms of processor time with the picked sensors, "
+        f"{pick['cpu_given_s'] * 1e3:.3g} ms as the scene is given (errors {own} in {', '.join(names)}), "
+        f"{pick['cpu_full_s'] * 1e3:.3g} ms on the full model by {document['full']['engine']}"
+    )
+    if pick["sensors"] == "ideal":
+        echo("  sensors ideal: these quantities are the model's own; --keep sensors keeps the chain")
+    if given["engine"].endswith("companion") and not pick["companion"]:
+        echo("  no companion: the errors are measured here, a run does not estimate its own")
+    echo(
+        f"  reference: full model by {document['reference']['engine']}, its own error the distance to "
+        f"{document['reference']['unlike']}; seed {pick['seed']}, {pick['date']}, rig {pick['rig']} {pick['commit']}"
+    )
+    if not document["all_engines_tried"]:
+        echo("  the budget ended before every engine was tried")
+
+
+def _error(value: float | None) -> str:
+    return "-" if value is None else f"{value:.1e}"
+
+
+def levels_table(document: dict[str, Any]) -> Table:
+    """What each level of the model costs, and errs by."""
+    names = [entry["name"] for entry in document["quantities"]]
+    table = new_table(
+        f"Levels of the model in scene {document['scene']}: model error, each against the full model",
+        *("level", *(f">{name}" for name in names), ">ms a second", ">ns a step", "on", "verdict", "remark"),
+        wrapped=("level", "on", "remark"),
+        spare=("remark", "ns a step", "on"),
+    )
+    for step in document["steps"]:
+        if step["stage"] not in ("full", "single", "together"):
+            continue
+        errors = [_error(step["errors"]["model"].get(name)) if step["stage"] != "full" else "0" for name in names]
+        table.add_row(
+            ("together: " if step["stage"] == "together" else "") + step["label"],
+            *errors,
+            f"{step['cost']['cpu_s'] * 1e3:.2f}",
+            f"{step['cost']['ns_a_step']:.0f}",
+            step["cost"]["engine"],
+            "passes" if step["passes"] else "fails",
+            step["note"],
+        )
+    return table
+
+
+def engines_table(document: dict[str, Any]) -> Table:
+    """The same of each engine and step, on the picked model."""
+    names = [entry["name"] for entry in document["quantities"]]
+    table = new_table(
+        "Engines and steps on the picked model: numerical error, total error",
+        *("engine", *(f">{name}" for name in names), ">ms a second", ">ns a step", "verdict", "remark"),
+        wrapped=("engine", "remark"),
+        spare=("remark", "ns a step"),
+    )
+    for step in document["steps"]:
+        if step["stage"] not in ("engine", "given"):
+            continue
+        errors = [
+            f"{_error(step['errors']['numerical'][name])}, {_error(step['errors']['total'][name])}" for name in names
+        ]
+        cpu, ns = step["cpu_s"], step["ns_a_step"]
+        table.add_row(
+            step["label"],
+            *errors,
+            "-" if cpu is None else f"{cpu * 1e3:.2f}",
+            "-" if ns is None else f"{ns:.0f}",
+            "passes" if step["passes"] else "fails",
+            step["note"],
+        )
+    return table

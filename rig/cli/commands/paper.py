@@ -1,0 +1,99 @@
+"""`rig paper`: the paper's figures, tables and conclusion, made again and judged, in one report."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from rig.cli.options import Force
+from rig.cli.output.folder import check_folder
+from rig.cli.output.origin import origin
+from rig.cli.output.progress import reporting
+from rig.cli.output.tables import Form, echo, echo_json, new_table
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from replays.studies.paper.findings import Findings
+
+
+def paper(
+    *,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", metavar="FILE", help="Write the report, .html or .pdf.")
+    ] = None,
+    pictures: Annotated[
+        Path | None, typer.Option("--pictures", metavar="FOLDER", help="Write the main pictures as PNG files as well.")
+    ] = None,
+    quick: Annotated[
+        bool, typer.Option("--quick/--full", help="Few, short runs (some seconds), or all of them (about a minute).")
+    ] = False,
+    processes: Annotated[int, typer.Option(min=1, max=64, help="Processes at a time.")] = 2,
+    force: Force = False,
+    form: Form,
+) -> None:
+    """Make the paper's figures, tables and claims again, as printed and corrected, each with a verdict."""
+    from replays.report import check_report, write_report
+    from replays.studies.paper.document import draw_pictures, write_up
+    from replays.studies.paper.findings import find, steps
+
+    if output is not None:
+        check_report(output, force=force, field="--output")
+    if pictures is not None:
+        check_folder(pictures, field="--pictures")
+    with reporting(compiles=True) as reporter:
+        reporter.begin(steps(quick=quick))
+        findings = find(quick=quick, processes=processes, progress=reporter.step)
+        if output is not None:
+            reporter.say("report")
+            sets = f"as-printed, corrected; {'few, short' if quick else 'all'} runs"
+            write_report(write_up(findings, quick=quick, origin=origin(parameter_sets=sets)), output)
+        drawn = []
+        if pictures is not None:
+            pictures.mkdir(exist_ok=True)
+            drawn = draw_pictures(findings, pictures)
+    if form.as_json:
+        echo_json(summary(findings))
+        return
+    _show(findings, form.console())
+    for path in drawn:
+        echo(f"picture  {path}")
+    if output is not None:
+        echo(f"report  {output}")
+    elif not drawn:
+        echo("nothing is written; -o paper.html writes the report with all figures and tables")
+
+
+def summary(findings: Findings) -> dict[str, object]:
+    """The summary as a JSON document: of ours 5, 50 and 95 %, nan where a number does not exist."""
+    from replays.studies.paper.scans.spread import percentiles
+
+    return {
+        "statements": [
+            {
+                **line.statement.model_dump(exclude={"low", "high"}),
+                "values": {name: percentiles(values) for name, values in line.values.items()},
+                "inside": {name: line.statement.inside(values) for name, values in line.values.items()},
+                "verdicts": line.verdicts,
+            }
+            for line in [*findings.lines, *findings.claims]
+        ]
+    }
+
+
+def _show(findings: Findings, console: Console) -> None:
+    from rich.text import Text
+
+    from replays.studies.paper.findings import JUDGED_BY
+
+    headings = ("statement", "the paper", ">unit", ">as-printed", ">corrected", ">inside", "verdict")
+    table = new_table("the paper's statements, and ours", *headings, wrapped=("statement", "verdict"))
+    colours = {"good": "green", "bad": "bold red", "open": "yellow", "plain": ""}
+    for line in [*findings.lines, *findings.claims]:
+        row = line.row()
+        says, _, *cells, verdict = row.cells
+        table.add_row(says, *cells, Text(verdict, colours[row.mark]))
+    console.print(table)
+    console.print(f"median (5–95 %), inside (of how many) over phases, assumed values and readings; {JUDGED_BY}")

@@ -1,0 +1,299 @@
+"""`rig record`: everything a rig publishes, into one file, several, or one around each trigger."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from rig.base.errors import InputError
+from rig.base.text import printable
+from rig.cli.connections.connection import Connection
+from rig.cli.groups import panel
+from rig.cli.options import Force
+from rig.cli.output.display import fitted
+from rig.cli.output.tables import echo, plain, table_console
+
+if TYPE_CHECKING:
+    from recorder.contents.summary import Progress, Summary
+    from recorder.output.room import Limits
+    from recorder.output.trigger import Capture
+    from recorder.session import RecordingSession
+    from rig.serve.transport.zenoh import ZenohClient
+
+_files, _triggers, _disk = panel("Several files"), panel("Around triggers"), panel("The disk")
+
+
+class WhenFull(StrEnum):
+    """What happens when there is no more room."""
+
+    STOP = "stop"
+    REMOVE_OLDEST = "remove-oldest"
+
+
+class Again(StrEnum):
+    """What a trigger does during a capture."""
+
+    EXTEND = "extend"
+    IGNORE = "ignore"
+
+
+_PRE_S, _POST_S = 0.5, 2.0
+_SPINNER = 2
+"""Columns of the sign that something goes on, with the blank behind it."""
+
+
+@dataclass(frozen=True)
+class Rotation:
+    """When a new file begins."""
+
+    rotate_mb: Annotated[float | None, _files("A new file at about this size, in MB: NAME.0000.mcap, ...")] = None
+    rotate_s: Annotated[float | None, _files("A new file after this simulated time, in s.")] = None
+
+
+@dataclass(frozen=True)
+class Triggers:
+    """What it is recorded around, if not all of the time."""
+
+    trigger: Annotated[
+        list[str] | None,
+        _triggers(
+            "Record only around this: an event (hammer, speed, release, fault, note, warning) or a level such as "
+            "'|disk_x|>0.5' or 'P_E>3200' (in the channel's unit, preload included); may be repeated. A level fires "
+            "where it is crossed, and again after 0.25 s clear of it. One file each: NAME.hammer-001.mcap, ...",
+            metavar="EVENT|LEVEL",
+        ),
+    ] = None
+    pre_s: Annotated[
+        float | None, _triggers("Simulated time kept before a trigger, in s.", show_default=f"{_PRE_S:g}")
+    ] = None
+    post_s: Annotated[
+        float | None, _triggers("Simulated time kept after a trigger, in s.", show_default=f"{_POST_S:g}")
+    ] = None
+    longest_s: Annotated[
+        float | None, _triggers("Longest length of a capture, in s of simulated time.", show_default="60")
+    ] = None
+    trigger_count: Annotated[int | None, _triggers("End after so many captures.")] = None
+    again: Annotated[
+        Again | None,
+        _triggers(
+            "What a trigger does during a capture: make it longer, or nothing.",
+            show_default="extend for events, ignore for levels",
+        ),
+    ] = None
+
+    def capture(self) -> Capture | None:
+        """What is recorded of a run; None: all of it.
+
+        Raises:
+            InputError: A trigger is none, or there is none that the other options are for.
+        """
+        from recorder.output.trigger import Capture, Trigger
+
+        around = {
+            "pre_s": self.pre_s,
+            "post_s": self.post_s,
+            "count": self.trigger_count,
+            "again": None if self.again is None else Again(self.again).value,
+            "longest_s": self.longest_s,
+        }
+        given = {name: value for name, value in around.items() if value is not None}
+        triggers = tuple(Trigger.parse(text) for text in self.trigger or ())
+        if given and not triggers:
+            name, value = next(iter(given.items()))
+            raise InputError("trigger_count" if name == "count" else name, "used with --trigger", value)
+        settings: dict[str, Any] = {"pre_s": _PRE_S, "post_s": _POST_S, **given}
+        return Capture(triggers, **settings) if triggers else None
+
+
+@dataclass(frozen=True)
+class Disk:
+    """What a recording may take of the disk and of memory."""
+
+    budget_mb: Annotated[float | None, _disk("What all files of this recording may take, in MB.")] = None
+    keep_free_mb: Annotated[float, _disk("Room to leave on the disk, in MB.")] = 100.0
+    when_full: Annotated[WhenFull, _disk("At the budget, or with no more room: end, or remove the oldest file.")] = (
+        WhenFull.STOP
+    )
+    backlog_mb: Annotated[float, _disk("What may wait in memory for a slow disk, in MB; more is a gap.")] = 256.0
+
+    def limits(self, rotation: Rotation) -> Limits:
+        """Size of the files, and what they may take.
+
+        Raises:
+            InputError: There cannot be so much memory.
+        """
+        from recorder.output.room import Limits
+
+        if not 1.0 <= self.backlog_mb <= 1e5:
+            raise InputError("backlog_mb", "from 1 to 1e5", self.backlog_mb)
+        return Limits(
+            rotate_mb=rotation.rotate_mb,
+            rotate_s=rotation.rotate_s,
+            budget_mb=self.budget_mb,
+            keep_free_mb=self.keep_free_mb,
+            when_full=WhenFull(self.when_full).value,
+        )
+
+
+def record(
+    output: Annotated[Path, typer.Option("--output", "-o", help="File to record to, ends in .mcap.")],
+    *,
+    connection: Connection,
+    duration_s: Annotated[
+        float | None, typer.Option(help="Simulated time to record, in s; without it until the rig's run ends.")
+    ] = None,
+    view_rate_hz: Annotated[
+        float, typer.Option(help="Rate of the messages for plots, in Hz; 0 leaves them out.")
+    ] = 500.0,
+    history: Annotated[
+        bool, typer.Option(help="From the start of the run on, as far as the rig's cache reaches.")
+    ] = False,
+    patience_s: Annotated[
+        float,
+        typer.Option(
+            metavar="S",
+            help="How long a rig that is lost may take to be there again, in s; the same run is then recorded on.",
+            min=0.0,
+        ),
+    ] = 10.0,
+    force: Force = False,
+    rotation: Rotation,
+    triggers: Triggers,
+    disk: Disk,
+) -> None:
+    """Record all streams of a running rig to FILE.mcap, losslessly; Ctrl-C ends the recording well.
+
+    Exit status 0: all that was to be recorded is in the file. 1: rows or messages were lost, the run failed, the rig
+    was lost, or the disk ended the recording; what was lost is told, and what is there is kept. 2: wrong input.
+    """
+    import os
+
+    from recorder.output.room import MB
+    from recorder.session import RecordingSession
+
+    limits, capture = disk.limits(rotation), triggers.capture()
+
+    def session_of(client: ZenohClient | None) -> RecordingSession:
+        return RecordingSession(
+            client,  # type: ignore[arg-type]  # only checked, in the first of two calls
+            output,
+            name=f"recorder-{os.getpid()}",
+            duration_s=duration_s,
+            view_rate_hz=view_rate_hz,
+            history=history,
+            patience_s=patience_s,
+            force=force,
+            limits=limits,
+            capture=capture,
+            inbox_bytes=round(disk.backlog_mb * MB),
+        )
+
+    session_of(None)  # whatever is wrong with the options is said before a rig is looked for
+    with connection.client() as client:
+        summary = run_session(session_of(client))
+    tell(summary)
+    if not summary.good:
+        raise typer.Exit(1)
+
+
+def run_session(session: RecordingSession) -> Summary:
+    """Record with a line of progress; the first SIGINT or SIGTERM ends it well, a second one at once."""
+    import signal
+
+    ends = (signal.SIGINT, signal.SIGTERM)
+
+    def stop(number: int, _: object) -> None:
+        session.stop(f"interrupted by {signal.Signals(number).name}")
+        for each in ends:
+            signal.signal(each, before[each])
+
+    def remark(lines: tuple[str, ...]) -> None:
+        nonlocal told
+        for line in lines[told:]:
+            console.print(line, soft_wrap=True)
+        told = len(lines)
+
+    before = {number: signal.signal(number, stop) for number in ends}
+    console = table_console(stderr=True)
+    told, begun, files = 0, False, session.first_files
+    more = "" if files == [session.path] else ", ..."
+    name = f"recording {printable(' or '.join(file.name for file in files), 30)}{more}"
+    try:
+        with console.status(plain(f"{name}: waiting for the rig")) as status:
+
+            def show(progress: Progress) -> None:
+                nonlocal begun
+                if progress.rows and not begun and not console.is_terminal:
+                    into = printable(" or ".join(map(str, files))) + more
+                    echo(f"rig: recording {into}; Ctrl-C ends it well", err=True)  # scripts wait for this line
+                begun = begun or progress.rows > 0
+                remark(progress.remarks)
+                lost = f"{progress.lost} lost"
+                parts = [
+                    f"{name}: {progress.time_s:.1f} s",
+                    lost,
+                    f"{progress.size_bytes / 1e6:.1f} MB",
+                    *([f"{progress.backlog_bytes / 1e6:.1f} MB wait"] if progress.backlog_bytes > 1e6 else []),
+                    *([f"{progress.files} files finished"] if progress.files else []),
+                    f"{progress.rows} samples",
+                ]
+                line = plain(fitted(parts, console.width - _SPINNER, ", "))
+                line.highlight_words([lost] if progress.lost else [], "red")
+                status.update(line)
+
+            summary = session.run(show)
+            remark(summary.remarks)
+            return summary
+    finally:
+        for number in ends:
+            signal.signal(number, before[number])
+
+
+def tell(summary: Summary) -> None:
+    """What became of a recording, line by line."""
+    from rig.base.wire import SENSORS, TRUTH
+
+    sensors = [rows for key, rows in summary.rows.items() if key.startswith(SENSORS + "/")]
+    truth = sum(rows for key, rows in summary.rows.items() if key.startswith(TRUTH + "/"))
+    files = str(summary.path)
+    if len(summary.files) > 1:
+        files = f"{summary.files[0]} to {summary.path.name} ({len(summary.files)} files)"
+    elif not summary.files:
+        files = f"{summary.path}: no file"
+    triggers = "1 trigger" if summary.fired == 1 else f"{summary.fired} triggers"
+    if summary.fired is not None and not summary.files:
+        came = triggers if summary.fired else "no trigger"
+        echo(f"{came} came in {summary.received_s:.3f} s; nothing was written; ended: {summary.reason}")
+    else:
+        around = ""
+        if summary.fired is not None:
+            around = f" (around {triggers}, of {summary.received_s:.3f} s received)"
+        echo(
+            f"{files}: {summary.duration_s:.3f} s from {summary.first_time_s:.3f} s on{around}, "
+            f"{sum(sensors)} samples in {len(sensors)} streams, {f'{truth} rows of' if truth else 'no'} truth, "
+            f"{summary.size_bytes / 1e6:.1f} MB; ended: {summary.reason}"
+        )
+    if summary.removed:
+        echo(f"{summary.removed} older files were removed to make room")
+    for line in summary.losses or ("nothing",):
+        echo(f"lost: {line}")
+    for key, rows in summary.declared.items():
+        echo(f"not lost: {rows} rows of {key}, which a fault took before they were sent, or sent late")
+    if summary.lost or summary.missed:
+        inside = ", those inside a capture," if summary.fired is not None else ""
+        echo(f"the gaps ({summary.gaps}){inside} are recorded in the file on recorder/gaps")
+    if summary.dropped:
+        echo(
+            f"{summary.dropped} blocks found no room before the disk; they are among the lost "
+            f"(at most {summary.high_water_bytes / 1e6:.1f} MB waited)"
+        )
+    if summary.malformed:
+        echo(f"{summary.malformed} payloads were not what their key promises; they are in the file as they came")
+    if summary.refused:
+        echo(f"{summary.refused} messages were not from this rig, or cannot be; they were left out")
+    if summary.error:
+        echo(summary.error, err=True)

@@ -1,0 +1,205 @@
+"""`rig replay`: a recording served as if it were the rig."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from rig.base.errors import InputError
+from rig.cli.connections.can_output import CanOptions
+from rig.cli.connections.connection import Serving, serve
+from rig.cli.groups import panel
+from rig.cli.options import Channels, FromS, RecordingFiles, ToS, names_of, pairs
+from rig.cli.output.display import all_lateness, lateness
+from rig.cli.output.tables import echo
+
+if TYPE_CHECKING:
+    from replays.player.edit import Edit
+    from replays.player.passes import Part
+    from replays.player.player import Player
+    from replays.player.track import Track
+    from rig.serve.transport import Server
+
+_part, _change = panel("What is played"), panel("What is changed")
+
+
+class Spacing(StrEnum):
+    """What the spacing follows."""
+
+    SIMULATED = "simulated"
+    ARRIVAL = "arrival"
+
+
+class Numbers(StrEnum):
+    """Which ticks and row numbers go out."""
+
+    ORIGINAL = "original"
+    NEW = "new"
+
+
+class Only(StrEnum):
+    """What goes out."""
+
+    SENSORS = "sensors"
+
+
+@dataclass(frozen=True)
+class Played:
+    """What is played, and when it begins."""
+
+    from_s: FromS = None
+    to_s: ToS = None
+    start_s: Annotated[float | None, _part("Where the first pass begins, in s.", "--start", metavar="S")] = None
+    loop: Annotated[int, _part("Passes through it; 0: endless.", metavar="N", min=0)] = 1
+    pause: Annotated[bool, _part("Wait for `rig resume`, or `rig step`.", "--pause")] = False
+    wait_for: Annotated[
+        int,
+        _part(
+            "Begin once N clients listen (recorders, DAQs, viewers), so that they get all of it.", metavar="N", min=0
+        ),
+    ] = 0
+    wait_s: Annotated[float, _part("Fail where they are not there after S s.", metavar="S")] = 60.0
+
+    def part(self) -> Part:
+        """Which part of the recording, and how often."""
+        from replays.player.passes import Part
+
+        return Part(from_s=self.from_s, to_s=self.to_s, start_s=self.start_s, loops=self.loop or None)
+
+
+@dataclass(frozen=True)
+class Changed:
+    """What is changed between the recording and the wire."""
+
+    time: Annotated[
+        Numbers, _change("Ticks and row numbers as recorded, or new ones that run on through loops and seeks.")
+    ] = Numbers.ORIGINAL
+    only: Annotated[Only | None, _change("Leave out what no instrument could know.")] = None
+    remap: Annotated[
+        list[str] | None, _change("The same payloads on another key; may be repeated.", metavar="KEY=KEY")
+    ] = None
+    channels: Channels = None
+    rename: Annotated[list[str] | None, _change("Another name for a channel, as if wired so.", metavar="NAME=NAME")] = (
+        None
+    )
+
+    def edit(self, track: Track) -> Edit:
+        """Which payloads go out, on which key, and which columns they have.
+
+        Raises:
+            InputError: The recording has no such key or channel, or two would get the same.
+        """
+        from replays.player.edit import Edit
+        from rig.base.wire import CATALOGUE
+
+        return Edit(
+            track.documents[CATALOGUE],
+            keys=pairs("--remap", self.remap, "KEY=KEY"),
+            channels=None if self.channels is None else names_of(self.channels),
+            names=pairs("--rename", self.rename, "NAME=NAME"),
+            truth=self.only is None,
+        )
+
+
+def replay(
+    files: RecordingFiles,
+    *,
+    rate: Annotated[float, typer.Option(help="Recorded seconds a second, 0.01 to 1000.")] = 1.0,
+    burst: Annotated[
+        bool, typer.Option("--burst", help="As fast as the clients take it, without loss; see --wait-for.")
+    ] = False,
+    spacing: Annotated[
+        Spacing, typer.Option("--by", help="By simulated time, or as it had arrived at the recorder.")
+    ] = Spacing.SIMULATED,
+    played: Played,
+    changed: Changed,
+    serving: Serving,
+    can: CanOptions,
+) -> None:
+    """Play a recording to whoever listens, as if it were the rig.
+
+    From another terminal: `rig pause`, `rig resume`, `rig seek S`, `rig rate X`, `rig step`, `rig stop`, `rig status`.
+    """
+    serving.exposure()  # what is wrong with that is said first
+    from rig.serve.pacing import FreeRun, RealTime, rare_collections
+
+    with rare_collections():
+        from replays.player.player import Player
+        from replays.player.playhead import check_rate
+        from replays.player.timeline import By
+        from replays.player.track import Track
+
+        check_rate(rate)
+        if burst and rate != 1.0:
+            raise InputError("rate", "left out with --burst", rate)
+        if played.wait_for and played.pause:
+            raise InputError("--wait-for", "left out with --pause", played.wait_for)
+        track = Track(files)
+        edit = changed.edit(track)
+        bus = can.output(track.table)
+
+    def make(server: Server) -> Player:
+        player = Player(
+            track,
+            server,
+            FreeRun() if burst else RealTime(),
+            part=played.part(),
+            edit=edit,
+            by=By(spacing),
+            rate=rate,
+            renumber=changed.time is Numbers.NEW,
+            paused=played.pause,
+            wait_for=played.wait_for,
+            wait_s=played.wait_s,
+        )
+        begin_s, end_s = player.reach_s
+        if not track.complete:
+            echo("rig: the recording was cut off; it is played as far as it goes", err=True)
+        what = "paused" if played.pause else "burst" if burst else f"x{rate:g}"
+        if played.wait_for:
+            what += f", waiting for {_clients(played.wait_for)}"
+        echo(f"rig: replay of {', '.join(map(str, files))}, {begin_s:g} to {end_s:g} s, {what}", err=True)
+        return player
+
+    # What the transport keeps for those who miss it lasts shorter when it goes faster, so there it waits for them.
+    serve(make, _words, _tell, serving=serving, bus=bus, paced=not burst, wait=burst or rate > 1.0)
+
+
+def _clients(count: int) -> str:
+    return "1 client" if count == 1 else f"{count} clients"
+
+
+def _words(status: dict[str, Any]) -> list[str]:
+    play = status["replay"]
+    if play["waiting_for"]:
+        pace = f"waiting for {_clients(play['waiting_for'])}"
+    else:
+        pace = "paused" if play["paused"] else f"x{play['achieved_rate']:.4f}"
+    if play["behind_s"]:
+        pace += f" of x{play['rate']:g}, behind by {play['behind_s']:.1f} s"
+    words = [f"{status['time_s']:7.2f} of {status['end_s']:.2f} s", pace, lateness(status)]
+    if play["passes"] != 1:
+        words.append(f"pass {play['pass']}" + (f" of {play['passes']}" if play["passes"] else ""))
+    return words
+
+
+def _tell(summary: dict[str, Any]) -> None:
+    play = summary["replay"]
+    echo(
+        f"replay: {summary['reason']} at {summary['time_s']:.3f} s, pass {play['pass']}; "
+        f"{summary['played_s']:.3f} s played in {summary['wall_s']:.3f} s, x{play['achieved_rate']:.5g} without pauses"
+    )
+    echo(
+        f"{play['payloads']} payloads, {summary['blocks']} blocks, {summary['rows']} rows; "
+        f"left out {summary['left_out']} payloads"
+    )
+    if play["rate"] is not None:
+        echo(f"{all_lateness(summary)}, not ready when due {summary['overruns']}")
+        if play["behind_s"]:
+            echo(
+                f"warning: at the end it was {play['behind_s']:.1f} s behind; for as fast as it goes see --burst",
+                err=True,
+            )

@@ -1,0 +1,187 @@
+"""`rig score`: what a DAQ under test recorded against what the rig sent."""
+
+from __future__ import annotations
+
+import json
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from rig.base.errors import InputError, Words, check_new_file, check_not_among, whole_file
+from rig.base.text import finite
+from rig.cli.connections.connection import Connection
+from rig.cli.groups import panel
+from rig.cli.options import Channels, Force, Wide, names_of
+from rig.cli.output.origin import origin
+from rig.cli.output.tables import echo, new_table, shown, table_console
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from replays.recordings.formats.mapping import Mapping
+    from replays.score.card.limits import Limits
+    from replays.score.card.scorecard import Scorecard
+
+_live = panel("Live")
+_FOR_S = 10.0
+_MATRIX_COLUMNS = 28
+"""Channels beside one another in a matrix of 80 columns."""
+
+
+class _Way(StrEnum):
+    DIGITAL = "digital"
+    ANALOGUE = "analogue"
+
+
+_STYLES = {"pass": "", "fail": "red", "inconclusive": "yellow", "no limit": ""}
+
+
+def score(
+    file: Annotated[
+        Path,
+        typer.Argument(
+            metavar="FILE",
+            help="What the DAQ recorded: as `rig import`, .mcap, or a CAN log; - for CSV that comes in while a rig "
+            "runs.",
+        ),
+    ],
+    *,
+    against: Annotated[
+        list[Path] | None,
+        typer.Option("--against", metavar="SESSION.mcap", help="What the rig sent; its parts, repeated."),
+    ] = None,
+    for_s: Annotated[
+        float | None,
+        _live("How long, from the first line on, in s; 10 unless given. Ctrl-C ends it before.", metavar="S"),
+    ] = None,
+    connection: Connection,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", metavar="FILE", help="Report with pictures, .html or .pdf.")
+    ] = None,
+    junit: Annotated[
+        Path | None, typer.Option(metavar="FILE.xml", help="JUnit's XML, a case for each quantity.")
+    ] = None,
+    as_json: Annotated[Path | None, typer.Option("--json", metavar="FILE.json", help="All of it as JSON.")] = None,
+    limits: Annotated[
+        str | None, typer.Option(metavar="SET", help="as-calibrated, api-670, iso-20816, or a .toml file.")
+    ] = None,
+    channels: Channels = None,
+    mapping: Annotated[
+        Path | None,
+        typer.Option("--mapping", "-m", metavar="FILE.toml", help="Names, units and bits, as of `rig import`."),
+    ] = None,
+    path: Annotated[_Way | None, typer.Option(help="How the DAQ is fed, if not as the file looks.")] = None,
+    force: Force = False,
+    wide: Wide = False,
+) -> None:
+    """Judge a DAQ by what it recorded, against what the rig sent.
+
+    A DAQ that took counts is judged row by row, exactly; one that sampled by itself by least squares against the known
+    signal. Where FILE is -, what comes in is judged against what the rig at --connect sends meanwhile. Exit
+    status: 0 pass, 1 fail, 2 wrong input, 3 inconclusive.
+    """
+    from replays.recordings.formats.mapping import load_mapping
+    from replays.report import check_report, write_report
+    from replays.score.card.limits import load_limits
+    from replays.score.card.scorecard import write_junit
+    from replays.score.judgement import judge
+
+    if output is not None:
+        check_report(output, force=force, field="--output")
+    for made, field, suffix in ((junit, "--junit", ".xml"), (as_json, "--json", ".json")):
+        if made is not None:
+            check_new_file(made, field=field, suffixes=(suffix,), force=force)
+            check_not_among([file, *(against or ())], made, field=field)
+    asked = load_limits(limits)
+    mapped = None if mapping is None else load_mapping(mapping)
+    due = None if channels is None else names_of(channels)
+    way = None if path is None else "digital" if path is _Way.DIGITAL else "analogue"
+    live = str(file) == "-"
+    if live == (against is not None):
+        must = "left out where FILE is -: what the rig at --connect sends" if live else "given: what the rig sent"
+        raise InputError("--against", must, None if against is None else str(against[0]))
+    if for_s is not None and not live:
+        raise InputError("--for-s", "left out where a file is judged", for_s)
+    if live:
+        card = _judge_live(connection, _FOR_S if for_s is None else for_s, asked, way, due, mapped)
+    else:
+        card = judge(file, against or [], limits=asked, path=way, channels=due, mapping=mapped)
+    if output is not None:
+        from replays.score.report import make_report
+
+        session = against[0].name if against else connection.connect
+        write_report(make_report(card, origin=origin(file=file.name, session=session, limits=card.limits)), output)
+    if junit is not None:
+        write_junit(card, junit)
+    if as_json is not None:
+        with whole_file(as_json) as draft:
+            draft.write_text(json.dumps(finite(card.document()), indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    _show(card, table_console(wide=wide), wide=wide)
+    for made in (output, junit, as_json):
+        if made is not None:
+            echo(f"written  {made}")
+    if card.outcome.exit_status:
+        raise typer.Exit(card.outcome.exit_status)
+
+
+def _judge_live(
+    connection: Connection, for_s: float, limits: Limits, path: Literal["digital", "analogue"] | None,
+    channels: list[str] | None, mapping: Mapping | None,
+) -> Scorecard:  # fmt: skip
+    """Take down what comes in by standard input, and what the rig sends meanwhile, and judge that."""
+    import sys
+    import tempfile
+    import threading
+
+    from replays.score.judgement import judge
+    from replays.score.records.live import LONGEST_S, SHORTEST_S, collect
+    from rig.cli.output.progress import reporting
+    from rig.cli.signals import stopping_on_signals
+
+    if not SHORTEST_S <= for_s <= LONGEST_S:
+        raise InputError("--for-s", f"from {SHORTEST_S:g} to {LONGEST_S:g}", for_s)
+    if sys.stdin.isatty():
+        raise InputError("FILE", "fed by a pipe where it is -: my-daq | rig score -", Words("a terminal"))
+    stopped = threading.Event()
+    with tempfile.TemporaryDirectory(prefix="rig-score-") as folder:
+        with connection.client() as client, reporting() as reporter, stopping_on_signals(stopped.set):
+            found = collect(client, sys.stdin.fileno(), Path(folder), for_s, stopped=stopped, tell=reporter.part)
+        card = judge(
+            found.file, [found.session], limits=limits, path=path, arrivals=found.arrivals, channels=channels,
+            mapping=mapping,
+        )  # fmt: skip
+    card.title = f"what came in, against the rig at {connection.connect}"
+    card.remarks[:0] = found.remarks
+    return card
+
+
+def _show(card: Scorecard, console: Console, *, wide: bool) -> None:
+    from replays.score.card.scorecard import FAIL, INCONCLUSIVE, make_matrix
+
+    console.print(shown(f"{card.title}, limits {card.limits}"))
+    console.print(shown(card.verdict_line))
+    names, lines = make_matrix(card)
+    for first in range(0, len(names) if lines else 0, _MATRIX_COLUMNS):
+        part = names[first : first + _MATRIX_COLUMNS]
+        height = max(map(len, part))  # names stand upright over their marks
+        above = [("", *letters) for letters in zip(*(name.rjust(height) for name in part), strict=True)]
+        for quantity, *marks in (*above, *((line[0], *line[1 + first :][: len(part)]) for line in lines)):
+            cells = "".join(f" {mark:1}" for mark in marks)
+            console.print(shown(f"{quantity:<22}{cells}".rstrip()))
+    if lines:
+        console.print("+ pass, X fail, ? inconclusive\n")
+    for line in (*card.doubts[1:], *card.remarks):
+        console.print(shown(line))
+    table = new_table(
+        "", "quantity", "channel", ">value", "95 %", "unit", "limit", "verdict", "note", "to show it", "source",
+        wrapped=("note", "to show it", "source"), spare=("source", "to show it", "note", "95 %"),
+    )  # fmt: skip
+    told = [row for row in card.rows if wide or row.verdict in (FAIL, INCONCLUSIVE)]
+    for row in told:
+        source = "" if row.limit is None else row.limit.source
+        table.add_row(*row.cells(), row.note, row.run, source, style=_STYLES[row.verdict])
+    console.print(table)
+    if len(told) < len(card.rows):
+        echo("what passes, or has no limit, is in --wide, and in the report, JUnit and JSON")

@@ -1,0 +1,39 @@
+"""`rig sessions`: make the reference sessions anew."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rig.base.errors import InputError
+from rig.cli.options import Force
+from rig.cli.output.folder import check_folder
+from rig.cli.output.progress import reporting
+from rig.cli.output.tables import echo
+
+
+def sessions(
+    names: Annotated[list[str] | None, typer.Argument(metavar="[SESSION]...", help="Only these.")] = None,
+    *,
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="FOLDER", help="Where to; made if missing.")],
+    force: Force = False,
+) -> None:
+    """Make the reference sessions anew: small recordings with their quantities as text, to be reviewed as a diff."""
+    from replays.sessions import SESSIONS, make
+
+    wanted = names or list(SESSIONS)
+    for name in wanted:
+        if name not in SESSIONS:
+            raise InputError("session", f"one of {', '.join(SESSIONS)}", name)
+    check_folder(output, field="--output")
+    taken = [path for name in wanted for path in (output / f"{name}.mcap", output / f"{name}.toml") if path.exists()]
+    if taken and not force:
+        raise InputError("output", "a folder without them (--force replaces them)", str(taken[0]))
+    output.mkdir(exist_ok=True)
+    with reporting() as reporter:
+        reporter.begin(len(wanted))
+        for name in wanted:
+            recording, text = make(SESSIONS[name], output, step=reporter.step)
+            echo(f"{recording}  {recording.stat().st_size / 1e3:.0f} kB, {text.name}")

@@ -1,0 +1,83 @@
+"""`rig simulate`: a scene without a clock, into a file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from rig.cli.options import Force, SceneChanges, SceneName
+from rig.cli.output.progress import reporting
+from rig.cli.output.tables import echo
+
+
+def simulate(
+    scene: SceneName,
+    *,
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="File to write: .mcap, .parquet, .csv, or .wav (sensors, volts).")
+    ],
+    scene_changes: SceneChanges,
+    check: Annotated[
+        bool,
+        typer.Option(
+            "--check", help="Run it again, finer: tells the error; status 1 where a wrong branch is suspected."
+        ),
+    ] = False,
+    force: Force = False,
+) -> None:
+    """Simulate a scene as fast as it goes and write it to a file: every state, force and sensor, with units."""
+    import time
+
+    from rig.serve.pacing import rare_collections
+
+    with rare_collections():
+        from replays.recordings.export import check_run_output, write_run
+        from rig.run.scenes import load_scene
+
+        check_run_output(output, force=force)
+        loaded = load_scene(scene, scene_changes.overrides())
+        if check:
+            from replays.studies.check import finer
+
+            finer(loaded)  # refused before a long run
+
+        from rig.run.simulation import Simulation
+
+        simulation = Simulation(loaded)
+        if loaded.fidelity_line:
+            echo(loaded.fidelity_line, err=True)
+        with reporting(compiles=True):
+            simulation.warm_up()
+    with reporting() as reporter:
+        begin = time.perf_counter()
+        write_run(simulation, output, force=force, progress=lambda part: reporter.part(part, scene))
+    seconds = simulation.tick / simulation.tick_rate_hz
+    factor = seconds / (time.perf_counter() - begin)
+    health = simulation.health()
+    echo(
+        f"{output}: {seconds:g} s simulated, {factor:.1f} times real time with the file, "
+        f"{output.stat().st_size / 1e6:.1f} MB{_moved(health)}"
+    )
+    for warning in health["warnings"]:
+        echo(f"warning: {warning}", err=True)
+    if check:
+        from replays.studies.check import check as check_scene
+
+        checked = check_scene(loaded)
+        if checked.wrong_branch:
+            echo(f"warning: {checked.line()}", err=True)
+            raise typer.Exit(1)
+        echo(f"checked: {checked.line()}")
+
+
+def _moved(health: dict[str, Any]) -> str:
+    """What there is to say of the motion; nothing of test signals."""
+    energy = health.get("energy")
+    if energy is None:
+        return ""
+    return (
+        f"; {health['contacts']} contacts, "
+        f"energy residual {energy['residual_j']:.1e} J of {energy['dissipated_j']:.3g} J dissipated"
+    )

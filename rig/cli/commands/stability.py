@@ -1,0 +1,283 @@
+"""`rig stability`: trials of every engine, each with an expected verdict; maps of where they hold; random scenes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from rig.base.errors import InputError
+from rig.cli.output.progress import reporting
+from rig.cli.output.tables import Form, Table, echo, echo_json, new_table
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.text import Text
+
+    from replays.studies.stability.scenes.scene_atlas import Outcome
+    from replays.studies.stability.trials.cell import Cell
+
+
+def stability(
+    *,
+    only: Annotated[
+        str | None,
+        typer.Option(
+            "--only", metavar="T3,T7", help="Only these trials; pictures stay whole. With --random or --scenes: scenes."
+        ),
+    ] = None,
+    engines: Annotated[str | None, typer.Option("--engines", metavar="ENGINE,...", help="Only these engines.")] = None,
+    full: Annotated[
+        bool, typer.Option("--full/--quick", help="Long ladders and fine maps (some minutes), or the short ones.")
+    ] = False,
+    random: Annotated[
+        int | None,
+        typer.Option("--random", metavar="N", min=1, help="Random scenes 0 to N-1 instead, against accurate runs."),
+    ] = None,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Of the random scenes.")] = 1,
+    scenes: Annotated[
+        bool,
+        typer.Option("--scenes", help="The chart's twelve scenes instead, at every setting of each engine and peer."),
+    ] = False,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="FOLDER",
+            help="Draw the maps as well, as PNG and SVG. With --random: keep what is measured, and go on from it.",
+        ),
+    ] = None,
+    form: Form,
+) -> None:
+    """Test where integration methods fail; exit status 1 if any does not do what theory expects.
+
+    With --random, every engine runs random scenes, wide over all parameters, laws and levels, against two accurate
+    engines that agree: exit status 1 if the first engine is wrong without a warning, or fails. With --scenes, the same
+    in twelve scenes, from coarse settings to fine ones, peers that are installed included unless --engines leaves
+    them out; twelve minutes.
+    """
+    from replays.studies.stability.table import chosen_engines, chosen_trials, run_trials
+
+    if scenes and (full or random is not None):
+        raise InputError("--scenes", "given without --full and --random", "--full" if full else f"--random {random}")
+    names = chosen_engines(engines)
+    if scenes:
+        _twelve(only, None if engines is None else names, output, form)
+        return
+    if random is not None:
+        _sweep(random, seed, only, names, output, form)
+        return
+    trials = chosen_trials(only)
+    cells: list[Cell] = []
+    pictures: list[Path] = []
+    with reporting(compiles=True) as reporter:
+        for cell in run_trials(trials, names, quick=not full):
+            cells.append(cell)
+            reporter.step(f"{cell.trial} {cell.case}, {cell.method}")
+        if output is not None:
+            from replays.studies.stability.maps.figure import draw_all
+
+            reporter.say("pictures")
+            pictures = draw_all(output, names, quick=not full)
+    wrong = [cell for cell in cells if not cell.agrees]
+    if form.as_json:
+        document = {
+            "cells": [cell.document() for cell in cells],
+            "disagree": len(wrong),
+            "pictures": [str(path) for path in pictures],
+        }
+        echo_json(document)
+    else:
+        _show(cells, names, form.console())
+        for path in pictures:
+            echo(f"picture  {path}")
+    if wrong:
+        raise typer.Exit(1)
+
+
+def _sweep(count: int, seed: int, only: str | None, engines: list[str], folder: Path | None, form: Form) -> None:
+    from replays.studies.stability.scenes.sweep import chosen_numbers, summary, sweep
+
+    numbers, rows, interrupted = chosen_numbers(only, count), [], False
+    with reporting() as reporter:
+        reporter.begin(len(numbers))
+        try:
+            for row in sweep(numbers, seed=seed, engines=engines, folder=folder):
+                rows.append(row)
+                reporter.step(f"scene {row['number']}: {row['status']}")
+        except KeyboardInterrupt:
+            interrupted = True
+    found = summary(rows, engines)
+    pictures: list[Path] = []
+    if folder is not None and found["scenes"]["decided"]:
+        from replays.studies.stability.scenes.sweep_figure import draw_sweep
+
+        pictures = draw_sweep(folder, rows, engines)
+    if form.as_json:
+        echo_json({"seed": seed, **found, "pictures": [str(path) for path in pictures]})
+    else:
+        console = form.console()
+        console.print(sweep_table(found, seed))
+        for line in _sweep_lines(found):
+            echo(line)
+        for path in pictures:
+            echo(f"picture  {path}")
+    if interrupted:
+        echo("stopped; the same command with the same -o FOLDER goes on from here", err=True)
+        raise typer.Exit(130)
+    own = found["engines"][engines[0]]
+    if any(own[kind] for kind in ("silent", "crashes", "hangs", "absurd")):
+        raise typer.Exit(1)
+
+
+def _twelve(only: str | None, engines: list[str] | None, folder: Path | None, form: Form) -> None:
+    from replays.studies.common.journal import prepare_folder
+    from replays.studies.stability.scenes.scene_atlas import (
+        Outcome,
+        chosen_scenes,
+        draw_scene_atlas,
+        is_silent,
+        outcomes,
+    )
+
+    names, found, interrupted = chosen_scenes(only), list[Outcome](), False
+    if folder is not None:
+        prepare_folder(folder)
+    with reporting(compiles=True) as reporter:
+        try:
+            for one in outcomes(names, engines, peers=engines is None):
+                found.append(one)
+                reporter.step(f"{one.scene}, {one.method} {one.setting}: {one.kind}")
+        except KeyboardInterrupt:
+            interrupted = True
+    pictures = [] if folder is None or interrupted else draw_scene_atlas(folder, found)
+    if form.as_json:
+        echo_json({"outcomes": [one.document() for one in found], "pictures": [str(path) for path in pictures]})
+    else:
+        form.console().print(scenes_table(found))
+        for path in pictures:
+            echo(f"picture  {path}")
+    if interrupted:
+        echo("stopped; only the runs shown were measured, and no picture was drawn", err=True)
+        raise typer.Exit(130)
+    if any(is_silent(one) for one in found if one.method == found[0].method):
+        raise typer.Exit(1)
+
+
+def scenes_table(found: list[Outcome]) -> Table:
+    """How often each method came to each outcome."""
+    from replays.studies.stability.scenes.scene_atlas import OUTCOMES
+
+    scenes = len({one.scene for one in found})
+    table = new_table(
+        f"{scenes} scenes, each method at its settings: number of runs", "method", *(f">{k}" for k in OUTCOMES)
+    )
+    for method in dict.fromkeys(one.method for one in found):
+        kinds = [one.kind for one in found if one.method == method]
+        table.add_row(method, *(str(kinds.count(kind) or "-") for kind in OUTCOMES))
+    return table
+
+
+def sweep_table(found: dict[str, Any], seed: int) -> Table:
+    """What each engine did in random scenes."""
+    from replays.studies.stability.scenes.sweep import QUANTILES
+
+    scenes = found["scenes"]
+    table = new_table(
+        f"random scenes of seed {seed}: " + ", ".join(f"{number} {status}" for status, number in scenes.items()),
+        "engine", ">told", *(f">{share:.0%}" for share in QUANTILES), ">within", ">silent", ">false", ">crash", ">hang",
+        ">absurd", ">slowest", ">median",
+    )  # fmt: skip
+    for name, one in found["engines"].items():
+        errors = [f"{error:.0e}" for error in one["error"] or []] or ["-"] * len(QUANTILES)
+        within = "-" if one["within"] is None else f"{one['within']:.0%}"
+        faults = [str(len(one[kind])) for kind in ("silent", "false_alarms", "crashes", "hangs", "absurd")]
+        speeds = ["-" if speed is None else f"{speed:.3g}" for speed in (one["slowest"], one["median_speed"])]
+        table.add_row(name, str(one["told"]), *errors, within, *faults, *speeds)
+    return table
+
+
+def _sweep_lines(found: dict[str, Any]) -> Iterator[str]:
+    """What the table's columns are, and which scenes stand behind its numbers."""
+    yield (
+        "\nQuantiles of the scaled error in decided scenes; within: share of those that are not chaotic with an error "
+        "of at most 10 times what was asked for; silent: wrong by more than 0.1 without a warning; false: warned, and "
+        "within; speeds: simulated s over processor s. Untold: scenes that no two accurate engines take; "
+        "unbounded: those where the model makes energy without end, in which no fault counts."
+    )
+    for name, one in found["engines"].items():
+        for kind in ("silent", "false_alarms", "crashes", "hangs", "absurd"):
+            if one[kind]:
+                yield f"{name}, {kind.replace('_', ' ')}: scenes {', '.join(map(str, one[kind]))}"
+        for reason, number in one["refused"].items():
+            if "accurate" not in name:
+                yield f"{name} refuses {number}: {reason}"
+    for scene in found["undecided"]:
+        odd = f", {scene['odd']} alone" if scene["odd"] else ""
+        yield (
+            f"undecided: scene {scene['number']}, accurate runs differ by {scene['distance']:.1e}{odd}; "
+            f"a nudge grows {scene['growth'] or math.nan:.1e} times"
+        )
+
+
+def _show(cells: list[Cell], names: list[str], console: Console) -> None:
+    console.print(trials_table([cell for cell in cells if cell.method in names], names))
+    if others := [cell for cell in cells if cell.method not in names]:
+        console.print()
+        console.print(peers_table(others))
+    console.print(
+        "\n*: fails, as was expected by theory or by measurement (--json says why); !: does not do what was expected; "
+        "in brackets: nothing is expected; all others hold, within their limits."
+    )
+    for cell in cells:
+        if not cell.agrees:
+            console.print(
+                f"! {cell.trial} {cell.case}, {cell.method}: {cell.value:.3g} {cell.unit}, limit {cell.limit:.3g}, "
+                f"expected to {'hold' if cell.expected else 'fail'}: {cell.because}"
+            )
+
+
+def trials_table(cells: list[Cell], names: list[str]) -> Table:
+    """What each engine of these names did in each case."""
+    from rich.text import Text
+
+    from replays.studies.stability.trials.trials import TRIALS
+
+    table = new_table("trials by engine: measured", "trial", "case", *(f">{name}" for name in names), keys=2)
+    seen = ""
+    for trial, case in dict.fromkeys((cell.trial, cell.case) for cell in cells):
+        found = {cell.method: cell for cell in cells if (cell.trial, cell.case) == (trial, case)}
+        if trial != seen:
+            table.add_row(Text(f"{trial}: {TRIALS[trial].title}", "bold"))
+            seen = trial
+        table.add_row(trial, case, *(_text(found.get(name)) for name in names))
+    return table
+
+
+def peers_table(cells: list[Cell]) -> Table:
+    """What other people's solvers did."""
+    title = "other people's solvers, where they are known to fail or to hold"
+    headings = ("trial", "case", "solver", ">measured", "because")
+    table = new_table(title, *headings, wrapped=("because", "case"), keys=2)
+    for cell in cells:
+        table.add_row(cell.trial, cell.case, cell.method, _text(cell), cell.skipped or cell.because)
+    return table
+
+
+def _text(cell: Cell | None) -> Text:
+    from rich.text import Text
+
+    if cell is None:
+        return Text("-", "dim")
+    if cell.skipped:
+        return Text("skipped", "dim")
+    value = f"{cell.value:.1e}" if cell.value and math.isfinite(cell.value) else f"{cell.value:g}"
+    if cell.expected is None:
+        return Text(f"({value})")
+    if not cell.agrees:
+        return Text(f"{value}!", "bold red")
+    return Text(value) if cell.holds else Text(f"{value}*", "dim")

@@ -1,0 +1,48 @@
+"""`rig twins`: the rig's instruments, as drivers find them."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from drivers.link import DEFAULT_ENDPOINT as INSTRUMENTS
+from rig.cli.connections.connection import Connection
+from rig.cli.output.tables import echo
+from rig.cli.signals import stopping_on_signals
+
+
+def twins(
+    *,
+    zenoh: Annotated[bool, typer.Option("--zenoh", help="Serve them over zenoh, at --listen; so by default.")] = False,
+    pty: Annotated[bool, typer.Option("--pty", help="Serve each at a pseudo-terminal of its own.")] = False,
+    can: Annotated[
+        str | None, typer.Option(metavar="SPEC", help="Serve them on a CAN bus, INTERFACE:CHANNEL, such as zenoh:can0.")
+    ] = None,
+    listen: Annotated[str, typer.Option(metavar="HOST:PORT", help="Where they listen with --zenoh.")] = INSTRUMENTS,
+    connection: Connection,
+) -> None:
+    """Serve the six instruments of a running rig to their drivers; Ctrl-C switches them off."""
+    import threading
+
+    from drivers.instruments.twins import Twins
+    from rig.cli.connections.can_output import parse_spec
+    from rig.serve.transport.endpoint import parse_loopback
+
+    # Whatever is wrong with the options is said before a rig is looked for.
+    parse_loopback(listen, field="--listen")
+    if can is not None:
+        parse_spec(can)
+    done = threading.Event()
+    with connection.client() as client, Twins(client) as serving:
+        if zenoh or not (pty or can):
+            serving.serve_zenoh(listen)
+        if pty:
+            serving.serve_pty()
+        if can:
+            serving.serve_can(can)
+        for twin in serving.twins:
+            echo(f"{twin.CODEC.address.name:14s}{twin.url}")
+        echo("rig: open one with its driver, such as drivers.instruments.hammer.driver.Hammer; Ctrl-C ends", err=True)
+        with stopping_on_signals(done.set):
+            done.wait()

@@ -1,0 +1,160 @@
+"""`rig validate`: a recording against the model."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from rig.cli.options import Changes, Engine, Force, RecordingFiles, ReportFile, SceneChanges
+from rig.cli.output.origin import of_recording
+from rig.cli.output.progress import reporting
+from rig.cli.output.tables import Form, Table, echo, echo_json, new_table, shown
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from replays.recordings.validation import Validation
+    from replays.recordings.validation.explanations.attribution import Explained, Explanation
+
+_SAID = {True: "pass", False: "FAIL", None: ""}
+_TELLING = 0.01
+"""What explains less than this part of the difference is not worth a line."""
+
+
+def validate(
+    files: RecordingFiles,
+    *,
+    criteria: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Criteria of your own; start from replays/recordings/validation/default.toml"
+        ),
+    ] = None,
+    changes: Changes = None,
+    engine: Engine = None,
+    declared: Annotated[
+        bool, typer.Option("--declared", help="Judge by the declared comparison even where every bit is equal.")
+    ] = False,
+    blind: Annotated[
+        bool, typer.Option("--blind", help="As if nothing were known of faults that the rig was told to have.")
+    ] = False,
+    report: ReportFile = None,
+    force: Force = False,
+    form: Form,
+) -> None:
+    """Do a recording again and hold it against the model: bit by bit, then by declared criteria.
+
+    Where a criterion fails, it says what explains the difference: a sensor, the time, or which number of the model.
+    Exit status: 0 pass, 1 fail, 2 wrong input, 3 inconclusive.
+    """
+    from recorder.reader import join
+    from replays.recordings.validation import load_criteria
+    from replays.recordings.validation import validate as hold
+    from replays.report import check_report, write_report
+    from rig.run.scenes import read_value
+
+    if report is not None:
+        check_report(report, force=force)
+    rules = load_criteria(criteria)
+    given = SceneChanges(changes=changes, engine=engine).overrides()
+    overrides = {key: read_value(value) for key, value in given.items()}
+    recording = join(files)
+    with reporting(compiles=True) as reporter:
+        found = hold(recording, criteria=rules, changes=overrides, declared=declared, blind=blind, step=reporter.step)
+        if report is not None:
+            from replays.recordings.validation.report import make_report
+
+            reporter.step("report")
+            write_report(make_report(found, origin=of_recording(found.title, recording)), report)
+    if form.as_json:
+        echo_json(found.document())
+    else:
+        _show(found, form.console())
+        if report is not None:
+            echo(f"report  {report}")
+    if found.outcome.exit_status:
+        raise typer.Exit(found.outcome.exit_status)
+
+
+def _show(found: Validation, console: Console) -> None:
+    changed = ", ".join(f"{key} = {value}" for key, value in found.changes.items())
+    console.print(shown(f"{found.title}, scene {found.scene}") + (f", validated with {changed}" if changed else ""))
+    console.print(found.verdict_line)
+    for line in found.doubts[1:]:
+        console.print(f"also: {line}")
+    if found.explained is not None:
+        console.print(f"first difference at {found.explained.from_s:.4f} s; {found.explained.conclusion}")
+    for fault in found.faults:
+        if found.explained is None or fault.line not in found.explained.conclusion:
+            console.print(shown(f"signal: {fault.line}"))
+    console.print(found.bits_line)
+    for one in found.fitted:
+        console.print(one.line)
+    if found.calibration:
+        console.print(f"calibration: {found.calibration_line}")
+    if found.bit_exact and not found.declared:
+        return
+    if found.explained is not None and any(_counts(one) for one in found.explained.ranked):
+        console.print()
+        console.print(_explanations(found.explained))
+        console.print("left: RMS of the residual that remains, over the noise; 1 is noise alone")
+    begin, end = found.window_s
+    console.print(f"\ntrajectory from {begin:.4f} to {end:.4f} s: {found.window_reason}\n")
+    console.print(_trajectory(found))
+    console.print()
+    if found.truth:
+        console.print(_truth(found))
+        console.print()
+    if found.statistics:
+        console.print(_statistics(found))
+
+
+def _trajectory(found: Validation) -> Table:
+    headings = ("channel", ">noise", ">RMS", ">limit", ">largest", ">drift", ">first at", "verdict")
+    table = new_table("Trajectory: residual over the channel's own noise", *headings)
+    for one in found.residuals:
+        table.add_row(
+            one.channel,
+            f"{one.floor:.3g} {one.unit}".rstrip(),
+            f"{one.rms:.3f}",
+            "" if math.isinf(one.limit) else f"{one.limit:.3f}",
+            f"{one.peak:.2f}",
+            f"{one.drift:.2f}",
+            "" if one.first_s is None else f"{one.first_s:.4f} s",
+            _SAID[one.good],
+        )
+    return table
+
+
+def _truth(found: Validation) -> Table:
+    headings = ("table", "column that is off most", ">off by", ">limit", "verdict")
+    table = new_table("Truth: largest difference as a part of the column's largest value", *headings)
+    for one in found.truth:
+        table.add_row(one.table, one.column, f"{one.relative:.1e}", f"{one.limit:.1e}", _SAID[one.good])
+    return table
+
+
+def _statistics(found: Validation) -> Table:
+    table = new_table("Phases", "phase", "quantity", ">recorded", ">predicted", ">limit", "verdict")
+    for one in found.statistics:
+        limit = "" if one.limit is None else f"± {one.limit:.2g}"
+        table.add_row(one.phase, one.title, f"{one.recorded:.6g}", f"{one.foretold:.6g}", limit, _SAID[one.good])
+    return table
+
+
+def _counts(one: Explanation) -> bool:
+    return one.explained >= _TELLING
+
+
+def _explanations(explained: Explained) -> Table:
+    headings = ("kind", "what", "change", ">explains", ">left", ">seen to", "verdict")
+    title = "What explains the difference, each candidate alone"
+    table = new_table(title, *headings, wrapped=["change"], spare=("kind", "seen to"))
+    for one in [one for one in explained.ranked if _counts(one)][:12]:
+        told = "named" if one.name in explained.best else ""
+        row = (one.kind, one.name, one.change, f"{one.explained:.2%}", f"{one.left:.3g}", f"{one.to_s:.3f} s", told)
+        table.add_row(*row)
+    return table

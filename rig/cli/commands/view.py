@@ -1,0 +1,254 @@
+"""`rig view`: a recording or the running rig in rerun."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from rig.base.errors import DiskError, InputError, RefusedError, Words, check_new_file, whole_file
+from rig.cli.connections.connection import Connection
+from rig.cli.options import Force, OptionalRecordingFiles
+from rig.cli.output.progress import reporting
+from rig.cli.output.tables import echo
+
+if TYPE_CHECKING:
+    import rerun as rr
+    import rerun.blueprint as rrb
+
+    from recorder.viewer.window import Kind, Window
+
+_EVERY_S = 5.0
+"""How often it is told how it goes, where that is no live line [s]."""
+
+
+def view(
+    files: OptionalRecordingFiles = None,
+    *,
+    live: Annotated[bool, typer.Option("--live", help="View the running rig.")] = False,
+    connection: Connection,
+    web: Annotated[bool, typer.Option("--web", help="Serve the viewer to a browser on this machine.")] = False,
+    save: Annotated[Path | None, typer.Option(help="Write an .rrd file instead of opening a viewer.")] = None,
+    screenshot: Annotated[Path | None, typer.Option(help="Write a .png picture instead of opening a viewer.")] = None,
+    at_s: Annotated[
+        float | None, typer.Option(help="Simulated time of the picture, in s; default: the last contact, else the end.")
+    ] = None,
+    force: Force = False,
+) -> None:
+    """View a recording, or the running rig, in rerun.
+
+    Opens a window where there is a screen; otherwise serves the viewer on 127.0.0.1 and prints the address.
+    """
+    _check(files, live=live, web=web, save=save, screenshot=screenshot, at_s=at_s, force=force)
+    _hush()
+    from recorder.viewer.window import WindowError
+
+    try:
+        with _interruptible():
+            if live:
+                _view_live(connection, web=web, save=save)
+            elif files:
+                _view_file(files, web=web, save=save, screenshot=screenshot, at_s=at_s)
+    except WindowError as error:
+        raise RefusedError(str(error)) from None
+
+
+def _check(
+    files: list[Path] | None,
+    *,
+    live: bool,
+    web: bool,
+    save: Path | None,
+    screenshot: Path | None,
+    at_s: float | None,
+    force: bool,
+) -> None:
+    """Refuse what does not go together before anything starts."""
+    if bool(files) == live:
+        raise InputError("view", "given either a FILE or --live", Words("both" if live else "neither"))
+    if sum((web, save is not None, screenshot is not None)) > 1:
+        raise InputError("view", "given at most one of --web, --save and --screenshot", Words("several"))
+    if live and screenshot is not None:
+        raise InputError("--screenshot", "used with a FILE", "--live")
+    if at_s is not None and screenshot is None:
+        raise InputError("--at-s", "used with --screenshot", at_s)
+    for option, path, suffix in (("--save", save, ".rrd"), ("--screenshot", screenshot, ".png")):
+        if path is not None:
+            check_new_file(path, field=option, suffixes=(suffix,), force=force)
+
+
+def _view_file(files: list[Path], *, web: bool, save: Path | None, screenshot: Path | None, at_s: float | None) -> None:
+    from recorder.reader import join
+    from recorder.viewer import blueprint
+    from recorder.viewer.canvas import Canvas, new_stream
+    from recorder.viewer.drawings.geometry import Geometry
+    from recorder.viewer.file import paint
+    from recorder.viewer.painter import not_drawn
+
+    recording = join(files)
+    name = recording.path.name + (f" and {len(files) - 1} more" if len(files) > 1 else "")
+    for text in not_drawn(recording.table):
+        echo(f"not shown: {text}", err=True)
+    stream = new_stream(name, batch_s=2.0)
+    plan = blueprint.layout(recording.table, Geometry.from_parameters(recording.parameters), live=False)
+    if save is not None:
+        with _saved(stream, save, plan):
+            painted = paint(recording, Canvas(stream))
+        size = save.stat().st_size / 1e6
+        echo(f"{save}: {size:.1f} MB, {painted.points} points of curves, {painted.end_s:.3f} s")
+        return
+    with _window_of_file(screenshot, web=web) as shown:
+        _connect(stream, shown, plan)
+        try:
+            painted = paint(recording, Canvas(stream))
+        finally:
+            _close(stream, timeout_s=60.0)
+        if screenshot is not None:
+            if at_s is None:
+                at_s = painted.end_s if painted.last_contact_s is None else painted.last_contact_s
+            if not painted.start_s <= at_s <= painted.end_s:
+                raise InputError("--at-s", f"in the recording, {painted.start_s:g} to {painted.end_s:g} s", at_s)
+            shown.picture(screenshot, at_s=at_s, end_s=painted.end_s)
+            echo(f"{screenshot}: at {at_s:.3f} s")
+        else:
+            _tell(shown, name)
+            _wait_for_the_end(shown)
+
+
+def _view_live(connection: Connection, *, web: bool, save: Path | None) -> None:
+    from recorder.viewer import blueprint, live, window
+    from recorder.viewer.canvas import Canvas, new_stream
+
+    with connection.client() as client:
+        described = live.ask(client)
+        stream = new_stream(f"rig at {connection.connect}")
+        plan = blueprint.layout(described.table, described.geometry, live=True)
+        if save is not None:
+            view = live.LiveView(client, Canvas(stream), described)
+            with _saved(stream, save, plan, until_interrupted=True):
+                echo(view.run())
+            if view.failed:
+                raise typer.Exit(1)
+            return
+        with window.Window(_kind(web=web), live=True) as shown:
+            _connect(stream, shown, plan)
+            _tell(shown, f"the rig at {connection.connect}")
+            try:
+                view = live.LiveView(client, Canvas(stream), described, taken=shown.taken)
+                with reporting() as reporter:
+
+                    def tell(text: str) -> None:
+                        if shown.page is not None:
+                            shown.page.title = f"rig: {text}"
+                        reporter.show(text, every_s=_EVERY_S)
+
+                    reason = view.run(stop=lambda: not shown.open, tell=tell)
+                echo(reason)
+            finally:
+                _close(stream)
+            if shown.open:
+                echo("the viewer stays open; end it with Ctrl-C")
+            try:
+                _wait_for_the_end(shown)
+            finally:
+                if view.failed:
+                    raise typer.Exit(1)
+
+
+def _window_of_file(screenshot: Path | None, *, web: bool) -> Window:
+    from recorder.viewer import window
+
+    if screenshot is None:
+        return window.Window(_kind(web=web))
+    return window.picture_of(screenshot, tell=lambda text: echo(text, err=True))
+
+
+def _kind(*, web: bool) -> Kind:
+    from recorder.viewer.window import screen_is_there
+
+    return "web" if web or not screen_is_there() else "native"
+
+
+def _tell(shown: Window, what: str) -> None:
+    # The address comes first, so that no terminal breaks it.
+    echo(f"{shown.address} shows {what}" if shown.address else f"viewing {what}")
+    if shown.page is not None:
+        shown.page.title = f"rig: {what}"
+    echo("Ctrl-C ends the viewer")
+    sys.stdout.flush()  # the address is wanted now, also in a pipe
+
+
+def _wait_for_the_end(shown: Window) -> None:
+    """Until the user closes the viewer, or ends the command."""
+    sys.stdout.flush()
+    while not shown.wait(0.5):
+        pass
+    if shown.failure:
+        raise RefusedError(f"the viewer failed: {shown.failure} (--web needs no graphics driver)")
+
+
+def _hush() -> None:
+    """Keep rerun's own log off the terminal: a window that the user closes is no error here."""
+    import os
+
+    os.environ.setdefault("RUST_LOG", "off")
+
+
+def _connect(stream: rr.RecordingStream, shown: Window, plan: rrb.Blueprint) -> None:
+    """Draw to a viewer, in our layout: as a default only, it would give way to the one that was shown last."""
+    stream.connect_grpc(shown.url)
+    stream.send_blueprint(plan)
+
+
+def _close(stream: rr.RecordingStream, *, timeout_s: float = 5.0) -> None:
+    """Send what is buffered, as long as there is somebody to take it."""
+    with suppress(RuntimeError, ValueError):  # the viewer is gone: nobody misses the rest
+        stream.flush(timeout_sec=timeout_s)
+    stream.disconnect()
+
+
+@contextmanager
+def _saved(
+    stream: rr.RecordingStream, path: Path, plan: rrb.Blueprint, *, until_interrupted: bool = False
+) -> Iterator[None]:
+    """Write what is drawn inside to a file that has its name only once it is whole.
+
+    Args:
+        stream: What is drawn to.
+        path: The file.
+        plan: The blueprint.
+        until_interrupted: Ctrl-C is how it ends, not a reason to throw it away.
+    """
+    with whole_file(path) as part:
+        stream.save(part, default_blueprint=plan)
+        with suppress(*([KeyboardInterrupt] if until_interrupted else [])):
+            yield
+        stream.flush(timeout_sec=60.0)  # raises where the disk has refused, and then nothing is left to disconnect
+        stream.disconnect()
+        # The library itself only logs what the disk refuses: a file that is whole ends with its table of contents.
+        with part.open("rb") as file:
+            file.seek(max(0, part.stat().st_size - 64))
+            if b"RRF2FOOT" not in file.read():
+                raise DiskError(f"{path} could not be written to its end; nothing of it is kept")
+
+
+@contextmanager
+def _interruptible() -> Iterator[None]:
+    """Ctrl-C and a request to terminate are both how a viewer ends: child processes go, and it is no failure."""
+    import signal
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    before = {number: signal.signal(number, interrupt) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    try:
+        yield
+    except KeyboardInterrupt:
+        pass
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -1,0 +1,86 @@
+"""Ways to a CAN bus for programs that do not speak zenoh: a socketcand server, and ports with an SLCAN adapter."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import ExitStack
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from drivers.can.bus.outlets.outlet import OpenBus
+    from drivers.can.bus.outlets.slcan import SlcanPort
+    from drivers.can.bus.outlets.socketcand import SocketcandServer
+    from drivers.can.bus.timing import Speed
+
+
+class CanOutlets:
+    """The outlets of some buses.
+
+    Args:
+        buses: By name, what makes a node on the bus.
+        speed: Bit rates of the buses.
+        socketcand: HOST:PORT of a server for all of them, or none.
+        slcan: Whether each has a port with an adapter.
+
+    Raises:
+        InputError: There can be no such server.
+    """
+
+    def __init__(
+        self,
+        buses: Mapping[str, OpenBus],
+        speed: Speed,
+        *,
+        socketcand: str | None = None,
+        slcan: bool = False,
+    ) -> None:
+        self._server: SocketcandServer | None = None
+        self._ports: dict[str, SlcanPort] = {}
+        self._stack = ExitStack()
+        with ExitStack() as stack:
+            if socketcand is not None:
+                from drivers.can.bus.outlets.socketcand import SocketcandServer
+                from rig.serve.transport.endpoint import parse_loopback
+
+                host, port = parse_loopback(socketcand, field="socketcand")
+                self._server = stack.enter_context(SocketcandServer(buses, host=host, port=port))
+            if slcan:
+                from drivers.can.bus.outlets.slcan import SlcanPort
+
+                for name, open_bus in buses.items():
+                    self._ports[name] = stack.enter_context(SlcanPort(open_bus, speed=speed))
+            self._stack = stack.pop_all()
+
+    def __enter__(self) -> CanOutlets:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+    def lines(self) -> list[str]:
+        """Where each is, in a line."""
+        found = [f"CAN {name} as an SLCAN adapter on {port.path}" for name, port in self._ports.items()]
+        if self._server is not None:
+            found.append(f"CAN by socketcand on {self._server.host}:{self._server.port}, classic frames only")
+        return found
+
+    def warnings(self) -> list[str]:
+        """What a person should know of, while it is so."""
+        doors = [*self._ports.values(), *([] if self._server is None else [self._server])]
+        return [text for door in doors for text in door.warnings()]
+
+    def dropped(self) -> int:
+        """Frames that clients did not read in time."""
+        ports = sum(port.counts["dropped"] for port in self._ports.values())
+        return ports + (0 if self._server is None else self._server.counts()["dropped"])
+
+    def summary(self) -> list[str]:
+        """What became of each, in a line."""
+        found = {f"slcan {port.path}": port.figures() for port in self._ports.values()}
+        if self._server is not None:
+            found["socketcand"] = self._server.counts()
+        return [
+            "  ".join([name, *(f"{what.replace('_', ' ')} {count}" for what, count in counts.items() if count)])
+            for name, counts in found.items()
+            if any(counts.values())
+        ]

@@ -1,0 +1,112 @@
+"""What the terminal shows of a run or a replay that is served here, while it lasts."""
+
+from __future__ import annotations
+
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import typer
+
+from rig.cli.output.tables import echo, progress_bar
+
+Status = Callable[[], dict[str, Any]]
+Line = Callable[[dict[str, Any]], list[str]]
+
+
+@contextmanager
+def showing(status: Status, words: Line) -> Iterator[None]:
+    """Show how it goes: on a terminal one live line, else a line every 5 s.
+
+    Args:
+        status: Gives the status document.
+        words: What to show of it.
+    """
+    done = threading.Event()
+    # A thread of its own, so that a terminal that is held up (Ctrl-S) holds up nothing else.
+    show = _show_live if sys.stderr.isatty() else _show_lines
+    thread = threading.Thread(target=show, args=(status, words, done), name="display", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        done.set()
+        thread.join(timeout=1.0)
+
+
+def _show_live(status: Status, words: Line, done: threading.Event) -> None:
+    with progress_bar(auto_refresh=False, transient=True) as bar:
+        task = bar.add_task("")
+        while not done.wait(0.5):
+            bar.update(task, description=fitted(_parts(status(), words), bar.console.width), refresh=True)
+
+
+def _show_lines(status: Status, words: Line, done: threading.Event) -> None:
+    while not done.wait(5.0):
+        echo("  ".join(_parts(status(), words)), err=True)
+
+
+def _parts(status: dict[str, Any], words: Line) -> list[str]:
+    """What to say, first what matters most; what should be none is only said where it is not."""
+    counts = {
+        "stalled links": status["congestion"].get("stalled_links", 0),
+        "dropped": status["queue"]["dropped"],
+    }
+    told = [f"{name} {count:.0f}" for name, count in counts.items() if count]
+    overruns = [f"overruns {status['overruns']}"] if status["overruns"] else []
+    return [*words(status), *told, f"clients {len(status['clients'])}", *overruns]
+
+
+def fitted(parts: list[str], width: int, between: str = "  ") -> str:
+    """The parts on one line, without those at the end that find no room."""
+    while len(between.join(parts)) > width and len(parts) > 1:
+        parts = parts[:-1]
+    return between.join(parts)
+
+
+def end_with(troubles: list[str]) -> None:
+    """Exit status 1 where something failed that did not end the run, told in a line each."""
+    for text in troubles:
+        echo(f"rig: {text}", err=True)
+    if troubles:
+        raise typer.Exit(1)
+
+
+def lateness(status: dict[str, Any]) -> str:
+    """How late it was so far, in a few words."""
+    late = status["lateness_ms"]
+    p99, most = (f"{late[name]:.2f}" if late[name] < 10.0 else f"{late[name]:.0f}" for name in ("p99", "max"))
+    return f"late p99 {p99} max {most} ms"
+
+
+def all_lateness(summary: dict[str, Any]) -> str:
+    """How late it was in the end."""
+    late = summary["lateness_ms"]
+    return "lateness " + " ".join(f"{name} {late[name]:.3f}" for name in ("p50", "p99", "max", "last")) + " ms"
+
+
+def engine_text(engine: dict[str, Any]) -> str:
+    """Return name and step of an engine, and the part of the time in which it rolled by collocation."""
+    share = engine.get("rolling_share")
+    rolled = f", {share:.0%} of the time rolling by collocation" if isinstance(share, float) and share else ""
+    return f"{engine.get('name', '?')}, {engine.get('step_us', '?')} us{rolled}"
+
+
+def accuracy_text(accuracy: dict[str, Any]) -> str:
+    """Return the error estimate of a status, each quantity in its unit; before version 0.2 it was one number."""
+    quantities = accuracy.get("quantities")
+    if not isinstance(quantities, dict):
+        return number_text(accuracy.get("estimate"), "(scaled)")
+    parts = []
+    for one in (one for one in quantities.values() if isinstance(one, dict)):
+        limit = one.get("tolerance")
+        within = f" (tolerance {limit:.2g})" if isinstance(limit, float | int) else ""
+        parts.append(f"{one.get('label')} {number_text(one.get('error'), one.get('unit', ''), digits=2)}{within}")
+    return ", ".join(parts)
+
+
+def number_text(value: float | None, unit: str, *, digits: int = 4) -> str:
+    """Return a number of a status with its unit."""
+    return f"{value:.{digits}g} {unit}" if isinstance(value, float | int) else "not finite"

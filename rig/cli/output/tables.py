@@ -1,0 +1,317 @@
+"""What is printed goes out through here: tables, lines and progress, none of it acted on by the terminal or by rich.
+
+Names of scenes, channels and clients, notes and paths are not ours: square brackets in them are no markup, and escapes,
+line breaks and marks that turn the direction of writing come out in their escaped form.
+
+On a terminal, tables and lines fit its width, and no value is cut. Into a pipe, and with `--wide`, a table has every
+column and a row one line, whatever the width: two blanks or more between the columns, and `-` where nothing stands.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import shutil
+import sys
+import textwrap
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+from rig.base.text import finite, printable
+from rig.cli.options import Json, Wide
+
+if TYPE_CHECKING:
+    from rich.console import Console, ConsoleOptions
+    from rich.segment import Segment
+    from rich.text import Text
+
+    _Rows = list[tuple[list[Text], str]]
+
+_ENDLESS = 1_000_000
+"""Width of a pipe [characters]."""
+_GAP = 2
+_LEAST = 20
+"""What a text is wrapped to, at the least [characters]."""
+_WORTH = 48
+"""The same of one that can be left out: in fewer it is not worth its lines."""
+_UNIT = re.compile(r"(?<=\d)(?: (?:%|°|ppm\b|[kMGmuµn]?(?:s|m|g|N|B|V|W|J|A|Pa|Hz|rad|bit)\b))+")
+_KEPT = "\ue000"
+"""A blank at which no line is broken; unlike one of Unicode's it is none to rich."""
+
+
+@dataclass(frozen=True)
+class Form:
+    """In which form a command answers."""
+
+    as_json: Json = False
+    wide: Wide = False
+
+    def console(self) -> Console:
+        """Where it answers, if not as JSON."""
+        return table_console(wide=self.wide)
+
+
+def _lines(text: str) -> str:
+    """The same text, each of its lines fit to be shown."""
+    return "\n".join(map(printable, text.split("\n")))
+
+
+def echo(text: object = "", *, err: bool = False) -> None:
+    """Print lines, which a terminal shows broken between words.
+
+    Args:
+        text: They are kept apart; everything else that cannot be printed is escaped.
+        err: To stderr.
+    """
+    lines = _lines(str(text)).split("\n")
+    if (sys.stderr if err else sys.stdout).isatty():
+        lines = [part for line in lines for part in _broken(line, shutil.get_terminal_size().columns) or [""]]
+    # Who reads what happens may have gone; what happens goes on.
+    with contextlib.suppress(*([OSError] if err else [])):
+        typer.echo("\n".join(lines), err=err)
+
+
+def _broken(line: str, width: int) -> list[str]:
+    indent = line[: len(line) - len(line.lstrip())]
+    parts = textwrap.wrap(_kept(line), width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
+    return [part.replace(_KEPT, " ") for part in parts]
+
+
+def echo_document(text: str) -> None:
+    """Print a text as it stands, but for what cannot be printed, and without a line break behind it."""
+    typer.echo(_lines(text), nl=False)
+
+
+def echo_json(document: Any, *, indent: int | None = 2) -> None:
+    """Print a document as JSON, with null for a number that is not finite."""
+    import json
+
+    echo_document(json.dumps(finite(document), indent=indent, allow_nan=False) + "\n")
+
+
+def shown(document: Any) -> Any:
+    """A document as it may be shown: each text on one line, as one with line breaks could pass for ours."""
+    if isinstance(document, str):
+        return printable(document)
+    if isinstance(document, dict):
+        return {shown(name): shown(value) for name, value in document.items()}
+    return [shown(value) for value in document] if isinstance(document, list | tuple) else document
+
+
+class Table:
+    """A table without lines, of cells that are texts on one line; see `new_table`.
+
+    Attributes:
+        title: The title.
+        headings: Of its columns.
+        wrapped, spare: Numbers of columns that may take several lines, and that can be left out, the first first.
+        keys: How many columns say what a row is of.
+        rows: Cells and style of each; one cell alone stands across all columns.
+    """
+
+    def __init__(
+        self, title: str, headings: Sequence[str], *, wrapped: Collection[int], spare: Sequence[int], keys: int
+    ) -> None:
+        self.title = printable(title)
+        self.headings = [printable(heading.removeprefix(">")) for heading in headings]
+        self._right = [heading.startswith(">") for heading in headings]
+        self.wrapped, self.spare, self.keys = wrapped, spare, keys
+        self.rows: _Rows = []
+
+    def add_row(self, *cells: str | Text, style: str = "") -> None:
+        """Add a row: a cell for each column, or one across all of them."""
+        from rich.text import Text
+
+        if len(cells) not in (1, len(self.headings)):
+            raise ValueError(f"a row must be 1 or {len(self.headings)} cells; instead received {len(cells)}")
+        texts = [Text(cell) if isinstance(cell, str) else cell for cell in cells]
+        self.rows.append(([Text(printable(text.plain), text.style) for text in texts], style))
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[Segment]:
+        from rich.segment import Segment
+        from rich.text import Text
+
+        room = options.max_width
+        rows = [([cell.copy() for cell in cells], style) for cells, style in self.rows]
+        for cell in (cell for cells, _ in rows for cell in cells):
+            cell.plain = _kept(cell.plain)
+        blocks = self._blocks(room, rows)
+        lines = list(Text(self.title, "italic").wrap(console, room)) if self.title else []
+        for number, widths in enumerate(blocks):
+            lines += [Text()] if number else []
+            lines += self._head(widths)
+            for cells, style in rows:
+                if len(cells) < len(self.headings):
+                    lines += cells[0].wrap(console, room)
+                    continue
+                filled = [cell if cell or room < _ENDLESS else Text("-") for cell in cells]
+                wrapped = {at: list(filled[at].wrap(console, width, overflow="fold")) for at, width in widths.items()}
+                for row in range(max(map(len, wrapped.values()))):
+                    parts = {at: texts[row] if row < len(texts) else Text() for at, texts in wrapped.items()}
+                    lines.append(self._line(parts, widths, style))
+        if gone := [heading for at, heading in enumerate(self.headings) if all(at not in block for block in blocks)]:
+            lines += Text(f"without {', '.join(gone)}: see --wide", "dim").wrap(console, room)
+        for line in lines:
+            line.rstrip()
+            yield from line.render(console)
+            yield Segment.line()
+
+    def _head(self, widths: dict[int, int]) -> list[Text]:
+        from rich.text import Text
+
+        if not any(self.headings):
+            return []
+        parts = {at: _stacked(self.headings[at], width) for at, width in widths.items()}
+        height = max(map(len, parts.values()))
+        padded = {at: [""] * (height - len(words)) + words for at, words in parts.items()}
+        return [
+            self._line({at: Text(words[row]) for at, words in padded.items()}, widths, "bold") for row in range(height)
+        ]
+
+    def _line(self, parts: dict[int, Text], widths: dict[int, int], style: str) -> Text:
+        from rich.text import Text
+
+        for at, part in parts.items():
+            part.rstrip()
+            part.align("right" if self._right[at] else "left", widths[at])
+        return Text(" " * _GAP, style).join(parts.values())
+
+    def _blocks(self, room: int, rows: _Rows) -> list[dict[int, int]]:
+        """Widths by the number of their columns: of all, or without spare ones, or in blocks below each other."""
+        columns = list(range(len(self.headings)))
+        for spare in (None, *self.spare):
+            columns = [at for at in columns if at != spare]
+            widths = self._widths(columns, room, rows)
+            if _total(widths) <= room:
+                return [widths]
+        keys, blocks = columns[: self.keys], [columns[: self.keys + 1]]
+        for at in columns[self.keys + 1 :]:
+            if _total(self._widths([*blocks[-1], at], room, rows)) <= room:
+                blocks[-1].append(at)
+            else:
+                blocks.append([*keys, at])
+        return [self._widths(block, room, rows) for block in blocks]
+
+    def _widths(self, columns: Iterable[int], room: int, rows: _Rows) -> dict[int, int]:
+        """Widths of columns beside each other: as they would like to be, or as narrow as they can be."""
+        wanted, widths = {}, {}
+        for at in columns:
+            cells = [cells[at] for cells, _ in rows if len(cells) == len(self.headings)]
+            words = _stacked(self.headings[at], 1)
+            whole = max((cell.cell_len for cell in cells), default=1)
+            wanted[at] = max(whole, len(self.headings[at]))
+            if at in self.wrapped:
+                longest = max((len(word) for cell in cells for word in cell.plain.split()), default=1)
+                least = _WORTH if at in self.spare else _LEAST
+                whole = longest if whole <= least else max(longest, least)
+            # Names that are not ours may be of any length.
+            whole = min(whole, max(room // (self.keys + 1) - _GAP, 1))
+            widths[at] = max([whole, *map(len, words)])
+        roomy = {at: min(width, _WORTH) if at in self.wrapped else width for at, width in wanted.items()}
+        for better in (wanted, roomy):
+            if _total(better) <= room:
+                widths = better
+                break
+        while _total(widths) < room and (narrow := [at for at in widths if widths[at] < wanted[at]]):
+            widths[max(narrow, key=lambda at: wanted[at] / widths[at])] += 1
+        return widths
+
+
+def _kept(text: str) -> str:
+    """The same text, in which a number keeps its unit beside it."""
+    return _UNIT.sub(lambda unit: unit[0].replace(" ", _KEPT), text)
+
+
+def _stacked(heading: str, width: int) -> list[str]:
+    """The lines of a heading, as even as they can be; what stands in brackets, a unit, is not broken."""
+    text = re.sub(r"\[.*?\]", lambda unit: unit[0].replace(" ", "\u00a0"), heading)
+    longest = max(map(len, textwrap.wrap(text, 1, break_long_words=False)), default=1)
+    lines = [textwrap.wrap(text, width) for width in range(longest, max(width, longest) + 1)]
+    return [line.replace("\u00a0", " ") for line in next(each for each in lines if len(each) == len(lines[-1]))]
+
+
+def _total(widths: dict[int, int]) -> int:
+    return sum(widths.values()) + _GAP * (len(widths) - 1)
+
+
+def new_table(
+    title: str, *headings: str, wrapped: Collection[str] = (), spare: Sequence[str] = (), keys: int = 1
+) -> Table:
+    """A table under a title, whose cells are whole and on one line each, but for texts that may be wrapped.
+
+    Where a terminal is too narrow for all columns, spare ones are left out, which is said; what still finds no room
+    goes on below, in a block that begins with the same columns.
+
+    Args:
+        title: The title.
+        headings: Of its columns; behind a `>` stand numbers, which are aligned to the right.
+        wrapped: Of those that hold texts, which may take several lines.
+        spare: Of those that can be left out, the first to go first.
+        keys: How many columns say what a row is of.
+    """
+    places = {heading.removeprefix(">"): at for at, heading in enumerate(headings)}
+    wrapped_at, spare_at = ([places[name] for name in names if name in places] for names in (wrapped, spare))
+    return Table(title, headings, wrapped=wrapped_at, spare=spare_at, keys=keys)
+
+
+def facts(title: str, rows: Iterable[tuple[str, str]], **styles: str) -> Table:
+    """A table of names, in bold, and what is to be said of each; `styles`: of the rows of some names."""
+    from rich.text import Text
+
+    table = Table(title, ("", ""), wrapped=(1,), spare=(), keys=1)
+    for name, said in rows:
+        table.add_row(Text(name, "bold"), said, style=styles.get(name, ""))
+    return table
+
+
+def table_console(*, wide: bool = False, stderr: bool = False) -> Console:
+    """Where tables are printed: on a terminal they fit it, into a pipe all lines keep their whole length.
+
+    Strings are text and no markup; what is styled is a `rich.text.Text` or a style.
+
+    Args:
+        wide: Print on a terminal as into a pipe.
+        stderr: Print there.
+    """
+    from rich.console import Console
+    from rich.segment import Segment
+
+    class Screen(Console):
+        """Markup is off for every kind of string, no text leaves unescaped, and none is cropped."""
+
+        def print(self, *objects: Any, **options: Any) -> None:
+            options.setdefault("crop", False)
+            super().print(*objects, **options)
+
+        def render_str(self, text: str, **options: Any) -> Any:
+            options.update(markup=False, emoji=False)
+            return super().render_str(_kept(_lines(text)), **options)
+
+        def render(self, renderable: Any, options: Any = None) -> Any:
+            for segment in super().render(renderable, options):
+                if segment.control or segment.text == "\n":
+                    yield segment
+                else:
+                    yield Segment(_lines(segment.text.replace(_KEPT, " ")), segment.style)
+
+    terminal = (sys.stderr if stderr else sys.stdout).isatty()
+    width = None if terminal and not wide else _ENDLESS
+    return Screen(width=width, highlight=False, markup=False, emoji=False, stderr=stderr)
+
+
+def progress_bar(*columns: Any, **options: Any) -> Any:
+    """A `rich.progress.Progress` on stderr with the columns and, behind them, each task's description as it stands."""
+    from rich.progress import Progress, TextColumn
+
+    console = table_console(stderr=True)
+    return Progress(*columns, TextColumn("{task.description}", markup=False), console=console, **options)
+
+
+def plain(text: str) -> Any:
+    """A line for what would take a string for markup, such as the status of a console."""
+    from rich.text import Text
+
+    return Text(printable(text))

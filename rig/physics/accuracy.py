@@ -1,0 +1,257 @@
+"""The error of a run, estimated by the distance from its companion, one quantity at a time in its own unit.
+
+Both runs are compared in windows of samples at the same instants. A whirl that is ahead or behind in angle has other
+instantaneous values although it is the same motion, so a difference also counts only as far as it remains where both
+runs are compared at the same whirl angle.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from rig.physics.engines import ENGINES
+from rig.physics.kernels import signals as S
+from rig.physics.kernels.signals import COLUMN
+
+COMPANION_REFINEMENT = 1.0 / 16.0
+"""Companion's tolerance over engine.tolerance: the difference is then the run's own error to about 6 %."""
+QUANTITIES = {
+    "radius": ("whirl radius", "um", 1e6),
+    "force": ("contact force", "N", 1.0),
+    "frequency": ("whirl frequency", "Hz", 1.0),
+    "state": ("state", "(scaled)", 1.0),
+    "angle": ("whirl angle", "deg", math.degrees(1.0)),
+    "spin_angle": ("spin angle", "deg", math.degrees(1.0)),
+}
+"""Label, unit and units per SI unit of each quantity; the two angles have no tolerance unless a limit is given."""
+STATE_FACTOR = 10.0
+"""Tolerance of the scaled state over engine.tolerance: the warning level of version 0.1."""
+FORCE_FLOOR_N = 100.0
+"""Smallest force scale [N], the default hammer's peak: a light graze does not warn for millinewtons."""
+FREQUENCY_SCALE_HZ = 100.0
+"""Whirl frequency scale [Hz]: the rig whirls at 40 to 130 Hz."""
+_WINDOW_ROWS, _WINDOW_S = 64, 0.064
+"""At least this many samples and this long [s], which is three turns of the slowest whirl that rolls."""
+_HARMONICS = np.arange(1, 5)
+"""Harmonics of the whirl angle in what a value is as a function of it; weight and stiffness give the first two."""
+_MIN_FIT_ROWS = 30
+"""Samples that a fit of twelve coefficients needs to have a residual that means something."""
+_MIN_WHIRL_RADIUS = 0.5
+"""Part of the clearance above which an orbit has a whirl angle."""
+_COLUMNS = [*range(S.N_STATE), COLUMN["ring_x"], COLUMN["ring_y"], COLUMN["normal_force"]]
+_MOVING = [2 + k for k in range(S.N_STATE) if k != S.THETA]
+"""Columns of a window's differences that are states, without the spin angle; before them are radius and force."""
+_FIRST, _LOST = 1e-9, 0.1
+"""Growth is measured from the first distance above rounding, up to where two runs no longer have to do with each
+other."""
+
+
+def choose_companion(engine: str, tolerance: float, friction: str) -> tuple[str, float]:
+    """Return engine and tolerance of the companion.
+
+    A per-step tolerance bounds nothing where the step is limited by the grid, as with `tsit5` at 1e-3: a companion of
+    the same method then shares the error. Other engines are compared with the default engine, or with `rk8` where the
+    default engine does not take the friction law.
+
+    Args:
+        engine: Name of the run's own engine.
+        tolerance: engine.tolerance of the run.
+        friction: Friction law of the model.
+    """
+    default = next(iter(ENGINES))
+    name = default if friction in ENGINES[default].frictions else "rk8"
+    return name, COMPANION_REFINEMENT * (tolerance if name == engine else min(tolerance, ENGINES[name].tolerance))
+
+
+@dataclass
+class Accuracy:
+    """Error estimate of a run.
+
+    Attributes:
+        tolerance: engine.tolerance [1].
+        clearance: Radial clearance of the ring [m].
+        block_s: Time between compared samples [s].
+        limits: Limits that replace tolerances, by quantity, each in the quantity's unit.
+        estimate: Largest distance of all states at the same instant, RMS of the scaled states (`STATE_SCALE`) [1].
+        grown_per_s: Mean growth rate of a small distance [1/s].
+        errors: Largest error of each of `QUANTITIES` [SI], shape (6,).
+        since_s: Start of the window in which a quantity exceeded its tolerance [s].
+        peak_force: Largest contact force of the compared samples [N].
+    """
+
+    tolerance: float
+    clearance: float
+    block_s: float
+    limits: dict[str, float] = field(default_factory=dict)
+    estimate: float = 0.0
+    grown_per_s: float = 0.0
+    errors: np.ndarray = field(default_factory=lambda: np.zeros(len(QUANTITIES)))
+    since_s: dict[str, float] = field(default_factory=dict)
+    peak_force: float = 0.0
+    _first: tuple[float, float] | None = None
+    _window: np.ndarray = field(default_factory=lambda: np.empty((0, 1 + 2 * len(_COLUMNS))))
+    _waiting: list[np.ndarray] = field(default_factory=lambda: [])
+
+    def compare(self, rows: np.ndarray, companion: np.ndarray, times_s: np.ndarray) -> list[tuple[float, str]]:
+        """Add samples of both runs.
+
+        Args:
+            rows: Observed rows, shape (n, N_ROW).
+            companion: The companion's rows at the same instants, shape (n, N_ROW).
+            times_s: Instants [s], shape (n,).
+
+        Returns:
+            Time [s] and text of a warning for each window in which another quantity exceeded its tolerance.
+        """
+        self._waiting.append(np.concatenate([times_s[:, None], rows[:, _COLUMNS], companion[:, _COLUMNS]], axis=1))
+        size, warnings = max(_WINDOW_ROWS, math.ceil(_WINDOW_S / self.block_s)), []
+        if sum(map(len, self._waiting)) < size:
+            return warnings
+        waiting = np.concatenate(self._waiting)
+        while len(waiting) >= size:
+            self._window, waiting = waiting[:size], waiting[size:]
+            if self._add_window(self._window):
+                warnings.append((float(self._window[-1, 0]), self.warning()))
+        self._waiting = [waiting]
+        return warnings
+
+    def completed(self) -> Accuracy:
+        """Return a copy that includes the samples of the window that is not full yet."""
+        done = copy.deepcopy(self)
+        done.complete()
+        return done
+
+    def complete(self) -> None:
+        """Add the samples of the window that is not full yet, filled up by those before them."""
+        if count := sum(map(len, self._waiting)):
+            self._add_window(np.concatenate([self._window, *self._waiting])[-max(len(self._window), count) :])
+
+    def document(self) -> dict[str, Any]:
+        """Return the estimate as JSON: each quantity's largest error and tolerance in its unit, and since when."""
+        tolerances = self._tolerances()
+        return {
+            "estimate": self.estimate,
+            "growth_per_s": self.grown_per_s,
+            "doubted_s": min(self.since_s.values(), default=None),
+            "quantities": {
+                name: {
+                    "label": label,
+                    "unit": unit,
+                    "error": error * per_si,
+                    "tolerance": self.limits.get(name, tolerances[name] * per_si if name in tolerances else None),
+                    "exceeded_s": self.since_s.get(name),
+                }
+                for (name, (label, unit, per_si)), error in zip(QUANTITIES.items(), self.errors.tolist(), strict=True)
+            },
+        }
+
+    def warning(self) -> str:
+        """Return a sentence that names each quantity above its tolerance; empty if there is none."""
+        parts = [
+            f"{one['label']} off by {one['error']:.2g} {one['unit']} "
+            f"({'limit' if name in self.limits else 'tolerance'} {one['tolerance']:.2g}) "
+            f"since {one['exceeded_s']:.3f} s"
+            for name, one in self.document()["quantities"].items()
+            if one["exceeded_s"] is not None
+        ]
+        advice = (
+            f"differences grow by {self.grown_per_s:.3g} 1/s: ask for a finer engine.tolerance ({self.tolerance:g})"
+        )
+        return f"accuracy: {'; '.join(parts)}; {advice}, or use statistics only" if parts else ""
+
+    def _tolerances(self) -> dict[str, float]:
+        """Return the tolerance of each quantity that has one [SI]."""
+        scales = self.clearance, max(self.peak_force, FORCE_FLOOR_N), FREQUENCY_SCALE_HZ, STATE_FACTOR
+        given = {name: limit / QUANTITIES[name][2] for name, limit in self.limits.items()}
+        return {name: self.tolerance * scale for name, scale in zip(QUANTITIES, scales, strict=False)} | given
+
+    def _add_window(self, window: np.ndarray) -> bool:
+        """Update all estimates by one window; return whether another quantity exceeds its tolerance."""
+        # Sums along rows differ in their last bit by the order in memory, which goes by how the run was cut.
+        window = np.ascontiguousarray(window)
+        times_s, both = window[:, 0], window[:, 1:].reshape(len(window), 2, len(_COLUMNS))
+        orbit, force = both[..., -3] + 1j * both[..., -2], both[..., -1:]
+        radius = np.abs(orbit)
+        values = np.concatenate([radius[..., None], force, both[..., : S.N_STATE] / S.STATE_SCALE], axis=-1)
+        apart = np.abs(values[:, 0] - values[:, 1])
+        apart[np.isnan(apart)] = math.inf
+        self._note_growth(times_s, np.sqrt(np.mean(apart[:, 2:] ** 2, axis=1)))
+        self.peak_force = max(self.peak_force, float(force[:, 0].max()))
+        between = np.angle(orbit[:, 0] * np.conj(orbit[:, 1]))
+        whirls = radius.min(axis=1) > _MIN_WHIRL_RADIUS * self.clearance
+        errors = self._at_instant(apart)
+        if len(window) >= _MIN_FIT_ROWS and np.isfinite(apart).all() and (errors > self.errors[[0, 1, 3]]).any():
+            phases = np.stack([np.angle(orbit), both[..., S.THETA]], axis=-1)
+            (own, other), (phase, phase_other) = values.swapaxes(0, 1), phases.swapaxes(0, 1)
+            same_angle = _apart_at_same_angle(own, other, phase, phase_other, times_s)
+            errors = self._at_instant(np.minimum(apart, same_angle))
+        span_s = times_s[-1] - times_s[0]
+        frequency = 0.0
+        if whirls.all() and span_s >= 0.5 * _WINDOW_S:
+            turned = np.unwrap(between)
+            frequency = abs(turned[-1] - turned[0]) / (2.0 * math.pi * span_s)
+        angle = np.abs(between[whirls]).max(initial=0.0)
+        found = np.array([errors[0], errors[1], frequency, errors[2], angle, apart[:, 2 + S.THETA].max()])
+        self.errors = np.maximum(self.errors, found)
+        errors_by_name, tolerances = dict(zip(QUANTITIES, self.errors, strict=True)), self._tolerances()
+        exceeded = [
+            name
+            for name, tolerance in tolerances.items()
+            if errors_by_name[name] > tolerance and name not in self.since_s
+        ]
+        self.since_s |= dict.fromkeys(exceeded, float(times_s[0]))
+        return bool(exceeded)
+
+    def _note_growth(self, times_s: np.ndarray, distances: np.ndarray) -> None:
+        """Update the largest distance of all states and its growth, by distances at some instants, shape (n,)."""
+        self.estimate, begin = max(self.estimate, float(distances.max())), 0
+        if self._first is None and (above := distances > _FIRST).any():
+            begin = int(np.argmax(above)) + 1
+            self._first = float(times_s[begin - 1]), float(distances[begin - 1])
+        if self._first is not None:
+            grown = np.flatnonzero((distances[begin:] > self._first[1]) & (distances[begin:] < _LOST))
+            if len(grown):
+                last = begin + int(grown[-1])
+                self.grown_per_s = math.log(distances[last] / self._first[1]) / float(times_s[last] - self._first[0])
+
+    @staticmethod
+    def _at_instant(apart: np.ndarray) -> np.ndarray:
+        """Largest radius [m], force [N] and scaled state (without the spin angle) error, shape (3,)."""
+        rms = np.sqrt(np.sum(apart[:, _MOVING] ** 2, axis=1) / S.N_STATE)
+        return np.array([apart[:, 0].max(), apart[:, 1].max(), rms.max()])
+
+
+def _apart_at_same_angle(
+    own: np.ndarray, other: np.ndarray, phase: np.ndarray, phase_other: np.ndarray, times_s: np.ndarray
+) -> np.ndarray:
+    """Return how far another run is from this one at the same whirl angle.
+
+    This run's values are fitted as a function of its whirl angle, of that angle from the turning unbalance, and of
+    time; the fit's own residual is added, so that a motion that is no such function, as impacts are, is never explained
+    by an angle.
+
+    Args:
+        own: Values of this run, shape (n, k).
+        other: Values of the other run, shape (n, k).
+        phase: Whirl angle and spin angle of this run [rad], shape (n, 2).
+        phase_other: Those of the other run [rad], shape (n, 2).
+        times_s: Instants [s], shape (n,).
+
+    Returns:
+        Distances in the units of the values, shape (n, k).
+    """
+    elapsed = (times_s - times_s.mean()) / max(np.ptp(times_s), 1e-9)
+
+    def basis(at: np.ndarray) -> np.ndarray:
+        turns = np.column_stack([np.outer(at[:, 0], _HARMONICS), at[:, 0] - at[:, 1]])
+        return np.column_stack([np.ones_like(elapsed), elapsed, np.cos(turns), np.sin(turns)])
+
+    terms = basis(phase)
+    coefficients, *_ = np.linalg.lstsq(terms, own)
+    residual = np.abs(own - terms @ coefficients).max(axis=0)
+    return np.abs(other - basis(phase_other) @ coefficients) + residual

@@ -1,0 +1,6 @@
+"""The Taylor engine; see `rig.physics.engines.taylor.march`."""
+
+from rig.physics.engines.taylor.march import advance, start
+from rig.physics.engines.taylor.place import ORDER
+
+__all__ = ["ORDER", "advance", "start"]

@@ -1,0 +1,62 @@
+"""Numba kernels: functions of floats, arrays and NamedTuples, nothing else.
+
+numba's own cache looks only at the file of the function it loads: it returns stale machine code when a kernel or a
+constant in *another* file has changed. So the cache folder is named by a digest of every kernel and engine file, of
+installed packages that add an engine too (unless the user set NUMBA_CACHE_DIR), before the first kernel is defined.
+
+numba also hands a caller's `fastmath` on to what it calls. Kernels that engines share name theirs, so that their bits
+do not depend on which engine was compiled first.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import sys
+from collections.abc import Iterator
+from importlib.metadata import entry_points
+from importlib.util import find_spec
+from pathlib import Path
+
+from numba.core import config as numba_config
+
+ENGINE_GROUP = "rig.engines"
+"""Entry points by which an installed package adds an engine (`rig.physics.engines`)."""
+_KERNELS = Path(__file__).parent
+_SOURCES = (_KERNELS, _KERNELS.parent / "engines", _KERNELS.parents[1] / "channels" / "sensors")
+
+
+def source_digest() -> str:
+    """Digest of all files that hold compiled code, and of their place: numba's cache serves no other."""
+    digest = hashlib.sha256(str(Path(__file__).parent).encode())
+    own = (path for folder in _SOURCES for path in folder.rglob("*.py"))
+    for path in [*sorted(own), *_files_of_other_packages()]:
+        digest.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
+    return digest.hexdigest()[:16]
+
+
+def _files_of_other_packages() -> Iterator[Path]:
+    for package in sorted({point.module.partition(".")[0] for point in entry_points(group=ENGINE_GROUP)}):
+        spec = find_spec(package)
+        if spec is not None and spec.submodule_search_locations:
+            yield from sorted(path for folder in spec.submodule_search_locations for path in Path(folder).rglob("*.py"))
+        elif spec is not None and spec.origin:
+            yield Path(spec.origin)
+
+
+def _cache_folder() -> Path:
+    if sys.platform == "win32":
+        root = Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData" / "Local"))
+    else:
+        root = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
+    return root / "rotor-stator-rig" / "kernels" / source_digest()
+
+
+if "NUMBA_CACHE_DIR" not in os.environ:
+    numba_config.CACHE_DIR = str(_cache_folder())  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def compiled_before() -> bool:
+    """True where the cache already holds kernels of exactly these sources: the start will be quick."""
+    folder = Path(str(numba_config.CACHE_DIR))  # pyright: ignore[reportAttributeAccessIssue]
+    return folder.is_dir() and any(folder.rglob("*.nbc"))

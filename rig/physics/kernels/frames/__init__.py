@@ -1,0 +1,1 @@
+"""Frames: the shaft's tilt, its axis, and its place in the ring."""

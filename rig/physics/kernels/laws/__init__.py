@@ -1,0 +1,1 @@
+"""Forces of single parts as laws: contact, magnet, bearing house."""

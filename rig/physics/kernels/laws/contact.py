@@ -1,0 +1,160 @@
+"""Contact laws between shaft and ring: normal force with impact memory, and friction against the sliding speed."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from rig.physics.kernels.stage import stage
+
+NO_FRICTION, SMOOTHED, SWITCH, EXACT = range(4)
+"""Friction laws: none; mu F_n tanh(v_t/v_s); clamped linear law that aims at rolling within v_s; Coulomb's, set-valued.
+
+The set-valued law is a matter of phases: sliding forward, sliding backward, rolling. An engine has to keep them.
+"""
+FLIGHT, TOUCHING, FORWARD, BACKWARD, ROLLING = range(5)
+"""Phases: apart; touching, with a friction that the state alone decides; touching and sliding with v_t > 0, with
+v_t < 0; touching and rolling, the friction force being what keeps v_t at 0."""
+
+
+class RingForce(NamedTuple):
+    """Force between shaft and ring, in the ring's plane."""
+
+    Fx: float  # on the shaft [N]
+    Fy: float
+    Fn: float  # normal [N]
+    elastic: float  # part of it [N]
+    Ft: float  # friction against the sliding speed [N]
+    delta: float  # penetration [m]; negative is the gap
+    rate: float  # of it [m/s]
+    sliding: float  # speed of the shaft's surface along the ring [m/s]
+    nx: float  # direction from the ring's centre to the shaft's
+    ny: float
+
+
+@stage
+def elastic_force(penetration, stiffness, exponent):
+    """Elastic part of the normal force, K delta^n [N], for a penetration >= 0 [m]."""
+    if exponent == 1.5:
+        return stiffness * penetration * math.sqrt(penetration)
+    if exponent == 1.0:
+        return stiffness * penetration
+    return stiffness * penetration**exponent
+
+
+@stage
+def held_speed(speed, contact):
+    """Impact speed v0 that a contact holds until it ends, by that at its onset [m/s]."""
+    return max(speed, contact.speed_floor)
+
+
+@stage
+def damping_ratio(rate, onset_speed, contact):
+    """Force without viscous damping over its elastic part, 1 + c delta'/v0 [1]."""
+    return 1.0 + contact.damping_factor * rate / onset_speed
+
+
+@stage
+def penetration_of(distance, contact):
+    """Penetration of the shaft into the ring [m] by the distance of their centres [m]; negative is the gap."""
+    return distance - contact.clearance
+
+
+@stage
+def normal_force(penetration, rate, onset_speed, contact):
+    """Compliant normal force, eq. 44 and its family.
+
+    F = K delta^n (1 + c delta'/v0) + D delta', clamped at 0: a contact cannot pull.
+
+    Trap: v0 -> 0 at grazing onsets makes the damping term grow without bound; `held_speed` keeps v0 from 0.
+
+    Args:
+        penetration: delta [m]; no force unless positive.
+        rate: delta' [m/s], positive while the bodies approach.
+        onset_speed: v0 [m/s], delta' at the onset of this contact, floored.
+        contact: Constants of the contact: K, n, c, D.
+
+    Returns:
+        Force [N] and its elastic part [N], both >= 0.
+    """
+    if penetration <= 0.0:
+        return 0.0, 0.0
+    elastic = elastic_force(penetration, contact.stiffness, contact.exponent)
+    force = elastic * damping_ratio(rate, onset_speed, contact) + contact.viscous_damping * rate
+    return max(0.0, force), elastic
+
+
+@stage
+def friction_force(law, phase, force, sliding_speed, contact):
+    """Friction against the sliding speed of eq. 39 (not sgn(theta') of eq. 12), where the state or the phase decides.
+
+    Smoothed: mu F_n tanh(v_t / v_s). Exact, while it slides: mu F_n with the sign of the phase.
+
+    Trap: below sliding at about v_s the smoothed law creeps by v_s atanh(needed / mu), and an explicit step must stay
+    below about 2 m_t v_s / (mu F_n).
+
+    Args:
+        law: One of the friction laws.
+        phase: One of the phases.
+        force: F_n [N].
+        sliding_speed: v_t [m/s].
+        contact: Constants of the contact: mu, v_s.
+
+    Returns:
+        Force [N], positive against a positive sliding speed; 0 for a rolling phase and for the switch law, whose force
+        depends on the whole motion (`rig.physics.kernels.dynamics`).
+    """
+    if phase == FORWARD:
+        return contact.friction * force
+    if phase == BACKWARD:
+        return -contact.friction * force
+    if law == SMOOTHED and phase == TOUCHING:
+        return contact.friction * force * math.tanh(sliding_speed / contact.smoothing_speed)
+    return 0.0
+
+
+@stage
+def ring_force(ex, ey, vx, vy, surface_speed, onset_speed, law, phase, contact):
+    """Force of the ring on the shaft, eqs. 12 and 44 in the plane of the ring.
+
+    Frame: n = e/|e| points from the ring's centre to the shaft's, t = (-n_y, n_x). F = -F_n n - F_t t acts on the
+    shaft, the opposite on the inner house; the shaft's spin feels -radius F_t.
+
+    Args:
+        ex: Shaft centre minus ring centre, x [m].
+        ey: The same, y [m].
+        vx: Its rate, x [m/s].
+        vy: Its rate, y [m/s].
+        surface_speed: Speed of the shaft's surface from spin, R_S w [m/s].
+        onset_speed: v0 [m/s].
+        law: Friction law.
+        phase: Phase of the contact; no force in flight.
+        contact: Constants of the contact.
+    """
+    distance = math.sqrt(ex * ex + ey * ey)
+    penetration = penetration_of(distance, contact)
+    if distance == 0.0:
+        return RingForce(0.0, 0.0, 0.0, 0.0, 0.0, penetration, 0.0, 0.0, 1.0, 0.0)
+    per_distance = 1.0 / distance
+    nx = ex * per_distance
+    ny = ey * per_distance
+    rate = vx * nx + vy * ny
+    sliding = vy * nx - vx * ny + surface_speed
+    if phase == FLIGHT:
+        return RingForce(0.0, 0.0, 0.0, 0.0, 0.0, penetration, rate, sliding, nx, ny)
+    force, elastic = normal_force(penetration, rate, onset_speed, contact)
+    tangential = 0.0
+    if force > 0.0:
+        tangential = friction_force(law, phase, force, sliding, contact)
+    return RingForce(
+        -force * nx + tangential * ny,
+        -force * ny - tangential * nx,
+        force,
+        elastic,
+        tangential,
+        penetration,
+        rate,
+        sliding,
+        nx,
+        ny,
+    )

@@ -1,0 +1,27 @@
+"""Bearing house: two bodies on beams and pre-compressed transducers, eqs. 22-25 with absolute coordinates."""
+
+from __future__ import annotations
+
+from rig.physics.kernels.stage import stage
+
+
+@stage
+def pair_readings(displacement, pair_stiffness, preload):
+    """Readings of one opposed, pre-compressed pair of transducers.
+
+    The pair carries `pair_stiffness` times the displacement: one side loads by half of that, the other unloads by
+    half. A transducer that has lost its preload reads 0 and has dropped out of the stiffness.
+
+    Args:
+        displacement: Of the body between them, positive toward the first [m].
+        pair_stiffness: k_T of the pair with both loaded [N/m].
+        preload: Of each [N].
+
+    Returns:
+        Compression of the first and of the second transducer [N], and the energy stored above the preloaded rest [J].
+    """
+    change = 0.5 * pair_stiffness * displacement
+    first = max(0.0, preload + change)
+    second = max(0.0, preload - change)
+    stored = (first * first + second * second - 2.0 * preload * preload) / pair_stiffness
+    return first, second, stored

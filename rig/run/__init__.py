@@ -1,0 +1,1 @@
+"""A run of a scene: scene in, frames out, commands on the way."""

@@ -1,0 +1,235 @@
+"""What stands for engine, sensors and keyphasor in scenes of test signals (`rig.channels.generators`); not compiled."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterable, Iterator, Mapping
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+
+from rig.channels.faults import At, Kind, plugged
+from rig.channels.faults.sending import Active
+from rig.channels.generators import Instants, Source, exact
+from rig.channels.sampling import TICKS_HZ
+from rig.channels.sensors.keyphasor import FRACTIONS
+from rig.channels.sensors.noise import noise_streams
+from rig.channels.table import Group
+from rig.physics.engines import Engine
+from rig.physics.kernels.constants import Constants, Inputs
+from rig.physics.kernels.signals import SPIN_RATE, THETA_RATE
+from rig.run.scenes import Scene
+
+
+def _stand_still(
+    constants: Constants, inputs: Inputs, y: Any, memory: Any, tick: int, step: int, steps: int, stride: int, rows: Any
+) -> None:
+    """Rows in which nothing moves, and the shaft has the nominal speed."""
+    rows[:] = 0.0
+    rows[:, THETA_RATE] = rows[:, SPIN_RATE] = inputs.speed
+
+
+STILL = Engine(start=lambda *_: None, advance=_stand_still, order=0)
+"""In place of an engine."""
+
+
+class Calibrator:
+    """In place of the conditioning of all channels: volts of generators, noise, converter.
+
+    Args:
+        groups: What is measured.
+        sources: At the converter of each channel.
+        seed: Of the noise, which is that of the sensors: a stream of its own for every channel.
+        noise: Whether there is any.
+        row_ticks: Ticks a row.
+        tick: Of the first row.
+    """
+
+    def __init__(
+        self,
+        groups: Iterable[Group],
+        sources: dict[str, Source],
+        *,
+        seed: int,
+        noise: bool,
+        row_ticks: int,
+        tick: int = 0,
+    ) -> None:
+        self.groups = tuple(groups)
+        self._sources, self._row_ticks, self._tick = sources, row_ticks, tick
+        self._waves = {name: source.wave for name, source in sources.items()}
+        names = [name for group in self.groups for name in group.names]
+        self._noise = dict(zip(names, map(_normal, noise_streams(names, seed)), strict=True)) if noise else {}
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Calibrator:
+        """With noise of its own to draw; what does not change is shared."""
+        other = copy.copy(self)
+        other.__dict__["_noise"] = copy.deepcopy(self._noise)
+        return other
+
+    @property
+    def columns(self) -> np.ndarray:
+        """Column of each channel's signal in the rows: none has one, shape (0,)."""
+        return np.empty(0, int)
+
+    def volts(self, name: str, instants: Instants) -> np.ndarray:
+        """What stands at the converter of a channel at any instants [V], shape (n,)."""
+        source = self._sources[name]
+        return source.at(source.shape(instants))
+
+    def counts(
+        self, rows: np.ndarray, made: np.ndarray | None = None, faults: Generated | None = None
+    ) -> dict[str, np.ndarray]:
+        """Samples from the first of these rows on that lie before the last one.
+
+        Args:
+            rows: That follow those of the call before, shape (n, N_ROW); only how many they are counts.
+            made: Nothing of it counts.
+            faults: What becomes of volts and counts on faulty channels.
+
+        Returns:
+            ADC counts by group, int32, shape (samples, channels).
+        """
+        start, self._tick = self._tick, self._tick + (len(rows) - 1) * self._row_ticks
+        found, shapes = {}, dict[tuple[int, Any], np.ndarray]()
+        for group in self.groups:
+            rate = group.rate_hz
+            first, end = (-(-tick * rate // TICKS_HZ) for tick in (start, self._tick))
+            n = np.arange(first, end)
+            instants = Instants.of_samples(n, rate)
+            counts = found[group.name] = np.empty((end - first, len(group.channels)), np.int32)
+            for c, channel in enumerate(group.channels):
+                source, key = self._sources[channel.name], (rate, self._waves[channel.name])
+                if key not in shapes:
+                    shapes[key] = source.shape(instants)
+                volts = source.at(shapes[key])
+                if faults is not None and (changed := faults.volts(channel.name, n)) is not None:
+                    volts = changed
+                if self._noise:
+                    volts = volts + channel.noise_v * self._noise[channel.name].standard_normal(end - first)
+                half = 2.0 ** (channel.adc_bits - 1)
+                whole = np.rint(volts / channel.lsb_v)
+                if faults is not None:
+                    whole = faults.counts(channel.name, n, whole)
+                counts[:, c] = np.clip(whole, -half, half - 1.0)
+        return found
+
+
+class Generated:
+    """What faults make of test signals: of volts at the very instants of samples, and of counts.
+
+    Args:
+        calibrator: What makes the sound ones.
+        faults: Those of faulty channels, by name.
+    """
+
+    def __init__(self, calibrator: Calibrator, faults: Mapping[str, list[Active]]) -> None:
+        self._calibrator, self._faults = calibrator, faults
+        swaps = {one.id: one for faults_here in faults.values() for one in faults_here}
+        self._plugs = plugged(swaps[number] for number in sorted(swaps))
+        self._channels = {channel.name: channel for group in calibrator.groups for channel in group.channels}
+
+    def _ats(self, name: str, n: np.ndarray) -> Iterator[tuple[Kind, At]]:
+        channel = self._channels[name]
+        none = np.empty(0)
+        for one in self._faults.get(name, []):
+            t = n / channel.rate_hz - one.begin / TICKS_HZ
+            draw, kept = one.draws[name], one.kept
+            yield one.what, At(t, n, channel, draw, kept, lambda x: self._beyond(x, n, name), none, none, lambda x: x)
+
+    def _conditioned(self, name: str, instants: Instants, ats: Iterable[tuple[Kind, At]]) -> np.ndarray:
+        """What comes from a sensor, with the faults of transducers [V]."""
+        channel = self._channels[name]
+        x = (self._calibrator.volts(name, instants) - channel.bias_v) / channel.sensitivity_v
+        for what, at in ats:
+            x = what.signal(x, at)
+        return channel.bias_v + channel.sensitivity_v * x
+
+    def _beyond(self, name: str, n: np.ndarray, at: str) -> np.ndarray:
+        channel = self._channels[name]
+        instants = Instants.of_samples(n, self._channels[at].rate_hz)
+        return self._conditioned(name, instants, ()) - channel.bias_v
+
+    def volts(self, name: str, n: np.ndarray) -> np.ndarray | None:
+        """At the converter in samples of these numbers [V], shape (n,); None of a sound channel."""
+        if name not in self._faults or not len(n):
+            return None
+        ats, late_s = list(self._ats(name, n)), np.zeros(len(n))
+        for what, at in ats:
+            late_s += np.minimum(what.late_s(at), at.t)  # nothing from before the fault
+        source = self._plugs.get(name, name)
+        instants = Instants.of_samples(n, self._channels[name].rate_hz).later(late_s)
+        volts = self._conditioned(source, instants, ats if source == name else self._ats(source, n))
+        for what, at in ats:
+            volts = what.volts(volts, at)
+        return volts
+
+    def counts(self, name: str, n: np.ndarray, counts: np.ndarray) -> np.ndarray:
+        """What the converter says of that, before it is limited, shape (n,)."""
+        for what, at in self._ats(name, n):
+            counts = what.counts(counts, at) if len(n) else counts
+        return counts
+
+
+def _normal(stream: np.ndarray) -> np.random.Generator:
+    """What draws the numbers of one of the sensors' streams of noise."""
+    bits = np.random.SFC64(0)
+    state = bits.state
+    state["state"]["state"] = stream
+    bits.state = state
+    return np.random.Generator(bits)
+
+
+class Turns:
+    """In place of the keyphasor: edges at the whole turns of a nominal speed, none where that is 0.
+
+    Args:
+        speed_hz: The speed [Hz].
+        tick: Of the first row.
+    """
+
+    def __init__(self, speed_hz: float, tick: int = 0) -> None:
+        self.edges_seen = 0
+        self._speed, self._tick = exact(speed_hz), tick
+
+    def edges(self, rows: np.ndarray, row_ticks: int) -> np.ndarray:
+        """Edges from the first of these rows on, before the one that follows the last.
+
+        Args:
+            rows: That follow those of the call before, shape (n, N_ROW); only how many they are counts.
+            row_ticks: Ticks a row.
+
+        Returns:
+            Instants in ticks from the first of these rows, with their fraction, shape (edges,).
+        """
+        start, self._tick = self._tick, self._tick + len(rows) * row_ticks
+        if not self._speed:
+            return np.empty(0)
+        turn = TICKS_HZ / self._speed
+        first, end = (-(-Fraction(tick) // turn) for tick in (max(start, 1), self._tick))
+        self.edges_seen += end - first
+        return np.array([(round(n * turn * FRACTIONS) - start * FRACTIONS) / FRACTIONS for n in range(first, end)])
+
+
+def stand_ins(scene: Scene, *, row_ticks: int, tick: int) -> tuple[list[Any], Any]:
+    """In place of the conditioners, and of the keyphasor, in a scene with a generator.
+
+    Args:
+        scene: The scene.
+        row_ticks: Ticks a row.
+        tick: Of the first row.
+    """
+    sensors = scene.sensors
+    noise = sensors.noise and sensors.chain == "full"
+    groups = scene.table.groups.values()
+    calibrator = Calibrator(groups, scene.sources(), seed=scene.seed, noise=noise, row_ticks=row_ticks, tick=tick)
+    return [calibrator], Turns(scene.drive.speed_hz, tick)
+
+
+def health(scene: Scene) -> dict[str, Any]:
+    """What there is to say of a run with a generator: nominal speed, and who is driven beyond the converter."""
+    sources = scene.sources().items()
+    limited = [name for name, one in sources if one.largest_v > one.channel.adc_v + one.channel.lsb_v]
+    said = f"driven beyond the converter, which limits: {', '.join(limited)}"
+    return {"spin_hz": scene.drive.speed_hz, "contacts": 0, "warnings": [said] if limited else []}

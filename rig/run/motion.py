@@ -1,0 +1,160 @@
+"""The motion that an engine moves on: its start, its steps, and its energy ledger."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from rig.base.errors import InputError
+from rig.physics.engines import Engine
+from rig.physics.engines.common.memory import MEMORY
+from rig.physics.kernels import signals as S
+from rig.physics.kernels.constants import Constants, Inputs
+from rig.physics.kernels.signals import COLUMN
+from rig.physics.model import Model
+from rig.run.scenes import Initial
+
+STORED = ("kinetic_energy", "gravity_energy", "magnet_energy", "house_energy", "contact_energy")
+SUPPLIED = ("drive_work", "hammer_work", "unbalance_work", "gap_work", "release_work")
+DISSIPATED = ("bearing_loss", "house_loss", "contact_loss", "friction_loss")
+BRANCH_ALARM = 1e-2
+"""Energy residual over dissipated energy above which a run may have missed a contact or made one up."""
+
+
+class Begin(NamedTuple):
+    """Where a run is taken up that was under way before: the shaft in the ring, its houses at rest."""
+
+    tick: int
+    ring_x: float = 0.0  # [m]
+    ring_y: float = 0.0
+    vx: float = 0.0  # [m/s]
+    vy: float = 0.0
+    angle: float = 0.0  # theta [rad]
+
+
+def initial_state(model: Model, initial: Initial, begin: Begin | None, *, spin: float) -> np.ndarray:
+    """State and integrals at the start of a run, shape (N_VECTOR,).
+
+    Args:
+        model: The model.
+        initial: What the scene says of it.
+        begin: Where it is taken up instead; None: at the scene's start.
+        spin: theta' [rad/s].
+
+    Raises:
+        InputError: The shaft would not be inside the ring.
+    """
+    contact, inside = model.constants.contact, "inside the ring (r0 = {:g} mm)".format
+    if begin is not None:
+        if math.hypot(begin.ring_x, begin.ring_y) >= contact.clearance:
+            place = [begin.ring_x * 1e3, begin.ring_y * 1e3]
+            raise InputError("begin", inside(contact.clearance * 1e3), place)
+        return model.state(
+            ring_x=begin.ring_x, ring_y=begin.ring_y, velocity=(begin.vx, begin.vy), spin=spin, angle=begin.angle
+        )
+    if initial.position == "equilibrium":
+        sag = model.sag
+        if math.hypot(contact.offset_x, sag - contact.offset_y) > contact.clearance:
+            r0 = contact.clearance * 1e3
+            place = f"within {r0:g} mm of the shaft at rest on its magnets, (0, {sag * 1e3:.4g}) mm"
+            raise InputError("ring.offset", place, [contact.offset_x * 1e3, contact.offset_y * 1e3])
+        return model.state(spin=spin)
+    # Just inside the clearance, so that rounding does not make it a contact.
+    within = contact.clearance * (1.0 - 1e-12)
+    places = {"top": (0.0, within), "bottom": (0.0, -within), "given": (initial.x_mm * 1e-3, initial.y_mm * 1e-3)}
+    x, y = places[initial.position]
+    if math.hypot(x, y) > contact.clearance:
+        raise InputError("initial.position", inside(contact.clearance * 1e3), [initial.x_mm, initial.y_mm])
+    return model.state(ring_x=x, ring_y=y, spin=spin)
+
+
+@dataclass
+class Motion:
+    """State and integrals, what the engine keeps, and the grid that rows are observed on.
+
+    Attributes:
+        y: Shape (N_VECTOR,).
+        step_ticks: The engine's own step [ticks].
+        stride: Steps a row.
+        tolerance: That the engine is asked for.
+        memory: Shape (MEMORY,).
+    """
+
+    y: np.ndarray
+    step_ticks: int
+    stride: int
+    tolerance: float
+    memory: np.ndarray = field(default_factory=lambda: np.zeros(MEMORY))
+
+    def begin(self, engine: Engine, constants: Constants, inputs: Inputs) -> None:
+        """Start the engine on this state."""
+        engine.start(constants, inputs, self.y, self.memory, float(self.step_ticks), self.tolerance)
+
+    def warm_up(self, engine: Engine, constants: Constants, inputs: Inputs) -> None:
+        """Compile what the engine may call later than in its first steps."""
+        if engine.warm_up is not None and len(self.memory) == engine.memory_size:
+            engine.warm_up(constants, inputs)
+
+    def run(
+        self, engine: Engine, constants: Constants, inputs: Inputs, rows: np.ndarray, start: int, tick: int, stop: int
+    ) -> None:
+        """Move on from one tick to another under the same inputs.
+
+        Commands live on ticks, rows only observe: off the rows' grid the steps are what fits, and no row is kept.
+
+        Args:
+            engine: The engine.
+            constants: Of the model.
+            inputs: Hammer, drive, magnets.
+            rows: Out, one every `stride` steps from the tick `start` on, shape (n, N_ROW); also that at `stop`, before
+                anything changes there, where there is room for it.
+            start: Tick of the first row.
+            tick: From here.
+            stop: To here.
+        """
+        row_ticks = self.stride * self.step_ticks
+        while tick < stop:
+            row, beyond = divmod(tick - start, row_ticks)
+            whole = 0 if beyond else (stop - tick) // row_ticks
+            if whole:
+                step, steps, stride = self.step_ticks, whole * self.stride, self.stride
+                out = rows[row : row + whole + 1]
+            else:
+                ticks = min(stop - tick, row_ticks - beyond)
+                step = math.gcd(ticks, self.step_ticks)
+                stride = steps = ticks // step
+                out = np.full((2, S.N_ROW), np.nan)
+            engine.advance(constants, inputs, self.y, self.memory, tick, step, steps, stride, out)
+            if not whole and not beyond:
+                rows[row] = out[0]
+            elif not whole and beyond + steps * step == row_ticks and row + 1 < len(rows):
+                rows[row + 1] = out[1]
+            tick += steps * step
+
+
+def energy_balance(rows: np.ndarray, first: np.ndarray) -> dict[str, np.ndarray]:
+    """The energy ledger of a run.
+
+    Args:
+        rows: Observed rows, shape (n, N_ROW).
+        first: Row at the start of the run, shape (N_ROW,).
+
+    Returns:
+        stored (change since the start), supplied, dissipated, and residual = stored - supplied + dissipated [J], each
+        shape (n,).
+    """
+
+    def total(names: tuple[str, ...], table: np.ndarray) -> np.ndarray:
+        return np.sum([table[..., COLUMN[name]] for name in names], axis=0)
+
+    stored = total(STORED, rows) - total(STORED, first)
+    supplied, dissipated = total(SUPPLIED, rows), total(DISSIPATED, rows)
+    return {
+        "stored": stored,
+        "supplied": supplied,
+        "dissipated": dissipated,
+        "residual": stored - supplied + dissipated,
+    }

@@ -1,0 +1,317 @@
+"""Run a scene as fast as it goes and keep everything as named arrays."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rig.base.errors import InputError, UnknownNameError, Words, whole_file
+from rig.base.samples import Samples, joined, place
+from rig.channels.formula import check_computed
+from rig.channels.table import ChannelTable
+from rig.physics.kernels.signals import COLUMN, N_ROW, ROW
+from rig.run.motion import DISSIPATED, STORED, SUPPLIED, energy_balance
+from rig.run.scenes import Scene, load_scene, parse_scene
+from rig.run.simulation import Frame, Simulation
+
+NAMES = tuple(COLUMN)
+_MUST = "one of the signals it keeps of the model (those of the sensors are in run.samples)"
+_MOST_ROWS = 100_000
+"""Rows of which the energy ledger is drawn up at a time."""
+
+
+class SentCommand(NamedTuple):
+    """A command that came from outside a scene, at the tick at which it was taken."""
+
+    tick: int
+    name: str
+    request: dict[str, Any]
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class Run:
+    """A finished run: `run["disk_x"]` is what the model had, in SI, and `run.samples["disk_x"]` what the probe showed.
+
+    Attributes:
+        simulation: The simulation at its end (model, scene, engine memory).
+        times_s: Instants of the signals [s], shape (n,); those of the samples, where rows fall on them.
+        signals: States, forces and energies of the model, SI, shape (n, columns); `run["normal_force"]` is one column.
+        names: Names of the model's signals that were kept, all by default; the sensors' are `run.samples.names`.
+        sampled: What each sensor showed, in its own unit: a table for every rate.
+        counted: The same as the converter gave it, int32.
+        edges_s: Keyphasor edges [s], shape (turns,).
+        events: What took effect, each with event, tick and time_s.
+
+    Example:
+        >>> import rig
+        >>> run = rig.simulate("hammer", duration_s=0.05)
+        >>> run
+        Run(hammer: 0.05 s, 1000 rows at 20000 Hz of 66 signals and 15 channels; split 25 us, seed 1)
+        >>> f"{run['disk_x'].max():.5f} {run.unit('disk_x')}"
+        '0.00157 m'
+        >>> f"{run.samples['disk_x'].max():.2f} {run.samples.unit('disk_x')}"
+        '1.57 mm'
+        >>> run["disk_z"]
+        Traceback (most recent call last):
+        rig.base.errors.UnknownNameError: name must be one of the signals it keeps of the model (...), such as ...
+        >>> run.energy()
+        Samples(stored, supplied, dissipated, residual [J]; 1000 rows at 20000 Hz, 0 to 0.04995 s)
+    """
+
+    simulation: Simulation
+    times_s: np.ndarray
+    signals: np.ndarray
+    names: tuple[str, ...]
+    sampled: tuple[Samples, ...]
+    counted: tuple[Samples, ...]
+    edges_s: np.ndarray
+    events: list[dict[str, Any]]
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        """One signal of the model [SI], shape (n,).
+
+        Raises:
+            UnknownNameError: There is no such signal, or it was not kept; it is a KeyError.
+        """
+        return self.signals[:, place(name, self.names, must=_MUST)]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.names)
+
+    def unit(self, name: str) -> str:
+        """SI unit of one signal of the model, `run[name]`."""
+        return ROW[COLUMN[self.names[place(name, self.names, must=_MUST)]]].unit
+
+    def __repr__(self) -> str:
+        scene, rate = self.simulation.scene, _kept_rate(self.simulation)
+        return (
+            f"Run({scene.name}: {len(self.times_s) / rate:g} s, {len(self.times_s)} rows at "
+            f"{rate:g} Hz of {len(self.names)} signals and {len(self.table.channels)} channels; "
+            f"{scene.engine.name} {scene.engine.step_us} us, seed {scene.seed})"
+        )
+
+    @property
+    def samples(self) -> Samples:
+        """What each sensor showed, in its own unit; `run.samples.to_si()` has SI.
+
+        Raises:
+            InputError: Groups have rates of their own: `run.groups` has each.
+        """
+        return joined(self.sampled)
+
+    @property
+    def counts(self) -> Samples:
+        """The same as the converter gave it, int32."""
+        return joined(self.counted)
+
+    @property
+    def groups(self) -> dict[str, Samples]:
+        """What each sensor showed, group by group."""
+        found = {}
+        for name, group in self.table.groups.items():
+            table = next(table for table in self.sampled if group.names[0] in table.names)
+            first = table.names.index(group.names[0])
+            part = slice(first, first + len(group.names))
+            found[name] = replace(
+                table, name=name, values=table.values[:, part], names=group.names, units=table.units[part]
+            )
+        return found
+
+    @property
+    def table(self) -> ChannelTable:
+        """Channel table of the sensors that were on."""
+        return self.simulation.table
+
+    def energy(self) -> Samples:
+        """Energy ledger: stored, supplied, dissipated, residual [J], shape (n, 4).
+
+        Raises:
+            InputError: The run does not keep all signals of the ledger.
+        """
+        lacking = [name for name in (*STORED, *SUPPLIED, *DISSIPATED) if name not in self.names]
+        if lacking:
+            raise InputError("signals", f"with {', '.join(lacking)} for an energy ledger", list(self.names))
+        columns, parts = [COLUMN[name] for name in self.names], []
+        first = np.zeros(N_ROW)
+        first[columns] = self.signals[0]
+        for begin in range(0, len(self.signals), _MOST_ROWS):
+            kept = self.signals[begin : begin + _MOST_ROWS]
+            rows = np.zeros((len(kept), N_ROW))
+            rows[:, columns] = kept
+            parts.append(energy_balance(rows, first))
+        names = tuple(parts[0])
+        values = np.column_stack([np.concatenate([part[name] for part in parts]) for name in names])
+        index, rate = np.arange(len(values)), _kept_rate(self.simulation)
+        return Samples("energy", self.times_s, index, values, names, ("J",) * len(names), rate)
+
+
+def frames(simulation: Simulation, *, chunk_s: float = 0.1, commands: Iterable[SentCommand] = ()) -> Iterator[Frame]:
+    """Advance a simulation to the end of its scene, chunk by chunk.
+
+    Args:
+        simulation: What to advance.
+        chunk_s: Longest chunk [s].
+        commands: What is sent on the way beside the scene's own commands, each at a tick that is a multiple of the
+            simulation's `block_ticks`.
+    """
+    chunk = max(1, round(chunk_s * simulation.tick_rate_hz) // simulation.block_ticks) * simulation.block_ticks
+    due = deque(sorted(commands, key=lambda command: command.tick))
+    while simulation.tick < simulation.end_tick:
+        while due and due[0].tick <= simulation.tick:
+            command = due.popleft()
+            simulation.submit(command.name, dict(command.request))
+        stop = min(simulation.tick + chunk, simulation.end_tick, *(command.tick for command in list(due)[:1]))
+        yield simulation.advance(stop - simulation.tick)
+
+
+def simulate(
+    scene: Scene | str | Path,
+    changes: dict[str, Any] | None = None,
+    *,
+    duration_s: float | None = None,
+    signals: Iterable[str] | None = None,
+    folder: str | Path | None = None,
+    commands: Iterable[SentCommand] = (),
+    progress: Callable[[float], None] | None = None,
+) -> Run:
+    """Run a scene as fast as it goes.
+
+    Args:
+        scene: What to run: a scene that comes with the rig by its name, the path of a .toml file, or a loaded one.
+        changes: Other values by dotted key, of the scene or of its parameters, as for `rig.load_scene`.
+        duration_s: Another duration than the scene's [s].
+        signals: Names of the model's signals to keep; all of them unless given (of test signals, there are none).
+        folder: Where signals.npy, samples.npy and counts.npy are written (a new one is made; with groups of several
+            rates, a file for each), to be read from there row by row as they are used; in memory unless given.
+        commands: What is sent on the way, as for `frames`.
+        progress: Called with the part done, 0 to 1.
+
+    Returns:
+        The run; signals are kept at the sensors' rate, or at every row where samples fall between rows.
+
+    Raises:
+        InputError: There is no such scene, signal or folder, or a value is none that it can have.
+        SimulationError: The state became non-finite.
+        DiskError: The disk refused.
+
+    Example:
+        >>> import rig
+        >>> run = rig.simulate("hammer", {"drive.speed_hz": 5.2}, duration_s=0.05)
+        >>> [event["event"] for event in run.events]
+        ['hammer']
+        >>> f"{run['normal_force'].max():.0e} {run.unit('normal_force')}"  # in the first impacts
+        '3e+03 N'
+        >>> run.samples["disk_x"].shape, run.samples.unit("disk_x")
+        ((1000,), 'mm')
+        >>> rig.simulate("hammer", duration_s=0.05, signals=["normal_force"])
+        Run(hammer: 0.05 s, 1000 rows at 20000 Hz of 1 signals and 15 channels; split 25 us, seed 1)
+    """
+    scene = load_scene(scene, changes)
+    if signals is not None:
+        scene.check_physics()
+    names = () if signals is None else _names(signals)
+    if duration_s is not None:
+        scene = parse_scene({**scene.model_dump(), "duration_s": duration_s})
+    simulation = Simulation(scene)
+    if signals is None and scene.generator is None:
+        names = simulation.computed
+    if names:
+        check_computed({"signals": names}, simulation.first_row, engine=scene.engine.name)
+    every, end = simulation.kept_every, simulation.end_tick
+    n, table = -(-end // (every * simulation.row_ticks)), simulation.table
+    columns = slice(None) if names == NAMES else [COLUMN[name] for name in names]
+    edges, events = [], []
+    rates = dict.fromkeys(group.rate_hz for group in table.groups.values())
+    alike = {rate: [group for group in table.groups.values() if group.rate_hz == rate] for rate in rates}
+    shown, counts = dict[int, _Rows](), dict[int, _Rows]()
+    with ExitStack() as stack:
+        kept = _Rows(stack, folder, "signals", (n, len(names)), np.float64)
+        for rate, groups in alike.items():
+            shape = (-(-end * rate // simulation.tick_rate_hz), sum(len(group.channels) for group in groups))
+            of = f"-{rate}-hz" if len(alike) > 1 else ""
+            shown[rate] = _Rows(stack, folder, f"samples{of}", shape, np.float64)
+            counts[rate] = _Rows(stack, folder, f"counts{of}", shape, np.int32)
+        for frame in frames(simulation, commands=commands):
+            kept.add(frame.rows[-(frame.tick // simulation.row_ticks) % every :: every, columns])
+            for rate, groups in alike.items():
+                blocks = [frame.samples[group.name].values for group in groups]
+                counts[rate].add(np.hstack(blocks))
+                shown[rate].add(
+                    np.hstack([group.engineering(block) for group, block in zip(groups, blocks, strict=True)])
+                )
+            if frame.edges is not None:
+                edges.append((frame.edges.tick + frame.edges.values[:, 0]) / simulation.tick_rate_hz)
+            events += frame.events
+            if progress is not None:
+                progress(simulation.tick / simulation.end_tick)
+    sampled, counted = [], []
+    for rate, groups in alike.items():
+        values, channels = shown[rate].array(), [channel for group in groups for channel in group.channels]
+        index = np.arange(len(values))
+        called = "sensors" if len(alike) == 1 else ", ".join(group.name for group in groups)
+        labels, units = tuple(channel.name for channel in channels), tuple(channel.unit for channel in channels)
+        sampled.append(Samples(called, index / rate, index, values, labels, units, float(rate)))
+        counted.append(replace(sampled[-1], values=counts[rate].array(), units=("count",) * len(units)))
+    return Run(
+        simulation=simulation,
+        times_s=np.arange(n) / _kept_rate(simulation),
+        signals=kept.array(),
+        names=names,
+        sampled=tuple(sampled),
+        counted=tuple(counted),
+        edges_s=np.concatenate(edges) if edges else np.empty(0),
+        events=events,
+    )
+
+
+def _kept_rate(simulation: Simulation) -> float:
+    """Rate of the signals that a run keeps [Hz]."""
+    return simulation.tick_rate_hz / (simulation.kept_every * simulation.row_ticks)
+
+
+def _names(signals: Iterable[str]) -> tuple[str, ...]:
+    if isinstance(signals, str) or not isinstance(signals, Iterable):
+        raise InputError("signals", "a list of names of the model's signals", signals)
+    names = tuple(signals)
+    for name in names:
+        if name not in NAMES:
+            raise UnknownNameError("signals", "names of the model's signals", name, NAMES)
+    return names
+
+
+class _Rows:
+    """Rows that come block by block, into memory or into a .npy file that is then read where it lies."""
+
+    def __init__(
+        self, stack: ExitStack, folder: str | Path | None, name: str, shape: tuple[int, int], dtype: type
+    ) -> None:
+        self._seen, self._file = 0, None
+        if folder is None:
+            self._values = np.empty(shape, dtype)
+            return
+        try:
+            Path(folder).mkdir(exist_ok=True)
+        except (OSError, TypeError, ValueError) as error:
+            raise InputError("folder", "a folder, or a new one in a folder that exists", Words(error)) from None
+        self._path = Path(folder) / f"{name}.npy"
+        self._file = stack.enter_context(stack.enter_context(whole_file(self._path)).open("wb"))
+        header = {"descr": np.dtype(dtype).str, "fortran_order": False, "shape": shape}
+        np.lib.format.write_array_header_1_0(self._file, header)
+
+    def add(self, block: np.ndarray) -> None:
+        """Add a block of rows."""
+        if self._file is None:
+            self._values[self._seen : self._seen + len(block)] = block
+            self._seen += len(block)
+        else:
+            self._file.write(block.tobytes())
+
+    def array(self) -> np.ndarray:
+        """All of them, when the last has come."""
+        return self._values if self._file is None else np.load(self._path, mmap_mode="r")

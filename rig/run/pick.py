@@ -1,0 +1,130 @@
+"""What `rig ladder` picks for a scene: the cheapest model, engine and step that are good enough, and for what."""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import FiniteFloat
+
+from rig.base.outside import Written, table_in
+from rig.physics.levels import ModelLevels
+
+_RIG = Path(__file__).parents[1]
+_WORDS = ("base/errors", "base/outside", "base/text")
+"""Modules that say what is wrong with an input, and compute nothing."""
+
+
+class PickedQuantity(Written):
+    """One quantity that a pick was made for, with its errors as `rig ladder` measured them."""
+
+    quantity: str
+    unit: str = ""
+    tolerance: FiniteFloat
+    """Error allowed, as a part of the quantity's scale."""
+    value: FiniteFloat | str
+    """By the picked model and engine [unit]."""
+    reference: FiniteFloat | str
+    """By the full model and the engine of the reference [unit]."""
+    model_error: FiniteFloat
+    """Of the picked levels against the full model, both converged."""
+    numerical_error: FiniteFloat
+    """Of the picked engine against a converged one on the picked levels."""
+    total_error: FiniteFloat
+    reference_error: FiniteFloat
+    """Of the reference itself: its distance from an unlike engine."""
+
+
+class Pick(Written):
+    """The cheapest model, engine and step that `rig ladder` found good enough, with what they were picked on."""
+
+    magnet: str
+    shaft: str
+    stator: str
+    contact: str
+    friction: str
+    drive: Literal["torque", "ideal"]
+    sensors: Literal["ideal", "full"]
+    engine: str
+    step_us: int
+    engine_tolerance: FiniteFloat = 0.0
+    companion: bool | None = None
+    """None in a pick of an earlier version: what the scene has."""
+    quantities: tuple[PickedQuantity, ...]
+    cpu_s: FiniteFloat
+    """Processor time of a simulated second of the pick, with its sensors [s]."""
+    cpu_given_s: FiniteFloat
+    """The same of the scene as it is given [s]."""
+    cpu_full_s: FiniteFloat
+    """The same of the full model on the engine of the reference [s]."""
+    reference_engine: str = ""
+    unlike_engine: str = ""
+    """Whose distance from the reference is the reference's own error."""
+    date: str = ""
+    rig: str = ""
+    """Version of the rig."""
+    commit: str = ""
+    machine: str = ""
+    seed: int = 0
+    scene_digest: str
+    parameters_digest: str
+    code_digest: str
+
+    def apply(self, data: dict[str, Any]) -> dict[str, Any]:
+        """The fields of a scene with the pick's in their place."""
+        levels = {name: getattr(self, name) for name in ModelLevels.model_fields}
+        engine: dict[str, Any] = {"name": self.engine, "step_us": self.step_us, "tolerance": self.engine_tolerance}
+        if self.companion is not None:
+            engine["companion"] = self.companion
+        given = dict(table_in(data, "engine"))
+        if self.companion is False:
+            given.pop("limits", None)  # without a companion there is no estimate to hold against them
+        return {
+            **data,
+            "model": levels,
+            "engine": {**given, **engine},
+            "drive": {**table_in(data, "drive"), "mode": self.drive},
+            "sensors": {**table_in(data, "sensors"), "chain": self.sensors},
+        }
+
+
+def digest(*parts: bytes) -> str:
+    """Digest of parts in their order, hexadecimal."""
+    total = hashlib.sha256()
+    for part in parts:
+        total.update(len(part).to_bytes(8, "big") + part)
+    return total.hexdigest()[:16]
+
+
+def equations_digest(rig: Path = _RIG) -> str:
+    """Digest of the code of the model, the kernels and the engines, and of every module of the rig that they use.
+
+    Args:
+        rig: Folder of the package.
+    """
+    found: dict[str, bytes] = {}
+    waiting = [rig / "physics" / name for name in ("model.py", "kernels", "engines")]
+    while waiting:
+        place = waiting.pop()
+        for file in sorted(place.rglob("*.py")) if place.is_dir() else [place]:
+            name = file.relative_to(rig).as_posix()
+            if name in found:
+                continue
+            # Line ends differ between systems.
+            found[name] = file.read_bytes().replace(b"\r\n", b"\n")
+            used = _modules_used(found[name]) - {*_WORDS}
+            waiting += [rig / each if (rig / each).is_dir() else rig / f"{each}.py" for each in sorted(used)]
+    return digest(*(part for name in sorted(found) for part in (name.encode(), found[name])))
+
+
+def _modules_used(code: bytes) -> set[str]:
+    """Places in the rig of the modules and packages that a module imports."""
+    names = []
+    for node in ast.walk(ast.parse(code)):
+        if isinstance(node, ast.Import):
+            names += [each.name for each in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            names += [f"{node.module}.{each.name}" for each in node.names]
+    return {"/".join(name.split(".")[1:3]) for name in names if name.startswith("rig.")}

@@ -1,0 +1,459 @@
+"""Scenes: what happens in a run. TOML in, checked and frozen out; single values may be overridden by dotted key."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from functools import cache
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_args
+
+from pydantic import Field, FiniteFloat, field_validator, model_validator
+
+from rig.base.errors import InputError, Words, such_as
+from rig.base.outside import Written, check, parse_toml, read_toml, table_in
+from rig.channels.channel_file import check_table, read_channels
+from rig.channels.faults import Setting
+from rig.channels.formula import Formulas
+from rig.channels.generators import Generator, Source, sources
+from rig.channels.sampling import SensorChoice, check_rates, row_ticks
+from rig.channels.table import ChannelTable, check_signals, default_table
+from rig.physics.engine_choice import EngineChoice
+from rig.physics.engines import ENGINES
+from rig.physics.kernels.signals import COLUMN
+from rig.physics.levels import ModelLevels
+from rig.physics.parameters import DEFAULT_SET, ParameterSet, load_parameters, with_changes
+from rig.physics.speed_target import Drive
+from rig.run.commands import HammerCommand, ReleaseCommand, SpeedCommand, TimedCommand, with_faults
+from rig.run.pick import Pick, digest, equations_digest
+
+SCENES = Path(__file__).with_name("scenes")
+
+
+class Initial(Written):
+    """Where the shaft is at time zero, at rest but for its spin."""
+
+    position: Literal["equilibrium", "top", "bottom", "given"] = "equilibrium"
+    x_mm: FiniteFloat = 0.0
+    """Shaft in the ring, for position "given" [mm]."""
+    y_mm: FiniteFloat = 0.0
+    """Shaft in the ring, for position "given" [mm]."""
+    magnets: bool = True
+    """False: the magnets have let go already."""
+
+
+@cache
+def rig_table() -> ChannelTable:
+    """The rig's own channel table, held against the model.
+
+    Raises:
+        InputError: A channel feels a signal that the model does not have.
+    """
+    table = default_table()
+    check_signals(table.channels.values(), COLUMN)
+    return table
+
+
+class Scene(Written):
+    """One run: initial state, drive, timed commands, engine, sensors, seed, and the parameters it runs on.
+
+    Frozen, and checked when it is made; the fields and their units are those of a scene's file, such as `duration_s`.
+    `rig.load_scene` makes one of a name or a file, with other values where they are given.
+
+    Example:
+        >>> import rig
+        >>> scene = rig.load_scene("hammer", {"duration_s": 0.5})
+        >>> scene
+        Scene(hammer: 0.5 s at 6.2 Hz, 1 command; parameters corrected, engine split 25 us, seed 1)
+        >>> scene.commands[0].at_s, scene.commands[0].request.force_n, scene.table.groups["probes"].rate_hz
+        (0.02, 100.0, 20000)
+    """
+
+    name: str = "scene"
+    title: str = ""
+    parameters: str = DEFAULT_SET
+    """Name of a parameter set, or the path of a file."""
+    set: dict[str, Any] = Field(default={})
+    """Parameters changed for this scene, each in its own unit."""
+    duration_s: Annotated[FiniteFloat, Field(gt=0.0, le=86_400.0)] = 2.0
+    seed: Annotated[int, Field(ge=0, lt=2**63)] = 1
+    initial: Initial = Initial()
+    drive: Drive = Drive()
+    commands: tuple[TimedCommand, ...] = ()
+    model: ModelLevels = ModelLevels()
+    engine: EngineChoice = EngineChoice()
+    sensors: SensorChoice = SensorChoice()
+    channels: ChannelTable | None = None
+    """The user's own channel table, of the file that a scene names (`rig.channels.channel_file`); none: the rig's."""
+    generator: Generator | None = None
+    """Test signals in place of the physics (`rig.channels.generators`)."""
+    fidelity: Literal["given", "auto"] = "given"
+    """Model and engine as given here, or as `rig ladder` has picked and stored them."""
+    pick: Pick | None = None
+    """What `rig ladder --write` has stored; only fidelity "auto" makes use of it."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _faults_too(cls, data: Any) -> Any:
+        return with_faults(data)
+
+    @field_validator("commands", mode="before")
+    @classmethod
+    def _tables(cls, commands: Any) -> Any:
+        if not isinstance(commands, list | tuple):
+            raise ValueError("a list of tables, each headed [[commands]]")
+        return commands
+
+    @field_validator("set")
+    @classmethod
+    def _parameters_exist(cls, changes: dict[str, Any]) -> dict[str, Any]:
+        # Every set has the same keys and limits, so any will do to check them.
+        load_parameters().override(changes)
+        return changes
+
+    @model_validator(mode="after")
+    def _engine_takes_model(self) -> Scene:
+        method = ENGINES[self.engine.name]
+        for field, takes in (("friction", method.frictions), ("contact", method.contacts)):
+            if getattr(self.model, field) not in takes:
+                must = f"one of {', '.join(takes)} with engine {self.engine.name}"
+                raise InputError(f"model.{field}", must, getattr(self.model, field))
+        if self.engine.tolerance and not method.tolerance:
+            must = f"left out with engine {self.engine.name}, whose steps are fixed"
+            raise InputError("engine.tolerance", must, self.engine.tolerance)
+        if self.engine.companion and not self.engine.tolerance:
+            raise InputError("engine.companion", "false without an engine.tolerance", True)
+        for name, limit in self.engine.limits.given().items():
+            if not self.engine.companion:
+                must = "left out without engine.companion = true, whose estimate it limits"
+                raise InputError(f"engine.limits.{name}", must, limit)
+        return self
+
+    @field_validator("channels", mode="before")
+    @classmethod
+    def _read_table(cls, channels: Any) -> Any:
+        if not isinstance(channels, str | Path):
+            return channels
+        numbers = load_parameters().numbers()
+        return read_channels(Path(channels), lambda table: Formulas(numbers, table.curves).check(table))
+
+    @model_validator(mode="after")
+    def _possible_sensors(self) -> Scene:
+        if self.channels is not None:
+            check_table(self.channels)
+        known = (self.channels or rig_table()).groups
+        for name in self.sensors.groups:
+            if name not in known or self.sensors.groups.count(name) > 1:
+                raise InputError("sensors.groups", f"a list of different names out of {', '.join(known)}", name)
+        self.formulas().check(self.table)
+        check_rates(self.table, 1_000_000 // self.row_ticks, field="sensors.rate_hz" if self.sensors.rate_hz else "")
+        return self
+
+    @model_validator(mode="after")
+    def _possible_commands(self) -> Scene:
+        held = self.initial.magnets
+        free_s = 0.0
+        for timed in sorted(self.commands, key=lambda timed: timed.at_s):
+            command = timed.request
+            if isinstance(command, ReleaseCommand):
+                if not held:
+                    again = Words(f"another at {timed.at_s:g} s")
+                    raise InputError("release", "given once, while the magnets hold", again)
+                held = False
+            elif isinstance(command, HammerCommand):
+                if timed.at_s < free_s:
+                    again = Words(f"a pulse at {timed.at_s:g} s")
+                    raise InputError("hammer", f"idle (in a pulse until {free_s:g} s)", again)
+                free_s = timed.at_s + command.duration_ms * 1e-3
+        return self
+
+    @model_validator(mode="after")
+    def _possible_generator(self) -> Scene:
+        if self.generator is not None:
+            commands = [one for one in self.commands if one.request.command not in ("fault", "clear")]
+            limits = self.engine.limits.given()
+            fields = {"commands": commands, "drive.profile": self.drive.profile, "engine.limits": limits}
+            for name, given in fields.items():
+                if given:
+                    raise InputError(name, "left out with a [generator], which stands for the physics", Words("some"))
+            if self.fidelity == "auto":
+                raise InputError("fidelity", '"given" with a [generator], which has no model', "auto")
+            self.sources()
+        return self
+
+    @model_validator(mode="after")
+    def _pick_in_force(self) -> Scene:
+        if self.fidelity == "auto":
+            if self.pick is None:
+                raise InputError("fidelity", '"given" until `rig ladder SCENE --write FILE` has stored a pick', "auto")
+            asked = self.pick.apply(self.model_dump())
+            own = self.model_dump()
+            if any(own[name] != asked[name] for name in ("model", "engine", "drive", "sensors")):
+                raise InputError("fidelity", '"given" where model, engine, drive or sensors are chosen by hand', "auto")
+        return self
+
+    def __repr__(self) -> str:
+        if self.generator is not None:
+            return f"Scene({self.name}: {self.duration_s:g} s of signals, {self.generator.kind}; seed {self.seed})"
+        speeds = [speed for _, speed in self.drive.profile] or [self.drive.speed_hz]
+        speed = " to ".join(f"{each:g}" for each in dict.fromkeys((speeds[0], speeds[-1])))
+        commands = f"{len(self.commands)} command{'s' * (len(self.commands) != 1)}"
+        return (
+            f"Scene({self.name}: {self.duration_s:g} s at {speed} Hz, {commands}; parameters "
+            f"{self.parameters}, engine {self.engine.name} {self.engine.step_us} us, seed {self.seed})"
+        )
+
+    __str__ = __repr__
+
+    @property
+    def fidelity_line(self) -> str | None:
+        """What a run says of a pick in force; None for a scene as given."""
+        if self.fidelity == "given" or self.pick is None:
+            return None
+        pick = self.pick
+        levels = ", ".join(getattr(pick, name) for name in ModelLevels.model_fields)
+        asked = ", ".join(
+            f"{entry.quantity} within {entry.tolerance:g} (measured {entry.total_error:.1e})"
+            for entry in pick.quantities
+        )
+        finest = f" at {pick.engine_tolerance:g}" if pick.engine_tolerance else ""
+        return (
+            f"fidelity auto: {levels}; drive {pick.drive}, sensors {pick.sensors}; {pick.engine} "
+            f"{pick.step_us} us{finest}; picked {pick.date} for {asked}"
+        )
+
+    @property
+    def table(self) -> ChannelTable:
+        """Channel table of the sensors that are on, at their rates."""
+        return (self.channels or rig_table()).only(self.sensors.groups, self.sensors.rate_hz or None)
+
+    @property
+    def row_ticks(self) -> int:
+        """Ticks between the rows that sensors and truth see: of the channels' making, whatever the engine's step."""
+        sensors = self.sensors
+        return row_ticks(self.table, truth_rate_hz=sensors.truth_rate_hz, ideal=sensors.chain == "ideal")
+
+    @property
+    def setting(self) -> Setting:
+        """What decides which faults make sense."""
+        return Setting(self.sensors.chain == "ideal", self.sensors.noise, self.generator is not None)
+
+    def sources(self) -> dict[str, Source]:
+        """What the generator puts at the converter of every channel that is on: `sources()["disk_x"].volts(times_s)`.
+
+        Raises:
+            InputError: The scene has no generator.
+        """
+        if self.generator is None:
+            raise InputError("scene", "one with a [generator]", self.name)
+        rate = self.sensors.rate_hz or None
+        # A channel's place among all of them does not hang on which are on.
+        made = sources(self.generator, (self.channels or rig_table()).only((), rate), self.drive.speed_hz)
+        return {name: made[name] for name in self.table.channels}
+
+    def check_physics(self) -> None:
+        """Refuse a scene of test signals, in which nothing moves.
+
+        Raises:
+            InputError: It is one.
+        """
+        if self.generator is not None:
+            raise InputError("scene", "one of the physics, without a [generator]", self.name)
+
+    def formulas(self) -> Formulas:
+        """What the channels' formulas may use."""
+        return Formulas(self.load_parameters().numbers(), self.table.curves)
+
+    def load_parameters(self) -> ParameterSet:
+        """The scene's parameters with its own changes applied."""
+        parameters = load_parameters(self.parameters)
+        return with_changes(parameters, self.set, source=f"scene {self.name}") if self.set else parameters
+
+
+def scene_names() -> list[str]:
+    """Names of the scenes that come with the rig."""
+    return sorted(path.stem for path in SCENES.glob("*.toml"))
+
+
+def scene_path(name_or_path: str | Path) -> Path:
+    """The file of a scene that comes with the rig, or of a user's own.
+
+    Raises:
+        InputError: There is none.
+    """
+    if not isinstance(name_or_path, str | Path):
+        raise InputError("scene", "a name, or the path of a .toml file", name_or_path)
+    path = SCENES / f"{name_or_path}.toml"
+    if not path.is_file():
+        path = Path(name_or_path)
+        if path.suffix != ".toml" or not path.is_file():
+            raise InputError(
+                "scene",
+                f"one of {', '.join(scene_names())}, or the path of a .toml file that exists",
+                str(name_or_path),
+            )
+    return path
+
+
+def load_scene(scene: Scene | str | Path, overrides: dict[str, Any] | None = None) -> Scene:
+    """Load a scene by name, or a user's file by path; one that is loaded stays as it is, or is changed.
+
+    Args:
+        scene: One of `scene_names()`, a .toml file, or a loaded one.
+        overrides: Changes by dotted key, of the scene (`drive.speed_hz`) or of its parameters (`contact.friction`, in
+            the parameter's own unit). Strings are read as TOML values where they are such.
+
+    Raises:
+        InputError: The one thing that is wrong, with its field, and its file unless that is among the overrides.
+
+    Example:
+        >>> scene = load_scene("hammer", {"drive.speed_hz": 5.2, "contact.friction": 0.3})
+        >>> scene.drive.speed_hz, scene.load_parameters()["contact.friction"]
+        (5.2, 0.3)
+        >>> load_scene("hammer", {"drive.sped_hz": 5.2})
+        Traceback (most recent call last):
+        rig.base.errors.InputError: drive.sped_hz must be a field of a scene or a parameter, such as drive.speed_hz, ...
+    """
+    if isinstance(scene, Scene):
+        return scene if overrides is None else change_scene(scene, overrides)
+    path = scene_path(scene)
+    data = {"name": path.stem, **read_toml(path)}
+    for table, key in ((data, "channels"), (data.get("generator"), "file")):
+        if isinstance(table, dict) and isinstance(table.get(key), str):
+            table[key] = path.parent / table[key]  # as whoever wrote the scene means it
+    for key, value in _keyed(overrides or {}):
+        _override(data, key, read_value(value, field=key) if isinstance(value, str) else value)
+    try:
+        return _checked(data, list(overrides or {}))
+    except InputError as error:
+        if path.parent == SCENES or error.field in (overrides or {}):
+            raise
+        raise InputError(f"{path.name}: {error.field}", error.must, error.received) from None
+
+
+def _checked(data: dict[str, Any], overrides: list[str]) -> Scene:
+    """The scene of a file with overrides, if it can run."""
+    scene = parse_scene({**data, "fidelity": "given"} if data.get("fidelity") == "auto" else data)
+    if data.get("fidelity") == "auto":
+        scene = _with_pick(scene, data, overrides)
+    # Parameters are checked here, so that a scene that loads can run.
+    top = scene.load_parameters().entries["drive.top_speed"].value
+    speeds = {"drive.speed_hz": [scene.drive.speed_hz], "drive.profile": [speed for _, speed in scene.drive.profile]}
+    speeds["speed.speed_hz"] = [
+        timed.request.speed_hz for timed in scene.commands if isinstance(timed.request, SpeedCommand)
+    ]
+    for field, values in speeds.items():
+        if not isinstance(top, str) and max(values, default=0.0) > top:
+            raise InputError(field, f"at most drive.top_speed = {top:g} Hz", max(values))
+    return scene
+
+
+def change_scene(scene: Scene, changes: dict[str, Any]) -> Scene:
+    """A loaded scene with other values, by dotted key as in `load_scene`.
+
+    Another engine comes with its own step, tolerance and companion, and without limits. Other limits choose
+    engine.tolerance again, unless that was given.
+
+    Raises:
+        InputError: The one thing that is wrong, with its field.
+    """
+    data = scene.model_dump()
+    named = _keyed(changes)
+    if "engine.name" in changes:
+        data["engine"] = {}
+    elif any(key.startswith("engine.limits") for key in changes) and scene.engine.tolerance_by_limits:
+        data["engine"]["tolerance"] = 0.0
+    for key, value in named:
+        _override(data, key, value)
+    return parse_scene(data)
+
+
+def _keyed(changes: dict[str, Any]) -> list[tuple[str, Any]]:
+    """Keys and values of changes, which come from a notebook as anything."""
+    if not isinstance(changes, dict) or not all(isinstance(key, str) for key in changes):
+        raise InputError("changes", "a dictionary of values by dotted key", changes)
+    return list(changes.items())
+
+
+def _with_pick(scene: Scene, data: dict[str, Any], overrides: list[str]) -> Scene:
+    """The scene with its stored pick in force, if that is of this very scene."""
+    by_hand = [key for key in overrides if key.split(".")[0] in ("model", "engine") or key in _PICKED]
+    if by_hand:
+        raise InputError("fidelity", f'"given" where {by_hand[0]} is chosen by hand', "auto")
+    if scene.pick is not None:
+        stored = (scene.pick.scene_digest, scene.pick.parameters_digest, scene.pick.code_digest)
+        names = ("the scene", "its parameters", "the rig's equations or engines")
+        changed = [name for name, a, b in zip(names, stored, pick_digests(scene), strict=True) if a != b]
+        if changed:
+            must = f'"given", or picked anew by `rig ladder --write`: {" and ".join(changed)} changed since the pick'
+            raise InputError("fidelity", must, "auto")
+        data = scene.pick.apply(data)
+    return parse_scene(data)
+
+
+_PICKED = ("drive.mode", "sensors.chain")
+
+
+def pick_digests(scene: Scene) -> tuple[str, str, str]:
+    """What a pick depends on: digests of the scene as given, of its parameters, and of equations and engines."""
+    # Neither its name nor the seed of the sensors' noise changes what a scene does.
+    left_out = {"name", "title", "seed", "parameters", "set", "model", "engine", "fidelity", "pick", "generator"}
+    given = scene.model_dump_json(exclude=left_out)
+    values = {key: [entry.value, entry.unit] for key, entry in scene.load_parameters().entries.items()}
+    return digest(given.encode()), digest(json.dumps(values, sort_keys=True).encode()), equations_digest()
+
+
+def parse_scene(data: dict[str, Any]) -> Scene:
+    """Check the fields of a scene.
+
+    Raises:
+        InputError: The first wrong field.
+    """
+    return check(Scene, data, field="")
+
+
+def _override(data: dict[str, Any], key: str, value: Any) -> None:
+    if key in load_parameters().entries:
+        data["set"] = {**table_in(data, "set"), key: value}
+        return
+    *path, last = key.split(".")
+    fields: Any = Scene
+    for part in [*path, last]:
+        known = _inner(fields)
+        if part not in known:
+            known = [*_scene_keys(), *load_parameters().entries]
+            raise InputError(key, such_as("a field of a scene or a parameter", key, known), value)
+        fields = known[part].annotation
+    place = data
+    for part in path:
+        place[part] = dict(table_in(place, part))
+        place = place[part]
+    place[last] = value
+    if key == "drive.speed_hz":
+        place.pop("profile", None)
+
+
+def _scene_keys(table: Any = Scene) -> list[str]:
+    keys = []
+    for name, field in _inner(table).items():
+        inner = _scene_keys(field.annotation)
+        keys += [f"{name}.{part}" for part in inner] if inner else [name]
+    return keys
+
+
+def _inner(annotation: Any) -> dict[str, Any]:
+    """The fields of a table, also of the one that may be left out."""
+    return getattr(Generator if Generator in get_args(annotation) else annotation, "model_fields", {})
+
+
+def read_value(text: str, *, field: str = "value") -> Any:
+    """A value from the command line: TOML where it is such, else the text itself."""
+    try:
+        return parse_toml(f"value = {text}", field=field)["value"]
+    except tomllib.TOMLDecodeError:
+        return text
+
+
+def scene_document(scene: Scene) -> dict[str, Any]:
+    """The scene as a JSON document, complete enough to run it again."""
+    return json.loads(scene.model_dump_json())

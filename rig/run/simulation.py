@@ -1,0 +1,507 @@
+"""A running simulation: scene in, frames of samples and truth out, commands on the way. No clock, no threads, no I/O.
+
+`Simulation.advance` is the one stepper behind every way to run the rig: free, in lockstep, or in real time. Time is
+an integer tick of 1 us. How a run is cut into calls changes no bit of the result.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from bisect import insort
+from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import accumulate
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rig.base.errors import InputError, SimulationError, Words
+from rig.base.wire import ROOT, Block
+from rig.channels.faults.sending import Frame
+from rig.channels.formula import check_computed, names_in
+from rig.channels.sensors.conditioning import Conditioner
+from rig.channels.sensors.keyphasor import Keyphasor
+from rig.channels.table import ChannelTable
+from rig.physics.accuracy import Accuracy, choose_companion
+from rig.physics.engines import ENGINES, load_engine
+from rig.physics.engines.common.memory import CEILING, CLAMPS, CONTACTS, FLOORED, MEMORY, PEAK_FORCE, ROLLED_S, STEPS
+from rig.physics.kernels import signals as S
+from rig.physics.kernels.constants import Inputs
+from rig.physics.kernels.laws.magnet import magnet_force
+from rig.physics.kernels.signals import COLUMN
+from rig.physics.model import build_model, describe
+from rig.physics.speed_target import Segment, segments
+from rig.run import calibrator
+from rig.run.commands import (
+    ClearCommand,
+    FaultCommand,
+    HammerCommand,
+    ReleaseCommand,
+    SpeedCommand,
+    check_command,
+    refusal,
+)
+from rig.run.faulty import Faulty
+from rig.run.motion import BRANCH_ALARM, Begin, Motion, energy_balance, initial_state
+from rig.run.scenes import Scene, load_scene, scene_document
+
+TICK_RATE_HZ = 1_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Snapshot:
+    """State of a run at one tick, to be picked up again by `Simulation.restore`."""
+
+    scene: Scene
+    changing: dict[str, Any] = field(repr=False)
+
+
+_CHANGING = (
+    "tick", "first_row", "_segments", "_engaged", "_pulse", "_pending", "_motion", "_companion", "_accuracy", "_last",
+    "_conditioners", "_keyphasor", "_edges_shown", "_faulty",
+)  # fmt: skip
+
+
+class Simulation:
+    """One run of one scene.
+
+    Attributes:
+        scene: The scene.
+        model: The model it runs on.
+        table: Channel table of the sensors that are on.
+        tick: Present time.
+        tick_rate_hz: Ticks a second.
+        block_ticks: An advance must be a whole multiple of this.
+        end_tick: Where the scene ends.
+        row_ticks: Ticks between observed rows.
+        begin: Where it is taken up; None: at the scene's own start.
+        kept_every: Rows from one that samples fall on to the next; 1 where some fall between rows.
+        told: What the last command comes to beside its tick: a fault's number, channels and first faulty rows.
+
+    Example:
+        >>> import rig
+        >>> simulation = rig.Simulation("hammer")  # or a scene of `rig.load_scene`
+        >>> frame = simulation.advance(100 * simulation.block_ticks)
+        >>> simulation, frame.samples["probes"].values.shape, frame.rows.shape  # ADC counts; the model's signals [SI]
+        (Simulation(hammer: at 0.05 of 2 s), (1000, 4), (2000, 66))
+    """
+
+    def __init__(self, scene: Scene | str | Path, *, begin: Begin | None = None) -> None:
+        self.scene = scene = load_scene(scene)
+        self.begin = begin
+        self.tick_rate_hz = TICK_RATE_HZ
+        self._warm = False
+        self.model = build_model(scene.load_parameters(), scene.model)
+        self._engines = [calibrator.STILL if scene.generator else load_engine(scene.engine.name)]
+        self._method = ENGINES[scene.engine.name]
+        sensors, self.row_ticks = scene.sensors, scene.row_ticks
+        # Steps are as long as may be of those that end on the rows.
+        self._step_ticks = next(
+            ticks for ticks in range(min(scene.engine.step_us, self.row_ticks), 0, -1) if self.row_ticks % ticks == 0
+        )
+        self._stride = self.row_ticks // self._step_ticks
+        self.table: ChannelTable = scene.table
+        groups = self.table.groups.values()
+        whole = [TICK_RATE_HZ // group.rate_hz for group in groups if TICK_RATE_HZ % group.rate_hz == 0]
+        self.kept_every = math.gcd(*whole) // self.row_ticks if len(whole) == len(groups) else 1
+        self.block_ticks = math.lcm(self.row_ticks, TICK_RATE_HZ // sensors.truth_rate_hz)
+        self.end_tick = math.ceil(max(1, round(scene.duration_s * TICK_RATE_HZ)) / self.block_ticks) * self.block_ticks
+        self._formulas = scene.formulas()
+        self._conditioners = [
+            Conditioner(
+                [group for group in groups if group.rate_hz == rate],
+                row_rate_hz=TICK_RATE_HZ // self.row_ticks,
+                seed=scene.seed,
+                noise=sensors.noise,
+                ideal=sensors.chain == "ideal",
+                columns=self._formulas.columns(group for group in groups if group.rate_hz == rate),
+            )
+            for rate in dict.fromkeys(group.rate_hz for group in groups if scene.generator is None)
+        ]
+        marked = any(channel.signal == "keyphasor" for channel in self.table.channels.values())
+        self._keyphasor = Keyphasor() if marked else None
+        self._edges_shown = 0
+        if scene.generator is not None:
+            tick = 0 if begin is None else begin.tick
+            self._conditioners, turns = calibrator.stand_ins(scene, row_ticks=self.row_ticks, tick=tick)
+            self._keyphasor = turns if marked else None
+        self._faulty = Faulty(
+            self.table, self._conditioners, seed=scene.seed, row_ticks=self.row_ticks, setting=scene.setting
+        )
+        self._truth_every = TICK_RATE_HZ // sensors.truth_rate_hz // self.row_ticks
+        self._truth_columns = np.array([COLUMN[column] for columns in S.TRUTH.values() for column in columns])
+        ends = accumulate(len(columns) for columns in S.TRUTH.values())
+        self._truth_parts = {
+            name: slice(end - len(columns), end)
+            for (name, columns), end in zip(S.TRUTH.items(), ends, strict=True)
+            if scene.generator is None  # else nothing of the model is true
+        }
+
+        self.told: dict[str, Any] = {}
+        self.tick = self._start = 0 if begin is None else begin.tick
+        if self.tick % self.block_ticks:
+            raise InputError("begin.tick", f"a multiple of {self.block_ticks}", self.tick)
+        self._segments = segments(scene.drive.profile or ((0.0, scene.drive.speed_hz),), TICK_RATE_HZ)
+        self._engaged = scene.initial.magnets
+        self._pulse: tuple[HammerCommand, int, int] | None = None
+        given = ((round(timed.at_s * TICK_RATE_HZ), timed.request) for timed in scene.commands)
+        self._pending = sorted(given, key=lambda entry: entry[0])
+        self._faulty.check_all(self._pending)
+        choice, initial = scene.engine, initial_state(self.model, scene.initial, begin, spin=self._speed())
+        memory = np.zeros(self._engines[0].memory_size if choice.rolling == "collocation" else MEMORY)
+        self._motion = Motion(initial, self._step_ticks, self._stride, choice.tolerance, memory)
+        self._companion: Motion | None = None
+        if choice.companion:
+            name, finer = choose_companion(choice.name, choice.tolerance, scene.model.friction)
+            self._engines.append(self._engines[0] if scene.generator or name == choice.name else load_engine(name))
+            stride = self.block_ticks // self._step_ticks
+            self._companion = Motion(initial.copy(), self._step_ticks, stride, finer, np.zeros_like(memory))
+        clearance = self.model.constants.contact.clearance
+        block_s, limits = self.block_ticks / TICK_RATE_HZ, choice.limits.by_quantity()
+        self._accuracy = Accuracy(choice.tolerance, clearance, block_s, limits)
+        self._rows = np.full((0, S.N_ROW), np.nan)
+        self._last: np.ndarray | None = None
+
+    def __repr__(self) -> str:
+        return f"Simulation({self.scene.name}: at {self.tick / self.tick_rate_hz:g} of {self.scene.duration_s:g} s)"
+
+    @cached_property
+    def first_row(self) -> np.ndarray:
+        """Observed row at time zero, shape (N_ROW,). The first use starts the engine, which compiles it."""
+        row, constants, inputs = np.full((1, S.N_ROW), np.nan), self.model.constants, self._inputs()
+        for motion, engine in zip(self._motions(), self._engines, strict=True):
+            motion.begin(engine, constants, inputs)
+        moved = copy.deepcopy(self._motion)
+        moved.run(self._engines[0], constants, inputs, row, self.tick, self.tick, self.tick + 1)
+        if np.isfinite(moved.y).all():
+            return row[0]
+        raise SimulationError(f"the state is not finite at its start; {self._method.advice}")
+
+    @cached_property
+    def computed(self) -> tuple[str, ...]:
+        """Names of the model's signals that a stage of this run computes: those that are a number at time zero.
+
+        Raises:
+            InputError: A channel or a truth table needs another one.
+        """
+        if self.scene.generator is not None:
+            return tuple(COLUMN)
+        needed = {f"channel {name}.signal": names_in(each.signal) for name, each in self.table.channels.items()}
+        needed |= {f"truth table {name}": S.TRUTH[name] for name in self._truth_parts}
+        return check_computed(needed, self.first_row, engine=self.scene.engine.name)
+
+    def _motions(self) -> list[Motion]:
+        return [self._motion] if self._companion is None else [self._motion, self._companion]
+
+    def advance(self, ticks: int) -> Frame:
+        """Move on by `ticks`.
+
+        Raises:
+            InputError: `ticks` is not a positive whole multiple of `block_ticks`.
+            SimulationError: The state has become non-finite.
+        """
+        if ticks <= 0 or ticks % self.block_ticks:
+            raise InputError("ticks", f"a positive multiple of {self.block_ticks}", ticks)
+        _ = self.computed  # starts the engine
+        start, end = self.tick, self.tick + ticks
+        n = ticks // self.row_ticks
+        if len(self._rows) <= n:
+            self._rows = np.full((n + 1, S.N_ROW), np.nan)
+        rows, seen = self._rows[: n + 1], 0
+        made = [rows]
+        if self._companion is not None:
+            made.append(np.full((ticks // self.block_ticks, S.N_ROW), np.nan))
+        events: list[dict[str, Any]] = []
+        counts: list[dict[str, np.ndarray]] = []
+        while self.tick < end:
+            self._take_effect(events)
+            stop, inputs = min(end, self._next_change()), self._inputs()
+            for motion, engine, out in zip(self._motions(), self._engines, made, strict=True):
+                motion.run(engine, self.model.constants, inputs, out, start, self.tick, stop)
+            self.tick = stop
+            # What changes on a row changes behind it: sensors see the row before the change, then that after it.
+            row, beyond = divmod(stop - start, self.row_ticks)
+            if not beyond:
+                counts.append(self._condition(rows[seen : row + 1], start + seen * self.row_ticks))
+                seen = row
+        rows = rows[:n]
+        self._last = rows[-1].copy()
+        if not all(map(math.isfinite, self._motion.y.tolist())):
+            at_s = self._lost_s(rows, start)
+            raise SimulationError(f"the state is no longer finite at {at_s:.6f} s; {self._method.advice}")
+        if self._companion is not None:
+            events = sorted(events + self._doubts(rows, made[1], start), key=lambda event: event["tick"])
+        samples, edges, truth = self._sample(counts, start), self._edges(rows, start), self._truth(rows, start)
+        frame = Frame(start, ticks, samples, edges, truth, events, rows)
+        return self._faulty.sending.pass_on(frame, last=self.tick >= self.end_tick)
+
+    def _lost_s(self, rows: np.ndarray, start: int) -> float:
+        finite = np.isfinite(rows[:, : S.N_STATE]).all(axis=1)
+        row = len(rows) if finite.all() else int(np.argmin(finite))
+        return (start + row * self.row_ticks) / TICK_RATE_HZ
+
+    def _doubts(self, rows: np.ndarray, companion: np.ndarray, start: int) -> list[dict[str, Any]]:
+        every = self.block_ticks // self.row_ticks
+        times_s = (start + self.block_ticks * np.arange(len(companion))) / TICK_RATE_HZ
+        warnings = self._accuracy.compare(rows[::every], companion, times_s)
+        return [
+            {"event": "warning", "tick": round(time_s * TICK_RATE_HZ), "time_s": time_s, "text": text}
+            for time_s, text in warnings
+        ]
+
+    def submit(self, name: str, request: dict[str, Any]) -> int:
+        """Check a command and schedule it for the present tick.
+
+        Returns:
+            The tick at which it takes effect.
+
+        Raises:
+            InputError: Unknown, malformed, out of range, or not possible now.
+        """
+        command, self.told = check_command(name, request), {}
+        waiting = [other for tick, other in self._pending if tick <= self.tick]
+        if isinstance(command, FaultCommand | ClearCommand):
+            self.told = self._faulty.check(command, self.tick, waiting)
+        elif self.scene.generator is not None:
+            raise InputError(name, "left out: signals of a [generator] stand for the physics", Words("a command to it"))
+        elif isinstance(command, HammerCommand):
+            busy_until = self._pulse[2] if self._pulse is not None else 0
+            if self.tick < busy_until or any(isinstance(other, HammerCommand) for other in waiting):
+                until = f"until {busy_until / TICK_RATE_HZ:.6f} s" if self.tick < busy_until else "from now on"
+                raise InputError("hammer", f"idle (it is in a pulse {until})", Words("another pulse"))
+        elif isinstance(command, SpeedCommand):
+            top = self.model.parameters.entries["drive.top_speed"].value
+            if not isinstance(top, str) and command.speed_hz > top:
+                raise InputError("speed.speed_hz", f"at most drive.top_speed = {top:g} Hz", command.speed_hz)
+        elif not isinstance(command, ReleaseCommand):
+            raise refusal(command)
+        elif not self._engaged or any(isinstance(other, ReleaseCommand) for other in waiting):
+            raise InputError("release", "given once (the magnets have let go already)", Words("another release"))
+        insort(self._pending, (self.tick, command), key=lambda entry: entry[0])
+        return self.tick
+
+    def serve(self, doors: tuple[str, ...]) -> None:
+        """Take note of where its blocks leave the rig.
+
+        Raises:
+            InputError: The scene has a fault at a door that is not there.
+        """
+        self._faulty.doors = doors
+        self._faulty.check_all(self._pending)
+
+    def warm_up(self) -> None:
+        """Compile (or load) every kernel that `advance` will call, without moving on."""
+        if not self._warm:
+            twin = Simulation(self.scene, begin=self.begin)
+            twin.advance(twin.block_ticks)
+            twin._motion.warm_up(twin._engines[0], twin.model.constants, twin._inputs())
+            self._warm = True
+
+    def health(self) -> dict[str, Any]:
+        """Spin, energy ledger and doubts at the present tick, for the status."""
+        if self.scene.generator is not None:
+            return calibrator.health(self.scene)
+        first = self.first_row
+        last = first if self._last is None else self._last
+        balance = energy_balance(last[None, :], first)
+        residual, dissipated = float(balance["residual"][0]), float(balance["dissipated"][0])
+        memory, warnings = self._motion.memory, list[str]()
+        share = min(float(memory[ROLLED_S]) * TICK_RATE_HZ / max(self.tick - self._start, 1), 1.0)
+        choice = {**self.scene.engine.model_dump(), "step_us": self._step_ticks, "rolling_share": share}
+        accuracy = self._accuracy.completed()
+        if text := accuracy.warning():
+            warnings.append(text)
+        # Where little is dissipated, what was stored is what the ledger has to account for.
+        turned_over = max(dissipated, abs(float(balance["stored"][0])), 1e-6)
+        if abs(residual) > self._method.energy * turned_over:
+            text = f"energy residual {residual:.2e} J is above {self._method.energy:g} of what was turned over"
+            if abs(residual) > BRANCH_ALARM * turned_over and memory[CONTACTS] > 1:
+                text += "; after contacts, a wrong branch is suspected"
+            warnings.append(text)
+        if memory[CLAMPS]:
+            warnings.append(f"the contact law would have pulled at {memory[CLAMPS]:.0f} steps and was held at 0")
+        late = sum(tick >= self.end_tick for tick, _ in self._pending)
+        if late:
+            warnings.append(f"{late} commands of the scene lie after its end and will not be given")
+        if memory[CEILING]:
+            warnings.append(
+                f"{memory[CEILING]:.0f} steps with events that piled up, or above engine.tolerance at least size"
+            )
+        if memory[FLOORED]:
+            warnings.append(f"{memory[FLOORED]:.0f} contacts began slower than contact.speed_floor")
+        return {
+            "spin_hz": float(last[COLUMN["theta_rate"]]) / (2.0 * math.pi),
+            "energy": {
+                "residual_j": residual,
+                "dissipated_j": dissipated,
+                "residual_share": residual / max(dissipated, 1e-6),
+                "alarm_share": self._method.energy,
+            },
+            "accuracy": None if self._companion is None else accuracy.document(),
+            "engine": {**choice, "levels": self.scene.model.model_dump()},
+            "contacts": int(memory[CONTACTS]),
+            "peak_normal_force_n": float(memory[PEAK_FORCE]),
+            "steps": int(memory[STEPS]),
+            "warnings": warnings,
+        }
+
+    def snapshot(self) -> Snapshot:
+        """All that changes in a run, so that `restore` goes on from here bit for bit, on this build."""
+        _ = self.first_row
+        return Snapshot(scene=self.scene, changing=copy.deepcopy({name: self.__dict__[name] for name in _CHANGING}))
+
+    def restore(self, snapshot: Snapshot) -> None:
+        """Go back, or over, to a snapshot of the same scene; from its start also to one of the scene without commands.
+
+        Before the first command a run is the same without it.
+
+        Raises:
+            InputError: It is of another scene, or behind the first command.
+        """
+        changing = copy.deepcopy(snapshot.changing)
+        if snapshot.scene != self.scene:
+            first_tick = min((tick for tick, _ in self._pending), default=changing["tick"])
+            alike = snapshot.scene == self.scene.model_copy(update={"commands": ()})
+            if self.tick > self._start or first_tick < changing["tick"] or not alike:
+                raise InputError("snapshot", f"one of this scene, {self.scene.name}", snapshot.scene.name)
+            changing["_pending"] = self._pending
+        self.__dict__.update(changing)
+
+    def catalogue(self) -> dict[str, Any]:
+        """Channel table with calibrations, and the columns of the truth tables, as a JSON document."""
+        signals = {signal.name: signal for signal in S.ROW}
+        return {
+            "root": ROOT,
+            "tick_rate_hz": TICK_RATE_HZ,
+            "table": self.table.model_dump(mode="json"),
+            "truth": {
+                name: {
+                    "rate_hz": self.scene.sensors.truth_rate_hz,
+                    "columns": [signals[column]._asdict() for column in S.TRUTH[name]],
+                }
+                for name in self._truth_parts
+            },
+        }
+
+    def parameters_document(self) -> dict[str, Any]:
+        """The parameters as a JSON document."""
+        return describe(self.model)
+
+    def scene_document(self) -> dict[str, Any]:
+        """The scene as a JSON document."""
+        return {"name": self.scene.name, "seed": self.scene.seed, "scene": scene_document(self.scene)}
+
+    def _segment(self) -> Segment:
+        return next(segment for segment in reversed(self._segments) if segment.tick <= self.tick)
+
+    def _speed(self) -> float:
+        """What the drive aims at now [rad/s]."""
+        segment = self._segment()
+        return segment.speed + segment.slope * (self.tick - segment.tick) / TICK_RATE_HZ
+
+    def _take_effect(self, events: list[dict[str, Any]]) -> None:
+        while self._pending and self._pending[0][0] <= self.tick:
+            command = self._pending.pop(0)[1]
+            event: dict[str, Any] = {"event": command.command, "tick": self.tick, "time_s": self.tick / TICK_RATE_HZ}
+            event |= command.model_dump(exclude={"command"})
+            if isinstance(command, HammerCommand):
+                if self._pulse is not None and self.tick < self._pulse[2]:  # one sent by hand is under way
+                    events.append(
+                        event | {"event": "warning", "text": "a hammer pulse of the scene found the hammer in a pulse"}
+                    )
+                    continue
+                length = round(command.duration_ms * 1e-3 * TICK_RATE_HZ)
+                self._pulse = (command, self.tick, self.tick + max(1, length))
+            elif isinstance(command, SpeedCommand):
+                self._ramp_to(2.0 * math.pi * command.speed_hz)
+            elif isinstance(command, FaultCommand):
+                event |= self._faulty.begin(command, self.tick, self._pending)
+            elif isinstance(command, ClearCommand):
+                events += [event | ended for ended in self._faulty.clear(command, self.tick)]
+                continue
+            elif isinstance(command, ReleaseCommand):
+                self._release()
+            else:
+                raise refusal(command)
+            events.append(event)
+
+    def _ramp_to(self, target: float) -> None:
+        now = self._speed()
+        length = round(abs(target - now) / self.model.parameters["drive.ramp_rate"] * TICK_RATE_HZ)
+        hold = Segment(tick=self.tick + length, speed=target, slope=0.0)
+        slope = (target - now) / length * TICK_RATE_HZ if length else 0.0
+        self._segments = [Segment(tick=self.tick, speed=now, slope=slope), hold] if length else [hold]
+
+    def _release(self) -> None:
+        # What the magnets hold is gone with them: booked, so that the ledger closes. A release that a scene has timed
+        # can find them released by hand.
+        if not self._engaged:
+            return
+        shaft, magnet = self.model.constants.shaft, self.model.constants.magnet
+        for motion in self._motions():
+            gamma, beta = motion.y[0], motion.y[1]
+            x, y = beta, -gamma
+            if self.model.constants.levels.euler:
+                x, y = math.sin(beta), -math.sin(gamma) * math.cos(beta)
+            _, _, stored = magnet_force(shaft.arm_magnet * x, shaft.arm_magnet * y, magnet)
+            motion.y[S.RELEASE_WORK] -= stored
+        self._engaged = False
+
+    def _next_change(self) -> int:
+        ticks = [segment.tick for segment in self._segments if segment.tick > self.tick]
+        ticks += [tick for tick, _ in self._pending]
+        if self._pulse is not None and self._pulse[2] > self.tick:
+            ticks.append(self._pulse[2])
+        return min(ticks, default=2**62)
+
+    def _inputs(self) -> Inputs:
+        segment = self._segment()
+        force, (dx, dy), begin, end = 0.0, (1.0, 0.0), 0, 0
+        if self._pulse is not None:
+            command, begin, end = self._pulse
+            force, (dx, dy) = float(command.force_n), command.cosines
+        return Inputs(
+            tick_s=1.0 / TICK_RATE_HZ,
+            hammer_force=force,
+            hammer_x=dx,
+            hammer_y=dy,
+            hammer_start=begin,
+            hammer_end=end,
+            speed=segment.speed,
+            speed_slope=segment.slope,
+            speed_tick=segment.tick,
+            ideal_drive=self.scene.drive.mode == "ideal",
+            magnet_engaged=self._engaged,
+        )
+
+    def _condition(self, rows: np.ndarray, tick: int) -> dict[str, np.ndarray]:
+        return self._faulty.counts(rows, self._formulas.values(rows), tick)
+
+    def _sample(self, counts: list[dict[str, np.ndarray]], start: int) -> dict[str, Block]:
+        found = {}
+        for name, group in self.table.groups.items():
+            values = counts[0][name] if len(counts) == 1 else np.concatenate([part[name] for part in counts])
+            # The first sample at or behind the start, to the nearest tick.
+            index = -(-start * group.rate_hz // TICK_RATE_HZ)
+            tick = round(index * TICK_RATE_HZ / group.rate_hz)
+            found[name] = self._block(tick, index, group.rate_hz, values)
+        return found
+
+    def _edges(self, rows: np.ndarray, start: int) -> Block | None:
+        if self._keyphasor is None:
+            return None
+        edges = self._keyphasor.edges(rows, self.row_ticks)
+        edges = self._faulty.edges(edges, rows, start)
+        index, self._edges_shown = self._edges_shown, self._edges_shown + len(edges)
+        return self._block(start, index, 0, edges[:, None]) if len(edges) else None
+
+    def _truth(self, rows: np.ndarray, start: int) -> dict[str, Block]:
+        rate = self.scene.sensors.truth_rate_hz
+        kept = rows[:: self._truth_every, self._truth_columns]
+        index = start * rate // TICK_RATE_HZ
+        return {name: self._block(start, index, rate, kept[:, part]) for name, part in self._truth_parts.items()}
+
+    def _block(self, tick: int, index: int, rate_hz: int, values: np.ndarray) -> Block:
+        return Block(tick, index, float(rate_hz), float(TICK_RATE_HZ), values)

@@ -1,0 +1,1 @@
+"""A run that is served: pace, commands, devices, transport."""

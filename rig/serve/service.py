@@ -1,0 +1,489 @@
+"""The only place where a simulation, a clock and a transport meet.
+
+The simulation thread (the caller of `Service.run`) takes commands at a block boundary, advances, waits until the block
+is due and puts it into a bounded queue; it never waits for another process. A publisher thread encodes and
+publishes. What does not fit into the queue of a paced run is dropped oldest first, whole blocks at a time, and counted;
+the gap also shows in the row numbers. An unpaced run waits for the publisher instead.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from rig.base import wire
+from rig.base.errors import InputError, Words
+from rig.base.text import finite
+from rig.channels.faults import DOORS, Message
+from rig.run.commands import COMMANDS as _COMMANDS
+from rig.run.commands import SERVICE_COMMANDS
+from rig.serve.bounded_queue import BoundedQueue
+from rig.serve.desk import Done, Join, Kept, Leave, Note, Pending, Step
+from rig.serve.devices import Devices
+from rig.serve.pacing import Clock, Lockstep, RealTime
+from rig.serve.served_run import ServedRun
+from rig.serve.transport import Server, doors_of
+from rig.serve.transport.limit import CommandLimit
+
+if TYPE_CHECKING:
+    from rig.channels.faults.sending import Frame
+    from rig.run.simulation import Simulation
+
+SIMULATION_COMMANDS = tuple(_COMMANDS)
+"""Commands that the simulation itself checks and carries out."""
+COMMANDS = (*SIMULATION_COMMANDS, *SERVICE_COMMANDS)
+REPLAY_COMMANDS = ("pause", "resume", "seek", "rate")
+"""Commands that only a replayed recording takes (`replays.player`)."""
+
+_STEP_S = 3600
+"""Longest single step [s of simulated time]."""
+_HELD_S = 0.1
+"""How long devices are waited for at a time, where none of them must be put out sooner [s]."""
+_WAITING = 256
+"""Commands that may wait for other devices."""
+_ANY_HZ = 1e9
+"""Commands a second of one sender in lockstep: any."""
+_HELD_UP_S = 1.0
+"""Blocks that wait to be published for longer than this are told [s]."""
+
+
+@dataclass(slots=True)
+class _Entry:
+    """What the publisher sends in one go: events, a block of everything, events, that the block is over; then replies.
+
+    The replies have waited for it.
+    """
+
+    before: list[dict[str, Any]]
+    frame: Frame | None = None
+    after: list[dict[str, Any]] = field(default_factory=list)
+    over: dict[str, Any] | None = None
+    replies: list[tuple[Pending, dict[str, Any]]] = field(default_factory=list)
+
+
+def _inherit(dropped: _Entry, following: _Entry) -> None:
+    """Events and replies are few, and are not dropped with their block."""
+    following.before = [*dropped.before, *dropped.after, *following.before]
+    following.replies = [*dropped.replies, *following.replies]
+
+
+class Service(ServedRun):
+    """Runs one simulation to its end and serves it.
+
+    Args:
+        simulation: Advances, checks commands, describes itself.
+        server: Transport; stays open when the run ends.
+        clock: Pace.
+        block_ticks: Length of a published block [ticks], a whole multiple of the simulation's own.
+        queue_seconds: Blocks that may wait for the publisher [s of simulated time]; more than the transport's patience
+            with one client that stalls in the middle of its recovery.
+        status_period_s: Wall time between status messages [s].
+        linger_s: At the end of a run, wait at most this long [s] until clients have recovered what they missed.
+        limit: How many commands a second are taken; in lockstep any unless given.
+
+    Raises:
+        InputError: `block_ticks` does not fit the simulation.
+    """
+
+    def __init__(
+        self,
+        simulation: Simulation,
+        server: Server,
+        clock: Clock,
+        *,
+        block_ticks: int,
+        queue_seconds: float = 30.0,
+        status_period_s: float = 0.5,
+        linger_s: float = 10.0,
+        limit: CommandLimit | None = None,
+    ) -> None:
+        if block_ticks <= 0 or block_ticks % simulation.block_ticks:
+            raise InputError("block_ticks", f"a whole multiple of {simulation.block_ticks} ticks", block_ticks)
+        super().__init__(
+            server,
+            clock,
+            scene=simulation.scene_document(),
+            tick_rate_hz=simulation.tick_rate_hz,
+            commands=COMMANDS,
+            others={
+                name: f"{name} is for a recording that is replayed (rig replay); this is a simulator, which runs on"
+                for name in REPLAY_COMMANDS
+            },
+            running="the rig runs",
+            linger_s=linger_s,
+            # In lockstep nobody is held up by many, and none may be refused by the clock on the wall.
+            limit=limit or (CommandLimit(_ANY_HZ) if isinstance(clock, Lockstep) else None),
+        )
+        simulation.serve(tuple(doors_of(server)))
+        self._simulation = simulation
+        self._block_ticks = block_ticks
+        self._status_period_s = status_period_s
+        self._queue: BoundedQueue[_Entry] = BoundedQueue(
+            max(2, math.ceil(queue_seconds * self._rate / block_ticks)),
+            size=lambda entry: int(entry.frame is not None),
+            inherit=_inherit,
+        )
+        self._publisher = threading.Thread(target=self._publish_all, name="publisher", daemon=True)
+        self._end_event: dict[str, Any] = {}
+        self._may_drop = isinstance(clock, RealTime)
+        self._overflowing = False
+        self._tick = simulation.tick
+        self._health: dict[str, Any] = {}
+        self._next_health_s = 0.0
+
+        self._kept = Kept()
+        """Commands that the simulation took: whoever comes later cannot run the scene again without them."""
+        self._waiting: list[Pending] = []
+        """Commands of devices that wait for those of others."""
+        self._steps: list[tuple[int, Pending, dict[str, Any]]] = []
+        self._step_target: int | None = None
+
+        self._devices = Devices()
+        self._blocks = 0
+        """Blocks that were run."""
+        self._ends: dict[int | None, int] = {}
+        """Ends of the last two [ticks], by number."""
+        self._over: tuple[int, float] = (-1, 0.0)
+        """End of the last block that devices were told is over [ticks], and when [s, monotonic]."""
+        self._sent: dict[str, int] = {}
+        """Messages published of each key, as zenoh numbers them."""
+        self._sent_before: dict[str, int] = {}
+        """The same, up to the end of the last block."""
+
+        self._rows = wire.Continuity()
+        self._samples_rate_hz = 0.0
+        self._samples_published = 0
+
+    # ---- from any thread ----
+
+    @property
+    def published(self) -> int:
+        """Row after the last one published, of the stream that clients report on."""
+        return self._samples_published
+
+    def status(self) -> dict[str, Any]:
+        """The status document (see rig/KEYS.md)."""
+        queue, end_tick = self._queue, self._simulation.end_tick
+        warnings = list(self._health.get("warnings", []))
+        if queue.dropped:
+            warnings.append(f"{queue.dropped} blocks dropped: the publisher did not keep up")
+        waiting_s = queue.used * self._block_ticks / self._rate
+        if self._may_drop and waiting_s > _HELD_UP_S:
+            warnings.append(f"{waiting_s:.1f} s of blocks wait: a client holds up the publisher")
+        status = self._status(
+            tick=self._tick,
+            end_s=None if end_tick is None else end_tick / self._rate,
+            pace=self._clock.pace,
+            block_ms=1e3 * self._block_ticks / self._rate,
+            queue={
+                "depth": queue.used,
+                "capacity": queue.room,
+                "high_water": queue.high_water,
+                "dropped": queue.dropped,
+            },
+            rate_hz=self._samples_rate_hz,
+            health=self._health,
+            warnings=warnings,
+        )
+        return {**status, "devices": self._devices.told(*self._over, time.monotonic())}
+
+    def _warn(self, text: str) -> None:
+        self._queue.push(_Entry([self._event("warning", self._simulation.tick, text=text)]))
+
+    # ---- on the simulation thread ----
+
+    def _get_ready(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Compile everything."""
+        self._simulation.warm_up()
+        self._health = self._simulation.health()
+        return self._simulation.catalogue(), self._simulation.parameters_document()
+
+    def _scene_now(self) -> dict[str, Any]:
+        return {**self._scene, **self._kept.told}
+
+    def _go(self) -> str:
+        simulation = self._simulation
+        start = {"scene": self._scene.get("name"), "seed": self._scene.get("seed"), "pace": self._clock.pace}
+        self._queue.push(_Entry([self._event("start", simulation.tick, **start)]))
+        self._publisher.start()
+        self._clock.start(simulation.tick, self._rate)
+        reason = self._advance_all()
+        # A recording keeps the last status: it has to be of the end, whatever the time since the one before.
+        self._next_health_s = 0.0
+        self._refresh_health()
+        return reason
+
+    def _advance_all(self) -> str:
+        """The loop; returns why it ended."""
+        simulation, clock, queue = self._simulation, self._clock, self._queue
+        end = simulation.end_tick
+        while True:
+            events = self._take_commands()
+            if self._stop_requested:
+                queue.push(_Entry(events))
+                return "stopped"
+            if self._devices.behind(simulation.tick):
+                self._hold(events)
+                continue
+            if replies := self._finished_steps():
+                queue.push(_Entry(events, replies=replies))
+                events = []
+            if not self._may_drop:
+                # Whoever is to grant the next block may wait for just that.
+                self._defer(events)
+                events = []
+            if end is not None and simulation.tick >= end:
+                queue.push(_Entry(events))
+                return "completed"
+            want = self._block_ticks
+            if end is not None:
+                rest = end - simulation.tick
+                want = min(want, math.ceil(rest / simulation.block_ticks) * simulation.block_ticks)
+            if not self._may_drop and not queue.wait_for_room(0.1):
+                self._defer(events)
+                continue
+            ticks = clock.grant(want)
+            if ticks == 0:
+                self._defer(events)
+                continue
+            frame = simulation.advance(ticks)
+            answered = []
+            while not clock.release(simulation.tick):
+                # A command that comes while the block is not yet due takes effect at its end, and is answered now.
+                answered += self._take_commands()
+            self._tick = simulation.tick
+            after = [{**event, "wall_s": time.time()} for event in frame.events]
+            self._blocks += 1
+            self._ends = {self._blocks - 1: frame.tick, self._blocks: self._tick}
+            over = {"block": self._blocks, "tick": self._tick, "time_s": self._tick / self._rate}
+            entry = _Entry(events, frame, [*after, *answered], over if self._devices else None, self._finished_steps())
+            self._overflow(queue.push(entry))
+            self._refresh_health()
+
+    def _defer(self, events: list[dict[str, Any]]) -> None:
+        """Publish events without a block, where the next block is not yet to be run."""
+        if events:
+            self._queue.push(_Entry(events))
+
+    def _hold(self, events: list[dict[str, Any]]) -> None:
+        """Wait for devices that are not yet done with the last block; who takes too long over it is put out."""
+        tick, now_s, (over, since_s) = self._simulation.tick, time.monotonic(), self._over
+        # Their time begins when they can know that the block is over.
+        since_s = since_s if over == tick else now_s
+        late, left_s = self._devices.put_out_late(tick, since_s, now_s, {each.sender for each in self._waiting})
+        self._defer([*events, *(self._device(name, "lost", reason=reason) for name, reason in late.items())])
+        if not late:
+            self._clock.hold(min(left_s, _HELD_S))
+
+    def _device(self, name: str, state: str, **more: Any) -> dict[str, Any]:
+        return self._event("device", self._simulation.tick, device=name, state=state, **more)
+
+    def _overflow(self, dropped: int) -> None:
+        """Say once for each time that the queue overflows; the count is in the status."""
+        if dropped and not self._overflowing:
+            text = "the publisher does not keep up: the oldest blocks in the queue are dropped"
+            self._queue.push(_Entry([self._event("warning", self._simulation.tick, text=text)]))
+        self._overflowing = bool(dropped)
+
+    def _arrived(self) -> Iterator[Pending]:
+        """What has come, of devices in the order of their names: whose comes first of two must not be chance.
+
+        What one of them commands is taken once those before it are done with the block.
+        """
+        for pending in self._desk.taken():
+            if len(self._waiting) < _WAITING:
+                self._waiting.append(pending)
+            else:
+                pending.refuse(InputError("commands", f"at most {_WAITING} that wait for other devices", _WAITING + 1))
+        while (place := self._devices.first_due(self._waiting, self._simulation.tick)) is not None:
+            yield self._waiting.pop(place)
+
+    def _carry_out(self, pending: Pending) -> dict[str, Any] | None:
+        asked, tick, done_tick = pending.asked, self._simulation.tick, None
+        if isinstance(asked, Join | Done | Leave):
+            return self._take_device(pending, asked)
+        told: dict[str, Any] = {}
+        if pending.command == "stop":
+            self._stop_requested = True
+        elif isinstance(asked, Step):
+            done_tick = self._check_step(asked)
+        elif not isinstance(asked, Note):
+            tick = self._simulation.submit(pending.command, dict(pending.request))
+            told = self._simulation.told
+            self._kept.add(
+                {"id": self._accepted + 1, "tick": tick, "command": pending.command, "request": pending.request}
+            )
+        reply = self._accept(pending, tick if done_tick is None else done_tick)
+        if done_tick is None:
+            pending.answer({**reply, **told})
+        else:
+            self._steps.append((done_tick, pending, reply))
+        if isinstance(asked, Note):
+            # An event of its own: it does nothing to the rig, so whoever repeats the commands can pass over it.
+            return {**self._event("note", tick, id=self._accepted), **asked.model_dump(), "from": pending.sender}
+        detail = {"id": self._accepted, "command": pending.command, "request": pending.request, "from": pending.sender}
+        return self._event("command", tick, **detail)
+
+    def _take_device(self, pending: Pending, asked: Join | Done | Leave) -> dict[str, Any] | None:
+        """A device under test joins, is done with a block, or leaves."""
+        self._need_lockstep(pending.command)
+        tick, name = self._simulation.tick, asked.device
+        if isinstance(asked, Done):
+            by_block = asked.block is not None
+            said = self._ends.get(asked.block) if by_block else asked.tick
+            word = f"block {asked.block}" if by_block else f"tick {said}"
+            reason = self._devices.done(name, said, tick, word)
+            if reason is not None:
+                must = f"with tick {tick}, the end of the last block ({self._blocks})"
+                pending.refuse(InputError("done", must, Words(word)))
+                return self._device(name, "lost", reason=reason)
+            # Not counted, and no event: there is one a block, and who of several is first is chance.
+            pending.answer({"accepted": True, "id": 0, "command": "done", "tick": tick, "time_s": tick / self._rate})
+            return None
+        if isinstance(asked, Join):
+            self._devices.join(name, asked.patience_s, tick)
+            pending.answer(self._accept(pending, tick))
+            return self._device(name, "joined", **{"from": pending.sender}, patience_s=asked.patience_s)
+        self._devices.leave(name)
+        pending.answer(self._accept(pending, tick))
+        return self._device(name, "left", **{"from": pending.sender})
+
+    def _need_lockstep(self, command: str) -> Lockstep:
+        if isinstance(self._clock, Lockstep):
+            return self._clock
+        raise InputError(command, "sent to a rig that runs with --pace lockstep", Words(f"--pace {self._clock.pace}"))
+
+    def _check_step(self, asked: Step) -> int:
+        """Grant a step; returns the tick at which it is done."""
+        clock = self._need_lockstep("step")
+        ticks, unit = asked.ticks, self._simulation.block_ticks
+        most = _STEP_S * self._rate
+        if asked.blocks is not None:
+            raise InputError("step.blocks", "left out, but for a replay", asked.blocks)
+        if ticks is None or ticks > most or ticks % unit:
+            raise InputError("ticks", f"a positive whole multiple of {unit}, at most {most}", ticks)
+        start = self._step_target if self._step_target is not None else self._simulation.tick
+        end = self._simulation.end_tick
+        if end is not None and start + ticks > end:
+            raise InputError("ticks", f"at most {end - start}, the rest of the scene", ticks)
+        self._step_target = start + ticks
+        clock.allow(ticks)
+        return self._step_target
+
+    def _finished_steps(self) -> list[tuple[Pending, dict[str, Any]]]:
+        """Steps that the last block completed; they are answered once it is published and all devices are done."""
+        if not self._steps or self._devices.behind(self._tick):
+            return []
+        lost = {"lost": dict(self._devices.lost)} if self._devices.lost else {}
+        done = [(reply, {**document, **lost}) for tick, reply, document in self._steps if tick <= self._tick]
+        if done:
+            self._devices.lost.clear()
+        self._steps = [row for row in self._steps if row[0] > self._tick]
+        if not self._steps:
+            self._step_target = None
+        return done
+
+    def _refresh_health(self) -> None:
+        """Ask the simulation how it is, a few times a second; each new kind of warning becomes an event."""
+        now = time.monotonic()
+        if now < self._next_health_s:
+            return
+        self._next_health_s = now + self._status_period_s
+        self._health = self._simulation.health()
+        for text in self._health.get("warnings", []):
+            self._desk.warn(text)
+
+    def _end(self, reason: str) -> dict[str, Any]:
+        self._desk.close(f"{wire.ENDED}: {reason}", [*(each for _, each, _ in self._steps), *self._waiting])
+        self._end_event = self._event("end", self._simulation.tick, reason=reason)
+        self._queue.close()
+        if self._publisher.ident is not None:
+            self._publisher.join(timeout=60.0)
+        # Where the publisher failed, nobody else answers the steps that it left.
+        while (entry := self._queue.take(0.0)) is not None:
+            self._answer(entry)
+        return {"rows": dict(self._rows.next)}
+
+    # ---- on the publisher thread ----
+
+    def _publish_all(self) -> None:
+        next_status_s = time.monotonic()
+        while not self._queue.ended:
+            entry = self._queue.take(max(0.0, next_status_s - time.monotonic()))
+            if entry is not None:
+                self._publish_entry(entry)
+            now = time.monotonic()
+            if now >= next_status_s:
+                self._guarded("publishing the status", self._publish_status)
+                # Not one period after the last: a status that was held up is not followed by a burst.
+                next_status_s = now + self._status_period_s
+        # Last of all events: what fails while the rest of the queue is published is told before it.
+        self._guarded("publishing events", self._publish_event, self._end_event)
+        self._guarded("publishing the status", self._publish_status)
+
+    def _guarded(self, what: str, work: Callable[..., None], *arguments: Any) -> None:
+        """Do one thing of this thread, which fails alone: pacing and all other streams go on."""
+        try:
+            work(*arguments)
+        except Exception as error:
+            self._desk.trouble(what, error)
+
+    def _publish_entry(self, entry: _Entry) -> None:
+        for event in entry.before:
+            self._guarded("publishing events", self._publish_event, event)
+        if entry.frame is not None:
+            for told in entry.frame.told:
+                self._guarded(
+                    "publishing faults", self._server.publish, wire.FAULTS, wire.encode_document(finite(told))
+                )
+            for message in entry.frame.messages:
+                self._guarded(f"publishing {message.key}", self._publish_block, message)
+            self._count_samples(entry.frame)
+        for event in entry.after:
+            self._guarded("publishing events", self._publish_event, event)
+        if entry.over is not None:
+            self._guarded("publishing the end of a block", self._publish_over, entry.over)
+            self._over = (entry.over["tick"], time.monotonic())
+            self._wake()
+        if entry.frame is not None:
+            self._sent_before = dict(self._sent)
+        self._answer(entry)
+
+    def _publish_block(self, message: Message) -> None:
+        # Whoever does not get it learns from the end what is missing.
+        self._rows.follow(message.key, message.row, len(message.block.values), late_rows=math.inf)
+        if "zenoh" in message.doors:
+            self._sent[message.key] = self._sent.get(message.key, 0) + 1
+        servers = [self._server]
+        if message.doors != DOORS:
+            servers = [server for door, server in doors_of(self._server).items() if door in message.doors]
+        for server in servers:
+            server.publish(message.key, wire.encode_block(message.block))
+
+    def _publish_over(self, over: dict[str, Any]) -> None:
+        """That all of a block was published, and the last message of each key that anything came of since the last."""
+        last = {key: sent - 1 for key, sent in self._sent.items() if sent != self._sent_before.get(key)}
+        self._server.publish(wire.BLOCK, wire.encode_document({**over, "messages": last}))
+
+    def _publish_event(self, event: dict[str, Any]) -> None:
+        self._sent[wire.EVENTS] = self._sent.get(wire.EVENTS, 0) + 1
+        self._server.publish(wire.EVENTS, wire.encode_document(finite(self._rows.tell(event))))
+
+    def _publish_status(self) -> None:
+        self._server.publish(wire.STATUS, wire.encode_document(self.status()))
+
+    def _count_samples(self, frame: Frame) -> None:
+        """What clients are measured against: the probes, or the first group of a scene without them."""
+        group = "probes" if "probes" in frame.samples else next(iter(frame.samples), None)
+        if group is not None:
+            self._samples_rate_hz = frame.samples[group].rate_hz
+            self._samples_published = self._rows.next.get(wire.sensor_key(group), 0)
+
+    @staticmethod
+    def _answer(entry: _Entry) -> None:
+        for pending, document in entry.replies:
+            pending.answer(document)

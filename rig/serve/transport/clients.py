@@ -1,0 +1,242 @@
+"""What clients report about how far they have come: for the status, for the end of a run, and for a free pace."""
+
+from __future__ import annotations
+
+import secrets
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+from rig.base import wire
+from rig.base.outside import Count, Name, Outside, a_line, check
+from rig.serve.transport import Client, Server
+
+SHOWN = 64
+"""Clients in the status."""
+MOST = 4096
+"""Names that are remembered: so many made-up ones cannot crowd out those that get on."""
+_FORGOTTEN_S = 600.0
+_GONE_S = 3.0
+"""A client that did not report for this long is not waited for; others report twice a second."""
+_QUIET_S = 0.6
+"""At the end of a run: for how long nobody must be behind before the cache may go; two heartbeats of the transport."""
+_STUCK_S = 60.0
+"""Who reports but has got nothing for this long is not waited for, in the middle of a run."""
+_STUCK_AT_END_S = 3.0
+_STRANGERS_S = 0.4
+"""At the end of a run: how much longer a link is waited for that is stalled, while all who report have everything."""
+
+
+class Sender(Outside):
+    """Who reports: the last part of the key."""
+
+    name: Name
+
+
+class Report(Outside):
+    """What a client sends twice a second on `rig/clients/NAME`."""
+
+    name: Name | None = None
+    received_index: Count | None
+    """Number of the row that it gets next; None: it listens, and has nothing yet."""
+    lost: Count = 0
+    """Rows that it knows to be lost."""
+    room: Count | None = None
+    """Rows that it can hold."""
+    done: bool = False
+    """Whether it leaves."""
+    wall_s: float | None = None
+    secret: Annotated[str, a_line(64)] | None = None
+    """What only this client knows: who reports under its name without it is somebody else."""
+
+
+class Reporter:
+    """A client's own side: tells the rig how far it has come.
+
+    Args:
+        client: Transport to the rig.
+        name: What it is called in the status.
+    """
+
+    def __init__(self, client: Client, name: str) -> None:
+        self._client = client
+        self._name = name
+        self._secret = secrets.token_hex(16)
+
+    def tell(self, received_index: int | None, *, lost: int, room: int | None = None, done: bool = False) -> None:
+        """Report; as of `Report`."""
+        report = Report(
+            name=self._name, received_index=received_index, lost=lost, room=room, done=done, secret=self._secret
+        )
+        self._client.report(f"{wire.CLIENTS}/{self._name}", report.model_dump_json().encode())
+
+
+@dataclass(frozen=True, slots=True)
+class _Heard:
+    received_index: int | None
+    """None: it listens, and has nothing yet."""
+    lost: int
+    heard_s: float
+    room: int | None
+    moved_s: float
+    """When it was last heard to have got on."""
+    from_index: int
+    from_s: float
+    """Where it stood when it was first heard, or last stepped back."""
+
+    @property
+    def pace(self) -> float:
+        """How fast it gets on [rows/s]."""
+        return ((self.received_index or 0) - self.from_index) / max(self.heard_s - self.from_s, 1.0)
+
+
+_Who = tuple[str, str | None]
+"""Name and secret."""
+
+
+class Clients:
+    """The clients of one rig, by the names that they give themselves.
+
+    Args:
+        now_s: Clock [s], monotonic.
+    """
+
+    def __init__(self, *, now_s: Callable[[], float] = time.monotonic) -> None:
+        self._now_s = now_s
+        self._lock = threading.Lock()
+        self._reports: dict[_Who, _Heard] = {}
+        self._joined: dict[_Who, int] = {}
+        """Row that was next when a client was first seen that had nothing yet: what it will be measured from."""
+        self._swept_s = now_s()
+        self.malformed = 0
+        """Reports that could not be read."""
+
+    def take(self, key: str, payload: bytes) -> None:
+        """Take a report; on a thread of the transport."""
+        try:
+            name = Sender(name=key.rpartition("/")[2]).name
+            report = check(Report, payload, field="report")
+        except ValueError:
+            self.malformed += 1
+            return
+        now_s, who, index = self._now_s(), (name, report.secret), report.received_index
+        with self._lock:
+            if report.done:
+                self._forget(who)
+                return
+            before = self._reports.get(who)
+            if before is None:
+                self._make_room(now_s)
+                origin, moved_s = (index or 0, now_s), now_s
+            else:
+                step = (index or 0) - (before.received_index or 0)
+                begins = step < 0 or before.received_index is None
+                origin = (index or 0, now_s) if begins else (before.from_index, before.from_s)
+                moved_s = now_s if step > 0 else before.moved_s
+            self._reports[who] = _Heard(index, report.lost, now_s, report.room, moved_s, *origin)
+
+    def _make_room(self, now_s: float) -> None:
+        """For other names: forget those long silent, or where none is, a quarter, of those that did not get on."""
+        if len(self._reports) < MOST and now_s - self._swept_s < _FORGOTTEN_S:
+            return
+        self._swept_s = now_s
+        for who in [who for who, row in self._reports.items() if now_s - row.heard_s > _FORGOTTEN_S]:
+            self._forget(who)
+        if len(self._reports) >= MOST:
+            for who in sorted(self._reports, key=lambda who: self._reports[who].pace)[: MOST // 4]:
+                self._forget(who)
+
+    def _forget(self, who: _Who) -> None:
+        self._reports.pop(who, None)
+        self._joined.pop(who, None)
+
+    @property
+    def present(self) -> int:
+        """How many are there: those that reported lately."""
+        return len(self._live())
+
+    def rows(self, published: int, rate_hz: float) -> dict[str, dict[str, Any]]:
+        """Each client for the status.
+
+        Args:
+            published: Number of the row after the last one published of the stream that clients report on.
+            rate_hz: Rate of that stream [Hz]; 0 where nothing was published yet.
+        """
+        now_s = self._now_s()
+        with self._lock:
+            # Those that get on first: names can be made up by the thousand.
+            first = sorted(self._reports.items(), key=lambda row: -row[1].pace)
+        rows: dict[str, dict[str, Any]] = {}
+        for who, report in first[:SHOWN]:
+            name = who[0]
+            while name in rows:
+                name += " (another)"
+            rows[name] = {
+                "received_index": report.received_index,
+                "lag_s": round(self._lacks(who, report, published) / rate_hz, 4) if rate_hz else 0.0,
+                "last_heard_s": round(now_s - report.heard_s, 3),
+                "lost": report.lost,
+            }
+        return rows
+
+    @property
+    def hidden(self) -> int:
+        """How many more there are than the status shows."""
+        return max(0, len(self._reports) - SHOWN)
+
+    def behind(self, published: int, *, silent: bool = False, stuck_s: float = _STUCK_S) -> int:
+        """Rows that the slowest client still lacks, of those that are there; 0 where nobody reports.
+
+        Args:
+            published: Number of the row after the last one published.
+            silent: Also of those that no longer report.
+            stuck_s: Without those that have got nothing for so long [s].
+        """
+        live = self._live(silent=silent, stuck_s=stuck_s)
+        return max((self._lacks(who, report, published) for who, report in live.items()), default=0)
+
+    def crowded(self, published: int, most: int) -> str | None:
+        """Name of a client that is there and has more on its way than so many rows, or than half of its own room."""
+        for who, report in self._live().items():
+            if self._lacks(who, report, published) > (most if report.room is None else min(most, report.room // 2)):
+                return who[0]
+        return None
+
+    def _lacks(self, who: _Who, report: _Heard, published: int) -> int:
+        """Rows that a client still has to get."""
+        has = report.received_index
+        return max(0, published - (self._joined.setdefault(who, published) if has is None else has))
+
+    def _live(self, *, silent: bool = False, stuck_s: float = _STUCK_S) -> dict[_Who, _Heard]:
+        now_s = self._now_s()
+        with self._lock:
+            return {
+                who: row
+                for who, row in self._reports.items()
+                # Whoever is silent has been stopped, not stuck: it may be about to go on.
+                if (row.heard_s - row.moved_s < stuck_s and now_s - row.heard_s < _GONE_S)
+                or (silent and now_s - row.heard_s >= _GONE_S)
+            }
+
+    def settle(self, server: Server, published: int, *, patience_s: float) -> None:
+        """Wait until everybody who is connected has everything, so that the cache may go.
+
+        Args:
+            server: Whose links are looked at.
+            published: Number of the row after the last one published.
+            patience_s: Longest wait [s].
+        """
+        deadline = time.monotonic() + patience_s
+        quiet_since = strangers_since = time.monotonic()
+        while (now := time.monotonic()) < deadline:
+            counts = server.congestion()
+            if not counts.get("links", 0) or now - quiet_since >= _QUIET_S:
+                return
+            stalled = counts.get("stalled_links", 0) > 0
+            if self.behind(published, silent=stalled, stuck_s=_STUCK_AT_END_S):
+                quiet_since = strangers_since = now
+            elif stalled and now - strangers_since < _STRANGERS_S:
+                quiet_since = now
+            time.sleep(0.1)

@@ -1,0 +1,1 @@
+"""Who is who on a rig that is exposed, and who may say what."""

@@ -1,0 +1,74 @@
+"""One service on several transports at once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future
+
+from rig.serve.transport import Server
+
+
+class Fanout:
+    """The rig's side of several transports: what is published goes to all, and each may ask and report.
+
+    Args:
+        servers: The transports, in the order in which they are given each payload; each stays its owner's to close.
+        doors: Which of them is which way out of the rig.
+        figures: Further counts for the status, named as `congestion` names its own.
+        warnings: What else a person should know of, while it is so.
+    """
+
+    def __init__(
+        self,
+        servers: Sequence[Server],
+        *,
+        doors: Mapping[str, Server] | None = None,
+        figures: Callable[[], dict[str, float]] | None = None,
+        warnings: Callable[[], list[str]] = list,
+    ) -> None:
+        self._servers = tuple(servers)
+        self.doors = dict(doors or {"zenoh": self._servers[0]})
+        self.warnings = warnings
+        self._figures = figures
+
+    def publish(self, key: str, payload: bytes) -> None:
+        """Send one payload to all subscribers of all transports."""
+        for server in self._servers:
+            server.publish(key, payload)
+
+    def answer(self, key: str, handler: Callable[[bytes], bytes]) -> None:
+        """Answer requests on a key on all transports."""
+        for server in self._servers:
+            server.answer(key, handler)
+
+    def answer_all(self, expression: str, handler: Callable[[str, bytes], bytes | Future[bytes]]) -> None:
+        """Answer requests on all keys that match on all transports."""
+        for server in self._servers:
+            server.answer_all(expression, handler)
+
+    def on_trouble(self, tell: Callable[[str, BaseException], None]) -> None:
+        """Tell what failed on the threads of all transports."""
+        for server in self._servers:
+            server.on_trouble(tell)
+
+    def hear(self, key: str, callback: Callable[[str, bytes], None]) -> None:
+        """Receive what clients of all transports report."""
+        for server in self._servers:
+            server.hear(key, callback)
+
+    def announce(self) -> None:
+        """Show the rig's token on all transports."""
+        for server in self._servers:
+            server.announce()
+
+    def congestion(self) -> dict[str, float]:
+        """The counts of all transports, and the further ones."""
+        counts: dict[str, float] = {}
+        for server in self._servers:
+            counts |= server.congestion()
+        return counts | (self._figures() if self._figures is not None else {})
+
+    def close(self) -> None:
+        """Close all transports."""
+        for server in self._servers:
+            server.close()

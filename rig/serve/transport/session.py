@@ -1,0 +1,150 @@
+"""A zenoh session with its receiving threads, and the settings that both sides share."""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import json
+import os
+import threading
+from collections.abc import Callable
+from typing import Any
+
+from rig.base import wire
+
+_LEASE_S = 60.0
+"""A stopped subscriber sends no keep-alives, and must keep its link for well over 10 s. A killed process is noticed
+by its closed socket, not by the lease."""
+PATIENCE_S = 20.0
+"""How long a receiver waits for recovered messages [s]."""
+_HELD_S = 2.0
+"""How long recovered messages wait for room in a link whose other side does not read them [s]. Then it is closed: a
+client of ours connects again and asks again, and one that means harm holds up no longer."""
+
+
+def locator(host: str, port: int, *, tls: bool = False) -> str:
+    """An address as zenoh names it."""
+    # "localhost" may resolve to ::1 first, where nobody listens.
+    return f"{'tls' if tls else 'tcp'}/{'127.0.0.1' if host == 'localhost' else host}:{port}"
+
+
+def config_of(**settings: Any) -> Any:
+    """The settings that both sides share, and those given (`__` stands for `/`)."""
+    import zenoh
+
+    config = zenoh.Config()
+    shared = {
+        "mode": "peer",
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        # Blocks are of a few kB: shared memory saves nothing and would leave segments behind when a process is killed.
+        "transport/shared_memory/enabled": False,
+        "transport/unicast/compression/enabled": False,
+        "adminspace/enabled": False,
+        "transport/link/tx/lease": round(_LEASE_S * 1000),
+        "transport/link/tx/keep_alive": 30,
+        # Recovered messages wait for room in their link, and while they do, the publisher of that key waits for its
+        # cache. After this time the link is closed instead, which can cost that client messages. It must be below the
+        # time that the service can queue [us].
+        "transport/link/tx/queue/congestion_control/block/wait_before_close": round(_HELD_S * 1e6),
+    }
+    for key, value in {**shared, **{name.replace("__", "/"): value for name, value in settings.items()}}.items():
+        config.insert_json5(key, json.dumps(value))
+    return config
+
+
+class Session:
+    """A zenoh session with its receiving threads, closed for certain.
+
+    zenoh's own callback threads are not daemons: a script that forgets to close would hang on exit. So all receiving
+    is by channels, drained by daemon threads, and an exit handler closes what was left open.
+    """
+
+    def __init__(self, config: Any) -> None:
+        import zenoh
+
+        # A receiving thread waits where it sends a recovery to a stalled link, or fills the channel of a slow callback.
+        # The default of two would leave none for the rest. Read when the first session of a process opens.
+        os.environ.setdefault("ZENOH_RUNTIME", "(rx: (worker_threads: 16))")
+        self.session = zenoh.open(config)
+        self._threads: list[threading.Thread] = []
+        self._closing = threading.Lock()
+        self._closed = False
+        self._printed: set[str] = set()
+        self.on_trouble: Callable[[str, BaseException], None] = self._print_trouble
+        """Told of what fails on a receiving thread, which goes on."""
+        atexit.register(self._close_at_exit)
+
+    def _print_trouble(self, where: str, error: BaseException) -> None:
+        if where not in self._printed:  # it may fail with each message
+            self._printed.add(where)
+            thread = threading.current_thread()
+            threading.excepthook(threading.ExceptHookArgs((type(error), error, error.__traceback__, thread)))
+
+    def drain(
+        self, channel: Any, take: Callable[[Any], None], name: str, *, first: Callable[[], None] | None = None
+    ) -> None:
+        """Give all that arrives in a channel to `take`, on a thread of its own, after calling `first` there.
+
+        What fails there fails alone: a channel that nobody empties would in the end block the whole link.
+        """
+        import zenoh
+
+        def guarded(work: Callable[..., None], *arguments: Any) -> None:
+            try:
+                work(*arguments)
+            except BaseException as error:
+                if not (self._closed and isinstance(error, zenoh.ZError)):
+                    self.on_trouble(f"zenoh {name}", error)
+
+        def loop() -> None:
+            if first is not None:
+                guarded(first)
+            with contextlib.suppress(zenoh.ZError):  # the channel ends with the session
+                for item in channel:
+                    if not self._closed:
+                        guarded(take, item)
+
+        thread = threading.Thread(target=loop, name=f"zenoh {name}", daemon=True)
+        self._threads.append(thread)
+        thread.start()
+
+    def _close_at_exit(self) -> None:
+        self.close(wait_s=None)
+
+    def close(self, *, wait_s: float | None = 2.0) -> None:
+        """Close, and wait so long for that [s]; None: to its end."""
+        import zenoh
+
+        with self._closing:
+            if self._closed:
+                return
+            self._closed = True
+        atexit.unregister(self._close_at_exit)
+
+        def close() -> None:
+            with contextlib.suppress(zenoh.ZError):
+                self.session.close()
+
+        # Takes 10 s and fails where a callback never returns. A daemon would be ended in the middle of it where the
+        # process ends meanwhile, which aborts the process.
+        closing = threading.Thread(target=close, name="zenoh closes")
+        closing.start()
+        closing.join(timeout=wait_s)
+        for thread in self._threads:
+            if thread is not threading.current_thread():
+                thread.join(timeout=1.0)
+
+
+def encoding_of(key: str, schema: str | None) -> str:
+    """Zenoh's name for what a key's payloads are."""
+    if schema is not None:
+        return f"application/cdr;{schema}"
+    return "application/octet-stream" if key.startswith(f"{wire.ROOT}/can/") else "application/json"
+
+
+def fifo() -> Any:
+    """A channel of requests, reports or tokens that wait for their thread."""
+    import zenoh
+
+    return zenoh.handlers.FifoChannel(256)

@@ -1,0 +1,500 @@
+"""Server and client over zenoh: TCP on the loopback, TLS beyond it, between two peers; no router, multicast or gossip.
+
+The server publishes without waiting (a stalled subscriber must not delay it) and keeps the last messages of each key;
+a lossless client notices from the numbers of the messages what it did not get, and fetches it from there.
+"""
+
+from __future__ import annotations
+
+import socket
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
+from pathlib import Path
+from queue import SimpleQueue
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from rig.base import wire
+from rig.base.closing import Closing
+from rig.base.errors import InputError
+from rig.serve.transport import DEFAULT_ENDPOINT, NoReplyError
+from rig.serve.transport.endpoint import backlog_of, hang_up, not_free, parse_endpoint, place_to_listen
+from rig.serve.transport.exposure.access import Verb, allows, rules
+from rig.serve.transport.names import address_in, endpoint_of
+from rig.serve.transport.recovery import CACHE, Publisher, Recovery
+from rig.serve.transport.session import PATIENCE_S, Session, config_of, encoding_of, fifo, locator
+
+if TYPE_CHECKING:
+    from rig.serve.transport.exposure.certificates import Holder
+
+_SLOW_PUT_S = 0.5e-3
+_STALLED_BYTES = 256 * 1024
+"""Unread bytes that make a link stalled: about 0.1 s of all streams; one that keeps up leaves none."""
+_HEARTBEAT_S = 0.25
+"""How soon a subscriber learns that the last message of a key is missing."""
+_FIFO = 20_000
+"""Messages that wait for a callback: about 20 s of all streams. Beyond that the link backs up, the rig drops (or waits,
+where it is not paced), and the rest is recovered."""
+_HEARTBEATS = 500
+"""Heartbeats that a subscriber holds: several of each key. A ring takes its memory as it first goes round, a long one
+for hours."""
+_RING = 2000
+"""Messages that a subscriber which may lose some holds: about 2 s of all streams."""
+_FROM_CLIENTS = {
+    "transport/link/rx/max_message_size": 1 << 20,
+    "transport/unicast/accept_timeout": 3000,
+    "transport/unicast/accept_pending": 1000,
+}
+"""The largest that a server takes: requests have at most 64 kB. What it sends is not bounded by this. And how many may
+be about to connect, for how long [ms]: whoever opens connections and says nothing must not shut out all others."""
+_FROM_AFAR = {"transport/unicast/max_sessions": 32, "transport/unicast/accept_pending": 32}
+"""Where it is exposed; a client that subscribes has two sessions."""
+_OPENING_S, _OPENING_TLS_S, _BACK_S = 0.5, 2.0, 5.0
+"""How long one attempt to connect may take: beyond the loopback it is several times there and back. And how long a
+request without a link waits for a rig that is started again."""
+
+
+class Exposure(NamedTuple):
+    """Where a rig listens beyond the loopback.
+
+    Args:
+        endpoint: HOST:PORT.
+        holder: The rig's own certificate and who may connect; None lets everybody in, unencrypted.
+    """
+
+    endpoint: str
+    holder: Holder | None
+
+
+class ZenohServer(Closing):
+    """The rig's side: listens on the loopback, and elsewhere where it is told to.
+
+    Whoever connects may do what `rig.serve.transport.exposure.access` says.
+
+    Args:
+        endpoint: HOST:PORT to listen on, on the loopback; with port 0, one that is free.
+        exposed: Where else.
+        wait: Make `publish` wait for slow subscribers (at most 2 s, then their link is closed and they recover from
+            the cache) instead of letting them recover later. For runs that are not paced by the wall clock: there the
+            cache would hold a much shorter wall time.
+
+    Raises:
+        InputError: An endpoint is malformed, in use, or `endpoint` not on the loopback.
+    """
+
+    def __init__(
+        self, endpoint: str = DEFAULT_ENDPOINT, *, exposed: Exposure | None = None, wait: bool = False
+    ) -> None:
+        import zenoh
+
+        host, port = place_to_listen(endpoint, field="listen")
+        self.endpoint = f"{host}:{port}"
+        self._ports = {port}
+        locators, settings = [locator(host, port)], dict[str, Any](_FROM_CLIENTS)
+        if exposed is not None:
+            host, port = parse_endpoint(exposed.endpoint, field="expose")
+            self._ports.add(port)
+            locators.append(locator(host, port, tls=exposed.holder is not None))
+            settings |= _FROM_AFAR
+            if exposed.holder is not None:
+                settings["transport/link/tls"] = exposed.holder.settings(listens=True)
+        try:
+            self._session = Session(config_of(listen__endpoints=locators, access_control=rules(), **settings))
+        except zenoh.ZError as error:
+            field, where = "listen", self.endpoint
+            if exposed is not None and f"{host}:{port}" in str(error):
+                field, where = "expose", exposed.endpoint
+            raise not_free(field, where, in_use="in use" in str(error)) from None
+        self._congestion_control = zenoh.CongestionControl.BLOCK if wait else zenoh.CongestionControl.DROP
+        self._publishers: dict[str, Any] = {}
+        self._declared: list[Any] = []
+        self._slow_puts = 0
+        self._longest_put_s = 0.0
+        self._stalls = 0
+        self._stalled: set[int] = set()
+        self._replies: SimpleQueue[tuple[Any, str, bytes] | None] = SimpleQueue()
+        self._session.drain(iter(self._replies.get, None), lambda late: _reply(*late), "replies")
+
+    def publish(self, key: str, payload: bytes) -> None:
+        """Send one payload to all subscribers, and keep it for those who miss it. One thread only."""
+        publisher = self._publishers.get(key) or self._declare(key)
+        start = time.perf_counter()
+        publisher.put(payload)
+        taken = time.perf_counter() - start
+        if taken > _SLOW_PUT_S:
+            self._slow_puts += 1
+            self._longest_put_s = max(self._longest_put_s, taken)
+
+    def _declare(self, key: str) -> Any:
+        from zenoh import ext
+
+        schema = wire.schema_of(key)
+        publisher = ext.declare_advanced_publisher(
+            self._session.session,
+            key,
+            encoding=encoding_of(key, schema),
+            congestion_control=self._congestion_control,
+            cache=ext.CacheConfig(CACHE),
+            sample_miss_detection=ext.MissDetectionConfig(heartbeat=_HEARTBEAT_S, sporadic_heartbeat=None),
+        )
+        self._publishers[key] = publisher
+        return publisher
+
+    def answer(self, key: str, handler: Callable[[bytes], bytes]) -> None:
+        """Answer requests on a key, one after another, on a thread of that key."""
+        self.answer_all(key, lambda _, payload: handler(payload))
+
+    def answer_all(self, expression: str, handler: Callable[[str, bytes], bytes | Future[bytes]]) -> None:
+        """Answer requests on all keys that match, on a thread of this expression; what comes later, on one for that."""
+        queryable = self._session.session.declare_queryable(expression, fifo())
+        self._declared.append(queryable)
+        own = None if "*" in expression else expression
+
+        def take(query: Any) -> None:
+            key = own or str(query.key_expr)
+            try:
+                if "*" in key:
+                    raise InputError("key", "one key, without *", key)
+                answer = handler(key, b"" if query.payload is None else query.payload.to_bytes())
+            except Exception as error:
+                with query:
+                    query.reply_err(f"{type(error).__name__}: {error}".encode())
+                if not isinstance(error, InputError):
+                    raise
+            else:
+                if isinstance(answer, Future):
+                    # Completed on a thread that must not wait for a link.
+                    answer.add_done_callback(lambda done: self._replies.put((query, key, done.result())))
+                else:
+                    _reply(query, key, answer)
+
+        self._session.drain(queryable, take, f"answers {expression}")
+
+    def on_trouble(self, tell: Callable[[str, BaseException], None]) -> None:
+        """Tell where and why something failed on a receiving thread."""
+        self._session.on_trouble = tell
+
+    def hear(self, key: str, callback: Callable[[str, bytes], None]) -> None:
+        """Receive what clients report on matching keys."""
+        subscriber = self._session.session.declare_subscriber(key, fifo())
+        self._declared.append(subscriber)
+        self._session.drain(subscriber, lambda x: callback(str(x.key_expr), x.payload.to_bytes()), f"hears {key}")
+
+    def announce(self, key: str = wire.ALIVE) -> None:
+        """Show the rig's token, or another: it vanishes when this process ends, however it ends."""
+        self._declared.append(self._session.session.liveliness().declare_token(key))
+
+    def watch(self, key: str, callback: Callable[[str, bool], None]) -> None:
+        """Call back with key and True / False when tokens of clients on keys that match appear / vanish."""
+        import zenoh
+
+        subscriber = self._session.session.liveliness().declare_subscriber(key, fifo(), history=True)
+        self._declared.append(subscriber)
+        self._session.drain(
+            subscriber, lambda x: callback(str(x.key_expr), x.kind == zenoh.SampleKind.PUT), f"watches {key}"
+        )
+
+    def congestion(self) -> dict[str, float]:
+        """What a stalled subscriber looks like from here.
+
+        A put waits once, for 1 ms, when a link's queue fills, and drops at once from then on: `slow_puts` counts
+        the beginnings of long stalls, not their length. What shows a stall at once and as long as it lasts is the
+        number of bytes that its link holds unread (`backlog_bytes`: the largest of all links, 0 where the operating
+        system does not tell). `stalls` counts how often a link was found stalled that was not in the call before;
+        `links_NAME` are those whose certificate has that name.
+        """
+        links = list(self._session.session.info.links())
+        names = Counter(f"links_{link.auth_identifier}" for link in links if link.auth_identifier is not None)
+        backlog = {other: size for port in self._ports for other, size in backlog_of(port).items()}
+        stalled = {port for port, size in backlog.items() if size > _STALLED_BYTES}
+        self._stalls += len(stalled - self._stalled)
+        self._stalled = stalled
+        return {
+            "links": len(links),
+            **names,
+            "stalled_links": len(stalled),
+            "stalls": self._stalls,
+            "backlog_bytes": max(backlog.values(), default=0),
+            "slow_puts": self._slow_puts,
+            "longest_put_ms": round(self._longest_put_s * 1e3, 3),
+        }
+
+    def close(self) -> None:
+        """Send the last replies, and close the session and with it all that was declared."""
+        self._replies.put(None)
+        # zenoh waits for some seconds until a stalled link takes the farewell.
+        for port in self._ports:
+            hang_up(port, {other for other, size in backlog_of(port).items() if size > _STALLED_BYTES})
+        self._session.close()
+
+
+def _reply(query: Any, key: str, payload: bytes) -> None:
+    with query:
+        query.reply(key, payload, encoding="application/json")
+
+
+class ZenohClient(Closing):
+    """A client's side: connects to one rig and listens on nothing. Reconnects by itself when that rig is started again.
+
+    Subscriptions have a link of their own. It backs up when a callback is slow, and then nothing on it is read, which
+    must not hold up requests and the token, and least of all the recovery that this very subscription waits for.
+
+    Args:
+        endpoint: HOST:PORT of the rig, or its name.
+        wait_s: How long to wait for a rig to be there [s]; may be infinite.
+        tls: Folder with the keys of a role (`rig keys init`), for a rig that is exposed; None connects without.
+
+    Raises:
+        InputError: The endpoint is malformed, no rig has that name, or the folder holds no keys.
+        NoReplyError: No rig was there in time, or it does not let us in.
+    """
+
+    def __init__(self, endpoint: str = DEFAULT_ENDPOINT, *, wait_s: float = 1.0, tls: Path | str | None = None) -> None:
+        self._host, self._port = endpoint_of(endpoint, field="connect", wait_s=wait_s)
+        self._holder: Holder | None = None
+        if tls is not None:
+            from rig.serve.transport.exposure.certificates import holder_in
+
+            self._holder = holder_in(tls, server=False)
+        self.endpoint = f"{self._host}:{self._port}"
+        self._declared: list[Any] = []
+        self._rigs: set[str] = set()
+        """Rigs that this client is or was linked to: what they sent may still be on its way."""
+        self.foreign = 0
+        self._streams: Session | None = None
+        self._lossless: list[tuple[str, Recovery]] = []
+        self._session = self._open(wait_s)
+
+    @property
+    def rig(self) -> str | None:
+        """Who the rig at the other end of the link is; None without a link."""
+        return next(iter(self._linked()), None)
+
+    def _linked(self) -> set[str]:
+        # A client listens on nothing, so that whom it is linked to is whom it has asked for.
+        found = set(map(str, self._session.session.info.peers_zid()))
+        self._rigs |= found
+        return found
+
+    def _is_rigs(self, publisher: str | None) -> bool:
+        """Whether a message is from the rig, by the publisher that it names; others are counted, and left out."""
+        if publisher is not None and (publisher in self._rigs or publisher in self._linked()):
+            return True
+        self.foreign += 1
+        return False
+
+    def _from_rig(self, sample: Any) -> bool:
+        return self._is_rigs(None if (info := sample.source_info) is None else str(info.source_id.zid))
+
+    def _open(self, wait_s: float) -> Session:
+        import zenoh
+
+        deadline = time.monotonic() + wait_s
+        longest_s, settings = _OPENING_S, {}
+        if self._holder is not None:
+            longest_s, settings = _OPENING_TLS_S, {"transport/link/tls": self._holder.settings(listens=False)}
+        while True:
+            left = deadline - time.monotonic()
+            config = config_of(
+                listen__endpoints=[],
+                connect__endpoints=[locator(self._host, self._port, tls=self._holder is not None)],
+                # Opening waits for the link, so that the first request cannot come too early; in slices, so that
+                # Ctrl-C works meanwhile.
+                connect__timeout_ms=round(1000 * min(longest_s, max(left, 0.05))),
+                connect__exit_on_failure=True,
+                connect__retry={"period_init_ms": 50, "period_max_ms": 500, "period_increase_factor": 2},
+                **settings,
+            )
+            try:
+                return Session(config)
+            except zenoh.ZError:
+                if time.monotonic() >= deadline:
+                    raise self._not_let_in() from None
+
+    def _not_let_in(self) -> NoReplyError:
+        """Whether nobody is there, or somebody who does not let us in."""
+        try:
+            if self._holder is None:
+                socket.create_connection((self._host, self._port), timeout=1.0).close()
+                why = "without a certificate: for a rig that is exposed give --tls FOLDER; else it is no rig, or hangs"
+            elif (said := self._holder.turned_away(self._host, self._port)) is not None:
+                why = f"as {self._holder.name}, by the keys in {self._holder.folder}: {said}"
+            else:
+                why = "though its certificates are right: it has too many links, or hangs"
+        except OSError:
+            return self._no_reply()
+        return NoReplyError(f"{self.endpoint} listens, but does not let us in {why}")
+
+    def _no_reply(self) -> NoReplyError:
+        start = "start one with: rig run stable-run (--wait-s 60 waits for one that still compiles)"
+        return NoReplyError(f"no rig answers at {self.endpoint}; {start}")
+
+    @property
+    def connection(self) -> str | None:
+        """By which certificates both ends know each other; None without TLS."""
+        if self._holder is None:
+            return None
+        rig = next((link.auth_identifier for link in self._session.session.info.links()), None)
+        return f"TLS as {self._holder.name}, valid until {self._holder.expires:%Y-%m-%d}; the rig is {rig}"
+
+    def subscribe(
+        self,
+        key: str,
+        on_message: Callable[[str, bytes], None],
+        *,
+        on_miss: Callable[[str, int], None] | None = None,
+        history: bool = False,
+        lossless: bool = True,
+    ) -> None:
+        """Receive payloads on a thread of this subscription.
+
+        The messages of each key arrive in order; messages of different keys may arrive in another order than they
+        were sent in (after a stall each key is recovered for itself), so an `end` event can overtake blocks. A
+        callback that blocks stops only this subscription; the rig goes on, and what was missed is recovered.
+        `on_miss` and `on_message` are never called at the same time.
+        """
+        import zenoh
+
+        if self._streams is None:
+            self._streams = self._open(5.0)
+        streams, session = self._streams, self._streams.session
+        self._linked()
+        if not lossless:
+            subscriber = session.declare_subscriber(key, zenoh.handlers.RingChannel(_RING))
+            self._declared.append(subscriber)
+
+            def take_any(sample: Any) -> None:
+                if self._from_rig(sample):
+                    on_message(str(sample.key_expr), sample.payload.to_bytes())
+
+            streams.drain(subscriber, take_any, f"takes {key}")
+            return
+
+        def get(link: Session, selector: str) -> list[Any]:
+            replies = link.session.get(
+                selector,
+                timeout=PATIENCE_S,
+                consolidation=zenoh.ConsolidationMode.NONE,
+                accept_replies=zenoh.ReplyKeyExpr.ANY,
+            )
+            return [reply.ok for reply in replies if reply.ok is not None and self._from_rig(reply.ok)]
+
+        def ask(name: str, publisher: Publisher, selection: str) -> list[Any]:
+            zid, eid = publisher
+            return get(self._session, f"{name}/@adv/*/{zid}/{eid}/**?{selection}")
+
+        def begin() -> None:
+            if history:
+                heads = get(streams, f"{key}/@adv/**?_max=1")
+                # What came before these replies, over the same link, goes first: it may be older than all that the
+                # caches still have, where this process was stopped meanwhile.
+                while (sample := subscriber.try_recv()) is not None:
+                    take(sample)
+                stream.begin(heads)
+
+        def take(sample: Any) -> None:
+            if self._from_rig(sample):
+                stream.take(sample)
+
+        def heartbeat(sample: Any) -> None:
+            if self._is_rigs(str(sample.key_expr).partition("/@adv/pub/")[2].partition("/")[0]):
+                stream.heartbeat(sample)
+
+        stream = Recovery(ask, on_message, on_miss, history=history)
+        self._lossless.append((key, stream))
+        subscriber = session.declare_subscriber(key, zenoh.handlers.FifoChannel(_FIFO))
+        heartbeats = session.declare_subscriber(f"{key}/@adv/pub/**", zenoh.handlers.RingChannel(_HEARTBEATS))
+        self._declared += [subscriber, heartbeats]
+        streams.drain(subscriber, take, f"takes {key}", first=begin)
+        streams.drain(heartbeats, heartbeat, f"heartbeats {key}")
+
+    def settle(self) -> None:
+        """Return when all subscriptions so far are in effect: a reply over their link is behind them."""
+        if self._streams is not None:
+            list(self._streams.session.get(wire.STATUS, timeout=PATIENCE_S))
+
+    def wait_for(self, key: str, number: int, *, timeout_s: float) -> bool:
+        """Wait until a message was handed on, by its number; True at once of a key that is not subscribed."""
+        deadline = time.monotonic() + timeout_s
+        streams = [stream for subscribed, stream in self._lossless if subscribed == key]
+        return all(each.wait_for(key, number, timeout_s=max(0.0, deadline - time.monotonic())) for each in streams)
+
+    def request(self, key: str, payload: bytes = b"", *, timeout_s: float = 2.0) -> bytes:
+        """Ask the rig and return its reply.
+
+        Raises:
+            NoReplyError: Nobody answered in time, or the rig failed to, or went, and may have done what was asked.
+        """
+        import zenoh
+
+        begun, asked = time.monotonic(), self._linked()
+        while True:
+            replies: Iterator[Any] = self._session.session.get(
+                key,
+                payload=payload,
+                timeout=max(begun + timeout_s - time.monotonic(), 0.01),
+                # Replies inherit both: one that waited for a stalled client would hold up all others and close its link
+                # after 5 s; and replies need not queue behind recovered blocks.
+                congestion_control=zenoh.CongestionControl.DROP,
+                priority=zenoh.Priority.INTERACTIVE_HIGH,
+            )
+            for reply in replies:
+                payload_back = reply.result.payload.to_bytes()
+                if reply.ok is not None:
+                    return payload_back
+                if (text := payload_back.decode(errors="replace")) != "Timeout":
+                    raise NoReplyError(f"the rig at {self.endpoint} could not answer {key}: {text}")
+            if asked and not asked & self._linked():
+                raise NoReplyError(f"the rig at {self.endpoint} has gone, and has not answered {key}")
+            # Without a rig the reply is empty at once: it may be about to start. So it is where the rig denies this.
+            late = time.monotonic() + 0.05 >= begun + (timeout_s if self._linked() else min(timeout_s, _BACK_S))
+            role = None if self._holder is None else self._holder.name
+            denied = not allows(role, Verb.ASK, key)
+            if (late or denied) and self.tokens(wire.ALIVE):
+                what = f"denies {key} to {role or 'everybody'}" if denied else f"does not answer {key}"
+                raise NoReplyError(f"the rig at {self.endpoint} {what}")
+            if late:
+                raise self._no_reply()
+            time.sleep(0.05)
+
+    def watch(self, key: str, callback: Callable[[bool], None]) -> None:
+        """Call back with True / False when the rig's token appears / vanishes; True at once if it is there."""
+        import zenoh
+
+        subscriber = self._session.session.liveliness().declare_subscriber(key, fifo(), history=True)
+        self._declared.append(subscriber)
+        self._session.drain(subscriber, lambda x: callback(x.kind == zenoh.SampleKind.PUT), f"watches {key}")
+
+    def announce(self, key: str) -> None:
+        """Show a token of this client: it vanishes when this process ends, however it ends."""
+        self._declared.append(self._session.session.liveliness().declare_token(key))
+
+    def tokens(self, key: str, *, timeout_s: float = 0.5) -> list[str]:
+        """Keys of the tokens that are there now, of those that match."""
+        replies = self._session.session.liveliness().get(key, timeout=timeout_s)
+        return sorted({str(reply.ok.key_expr) for reply in replies if reply.ok is not None})
+
+    def report(self, key: str, payload: bytes) -> None:
+        """Send one payload to the rig; it is dropped where the link is congested."""
+        import zenoh
+
+        self._session.session.put(
+            key,
+            payload,
+            encoding=encoding_of(key, None),
+            congestion_control=zenoh.CongestionControl.DROP,
+            allowed_destination=zenoh.Locality.REMOTE,  # not to the own subscriptions of this client
+        )
+
+    def close(self) -> None:
+        """Close both links and with them all that was declared."""
+        if self._streams is not None:
+            self._streams.close()
+        self._session.close()
+
+
+def client_of(url: str, *, wait_s: float) -> ZenohClient:
+    """A client of the rig at a URL (`names.address_in`), with the keys of a role in ?tls=DIR; errors as of these."""
+    endpoint, query, folder = address_in(url).partition("?tls=")
+    return ZenohClient(endpoint, wait_s=wait_s, tls=folder if query else None)

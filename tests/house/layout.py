@@ -1,0 +1,65 @@
+"""Rooms and floors of every package, counted on its imports: `python -m tests.house.layout [PACKAGE]`.
+
+A room is a module or a folder right inside a package. It stands one floor above the highest of the rooms beside it that
+it imports. A folder of like entries, which do not import each other, is one room for whoever looks into it.
+"""
+
+from __future__ import annotations
+
+import sys
+
+import grimp
+
+ROOTS = ("rig", "drivers", "recorder", "replays")
+MOST_ROOMS, MOST_FLOORS = 10, 6
+LIKE_ENTRIES = frozenset({"rig.cli.commands"})
+"""Folders whose entries are of one kind, and any number of them."""
+
+
+def build() -> grimp.ImportGraph:
+    """All imports of the product, those inside functions too."""
+    return grimp.build_graph(*ROOTS, cache_dir=None)
+
+
+def rooms(graph: grimp.ImportGraph, package: str) -> dict[str, set[str]]:
+    """Rooms of a package, each with those beside it that it imports; `__main__`, which starts a package, is none."""
+    found = sorted(name for name in graph.find_children(package) if not name.endswith(".__main__"))
+    inside = {name: {name, *graph.find_descendants(name)} for name in found}
+    imported = {
+        name: {each for module in inside[name] for each in graph.find_modules_directly_imported_by(module)}
+        for name in found
+    }
+    return {name: {each for each in found if each != name and imported[name] & inside[each]} for name in found}
+
+
+def floors(graph: grimp.ImportGraph, package: str) -> list[list[str]]:
+    """Rooms of a package by floor, the highest first.
+
+    Raises:
+        ValueError: Rooms import each other in a circle.
+    """
+    waiting, found = rooms(graph, package), list[list[str]]()
+    while waiting:
+        floor = [name for name, imported in waiting.items() if not imported & waiting.keys()]
+        if not floor:
+            raise ValueError(f"{package}: {', '.join(waiting)} import each other in a circle")
+        found.insert(0, floor)
+        for name in floor:
+            del waiting[name]
+    return found
+
+
+def packages(graph: grimp.ImportGraph) -> list[str]:
+    """All packages of the product."""
+    return sorted(name for name in graph.modules if graph.find_children(name))
+
+
+def _tell(package: str) -> None:
+    for number, floor in enumerate(reversed(floors(build(), package)), 1):
+        print(number, *(name.rpartition(".")[2] for name in floor))
+
+
+if __name__ == "__main__":
+    for asked in sys.argv[1:] or ROOTS:
+        print(asked)
+        _tell(asked)

@@ -1,0 +1,50 @@
+"""No package has more rooms or floors than one can keep in mind (`tests.house.layout` says what these are)."""
+
+from __future__ import annotations
+
+import grimp
+import pytest
+
+from tests.house.layout import LIKE_ENTRIES, MOST_FLOORS, MOST_ROOMS, ROOTS, build, floors, packages, rooms
+
+
+@pytest.fixture(scope="module")
+def graph() -> grimp.ImportGraph:
+    return build()
+
+
+def test_packages_have_few_rooms_on_few_floors(graph: grimp.ImportGraph) -> None:
+    wrong = []
+    for package in packages(graph):
+        count = len(rooms(graph, package))
+        if count > MOST_ROOMS and package not in LIKE_ENTRIES:
+            wrong.append(f"{package} has {count} rooms, at most {MOST_ROOMS}: give those that belong together a folder")
+        if (high := len(floors(graph, package))) > MOST_FLOORS:
+            wrong.append(f"{package} has {high} floors, at most {MOST_FLOORS}: python -m tests.house.layout {package}")
+    assert not wrong, "\n".join(wrong)
+
+
+def test_like_entries_do_not_import_each_other(graph: grimp.ImportGraph) -> None:
+    for package in LIKE_ENTRIES:
+        wrong = {name: beside for name, beside in rooms(graph, package).items() if beside}
+        assert not wrong, "what two entries need stands in neither of them"
+
+
+def test_the_rig_has_two_modules_at_its_top(graph: grimp.ImportGraph) -> None:
+    assert not [name for name in graph.find_children("rig") if not graph.find_children(name) and "__" not in name]
+
+
+def test_floors_are_counted_on_imports() -> None:
+    graph = grimp.ImportGraph()
+    for name in ("p", "p.a", "p.b", "p.b.c", "p.d", "p.__main__"):
+        graph.add_module(name)
+    graph.add_import(importer="p.a", imported="p.b.c")
+    graph.add_import(importer="p.b.c", imported="p.d")
+    assert floors(graph, "p") == [["p.a"], ["p.b"], ["p.d"]]
+    graph.add_import(importer="p.d", imported="p.a")
+    with pytest.raises(ValueError, match="circle"):
+        floors(graph, "p")
+
+
+def test_all_packages_are_counted(graph: grimp.ImportGraph) -> None:
+    assert set(ROOTS) < set(packages(graph))
