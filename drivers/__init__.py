@@ -1,5 +1,5 @@
 """Programs that talk to a running rig: they know the channel table, the wire and the transport, never the model."""
 
-from rig.base.old_paths import serve_old_paths
+from rig.base.import_paths import find_our_modules
 
-serve_old_paths()
+find_our_modules()

@@ -23,7 +23,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from rig.base.old_paths import serve_old_paths
+from rig.base.import_paths import find_our_modules
 
 if TYPE_CHECKING:
     from rig.base.errors import InputError, UnknownNameError
@@ -43,7 +43,7 @@ __all__ = [
     "full_spectrum", "load_parameters", "load_scene", "simulate", "synchronous", "waterfall", "whirl_frequency",
 ]  # fmt: skip
 
-serve_old_paths()
+find_our_modules()
 _HOMES = {
     "base.errors": ("InputError", "UnknownNameError"),
     "run.offline": ("Run", "simulate"),
@@ -61,7 +61,12 @@ if not TYPE_CHECKING:  # a type checker knows all names by the imports above
         from importlib import import_module, metadata
 
         if name == "connect":
-            return import_module("drivers.client").connect
+            from rig.base.import_paths import PLACE
+
+            client = import_module("drivers.client")
+            if not str(client.__file__).startswith(PLACE):
+                raise ImportError(f"drivers.client must be the rig's own, and is {client.__file__}: rename that folder")
+            return client.connect
         if name == "__version__":
             return metadata.version("rotor-stator-rig")
         home = next((home for home, names in _HOMES.items() if name in names), None)

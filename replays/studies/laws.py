@@ -29,13 +29,17 @@ from rig.physics.contacts import (
     STIFFNESS,
     WORKING_FORCES,
     ContactPair,
+    DampingLaw,
     NormalLaw,
     ReferenceImpact,
+    StiffnessLaw,
+    damping_law,
     fit_power,
     free_impact,
     resolve,
     returned_restitution,
     same_depth,
+    stiffness_law,
 )
 from rig.physics.model import contact_pair, normal_law, reference_impact
 from rig.physics.parameters import ParameterSet
@@ -92,6 +96,7 @@ def compare(parameters: ParameterSet) -> dict[str, Any]:
     own = normal_law(parameters)
     wanted = [round(LEAST * n, 2) for n in range(1, 21)]
     speeds = [float(f"{v:.3g}") for v in np.geomspace(*SPEEDS, 17)]
+    damping = damping_laws(parameters)
     return {
         "set": parameters.name,
         "title": parameters.title,
@@ -120,11 +125,11 @@ def compare(parameters: ParameterSet) -> dict[str, Any]:
                 **_impact(_resolved(parameters, pair, impact, name, restitution), impact, floor),
                 "in_use": parameters.rule("contact.damping_factor") == name,
             }
-            for name, law in DAMPING.items()
+            for name, law in damping.items()
         ],
-        "stiffness": [_stiffness(parameters, pair, name) for name in STIFFNESS],
+        "stiffness": [_stiffness(parameters, pair, name) for name in stiffness_laws(parameters)],
         "wanted": wanted,
-        "returned": {name: [_returned(name, e) for e in wanted] for name in DAMPING},
+        "returned": {name: [_returned(law, e) for e in wanted] for name, law in damping.items()},
         "speed": speeds,
         "returned_over_speed": over_speed(parameters, speeds),
         "lean": {
@@ -179,7 +184,10 @@ def draw(parameters: ParameterSet, path: Path) -> None:
 
 def _draw_restitution(wanted: Any, difference: Any, parameters: ParameterSet) -> None:
     asked = np.linspace(LEAST, 1.0, 191)
-    curves = {name: np.array([_returned(name, float(e)) for e in asked]) for name in DAMPING}
+    curves = {
+        name: np.array([_returned(law, float(e)) for e in asked], float)
+        for name, law in damping_laws(parameters).items()
+    }
     # From the most elastic down, as the curves stand in the picture at half.
     for name in sorted(curves, key=lambda name: -float(curves[name][90])):
         color, dash = _STYLES.get(name, _OTHER)
@@ -233,7 +241,7 @@ def _draw_speed(axes: Any, parameters: ParameterSet) -> None:
 def _draw_stiffness(axes: Any, parameters: ParameterSet) -> None:
     pair = contact_pair(parameters)
     depths = np.geomspace(0.3e-6, 30e-6, 49)
-    for name, law in STIFFNESS.items():
+    for name, law in stiffness_laws(parameters).items():
         entry = _stiffness(parameters, pair, name)
         if entry["refused"]:
             continue
@@ -279,10 +287,27 @@ def _resolved(
     ).law
 
 
-def _returned(name: str, restitution: float) -> float:
-    """What a damping law returns at any speed above the lower limit of v0: Kelvin-Voigt's D is set to return it."""
-    factor = DAMPING[name].factor
-    return restitution if factor is None else returned_restitution(factor(restitution))
+def damping_laws(parameters: ParameterSet) -> dict[str, DampingLaw]:
+    """The rig's damping laws by name, and the one that the parameters give as a formula."""
+    chosen = parameters.rule("contact.damping_factor")
+    return DAMPING | ({} if chosen is None else {chosen: damping_law(chosen)})
+
+
+def stiffness_laws(parameters: ParameterSet) -> dict[str, StiffnessLaw]:
+    """The rig's stiffness laws by name, and the one that the parameters give as a formula."""
+    chosen = parameters.rule("contact.stiffness")
+    return STIFFNESS | ({} if chosen is None else {chosen: stiffness_law(chosen)})
+
+
+def _returned(law: DampingLaw, restitution: float) -> float | None:
+    """What a damping law returns at any speed above the lower limit of v0: Kelvin-Voigt's D is set to return it.
+
+    None where a formula gives no c for this restitution.
+    """
+    try:
+        return restitution if law.factor is None else returned_restitution(law.factor(restitution))
+    except InputError:
+        return None
 
 
 def _impact(law: NormalLaw, impact: ReferenceImpact, floor: float) -> dict[str, float]:
@@ -316,7 +341,7 @@ def _constant_damping(law: NormalLaw, impact: ReferenceImpact, restitution: floa
 
 
 def _stiffness(parameters: ParameterSet, pair: ContactPair, name: str) -> dict[str, Any]:
-    law = STIFFNESS[name]
+    law = stiffness_law(name)
     entry: dict[str, Any] = {
         "name": name,
         "formula": law.formula,

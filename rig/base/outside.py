@@ -14,7 +14,7 @@ import os
 import re
 import stat
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, BinaryIO, TypeVar, get_args
 
@@ -252,6 +252,7 @@ def _finite(digits: str) -> float:
 
 
 Model = TypeVar("Model", bound=BaseModel)
+Extension = TypeVar("Extension")
 
 
 def check(model: type[Model], document: Any, *, field: str, most_bytes: int = 10_000) -> Model:
@@ -279,6 +280,33 @@ def check(model: type[Model], document: Any, *, field: str, most_bytes: int = 10
 # What pydantic puts into the place of an error beside the names that stand in the file: branches of a union.
 _BRANCH = re.compile(r"(function-\w+|tuple|list|dict|set|literal|nullable|chain)\[.*\]|constrained-\w+", re.DOTALL)
 _PLAIN_BRANCH = {"float": ("float", "finite", "greater", "less"), "int": ("int", "greater", "less"), "str": ("string",)}
+
+
+def load_extensions(group: str, kind: type[Extension], taken: Iterable[str]) -> tuple[dict[str, Extension], list[str]]:
+    """Return what other installed packages add to a table by entry points, by name, and why others cannot be used.
+
+    Args:
+        group: Group of the entry points.
+        kind: Class that an entry must be of.
+        taken: Names that the table has already.
+    """
+    from importlib.metadata import entry_points
+
+    found: dict[str, Extension] = {}
+    broken = []
+    for point in entry_points(group=group):
+        try:
+            entry = point.load()
+        except Exception as error:  # whatever other people's code raises
+            broken.append(f"{point.name} ({point.value} cannot be loaded: {type(error).__name__}: {error})")
+            continue
+        if point.name in {*taken, *found}:
+            broken.append(f"{point.name} ({point.value} has a name that is taken)")
+        elif not isinstance(entry, kind):
+            broken.append(f"{point.name} ({point.value} must be a {kind.__module__}.{kind.__qualname__})")
+        else:
+            found[point.name] = entry
+    return found, broken
 
 
 def _place(parts: tuple[str | int, ...], kind: str) -> list[str]:

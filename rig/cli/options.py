@@ -22,6 +22,9 @@ SetName = Annotated[str, typer.Argument(metavar="[SET]", help="A parameter set, 
 Changes = Annotated[
     list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Change one value; may be repeated.")
 ]
+Law = Annotated[
+    Path | None, typer.Option("--law", metavar="FILE.toml", help="A contact law of your own: numbers or formulas.")
+]
 Parameters = Annotated[str | None, typer.Option(metavar="SET", help="Parameter set, by name or path.")]
 Engine = Annotated[str | None, typer.Option(metavar="ENGINE", help="Integration method.")]
 Plot = Annotated[Path | None, typer.Option("--plot", metavar="FILE", help="Draw them as well, to a .png or .svg file.")]
@@ -52,6 +55,7 @@ class SceneChanges:
     parameters: Parameters = None
     channels: ChannelFile = None
     changes: Changes = None
+    law: Law = None
     engine: Engine = None
     duration_s: Annotated[float | None, typer.Option(help="Length of the run, in s.")] = None
     seed: Annotated[int | None, typer.Option(help="Seed of the sensors' noise.")] = None
@@ -60,9 +64,13 @@ class SceneChanges:
         """The changes by dotted key.
 
         Raises:
-            InputError: One is not of the form KEY=VALUE.
+            InputError: One is not of the form KEY=VALUE, or the law's file is wrong.
         """
         overrides = pairs("--set", self.changes, "KEY=VALUE, such as drive.speed_hz=5.2")
+        if self.law is not None:
+            from rig.physics.law_file import read_law
+
+            overrides |= {key: str(value) for key, value in read_law(self.law).changes().items()}
         named = {
             "parameters": self.parameters,
             "channels": self.channels,
@@ -100,13 +108,16 @@ def pairs(option: str, texts: list[str] | None, form: str) -> dict[str, str]:
     return found
 
 
-def changed_parameters(name: str, changes: list[str] | None, also: dict[str, Any] | None = None) -> ParameterSet:
+def changed_parameters(
+    name: str, changes: list[str] | None, also: dict[str, Any] | None = None, law: Path | None = None
+) -> ParameterSet:
     """A parameter set with changes from the command line.
 
     Args:
         name: Name or path of the set.
         changes: Values of `--set`, each KEY=VALUE.
         also: Values by key from options of their own; they come last.
+        law: File of a contact law.
 
     Raises:
         InputError: No such set or key, or a value that the model does not take.
@@ -114,5 +125,5 @@ def changed_parameters(name: str, changes: list[str] | None, also: dict[str, Any
     from rig.physics.parameters import load_parameters
     from rig.run.scenes import read_value
 
-    values = {key: read_value(text) for key, text in SceneChanges(changes=changes).overrides().items()}
+    values = {key: read_value(text) for key, text in SceneChanges(changes=changes, law=law).overrides().items()}
     return load_parameters(name).override(values | (also or {}), source="--set")

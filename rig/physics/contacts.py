@@ -1,10 +1,11 @@
 """The family of normal contact laws, each resolved to the four numbers that the kernels take.
 
-It is long because all laws stand here, each with its formula and source.
-
 F_n = K delta^n (1 + c delta'/v0) + D delta', clamped at 0 (`rig.physics.kernels.laws.contact.normal_force`). A
 stiffness law gives K and n, a damping law c (and D, for the one without memory). Stiffness laws that are no power of
 delta are fitted over the rig's working range, and the fit says how far off it is.
+
+A law of a user's own is a formula in place of a law's name: c of the restitution `e`, or the elastic force [N] of the
+penetration `delta` [m], with `R_S`, `r0`, `L` and `E` of `ContactPair` [m, Pa].
 
 None of them is validated on this rig. The sphere laws take shaft and ring for spheres; the cylinder laws take them for
 parallel cylinders that touch over the ring's whole width, while this shaft tilts by up to r0 / l0A. Goldsmith's
@@ -22,7 +23,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rig.base.errors import InputError
-from rig.base.roots import find_root
+from rig.base.maths.expression import Grammar, value_of
+from rig.base.maths.roots import find_root
 
 WORKING_FORCES = (5.0, 3000.0)
 """Forces that the rig's scenes reach [N]; a law that is no power of delta is fitted over them."""
@@ -363,6 +365,57 @@ STIFFNESS: dict[str, StiffnessLaw] = {
 """Stiffness laws: what `contact.stiffness` may name."""
 
 
+_MOST_DAMPED = 100.0
+"""Largest c that a formula may give, as large as a number may be."""
+_DEEPEST_M = 1e-2
+"""Penetration at which a force given by a formula must have reached the working forces [m]."""
+
+
+def damping_law(name: str) -> DampingLaw:
+    """Return a damping law by its name, or made of the formula of c that stands in place of one.
+
+    Raises:
+        InputError: It is no formula of e.
+    """
+    field = "contact.damping_factor"
+    if name in DAMPING:
+        return DAMPING[name]
+    formula = Grammar(("e",)).read(name, field)
+
+    def factor(restitution: float) -> float:
+        c = value_of(formula, e=restitution)
+        if not 0.0 <= c <= _MOST_DAMPED:
+            raise InputError(field, f"from 0 to {_MOST_DAMPED:g} at e = {restitution:g}", f"{name} = {c:g}")
+        return c
+
+    return DampingLaw(name, "given as a formula", factor)
+
+
+def stiffness_law(name: str) -> StiffnessLaw:
+    """Return a stiffness law by its name, or made of the formula of the force that stands in place of one.
+
+    Raises:
+        InputError: It is no formula of the penetration and the contact pair.
+    """
+    field = "contact.stiffness"
+    if name in STIFFNESS:
+        return STIFFNESS[name]
+    formula = Grammar(("delta", "R_S", "r0", "L", "E")).read(name, field)
+
+    def penetration(force: float, pair: ContactPair) -> float:
+        sizes = {"R_S": pair.shaft_radius, "r0": pair.clearance, "L": pair.width, "E": pair.modulus}
+
+        def missing(depth: float) -> float:
+            return value_of(formula, delta=depth, **sizes) - force
+
+        if not missing(0.0) < 0.0 < missing(_DEEPEST_M):
+            must = f"a force that passes {force:g} N between penetrations of 0 and {_DEEPEST_M * 1e3:g} mm"
+            raise InputError(field, must, name)
+        return find_root(missing, 0.0, _DEEPEST_M, within=1e-16)
+
+    return StiffnessLaw(name, "given as a formula", "what its author takes for granted", penetration=penetration)
+
+
 def fit_power(name: str, pair: ContactPair) -> PowerFit:
     """K delta^n of a stiffness law over `WORKING_FORCES`, with the smallest possible largest relative error.
 
@@ -377,7 +430,7 @@ def fit_power(name: str, pair: ContactPair) -> PowerFit:
         >>> f"F = {fit.stiffness:.2e} delta^{fit.exponent:.2f}, to {100.0 * fit.error:.0f} %"
         'F = 1.69e+09 delta^1.11, to 3 %'
     """
-    law = STIFFNESS[name]
+    law = stiffness_law(name)
     low, high = WORKING_FORCES
     if law.power is not None:
         stiffness, exponent = law.power(pair)
@@ -420,9 +473,9 @@ def resolve(
     """Work out K, n, c and D.
 
     Args:
-        stiffness: K [N/m^n] or the name of a stiffness law.
+        stiffness: K [N/m^n], the name of a stiffness law, or a formula of the force.
         exponent: n, or `LAW`: 1 for Kelvin-Voigt, else the stiffness law's own, else 1.5.
-        damping: c, or the name of a damping law.
+        damping: c, the name of a damping law, or a formula of c.
         viscous: D [N s/m], or `LAW`: Kelvin-Voigt's, else 0.
         restitution: e that is asked for.
         pair: Shaft and ring.
@@ -447,7 +500,7 @@ def resolve(
         n = (1.0 if linear else 1.5) if exponent == LAW else float(exponent)
     d = 0.0
     if isinstance(damping, str):
-        factor = DAMPING[damping].factor
+        factor = damping_law(damping).factor
         c = 0.0 if factor is None else factor(restitution)
         if factor is None:
             d = 2.0 * linear_damping_ratio(restitution) * math.sqrt(k * impact.mass)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from rig.base.errors import InputError
-from rig.base.roots import find_root
+from rig.base.maths.roots import find_root
 from rig.physics.contacts import ContactPair, ReferenceImpact, ResolvedLaw, resolve
 from rig.physics.kernels.constants import Constants, Contact, House, Magnet, Shaft
 from rig.physics.kernels.signals import N_VECTOR

@@ -7,6 +7,7 @@ names a `base` and the values in which it differs. A user's own file works the s
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
 from functools import cache, lru_cache
 from pathlib import Path
@@ -22,6 +23,7 @@ from pydantic import (
 )
 
 from rig.base.errors import InputError, UnknownNameError, such_as
+from rig.base.maths.expression import Grammar
 from rig.base.outside import check, read_toml
 
 SETS = Path(__file__).with_name("sets")
@@ -34,6 +36,9 @@ SI = {
 }  # fmt: skip
 """Every unit that a set may use, in SI (a frequency becomes rad/s)."""
 
+_FORMULA = re.compile(r"[\d\s()*/+]")
+_OF_THE_MODEL = ("range", "rules", "formula")
+"""Fields of a parameter that no file changes and no recording needs."""
 Kind = Literal["paper", "corrected", "literature", "datasheet", "fitted", "assumed"]
 
 
@@ -51,6 +56,9 @@ class Parameter(BaseModel, frozen=True, extra="forbid"):
     kind: Kind
     range: tuple[float, float]
     rules: tuple[str, ...] = ()
+    """Names that may stand in place of a number."""
+    formula: tuple[str, ...] = ()
+    """Variables of a formula that may stand in place of a number; none: no formula may."""
 
     @field_validator("unit")
     @classmethod
@@ -143,7 +151,7 @@ class ParameterSet:
             "set": self.name,
             "title": self.title,
             "values": {
-                key: entry.model_dump(mode="json", exclude={"range", "rules"}) for key, entry in self.entries.items()
+                key: entry.model_dump(mode="json", exclude=set(_OF_THE_MODEL)) for key, entry in self.entries.items()
             },
         }
 
@@ -235,7 +243,7 @@ def _parse(name: str, data: dict[str, Any], path: Path, loading: tuple[str, ...]
                 must = such_as(f"a parameter of the set {base}", key, entries)
                 raise InputError(f"{path.name}: {key}", must, given.get("value"))
             known = entries[key].model_dump() if key in entries else {}
-            for fixed in ("range", "rules"):
+            for fixed in _OF_THE_MODEL:
                 if fixed in given and known:
                     raise InputError(f"{path.name}: {key}.{fixed}", "left as the model has it", given[fixed])
             if "unit" in given and known and given["unit"] != known["unit"]:
@@ -249,7 +257,8 @@ def _accepts(entry: Parameter) -> str:
     whole = entry.unit == "count"
     text = f"a {'whole ' if whole else ''}number from {low:g} to {high:g}"
     text += "" if whole or entry.unit == "1" else f" {entry.unit}"
-    return text + (f" or one of {', '.join(entry.rules)}" if entry.rules else "")
+    text += f" or one of {', '.join(entry.rules)}" if entry.rules else ""
+    return text + (f", or a formula of {', '.join(entry.formula)}" if entry.formula else "")
 
 
 def _check(key: str, entry: Parameter) -> None:
@@ -257,6 +266,9 @@ def _check(key: str, entry: Parameter) -> None:
     low, high = entry.range
     if isinstance(value, str):
         good = value in entry.rules
+        if not good and entry.formula and _FORMULA.search(value):  # what looks like a name is a wrong name
+            Grammar(entry.formula).read(value, key)
+            good = True
     else:
         good = low <= value <= high and (entry.unit != "count" or float(value).is_integer())
     if not good:

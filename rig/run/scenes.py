@@ -23,9 +23,9 @@ from rig.physics.engines import ENGINES
 from rig.physics.kernels.signals import COLUMN
 from rig.physics.levels import ModelLevels
 from rig.physics.parameters import DEFAULT_SET, ParameterSet, load_parameters, with_changes
-from rig.physics.speed_target import Drive
 from rig.run.commands import HammerCommand, ReleaseCommand, SpeedCommand, TimedCommand, with_faults
 from rig.run.pick import Pick, digest, equations_digest
+from rig.run.speed_target import Drive
 
 SCENES = Path(__file__).with_name("scenes")
 

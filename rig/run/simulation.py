@@ -32,7 +32,6 @@ from rig.physics.kernels.constants import Inputs
 from rig.physics.kernels.laws.magnet import magnet_force
 from rig.physics.kernels.signals import COLUMN
 from rig.physics.model import build_model, describe
-from rig.physics.speed_target import Segment, segments
 from rig.run import calibrator
 from rig.run.commands import (
     ClearCommand,
@@ -46,6 +45,7 @@ from rig.run.commands import (
 from rig.run.faulty import Faulty
 from rig.run.motion import BRANCH_ALARM, Begin, Motion, energy_balance, initial_state
 from rig.run.scenes import Scene, load_scene, scene_document
+from rig.run.speed_target import Segment, segments
 
 TICK_RATE_HZ = 1_000_000
 

@@ -540,21 +540,21 @@ def test_requests_to_instruments_are_answered_and_only_exact_ones_carried_out() 
         served = [twins.serve(kind, MessagePort(memory.pair()[0], "memory:")) for kind in TWINS]
         for number in range(inputs(3000)):
             twin = served[random.integers(len(served))]
-            request, before = a_request(random, twin.CODEC), len(rig.run.commands)
+            request, before = a_request(random, twin.CODEC), len(rig.commands)
             _, reply = twin.CODEC.decode(twin.answer(request))
             try:
                 sequence, message = twin.CODEC.decode(request)
             except ProtocolError:
                 assert type(reply).__name__ == "Refused"
-                assert len(rig.run.commands) == before
+                assert len(rig.commands) == before
             else:
                 # What is read is what stands there, to the byte.
                 assert twin.CODEC.encode(message, sequence) == request
-                assert len(rig.run.commands) == before + (type(reply).__name__ == "Done")
+                assert len(rig.commands) == before + (type(reply).__name__ == "Done")
             if number % 500 == 0:
                 rig.publish("probes", "forces", "accelerations", "drive", "hammer")
-        assert len(rig.run.commands) > 10
-        rig.run.commands.clear()
+        assert len(rig.commands) > 10
+        rig.commands.clear()
     for kind in TWINS:
         with pytest.raises(ProtocolError):
             kind.CODEC.decode(b"")
@@ -613,7 +613,7 @@ def test_transport_frames_of_instruments_on_a_bus_leave_them_answering() -> None
                 time.sleep(0.02)
             while villain.recv(0) is not None:
                 pass
-        assert len(rig.run.commands) == 0
+        assert len(rig.commands) == 0
         codec = TWINS[0].CODEC
         link = CanLink(f"virtual:{channel}", codec.address)
         try:

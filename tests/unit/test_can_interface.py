@@ -345,7 +345,7 @@ def test_many_flushes_during_one_frame_use_up_no_controllers() -> None:
             sender.send(message(0x100), timeout=0)
             sender.flush_tx_buffer()
         with pytest.raises(InputError, match="the number of a node of this bus"):
-            rig.physics.model.node(8)
+            rig.model.node(8)
         sender.send(message(0x300), timeout=0)
         found = 0
         while read(receiver, 1)[0].arbitration_id != 0x300:
@@ -395,7 +395,7 @@ def test_a_reader_that_is_late_loses_the_oldest_and_is_told(rig: Rig) -> None:
 
 def test_a_spoiled_frame_is_an_error_frame_and_comes_again(rig: Rig) -> None:
     sender, receiver = rig.bus(), rig.bus()
-    rig.physics.model.disturb(rig.node(sender), count=1)
+    rig.model.disturb(rig.node(sender), count=1)
     sender.send(message(0x100))
     error, frame = read(receiver, 2)
     assert error.is_error_frame
@@ -429,7 +429,7 @@ def test_without_anybody_to_acknowledge_a_node_becomes_passive_and_never_bus_off
 
 def test_bus_off_is_told_to_its_own_node_refuses_and_ends(rig: Rig) -> None:
     sender, other = rig.bus(), rig.bus()
-    rig.physics.model.disturb(rig.node(sender), count=40)
+    rig.model.disturb(rig.node(sender), count=40)
     sender.send(message(0x100))
     kinds: dict[can.BusABC, set[int]] = {sender: set(), other: set()}
     while codec.BUS_OFF | codec.COUNTERS not in kinds[sender]:
@@ -439,7 +439,7 @@ def test_bus_off_is_told_to_its_own_node_refuses_and_ends(rig: Rig) -> None:
     assert kinds[other] == {codec.PROTOCOL | codec.BUS_ERROR}
     # 128 times 11 recessive bits: 1.4 ms.
     until(lambda: sender.state is BusState.ACTIVE)
-    rig.physics.model.disturb(rig.node(sender), count=0)
+    rig.model.disturb(rig.node(sender), count=0)
     sender.send(message(0x101))
     assert read(other, 1)[0].arbitration_id == 0x101
 
@@ -761,7 +761,7 @@ def test_requests_are_strict(name: str, document: dict[str, Any], field: str) ->
 
 def test_a_hub_that_fails_inside_goes_on_and_says_so(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     sender, receiver = rig.bus(), rig.bus()
-    for owner, name in ((rig.physics.model, "next_ns"), (rig.hub.endpoints, "offer")):
+    for owner, name in ((rig.model, "next_ns"), (rig.hub.endpoints, "offer")):
 
         def bad(*arguments: Any, good: Any = getattr(owner, name), calls: Any = itertools.count()) -> Any:  # noqa: B008
             if next(calls) % 3 == 0:

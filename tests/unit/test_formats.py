@@ -21,7 +21,7 @@ from recorder.reader import Recording
 from recorder.writer import RecordingWriter
 from replays.recordings.export import write_run
 from replays.recordings.formats import clock
-from replays.recordings.formats.exporting.export import SUFFIXES, Written, export
+from replays.recordings.formats.exporting.export import Written, export, written_suffixes
 from replays.recordings.formats.exporting.selection import Selection, Unit, select
 from replays.recordings.formats.mapping import FileOptions
 from replays.recordings.formats.source import open_source
@@ -132,7 +132,7 @@ def test_events_and_documents_go_where_a_format_has_a_place(noted: Recording, tm
     from pyarrow import parquet
 
     made = {}
-    for suffix in SUFFIXES:
+    for suffix in written_suffixes():
         _, (made[suffix],) = written(noted, tmp_path / f"x{suffix}", "probes")
     told = TdmsFile.read_metadata(tmp_path / "x.tdms").properties
     assert told["events"].splitlines() == [f"{time_s:.6f} s  {text}" for time_s, _, text in HAPPENED]
@@ -182,7 +182,7 @@ def counts_of(recording: Recording, group: str) -> np.ndarray:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="file names are text")
-@pytest.mark.parametrize("suffix", SUFFIXES)
+@pytest.mark.parametrize("suffix", written_suffixes())
 def test_a_recording_whose_name_is_no_text_is_exported(suffix: str, recording: Recording, tmp_path: Path) -> None:
     path = tmp_path / os.fsdecode(b"a\xff\x01.mcap")
     path.write_bytes(recording.path.read_bytes())
@@ -435,7 +435,7 @@ def test_rows_that_are_missing_are_left_out_or_nan_never_made_up(gappy: Recordin
     assert {path.suffix for path in tmp_path.iterdir()} == {".csv", ".json", ".tdms", ".mf4"}
 
 
-@pytest.mark.parametrize("suffix", SUFFIXES)
+@pytest.mark.parametrize("suffix", written_suffixes())
 def test_one_row_is_exported_and_none_is_told(suffix: str, recording: Recording, tmp_path: Path) -> None:
     key = sensor_key("probes")
     for rows in (0, 1):
@@ -455,7 +455,7 @@ def test_one_row_is_exported_and_none_is_told(suffix: str, recording: Recording,
     assert not list(tmp_path.glob("y*"))
 
 
-@pytest.mark.parametrize("suffix", SUFFIXES)
+@pytest.mark.parametrize("suffix", written_suffixes())
 def test_export_that_fails_leaves_nothing(suffix: str, recording: Recording, tmp_path: Path) -> None:
     path = tmp_path / f"x{suffix}"
     path.write_text("precious")

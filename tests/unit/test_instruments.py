@@ -231,12 +231,12 @@ def test_commands_are_acknowledged_with_their_time_or_refused_with_the_rigs_text
     driver = bench.open(name)
     done = act(driver)
     assert (done.id, done.tick, done.time_s) == (1, 1000, 1e-3)
-    assert bench.rig.run.commands == [request]
+    assert bench.rig.commands == [request]
     bench.rig.refusal = "force_n must be from 1 to 1000; instead received 5000"
     with pytest.raises(RefusedError) as caught:
         act(driver)
     assert str(caught.value) == bench.rig.refusal
-    assert len(bench.rig.run.commands) == 2
+    assert len(bench.rig.commands) == 2
 
 
 def test_numbers_that_are_none_never_reach_the_rig(bench: Bench) -> None:
@@ -244,7 +244,7 @@ def test_numbers_that_are_none_never_reach_the_rig(bench: Bench) -> None:
         bench.open("hammer").trigger(force_n=float("nan"))
     with pytest.raises(RefusedError, match="finite"):
         bench.open("drive").set_speed(float("inf"))
-    assert bench.rig.run.commands == []
+    assert bench.rig.commands == []
 
 
 def test_a_command_goes_through_while_data_stream(bench: Bench) -> None:
@@ -481,7 +481,7 @@ def test_random_bytes_crash_nothing(bench: Bench) -> None:
         assert link.receive(timeout_s=2.0) is not None
     assert bench.twin("hammer").refused == 30 or bench.link.startswith("can")
     assert driver.identify().virtual
-    assert bench.rig.run.commands == []
+    assert bench.rig.commands == []
 
 
 @pytest.mark.parametrize("name", DRIVERS)

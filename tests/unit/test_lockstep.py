@@ -66,7 +66,7 @@ def test_no_block_is_run_before_all_devices_are_done_and_what_they_sent_before_i
         assert one.hammer().tick == BLOCK
         one.done(BLOCK)
         one.done(BLOCK)  # told twice is told once
-        assert rig.serve.service.status()["tick"] == BLOCK
+        assert rig.service.status()["tick"] == BLOCK
         assert two.speed(3.0).tick == BLOCK
         two.done(BLOCK)
         assert one.wait(2) == 2 * BLOCK

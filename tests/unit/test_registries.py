@@ -23,6 +23,7 @@ from replays.campaigns.files.expectation import EventName
 from replays.recordings import export
 from replays.recordings.formats.events.events import told_as
 from replays.recordings.formats.events.motion import Impact
+from replays.recordings.formats.exporting.export import FormatWriter
 from replays.recordings.formats.source import FORMATS
 from rig.base import wire
 from rig.base.errors import InputError
@@ -162,11 +163,19 @@ def test_the_bounds_of_a_hammer_pulse_are_those_of_its_command() -> None:
     assert "force_n = 1e+03, duration_ms = 0.5" in told_as(hit)
 
 
-def test_every_format_has_its_reader() -> None:
-    for name, (words, suffixes) in FORMATS.items():
-        assert callable(importlib.import_module(f"replays.recordings.formats.readers.{name}").look_into)
-        assert words
-        assert all(each.startswith(".") for each in suffixes.split())
+def test_every_format_has_its_reader_and_writer() -> None:
+    for name, form in FORMATS.items():
+        module = importlib.import_module(form.module)
+        assert callable(getattr(module, "look_into", None)), f"format {name}: {form.module} needs look_into"
+        assert form.title, f"format {name} needs a title"
+        assert all(each.startswith(".") for each in form.suffixes), f"format {name}: suffixes begin with a dot"
+        if form.writer:
+            writer = getattr(module, form.writer, None)
+            assert isinstance(writer, type), f"format {name}: {form.module} has no class {form.writer}"
+            assert issubclass(writer, FormatWriter), f"format {name}: {form.writer} must derive from FormatWriter"
+            assert writer.write is not FormatWriter.write, f"format {name}: {form.writer} needs write"
+    ends = [suffix for form in FORMATS.values() for suffix in form.suffixes]
+    assert len(set(ends)) == len(ends), "a suffix belongs to one format"
 
 
 def test_every_class_of_a_fault_is_in_the_union_and_in_every_table_of_kinds() -> None:

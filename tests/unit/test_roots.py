@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from rig.base.roots import find_root
+from rig.base.maths.roots import find_root
 
 
 @pytest.mark.parametrize("within", [1e-6, 1e-12, 1e-16])

@@ -9,23 +9,58 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from datetime import datetime
+from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from rig.base.errors import InputError, RefusedError, Words
-from rig.base.outside import DOCUMENT_BYTES, open_file, read_json, unreadable
+from rig.base.outside import DOCUMENT_BYTES, load_extensions, open_file, read_json, unreadable
 
 if TYPE_CHECKING:
     from replays.recordings.formats.mapping import FileOptions
 
+
+class Format(NamedTuple):
+    """A file format that is read, and perhaps written.
+
+    Another package adds one by an entry point of the group `rig.formats` that refers to a `Format`.
+    """
+
+    title: str
+    """Name in words."""
+    suffixes: tuple[str, ...]
+    """Endings of its files; one that is written ends in the first."""
+    module: str
+    """Where `look_into(path, options)` returns a file's `Source`."""
+    writer: str = ""
+    """Class in that module that writes it (`exporting.export.FormatWriter`); empty: it is read only."""
+
+
+_OWN = "replays.recordings.formats.readers"
 FORMATS = {
-    "mdf": ("MDF", ".mf4 .mdf .dat"), "tdms": ("TDMS", ".tdms"), "uff": ("universal (UFF)", ".uff .unv"),
-    "delimited": ("text", ".csv .txt .asc .tsv .lvm"), "columnar": ("Parquet", ".parquet"), "wav": ("WAV", ".wav"),
-}  # fmt: skip
-"""Formats by the module that reads them: their name in words, and the suffixes of their files."""
-_READERS = {suffix: name for name, (_, suffixes) in FORMATS.items() for suffix in suffixes.split()}
+    "mdf": Format("MDF", (".mf4", ".mdf", ".dat"), f"{_OWN}.mdf", "MdfWriter"),
+    "tdms": Format("TDMS", (".tdms",), f"{_OWN}.tdms", "TdmsWriter"),
+    "uff": Format("universal (UFF)", (".uff", ".unv"), f"{_OWN}.uff", "UffWriter"),
+    "text": Format("text", (".csv", ".txt", ".asc", ".tsv", ".lvm"), f"{_OWN}.delimited", "CsvWriter"),
+    "parquet": Format("Parquet", (".parquet",), f"{_OWN}.columnar", "ParquetWriter"),
+    "wav": Format("WAV", (".wav",), f"{_OWN}.wav", "WavWriter"),
+}
+"""Our own formats by name."""
+
+
+@cache
+def formats() -> dict[str, Format]:
+    """Our formats, then those of other packages, by name."""
+    return FORMATS | _extensions()[0]
+
+
+@cache
+def _extensions() -> tuple[dict[str, Format], list[str]]:
+    return load_extensions("rig.formats", Format, FORMATS)
+
+
 _MOST_ABOUT = 2000
 """Longest text that is taken over of what a file tells of itself [characters]; longer ones are documents."""
 DOCUMENTS = ("catalogue.json", "parameters.json", "scene.json")
@@ -126,9 +161,13 @@ def open_source(path: Path, options: FileOptions) -> Source:
     Raises:
         InputError: It cannot be read, is no such file, or the library for it is missing.
     """
-    name = _READERS.get(path.suffix.lower())
-    if name is None:
-        raise InputError("file", f"a file that ends in {', '.join(_READERS)}", str(path))
+    suffix = path.suffix.lower()
+    form = next((each for each in formats().values() if suffix in each.suffixes), None)
+    if form is None:
+        known = ", ".join(suffix for each in formats().values() for suffix in each.suffixes)
+        broken = _extensions()[1]
+        unusable = f"; not usable: {', '.join(broken)}" if broken else ""
+        raise InputError("file", f"a file that ends in {known}{unusable}", str(path))
     try:
         with open_file(path) as file:
             empty = not file.read(1)
@@ -136,10 +175,9 @@ def open_source(path: Path, options: FileOptions) -> Source:
         raise unreadable(path, error) from None
     if empty:
         raise InputError("file", "a file with something in it", str(path))
-    if name != "delimited":
+    if form is not FORMATS["text"]:
         options.only_for_text(path)
-    what = FORMATS[name][0]
-    module = importlib.import_module(f"replays.recordings.formats.readers.{name}")
+    what, module = form.title, importlib.import_module(form.module)
     with _parsing(path, what):
         source: Source = module.look_into(path, options)
     if not source.entries:

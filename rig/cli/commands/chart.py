@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from rig.cli.options import Law
 from rig.cli.output.progress import reporting
 from rig.cli.output.tables import echo
 
@@ -29,6 +30,7 @@ def chart(
     ] = None,
     no_peers: Annotated[bool, typer.Option("--no-peers", help="Our engines only.")] = False,
     fresh: Annotated[bool, typer.Option("--fresh", help="Start over instead of going on where a run ended.")] = False,
+    law: Law = None,
     add: Annotated[
         list[Path] | None,
         typer.Option("--add", metavar="FILE.csv", help="Add a solver by its results; may be repeated."),
@@ -41,6 +43,7 @@ def chart(
     """Chart speed against error: our engines against other solvers, by phase of the motion and by contact law."""
     from replays.studies.chart.session import Progress, add_solvers, draw_again, make_chart
     from replays.studies.chart.submission import write_problem
+    from replays.studies.common.law_scene import add_law_scene
     from rig.base.errors import InputError, Words
 
     if quick and full:
@@ -54,6 +57,8 @@ def chart(
         for path in draw_again(output, only=only, panels=panel).files:
             echo(str(path))
         return
+    if law is not None:
+        add_law_scene(law)
     mode = "full" if full else "quick"
     with reporting(compiles=True) as reporter:
         reporter.show("references")

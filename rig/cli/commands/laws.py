@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rig.cli.options import Changes, Plot, SetName, changed_parameters
+from rig.cli.options import Changes, Law, Plot, SetName, changed_parameters
 from rig.cli.output.comparison import answer
 from rig.cli.output.tables import Form, Table, new_table
 
@@ -18,6 +18,7 @@ def laws(
     name: SetName = "corrected",
     *,
     changes: Changes = None,
+    law: Law = None,
     restitution: Annotated[
         float | None, typer.Option("--restitution", metavar="E", help="Restitution asked for, instead of the set's.")
     ] = None,
@@ -28,7 +29,7 @@ def laws(
     from replays.studies.laws import compare, draw
 
     also = {} if restitution is None else {"contact.restitution": restitution}
-    parameters = changed_parameters(name, changes, also)
+    parameters = changed_parameters(name, changes, also, law)
     answer(parameters, compare=compare, draw=draw, show=_show, plot=plot, form=form)
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rig.base.errors import InputError
+from rig.cli.options import Law, names_of
 from rig.cli.output.progress import reporting
 from rig.cli.output.tables import Form, Table, echo, echo_json, new_table
 
@@ -42,6 +43,7 @@ def stability(
         bool,
         typer.Option("--scenes", help="The chart's twelve scenes instead, at every setting of each engine and peer."),
     ] = False,
+    law: Law = None,
     output: Annotated[
         Path | None,
         typer.Option(
@@ -58,12 +60,19 @@ def stability(
     With --random, every engine runs random scenes, wide over all parameters, laws and levels, against two accurate
     engines that agree: exit status 1 if the first engine is wrong without a warning, or fails. With --scenes, the same
     in twelve scenes, from coarse settings to fine ones, peers that are installed included unless --engines leaves
-    them out; twelve minutes.
+    them out; twelve minutes. --law adds the hammer scene with that law to them, which --only calls "law".
     """
     from replays.studies.stability.table import chosen_engines, chosen_trials, run_trials
 
     if scenes and (full or random is not None):
         raise InputError("--scenes", "given without --full and --random", "--full" if full else f"--random {random}")
+    if law is not None:
+        from replays.studies.common.law_scene import add_law_scene
+
+        if not scenes:
+            raise InputError("--law", "given with --scenes", str(law))
+        name = add_law_scene(law)
+        only = only and ",".join(name if one == "law" else one for one in names_of(only))
     names = chosen_engines(engines)
     if scenes:
         _twelve(only, None if engines is None else names, output, form)

@@ -14,14 +14,9 @@ import numpy as np
 
 from replays.recordings.formats import clock
 from replays.recordings.formats.exporting.selection import ROWS, ExportChunk, ExportTable, Selection
+from replays.recordings.formats.source import formats
 from rig.base.errors import InputError, Words, check_new_file, check_not_among, whole_file
 
-_WRITERS = {
-    ".mf4": ("mdf", "MdfWriter"), ".tdms": ("tdms", "TdmsWriter"), ".uff": ("uff", "UffWriter"),
-    ".csv": ("delimited", "CsvWriter"), ".parquet": ("columnar", "ParquetWriter"), ".wav": ("wav", "WavWriter"),
-}  # fmt: skip
-"""Module and class of each format."""
-SUFFIXES = tuple(_WRITERS)
 Method = Literal["polyphase", "linear"]
 _MOST_MISSING = 1_000_000
 """Missing rows that a format with a start and a step fills in, besides as many as there are."""
@@ -77,13 +72,18 @@ class Written:
     documents: str
 
 
-def check_output(path: Path, *, force: bool, suffixes: tuple[str, ...] = SUFFIXES) -> None:
+def written_suffixes() -> tuple[str, ...]:
+    """Endings of the files that can be written."""
+    return tuple(form.suffixes[0] for form in formats().values() if form.writer)
+
+
+def check_output(path: Path, *, force: bool, suffixes: tuple[str, ...] = ()) -> None:
     """Refuse a file that cannot be written, before anything is worked out.
 
     Raises:
         InputError: Another suffix, a folder that is missing or read-only, or an existing file.
     """
-    check_new_file(path, field="output", suffixes=suffixes, force=force)
+    check_new_file(path, field="output", suffixes=suffixes or written_suffixes(), force=force)
 
 
 def merged(path: Path) -> bool:
@@ -92,8 +92,8 @@ def merged(path: Path) -> bool:
 
 
 def _writer_class(path: Path) -> type[FormatWriter]:
-    module, name = _WRITERS[path.suffix]
-    return getattr(importlib.import_module(f"replays.recordings.formats.readers.{module}"), name)
+    form = next(form for form in formats().values() if form.writer and path.suffix == form.suffixes[0])
+    return getattr(importlib.import_module(form.module), form.writer)
 
 
 def export(
@@ -131,7 +131,7 @@ def export(
     total = sum(table.rows for table in source.tables)
     for target, part in jobs:
         for made in [target, *([_beside(target)] if kind.sidecar else [])]:
-            check_output(made, force=force, suffixes=(*SUFFIXES, ".json"))
+            check_output(made, force=force, suffixes=(*written_suffixes(), ".json"))
             check_not_among([each.path for each in selection.recording.parts], made)
         for table in part.tables:
             names = [column.name for column in table.columns]

@@ -1,0 +1,69 @@
+"""Imports that the usual search would not find, or would find in another place.
+
+Paths of version 0.1, such as `rig.scenes` for `rig.run.scenes`, work in this version, with a warning. And a folder of a
+user's own that is named `drivers`, `recorder` or `replays` hides no module of ours, unless it has one of the same name.
+"""
+
+from __future__ import annotations
+
+import sys
+from importlib.machinery import ModuleSpec, PathFinder
+from os.path import dirname, exists, join
+from types import ModuleType
+from typing import Any
+
+PLACE = dirname(dirname(dirname(__file__)))  # noqa: PTH120 - pathlib would take longer to load than all else here
+"""Folder that our packages are in."""
+_FOLDERS = {
+    "rig": ("base", "physics", "channels", "run", "serve"),
+    "drivers": ("instruments", "sources"),
+    "recorder": ("files", "contents", "output"),
+    "replays": (),
+}
+"""Our packages, and where in them a module that stood at the top may be now."""
+
+
+class Paths:
+    """Finds a module that has moved by its old name, and one of ours in a package of another's."""
+
+    def find_spec(self, fullname: str, path: Any, target: object = None) -> ModuleSpec | None:
+        """Return a spec for such a module, none for others."""
+        package, *rest = fullname.split(".")
+        if package not in _FOLDERS or not rest:
+            return None
+        ours = join(PLACE, package)  # noqa: PTH118
+        if _is_there(package, rest[0]):
+            if len(rest) > 1 or ours in path or PathFinder.find_spec(fullname, path):
+                return None
+            return PathFinder.find_spec(fullname, [ours])
+        folder = next((each for each in _FOLDERS[package] if _is_there(package, each, rest[0])), None)
+        if folder is None or not _is_there(package, folder, *rest):
+            return None
+        loader: Any = self
+        return ModuleSpec(fullname, loader, origin=".".join([package, folder, *rest]))
+
+    def create_module(self, spec: ModuleSpec) -> None:
+        """Leave it to the import system: the module is replaced when it is executed."""
+
+    def exec_module(self, module: ModuleType) -> None:
+        """Put the module of the new name in the place of the one that was made."""
+        import warnings
+        from importlib import import_module
+
+        spec = module.__spec__
+        assert spec is not None
+        warnings.warn(f"{spec.name} is {spec.origin} now", DeprecationWarning, stacklevel=2)
+        sys.modules[spec.name] = import_module(str(spec.origin))
+
+
+def _is_there(*names: str) -> bool:
+    path = join(PLACE, *names)  # noqa: PTH118
+    return exists(path) or exists(f"{path}.py")  # noqa: PTH110
+
+
+def find_our_modules() -> None:
+    """Let imports find old names, and our modules beside another's."""
+    if not any(isinstance(finder, Paths) for finder in sys.meta_path):
+        # Before the usual search, which would load a second copy of what lies deeper.
+        finder: Any = Paths()
+        sys.meta_path.insert(0, finder)

@@ -1,0 +1,65 @@
+"""Import paths of earlier versions, and folders of a user's own with the names of ours."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+
+
+@pytest.mark.filterwarnings("ignore:(rig.(kernels|sensors)|drivers.force) is")
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("rig.scenes", "rig.run.scenes"),
+        ("rig.wire", "rig.base.wire"),
+        ("rig.transport", "rig.serve.transport"),
+        ("rig.kernels.signals", "rig.physics.kernels.signals"),
+        ("rig.sensors.conditioning", "rig.channels.sensors.conditioning"),
+        ("drivers.force.driver", "drivers.instruments.force.driver"),
+    ],
+)
+def test_an_old_path_is_the_same_module(old: str, new: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in [name for name in sys.modules if f"{old}.".startswith(f"{name}.") and name != "rig"]:
+        monkeypatch.delitem(sys.modules, name)
+    with pytest.warns(DeprecationWarning, match=f"^{old} is {new} now$"):
+        assert import_module(old) is import_module(new)
+
+
+@pytest.mark.filterwarnings("ignore:rig.kernels is")
+@pytest.mark.parametrize("name", ["rig.nonsense", "rig.kernels.nonsense", "rig.run.nonsense"])
+def test_a_wrong_path_is_no_module(name: str) -> None:
+    with pytest.raises(ModuleNotFoundError, match=f"No module named '{name}'"):
+        import_module(name)
+
+
+def imported(folder: Path, code: str) -> str:
+    """What a script in a folder prints, or the last line of its error."""
+    (folder / "script.py").write_text(code)
+    command = [sys.executable, str(folder / "script.py")]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    return done.stdout.strip() or done.stderr.splitlines()[-1]
+
+
+@pytest.mark.parametrize("package", ["drivers", "recorder", "replays"])
+def test_a_folder_of_a_user_s_own_hides_no_module_of_ours(package: str, tmp_path: Path) -> None:
+    (tmp_path / package).mkdir()
+    (tmp_path / package / "__init__.py").write_text("MINE = True")
+    (tmp_path / package / "mine.py").write_text("VALUE = 7")
+    module = {"drivers": "drivers.daq", "recorder": "recorder.reader", "replays": "replays.report.canvas"}[package]
+    code = f"import rig, {package}.mine, {module}\nfrom rig import connect\n"
+    told = imported(tmp_path, f"{code}print({package}.MINE, {package}.mine.VALUE, {module}.__name__, connect.__name__)")
+    assert told == f"True 7 {module} connect"
+
+
+def test_a_module_of_a_user_s_own_in_the_place_of_ours_is_named(tmp_path: Path) -> None:
+    (tmp_path / "drivers").mkdir()
+    (tmp_path / "drivers/__init__.py").touch()
+    (tmp_path / "drivers/client.py").touch()
+    told = imported(tmp_path, "import rig\nrig.connect()")
+    assert told == (
+        f"ImportError: drivers.client must be the rig's own, and is {tmp_path}/drivers/client.py: rename that folder"
+    )
