@@ -7,11 +7,13 @@ import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partialmethod
 from typing import Any, Self
 
 from rig.base import wire
 from rig.base.closing import Closing
 from rig.base.errors import InputError, RefusedError
+from rig.run.commands import SUMMARIES
 from rig.serve.transport import DEFAULT_ENDPOINT, Client, NoReplyError
 
 
@@ -101,6 +103,20 @@ class Console(Closing):
         """Close the client."""
         self._client.close()
 
+    def send(self, command: str, timeout_s: float | None = None, /, **fields: Any) -> Accepted:
+        """Send a command by its name, with its fields as rig/KEYS.md lists them.
+
+        Args:
+            command: Name of the command.
+            timeout_s: How long to wait for the reply [s]; that of the console unless given.
+            fields: Fields of the command.
+
+        Raises:
+            RefusedError: The rig refused, for the reason in the message.
+        """
+        reply = self._reply(command, timeout_s, **fields)
+        return Accepted(command=command, id=reply["id"], tick=reply["tick"], time_s=reply["time_s"])
+
     def hammer(self, *, force_n: float = 100.0, duration_ms: float = 5.0, direction: str | float = "x") -> Accepted:
         """Hit the shaft at the disk.
 
@@ -112,7 +128,7 @@ class Console(Closing):
         Raises:
             RefusedError: The rig refused, for the reason in the message.
         """
-        return self._command("hammer", force_n=force_n, duration_ms=duration_ms, direction=direction)
+        return self.send("hammer", force_n=force_n, duration_ms=duration_ms, direction=direction)
 
     def speed(self, hz: float) -> Accepted:
         """Set the speed that the drive holds [Hz].
@@ -120,7 +136,7 @@ class Console(Closing):
         Raises:
             RefusedError: The rig refused, for the reason in the message.
         """
-        return self._command("speed", speed_hz=hz)
+        return self.send("speed", speed_hz=hz)
 
     def release(self) -> Accepted:
         """Release the magnet that holds the shaft.
@@ -128,7 +144,7 @@ class Console(Closing):
         Raises:
             RefusedError: The rig refused, for the reason in the message.
         """
-        return self._command("release")
+        return self.send("release")
 
     def fault(self, channel: str, kind: str, *, for_s: float | None = None, **numbers: Any) -> AcceptedFault:
         """Make a channel misbehave; `rig fault --list` has the kinds and their numbers.
@@ -153,7 +169,7 @@ class Console(Closing):
         Raises:
             RefusedError: There is no such fault.
         """
-        return self._command("clear", id=number)
+        return self.send("clear", id=number)
 
     def stop(self) -> Accepted:
         """End the run.
@@ -161,7 +177,7 @@ class Console(Closing):
         Raises:
             RefusedError: The rig refused, for the reason in the message.
         """
-        return self._command("stop")
+        return self.send("stop")
 
     def step(self, ticks: int, *, timeout_s: float = 600.0) -> AcceptedStep:
         """Let a rig in lockstep run this many ticks; returns when they were published and all devices are done.
@@ -187,7 +203,7 @@ class Console(Closing):
         Raises:
             RefusedError: The rig is not in lockstep, or such a device has joined.
         """
-        return self._command("join", device=device or self._name, patience_s=float(patience_s))
+        return self.send("join", device=device or self._name, patience_s=float(patience_s))
 
     def done(self, tick: int, device: str | None = None) -> Accepted:
         """Say that a device has dealt with everything up to the end of a block [ticks].
@@ -195,7 +211,7 @@ class Console(Closing):
         Raises:
             RefusedError: The device was put out, or is by this: there is no such block.
         """
-        return self._command("done", device=device or self._name, tick=tick)
+        return self.send("done", device=device or self._name, tick=tick)
 
     def leave(self, device: str | None = None) -> Accepted:
         """Make the rig wait for a device no longer.
@@ -203,7 +219,7 @@ class Console(Closing):
         Raises:
             RefusedError: It has not joined.
         """
-        return self._command("leave", device=device or self._name)
+        return self.send("leave", device=device or self._name)
 
     def step_blocks(self, blocks: int, *, timeout_s: float = 600.0) -> Accepted:
         """Let a recording whose replay is paused go on by so many blocks; returns when they have been published.
@@ -211,7 +227,7 @@ class Console(Closing):
         Raises:
             RefusedError: It is no replay that is paused, or the number is none.
         """
-        return self._command("step", timeout_s, blocks=blocks)
+        return self.send("step", timeout_s, blocks=blocks)
 
     def pause(self) -> Accepted:
         """Hold the replay of a recording.
@@ -219,7 +235,7 @@ class Console(Closing):
         Raises:
             RefusedError: A rig cannot be held.
         """
-        return self._command("pause")
+        return self.send("pause")
 
     def resume(self) -> Accepted:
         """Let the replay of a recording go on.
@@ -227,7 +243,7 @@ class Console(Closing):
         Raises:
             RefusedError: It is no replay.
         """
-        return self._command("resume")
+        return self.send("resume")
 
     def seek(self, time_s: float) -> Accepted:
         """Let the replay of a recording go on from another position [s of its simulated time].
@@ -235,7 +251,7 @@ class Console(Closing):
         Raises:
             RefusedError: It is no replay, or it has no such position.
         """
-        return self._command("seek", time_s=time_s)
+        return self.send("seek", time_s=time_s)
 
     def rate(self, rate: float) -> Accepted:
         """Set how many recorded seconds a replay plays a second.
@@ -243,7 +259,7 @@ class Console(Closing):
         Raises:
             RefusedError: It is no replay with a rate, or there is no such rate.
         """
-        return self._command("rate", rate=rate)
+        return self.send("rate", rate=rate)
 
     def note(self, text: str, *, tags: list[str] | None = None) -> Accepted:
         """Put a note into the stream's events, and so into every recording of it.
@@ -251,7 +267,7 @@ class Console(Closing):
         Raises:
             RefusedError: The rig refused, for the reason in the message.
         """
-        return self._command("note", text=text, tags=tags or [])
+        return self.send("note", text=text, tags=tags or [])
 
     def status(self) -> dict[str, Any]:
         """The rig's status document, as published twice a second."""
@@ -270,10 +286,6 @@ class Console(Closing):
                 return f"; it waits for {', '.join(late)}"
         return ""
 
-    def _command(self, command: str, timeout_s: float | None = None, /, **fields: Any) -> Accepted:
-        reply = self._reply(command, timeout_s, **fields)
-        return Accepted(command=command, id=reply["id"], tick=reply["tick"], time_s=reply["time_s"])
-
     def _reply(self, command: str, timeout_s: float | None = None, /, **fields: Any) -> dict[str, Any]:
         for name, value in fields.items():
             if isinstance(value, float) and not math.isfinite(value):
@@ -287,3 +299,7 @@ class Console(Closing):
         if not reply.get("accepted"):
             raise RefusedError(str(reply.get("error", f"the rig refused {command} without a reason")))
         return reply
+
+
+for _name in SUMMARIES.keys() - vars(Console).keys():
+    setattr(Console, _name, partialmethod(Console.send, _name))

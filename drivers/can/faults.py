@@ -9,13 +9,14 @@ from drivers.can.message import Message, Signal
 from rig.base.errors import InputError, UnknownNameError
 from rig.channels.faults import KINDS
 from rig.channels.table import ChannelTable
+from rig.run.commands.table import ClearCommand, FaultCommand
 
 
 class FaultKind(IntEnum):
-    """What a command about faults asks for; it differs from every other kind of command in at least four bits."""
+    """Kind of a command of the message Fault; the two differ in at least four bits."""
 
-    FAULT = 0x6B
-    CLEAR = 0x9A
+    FAULT = FaultCommand.CAN.kind
+    CLEAR = ClearCommand.CAN.kind
 
 
 _FAULT, _CLEAR = (int(FaultKind.FAULT),), (int(FaultKind.CLEAR),)

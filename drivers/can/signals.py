@@ -18,7 +18,8 @@ on the very identifier of commands, one of `ODDS` passes all that.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cache
@@ -30,7 +31,7 @@ from drivers.can.faults import FaultKind, fault_raw, fault_request, fault_signal
 from drivers.can.message import ABSENT, KEY, Message, MessageTable, Samples, Signal, checksum
 from rig.base.errors import InputError
 from rig.channels.table import Channel, ChannelTable, default_table
-from rig.run.commands import HAMMER_BOUNDS
+from rig.run.commands.table import COMMANDS
 
 CLASSIC_HZ = 1_000
 FD_HZ = 10_000
@@ -50,13 +51,23 @@ RIG = "Rig"
 CONTROLLER = "Controller"
 
 
-class Kind(IntEnum):
-    """What a command asks for; any two differ in at least four bits."""
+_FRAMES = {name: command.CAN for name, command in COMMANDS.items() if hasattr(command, "CAN")}
+_COMMANDS = {name: COMMANDS[name].quantities() for name, frame in _FRAMES.items() if frame.message == "Command"}
+"""Commands of the message Command, each with its fields."""
+_SIGNALS = {
+    name: {field: each.quantity.can for field, each in fields.items() if each.quantity.can is not None}
+    for name, fields in _COMMANDS.items()
+}
+"""Signals of their fields, in their order in the frame."""
+EVENT_VALUES = {name: COMMANDS[name].SHOWN_FIELD for name, frame in _FRAMES.items() if frame.shown}
+"""Field of an event that its frame carries, by command."""
 
-    RELEASE = 0x36
-    SPEED = 0x5C
-    HAMMER = 0xA1
+
+class Kind(IntEnum):
+    """Kind of a command of the message Command, or Stop; any two differ in at least four bits."""
+
     STOP = 0xC7
+    vars().update({name.upper(): _FRAMES[name].kind for name in _COMMANDS})
 
 
 class Result(IntEnum):
@@ -79,10 +90,7 @@ class Field(IntEnum):
     """Which value of a command was out of range."""
 
     NONE = 0
-    FORCE = 1
-    DURATION = 2
-    DIRECTION = 3
-    SPEED = 4
+    vars().update({each.name.upper(): each.number for signals in _SIGNALS.values() for each in signals.values()})
 
 
 class State(IntEnum):
@@ -99,19 +107,15 @@ class EventKind(IntEnum):
 
     START = 1
     COMMAND = 2
-    HAMMER = 3
-    SPEED = 4
-    RELEASE = 5
     WARNING = 6
     END = 7
-    FAULT = 8
-    CLEAR = 9
     DEVICE = 10
     OTHER = 15
+    vars().update({name.upper(): frame.event for name, frame in _FRAMES.items()})
 
 
 def _choices(names: type[IntEnum]) -> dict[int, str]:
-    return {member.value: member.name.lower() for member in names}
+    return {member.value: member.name.lower() for member in sorted(names)}
 
 
 _TIME = "Simulated time, modulo 2^32 us (71.6 min)"
@@ -126,13 +130,30 @@ _STOP_SIGNALS = (
     Signal("reserved", 16, 32, label="Always 0"),
     *_HEAD,
 )
-LIMITS = HAMMER_BOUNDS
+LIMITS = {
+    field: (each.low, each.high)
+    for fields in _COMMANDS.values()
+    for field, each in fields.items()
+    if not each.takes_text and math.isfinite(each.high)
+}
 """Least and largest value of a command's field that the rig takes [N], [ms]; the drive's top speed is its parameter."""
-_HAMMER, _SPEED, _RELEASE = (int(Kind.HAMMER),), (int(Kind.SPEED),), (int(Kind.RELEASE),)
+_VALUE_BITS = range(16, 48)
+"""Bits of the fields in the frame of a command."""
 
 
-def _within(label: str, name: str) -> str:
-    return "{}, {:g} to {:g}".format(label, *LIMITS[name])
+def _field_signals() -> Iterator[Signal]:
+    """Give the signals of each command's fields one after another, and a reserved one for the bits that are left."""
+    bare = tuple(int(Kind[name.upper()]) for name, signals in _SIGNALS.items() if not signals)
+    for name, signals in _SIGNALS.items():
+        start, kind = _VALUE_BITS.start, (int(Kind[name.upper()]),)
+        for field, each in signals.items():
+            unit = each.unit or _COMMANDS[name][field].quantity.unit
+            label = "{}, {:g} to {:g}".format(each.label, *LIMITS[field]) if field in LIMITS else each.label
+            yield Signal(each.name, start, each.bits, scale=each.scale, unit=unit, label=label, selected_by=kind)
+            start += each.bits
+        if signals and start < _VALUE_BITS.stop:
+            yield Signal(f"reserved_{name}", start, _VALUE_BITS.stop - start, label="Always 0", selected_by=kind)
+    yield Signal("reserved", _VALUE_BITS.start, len(_VALUE_BITS), label="Always 0", selected_by=bare)
 
 
 _COMMAND_SIGNALS = (
@@ -140,18 +161,9 @@ _COMMAND_SIGNALS = (
         "kind", 0, 8, label="What to do", selects=True,
         choices={value: name for value, name in _choices(Kind).items() if value != Kind.STOP},
     ),
-    Signal("force", 16, 16, scale=0.1, unit="N", label=_within("Peak force", "force_n"), selected_by=_HAMMER),
-    Signal(
-        "duration", 32, 8, scale=0.25, unit="ms", label=_within("Of the half sine", "duration_ms"), selected_by=_HAMMER
-    ),
-    Signal("direction", 40, 8, scale=1.5, unit="deg", label="From x (EAST) toward y (up)", selected_by=_HAMMER),
-    Signal("speed", 16, 24, scale=0.001, unit="Hz", label="Speed that the drive holds", selected_by=_SPEED),
-    Signal("reserved_speed", 40, 8, label="Always 0", selected_by=_SPEED),
-    Signal("reserved", 16, 32, label="Always 0", selected_by=_RELEASE),
+    *_field_signals(),
     *_HEAD,
 )  # fmt: skip
-_DIRECTIONS = 240
-"""Steps of the direction in a full turn."""
 
 
 def _other_messages() -> list[Message]:
@@ -159,6 +171,7 @@ def _other_messages() -> list[Message]:
         "A command: 8 bytes; kind, counter, key, checksum are checked, bits that the kind does not use must be 0. "
         "The rig checks ranges and says at which simulated time it takes effect (Acknowledge)"
     )
+    shown = ", ".join(frame.shown for frame in _FRAMES.values() if frame.shown)
     spin = Signal(
         "spin", 8, 16, scale=0.001, unit="Hz", label="Spin speed of the shaft, as the status has it; 65.535: more"
     )
@@ -182,7 +195,7 @@ def _other_messages() -> list[Message]:
                 Signal("event", 0, 8, label="What", choices=_choices(EventKind)),
                 Signal("number", 8, 8, label="Running number, modulo 256"),
                 Signal("time", 16, 32, unit="us", label=_TIME),
-                Signal("value", 48, 16, scale=0.1, label="Force of a hammer pulse, N, speed, Hz, number of a fault"),
+                Signal("value", 48, 16, scale=0.1, label=shown[0].upper() + shown[1:]),
             ),
         ),
         Message(
@@ -373,54 +386,42 @@ class Command:
     values: dict[str, Any]
 
 
-_REQUEST_FIELDS = {
-    Kind.HAMMER: {"force": "force_n", "duration": "duration_ms", "direction": "direction"},
-    Kind.SPEED: {"speed": "speed_hz"},
-    Kind.RELEASE: {},
-    Kind.STOP: {},
-}
-FIELDS = {"force_n": Field.FORCE, "duration_ms": Field.DURATION, "direction": Field.DIRECTION, "speed_hz": Field.SPEED}
+FIELDS = {field: Field(each.number) for signals in _SIGNALS.values() for field, each in signals.items()}
 
 
-def command_frame(
-    kind: Kind,
-    counter: int,
-    *,
-    force_n: float | None = None,
-    duration_ms: float | None = None,
-    direction: float | None = None,
-    speed_hz: float | None = None,
-) -> tuple[int, bytes]:
+def command_frame(kind: Kind, counter: int, **values: float | str | None) -> tuple[int, bytes]:
     """Identifier and data of a command, as a controller sends it. Whether the rig takes its values, the rig says.
 
     Args:
         kind: What to do.
         counter: One more than that of the last one (see Heartbeat), modulo 256; the first has 1.
-        force_n: Peak force [N], to 0.1.
-        duration_ms: Length of the half sine [ms], to 0.25.
-        direction: From x toward y [degrees], to 1.5; 0 unless given.
-        speed_hz: Speed that the drive holds [Hz], to 0.001.
+        values: Fields of the rig's command of that name, in their units, rounded to the steps of the frame; an angle
+            is 0 unless given.
 
     Raises:
         InputError: A value is missing, is one of another kind, or finds no room in the frame.
     """
     message = default_messages().by_name["Stop" if kind is Kind.STOP else "Command"]
-    values = {"force_n": force_n, "duration_ms": duration_ms, "direction": direction, "speed_hz": speed_hz}
-    if kind is Kind.HAMMER:
-        values["direction"] = (direction or 0.0) % 360.0
     signals = {signal.name: signal for signal in message.signals}
     raw = {}
-    for key, name in _REQUEST_FIELDS[kind].items():
-        signal, value = signals[key], values.pop(name)
+    for name, each in _SIGNALS.get(kind.name.lower(), {}).items():
+        signal, value = signals[each.name], values.pop(name, None)
+        if isinstance(value, str):
+            if value not in each.words:
+                must = ", ".join(each.words) + (", or an angle" if each.full_turn else "")
+                raise InputError(name, must or "a number", value)
+            value = each.words[value]
+        if each.full_turn:
+            value = (value or 0.0) % (each.full_turn * each.scale)
         most = signal.raw_range[1] * signal.scale
         if value is None or not 0.0 <= value <= most:
             raise InputError(name, f"given for {kind.name}, from 0 to {most:g} {signal.unit}", value)
-        raw[key] = round(value / signal.scale)
+        raw[each.name] = round(value / signal.scale)
+        if each.full_turn:
+            raw[each.name] %= each.full_turn
     for name, value in values.items():
         if value is not None:
             raise InputError(name, f"left out: {kind.name} has no such value", value)
-    if "direction" in raw:
-        raw["direction"] %= _DIRECTIONS
     return _signed(message, counter, kind=int(kind), **raw)
 
 
@@ -484,14 +485,15 @@ def parse_command(
     if (message.name == "Stop") != (kind is Kind.STOP):
         return Result.BAD_KIND
     raw = message.decode(data)
-    if raw.get("reserved", 0) or raw.get("reserved_speed", 0) or raw.get("direction", 0) >= _DIRECTIONS:
+    fields = _SIGNALS.get(kind.name.lower(), {})
+    turned = [each for each in fields.values() if each.full_turn and raw[each.name] >= each.full_turn]
+    if turned or any(raw[name] for name in raw if name.startswith("reserved")):
         return Result.RESERVED_BITS
     if not 1 <= (data[1] - last_counter) % 256 <= AHEAD:
         return Result.STALE_COUNTER
     if isinstance(kind, FaultKind):
         request = fault_request(message, raw)
         return Result.OUT_OF_RANGE if request is None else Command(kind, data[1], request)
-    scales = {signal.name: signal.scale for signal in message.signals}
     # Rounded to the steps of the wire, so that 0.1 N x 800 is 80 N.
-    values = {name: round(raw[key] * scales[key], 6) for key, name in _REQUEST_FIELDS[kind].items()}
+    values = {field: round(raw[each.name] * each.scale, 6) for field, each in fields.items()}
     return Command(kind, data[1], values)

@@ -13,7 +13,17 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from drivers.can.devices import DeviceKind, Standing, device_frame, name_of
-from drivers.can.signals import EventKind, Field, Kind, Result, State, clear_frame, command_frame, fault_frame
+from drivers.can.signals import (
+    EVENT_VALUES,
+    EventKind,
+    Field,
+    Kind,
+    Result,
+    State,
+    clear_frame,
+    command_frame,
+    fault_frame,
+)
 from drivers.sources.can import CanSource
 from rig.base import wire
 from rig.base.closing import Closing
@@ -26,9 +36,8 @@ _MAX_SYNC_AGE_TICKS = 60_000_000
 """A Sync corrects a time that is further off: the client has just joined, or a new run has begun [us]."""
 _BEAT_S = 1.5
 """A heartbeat comes within this time [s]."""
-_DIRECTIONS = {"x": 0.0, "y": 90.0, "-x": 180.0, "-y": 270.0}
-_VALUES = {EventKind.HAMMER: ("force_n", 0.1), EventKind.SPEED: ("speed_hz", 0.1), EventKind.FAULT: ("fault", 0.1)}
-"""What the value of an event is, and its unit per step."""
+_VALUE_STEP = 0.1
+"""Unit per step of the value of an event, as the message Event has it."""
 
 
 class CanClient(Closing):
@@ -98,8 +107,8 @@ class CanClient(Closing):
             self._answers.put(raw)
         elif name == "Event" and raw["event"] != EventKind.DEVICE:
             kind = EventKind(raw["event"])
-            field, step = _VALUES.get(kind, ("", 0.0))
-            value = {field: raw["value"] * step} if field else {}
+            field = EVENT_VALUES.get(kind.name.lower())
+            value = {field: raw["value"] * _VALUE_STEP} if field else {}
             self._tell(wire.EVENTS, {"event": kind.name.lower(), **self._time(raw["time"]), **value})
         elif name == "DeviceState":
             standing = Standing(raw["state"])
@@ -193,12 +202,7 @@ class CanClient(Closing):
         if command.upper() not in Kind.__members__:
             known = ", ".join(each.name.lower() for each in Kind)
             raise InputError("command", f"one that a CAN bus has a frame for ({known}, fault, clear)", command)
-        values = dict(fields)
-        if isinstance(direction := values.get("direction"), str):
-            if direction not in _DIRECTIONS:
-                raise InputError("direction", f"{', '.join(_DIRECTIONS)}, or an angle", direction)
-            values["direction"] = _DIRECTIONS[direction]
-        return command_frame(Kind[command.upper()], counter, **values)
+        return command_frame(Kind[command.upper()], counter, **fields)
 
     def _command(self, command: str, fields: Mapping[str, Any], timeout_s: float) -> dict[str, Any]:
         """Send a command; returns the reply to it."""

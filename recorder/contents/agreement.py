@@ -20,10 +20,9 @@ from rig.base.errors import InputError
 from rig.base.text import printable
 from rig.base.wire import EDGES, EVENTS, SENSORS, STATUS, TRUTH, Gap
 from rig.channels.table import ChannelTable, default_table
-from rig.run.commands import COMMANDS, SERVICE_COMMANDS, check_command
+from rig.run.commands.channel import MAX_FAULT_S
+from rig.run.commands.table import COMMANDS, SERVICE_COMMANDS, check_command
 
-_MAX_FAULT_S = 86_400.0
-"""Longest time of a fault, as `rig.run.commands.FaultCommand` has it [s]."""
 _SCENE, _PARAMETERS, _CATALOGUE, _OWN_TABLE = "scene.json", "parameters.json", "catalogue.json", "the scene's own table"
 _CALIBRATION = (
     "signal", "unit", "sensitivity_v", "bias_v", "range_v", "bandwidth_hz", "filter_order", "highpass_hz", "noise_v",
@@ -313,7 +312,7 @@ class Agreement:
         # A fault with a time ends by itself, also where it began before this file does.
         begun = [(*at, request) for at, causes in asked.items() for _, request in causes if at not in effects]
         for name, tick, one in [*begun, *met]:
-            if name == "fault" and isinstance(one.get("for_s"), float | int) and 0.0 < one["for_s"] <= _MAX_FAULT_S:
+            if name == "fault" and isinstance(one.get("for_s"), float | int) and 0.0 < one["for_s"] <= MAX_FAULT_S:
                 over = tick + max(1, round(one["for_s"] * self._ticks_hz))
                 known = {"id": one["fault"]} if "fault" in one else None
                 asked.setdefault(("clear", over), []).append(("its end", known))

@@ -13,8 +13,9 @@ from recorder.contents.counts import NS
 from rig.base.errors import InputError
 from rig.base.wire import Block, sensor_key
 from rig.channels.table import ChannelTable
+from rig.run.commands.table import TRIGGERS
 
-EVENT_NAMES = ("hammer", "speed", "release", "fault", "note", "warning")
+EVENT_NAMES = (*TRIGGERS, "note", "warning")
 """Events of the stream that can be waited for."""
 _LEVEL = re.compile(r"\s*(\|?)([A-Za-z_]\w*)(\|?)\s*([<>])\s*([-+.\deE]+)\s*")
 MOST_CAPTURES = 1000

@@ -9,7 +9,7 @@ from pydantic import Field, FiniteFloat
 
 from replays.campaigns.equipment.bench import BenchSettings, Pace
 from rig.base.outside import Written, check
-from rig.run.commands import TimedCommand
+from rig.run.commands.table import TimedCommand
 from rig.run.scenes import load_scene
 
 

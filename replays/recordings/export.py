@@ -28,7 +28,7 @@ from rig.base import wire
 from rig.base.errors import PART_SUFFIX, InputError, Words, whole_file
 from rig.base.text import finite
 from rig.physics.kernels.signals import ROW
-from rig.run.commands import FaultCommand
+from rig.run.commands.table import FaultCommand
 from rig.run.offline import frames
 from rig.run.simulation import Frame, Simulation
 

@@ -20,10 +20,6 @@ from rig.base.outside import read_json
 ROOT = "rig"
 STATUS = f"{ROOT}/status"
 EVENTS = f"{ROOT}/events"
-EVENT_KINDS = (
-    "start", "command", "hammer", "speed", "release", "fault", "clear", "note", "device", "warning", "end",
-)  # fmt: skip
-"""Every `event` that a rig publishes on `EVENTS`."""
 CATALOGUE = f"{ROOT}/catalogue"
 PARAMETERS = f"{ROOT}/parameters"
 SCENE = f"{ROOT}/scene"

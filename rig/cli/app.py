@@ -10,9 +10,10 @@ from typing import Annotated, Any, NoReturn
 import typer
 
 from rig.base.errors import WHOLE_RIG, DiskError, InputError, SimulationError, lacks_full, need_of_full
-from rig.cli.command import Group, load_command, make_group, usage_error
+from rig.cli.command import Group, load_command, made_command, make_group, usage_error
 from rig.cli.output import origin
 from rig.cli.output.tables import echo
+from rig.run.commands import SUMMARIES
 
 # Wrong options and arguments; typer names only these two of its own exceptions, which have moved between its versions.
 _UsageError: Any = typer.BadParameter.__base__
@@ -34,10 +35,7 @@ COMMANDS = {
     },
     "The rig as a service": {
         "run": "Run a scene in real time and publish its sensors",
-        "hammer": "Hit the shaft of a running rig at the disk",
-        "speed": "Set the spin speed of a running rig",
-        "release": "Make the magnets of a running rig let go of the shaft",
-        "fault": "Make a channel of a running rig misbehave, or end that",
+        **{name: line for name, line in SUMMARIES.items() if line},
         "step": "Let a rig that runs with --pace lockstep simulate TICKS more",
         "note": "Put a note into every recording that is being made of a rig",
         "status": "Show how a running rig is doing: time, pace, lateness, losses",
@@ -80,8 +78,10 @@ COMMANDS = {
 """What the help says of each command, which is what its own text begins with; the command itself is the function of its
 name in the module of its name, or in that of the requests, and is imported when it is called."""
 
-REQUESTS = ("hammer", "speed", "release", "step", "note", "stop", "pause", "resume", "seek", "rate")
-"""The commands that only ask something of a running rig or replay."""
+_REQUESTS = ("step", "note", "stop", "pause", "resume", "seek", "rate")
+"""Requests to a running rig or replay that are no scene commands."""
+_MODULES = ("fault",)
+"""Scene commands whose command line is more than their fields, in a module of its own."""
 
 GROUPS = {
     "can": {
@@ -112,7 +112,11 @@ def rig() -> Group:
 
 def _load(name: str) -> Any:
     if name not in GROUPS:
-        return load_command("requests" if name in REQUESTS else name, name)
+        if name in SUMMARIES and name not in _MODULES:
+            from rig.cli.commands.requests import scene_command
+
+            return made_command(scene_command(name), name)
+        return load_command("requests" if name in _REQUESTS else name, name)
     from importlib import import_module
 
     function = getattr(import_module(f"rig.cli.commands.{name}"), name)

@@ -167,9 +167,14 @@ class Group(_Page, TyperGroup):
 def load_command(module: str, name: str) -> Any:
     """The command that is the function of its name in a module, behind which an underscore stands if need be."""
     name, shown = name + "_" * iskeyword(name), name
-    function = grouped(getattr(import_module(f"rig.cli.commands.{module}{'_' * iskeyword(module)}"), name))
+    return made_command(getattr(import_module(f"rig.cli.commands.{module}{'_' * iskeyword(module)}"), name), shown)
+
+
+def made_command(function: Callable[..., None], name: str) -> Any:
+    """Return the command of a name that calls a function."""
+    function = grouped(function)
     app = typer.Typer(**_PLAIN)
-    app.command(shown, cls=_Command, context_settings=_SETTINGS)(function)
+    app.command(name, cls=_Command, context_settings=_SETTINGS)(function)
     command = typer.main.get_command(app)
     for param in command.params:
         if param.metavar is None and param.param_type_name == "option" and not getattr(param, "is_flag", False):

@@ -41,7 +41,7 @@ from rig.channels.sensors.keyphasor import FRACTIONS, TURN
 from rig.channels.table import Channel, ChannelTable
 from rig.physics.kernels.signals import COLUMN, N_ROW
 from rig.run.calibrator import Calibrator, Generated
-from rig.run.commands import ClearCommand, FaultCommand
+from rig.run.commands.table import ClearCommand, FaultCommand
 
 _MOST = 64
 """Faults at a time."""

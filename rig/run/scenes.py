@@ -23,7 +23,7 @@ from rig.physics.engines import ENGINES
 from rig.physics.kernels.signals import COLUMN
 from rig.physics.levels import ModelLevels
 from rig.physics.parameters import DEFAULT_SET, ParameterSet, load_parameters, with_changes
-from rig.run.commands import HammerCommand, ReleaseCommand, SpeedCommand, TimedCommand, with_faults
+from rig.run.commands.table import SpeedCommand, TimedCommand, with_faults
 from rig.run.pick import Pick, digest, equations_digest
 from rig.run.speed_target import Drive
 
@@ -151,26 +151,16 @@ class Scene(Written):
 
     @model_validator(mode="after")
     def _possible_commands(self) -> Scene:
-        held = self.initial.magnets
-        free_s = 0.0
+        last: dict[str, TimedCommand] = {}
         for timed in sorted(self.commands, key=lambda timed: timed.at_s):
-            command = timed.request
-            if isinstance(command, ReleaseCommand):
-                if not held:
-                    again = Words(f"another at {timed.at_s:g} s")
-                    raise InputError("release", "given once, while the magnets hold", again)
-                held = False
-            elif isinstance(command, HammerCommand):
-                if timed.at_s < free_s:
-                    again = Words(f"a pulse at {timed.at_s:g} s")
-                    raise InputError("hammer", f"idle (in a pulse until {free_s:g} s)", again)
-                free_s = timed.at_s + command.duration_ms * 1e-3
+            timed.request.check_in_scene(timed.at_s, last, magnets=self.initial.magnets)
+            last[timed.request.command] = timed
         return self
 
     @model_validator(mode="after")
     def _possible_generator(self) -> Scene:
         if self.generator is not None:
-            commands = [one for one in self.commands if one.request.command not in ("fault", "clear")]
+            commands = [one for one in self.commands if one.request.MECHANICAL]
             limits = self.engine.limits.given()
             fields = {"commands": commands, "drive.profile": self.drive.profile, "engine.limits": limits}
             for name, given in fields.items():

@@ -33,15 +33,8 @@ from rig.physics.kernels.laws.magnet import magnet_force
 from rig.physics.kernels.signals import COLUMN
 from rig.physics.model import build_model, describe
 from rig.run import calibrator
-from rig.run.commands import (
-    ClearCommand,
-    FaultCommand,
-    HammerCommand,
-    ReleaseCommand,
-    SpeedCommand,
-    check_command,
-    refusal,
-)
+from rig.run.commands.command import SceneCommand
+from rig.run.commands.table import check_command
 from rig.run.faulty import Faulty
 from rig.run.motion import BRANCH_ALARM, Begin, Motion, energy_balance, initial_state
 from rig.run.scenes import Scene, load_scene, scene_document
@@ -59,8 +52,8 @@ class Snapshot:
 
 
 _CHANGING = (
-    "tick", "first_row", "_segments", "_engaged", "_pulse", "_pending", "_motion", "_companion", "_accuracy", "_last",
-    "_conditioners", "_keyphasor", "_edges_shown", "_faulty",
+    "tick", "first_row", "_segments", "inputs", "pending", "_motion", "_companion", "_accuracy", "_last",
+    "_conditioners", "_keyphasor", "_edges_shown", "faulty",
 )  # fmt: skip
 
 
@@ -79,6 +72,9 @@ class Simulation:
         begin: Where it is taken up; None: at the scene's own start.
         kept_every: Rows from one that samples fall on to the next; 1 where some fall between rows.
         told: What the last command comes to beside its tick: a fault's number, channels and first faulty rows.
+        inputs: Inputs of the kernels that commands set.
+        pending: Commands that wait, each with its tick, in order.
+        faulty: Faults of the channels.
 
     Example:
         >>> import rig
@@ -127,7 +123,7 @@ class Simulation:
             tick = 0 if begin is None else begin.tick
             self._conditioners, turns = calibrator.stand_ins(scene, row_ticks=self.row_ticks, tick=tick)
             self._keyphasor = turns if marked else None
-        self._faulty = Faulty(
+        self.faulty = Faulty(
             self.table, self._conditioners, seed=scene.seed, row_ticks=self.row_ticks, setting=scene.setting
         )
         self._truth_every = TICK_RATE_HZ // sensors.truth_rate_hz // self.row_ticks
@@ -144,11 +140,13 @@ class Simulation:
         if self.tick % self.block_ticks:
             raise InputError("begin.tick", f"a multiple of {self.block_ticks}", self.tick)
         self._segments = segments(scene.drive.profile or ((0.0, scene.drive.speed_hz),), TICK_RATE_HZ)
-        self._engaged = scene.initial.magnets
-        self._pulse: tuple[HammerCommand, int, int] | None = None
+        self.inputs: dict[str, Any] = {
+            "hammer_force": 0.0, "hammer_x": 1.0, "hammer_y": 0.0, "hammer_start": 0, "hammer_end": 0,
+            "magnet_engaged": scene.initial.magnets,
+        }  # fmt: skip
         given = ((round(timed.at_s * TICK_RATE_HZ), timed.request) for timed in scene.commands)
-        self._pending = sorted(given, key=lambda entry: entry[0])
-        self._faulty.check_all(self._pending)
+        self.pending: list[tuple[int, SceneCommand]] = sorted(given, key=lambda entry: entry[0])
+        self.faulty.check_all(self.pending)
         choice, initial = scene.engine, initial_state(self.model, scene.initial, begin, spin=self._speed())
         memory = np.zeros(self._engines[0].memory_size if choice.rolling == "collocation" else MEMORY)
         self._motion = Motion(initial, self._step_ticks, self._stride, choice.tolerance, memory)
@@ -235,7 +233,7 @@ class Simulation:
             events = sorted(events + self._doubts(rows, made[1], start), key=lambda event: event["tick"])
         samples, edges, truth = self._sample(counts, start), self._edges(rows, start), self._truth(rows, start)
         frame = Frame(start, ticks, samples, edges, truth, events, rows)
-        return self._faulty.sending.pass_on(frame, last=self.tick >= self.end_tick)
+        return self.faulty.sending.pass_on(frame, last=self.tick >= self.end_tick)
 
     def _lost_s(self, rows: np.ndarray, start: int) -> float:
         finite = np.isfinite(rows[:, : S.N_STATE]).all(axis=1)
@@ -261,25 +259,12 @@ class Simulation:
             InputError: Unknown, malformed, out of range, or not possible now.
         """
         command, self.told = check_command(name, request), {}
-        waiting = [other for tick, other in self._pending if tick <= self.tick]
-        if isinstance(command, FaultCommand | ClearCommand):
-            self.told = self._faulty.check(command, self.tick, waiting)
-        elif self.scene.generator is not None:
+        if command.MECHANICAL and self.scene.generator is not None:
             raise InputError(name, "left out: signals of a [generator] stand for the physics", Words("a command to it"))
-        elif isinstance(command, HammerCommand):
-            busy_until = self._pulse[2] if self._pulse is not None else 0
-            if self.tick < busy_until or any(isinstance(other, HammerCommand) for other in waiting):
-                until = f"until {busy_until / TICK_RATE_HZ:.6f} s" if self.tick < busy_until else "from now on"
-                raise InputError("hammer", f"idle (it is in a pulse {until})", Words("another pulse"))
-        elif isinstance(command, SpeedCommand):
-            top = self.model.parameters.entries["drive.top_speed"].value
-            if not isinstance(top, str) and command.speed_hz > top:
-                raise InputError("speed.speed_hz", f"at most drive.top_speed = {top:g} Hz", command.speed_hz)
-        elif not isinstance(command, ReleaseCommand):
-            raise refusal(command)
-        elif not self._engaged or any(isinstance(other, ReleaseCommand) for other in waiting):
-            raise InputError("release", "given once (the magnets have let go already)", Words("another release"))
-        insort(self._pending, (self.tick, command), key=lambda entry: entry[0])
+        if not command.is_carried_out():
+            raise command.refusal()
+        self.told = command.check(self, [other for tick, other in self.pending if tick <= self.tick])
+        insort(self.pending, (self.tick, command), key=lambda entry: entry[0])
         return self.tick
 
     def serve(self, doors: tuple[str, ...]) -> None:
@@ -288,8 +273,8 @@ class Simulation:
         Raises:
             InputError: The scene has a fault at a door that is not there.
         """
-        self._faulty.doors = doors
-        self._faulty.check_all(self._pending)
+        self.faulty.doors = doors
+        self.faulty.check_all(self.pending)
 
     def warm_up(self) -> None:
         """Compile (or load) every kernel that `advance` will call, without moving on."""
@@ -322,7 +307,7 @@ class Simulation:
             warnings.append(text)
         if memory[CLAMPS]:
             warnings.append(f"the contact law would have pulled at {memory[CLAMPS]:.0f} steps and was held at 0")
-        late = sum(tick >= self.end_tick for tick, _ in self._pending)
+        late = sum(tick >= self.end_tick for tick, _ in self.pending)
         if late:
             warnings.append(f"{late} commands of the scene lie after its end and will not be given")
         if memory[CEILING]:
@@ -362,11 +347,11 @@ class Simulation:
         """
         changing = copy.deepcopy(snapshot.changing)
         if snapshot.scene != self.scene:
-            first_tick = min((tick for tick, _ in self._pending), default=changing["tick"])
+            first_tick = min((tick for tick, _ in self.pending), default=changing["tick"])
             alike = snapshot.scene == self.scene.model_copy(update={"commands": ()})
             if self.tick > self._start or first_tick < changing["tick"] or not alike:
                 raise InputError("snapshot", f"one of this scene, {self.scene.name}", snapshot.scene.name)
-            changing["_pending"] = self._pending
+            changing["pending"] = self.pending
         self.__dict__.update(changing)
 
     def catalogue(self) -> dict[str, Any]:
@@ -402,42 +387,25 @@ class Simulation:
         return segment.speed + segment.slope * (self.tick - segment.tick) / TICK_RATE_HZ
 
     def _take_effect(self, events: list[dict[str, Any]]) -> None:
-        while self._pending and self._pending[0][0] <= self.tick:
-            command = self._pending.pop(0)[1]
+        while self.pending and self.pending[0][0] <= self.tick:
+            command = self.pending.pop(0)[1]
             event: dict[str, Any] = {"event": command.command, "tick": self.tick, "time_s": self.tick / TICK_RATE_HZ}
             event |= command.model_dump(exclude={"command"})
-            if isinstance(command, HammerCommand):
-                if self._pulse is not None and self.tick < self._pulse[2]:  # one sent by hand is under way
-                    events.append(
-                        event | {"event": "warning", "text": "a hammer pulse of the scene found the hammer in a pulse"}
-                    )
-                    continue
-                length = round(command.duration_ms * 1e-3 * TICK_RATE_HZ)
-                self._pulse = (command, self.tick, self.tick + max(1, length))
-            elif isinstance(command, SpeedCommand):
-                self._ramp_to(2.0 * math.pi * command.speed_hz)
-            elif isinstance(command, FaultCommand):
-                event |= self._faulty.begin(command, self.tick, self._pending)
-            elif isinstance(command, ClearCommand):
-                events += [event | ended for ended in self._faulty.clear(command, self.tick)]
-                continue
-            elif isinstance(command, ReleaseCommand):
-                self._release()
-            else:
-                raise refusal(command)
-            events.append(event)
+            events += [event | more for more in command.take_effect(self)]
 
-    def _ramp_to(self, target: float) -> None:
-        now = self._speed()
+    def ramp_to(self, speed_hz: float) -> None:
+        """Let the drive approach a speed at its ramp rate."""
+        now, target = self._speed(), 2.0 * math.pi * speed_hz
         length = round(abs(target - now) / self.model.parameters["drive.ramp_rate"] * TICK_RATE_HZ)
         hold = Segment(tick=self.tick + length, speed=target, slope=0.0)
         slope = (target - now) / length * TICK_RATE_HZ if length else 0.0
         self._segments = [Segment(tick=self.tick, speed=now, slope=slope), hold] if length else [hold]
 
-    def _release(self) -> None:
+    def release_magnets(self) -> None:
+        """Switch the magnets off."""
         # What the magnets hold is gone with them: booked, so that the ledger closes. A release that a scene has timed
         # can find them released by hand.
-        if not self._engaged:
+        if not self.inputs["magnet_engaged"]:
             return
         shaft, magnet = self.model.constants.shaft, self.model.constants.magnet
         for motion in self._motions():
@@ -447,37 +415,28 @@ class Simulation:
                 x, y = math.sin(beta), -math.sin(gamma) * math.cos(beta)
             _, _, stored = magnet_force(shaft.arm_magnet * x, shaft.arm_magnet * y, magnet)
             motion.y[S.RELEASE_WORK] -= stored
-        self._engaged = False
+        self.inputs["magnet_engaged"] = False
 
     def _next_change(self) -> int:
         ticks = [segment.tick for segment in self._segments if segment.tick > self.tick]
-        ticks += [tick for tick, _ in self._pending]
-        if self._pulse is not None and self._pulse[2] > self.tick:
-            ticks.append(self._pulse[2])
+        ticks += [tick for tick, _ in self.pending]
+        if self.inputs["hammer_end"] > self.tick:
+            ticks.append(self.inputs["hammer_end"])
         return min(ticks, default=2**62)
 
     def _inputs(self) -> Inputs:
         segment = self._segment()
-        force, (dx, dy), begin, end = 0.0, (1.0, 0.0), 0, 0
-        if self._pulse is not None:
-            command, begin, end = self._pulse
-            force, (dx, dy) = float(command.force_n), command.cosines
         return Inputs(
             tick_s=1.0 / TICK_RATE_HZ,
-            hammer_force=force,
-            hammer_x=dx,
-            hammer_y=dy,
-            hammer_start=begin,
-            hammer_end=end,
             speed=segment.speed,
             speed_slope=segment.slope,
             speed_tick=segment.tick,
             ideal_drive=self.scene.drive.mode == "ideal",
-            magnet_engaged=self._engaged,
+            **self.inputs,
         )
 
     def _condition(self, rows: np.ndarray, tick: int) -> dict[str, np.ndarray]:
-        return self._faulty.counts(rows, self._formulas.values(rows), tick)
+        return self.faulty.counts(rows, self._formulas.values(rows), tick)
 
     def _sample(self, counts: list[dict[str, np.ndarray]], start: int) -> dict[str, Block]:
         found = {}
@@ -493,7 +452,7 @@ class Simulation:
         if self._keyphasor is None:
             return None
         edges = self._keyphasor.edges(rows, self.row_ticks)
-        edges = self._faulty.edges(edges, rows, start)
+        edges = self.faulty.edges(edges, rows, start)
         index, self._edges_shown = self._edges_shown, self._edges_shown + len(edges)
         return self._block(start, index, 0, edges[:, None]) if len(edges) else None
 

@@ -12,7 +12,8 @@ from rig.base import wire
 from rig.channels.faults import described
 from rig.channels.sampling import SensorChoice
 from rig.physics.kernels import signals
-from rig.run.commands import COMMANDS
+from rig.run.commands.command import Quantity
+from rig.run.commands.table import COMMANDS, EVENT_KINDS
 from rig.run.scenes import rig_table
 from rig.serve.transport.exposure import access
 
@@ -32,6 +33,7 @@ def page() -> str:
         signals=signals,
         truth_hz=SensorChoice().truth_rate_hz,
         commands=COMMANDS,
+        event_kinds=EVENT_KINDS,
         faults=described(rig_table()),
         access=access,
     )
@@ -53,8 +55,7 @@ def _field(key: str, field: Any) -> str:
     text = f"`{key}`"
     if limits:
         text += " " + " ".join(f"{'from' if kind == 'ge' else 'to'} {value:g}" for kind, value in limits.items())
-    if key == "direction":
-        text += " x, y, -x, -y, or degrees from x toward y"
+    text += "".join(f" {item.takes}" for item in field.metadata if isinstance(item, Quantity) and item.takes)
     if not field.is_required():
         text += f" (default {field.default})"
     return text

@@ -19,8 +19,8 @@ from rig.base import wire
 from rig.base.errors import InputError, Words
 from rig.base.text import finite
 from rig.channels.faults import DOORS, Message
-from rig.run.commands import COMMANDS as _COMMANDS
-from rig.run.commands import SERVICE_COMMANDS
+from rig.run.commands import SUMMARIES
+from rig.run.commands.table import SERVICE_COMMANDS
 from rig.serve.bounded_queue import BoundedQueue
 from rig.serve.desk import Done, Join, Kept, Leave, Note, Pending, Step
 from rig.serve.devices import Devices
@@ -33,9 +33,7 @@ if TYPE_CHECKING:
     from rig.channels.faults.sending import Frame
     from rig.run.simulation import Simulation
 
-SIMULATION_COMMANDS = tuple(_COMMANDS)
-"""Commands that the simulation itself checks and carries out."""
-COMMANDS = (*SIMULATION_COMMANDS, *SERVICE_COMMANDS)
+COMMANDS = (*SUMMARIES, *SERVICE_COMMANDS)
 REPLAY_COMMANDS = ("pause", "resume", "seek", "rate")
 """Commands that only a replayed recording takes (`replays.player`)."""
 

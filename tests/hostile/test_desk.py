@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from rig.base import wire
-from rig.run.commands import COMMANDS as DONE_TO_THE_RIG
-from rig.run.commands import check_command
+from rig.run.commands.table import COMMANDS as DONE_TO_THE_RIG
+from rig.run.commands.table import check_command
 from rig.serve.desk import REQUESTS
 from rig.serve.pacing import Lockstep
 from rig.serve.service import COMMANDS, Service

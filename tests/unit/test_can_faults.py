@@ -68,7 +68,8 @@ def test_clear_and_what_is_none() -> None:
     assert change(3, 0) is Result.OUT_OF_RANGE
     assert change(4, 1) is Result.OUT_OF_RANGE  # freeze has no number
     assert change(0, Kind.HAMMER) is Result.BAD_KIND
-    assert min((one ^ other).bit_count() for one in FaultKind for other in (*Kind, *FaultKind) if one != other) >= 4
+    others = (*FaultKind, Kind.HAMMER, Kind.SPEED, Kind.RELEASE, Kind.STOP)
+    assert min((one ^ other).bit_count() for one in FaultKind for other in others if one != other) >= 4
     for given, line in (
         (("P_Q", "freeze", 1), "fault.channel must be one of the channels"),
         (("P_E", "frieze", 1), "fault.kind must be one of the kinds, such as freeze"),

@@ -24,7 +24,7 @@ from drivers.can.signals import ABSENT, LIMITS, Field, Kind, Result, State, comm
 from rig.base import wire
 from rig.base.errors import InputError
 from rig.channels.table import default_table
-from rig.run.commands import HammerCommand, SpeedCommand, check_command
+from rig.run.commands.table import HammerCommand, SpeedCommand, check_command
 from rig.serve.health import Rising
 from rig.serve.pacing import FreeRun, RealTime
 from rig.serve.service import Service

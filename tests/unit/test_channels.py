@@ -19,7 +19,7 @@ from rig.channels.sensors.conditioning import Conditioner
 from rig.channels.table import TABLE, Channel, ChannelTable, default_table, parse_table
 from rig.cli.app import start
 from rig.physics.kernels.signals import ROW
-from rig.run.commands import HammerCommand
+from rig.run.commands.table import HammerCommand
 from rig.run.scenes import rig_table
 
 TABLE_TEXT = TABLE.read_text()

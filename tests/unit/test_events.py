@@ -17,7 +17,7 @@ from replays.recordings.export import write_run
 from replays.recordings.validation import validate
 from rig.base import wire
 from rig.base.errors import InputError
-from rig.run.commands import COMMANDS
+from rig.run.commands.table import COMMANDS, EVENT_KINDS
 from rig.run.scenes import parse_scene
 from rig.run.simulation import Simulation
 from rig.serve.intake import event_in
@@ -33,7 +33,7 @@ def named_in_the_code() -> set[str]:
     """Kinds of events that the code spells out, in `_event("...")` and in `{"event": "..."}`."""
     found = set[str]()
     folder = Path(rig.__file__).parent
-    for path in (*folder.glob("*.py"), folder.parent / "replays/recordings/export.py"):
+    for path in (*folder.rglob("*.py"), folder.parent / "replays/recordings/export.py"):
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr == "_event":
                 found |= {arg.value for arg in node.args[:1] if isinstance(arg, ast.Constant)}
@@ -48,7 +48,7 @@ def named_in_the_code() -> set[str]:
 
 
 def test_the_table_of_events_is_complete() -> None:
-    assert set(COMMANDS) | named_in_the_code() == set(wire.EVENT_KINDS)
+    assert set(COMMANDS) | named_in_the_code() == set(EVENT_KINDS)
 
 
 def test_every_kind_of_event_is_recorded_and_validated(tmp_path: Path) -> None:
@@ -86,7 +86,7 @@ def test_every_kind_of_event_is_recorded_and_validated(tmp_path: Path) -> None:
     assert (summary.malformed, summary.good) == (0, True)
     recording = Recording.open(tmp_path / "a.mcap")
     events = recording.events
-    assert {event["event"] for event in events} == set(wire.EVENT_KINDS)
+    assert {event["event"] for event in events} == set(EVENT_KINDS)
     cleared = [event for event in events if event["event"] == "clear"]
     assert [(event["id"], event["fault"]) for event in cleared] == [(4, [4]), (1, [1]), (2, [2]), (3, [3])]
     assert recording.doubts == ()

@@ -11,7 +11,7 @@ from rig.base import wire
 from rig.channels.table import default_table
 from rig.cli.main import main
 from rig.physics.kernels.signals import ROW, TRUTH
-from rig.run.commands import COMMANDS
+from rig.run.commands.table import COMMANDS
 from rig.serve.interface import page
 
 ROWS = page().splitlines()

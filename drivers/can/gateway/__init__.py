@@ -24,7 +24,7 @@ from drivers.can.gateway.commands import IDENTIFIERS, Commands
 from drivers.can.gateway.outbox import Outbox
 from drivers.can.gateway.samples import sample_frames, steps
 from drivers.can.schedule import SLOT_S, Schedule
-from drivers.can.signals import EventKind, State
+from drivers.can.signals import EVENT_VALUES, EventKind, State
 from rig.base import wire
 from rig.base.closing import Closing
 from rig.base.outside import DOCUMENT_BYTES, Outside, check, input_error
@@ -353,7 +353,7 @@ class Gateway(Closing):
         kind = EventKind[name.upper()] if name.upper() in EventKind.__members__ else EventKind.OTHER
         self._ended |= kind is EventKind.END
         time_us = round(1e6 * float(event.get("time_s", 0.0)))
-        value = event.get({EventKind.HAMMER: "force_n", EventKind.FAULT: "fault"}.get(kind, "speed_hz"), 0.0)
+        value = event.get(EVENT_VALUES.get(name, ""), 0.0)
         value = value if isinstance(value, (int, float)) and math.isfinite(value) else 0.0
         # With the samples of its time; its identifier loses against theirs, so that the end comes last.
         self.outbox.put_one(

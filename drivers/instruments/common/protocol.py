@@ -112,7 +112,12 @@ class Stop(Message):
 
 @dataclass(frozen=True, slots=True)
 class Act(Message):
-    """Base of what an acting instrument can be told to do; kinds from 0x40 on, each instrument's own."""
+    """Base of what an acting instrument can be told to do; kinds from 0x40 on, each instrument's own.
+
+    It has the fields of the rig's command `COMMAND`, with a text where that takes a word or a number.
+    """
+
+    COMMAND: ClassVar[str] = ""
 
 
 # Replies, from the instrument.

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import ClassVar
 
 import numpy as np
@@ -21,6 +21,7 @@ from drivers.sources.stream import RigStream, thin, whole_step
 from rig.base import wire
 from rig.base.errors import InputError, Words
 from rig.channels.table import Group
+from rig.run.commands.command import as_number
 from rig.serve.desk import one_line
 from rig.serve.transport import NoReplyError
 
@@ -101,13 +102,14 @@ class Twin:
         return self.CODEC.encode(reply, sequence)
 
     def act(self, act: protocol.Act) -> Accepted:
-        """Carry out what this instrument can be told to do; the acting ones override it.
+        """Send an act of this instrument to the rig, as the command that it stands for.
 
         Raises:
             InputError: The rig refuses.
             NoReplyError: No rig answers.
         """
-        raise NotImplementedError
+        given = {name: as_number(value) if isinstance(value, str) else value for name, value in asdict(act).items()}
+        return self._console.send(act.COMMAND, **given)
 
     def _carry_out(self, request: Message) -> Message:
         if isinstance(request, protocol.Identify):

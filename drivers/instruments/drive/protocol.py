@@ -17,6 +17,7 @@ class SetSpeed(Act):
     """
 
     KIND = 0x40
+    COMMAND = "speed"
     LAYOUT = "<d"
     speed_hz: float
 

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from drivers.console import Accepted
-from drivers.instruments.common.protocol import Act
 from drivers.instruments.common.twin import Twin
-from drivers.instruments.drive.protocol import CODEC, SetSpeed
+from drivers.instruments.drive.protocol import CODEC
 
 
 class DriveTwin(Twin):
@@ -14,8 +12,3 @@ class DriveTwin(Twin):
     CODEC = CODEC
     TITLE = "Drive controller"
     GROUP = "drive"
-
-    def act(self, act: Act) -> Accepted:
-        """Let the rig's drive hold a speed."""
-        assert isinstance(act, SetSpeed)
-        return self._console.speed(act.speed_hz)

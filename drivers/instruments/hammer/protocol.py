@@ -19,6 +19,7 @@ class Hit(Act):
     """
 
     KIND = 0x40
+    COMMAND = "hammer"
     LAYOUT = "<dd"
     TAIL = Tail.TEXT
     force_n: float

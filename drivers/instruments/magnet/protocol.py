@@ -13,6 +13,7 @@ class Release(Act):
     """Let the shaft go."""
 
     KIND = 0x40
+    COMMAND = "release"
 
 
 CODEC = Codec(Address("magnet", 6), (Release,))

@@ -9,9 +9,10 @@ import rerun as rr
 
 from recorder.viewer.canvas import Canvas
 from rig.base.text import printable
+from rig.run.commands.table import COMMANDS, MECHANICAL
 
 ROOT = "/marks"
-_DONE = {"hammer": "force_n", "speed": "speed_hz", "release": ""}
+_DONE = {name: COMMANDS[name].SHOWN_FIELD for name in MECHANICAL}
 """Commands that are marked, each with the field that says most."""
 _SHOWN_S = 0.05
 """How long a mark of a command is [s]."""

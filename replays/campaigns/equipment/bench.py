@@ -26,7 +26,7 @@ from rig.serve.transport.endpoint import free_port
 if TYPE_CHECKING:
     from drivers.client import Rig
     from drivers.console import AcceptedStep
-    from rig.run.commands import TimedCommand
+    from rig.run.commands.table import TimedCommand
 
 START_S = 300.0
 """Longest that a rig takes to be there, where nothing is compiled yet [s]."""

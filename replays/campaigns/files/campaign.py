@@ -27,7 +27,7 @@ from rig.base.outside import Written, check, open_file, parse_toml, unreadable
 from rig.channels.faults import channels_of, stream_of
 from rig.channels.faults.blocks import OfBlocks
 from rig.physics.kernels import signals
-from rig.run.commands import COMMANDS, FaultCommand, TimedCommand, check_command
+from rig.run.commands.table import COMMANDS, FaultCommand, TimedCommand, check_command
 from rig.run.scenes import Scene, load_scene
 
 SUFFIX = ".campaign.toml"

@@ -14,7 +14,7 @@ from replays.campaigns.files.seen import Expected, Seen, Time, Units, asked, in_
 from replays.campaigns.measurement import Measurement, Must, quantity
 from rig.base.errors import InputError, UnknownNameError, Words
 from rig.base.outside import Written
-from rig.run.commands import COMMANDS
+from rig.run.commands.table import EVENT_KINDS
 from rig.serve.service import REPLAY_COMMANDS
 
 Take = Literal[
@@ -25,7 +25,7 @@ _TIMES = ("first beyond", "last beyond", "time beyond")
 if TYPE_CHECKING:
     EventName = str
 else:
-    EventName = Literal["start", "end", "command", "note", "warning", "device", *COMMANDS, *REPLAY_COMMANDS]
+    EventName = Literal[*EVENT_KINDS, *REPLAY_COMMANDS]
     """What a rig or a replay tells of."""
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from replays.campaigns.equipment.bench import NotThereError
 from replays.campaigns.equipment.keeper import KILLED, PATIENCE_S
@@ -13,15 +13,7 @@ from replays.campaigns.files.seen import Seen
 from replays.campaigns.measurement import Measurement, Must
 from rig.base import wire
 from rig.base.errors import RefusedError
-from rig.run.commands import (
-    ClearCommand,
-    FaultCommand,
-    HammerCommand,
-    ReleaseCommand,
-    SpeedCommand,
-    TimedCommand,
-    refusal,
-)
+from rig.run.commands.table import TimedCommand
 
 if TYPE_CHECKING:
     from drivers.client import Rig
@@ -99,20 +91,8 @@ def _send(machine: Rig, step: Step) -> None:
         if step.command is None:
             machine.note(step.note, tags=list(step.tags))
             return
-        request: Any = step.command.request
-        if isinstance(request, HammerCommand):
-            machine.hammer(force_n=request.force_n, duration_ms=request.duration_ms, direction=request.direction)
-        elif isinstance(request, SpeedCommand):
-            machine.speed(request.speed_hz)
-        elif isinstance(request, FaultCommand):
-            numbers = request.what.model_dump(exclude_none=True)
-            machine.fault(request.channel, numbers.pop("kind"), for_s=request.for_s, **numbers)
-        elif isinstance(request, ClearCommand):
-            machine.clear(request.id)
-        elif isinstance(request, ReleaseCommand):
-            machine.release()
-        else:
-            raise refusal(request)
+        request = step.command.request
+        machine.send(request.command, **request.request())
     except RefusedError as error:
         if wire.ENDED in str(error):
             return  # the verdict is of the run's end

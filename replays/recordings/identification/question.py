@@ -18,7 +18,8 @@ from rig.base.text import nearest
 from rig.base.wire import sensor_key
 from rig.channels.table import Channel
 from rig.physics.parameters import load_parameters
-from rig.run.commands import COMMANDS, HAMMER_BOUNDS, HammerCommand
+from rig.run.commands.command import UNBOUNDED
+from rig.run.commands.table import COMMANDS, QUANTITIES, HammerCommand
 from rig.run.scenes import Scene
 from rig.run.simulation import TICK_RATE_HZ
 
@@ -30,8 +31,7 @@ _SCENE_KEYS = ("drive.speed_hz", "initial.x_mm", "initial.y_mm")
 """Of a scene, what was done to the rig; the rest is how it is simulated."""
 _QUIET_S = 0.5
 """The window begins this long before the first command: enough to see where the shaft runs."""
-_COMMAND_BOUNDS = {**HAMMER_BOUNDS, "direction": (-360.0, 360.0)}
-_COMMAND_UNITS = {"force_n": "N", "duration_ms": "ms", "direction": "degrees", "at_s": "s", "speed_hz": "Hz"}
+_COMMAND_UNITS = {"at_s": "s"} | {name: each.quantity.unit for name, each in QUANTITIES.items()}
 
 
 @dataclass(frozen=True)
@@ -323,7 +323,8 @@ def _accepted(key: str) -> tuple[float, float]:
     entries = load_parameters().entries
     if key in entries:
         return entries[key].range
-    return _COMMAND_BOUNDS.get(key.split(".")[-1], (-math.inf, math.inf))
+    each = QUANTITIES.get(key.split(".")[-1])
+    return UNBOUNDED if each is None else (each.low, each.high)
 
 
 def unit_of(key: str) -> str:

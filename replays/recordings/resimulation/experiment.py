@@ -18,7 +18,7 @@ from rig.base.outside import table_in
 from rig.base.wire import EDGES, sensor_key, truth_key
 from rig.channels.faults import channels_of
 from rig.physics.parameters import DEFAULT_SET, load_parameters, set_names
-from rig.run.commands import COMMANDS, ClearCommand, FaultCommand, check_command
+from rig.run.commands.table import COMMANDS, MECHANICAL, FaultCommand, check_command
 from rig.run.motion import Begin
 from rig.run.offline import Run, SentCommand, frames, simulate
 from rig.run.scenes import Scene, change_scene, parse_scene
@@ -85,8 +85,8 @@ class Experiment:
 
     def without_faults(self) -> Experiment:
         """The same with sound sensors: as one who knows nothing of faults has it."""
-        kept = tuple(one for one in self.scene.commands if not isinstance(one.request, FaultCommand | ClearCommand))
-        sent = tuple(one for one in self.commands if one.name not in ("fault", "clear"))
+        kept = tuple(one for one in self.scene.commands if one.request.MECHANICAL)
+        sent = tuple(one for one in self.commands if one.name in MECHANICAL)
         return replace(self, scene=self.scene.model_copy(update={"commands": kept}), commands=sent)
 
     @property

@@ -23,7 +23,7 @@ from rig.base.errors import InputError, SimulationError
 from rig.channels.sampling import ROW_TICKS
 from rig.physics.model import build_model
 from rig.physics.parameters import load_parameters
-from rig.run.commands import TimedCommand, check_command
+from rig.run.commands.table import MECHANICAL, TimedCommand, check_command
 from rig.run.motion import Begin
 from rig.run.scenes import Scene, change_scene, parse_scene
 from rig.run.simulation import TICK_RATE_HZ
@@ -46,7 +46,7 @@ _KEPT = 8
 _MARGIN_S = 1e-4
 """The model is followed so far behind the last row, which may lie between two of its own."""
 _ROWS_HZ = TICK_RATE_HZ // ROW_TICKS
-_COMMAND_KEY = re.compile(r"(hammer|speed|release)\.([1-9][0-9]*)\.(\w+)")
+_COMMAND_KEY = re.compile(rf"({'|'.join(MECHANICAL)})\.([1-9][0-9]*)\.(\w+)")
 _TICK_S = 1.0 / TICK_RATE_HZ
 _STEPS = {"at_s": 2.0 * _TICK_S, "duration_ms": 2e3 * _TICK_S}
 """Steps of difference quotients of what a simulation rounds to ticks, by field of a command, in the field's unit: as

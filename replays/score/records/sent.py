@@ -18,12 +18,12 @@ from rig.base.wire import sensor_key
 from rig.channels.generators import Source
 from rig.channels.sampling import TICKS_HZ
 from rig.channels.table import Channel
+from rig.run.commands.table import TRIGGERS
 from rig.run.scenes import Scene, parse_scene
 
 Formula = Callable[[np.ndarray], np.ndarray]
 
 _PART = 1 << 16
-_TRIGGERS = ("hammer", "speed", "release", "fault")
 _SMOOTH = ("sine", "two-tone", "chirp", "multisine", "quiet", "recorded")
 """Test signals that are known between samples; in the others an instant lies on this or that side of a jump."""
 LOUD = 4.0
@@ -84,7 +84,7 @@ class Session:
     @property
     def trigger_s(self) -> float | None:
         """When the first command took effect, by which a DAQ may be triggered [s]; None if there was none."""
-        ticks = [event["tick"] for event in self.recording.events if event.get("event") in _TRIGGERS]
+        ticks = [event["tick"] for event in self.recording.events if event.get("event") in TRIGGERS]
         return ticks[0] / TICKS_HZ if ticks else None
 
     @property

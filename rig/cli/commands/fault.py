@@ -2,23 +2,32 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+import inspect
+from typing import Annotated, Any, get_args
 
 import typer
 
 from rig.base.errors import InputError, UnknownNameError, Words
+from rig.channels.faults import KINDS
 from rig.cli.connections.connection import Connection, show
 from rig.cli.groups import panel
 from rig.cli.output.tables import Form, echo, echo_json, new_table
 
 _numbers = panel("Numbers of the kinds")
-_OWN = ("channel", "kind", "for_s", "clear", "listed", "connection", "form")
-_SOME = "lose-blocks, duplicate-blocks, reorder-blocks"
-_BLOCKS = "the kinds of blocks"
 
 
-def _of(kinds: str, *, metavar: str = "X") -> Any:
-    return _numbers(f"Of {kinds}.", metavar=metavar)
+def _options() -> dict[str, Any]:
+    """Return an option for each number of the kinds of faults, by name."""
+    blocks, found = {name for name, kind in KINDS.items() if kind.of_blocks}, dict[str, Any]()
+    for field in dict.fromkeys(field for kind in KINDS.values() for field in kind.model_fields if field != "kind"):
+        own = {name: kind.model_fields for name, kind in KINDS.items()}
+        hints = {name: fields[field].annotation for name, fields in own.items() if field in fields}
+        hint = next(iter(hints.values()))
+        words = get_args(hint) if field == "door" else ()
+        of = "the kinds of blocks" if hints.keys() == blocks else ", ".join(hints)
+        option = _numbers(f"Of {of}.", metavar="|".join(words) or ("CHANNEL" if hint is str else "X"))
+        found[field] = Annotated[str | None if words or hint is str else float | None, option]
+    return found
 
 
 def fault(
@@ -30,41 +39,12 @@ def fault(
     for_s: Annotated[float | None, typer.Option(metavar="S", help="How long, in s; until it is cleared.")] = None,
     clear: Annotated[str | None, typer.Option(metavar="ID|all", help="End a fault by its number, or all.")] = None,
     listed: Annotated[bool, typer.Option("--list", help="Show all kinds, or those that CHANNEL can have.")] = False,
-    factor: Annotated[float | None, _of("gain, noise")] = None,
-    ramp_s: Annotated[float | None, _of("gain, offset")] = None,
-    value: Annotated[float | None, _of("offset, stuck-bit")] = None,
-    rate: Annotated[float | None, _of("drift")] = None,
-    tau_s: Annotated[float | None, _of("drift")] = None,
-    end: Annotated[float | None, _of("nonlinear")] = None,
-    level_v: Annotated[float | None, _of("open, short, intermittent")] = None,
-    part: Annotated[float | None, _of(f"intermittent, saturation, clip, miss-pulses, extra-pulses, {_SOME}")] = None,
-    slot_s: Annotated[float | None, _of("intermittent")] = None,
-    amplitude_v: Annotated[float | None, _of("hum")] = None,
-    frequency_hz: Annotated[float | None, _of("hum, resonance")] = None,
-    quality: Annotated[float | None, _of("resonance")] = None,
-    third: Annotated[float | None, _of("hum")] = None,
-    offset_v: Annotated[float | None, _of("hum")] = None,
-    source: Annotated[str | None, _of("crosstalk", metavar="CHANNEL")] = None,
-    db: Annotated[float | None, _of("crosstalk")] = None,
-    other: Annotated[str | None, _of("swap", metavar="CHANNEL")] = None,
-    corner_hz: Annotated[float | None, _of("bandwidth")] = None,
-    late_us: Annotated[float | None, _of("late")] = None,
-    ppm: Annotated[float | None, _of("clock")] = None,
-    rms_us: Annotated[float | None, _of("jitter, edge-jitter")] = None,
-    amplitude_us: Annotated[float | None, _of("wander")] = None,
-    period_s: Annotated[float | None, _of("wander")] = None,
-    rate_hz: Annotated[float | None, _of("spikes")] = None,
-    size_v: Annotated[float | None, _of("spikes")] = None,
-    lost: Annotated[float | None, _of("bits")] = None,
-    bit: Annotated[float | None, _of("stuck-bit")] = None,
-    door: Annotated[str | None, _of(_BLOCKS, metavar="zenoh|can|all")] = None,
-    block_s: Annotated[float | None, _of(_BLOCKS)] = None,
-    delay_s: Annotated[float | None, _of("late-blocks")] = None,
     connection: Connection,
     form: Form,
+    **numbers: float | str | None,
 ) -> None:
     """Make a channel of a running rig misbehave, or end that; the reply tells the first row that changes."""
-    given = {name: _plain(value) for name, value in locals().items() if value is not None and name not in _OWN}
+    given = {name: _plain(value) for name, value in numbers.items() if value is not None}
     if listed:
         _show_kinds(channel, form)
         return
@@ -74,8 +54,6 @@ def fault(
         with connection.console("fault") as rig:
             show(rig.clear(int(clear) if clear.isdecimal() else clear), "clear")
         return
-    from rig.channels.faults import KINDS
-
     if kind not in KINDS:
         raise UnknownNameError("KIND", "one of `rig fault --list`", kind or "nothing", KINDS)
     with connection.console("fault") as rig:
@@ -87,13 +65,23 @@ def fault(
     )
 
 
+_own, _given = inspect.signature(fault), _options()
+fault.__annotations__ |= _given
+fault.__signature__ = _own.replace(  # type: ignore[attr-defined]
+    parameters=[
+        *list(_own.parameters.values())[:-1],
+        *(inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None) for name in _given),
+    ]
+)
+
+
 def _plain(value: Any) -> Any:
     """Whole numbers are whole: bits are."""
     return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
 def _show_kinds(channel: str | None, form: Form) -> None:
-    from rig.channels.faults import KINDS, described, supported
+    from rig.channels.faults import described, supported
     from rig.run.scenes import rig_table
 
     table = rig_table()

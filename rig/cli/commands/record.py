@@ -16,6 +16,7 @@ from rig.cli.groups import panel
 from rig.cli.options import Force
 from rig.cli.output.display import fitted
 from rig.cli.output.tables import echo, plain, table_console
+from rig.run.commands import SUMMARIES
 
 if TYPE_CHECKING:
     from recorder.contents.summary import Progress, Summary
@@ -24,6 +25,8 @@ if TYPE_CHECKING:
     from recorder.session import RecordingSession
     from rig.serve.transport.zenoh import ZenohClient
 
+_EVENTS = ", ".join([*filter(SUMMARIES.get, SUMMARIES), "note", "warning"])
+"""Events that start a capture, as `recorder.output.trigger` has them; a test compares them."""
 _files, _triggers, _disk = panel("Several files"), panel("Around triggers"), panel("The disk")
 
 
@@ -61,7 +64,7 @@ class Triggers:
     trigger: Annotated[
         list[str] | None,
         _triggers(
-            "Record only around this: an event (hammer, speed, release, fault, note, warning) or a level such as "
+            f"Record only around this: an event ({_EVENTS}) or a level such as "
             "'|disk_x|>0.5' or 'P_E>3200' (in the channel's unit, preload included); may be repeated. A level fires "
             "where it is crossed, and again after 0.25 s clear of it. One file each: NAME.hammer-001.mcap, ...",
             metavar="EVENT|LEVEL",

@@ -2,49 +2,44 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+import inspect
+from collections.abc import Callable
+from typing import Annotated, Any
 
 import typer
 
 from rig.base.errors import InputError, Words
 from rig.cli.connections.connection import Connection, show
 from rig.cli.output.tables import echo
+from rig.run.commands import SUMMARIES, mechanical
+from rig.run.commands.command import as_number, entries
 
 
-def hammer(
-    *,
-    force_n: Annotated[float, typer.Option(help="Peak force, in N.")] = 100.0,
-    duration_ms: Annotated[float, typer.Option(help="Length of the half-sine pulse, in ms.")] = 5.0,
-    direction: Annotated[
-        str, typer.Option(metavar="x|y|-x|-y|ANGLE", help="Along x or y, or at an angle from x towards y, in degrees.")
-    ] = "x",
-    connection: Connection,
-) -> None:
-    """Hit the shaft of a running rig at the disk."""
-    try:
-        along: str | float = float(direction)
-    except ValueError:
-        along = direction  # a name, or an error that the rig explains
-    with connection.console("hammer") as rig:
-        show(rig.hammer(force_n=force_n, duration_ms=duration_ms, direction=along), "hammer")
+def scene_command(name: str) -> Callable[..., None]:
+    """Return the command line of a scene command: fields without a default are arguments, the others are options."""
+    fields, hints, parameters = entries(mechanical)[name].quantities(), dict[str, Any](), list[inspect.Parameter]()
+    for field, each in fields.items():
+        quantity, unit = each.quantity, each.quantity.unit.replace(" ", "")
+        shown = {"metavar": each.quantity.metavar, "help": each.quantity.help}
+        if each.required:
+            given: Any = typer.Argument(**{**shown, "metavar": quantity.metavar or unit.upper()})
+        else:
+            given = typer.Option(**shown)
+        hints[field] = Annotated[str if each.takes_text else float, given]
+        default = inspect.Parameter.empty if each.required else each.default
+        parameters.append(inspect.Parameter(field, inspect.Parameter.KEYWORD_ONLY, default=default))
 
+    def command(*, connection: Connection, **given: Any) -> None:
+        values = {field: as_number(value) if isinstance(value, str) else value for field, value in given.items()}
+        told = [f"{values[field]:g} {each.quantity.unit}" for field, each in fields.items() if each.required]
+        with connection.console(name) as rig:
+            show(rig.send(name, **values), " ".join([name, *told]))
 
-def speed(
-    speed_hz: Annotated[
-        float, typer.Argument(metavar="HZ", help="Spin speed [Hz], approached at the drive's ramp rate.")
-    ],
-    *,
-    connection: Connection,
-) -> None:
-    """Set the spin speed of a running rig."""
-    with connection.console("speed") as rig:
-        show(rig.speed(speed_hz), f"speed {speed_hz:g} Hz")
-
-
-def release(*, connection: Connection) -> None:
-    """Make the magnets of a running rig let go of the shaft."""
-    with connection.console("release") as rig:
-        show(rig.release(), "release")
+    parameters.append(inspect.Parameter("connection", inspect.Parameter.KEYWORD_ONLY))
+    command.__name__, command.__doc__ = name, f"{SUMMARIES[name]}."
+    command.__annotations__ = {**hints, "connection": Connection}
+    command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    return command
 
 
 def step(

@@ -11,7 +11,7 @@ import numpy as np
 from replays.recordings.formats.events.motion import Impact, Motion, impact, turning
 from rig.base.errors import InputError, Words
 from rig.channels.table import ChannelTable, default_table
-from rig.run.commands import HAMMER_BOUNDS
+from rig.run.commands.table import HAMMER_BOUNDS
 
 if TYPE_CHECKING:
     from replays.recordings.formats.events.pulses import HammerPulse

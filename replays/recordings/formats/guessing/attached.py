@@ -12,7 +12,7 @@ from replays.recordings.formats.source import DOCUMENTS, Source
 from replays.recordings.resimulation.experiment import recorded_scene
 from rig.base.text import printable
 from rig.channels.table import Channel
-from rig.run.commands import COMMANDS, check_command
+from rig.run.commands.table import COMMANDS, check_command
 from rig.run.scenes import Scene, load_scene, parse_scene, scene_names
 from rig.run.simulation import TICK_RATE_HZ
 

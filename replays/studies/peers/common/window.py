@@ -16,7 +16,7 @@ from rig.physics.kernels.laws.contact import BACKWARD, FLIGHT, FORWARD, TOUCHING
 from rig.physics.kernels.signals import N_STATE
 from rig.physics.levels import FRICTION_LAWS
 from rig.physics.model import build_model
-from rig.run.commands import HammerCommand, ReleaseCommand, SpeedCommand
+from rig.run.commands.table import HammerCommand, ReleaseCommand, SpeedCommand
 from rig.run.motion import initial_state
 from rig.run.scenes import Scene
 

@@ -1,0 +1,210 @@
+"""Base class of the scene commands, and what an entry says of each of its fields and of its CAN frame.
+
+Recorders and drivers read entries, so an entry must not import the simulation: it gets a `Run`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from types import ModuleType
+from typing import Any, ClassVar, NamedTuple, Protocol
+
+from pydantic import ConfigDict
+
+from rig.base.errors import InputError
+from rig.base.outside import Written
+from rig.run.commands import SUMMARIES
+
+UNBOUNDED = (-math.inf, math.inf)
+
+
+@dataclass(frozen=True, slots=True)
+class CanField:
+    """Signal of a field in the frame of its command, after the signals of the fields before it.
+
+    Attributes:
+        name: Name of the signal.
+        number: Number of the field in the frame Acknowledge; a number never changes.
+        bits: Width.
+        scale: Unit per step.
+        label: Description in the DBC.
+        unit: Unit in the DBC; that of the field unless given.
+        full_turn: Steps of a full turn, for an angle, which is taken modulo that; 0 for other fields.
+        words: Values of the words that the field takes.
+    """
+
+    name: str
+    number: int
+    bits: int
+    scale: float
+    label: str
+    unit: str = ""
+    full_turn: int = 0
+    words: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Quantity:
+    """Annotation of a command's field.
+
+    Attributes:
+        unit: Unit of the field.
+        help: Description on the command line.
+        can: Signal in the CAN frame.
+        metavar: Placeholder on the command line; the unit unless given.
+        takes: Accepted values in rig/KEYS.md, where limits do not describe them.
+        span: Least and largest value that can be fitted, where the field has no limits of its own.
+    """
+
+    unit: str
+    help: str
+    can: CanField | None = None
+    metavar: str | None = None
+    takes: str = ""
+    span: tuple[float, float] = UNBOUNDED
+
+
+@dataclass(frozen=True, slots=True)
+class CanFrame:
+    """Numbers of a command on a CAN bus; a number never changes.
+
+    Attributes:
+        kind: First byte of the frame; any two of a message differ in at least four bits.
+        event: Number of the command's event in the frame Event.
+        shown: Description of `SHOWN_FIELD` in the DBC, where the event carries it.
+        message: Message that carries it; one that has a message of its own defines its signals in `drivers.can`.
+    """
+
+    kind: int
+    event: int
+    shown: str = ""
+    message: str = "Command"
+
+
+class CommandField(NamedTuple):
+    """Field of a command that is a quantity."""
+
+    quantity: Quantity
+    low: float
+    high: float
+    default: Any
+    required: bool
+    takes_text: bool
+
+
+class Run(Protocol):
+    """State of a simulation that a command may read and change."""
+
+    tick: int
+    tick_rate_hz: int
+    model: Any
+    faulty: Any
+    pending: list[tuple[int, Any]]
+    inputs: dict[str, Any]
+    """Inputs of the kernels (`rig.physics.kernels.constants.Inputs`) from now on."""
+
+    def ramp_to(self, speed_hz: float) -> None:
+        """Approach a speed at the drive's ramp rate."""
+
+    def release_magnets(self) -> None:
+        """Switch the magnets off."""
+
+
+class SceneCommand(Written):
+    """Base class of an entry.
+
+    Attributes:
+        command: Name of the command, and of its event.
+    """
+
+    # `"100"` is no number, be it in a file or on a wire.
+    model_config = ConfigDict(strict=True)
+
+    CAN: ClassVar[CanFrame]
+    """Each entry has its own; one without it is on no bus, and fails its test."""
+    MECHANICAL: ClassVar[bool] = True
+    """Acts on the shaft, and not on channels: needs the model, can be identified, has a mark in the viewer."""
+    TRIGGERS: ClassVar[bool] = True
+    """Its event can start a capture."""
+    SHOWN_FIELD: ClassVar[str] = ""
+    """Field of the event that the viewer and the CAN frame Event show."""
+    command: str
+
+    @classmethod
+    def quantities(cls) -> dict[str, CommandField]:
+        """Return the fields that have a unit, by name, with their limits."""
+        found = {}
+        for name, info in cls.model_fields.items():
+            if (quantity := next((each for each in info.metadata if isinstance(each, Quantity)), None)) is not None:
+                ends = [[getattr(each, end) for each in info.metadata if hasattr(each, end)] for end in ("ge", "le")]
+                low, high = (own[0] if own else edge for own, edge in zip(ends, quantity.span, strict=True))
+                takes_text = info.annotation is not float
+                found[name] = CommandField(quantity, low, high, info.default, info.is_required(), takes_text)
+        return found
+
+    def request(self) -> dict[str, Any]:
+        """Return the fields as a client sends them."""
+        return self.model_dump(exclude={"command"})
+
+    def check_in_scene(self, at_s: float, last: Mapping[str, Any], *, magnets: bool) -> None:
+        """Raise where a scene asks for what cannot be.
+
+        Args:
+            at_s: Time of the command in the scene [s].
+            last: The latest earlier command of each name, with its time.
+            magnets: Whether the magnets hold at the start.
+
+        Raises:
+            InputError: It is not possible after these commands.
+        """
+
+    def check(self, run: Run, waiting: Sequence[Any]) -> dict[str, Any]:
+        """Check whether the command is possible now.
+
+        Args:
+            run: The simulation.
+            waiting: Commands that take effect before this one.
+
+        Returns:
+            Fields that the reply has in addition to the tick.
+
+        Raises:
+            InputError: It is not possible now.
+        """
+        return {}
+
+    def take_effect(self, run: Run) -> list[dict[str, Any]]:
+        """Carry the command out.
+
+        Returns:
+            For each of its events the fields that it has beside those of the command.
+
+        Raises:
+            InputError: Nothing carries it out.
+        """
+        raise self.refusal()
+
+    @classmethod
+    def is_carried_out(cls) -> bool:
+        """Return whether the entry says how the command is carried out."""
+        return cls.take_effect is not SceneCommand.take_effect
+
+    def refusal(self) -> InputError:
+        """Return the error for a command that nothing carries out."""
+        return InputError("command", "one that is carried out here", type(self).__name__)
+
+
+def entries(module: ModuleType) -> dict[str, type[SceneCommand]]:
+    """Return the commands of a module by name: the classes that have one."""
+    found = {name: vars(module).get(f"{name.capitalize()}Command") for name in SUMMARIES}
+    return {name: each for name, each in found.items() if each is not None}
+
+
+def as_number(text: str) -> str | float:
+    """Return the number in a text, or the text where it is none."""
+    try:
+        return float(text)
+    except ValueError:
+        return text  # a word, or an error that the rig explains

@@ -1,0 +1,78 @@
+"""All scene commands by name, and what follows from all of them together."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated, Any, Union
+
+from pydantic import Field, FiniteFloat, model_validator
+
+from rig.base.errors import InputError
+from rig.base.outside import Written, check
+from rig.run.commands import SUMMARIES, channel, mechanical
+from rig.run.commands.channel import ClearCommand, FaultCommand  # noqa: F401
+from rig.run.commands.command import SceneCommand, entries
+from rig.run.commands.mechanical import HammerCommand, ReleaseCommand, SpeedCommand  # noqa: F401
+
+_FOUND = entries(mechanical) | entries(channel)
+COMMANDS: dict[str, type[SceneCommand]] = {name: _FOUND[name] for name in SUMMARIES if name in _FOUND}
+if TYPE_CHECKING:
+    Command = SceneCommand
+else:
+    Command = Union[tuple(COMMANDS.values())]
+SERVICE_COMMANDS = ("stop", "step", "note", "join", "done", "leave")
+"""Commands that the service carries out, and no simulation."""
+EVENT_KINDS = ("start", "command", *COMMANDS, "note", "device", "warning", "end")
+"""Every `event` that a rig publishes."""
+MECHANICAL = tuple(name for name, command in COMMANDS.items() if command.MECHANICAL)
+"""Commands that act on the shaft."""
+TRIGGERS = tuple(name for name, command in COMMANDS.items() if command.TRIGGERS)
+"""Commands whose events can start a capture."""
+QUANTITIES = {field: each for command in COMMANDS.values() for field, each in command.quantities().items()}
+"""Fields of all commands that have a unit; one name is one quantity, whatever the command."""
+HAMMER_BOUNDS = {
+    name: (each.low, each.high) for name, each in HammerCommand.quantities().items() if not each.takes_text
+}
+"""Least and largest peak force [N] and length [ms] of a hammer pulse, by field."""
+
+
+class TimedCommand(Written):
+    """A command at a fixed time of the scene."""
+
+    at_s: Annotated[FiniteFloat, Field(ge=0.0)]
+    request: Annotated[Command, Field(discriminator="command")]
+
+    @model_validator(mode="before")
+    @classmethod
+    def _flat(cls, data: Any) -> Any:
+        # In the file the command's own fields stand beside at_s.
+        if isinstance(data, dict) and "request" not in data:
+            return {"at_s": data.get("at_s"), "request": {key: value for key, value in data.items() if key != "at_s"}}
+        return data
+
+
+def check_command(name: str, request: dict[str, Any]) -> SceneCommand:
+    """Check a command that came from outside.
+
+    Raises:
+        InputError: No such command, an unknown field, or a value out of its range; the message names the range.
+    """
+    if name not in COMMANDS:
+        raise InputError("command", f"one of {', '.join(COMMANDS)}", name)
+    return check(COMMANDS[name], request, field=name)
+
+
+def with_faults(scene: Any) -> Any:
+    """A scene as it is written, whose faults, under a heading of their own there, stand among its commands.
+
+    Raises:
+        InputError: They are no tables.
+    """
+    if not isinstance(scene, dict) or "faults" not in scene:
+        return scene
+    faults, commands = scene["faults"], scene.get("commands", ())
+    if not isinstance(faults, list | tuple) or not all(isinstance(each, dict) for each in faults):
+        raise InputError("faults", "a list of tables, each headed [[faults]]", faults)
+    rest = {key: value for key, value in scene.items() if key != "faults"}
+    if isinstance(commands, list | tuple):
+        rest["commands"] = [*commands, *({"command": "fault", **each} for each in faults)]
+    return rest
