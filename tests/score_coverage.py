@@ -22,14 +22,14 @@ from typing import Any, cast
 
 import numpy as np
 
+from replays.estimate.sine import fit_sine, quality
 from replays.score.analogue import score_analogue
 from replays.score.card.scorecard import Scorecard
-from replays.score.fits.sine import fit_sine, quality
-from replays.score.fits.waveform import behind_filter, fit_waveform, order_of, response
 from replays.score.records.recorded import Recorded, Table
 from replays.score.records.sent import Session
 from replays.score.records.stimulus import Exact
 from replays.score.records.wiring import Wire
+from replays.score.waveform import behind_filter, fit_waveform, order_of, response
 from rig.channels.table import default_table
 from tests.score_daqs import RATE_HZ, Tones
 

@@ -8,6 +8,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from replays.estimate.intervals import about, pooled, sandwich, scaled, student
+from replays.estimate.least_squares import solve
+from replays.estimate.sine import fit_sine, is_sine, quality
 from replays.score.alignment.alignment import align
 from replays.score.alignment.following import Alignment, Source
 from replays.score.alignment.stamps import Stamps
@@ -22,9 +25,13 @@ from replays.score.card.scorecard import (
     Verdict,
     text_row,
 )
-from replays.score.fits.intervals import about, pooled, sandwich, scaled, student
-from replays.score.fits.sine import fit_sine, is_sine, quality
-from replays.score.fits.waveform import (
+from replays.score.quantities.noise import split_noise
+from replays.score.quantities.rounding import Converter, find_step, undithered, widen
+from replays.score.records.recorded import Recorded
+from replays.score.records.sent import LOUD, Formula, Session
+from replays.score.records.stimulus import Exact, Sampled, Stimulus, parted, without_noise
+from replays.score.records.wiring import Wire
+from replays.score.waveform import (
     Response,
     Waveform,
     behind_filter,
@@ -32,12 +39,6 @@ from replays.score.fits.waveform import (
     response,
     through,
 )
-from replays.score.quantities.noise import split_noise
-from replays.score.quantities.rounding import Converter, find_step, undithered, widen
-from replays.score.records.recorded import Recorded
-from replays.score.records.sent import LOUD, Formula, Session
-from replays.score.records.stimulus import Exact, Sampled, Stimulus, parted, without_noise
-from replays.score.records.wiring import Wire
 from rig.base import units
 from rig.channels.table import Channel
 
@@ -226,14 +227,11 @@ def _folded(found: Waveform, above: Sequence[np.ndarray]) -> tuple[np.ndarray, t
         found: A fit of what is below.
         above: What is above at the fitted instants, and that a quarter of a period later, each shape (n,).
     """
-    columns = [*above, found.known, found.slope, np.ones(len(found.known))]
-    sizes = np.maximum([np.sqrt(np.mean(each**2)) for each in columns], 1e-300)
-    matrix = np.column_stack(columns) / sizes
-    parts = np.linalg.lstsq(matrix, found.residual, rcond=None)[0]
+    matrix = np.column_stack([*above, found.known, found.slope, np.ones(len(found.known))])
+    parts = solve(matrix, found.residual)
     covariance, freedom = sandwich(matrix, found.residual - matrix @ parts)
-    both = parts[:2] / sizes[:2]
-    amount = max(float(np.linalg.norm(both)), 1e-300)
-    way = both / amount / sizes[:2]
+    amount = max(float(np.linalg.norm(parts[:2])), 1e-300)
+    way = parts[:2] / amount
     half = float(student(freedom[:2].min())) * math.sqrt(way @ covariance[:2, :2] @ way)
     return matrix @ parts, (amount, max(0.0, amount - half), amount + half)
 

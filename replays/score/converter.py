@@ -7,9 +7,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from replays.estimate.intervals import scaled
 from replays.score.analogue import Fitted
 from replays.score.card.scorecard import Scorecard
-from replays.score.fits.intervals import scaled
 from replays.score.quantities.crosstalk import find_crosstalk
 from replays.score.quantities.nonlinearity import intermodulation, transfer_curve
 from replays.score.quantities.rounding import rounding_errors

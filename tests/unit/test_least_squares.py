@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from replays.recordings.least_squares import fit
+from replays.estimate.least_squares import fit
 
 TIMES = np.linspace(0.0, 1.0, 50)
 

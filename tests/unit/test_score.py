@@ -13,6 +13,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
+from replays.estimate.sine import fit_sine, is_sine, quality
 from replays.recordings.export import write_run
 from replays.recordings.formats.mapping import FileOptions
 from replays.recordings.formats.readers import columnar, delimited, mdf
@@ -29,12 +30,11 @@ from replays.score.card.scorecard import (
     judge_row,
     write_junit,
 )
-from replays.score.fits.sine import fit_sine, is_sine, quality
-from replays.score.fits.waveform import fit_waveform, student
 from replays.score.judgement import judge
 from replays.score.quantities.noise import split_noise
 from replays.score.records.rows import NO_COUNT, follow, stretches
 from replays.score.records.stimulus import EDGE, Exact, Sampled
+from replays.score.waveform import fit_waveform, student
 from rig.base.errors import InputError
 from rig.base.outcome import Outcome
 from rig.channels.table import default_table

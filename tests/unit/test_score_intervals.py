@@ -8,15 +8,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from replays.estimate.intervals import pooled, refine, sandwich, student
+from replays.estimate.sine import fit_sine, quality
 from replays.score.alignment.stamps import Stamps
 from replays.score.card.limits import load_limits
 from replays.score.card.scorecard import FAIL, INCONCLUSIVE, PASS, Bounds, Scorecard, judge_row
-from replays.score.fits.intervals import pooled, refine, sandwich, student
-from replays.score.fits.sine import fit_sine, quality
-from replays.score.fits.waveform import Waveform
 from replays.score.quantities.noise import split_noise
 from replays.score.quantities.rounding import Converter, undithered, widen
 from replays.score.records.recorded import Table
+from replays.score.waveform import Waveform
 from rig.channels.table import default_table
 from tests.score_coverage import NOISES, ROWS, Estimate, cell, estimates
 

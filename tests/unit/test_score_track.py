@@ -14,10 +14,10 @@ from replays.score.alignment.following import Source
 from replays.score.alignment.repeats import find_repeats
 from replays.score.alignment.track import Follower, Track, follow_record
 from replays.score.card.scorecard import FAIL, INCONCLUSIVE, PASS, Scorecard
-from replays.score.fits.waveform import fit_stretch
 from replays.score.judgement import judge
 from replays.score.records.stimulus import Exact
 from replays.score.records.wiring import Wire, find_wires
+from replays.score.waveform import fit_stretch
 from rig.channels.table import default_table
 from tests.score_cases import Converter, as_columns
 from tests.score_daqs import RATE_HZ, Tones, counts_of, write_parquet, write_session

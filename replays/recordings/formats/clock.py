@@ -7,6 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from replays.estimate.clock import Line, fit_line
+from replays.estimate.spectra import parabola_top
 from rig.base.errors import InputError, Words
 
 EVEN = 0.05
@@ -95,7 +97,8 @@ def axis_of_stamps(times_s: np.ndarray, *, line: bool, what: str) -> Axis:
         raise InputError(
             "time stamps", must, Words(f"{what}, {times_s[at]:g} s after {times_s[at - 1]:g} s (row {at + 1})")
         )
-    first_s, step, jitter = _line(times_s, np.arange(n))
+    whole = fit_line(np.arange(n), times_s)
+    step, jitter = whole.slope, _jitter(whole)
     if not step >= _MIN_STEP_S:
         must = "ascending by 1 ns a sample or more, on the whole (or time.rate_hz given)"
         raise InputError("time stamps", must, Words(f"{what}, {step:g} s a sample"))
@@ -104,24 +107,18 @@ def axis_of_stamps(times_s: np.ndarray, *, line: bool, what: str) -> Axis:
         # Samples may be missing from an even axis, as where a network has lost some.
         numbers = np.concatenate([[0], np.cumsum(np.rint(steps / np.median(steps)))]).astype(np.int64)
         if np.all(np.diff(numbers) > 0) and n <= numbers[-1] < 4 * n:
-            started_s, spaced, spread = _line(times_s, numbers)
-            if spread[1] < EVEN * spaced:
+            kept = fit_line(numbers, times_s)
+            if (spread := _jitter(kept))[1] < EVEN * kept.slope:
                 rows = int(numbers[-1]) + 1
                 note = f"straight line through the time stamps, {rows - n} samples missing"
-                return Axis(started_s, 1.0 / spaced, rows, None, spread, note, numbers)
+                return Axis(kept.at_zero, 1.0 / kept.slope, rows, None, spread, note, numbers)
         return Axis(float(times_s[0]), 1.0 / step, n, times_s, jitter, "time stamps as they are")
-    return Axis(first_s, 1.0 / step, n, None, jitter, "straight line through the time stamps")
+    return Axis(whole.at_zero, 1.0 / step, n, None, jitter, "straight line through the time stamps")
 
 
-def _line(times_s: np.ndarray, numbers: np.ndarray) -> tuple[float, float, tuple[float, float]]:
-    """Straight line through times by number: time of number 0, step, residual rms and largest, all [s]."""
-    # About the middle, so that no digits are lost.
-    centre, middle = numbers.mean(), times_s.mean()
-    rows = numbers - centre
-    step = float(rows @ (times_s - middle)) / float(rows @ rows)
-    residual = times_s - middle - step * rows
-    jitter = (float(np.sqrt(np.mean(residual**2))), float(np.abs(residual).max()))
-    return float(middle - step * centre), step, jitter
+def _jitter(line: Line) -> tuple[float, float]:
+    """Return the residual of stamps from their line, rms and largest [s]."""
+    return float(np.sqrt(np.mean(line.residual**2))), float(np.abs(line.residual).max())
 
 
 def linear(values: np.ndarray, axis: Axis, instants_s: np.ndarray) -> np.ndarray:
@@ -247,10 +244,8 @@ def shift_by_edges(
         raise InputError("align", must, Words(f"{len(found[0])} in the reference, {len(found[1])} in what is moved"))
     a, b = found
     if len(a) == len(b) > 1:
-        middle = b.mean()
-        stretch, offset = np.polyfit(b - middle, a, 1)
-        residual = float(np.abs(a - offset - stretch * (b - middle)).max())
-        offset = float(offset - stretch * middle)
+        line = fit_line(b, a)
+        stretch, offset, residual = line.slope, line.at_zero, _jitter(line)[1]
         how = f"{len(a)} common edges, clock {1e6 * (stretch - 1.0):+.2f} ppm, worst edge {residual * 1e6:.2f} µs off"
     else:
         stretch, offset = 1.0, float(a[0] - b[0])
@@ -258,7 +253,7 @@ def shift_by_edges(
     moves = max(abs(offset + (stretch - 1.0) * t) for t in (b[0], b[-1]))
     if moves > within_s:
         raise InputError("align", f"within {within_s:g} s (align.within_s)", Words(f"{moves:g} s"))
-    return Shift(offset, float(stretch), f"by {how}")
+    return Shift(offset, stretch, f"by {how}")
 
 
 def shift_by_correlation(
@@ -295,7 +290,5 @@ def shift_by_correlation(
         raise InputError("align", "alike by a correlation of 0.3 or more", round(peak, 3))
     offset = float(lags[best])
     if 0 < best < len(alike) - 1:
-        left, centre, right = alike[best - 1 : best + 2]
-        bend = left - 2.0 * centre + right
-        offset += 0.5 * float((left - right) / bend) / rate if bend < 0.0 else 0.0
+        offset += float(parabola_top(*alike[best - 1 : best + 2])[0]) / rate
     return Shift(offset, 1.0, f"by cross-correlation {peak:.3f}")

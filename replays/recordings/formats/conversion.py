@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from replays.estimate.runs import true_runs
 from replays.recordings.formats import clock
 from replays.recordings.formats.events import events
 from replays.recordings.formats.events.motion import Motion
@@ -381,7 +382,7 @@ def _blocks(conversion: Conversion, name: str) -> Iterator[tuple[int, str, wire.
     base = round(first * rate / TICK_RATE_HZ)
     starts = [*block_starts(len(counts), first, rate), len(counts)]
     for start, stop in pairwise(starts):
-        for low, high in _runs(present[start:stop]):
+        for low, high in true_runs(present[start:stop]):
             at = start + low
             values = np.ascontiguousarray(counts[at : start + high])
             block = wire.Block(round(first + at * TICK_RATE_HZ / rate), base + at, rate, float(TICK_RATE_HZ), values)
@@ -407,12 +408,6 @@ def block_starts(rows: int, first: float, rate: float) -> list[int]:
         ticks = first + near * (TICK_RATE_HZ / rate)
         found.append(int(near[np.argmin(np.abs(ticks - np.rint(ticks)))]))
     return found
-
-
-def _runs(present: np.ndarray) -> list[tuple[int, int]]:
-    """Starts and ends of the stretches that are there."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], present, [False]]).astype(np.int8)))
-    return [(int(low), int(high)) for low, high in edges.reshape(-1, 2)]
 
 
 def _edge_blocks(conversion: Conversion) -> Iterator[tuple[int, str, wire.Block]]:

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from replays.estimate.intervals import jackknife
+from replays.estimate.least_squares import solve_normal
 from replays.recordings.resimulation.prediction import Measured
 from replays.recordings.resimulation.sensitivity import Predictor
 from rig.base.errors import InputError, SimulationError
@@ -56,16 +58,9 @@ def by_agreement(
         side = sum(one / scale**2 for one, scale in zip(sides, scales, strict=True))
         if held is not None:
             square, side = square + np.diag(held[1] ** -2.0), side + held[0] * held[1] ** -2.0
-        found = _solve(np.asarray(square), np.asarray(side))
+        found = solve_normal(np.asarray(square), np.asarray(side))
         scales = [max(1.0, rms(z - a @ found)) for z, a in zip(target, columns, strict=True)]
     return found
-
-
-def _solve(square: np.ndarray, side: np.ndarray) -> np.ndarray:
-    """Solve the normal equations `square` x = `side`, shapes (unknowns, unknowns) and (unknowns,)."""
-    # In units in which each is 1 of its own: sizes differ by a million.
-    size: np.ndarray = 1.0 / np.sqrt(np.maximum(np.diag(square), 1e-300))
-    return size * np.linalg.lstsq(square * np.outer(size, size), side * size, rcond=1e-14)[0]
 
 
 def signals_of(parts: Mapping[str, Measured]) -> list[float]:
@@ -176,55 +171,42 @@ def elsewhere(predictor: Predictor, values: np.ndarray, places: list[int], heard
     return best[1]
 
 
-def without_each(steps: np.ndarray) -> np.ndarray:
-    """Half of 95 % intervals by how far values go without one of n parts of the samples, shape (unknowns,).
-
-    Whatever the model lacks acts on some channels and at some times more than on others. Tukey's jackknife with groups
-    left out (J. Shao and C. F. J. Wu, Annals of Statistics 17, 1989).
-
-    Args:
-        steps: What values go by without each part, shape (n, unknowns).
-    """
-    from scipy.stats import t
-
-    n = len(steps)
-    if n < 2:
-        return np.zeros(steps.shape[-1])
-    deviation = np.sqrt((n - 1) / n * ((steps - steps.mean(axis=0)) ** 2).sum(axis=0))
-    return float(t.ppf(0.975, n - 1)) * deviation
-
-
 def stretches(times_s: np.ndarray, first_s: float) -> np.ndarray:
     """Number of the stretch that each sample is in, shape (n,): long ones before the hammer pulse, and short ones."""
     return np.floor((times_s - first_s) / np.where(times_s < first_s, _LONG_S, _SHORT_S)).astype(int)
 
 
-def jackknife(
-    here: Here, parts: Mapping[str, Measured], scales: Sequence[float], priors: np.ndarray, first_s: float
+def half_without_parts(
+    here: Here,
+    times_s: Sequence[np.ndarray],
+    scales: Sequence[float],
+    known: tuple[np.ndarray, np.ndarray],
+    first_s: float,
 ) -> np.ndarray:
-    """Half of 95 % intervals by what values do without single channels, and stretches of time, shape (unknowns,).
+    """Return half of 95 % intervals by what values do without single channels, and stretches of time.
 
     Args:
         here: The channels at the values.
-        parts: The samples.
+        times_s: Of each channel's samples [s], shape (n,).
         scales: By what each channel counts less.
-        priors: Standard deviations of what is known before, shape (unknowns,).
+        known: What is known before, as a part of the normal equations, shapes (unknowns, unknowns) and (unknowns,).
         first_s: When the hammer pulse comes [s].
+
+    Returns:
+        Shape (unknowns,).
     """
-    times = [part.times_s for part in parts.values() for _ in part.names]
     pieces = []
     for c, (z, a, scale) in enumerate(zip(here.apart, here.slopes, scales, strict=True)):
-        number = stretches(times[c], first_s)
+        number = stretches(times_s[c], first_s)
         for one in np.unique(number):
             rows = number == one
             pieces.append((c, int(one), a[rows].T @ a[rows] / scale**2, a[rows].T @ z[rows] / scale**2))
 
     def step(place: int, one: int) -> np.ndarray:
         kept = [piece for piece in pieces if piece[place] != one]
-        square = np.diag(priors**-2.0) + sum(piece[2] for piece in kept)
-        return _solve(square, np.asarray(sum(piece[3] for piece in kept)))
+        return solve_normal(known[0] + sum(piece[2] for piece in kept), known[1] + sum(piece[3] for piece in kept))
 
     return np.max(
-        [without_each(np.array([step(place, one) for one in {piece[place] for piece in pieces}])) for place in (0, 1)],
+        [jackknife(np.array([step(place, one) for one in {piece[place] for piece in pieces}])) for place in (0, 1)],
         axis=0,
     )

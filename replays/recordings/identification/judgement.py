@@ -8,6 +8,7 @@ from typing import Literal
 
 import numpy as np
 
+from replays.estimate.intervals import chi2_quantile, draw_normal, student
 from replays.recordings.identification.question import Unknown
 from replays.recordings.identification.window import Window
 
@@ -121,15 +122,13 @@ def judge(window: Window, z: np.ndarray, slopes: np.ndarray, residuals: np.ndarr
         residuals: Measured less predicted over the noise, shape (rows, channels).
         known: Which samples count, shape (rows, channels); slopes and residuals are 0 for the others.
     """
-    from scipy.stats import t
-
     unknowns, observation, values = window.question.unknowns, window.question.observation, window.values(z)
     reach = np.array([unknown.reach / unknown.scale for unknown in unknowns])
     count = int(known.sum())
     _, singular, directions = np.linalg.svd(triangle_of(slopes * reach))
     freedom = max(1, count - len(unknowns))
     chi2 = float((residuals**2).sum()) / freedom
-    quantile = float(t.ppf(0.975, freedom))
+    quantile = float(student(freedom))
     unsure = _FITS if "measured" in observation.noise_from else 0.0
     spread = 1.0 + _ALONG * _misfit(residuals, known, unsure) / quantile
     seen = quantile * spread < singular  # a direction's 95 % interval is within the reach
@@ -209,9 +208,7 @@ def _together_factor(correlation: np.ndarray) -> float:
     """Width of simultaneous 95 % intervals over that of single ones, by drawing from the normal distribution."""
     if len(correlation) < 2:
         return 1.0
-    sizes, directions = np.linalg.eigh(correlation)
-    draws = np.random.default_rng(0).standard_normal((_DRAWS, len(correlation)))
-    largest = np.abs(draws * np.sqrt(np.maximum(sizes, 0.0)) @ directions.T).max(axis=1)
+    largest = np.abs(draw_normal(correlation, np.random.default_rng(0), _DRAWS)).max(axis=1)
     return max(1.0, float(np.quantile(largest, 0.95)) / 1.96)
 
 
@@ -359,8 +356,6 @@ def _wider(covariance: np.ndarray, other: np.ndarray) -> np.ndarray:
 
 
 def _channel(name: str, residuals: np.ndarray, known: np.ndarray) -> ChannelFit:
-    from scipy.stats import chi2
-
     held = residuals[known]
     if len(held) < 2 * _LAGS or not held.any():
         return ChannelFit(name, float(np.sqrt(np.mean(held**2))) if len(held) else 0.0, 0.0, white=True)
@@ -370,5 +365,5 @@ def _channel(name: str, residuals: np.ndarray, known: np.ndarray) -> ChannelFit:
     correlations = np.array([float(centred[lag:] @ centred[:-lag]) / power for lag in lags]) if power else 0.0 * lags
     statistic = len(held) * (len(held) + 2.0) * float((correlations**2 / (len(held) - lags)).sum())
     return ChannelFit(
-        name, float(np.sqrt(np.mean(held**2))), float(correlations[0]), white=bool(statistic < chi2.ppf(0.999, _LAGS))
+        name, float(np.sqrt(np.mean(held**2))), float(correlations[0]), white=statistic < chi2_quantile(0.999, _LAGS)
     )

@@ -14,7 +14,8 @@ from dataclasses import replace
 import numpy as np
 
 from recorder.reader import Recording
-from replays.recordings.identification.agreement import stretches, without_each
+from replays.estimate.least_squares import solve_normal
+from replays.recordings.identification.agreement import Here, half_without_parts
 from replays.recordings.identification.fit import Identification
 from replays.recordings.identification.judgement import Judgement, judge, widened
 from replays.recordings.identification.nuisance import NUISANCES, looks_from, nuisances_of, tune
@@ -80,13 +81,18 @@ def identify_log(
     scale = np.array([unknown.scale for unknown in question.unknowns])
     places = [list(tuned.values).index(key) for key in question.keys]
     moves = 1.96 * np.sqrt(np.mean(tuned.moves[:, places] ** 2, axis=0)) / scale
-    moved = np.hypot(_jackknife(question, slopes, residuals), moves)
+    square, side = _priors(question)
+    here = Here(list(np.nan_to_num(residuals).T), list(np.moveaxis(slopes, 1, 0)))
+    times = [observation.times_s[: len(residuals)]] * len(here.apart)
+    lacking = half_without_parts(here, times, [1.0] * len(times), (square, side), first_command_s(question.experiment))
+    moved = np.hypot(lacking, moves)
     shown = [residuals - apart / louder]
     for changes in variants:
         shown.append(_of(replace(question, experiment=question.experiment.changed(dict(changes)))).residuals(z))
-    here = _step(question, slopes, residuals)
+    flat = slopes.reshape(-1, len(scale))
     for one in shown:
-        moved = np.hypot(moved, np.abs(_step(question, slopes, one) - here))
+        change = solve_normal(square + flat.T @ flat, flat.T @ np.nan_to_num(one - residuals).ravel())
+        moved = np.hypot(moved, np.abs(change))
     judgement, why = (
         judge(window, z, slopes, residuals, known),
         "the model, or a search that follows it, goes no further",
@@ -99,17 +105,6 @@ def identify_log(
     )  # fmt: skip
 
 
-def _jackknife(question: Question, slopes: np.ndarray, residuals: np.ndarray) -> np.ndarray:
-    """Half of 95 % intervals by what values do without single channels, and stretches of time, in scales."""
-    times_s = question.observation.times_s[: len(residuals)]
-    number = stretches(times_s, first_command_s(question.experiment))
-    return np.max([
-        without_each(np.array([_step(question, slopes, residuals, groups != one) for one in np.unique(groups)]))
-        for groups in (np.broadcast_to(np.arange(residuals.shape[1]), residuals.shape),
-                       np.broadcast_to(number[:, None], residuals.shape))
-    ], axis=0)  # fmt: skip
-
-
 def _of(question: Question, parts: dict[str, Measured] | None = None) -> Window:
     """All samples of a question; where other parts are given, behind their filters."""
     if parts is not None:
@@ -117,18 +112,11 @@ def _of(question: Question, parts: dict[str, Measured] | None = None) -> Window:
     return Window(question, float(question.observation.times_s[-1]) + 1e-6)
 
 
-def _step(question: Question, slopes: np.ndarray, residuals: np.ndarray, kept: np.ndarray | None = None) -> np.ndarray:
-    """How far values go by least squares, with what is known of them before, in scales, shape (unknowns,)."""
-    n = slopes.shape[-1]
-    weights = 1.0 if kept is None else kept.ravel()
-    flat = slopes.reshape(-1, n)
-    square, side = (flat.T * weights) @ flat, flat.T @ (np.nan_to_num(residuals).ravel() * weights)
-    for place, unknown in enumerate(question.unknowns):
-        mean, sigma = unknown.prior or (unknown.start, unknown.scale)
-        square[place, place] += (unknown.scale / sigma) ** 2
-        side[place] += (mean - unknown.start) * unknown.scale / sigma**2
-    size = 1.0 / np.sqrt(np.diag(square))
-    return size * np.linalg.lstsq(square * np.outer(size, size), side * size, rcond=1e-14)[0]
+def _priors(question: Question) -> tuple[np.ndarray, np.ndarray]:
+    """Return the normal equations of what is known before, in scales, shapes (unknowns, unknowns) and (unknowns,)."""
+    known = [(one, *(one.prior or (one.start, one.scale))) for one in question.unknowns]
+    square = np.diag([(one.scale / sigma) ** 2 for one, _, sigma in known])
+    return square, np.array([(mean - one.start) * one.scale / sigma**2 for one, mean, sigma in known])
 
 
 def _wider(judgement: Judgement, moved: np.ndarray) -> Judgement:

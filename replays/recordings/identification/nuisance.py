@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from recorder.reader import Recording
+from replays.estimate.intervals import draw_normal
 from replays.recordings.identification.agreement import (
     BEYOND,
     Here,
@@ -22,7 +23,7 @@ from replays.recordings.identification.agreement import (
     centred,
     channels_of,
     elsewhere,
-    jackknife,
+    half_without_parts,
     look,
     rms,
     signals_of,
@@ -171,9 +172,7 @@ class Tuned:
 
     def drawn(self, generator: np.random.Generator) -> Tuned:
         """The same with values as far off as the fit leaves open, and as what the model lacks still moves them."""
-        size = np.sqrt(np.diag(self.covariance))  # of which some are a million times as large as others
-        sizes, directions = np.linalg.eigh(self.covariance / np.outer(size, size))
-        off = size * (directions @ (np.sqrt(np.maximum(sizes, 0.0)) * generator.standard_normal(len(size))))
+        off = draw_normal(self.covariance, generator, 1)[0]
         off += generator.standard_normal(len(self.moves)) @ self.moves
         moved = {key: value + d for (key, value), d in zip(self.values.items(), off.tolist(), strict=True)}
         return replace(self, values=_possible(self.begun, moved))
@@ -481,7 +480,9 @@ def _grown(
         square = sum(one.T @ one / scale**2 for one, scale in zip(here.slopes, scales, strict=True))
         moves.append(found - values)
         covariance, values = np.linalg.inv(square + np.diag(known[1] ** -2.0)), found
-        end_s, lacking = first_s + length, jackknife(here, parts, scales, known[1], first_s)
+        times = [part.times_s for part in parts.values() for _ in part.names]
+        before = np.diag(known[1] ** -2.0), np.zeros(len(values))
+        end_s, lacking = first_s + length, half_without_parts(here, times, scales, before, first_s)
     return _Grown(values, covariance, np.array(moves[-_LAST:]), end_s, scales, lacking)
 
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 
+from replays.estimate.runs import block_means, split_at
 from replays.recordings.resimulation.prediction import Measured
+from rig.channels.orbit import full_spectrum, whirl_frequency
 from rig.channels.orbit import phase as phase_of
-from rig.channels.orbit import whirl_frequency
 
 PHASES = ("free run", "impacts", "whirl", "rest", "decay")
 """Before the first contact; contact that comes and goes; lasting contact that goes round, or does not; after it."""
@@ -152,8 +152,7 @@ SPECTRA = {"spectrum_ring": _RING, "spectrum_disk": _DISK, "spectrum_force": _FO
 def _lowest(view: View) -> float:
     times, speed = view.times_s["speed"], view.values["speed"]
     n = max(1, round(5e-3 / (times[1] - times[0])))
-    whole = len(speed) // n * n
-    return float(speed[:whole].reshape(-1, n).mean(axis=1).min()) if whole else float(speed.mean())
+    return float(block_means(speed, n).min(initial=math.inf) if len(speed) >= n else speed.mean())
 
 
 def spectrum_distance(a: np.ndarray, b: np.ndarray) -> float:
@@ -166,8 +165,7 @@ def spectrum_distance(a: np.ndarray, b: np.ndarray) -> float:
         a: Complex signal x + j y, shape (n,).
         b: Another, shape (n,).
     """
-    window = np.hanning(len(a))
-    x, y = (np.abs(np.fft.fft((signal - signal.mean()) * window)) for signal in (a, b))
+    (_, x), (_, y) = (full_spectrum(signal.real, signal.imag, 1.0) for signal in (a, b))
     total = np.sum(x**2) + np.sum(y**2)
     return float(np.sqrt(np.sum((x - y) ** 2) / total)) if total > 0.0 else 0.0
 
@@ -185,13 +183,10 @@ def view_of(
     shown: dict[str, np.ndarray] = {}
     for name, part in parts.items():
         kept = slice(*np.searchsorted(part.times_s, (phase.from_s, phase.to_s)))
-        n = kept.stop - kept.start
-        if n < 2:
+        if kept.stop - kept.start < 2:
             continue
-        breaks = np.flatnonzero(np.diff(part.index[kept]) != 1) + 1
-        edges = [0, *breaks, n]
-        begin, end = max(pairwise(edges), key=lambda pair: pair[1] - pair[0])
-        stretch = slice(kept.start + int(begin), kept.start + int(end))
+        begin, end = max(split_at(np.diff(part.index[kept]) != 1), key=lambda pair: pair[1] - pair[0])
+        stretch = slice(kept.start + begin, kept.start + end)
         for c, channel in enumerate(part.channels):
             times[channel.name] = part.times_s[stretch]
             shown[channel.name] = values[name][stretch, c]
@@ -275,15 +270,11 @@ def _lasting(times: np.ndarray, contact: np.ndarray, angle: np.ndarray) -> tuple
         held = contact[s : s + n].mean() > LASTING
         round_ = abs(angle[s + n - 1] - angle[s]) > TURNS
         kinds.append(("whirl" if round_ else "rest") if held else "")
-    best: tuple[int, int, str] = (0, 0, "")
-    run = 0
-    for k, kind in enumerate(kinds):
-        run = run + 1 if k and kind == kinds[k - 1] else 1
-        if kind and run > best[1]:
-            best = (k - run + 1, run, kind)
-    first, length, kind = best
-    if not length:
+    alike = np.array(kinds)
+    runs = [run for run in split_at(alike[1:] != alike[:-1]) if kinds and kinds[run[0]]]
+    if not runs:
         return (0.0, 0.0), ""
-    stop = min((first + length) * n, len(times) - 1)
-    last_window = first + length == len(kinds)  # what is left behind the last window is too short to judge
-    return (float(times[first * n]), float(times[-1] + 1e-9 if last_window else times[stop])), kind
+    first, end = max(runs, key=lambda run: run[1] - run[0])
+    stop = min(end * n, len(times) - 1)
+    last_window = end == len(kinds)  # what is left behind the last window is too short to judge
+    return (float(times[first * n]), float(times[-1] + 1e-9 if last_window else times[stop])), kinds[first]

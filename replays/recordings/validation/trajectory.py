@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from replays.estimate.runs import block_means
 from replays.recordings.resimulation.prediction import Measured, Prediction
 from replays.recordings.validation.criteria import Criteria, TrajectoryCriterion
 
@@ -129,9 +130,8 @@ def residuals(
 
 def _judge(part: Measured, c: int, z: np.ndarray, criterion: TrajectoryCriterion | None) -> ChannelResidual:
     rms, peak = float(np.sqrt(np.mean(z**2))), float(np.abs(z).max())
-    whole = len(z) // STRETCH * STRETCH
-    means = z[:whole].reshape(-1, STRETCH).mean(axis=1) * math.sqrt(STRETCH) if whole else np.empty(0)
-    drift = float(np.abs(means).max()) if len(means) else 0.0
+    means = block_means(z, STRETCH) * math.sqrt(STRETCH)
+    drift = float(np.abs(means).max(initial=0.0))
     limit, good, first = math.inf, None, None
     peak_limit = drift_limit = math.inf
     if criterion is not None:

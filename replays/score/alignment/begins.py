@@ -12,8 +12,8 @@ import numpy as np
 
 from replays.score.alignment.following import FEWEST, SOUND, Alignment, Source, busiest, follow
 from replays.score.alignment.repeats import find_repeats
-from replays.score.fits.waveform import Waveform, fit_stretch, fit_waveform
 from replays.score.records.stimulus import Exact
+from replays.score.waveform import Waveform, fit_stretch, fit_waveform
 
 _NOISES = 1.2
 """Nominal noises that a residual may have, for it to be nothing but noise."""

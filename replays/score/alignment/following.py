@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from replays.score.alignment.track import Follower, Track, follow_record
-from replays.score.fits.waveform import Waveform, fit_stretch
 from replays.score.records.stimulus import Stimulus
 from replays.score.records.wiring import Wire
+from replays.score.waveform import Waveform, fit_stretch
 from rig.channels.table import Channel
 
 FEWEST = 400

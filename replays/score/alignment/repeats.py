@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from replays.score.fits.waveform import Waveform
 from replays.score.records.stimulus import Stimulus
+from replays.score.waveform import Waveform
 
 _MOST, _FINER, _TOLD = 1 << 20, 8, 12
 """Samples of a record that are compared, places between two of them, and how many times are returned."""

@@ -6,8 +6,9 @@ import math
 
 import numpy as np
 
+from replays.estimate.clock import fit_line
+from replays.estimate.intervals import about, chi2_mean_ends, student
 from replays.score.card.scorecard import Interval
-from replays.score.fits.intervals import about, student
 from replays.score.records.recorded import Table
 
 _BATCHES, _APART = 256, 32
@@ -61,24 +62,18 @@ class Stamps:
         found["stamps that go back"] = (float(self._back),) * 3
         if len(self._means) < 8:
             return found
-        from scipy.stats import chi2
-
         # Rows that came in bursts are not independent: several batches are one here.
         several = max(1, len(self._means) // _APART)
         whole = np.array(self._means[: len(self._means) // several * several])
         since, late = whole.reshape(-1, several, 2).mean(axis=1).T
-        (rate, offset), covariance = np.polyfit(since, late - late[0], 1, cov=True)
-        half = student(len(since) - 2) * np.sqrt(np.diag(covariance))
-        for name, at, wide, size in (
-            ("stamp offset", late[0] + offset, half[1], 1.0),
-            ("stamp rate", rate, half[0], 1e6),
-        ):
-            found[name] = about(at, wide, size)
+        line = fit_line(since, late)
+        found["stamp rate"] = about(line.slope, line.half[0], 1e6)
+        found["stamp offset"] = about(line.at_zero, line.half[1])
         if wall_s is not None and abs(late.mean() - wall_s) < apart_s:
             value, wide = late.mean() - wall_s, student(len(late) - 1) * late.std(ddof=1) / math.sqrt(len(late))
             found["latency"] = about(float(value), float(wide))
-        ends = [math.sqrt(self._squares / chi2.ppf(p, self._freedom)) for p in (0.975, 0.025)]
-        found["stamp jitter"] = math.sqrt(self._squares / self._freedom), ends[0], ends[1]
+        jitter_s, (low, high) = math.sqrt(self._squares / self._freedom), chi2_mean_ends(self._freedom)
+        found["stamp jitter"] = jitter_s, jitter_s / math.sqrt(high), jitter_s / math.sqrt(low)
         return found
 
     def picture(self) -> np.ndarray:

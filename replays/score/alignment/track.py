@@ -13,6 +13,8 @@ from itertools import pairwise
 
 import numpy as np
 
+from replays.estimate.clock import fit_line, time_error
+from replays.estimate.least_squares import solve
 from replays.score.records.stimulus import Stimulus
 
 _CHUNK = 8192
@@ -122,7 +124,7 @@ class Track:
         if len(self.blocks) < 4:
             return np.array([float(np.mean(self.blocks[:, 1])) if len(self.blocks) else 0.0, 0.0, 0.0])
         scale = float(np.ptp(self.blocks[:, 0]))
-        parts = np.polynomial.polynomial.polyfit((self.blocks[:, 0] - centre) / scale, self.blocks[:, 1], 2)
+        parts = solve(np.vander((self.blocks[:, 0] - centre) / scale, 3, increasing=True), self.blocks[:, 1])
         return parts / scale ** np.arange(3.0)
 
     def places(self, rows: int) -> tuple[np.ndarray, np.ndarray]:
@@ -382,8 +384,7 @@ def _fit(y: np.ndarray, s: np.ndarray, ds: np.ndarray, least: float = _HALF) -> 
     """
     use = np.isfinite(y) & np.isfinite(s)
     r, slope = np.where(use, y - s, 0.0), np.where(use, ds, 0.0)
-    known = float(np.sum(slope**2))
-    error = float(np.sum(slope * r)) / known if known > 0.0 else 0.0
+    known, error = float(np.sum(slope**2)), time_error(slope, r)
     if abs(error) < 1.0:
         r = r - error * slope
     rows = use.sum(axis=1)
@@ -446,9 +447,8 @@ def _predict(history: list[tuple[float, float]], line: np.ndarray, row: int) -> 
         if history:
             late += history[-1][1] - line[1] - line[2] * (history[-1][0] - line[0])
         return np.array([row, late, line[2]])
-    at, errors = np.array(history).T
-    pace, late = np.polyfit(at - row, errors, 1)
-    return np.array([row, late, pace if len(history) == _MEMORY else line[2]])
+    fitted = fit_line(*np.array(history).T)
+    return np.array([row, fitted(row), fitted.slope if len(history) == _MEMORY else line[2]])
 
 
 def follow_record(

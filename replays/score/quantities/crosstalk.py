@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from replays.estimate.intervals import sandwich, simultaneous
+from replays.estimate.least_squares import solve
 from replays.score.card.scorecard import Interval
-from replays.score.fits.intervals import sandwich, simultaneous
 
 _SEPARATE = 0.01
 """Part of the power of a source that the other signals must leave: below, none of them can be told from it."""
@@ -42,7 +43,7 @@ def find_crosstalk(
     own_part = 1.0 / np.diag(np.linalg.inv(likeness + 1e-9 * np.eye(len(sizes))))[: len(sources)]
     if own_part.min() < _SEPARATE:
         return int(own_part.argmin()), None
-    parts, *moved = np.linalg.lstsq(matrix, np.column_stack([left, *map(detrend, errors)]), rcond=None)[0].T
+    parts, *moved = solve(matrix, np.column_stack([left, *map(detrend, errors)])).T
     covariance, freedom = sandwich(matrix, left - matrix @ parts)
     held, own_size = slice(len(sources)), sizes[len(sources)]
     sizes, parts = sizes[held], np.abs(parts[held] / sizes[held])

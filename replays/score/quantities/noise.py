@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from replays.score.fits.intervals import sandwich, student, wander_columns
-from replays.score.fits.waveform import Waveform
+from replays.estimate.intervals import sandwich, student, wander_columns
+from replays.estimate.least_squares import solve_normal
+from replays.score.waveform import Waveform
 
 _SKEW = 0.6
 """Half interval of a power, over the power, from which it may be 0 and its interval is even to both sides."""
@@ -70,8 +71,7 @@ def _powers(
     fast = squared - wander
     while True:
         weighted = matrix * weights[:, None]
-        inverse = np.linalg.inv(weighted.T @ matrix)
-        parts = inverse @ (weighted.T @ fast)
+        parts = solve_normal(weighted.T @ matrix, weighted.T @ fast)
         rounds -= 1
         if not rounds:
             break

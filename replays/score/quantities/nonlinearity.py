@@ -7,13 +7,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 
+from replays.estimate.clock import fit_line
+from replays.estimate.intervals import simultaneous
+from replays.estimate.least_squares import inverse_of, solve
+from replays.estimate.runs import block_means, split_at
+from replays.estimate.sine import decibels, fit_sine, fit_tones, tone_columns
 from replays.score.card.scorecard import Interval
-from replays.score.fits.intervals import simultaneous
-from replays.score.fits.sine import decibels, fit_sine
 
 _PURITY = 1e-4
 """Part of its power that a signal of two tones may have besides them: session noise is 1e-6 of it."""
@@ -23,7 +25,8 @@ _TONE_RATIO = 400.0
 """Power of one tone over the other, at most (26 dB)."""
 _SEARCH_ROWS = 1 << 14
 """Rows by which the two tones are found; their frequencies are then refined over all."""
-_ROUNDS, _SETTLED = 8, 1e-9
+_SETTLED = 1e-9
+"""Change of a tone's phase over all rows by the last step [cycles]: a thousandth of what session noise leaves open."""
 _ORDERS = (1, -1), (1, 1), (2, -1), (-1, 2), (2, 1), (1, 2), (2, 0), (0, 2), (3, 0), (0, 3)
 """Multiples of the two tones that are fitted: products of second and third order, and harmonics."""
 _COUNTED = 4
@@ -42,12 +45,6 @@ _NOISES = 4.0
 """Noises from the ends of the ramp within which the converter may limit."""
 
 
-def _basis(n: np.ndarray, turns: list[float]) -> np.ndarray:
-    """Cosine and sine of each frequency [cycles a row] at rows, and a constant, shape (n, 2 frequencies + 1)."""
-    phases = 2.0 * math.pi * np.outer(n, turns)
-    return np.column_stack([np.cos(phases), np.sin(phases), np.ones(len(n))])
-
-
 def _two_tones(n: np.ndarray, known: np.ndarray) -> tuple[list[float], float] | None:
     """Frequencies [cycles a row] and power [unit^2] of two tones; None where the signal is none of two tones."""
     if len(known) < _SEGMENT_ROWS or not np.var(known):
@@ -56,18 +53,7 @@ def _two_tones(n: np.ndarray, known: np.ndarray) -> tuple[list[float], float] | 
     second = fit_sine(first.residual)
     if np.var(second.residual) > _ROUGH * np.var(known):
         return None
-    tones, parts, left = np.array([first.frequency[0], second.frequency[0]]), np.zeros(5), known
-    for _ in range(_ROUNDS):
-        basis = _basis(n, tones.tolist())
-        parts = np.linalg.lstsq(basis, known, rcond=None)[0]
-        slopes = 2.0 * math.pi * n[:, None] * (basis[:, :2] * parts[2:4] - basis[:, 2:4] * parts[:2])
-        left = known - basis @ parts
-        if not np.isfinite(slopes).all() or not slopes.any():
-            return None
-        moved = np.linalg.lstsq(np.column_stack([slopes, basis]), left, rcond=None)[0][:2]
-        tones = tones + moved
-        if np.abs(moved).max() * len(n) < _SETTLED:
-            break
+    tones, parts, _, left = fit_tones(n, known, np.array([first.frequency[0], second.frequency[0]]), _SETTLED)
     powers = 0.5 * (parts[:2] ** 2 + parts[2:4] ** 2)
     if np.var(left) > _PURITY * np.var(known) or powers.max() > _TONE_RATIO * powers.min():
         return None
@@ -101,8 +87,8 @@ def intermodulation(times_s: np.ndarray, known: np.ndarray, residual: np.ndarray
             counted += number < _COUNTED
     if not counted:
         return None
-    basis = _basis(n, turns)
-    parts = np.linalg.lstsq(basis, residual, rcond=None)[0]
+    basis = tone_columns(n, np.array(turns))
+    parts = solve(basis, residual)
     line = 2.0 * float(np.var(residual - basis @ parts)) / len(n)  # variance of one part of a line
     squares = (parts[: len(turns)] ** 2 + parts[len(turns) : -1] ** 2)[:counted].tolist()
     half = 1.96 * math.sqrt(sum(4.0 * line * each + 4.0 * line**2 for each in squares))
@@ -128,14 +114,13 @@ class Transfer:
 
 def _ramp(times_s: np.ndarray, known: np.ndarray, span: float) -> np.ndarray | None:
     """A ramp's lines through the known signal, nan beside its jumps, shape (n,); None where it is none."""
-    edges = [0, *(np.flatnonzero(np.abs(np.diff(known)) > _JUMP * span) + 1), len(known)]
     ramp = np.full(len(known), np.nan)
-    for a, b in pairwise(edges):
+    for a, b in split_at(np.abs(np.diff(known)) > _JUMP * span):
         if b - a > _SEGMENT_ROWS + 2 * _RING_ROWS:
             part = slice(a + _RING_ROWS, b - _RING_ROWS)
-            line = np.polynomial.Polynomial.fit(times_s[part], known[part], 1)
+            line = fit_line(times_s[part], known[part])
             ramp[part] = line(times_s[part])
-            if np.std(known[part] - ramp[part]) > _STRAIGHT * span:
+            if np.std(line.residual) > _STRAIGHT * span:
                 return None
     held = np.isfinite(ramp)
     return ramp if held.any() and np.ptp(ramp[held]) > _SLOW * span else None
@@ -159,25 +144,22 @@ def transfer_curve(times_s: np.ndarray, known: np.ndarray, values: np.ndarray, s
         return None
     low, high = np.nanmin(ramp), np.nanmax(ramp)
     held = np.isfinite(ramp)
-    line = np.polynomial.Polynomial.fit(ramp[held], values[held], 1)
-    edge = _NOISES * float(np.std(np.diff(values[held] - line(ramp[held])))) / math.sqrt(2.0)
+    edge = _NOISES * float(np.std(np.diff(fit_line(ramp[held], values[held]).residual))) / math.sqrt(2.0)
     held[held] = (ramp[held] > low + edge) & (ramp[held] < high - edge)
     if held.sum() < _SEGMENT_ROWS:
         return None
     x, y = ramp[held], values[held]
-    line = np.polynomial.Polynomial.fit(x, y, 1)
+    line = fit_line(x, y)
     place = (x - x.min()) / (np.ptp(x) / _KNOTS)
     knot = np.minimum(place.astype(int), _KNOTS - 1)
     part, row = place - knot, np.arange(len(x))
     entries = np.concatenate([1.0 - part, part]), (np.tile(row, 2), np.concatenate([knot, knot + 1]))
     hats = csr_array(entries, shape=(len(x), _KNOTS + 1))
-    inverse = np.linalg.pinv((hats.T @ hats).toarray())
-    residual = y - line(x)
-    curve = inverse @ (hats.T @ residual)
-    left = residual - hats @ curve
+    inverse = inverse_of((hats.T @ hats).toarray())
+    curve = inverse @ (hats.T @ line.residual)
+    left = line.residual - hats @ curve
     block = max(1, len(x) // (8 * _KNOTS))  # noise of a colour has means of blocks that spread more
-    means = left[: len(x) // block * block].reshape(-1, block).mean(axis=1)
-    variance = max(float(np.var(left)), block * float(np.var(means)))
+    variance = max(float(np.var(left)), block * float(np.var(block_means(left, block))))
     inl = simultaneous(np.abs(curve), np.sqrt(np.diag(inverse) * variance))
     coverage = float(high - low) / span
     dnl, samples = _code_widths(y, line(x), float(np.std(left)))

@@ -12,8 +12,9 @@ from itertools import product
 
 import numpy as np
 
-from replays.score.fits.intervals import student
-from replays.score.fits.waveform import Waveform
+from replays.estimate.intervals import student
+from replays.estimate.least_squares import solve
+from replays.score.waveform import Waveform
 
 _PHASES = 8
 """Places of the steps against the signal that are tried: the true one is not known to a part of a step."""
@@ -118,8 +119,7 @@ def widen(found: Waveform, converters: Sequence[Converter]) -> Waveform:
     known, slope, since = found.known[rows], found.slope[rows], found.times_s[rows] - found.middle_s
     late = [slope, slope * since, slope * 0.5 * (since**2 - found.half_s**2 / 3.0)]
     columns = np.column_stack([known, np.ones(len(since)), *(found.gain * each for each in late)])
-    sizes = np.maximum(np.sqrt(np.mean(columns**2, axis=0)), 1e-300)
-    moved = np.linalg.lstsq(columns / sizes, errors.T, rcond=None)[0] / sizes[:, None]
+    moved = solve(columns, errors.T)
     return replace(
         found, covariance=found.covariance + np.diag((np.abs(moved).max(axis=1) / student(found.freedom)) ** 2)
     )

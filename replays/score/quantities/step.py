@@ -10,8 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from replays.estimate.intervals import simultaneous
+from replays.estimate.spectra import parabola_top
 from replays.score.card.scorecard import Interval
-from replays.score.fits.intervals import simultaneous
 
 _LEVEL_PART, _BETWEEN_ROWS = 0.1, 3
 """Part of a step within which a row is at a level, and rows between two levels, at most, of a signal that is steps."""
@@ -89,7 +90,7 @@ def step_response(known: np.ndarray, values: np.ndarray) -> StepResponse | None:
     after = slice(_BEFORE_ROWS - 1, None)
     over = simultaneous(mean[after] - 1.0, spread[after])
     before, peak, behind = mean[np.clip(np.argmax(mean), 1, len(mean) - 2) + np.arange(-1, 2)]
-    between = 0.125 * (behind - before) ** 2 / max(2.0 * peak - before - behind, 1e-300)  # of a parabola, at its top
+    _, between = parabola_top(before, peak, behind)
     overshoot = 100.0 * (over[0] + between), 100.0 * over[1], 100.0 * (over[2] + 2.0 * between)
     curve, fine = PchipInterpolator(grid, mean), np.arange(grid[0], grid[-1], 1.0 / 64.0)
 

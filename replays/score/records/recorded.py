@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from recorder.reader import Recording
+from replays.estimate.clock import fit_line
 from replays.recordings.formats.mapping import ChannelMapping, FileOptions
 from replays.recordings.formats.source import MAX_RATE_HZ, Entry, FileSignal, Source, even_rate_hz, open_source
 from replays.score.records.rows import take_rows
@@ -294,8 +295,8 @@ def _fit_line(times_s: np.ndarray, counts: np.ndarray) -> tuple[float, float]:
         counts: Rows from each to the next, shape (n - 1,).
     """
     rows = np.append(0.0, np.cumsum(counts))
-    line = np.polynomial.Polynomial.fit(rows, times_s, 1)
-    return float(np.ptp(times_s - line(rows))), float(line(1.0) - line(0.0))
+    line = fit_line(rows, times_s)
+    return float(np.ptp(line.residual)), line.slope
 
 
 def _ends_with_line_end(path: Path) -> bool:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from replays.estimate.clock import fit_line
 from replays.score.records.rows import NO_COUNT
 from rig.base import units
 from rig.channels.table import Channel
@@ -145,8 +146,8 @@ def _judge_fit(fitted: Scale, values: np.ndarray, counts: np.ndarray, candidates
     x, sign = counts[same].astype(float), 1.0 if fitted.each / near.each > 0.0 else -1.0
     off = (sign * values[same] - near.zero) / near.each - x
     x += near.zero / near.each  # a gain acts on values, which are zero there
-    mean, spread = float(x.mean()), float(np.ptp(x))
-    slope = float(np.polyfit(x - mean, off, 1)[0]) if spread else 0.0
+    mean = float(x.mean())
+    slope = fit_line(x, off).slope
     alone = float(off @ x / (x @ x)) if x.any() else 0.0
     forms = ((0.0, 0.0), (alone, 0.0), (0.0, float(off.mean())), (slope, float(off.mean()) - slope * mean))
     left = [float(np.sqrt(np.mean((off - gain * x - zero) ** 2))) for gain, zero in forms]

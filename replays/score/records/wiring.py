@@ -8,6 +8,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from replays.estimate.runs import true_runs
+from replays.estimate.spectra import correlation, spectrum
+
 _ALIKE, _CHANCE = 0.2, 6.0
 """Correlation from which a signal counts as found, and times the root of its samples: few are by chance."""
 _DISTINCT = 0.95
@@ -235,7 +238,7 @@ def _spectra(
     for values, each in sent.values():
         even = _even(values, each, rate, length)
         rows.append(np.pad(even - even.mean(), (0, math.ceil(length * rate) - len(even))))
-    return np.fft.rfft(np.array(rows, np.float32), size, axis=1), np.array(rows)
+    return spectrum(np.array(rows, np.float32), size), np.array(rows)
 
 
 def _lengths(sent: np.ndarray, before: int, n: int) -> np.ndarray:
@@ -252,7 +255,7 @@ def _likeness(here: np.ndarray, before: int, there: np.ndarray, lengths: np.ndar
     """Correlation with each channel by lag, from so many samples before the session on."""
     size = 2 * (there.shape[1] - 1)
     here = (here - here.mean()).astype(np.float32)
-    whole = np.fft.irfft(np.conj(np.fft.rfft(here, size)) * there, size, axis=1)
+    whole = correlation(here, there, size)
     curve = np.concatenate([whole[:, size - before :], whole[:, : lengths.shape[1] - before]], axis=1)
     return curve / (lengths * max(float(np.linalg.norm(here)), 1e-150))
 
@@ -274,8 +277,7 @@ def _common_lags(curves: list[tuple[np.ndarray, np.ndarray, np.ndarray]], zero: 
         return [zero]
     curve = np.mean(clear, axis=0)
     high = curve >= _DISTINCT * curve.max()
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], high.astype(np.int8), [0]])))
-    peaks = [low + int(np.argmax(curve[low:up])) for low, up in edges.reshape(-1, 2)]
+    peaks = [low + int(np.argmax(curve[low:up])) for low, up in true_runs(high)]
 
     def rank(at: int) -> tuple[int, int, bool, int]:
         named = sum(bool(own[at] >= _CLEAR * alike[at]) for alike, own, _ in curves)

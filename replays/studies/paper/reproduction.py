@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from replays.estimate.least_squares import solve
 from replays.studies.paper.scans.pulse import (
     BANDWIDTH,
     FORCE_N,
@@ -135,7 +136,7 @@ def drop_impact(run: Run) -> tuple[float, float]:
     first = int(np.argmax(run["contact_impulse"] > 0.0))
     height = run["ring_y"] + run.simulation.model.constants.contact.clearance
     before = slice(0, first - 1)
-    a, b, c = np.polyfit(run.times_s[before], height[before], 2)
+    a, b, c = solve(np.vander(run.times_s[before], 3), height[before])
     time_s = (-b - math.sqrt(b * b - 4.0 * a * c)) / (2.0 * a)
     return float(time_s), float(-2.0 * a * time_s - b)
 

@@ -8,8 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from replays.estimate.runs import block_means
 from replays.recordings.formats.clock import Axis
 from replays.recordings.formats.events.pulses import find_pulses
+from rig.channels.orbit import full_spectrum
 from rig.channels.table import default_table
 
 _STEP_S, _SLOWEST_HZ = 1e-3, 200.0
@@ -53,9 +55,7 @@ class Motion(NamedTuple):
         if gone.any() and not gone.all():
             values = np.interp(rows, rows[~gone], values[~gone])
         several = max(1, round(_STEP_S * self.axis.rate_hz))
-        whole = len(values) // several * several
-        times = self.axis.instants()[: len(values)]
-        return times[:whole].reshape(-1, several).mean(axis=1), values[:whole].reshape(-1, several).mean(axis=1)
+        return block_means(self.axis.instants()[: len(values)], several), block_means(values, several)
 
 
 class Impact(NamedTuple):
@@ -155,14 +155,13 @@ def turning(motions: Sequence[Motion], *, until_s: float = math.inf) -> tuple[fl
         n = int(rows.sum())
         if n < _PADDED:
             continue
-        centred = [values[rows] - values[rows].mean() for _, values in parts]
-        path = centred[0] + (1j * centred[1] if len(centred) > 1 else 0.0)
+        x, y = parts[0][1][rows], parts[1][1][rows] if len(parts) > 1 else np.zeros(n)
         size = _PADDED << (n - 1).bit_length()
         step_s = float(times[rows][-1] - times[rows][0]) / (n - 1)
-        both = np.abs(np.fft.fft(path * np.hanning(n), size)) ** 2
+        both = full_spectrum(x, y, 1.0 / step_s, lines=size)[1] ** 2  # from -half of the rate
         hz, apart_hz = np.arange(size // 2) / (size * step_s), 1.0 / (n * step_s)
         moves = hz >= 2.0 * apart_hz
-        power, behind = moves * both[: size // 2], moves * np.roll(both[::-1], 1)[: size // 2]
+        power, behind = moves * both[size // 2 :], moves * both[size // 2 : 0 : -1]
         peak = int(np.argmax(power))
         if behind.max() > 2.0 * power[peak]:
             continue  # it whirls backward

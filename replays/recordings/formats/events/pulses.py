@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from replays.estimate.runs import true_runs
+
 if TYPE_CHECKING:
     from replays.recordings.formats.clock import Axis
     from replays.recordings.formats.mapping import HammerMapping
@@ -58,13 +60,11 @@ def find_pulses(force_n: np.ndarray, axis: Axis, wanted: HammerMapping) -> tuple
     """
     times_s = axis.instants()
     force = np.nan_to_num(force_n)
-    above = force >= wanted.threshold_n
     loud_s = times_s[np.abs(force) >= wanted.threshold_n]  # ringing goes to both sides
-    starts = np.flatnonzero(above & ~np.concatenate([[False], above[:-1]]))
     found: list[HammerPulse] = []
     passed_over: list[HammerPulse] = []
     free_s = -math.inf
-    for start in starts.tolist():
+    for start, end in true_runs(force >= wanted.threshold_n):
         at_s = float(times_s[start])
         last = found[-1] if found else None
         soon = last is not None and at_s < free_s
@@ -72,7 +72,7 @@ def find_pulses(force_n: np.ndarray, axis: Axis, wanted: HammerMapping) -> tuple
             before = int(np.searchsorted(loud_s, at_s))
             if at_s - loud_s[before - 1] < _RESTED * 1e-3 * last.duration_ms:
                 continue
-        pulse = _pulse(force, times_s, start, axis.rate_hz, wanted)
+        pulse = _pulse(force, times_s, (start, end), axis.rate_hz, wanted)
         if last is not None and soon and (wanted.dead_s is not None or pulse.force_n < _LARGE * last.force_n):
             passed_over.append(pulse)
             continue
@@ -81,13 +81,12 @@ def find_pulses(force_n: np.ndarray, axis: Axis, wanted: HammerMapping) -> tuple
     return found, passed_over
 
 
-def _pulse(force: np.ndarray, times_s: np.ndarray, start: int, rate_hz: float, wanted: HammerMapping) -> HammerPulse:
-    """The pulse that rises above the threshold at a row."""
-    end = start
-    while end < len(force) and force[end] >= wanted.threshold_n:
-        end += 1
-    foot = _FOOT * float(force[start:end].max())
-    low, high = start, end
+def _pulse(
+    force: np.ndarray, times_s: np.ndarray, above: tuple[int, int], rate_hz: float, wanted: HammerMapping
+) -> HammerPulse:
+    """Return the pulse that is above the threshold in a run of rows."""
+    low, high = above
+    foot = _FOOT * float(force[low:high].max())
     while low > 0 and force[low - 1] > foot:
         low -= 1
     while high < len(force) and force[high] > foot:

@@ -8,6 +8,8 @@ from functools import cached_property
 
 import numpy as np
 
+from replays.estimate.runs import block_means
+from replays.estimate.spectra import spectrum
 from replays.recordings.formats import clock
 from replays.recordings.formats.guessing import noise
 from replays.recordings.formats.source import FileSignal, even_rate_hz
@@ -126,8 +128,7 @@ class Look:
     @cached_property
     def slow(self) -> np.ndarray:
         """The same as means of several samples, without their mean, shape (m,)."""
-        several = -(-len(self.values) // _SLOW)
-        whole = self.values[: len(self.values) // several * several].reshape(-1, several).mean(axis=1)
+        whole = block_means(self.values, -(-len(self.values) // _SLOW))
         return whole - whole.mean()
 
     def sparkline(self, width: int) -> str:
@@ -193,7 +194,7 @@ def relation(a: Look, b: Look) -> Relation | None:
     if len(x) < 64 or norm == 0.0:
         return None
     window, rows = np.hanning(len(x)), 1 << (len(x) - 1).bit_length()
-    ax, by = np.fft.rfft(x * window, rows), np.fft.rfft(y * window, rows)
+    ax, by = spectrum(x * window, rows), spectrum(y * window, rows)
     power = np.abs(ax) * np.abs(by)
     power[:3] = 0.0
     peak = int(np.argmax(power))

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from replays.estimate.spectra import periodic_hann, power
+
 _LENGTH = 256
 """Samples of a stretch."""
 _LOW = 16
@@ -38,8 +40,7 @@ def _spectra(values: np.ndarray) -> np.ndarray:
     still = ~stretches.any(axis=1)
     if not still.all() and (stretches[~still] == 0.0).mean() < _RARE:
         stretches = stretches[~still]  # where it is stuck it has no noise; where all of it is coarse it has little
-    window = np.hanning(_LENGTH + 1)[:-1]
-    lines = np.abs(np.fft.rfft(stretches * window, axis=1)[:, _LOW:-1]) ** 2 / float(window @ window)
+    lines = power(stretches, periodic_hann(_LENGTH))[:, _LOW:-1]
     return lines / (2.0 * np.sin(np.pi * np.arange(_LOW, _LENGTH // 2) / _LENGTH)) ** 4
 
 

@@ -13,9 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from replays.estimate.least_squares import Fit, fit
 from replays.recordings.identification.nuisance import Tuned
 from replays.recordings.identification.question import unit_of
-from replays.recordings.least_squares import Fit, fit
 from replays.recordings.resimulation.experiment import Experiment
 from replays.recordings.resimulation.prediction import Measured, Prediction, predict
 from replays.recordings.resimulation.sensitivity import scale_of, value_of, with_values

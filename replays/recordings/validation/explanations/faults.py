@@ -10,7 +10,7 @@ from itertools import combinations
 
 import numpy as np
 
-from replays.recordings.least_squares import fit
+from replays.estimate.least_squares import fit
 from replays.recordings.resimulation.prediction import Measured, Prediction
 from replays.recordings.validation.explanations.explanation import (
     Explanation,

@@ -9,9 +9,11 @@ from functools import cache
 
 import numpy as np
 
+from replays.estimate.runs import true_runs
+from replays.estimate.spectra import spectrum
 from replays.recordings.validation.explanations.explanation import excess, is_noise
 from replays.recordings.validation.explanations.shown import DECIDES, FEW, OFF, Law, Shown, gain_words, least_at, rms_of
-from replays.recordings.validation.explanations.signals import runs_of, steady_rows
+from replays.recordings.validation.explanations.signals import steady_rows
 from replays.recordings.validation.explanations.timing import delayed_by, filtered, late, ringing
 
 _EXACTLY = 0.01
@@ -214,8 +216,8 @@ def _of_time(one: Shown) -> Iterator[Law]:
     if not one.uniform:
         return
     period_s = length_s / (len(t) - 1)
-    size = np.abs(np.fft.rfft((d - d.mean()) * np.hanning(len(d)), 4 * len(d)))
-    hz = np.fft.rfftfreq(4 * len(d), period_s)
+    size = np.abs(spectrum((d - d.mean()) * np.hanning(len(d)), 4 * len(d)))
+    hz = np.arange(len(size)) / (4 * len(d) * period_s)
     within = (hz * length_s > _PERIODS) & (hz < min(_HIGHEST_HZ, 0.45 / period_s))
     if not within.any():
         return
@@ -289,7 +291,7 @@ def _at_random(one: Shown) -> Iterator[Law]:
     """What no sample tells of the next: spikes, a loose contact, jitter, noise."""
     e, d = one.foretold, one.values - one.foretold
     off = np.abs(d) > OFF * one.floor
-    lengths = [end - begin for begin, end in runs_of(off)]
+    lengths = [end - begin for begin, end in true_runs(off)]
     if off.any() and off.mean() < _SPARSE and max(lengths) < 3 and is_noise(one.apart[~off]):
         yield _spikes(one, off, one.apart[~off])
         return

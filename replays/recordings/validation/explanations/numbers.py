@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from replays.estimate.least_squares import solve_normal
 from replays.recordings.identification.agreement import BEYOND
 from replays.recordings.identification.nuisance import Tuned
 from replays.recordings.identification.question import first_command_s, unit_of
@@ -80,8 +81,7 @@ def numbers_of_the_model(
         place = np.arange(1, len(known) + 1)
         square[place, place] += deviations**-2.0
         side[place] -= off / deviations
-        size = 1.0 / np.sqrt(np.maximum(np.diag(square), 1e-300))
-        change = size * np.linalg.lstsq(square * np.outer(size, size), side * size, rcond=1e-14)[0]
+        change = solve_normal(square, side)
         left, back = z - table @ change, off + change[1:] / deviations
         if abs(change[0]) > one.largest or (np.abs(back) > BEYOND).any() or before == 0.0:
             continue

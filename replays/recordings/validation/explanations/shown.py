@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from replays.estimate.least_squares import solve
 from rig.channels.table import Channel
 
 if TYPE_CHECKING:
@@ -169,8 +170,7 @@ class Shown:
         weights = 1.0 / self.floor
         table = np.column_stack(columns) * weights[:, None]
         goal = (self.values if aim is None else aim) * weights
-        size = np.sqrt(np.maximum((table**2).sum(axis=0), 1e-300))
-        found = np.linalg.lstsq(table / size, goal, rcond=None)[0] / size
+        found = solve(table, goal)
         return found, goal - table @ found
 
     def fitted(

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from replays.estimate.runs import true_runs
 from replays.recordings.identification.question import measured_noise
 from replays.recordings.resimulation.prediction import Measured
 
@@ -46,7 +47,7 @@ class SignalFault(NamedTuple):
 def steady_rows(values: np.ndarray, held: int = _HELD) -> np.ndarray:
     """Rows of stretches of one and the same number, shape (n,)."""
     found = np.zeros(len(values), dtype=bool)
-    for begin, end in runs_of(np.concatenate([[False], np.diff(values) == 0.0])):
+    for begin, end in true_runs(np.concatenate([[False], np.diff(values) == 0.0])):
         if end - begin >= held - 1:
             found[begin - 1 : end] = True
     return found
@@ -142,23 +143,17 @@ def _held(name: str, unit: str, times_s: np.ndarray, values: np.ndarray) -> list
     rails = np.zeros(len(values), dtype=bool)
     for side, level in (("largest", values.max()), ("smallest", values.min())):
         at = steady_rows(np.where(values == level, level, np.arange(len(values)) + level + 1.0), _RAIL)
-        runs = runs_of(at)
+        runs = true_runs(at)
         if at.sum() >= _AT_RAIL and (len(runs) > 1 or at.sum() < _HELD):
             rails |= at
             text = f"{at.sum()} rows at its {side}, {level:.6g} {unit}, the first at {times_s[runs[0][0]]:.4f} s"
             found.append(SignalFault(name, "clipped", *_span(times_s, runs), text))
-    runs = runs_of(steady & ~rails)
+    runs = true_runs(steady & ~rails)
     if runs:
         begin, end = _span(times_s, runs)
         text = f"one and the same number in {sum(b - a for a, b in runs)} rows, from {begin:.4f} to {end:.4f} s"
         found.append(SignalFault(name, "stuck", begin, end, text))
     return found
-
-
-def runs_of(rows: np.ndarray) -> list[tuple[int, int]]:
-    """Beginnings and ends of stretches of rows, shape (n,)."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], rows.astype(int), [0]])))
-    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
 
 
 def _span(times_s: np.ndarray, runs: list[tuple[int, int]]) -> tuple[float, float]:

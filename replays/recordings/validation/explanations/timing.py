@@ -8,6 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from replays.estimate.clock import fit_line, time_error
+from replays.estimate.least_squares import solve
+from replays.estimate.spectra import Spectrum
 from replays.recordings.validation.explanations.shown import FEW, Law, Shown, gain_words, least_at, rms_of
 from rig.channels.sensors.filters import channel_poles
 
@@ -64,9 +67,9 @@ def late(one: Shown) -> Iterator[Law]:
     at, delays = _delays(one)
     if len(at) < 6:
         return
-    rate, start = np.polyfit(at, delays, 1)
+    line = fit_line(at, delays)
     (start, rate), left = one.fitted(
-        lambda p: spline(one.times_s - p[0] - p[1] * t), [[start, rate], [0.0, rate]], [1e-6, 1e-6]
+        lambda p: spline(one.times_s - p[0] - p[1] * t), [[line.at_zero, line.slope], [0.0, line.slope]], [1e-6, 1e-6]
     )
     if min(start, start + rate * t[-1]) > _EARLIEST_S:
         yield Law("clock", f"{1e6 * rate:+.5g} ppm", 1e6 * float(rate), left, 2, "ppm")
@@ -75,7 +78,7 @@ def late(one: Shown) -> Iterator[Law]:
     for period_s in 2.0 * length_s / np.arange(1.0, 2.0 * _SEGMENTS / 3.0):
         turn = 2.0 * math.pi * at / period_s
         table = np.column_stack([np.ones(len(at)), np.cos(turn), np.sin(turn)])
-        starts.append([*np.linalg.lstsq(table, delays, rcond=None)[0].tolist(), period_s])
+        starts.append([*solve(table, delays).tolist(), period_s])
     (mean_s, a, b, period_s), left = one.fitted(
         lambda p: spline(
             one.times_s - p[0] - p[1] * np.cos(2.0 * math.pi * t / p[3]) - p[2] * np.sin(2.0 * math.pi * t / p[3])
@@ -97,8 +100,7 @@ def _delays(one: Shown) -> tuple[np.ndarray, np.ndarray]:
         for _ in range(8):
             places = one.times_s[rows] - late_s
             falls, off = -slope(places), one.values[rows] - spline(places)
-            weight = float(falls @ falls)
-            step = float(falls @ off) / weight if weight > 0.0 else 0.0
+            step = time_error(falls, off)
             late_s = float(np.clip(late_s + np.clip(step, -20.0 * one.period_s, 20.0 * one.period_s), -0.02, 0.02))
         at.append(float(t[rows].mean()))
         found.append(late_s)
@@ -147,12 +149,13 @@ def filtered(one: Shown) -> Iterator[Law]:
     channel = one.channel
     if not one.uniform or not channel.bandwidth_hz:
         return
-    begin, wave, turn = _waves(one)
+    begin, wave = _wave(one)
 
     def through(corner_hz: float) -> np.ndarray:
         poles, residues, direct = channel_poles(
             channel.model_copy(update={"bandwidth_hz": corner_hz, "highpass_hz": 0.0})
         )
+        turn = wave.turn
         shown = np.full(len(turn), complex(direct))
         for pole, residue in zip(poles.tolist(), residues.tolist(), strict=True):
             shown += residue / (turn - pole)
@@ -160,13 +163,13 @@ def filtered(one: Shown) -> Iterator[Law]:
                 shown += 0.5 * (residue.conjugate() / (turn - pole.conjugate()) - residue / (turn - pole))
         return shown
 
-    plain = wave / through(channel.bandwidth_hz)
+    told = through(channel.bandwidth_hz)
     margin = min(len(one.values) // 8, round(_SETTLES_S / one.period_s))
     if len(one.values) - margin - round(_ENDS_S / one.period_s) < 2 * FEW:
         return  # too short to tell
 
     def left_by(other: np.ndarray | float) -> np.ndarray:
-        left = one.values - np.fft.irfft(plain * other)[begin:][: len(one.values)]
+        left = one.values - wave.through(other / told)[begin:][: len(one.values)]
         left = one.left([one.level], left)[1] if channel.highpass_hz and one.counts is not None else left / one.floor
         known = slice(margin, -round(_ENDS_S / one.period_s))  # how it goes on tells of what is behind a filter
         left[: known.start] = left[known.stop :] = rms_of(left[known])
@@ -196,12 +199,11 @@ def filtered(one: Shown) -> Iterator[Law]:
         yield Law("no-filter", "what is above half of the rate folds back", 0.0, left, 1)
 
 
-def _waves(one: Shown) -> tuple[int, np.ndarray, np.ndarray]:
-    """What it should show, from before to behind, there and back: its first row, spectrum, frequencies [2 pi i Hz]."""
+def _wave(one: Shown) -> tuple[int, Spectrum]:
+    """Return the first row and the spectrum of what it should show, from before to after its rows, there and back."""
     times_s, e = one.around or (one.times_s, one.foretold)
     round_trip = np.concatenate([e, e[::-1]])
-    turn = 2j * math.pi * np.fft.rfftfreq(len(round_trip), one.period_s)
-    return int(np.searchsorted(times_s, one.times_s[0])), np.fft.rfft(round_trip), turn
+    return int(np.searchsorted(times_s, one.times_s[0])), Spectrum.of(round_trip, one.period_s)
 
 
 def ringing(one: Shown) -> Iterator[Law]:
@@ -211,12 +213,13 @@ def ringing(one: Shown) -> Iterator[Law]:
     from scipy.interpolate import make_interp_spline
     from scipy.optimize import minimize
 
-    begin, wave, turn = _waves(one)
+    begin, wave = _wave(one)
     t = one.times_s - one.times_s[0]
 
     def left(logs: np.ndarray) -> np.ndarray:
         w, quality = 2.0 * math.pi * math.exp(logs[0]), 0.5 + math.exp(logs[1])
-        shown = np.fft.irfft(wave * w**2 / (turn**2 + turn * w / quality + w**2))[begin:][: len(t)]
+        response = w**2 / (wave.turn**2 + wave.turn * w / quality + w**2)
+        shown = wave.through(response)[begin:][: len(t)]
         fading, angle = np.exp(-0.5 * w / quality * t), w * math.sqrt(1.0 - 0.25 / quality**2) * t
         return one.left([fading * np.cos(angle), fading * np.sin(angle), one.level], one.values - shown)[1]
 

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from replays.estimate.least_squares import column_sizes, solve
+
 _BLOCKS = 64
 _MAX_FOLLOW = 0.8
 """Correlation of neighbouring blocks, at most: from 64 blocks a larger one is not known."""
@@ -61,7 +63,7 @@ def refine(matrix: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, np.nda
     if not slow.shape[1]:
         return np.zeros(k), residual, *sandwich(matrix, residual)
     both = np.column_stack([matrix, slow])
-    change = np.linalg.lstsq(both, residual, rcond=None)[0]
+    change = solve(both, residual)
     covariance, freedom = sandwich(both, residual - both @ change)
     return change[:k], residual - matrix @ change[:k], covariance[:k, :k], freedom[:k]
 
@@ -74,12 +76,14 @@ def sandwich(matrix: np.ndarray, residual: np.ndarray, *, even: bool = False) ->
     A block that has more say in the fit leaves less of its own noise: each is lifted by the root of what it leaves, and
     variances of which few blocks decide have few degrees of freedom (Bell & McCaffrey 2002, Survey Methodology 28).
     """
+    sizes = column_sizes(matrix)
+    matrix = matrix / sizes
     edges = np.linspace(0, len(residual), _BLOCKS + 1).astype(int)
     rows = [slice(*ends) for ends in pairwise(edges)]
     grams = np.array([matrix[part].T @ matrix[part] for part in rows])
     scores = np.array([matrix[part].T @ residual[part] for part in rows])
-    sizes, turn = np.linalg.eigh(grams.sum(axis=0))
-    white = turn * np.where(sizes > 1e-14 * sizes[-1], np.maximum(sizes, 1e-300) ** -0.5, 0.0)
+    powers, turn = np.linalg.eigh(grams.sum(axis=0))
+    white = turn * np.where(powers > 1e-14 * powers[-1], np.maximum(powers, 1e-300) ** -0.5, 0.0)
     shares = white.T @ grams @ white
     say, axes = np.linalg.eigh(shares)
     lift = (axes / np.sqrt(np.maximum(1.0 - say, 1.0 / _BLOCKS))[:, None, :]) @ axes.transpose(0, 2, 1)
@@ -97,14 +101,61 @@ def sandwich(matrix: np.ndarray, residual: np.ndarray, *, even: bool = False) ->
     follow = np.sum(pulls[1:] * pulls[:-1], axis=0) / np.maximum(np.diag(covariance), 1e-300)
     follow = np.clip(follow - _BLOCKS**-0.5, 0.0, _MAX_FOLLOW)
     growth = (1.0 + follow) / (1.0 - follow)
-    return covariance * np.sqrt(np.outer(growth, growth)), np.maximum(1.0, freedom / growth)
+    return covariance * np.sqrt(np.outer(growth, growth)) / np.outer(sizes, sizes), np.maximum(1.0, freedom / growth)
 
 
 def student(freedom: ArrayLike) -> Any:
     """The 97.5 % quantile of Student's t, one for each number of degrees of freedom."""
+    return student_quantile(0.975, freedom)
+
+
+def student_quantile(probability: float, freedom: ArrayLike) -> Any:
+    """Return a quantile of Student's t, one for each number of degrees of freedom."""
     from scipy.stats import t
 
-    return t.ppf(0.975, freedom)
+    return t.ppf(probability, freedom)
+
+
+def chi2_quantile(probability: float, freedom: float) -> float:
+    """Return a quantile of chi squared."""
+    from scipy.stats import chi2
+
+    return float(chi2.ppf(probability, freedom))
+
+
+def chi2_mean_ends(freedom: float) -> tuple[float, float]:
+    """Return the ends of the 95 % interval of a mean of squares, over its expectation."""
+    return chi2_quantile(0.025, freedom) / freedom, chi2_quantile(0.975, freedom) / freedom
+
+
+def jackknife(steps: np.ndarray) -> np.ndarray:
+    """Return half of the 95 % intervals by how far estimates go without one of n parts of the samples, shape (k,).
+
+    What a model lacks acts on some channels and at some times more than on others. Tukey's jackknife with groups left
+    out (J. Shao and C. F. J. Wu, Annals of Statistics 17, 1989).
+
+    Args:
+        steps: By how much the estimates change without each part, shape (n, k).
+    """
+    n = len(steps)
+    if n < 2:
+        return np.zeros(steps.shape[-1])
+    deviation = np.sqrt((n - 1) / n * ((steps - steps.mean(axis=0)) ** 2).sum(axis=0))
+    return student(n - 1) * deviation
+
+
+def draw_normal(covariance: np.ndarray, generator: np.random.Generator, draws: int) -> np.ndarray:
+    """Draw from a normal distribution of mean 0, shape (draws, k); a covariance may have sizes a million apart.
+
+    Args:
+        covariance: Shape (k, k), with no variance of 0.
+        generator: Source of the draws.
+        draws: Number of draws.
+    """
+    size = np.sqrt(np.diag(covariance))
+    powers, directions = np.linalg.eigh(covariance / np.outer(size, size))
+    white = generator.standard_normal((draws, len(size)))
+    return size * (white * np.sqrt(np.maximum(powers, 0.0)) @ directions.T)
 
 
 def simultaneous(values: np.ndarray, spread: np.ndarray, freedom: ArrayLike = math.inf) -> tuple[float, float, float]:
@@ -115,9 +166,7 @@ def simultaneous(values: np.ndarray, spread: np.ndarray, freedom: ArrayLike = ma
         spread: Their standard deviations, shape (n,).
         freedom: Degrees of freedom of these.
     """
-    from scipy.stats import t
-
-    half = t.ppf(1.0 - 0.025 / len(values), freedom) * spread
+    half = student_quantile(1.0 - 0.025 / len(values), freedom) * spread
     return float(values.max()), float((values - half).max()), float((values + half).max())
 
 

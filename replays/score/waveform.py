@@ -12,7 +12,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from replays.score.fits.intervals import refine, student
+from replays.estimate.intervals import refine, student
+from replays.estimate.least_squares import inverse_square, solve
+from replays.estimate.spectra import Spectrum, transfer
 from replays.score.records.stimulus import Stimulus
 
 _ROUNDS, _FINAL = 4, 3
@@ -136,19 +138,16 @@ def _solve(
         if use.sum() < _LEAST:
             return None
         s, ds = stimulus(at[use])
-        scale = max(float(np.std(s)), 1e-300)
-        steep = max(float(np.sqrt(np.mean(ds**2))), 1e-300)
         ones = np.ones(len(s))
         # Gain and offset follow linearly; the step of time is taken about them.
-        gain, offset = np.linalg.lstsq(np.column_stack([s / scale, ones]), y[use], rcond=None)[0]
-        gain /= scale
+        gain, offset = solve(np.column_stack([s, ones]), y[use])
         if not gain:
             return None
-        jacobian = np.column_stack([s / scale, ones, (ds / steep)[:, None] * shape[use]])
+        jacobian = np.column_stack([s, ones, gain * ds[:, None] * shape[use]])
         residual = y[use] - gain * s - offset
-        inverse = np.linalg.pinv(jacobian.T @ jacobian)
+        inverse = inverse_square(jacobian)
         step = inverse @ (jacobian.T @ residual)
-        moved = moved + step[2:] / (gain * steep)
+        moved = moved + step[2:]
         small = (
             np.abs(step[2:])
             < (_SETTLED if final else 0.1) * np.sqrt(np.diag(inverse)[2:] * np.mean(residual**2)) + 1e-300
@@ -157,19 +156,18 @@ def _solve(
         if number > 1 and (small.all() or number >= _ROUNDS + (_FINAL if final else 0)):
             break
     # The curve that the fit began with, about this centre, is part of what was found.
-    begun = np.linalg.lstsq(np.column_stack([np.ones(len(u)), u, u**2 - 1.0 / 3.0]), start_s, rcond=None)[0]
+    begun = solve(np.column_stack([np.ones(len(u)), u, u**2 - 1.0 / 3.0]), start_s)
     begun[: len(moved)] += moved
     residual = residual - jacobian @ step
-    units = np.array([scale, 1.0, gain * steep, gain * steep * span, 0.5 * gain * steep * span**2])
-    units = np.where(np.abs(units) > 1e-140, units, 1e-140)
+    units = np.array([1.0, 1.0, 1.0, span, 0.5 * span**2])
     covariance, freedom = np.diag([0.0, 0.0, 0.0, 0.0, units[4] ** 2]), np.ones(5)
     if final:
         fitted = slice(jacobian.shape[1])
         change, residual, covariance[fitted, fitted], freedom[fitted] = refine(jacobian, residual)
         step = step + change
-        begun[: len(moved)] += change[2:] / (gain * steep)
+        begun[: len(moved)] += change[2:]
     return Waveform(
-        float(gain + step[0] / scale), float(offset + step[1]), float(begun[0]), float(begun[1] / span),
+        float(gain + step[0]), float(offset + step[1]), float(begun[0]), float(begun[1] / span),
         float(2.0 * begun[2] / span**2), covariance / np.outer(units, units), freedom, centre, span,
         t[use], y[use], s, ds, residual,
     )  # fmt: skip
@@ -198,23 +196,14 @@ def response(found: Waveform) -> Response | None:
     Spread: sqrt((1 - coherence) / (2 coherence segments)) (Bendat & Piersol, Random Data, table 9.6). The corner is
     where a parabola through the logarithms about it passes -3 dB.
     """
-    from scipy.signal import csd, welch
-
     n = len(found.known)
     rate = (n - 1) / (found.times_s[-1] - found.times_s[0])
     length = int(min(2048, n // 16))
-    x, y = found.known, found.values
-    told = {"fs": rate, "nperseg": length, "window": "hann", "detrend": "constant"}
-    f, sxx = welch(x, **told)
-    _, syy = welch(y, **told)
-    _, sxy = csd(x, y, **told)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        coherence = np.minimum(1.0, np.abs(sxy) ** 2 / (sxx * syy))
-        gain = np.abs(sxy) / sxx / abs(found.gain)
-    shown = (coherence > _SEEN) & (sxx > 1e-5 * sxx.max()) & (f > 0.0)
+    f, power, gain, coherence = transfer(found.known, found.values, rate, length)
+    shown = (coherence > _SEEN) & (power > 1e-5 * power.max()) & (f > 0.0)
     if shown.sum() < 16:
         return None
-    f, gain, coherence = f[shown], gain[shown], coherence[shown]
+    f, gain, coherence = f[shown], gain[shown] / abs(found.gain), coherence[shown]
     segments = 2.0 * n / length * 0.9
     spread = np.sqrt((1.0 - coherence) / (2.0 * coherence * segments)) + 1e-9
     lowest = f <= max(f[7], 0.1 * f[-1])
@@ -236,9 +225,10 @@ def _corner(f: np.ndarray, log: np.ndarray, spread: np.ndarray) -> tuple[float, 
     if near.sum() < 8:
         return None
     x, weights = np.log(f[near] / at), 1.0 / spread[near]
-    parts, inverse = np.polyfit(x, log[near], 2, w=weights, cov="unscaled")
-    left = weights * (log[near] - np.polyval(parts, x))
-    inverse *= max(1.0, float(left @ left) / (len(x) - 3))
+    matrix = np.vander(x, 3) * weights[:, None]
+    parts = solve(matrix, weights * log[near])
+    left = weights * log[near] - matrix @ parts
+    inverse = inverse_square(matrix) * max(1.0, float(left @ left) / (len(x) - 3))
     roots = [r.real for r in np.roots(parts - [0.0, 0.0, level]) if abs(r.imag) < 1e-9]
     if not roots:
         return None
@@ -338,15 +328,14 @@ def _behind(
     if n > len(places):  # the filter needs the instants of lost samples, too
         even_s = found.times_s[0] + step_s * np.arange(n)
         known, slope = stimulus(even_s + found.late_at(even_s))
-    spectra = [np.fft.rfft(values) for values in (known, slope)]
-    f = np.fft.rfftfreq(n, step_s)
+    spectra = [Spectrum.of(values, step_s) for values in (known, slope)]
     poles = np.exp(1j * np.pi * (2.0 * np.arange(1, order + 1) + order - 1.0) / (2.0 * order))
     log = math.log(corner_hz)
 
-    def passed(spectrum: np.ndarray, log_corner: float) -> np.ndarray:
-        s = 1j * f / math.exp(log_corner)
+    def passed(spectrum: Spectrum, log_corner: float) -> np.ndarray:
+        s = spectrum.turn / (2.0 * math.pi * math.exp(log_corner))
         loss = np.prod([1.0 - s / pole for pole in poles], axis=0)
-        return np.fft.irfft(spectrum * np.exp(2j * np.pi * f * delay_s) / loss, n)[places[kept]]
+        return spectrum.through(np.exp(spectrum.turn * delay_s) / loss)[places[kept]]
 
     u = (2.0 * (found.times_s - found.middle_s) / span_s)[kept]
     ones = np.ones(len(u))
@@ -354,24 +343,22 @@ def _behind(
     for _ in range(2 * _ROUNDS):
         s, ds = (passed(spectrum, log) for spectrum in spectra)
         moved = (passed(spectra[0], log + _RISE) - passed(spectra[0], log - _RISE)) / (2.0 * _RISE)
-        gain = float(np.linalg.lstsq(np.column_stack([s, ones]), y[kept], rcond=None)[0][0])
+        gain = float(solve(np.column_stack([s, ones]), y[kept])[0])
         matrix = np.column_stack([s, ones, gain * ds, gain * ds * u, gain * ds * (u**2 - 1.0 / 3.0), gain * moved])
-        sizes = np.maximum(np.sqrt(np.mean(matrix**2, axis=0)), 1e-300)
-        jacobian = matrix / sizes
-        parts = np.linalg.lstsq(jacobian, y[kept], rcond=None)[0] / sizes
+        parts = solve(matrix, y[kept])
         delay_s, log = delay_s + parts[2], log + float(np.clip(parts[5], -0.2, 0.2))
         if abs(log - math.log(corner_hz)) > _FAR:
             return None
-        solved = s, ds, matrix, jacobian, sizes, parts
+        solved = s, ds, matrix, parts
         if abs(parts[5]) < 1e-9 and abs(parts[2]) < 1e-13:
             break
     assert solved is not None
-    s, ds, matrix, jacobian, sizes, parts = solved
-    change, residual, covariance, freedom = refine(jacobian, y[kept] - matrix @ parts)
-    parts = parts + change / sizes
-    delay_s, log = delay_s + float(change[2] / sizes[2]), log + float(change[5] / sizes[5])
-    sizes = sizes * np.array([1.0, 1.0, 1.0, 0.5 * span_s, 0.125 * span_s**2, 1.0])
-    covariance = covariance / np.outer(sizes, sizes)
+    s, ds, matrix, parts = solved
+    change, residual, covariance, freedom = refine(matrix, y[kept] - matrix @ parts)
+    parts = parts + change
+    delay_s, log = delay_s + float(change[2]), log + float(change[5])
+    units = np.array([1.0, 1.0, 1.0, 0.5 * span_s, 0.125 * span_s**2, 1.0])
+    covariance = covariance / np.outer(units, units)
     half = float(student(freedom[5])) * math.sqrt(covariance[5, 5])
     fitted = Waveform(
         float(parts[0]), float(parts[1]), found.late_s + float(delay_s),

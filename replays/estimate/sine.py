@@ -10,11 +10,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from replays.estimate.intervals import chi2_mean_ends
+from replays.estimate.least_squares import inverse_square, solve
+from replays.estimate.spectra import parabola_top, periodic_hann, power, spectrum
+
 HARMONICS = 10
 """The highest harmonic that counts for the total distortion."""
 _PURE = 3e-5
 """Rest of a formula over its amplitude up to which it is a sine: a fitted clock bends it by 1e-6 and more."""
 _ROUNDS = 20
+_SAME_TURNS = 1.6e-13
+"""Change of a phase over all rows that is rounding [cycles]."""
 _NEIGHBOURS = 17
 """Lines by which the noise at a line is known, to a third."""
 
@@ -39,36 +45,52 @@ class SineFit:
         return math.sqrt(float(self.residual @ self.residual) / (len(self.residual) - 4))
 
 
+def tone_columns(n: np.ndarray, turns: np.ndarray) -> np.ndarray:
+    """Return cosine and sine of each frequency [cycles a row] at rows, and a constant, shape (n, 2 frequencies + 1)."""
+    phases = 2.0 * math.pi * np.outer(n, turns)
+    return np.column_stack([np.cos(phases), np.sin(phases), np.ones(len(n))])
+
+
+def fit_tones(
+    n: np.ndarray, values: np.ndarray, turns: np.ndarray, settled: float = _SAME_TURNS
+) -> tuple[np.ndarray, ...]:
+    """Refine the frequencies of tones in a signal by Gauss and Newton's steps.
+
+    Args:
+        n: Numbers of the rows, about 0, shape (n,).
+        values: The signal, shape (n,).
+        turns: Frequencies near which the tones are [cycles a row], shape (k,).
+        settled: Change of the phase over all rows by a step that is the last [cycles].
+
+    Returns:
+        Frequencies [cycles a row], shape (k,); cosine parts, sine parts and the constant, shape (2 k + 1,); slopes by
+        frequency and by part, shape (n, 3 k + 1); and what is left, shape (n,).
+    """
+    k, moved, rounds = len(turns), np.full(len(turns), np.inf), 0
+    while True:
+        basis = tone_columns(n, turns)
+        parts = solve(basis, values)
+        slopes = 2.0 * math.pi * n[:, None] * (basis[:, :k] * parts[k : 2 * k] - basis[:, k : 2 * k] * parts[:k])
+        matrix, residual = np.column_stack([slopes, basis]), values - basis @ parts
+        if rounds == _ROUNDS or np.abs(moved).max() * len(n) < settled:
+            return turns, parts, matrix, residual
+        moved = solve(matrix, residual)[:k]
+        turns, rounds = turns + moved, rounds + 1
+
+
 def fit_sine(values: np.ndarray) -> SineFit:
     """Fit a sine with four parameters to values, shape (n,)."""
     n = np.arange(len(values)) - 0.5 * (len(values) - 1)
-    w, ones = 2.0 * math.pi * _peak(values), np.ones(len(n))
-
-    def solved(*more: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        matrix = np.column_stack([np.cos(w * n), np.sin(w * n), ones, *more])
-        return matrix, np.linalg.lstsq(matrix, values, rcond=None)[0]
-
-    _, beta = solved()
-    for _ in range(_ROUNDS):
-        _, beta = solved(n * (beta[1] * np.cos(w * n) - beta[0] * np.sin(w * n)))
-        w += beta[3]
-        if abs(beta[3]) * len(n) < 1e-12:
-            break
-    matrix, beta = solved()
-    residual = values - matrix @ beta
-    matrix, _ = solved(n * (beta[1] * np.cos(w * n) - beta[0] * np.sin(w * n)))
-    spread = np.sqrt(np.diag(np.linalg.inv(matrix.T @ matrix)) * float(residual @ residual) / (len(n) - 4))
+    turns, (cosine, sine, _), matrix, residual = fit_tones(n, values, np.array([_peak(values)]), _SAME_TURNS)
+    spread = np.sqrt(np.diag(inverse_square(matrix)) * float(residual @ residual) / (len(n) - 4))
     return SineFit(
-        (w / (2.0 * math.pi), spread[3] / (2.0 * math.pi)),
-        (math.hypot(beta[0], beta[1]), float(max(spread[0], spread[1]))),
-        residual,
+        (float(turns[0]), float(spread[0])), (math.hypot(cosine, sine), float(max(spread[1], spread[2]))), residual
     )
 
 
 def _peak(values: np.ndarray) -> float:
     """Frequency of the largest line [cycles a sample]: with a Hann window, between two lines as the window has it."""
-    window = np.hanning(len(values) + 1)[:-1]
-    lines = np.abs(np.fft.rfft((values - values.mean()) * window))
+    lines = np.abs(spectrum((values - values.mean()) * periodic_hann(len(values))))
     k = int(np.argmax(lines[1:-1])) + 1
     side = 1 if lines[k + 1] > lines[k - 1] else -1
     ratio = lines[k + side] / lines[k] if lines[k] else 0.0
@@ -108,19 +130,17 @@ def quality(fit: SineFit) -> Quality:
     Intervals: SINAD by chi squared, with the degrees of freedom of the residual's spectrum; THD and SFDR by the noise
     around each harmonic, or line (delta method, with none the noise's own).
     """
-    from scipy.stats import chi2
-
     n, amplitude, nad = len(fit.residual), fit.amplitude[0], fit.nad
     ratio = 20.0 * math.log10(amplitude / math.sqrt(2.0) / nad)
-    rows, lines = np.arange(n), np.abs(np.fft.rfft(fit.residual)) ** 2 * (2.0 / n**2)
+    rows, lines = np.arange(n), power(fit.residual) * (2.0 / n)
     floor = _noise_floor(fit.residual)
     # A line of noise spreads as its own power, and one that stands out by twice the product of its power and the noise.
     spread = max(float(floor @ (2.0 * lines - floor)), 0.5 * float(floor @ floor))
     freedom = (1.0 - 4.0 / n) * 2.0 * float(lines.sum()) ** 2 / spread
-    ends = [10.0 * math.log10(chi2.ppf(p, freedom) / freedom) for p in (0.025, 0.975)]
+    ends = [10.0 * math.log10(end) for end in chi2_mean_ends(freedom)]
     sinad = (ratio, ratio + ends[0], ratio + ends[1])
     enob = ((sinad[0] - 1.76) / 6.02, (sinad[1] - 1.76) / 6.02, (sinad[2] - 1.76) / 6.02)
-    power, variance = 0.0, 0.0
+    distortion, variance = 0.0, 0.0
     for harmonic in range(2, HARMONICS + 1):
         folded = abs((harmonic * fit.frequency[0] + 0.5) % 1.0 - 0.5)
         if not 2.0 / n < folded < 0.5 - 2.0 / n or abs(folded - fit.frequency[0]) < 2.0 / n:
@@ -129,12 +149,12 @@ def quality(fit: SineFit) -> Quality:
         parts = 2.0 / n * np.array([np.cos(phase) @ fit.residual, np.sin(phase) @ fit.residual])
         # Variance of one part of a line's amplitude.
         line, each = float(floor[round(folded * n)]), float(parts @ parts)
-        power, variance = power + each - 2.0 * line, variance + 4.0 * line * each + 4.0 * line**2
-    thd = decibels(power / amplitude**2, 1.96 * math.sqrt(variance) / amplitude**2)
+        distortion, variance = distortion + each - 2.0 * line, variance + 4.0 * line * each + 4.0 * line**2
+    thd = decibels(distortion / amplitude**2, 1.96 * math.sqrt(variance) / amplitude**2)
     window = np.blackman(n)
-    spectrum = (np.abs(np.fft.rfft(fit.residual * window)) * 2.0 / window.sum()) ** 2
-    at = 3 + int(np.argmax(spectrum[3:])) if n > 8 else 0
-    largest = _crest(spectrum[at - 1 : at + 2]) if n > 8 else 0.0
+    shown = (np.abs(spectrum(fit.residual * window)) * 2.0 / window.sum()) ** 2
+    at = 3 + int(np.argmax(shown[3:])) if n > 8 else 0
+    largest = _crest(shown[at - 1 : at + 2]) if n > 8 else 0.0
     # A window widens lines: of a line's noise it lets through 1.73 times as much power as none.
     wide = 1.96 * math.sqrt(4.0 * 1.73 * float(floor[at]) * largest)
     value, low, high = decibels(largest / amplitude**2, wide / amplitude**2)
@@ -145,17 +165,15 @@ def _crest(powers: np.ndarray) -> float:
     """Return the power of a line between those of a window's spectrum, of which the largest is the middle one."""
     if len(powers) < 3 or not powers.min() > 0.0:
         return float(powers.max())
-    before, middle, after = np.log(powers)
-    bent = before - 2.0 * middle + after
-    return math.exp(middle - (after - before) ** 2 / (8.0 * bent)) if bent < 0.0 else float(powers[1])
+    return float(powers[1]) * math.exp(parabola_top(*np.log(powers))[1])
 
 
 def _noise_floor(residual: np.ndarray) -> np.ndarray:
     """Return the noise's power at each line of a residual's spectrum [unit^2], by the median of its neighbours."""
     from scipy.ndimage import median_filter
 
-    window = np.hanning(len(residual) + 1)[:-1]  # so that lines that stand out do not leak to their neighbours
-    lines = np.abs(np.fft.rfft(residual * window)) ** 2 * (2.0 / len(residual) / float(window @ window))
+    # Behind a window, lines that stand out do not leak to their neighbours.
+    lines = power(residual, periodic_hann(len(residual))) * (2.0 / len(residual))
     # The median of chi squared with two degrees of freedom is ln 2 times its mean; the ends are mirrored.
     return median_filter(lines, size=_NEIGHBOURS, mode="mirror") / math.log(2.0)
 

@@ -1,0 +1,74 @@
+"""Straight lines through two clocks, or through a clock and row numbers, and the time error of a residual."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from replays.estimate.intervals import student
+
+
+class Line(NamedTuple):
+    """A straight line y = offset + slope (x - centre) by least squares.
+
+    Attributes:
+        slope: Unit of y by unit of x.
+        centre: Mean of x.
+        offset: Mean of y, the value at the centre.
+        x: What it was fitted to, shape (n,).
+        residual: y less the line, shape (n,).
+    """
+
+    slope: float
+    centre: float
+    offset: float
+    x: np.ndarray
+    residual: np.ndarray
+
+    def __call__(self, x: np.ndarray | float) -> np.ndarray:
+        """Return the line at x."""
+        return np.asarray(self.offset + self.slope * (x - self.centre))
+
+    @property
+    def at_zero(self) -> float:
+        """Value of the line at x = 0."""
+        return float(self.offset - self.slope * self.centre)
+
+    @property
+    def half(self) -> tuple[float, float]:
+        """Half of the 95 % intervals of the slope and of the value at x = 0, for independent residuals."""
+        n = len(self.residual)
+        variance = float(self.residual @ self.residual) / (n - 2)
+        spread = float(np.sum((self.x - self.centre) ** 2))
+        of_one = float(student(n - 2)) * math.sqrt(variance)
+        return of_one / math.sqrt(spread), of_one * math.sqrt(1.0 / n + self.centre**2 / spread)
+
+
+def fit_line(x: np.ndarray, y: np.ndarray) -> Line:
+    """Fit a straight line about the means, so that no digits are lost where both are large; level where x is constant.
+
+    Args:
+        x: Times of one clock or row numbers, shape (n,).
+        y: Times of the other clock, or any values, shape (n,).
+    """
+    centre, offset = float(x.mean()), float(y.mean())
+    apart = x - centre
+    spread = float(apart @ apart)
+    slope = float(apart @ (y - offset)) / spread if spread else 0.0
+    return Line(slope, centre, offset, x, y - offset - slope * apart)
+
+
+def time_error(slope: np.ndarray, residual: np.ndarray) -> float:
+    """Return by how much a signal is early, by least squares of a residual over its slope.
+
+    Args:
+        slope: Of the known signal [unit/s], or by sample, shape (n,) or (channels, n).
+        residual: Recorded less known [unit], of the same shape.
+
+    Returns:
+        Time error [s], or [samples]; 0 where the signal has no slope.
+    """
+    known = float(np.sum(slope**2))
+    return float(np.sum(slope * residual)) / known if known > 0.0 else 0.0

@@ -1,0 +1,89 @@
+"""Spectra of real signals, their use as filters and correlations, and the peak of a curve between its samples.
+
+The two-sided spectrum of an orbit x + j y is `rig.channels.orbit.full_spectrum`.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+
+def spectrum(values: np.ndarray, size: int | None = None) -> np.ndarray:
+    """Return the one-sided spectrum along the last axis, complex, with zeros appended up to `size` rows."""
+    return np.fft.rfft(values, size)
+
+
+def power(values: np.ndarray, window: np.ndarray | float = 1.0) -> np.ndarray:
+    """Return the power of each line along the last axis: of white noise, its variance [unit^2]."""
+    window = np.broadcast_to(window, values.shape[-1:])
+    return np.abs(spectrum(values * window)) ** 2 / float(window @ window)
+
+
+def periodic_hann(rows: int) -> np.ndarray:
+    """Return a Hann window whose second zero comes after its last row, shape (rows,)."""
+    return np.hanning(rows + 1)[:-1]
+
+
+def correlation(values: np.ndarray, spectra: np.ndarray, size: int) -> np.ndarray:
+    """Return the circular correlation of values with the signals of some spectra, by lag, shape (signals, size)."""
+    return np.fft.irfft(np.conj(spectrum(values, size)) * spectra, size)
+
+
+class Spectrum(NamedTuple):
+    """A signal by its frequencies, to be passed through filters.
+
+    Attributes:
+        lines: Its one-sided spectrum, shape (rows // 2 + 1,).
+        turn: 2 pi i times the frequencies [rad/s], of the same shape.
+        rows: Rows of the signal.
+    """
+
+    lines: np.ndarray
+    turn: np.ndarray
+    rows: int
+
+    @classmethod
+    def of(cls, values: np.ndarray, step_s: float) -> Spectrum:
+        """Take the spectrum of even samples, shape (n,)."""
+        return cls(spectrum(values), 2j * np.pi * np.fft.rfftfreq(len(values), step_s), len(values))
+
+    def through(self, response: np.ndarray | float) -> np.ndarray:
+        """Return the signal behind a filter with a response at each line, shape (rows,)."""
+        return np.fft.irfft(self.lines * response, self.rows)
+
+
+def transfer(x: np.ndarray, y: np.ndarray, rate_hz: float, rows: int) -> tuple[np.ndarray, ...]:
+    """Estimate a transfer function by Welch's cross spectra, Hann windows overlapping by half.
+
+    Args:
+        x: What goes in, shape (n,).
+        y: What comes out, shape (n,).
+        rate_hz: Sample rate [Hz].
+        rows: Rows of a segment.
+
+    Returns:
+        Frequencies [Hz], power density of x, amount of y over x, and coherence, each shape (rows // 2 + 1,).
+    """
+    from scipy.signal import csd, welch
+
+    settings = {"fs": rate_hz, "nperseg": rows, "window": "hann", "detrend": "constant"}
+    f, sxx = welch(x, **settings)
+    _, syy = welch(y, **settings)
+    _, sxy = csd(x, y, **settings)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        coherence = np.minimum(1.0, np.abs(sxy) ** 2 / (sxx * syy))
+        return f, sxx, np.abs(sxy) / sxx, coherence
+
+
+def parabola_top(before: float, middle: float, after: float) -> tuple[float, float]:
+    """Return the top of a parabola through three equally spaced values, the largest in the middle.
+
+    Returns:
+        Place of the top from the middle value [samples], and its height above that value; both 0 where they are level.
+    """
+    bend = before - 2.0 * middle + after
+    if not bend < 0.0:
+        return 0.0, 0.0
+    return 0.5 * (before - after) / bend, -((before - after) ** 2) / (8.0 * bend)

@@ -1,1 +1,0 @@
-"""Fits of known signals, and what they are worth."""
