@@ -17,7 +17,6 @@ from __future__ import annotations
 import contextlib
 import math
 import queue
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -37,6 +36,7 @@ from rig.base import wire
 from rig.base.errors import InputError, RefusedError, UnknownNameError, Words
 from rig.serve.intake import Catalogue, event_in
 from rig.serve.transport import DEFAULT_ENDPOINT, Client
+from rig.serve.waiting import Deadline
 
 _PATIENCE_S = 10.0
 """How long a rig that runs may send nothing [s]."""
@@ -349,7 +349,7 @@ class Rig(Console):
         if taken is not None and len(taken) >= rows:
             self._give_back(taken.rows(rows, len(taken)))
             return taken.rows(0, rows)
-        deadline = time.monotonic() + _PATIENCE_S
+        deadline = Deadline(_PATIENCE_S)
         while taken is None or (whole and len(taken) < rows):
             # No more at a time than there is room for.
             missing = min(rows - (0 if taken is None else len(taken)), self._room)
@@ -357,7 +357,7 @@ class Rig(Console):
             try:
                 fresh = daq.read(missing, timeout_s=LOST_S if self._steps and refused is None else _PATIENCE_S)
             except LinkTimeoutError as error:
-                if refused is not None or not self._steps or time.monotonic() > deadline:
+                if refused is not None or not self._steps or deadline.passed:
                     raise refused or NotSeenError(f"the rig sent no rows: {error}") from error
                 # What was published and has not come is lost: what comes behind it tells of the gap.
                 self._next = max(self._next + 1, math.floor(self._at * daq.rate_hz / self._tick_rate_hz))
@@ -406,13 +406,13 @@ class Rig(Console):
             NotSeenError: It did not come.
         """
         wanted = (lambda event: event["event"] == what) if isinstance(what, str) else what
-        deadline = time.monotonic() + timeout_s
+        deadline = Deadline(timeout_s)
         for place, event in enumerate(self._seen):
             if wanted(event):
                 return self._seen.pop(place)
         while True:
             try:
-                event = self._events.get(timeout=max(0.0, deadline - time.monotonic()))
+                event = self._events.get(timeout=deadline.left_s)
             except queue.Empty:
                 others = ", ".join(dict.fromkeys(event["event"] for event in self._seen)) or "none"
                 raise NotSeenError(f"no such event in {timeout_s:g} s; what came: {others}") from None
@@ -442,13 +442,13 @@ class Rig(Console):
             raise UnknownNameError(
                 "table", "one that was named in `truth` when the rig was connected to", table, self._truth
             )
-        deadline, made = time.monotonic() + timeout_s, self._truth[table]
+        deadline, made = Deadline(timeout_s), self._truth[table]
         found: Samples | None = None
         while found is None or (to_s is not None and found.times_s[-1] + 1.0 / found.rate_hz < to_s - 1e-9):
             if to_s is not None and self._steps and to_s * self._tick_rate_hz > self._at:
                 self._step(to_s * self._tick_rate_hz - self._at)
             try:
-                fresh = made.get(timeout=max(0.0, deadline - time.monotonic()))
+                fresh = made.get(timeout=deadline.left_s)
             except queue.Empty:
                 raise NotSeenError(f"no truth of {table} came in {timeout_s:g} s") from None
             found = fresh if found is None else joined(found, fresh)

@@ -10,7 +10,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -24,6 +23,7 @@ from drivers.sources.samples import Pile, Samples, StreamEndedError, follow
 from rig.base.closing import Closing
 from rig.base.errors import InputError, UnknownNameError, Words
 from rig.base.wire import Continuity, Gap
+from rig.serve.waiting import Deadline
 
 _GAPS = 1000
 """Gaps that are remembered; all are counted."""
@@ -260,12 +260,11 @@ class Daq(Closing):
             LinkTimeoutError: They did not come in time; those that did can still be read.
             StreamEndedError: The run has ended and everything was read.
         """
-        deadline = time.monotonic() + timeout_s
+        deadline = Deadline(timeout_s)
         with self._changed:
             while (ready := self._take(rows)) is None:
-                if (left := deadline - time.monotonic()) <= 0:
+                if not deadline.wait(self._changed):
                     raise self._late(rows, timeout_s)
-                self._changed.wait(left)
             return ready
 
     def blocks(self, rows: int | None = None, *, timeout_s: float = 5.0) -> Iterator[Samples]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import queue
-import time
 from collections.abc import Iterator
 
 from drivers.daq import Daq
@@ -15,6 +14,7 @@ from rig.base import wire
 from rig.base.errors import RefusedError
 from rig.serve.intake import BlockEnd, block_end_in, event_in
 from rig.serve.transport import Client
+from rig.serve.waiting import Deadline
 
 LOST_S = 2.0
 """Rows of a block that is over are there, or lost [s]."""
@@ -73,9 +73,9 @@ class Blocks:
 
     def rows(self, end: BlockEnd) -> Iterator[Samples]:
         """All rows that have come up to the end of a block, parted where rows are missing."""
-        deadline = time.monotonic() + LOST_S
+        deadline = Deadline(LOST_S)
         for key, number in end.messages.items():
-            self._client.wait_for(key, number, timeout_s=max(0.0, deadline - time.monotonic()))
+            self._client.wait_for(key, number, timeout_s=deadline.left_s)
         rows: Samples | None = None
         with contextlib.suppress(LinkTimeoutError, StreamEndedError):
             while True:

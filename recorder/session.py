@@ -23,7 +23,7 @@ from recorder.writer import RecordingError, RecordingWriter, check_view_rate
 from rig.base import wire
 from rig.base.errors import InputError
 from rig.base.text import printable
-from rig.serve.bounded_queue import BoundedQueue
+from rig.serve.waiting import BoundedQueue
 from rig.serve.intake import Catalogue, Intake
 from rig.serve.transport import Client
 from rig.serve.transport.clients import Reporter

@@ -11,14 +11,13 @@ import contextlib
 import logging
 import queue
 import threading
-import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from drivers.link import FORMS, ROOM, Address, LinkClosedError, LinkTimeoutError
 from rig.base.errors import InputError
-from rig.serve.bounded_queue import BoundedQueue
 from rig.serve.desk import one_line
+from rig.serve.waiting import BoundedQueue, Deadline
 
 if TYPE_CHECKING:
     import can
@@ -203,12 +202,12 @@ class CanLink:
 
         if len(message) > _MAX_BYTES:
             raise InputError("message", f"of at most {_MAX_BYTES} bytes", len(message))
-        deadline = time.monotonic() + timeout_s
+        deadline = Deadline(timeout_s)
         with self._sending:
             if self._closed:
                 raise LinkClosedError("the link is closed")
             try:
-                self._stack.send(message, send_timeout=max(0.0, deadline - time.monotonic()))
+                self._stack.send(message, send_timeout=deadline.left_s)
             except isotp.BlockingSendFailure:
                 with contextlib.suppress(Exception):
                     self._stack.stop_sending()

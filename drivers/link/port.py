@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable
 
 from drivers.link import FAREWELL_S, ROOM, Link, LinkClosedError, LinkError
-from rig.serve.bounded_queue import BoundedQueue, take_first
+from rig.serve.waiting import BoundedQueue, take_first
 
 _ROOM_BYTES = 1 << 20
 """About 3 s of four channels at 20 kHz."""

@@ -7,7 +7,6 @@ import os
 import select
 import termios
 import threading
-import time
 import tty
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,6 +14,7 @@ from pathlib import Path
 from drivers.link import FORMS, LinkClosedError, LinkTimeoutError
 from drivers.link.frames import Deframer, frame
 from rig.base.errors import InputError
+from rig.serve.waiting import Deadline
 
 _MAX_BYTES = 1 << 16
 _PORTION = 1 << 16
@@ -51,7 +51,7 @@ class SerialLink:
         """Write one frame; one that the line does not take in time stays cut, and the other end skips it."""
         if len(message) > _MAX_BYTES:
             raise InputError("message", f"of at most {_MAX_BYTES} bytes", len(message))
-        deadline = time.monotonic() + timeout_s
+        deadline = Deadline(timeout_s)
         rest = memoryview(frame(message))
         with self._sending:
             while rest:
@@ -61,7 +61,7 @@ class SerialLink:
 
     def receive(self, *, timeout_s: float) -> bytes | None:
         """The next message, or None where none came in time."""
-        deadline = time.monotonic() + timeout_s
+        deadline = Deadline(timeout_s)
         with self._receiving:
             while not self._messages:
                 try:
@@ -75,13 +75,13 @@ class SerialLink:
                     self._messages = self._deframer.feed(data)
             return self._messages.pop(0)
 
-    def _wait(self, event: int, deadline: float, text: str) -> None:
+    def _wait(self, event: int, deadline: Deadline, text: str) -> None:
         if self._closed:
             raise LinkClosedError("the line is closed")
         poll = select.poll()
         poll.register(self._descriptor, event)
         poll.register(self._wake_read, select.POLLIN)
-        ready = dict(poll.poll(max(0.0, deadline - time.monotonic()) * 1e3))
+        ready = dict(poll.poll(deadline.left_s * 1e3))
         if self._closed or self._wake_read in ready:
             raise LinkClosedError("the line is closed")
         state = ready.get(self._descriptor, 0)

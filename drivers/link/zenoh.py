@@ -7,8 +7,8 @@ from collections.abc import Callable
 
 from drivers.link import ROOM, Address, LinkClosedError, LinkTimeoutError
 from drivers.link.port import Outbox, OutboxPort
-from rig.serve.bounded_queue import BoundedQueue, take_first
 from rig.serve.transport import NoReplyError, Server
+from rig.serve.waiting import BoundedQueue, take_first
 
 _ROOT = "rig/instruments"
 _MAX_BYTES = 1 << 16

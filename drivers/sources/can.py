@@ -24,6 +24,7 @@ from drivers.sources.stream import RIG_GONE, whole_step
 from rig.base.errors import InputError
 from rig.channels.channel_file import read_channels
 from rig.channels.table import default_table
+from rig.serve.waiting import Deadline
 
 _PATIENCE_S = 3.0
 """A bus that is silent for so long has no rig any more, whose heart beats once a second."""
@@ -194,11 +195,11 @@ class CanSource:
         self._wish = layout
         rows = self._table.fd if layout == "fd" else self._table.classic
         # A run may lack groups: only what has been seen is there; of lockstep, all that may come.
-        deadline = time.monotonic() + _PATIENCE_S
         count = -1
-        while not self.lockstep and count < max(1, len(self._seen)) and time.monotonic() < deadline:
+        for _ in Deadline(_PATIENCE_S).polls(_SETTLED_S):
+            if self.lockstep or count >= max(1, len(self._seen)):
+                break
             count = len(self._seen)
-            time.sleep(_SETTLED_S)
         return {
             row.name: tuple(channel.name for channel in row.samples.channels)
             for row in rows

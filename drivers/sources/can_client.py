@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import queue
 import threading
-import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -29,6 +28,7 @@ from rig.base import wire
 from rig.base.closing import Closing
 from rig.base.errors import InputError, Words
 from rig.serve.transport import NoReplyError
+from rig.serve.waiting import Deadline
 
 _US = 1e-6
 _WRAP = 1 << 32
@@ -237,10 +237,10 @@ class CanClient(Closing):
         while not self._answers.empty():
             self._answers.get()
         self.source.send(*frame)
-        deadline = time.monotonic() + timeout_s
+        deadline = Deadline(timeout_s)
         while True:
             try:
-                answer = self._answers.get(timeout=max(0.0, deadline - time.monotonic()))
+                answer = self._answers.get(timeout=deadline.left_s)
             except queue.Empty:
                 raise NoReplyError(f"the rig on this bus did not acknowledge {command} in {timeout_s:g} s") from None
             if answer["counter"] == counter:

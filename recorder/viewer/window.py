@@ -25,6 +25,7 @@ from recorder.viewer.canvas import PICTURE, SIMULATED
 from recorder.viewer.page import Page
 from rig.base.closing import Closing
 from rig.base.errors import InputError, Words
+from rig.serve.waiting import Deadline
 
 Kind = Literal["native", "web", "headless"]
 _Answer = TypeVar("_Answer")
@@ -239,15 +240,15 @@ class Window(Closing):
 
     def _while_it_runs(self, timeout_s: float, pause_s: float) -> Iterator[None]:
         """Again and again for a time, with a pause after each turn."""
-        begin_s = told_s = time.monotonic()
-        while (now_s := time.monotonic()) - begin_s < timeout_s:
+        deadline, report = Deadline(timeout_s), Deadline(_TOLD_S)
+        for _ in deadline.polls(pause_s):
             if not self.open:
                 raise WindowError(f"the viewer could not start: {self.last_words()}")
-            if now_s - told_s > _TOLD_S:
-                told_s = now_s
-                self._tell(f"waiting for the viewer since {now_s - begin_s:.0f} s, at most {timeout_s:.0f} s")
+            if report.passed:
+                report = Deadline(_TOLD_S)
+                waited_s = timeout_s - deadline.left_s
+                self._tell(f"waiting for the viewer since {waited_s:.0f} s, at most {timeout_s:.0f} s")
             yield
-            time.sleep(pause_s)
 
 
 def _end_of(timeline: str, state: ViewerState) -> int:

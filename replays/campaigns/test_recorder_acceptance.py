@@ -18,6 +18,7 @@ from replays.campaigns.equipment.record import Record
 from replays.score.card.scorecard import FAIL
 from replays.score.judgement import judge
 from rig.base.errors import InputError
+from rig.serve.waiting import Deadline
 
 RECORDER = "python -m rig record --connect {url} --history -o {folder}/daq.mcap"
 RECOVER = "python -m rig recover {folder}/daq.mcap.part"
@@ -44,12 +45,11 @@ Measure = Callable[..., float]
 def start(dut: Start, record: Record, command: str | Sequence[str]) -> Device:
     """The recorder under test, once it records."""
     recorder = dut(command, name="recorder", joins=False)
-    deadline = time.monotonic() + _END_S
-    while not (record.path.parent / WRITTEN).exists():
+    for _ in Deadline(_END_S).polls():
+        if (record.path.parent / WRITTEN).exists():
+            return recorder
         recorder.check_running()
-        assert time.monotonic() < deadline, f"it has not begun {WRITTEN}"
-        time.sleep(0.02)
-    return recorder
+    raise AssertionError(f"it has not begun {WRITTEN}")
 
 
 def lost_s(record: Record, measure: Measure, until_s: float) -> float:

@@ -28,6 +28,7 @@ from rig.serve.pacing import FreeRun, RealTime
 from rig.serve.served_run import ServedRun
 from rig.serve.service import COMMANDS, REPLAY_COMMANDS
 from rig.serve.transport import Server
+from rig.serve.waiting import Deadline
 
 _OWN = (*REPLAY_COMMANDS, "step", "stop")
 _AHEAD_S = 30.0
@@ -229,7 +230,7 @@ class Player(ServedRun):
         assert self._ahead is not None
         if not self._paused:
             self._playhead.start()
-        give_up_s = time.monotonic() + self._wait_s
+        deadline = Deadline(self._wait_s)
         while True:
             self._take_commands()
             while self._told:
@@ -237,7 +238,7 @@ class Player(ServedRun):
             if self._stop_requested:
                 return "stopped"
             if self._awaited and self._step is None:
-                self._look_for_clients(give_up_s)
+                self._look_for_clients(deadline)
             if not self._playhead.runs:
                 self._rest(_LOOK_S)
                 continue
@@ -255,12 +256,12 @@ class Player(ServedRun):
             elif self._head is not None:
                 self._play_batch(self._head)
 
-    def _look_for_clients(self, give_up_s: float) -> None:
+    def _look_for_clients(self, deadline: Deadline) -> None:
         """Go on once all are there that are waited for."""
         present = self._desk.clients.present
         if present >= self._awaited:
             self._resume()
-        elif time.monotonic() > give_up_s:
+        elif deadline.passed:
             raise RefusedError(f"{present} of {self._awaited} clients were there after {self._wait_s:g} s")
 
     def _play_batch(self, batch: Batch) -> None:

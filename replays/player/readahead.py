@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable, Iterator
 from typing import Generic, TypeVar
 
-from rig.serve.bounded_queue import BoundedQueue
+from rig.serve.waiting import BoundedQueue
 
 _BYTES = 16 << 20
 """What may wait: about 5 s of the default streams."""

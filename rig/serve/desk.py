@@ -19,10 +19,10 @@ from rig.base import wire
 from rig.base.errors import InputError, RefusedError
 from rig.base.outside import LARGEST, Name, Outside, a_line, check, read_json
 from rig.base.text import printable
-from rig.serve.bounded_queue import BoundedQueue
 from rig.serve.transport import Server
 from rig.serve.transport.clients import Clients
 from rig.serve.transport.limit import CommandLimit
+from rig.serve.waiting import BoundedQueue
 
 REQUEST_BYTES = 10_000
 _PENDING_COMMANDS = 256

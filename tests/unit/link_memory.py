@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from drivers.link import ROOM, LinkClosedError, LinkTimeoutError
-from rig.serve.bounded_queue import BoundedQueue
+from rig.serve.waiting import BoundedQueue
 
 _MAX_BYTES = 1 << 16
 

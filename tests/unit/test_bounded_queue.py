@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 
-from rig.serve.bounded_queue import BoundedQueue, take_first
+from rig.serve.waiting import BoundedQueue, take_first
 
 
 def test_a_full_queue_refuses_drops_the_oldest_or_waits() -> None:

@@ -18,6 +18,7 @@ from drivers.can.bus import codec
 from drivers.can.bus.frame import packed
 from rig.base.errors import InputError
 from rig.base.outside import check
+from rig.serve.waiting import Deadline
 
 if TYPE_CHECKING:
     from can.typechecking import CanFilters
@@ -236,7 +237,7 @@ class NodeBus(can.BusABC):
         return message, message.is_error_frame or self._ready_filters is self._filters
 
     def _next(self, timeout: float | None) -> can.Message | None:
-        deadline = None if timeout is None else time.monotonic() + timeout
+        deadline = Deadline(timeout)
         with self._arrived:
             while not self._ready:
                 if self._overflowed:
@@ -248,10 +249,8 @@ class NodeBus(can.BusABC):
                     self.waiting -= len(frames)
                     self._ready.extend(codec.messages_of(frames, channel=self.channel, node=self.node))
                     continue
-                left = None if deadline is None else deadline - time.monotonic()
-                if self._is_shutdown or (left is not None and left <= 0):
+                if self._is_shutdown or not deadline.wait(self._arrived):
                     return None
-                self._arrived.wait(left)
             return self._ready.popleft()
 
     # Sending.
@@ -294,7 +293,7 @@ class NodeBus(can.BusABC):
     def _reserve(self, count: int, timeout: float | None) -> None:
         """Wait for room for some frames in the transmit queue, and take it."""
         with self._room:
-            deadline = None if timeout is None else time.monotonic() + timeout
+            deadline = Deadline(timeout)
             while True:
                 self._check_open()
                 if not self._there:
@@ -306,12 +305,10 @@ class NodeBus(can.BusABC):
                 if self.offered - self.done + count <= max(self._window, count):
                     self.offered += count
                     return
-                left = None if deadline is None else deadline - time.monotonic()
-                if left is not None and left <= 0:
+                if not deadline.wait(self._room):
                     raise can.CanOperationError(
                         f"transmit queue of {self.channel} is full: {self.offered - self.done} frames wait"
                     )
-                self._room.wait(left)
 
     def flush_tx_buffer(self) -> None:
         """Withdraw what waits to be sent; the frame that is on the wire is finished."""
@@ -359,10 +356,9 @@ class NodeBus(can.BusABC):
             self._arrived.notify_all()
             self._room.notify_all()
             # As from a socket, what was sent before goes out, unless the bus does not take it.
-            deadline = time.monotonic() + _PARTING_S
-            while self._there and self.offered > self.done and self._report.state != 2:
-                if not self._room.wait(deadline - time.monotonic()):
-                    break
+            self._room.wait_for(
+                lambda: not self._there or self.offered <= self.done or self._report.state == 2, _PARTING_S
+            )
         self._leave()
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import random
-import time
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -23,6 +22,7 @@ from rig.base.closing import Closing
 from rig.base.errors import InputError, RefusedError, Words
 from rig.base.wire import Continuity
 from rig.channels.table import Group
+from rig.serve.waiting import Deadline
 
 M = TypeVar("M", bound=Message)
 _SLICE_S = 1.0
@@ -129,10 +129,10 @@ class Instrument(Closing):
             LinkError: It could not answer, or did not in time.
         """
         self._sequence = (self._sequence + 1) & 0xFFFFFFFF
-        deadline = time.monotonic() + self._timeout_s
+        deadline = Deadline(self._timeout_s)
         self.link.send(self.CODEC.encode(request, self._sequence), timeout_s=self._timeout_s)
-        while (left := deadline - time.monotonic()) > 0:
-            received = self._receive(left)
+        while not deadline.passed:
+            received = self._receive(deadline.left_s)
             if received is None:
                 continue
             sequence, message = received
@@ -244,7 +244,7 @@ class Sampler(Instrument):
             raise InputError("rows", "at least 1", rows)
         if self._stream is None:
             raise InputError("read", "called after start", Words("no stream"))
-        deadline = time.monotonic() + timeout_s
+        deadline = Deadline(timeout_s)
         while (ready := self._pile.take(rows, ended=self._ended is not None)) is None:
             if self._ended is not None:
                 raise StreamEndedError(self._ended)
@@ -268,15 +268,15 @@ class Sampler(Instrument):
             except StreamEndedError:
                 return
 
-    def _next(self, deadline: float) -> Message | None:
+    def _next(self, deadline: Deadline) -> Message | None:
         if self._data:
             return self._data.popleft()
         while True:
-            left = deadline - time.monotonic()
-            received = self._receive(max(0.0, min(left, _SLICE_S)))
+            passed = deadline.passed
+            received = self._receive(min(deadline.left_s, _SLICE_S))
             if received is not None and isinstance(received[1], protocol.Rows | protocol.Ended):
                 return received[1]
-            if left <= 0:
+            if passed:
                 return None
 
     def _add(self, rows: protocol.Rows) -> None:

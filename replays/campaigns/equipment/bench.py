@@ -22,6 +22,7 @@ from rig.base.errors import InputError, RefusedError, Words
 from rig.base.outcome import InconclusiveError
 from rig.channels.sampling import TICKS_HZ
 from rig.serve.transport.endpoint import free_port
+from rig.serve.waiting import Deadline
 
 if TYPE_CHECKING:
     from drivers.client import Rig
@@ -248,16 +249,14 @@ class Bench(Closing):
         Raises:
             BenchError: None does in time.
         """
-        deadline = time.monotonic() + timeout_s
-        while True:
+        now: list[str] = []
+        for _ in Deadline(timeout_s).polls():
             now = self.joined
             if found := next(filter(fits, now), None):
                 return found
             look()
-            if time.monotonic() > deadline:
-                others = ", ".join(now) or "nobody"
-                raise BenchError(f"device {device} did not join in {timeout_s:g} s; what has: {others}")
-            time.sleep(0.02)
+        others = ", ".join(now) or "nobody"
+        raise BenchError(f"device {device} did not join in {timeout_s:g} s; what has: {others}")
 
     def advance_to(self, time_s: float) -> None:
         """Let the rig go on to a time [s] or to its end: step it in lockstep, to whole blocks, or wait.
@@ -267,9 +266,9 @@ class Bench(Closing):
         """
         client = self._console
         if self.pace != "lockstep":
-            deadline = time.monotonic() + 10.0 + 2.0 * max(0.0, time_s - client.status()["time_s"])
+            deadline = Deadline(10.0 + 2.0 * max(0.0, time_s - client.status()["time_s"]))
             while (left := time_s - (status := client.status())["time_s"]) > 0.0 and status["state"] != "ended":
-                if time.monotonic() > deadline:
+                if deadline.passed:
                     raise BenchError(f"the rig did not reach {time_s:g} s")
                 time.sleep(min(0.2, max(0.002, left)))
             return

@@ -5,13 +5,13 @@ from __future__ import annotations
 import shlex
 import shutil
 import sys
-import time
 from collections.abc import Sequence
 from pathlib import Path
 
 from replays.campaigns.equipment.bench import Bench, BenchError
 from replays.campaigns.equipment.process import Program
 from rig.base.errors import InputError
+from rig.serve.waiting import Deadline
 
 _LINK_S = 10.0
 """Longest that is waited for a device's link [s]."""
@@ -65,10 +65,10 @@ class Device:
         Raises:
             BenchError: It has ended.
         """
-        deadline = time.monotonic() + _LINK_S
-        while self._bench.links <= before and time.monotonic() < deadline:
+        for _ in Deadline(_LINK_S).polls():
+            if self._bench.links > before:
+                return
             self.check_running()
-            time.sleep(0.02)
 
     def check_running(self) -> None:
         """Refuse one that has ended.

@@ -6,11 +6,11 @@ import contextlib
 import os
 import subprocess
 import sys
-import time
 from collections.abc import Sequence
 from pathlib import Path
 
 from rig.base.errors import DiskError
+from rig.serve.waiting import Deadline
 
 _KEEPER = Path(__file__).with_name("keeper.py")
 
@@ -61,15 +61,13 @@ class Program:
 
     def wait_for(self, words: str, timeout_s: float) -> str | None:
         """The line with these words, once it is printed; None where it ends before, or does not print it."""
-        deadline = time.monotonic() + timeout_s
-        while time.monotonic() < deadline:
+        for _ in Deadline(timeout_s).polls():
             ended = self.status is not None
             for line in self.said().splitlines(keepends=True):
                 if words in line and line.endswith("\n"):
                     return line.strip()
             if ended:
                 return None
-            time.sleep(0.02)
         return None
 
     def kill(self) -> None:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import threading
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from replays.campaigns.equipment.bench import BenchError
+from rig.serve.waiting import Deadline, wait_until
 
 if TYPE_CHECKING:
     from recorder.contents.summary import Progress, Summary
@@ -61,11 +61,12 @@ class Record:
         Raises:
             BenchError: It does not.
         """
-        deadline = time.monotonic() + _BEGIN_S
-        while "campaign" not in self._bench.status()["clients"]:
-            if time.monotonic() > deadline or not self._thread.is_alive():
-                raise BenchError(f"nothing is recorded: {self._error or 'the rig does not hear of it'}")
-            time.sleep(0.02)
+        for _ in Deadline(_BEGIN_S).polls():
+            if "campaign" in self._bench.status()["clients"]:
+                return
+            if not self._thread.is_alive():
+                break
+        raise BenchError(f"nothing is recorded: {self._error or 'the rig does not hear of it'}")
 
     def stop(self) -> Recording:
         """End it, and open what was recorded; rows that the rig has sent are waited for.
@@ -94,11 +95,13 @@ class Record:
         """Wait for what a rig in lockstep has published: it is done with the step before its rows are here."""
         if self._bench.pace != "lockstep" or not self._thread.is_alive():
             return
-        status, deadline = self._bench.status(), time.monotonic() + 5.0
-        while status["time_s"] > 0.0 and self._thread.is_alive() and time.monotonic() < deadline:
-            if self._progress is not None and self._progress.time_s >= status["time_s"] - _LAST_S:
-                return
-            time.sleep(0.02)
+        time_s = self._bench.status()["time_s"]
+
+        def all_here() -> bool:
+            return self._progress is not None and self._progress.time_s >= time_s - _LAST_S
+
+        if time_s > 0.0:
+            wait_until(lambda: all_here() or not self._thread.is_alive(), 5.0)
 
 
 _LAST_S = 2e-3

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -14,6 +13,7 @@ from replays.campaigns.measurement import Measurement, Must
 from rig.base import wire
 from rig.base.errors import RefusedError
 from rig.run.commands.table import TimedCommand
+from rig.serve.waiting import wait_until
 
 if TYPE_CHECKING:
     from drivers.client import Rig
@@ -108,9 +108,7 @@ def _stop(machine: Rig) -> None:
 
 def end_device(device: Device, trial: Trial) -> None:
     """Let a device end by itself, as the run has ended, and judge how it did."""
-    deadline = time.monotonic() + _LAST_S
-    while device.program.status is None and time.monotonic() < deadline and trial.target.own:
-        time.sleep(0.02)
+    wait_until(lambda: device.program.status is not None or not trial.target.own, _LAST_S)
     status = device.program.status
     device.program.end()
     note = f"its last line: {device.program.last_line}" if status else ""

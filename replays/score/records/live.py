@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rig.base.errors import InputError, RefusedError, Words
+from rig.serve.waiting import Deadline
 
 if TYPE_CHECKING:
     from recorder.contents.summary import Progress
@@ -196,21 +197,20 @@ def _watch(
     tell: Callable[[float, str], None],
 ) -> str:  # fmt: skip
     """Wait for the end of the stretch; why that was."""
-    due_s, first, ended_s = time.monotonic() + PATIENCE_S, False, None
+    due, first, rest = Deadline(PATIENCE_S), False, None
     while True:
-        now_s = time.monotonic()
         if not first and lines.count:
-            first, due_s = True, now_s + for_s
+            first, due = True, Deadline(for_s)
         if stopped.is_set():
             return "until it was interrupted"
         if lines.ended:
             return "to the DAQ's end"
         if lines.size > MOST_BYTES:
             return f"until they took {MOST_BYTES / 1e9:.0f} GB"
-        ended_s = now_s if ended_s is None and not recording.is_alive() else ended_s
-        if ended_s is not None and now_s - ended_s > _BEHIND_S:
+        rest = Deadline(_BEHIND_S) if rest is None and not recording.is_alive() else rest
+        if rest is not None and rest.passed:
             return "to the end of the rig's run"
-        if now_s >= due_s:
+        if due.passed:
             return "all of the stretch" if first else f"in {PATIENCE_S:g} s"
-        tell(1.0 - (due_s - now_s) / for_s if first else 0.0, f"{lines.count} lines")
+        tell(1.0 - due.left_s / for_s if first else 0.0, f"{lines.count} lines")
         stopped.wait(_LOOK_S)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Annotated
 
@@ -145,20 +145,17 @@ def _processes(log: Path) -> Iterator[Callable[..., Process]]:
 
 
 def _wait_until_up(endpoint: str, service: Process) -> None:
-    import time
-
     from rig.base.wire import STATUS
     from rig.serve.transport import NoReplyError
     from rig.serve.transport.zenoh import ZenohClient
+    from rig.serve.waiting import Deadline
 
-    deadline = time.monotonic() + _READY_S
-    while service.poll() is None and time.monotonic() < deadline:
-        try:
-            with ZenohClient(endpoint) as client:
-                client.request(STATUS)
+    for _ in Deadline(_READY_S).polls(0.2):
+        if service.poll() is not None:
+            break
+        with suppress(NoReplyError), ZenohClient(endpoint) as client:
+            client.request(STATUS)
             return
-        except NoReplyError:
-            time.sleep(0.2)
     raise typer.Exit(
         _complain(None, f"the service did not come up (status {service.poll()}); see processes.log in the folder")
     )

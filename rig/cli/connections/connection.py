@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
@@ -57,17 +56,17 @@ class Connection:
         """
         from rig.base.wire import ALIVE
         from rig.serve.transport.zenoh import ZenohClient
+        from rig.serve.waiting import Deadline
 
         by_environment = self.tls is not None and os.environ.get(_TLS) == str(self.tls)
-        deadline_s = time.monotonic() + self.wait_s
+        deadline = Deadline(self.wait_s)
         try:
             with ExitStack() as stack:
                 with self._waiting() if self.wait_s else nullcontext():
                     wait_s = max(_LINK_S, self.wait_s)
                     client = stack.enter_context(ZenohClient(self.connect, wait_s=wait_s, tls=self.tls))
                     # One that is being prepared listens already.
-                    while time.monotonic() < deadline_s and not client.tokens(ALIVE):
-                        time.sleep(0.1)
+                    any(client.tokens(ALIVE) for _ in deadline.polls(0.1))
                 yield client
         except NoReplyError as error:
             source = f" (the keys are those of {_TLS})" if by_environment and str(self.tls) in str(error) else ""

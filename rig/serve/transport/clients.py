@@ -12,6 +12,7 @@ from typing import Annotated, Any
 from rig.base import wire
 from rig.base.outside import Count, Name, Outside, a_line, check
 from rig.serve.transport import Client, Server
+from rig.serve.waiting import Deadline
 
 SHOWN = 64
 """Clients in the status."""
@@ -228,10 +229,9 @@ class Clients:
             published: Number of the row after the last one published.
             patience_s: Longest wait [s].
         """
-        deadline = time.monotonic() + patience_s
         quiet_since = strangers_since = time.monotonic()
-        while (now := time.monotonic()) < deadline:
-            counts = server.congestion()
+        for _ in Deadline(patience_s).polls(0.1):
+            counts, now = server.congestion(), time.monotonic()
             if not counts.get("links", 0) or now - quiet_since >= _QUIET_S:
                 return
             stalled = counts.get("stalled_links", 0) > 0
@@ -239,4 +239,3 @@ class Clients:
                 quiet_since = strangers_since = now
             elif stalled and now - strangers_since < _STRANGERS_S:
                 quiet_since = now
-            time.sleep(0.1)

@@ -11,7 +11,6 @@ import os
 import re
 import stat
 import tempfile
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -23,6 +22,7 @@ from rig.base.errors import InputError, UnknownNameError, Words
 from rig.base.outside import Outside, check
 from rig.serve.transport import DEFAULT_ENDPOINT
 from rig.serve.transport.endpoint import parse_endpoint
+from rig.serve.waiting import Deadline
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 _SUFFIX = ".json"
@@ -109,17 +109,13 @@ def endpoint_of(text: str, *, field: str, wait_s: float = 0.0) -> tuple[str, int
     text = text.removeprefix("zenoh:")
     if ":" in text:
         return parse_endpoint(text, field=field)
-    deadline = time.monotonic() + wait_s
-    while True:
+    found = {}
+    for _ in Deadline(wait_s).polls(_AGAIN_S):
         found = {entry.name: entry.endpoint for entry in running()} if _NAME.fullmatch(text) else {}
         if text in found:
             return parse_endpoint(found[text], field=field)
-        if time.monotonic() >= deadline:
-            must = f"HOST:PORT such as {DEFAULT_ENDPOINT}, or the name of a rig that runs"
-            raise (
-                UnknownNameError(field, must, text, found) if found else InputError(field, f"{must} (none does)", text)
-            )
-        time.sleep(_AGAIN_S)
+    must = f"HOST:PORT such as {DEFAULT_ENDPOINT}, or the name of a rig that runs"
+    raise UnknownNameError(field, must, text, found) if found else InputError(field, f"{must} (none does)", text)
 
 
 def address_in(url: str) -> str:

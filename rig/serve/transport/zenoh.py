@@ -24,6 +24,7 @@ from rig.serve.transport.exposure.access import Verb, allows, rules
 from rig.serve.transport.names import address_in, endpoint_of
 from rig.serve.transport.recovery import CACHE, Publisher, Recovery
 from rig.serve.transport.session import PATIENCE_S, Session, config_of, encoding_of, fifo, locator
+from rig.serve.waiting import Deadline
 
 if TYPE_CHECKING:
     from rig.serve.transport.exposure.certificates import Holder
@@ -53,6 +54,8 @@ _FROM_AFAR = {"transport/unicast/max_sessions": 32, "transport/unicast/accept_pe
 _OPENING_S, _OPENING_TLS_S, _BACK_S = 0.5, 2.0, 5.0
 """How long one attempt to connect may take: beyond the loopback it is several times there and back. And how long a
 request without a link waits for a rig that is started again."""
+_RETRY_S = 0.05
+"""Pause before a request is repeated that nobody has answered [s]."""
 
 
 class Exposure(NamedTuple):
@@ -290,18 +293,17 @@ class ZenohClient(Closing):
     def _open(self, wait_s: float) -> Session:
         import zenoh
 
-        deadline = time.monotonic() + wait_s
+        deadline = Deadline(wait_s)
         longest_s, settings = _OPENING_S, {}
         if self._holder is not None:
             longest_s, settings = _OPENING_TLS_S, {"transport/link/tls": self._holder.settings(listens=False)}
         while True:
-            left = deadline - time.monotonic()
             config = config_of(
                 listen__endpoints=[],
                 connect__endpoints=[locator(self._host, self._port, tls=self._holder is not None)],
                 # Opening waits for the link, so that the first request cannot come too early; in slices, so that
                 # Ctrl-C works meanwhile.
-                connect__timeout_ms=round(1000 * min(longest_s, max(left, 0.05))),
+                connect__timeout_ms=round(1000 * min(longest_s, max(deadline.left_s, 0.05))),
                 connect__exit_on_failure=True,
                 connect__retry={"period_init_ms": 50, "period_max_ms": 500, "period_increase_factor": 2},
                 **settings,
@@ -309,7 +311,7 @@ class ZenohClient(Closing):
             try:
                 return Session(config)
             except zenoh.ZError:
-                if time.monotonic() >= deadline:
+                if deadline.passed:
                     raise self._not_let_in() from None
 
     def _not_let_in(self) -> NoReplyError:
@@ -416,9 +418,9 @@ class ZenohClient(Closing):
 
     def wait_for(self, key: str, number: int, *, timeout_s: float) -> bool:
         """Wait until a message was handed on, by its number; True at once of a key that is not subscribed."""
-        deadline = time.monotonic() + timeout_s
+        deadline = Deadline(timeout_s)
         streams = [stream for subscribed, stream in self._lossless if subscribed == key]
-        return all(each.wait_for(key, number, timeout_s=max(0.0, deadline - time.monotonic())) for each in streams)
+        return all(each.wait_for(key, number, timeout_s=deadline.left_s) for each in streams)
 
     def request(self, key: str, payload: bytes = b"", *, timeout_s: float = 2.0) -> bytes:
         """Ask the rig and return its reply.
@@ -428,12 +430,12 @@ class ZenohClient(Closing):
         """
         import zenoh
 
-        begun, asked = time.monotonic(), self._linked()
+        deadline, sooner, asked = Deadline(timeout_s), Deadline(min(timeout_s, _BACK_S)), self._linked()
         while True:
             replies: Iterator[Any] = self._session.session.get(
                 key,
                 payload=payload,
-                timeout=max(begun + timeout_s - time.monotonic(), 0.01),
+                timeout=max(deadline.left_s, 0.01),
                 # Replies inherit both: one that waited for a stalled client would hold up all others and close its link
                 # after 5 s; and replies need not queue behind recovered blocks.
                 congestion_control=zenoh.CongestionControl.DROP,
@@ -448,7 +450,7 @@ class ZenohClient(Closing):
             if asked and not asked & self._linked():
                 raise NoReplyError(f"the rig at {self.endpoint} has gone, and has not answered {key}")
             # Without a rig the reply is empty at once: it may be about to start. So it is where the rig denies this.
-            late = time.monotonic() + 0.05 >= begun + (timeout_s if self._linked() else min(timeout_s, _BACK_S))
+            late = (deadline if self._linked() else sooner).left_s <= _RETRY_S
             role = None if self._holder is None else self._holder.name
             denied = not allows(role, Verb.ASK, key)
             if (late or denied) and self.tokens(wire.ALIVE):
@@ -456,7 +458,7 @@ class ZenohClient(Closing):
                 raise NoReplyError(f"the rig at {self.endpoint} {what}")
             if late:
                 raise self._no_reply()
-            time.sleep(0.05)
+            time.sleep(_RETRY_S)
 
     def watch(self, key: str, callback: Callable[[bool], None]) -> None:
         """Call back with True / False when the rig's token appears / vanishes; True at once if it is there."""

@@ -31,6 +31,7 @@ from drivers.can.bus.outlets.outlet import PATIENCE_S, ROOM, OpenBus, Outlet, me
 from rig.base.errors import InputError
 from rig.serve.health import Guard
 from rig.serve.transport.endpoint import parse_loopback
+from rig.serve.waiting import wait_until
 
 if TYPE_CHECKING:
     import can
@@ -336,9 +337,7 @@ class SocketcandServer(socketserver.ThreadingTCPServer):
             clients = list(self.clients)
         for client in clients:
             client.stop()
-        deadline = time.monotonic() + _ENDING_S
-        while self.clients and time.monotonic() < deadline:
-            time.sleep(0.01)
+        wait_until(lambda: not self.clients, _ENDING_S)
 
     def counts(self) -> dict[str, int]:
         """What has happened: `clients` now, `dropped` frames, `fd_left_out`, `malformed`, `refused`, `given_up`."""

@@ -1,17 +1,84 @@
-"""Items on their way from one thread to others, bounded by what they take of a room.
+"""Waiting of one thread for others: until a deadline, and for items in a bounded queue.
 
-Whoever adds an item chooses what happens where there is no room: `offer` refuses it, `push` drops the oldest, and `put`
-waits.
+Every wait with a deadline goes through `Deadline` or `wait_until`; tests/house/test_one_deadline.py finds another.
+Whoever adds an item to a queue chooses what happens where there is no room: `offer` refuses it, `push` drops the
+oldest, and `put` waits.
 """
 
 from __future__ import annotations
 
+import math
 import threading
+import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Generic, TypeVar
 
 T = TypeVar("T")
+POLL_S = 0.02
+"""Usual time between two looks at a condition of which no thread notifies [s]."""
+
+
+class Deadline:
+    """An end of waiting, on the monotonic clock.
+
+    Args:
+        timeout_s: Time from now to the deadline [s]; None: never.
+    """
+
+    def __init__(self, timeout_s: float | None) -> None:
+        self._end_s = math.inf if timeout_s is None else time.monotonic() + timeout_s
+
+    @property
+    def left_s(self) -> float:
+        """Time that is left [s]: 0 once the deadline has passed, infinite without one."""
+        return max(0.0, self._end_s - time.monotonic())
+
+    @property
+    def passed(self) -> bool:
+        """Whether the deadline has passed."""
+        return time.monotonic() >= self._end_s
+
+    def wait(self, changed: threading.Condition) -> bool:
+        """Wait until a condition is notified, at the latest until the deadline.
+
+        Args:
+            changed: The condition, whose lock is held.
+
+        Returns:
+            Whether to look at what is waited for again; False, without a wait, once the deadline has passed.
+        """
+        left_s = self.left_s
+        if left_s > 0.0:
+            changed.wait(None if math.isinf(left_s) else left_s)
+        return left_s > 0.0
+
+    def polls(self, every_s: float = POLL_S) -> Iterator[None]:
+        """Yield at once, then after each pause, the last time when the deadline has passed.
+
+        Args:
+            every_s: Length of a pause [s].
+        """
+        while True:
+            passed = self.passed
+            yield
+            if passed:
+                return
+            time.sleep(min(every_s, self.left_s))
+
+
+def wait_until(condition: Callable[[], object], timeout_s: float, *, every_s: float = POLL_S) -> bool:
+    """Look at a condition again and again until it holds or the time is over.
+
+    Args:
+        condition: Returns whether it holds.
+        timeout_s: Longest wait [s].
+        every_s: Time between two looks [s].
+
+    Returns:
+        Whether it holds.
+    """
+    return any(condition() for _ in Deadline(timeout_s).polls(every_s))
 
 
 class BoundedQueue(Generic[T]):
