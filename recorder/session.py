@@ -23,10 +23,10 @@ from recorder.writer import RecordingError, RecordingWriter, check_view_rate
 from rig.base import wire
 from rig.base.errors import InputError
 from rig.base.text import printable
-from rig.serve.waiting import BoundedQueue
-from rig.serve.intake import Catalogue, Intake
+from rig.serve.intake import Catalogue, Intake, Taken
 from rig.serve.transport import Client
 from rig.serve.transport.clients import Reporter
+from rig.serve.waiting import BoundedQueue
 
 Document = dict[str, Any]
 RIG_LOST = "rig lost"
@@ -158,8 +158,8 @@ class RecordingSession:
         self._force = force
         self._wall_ns = wall_ns
         self._monotonic_s = monotonic_s
-        self._inbox: BoundedQueue[tuple[str, bytes, int]] = BoundedQueue(
-            inbox_bytes, size=lambda item: len(item[1]), holds=True
+        self._inbox: BoundedQueue[Payload] = BoundedQueue(
+            inbox_bytes, size=lambda payload: len(payload.data), holds=True
         )
         """Payloads that wait to be written; a full one refuses blocks, for a transport that waits would stall the rig.
         What it refuses shows as a gap of the row numbers. Documents are small and rare, and have room of their own."""
@@ -262,31 +262,34 @@ class RecordingSession:
 
     def _on_message(self, key: str, payload: bytes) -> None:
         wall_ns = self._wall_ns()
-        if wire.schema_of(key) is None and not self._replaced:
-            self._inbox.offer((key, payload, wall_ns), room=self._inbox.room + _DOCUMENTS_BYTES)
-        with self._order:
-            self._take(key, payload, wall_ns)
+        if wire.schema_of(key) is not None:
+            with self._order:
+                self._take(key, payload, wall_ns)
+        elif not self._replaced:
+            document = Payload(key, payload, wall_ns)
+            self._inbox.offer(document, room=self._inbox.room + _DOCUMENTS_BYTES)
+            if key == wire.FAULTS and document.document is not None:
+                with self._order:
+                    self._offer(self._intake.declare(document.document))
+
+    def _offer(self, taken: list[Taken]) -> None:
+        for each in taken if not self._replaced else ():
+            self._inbox.offer(Payload.of(each))
 
     def _take(self, key: str, payload: bytes, wall_ns: int) -> None:
-        """Take a block, or what is told of blocks: each on a thread of its own."""
-        if wire.schema_of(key) is None:
-            told = Payload.read(key, payload, wall_ns).document if key == wire.FAULTS else None
-            for each in self._intake.declare(told) if told is not None and not self._replaced else ():
-                self._inbox.offer((each.key, each.payload, each.wall_ns))
-            return
+        """Take a block, on the thread of its stream."""
         due = self._intake.next.get(key, 0)
         try:
             taken = self._intake.take(key, payload, wall_ns)
         except ValueError:
             if self._intake.knows(key):
-                self._inbox.offer((key, payload, wall_ns))  # kept as it came, for the reader to judge
+                self._inbox.offer(Payload.read(key, payload, wall_ns))  # kept as it came, for the reader to judge
             return
         if taken:
             # Whoever goes on after the rig was lost and counts from the start again is another one in its place.
             self._replaced = self._replaced or (self._rig_lost and taken[0].block.index < due)
             self._heard_s = self._monotonic_s()
-        for each in taken if not self._replaced else ():
-            self._inbox.offer((each.key, each.payload, each.wall_ns))
+        self._offer(taken)
 
     def _on_miss(self, key: str, messages: int) -> None:
         self._misses.append((key, messages, self._wall_ns()))
@@ -307,8 +310,7 @@ class RecordingSession:
     def _write_all(self, writer: Sink) -> None:
         try:
             while not self._inbox.ended:
-                for item in self._inbox.take_many(_PORTION, 0.1):
-                    payload = Payload.read(*item)
+                for payload in self._inbox.take_many(_PORTION, 0.1):
                     if not self._extent.takes(payload):
                         continue
                     writer.take(payload)
@@ -419,7 +421,7 @@ class RecordingSession:
             while self._misses:
                 writer.write_missed(*self._misses.popleft())
             for each in self._intake.rest(self._end_rows) if not self._replaced and self._failure is None else ():
-                payload = Payload.read(each.key, each.payload, each.wall_ns)
+                payload = Payload.of(each)
                 if self._extent.takes(payload):
                     writer.take(payload)
             if reason == self._end_reason and self._end_rows:

@@ -1,4 +1,4 @@
-"""Payloads, read once, and believed only where a recording can hold what they say.
+"""Payloads, decoded once, and believed only where a recording can hold what they say.
 
 What comes off a wire or out of a damaged file may be of the right form and still name a time in the far future or a
 rate of zero. Such a payload is malformed like one that does not decode; it must not end a recording.
@@ -6,48 +6,57 @@ rate of zero. Such a payload is malformed like one that does not decode; it must
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass
-from typing import Any
+from functools import cached_property
+from typing import Any, Self
 
 import numpy as np
 
 from rig.base.wire import EDGES, EVENTS, Block, decode_block, decode_document, schema_of
-from rig.serve.intake import event_in
+from rig.serve.intake import Taken, event_in
 
 _MOST = 1 << 53
 """Ticks up to here are exact in every number that they become: 285 years of microseconds."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, eq=False)
 class Payload:
-    """What came on a key, and what it says.
+    """Message of a stream, as bytes and decoded.
 
     Attributes:
-        key: The key.
-        data: The bytes, as they came.
-        wall_ns: When they came [unix ns].
-        block: The block in them; None on a key of documents.
-        document: The document in them; None on a key of blocks.
+        key: Key of the stream.
+        data: Bytes, as they came.
+        wall_ns: Time of arrival [unix ns].
+        block: Decoded block; None on a key of documents, and where it is malformed.
     """
 
     key: str
     data: bytes
     wall_ns: int
     block: Block | None = None
-    document: dict[str, Any] | None = None
 
     @classmethod
-    def read(cls, key: str, data: bytes, wall_ns: int) -> Payload:
-        """Read a payload; one that is not what its key promises has neither block nor document."""
-        block = document = None
-        try:
-            if schema_of(key) is None:
-                document = event_in(data) if key == EVENTS else decode_document(data)
-            else:
-                block = block_in(key, data)
-        except ValueError:
-            pass
-        return cls(key, data, wall_ns, block, document)
+    def read(cls, key: str, data: bytes, wall_ns: int) -> Self:
+        """Decode a payload; one that is not what its key promises has neither block nor document."""
+        block = None
+        with contextlib.suppress(ValueError):
+            block = None if schema_of(key) is None else block_in(key, data)
+        return cls(key, data, wall_ns, block)
+
+    @classmethod
+    def of(cls, taken: Taken) -> Self:
+        """Return the payload of a block that the intake has decoded; an unsound block makes it malformed."""
+        block = taken.block if _is_sound(taken.key, taken.block) else None
+        return cls(taken.key, taken.payload, taken.wall_ns, block)
+
+    @cached_property
+    def document(self) -> dict[str, Any] | None:
+        """Document, decoded when it is first asked for; None on a key of blocks, and where it is malformed."""
+        if schema_of(self.key) is None:
+            with contextlib.suppress(ValueError):
+                return event_in(self.data) if self.key == EVENTS else decode_document(self.data)
+        return None
 
     @property
     def malformed(self) -> bool:
@@ -75,13 +84,16 @@ def block_in(key: str, payload: bytes) -> Block:
         ValueError: It is not what the key promises.
     """
     block = decode_block(payload, schema_of(key) or "")
-    if key == EDGES:
-        sound = block.values.shape[1] == 1 and bool((np.abs(block.values) <= _MOST).all())
-    else:
-        sound = block.rate_hz > 0.0
-    if not sound:
+    if not _is_sound(key, block):
         raise ValueError(f"payload must have rows at a rate, or edges at times; instead received {key}: {block}")
     return block
+
+
+def _is_sound(key: str, block: Block) -> bool:
+    """Return whether a block has rows at a rate or, on the key of edges, one column of times that a clock can have."""
+    if key == EDGES:
+        return block.values.shape[1] == 1 and bool((np.abs(block.values) <= _MOST).all())
+    return block.rate_hz > 0.0
 
 
 def tick_in(document: dict[str, Any] | None) -> int | None:

@@ -6,10 +6,14 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+import recorder.files.payload
 import recorder.session
+import rig.base.wire
+import rig.serve.intake
 from recorder.contents.summary import Progress, Summary
 from recorder.files.payload import Payload
 from recorder.output.room import Limits
@@ -23,6 +27,7 @@ from rig.base.wire import (
     CATALOGUE,
     CLIENTS,
     EVENTS,
+    FAULTS,
     STATUS,
     Gap,
     decode_document,
@@ -99,6 +104,35 @@ def test_records_to_the_end_of_the_stream(path):
     for key in {key for key, _ in items}:
         assert [p for _, p in recording.payloads(key)] == [p for k, p in items if k == key]
     assert progress[-1].lost == 0
+
+
+def test_each_block_and_each_document_is_decoded_once(path, monkeypatch):
+    decoded: list[bytes] = []
+
+    def counted(decode: Callable[..., Any]) -> Callable[..., Any]:
+        def count(payload: bytes, *rest: Any, **more: Any) -> Any:
+            decoded.append(payload)
+            return decode(payload, *rest, **more)
+
+        return count
+
+    client = ScriptedClient()
+    told = {"event": "fault", "tick": 0, "time_s": 0.0, "fault": 1}
+    items = [(FAULTS, encode_document(told)), *stream(30)]
+    act = play(client, items)
+
+    def count_and_act() -> None:
+        for module, name in (
+            (rig.base.wire, "decode_block"),
+            (recorder.files.payload, "decode_block"),
+            (rig.serve.intake, "read_json"),
+            (recorder.files.payload, "decode_document"),
+        ):
+            monkeypatch.setattr(module, name, counted(getattr(module, name)))
+        act()
+
+    record(RecordingSession(client, path), client, count_and_act)
+    assert sorted(decoded) == sorted(payload for _, payload in items)
 
 
 @pytest.mark.parametrize(("status", "short", "reason"), [(True, 0, "completed"), (False, 0, "late"), (True, 1, "late")])
