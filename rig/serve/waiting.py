@@ -88,7 +88,8 @@ class BoundedQueue(Generic[T]):
         room: What may wait, in the unit of `size`.
         size: What an item takes of it.
         holds: Whether what was taken counts until something else is taken: it is in memory while it is dealt with.
-        inherit: Called with an item that is dropped and the one after it, before anybody can take that.
+        inherit: Called with an item that is dropped and the one after it, before anybody can take that. Without it,
+            items that take no room are never dropped.
         changed: Condition that is shared with other queues, to wait for all of them (`take_first`).
 
     Attributes:
@@ -104,7 +105,7 @@ class BoundedQueue(Generic[T]):
         *,
         size: Callable[[T], int] = lambda _: 1,
         holds: bool = False,
-        inherit: Callable[[T, T], None] = lambda dropped, following: None,
+        inherit: Callable[[T, T], None] | None = None,
         changed: threading.Condition | None = None,
     ) -> None:
         self.room = room
@@ -145,8 +146,12 @@ class BoundedQueue(Generic[T]):
         size, dropped = self._size(item), 0
         with self._changed:
             while self._items and size and self.used + size > self.room:
-                oldest = self._items.popleft()
-                self._inherit(oldest, self._items[0] if self._items else item)
+                sizes = enumerate(map(self._size, self._items))
+                place = 0 if self._inherit else next((n for n, each in sizes if each), 0)
+                oldest = self._items[place]
+                del self._items[place]
+                if self._inherit is not None:
+                    self._inherit(oldest, self._items[0] if self._items else item)
                 self.used -= self._size(oldest)
                 dropped += self._size(oldest) > 0
             self.dropped += dropped

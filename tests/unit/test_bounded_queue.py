@@ -61,6 +61,14 @@ def test_the_next_item_inherits_from_one_that_is_dropped_and_what_takes_no_room_
     assert queue.ended
 
 
+def test_without_an_heir_what_takes_no_room_is_never_dropped() -> None:
+    queue = BoundedQueue[str](2, size=lambda item: item.isdigit())
+    for item in ("start", "1", "fault", "2", "3", "stop", "4"):
+        queue.push(item)
+    assert queue.dropped == 2
+    assert queue.take_many(9) == ["start", "fault", "3", "stop", "4"]
+
+
 def test_a_closed_queue_gives_what_waits_and_takes_no_more() -> None:
     queue = BoundedQueue[int](5)
     queue.offer(1)

@@ -282,6 +282,27 @@ def test_a_stalled_bus_loses_the_oldest_blocks_and_does_not_slow_the_rig() -> No
         setup.gateway.close()
 
 
+def test_blocks_that_find_no_room_never_take_the_place_of_an_event(monkeypatch: pytest.MonkeyPatch) -> None:
+    documents, probes = [wire.EVENTS, wire.STATUS, wire.FAULTS, wire.BLOCK], wire.sensor_key("probes")
+    with rig(Fake(duration_s=None), paced=True, bus=Stubborn()) as setup:
+        unpacked: list[str] = []
+        begun, may_go_on = threading.Event(), threading.Event()
+
+        def unpack(key: str, _: bytes) -> None:
+            begun.set()
+            may_go_on.wait()
+            unpacked.append(key)
+
+        monkeypatch.setattr(setup.gateway, "unpack", unpack)
+        setup.server.publish(probes, b"")
+        begun.wait()
+        for key in (*documents, *[probes] * 1000):
+            setup.server.publish(key, b"")
+        assert setup.gateway.blocks_dropped > 900
+        may_go_on.set()
+        until(lambda: set(documents) <= set(unpacked))
+
+
 def test_what_the_bus_refuses_is_counted() -> None:
     with rig(Fake(duration_s=0.6), paced=True, bus=Stubborn(refuse=True)) as setup:
         setup.start()

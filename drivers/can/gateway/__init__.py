@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections import deque
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Annotated, Any, Self
 
@@ -32,6 +31,7 @@ from rig.channels.table import ChannelTable
 from rig.serve.health import Guard, Rising
 from rig.serve.intake import block_end_in
 from rig.serve.transport import Client
+from rig.serve.waiting import BoundedQueue
 
 if TYPE_CHECKING:
     import can
@@ -117,10 +117,11 @@ class Gateway(Closing):
         self._rate_hz, self._steps = steps(table, schedule)
         self._samples = sample_frames(table, schedule, self._steps)
         self._groups = tuple(table.groups)
-        self._queue: deque[tuple[str, bytes]] = deque()
         self._queue_seconds = queue_seconds
-        self._capacity = 8 * len(self._groups)
         self._changed = threading.Condition()
+        self._queue: BoundedQueue[tuple[str, bytes]] = BoundedQueue(
+            8 * len(self._groups), size=lambda entry: int(entry[0] not in _WORDS), changed=self._changed
+        )
         self._stopping = False
         self._end_s = math.inf
 
@@ -133,8 +134,6 @@ class Gateway(Closing):
         self._event_number = 0
         self._next_status_s = self._next_heartbeat_s = now()
 
-        self.blocks_dropped = 0
-        """Blocks that the sender had no time for."""
         self.taken = 0
         """Frames that were never made because a fault of blocks took their samples, or sent them out of turn."""
         self._told: dict[str, int] = {}
@@ -180,7 +179,7 @@ class Gateway(Closing):
         """Send what is still due, then end."""
         with self._changed:
             self._stopping = True
-            self._changed.notify_all()
+            self._queue.close()
         self.commands.close()
         for thread in self._threads:
             if thread.is_alive():
@@ -212,6 +211,11 @@ class Gateway(Closing):
         ]
 
     @property
+    def blocks_dropped(self) -> int:
+        """Blocks that the sender had no time for."""
+        return self._queue.dropped
+
+    @property
     def dropped(self) -> int:
         """Frames that the bus did not take, or that were never made because samples were missing."""
         return self.outbox.dropped + sum(each.skipped for each in self._samples) - self.taken
@@ -219,16 +223,8 @@ class Gateway(Closing):
     # On the publisher's thread.
 
     def _take(self, key: str, payload: bytes) -> None:
-        with self._changed:
-            if not self._paced:
-                while len(self._queue) >= self._capacity and not self._stopping:
-                    self._changed.wait(0.1)
-            while len(self._queue) >= self._capacity and key not in _WORDS:
-                self._queue.popleft()
-                self.blocks_dropped += 1
-            self._queue.append((key, payload))
-            if not self._paced or len(self._queue) == 1:
-                self._changed.notify_all()
+        if self._paced or not self._queue.put((key, payload)):
+            self._queue.push((key, payload))
 
     # On the sender's thread.
 
@@ -241,12 +237,7 @@ class Gateway(Closing):
 
     def _send_some(self) -> bool:
         """What is due now, and the wait for more; whether that was all."""
-        with self._changed:
-            entries = list(self._queue)
-            self._queue.clear()
-            if not self._paced:
-                self._changed.notify_all()
-        for key, payload in entries:
+        for key, payload in self._queue.take_many(len(self._queue), 0.0):
             self.guard(self.unpack, key, payload)
         now = self._now()
         self.outbox.send_due()
@@ -271,9 +262,10 @@ class Gateway(Closing):
             if not self._queue and not self.outbox.stuck:
                 next_s = min(self.outbox.next_s, self._next_status_s, self._next_heartbeat_s)
                 self._changed.wait(min(max(next_s - self._now(), 0.0), _IDLE_S))
-            if self._queue or self.outbox.stuck:
-                # On a grid of slots: what comes with the first part of a block is taken with it.
-                self._changed.wait(SLOT_S - self._now() % SLOT_S)
+            waiting = bool(self._queue or self.outbox.stuck)
+        if waiting:
+            # On a grid of slots: what comes with the first part of a block is taken with it.
+            time.sleep(SLOT_S - self._now() % SLOT_S)
         return False
 
     def unpack(self, key: str, payload: bytes) -> None:
@@ -326,7 +318,7 @@ class Gateway(Closing):
         self._time_us = max(self._time_us, round(1e6 * (block.tick / block.tick_rate_hz + length_s)))
         if self._paced:
             blocks = math.ceil(self._queue_seconds / length_s)
-            self._capacity = max(8 * len(self._groups), blocks * (len(self._groups) + 1))
+            self._queue.room = max(8 * len(self._groups), blocks * (len(self._groups) + 1))
 
     def _sync(self, block: wire.Block) -> None:
         every = round(_SYNC_S * self._rate_hz)
