@@ -27,14 +27,14 @@ import numpy as np
 from drivers.console import Console
 from drivers.daq import Daq
 from drivers.link import LinkTimeoutError
-from drivers.lockstep import LOST_S, Blocks
 from drivers.sources import Source
 from drivers.sources.rig import RigSource
-from drivers.sources.samples import Samples, StreamEndedError
-from drivers.sources.turns import HALF, Turn, edges, joined, turn_in
+from drivers.sources.samples import ALL, RowReader, Samples, StreamEndedError, follow, joined
+from drivers.sources.stream import RigStream
+from drivers.sources.turns import HALF, Turn, edges, turn_in
 from rig.base import wire
 from rig.base.errors import InputError, RefusedError, UnknownNameError, Words
-from rig.serve.intake import Catalogue, event_in
+from rig.serve.intake import BlockEnd, Catalogue, block_end_in, event_in
 from rig.serve.transport import DEFAULT_ENDPOINT, Client
 from rig.serve.waiting import Deadline
 
@@ -43,6 +43,10 @@ _PATIENCE_S = 10.0
 _TURN_S = 120.0
 """How long a device may wait for those before it by name to be done with a block [s]: zenoh keeps a kB of each request
 for as long as the request might have taken, 50 MB of 400 a second."""
+_LOST_S = 2.0
+"""Rows of a block that is over are there, or lost [s]."""
+_LOOK_S = 0.2
+"""How often whoever waits for a block looks whether the run is over, where no event has told so [s]."""
 
 
 class NotSeenError(TimeoutError):
@@ -112,19 +116,20 @@ class Rig(Console):
         """Up to where a rig in lockstep was stepped [ticks]."""
         self.lost: dict[str, str] = {}
         """Devices under test that were put out while this client stepped the rig, with the reason."""
-        self._blocks: Blocks | None = None
-        self._joined = False
+        self._ends: queue.SimpleQueue[BlockEnd | None] | None = None
+        """Ends of blocks, from the first call of `blocks` in lockstep on; None: look why none comes."""
+        self._joined, self._put_out = False, ""
+        """Whether the rig waits for this client as a device, and why it does not any more."""
         self._events: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
         self._seen: list[dict[str, Any]] = []
         client.subscribe(wire.EVENTS, self._on_event)
-        self._truth: dict[str, queue.SimpleQueue[Samples]] = {}
+        self._truth: dict[str, RowReader] = {}
+        stream = RigStream(client)
         for table in truth:
             known = document.get("truth", {})
             if table not in known:
                 raise UnknownNameError("truth", "one of the rig's tables", table, known)
-            self._truth[table] = queue.SimpleQueue()
-            columns = known[table]["columns"]
-            self._listen_to(table, [one["name"] for one in columns], [one["unit"] for one in columns])
+            self._truth[table] = _read_truth(stream, table, known[table]["columns"])
         self._daq: Daq | None = None
         if channels:
             source = source or RigSource(client)
@@ -317,13 +322,20 @@ class Rig(Console):
 
     def _blocks_done(self, patience_s: float) -> Iterator[Samples]:
         """Join, and be done with each block when the next one is asked for."""
-        blocks = self._blocks = self._blocks or Blocks(self._client, self.daq, self._name)
+        if self._ends is None:
+            self._ends = queue.SimpleQueue()
+            self._client.subscribe(wire.BLOCK, self._on_block_end)
+            self._client.settle()
+        self._put_out = ""
         begin, self._joined = self.join(patience_s=patience_s).tick, True
         usual_s, self._timeout_s = self._timeout_s, _TURN_S if self._steps else self._timeout_s
         try:
-            while (end := blocks.next()) is not None:
+            while (end := self._next_end(self._ends)) is not None:
                 if end.tick > begin:
-                    yield from blocks.rows(end)
+                    deadline = Deadline(_LOST_S)
+                    for key, number in end.messages.items():
+                        self._client.wait_for(key, number, timeout_s=deadline.left_s)
+                    yield from self.daq.ready()
                     self.done(end.tick)
         except RefusedError as error:
             if wire.ENDED not in str(error):
@@ -334,6 +346,26 @@ class Rig(Console):
         finally:
             self._timeout_s = usual_s
             self._part()
+
+    def _next_end(self, ends: queue.SimpleQueue[BlockEnd | None]) -> BlockEnd | None:
+        """Return the end of the next block; None at that of the run.
+
+        Raises:
+            RefusedError: The device was put out.
+        """
+        while True:
+            with contextlib.suppress(queue.Empty):
+                if (end := ends.get(timeout=_LOOK_S)) is not None:
+                    return end
+            if self._put_out:
+                raise RefusedError(f"the rig waits for {self._name} no longer: {self._put_out}")
+            if self.daq.ended is not None:
+                return None
+
+    def _on_block_end(self, _: str, payload: bytes) -> None:
+        assert self._ends is not None
+        with contextlib.suppress(ValueError):
+            self._ends.put(block_end_in(payload))
 
     def _part(self) -> None:
         """Leave, where the rig may wait for this device."""
@@ -355,7 +387,7 @@ class Rig(Console):
             missing = min(rows - (0 if taken is None else len(taken)), self._room)
             refused = self._step_to(self._next + missing)
             try:
-                fresh = daq.read(missing, timeout_s=LOST_S if self._steps and refused is None else _PATIENCE_S)
+                fresh = daq.read(missing, timeout_s=_LOST_S if self._steps and refused is None else _PATIENCE_S)
             except LinkTimeoutError as error:
                 if refused is not None or not self._steps or deadline.passed:
                     raise refused or NotSeenError(f"the rig sent no rows: {error}") from error
@@ -422,12 +454,20 @@ class Rig(Console):
 
     def _on_event(self, _: str, payload: bytes) -> None:
         with contextlib.suppress(ValueError):
-            self._events.put(event_in(payload))
+            event = event_in(payload)
+            self._events.put(event)
+            if event["event"] == "device" and event.get("device") == self._name:
+                lost = event.get("state") == "lost"
+                self._put_out = str(event.get("reason", "not done in time, or with another block")) if lost else ""
+            if self._ends is not None and (self._put_out or event["event"] == "end"):
+                self._ends.put(None)
 
     # ---- the truth, by name ----
 
     def truth(self, table: str, *, to_s: float | None = None, timeout_s: float = 10.0) -> Samples:
         """Rows of a table of the truth, in SI, that came since the rig was connected to, or since the last call.
+
+        Rows that are missing end them; the next call tells of the gap.
 
         Args:
             table: One of those that were named when the rig was connected to.
@@ -448,29 +488,27 @@ class Rig(Console):
             if to_s is not None and self._steps and to_s * self._tick_rate_hz > self._at:
                 self._step(to_s * self._tick_rate_hz - self._at)
             try:
-                fresh = made.get(timeout=deadline.left_s)
-            except queue.Empty:
+                fresh = made.read(ALL, timeout_s=deadline.left_s, whole=False)
+            except LinkTimeoutError:
                 raise NotSeenError(f"no truth of {table} came in {timeout_s:g} s") from None
+            if found is not None and fresh.gap:
+                made.put_back(fresh)
+                break
             found = fresh if found is None else joined(found, fresh)
-            while to_s is None and not made.empty():
-                found = joined(found, made.get())
         return found
 
-    def _listen_to(self, table: str, columns: Sequence[str], units: Sequence[str]) -> None:
-        made, key = self._truth[table], wire.truth_key(table)
-        schema = wire.schema_of(key)
-        assert schema is not None
 
-        def take(_: str, payload: bytes) -> None:
-            block = wire.decode_block(payload, schema)
-            made.put(
-                Samples(
-                    block.index, block.tick, block.rate_hz, block.tick_rate_hz, tuple(columns), tuple(units),
-                    block.values,
-                )
-            )  # fmt: skip
+def _read_truth(stream: RigStream, table: str, columns: Sequence[dict[str, str]]) -> RowReader:
+    """Read a table of the truth, given its columns, from now on."""
+    names, units = tuple(one["name"] for one in columns), tuple(one["unit"] for one in columns)
+    made, rows = RowReader(f"truth of {table}"), wire.Continuity()
 
-        self._client.subscribe(key, take)
+    def take(block: wire.Block) -> None:
+        if (new := follow(rows, Samples.of(block, names, units))) is not None:
+            made.add(new)
+
+    stream.listen(wire.truth_key(table), take, lambda _: None)
+    return made
 
 
 def connect(

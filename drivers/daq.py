@@ -19,11 +19,10 @@ import numpy as np
 
 from drivers.link import LinkTimeoutError
 from drivers.sources import Source, open_source
-from drivers.sources.samples import Pile, Samples, StreamEndedError, follow
+from drivers.sources.samples import Pile, RowReader, Samples, StreamEndedError, follow
 from rig.base.closing import Closing
 from rig.base.errors import InputError, UnknownNameError, Words
 from rig.base.wire import Continuity, Gap
-from rig.serve.waiting import Deadline
 
 _GAPS = 1000
 """Gaps that are remembered; all are counted."""
@@ -122,7 +121,7 @@ class Aligner:
         return followed
 
 
-class Daq(Closing):
+class Daq(RowReader, Closing):
     """Chosen channels as blocks without a gap inside; each tells how many rows are missing right before it.
 
     Args:
@@ -166,10 +165,9 @@ class Daq(Closing):
         rate_hz: float | None = None,
         buffer_s: float = 10.0,
     ) -> None:
+        super().__init__("daq")
         self._source = source
-        self._changed = threading.Condition()
         self._wakers: set[Callable[[], None]] = set()
-        self._ended: str | None = None
         self._closed = False
         self._thread: threading.Thread | None = None
         self._error: BaseException | None = None
@@ -249,32 +247,6 @@ class Daq(Closing):
         with self._changed:
             return list(self._aligner.gaps)
 
-    def read(self, rows: int | None = None, *, timeout_s: float = 5.0) -> Samples:
-        """The next rows.
-
-        Args:
-            rows: How many; None takes what comes next. Fewer come before a gap and at the end.
-            timeout_s: How long to wait [s].
-
-        Raises:
-            LinkTimeoutError: They did not come in time; those that did can still be read.
-            StreamEndedError: The run has ended and everything was read.
-        """
-        deadline = Deadline(timeout_s)
-        with self._changed:
-            while (ready := self._take(rows)) is None:
-                if not deadline.wait(self._changed):
-                    raise self._late(rows, timeout_s)
-            return ready
-
-    def blocks(self, rows: int | None = None, *, timeout_s: float = 5.0) -> Iterator[Samples]:
-        """Read until the end."""
-        while True:
-            try:
-                yield self.read(rows, timeout_s=timeout_s)
-            except StreamEndedError:
-                return
-
     def __iter__(self) -> Iterator[Samples]:
         return self.blocks()
 
@@ -317,6 +289,7 @@ class Daq(Closing):
         """As `read`, for asyncio."""
         import asyncio
 
+        self._check(rows)
         loop, event = asyncio.get_running_loop(), asyncio.Event()
 
         def wake() -> None:
@@ -350,19 +323,11 @@ class Daq(Closing):
     def __aiter__(self) -> AsyncIterator[Samples]:
         return self.ablocks()
 
-    def _late(self, rows: int | None, timeout_s: float) -> LinkTimeoutError:
-        wanted = "any" if rows is None else rows
-        return LinkTimeoutError(f"daq: {self._pile.rows} of {wanted} rows came in {timeout_s:g} s")
-
-    def _take(self, rows: int | None) -> Samples | None:
+    def _take(self, rows: int | None, *, whole: bool = True) -> Samples | None:
         """Rows that are ready; the lock is held."""
-        if rows is not None and rows < 1:
-            raise InputError("rows", "at least 1", rows)
         if self._closed:
             raise StreamEndedError("the client was closed")
-        ready = self._pile.take(rows, ended=self._ended is not None)
-        if ready is None and self._ended is not None:
-            raise StreamEndedError(self._ended)
+        ready = super()._take(rows, whole=whole)
         if ready is not None:
             lost = sum(self._aligner.lost.values())
             self._source.taken(ready.index + len(ready), room=self._room, lost=lost)

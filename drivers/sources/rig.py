@@ -79,18 +79,11 @@ class RigSource:
                 return
             block = thin(block, step)
             if len(block.values):
-                samples = Samples(
-                    index=block.index,
-                    tick=block.tick,
-                    rate_hz=block.rate_hz,
-                    tick_rate_hz=block.tick_rate_hz,
-                    names=group.names,
-                    units=units,
-                    values=group.engineering(block.values),
-                )
-                on_samples(group.name, samples)
+                on_samples(group.name, Samples.of(block, group.names, units, group.engineering(block.values)))
 
-        self._leave.append(self._stream.listen(group.name, take, lambda reason: on_end(group.name, reason)))
+        self._leave.append(
+            self._stream.listen(wire.sensor_key(group.name), take, lambda reason: on_end(group.name, reason))
+        )
 
     def taken(self, index: int | None, *, room: int, lost: int) -> None:
         """Tell the rig twice a second, and at once where much of the room has been used: a replay waits for it."""

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import sys
+import threading
 from collections import deque
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 
+from drivers.link import LinkTimeoutError
+from rig.base.errors import InputError
 from rig.base.samples import Columns
-from rig.base.wire import Continuity, row_tick, row_times_s
+from rig.base.wire import Block, Continuity, row_tick, row_times_s
+from rig.serve.waiting import Deadline
 
 
 class StreamEndedError(EOFError):
@@ -38,6 +45,12 @@ class Samples(Columns):
     units: tuple[str, ...]  # pyrefly: ignore[bad-override]
     values: np.ndarray  # pyrefly: ignore[bad-override]
     gap: int = 0
+
+    @classmethod
+    def of(cls, block: Block, names: tuple[str, ...], units: tuple[str, ...], values: np.ndarray | None = None) -> Self:
+        """Return the rows of a block, with its values unless others are given, as columns."""
+        chosen = block.values if values is None else values
+        return cls(block.index, block.tick, block.rate_hz, block.tick_rate_hz, names, units, chosen)
 
     def __repr__(self) -> str:
         missing = f"; {self.gap} missing before them)" if self.gap else ")"
@@ -125,12 +138,17 @@ class Pile:
                 run += 1
             if count < rows and run == len(parts) and not ended:
                 return None
-        whole = _join([parts.popleft() for _ in range(run)])
+        whole = joined(*[parts.popleft() for _ in range(run)])
         if rows is not None and count > rows:
             parts.appendleft(whole.rows(rows, count))
             whole = whole.rows(0, rows)
         self.rows -= len(whole)
         return whole
+
+    def put_back(self, samples: Samples) -> None:
+        """Put rows that were taken below all others."""
+        self._parts.appendleft(samples)
+        self.rows += len(samples)
 
     def clear(self) -> None:
         """Forget all."""
@@ -138,12 +156,97 @@ class Pile:
         self.rows = 0
 
 
+ALL = sys.maxsize
+"""Number of rows for `RowReader.read`, without `whole`: all that have come."""
+
+
+class RowReader:
+    """Rows of one stream, read in order by one thread, while they come in on another or during the read.
+
+    Args:
+        name: Name of the reader in errors.
+        most: Number of rows that wait to be read; beyond, the oldest are dropped. None: any number.
+    """
+
+    def __init__(self, name: str, most: int | None = None) -> None:
+        self._reader_name = name
+        self._changed = threading.Condition()
+        self._pile = Pile(most)
+        self._ended: str | None = None
+
+    def add(self, samples: Samples) -> None:
+        """Add rows behind all others."""
+        with self._changed:
+            self._pile.add(samples)
+            self._changed.notify_all()
+
+    def put_back(self, samples: Samples) -> None:
+        """Put back rows that were read: they are read next."""
+        with self._changed:
+            self._pile.put_back(samples)
+
+    def read(self, rows: int | None = None, *, timeout_s: float = 5.0, whole: bool = True) -> Samples:
+        """Return the next rows, without a gap inside; `gap` is the number of rows missing right before them.
+
+        Args:
+            rows: Number of rows; None takes what comes next, at least one. Fewer come before a gap and at the end.
+            timeout_s: Longest wait [s].
+            whole: Whether to wait for all of them; False takes what has come, at least one.
+
+        Raises:
+            LinkTimeoutError: They did not come in time; those that did can still be read.
+            StreamEndedError: The stream has ended and everything was read.
+        """
+        self._check(rows)
+        deadline = Deadline(timeout_s)
+        with self._changed:
+            while (ready := self._take(rows, whole=whole)) is None:
+                if not self._wait(deadline):
+                    raise self._late(rows, timeout_s)
+            return ready
+
+    def ready(self) -> Iterator[Samples]:
+        """Yield the rows that have come, in pieces without a gap inside."""
+        try:
+            while True:
+                yield self.read(ALL, timeout_s=0.0, whole=False)
+        except (LinkTimeoutError, StreamEndedError):
+            return
+
+    def blocks(self, rows: int | None = None, *, timeout_s: float = 5.0) -> Iterator[Samples]:
+        """Read until the end."""
+        while True:
+            try:
+                yield self.read(rows, timeout_s=timeout_s)
+            except StreamEndedError:
+                return
+
+    @staticmethod
+    def _check(rows: int | None) -> None:
+        if rows is not None and rows < 1:
+            raise InputError("rows", "at least 1", rows)
+
+    def _take(self, rows: int | None, *, whole: bool = True) -> Samples | None:
+        """Rows that are ready; the lock is held."""
+        ready = self._pile.take(rows, ended=not whole or self._ended is not None)
+        if ready is None and self._ended is not None:
+            raise StreamEndedError(self._ended)
+        return ready
+
+    def _wait(self, deadline: Deadline) -> bool:
+        """Wait for more to happen; False once the deadline has passed. The lock is held."""
+        return deadline.wait(self._changed)
+
+    def _late(self, rows: int | None, timeout_s: float) -> LinkTimeoutError:
+        wanted = "any" if rows in (None, ALL) else rows
+        return LinkTimeoutError(f"{self._reader_name}: {self._pile.rows} of {wanted} rows came in {timeout_s:g} s")
+
+
 def _follows(one: Samples, other: Samples) -> bool:
     same = one.names == other.names and one.rate_hz == other.rate_hz
     return same and other.gap == 0 and other.index == one.index + len(one)
 
 
-def _join(parts: list[Samples]) -> Samples:
-    if len(parts) == 1:
-        return parts[0]
-    return replace(parts[0], values=np.concatenate([part.values for part in parts]))
+def joined(*parts: Samples) -> Samples:
+    """Return rows, and those that follow them, as one."""
+    return parts[0] if len(parts) == 1 else replace(parts[0], values=np.concatenate([part.values for part in parts]))

@@ -1,6 +1,7 @@
-"""The sensor blocks of one rig for any number of listeners in this process: what twins and the DAQ client read from.
+"""The blocks of one rig for any number of listeners in this process: what twins and the DAQ client read from.
 
-Only sensor keys, the catalogue, the events and the rig's token are asked for: whoever reads here cannot see the truth.
+Only the keys that are listened to, the catalogue, the events and the rig's token are asked for: whoever listens to
+sensors cannot see the truth.
 """
 
 from __future__ import annotations
@@ -57,7 +58,7 @@ class _Listener:
 
 
 class RigStream:
-    """Hands each block of a group to whoever listens to that group.
+    """Hands each block of a stream to whoever listens to its key.
 
     Args:
         client: Transport to the rig; stays open, and is closed by its owner.
@@ -75,7 +76,7 @@ class RigStream:
         self._rig: str | None = None
         self._gone = False
         self._ends: dict[str, tuple[int, str]] = {}
-        """Groups of which the run's end was announced: number of rows in all, and the reason."""
+        """Keys of which the run's end was announced: number of rows in all, and the reason."""
         self._heard_s = 0.0
         """When the last block came [s, monotonic]."""
         self.malformed = 0
@@ -108,12 +109,12 @@ class RigStream:
         return groups[name]
 
     def listen(
-        self, group: str, on_block: Callable[[wire.Block], None], on_end: Callable[[str], None]
+        self, key: str, on_block: Callable[[wire.Block], None], on_end: Callable[[str], None]
     ) -> Callable[[], None]:
-        """Take all blocks of a group from now on; returns what ends that.
+        """Take all blocks of a stream from now on; returns what ends that.
 
         Args:
-            group: Name in the channel table.
+            key: Of a sensor group, or of a table of the truth.
             on_block: Takes blocks in order, on a thread of the transport; must not wait.
             on_end: Takes the reason for which nothing more comes: the run has ended, or the rig has gone. Where another
                 run begins, its blocks come, numbered from 0.
@@ -121,9 +122,9 @@ class RigStream:
         listener = _Listener(on_block, on_end)
         intake = self._intake or Intake(self._catalogue())
         with self._lock:
-            self._listeners.setdefault(group, []).append(listener)
-            new, watch = group not in self._subscribed, self._intake is None
-            self._subscribed.add(group)
+            self._listeners.setdefault(key, []).append(listener)
+            new, watch = key not in self._subscribed, self._intake is None
+            self._subscribed.add(key)
             self._rig = self._client.rig if watch else self._rig
             self._intake = self._intake or intake
         # Not under the lock: a transport may deliver at once.
@@ -131,30 +132,23 @@ class RigStream:
             self._client.subscribe(wire.EVENTS, self._on_event, on_miss=self._on_miss)
             self._client.watch(wire.ALIVE, self._on_alive)
         if new:
-            self._client.subscribe(
-                wire.sensor_key(group), lambda _, payload: self._on_block(group, payload), on_miss=self._on_miss
-            )
+            self._client.subscribe(key, self._on_block, on_miss=self._on_miss)
 
         def leave() -> None:
             with self._lock:
-                if listener in self._listeners[group]:
-                    self._listeners[group].remove(listener)
+                if listener in self._listeners[key]:
+                    self._listeners[key].remove(listener)
 
         return leave
-
-    def _of(self, group: str) -> list[_Listener]:
-        with self._lock:
-            return list(self._listeners.get(group, ()))
 
     def _on_miss(self, _: str, count: int) -> None:
         self.missed += count
 
-    def _on_block(self, group: str, payload: bytes) -> None:
+    def _on_block(self, key: str, payload: bytes) -> None:
         with self._order:
-            self._take(group, payload)
+            self._take(key, payload)
 
-    def _take(self, group: str, payload: bytes) -> None:
-        key = wire.sensor_key(group)
+    def _take(self, key: str, payload: bytes) -> None:
         with self._lock:
             intake = self._intake
             assert intake is not None
@@ -169,17 +163,19 @@ class RigStream:
                 self._heard_s = time.monotonic()
             if intake.next.get(key, 0) < due:
                 # Another run.
-                self._ends.pop(group, None)
-            ending = self._ends.get(group)
+                self._ends.pop(key, None)
+            ending = self._ends.get(key)
             if ending is not None:
                 taken += intake.rest({key: ending[0]}, key)
             done = ending is not None and intake.next.get(key, 0) >= ending[0]
             if done:
-                del self._ends[group]
-        self._hand_on(group, taken, ending[1] if done and ending else None)
+                del self._ends[key]
+        self._hand_on(key, taken, ending[1] if done and ending else None)
 
-    def _hand_on(self, group: str, taken: list[Taken], reason: str | None) -> None:
-        for listener in self._of(group):
+    def _hand_on(self, key: str, taken: list[Taken], reason: str | None) -> None:
+        with self._lock:
+            listeners = list(self._listeners.get(key, ()))
+        for listener in listeners:
             for each in taken:
                 listener.on_block(each.block)
             if reason is not None:
@@ -199,8 +195,7 @@ class RigStream:
             self._heard_s = time.monotonic()
             self._end_in_silence(GRACE_S, reason)
             return
-        for group in list(self._subscribed):
-            key = wire.sensor_key(group)
+        for key in list(self._subscribed):
             with self._order:
                 with self._lock:
                     assert self._intake is not None
@@ -208,11 +203,11 @@ class RigStream:
                     taken, total = self._intake.rest(rows, key), rows.get(key, 0)
                     done = self._intake.next.get(key, 0) >= total
                     if not done:
-                        self._ends[group] = (total, reason)
-                self._hand_on(group, taken, reason if done else None)
+                        self._ends[key] = (total, reason)
+                self._hand_on(key, taken, reason if done else None)
 
     def _end_in_silence(self, wait_s: float, reason: str) -> None:
-        """End all groups once no block has come for so long; look again at the earliest time at which that can be."""
+        """End all streams once no block has come for so long; look again at the earliest time at which that can be."""
 
         def look() -> None:
             rest_s = GRACE_S - (time.monotonic() - self._heard_s)
@@ -244,9 +239,9 @@ class RigStream:
             self._end(RIG_GONE)
 
     def _end(self, reason: str) -> None:
-        for group in list(self._subscribed):
+        for key in list(self._subscribed):
             with self._order:
                 with self._lock:
-                    self._ends.pop(group, None)
-                    taken = self._intake.rest(None, wire.sensor_key(group)) if self._intake is not None else []
-                self._hand_on(group, taken, reason)
+                    self._ends.pop(key, None)
+                    taken = self._intake.rest(None, key) if self._intake is not None else []
+                self._hand_on(key, taken, reason)

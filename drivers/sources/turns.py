@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -34,11 +34,6 @@ class Turn:
     gap: dict[str, float]
     once: dict[str, complex]
     samples: Samples
-
-
-def joined(first: Samples, second: Samples) -> Samples:
-    """Rows and those that follow them."""
-    return replace(first, values=np.concatenate([first.values, second.values]))
 
 
 def edges(samples: Samples) -> np.ndarray:

@@ -254,8 +254,8 @@ def test_an_end_does_not_overtake_rows_that_are_being_handed_on() -> None:
         for key in (wire.sensor_key("forces"), wire.EVENTS):
             keeper.subscribe(key, sent.__setitem__)
         rows = stream.RigStream(client)
-        rows.listen("forces", hold, lambda _: None)
-        rows.listen("forces", lambda block: heard.append(len(block.values)), heard.append)
+        rows.listen(wire.sensor_key("forces"), hold, lambda _: None)
+        rows.listen(wire.sensor_key("forces"), lambda block: heard.append(len(block.values)), heard.append)
         rig.publish("forces")
         rig.end()
         threads = [threading.Thread(target=takes[key], args=each) for each in sent.items() for key in each[:1]]

@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import random
 from collections import deque
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import ClassVar, Self, TypeVar
 
@@ -17,7 +16,7 @@ from drivers.instruments.common import protocol
 from drivers.instruments.common.datasheet import Datasheet, parse_datasheet
 from drivers.instruments.common.protocol import Codec, Message, ProtocolError
 from drivers.link import ROOM, Link, LinkError, LinkTimeoutError, open_link
-from drivers.sources.samples import Pile, Samples, StreamEndedError, follow
+from drivers.sources.samples import RowReader, Samples, follow
 from rig.base.closing import Closing
 from rig.base.errors import InputError, RefusedError, Words
 from rig.base.wire import Continuity
@@ -165,16 +164,15 @@ class Instrument(Closing):
         self._data.append(message)
 
 
-class Sampler(Instrument):
+class Sampler(Instrument, RowReader):
     """An instrument that measures: configure, start, read."""
 
     def __init__(self, link: Link, *, timeout_s: float = 3.0) -> None:
-        super().__init__(link, timeout_s=timeout_s)
+        Instrument.__init__(self, link, timeout_s=timeout_s)
+        RowReader.__init__(self, self.CODEC.address.name)
         self._group: Group | None = None
         self._stream: int | None = None
         self._rows = Continuity()
-        self._pile = Pile()
-        self._ended: str | None = None
 
     def configure(self, *, channels: tuple[str, ...] | list[str] | None = None, rate_hz: float = 0.0) -> Configuration:
         """Choose what to measure; a stream that runs ends.
@@ -226,47 +224,20 @@ class Sampler(Instrument):
     def _stop(self, *, discard: bool) -> None:
         self.ask(protocol.Stop(self._stream or 0, int(discard)), protocol.Stopped)
 
-    def read(self, rows: int | None = None, *, timeout_s: float = 5.0) -> Samples:
-        """The next rows of the stream.
-
-        Args:
-            rows: How many; None takes what comes next, at least one. Fewer come before a gap and at the stream's end.
-            timeout_s: How long to wait [s].
-
-        Returns:
-            Rows without a gap inside; `gap` tells how many are missing right before them.
-
-        Raises:
-            LinkTimeoutError: They did not come in time; those that did can still be read.
-            StreamEndedError: The stream has ended and everything was read.
-        """
-        if rows is not None and rows < 1:
-            raise InputError("rows", "at least 1", rows)
+    def _take(self, rows: int | None, *, whole: bool = True) -> Samples | None:
         if self._stream is None:
             raise InputError("read", "called after start", Words("no stream"))
-        deadline = Deadline(timeout_s)
-        while (ready := self._pile.take(rows, ended=self._ended is not None)) is None:
-            if self._ended is not None:
-                raise StreamEndedError(self._ended)
-            message = self._next(deadline)
-            if message is None:
-                wanted = "any" if rows is None else rows
-                kept = f"{self._pile.rows} of {wanted} rows came in {timeout_s:g} s"
-                raise LinkTimeoutError(f"{self.CODEC.address.name}: {kept}")
-            if isinstance(message, protocol.Ended):
-                if message.stream == self._stream:
-                    self._ended = message.reason
-            elif isinstance(message, protocol.Rows) and message.stream == self._stream:
-                self._add(message)
-        return ready
+        return super()._take(rows, whole=whole)
 
-    def blocks(self, rows: int | None = None, *, timeout_s: float = 5.0) -> Iterator[Samples]:
-        """Read until the stream ends."""
-        while True:
-            try:
-                yield self.read(rows, timeout_s=timeout_s)
-            except StreamEndedError:
-                return
+    def _wait(self, deadline: Deadline) -> bool:
+        """Take the next message of data; False where none came in time."""
+        message = self._next(deadline)
+        if isinstance(message, protocol.Ended):
+            if message.stream == self._stream:
+                self._ended = message.reason
+        elif isinstance(message, protocol.Rows) and message.stream == self._stream:
+            self._add(message)
+        return message is not None
 
     def _next(self, deadline: Deadline) -> Message | None:
         if self._data:

@@ -164,7 +164,7 @@ class Twin:
         if not self._listening:
             self._listening = True
             assert self.GROUP is not None
-            self._leave = self._stream.listen(self.GROUP, self.take, self.rig_ended)
+            self._leave = self._stream.listen(wire.sensor_key(self.GROUP), self.take, self.rig_ended)
         rate = self._rate_hz or float(group.rate_hz)
         mask = self._mask or (1 << len(group.channels)) - 1
         chosen = [n for n in range(len(group.channels)) if mask >> n & 1]
