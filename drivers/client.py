@@ -46,7 +46,7 @@ for as long as the request might have taken, 50 MB of 400 a second."""
 _LOST_S = 2.0
 """Rows of a block that is over are there, or lost [s]."""
 _LOOK_S = 0.2
-"""How often whoever waits for a block looks whether the run is over, where no event has told so [s]."""
+"""Period of the check for the end of the run while the client waits for a block [s]: its event may be lost."""
 
 
 class NotSeenError(TimeoutError):
@@ -119,7 +119,7 @@ class Rig(Console):
         self._ends: queue.SimpleQueue[BlockEnd | None] | None = None
         """Ends of blocks, from the first call of `blocks` in lockstep on; None: look why none comes."""
         self._joined, self._put_out = False, ""
-        """Whether the rig waits for this client as a device, and why it does not any more."""
+        """State as a device under test: whether the rig waits for it, and the reason if the rig removed it."""
         self._events: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
         self._seen: list[dict[str, Any]] = []
         client.subscribe(wire.EVENTS, self._on_event)
@@ -351,7 +351,7 @@ class Rig(Console):
         """Return the end of the next block; None at that of the run.
 
         Raises:
-            RefusedError: The device was put out.
+            RefusedError: The rig removed the device.
         """
         while True:
             with contextlib.suppress(queue.Empty):
@@ -467,7 +467,7 @@ class Rig(Console):
     def truth(self, table: str, *, to_s: float | None = None, timeout_s: float = 10.0) -> Samples:
         """Rows of a table of the truth, in SI, that came since the rig was connected to, or since the last call.
 
-        Rows that are missing end them; the next call tells of the gap.
+        Missing rows end a piece; `gap` of the next call's rows is their number.
 
         Args:
             table: One of those that were named when the rig was connected to.

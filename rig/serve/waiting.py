@@ -46,7 +46,7 @@ class Deadline:
             changed: The condition, whose lock is held.
 
         Returns:
-            Whether to look at what is waited for again; False, without a wait, once the deadline has passed.
+            True: check again what is waited for. False, without a wait: the deadline has passed.
         """
         left_s = self.left_s
         if left_s > 0.0:
