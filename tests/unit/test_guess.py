@@ -12,6 +12,7 @@ import pytest
 from recorder.reader import Recording
 from replays.recordings.formats import clock
 from replays.recordings.formats.conversion import Conversion, block_starts, convert, write_recording
+from replays.recordings.formats.events.motion import Motion, turning
 from replays.recordings.formats.guessing import noise, overview
 from replays.recordings.formats.guessing.guess import Guess
 from replays.recordings.formats.guessing.naming import read_name
@@ -349,3 +350,17 @@ def test_wrong_input_is_one_line(
     assert (status, complaints.count("\n")) == (2, 1), complaints
     assert complaint in complaints
     assert {path.name for path in tmp_path.iterdir()} == {"x.csv", "m.toml"}
+
+
+@pytest.mark.parametrize("missing", [("disk_x",), ("disk_y",), ("disk_x", "disk_y"), ()])
+def test_a_channel_without_a_number_does_not_turn(missing: tuple[str, ...]) -> None:
+    axis = clock.Axis(first_s=0.0, rate_hz=2000.0, rows=40_000)
+    angle = 2.0 * np.pi * 6.2 * axis.instants()
+    signals = {"disk_x": np.cos(angle), "disk_y": np.sin(angle)}
+    motions = [Motion(name, np.full(axis.rows, np.nan) if name in missing else x, axis) for name, x in signals.items()]
+    found = turning(motions)
+    if len(missing) == 2:
+        assert found is None
+    else:
+        assert found is not None
+        assert found[0] == pytest.approx(6.2, abs=0.05)

@@ -100,7 +100,7 @@ def test_help_is_told_once_and_fits_80_columns(capsys: pytest.CaptureFixture[str
         ("can lod", "command must be one of `rig can -h`, such as load (3 in all); instead received 'lod'"),
         (
             "run x --sed 1",
-            "option must be one of `rig run -h`, such as --seed, --set, --listen (21 in all); instead received '--sed'",
+            "option must be one of `rig run -h`, such as --seed, --set, --listen (22 in all); instead received '--sed'",
         ),
         ("can -z", "option must be one of `rig can -h`; instead received '-z'"),
         (

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ast
 import json
 import math
+import re
 import tomllib
 from pathlib import Path
 
@@ -80,17 +82,39 @@ def test_override_is_in_the_parameters_own_unit(key: str, part: float) -> None:
     assert others == {other: entry for other, entry in DEFAULT.entries.items() if other != key}
 
 
+ARITHMETIC = (
+    ast.Expression, ast.BinOp, ast.UnaryOp, ast.Constant, ast.Name, ast.Load, ast.Add, ast.Sub, ast.Mult, ast.Div,
+    ast.Pow, ast.USub, ast.UAdd,
+)  # fmt: skip
+
+
+def is_formula(text: str, variables: tuple[str, ...]) -> bool:
+    """Whether a short text is one and no wrong name: numbers and variables, with a digit, an operator or a space."""
+    try:
+        nodes = list(ast.walk(ast.parse(text.strip(), mode="eval")))
+    except (SyntaxError, ValueError):
+        return False
+    constants = [node.value for node in nodes if isinstance(node, ast.Constant)]
+    return (
+        re.search(r"[\d\s()*/+]", text) is not None
+        and all(isinstance(node, ARITHMETIC) for node in nodes)
+        and all(type(value) in (int, float) and abs(value) < 1e300 for value in constants)
+        and all(node.id in {*variables, "pi"} for node in nodes if isinstance(node, ast.Name))
+    )
+
+
 @given(key=st.sampled_from(list(DEFAULT.entries)), value=st.floats() | st.text(max_size=5))
 def test_override_accepts_just_what_the_entry_says(key: str, value: float | str) -> None:
     entry = DEFAULT.entries[key]
     if isinstance(value, str):
-        good = value in entry.rules
+        good = value in entry.rules or (bool(entry.formula) and is_formula(value, entry.formula))
     else:
         good = entry.range[0] <= value <= entry.range[1] and (entry.unit != "count" or value.is_integer())
     if good:
         assert DEFAULT.override({key: value}).entries[key].value == value
     else:
-        with pytest.raises(InputError, match=f"^{key} must be a (whole )?number from "):
+        must = "a (whole )?number from " if isinstance(value, float) or not entry.formula else ""
+        with pytest.raises(InputError, match=f"^{key} must be {must}"):
             DEFAULT.override({key: value})
 
 

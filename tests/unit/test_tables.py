@@ -260,7 +260,7 @@ def test_compiling_is_told_as_long_as_it_lasts(monkeypatch: pytest.MonkeyPatch) 
         for module in modules:
             listener.on_end(event(module))
     assert [text.partition(" (")[0] for text in told] == [
-        "compiling split.method", "compiling in a second process", "", "compiling kernels.contact", "",
+        "compiling split.method", "compiling in a second process", "", "compiling laws.contact", "",
     ]  # fmt: skip
     (first,) = begun
     assert first.startswith("compiling split.method (0 s of CPU; ")

@@ -11,12 +11,14 @@ import typer
 from rig.base.errors import InputError, Words
 from rig.cli.connections.connection import Connection, show
 from rig.cli.output.tables import echo
-from rig.run.commands import SUMMARIES, mechanical
-from rig.run.commands.command import as_number, entries
+from rig.run.commands import SUMMARIES
 
 
 def scene_command(name: str) -> Callable[..., None]:
     """Return the command line of a scene command: fields without a default are arguments, the others are options."""
+    from rig.run.commands import mechanical
+    from rig.run.commands.command import as_number, entries
+
     fields, hints, parameters = entries(mechanical)[name].quantities(), dict[str, Any](), list[inspect.Parameter]()
     for field, each in fields.items():
         quantity, unit = each.quantity, each.quantity.unit.replace(" ", "")

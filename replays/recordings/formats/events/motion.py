@@ -52,8 +52,8 @@ class Motion(NamedTuple):
         """Times [s] and means of as many samples as a step takes, each shape (m,)."""
         gone = ~np.isfinite(self.values)
         values, rows = self.values, np.arange(len(self.values))
-        if gone.any() and not gone.all():
-            values = np.interp(rows, rows[~gone], values[~gone])
+        if gone.any():  # a channel without a number does not move
+            values = np.zeros(len(rows)) if gone.all() else np.interp(rows, rows[~gone], values[~gone])
         several = max(1, round(_STEP_S * self.axis.rate_hz))
         return block_means(self.axis.instants()[: len(values)], several), block_means(values, several)
 
