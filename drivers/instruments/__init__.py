@@ -1,1 +1,1 @@
-"""The rig's six instruments: a folder each, and what they share."""
+"""The rig's instruments: a folder each, and what they share."""

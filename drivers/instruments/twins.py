@@ -1,4 +1,4 @@
-"""All six twins of a running rig, at once and on any number of links."""
+"""All twins of a running rig, at once and on any number of links."""
 
 from __future__ import annotations
 

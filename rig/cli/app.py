@@ -40,7 +40,7 @@ COMMANDS = {
         "note": "Put a note into every recording that is being made of a rig",
         "status": "Show how a running rig is doing: time, pace, lateness, losses",
         "stop": "End the run of a rig; recordings of it close",
-        "twins": "Serve the six instruments of a running rig to their drivers",
+        "twins": "Serve the instruments of a running rig to their drivers",
         "can": "Run virtual CAN buses, and show what the rig sends on one",
     },
     "A recording as the rig": {

@@ -33,10 +33,6 @@ DATABASE = dbc.database()
 SAMPLED = (*TABLE.classic, *TABLE.fd)
 
 
-def test_the_committed_copy_is_up_to_date() -> None:
-    assert dbc.COPY.read_text(encoding="utf-8") == dbc.text(), "run `rig can dbc -o drivers/can/rig.dbc`"
-
-
 def test_the_command_shows_and_writes_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert shown(capsys, "can", "dbc") == dbc.text()
     shown(capsys, "can", "dbc", "-o", tmp_path / "rig.dbc")

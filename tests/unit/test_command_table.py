@@ -29,6 +29,7 @@ from rig.run.commands.command import CanField, CanFrame, Quantity, SceneCommand
 from rig.run.commands.table import COMMANDS, EVENT_KINDS, MECHANICAL, TRIGGERS
 from rig.run.simulation import Simulation
 from rig.serve import service
+from tests.generated import missing_in_generated_files
 
 _VALUE_BITS = 32
 """Bits of the fields in the frame of a command."""
@@ -51,14 +52,19 @@ def missing_in(name: str, entry: type[SceneCommand]) -> Iterator[str]:
         taken = {other.CAN.event: key for key, other in COMMANDS.items() if key != name and hasattr(other, "CAN")}
         taken |= {int(kind): kind.name.lower() for kind in EventKind if kind.name.lower() not in COMMANDS}
         if entry.CAN.event in taken or not 0 < entry.CAN.event < 256:
-            yield f"{where}: CAN event {entry.CAN.event} is taken by {taken.get(entry.CAN.event)}, or is not 1 to 255"
+            free = next(number for number in range(1, 256) if number not in taken)
+            holder = f"taken by {taken[entry.CAN.event]}" if entry.CAN.event in taken else "not 1 to 255"
+            yield f"{where}: CAN event {entry.CAN.event} of {name} is {holder}; {free} is free"
         kinds = {
             key: other.CAN.kind for key, other in COMMANDS.items()
             if key != name and getattr(other, "CAN", entry.CAN).message == entry.CAN.message and hasattr(other, "CAN")
         }  # fmt: skip
-        for key, kind in {**kinds, "stop": int(Kind.STOP)}.items():
-            if (kind ^ entry.CAN.kind).bit_count() < 4:
-                yield f"{where}: CAN kind {entry.CAN.kind:#04x} differs from that of {key} in fewer than four bits"
+        kinds["stop"] = int(Kind.STOP)
+        near = sorted(key for key, kind in kinds.items() if (kind ^ entry.CAN.kind).bit_count() < 4)
+        if near:
+            good = (k for k in range(1, 256) if all((k ^ other).bit_count() >= 4 for other in kinds.values()))
+            yield (f"{where}: CAN kind {entry.CAN.kind:#04x} of {name} differs from that of {', '.join(near)} in fewer "
+                   f"than four bits; {next(good):#04x} is free")  # fmt: skip
         if entry.CAN.shown and not entry.SHOWN_FIELD:
             yield f"{where}: SHOWN_FIELD is missing: the CAN event has a description of its value, and no value"
     if not entry.MECHANICAL:
@@ -85,7 +91,9 @@ def missing_in(name: str, entry: type[SceneCommand]) -> Iterator[str]:
         bits += quantity.can.bits
         if quantity.can.number in numbers or not 0 < quantity.can.number < 16:
             used = numbers.get(quantity.can.number)
-            yield f"{where}: CAN number {quantity.can.number} of field {field} is that of {used}, or is not 1 to 15"
+            free = next((number for number in range(1, 16) if number not in numbers), "none")
+            holder = f"that of {used[1]} of {used[0]}" if used else "not 1 to 15"
+            yield f"{where}: CAN number {quantity.can.number} of field {field} is {holder}; {free} is free"
         largest = ((1 << quantity.can.bits) - 1) * quantity.can.scale
         if not known.takes_text and largest < known.high < math.inf:
             yield f"{where}: the largest {field}, {known.high:g}, does not fit into its CAN signal"
@@ -96,7 +104,14 @@ def missing_in(name: str, entry: type[SceneCommand]) -> Iterator[str]:
 
 
 def test_no_entry_lacks_anything() -> None:
-    assert [line for name, entry in COMMANDS.items() for line in missing_in(name, entry)] == []
+    missing = [line for name, entry in COMMANDS.items() for line in missing_in(name, entry)]
+    if missing:
+        pytest.fail("\n".join(missing), pytrace=False)
+
+
+def test_the_generated_files_have_every_command() -> None:
+    if missing := [*missing_in_generated_files()]:
+        pytest.fail("\n".join(missing), pytrace=False)
 
 
 def test_every_class_has_a_line_of_help_and_every_line_a_class() -> None:
@@ -106,7 +121,10 @@ def test_every_class_has_a_line_of_help_and_every_line_a_class() -> None:
     }  # fmt: skip
     classes -= {"SceneCommand", "_ChannelCommand"}
     named = {f"{name.capitalize()}Command" for name in commands.SUMMARIES}
-    assert named == classes, "SUMMARIES in rig/run/commands/__init__.py and the classes beside it differ"
+    missing = [f"rig/run/commands/__init__.py: SUMMARIES has no line for {each}" for each in classes - named]
+    missing += [f"rig/run/commands/mechanical.py: class {each} of SUMMARIES is missing" for each in named - classes]
+    if missing:
+        pytest.fail("\n".join(missing), pytrace=False)
     assert list(COMMANDS) == list(commands.SUMMARIES)
 
 
@@ -143,16 +161,22 @@ def sized(**quantity: Any) -> Any:
         (half(__doc__=None), "has no docstring"),
         (half(take_effect=None), "nothing carries it out in the simulation: take_effect is missing"),
         (half(CAN=None), "no CAN kind and no CAN event"),
-        (half(CAN=CanFrame(KIND, event=3)), "CAN event 3 is taken by hammer"),
-        (half(CAN=CanFrame(KIND, event=10)), "CAN event 10 is taken by device"),
-        (half(CAN=CanFrame(Kind.HAMMER ^ 1, event=EVENT)), "differs from that of hammer in fewer than four bits"),
+        (half(CAN=CanFrame(KIND, event=3)), "CAN event 3 of tilt is taken by hammer; "),
+        (half(CAN=CanFrame(KIND, event=10)), "CAN event 10 of tilt is taken by device; "),
+        (
+            half(CAN=CanFrame(Kind.HAMMER ^ 1, event=EVENT)),
+            "of tilt differs from that of hammer in fewer than four bits; 0x",
+        ),
         (half(CAN=CanFrame(KIND, event=EVENT, shown="tilt, deg")), "SHOWN_FIELD is missing"),
         (half(SHOWN_FIELD="force"), "SHOWN_FIELD is force, which is no field"),
         (half(FiniteFloat), "field force_n has no Quantity"),
         (half(sized(unit="")), "field force_n has no unit"),
         (half(sized(help="")), "field force_n has no help"),
         (half(sized(can=None)), "field force_n has no CAN signal"),
-        (half(sized(can=CanField("tilt", 1, 16, 0.1, ""))), "CAN number 1 of field force_n is that of ('hammer'"),
+        (
+            half(sized(can=CanField("tilt", 1, 16, 0.1, ""))),
+            "CAN number 1 of field force_n is that of force_n of hammer; 5 is free",
+        ),
         (half(sized(can=CanField("tilt", 15, 4, 0.1, ""))), "the largest force_n, 10, does not fit"),
         (half(sized(can=CanField("tilt", 15, 40, 0.1, ""))), "the CAN signals have 40 bits"),
         (half(Annotated[FiniteFloat, FORCE]), "field force_n has no least value"),

@@ -1,7 +1,7 @@
-"""What comes as one of many has every part of it: half an entry fails here, with what is missing.
+"""Completeness of entries: half an entry fails here, and the message names the entry and the part that is missing.
 
-A contact law, an engine, a scorecard's quantity, a command of `rig`, an instrument; channels, commands of a run, faults
-and file formats have their checks in test_registries.py and test_command_table.py.
+Contact laws, engines, channels, kinds of faults, file formats, quantities of a scorecard, commands of `rig` and
+instruments. Commands of a run have test_command_table.py; test_registries.py tests how a half entry is refused.
 """
 
 from __future__ import annotations
@@ -9,20 +9,27 @@ from __future__ import annotations
 import ast
 import importlib
 import inspect
+import pkgutil
+import re
 import tomllib
+from collections.abc import Collection, Iterator
 from importlib.util import find_spec
 from pathlib import Path
+from typing import get_args
 
 import pytest
 
-from drivers.instruments.twins import TWINS
+from replays.recordings.formats.exporting.export import FormatWriter
+from replays.recordings.formats.source import FORMATS
 from replays.score.card.scorecard import QUANTITIES
+from rig.channels import faults
 from rig.cli import app
 from rig.cli.commands import requests
 from rig.physics.contacts import DAMPING, STIFFNESS
 from rig.physics.engines import ENGINES
 from rig.physics.parameters import load_parameters
 from rig.run.commands import SUMMARIES
+from tests.generated import missing_in_generated_files
 
 ROOT = Path(__file__).parents[2]
 SHARED = {"common", "tape", "split", "taylor"}
@@ -33,75 +40,183 @@ def page(name: str) -> str:
     return (ROOT / "docs" / name).read_text(encoding="utf-8")
 
 
+def require(problems: Collection[str]) -> None:
+    """Fail with a line for each problem, and nothing else."""
+    if problems:
+        pytest.fail("\n".join(problems), pytrace=False)
+
+
 @pytest.mark.parametrize(("key", "laws"), [("damping_factor", DAMPING), ("stiffness", STIFFNESS)])
 def test_a_contact_law_has_a_row_and_a_rule(key: str, laws: dict) -> None:
     rules = set(load_parameters().entries[f"contact.{key}"].rules)
-    where = f"contact.{key}.rules in rig/physics/sets/corrected.toml"
-    assert not laws.keys() - rules, f"{where} must name what rig/physics/contacts.py has"
-    assert not rules - laws.keys(), f"rig/physics/contacts.py must have what {where} names"
-    for name, law in laws.items():
-        assert law.formula, f"{name} needs a formula"
-        assert law.source, f"{name} needs a source"
+    where = f"contact.{key} in rig/physics/sets/corrected.toml"
+    missing = [f"contact law {name}: `rules` of {where} must name it" for name in sorted(laws.keys() - rules)]
+    missing += [f"contact law {name}: {where} names it, and rig/physics/contacts.py has no row of it"
+                for name in sorted(rules - laws.keys())]  # fmt: skip
+    missing += [f"contact law {name}: its row in rig/physics/contacts.py needs a {part}"
+                for name, law in laws.items() for part in ("formula", "source") if not getattr(law, part)]  # fmt: skip
+    require(missing)
 
 
 def test_an_engine_has_a_module_a_row_and_a_contract() -> None:
     folder = ROOT / "rig/physics/engines"
     modules = {path.stem.replace("_", "-") for path in folder.glob("[!_]*.py")} | {"split", "taylor"}
-    assert not modules - ENGINES.keys(), "a module in rig/physics/engines needs its row in ENGINES"
     own = {name for name, row in ENGINES.items() if not row.module}
-    assert not own - modules, "a row in ENGINES needs its module in rig/physics/engines"
     contracts = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
     named = {name.rpartition(".")[2].replace("_", "-") for each in contracts for name in each.get("modules", ())}
-    assert not own - named - {"split"}, "pyproject.toml: the contract 'An engine does not know another' must name it"
-    for name in own:
-        code = ast.parse((folder / f"{name.replace('-', '_')}.py").read_text() if name not in SHARED else "")
+    missing = [f"engine {name}: rig/physics/engines/__init__.py has no row of it in ENGINES"
+               for name in sorted(modules - ENGINES.keys())]  # fmt: skip
+    missing += [f"engine {name}: rig/physics/engines/{name.replace('-', '_')}.py is missing"
+                for name in sorted(own - modules)]  # fmt: skip
+    missing += [f"engine {name}: pyproject.toml: the contract 'An engine does not know another' must name it"
+                for name in sorted(own - named - {"split"})]  # fmt: skip
+    for name in sorted((own & modules) - SHARED):
+        place = f"rig/physics/engines/{name.replace('-', '_')}.py"
+        code = ast.parse((ROOT / place).read_text())
         defined = {ast.unparse(target) for node in code.body if isinstance(node, ast.Assign) for target in node.targets}
-        if code.body:
-            assert "ORDER" in defined, f"{name} needs ORDER"
-            assert "METHOD" in defined or {"start", "advance"} <= {
-                node.name for node in code.body if isinstance(node, ast.FunctionDef)
-            }, f"{name} needs METHOD, or start and advance"
+        functions = {node.name for node in code.body if isinstance(node, ast.FunctionDef)}
+        if "ORDER" not in defined:
+            missing.append(f"engine {name}: {place} needs ORDER")
+        if "METHOD" not in defined and not {"start", "advance"} <= functions:
+            missing.append(f"engine {name}: {place} needs METHOD, or start and advance")
+    require(missing)
 
 
-def test_a_quantity_of_a_scorecard_is_made_somewhere_and_on_the_page() -> None:
-    texts = {
-        node.value
-        for path in (ROOT / "replays/score").rglob("*.py")
-        if path.name != "scorecard.py"
-        for node in ast.walk(ast.parse(path.read_text()))
-        if isinstance(node, ast.Constant) and isinstance(node.value, str)
-    }
+def test_a_channel_stands_in_the_generated_files() -> None:
+    require([*missing_in_generated_files()])
+
+
+def test_a_kind_of_fault_is_in_the_union_and_on_the_page() -> None:
+    """A class outside the union has tests of its own and can be given nowhere."""
+
+    def concrete(cls: type[faults.Kind]) -> Iterator[type[faults.Kind]]:
+        for each in cls.__subclasses__():
+            yield from concrete(each)
+            if "kind" in each.model_fields:
+                yield each
+
+    for module in pkgutil.iter_modules(faults.__path__, "rig.channels.faults."):
+        importlib.import_module(module.name)
+    classes = {each for each in concrete(faults.Kind) if each.__module__.startswith("rig.channels.faults")}
+    missing = [f"kind of fault {each.name()}: AnyKind in rig/channels/faults/kinds.py must name {each.__name__}"
+               for each in classes - set(get_args(faults.AnyKind))]  # fmt: skip
+    missing += [f"kind of fault {each.name()}: {each.__module__} has two classes of that name"
+                for each in classes if faults.KINDS.get(each.name(), each) is not each]  # fmt: skip
+    listed = page("hardware.md").partition("## Faults on command")[2].partition("```")[0].replace("\n", " ")
+    missing += [f"kind of fault {name}: docs/hardware.md, Faults on command, must list it under {kind.stage}"
+                for name, kind in faults.KINDS.items()
+                if name not in listed.partition(f"{kind.stage} (")[2].partition(")")[0].split(", ")]  # fmt: skip
+    require(missing)
+
+
+def test_a_file_format_has_a_row_and_a_reader() -> None:
+    readers = "replays/recordings/formats/readers"
+    missing = []
+    for name, form in FORMATS.items():
+        where = f"file format {name}: {form.module.replace('.', '/')}.py"
+        if find_spec(form.module) is None:
+            missing.append(f"{where} is missing")
+            continue
+        module = importlib.import_module(form.module)
+        if not callable(getattr(module, "look_into", None)):
+            missing.append(f"{where} needs look_into(path, options)")
+        if not form.title or not form.suffixes or not all(each.startswith(".") for each in form.suffixes):
+            missing.append(f"file format {name}: its row in FORMATS needs a title, and suffixes that begin with a dot")
+        writer = getattr(module, form.writer, None) if form.writer else FormatWriter
+        if not (isinstance(writer, type) and issubclass(writer, FormatWriter)):
+            missing.append(f"{where} needs a class {form.writer} derived from FormatWriter")
+        elif form.writer and writer.write is FormatWriter.write:
+            missing.append(f"{where}: {form.writer} needs write")
+    used = {form.module for form in FORMATS.values()}
+    for path in (ROOT / readers).glob("*.py"):
+        if f"{readers}/{path.stem}".replace("/", ".") not in used and "\ndef look_into(" in path.read_text():
+            missing.append(f"file format {path.stem}: FORMATS in replays/recordings/formats/source.py has no row of it")
+    ends = [suffix for form in FORMATS.values() for suffix in form.suffixes]
+    missing += [f"suffix {each}: two rows of FORMATS have it" for each in set(ends) if ends.count(each) > 1]
+    require(missing)
+
+
+def _texts(node: ast.AST) -> Iterator[str]:
+    for each in ast.walk(node):
+        if isinstance(each, ast.Constant) and isinstance(each.value, str):
+            yield each.value
+
+
+def test_a_quantity_of_a_scorecard_has_an_entry_a_row_and_is_on_the_page() -> None:
+    trees = {path.relative_to(ROOT): ast.parse(path.read_text()) for path in (ROOT / "replays/score").rglob("*.py")
+             if path.name != "scorecard.py"}  # fmt: skip
+    texts = {text for tree in trees.values() for text in _texts(tree)}
+    entries = "replays/score/card/scorecard.py"
+    missing = [f"quantity {name}: no module of replays/score adds a row of it to the {path} scorecard"
+               for path, quantities in QUANTITIES.items() for name in quantities if name not in texts]  # fmt: skip
     for path, quantities in QUANTITIES.items():
-        for name in quantities:
-            assert name in texts, f"{path} quantity {name}: no module of replays/score makes a row of it"
-            assert name in page("score.md"), f"{path} quantity {name}: docs/score.md must say what it is"
+        listed = page("score.md").partition(f"\n- {path}: ")[2].partition("\n-")[0].partition("\n\n")[0]
+        names = listed.replace("\n ", "").split(", ")
+        missing += [f"quantity {name}: docs/score.md must list it under {path}"
+                    for name in quantities if name not in names]  # fmt: skip
+    found = 0
+    for path, tree in trees.items():
+        for call in ast.walk(tree):
+            if not isinstance(call, ast.Call) or len(call.args) < 2:
+                continue
+            function = ast.unparse(call.func)
+            if function in ("add", "card.add"):
+                name = call.args[0]
+            elif function in ("text_row", "judge_row"):
+                name = call.args[1]
+            else:
+                continue
+            if isinstance(name, ast.Constant):
+                found += 1
+                known = QUANTITIES["digital" if path.name in ("digital.py", "judgement.py") else "analogue"]
+                if name.value not in known:
+                    missing.append(f"quantity {name.value}: {path} adds a row, and {entries} has no Quantity of it")
+    assert found > 20
+    require(missing)
 
 
 def test_a_command_has_a_line_a_function_and_is_on_the_page() -> None:
     named = {name: text for commands in app.COMMANDS.values() for name, text in commands.items()}
+    missing = []
     for name, text in named.items():
         if hasattr(requests, name) or (name in SUMMARIES and name != "fault"):
             continue  # a request, or made of the command's own class
         module = name.replace("import", "import_")
         place = f"rig/cli/commands/{module}.py"
-        assert find_spec(f"rig.cli.commands.{module}"), f"command {name}: {place} is missing"
+        if not re.search(rf"\brig {name}\b", page("commands.md")):
+            missing.append(f"command {name}: docs/commands.md must name `rig {name}`")
+        if find_spec(f"rig.cli.commands.{module}") is None:
+            missing.append(f"command {name}: {place} is missing")
+            continue
         function = getattr(importlib.import_module(f"rig.cli.commands.{module}"), module, None)
-        assert function is not None, f"command {name}: {place} has no function of its name"
-        told = inspect.getdoc(function) or ""
-        assert told.startswith(text), f"command {name}: the docstring in {place} must begin with its line in app.py"
-        assert f"rig {name}" in page("commands.md"), f"command {name}: docs/commands.md must name it"
+        if function is None:
+            missing.append(f"command {name}: {place} has no function of its name")
+        elif not (inspect.getdoc(function) or "").startswith(text):
+            missing.append(f"command {name}: the docstring in {place} must begin with its line in rig/cli/app.py")
     modules = {path.stem.rstrip("_") for path in (ROOT / "rig/cli/commands").glob("[!_]*.py")} - {"requests"}
-    assert not modules - named.keys(), "a module in rig/cli/commands needs its line in COMMANDS of rig/cli/app.py"
+    missing += [f"command {name}: COMMANDS in rig/cli/app.py has no line of it" for name in modules - named.keys()]
+    require(missing)
 
 
 def test_an_instrument_has_a_protocol_a_driver_a_twin_and_is_served() -> None:
     folder = ROOT / "drivers/instruments"
     found = {path.name for path in folder.iterdir() if path.is_dir() and path.name not in ("common", "__pycache__")}
-    for name in found:
-        for part in ("protocol", "driver", "twin"):
-            assert (folder / name / f"{part}.py").is_file(), f"instrument {name}: {part}.py is missing"
-        assert (folder / name / "__init__.py").is_file(), f"instrument {name}: __init__.py is missing"
+    parts = [f"{name}/{part}.py" for name in found for part in ("__init__", "protocol", "driver", "twin")]
+    require([f"instrument: drivers/instruments/{part} is missing" for part in parts if not (folder / part).is_file()])
+    from drivers.instruments.twins import TWINS  # a missing twin would be an error of the import
+
     served = {twin.__module__.split(".")[2] for twin in TWINS}
-    assert not found - served, "TWINS in drivers/instruments/twins.py must have its twin"
+    missing = [f"instrument {name}: TWINS in drivers/instruments/twins.py must name its twin"
+               for name in found - served]  # fmt: skip
     numbers = [twin.CODEC.address.number for twin in TWINS]
-    assert len(set(numbers)) == len(numbers), "each instrument needs a number of its own"
+    missing += [f"instrument {twin.CODEC.address.name}: its number {twin.CODEC.address.number} is another's; "
+                f"{next(n for n in range(1, 256) if n not in numbers)} is free"
+                for twin in TWINS if numbers.count(twin.CODEC.address.number) > 1]  # fmt: skip
+    for name in found:
+        code = ast.parse((folder / name / "driver.py").read_text())
+        bases = [ast.unparse(base).partition("[")[0] for node in code.body if isinstance(node, ast.ClassDef)
+                 for base in node.bases]  # fmt: skip
+        missing += [f"instrument {name}: drivers/instruments/{name}/driver.py needs a class derived from {kind}Sampler "
+                    f"or {kind}Instrument of drivers.instruments.common"
+                    for kind in ("", "Async") if not {f"{kind}Sampler", f"{kind}Instrument"} & {*bases}]  # fmt: skip
+    require(missing)

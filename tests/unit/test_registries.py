@@ -1,16 +1,13 @@
 """Closed sets: a member that only one of its tables has is refused; it neither acts nor shows a number."""
 
 import ast
-import importlib
 import os
-import pkgutil
 import subprocess
 import sys
 import textwrap
-from collections.abc import Iterator
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal
 
 import pytest
 
@@ -19,10 +16,7 @@ from drivers.can.signals import LIMITS
 from replays.recordings import export
 from replays.recordings.formats.events.events import told_as
 from replays.recordings.formats.events.motion import Impact
-from replays.recordings.formats.exporting.export import FormatWriter
-from replays.recordings.formats.source import FORMATS
 from rig.base.errors import InputError
-from rig.channels import faults
 from rig.run.commands import table as commands
 from rig.run.commands.command import SceneCommand
 from rig.run.commands.table import TimedCommand
@@ -138,34 +132,3 @@ def test_the_bounds_of_a_hammer_pulse_are_those_of_its_command() -> None:
                 commands.check_command("hammer", {field: value})
     hit = Impact(0.5, ("disk_x",), (0.5, 1e6, 1e-6, 0.0))
     assert "force_n = 1e+03, duration_ms = 0.5" in told_as(hit)
-
-
-def test_every_format_has_its_reader_and_writer() -> None:
-    for name, form in FORMATS.items():
-        module = importlib.import_module(form.module)
-        assert callable(getattr(module, "look_into", None)), f"format {name}: {form.module} needs look_into"
-        assert form.title, f"format {name} needs a title"
-        assert all(each.startswith(".") for each in form.suffixes), f"format {name}: suffixes begin with a dot"
-        if form.writer:
-            writer = getattr(module, form.writer, None)
-            assert isinstance(writer, type), f"format {name}: {form.module} has no class {form.writer}"
-            assert issubclass(writer, FormatWriter), f"format {name}: {form.writer} must derive from FormatWriter"
-            assert writer.write is not FormatWriter.write, f"format {name}: {form.writer} needs write"
-    ends = [suffix for form in FORMATS.values() for suffix in form.suffixes]
-    assert len(set(ends)) == len(ends), "a suffix belongs to one format"
-
-
-def test_every_class_of_a_fault_is_in_the_union_and_in_every_table_of_kinds() -> None:
-    """A class outside the union has tests of its own and can be given nowhere."""
-
-    def concrete(cls: type[faults.Kind]) -> Iterator[type[faults.Kind]]:
-        for each in cls.__subclasses__():
-            yield from concrete(each)
-            if "kind" in each.model_fields:
-                yield each
-
-    for module in pkgutil.iter_modules(faults.__path__, "rig.channels.faults."):
-        importlib.import_module(module.name)
-    classes = {each for each in concrete(faults.Kind) if each.__module__.startswith("rig.channels.faults")}
-    assert classes == set(get_args(faults.AnyKind)) == set(faults.KINDS.values())
-    assert set(faults.KINDS) == {kind.name() for kind in classes}

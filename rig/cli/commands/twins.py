@@ -22,7 +22,7 @@ def twins(
     listen: Annotated[str, typer.Option(metavar="HOST:PORT", help="Where they listen with --zenoh.")] = INSTRUMENTS,
     connection: Connection,
 ) -> None:
-    """Serve the six instruments of a running rig to their drivers; Ctrl-C switches them off."""
+    """Serve the instruments of a running rig to their drivers; Ctrl-C switches them off."""
     import threading
 
     from drivers.instruments.twins import Twins

@@ -1,0 +1,32 @@
+"""Generated files against what the tables give now: the differing lines, and the command that writes each file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import rig
+from drivers.can import dbc
+from rig.serve.interface import page
+
+MAX_LINES = 3
+"""Lines shown that a file lacks, and as many that it has in surplus; a shifted table differs in all of them."""
+MAX_CHARACTERS = 200
+"""Length of each; the list of all kinds of faults is one line of 1,000."""
+
+
+def missing_in_generated_files() -> Iterator[str]:
+    """Yield a line for each generated file that is out of date, with the command and the first differing lines."""
+    keys = Path(rig.__file__).with_name("KEYS.md")
+    for name, path, text, command in (
+        ("rig/KEYS.md", keys, page(), "rig keys --markdown > rig/KEYS.md"),
+        ("drivers/can/rig.dbc", dbc.COPY, dbc.text(), "rig can dbc -o drivers/can/rig.dbc"),
+    ):
+        committed = path.read_text(encoding="utf-8")
+        if committed == text:
+            continue
+        old, new = committed.splitlines(), text.splitlines()
+        lacking = [line[:MAX_CHARACTERS] for line in new if line not in old][:MAX_LINES]
+        surplus = [line[:MAX_CHARACTERS] for line in old if line not in new][:MAX_LINES]
+        shown = [*(f"lacks {line!r}" for line in lacking), *(f"has a surplus {line!r}" for line in surplus)]
+        yield f"{name} is out of date, run `{command}`: it {'; it '.join(shown) or 'has another order'}"
