@@ -1,1 +1,1 @@
-"""What a recording holds, checked: documents, channels, counts, and their agreement."""
+"""Documents, channels and counts of a recording, checked against each other."""

@@ -1,1 +1,1 @@
-"""An MCAP file: its records and chunks, while it is made and once it is whole."""
+"""MCAP files: records, chunks, and the file while it is being written."""

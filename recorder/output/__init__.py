@@ -1,1 +1,1 @@
-"""Where a session writes: one or several files, and the room that they may take."""
+"""Output of a recording session: one or several files within a limit of disk space."""

@@ -1,1 +1,1 @@
-"""What every part of the rig uses: units, errors, text, the wire's form, samples."""
+"""Common parts of the rig: units, errors, text, checks of input, messages, samples."""

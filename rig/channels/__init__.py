@@ -1,1 +1,1 @@
-"""Channels: their table, formulas, generators and the sensors' chain."""
+"""Channels: their table, formulas, generators, faults and sensors."""

@@ -1,1 +1,1 @@
-"""A run of a scene: scene in, frames out, commands on the way."""
+"""Simulation of a scene: commands, faults, frames."""

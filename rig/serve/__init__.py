@@ -1,1 +1,1 @@
-"""A run that is served: pace, commands, devices, transport."""
+"""Serving a run: pace, requests, devices, transport."""

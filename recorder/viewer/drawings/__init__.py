@@ -1,1 +1,1 @@
-"""What the viewer shows, a module each, and what they share."""
+"""Drawings of the viewer, one module each, with common geometry and history."""

@@ -1,1 +1,1 @@
-"""What a test runs: a bench, a device under test, a recorder, and their processes."""
+"""Equipment of a test: bench, device under test, recorder, and their processes."""

@@ -1,1 +1,1 @@
-"""Campaigns written in TOML: the file, its cases, and what it expects."""
+"""Campaign files in TOML: cases, steps and expectations."""

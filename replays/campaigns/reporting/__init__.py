@@ -1,1 +1,1 @@
-"""What is handed in of a campaign: results, page, pictures."""
+"""Reports of a campaign: results, page, pictures."""

@@ -1,1 +1,1 @@
-"""Where a record's rows are in the session."""
+"""Alignment of a record's rows with the session."""

@@ -1,1 +1,1 @@
-"""Quantities of the analogue path, a module each."""
+"""Quantities of the analogue path, one module each."""

@@ -1,1 +1,1 @@
-"""What was sent, what was recorded, and how the two are wired."""
+"""Sent and recorded rows, and the wiring between them."""

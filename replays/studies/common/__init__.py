@@ -1,1 +1,1 @@
-"""What studies share: scenes, runs of engines, journals, and where numbers come from."""
+"""Common parts of the studies: scenes, runs of engines, journals, provenance of numbers."""

@@ -1,1 +1,1 @@
-"""The subcommands of `rig`, a module each."""
+"""The subcommands of `rig`, one module each."""

@@ -1,1 +1,1 @@
-"""The ends of a connection to a rig, and its node on a CAN bus."""
+"""Connections of a command to a rig, and the rig's node on a CAN bus."""

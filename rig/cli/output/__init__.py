@@ -1,1 +1,1 @@
-"""What the terminal shows: tables, progress, compiling, reports' origin."""
+"""Terminal output: tables, progress, compiling, provenance of reports."""

@@ -1,1 +1,1 @@
-"""Ways to the bus for programs that speak in text."""
+"""Access to the bus for programs with text protocols: socketcand and SLCAN."""

@@ -1,1 +1,1 @@
-"""What happened in an imported log: commands, impacts, motion."""
+"""Events of an imported log: commands, impacts, motion."""

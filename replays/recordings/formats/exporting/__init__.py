@@ -1,1 +1,1 @@
-"""Recordings for other tools."""
+"""Export of recordings for other tools."""

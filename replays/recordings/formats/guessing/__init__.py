@@ -1,1 +1,1 @@
-"""What a log's signals may be, and a mapping to start from."""
+"""Guesses at the channels of a log's signals, and a mapping to start from."""

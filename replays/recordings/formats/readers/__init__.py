@@ -1,1 +1,1 @@
-"""Formats of other systems, a module each."""
+"""File formats of other systems, one module each."""

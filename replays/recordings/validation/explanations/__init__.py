@@ -1,1 +1,1 @@
-"""What explains a difference between recording and model."""
+"""Explanations of a difference between recording and model."""

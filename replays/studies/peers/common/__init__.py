@@ -1,1 +1,1 @@
-"""What peers share: the problem, its right-hand side, the solution."""
+"""Common parts of the peers: the problem, its right-hand side, the solution."""

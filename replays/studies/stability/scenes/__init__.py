@@ -1,1 +1,1 @@
-"""Whole scenes: random ones by number, and the twelve."""
+"""Whole scenes: random ones by number, and the twelve of the chart."""

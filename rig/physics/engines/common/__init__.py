@@ -1,1 +1,1 @@
-"""What engines share: their memory, events, and the march of one-step methods through them."""
+"""Common parts of the engines: memory, events, and the march of one-step methods through them."""

@@ -1,1 +1,1 @@
-"""Who is who on a rig that is exposed, and who may say what."""
+"""Certificates and permissions of a rig that is exposed to other hosts."""
