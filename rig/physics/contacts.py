@@ -15,6 +15,7 @@ half or full width stands in it.
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -22,9 +23,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rig.base.errors import InputError
+from rig.base.errors import InputError, Words
 from rig.base.maths.expression import Grammar, value_of
 from rig.base.maths.roots import find_root
+from rig.base.text import printable
 
 WORKING_FORCES = (5.0, 3000.0)
 """Forces that the rig's scenes reach [N]; a law that is no power of delta is fitted over them."""
@@ -106,6 +108,7 @@ class StiffnessLaw:
         valid: What it takes for granted.
         power: K [N/m^n] and n, where it is a power of delta.
         penetration: delta(F) [m], where it is none.
+        elastic_force: F(delta) [N], where a user's formula gives it.
     """
 
     formula: str
@@ -113,6 +116,7 @@ class StiffnessLaw:
     valid: str
     power: Callable[[ContactPair], tuple[float, float]] | None = None
     penetration: Callable[[float, ContactPair], float] | None = None
+    elastic_force: Callable[[float, ContactPair], float] | None = None
 
     def depth(self, force: float, pair: ContactPair) -> float:
         """The law's own delta(F) [m], not the fit's."""
@@ -124,6 +128,8 @@ class StiffnessLaw:
 
     def force(self, penetration: float, pair: ContactPair) -> float:
         """The law's own F(delta) [N], not the fit's; nan where the law breaks down before it gets so deep."""
+        if self.elastic_force is not None:
+            return self.elastic_force(penetration, pair)
         if self.power is not None:
             stiffness, exponent = self.power(pair)
             return stiffness * penetration**exponent
@@ -367,8 +373,15 @@ STIFFNESS: dict[str, StiffnessLaw] = {
 
 _MOST_DAMPED = 100.0
 """Largest c that a formula may give, as large as a number may be."""
-_DEEPEST_M = 1e-2
-"""Penetration at which a force given by a formula must have reached the working forces [m]."""
+_PENETRATIONS_M = (1e-7, 1e-2)
+"""Penetrations between which a force given by a formula must reach the largest working force [m]; a stiffness given as
+a number has the same upper limit, as 1e14 N/m^1.5 reaches 3 kN at 1e-7 m."""
+_EXPONENTS = (1.0, 2.5)
+"""Exponents of the power fitted to a formula; `contact.exponent` has the same limits."""
+_MAX_FIT_ERROR = 0.25
+"""Largest relative error of the power fitted to a formula: above it, a run would be one of another law."""
+_FIT_ROUNDING = 1e-8
+"""Error of a fit below which it is rounding of the root finder, and the law is the power itself."""
 
 
 def damping_law(name: str) -> DampingLaw:
@@ -402,18 +415,23 @@ def stiffness_law(name: str) -> StiffnessLaw:
         return STIFFNESS[name]
     formula = Grammar(("delta", "R_S", "r0", "L", "E")).read(name, field)
 
-    def penetration(force: float, pair: ContactPair) -> float:
+    def elastic_force(depth: float, pair: ContactPair) -> float:
         sizes = {"R_S": pair.shaft_radius, "r0": pair.clearance, "L": pair.width, "E": pair.modulus}
+        return value_of(formula, delta=depth, **sizes)
 
+    def penetration(force: float, pair: ContactPair) -> float:
         def missing(depth: float) -> float:
-            return value_of(formula, delta=depth, **sizes) - force
+            return elastic_force(depth, pair) - float(force)
 
-        if not missing(0.0) < 0.0 < missing(_DEEPEST_M):
-            must = f"a force that passes {force:g} N between penetrations of 0 and {_DEEPEST_M * 1e3:g} mm"
-            raise InputError(field, must, name)
-        return find_root(missing, 0.0, _DEEPEST_M, within=1e-16)
+        if missing(0.0) < 0.0 < missing(_PENETRATIONS_M[1]):
+            with contextlib.suppress(ValueError):  # the formula has no value at a penetration in between
+                return find_root(missing, 0.0, _PENETRATIONS_M[1], within=1e-22)
+        must = f"a force that passes {force:g} N between penetrations of 0 and {_PENETRATIONS_M[1] * 1e3:g} mm"
+        raise InputError(field, must, name)
 
-    return StiffnessLaw(name, "given as a formula", "what its author takes for granted", penetration=penetration)
+    return StiffnessLaw(
+        name, "given as a formula", "what its author takes for granted", None, penetration, elastic_force
+    )
 
 
 def fit_power(name: str, pair: ContactPair) -> PowerFit:
@@ -441,14 +459,40 @@ def fit_power(name: str, pair: ContactPair) -> PowerFit:
         raise InputError("contact.stiffness", f"another law: with this ring, {name} breaks down below {high:g} N", name)
     x, y = np.log(depths), np.log(forces)
     slope = (y[-1] - y[0]) / (x[-1] - x[0])
+    if law.elastic_force is not None and abs(slope - round(slope, 6)) < _FIT_ROUNDING:
+        # Rounding must not give an n just below 1, where the stiffness at the first touch is infinite.
+        slope = round(slope, 6)
     rest = y - slope * x
-    return PowerFit(
+    error = float(np.expm1(0.5 * (rest.max() - rest.min())))
+    fit = PowerFit(
         stiffness=float(np.exp(0.5 * (rest.max() + rest.min()))),
         exponent=float(slope),
-        error=float(np.expm1(0.5 * (rest.max() - rest.min()))),
+        error=error if error > _FIT_ROUNDING else 0.0,
         low=float(depths[0]),
         high=float(depths[-1]),
     )
+    if law.elastic_force is not None:
+        _check_formula_fit(name, law, fit, pair)
+    return fit
+
+
+def _check_formula_fit(name: str, law: StiffnessLaw, fit: PowerFit, pair: ContactPair) -> None:
+    """Raise an InputError where a formula's force is not what K delta^n can stand for."""
+    field, (low, high) = "contact.stiffness", WORKING_FORCES
+    forces = np.array([law.force(depth, pair) for depth in np.geomspace(fit.low, fit.high, 200)])
+    if not np.all(np.diff(forces) > 0.0):  # not a number fails as well
+        raise InputError(field, f"a force that increases with delta from {low:g} N to {high:g} N", name)
+    if fit.high < _PENETRATIONS_M[0]:
+        must = f"a force that reaches {high:g} N at a penetration of at least {_PENETRATIONS_M[0] * 1e6:g} µm"
+        raise InputError(field, must, Words(f"{printable(name, 80)}, which reaches it at {fit.high * 1e6:.2g} µm"))
+    if not (_EXPONENTS[0] <= fit.exponent <= _EXPONENTS[1] and fit.error <= _MAX_FIT_ERROR):
+        must = (
+            f"a force that K delta^n follows within {_MAX_FIT_ERROR:.0%} from {low:g} N to {high:g} N, "
+            f"with n from {_EXPONENTS[0]:g} to {_EXPONENTS[1]:g}"
+        )
+        raise InputError(
+            field, must, Words(f"{printable(name, 80)}: within {fit.error:.0%}, with n = {fit.exponent:.3g}")
+        )
 
 
 class ResolvedLaw(NamedTuple):

@@ -11,18 +11,18 @@ viscous_damping = 0.0                    # D [N s/m]
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from pydantic import FiniteFloat
 
 from rig.base.errors import InputError, Words
-from rig.base.outside import Written, check, read_toml
+from rig.base.outside import Written, a_line, check, read_toml
 
 
 class ContactLaw(Written):
     """What a law's file says; what it leaves out stays as the parameter set has it."""
 
-    title: str
+    title: Annotated[str, a_line(100)]
     source: str = ""
     stiffness: FiniteFloat | str | None = None
     exponent: FiniteFloat | str | None = None

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from functools import cache, lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -36,7 +36,7 @@ SI = {
 }  # fmt: skip
 """Every unit that a set may use, in SI (a frequency becomes rad/s)."""
 
-_FORMULA = re.compile(r"[\d\s()*/+]")
+_NAME = re.compile(r"\s*([^\W\d][\w-]*)?\s*")
 _OF_THE_MODEL = ("range", "rules", "formula")
 """Fields of a parameter that no file changes and no recording needs."""
 Kind = Literal["paper", "corrected", "literature", "datasheet", "fitted", "assumed"]
@@ -266,10 +266,15 @@ def _check(key: str, entry: Parameter) -> None:
     low, high = entry.range
     if isinstance(value, str):
         good = value in entry.rules
-        if not good and entry.formula and _FORMULA.search(value):  # what looks like a name is a wrong name
+        if not good and entry.formula and not _is_unknown_name(value, entry.formula):
             Grammar(entry.formula).read(value, key)
             good = True
     else:
         good = low <= value <= high and (entry.unit != "count" or float(value).is_integer())
     if not good:
         raise InputError(key, _accepts(entry), value)
+
+
+def _is_unknown_name(value: str, variables: Iterable[str]) -> bool:
+    """True for text like `hunt-crosley`: a misspelt rule, unless it consists of variables, as `R_S-r0` does."""
+    return _NAME.fullmatch(value) is not None and not set(value.strip().split("-")) <= set(variables)

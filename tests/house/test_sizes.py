@@ -43,10 +43,10 @@ BUDGETS = {
     "replays/sessions": 73,
     "replays/studies": 8889,
     "rig": 52,
-    "rig/base": 873,
+    "rig/base": 878,
     "rig/channels": 2358,
     "rig/cli": 5127,
-    "rig/physics": 5405,
+    "rig/physics": 5442,
     "rig/run": 1783,
     "rig/serve": 2800,
 }

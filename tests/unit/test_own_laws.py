@@ -54,6 +54,25 @@ def test_a_power_of_the_penetration_is_resolved_to_its_numbers() -> None:
         ("damping_factor", "0 / 0 * e", "contact.damping_factor must be from 0 to 100 at e = 0.9"),
         ("damping_factor", "__import__('os').system('x')", "contact.damping_factor must be made of .* received"),
         ("stiffness", "1e5 * delta", "contact.stiffness must be a force that passes .* N between penetrations of 0"),
+        ("damping_factor", "1if 1else 2", "contact.damping_factor must be made of .* received '1if 1else 2'"),
+        ("damping_factor", "e * 1e300", "contact.damping_factor must be made of numbers below 1e[+]300"),
+        ("damping_factor", "e.real", "contact.damping_factor must be made of .* instead received 'e.real'"),
+        ("damping_factor", " ", "or a formula of e; instead received ' '"),
+        ("stiffness", "exp(delta * 1e6) - 1", "that K delta.n follows within 25% .* received exp.* 70%, with n = 4.27"),
+        ("stiffness", "exp(delta * 1e9)", "must be a force that reaches 3000 N .* which reaches it at 0.008 µm"),
+        ("stiffness", "1e6 * max(delta - 1e-5, 0)", "that K delta.n follows within 25% .* within 37%, with n = 1.21"),
+        (
+            "stiffness",
+            "1e6 * sqrt(delta)",
+            "that K delta.n follows .* n from 1 to 2.5; .* within 0%, with n = 0.5",
+        ),
+        ("stiffness", "1e12 * delta**3", "that K delta.n follows .* with n from 1 to 2.5; .* within 0%, with n = 3"),
+        ("stiffness", "1e6 * abs(sin(1e9 * delta))", "must be a force that reaches 3000 N at .* at least 0.1 µm"),
+        ("stiffness", "1e15 * delta", "must be a force that reaches 3000 N at .* which reaches it at 3e-06 µm"),
+        ("stiffness", "2e6 * delta + 1e3 * sin(5e3 * delta)", "must be a force that increases with delta from 5 N"),
+        ("stiffness", "1e8 * delta / (delta > 0)", "contact.stiffness must be made of"),
+        ("stiffness", "1e8 * delta + 0 * log(abs(delta - 3e-5) - 1e-6)", "must be a force that passes .* N between"),
+        ("stiffness", "1e8 * delta + 0 * log(abs(delta - 1e-5) - 1e-6)", "contact.stiffness must be a force that"),
         ("stiffness", "1e9 * x", "contact.stiffness must be made of .* instead received 'x'"),
         ("friction", "0.1 + 0.1", "contact.friction must be a number from 0 to"),
     ],
@@ -61,6 +80,19 @@ def test_a_power_of_the_penetration_is_resolved_to_its_numbers() -> None:
 def test_a_formula_that_is_no_law_is_refused_in_one_line(key: str, value: str, words: str) -> None:
     with pytest.raises(InputError, match=words):
         build_model(load_parameters().override({f"contact.{key}": value}))
+
+
+@pytest.mark.parametrize("formula", ["e", " e ", "e-e", "1-e", "e**1e9", "(e)"])
+def test_a_formula_may_be_a_variable_alone(formula: str) -> None:
+    assert build_model(load_parameters().override({"contact.damping_factor": formula}))
+
+
+@pytest.mark.parametrize(
+    ("formula", "exponent"), [("1e9 * delta", 1.0), ("2e12 * delta**2.5", 2.5), ("E*L*delta", 1.0)]
+)
+def test_a_power_at_the_limits_of_the_exponent_is_taken_exactly(formula: str, exponent: float) -> None:
+    fit = fit_power(formula, PAIR)
+    assert (fit.exponent, fit.error) == (exponent, 0.0)
 
 
 def test_a_law_file_gives_parameters(tmp_path: Path) -> None:
@@ -80,6 +112,9 @@ def test_a_law_file_gives_parameters(tmp_path: Path) -> None:
         ('title = "a"\nstiffness = true', "stiffness"),
         ('title = "a"\nstiffness = nan', "stiffness"),
         ("title", "x.toml"),
+        ('title = "\\u001b[31m"\nstiffness = 1e9', "x.toml.title must be a line of 1 to 100 printable characters"),
+        (f'title = "{"x" * 10000}"\nstiffness = 1e9', "x.toml.title must be a line of 1 to 100 printable characters"),
+        (f'title = "x"\nstiffness = "{"delta*" * 2000}1"', "contact.stiffness must be a formula of at most 500"),
     ],
 )
 def test_a_wrong_law_file_is_refused_in_one_line(

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ast
 import math
+import warnings
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
@@ -16,6 +17,8 @@ from rig.base.errors import InputError, UnknownNameError
 
 LONGEST = 500
 """Characters of an expression."""
+_LARGEST = 1e300
+"""Numbers of an expression are below this."""
 _DEEPEST = 30
 """Parts of an expression inside each other."""
 
@@ -83,7 +86,8 @@ class Grammar:
         if len(text) > LONGEST:
             raise InputError(field, f"a formula of at most {LONGEST} characters", len(text))
         try:
-            tree = ast.parse(text.strip(), mode="eval").body
+            with warnings.catch_warnings(action="ignore"):  # of what it reads, such as `1if`, and refuses below
+                tree = ast.parse(text.strip(), mode="eval").body
         except (SyntaxError, ValueError, MemoryError, RecursionError):
             raise InputError(field, self.what, text) from None
         return self._part(tree, field, text, 0)
@@ -127,7 +131,9 @@ class Grammar:
         match node:
             case ast.Constant(value=bool()):
                 pass
-            case ast.Constant(value=int() | float() as value) if abs(value) < 1e300:
+            case ast.Constant(value=int() | float() as value):
+                if abs(value) >= _LARGEST:
+                    raise InputError(field, f"made of numbers below {_LARGEST:g}", text[:60])
                 return np.float64(value)
             case ast.Name(id="pi"):
                 return math.pi
