@@ -1,14 +1,16 @@
 """Imports that the usual search would not find, or would find in another place.
 
-Paths of version 0.1, such as `rig.scenes` for `rig.run.scenes`, work in this version, with a warning. And a folder of a
-user's own that is named `drivers`, `recorder` or `replays` hides no module of ours, unless it has one of the same name.
+Paths of version 0.1, such as `rig.scenes` for `rig.run.scenes`, work in this version, with a warning. And a folder or
+file of a user's own that is named `drivers`, `recorder` or `replays` hides no module of ours, unless the folder has one
+of the same name.
 """
 
 from __future__ import annotations
 
 import sys
 from importlib.machinery import ModuleSpec, PathFinder
-from os.path import dirname, exists, join
+from importlib.util import spec_from_file_location
+from os.path import abspath, dirname, exists, join
 from types import ModuleType
 from typing import Any
 
@@ -29,8 +31,10 @@ class Paths:
     def find_spec(self, fullname: str, path: Any, target: object = None) -> ModuleSpec | None:
         """Return a spec for such a module, none for others."""
         package, *rest = fullname.split(".")
-        if package not in _FOLDERS or not rest:
+        if package not in _FOLDERS:
             return None
+        if not rest:
+            return _spec_of_file(package)
         ours = join(PLACE, package)  # noqa: PTH118
         if _is_there(package, rest[0]):
             if len(rest) > 1 or ours in path or PathFinder.find_spec(fullname, path):
@@ -56,6 +60,17 @@ class Paths:
         sys.modules[spec.name] = import_module(str(spec.origin))
 
 
+def _spec_of_file(package: str) -> ModuleSpec | None:
+    """Return a spec for a user's file such as `recorder.py`, by which our modules are found in it; none for folders."""
+    spec = PathFinder.find_spec(package)
+    if spec is None or spec.submodule_search_locations is not None or spec.origin is None:
+        return None
+    main = getattr(sys.modules.get("__main__"), "__file__", None)
+    if main is not None and abspath(main) == abspath(spec.origin):  # noqa: PTH100
+        return PathFinder.find_spec(package, [PLACE])  # a script that runs is not run again
+    return spec_from_file_location(package, spec.origin, submodule_search_locations=[join(PLACE, package)])  # noqa: PTH118
+
+
 def _is_there(*names: str) -> bool:
     path = join(PLACE, *names)  # noqa: PTH118
     return exists(path) or exists(f"{path}.py")  # noqa: PTH110
@@ -67,3 +82,7 @@ def find_our_modules() -> None:
         # Before the usual search, which would load a second copy of what lies deeper.
         finder: Any = Paths()
         sys.meta_path.insert(0, finder)
+        for package in _FOLDERS:
+            module: Any = sys.modules.get(package)
+            if module is not None and not hasattr(module, "__path__"):  # a file of the user's, imported before us
+                module.__path__ = [join(PLACE, package)]  # noqa: PTH118

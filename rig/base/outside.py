@@ -18,7 +18,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, BinaryIO, TypeVar, get_args
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
 from rig.base.errors import InputError, Words, such_as
 from rig.base.text import nearest, printable
@@ -282,6 +282,14 @@ _BRANCH = re.compile(r"(function-\w+|tuple|list|dict|set|literal|nullable|chain)
 _PLAIN_BRANCH = {"float": ("float", "finite", "greater", "less"), "int": ("int", "greater", "less"), "str": ("string",)}
 
 
+def describe_error(error: BaseException) -> str:
+    """Return class and text, on one line, of an error that another package's code has raised."""
+    try:
+        return printable(f"{type(error).__name__}: {error}", 200)
+    except Exception:  # of its __str__
+        return type(error).__name__
+
+
 def load_extensions(group: str, kind: type[Extension], taken: Iterable[str]) -> tuple[dict[str, Extension], list[str]]:
     """Return what other installed packages add to a table by entry points, by name, and why others cannot be used.
 
@@ -297,15 +305,19 @@ def load_extensions(group: str, kind: type[Extension], taken: Iterable[str]) -> 
     for point in entry_points(group=group):
         try:
             entry = point.load()
-        except Exception as error:  # whatever other people's code raises
-            broken.append(f"{point.name} ({point.value} cannot be loaded: {type(error).__name__}: {error})")
+        except (Exception, SystemExit) as error:  # whatever other people's code raises
+            broken.append(f"{point.name} ({point.value} cannot be loaded: {describe_error(error)})")
             continue
         if point.name in {*taken, *found}:
             broken.append(f"{point.name} ({point.value} has a name that is taken)")
         elif not isinstance(entry, kind):
             broken.append(f"{point.name} ({point.value} must be a {kind.__module__}.{kind.__qualname__})")
         else:
-            found[point.name] = entry
+            try:
+                found[point.name] = TypeAdapter(kind).validate_python(entry, strict=True)
+            except ValidationError as error:
+                wrong = input_error(error, "", BaseModel)
+                broken.append(f"{point.name} ({point.value}: {wrong})")
     return found, broken
 
 

@@ -18,8 +18,9 @@ from pydantic import (
     model_validator,
 )
 
-from rig.base.outside import Written
-from rig.physics.engines import BROKEN, ENGINES
+from rig.base.errors import InputError, Words
+from rig.base.outside import Written, describe_error
+from rig.physics.engines import BROKEN, ENGINES, Engine, load_engine
 
 Limit = Annotated[FiniteFloat, Field(gt=0.0, strict=True)] | None
 """A limit of an error; None: that of engine.tolerance, or of an angle none."""
@@ -123,3 +124,18 @@ class EngineChoice(Written):
     def tolerance_by_limits(self) -> bool:
         """Whether `tolerance` is the one chosen where it is left out."""
         return self.tolerance == self.limits.choose_tolerance(ENGINES[self.name].tolerance)
+
+
+def load_chosen_engine(name: str) -> Engine:
+    """Return one of `ENGINES`, ready to run.
+
+    Raises:
+        InputError: It is another package's, and cannot be imported or lacks what an engine must have.
+    """
+    try:
+        return load_engine(name)
+    except (Exception, SystemExit) as error:
+        if not ENGINES[name].module:
+            raise
+        received = f"{name}, of which {ENGINES[name].module} fails: {describe_error(error)}"
+        raise InputError("engine.name", "an engine that can be loaded", Words(received)) from None

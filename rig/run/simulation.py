@@ -25,7 +25,8 @@ from rig.channels.sensors.conditioning import Conditioner
 from rig.channels.sensors.keyphasor import Keyphasor
 from rig.channels.table import ChannelTable
 from rig.physics.accuracy import Accuracy, choose_companion
-from rig.physics.engines import ENGINES, load_engine
+from rig.physics.engine_choice import load_chosen_engine
+from rig.physics.engines import ENGINES
 from rig.physics.engines.common.memory import CEILING, CLAMPS, CONTACTS, FLOORED, MEMORY, PEAK_FORCE, ROLLED_S, STEPS
 from rig.physics.kernels import signals as S
 from rig.physics.kernels.constants import Inputs
@@ -90,7 +91,7 @@ class Simulation:
         self.tick_rate_hz = TICK_RATE_HZ
         self._warm = False
         self.model = build_model(scene.load_parameters(), scene.model)
-        self._engines = [calibrator.STILL if scene.generator else load_engine(scene.engine.name)]
+        self._engines = [calibrator.STILL if scene.generator else load_chosen_engine(scene.engine.name)]
         self._method = ENGINES[scene.engine.name]
         sensors, self.row_ticks = scene.sensors, scene.row_ticks
         # Steps are as long as may be of those that end on the rows.
@@ -153,7 +154,9 @@ class Simulation:
         self._companion: Motion | None = None
         if choice.companion:
             name, finer = choose_companion(choice.name, choice.tolerance, scene.model.friction)
-            self._engines.append(self._engines[0] if scene.generator or name == choice.name else load_engine(name))
+            self._engines.append(
+                self._engines[0] if scene.generator or name == choice.name else load_chosen_engine(name)
+            )
             stride = self.block_ticks // self._step_ticks
             self._companion = Motion(initial.copy(), self._step_ticks, stride, finer, np.zeros_like(memory))
         clearance = self.model.constants.contact.clearance

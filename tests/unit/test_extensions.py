@@ -19,6 +19,63 @@ wrong = my_engine.heun:ORDER
 gone = my_engine.missing:ROW
 [rig.formats]
 bad = my_engine:ROW
+exits = my_wrong.exits:ROW
+mute = my_wrong.mute:ROW
+text = my_formats.raw:RAW
+twice = my_formats.raw:RAW
+number = my_wrong.formats:NUMBER
+endless = my_wrong.formats:ENDLESS
+loud = my_wrong.formats:LOUD
+ours = my_wrong.formats:OURS
+nowhere = my_wrong.formats:NOWHERE
+empty = my_wrong.formats:EMPTY
+reader = my_wrong.formats:READER
+writer = my_wrong.formats:WRITER
+"""
+MODULES = {
+    "__init__": "",
+    "exits": "import sys\nsys.exit('no licence')",
+    "mute": "class Mute(Exception):\n    def __str__(self): raise ValueError\nraise Mute",
+    "formats": """
+from replays.recordings.formats.source import Format
+NUMBER = Format("n", (".n",), 3)
+ENDLESS = Format("n", (), "my_wrong.reader")
+LOUD = Format("n", (".N",), "my_wrong.reader")
+OURS = Format("n", (".n", ".csv"), "my_wrong.reader")
+NOWHERE = Format("nowhere", (".no",), "my_wrong.missing")
+EMPTY = Format("empty", (".em",), "my_wrong.exits")
+READER = Format("reader", (".rd",), "my_wrong.reader")
+WRITER = Format("writer", (".wr",), "my_wrong.reader", "Writer")
+""",
+    "reader": """
+import sys
+def look_into(path, options):
+    return None if path.read_bytes() == b"1" else sys.exit("no licence")
+""",
+    "lame": "METHOD = 3",
+}
+"""Modules of the package my_wrong."""
+LINES = """
+from pathlib import Path
+import rig
+from replays.recordings.formats.mapping import FileOptions
+from replays.recordings.formats.source import open_source, load_format, formats
+from rig.physics.engine_choice import load_chosen_engine
+from rig.physics.engines import ENGINES
+
+def line(act, *given):
+    try:
+        act(*given)
+    except rig.InputError as error:
+        print(error)
+
+folder = Path(sys.argv[1])
+for name, text in (("a.x", "1"), ("a.no", "1"), ("a.em", "1"), ("a.rd", "1"), ("b.rd", "2"), ("a.wr", "1")):
+    (folder / name).write_text(text)
+    line(open_source, folder / name, FileOptions())
+for module in ("my_wrong.missing", "my_wrong.exits", "my_wrong.lame"):
+    ENGINES["own"] = ENGINES["heun"]._replace(module=module)
+    line(load_chosen_engine, "own")
 """
 ASK = """
 import rig
@@ -78,6 +135,9 @@ def package(tmp_path: Path) -> Path:
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text(text)
     (tmp_path / "my_formats/__init__.py").touch()
+    (tmp_path / "my_wrong").mkdir()
+    for name, text in MODULES.items():
+        (tmp_path / f"my_wrong/{name}.py").write_text(text)
     added = re.findall(r'entry-points\."(rig\.\w+)"\]\n(\w+) = "(.*?)"\n', PAGE)
     entries = "".join(f"[{group}]\n{name} = {value}\n" for group, name, value in added)
     for name, text in (("page", entries), ("wrong", WRONG)):
@@ -117,4 +177,33 @@ def test_a_format_is_read_as_any_other(package: Path) -> None:
     values, damaged, unknown = python(IMPORT, package)
     assert values == "raw 0.0 1.0 2.0 3.0 4.0"
     assert "file must be an intact raw file" in damaged
-    assert ".raw; not usable: bad (my_engine:ROW must be a replays.recordings.formats.source.Format)" in unknown
+    assert "; not usable: bad (my_engine:ROW must be a replays.recordings.formats.source.Format)" in unknown
+
+
+def test_what_is_wrong_with_another_s_package_is_one_line(package: Path) -> None:
+    unknown, *lines = python(LINES, package)
+    for words in (
+        "exits (my_wrong.exits:ROW cannot be loaded: SystemExit: no licence)",
+        "mute (my_wrong.mute:ROW cannot be loaded: Mute)",
+        "text (my_formats.raw:RAW has a name that is taken)",
+        "twice (.raw is the ending of another format)",
+        "number (my_wrong.formats:NUMBER: module must be a valid string; instead received 3)",
+        "endless (my_wrong.formats:ENDLESS: suffixes must be a value of at least 1 item",
+        "loud (my_wrong.formats:LOUD: suffixes.0 must be an ending in lower case such as .raw",
+        "ours (.csv is the ending of another format)",
+    ):
+        assert words in unknown
+    lines = [line.replace(f"{package}/", "") for line in lines]
+    missing = "which fails: ModuleNotFoundError: No module named 'my_wrong.missing'"
+    must = "engine.name must be an engine that can be loaded; instead received own, of which"
+    assert lines == [
+        f"nowhere files need my_wrong.missing, {missing}",
+        "empty files need my_wrong.exits, which fails: SystemExit: no licence",
+        "file must be an intact reader file; instead received a.rd "
+        "(TypeError: my_wrong.reader.look_into returns NoneType, no Source)",
+        "file must be an intact reader file; instead received b.rd (SystemExit: no licence)",
+        "writer files need Writer in my_wrong.reader, which has none",
+        f"{must} my_wrong.missing fails: ModuleNotFoundError: No module named 'my_wrong.missing'",
+        f"{must} my_wrong.exits fails: SystemExit: no licence",
+        f"{must} my_wrong.lame fails: AttributeError: module 'my_wrong.lame' has no attribute 'ORDER'",
+    ]

@@ -36,10 +36,10 @@ def test_a_wrong_path_is_no_module(name: str) -> None:
         import_module(name)
 
 
-def imported(folder: Path, code: str) -> str:
+def imported(folder: Path, code: str, script: str = "script.py") -> str:
     """What a script in a folder prints, or the last line of its error."""
-    (folder / "script.py").write_text(code)
-    command = [sys.executable, str(folder / "script.py")]
+    (folder / script).write_text(code)
+    command = [sys.executable, str(folder / script)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     return done.stdout.strip() or done.stderr.splitlines()[-1]
 
@@ -53,6 +53,21 @@ def test_a_folder_of_a_user_s_own_hides_no_module_of_ours(package: str, tmp_path
     code = f"import rig, {package}.mine, {module}\nfrom rig import connect\n"
     told = imported(tmp_path, f"{code}print({package}.MINE, {package}.mine.VALUE, {module}.__name__, connect.__name__)")
     assert told == f"True 7 {module} connect"
+
+
+@pytest.mark.parametrize("first", ["", "import {package}\n"])
+@pytest.mark.parametrize("package", ["drivers", "recorder", "replays"])
+def test_a_file_of_a_user_s_own_hides_no_module_of_ours(package: str, first: str, tmp_path: Path) -> None:
+    (tmp_path / f"{package}.py").write_text("MINE = True")
+    module = {"drivers": "drivers.link", "recorder": "recorder.viewer", "replays": "replays.report"}[package]
+    code = f"{first}import rig, {package}, {module}\n".format(package=package)
+    assert imported(tmp_path, f"{code}print({package}.MINE, {module}.__name__)") == f"True {module}"
+
+
+@pytest.mark.parametrize("package", ["drivers", "recorder", "replays"])
+def test_a_script_with_a_name_of_ours_runs_once(package: str, tmp_path: Path) -> None:
+    code = f"print('once')\nimport rig, {package}\nprint({package}.__path__[0].endswith('{package}'))"
+    assert imported(tmp_path, code, script=f"{package}.py") == "once\nTrue"
 
 
 def test_a_module_of_a_user_s_own_in_the_place_of_ours_is_named(tmp_path: Path) -> None:

@@ -11,15 +11,22 @@ from dataclasses import dataclass, field, replace
 from datetime import datetime
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import numpy as np
+from pydantic import AfterValidator, Field
 
 from rig.base.errors import InputError, RefusedError, Words
-from rig.base.outside import DOCUMENT_BYTES, load_extensions, open_file, read_json, unreadable
+from rig.base.outside import DOCUMENT_BYTES, describe_error, load_extensions, open_file, read_json, unreadable
 
 if TYPE_CHECKING:
     from replays.recordings.formats.mapping import FileOptions
+
+
+def _check_ending(text: str) -> str:
+    if not text.startswith(".") or text in (".", ".mcap") or text != text.lower():
+        raise ValueError("an ending in lower case such as .raw, and not .mcap")
+    return text
 
 
 class Format(NamedTuple):
@@ -30,8 +37,8 @@ class Format(NamedTuple):
 
     title: str
     """Name in words."""
-    suffixes: tuple[str, ...]
-    """Endings of its files; one that is written ends in the first."""
+    suffixes: Annotated[tuple[Annotated[str, AfterValidator(_check_ending)], ...], Field(min_length=1)]
+    """Endings of its files, in lower case; one that is written ends in the first."""
     module: str
     """Where `look_into(path, options)` returns a file's `Source`."""
     writer: str = ""
@@ -58,7 +65,32 @@ def formats() -> dict[str, Format]:
 
 @cache
 def _extensions() -> tuple[dict[str, Format], list[str]]:
-    return load_extensions("rig.formats", Format, FORMATS)
+    found, broken = load_extensions("rig.formats", Format, FORMATS)
+    taken = {suffix for each in FORMATS.values() for suffix in each.suffixes}
+    for name, form in list(found.items()):
+        if twice := taken.intersection(form.suffixes):
+            broken.append(f"{name} ({', '.join(sorted(twice))} is the ending of another format)")
+            del found[name]
+        taken.update(form.suffixes)
+    return found, broken
+
+
+def load_format(form: Format) -> Any:
+    """Import the module of a format.
+
+    Raises:
+        RefusedError: It cannot be imported, or lacks what the format names.
+    """
+    try:
+        module = importlib.import_module(form.module)
+    except RefusedError:
+        raise
+    except (Exception, SystemExit) as error:  # whatever other people's code raises
+        raise RefusedError(f"{form.title} files need {form.module}, which fails: {describe_error(error)}") from None
+    for name in ("look_into", form.writer):
+        if name and not callable(getattr(module, name, None)):
+            raise RefusedError(f"{form.title} files need {name} in {form.module}, which has none")
+    return module
 
 
 _MOST_ABOUT = 2000
@@ -177,9 +209,11 @@ def open_source(path: Path, options: FileOptions) -> Source:
         raise InputError("file", "a file with something in it", str(path))
     if form is not FORMATS["text"]:
         options.only_for_text(path)
-    what, module = form.title, importlib.import_module(form.module)
+    what, module = form.title, load_format(form)
     with _parsing(path, what):
-        source: Source = module.look_into(path, options)
+        source = module.look_into(path, options)
+        if not isinstance(source, Source):
+            raise TypeError(f"{form.module}.look_into returns {type(source).__name__}, no Source")
     if not source.entries:
         raise InputError("file", "a file with signals in it", str(path))
     if not any(entry.rows for entry in source.entries):
@@ -237,7 +271,7 @@ def _parsing(path: Path, what: str) -> Iterator[None]:
         yield
     except InputError:
         raise
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise damaged(path, what, error) from None
 
 
@@ -294,9 +328,9 @@ def library(what: str, name: str, module: str | None = None) -> Any:
         raise RefusedError(line) from None
 
 
-def damaged(path: Path, what: str, error: Exception | str) -> InputError:
+def damaged(path: Path, what: str, error: BaseException | str) -> InputError:
     """The one line for whatever a library raises on a file that it cannot read."""
-    text = error if isinstance(error, str) else f"{type(error).__name__}: {error}"
+    text = error if isinstance(error, str) else describe_error(error)
     return InputError("file", f"an intact {what} file", Words(f"{path} ({text})"[:300]))
 
 

@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rig.base.errors import SimulationError
-from rig.physics.engines import ENGINES, load_engine
+from rig.physics.engine_choice import load_chosen_engine
+from rig.physics.engines import ENGINES
 from rig.physics.kernels.constants import Constants, Inputs
 from rig.physics.kernels.signals import N_VECTOR
 from rig.run.simulation import Simulation
@@ -51,7 +52,7 @@ class Course:
             tolerance: Of an adaptive engine; 0 for its own.
         """
         method = ENGINES[engine]
-        self._engine, self._constants, self._inputs = load_engine(engine), constants, inputs
+        self._engine, self._constants, self._inputs = load_chosen_engine(engine), constants, inputs
         self.step, self.tick = step or method.step_us, 0
         self.y, self.memory = np.zeros(N_VECTOR), np.zeros(self._engine.memory_size)
         self.y[: len(y0)] = y0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, suppress
@@ -14,7 +13,7 @@ import numpy as np
 
 from replays.recordings.formats import clock
 from replays.recordings.formats.exporting.selection import ROWS, ExportChunk, ExportTable, Selection
-from replays.recordings.formats.source import formats
+from replays.recordings.formats.source import formats, load_format
 from rig.base.errors import InputError, Words, check_new_file, check_not_among, whole_file
 
 Method = Literal["polyphase", "linear"]
@@ -93,7 +92,7 @@ def merged(path: Path) -> bool:
 
 def _writer_class(path: Path) -> type[FormatWriter]:
     form = next(form for form in formats().values() if form.writer and path.suffix == form.suffixes[0])
-    return getattr(importlib.import_module(form.module), form.writer)
+    return getattr(load_format(form), form.writer)
 
 
 def export(
