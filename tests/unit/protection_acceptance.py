@@ -116,49 +116,6 @@ def fault(kind: str, **numbers: Any) -> dict[str, Any]:
 
 
 VOTES = (("1oo2", "leaves"), ("2oo2", "leaves"), ("2oo2", "for"), ("1oo2", "for"))
-_BENIGN, _ONE, _BROKEN, _BLIND = ("-",) * 4, ("T", "a", "a", "T"), ("N", "N", "N", "TN"), ("N", "N", "TN", "TN")
-FAULTS: dict[str, tuple[dict[str, Any], tuple[str, ...]]] = {
-    # kind: its numbers, what comes of it by the votes above; the signal is 200 um peak-to-peak at 10 Hz.
-    # A level of its own above 1000 um, within the OK limits: one probe in danger.
-    "gain": ({"factor": 8.0}, _ONE),
-    "offset": ({"value": 1.2}, _ONE),
-    "hum": ({"amplitude_v": 2.5}, _ONE),
-    "stuck-bit": ({"bit": 21}, _ONE),  # 2^21 of 2^24 counts over 40 V: 5 V, 1.27 mm
-    # An output at 0 V, or beyond what the converter still gives: NOT OK in time, no alarm of this probe.
-    "open": ({}, _BROKEN),
-    "short": ({}, _BROKEN),
-    "intermittent": ({"part": 0.2}, _BROKEN),
-    "clip": ({"part": 0.05}, _BROKEN),  # at -1 V
-    # On its way to the OK limit, 1.9 mm at 20 mm/s, it is above 500 um for longer than the delay; above 1000, not.
-    "drift": ({"rate": 20.0}, ("aN", "aN", "aN", "TN")),
-    # What leaves the level where it is, or makes it less.
-    **{kind: ({}, _BENIGN) for kind in ("polarity", "stuck", "freeze")},
-    "nonlinear": ({"end": 0.02}, _BENIGN),
-    "resonance": ({"frequency_hz": 200.0}, _BENIGN),
-    "crosstalk": ({"source": "disk_y", "db": -6.0}, _BENIGN),
-    "saturation": ({"part": 0.01}, _BENIGN),
-    "swap": ({"other": "disk_y"}, _BENIGN),
-    "late": ({"late_us": 1000.0}, _BENIGN),
-    "clock": ({"ppm": 100.0}, _BENIGN),
-    "jitter": ({"rms_us": 5.0}, _BENIGN),
-    "wander": ({"amplitude_us": 100.0}, _BENIGN),
-    "noise": ({"factor": 100.0}, _BENIGN),  # 25 um rms
-    "spikes": ({"rate_hz": 10.0, "size_v": 1.0}, _BENIGN),  # 250 um
-    "bits": ({"lost": 8}, _BENIGN),
-    # Of blocks: half a second without any is longer than the window, and so are numbers that begin anew.
-    "dropout": ({"channel": "probes"}, _BLIND),
-    "restart": ({"channel": "probes"}, _BLIND),
-    **{kind: ({"channel": "probes"}, _BENIGN) for kind in ("lose-blocks", "duplicate-blocks", "reorder-blocks")},
-    "late-blocks": ({"channel": "probes", "delay_s": 0.1}, _BENIGN),
-    "stale-stamps": ({"channel": "probes"}, _BENIGN),
-}
-
-PULSES: dict[str, tuple[dict[str, Any], set[str]]] = {
-    # kind: its numbers, what comes of it at 6.2 Hz, where 7 Hz for three turns are too fast, and 0.3 s without a pulse.
-    "miss-pulses": ({"part": 1.0}, {"speed-lost"}),
-    "extra-pulses": ({"part": 1.0}, {"overspeed", "trip"}),
-    "edge-jitter": ({"rms_us": 100.0}, set()),
-}
 
 
 def keyphasor(kind: str, **numbers: Any) -> list[Samples]:

@@ -16,7 +16,7 @@ from rig.channels.faults.blocks import DuplicateBlocks, LoseBlocks, ReorderBlock
 from rig.channels.faults.sending import Active, Frame, Sending
 from rig.run.scenes import load_scene
 from rig.run.simulation import Simulation
-from tests.unit.test_channel_faults import BLOCKS, EXAMPLES
+from tests.fault_cases import BLOCKS, EXAMPLES
 
 SCENE = load_scene("hammer", {"duration_s": 0.4, "sensors.groups": ["probes", "forces"]})
 PROBES, FORCES = sensor_key("probes"), sensor_key("forces")

@@ -26,6 +26,7 @@ from rig.base.errors import InputError
 from rig.channels.channel_file import read_channels
 from rig.channels.table import default_table
 from rig.cli.connections.can_output import CanMessages, CanOptions, CanOutput
+from rig.run.commands.table import COMMANDS
 from tests.commands import said, shown
 
 TABLE = default_messages()
@@ -127,9 +128,10 @@ def test_a_command_made_by_cantools_alone_is_taken() -> None:
 
 
 def test_cantools_decodes_every_command() -> None:
-    values = {Kind.HAMMER: {"force_n": 100.0, "duration_ms": 5.0}, Kind.SPEED: {"speed_hz": 6.2}}
     for kind in Kind:
-        decoded = DATABASE.decode_message(*command_frame(kind, 9, **values.get(kind, {})))
+        fields = {} if kind is Kind.STOP else COMMANDS[kind.name.lower()].quantities()
+        values = {name: max(1.0, field.low) for name, field in fields.items() if not field.takes_text}
+        decoded = DATABASE.decode_message(*command_frame(kind, 9, **values))
         assert str(decoded["kind"]) == kind.name.lower()
         assert decoded["counter"] == 9
 

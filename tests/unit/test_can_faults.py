@@ -31,8 +31,8 @@ from rig.serve.pacing import FreeRun
 from rig.serve.service import Service
 from rig.serve.transport.fanout import Fanout
 from rig.serve.transport.memory import MemoryClient, MemoryServer
+from tests.fault_cases import BLOCKS, EXAMPLES
 from tests.unit.test_can_gateway import rig
-from tests.unit.test_channel_faults import BLOCKS, EXAMPLES
 from tests.waiting import until
 
 pytestmark = pytest.mark.wallclock

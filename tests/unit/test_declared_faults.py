@@ -27,8 +27,8 @@ from rig.base.errors import InputError
 from rig.channels.faults.declared import Declared
 from rig.run.scenes import load_scene, parse_scene
 from rig.run.simulation import Simulation
+from tests.fault_cases import BLOCKS
 from tests.unit.recorder_stream import ScriptedClient
-from tests.unit.test_channel_faults import BLOCKS
 
 PROBES = wire.sensor_key("probes")
 

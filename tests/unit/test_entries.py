@@ -29,6 +29,7 @@ from rig.physics.contacts import DAMPING, STIFFNESS
 from rig.physics.engines import ENGINES
 from rig.physics.parameters import load_parameters
 from rig.run.commands import SUMMARIES
+from tests import fault_cases
 from tests.generated import missing_in_generated_files
 
 ROOT = Path(__file__).parents[2]
@@ -106,6 +107,20 @@ def test_a_kind_of_fault_is_in_the_union_and_on_the_page() -> None:
     missing += [f"kind of fault {name}: docs/hardware.md, Faults on command, must list it under {kind.stage}"
                 for name, kind in faults.KINDS.items()
                 if name not in listed.partition(f"{kind.stage} (")[2].partition(")")[0].split(", ")]  # fmt: skip
+    of_channels = {name for name, kind in faults.KINDS.items() if not kind.of_blocks}
+    unfiltered = {name for name, kind in faults.KINDS.items() if kind.stage == "filter"}  # test signals have no filter
+    for table, needed, has in (
+        ("EXAMPLES", of_channels, fault_cases.EXAMPLES),
+        ("BLOCKS", faults.KINDS.keys() - of_channels, fault_cases.BLOCKS),
+        ("MONITORED", faults.KINDS.keys() - unfiltered, fault_cases.MONITORED | fault_cases.MONITORED_PULSES),
+        ("SCORED", of_channels, fault_cases.SCORED), ("BLIND_SIZES", of_channels, fault_cases.BLIND_SIZES),
+    ):  # fmt: skip
+        missing += [
+            f"kind of fault {name}: {table} in tests/fault_cases.py needs a case of it" for name in needed - {*has}
+        ]
+        where = f"{table} in tests/fault_cases.py"
+        missing += [f"kind of fault {name}: {where} needs a case of it" for name in needed - {*has}]
+        missing += [f"kind of fault {name}: {where} has a case of no such kind" for name in {*has} - needed]
     require(missing)
 
 

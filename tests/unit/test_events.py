@@ -17,7 +17,7 @@ from replays.recordings.export import write_run
 from replays.recordings.validation import validate
 from rig.base import wire
 from rig.base.errors import InputError
-from rig.run.commands.table import COMMANDS, EVENT_KINDS
+from rig.run.commands.table import COMMANDS, EVENT_KINDS, MECHANICAL
 from rig.run.scenes import parse_scene
 from rig.run.simulation import Simulation
 from rig.serve.intake import event_in
@@ -69,8 +69,10 @@ def test_every_kind_of_event_is_recorded_and_validated(tmp_path: Path) -> None:
     console.note("begin")
     console.join("dut")
     console.leave("dut")
-    console.speed(5.0)
-    console.release()
+    for name in MECHANICAL:
+        needed = {field: 5.0 for field, each in COMMANDS[name].quantities().items() if each.required}
+        if name != "hammer":  # below, as it meets another
+            console.send(name, **needed)
     for number in (1.1, 1.2, 1.3):
         console.fault("P_E", "gain", factor=number)
     console.fault("probes", "dropout", for_s=0.01)

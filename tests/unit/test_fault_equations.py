@@ -11,6 +11,7 @@ import pytest
 from rig.channels.faults import KINDS
 from rig.channels.faults.kind import At, Draws, Kind
 from rig.channels.table import default_table
+from tests.fault_cases import EXAMPLES
 
 CHANNEL = default_table().channels["disk_x"]
 RATE_HZ, ROWS = 20_000, 6000
@@ -122,15 +123,7 @@ def test_pulses(name: str, numbers: dict[str, float], expected: np.ndarray) -> N
 @pytest.mark.parametrize("name", sorted(name for name, each in KINDS.items() if not each.of_blocks))
 def test_what_a_fault_does_not_change_stays(name: str) -> None:
     """A fault of one stage leaves the values of all others."""
-    numbers: dict[str, dict[str, Any]] = {
-        "gain": {"factor": 2.0}, "offset": {"value": 1.0}, "drift": {"rate": 1.0}, "nonlinear": {"end": 1.0},
-        "resonance": {"frequency_hz": 80.0}, "hum": {"amplitude_v": 1.0}, "crosstalk": {"source": "disk_y"},
-        "saturation": {"part": 0.5}, "swap": {"other": "disk_y"}, "bandwidth": {"corner_hz": 50.0},
-        "late": {"late_us": 10.0}, "clock": {"ppm": 100.0}, "jitter": {"rms_us": 1.0}, "wander": {"amplitude_us": 1.0},
-        "noise": {"factor": 2.0}, "bits": {"lost": 2}, "stuck-bit": {"bit": 2}, "clip": {"part": 0.5},
-        "edge-jitter": {"rms_us": 1.0},
-    }  # fmt: skip
-    fault = kind(name, **numbers.get(name, {}))
+    fault = kind(name, **EXAMPLES[name])
     methods: dict[str, tuple[Callable[[np.ndarray, At], np.ndarray], np.ndarray]] = {
         "transducer": (fault.signal, X), "cable": (fault.volts, V), "converter": (fault.counts, COUNTS),
     }  # fmt: skip

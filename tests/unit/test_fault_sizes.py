@@ -13,11 +13,12 @@ import pytest
 from rig.base.errors import InputError
 from rig.channels.faults import KINDS
 from rig.channels.faults.converter import Clock
-from rig.channels.faults.kind import At
+from rig.channels.faults.kind import At, Kind
 from rig.channels.table import Channel
 from rig.run.scenes import load_scene, parse_scene
 from rig.run.simulation import Simulation
-from tests.unit.test_channel_faults import EXAMPLES, differs, run
+from tests.fault_cases import EXAMPLES
+from tests.unit.test_channel_faults import differs, run
 
 SCENE = load_scene("stable-run", {"duration_s": 0.2, "sensors.groups": ["probes", "forces", "drive"]})
 TINY: dict[str, tuple[str, dict[str, Any], str]] = {
@@ -36,10 +37,6 @@ RARE: dict[str, tuple[str, str]] = {
     "duplicate-blocks": ("forces", "part"), "reorder-blocks": ("forces", "part"), "miss-pulses": ("keyphasor", "part"),
     "extra-pulses": ("keyphasor", "part"),
 }  # fmt: skip
-SIZELESS = {
-    "polarity", "stuck", "open", "short", "swap", "no-filter", "resonance", "bits", "stuck-bit", "freeze", "dropout",
-    "stale-stamps", "restart",
-}  # fmt: skip
 
 
 def refused(request: dict[str, Any], scene: Any = SCENE) -> str:
@@ -53,8 +50,10 @@ def refused(request: dict[str, Any], scene: Any = SCENE) -> str:
     return str(caught.value)
 
 
-def test_every_kind_with_a_size_is_looked_at() -> None:
-    assert {*TINY, *RARE, "crosstalk", "late-blocks"} | SIZELESS == set(KINDS)
+def test_every_kind_with_a_size_has_a_case() -> None:
+    """A kind whose effect can be too small, or too rare, says so by a `reach_v` or a `chance` of its own."""
+    sized = {name for name, kind in KINDS.items() if (kind.reach_v, kind.chance) != (Kind.reach_v, Kind.chance)}
+    assert not sized - {*TINY, *RARE, "crosstalk", "late-blocks"}, "TINY or RARE must have a case of each"
 
 
 @pytest.mark.parametrize("kind", TINY)

@@ -11,7 +11,8 @@ import pytest
 from rig.base.errors import InputError
 from rig.run.scenes import load_scene, parse_scene, scene_document
 from rig.run.simulation import Simulation
-from tests.unit.test_channel_faults import EXAMPLES, differs, run
+from tests.fault_cases import EXAMPLES
+from tests.unit.test_channel_faults import differs, run
 
 SCENE = load_scene(
     "test-sine", {"duration_s": 0.4, "sensors.groups": ["probes", "forces", "drive"], "generator.frequency_hz": 1000.0}

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from rig.channels.faults import KINDS
+from tests.fault_cases import MONITORED, MONITORED_PULSES
 from tests.unit import protection_acceptance as table
 from tests.unit.protection_acceptance import monitor, outcome, sine
 
@@ -50,9 +50,9 @@ def test_ok_limits_are_where_they_are_told(volts: float, okay: bool) -> None:
     assert found == ([] if okay else [("disk_x", 5000)]), "the fault begins at 0.25 s"
 
 
-@pytest.mark.parametrize("kind", table.FAULTS)
+@pytest.mark.parametrize("kind", MONITORED)
 def test_a_fault_comes_to_what_the_vote_says(kind: str) -> None:
-    numbers, expected = table.FAULTS[kind]
+    numbers, expected = MONITORED[kind]
     rows = sine(200.0, duration_s=0.8, commands=[table.fault(kind, **numbers)])
     assert tuple(table.judged(rows, *vote) for vote in table.VOTES) == expected
 
@@ -66,17 +66,11 @@ def test_the_edge_of_a_cable_that_breaks_is_a_danger_without_a_delay_alone() -> 
         assert [(action.name, action.row) for action in actions if action.kind == "not-ok"] == [("disk_x", 5003)]
 
 
-@pytest.mark.parametrize("kind", table.PULSES)
+@pytest.mark.parametrize("kind", MONITORED_PULSES)
 def test_a_fault_of_the_keyphasor_comes_to_what_is_told(kind: str) -> None:
-    numbers, expected = table.PULSES[kind]
+    numbers, expected = MONITORED_PULSES[kind]
     given = monitor(overspeed_hz=7.0, speed_lost_s=0.3)
     assert kinds(given, table.keyphasor(kind, **numbers)) - {"clear"} == expected
-
-
-def test_all_kinds_of_faults_are_judged() -> None:
-    assert set(KINDS) - set(table.FAULTS) - set(table.PULSES) == {"no-filter", "bandwidth"}, (
-        "test signals have no filter"
-    )
 
 
 @pytest.mark.parametrize(("ramp_hz_s", "delay_s", "established"), table.WHIRL)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +14,6 @@ from recorder.reader import Recording
 from replays.score.card.scorecard import FAIL, Scorecard
 from replays.score.judgement import judge
 from replays.sessions.session import FOLDER
-from rig.channels.faults import KINDS
 from rig.channels.faults.kind import Setting
 from rig.channels.sensors.conditioning import Conditioner
 from rig.channels.table import default_table
@@ -22,55 +21,9 @@ from rig.physics.kernels.observe import EDGE, KEYPHASOR_WIDTH
 from rig.physics.kernels.signals import COLUMN, N_ROW
 from rig.run.commands.table import FaultCommand
 from rig.run.faulty import Faulty
+from tests.fault_cases import SCORED
 from tests.score_daqs import Tones, write_parquet, write_session
 
-LEFT = {"noise", "effective bits", "dynamic range"}
-
-
-class Declared(NamedTuple):
-    """A fault, and what it turns red where the DAQ samples by itself; where it takes counts, that they are altered."""
-
-    channel: str
-    numbers: dict[str, Any]
-    red: set[str]
-
-
-TABLE = {
-    "gain": Declared("disk_x", {"factor": 1.001}, {"gain"}),
-    "offset": Declared("disk_y", {"value": 0.01}, {"offset"}),
-    # Over a run its mean is an offset, and the rest of it is left.
-    "drift": Declared("ring_x", {"rate": 0.1}, {"offset", *LEFT}),
-    "polarity": Declared("P_N", {}, {"polarity"}),
-    "resonance": Declared("P_W", {"frequency_hz": 800.0, "quality": 5.0}, {"corner", *LEFT}),
-    "stuck": Declared("P_S", {}, {"mapping"}),
-    "nonlinear": Declared("P_E", {"end": 4000.0}, {"gain", *LEFT}),
-    "open": Declared("outer_y", {}, {"mapping"}),
-    "short": Declared("inner_x", {}, {"mapping"}),
-    "intermittent": Declared("inner_y", {"slot_s": 0.002}, LEFT),
-    "hum": Declared("outer_x", {"amplitude_v": 0.02}, LEFT),
-    "crosstalk": Declared("P_W", {"source": "disk_x", "db": -30.0}, {"crosstalk", *LEFT}),
-    "saturation": Declared("disk_x", {"part": 0.2}, {"gain", *LEFT}),
-    "swap": Declared("disk_y", {"other": "ring_x"}, {"mapping"}),
-    # The filter was in what was sent: without it, all is earlier, and more of high frequencies.
-    "no-filter": Declared("P_N", {}, {"gain", "skew", *LEFT}),
-    # The same of another one in its place.
-    "bandwidth": Declared("P_S", {"corner_hz": 500.0}, {"corner"}),
-    "late": Declared("P_E", {"late_us": 3.0}, {"skew"}),
-    "clock": Declared("P_W", {"ppm": 500.0}, {"clock", "skew"}),
-    # None can be early, so that the mean of the next two is a delay; what they leave goes with the slope.
-    "jitter": Declared("ring_y", {"rms_us": 0.5}, {"jitter", "skew", "effective bits"}),
-    "wander": Declared("inner_y", {"amplitude_us": 1.0, "period_s": 0.1}, {"effective bits"}),
-    "noise": Declared("outer_x", {"factor": 3.0}, LEFT),
-    "spikes": Declared("outer_y", {"rate_hz": 50.0, "size_v": 0.5}, LEFT),
-    # Rounded down, and set, are on the mean an offset.
-    "bits": Declared("disk_x", {"lost": 13}, {"offset", *LEFT}),
-    "stuck-bit": Declared("disk_y", {"bit": 14}, {"offset", *LEFT}),
-    "clip": Declared("ring_x", {"part": 0.55}, {"gain", "offset", *LEFT}),
-    "freeze": Declared("P_N", {}, {"mapping"}),
-    "miss-pulses": Declared("keyphasor", {"part": 1.0}, {"mapping"}),
-    "extra-pulses": Declared("keyphasor", {"part": 1.0}, LEFT),
-    "edge-jitter": Declared("keyphasor", {"rms_us": 300.0}, set()),
-}
 RATE_HZ, ROWS_HZ, SECONDS, TURN_HZ = 20_000, 100_000, 0.5, 15.0
 GROUPS = [default_table().groups[name] for name in ("probes", "forces", "accelerations", "drive")]
 CHANNELS = [channel for group in GROUPS for channel in group.channels if channel.name != "speed"]
@@ -102,7 +55,7 @@ class Rig:
         chain = Conditioner(GROUPS, row_rate_hz=ROWS_HZ, seed=2, noise=noisy, columns=self.columns)
         faulty = Faulty(default_table(), [chain], seed=2, row_ticks=10, setting=Setting())
         for kind in faults:
-            command = {"channel": TABLE[kind].channel, "kind": kind, **TABLE[kind].numbers}
+            command = {"channel": SCORED[kind].channel, "kind": kind, **SCORED[kind].numbers}
             faulty.begin(FaultCommand.model_validate(command), 0, [])
         return faulty.counts(self.rows, self.made, 0)
 
@@ -124,7 +77,7 @@ def red(card: Scorecard) -> set[tuple[str, str]]:
 
 
 def declared(kinds: tuple[str, ...], what: set[str] | None = None) -> set[tuple[str, str]]:
-    return {(name, row) for kind in kinds for name in names_of(kind) for row in what or TABLE[kind].red}
+    return {(name, row) for kind in kinds for name in names_of(kind) for row in what or SCORED[kind].red}
 
 
 def daq(
@@ -140,18 +93,14 @@ def daq(
     return write_parquet(path, columns)
 
 
-def test_every_kind_is_declared() -> None:
-    assert set(TABLE) == {name for name, kind in KINDS.items() if not kind.of_blocks}
-
-
 def names_of(kind: str) -> set[str]:
-    return {TABLE[kind].channel, TABLE[kind].numbers.get("other", TABLE[kind].channel)}
+    return {SCORED[kind].channel, SCORED[kind].numbers.get("other", SCORED[kind].channel)}
 
 
 def together(most: int) -> list[tuple[str, ...]]:
     """Kinds of which no two are on one channel, so many at a time."""
     sets: list[tuple[str, ...]] = []
-    for kind in TABLE:
+    for kind in SCORED:
         taken = [
             n
             for n, each in enumerate(sets)

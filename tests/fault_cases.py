@@ -1,0 +1,145 @@
+"""Kinds of faults in tests: an example of each, and its effect on monitor, scorecard and blind validation.
+
+A new kind needs its entry in each of these tables; tests/unit/test_entries.py names the ones that lack it.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+EXAMPLES: dict[str, dict[str, Any]] = {
+    "gain": {"factor": 1.1}, "offset": {"value": 0.05}, "drift": {"rate": 5.0}, "polarity": {}, "stuck": {},
+    "nonlinear": {"end": 0.01}, "open": {"level_v": 1.0}, "short": {}, "intermittent": {"part": 0.5, "slot_s": 0.002},
+    "hum": {"amplitude_v": 0.1}, "crosstalk": {"source": "P_N", "db": -20.0}, "saturation": {"part": 0.001},
+    "swap": {"other": "speed"}, "no-filter": {}, "bandwidth": {"corner_hz": 50.0}, "late": {"late_us": 2000.0},
+    "clock": {"ppm": 5e4}, "jitter": {"rms_us": 100.0}, "wander": {"amplitude_us": 2000.0, "period_s": 0.05},
+    "noise": {"factor": 3.0}, "spikes": {"rate_hz": 500.0, "size_v": 0.5}, "bits": {"lost": 6},
+    "stuck-bit": {"bit": 8}, "clip": {"part": 1e-4}, "freeze": {}, "miss-pulses": {"part": 1.0},
+    "extra-pulses": {"part": 1.0}, "edge-jitter": {"rms_us": 300.0}, "resonance": {"frequency_hz": 80.0},
+}  # fmt: skip
+"""Numbers of each kind that changes channels; each changes counts of `disk_x` or of the keyphasor."""
+BLOCKS: dict[str, dict[str, Any]] = {
+    "dropout": {}, "lose-blocks": {"part": 0.5}, "duplicate-blocks": {"part": 0.5}, "reorder-blocks": {"part": 0.5},
+    "late-blocks": {"delay_s": 0.033}, "stale-stamps": {}, "restart": {},
+}  # fmt: skip
+"""Numbers of each kind that changes blocks."""
+
+BENIGN, ONE, BROKEN, BLIND = ("-",) * 4, ("T", "a", "a", "T"), ("N", "N", "N", "TN"), ("N", "N", "TN", "TN")
+MONITORED: dict[str, tuple[dict[str, Any], tuple[str, ...]]] = {
+    # kind: its numbers, outcome by vote (VOTES of protection_acceptance); the signal is 200 um peak-to-peak at 10 Hz.
+    # A level of its own above 1000 um, within the OK limits: one probe in danger.
+    "gain": ({"factor": 8.0}, ONE),
+    "offset": ({"value": 1.2}, ONE),
+    "hum": ({"amplitude_v": 2.5}, ONE),
+    "stuck-bit": ({"bit": 21}, ONE),  # 2^21 of 2^24 counts over 40 V: 5 V, 1.27 mm
+    # An output at 0 V, or beyond what the converter still gives: NOT OK in time, no alarm of this probe.
+    "open": ({}, BROKEN),
+    "short": ({}, BROKEN),
+    "intermittent": ({"part": 0.2}, BROKEN),
+    "clip": ({"part": 0.05}, BROKEN),  # at -1 V
+    # On its way to the OK limit, 1.9 mm at 20 mm/s, it is above 500 um for longer than the delay; above 1000, not.
+    "drift": ({"rate": 20.0}, ("aN", "aN", "aN", "TN")),
+    # What leaves the level where it is, or makes it less.
+    **{kind: ({}, BENIGN) for kind in ("polarity", "stuck", "freeze")},
+    "nonlinear": ({"end": 0.02}, BENIGN),
+    "resonance": ({"frequency_hz": 200.0}, BENIGN),
+    "crosstalk": ({"source": "disk_y", "db": -6.0}, BENIGN),
+    "saturation": ({"part": 0.01}, BENIGN),
+    "swap": ({"other": "disk_y"}, BENIGN),
+    "late": ({"late_us": 1000.0}, BENIGN),
+    "clock": ({"ppm": 100.0}, BENIGN),
+    "jitter": ({"rms_us": 5.0}, BENIGN),
+    "wander": ({"amplitude_us": 100.0}, BENIGN),
+    "noise": ({"factor": 100.0}, BENIGN),  # 25 um rms
+    "spikes": ({"rate_hz": 10.0, "size_v": 1.0}, BENIGN),  # 250 um
+    "bits": ({"lost": 8}, BENIGN),
+    # Of blocks: half a second without any is longer than the window, and so are numbers that begin anew.
+    "dropout": ({"channel": "probes"}, BLIND),
+    "restart": ({"channel": "probes"}, BLIND),
+    **{kind: ({"channel": "probes"}, BENIGN) for kind in ("lose-blocks", "duplicate-blocks", "reorder-blocks")},
+    "late-blocks": ({"channel": "probes", "delay_s": 0.1}, BENIGN),
+    "stale-stamps": ({"channel": "probes"}, BENIGN),
+}
+MONITORED_PULSES: dict[str, tuple[dict[str, Any], set[str]]] = {
+    # kind: its numbers, what comes of it at 6.2 Hz, where 7 Hz for three turns are too fast, and 0.3 s without a pulse.
+    "miss-pulses": ({"part": 1.0}, {"speed-lost"}),
+    "extra-pulses": ({"part": 1.0}, {"overspeed", "trip"}),
+    "edge-jitter": ({"rms_us": 100.0}, set()),
+}
+
+LEFT = {"noise", "effective bits", "dynamic range"}
+
+
+class Declared(NamedTuple):
+    """A fault, and what it turns red where the DAQ samples by itself; where it takes counts, that they are altered."""
+
+    channel: str
+    numbers: dict[str, Any]
+    red: set[str]
+
+
+SCORED = {
+    "gain": Declared("disk_x", {"factor": 1.001}, {"gain"}),
+    "offset": Declared("disk_y", {"value": 0.01}, {"offset"}),
+    # Over a run its mean is an offset, and the rest of it is left.
+    "drift": Declared("ring_x", {"rate": 0.1}, {"offset", *LEFT}),
+    "polarity": Declared("P_N", {}, {"polarity"}),
+    "resonance": Declared("P_W", {"frequency_hz": 800.0, "quality": 5.0}, {"corner", *LEFT}),
+    "stuck": Declared("P_S", {}, {"mapping"}),
+    "nonlinear": Declared("P_E", {"end": 4000.0}, {"gain", *LEFT}),
+    "open": Declared("outer_y", {}, {"mapping"}),
+    "short": Declared("inner_x", {}, {"mapping"}),
+    "intermittent": Declared("inner_y", {"slot_s": 0.002}, LEFT),
+    "hum": Declared("outer_x", {"amplitude_v": 0.02}, LEFT),
+    "crosstalk": Declared("P_W", {"source": "disk_x", "db": -30.0}, {"crosstalk", *LEFT}),
+    "saturation": Declared("disk_x", {"part": 0.2}, {"gain", *LEFT}),
+    "swap": Declared("disk_y", {"other": "ring_x"}, {"mapping"}),
+    # The filter was in what was sent: without it, all is earlier, and more of high frequencies.
+    "no-filter": Declared("P_N", {}, {"gain", "skew", *LEFT}),
+    # The same of another one in its place.
+    "bandwidth": Declared("P_S", {"corner_hz": 500.0}, {"corner"}),
+    "late": Declared("P_E", {"late_us": 3.0}, {"skew"}),
+    "clock": Declared("P_W", {"ppm": 500.0}, {"clock", "skew"}),
+    # None can be early, so that the mean of the next two is a delay; what they leave goes with the slope.
+    "jitter": Declared("ring_y", {"rms_us": 0.5}, {"jitter", "skew", "effective bits"}),
+    "wander": Declared("inner_y", {"amplitude_us": 1.0, "period_s": 0.1}, {"effective bits"}),
+    "noise": Declared("outer_x", {"factor": 3.0}, LEFT),
+    "spikes": Declared("outer_y", {"rate_hz": 50.0, "size_v": 0.5}, LEFT),
+    # Rounded down, and set, are on the mean an offset.
+    "bits": Declared("disk_x", {"lost": 13}, {"offset", *LEFT}),
+    "stuck-bit": Declared("disk_y", {"bit": 14}, {"offset", *LEFT}),
+    "clip": Declared("ring_x", {"part": 0.55}, {"gain", "offset", *LEFT}),
+    "freeze": Declared("P_N", {}, {"mapping"}),
+    "miss-pulses": Declared("keyphasor", {"part": 1.0}, {"mapping"}),
+    "extra-pulses": Declared("keyphasor", {"part": 1.0}, LEFT),
+    "edge-jitter": Declared("keyphasor", {"rms_us": 300.0}, set()),
+}
+
+BLIND_CLASSES = {
+    # Names by which a kind goes that is right: what looks alike in what is recorded is one class.
+    "late": {"delay", "other noise"}, "clock": {"clock", "delay", "other noise"},
+    "wander": {"wander", "delay", "other noise"}, "jitter": {"jitter", "delay", "other noise"},
+    "open": {"open", "open or saturation", "open or short", "short", "open, short or stuck", "stuck"},
+    "short": {"open or short", "open", "short", "open, short or stuck"}, "stuck": {"stuck", "open, short or stuck"},
+    "saturation": {"saturation", "open or saturation"}, "clip": {"clip", "freeze"}, "freeze": {"freeze", "clip"},
+    "intermittent": {"intermittent", "open", "short", "open or short", "open, short or stuck"},
+    "miss-pulses": {"miss-pulses", "open, short or miss-pulses"}, "edge-jitter": {"edge-jitter", "delay"},
+    "crosstalk": {"crosstalk", "offset"}, "swap": {"swapped"},
+}  # fmt: skip
+BLIND_SIZES: dict[str, tuple[str, list[dict[str, Any]]]] = {
+    "gain": ("P_E", [{"factor": 1.005}, {"factor": 1.5}]), "offset": ("ring_x", [{"value": 0.002}, {"value": 0.2}]),
+    "drift": ("P_N", [{"rate": 2.0}, {"rate": 200.0, "tau_s": 0.05}]), "polarity": ("inner_y", [{}]),
+    "resonance": ("P_E", [{"frequency_hz": 300.0, "quality": 20.0}]), "stuck": ("P_S", [{}]),
+    "nonlinear": ("disk_x", [{"end": 5.0}, {"end": 1.0}]), "open": ("disk_y", [{}]),
+    "short": ("P_S", [{}]), "intermittent": ("disk_x", [{"part": 0.2, "slot_s": 0.002}]),
+    "hum": ("ring_x", [{"amplitude_v": 0.005}, {"amplitude_v": 0.3, "frequency_hz": 60.0, "third": 0.5}]),
+    "crosstalk": ("disk_x", [{"source": "disk_y", "db": -60.0}]), "saturation": ("P_E", [{"part": 0.32}]),
+    "swap": ("P_N", [{"other": "P_S"}, {"other": "inner_y"}]), "no-filter": ("inner_x", [{}]),
+    "bandwidth": ("P_E", [{"corner_hz": 3000.0}, {"corner_hz": 200.0}]),
+    "late": ("P_E", [{"late_us": 5.0}, {"late_us": 500.0}]), "clock": ("disk_x", [{"ppm": 1000.0}, {"ppm": -3000.0}]),
+    "jitter": ("disk_x", [{"rms_us": 5.0}]), "wander": ("disk_x", [{"amplitude_us": 50.0, "period_s": 0.1}]),
+    "noise": ("P_E", [{"factor": 1.2}]), "spikes": ("P_E", [{"rate_hz": 40.0, "size_v": 0.02}]),
+    "bits": ("disk_x", [{"lost": 2}]), "stuck-bit": ("disk_x", [{"bit": 12}]), "clip": ("P_E", [{"part": 0.32}]),
+    "freeze": ("ring_y", [{}]), "miss-pulses": ("keyphasor", [{"part": 0.5}]),
+    "extra-pulses": ("keyphasor", [{"part": 0.5}]), "edge-jitter": ("keyphasor", [{"rms_us": 300.0}]),
+}  # fmt: skip
