@@ -83,6 +83,17 @@ def test_an_engine_has_a_module_a_row_and_a_contract() -> None:
     require(missing)
 
 
+def test_an_observed_signal_is_computed() -> None:
+    """Compare texts: to import and run the kernels would compile them anew after such a change."""
+    kernels = "rig/physics/kernels"
+    table = (ROOT / kernels / "signals.py").read_text()
+    stages = "".join(path.read_text() for path in (ROOT / kernels).rglob("*.py") if path.name != "signals.py")
+    places = re.findall(r"^(?:(\w+) = )?_observed\(\s*\"(\w+)\"", table, re.MULTILINE)
+    assert len(places) > 20
+    require([f"signal {name}: {kernels}/observe.py must have the line that computes it"
+             for constant, name in places if not constant or not re.search(rf"\b{constant}\b", stages)])  # fmt: skip
+
+
 def test_a_channel_stands_in_the_generated_files() -> None:
     require([*missing_in_generated_files()])
 
