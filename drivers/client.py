@@ -34,7 +34,7 @@ from drivers.sources.stream import RigStream
 from drivers.sources.turns import HALF, Turn, edges, turn_in
 from rig.base import wire
 from rig.base.errors import InputError, RefusedError, UnknownNameError, Words
-from rig.serve.intake import BlockEnd, Catalogue, block_end_in, event_in
+from rig.serve.stream_check import BlockEnd, Catalogue, block_end_in, event_in
 from rig.serve.transport import DEFAULT_ENDPOINT, Client
 from rig.serve.waiting import Deadline
 

@@ -11,7 +11,7 @@ from functools import partialmethod
 from typing import Any, Self
 
 from rig.base import wire
-from rig.base.closing import Closing
+from rig.base.closeable import Closing
 from rig.base.errors import InputError, RefusedError
 from rig.run.commands import SUMMARIES
 from rig.serve.transport import DEFAULT_ENDPOINT, Client, NoReplyError

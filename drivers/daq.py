@@ -20,7 +20,7 @@ import numpy as np
 from drivers.link import LinkTimeoutError
 from drivers.sources import Source, open_source
 from drivers.sources.samples import Pile, RowReader, Samples, StreamEndedError, follow
-from rig.base.closing import Closing
+from rig.base.closeable import Closing
 from rig.base.errors import InputError, UnknownNameError, Words
 from rig.base.wire import Continuity, Gap
 

@@ -14,15 +14,15 @@ from typing import Any, Self
 import numpy as np
 
 from recorder.contents import documents
+from recorder.contents.inventory import OnBlock, Stream, Survey
 from recorder.contents.recording_file import Message, RecordingFile
 from recorder.contents.samples import row_times_s, samples_of
-from recorder.contents.survey import OnBlock, Stream, Survey
 from recorder.files import schemas
 from recorder.files.chunks import Chunk
 from rig.base.errors import InputError, UnknownNameError, Words
 from rig.base.samples import Samples, joined
 from rig.base.wire import EDGES, EVENTS, FAULTS, STATUS, Block, Gap, schema_of, sensor_key, truth_key
-from rig.channels.faults.declared import Declared, in_order
+from rig.channels.faults.ledger import Declared, in_order
 
 
 class Recording:

@@ -20,17 +20,17 @@ import numpy as np
 
 from recorder.contents import documents
 from recorder.contents.counts import Counts
-from recorder.contents.head import Beginning, Commands
+from recorder.contents.metadata import Beginning, Commands
 from recorder.files import schemas
-from recorder.files.draft import check_destination
 from recorder.files.payload import Payload, tick_in
 from recorder.files.records import COPY
+from recorder.files.unfinished_file import check_destination
 from recorder.reader import Recording
 from recorder.writer import RecordingWriter
+from rig.base.checks import open_file, unreadable
 from rig.base.errors import PART_SUFFIX, InputError, Words, check_not_among
-from rig.base.outside import open_file, unreadable
 from rig.base.wire import EDGES, FAULTS, SENSORS, TRUTH, Block, encode_block, schema_of
-from rig.channels.faults.declared import Declared
+from rig.channels.faults.ledger import Declared
 
 _TELL_EVERY = 5000
 """Messages between two reports of progress."""

@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any
 
 from recorder.contents.counts import NS, Counts
-from recorder.contents.head import Beginning
+from recorder.contents.metadata import Beginning
 from recorder.contents.summary import Progress, Summary
 from recorder.files.payload import Payload
 from recorder.output.captures import Captures, capture_path, check_captures
-from recorder.output.room import Limits
+from recorder.output.disk_limits import Limits
 from recorder.output.series import Series, check_series, part_path
 from recorder.output.sink import Needs, Sink
 from recorder.output.trigger import Capture
@@ -23,7 +23,7 @@ from recorder.writer import RecordingError, RecordingWriter, check_view_rate
 from rig.base import wire
 from rig.base.errors import InputError
 from rig.base.text import printable
-from rig.serve.intake import Catalogue, Intake, Taken
+from rig.serve.stream_check import Catalogue, Intake, Taken
 from rig.serve.transport import Client
 from rig.serve.transport.clients import Reporter
 from rig.serve.waiting import BoundedQueue

@@ -11,12 +11,12 @@ from typing import Any, Self
 
 from recorder.contents.counts import NS, Counts, Tally
 from recorder.contents.documents import definition_of
-from recorder.contents.head import Beginning, Head, about_view, instant
+from recorder.contents.metadata import Beginning, Head, about_view, instant
 from recorder.contents.views import Messages, View, Views
 from recorder.files import schemas
-from recorder.files.draft import Draft
 from recorder.files.mcap_file import McapFile
 from recorder.files.payload import Payload
+from recorder.files.unfinished_file import Draft
 from rig.base.errors import DiskError, InputError
 from rig.base.wire import EDGES, EVENTS, Gap, encode_document
 

@@ -48,14 +48,20 @@ _FAULTS = (
 )
 TESTS = {
     "replays/score/": ("score*", "time_order", "outcome"),
-    "rig/run/faulty.py": _FAULTS, "rig/channels/faults/": _FAULTS,
+    "rig/run/fault_injection.py": _FAULTS, "rig/channels/faults/": _FAULTS,
     "replays/recordings/validation/": (
         "faults", "validation", "verdict", "outcome", "declared_faults", "blind_faults", "events",
     ),
-    "rig/units.": ("units", "time_columns", "import"),
+    "rig/base/units.": ("units", "time_columns", "import"),
 }  # fmt: skip
 """Test files of each folder or module: patterns of their names."""
-MUTATED = ("replays/score", "rig/run/faulty.py", "rig/faults", "replays/recordings/validation", "rig/base/units.py")
+MUTATED = (
+    "replays/score",
+    "rig/run/fault_injection.py",
+    "rig/channels/faults",
+    "replays/recordings/validation",
+    "rig/base/units.py",
+)
 _TURNED = {
     ast.Lt: ">=", ast.LtE: ">", ast.Gt: "<=", ast.GtE: "<", ast.Eq: "!=", ast.NotEq: "==", ast.In: "not in",
     ast.NotIn: "in", ast.Is: "is not", ast.IsNot: "is",

@@ -14,8 +14,8 @@ import numpy as np
 
 from drivers.can.bus import codec
 from drivers.can.bus.node import NodeBus
+from rig.base.checks import read_json
 from rig.base.errors import InputError, RefusedError
-from rig.base.outside import read_json
 from rig.serve.transport.endpoint import parse_loopback
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from drivers.link import FORMS, ROOM, Address, LinkClosedError, LinkTimeoutError
 from rig.base.errors import InputError
-from rig.serve.desk import one_line
+from rig.serve.request_handler import one_line
 from rig.serve.waiting import BoundedQueue, Deadline
 
 if TYPE_CHECKING:

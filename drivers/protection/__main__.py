@@ -13,8 +13,8 @@ from typing import Any, Literal, get_args, get_origin
 
 from drivers.protection.monitor import Action, Protection
 from drivers.protection.settings import Settings
+from rig.base.checks import check
 from rig.base.errors import InputError
-from rig.base.outside import check
 from rig.serve.transport import DEFAULT_ENDPOINT
 
 

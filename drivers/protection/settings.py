@@ -6,8 +6,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, FiniteFloat, ValidationError, model_validator
 
+from rig.base.checks import Name, Written, input_error
 from rig.base.errors import InputError
-from rig.base.outside import Name, Written, input_error
 
 Above0 = Annotated[FiniteFloat, Field(gt=0.0, le=1e9)]
 Seconds = Annotated[FiniteFloat, Field(ge=0.0, le=86_400.0)]

@@ -25,7 +25,7 @@ from drivers.can.signals import (
 )
 from drivers.sources.can import CanSource
 from rig.base import wire
-from rig.base.closing import Closing
+from rig.base.closeable import Closing
 from rig.base.errors import InputError, Words
 from rig.serve.transport import NoReplyError
 from rig.serve.waiting import Deadline

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from rig.base import wire
 from rig.base.errors import InputError
 from rig.channels.table import ChannelTable, Group
-from rig.serve.intake import Catalogue, Intake, Taken, event_in
+from rig.serve.stream_check import Catalogue, Intake, Taken, event_in
 from rig.serve.transport import Client, NoReplyError
 
 GRACE_S = 2.0

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 
 from recorder.files.payload import Payload
 from rig.base.wire import EDGES, FAULTS, Gap
-from rig.channels.faults.declared import Declared
+from rig.channels.faults.ledger import Declared
 
 NS = 1_000_000_000
 

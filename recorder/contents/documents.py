@@ -9,8 +9,8 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from recorder.files import schemas
+from rig.base.checks import Count, input_error, read_json
 from rig.base.errors import InputError
-from rig.base.outside import Count, input_error, read_json
 from rig.base.wire import EVENTS, FAULTS, STATUS, schema_of
 from rig.channels.table import ChannelTable
 

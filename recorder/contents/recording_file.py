@@ -17,10 +17,10 @@ from recorder.files import schemas
 from recorder.files.chunks import Chunk, DamagedError, messages, unpack
 from recorder.files.payload import block_in
 from recorder.files.records import COPY, MAGIC, read_contents
+from rig.base.checks import open_file, read_json, unreadable
 from rig.base.errors import InputError, Words
-from rig.base.outside import open_file, read_json, unreadable
 from rig.base.wire import EVENTS, FAULTS, Block
-from rig.serve import intake
+from rig.serve import stream_check
 
 _OURS = "a recording made by `rig record`"
 _REACH_S = 0.25
@@ -114,7 +114,7 @@ class RecordingFile:
         if self.damaged and not salvage:
             must, several = "an intact recording (`rig recover` passes over what is damaged)", "s" * (self.damaged > 1)
             raise InputError("file", must, Words(f"{self.path}, with {self.damaged} damaged record{several}"))
-        self._catalogue = intake.Catalogue.read(self.catalogue)
+        self._catalogue = stream_check.Catalogue.read(self.catalogue)
         self.table = self._catalogue.table
 
     @property
@@ -140,7 +140,7 @@ class RecordingFile:
         return min(each.begin_ns for each in self.chunks) / 1e9, max(each.end_ns for each in self.chunks) / 1e9
 
     @cached_property
-    def promises(self) -> dict[str, intake.Promise]:
+    def promises(self) -> dict[str, stream_check.Promise]:
         """What the catalogue promises of each stream, by key."""
         return self._catalogue.promises()
 
@@ -175,7 +175,7 @@ class RecordingFile:
         except ValueError:
             return None
         columns = block.values.shape[1]
-        promise = self.promises.get(key, intake.Promise(columns, 0.0, self._catalogue.tick_rate_hz))
+        promise = self.promises.get(key, stream_check.Promise(columns, 0.0, self._catalogue.tick_rate_hz))
         return block if (columns, block.tick_rate_hz) == (promise.columns, promise.tick_rate_hz) else None
 
     def stamped(self, topics: Container[str] | None, chunks: Iterable[Chunk] | None = None) -> Iterator[Message]:

@@ -14,8 +14,8 @@ from mcap.stream_reader import MAGIC_SIZE
 from mcap.writer import Writer
 
 from recorder.files.chunks import CHUNK, RECORD
-from recorder.files.draft import Draft
 from recorder.files.schemas import TEXT, Definition, wrap_text
+from recorder.files.unfinished_file import Draft
 
 _CHUNK_BYTES = 1 << 20
 _CHUNK_LIST = "_Writer__chunk_indices"

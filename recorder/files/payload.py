@@ -14,7 +14,7 @@ from typing import Any, Self
 import numpy as np
 
 from rig.base.wire import EDGES, EVENTS, Block, decode_block, decode_document, schema_of
-from rig.serve.intake import Taken, event_in
+from rig.serve.stream_check import Taken, event_in
 
 _MOST = 1 << 53
 """Ticks up to here are exact in every number that they become: 285 years of microseconds."""

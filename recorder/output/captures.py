@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from recorder.contents.counts import NS
-from recorder.contents.head import Beginning, Commands
-from recorder.files.draft import files_like, remove
+from recorder.contents.metadata import Beginning, Commands
 from recorder.files.payload import Payload
-from recorder.output.room import Limits, check_files
+from recorder.files.unfinished_file import files_like, remove
+from recorder.output.disk_limits import Limits, check_files
 from recorder.output.sink import Needs, Sink
 from recorder.output.trigger import Capture, Crossings, Trigger
 from recorder.writer import RecordingError, RecordingWriter

@@ -14,10 +14,10 @@ from collections import deque
 from pathlib import Path
 
 from recorder.contents.counts import NS, Counts
-from recorder.contents.head import Beginning
-from recorder.files.draft import files_like, remove
+from recorder.contents.metadata import Beginning
 from recorder.files.payload import Payload
-from recorder.output.room import MB, Limits, check_files
+from recorder.files.unfinished_file import files_like, remove
+from recorder.output.disk_limits import MB, Limits, check_files
 from recorder.output.sink import Needs, Sink
 from recorder.writer import RecordingError, RecordingWriter
 from rig.base.errors import InputError

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from recorder.contents.counts import Counts, Tally
-from recorder.contents.head import Beginning, Commands
+from recorder.contents.metadata import Beginning, Commands
 from recorder.files.payload import Payload
-from recorder.output.room import Limits, Room
+from recorder.output.disk_limits import Limits, Room
 from recorder.writer import RecordingWriter
 from rig.channels.table import ChannelTable
 

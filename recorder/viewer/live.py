@@ -18,7 +18,7 @@ from recorder.viewer.painter import Painter
 from rig.base import wire
 from rig.base.text import printable
 from rig.channels.table import ChannelTable
-from rig.serve.intake import Catalogue, Intake, event_in
+from rig.serve.stream_check import Catalogue, Intake, event_in
 from rig.serve.transport import Client
 from rig.serve.transport.clients import Reporter
 

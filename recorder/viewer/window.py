@@ -23,7 +23,7 @@ from rerun.experimental import ViewerClient, ViewerState
 
 from recorder.viewer.canvas import PICTURE, SIMULATED
 from recorder.viewer.page import Page
-from rig.base.closing import Closing
+from rig.base.closeable import Closing
 from rig.base.errors import InputError, Words
 from rig.serve.waiting import Deadline
 

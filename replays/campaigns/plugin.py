@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from replays.campaigns.equipment.bench import Bench
     from replays.campaigns.equipment.device import Device
     from replays.campaigns.equipment.record import Record
+    from replays.campaigns.evidence import Trial
     from replays.campaigns.files.campaign import Case
-    from replays.campaigns.trial import Trial
 
 _SUFFIX = ".campaign.toml"
 _TRIAL: pytest.StashKey[Trial] = pytest.StashKey()
@@ -112,7 +112,7 @@ class CampaignItem(pytest.Item):
     def repr_failure(self, excinfo: pytest.ExceptionInfo[BaseException], style: Any = None) -> Any:
         """A line for each value that is not as it must be, or the one of what failed."""
         from replays.campaigns.equipment.bench import BenchError
-        from replays.campaigns.trial import MeasurementError
+        from replays.campaigns.evidence import MeasurementError
         from rig.base.errors import DiskError, InputError
 
         if isinstance(excinfo.value, BenchError | InputError | DiskError | ConnectionError | TimeoutError):
@@ -161,7 +161,7 @@ def pytest_report_teststatus(report: pytest.TestReport | pytest.CollectReport) -
 
 def _trial_of(item: pytest.Item) -> Trial:
     from replays.campaigns.equipment.bench import Target
-    from replays.campaigns.trial import Trial
+    from replays.campaigns.evidence import Trial
 
     options = item.config.option
     replay = None if options.rig_replay is None else Path(options.rig_replay).absolute()
@@ -182,7 +182,7 @@ def rig_trial(request: pytest.FixtureRequest) -> Iterator[Trial]:
 def bench(request: pytest.FixtureRequest, rig_trial: Trial) -> Bench:
     """A rig of the test's own, in lockstep unless `@pytest.mark.bench(...)` says else: `bench.connect(...)`."""
     from replays.campaigns.equipment.bench import NotThereError
-    from replays.campaigns.marker import settings_of
+    from replays.campaigns.mark_arguments import settings_of
 
     marker = request.node.get_closest_marker("bench")
     try:

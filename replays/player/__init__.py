@@ -2,5 +2,5 @@
 
 `track` reads the files, `timeline` puts the payloads in the order of their deadlines, `readahead` reads while others
 wait, `edit` changes keys, channels and numbers, `outlet` publishes and counts, `playhead` keeps the time of the play,
-`passes` says which part is played how often, and `player` serves it and obeys.
+`play_range` says which part is played how often, and `player` serves it and obeys.
 """

@@ -14,17 +14,17 @@ from dataclasses import dataclass
 from typing import Any
 
 from replays.player.edit import Edit
+from replays.player.messages import Track
 from replays.player.outlet import Outlet
-from replays.player.passes import Mark, Part, Passes, has_block, size_of
+from replays.player.play_range import Mark, Part, Passes, has_block, size_of
 from replays.player.playhead import NS, Playhead
 from replays.player.readahead import ReadAhead
 from replays.player.timeline import Batch, By, Timeline
-from replays.player.track import Track
 from rig.base import wire
 from rig.base.errors import InputError, RefusedError, Words
 from rig.base.text import finite
-from rig.serve.desk import Pending, Rate, Seek, Step
 from rig.serve.pacing import FreeRun, RealTime
+from rig.serve.request_handler import Pending, Rate, Seek, Step
 from rig.serve.served_run import ServedRun
 from rig.serve.service import COMMANDS, REPLAY_COMMANDS
 from rig.serve.transport import Server

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from itertools import accumulate
 
-from replays.player.track import Message, Track
+from replays.player.messages import Message, Track
 from rig.base import wire
 
 _NS = 1_000_000_000

@@ -233,7 +233,7 @@ class McapRun:
         self._background = Background()
 
     def __enter__(self) -> Self:
-        from recorder.contents.head import Beginning
+        from recorder.contents.metadata import Beginning
         from recorder.writer import RecordingWriter
 
         epoch_ns = self._epoch_ns

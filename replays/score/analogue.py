@@ -12,7 +12,7 @@ from replays.estimate.intervals import about, pooled, sandwich, scaled, student
 from replays.estimate.least_squares import solve
 from replays.estimate.sine import fit_sine, is_sine, quality
 from replays.score.alignment.alignment import align
-from replays.score.alignment.following import Alignment, Source
+from replays.score.alignment.one_begin import Alignment, Source
 from replays.score.alignment.stamps import Stamps
 from replays.score.card.scorecard import (
     ANALOGUE,

@@ -3,7 +3,7 @@
 A block is one CDR message (little-endian, ROS 2 message definitions below), so that any reader of ROS 2 messages
 decodes it without this project. A document is JSON. A stream is an event `start`, blocks, and an event `end` with a
 reason; any step of a block's index other than its length is a gap, counted by `Continuity` and never hidden. What of
-it comes from outside is taken by an `Intake` (`rig.serve.intake`).
+it comes from outside is taken by an `Intake` (`rig.serve.stream_check`).
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from rig.base.outside import read_json
+from rig.base.checks import read_json
 
 ROOT = "rig"
 STATUS = f"{ROOT}/status"
@@ -188,7 +188,7 @@ def decode_document(payload: bytes) -> dict[str, Any]:
     """The JSON document in a payload.
 
     Raises:
-        InputError: The payload is no JSON object, or one out of bounds (`rig.base.outside`).
+        InputError: The payload is no JSON object, or one out of bounds (`rig.base.checks`).
     """
     return read_json(payload)
 

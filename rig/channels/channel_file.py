@@ -34,8 +34,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, ConfigDict, Field
 
+from rig.base.checks import TOML_BYTES, Written, check, open_file, read_toml
 from rig.base.errors import InputError, UnknownNameError, Words
-from rig.base.outside import TOML_BYTES, Written, check, open_file, read_toml
 from rig.base.text import printable
 from rig.channels.sampling import TICKS_HZ
 from rig.channels.table import TABLE, Channel, ChannelTable, raw_groups, table_of

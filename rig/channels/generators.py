@@ -28,8 +28,8 @@ from typing import Annotated, Any, Literal, NamedTuple
 import numpy as np
 from pydantic import Field, field_validator
 
+from rig.base.checks import Written
 from rig.base.errors import InputError, UnknownNameError, Words
-from rig.base.outside import Written
 from rig.channels.table import Channel, ChannelTable
 from rig.channels.waveform import Waveform, exact, read_waveform
 

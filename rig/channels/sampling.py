@@ -9,8 +9,8 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, field_validator
 
+from rig.base.checks import Written
 from rig.base.errors import InputError
-from rig.base.outside import Written
 from rig.channels.table import ChannelTable
 
 TICKS_HZ = 1_000_000

@@ -15,8 +15,8 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import BaseModel, Field, FiniteFloat, PositiveFloat, PositiveInt, model_validator
 
+from rig.base.checks import check, parse_toml
 from rig.base.errors import InputError, UnknownNameError, Words
-from rig.base.outside import check, parse_toml
 
 VERSION = 2
 """Of tables that are made now: another one whenever the rig's own changes, as recordings are held against it."""

@@ -10,8 +10,8 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field, FiniteFloat, model_validator
 
+from rig.base.checks import Written, open_file
 from rig.base.errors import InputError, Words
-from rig.base.outside import Written, open_file
 
 _MOST, _BYTES = 200_000, 8 << 20
 """Most numbers of a waveform, and most bytes of its file: every recording of it holds it."""

@@ -11,7 +11,7 @@ import typer
 
 from rig.base.errors import WHOLE_RIG, DiskError, InputError, SimulationError, lacks_full, need_of_full
 from rig.cli.command import Group, load_command, made_command, make_group, usage_error
-from rig.cli.output import origin
+from rig.cli.output import provenance
 from rig.cli.output.tables import echo
 from rig.run.commands import SUMMARIES
 
@@ -143,7 +143,7 @@ def start(arguments: list[str] | None = None) -> None:
 
         sys.stdout.write("".join(f"{line}\n" for line in complete(rig(), *sys.argv[2:])))
         return
-    origin.given[:] = sys.argv[1:] if arguments is None else arguments
+    provenance.given[:] = sys.argv[1:] if arguments is None else arguments
     try:
         code = rig().main(arguments, prog_name="rig", standalone_mode=False)
     except InputError as error:

@@ -18,8 +18,8 @@ from pydantic import (
     model_validator,
 )
 
+from rig.base.checks import Written, describe_error
 from rig.base.errors import InputError, Words
-from rig.base.outside import Written, describe_error
 from rig.physics.engines import BROKEN, ENGINES, Engine, load_engine
 
 Limit = Annotated[FiniteFloat, Field(gt=0.0, strict=True)] | None

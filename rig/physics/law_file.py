@@ -15,8 +15,8 @@ from typing import Annotated, Any
 
 from pydantic import FiniteFloat
 
+from rig.base.checks import Written, a_line, check, read_toml
 from rig.base.errors import InputError, Words
-from rig.base.outside import Written, a_line, check, read_toml
 
 
 class ContactLaw(Written):

@@ -22,9 +22,9 @@ from pydantic import (
     field_validator,
 )
 
+from rig.base.checks import check, read_toml
 from rig.base.errors import InputError, UnknownNameError, such_as
 from rig.base.maths.expression import Grammar
-from rig.base.outside import check, read_toml
 
 SETS = Path(__file__).with_name("sets")
 DEFAULT_SET = "corrected"

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from rig.channels.faults import At, Kind, plugged
-from rig.channels.faults.sending import Active
+from rig.channels.faults.delivery import Active
 from rig.channels.generators import Instants, Source, exact
 from rig.channels.sampling import TICKS_HZ
 from rig.channels.sensors.keyphasor import FRACTIONS

@@ -10,8 +10,8 @@ from typing import Annotated, Any, Literal, get_args
 
 from pydantic import Field, FiniteFloat, field_validator, model_validator
 
+from rig.base.checks import Written, check, parse_toml, read_toml, table_in
 from rig.base.errors import InputError, Words, such_as
-from rig.base.outside import Written, check, parse_toml, read_toml, table_in
 from rig.channels.channel_file import check_table, read_channels
 from rig.channels.faults import Setting
 from rig.channels.formula import Formulas
@@ -24,7 +24,7 @@ from rig.physics.kernels.signals import COLUMN
 from rig.physics.levels import ModelLevels
 from rig.physics.parameters import DEFAULT_SET, ParameterSet, load_parameters, with_changes
 from rig.run.commands.table import SpeedCommand, TimedCommand, with_faults
-from rig.run.pick import Pick, digest, equations_digest
+from rig.run.model_choice import Pick, digest, equations_digest
 from rig.run.speed_target import Drive
 
 SCENES = Path(__file__).with_name("scenes")

@@ -19,7 +19,7 @@ import numpy as np
 
 from rig.base.errors import InputError, SimulationError, Words
 from rig.base.wire import ROOT, Block
-from rig.channels.faults.sending import Frame
+from rig.channels.faults.delivery import Frame
 from rig.channels.formula import check_computed, names_in
 from rig.channels.sensors.conditioning import Conditioner
 from rig.channels.sensors.keyphasor import Keyphasor
@@ -36,7 +36,7 @@ from rig.physics.model import build_model, describe
 from rig.run import calibrator
 from rig.run.commands.command import SceneCommand
 from rig.run.commands.table import check_command
-from rig.run.faulty import Faulty
+from rig.run.fault_injection import Faulty
 from rig.run.motion import BRANCH_ALARM, Begin, Motion, energy_balance, initial_state
 from rig.run.scenes import Scene, load_scene, scene_document
 from rig.run.speed_target import Segment, segments

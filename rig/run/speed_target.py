@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, FiniteFloat, field_validator
 
-from rig.base.outside import Written
+from rig.base.checks import Written
 
 _APART_S = 0.01
 """Least time between two points of a speed profile [s]: well above any step."""

@@ -10,8 +10,8 @@ from typing import Any
 from rig.base import wire
 from rig.base.errors import InputError
 from rig.base.text import finite
-from rig.serve.desk import Desk, Pending, one_line
 from rig.serve.pacing import Clock, StepTimeoutError, short_collections
+from rig.serve.request_handler import Desk, Pending, one_line
 from rig.serve.transport import Server
 
 _SUMMED_UP = (

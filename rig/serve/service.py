@@ -21,16 +21,16 @@ from rig.base.text import finite
 from rig.channels.faults import DOORS, Message
 from rig.run.commands import SUMMARIES
 from rig.run.commands.table import SERVICE_COMMANDS
-from rig.serve.desk import Done, Join, Kept, Leave, Note, Pending, Step
 from rig.serve.devices import Devices
 from rig.serve.pacing import Clock, Lockstep, RealTime
+from rig.serve.request_handler import Done, Join, Kept, Leave, Note, Pending, Step
 from rig.serve.served_run import ServedRun
 from rig.serve.transport import Server, doors_of
 from rig.serve.transport.limit import CommandLimit
 from rig.serve.waiting import BoundedQueue
 
 if TYPE_CHECKING:
-    from rig.channels.faults.sending import Frame
+    from rig.channels.faults.delivery import Frame
     from rig.run.simulation import Simulation
 
 COMMANDS = (*SUMMARIES, *SERVICE_COMMANDS)

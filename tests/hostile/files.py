@@ -15,7 +15,7 @@ import numpy as np
 import typer
 
 import replays
-from recorder.contents.head import Beginning
+from recorder.contents.metadata import Beginning
 from recorder.reader import Recording
 from recorder.writer import RecordingWriter
 from rig.base.wire import CATALOGUE, PARAMETERS, SCENE, Block, encode_block, encode_document, sensor_key
@@ -291,8 +291,8 @@ def uses() -> dict[str, Use]:
     """What is done with a recording, each through the door that a command uses."""
     from recorder.reader import join
     from recorder.rewrite import cut, recover
+    from replays.player.messages import Track
     from replays.player.timeline import By, Timeline
-    from replays.player.track import Track
     from replays.recordings.formats.exporting.export import export, merged
     from replays.recordings.formats.exporting.selection import select
     from replays.recordings.resimulation.experiment import Experiment

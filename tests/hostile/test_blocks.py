@@ -23,7 +23,7 @@ from drivers.link import LinkTimeoutError
 from drivers.sources.rig import RigSource
 from drivers.sources.samples import Samples, StreamEndedError
 from recorder.contents.summary import Summary
-from recorder.output.room import Limits
+from recorder.output.disk_limits import Limits
 from recorder.output.trigger import Capture, Trigger
 from recorder.reader import Recording, join
 from recorder.session import RecordingSession
@@ -31,7 +31,7 @@ from recorder.viewer import live
 from rig.base import wire
 from rig.base.errors import InputError
 from rig.channels.table import default_table
-from rig.serve.intake import Catalogue, Intake
+from rig.serve.stream_check import Catalogue, Intake
 from rig.serve.transport.memory import MemoryClient, MemoryServer
 from rig.serve.transport.zenoh import ZenohClient, ZenohServer
 from tests.hostile import inputs

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from recorder.contents.head import Head
+from recorder.contents.metadata import Head
 from recorder.reader import Recording
 from recorder.rewrite import cut, recover
 from replays.recordings.parameters import parameter_doubts

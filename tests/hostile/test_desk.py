@@ -12,8 +12,8 @@ import pytest
 from rig.base import wire
 from rig.run.commands.table import COMMANDS as DONE_TO_THE_RIG
 from rig.run.commands.table import check_command
-from rig.serve.desk import REQUESTS
 from rig.serve.pacing import Lockstep
+from rig.serve.request_handler import REQUESTS
 from rig.serve.service import COMMANDS, Service
 from rig.serve.transport.limit import CommandLimit
 from rig.serve.transport.memory import MemoryClient, MemoryServer

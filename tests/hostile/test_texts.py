@@ -30,8 +30,8 @@ from replays.recordings.formats.guessing.template import example
 from replays.recordings.formats.mapping import FileOptions, Mapping, load_mapping
 from replays.recordings.formats.source import open_source
 from replays.recordings.validation.criteria import DEFAULT, Criteria, load_criteria
+from rig.base.checks import check, read_toml
 from rig.base.errors import InputError
-from rig.base.outside import check, read_toml
 from rig.channels.table import TABLE, parse_table
 from rig.cli.main import main
 from rig.cli.output import tables

@@ -85,7 +85,7 @@ BREACHES = [
     ("replays.studies.laws", "replays.recordings.verdict", "Inside the replays"),
     ("replays.recordings.whirl", "replays.score.judgement", "Inside the replays"),
     ("replays.score.card.limits", "replays.campaigns.equipment.bench", "Inside the replays"),
-    ("replays.campaigns.equipment.bench", "replays.campaigns.trial", "No ring"),
+    ("replays.campaigns.equipment.bench", "replays.campaigns.evidence", "No ring"),
     ("replays.campaigns.files.expectation", "replays.campaigns.files.run", "No ring"),
     ("replays.studies.bench", "recorder.reader", "Studies of methods never"),
     ("replays.studies.ladder.quantity", "replays.studies.ladder.chart", "No ring"),
@@ -106,7 +106,7 @@ BREACHES = [
     ("rig.run.simulation", "time", "Physics"),
     ("rig.physics.kernels.laws.contact", "zenoh", "Physics"),
     ("rig.channels.sensors.noise", "random", "Physics"),
-    ("rig.base.outside", "socket", "Physics"),
+    ("rig.base.checks", "socket", "Physics"),
     ("rig.base.errors", "threading", "Physics"),
     ("rig.physics.model", "rig.serve.pacing", "Physics"),
 ]

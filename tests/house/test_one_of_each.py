@@ -61,7 +61,10 @@ EXCEPTIONS = {
     ("rig/physics/magnets.py", SQUARES): "coefficients of a force law below the replays",
     ("replays/estimate/intervals.py", SPECTRUM): "a cosine transform of 256 sums, by which a slow wander is found",
     ("replays/recordings/identification/fit.py", SQUARES): "bounds and a robust loss, which Gauss and Newton's has not",
-    ("replays/recordings/validation/explanations/shown.py", SQUARES): "laws in closed form from many starts: MINPACK",
+    (
+        "replays/recordings/validation/explanations/channel_fit.py",
+        SQUARES,
+    ): "laws in closed form from many starts: MINPACK",
     ("replays/score/records/stimulus.py", SPECTRUM): "a filter by time and frequency, there and back",
 }
 """Modules that have one of their own, each with the reason."""

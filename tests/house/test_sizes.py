@@ -37,7 +37,7 @@ BUDGETS = {
     "replays/campaigns": 2296,
     "replays/estimate": 332,
     "replays/player": 817,
-    "replays/recordings": 10183,
+    "replays/recordings": 10192,
     "replays/report": 475,
     "replays/score": 4166,
     "replays/sessions": 73,

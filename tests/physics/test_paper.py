@@ -27,7 +27,7 @@ import numpy as np
 import pytest
 
 from replays.studies.paper.findings import conditions
-from replays.studies.paper.question import fall, weight_at_ring
+from replays.studies.paper.open_questions import fall, weight_at_ring
 from replays.studies.paper.reproduction import drop_impact, drop_impulse
 from replays.studies.paper.scans import condition
 from replays.studies.paper.scans.pulse import Outcome, Pulse, outcome

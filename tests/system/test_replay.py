@@ -20,9 +20,9 @@ from drivers.console import Console
 from drivers.daq import Daq
 from recorder.reader import Recording
 from recorder.session import RecordingSession
-from replays.player.passes import Part
+from replays.player.messages import Track
+from replays.player.play_range import Part
 from replays.player.player import Player
-from replays.player.track import Track
 from rig.base import wire
 from rig.base.errors import RefusedError
 from rig.cli.connections.can_output import CanMessages, CanOptions, CanOutput

@@ -17,7 +17,7 @@ from replays.recordings.resimulation.prediction import measured, predict
 from replays.recordings.validation import validate
 from replays.recordings.validation.bits import Bits
 from replays.recordings.validation.explanations.explanation import Explanation
-from replays.recordings.validation.explanations.own import own_faults
+from replays.recordings.validation.explanations.single_channels import own_faults
 from rig.channels.faults import KINDS
 from tests.fault_cases import BLIND_CLASSES, BLIND_SIZES
 from tests.physics.test_identification import recorded

@@ -13,7 +13,7 @@ from rig.base.errors import InputError
 from rig.base.wire import Block, sensor_key
 from rig.channels.faults import KINDS, Draws, supported
 from rig.channels.faults.blocks import DuplicateBlocks, LoseBlocks, ReorderBlocks
-from rig.channels.faults.sending import Active, Frame, Sending
+from rig.channels.faults.delivery import Active, Frame, Sending
 from rig.run.scenes import load_scene
 from rig.run.simulation import Simulation
 from tests.fault_cases import BLOCKS, EXAMPLES

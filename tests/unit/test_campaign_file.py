@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from replays.campaigns.files.campaign import Campaign, campaign_path, load_campaign, shipped, title_of
-from replays.campaigns.files.lines import lines_of
+from replays.campaigns.files.line_numbers import lines_of
 from rig.base.errors import InputError
 from tests.commands import said
 

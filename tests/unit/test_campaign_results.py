@@ -16,19 +16,19 @@ import pytest
 
 from recorder.reader import Recording
 from replays.campaigns.equipment.bench import Target, check_replay
+from replays.campaigns.evidence import Trial
 from replays.campaigns.files.campaign import load_campaign, shipped
+from replays.campaigns.files.case_results import Seen
 from replays.campaigns.files.expectation import KINDS
 from replays.campaigns.files.run import end_device, measure_end
-from replays.campaigns.files.seen import Seen
 from replays.campaigns.measurement import Measurement, Must, measured
 from replays.campaigns.reporting.page import changes, make_page
 from replays.campaigns.reporting.picture import draw
 from replays.campaigns.reporting.results import Results, load_results, write_junit
-from replays.campaigns.trial import Trial
 from replays.report import junit, write_report
+from rig.base.checks import check
 from rig.base.errors import InputError
 from rig.base.outcome import Outcome
-from rig.base.outside import check
 from rig.channels.orbit import whirl_frequency
 from rig.channels.table import default_table
 from tests.processes import ROOT

@@ -20,7 +20,7 @@ from drivers.console import Console
 from drivers.instruments.twins import TWINS
 from recorder.output.trigger import EVENT_NAMES
 from replays.campaigns.files.expectation import EventName
-from replays.recordings.identification.question import unit_of
+from replays.recordings.identification.request import unit_of
 from rig.base.errors import InputError
 from rig.cli import app
 from rig.run import commands

@@ -15,7 +15,7 @@ import pytest
 
 import recorder.session
 from recorder.contents.summary import Summary
-from recorder.output.room import Limits
+from recorder.output.disk_limits import Limits
 from recorder.output.trigger import Capture, Trigger
 from recorder.reader import Recording, join
 from recorder.rewrite import cut
@@ -24,7 +24,7 @@ from replays.recordings.export import write_run
 from replays.recordings.validation import validate
 from rig.base import wire
 from rig.base.errors import InputError
-from rig.channels.faults.declared import Declared
+from rig.channels.faults.ledger import Declared
 from rig.run.scenes import load_scene, parse_scene
 from rig.run.simulation import Simulation
 from tests.fault_cases import BLOCKS

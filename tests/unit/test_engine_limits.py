@@ -16,7 +16,7 @@ from replays.recordings.resimulation.prediction import bare
 from rig.base.errors import InputError
 from rig.physics.accuracy import QUANTITIES
 from rig.physics.engine_choice import FINEST_TOLERANCE, SCALES, EngineChoice, Limits
-from rig.run.pick import Pick
+from rig.run.model_choice import Pick
 from rig.run.scenes import Scene, change_scene, load_scene, parse_scene, scene_document
 from rig.run.simulation import Simulation
 from tests.commands import said, shown

@@ -20,9 +20,9 @@ from rig.base.errors import InputError
 from rig.run.commands.table import COMMANDS, EVENT_KINDS, MECHANICAL
 from rig.run.scenes import parse_scene
 from rig.run.simulation import Simulation
-from rig.serve.intake import event_in
 from rig.serve.pacing import Lockstep
 from rig.serve.service import Service
+from rig.serve.stream_check import event_in
 from rig.serve.transport.memory import MemoryClient, MemoryServer
 from tests.waiting import until
 

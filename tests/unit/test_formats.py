@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from recorder.contents.head import Beginning
+from recorder.contents.metadata import Beginning
 from recorder.reader import Recording
 from recorder.writer import RecordingWriter
 from replays.recordings.export import write_run

@@ -19,7 +19,7 @@ from replays.recordings.formats.guessing.naming import read_name
 from replays.recordings.formats.guessing.template import CHECK, guessed
 from replays.recordings.formats.mapping import parse_mapping
 from rig.base.wire import sensor_key
-from rig.serve.intake import Catalogue
+from rig.serve.stream_check import Catalogue
 from tests import foreign
 from tests.commands import said, shown
 

@@ -16,7 +16,7 @@ from replays.recordings.export import write_run
 from replays.recordings.identification import ask, identify
 from replays.recordings.identification.horizon import horizon
 from replays.recordings.identification.judgement import Finding, widened
-from replays.recordings.identification.question import measured_noise
+from replays.recordings.identification.request import measured_noise
 from replays.recordings.identification.window import Window
 from replays.recordings.resimulation.experiment import Experiment
 from rig.base.errors import InputError

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import rig
-from rig.run.pick import equations_digest
+from rig.run.model_choice import equations_digest
 
 RIG = Path(rig.__file__).parent
 

@@ -16,10 +16,10 @@ from drivers.console import Console
 from recorder.reader import Recording, join
 from replays.player import player as player_module
 from replays.player.edit import Edit
-from replays.player.passes import Part
+from replays.player.messages import Track
+from replays.player.play_range import Part
 from replays.player.player import Player
 from replays.player.timeline import By, Timeline
-from replays.player.track import Track
 from rig.base import wire
 from rig.base.errors import InputError, RefusedError
 from rig.channels.table import ChannelTable

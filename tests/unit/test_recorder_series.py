@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 
 import recorder.output.series
-from recorder.contents.head import Beginning
+from recorder.contents.metadata import Beginning
 from recorder.files.payload import Payload
-from recorder.output.room import Limits
+from recorder.output.disk_limits import Limits
 from recorder.output.series import Series, part_path
 from recorder.output.sink import Needs
 from recorder.reader import Recording, join

@@ -13,10 +13,10 @@ import pytest
 import recorder.files.payload
 import recorder.session
 import rig.base.wire
-import rig.serve.intake
+import rig.serve.stream_check
 from recorder.contents.summary import Progress, Summary
 from recorder.files.payload import Payload
-from recorder.output.room import Limits
+from recorder.output.disk_limits import Limits
 from recorder.output.trigger import Capture, Trigger
 from recorder.reader import Recording
 from recorder.session import RIG_LOST, RecordingSession
@@ -125,7 +125,7 @@ def test_each_block_and_each_document_is_decoded_once(path, monkeypatch):
         for module, name in (
             (rig.base.wire, "decode_block"),
             (recorder.files.payload, "decode_block"),
-            (rig.serve.intake, "read_json"),
+            (rig.serve.stream_check, "read_json"),
             (recorder.files.payload, "decode_document"),
         ):
             monkeypatch.setattr(module, name, counted(getattr(module, name)))

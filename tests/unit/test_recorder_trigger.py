@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from recorder.contents.head import Beginning
+from recorder.contents.metadata import Beginning
 from recorder.files.payload import Payload
 from recorder.output.captures import Captures
-from recorder.output.room import Limits
+from recorder.output.disk_limits import Limits
 from recorder.output.sink import Needs
 from recorder.output.trigger import Capture, Trigger
 from recorder.reader import Recording

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from recorder.contents.documents import document_in
-from recorder.contents.head import Beginning
+from recorder.contents.metadata import Beginning
 from recorder.contents.views import Views
 from recorder.files import schemas
-from recorder.files.draft import check_destination
+from recorder.files.unfinished_file import check_destination
 from recorder.reader import Recording
 from recorder.writer import RecordingError, RecordingWriter
 from rig.base.errors import InputError

@@ -20,7 +20,7 @@ from rig.channels.table import default_table
 from rig.physics.kernels.observe import EDGE, KEYPHASOR_WIDTH
 from rig.physics.kernels.signals import COLUMN, N_ROW
 from rig.run.commands.table import FaultCommand
-from rig.run.faulty import Faulty
+from rig.run.fault_injection import Faulty
 from tests.fault_cases import SCORED
 from tests.score_daqs import Tones, write_parquet, write_session
 

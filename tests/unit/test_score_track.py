@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from replays.score.alignment.alignment import align
-from replays.score.alignment.following import Source
+from replays.score.alignment.one_begin import Source
 from replays.score.alignment.repeats import find_repeats
-from replays.score.alignment.track import Follower, Track, follow_record
+from replays.score.alignment.row_times import Follower, Track, follow_record
 from replays.score.card.scorecard import FAIL, INCONCLUSIVE, PASS, Scorecard
 from replays.score.judgement import judge
 from replays.score.records.stimulus import Exact

@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
+from rig.base.checks import read_toml
 from rig.base.errors import DiskError, InputError, check_new_file, check_not_among, whole_file
-from rig.base.outside import read_toml
 from rig.cli.app import start
 from rig.run.scenes import load_scene, parse_scene
 from rig.serve.transport.exposure.certificates import holder_in, make

@@ -29,7 +29,7 @@ from drivers.can.bus.frame import (
     fault_of,
     packed,
 )
-from rig.base.outside import Count, Outside
+from rig.base.checks import Count, Outside
 
 if TYPE_CHECKING:
     import can

@@ -24,9 +24,9 @@ from drivers.can.bus.frame import CLASSIC_WIDTH, FD_WIDTH, joined, packed, resiz
 from drivers.can.bus.model import BusModel, warm_up
 from drivers.can.bus.results import OUTCOMES
 from rig.base import wire
-from rig.base.closing import Closing
+from rig.base.checks import check
+from rig.base.closeable import Closing
 from rig.base.errors import InputError
-from rig.base.outside import check
 from rig.serve.health import Guard, Rising
 from rig.serve.transport.limit import Bucket
 

@@ -16,8 +16,8 @@ from can.bus import BusState  # noqa: TID253
 
 from drivers.can.bus import codec
 from drivers.can.bus.frame import packed
+from rig.base.checks import check
 from rig.base.errors import InputError
-from rig.base.outside import check
 from rig.serve.waiting import Deadline
 
 if TYPE_CHECKING:

@@ -25,11 +25,11 @@ from drivers.can.gateway.samples import sample_frames, steps
 from drivers.can.schedule import SLOT_S, Schedule
 from drivers.can.signals import EVENT_VALUES, EventKind, State
 from rig.base import wire
-from rig.base.closing import Closing
-from rig.base.outside import DOCUMENT_BYTES, Outside, check, input_error
+from rig.base.checks import DOCUMENT_BYTES, Outside, check, input_error
+from rig.base.closeable import Closing
 from rig.channels.table import ChannelTable
 from rig.serve.health import Guard, Rising
-from rig.serve.intake import block_end_in
+from rig.serve.stream_check import block_end_in
 from rig.serve.transport import Client
 from rig.serve.waiting import BoundedQueue
 

@@ -16,7 +16,7 @@ from drivers.can.devices import Said
 from drivers.can.message import MessageTable
 from drivers.can.signals import FIELDS, LIMITS, Command, Field, Kind, Result, default_messages, parse_command
 from rig.base import wire
-from rig.base.outside import DOCUMENT_BYTES, Outside, check
+from rig.base.checks import DOCUMENT_BYTES, Outside, check
 from rig.serve.health import Guard
 from rig.serve.transport import Client, NoReplyError
 from rig.serve.transport.limit import Bucket

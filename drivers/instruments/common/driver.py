@@ -17,7 +17,7 @@ from drivers.instruments.common.datasheet import Datasheet, parse_datasheet
 from drivers.instruments.common.protocol import Codec, Message, ProtocolError
 from drivers.link import ROOM, Link, LinkError, LinkTimeoutError, open_link
 from drivers.sources.samples import RowReader, Samples, follow
-from rig.base.closing import Closing
+from rig.base.closeable import Closing
 from rig.base.errors import InputError, RefusedError, Words
 from rig.base.wire import Continuity
 from rig.channels.table import Group

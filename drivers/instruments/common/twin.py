@@ -22,7 +22,7 @@ from rig.base import wire
 from rig.base.errors import InputError, Words
 from rig.channels.table import Group
 from rig.run.commands.command import as_number
-from rig.serve.desk import one_line
+from rig.serve.request_handler import one_line
 from rig.serve.transport import NoReplyError
 
 MANUFACTURER = "Virtual rotor-stator rig"

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from replays.campaigns.equipment.process import Program
 from rig.base import wire
-from rig.base.closing import Closing
+from rig.base.closeable import Closing
 from rig.base.errors import InputError, RefusedError, Words
 from rig.base.outcome import InconclusiveError
 from rig.channels.sampling import TICKS_HZ

@@ -12,7 +12,7 @@ from pathlib import Path
 from rig.base.errors import DiskError
 from rig.serve.waiting import Deadline
 
-_KEEPER = Path(__file__).with_name("keeper.py")
+_KEEPER = Path(__file__).with_name("cleanup.py")
 
 
 class Program:

@@ -17,13 +17,13 @@ from pydantic import AfterValidator, BeforeValidator, Field, FiniteFloat
 
 from replays.campaigns.equipment.bench import BenchSettings, Pace
 from replays.campaigns.equipment.device import PLACES, check_program
+from replays.campaigns.files.case_results import Time, Units
 from replays.campaigns.files.expectation import KINDS, Expect
-from replays.campaigns.files.lines import line_of, lines_of
-from replays.campaigns.files.seen import Time, Units
+from replays.campaigns.files.line_numbers import line_of, lines_of
 from replays.campaigns.measurement import split_quantity
 from rig.base import units
+from rig.base.checks import Written, check, open_file, parse_toml, unreadable
 from rig.base.errors import InputError, UnknownNameError, Words, such_as
-from rig.base.outside import Written, check, open_file, parse_toml, unreadable
 from rig.channels.faults import channels_of, stream_of
 from rig.channels.faults.blocks import OfBlocks
 from rig.physics.kernels import signals

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
+from replays.campaigns.files.case_results import Expected, Seen, Time, Units, asked, in_unit
 from replays.campaigns.files.scored import ExpectScore
-from replays.campaigns.files.seen import Expected, Seen, Time, Units, asked, in_unit
 from replays.campaigns.measurement import Measurement, Must, quantity
+from rig.base.checks import Written
 from rig.base.errors import InputError, UnknownNameError, Words
-from rig.base.outside import Written
 from rig.run.commands.table import EVENT_KINDS
 from rig.serve.service import REPLAY_COMMANDS
 

@@ -6,9 +6,9 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from replays.campaigns.equipment.bench import NotThereError
-from replays.campaigns.equipment.keeper import KILLED, PATIENCE_S
+from replays.campaigns.equipment.cleanup import KILLED, PATIENCE_S
+from replays.campaigns.files.case_results import Seen
 from replays.campaigns.files.expectation import EventOf, expected_events
-from replays.campaigns.files.seen import Seen
 from replays.campaigns.measurement import Measurement, Must
 from rig.base import wire
 from rig.base.errors import RefusedError
@@ -18,8 +18,8 @@ from rig.serve.waiting import wait_until
 if TYPE_CHECKING:
     from drivers.client import Rig
     from replays.campaigns.equipment.device import Device
+    from replays.campaigns.evidence import Trial
     from replays.campaigns.files.campaign import Case, Step
-    from replays.campaigns.trial import Trial
 
 _LAST_S = 5.0
 """How long a device may take to end behind the run [s]."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field
 
-from replays.campaigns.files.seen import Expected, Seen, Time, Units, asked, in_unit
+from replays.campaigns.files.case_results import Expected, Seen, Time, Units, asked, in_unit
 from replays.campaigns.measurement import Measurement, Must
 from rig.base.errors import InputError, UnknownNameError
 from rig.base.outcome import Outcome

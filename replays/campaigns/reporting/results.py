@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any
 
 from replays.report import junit, write_report
 from replays.studies.common import provenance
+from rig.base.checks import open_file, read_json, unreadable
 from rig.base.errors import DiskError, InputError, whole_file
-from rig.base.outside import open_file, read_json, unreadable
 from rig.base.text import finite, printable
 
 if TYPE_CHECKING:

@@ -16,8 +16,8 @@ from replays.recordings.formats.guessing import noise
 from replays.recordings.formats.mapped import BITS, MappedSignal
 from replays.recordings.formats.mapping import Mapping
 from rig.base import units
+from rig.base.checks import check
 from rig.base.errors import InputError, Words
-from rig.base.outside import check
 from rig.channels.table import VERSION, Channel, ChannelTable, Group, default_table
 
 _MOST_TIMES, _MOST_ROWS = 1000, 1_000_000

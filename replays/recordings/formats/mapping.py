@@ -11,8 +11,8 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveFloat, field_validator
 
 from rig.base import units
+from rig.base.checks import check, read_toml
 from rig.base.errors import InputError
-from rig.base.outside import check, read_toml
 
 _EPOCH = re.compile(r"\b(unix|epoch|posix|since|from|the|1970(-01-01)?|utc)\b", re.IGNORECASE)
 """Words about the zero of a time, which its unit does not depend on."""

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import numpy as np
 from pydantic import AfterValidator, Field
 
+from rig.base.checks import DOCUMENT_BYTES, describe_error, load_extensions, open_file, read_json, unreadable
 from rig.base.errors import InputError, RefusedError, Words
-from rig.base.outside import DOCUMENT_BYTES, describe_error, load_extensions, open_file, read_json, unreadable
 
 if TYPE_CHECKING:
     from replays.recordings.formats.mapping import FileOptions

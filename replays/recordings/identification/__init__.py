@@ -4,6 +4,6 @@ from __future__ import annotations
 
 from replays.recordings.identification.fit import PRECISION, SPREAD, Identification, identify
 from replays.recordings.identification.judgement import Finding, Judgement
-from replays.recordings.identification.question import Question, Unknown, ask
+from replays.recordings.identification.request import Question, Unknown, ask
 
 __all__ = ["PRECISION", "SPREAD", "Finding", "Identification", "Judgement", "Question", "Unknown", "ask", "identify"]

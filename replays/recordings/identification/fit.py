@@ -10,7 +10,7 @@ import numpy as np
 
 from replays.recordings.identification.horizon import Horizon, horizon
 from replays.recordings.identification.judgement import Judgement, blind_directions, judge, triangle_of
-from replays.recordings.identification.question import Question
+from replays.recordings.identification.request import Question
 from replays.recordings.identification.window import Window
 from rig.base.errors import InputError
 

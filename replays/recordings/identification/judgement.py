@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from replays.estimate.intervals import chi2_quantile, draw_normal, student
-from replays.recordings.identification.question import Unknown
+from replays.recordings.identification.request import Unknown
 from replays.recordings.identification.window import Window
 
 Standing = Literal["identified", "not seen", "only together", "at its bound", "not explained"]

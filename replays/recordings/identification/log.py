@@ -19,7 +19,7 @@ from replays.recordings.identification.agreement import Here, half_without_parts
 from replays.recordings.identification.fit import Identification
 from replays.recordings.identification.judgement import Judgement, judge, widened
 from replays.recordings.identification.nuisance import NUISANCES, looks_from, nuisances_of, tune
-from replays.recordings.identification.question import Question, ask, first_command_s
+from replays.recordings.identification.request import Question, ask, first_command_s
 from replays.recordings.identification.window import Window
 from replays.recordings.resimulation.experiment import Experiment
 from replays.recordings.resimulation.prediction import Measured

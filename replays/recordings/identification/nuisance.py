@@ -28,7 +28,7 @@ from replays.recordings.identification.agreement import (
     rms,
     signals_of,
 )
-from replays.recordings.identification.question import first_command_s, observe
+from replays.recordings.identification.request import first_command_s, observe
 from replays.recordings.resimulation.experiment import BEFORE_S, Experiment
 from replays.recordings.resimulation.prediction import Measured, Prediction
 from replays.recordings.resimulation.sensitivity import (

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from replays.recordings.identification.question import Question
+from replays.recordings.identification.request import Question
 from replays.recordings.resimulation.sensitivity import Predictor
 from rig.base.errors import InputError, SimulationError
 

@@ -13,8 +13,8 @@ from typing import Any, Self
 import numpy as np
 
 from recorder.reader import Recording
+from rig.base.checks import table_in
 from rig.base.errors import InputError, Words
-from rig.base.outside import table_in
 from rig.base.wire import EDGES, sensor_key, truth_key
 from rig.channels.faults import channels_of
 from rig.physics.parameters import DEFAULT_SET, load_parameters, set_names

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from recorder.contents.agreement import calibration_off
+from recorder.contents.consistency import calibration_off
 from recorder.reader import Recording
 from replays.recordings.identification.nuisance import Tuned, looks_from, tune
-from replays.recordings.identification.question import first_command_s
+from replays.recordings.identification.request import first_command_s
 from replays.recordings.parameters import parameter_doubts
 from replays.recordings.resimulation.experiment import Experiment, is_imported
 from replays.recordings.resimulation.prediction import Measured, Prediction, bare, measured, predict
@@ -30,8 +30,8 @@ from replays.recordings.validation.explanations.attribution import (
 from replays.recordings.validation.explanations.explanation import Explanation
 from replays.recordings.validation.explanations.faults import late_together
 from replays.recordings.validation.explanations.numbers import changes_of
-from replays.recordings.validation.explanations.own import as_faults, own_faults
 from replays.recordings.validation.explanations.signals import SignalFault, edge_faults, signal_faults
+from replays.recordings.validation.explanations.single_channels import as_faults, own_faults
 from replays.recordings.validation.outcome import Validation
 from replays.recordings.validation.phases import CONTACT, PHASES, Phase
 from replays.recordings.validation.statistics import perturbed, statistics

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, field_validator
 
 from replays.recordings.validation.phases import PHASES, QUANTITIES
-from rig.base.outside import check, read_toml
+from rig.base.checks import check, read_toml
 from rig.physics.parameters import load_parameters
 
 DEFAULT = Path(__file__).with_name("default.toml")

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from replays.score.alignment.begins import FOLLOWED, SAME_BALANCE, Begins, trimmed
-from replays.score.alignment.following import FEWEST, Alignment, Source, busiest, follow
+from replays.score.alignment.one_begin import FEWEST, Alignment, Source, busiest, follow
 
 _STRETCHES_S = (0.25, 0.03)
 """Lengths of the stretch that is fitted first; the second where clocks are apart, or samples lost, in the first [s]."""

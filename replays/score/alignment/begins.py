@@ -10,7 +10,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from replays.score.alignment.following import FEWEST, SOUND, Alignment, Source, busiest, follow
+from replays.score.alignment.one_begin import FEWEST, SOUND, Alignment, Source, busiest, follow
 from replays.score.alignment.repeats import find_repeats
 from replays.score.records.stimulus import Exact
 from replays.score.waveform import Waveform, fit_stretch, fit_waveform

@@ -10,8 +10,8 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
 from replays.score.card.scorecard import ANALOGUE, DIGITAL, Bounds
 from rig.base import units
+from rig.base.checks import check, read_toml
 from rig.base.errors import InputError, UnknownNameError, Words
-from rig.base.outside import check, read_toml
 from rig.channels.table import Channel
 
 FOLDER = Path(__file__).parent / "sets"

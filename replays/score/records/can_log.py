@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from replays.score.records.recorded import Pieces, Recorded, Table
+from rig.base.checks import unreadable
 from rig.base.errors import InputError, Words
-from rig.base.outside import unreadable
 from rig.channels.table import ChannelTable
 
 _SUFFIXES = (".log", ".asc", ".blf", ".trc")

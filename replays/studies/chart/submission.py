@@ -22,8 +22,8 @@ from replays.studies.peers import PEERS, Library, Peer, Setting
 from replays.studies.peers.common.problem import ERROR_COLUMNS, Problem
 from replays.studies.peers.common.reference import Reference
 from replays.studies.peers.common.solution import Solution
+from rig.base.checks import open_file, unreadable
 from rig.base.errors import InputError, UnknownNameError, Words, whole_file
-from rig.base.outside import open_file, unreadable
 from rig.physics.engines import ENGINES
 from rig.physics.kernels.signals import STATE
 

@@ -10,7 +10,7 @@ from replays.studies.common import provenance
 from replays.studies.ladder.measurement import Measurement
 from replays.studies.ladder.quantity import QUANTITIES, Value
 from replays.studies.ladder.search import Errors, Ladder
-from rig.run.pick import Pick, PickedQuantity
+from rig.run.model_choice import Pick, PickedQuantity
 from rig.run.scenes import pick_digests
 
 _PACKAGES = ("numba", "numpy", "scipy")

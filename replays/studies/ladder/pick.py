@@ -8,7 +8,7 @@ import tomllib
 from pathlib import Path
 
 from rig.base.errors import InputError, Words
-from rig.run.pick import Pick
+from rig.run.model_choice import Pick
 from rig.run.scenes import Scene, load_scene, pick_digests, scene_path
 
 _HEADER = re.compile(r"^\s*\[{1,2}\s*(?P<name>[^\]\[]+?)\s*\]{1,2}\s*(#.*)?$")

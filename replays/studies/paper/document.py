@@ -17,7 +17,7 @@ import numpy as np
 
 from replays.report import Report, Row
 from replays.report.canvas import save
-from replays.studies.paper import question
+from replays.studies.paper import open_questions
 from replays.studies.paper.claim import (
     BANDWIDTHS_HZ,
     LAWS,
@@ -171,11 +171,11 @@ def _numbers(findings: Findings) -> dict[str, Any]:
         "measured_n": MEASURED_N,
         "resolution_hz": 2.0 / (0.5 * found["corrected"].whirl.times_s[-1]),
         "unbalance_n": findings.constants.shaft.unbalance * (2.0 * math.pi * 6.2) ** 2,
-        "drop": question.drop_numbers(found),
-        **question.house_numbers(results),
-        "magnet": question.magnet_numbers(),
-        "running": question.running_numbers(),
-        "clearance": question.clearance_numbers(found),
+        "drop": open_questions.drop_numbers(found),
+        **open_questions.house_numbers(results),
+        "magnet": open_questions.magnet_numbers(),
+        "running": open_questions.running_numbers(),
+        "clearance": open_questions.clearance_numbers(found),
         "tornado": {"idle_n": IDLE_N, "idle": idle_changes(findings)},
         "moves": _moves(findings),
         "mobility": {f"× {scale:g}": f"mobility {scale:g}" for scale in SCALES} | {"rigid": "alternative house rigid"},

@@ -15,7 +15,7 @@ import numpy as np
 
 from replays.report import Mark, Row
 from replays.studies.paper.claim import ENDS, LAWS, Groups, Results, claim_groups, less_mobile, median
-from replays.studies.paper.question import question_groups
+from replays.studies.paper.open_questions import question_groups
 from replays.studies.paper.reproduction import SPEEDS_HZ, Reproduction, drop_spread, pulse_spread, reproduce
 from replays.studies.paper.scans import condition
 from replays.studies.paper.scans.condition import Slip, Start, Threshold

@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 
 from rig.channels.faults import At, NoFilter, Swap, acts, plugged
-from rig.channels.faults.sending import Active
+from rig.channels.faults.delivery import Active
 from rig.channels.sampling import TICKS_HZ
 from rig.channels.table import Channel, Group
 from rig.physics.kernels.observe import EDGE, KEYPHASOR_WIDTH

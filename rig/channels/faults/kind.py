@@ -11,7 +11,7 @@ from typing import Annotated, ClassVar, NamedTuple, Self, get_args
 import numpy as np
 from pydantic import AfterValidator, ConfigDict, Field, FiniteFloat
 
-from rig.base.outside import Written
+from rig.base.checks import Written
 from rig.channels.table import Channel
 
 SIGMAS = 4.0

@@ -32,7 +32,7 @@ def cut(
     force: Force = False,
 ) -> None:
     """Cut a recording, or join several files of one run; what is kept is kept byte for byte, trimmed at the edges."""
-    from recorder.files.draft import check_destination
+    from recorder.files.unfinished_file import check_destination
     from recorder.reader import join
     from recorder.rewrite import cut as cut_recording
 

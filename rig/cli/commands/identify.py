@@ -20,8 +20,8 @@ from rig.cli.options import (
     names_of,
     pairs,
 )
-from rig.cli.output.origin import of_recording
 from rig.cli.output.progress import reporting
+from rig.cli.output.provenance import of_recording
 from rig.cli.output.tables import Form, echo, echo_json, new_table
 
 if TYPE_CHECKING:
@@ -74,7 +74,7 @@ class Asked:
         from replays.recordings.identification import identify as run
         from replays.recordings.identification.log import identify_log
         from replays.recordings.identification.nuisance import asked_along, turned
-        from replays.recordings.identification.question import first_command_s
+        from replays.recordings.identification.request import first_command_s
         from replays.recordings.resimulation.experiment import is_imported
         from replays.recordings.validation import load_criteria
 

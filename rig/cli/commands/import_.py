@@ -72,7 +72,7 @@ def import_(
 
 def _import(files: list[Path], mapping: Path | str, output: Path, *, force: bool, form: Form) -> None:
     """Import by a mapping in a file, or by the text of one that was guessed."""
-    from recorder.files.draft import check_destination
+    from recorder.files.unfinished_file import check_destination
     from replays.recordings.formats.conversion import convert, write_recording
     from replays.recordings.formats.mapping import Mapping, load_mapping, parse_mapping
     from rig.cli.output.progress import reporting

@@ -9,8 +9,8 @@ import typer
 
 from rig.cli.options import Force
 from rig.cli.output.folder import check_folder
-from rig.cli.output.origin import origin
 from rig.cli.output.progress import reporting
+from rig.cli.output.provenance import origin
 from rig.cli.output.tables import Form, echo, echo_json, new_table
 
 if TYPE_CHECKING:

@@ -20,7 +20,7 @@ from rig.run.commands import SUMMARIES
 
 if TYPE_CHECKING:
     from recorder.contents.summary import Progress, Summary
-    from recorder.output.room import Limits
+    from recorder.output.disk_limits import Limits
     from recorder.output.trigger import Capture
     from recorder.session import RecordingSession
     from rig.serve.transport.zenoh import ZenohClient
@@ -129,7 +129,7 @@ class Disk:
         Raises:
             InputError: There cannot be so much memory.
         """
-        from recorder.output.room import Limits
+        from recorder.output.disk_limits import Limits
 
         if not 1.0 <= self.backlog_mb <= 1e5:
             raise InputError("backlog_mb", "from 1 to 1e5", self.backlog_mb)
@@ -175,7 +175,7 @@ def record(
     """
     import os
 
-    from recorder.output.room import MB
+    from recorder.output.disk_limits import MB
     from recorder.session import RecordingSession
 
     limits, capture = disk.limits(rotation), triggers.capture()

@@ -26,9 +26,9 @@ def recover(
 
     Of a file that is whole nothing is made, unless with --force. Ends with 1 where rows or records are lost.
     """
-    from recorder.files.draft import check_destination
+    from recorder.files.unfinished_file import check_destination
     from recorder.rewrite import recovered_path
-    from rig.base.outside import open_file, unreadable
+    from rig.base.checks import open_file, unreadable
 
     if output is not None and len(files) > 1:
         raise InputError("--output", "used with one FILE", Words(f"{len(files)} files"))

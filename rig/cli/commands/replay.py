@@ -18,9 +18,9 @@ from rig.cli.output.tables import echo
 
 if TYPE_CHECKING:
     from replays.player.edit import Edit
-    from replays.player.passes import Part
+    from replays.player.messages import Track
+    from replays.player.play_range import Part
     from replays.player.player import Player
-    from replays.player.track import Track
     from rig.serve.transport import Server
 
 _part, _change = panel("What is played"), panel("What is changed")
@@ -65,7 +65,7 @@ class Played:
 
     def part(self) -> Part:
         """Which part of the recording, and how often."""
-        from replays.player.passes import Part
+        from replays.player.play_range import Part
 
         return Part(from_s=self.from_s, to_s=self.to_s, start_s=self.start_s, loops=self.loop or None)
 
@@ -127,10 +127,10 @@ def replay(
     from rig.serve.pacing import FreeRun, RealTime, rare_collections
 
     with rare_collections():
+        from replays.player.messages import Track
         from replays.player.player import Player
         from replays.player.playhead import check_rate
         from replays.player.timeline import By
-        from replays.player.track import Track
 
         check_rate(rate)
         if burst and rate != 1.0:

@@ -14,7 +14,7 @@ from rig.base.text import finite
 from rig.cli.connections.connection import Connection
 from rig.cli.groups import panel
 from rig.cli.options import Channels, Force, Wide, names_of
-from rig.cli.output.origin import origin
+from rig.cli.output.provenance import origin
 from rig.cli.output.tables import echo, new_table, shown, table_console
 
 if TYPE_CHECKING:

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rig.cli.options import Changes, Engine, Force, RecordingFiles, ReportFile, SceneChanges
-from rig.cli.output.origin import of_recording
 from rig.cli.output.progress import reporting
+from rig.cli.output.provenance import of_recording
 from rig.cli.output.tables import Form, Table, echo, echo_json, new_table, shown
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from typing import Any
 
 from numba.core.event import Listener
 
-from rig.cli.output.ahead import MARCH, SERIES, start_beside
+from rig.cli.output.background_compiling import MARCH, SERIES, start_beside
 
 _ENGINE_S = 40
 """Processor time that an engine takes, with the kernels that it calls, on a usual machine [s]."""

@@ -7,8 +7,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, FiniteFloat, model_validator
 
+from rig.base.checks import check
 from rig.base.errors import UnknownNameError
-from rig.base.outside import check
 from rig.channels.faults import KINDS, AnyKind
 from rig.run.commands.command import CanFrame, Run, SceneCommand
 

@@ -13,8 +13,8 @@ from typing import Any, ClassVar, NamedTuple, Protocol
 
 from pydantic import ConfigDict
 
+from rig.base.checks import Written
 from rig.base.errors import InputError
-from rig.base.outside import Written
 from rig.run.commands import SUMMARIES
 
 UNBOUNDED = (-math.inf, math.inf)

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Union
 
 from pydantic import Field, FiniteFloat, model_validator
 
+from rig.base.checks import Written, check
 from rig.base.errors import InputError
-from rig.base.outside import Written, check
 from rig.run.commands import SUMMARIES, channel, mechanical
 from rig.run.commands.channel import ClearCommand, FaultCommand  # noqa: F401
 from rig.run.commands.command import SceneCommand, entries

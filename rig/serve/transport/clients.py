@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any
 
 from rig.base import wire
-from rig.base.outside import Count, Name, Outside, a_line, check
+from rig.base.checks import Count, Name, Outside, a_line, check
 from rig.serve.transport import Client, Server
 from rig.serve.waiting import Deadline
 

@@ -18,8 +18,8 @@ from typing import Annotated
 
 from pydantic import Field
 
+from rig.base.checks import Outside, check
 from rig.base.errors import InputError, UnknownNameError, Words
-from rig.base.outside import Outside, check
 from rig.serve.transport import DEFAULT_ENDPOINT
 from rig.serve.transport.endpoint import parse_endpoint
 from rig.serve.waiting import Deadline

@@ -16,7 +16,7 @@ from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from rig.base import wire
-from rig.base.closing import Closing
+from rig.base.closeable import Closing
 from rig.base.errors import InputError
 from rig.serve.transport import DEFAULT_ENDPOINT, NoReplyError
 from rig.serve.transport.endpoint import backlog_of, hang_up, not_free, parse_endpoint, place_to_listen

@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from recorder.contents.survey import Stream
+from recorder.contents.inventory import Stream
 from recorder.reader import Recording
 from replays.recordings.formats.exporting.history import ExportEvent, happenings
 from replays.recordings.formats.source import DOCUMENTS

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from statistics import median
 
-from replays.recordings.formats.guessing.looks import Look, look, relation
+from replays.recordings.formats.guessing.features import Look, look, relation
 from replays.recordings.formats.guessing.naming import Named, read_name, words_of
 from replays.recordings.formats.source import Entry, Source
 from rig.base import units

@@ -17,7 +17,7 @@ import numpy as np
 from replays.recordings.formats.exporting import export
 from replays.recordings.formats.source import DOCUMENTS, Entry, FileSignal, Source, damaged, even_rate_hz, library
 from rig.base import units
-from rig.base.outside import open_file
+from rig.base.checks import open_file
 
 if TYPE_CHECKING:
     from replays.recordings.formats.exporting.history import ExportEvent

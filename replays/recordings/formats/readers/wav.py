@@ -11,8 +11,8 @@ from pydantic import BaseModel, Field, FiniteFloat
 
 from replays.recordings.formats.exporting import export
 from replays.recordings.formats.source import Entry, FileSignal, Source, library
+from rig.base.checks import DOCUMENT_BYTES, check
 from rig.base.errors import InputError, Words
-from rig.base.outside import DOCUMENT_BYTES, check
 
 if TYPE_CHECKING:
     from replays.recordings.formats.exporting.selection import ExportChunk, ExportTable, Selection

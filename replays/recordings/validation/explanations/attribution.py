@@ -15,11 +15,12 @@ import numpy as np
 
 from replays.estimate.least_squares import Fit, fit
 from replays.recordings.identification.nuisance import Tuned
-from replays.recordings.identification.question import unit_of
+from replays.recordings.identification.request import unit_of
 from replays.recordings.resimulation.experiment import Experiment
 from replays.recordings.resimulation.prediction import Measured, Prediction, predict
 from replays.recordings.resimulation.sensitivity import scale_of, value_of, with_values
 from replays.recordings.validation.criteria import Attribution, Candidate
+from replays.recordings.validation.explanations.channel_fit import DECIDES
 from replays.recordings.validation.explanations.explanation import (
     Explanation,
     Kind,
@@ -30,9 +31,8 @@ from replays.recordings.validation.explanations.explanation import (
 )
 from replays.recordings.validation.explanations.faults import MOST, Clock, channels_in, cured_by, sensor_faults
 from replays.recordings.validation.explanations.numbers import numbers_of_the_model
-from replays.recordings.validation.explanations.own import as_faults
-from replays.recordings.validation.explanations.shown import DECIDES
 from replays.recordings.validation.explanations.signals import SignalFault
+from replays.recordings.validation.explanations.single_channels import as_faults
 from replays.recordings.validation.trajectory import scaled
 from rig.base.errors import InputError, SimulationError
 from rig.channels.table import default_table

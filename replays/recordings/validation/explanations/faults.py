@@ -12,6 +12,7 @@ import numpy as np
 
 from replays.estimate.least_squares import fit
 from replays.recordings.resimulation.prediction import Measured, Prediction
+from replays.recordings.validation.explanations.channel_fit import DECIDES, FEW, OFF, Shown, gain_words
 from replays.recordings.validation.explanations.explanation import (
     Explanation,
     excess,
@@ -20,7 +21,6 @@ from replays.recordings.validation.explanations.explanation import (
     vector,
 )
 from replays.recordings.validation.explanations.laws import law_of
-from replays.recordings.validation.explanations.shown import DECIDES, FEW, OFF, Shown, gain_words
 from replays.recordings.validation.trajectory import floors
 from rig.channels.table import Channel
 

@@ -11,8 +11,17 @@ import numpy as np
 
 from replays.estimate.runs import true_runs
 from replays.estimate.spectra import spectrum
+from replays.recordings.validation.explanations.channel_fit import (
+    DECIDES,
+    FEW,
+    OFF,
+    Law,
+    Shown,
+    gain_words,
+    least_at,
+    rms_of,
+)
 from replays.recordings.validation.explanations.explanation import excess, is_noise
-from replays.recordings.validation.explanations.shown import DECIDES, FEW, OFF, Law, Shown, gain_words, least_at, rms_of
 from replays.recordings.validation.explanations.signals import steady_rows
 from replays.recordings.validation.explanations.timing import delayed_by, filtered, late, ringing
 

@@ -9,7 +9,7 @@ import numpy as np
 from replays.estimate.least_squares import solve_normal
 from replays.recordings.identification.agreement import BEYOND
 from replays.recordings.identification.nuisance import Tuned
-from replays.recordings.identification.question import first_command_s, unit_of
+from replays.recordings.identification.request import first_command_s, unit_of
 from replays.recordings.resimulation.experiment import Experiment
 from replays.recordings.resimulation.prediction import Measured, Prediction
 from replays.recordings.resimulation.sensitivity import Predictor, value_of

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from replays.estimate.runs import true_runs
-from replays.recordings.identification.question import measured_noise
+from replays.recordings.identification.request import measured_noise
 from replays.recordings.resimulation.prediction import Measured
 
 _HELD = 8

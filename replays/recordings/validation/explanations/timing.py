@@ -11,7 +11,7 @@ import numpy as np
 from replays.estimate.clock import fit_line, time_error
 from replays.estimate.least_squares import solve
 from replays.estimate.spectra import Spectrum
-from replays.recordings.validation.explanations.shown import FEW, Law, Shown, gain_words, least_at, rms_of
+from replays.recordings.validation.explanations.channel_fit import FEW, Law, Shown, gain_words, least_at, rms_of
 from rig.channels.sensors.filters import channel_poles
 
 _LATEST_S = 4e-3

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 
 from replays.recordings.resimulation.prediction import Measured, Prediction
+from replays.recordings.validation.explanations.channel_fit import FEW, Shown
 from replays.recordings.validation.explanations.explanation import Explanation
 from replays.recordings.validation.explanations.faults import SOME, around, beside, channels_in, told_of
 from replays.recordings.validation.explanations.laws import law_of
-from replays.recordings.validation.explanations.shown import FEW, Shown
 from replays.recordings.validation.explanations.signals import SignalFault
 from rig.channels.table import Channel
 

@@ -16,8 +16,8 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, Field, model_validator
 
 from rig.base import wire
+from rig.base.checks import LARGEST, Name, Outside, a_line, check, read_json
 from rig.base.errors import InputError, RefusedError
-from rig.base.outside import LARGEST, Name, Outside, a_line, check, read_json
 from rig.base.text import printable
 from rig.serve.transport import Server
 from rig.serve.transport.clients import Clients

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from datetime import datetime
 from typing import Any
 
-from recorder.contents.head import Head
+from recorder.contents.metadata import Head
 from recorder.contents.recording_file import RecordingFile
 from recorder.files import schemas
 from recorder.files.payload import tick_in

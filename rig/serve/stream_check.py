@@ -16,9 +16,9 @@ from typing import Annotated, Any, Literal, NamedTuple
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from rig.base import wire
+from rig.base.checks import Count, Name, Outside, check, read_json
 from rig.base.errors import InputError
-from rig.base.outside import Count, Name, Outside, check, read_json
-from rig.channels.faults.declared import Declared
+from rig.channels.faults.ledger import Declared
 from rig.channels.table import ChannelTable
 
 _MOST_S = 1e9

@@ -1,4 +1,4 @@
-"""Half of a first start's compiling, in a process of its own beside it: `python -m rig.cli.output.ahead`.
+"""Half of a first start's compiling, in a second process: `python -m rig.cli.output.background_compiling`.
 
 Both need about the same time: one compiles the march of the engine, with the series of flight and rolling; this one
 those of sliding, rolling by collocation and the sensors, which the other then finds in the cache.

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from pydantic import FiniteFloat
 
-from rig.base.outside import Written, table_in
+from rig.base.checks import Written, table_in
 from rig.physics.levels import ModelLevels
 
 _RIG = Path(__file__).parents[1]

@@ -14,8 +14,8 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
+from rig.base.checks import Count, Outside, check
 from rig.base.errors import InputError
-from rig.base.outside import Count, Outside, check
 from rig.base.wire import Block, Continuity, Gap
 
 _MOST = 10_000

@@ -34,7 +34,7 @@ from rig.channels.faults import (
     stream_of,
 )  # fmt: skip
 from rig.channels.faults.cabling import Plan, Scales, Volts, no_other, seen_mark, where
-from rig.channels.faults.sending import Active, Sending
+from rig.channels.faults.delivery import Active, Sending
 from rig.channels.sampling import TICKS_HZ, first_row
 from rig.channels.sensors.conditioning import Conditioner
 from rig.channels.sensors.keyphasor import FRACTIONS, TURN

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from replays.score.alignment.track import Follower, Track, follow_record
+from replays.score.alignment.row_times import Follower, Track, follow_record
 from replays.score.records.stimulus import Stimulus
 from replays.score.records.wiring import Wire
 from replays.score.waveform import Waveform, fit_stretch

@@ -12,7 +12,7 @@ from pydantic import Field, FiniteFloat
 
 from replays.campaigns.measurement import Must
 from rig.base import units as units_of
-from rig.base.outside import Written
+from rig.base.checks import Written
 
 if TYPE_CHECKING:
     from recorder.reader import Recording

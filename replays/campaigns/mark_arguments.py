@@ -8,7 +8,7 @@ from typing import Annotated, Any
 from pydantic import Field, FiniteFloat
 
 from replays.campaigns.equipment.bench import BenchSettings, Pace
-from rig.base.outside import Written, check
+from rig.base.checks import Written, check
 from rig.run.commands.table import TimedCommand
 from rig.run.scenes import load_scene
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from numba.core.dispatcher import Dispatcher
 
-from rig.cli.output import ahead
+from rig.cli.output import background_compiling
 from rig.physics.engines.split.condensed import set_step
 from rig.physics.engines.taylor.series import sliding
 from rig.run.simulation import Simulation
@@ -34,7 +34,7 @@ print(*(each.py_func.__qualname__ for each, count in known().items() if count > 
 
 
 def test_a_run_compiles_nothing_of_it_again() -> None:
-    ahead.compile_last()
+    background_compiling.compile_last()
     compiled: dict[Dispatcher, list[object]] = {each: list(each.signatures) for each in (sliding, set_step)}
     assert all(len(signatures) == 1 for signatures in compiled.values())
     simulation = Simulation("hammer")
@@ -58,6 +58,6 @@ def test_the_second_process_takes_no_code_of_the_working_directory(
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("PYTHONPATH", raising=False)
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1}, raising=False)
-    child = ahead.start_beside()
+    child = background_compiling.start_beside()
     assert child is not None
     assert child.wait() == 0

@@ -9,12 +9,12 @@ from functools import cached_property
 import numpy as np
 
 from recorder.contents import documents
-from recorder.contents.agreement import Agreement
+from recorder.contents.consistency import Agreement
 from recorder.contents.recording_file import RecordingFile
 from recorder.contents.samples import row_times_s
 from recorder.files import schemas
 from rig.base.wire import EDGES, EVENTS, FAULTS, Block, Gap, schema_of
-from rig.channels.faults.declared import Declared
+from rig.channels.faults.ledger import Declared
 
 _LEAST_SPAN_S = 0.5
 """A stream without rows raises doubt in a recording of this length; in a shorter one it may not have begun."""

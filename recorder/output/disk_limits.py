@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from recorder.files.draft import check_destination, files_like
+from recorder.files.unfinished_file import check_destination, files_like
 from recorder.writer import RecordingWriter
 from rig.base.errors import InputError, Words
 

@@ -1,6 +1,6 @@
 """Runs a program, and ends it with all that it has started when its own input ends: with whoever started both.
 
-What comes in before that kills it at once. A program of its own, `python keeper.py PROGRAM ...`, of the standard
+What comes in before that kills it at once. A program of its own, `python cleanup.py PROGRAM ...`, of the standard
 library alone: a test run that is killed leaves nothing running.
 """
 
