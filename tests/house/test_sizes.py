@@ -41,7 +41,7 @@ BUDGETS = {
     "replays/report": 475,
     "replays/score": 4166,
     "replays/sessions": 73,
-    "replays/studies": 8890,
+    "replays/studies": 8892,
     "rig": 52,
     "rig/base": 902,
     "rig/channels": 2358,
