@@ -19,6 +19,7 @@ import contextlib
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -434,6 +435,7 @@ def stiffness_law(name: str) -> StiffnessLaw:
     )
 
 
+@lru_cache(maxsize=64)  # a comparison of laws, and a model that is described, ask for the same fit many times
 def fit_power(name: str, pair: ContactPair) -> PowerFit:
     """K delta^n of a stiffness law over `WORKING_FORCES`, with the smallest possible largest relative error.
 

@@ -46,7 +46,7 @@ BUDGETS = {
     "rig/base": 902,
     "rig/channels": 2358,
     "rig/cli": 5127,
-    "rig/physics": 5451,
+    "rig/physics": 5453,
     "rig/run": 1786,
     "rig/serve": 2800,
 }

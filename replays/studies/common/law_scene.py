@@ -1,4 +1,4 @@
-"""The hammer scene with a contact law of a user's own, beside the twelve scenes that methods are compared on."""
+"""The hammer scene with a user's contact law, in addition to the twelve scenes that methods are compared on."""
 
 from __future__ import annotations
 
