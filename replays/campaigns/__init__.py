@@ -1,4 +1,4 @@
-"""Campaigns: scripted tests of a device in the loop, as ordinary tests of pytest, written in Python or in TOML.
+"""Campaigns: scripted tests of a device in the loop, run as pytest tests and written in Python or in TOML.
 
-`plugin` is what pytest loads; `campaign` reads `*.campaign.toml`; `results` and `page` are what is handed in.
+pytest loads `plugin`. `files.campaign` reads `*.campaign.toml`; `reporting` writes the results and their page.
 """

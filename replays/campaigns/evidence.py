@@ -1,4 +1,4 @@
-"""What comes of one test: its measurements, and where it failed the evidence of that."""
+"""State and results of one test: its measurements and, after a failure, its evidence."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from replays.campaigns.equipment.bench import BehindError, Bench, BenchSettings, Target
+from replays.campaigns.equipment.bench import Bench, BenchSettings, LateRigError, Target
 from replays.campaigns.equipment.device import Device
 from replays.campaigns.measurement import Measurement
 from rig.base.errors import DiskError, InputError
@@ -22,30 +22,30 @@ if TYPE_CHECKING:
     from recorder.reader import Recording
     from replays.campaigns.equipment.record import Record
 
-AROUND_S = 1.0
-"""Simulated time that is kept before and after an event [s]."""
+EVENT_MARGIN_S = 1.0
+"""Simulated time that the evidence covers before and after an event [s]."""
 
-_LARGE_BYTES = 100 << 20
-"""A file that a device has left is kept as evidence if it is smaller."""
+_MAX_EVIDENCE_BYTES = 100 << 20
+"""Largest size of a device's file that is kept as evidence."""
 
 
 class MeasurementError(AssertionError):
-    """A value is not as it must be; one line."""
+    """Error of a measurement outside its limit; the message is one line."""
 
 
 @dataclass
 class Trial:
-    """One test while it runs, and what it leaves.
+    """One running test and its results.
 
     Attributes:
-        id: The test's.
-        evidence: Folder that evidence goes to; None: it stays where the test ran.
-        target: On what it runs.
-        folder: Where it runs, removed at the end unless the evidence stays there.
-        settings: Of its bench.
-        measurements: What was judged, in order.
+        id: Name of the test.
+        evidence: Folder for evidence; None leaves it where the test ran.
+        target: Rig or recording that the test runs on.
+        folder: Working folder, removed at the end unless it holds the evidence.
+        settings: Settings of the bench.
+        measurements: Judged values, in order.
         kept: Files of the evidence.
-        floor_ms: Round trips to a rig in real time: median and longest [ms].
+        floor_ms: Median and maximum round-trip time of a rig in real time [ms].
     """
 
     id: str
@@ -64,7 +64,7 @@ class Trial:
     floor_ms: tuple[float, float] | None = None
 
     def start_bench(self, settings: BenchSettings) -> Bench:
-        """The bench, begun."""
+        """Start the bench and return it."""
         self.settings = settings
         self.bench = Bench(settings, self.folder, self.target)
         if self.bench.pace == "real-time":
@@ -74,10 +74,16 @@ class Trial:
     def start_device(
         self, command: str | Sequence[str], *, name: str, where: Path, joins: bool | None = None
     ) -> Device:
-        """The program under test, begun; in lockstep once it takes part, if it is to, else once it has a link.
+        """Start a device under test and return it once it has joined lockstep, or else once it is connected.
+
+        Args:
+            command: Its command line.
+            name: Its name.
+            where: Working directory.
+            joins: Whether it takes part in lockstep; None: yes if the bench runs in lockstep.
 
         Raises:
-            BenchError: It ended, or did not take part in time.
+            BenchError: If it ends, or does not join in time.
         """
         assert self.bench is not None
         bench, before = self.bench, self.bench.links
@@ -92,7 +98,7 @@ class Trial:
         return device
 
     def start_record(self) -> Record:
-        """The recording of the bench, begun."""
+        """Start a recording of the bench and return it."""
         from replays.campaigns.equipment.record import Record
 
         assert self.bench is not None
@@ -101,33 +107,33 @@ class Trial:
 
     @property
     def resolution(self) -> str:
-        """What reactions are exact to."""
+        """Resolution of reaction times, in words."""
         return "" if self.bench is None else self.bench.resolution
 
     def take(self, measurement: Measurement) -> Measurement:
-        """Keep a measurement, whatever comes of it."""
-        note, reason = self.lasting(measurement.note), self.lasting(measurement.open_reason)
+        """Add a measurement and return it with run-specific names replaced."""
+        note, reason = self.mask_addresses(measurement.note), self.mask_addresses(measurement.open_reason)
         self.measurements.append(replace(measurement, note=note, open_reason=reason))
         return self.measurements[-1]
 
-    def failed(self, line: str) -> MeasurementError | BehindError:
-        """What a measurement that is not as it must be raises: of the device, unless the rig was behind meanwhile."""
+    def failed(self, line: str) -> MeasurementError | LateRigError:
+        """Return the error for a failed limit: the device's, unless the rig fell behind real time."""
         late = 0 if self.bench is None else self.bench.late_blocks()
         if not late:
             return MeasurementError(line)
-        return BehindError(f"not judged, as the rig fell behind real time in {late} blocks (lockstep cannot): {line}")
+        return LateRigError(f"not judged because the rig fell behind real time in {late} blocks (use lockstep): {line}")
 
-    def lasting(self, text: str) -> str:
-        """A text of this run without what is another in the next: folders, ports and names."""
-        found = text.replace(str(self.folder), "{folder}")
+    def mask_addresses(self, text: str) -> str:
+        """Replace the folders, ports and names of this run in a text, so that every run gives the same text."""
+        masked = text.replace(str(self.folder), "{folder}")
         for address in () if self.bench is None else (self.bench.can_url, self.bench.url, self.bench.name):
-            found = found.replace(address.partition(":")[2] or address, "{rig}") if address else found
-        return found
+            masked = masked.replace(address.partition(":")[2] or address, "{rig}") if address else masked
+        return masked
 
     def close(self, *, failed: bool) -> None:
-        """End all that runs; keep the evidence of a failure, and remove the rest."""
+        """End all processes; keep the evidence of a failure, and remove the rest."""
         with ExitStack() as stack:
-            stack.callback(self._tidy, failed)
+            stack.callback(self._clean_up, failed)
             if self.record is not None and self.recording is None:
                 with contextlib.suppress(RuntimeError, InputError):
                     self.recording = self.record.stop()
@@ -136,7 +142,7 @@ class Trial:
             if self.bench is not None:
                 stack.callback(self.bench.close)
 
-    def _tidy(self, failed: bool) -> None:
+    def _clean_up(self, failed: bool) -> None:
         if failed:
             self._keep_evidence()
         if not failed or self.evidence is not None:
@@ -145,11 +151,11 @@ class Trial:
     def _keep_evidence(self) -> None:
         if self.settings is None:
             return
-        folder = self.folder if self.evidence is None else self.evidence / plain(self.id)
+        folder = self.folder if self.evidence is None else self.evidence / folder_name(self.id)
         folder.mkdir(parents=True, exist_ok=True)
-        # Logs, and what devices have left; of the session that was recorded a piece is enough.
+        # Logs and files of devices; an excerpt replaces the recorded session.
         for left in sorted(self.folder.iterdir()):
-            if left.is_file() and left.suffix != ".mcap" and left.stat().st_size < _LARGE_BYTES:
+            if left.is_file() and left.suffix != ".mcap" and left.stat().st_size < _MAX_EVIDENCE_BYTES:
                 if folder != self.folder:
                     shutil.copyfile(left, folder / left.name)
                 self.kept.append(folder / left.name)
@@ -167,7 +173,7 @@ class Trial:
         failed = [each for each in self.measurements if not each.good]
         span = recording.span_s or (0.0, 0.0)
         about = next((each.at_s + self.origin_s for each in failed if each.at_s is not None), span[1])
-        from_s, to_s = max(span[0], about - AROUND_S), min(span[1] + 1e-3, about + AROUND_S)
+        from_s, to_s = max(span[0], about - EVENT_MARGIN_S), min(span[1] + 1e-3, about + EVENT_MARGIN_S)
         made, picture = folder / "event.mcap", folder / "event.png"
         cut(recording, made, from_s=from_s, to_s=to_s, force=True)
         channels = dict.fromkeys(name for each in failed for name in each.channels)
@@ -175,7 +181,7 @@ class Trial:
         return [made, picture]
 
     def document(self) -> dict[str, Any]:
-        """What a report of this test carries: basic types alone."""
+        """Return the test's data for the report, in basic types only."""
         root = None if self.evidence is None else self.evidence.parent
         return {
             "measurements": [each.document() for each in self.measurements],
@@ -187,17 +193,17 @@ class Trial:
         }
 
     def raise_outcome(self) -> None:
-        """Raise what became of the measurements, a failure before an inconclusive one; nothing where all pass.
+        """Raise the outcome of the measurements; a failure takes precedence over an inconclusive one.
 
         Raises:
-            MeasurementError: A measurement fails; the line has the first and the number of others.
-            InconclusiveError: None fails, and one is inconclusive; or the rig was behind real time meanwhile.
+            MeasurementError: If a measurement fails; the line gives the first one and the number of others.
+            InconclusiveError: If none fails and one is inconclusive, or if the rig fell behind real time.
         """
         for outcome, error in ((Outcome.FAIL, self.failed), (Outcome.INCONCLUSIVE, InconclusiveError)):
-            if found := [each for each in self.measurements if each.outcome is outcome]:
-                raise error(found[0].line + (f"; and {len(found) - 1} more" if found[1:] else ""))
+            if unmet := [each for each in self.measurements if each.outcome is outcome]:
+                raise error(unmet[0].line + (f"; and {len(unmet) - 1} more" if unmet[1:] else ""))
 
 
-def plain(name: str) -> str:
-    """A test's name as that of a folder."""
+def folder_name(name: str) -> str:
+    """Return a folder name for a test."""
     return re.sub(r"[^\w.=,+-]+", "_", name)[-150:]

@@ -1,4 +1,4 @@
-"""What stands in `@pytest.mark.bench(...)`, checked."""
+"""Arguments of `@pytest.mark.bench(...)` and their validation."""
 
 from __future__ import annotations
 
@@ -26,22 +26,22 @@ class _Marker(Written):
     can: bool = False
 
 
-def settings_of(given: dict[str, Any]) -> BenchSettings:
-    """Settings of a bench.
+def read_settings(given: dict[str, Any]) -> BenchSettings:
+    """Return bench settings from the arguments of the marker.
 
     Raises:
-        InputError: The first that is wrong.
+        InputError: If an argument is invalid; the message names the first one.
     """
-    made = check(_Marker, given, field="bench")
-    faults = [{"at_s": 0.0, **each, "command": "fault"} for each in made.faults]
+    args = check(_Marker, given, field="bench")
+    faults = [{"at_s": 0.0, **each, "command": "fault"} for each in args.faults]
     timed = tuple(
         check(TimedCommand, each, field=f"bench.{field}.{n}")
-        for field, several in (("commands", list(made.commands)), ("faults", faults))
+        for field, several in (("commands", list(args.commands)), ("faults", faults))
         for n, each in enumerate(several)
     )
-    if made.scene is not None:
-        load_scene(made.scene, dict(made.set))
-    scene = None if made.scene is None else str(made.scene)
+    if args.scene is not None:
+        load_scene(args.scene, dict(args.set))
+    scene = None if args.scene is None else str(args.scene)
     return BenchSettings(
-        scene, made.pace, made.block_ms, made.set, made.channels, timed, made.duration_s, made.table, made.can
+        scene, args.pace, args.block_ms, args.set, args.channels, timed, args.duration_s, args.table, args.can
     )

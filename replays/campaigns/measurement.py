@@ -1,4 +1,4 @@
-"""A value with its unit against a limit with its own: what is asked, what came out, and how much there was to spare."""
+"""Measurements: a value, its limit, both with units, and the margin between them."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ Limit = float | tuple[float, float]
 
 @dataclass(frozen=True)
 class Must:
-    """What is asked of a value.
+    """Limit of a value.
 
     Attributes:
         op: One of `OPERATORS`.
-        limit: The number, or both of "between".
-        unit: Theirs; "1" without one.
+        limit: Number, or lower and upper number for "between".
+        unit: Unit of the limit; "1" if dimensionless.
     """
 
     op: str
@@ -37,10 +37,10 @@ class Must:
 
     @classmethod
     def parse(cls, text: str, *, field: str) -> Must:
-        """Read `<= 100 ms`, `== 3` or `4 to 6 Hz`.
+        """Parse `<= 100 ms`, `== 3` or `4 to 6 Hz`.
 
         Raises:
-            InputError: It does not read so.
+            InputError: If the text has another form.
         """
         match = _MUST.fullmatch(text)
         if match is None:
@@ -53,10 +53,15 @@ class Must:
         return cls("between", (float(low), float(high)), unit or "1")
 
     def within(self, unit: str, *, field: str, of: str) -> Must:
-        """The same in the unit of what is measured.
+        """Return the limit in the unit of the measured value.
+
+        Args:
+            unit: Unit of the value.
+            field: Field named in errors.
+            of: What is measured, named in errors.
 
         Raises:
-            InputError: It has no unit where there is one, or one of something else.
+            InputError: If the unit is missing or of another kind.
         """
         scale = _factor(self.unit, unit, field=field, of=of, text=str(self))
         limit = self.limit
@@ -69,35 +74,35 @@ class Must:
         return with_unit(f"{self.op} {self.limit:.6g}", self.unit)
 
     def margin(self, value: float) -> float:
-        """How far inside the limit a value is; negative: outside."""
+        """Return the distance of a value from the limit, negative outside it."""
         if isinstance(self.limit, tuple):
             margin = min(value - self.limit[0], self.limit[1] - value)
         elif self.op in ("==", "!="):
             margin = abs(value - self.limit) * (-1.0 if self.op == "==" else 1.0)
         else:
             margin = self.limit - value if self.op.startswith("<") else value - self.limit
-        return float(f"{margin:.12g}") + 0.0  # no -0, and no digits that subtraction leaves
+        return float(f"{margin:.12g}") + 0.0  # drops -0 and rounding errors of the subtraction
 
     def holds(self, value: float) -> bool:
-        """Whether a value is as asked; nan is not."""
+        """Return whether a value is within the limit; NaN is not."""
         margin = self.margin(value)
         return margin > 0.0 if self.op in ("<", ">", "!=") else margin >= 0.0
 
 
 @dataclass(frozen=True)
 class Measurement:
-    """One value that was judged.
+    """One judged value.
 
     Attributes:
-        name: Of what.
-        value: In the unit of `must`; nan where there was nothing to measure.
-        must: What was asked.
-        source: Where the limit is from.
-        resolution: What the value is exact to.
-        note: What else is to be known, such as why there is no value.
-        at_s: Simulated time that it is about [s].
-        channels: Channels that it is about.
-        open_reason: Reason why the value neither passes nor fails; empty where it does.
+        name: What was measured.
+        value: Value in the unit of `must`; NaN if there was nothing to measure.
+        must: Limit.
+        source: Origin of the limit.
+        resolution: Resolution of the value.
+        note: Remark, such as the reason for a missing value.
+        at_s: Simulated time of the value [s].
+        channels: Channels that the value depends on.
+        open_reason: Reason why the value neither passes nor fails; empty if it does.
     """
 
     name: str
@@ -112,21 +117,21 @@ class Measurement:
 
     @property
     def outcome(self) -> Outcome:
-        """Inconclusive where there is a reason for that, else pass or fail by the limit."""
+        """Outcome: inconclusive if there is an open reason, otherwise pass or fail by the limit."""
         if self.open_reason:
             return Outcome.INCONCLUSIVE
         return Outcome.PASS if self.must.holds(self.value) else Outcome.FAIL
 
     @property
     def good(self) -> bool:
-        """Whether it passes."""
+        """True if the measurement passes."""
         return self.outcome is Outcome.PASS
 
     @property
     def line(self) -> str:
-        """All of it, in a line."""
+        """Complete result on one line."""
         unit = self.must.unit
-        told = with_unit(f"{self.value:.6g}", unit) if math.isfinite(self.value) else "nothing"
+        text = with_unit(f"{self.value:.6g}", unit) if math.isfinite(self.value) else "nothing"
         margin = with_unit(f"{self.must.margin(self.value):+.4g}", unit) if math.isfinite(self.value) else ""
         parts = [
             f"margin {margin}" if margin else "",
@@ -137,13 +142,13 @@ class Measurement:
         if self.open_reason:
             return f"{self.name} must be {self.must}; inconclusive: {self.open_reason}" + (f" [{rest}]" if rest else "")
         return (
-            f"{self.name} must be {self.must}; instead received {told}"
+            f"{self.name} must be {self.must}; instead received {text}"
             if not self.good
-            else f"{self.name} is {told}, as it must be: {self.must}"
+            else f"{self.name} is {text}, as it must be: {self.must}"
         ) + (f" ({self.note})" if self.note else "") + (f" [{rest}]" if rest else "")  # fmt: skip
 
     def document(self) -> dict[str, Any]:
-        """As a document for JSON."""
+        """Return the measurement as a JSON document."""
         return finite({
             "name": self.name, "value": self.value, "unit": self.must.unit,
             "op": self.must.op, "limit": self.must.limit,
@@ -153,31 +158,31 @@ class Measurement:
         })  # fmt: skip
 
     def properties(self) -> list[tuple[str, str]]:
-        """The same as JUnit's properties."""
-        told = self.document()
-        found = [(self.name, with_unit("nothing" if told["value"] is None else f"{told['value']:.9g}", self.must.unit))]
-        found += [(f"{self.name}.limit", str(self.must))]
-        if told["margin"] is not None:
-            found += [(f"{self.name}.margin", with_unit(f"{told['margin']:.6g}", self.must.unit))]
+        """Return the measurement as JUnit properties."""
+        document = self.document()
+        value = "nothing" if document["value"] is None else f"{document['value']:.9g}"
+        found = [(self.name, with_unit(value, self.must.unit)), (f"{self.name}.limit", str(self.must))]
+        if document["margin"] is not None:
+            found += [(f"{self.name}.margin", with_unit(f"{document['margin']:.6g}", self.must.unit))]
         rest = (("source", self.source), ("resolution", self.resolution))
         return found + [(f"{self.name}.{key}", value) for key, value in rest if value]
 
 
 def quantity(text: str, unit: str, *, field: str, of: str) -> float:
-    """A number with a unit, such as "0.2 mm", in the unit of what it is about.
+    """Parse a number with a unit, such as "0.2 mm", and return it in the unit of what it applies to.
 
     Raises:
-        InputError: It does not read so, or its unit is missing or of something else.
+        InputError: If the text has another form, or its unit is missing or of another kind.
     """
     number, given = split_quantity(text, field=field)
     return number * _factor(given, unit, field=field, of=of, text=text)
 
 
 def split_quantity(text: str, *, field: str) -> tuple[float, str]:
-    """Number and unit of a text such as "0.2 mm"; "1" where there is none.
+    """Split a text such as "0.2 mm" into number and unit; the unit is "1" if there is none.
 
     Raises:
-        InputError: It does not read so.
+        InputError: If the text has another form.
     """
     match = _QUANTITY.fullmatch(text)
     if match is None:
@@ -199,17 +204,17 @@ def _factor(given: str, wanted: str, *, field: str, of: str, text: str) -> float
 
 
 def with_unit(number: str, unit: str) -> str:
-    """A number with its unit behind it, if it has one."""
+    """Return a number followed by its unit, if it has one."""
     return number if unit in _UNITLESS else f"{number} {unit}"
 
 
-def measured(
-    name: str, value: float, unit: str, op: str, limit: Limit, *, unit_of_limit: str | None = None, **told: Any
+def judge_value(
+    name: str, value: float, unit: str, op: str, limit: Limit, *, unit_of_limit: str | None = None, **fields: Any
 ) -> Measurement:
-    """A value that is judged; as the fixture `measure`.
+    """Return a measurement from a value and its limit, as the fixture `measure` does.
 
     Raises:
-        InputError: There is no such comparison, the limit is none, or its unit is of something else.
+        InputError: If the operator is unknown, the limit is not a number, or the units are of different kinds.
     """
     if op not in OPERATORS:
         raise InputError("op", f"one of {', '.join(OPERATORS)}", op)
@@ -222,4 +227,4 @@ def measured(
     if isinstance(numbers, tuple) and (len(numbers) != 2 or not numbers[0] <= numbers[1]):
         raise InputError("limit", "two numbers, the lower first", limit)
     must = Must(op, numbers, unit_of_limit or unit).within(unit or "1", field="unit_of_limit", of=name)  # type: ignore[arg-type]
-    return Measurement(name, value, must, **told)
+    return Measurement(name, value, must, **fields)

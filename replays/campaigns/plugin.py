@@ -1,6 +1,6 @@
-"""What pytest loads: the fixtures `bench`, `dut`, `record` and `measure`, and campaigns in TOML as ordinary tests.
+"""pytest plugin: the fixtures `bench`, `dut`, `record` and `measure`, and campaigns in TOML as pytest tests.
 
-All that is heavy is imported where it is used, as every run of pytest in the same environment loads this.
+Heavy modules are imported where they are used, because every pytest run in the environment loads this plugin.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _MARKER = (
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Options of campaigns."""
+    """Add the options of campaigns."""
     group = parser.getgroup("rig", "campaigns on a rotor-stator rig")
     group.addoption("--rig-results", metavar="FOLDER", help="write results.json, junit.xml, index.html and evidence/")
     group.addoption("--rig-against", metavar="FOLDER", help="results of an earlier campaign to compare with")
@@ -39,18 +39,18 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Register the marker, and on the process that gathers them the results."""
+    """Register the marker and, on the controlling process, the results."""
     config.addinivalue_line("markers", _MARKER)
     folder, against, replay = config.option.rig_results, config.option.rig_against, config.option.rig_replay
     if hasattr(config, "workerinput") or not (folder or replay):
         return
-    from replays.campaigns.equipment.bench import check_replay
+    from replays.campaigns.equipment.bench import validate_replay
     from replays.campaigns.reporting.results import Results
     from rig.base.errors import DiskError, InputError
 
     try:
         if replay:
-            check_replay(Path(replay))
+            validate_replay(Path(replay))
         if folder:
             results = Results(Path(folder), None if against is None else Path(against), config)
             config.pluginmanager.register(results, "rig-results")
@@ -59,15 +59,15 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> pytest.Collector | None:
-    """Collect a campaign's file."""
+    """Collect a campaign file."""
     return CampaignFile.from_parent(parent, path=file_path) if file_path.name.endswith(_SUFFIX) else None
 
 
 class CampaignFile(pytest.File):
-    """A campaign in TOML."""
+    """A campaign file in TOML."""
 
     def collect(self) -> Iterator[pytest.Item]:
-        """Its cases."""
+        """Yield the cases of the file."""
         from replays.campaigns.files.campaign import load_campaign
         from rig.base.errors import InputError
 
@@ -87,48 +87,48 @@ class CampaignItem(pytest.Item):
         self.case = case
 
     def setup(self) -> None:
-        """Make its trial."""
+        """Create the trial of the case."""
         self.stash[_TRIAL] = _trial_of(self)
 
     def runtest(self) -> None:
-        """Run it."""
-        from replays.campaigns.equipment.bench import NotThereError
+        """Run the case."""
+        from replays.campaigns.equipment.bench import UnsupportedError
         from replays.campaigns.files.run import run_case
 
         trial = self.stash[_TRIAL]
         try:
             run_case(self.case, trial)
-        except NotThereError as error:
+        except UnsupportedError as error:
             pytest.skip(str(error))
         finally:
             for measurement in trial.measurements:
                 self.user_properties.extend(measurement.properties())
 
     def teardown(self) -> None:
-        """End what runs, and keep the evidence of a failure."""
+        """End all processes, and keep the evidence of a failure."""
         if (trial := self.stash.get(_TRIAL, None)) is not None:
             trial.close(failed=self.stash.get(_FAILED, False))
 
     def repr_failure(self, excinfo: pytest.ExceptionInfo[BaseException], style: Any = None) -> Any:
-        """A line for each value that is not as it must be, or the one of what failed."""
+        """Return one line for each measurement outside its limit, or the line of the error."""
         from replays.campaigns.equipment.bench import BenchError
         from replays.campaigns.evidence import MeasurementError
         from rig.base.errors import DiskError, InputError
 
         if isinstance(excinfo.value, BenchError | InputError | DiskError | ConnectionError | TimeoutError):
-            return self.stash[_TRIAL].lasting(str(excinfo.value))
+            return self.stash[_TRIAL].mask_addresses(str(excinfo.value))
         if isinstance(excinfo.value, MeasurementError | InconclusiveError):
             return "\n".join(each.line for each in self.stash[_TRIAL].measurements if not each.good)
         return super().repr_failure(excinfo, style)
 
     def reportinfo(self) -> tuple[Path, int | None, str]:
-        """Where it stands."""
+        """Return the location and title of the case."""
         return self.path, None, f"{self.case.title}: {self.name}"
 
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_call(item: pytest.Item) -> Generator[None, Any, Any]:
-    """Raise the outcome of a trial's measurements, once its test has ended without an error of its own."""
+    """Raise the outcome of a trial's measurements after its test has ended without an error of its own."""
     result = yield
     if (trial := item.stash.get(_TRIAL, None)) is not None:
         trial.raise_outcome()
@@ -137,13 +137,13 @@ def pytest_runtest_call(item: pytest.Item) -> Generator[None, Any, Any]:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) -> Generator[None, Any, Any]:
-    """Keep whether a test failed, and put what a trial has left into the last report of its test."""
+    """Note whether a test failed, and add the data of its trial to the report of its teardown."""
     report = yield
     if report.failed:
         item.stash[_FAILED] = True
         error = None if call.excinfo is None else call.excinfo.value
         if isinstance(error, InconclusiveError):
-            # In its phase "call" pytest reports a failure, and in every other phase an error.
+            # pytest reports a failure for the phase "call" and an error for every other phase.
             report.when, report.rig_inconclusive = "verdict", True
             report.longrepr = report.longrepr if isinstance(item, CampaignItem) else str(error)
     if report.when == "teardown" and (trial := item.stash.get(_TRIAL, None)) is not None:
@@ -155,7 +155,7 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) ->
 
 
 def pytest_report_teststatus(report: pytest.TestReport | pytest.CollectReport) -> tuple[str, str, str] | None:
-    """Count an inconclusive test among the errors."""
+    """Count an inconclusive test as an error."""
     return ("error", "I", "INCONCLUSIVE") if getattr(report, "rig_inconclusive", False) else None
 
 
@@ -171,7 +171,7 @@ def _trial_of(item: pytest.Item) -> Trial:
 
 @pytest.fixture
 def rig_trial(request: pytest.FixtureRequest) -> Iterator[Trial]:
-    """What the other fixtures share; ends all of it."""
+    """Provide the state that the other fixtures share; end all processes afterwards."""
     item = request.node
     trial = item.stash[_TRIAL] = _trial_of(item)
     yield trial
@@ -180,14 +180,14 @@ def rig_trial(request: pytest.FixtureRequest) -> Iterator[Trial]:
 
 @pytest.fixture
 def bench(request: pytest.FixtureRequest, rig_trial: Trial) -> Bench:
-    """A rig of the test's own, in lockstep unless `@pytest.mark.bench(...)` says else: `bench.connect(...)`."""
-    from replays.campaigns.equipment.bench import NotThereError
-    from replays.campaigns.mark_arguments import settings_of
+    """Provide a rig for the test, in lockstep by default: see `@pytest.mark.bench(...)` and `bench.connect(...)`."""
+    from replays.campaigns.equipment.bench import UnsupportedError
+    from replays.campaigns.mark_arguments import read_settings
 
     marker = request.node.get_closest_marker("bench")
     try:
-        made = rig_trial.start_bench(settings_of({} if marker is None else marker.kwargs))
-    except NotThereError as error:
+        made = rig_trial.start_bench(read_settings({} if marker is None else marker.kwargs))
+    except UnsupportedError as error:
         pytest.skip(str(error))
     made.begin()
     return made
@@ -195,7 +195,7 @@ def bench(request: pytest.FixtureRequest, rig_trial: Trial) -> Bench:
 
 @pytest.fixture
 def dut(bench: Bench, rig_trial: Trial, request: pytest.FixtureRequest) -> Callable[..., Device]:
-    """Starts a device under test: `dut("python protection.py {url} --name {name}", name="protection")`."""
+    """Start a device under test: `dut("python protection.py {url} --name {name}", name="protection")`."""
 
     def start(command: str | Sequence[str], *, name: str = "device", joins: bool | None = None) -> Device:
         return rig_trial.start_device(command, name=name, where=request.node.path.parent, joins=joins)
@@ -205,25 +205,25 @@ def dut(bench: Bench, rig_trial: Trial, request: pytest.FixtureRequest) -> Calla
 
 @pytest.fixture
 def record(bench: Bench, rig_trial: Trial) -> Record:
-    """A recording of the bench from the start of the test on; `record.stop()` gives it."""
+    """Record the bench from the start of the test; `record.stop()` returns the recording."""
     made = rig_trial.start_record()
-    made.wait_until_there()  # or its link would be taken for that of a device
+    made.wait_until_connected()  # otherwise its connection would count as that of a device
     return made
 
 
 @pytest.fixture
 def measure(request: pytest.FixtureRequest, rig_trial: Trial) -> Callable[..., float]:
-    """Holds a value against a limit, puts it into all results, and asserts."""
+    """Compare a value with a limit, add it to all results, and raise an error if it fails."""
 
     def hold(
         name: str, value: float, unit: str, op: str, limit: Any, *, unit_of_limit: str | None = None, source: str = "",
         at_s: float | None = None, channels: Sequence[str] = (),
     ) -> float:  # fmt: skip
         __tracebackhide__ = True
-        from replays.campaigns.measurement import measured
+        from replays.campaigns.measurement import judge_value
 
-        told = {"source": source, "resolution": rig_trial.resolution, "at_s": at_s, "channels": tuple(channels)}
-        made = rig_trial.take(measured(name, value, unit, op, limit, unit_of_limit=unit_of_limit, **told))
+        fields = {"source": source, "resolution": rig_trial.resolution, "at_s": at_s, "channels": tuple(channels)}
+        made = rig_trial.take(judge_value(name, value, unit, op, limit, unit_of_limit=unit_of_limit, **fields))
         request.node.user_properties.extend(made.properties())
         if made.outcome is Outcome.FAIL:
             raise rig_trial.failed(made.line)

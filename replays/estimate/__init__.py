@@ -1,4 +1,4 @@
 """Estimation: least squares, 95 % intervals, lines through two clocks, spectra and sines, each defined once.
 
-Functions of arrays, below everything else in `replays`: nothing here reads a recording, a scene or a file.
+Functions of arrays, independent of the other packages: they read no recording, scene or file.
 """

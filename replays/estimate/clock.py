@@ -1,4 +1,4 @@
-"""Straight lines through two clocks, or through a clock and row numbers, and the time error of a residual."""
+"""Straight lines between two clocks, or between a clock and row numbers, and the time error of a residual."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ class Line(NamedTuple):
     """A straight line y = offset + slope (x - centre) by least squares.
 
     Attributes:
-        slope: Unit of y by unit of x.
+        slope: Slope [unit of y per unit of x].
         centre: Mean of x.
         offset: Mean of y, the value at the centre.
-        x: What it was fitted to, shape (n,).
-        residual: y less the line, shape (n,).
+        x: Fitted abscissae, shape (n,).
+        residual: y minus the line, shape (n,).
     """
 
     slope: float
@@ -38,7 +38,7 @@ class Line(NamedTuple):
 
     @property
     def half(self) -> tuple[float, float]:
-        """Half of the 95 % intervals of the slope and of the value at x = 0, for independent residuals."""
+        """Half widths of the 95 % intervals of the slope and of the value at x = 0, for independent residuals."""
         n = len(self.residual)
         variance = float(self.residual @ self.residual) / (n - 2)
         spread = float(np.sum((self.x - self.centre) ** 2))
@@ -47,7 +47,7 @@ class Line(NamedTuple):
 
 
 def fit_line(x: np.ndarray, y: np.ndarray) -> Line:
-    """Fit a straight line about the means, so that no digits are lost where both are large; level where x is constant.
+    """Fit a straight line about the means, to keep digits if x and y are large; the slope is 0 if x is constant.
 
     Args:
         x: Times of one clock or row numbers, shape (n,).
@@ -61,14 +61,14 @@ def fit_line(x: np.ndarray, y: np.ndarray) -> Line:
 
 
 def time_error(slope: np.ndarray, residual: np.ndarray) -> float:
-    """Return by how much a signal is early, by least squares of a residual over its slope.
+    """Return how early a signal is, by least squares of a residual over its slope.
 
     Args:
-        slope: Of the known signal [unit/s], or by sample, shape (n,) or (channels, n).
-        residual: Recorded less known [unit], of the same shape.
+        slope: Slope of the known signal [unit/s], or per sample, shape (n,) or (channels, n).
+        residual: Recorded minus known signal [unit], of the same shape.
 
     Returns:
-        Time error [s], or [samples]; 0 where the signal has no slope.
+        Time error [s], or [samples]; 0 if the signal has no slope.
     """
     known = float(np.sum(slope**2))
     return float(np.sum(slope * residual)) / known if known > 0.0 else 0.0

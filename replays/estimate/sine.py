@@ -1,6 +1,6 @@
-"""The sine fit of IEEE 1057 with four parameters, and what of a record is neither the sine nor its offset.
+"""Four-parameter sine fit of IEEE 1057, and the noise and distortion of the record.
 
-Definitions are those of IEEE Std 1057-2017 as papers and tutorials give them; the standard itself was not at hand.
+Definitions follow papers and tutorials on IEEE Std 1057-2017; the standard itself was not available.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from replays.estimate.least_squares import inverse_square, solve
 from replays.estimate.spectra import parabola_top, periodic_hann, power, spectrum
 
 HARMONICS = 10
-"""The highest harmonic that counts for the total distortion."""
-_PURE = 3e-5
-"""Rest of a formula over its amplitude up to which it is a sine: a fitted clock bends it by 1e-6 and more."""
-_ROUNDS = 20
-_SAME_TURNS = 1.6e-13
-"""Change of a phase over all rows that is rounding [cycles]."""
+"""Highest harmonic included in the total harmonic distortion."""
+_MAX_SINE_RESIDUAL = 3e-5
+"""Largest residual of a sine over its amplitude for a formula; a fitted clock deforms it by 1e-6 and more."""
+_MAX_ROUNDS = 20
+_PHASE_ROUNDING = 1.6e-13
+"""Change of a phase over all rows at the level of rounding errors [cycles]."""
 _NEIGHBOURS = 17
-"""Lines by which the noise at a line is known, to a third."""
+"""Number of spectral lines whose median gives the noise at a line to within a third."""
 
 
 @dataclass(frozen=True)
@@ -30,9 +30,9 @@ class SineFit:
     """A sine in a record: offset + amplitude cos(2 pi f t + phase).
 
     Attributes:
-        frequency: [cycles a sample], and its standard deviation.
-        amplitude: [unit], and its standard deviation.
-        residual: What is left, shape (n,).
+        frequency: Frequency and its standard deviation [cycles/sample].
+        amplitude: Amplitude and its standard deviation [unit].
+        residual: Record minus sine, shape (n,).
     """
 
     frequency: tuple[float, float]
@@ -41,30 +41,30 @@ class SineFit:
 
     @property
     def nad(self) -> float:
-        """Noise and distortion, rms [unit]."""
+        """Rms of noise and distortion [unit]."""
         return math.sqrt(float(self.residual @ self.residual) / (len(self.residual) - 4))
 
 
 def tone_columns(n: np.ndarray, turns: np.ndarray) -> np.ndarray:
-    """Return cosine and sine of each frequency [cycles a row] at rows, and a constant, shape (n, 2 frequencies + 1)."""
+    """Return cosine and sine of each frequency [cycles/row] at rows, and a constant, shape (n, 2 frequencies + 1)."""
     phases = 2.0 * math.pi * np.outer(n, turns)
     return np.column_stack([np.cos(phases), np.sin(phases), np.ones(len(n))])
 
 
 def fit_tones(
-    n: np.ndarray, values: np.ndarray, turns: np.ndarray, settled: float = _SAME_TURNS
+    n: np.ndarray, values: np.ndarray, turns: np.ndarray, settled: float = _PHASE_ROUNDING
 ) -> tuple[np.ndarray, ...]:
-    """Refine the frequencies of tones in a signal by Gauss and Newton's steps.
+    """Refine the frequencies of tones in a signal by Gauss-Newton steps.
 
     Args:
-        n: Numbers of the rows, about 0, shape (n,).
-        values: The signal, shape (n,).
-        turns: Frequencies near which the tones are [cycles a row], shape (k,).
-        settled: Change of the phase over all rows by a step that is the last [cycles].
+        n: Row numbers, centred on 0, shape (n,).
+        values: Signal, shape (n,).
+        turns: Initial frequencies [cycles/row], shape (k,).
+        settled: Change of phase over all rows below which the iteration ends [cycles].
 
     Returns:
-        Frequencies [cycles a row], shape (k,); cosine parts, sine parts and the constant, shape (2 k + 1,); slopes by
-        frequency and by part, shape (n, 3 k + 1); and what is left, shape (n,).
+        Frequencies [cycles/row], shape (k,); cosine parts, sine parts and the constant, shape (2 k + 1,); derivatives
+        by frequency and by part, shape (n, 3 k + 1); and residual, shape (n,).
     """
     k, moved, rounds = len(turns), np.full(len(turns), np.inf), 0
     while True:
@@ -72,16 +72,16 @@ def fit_tones(
         parts = solve(basis, values)
         slopes = 2.0 * math.pi * n[:, None] * (basis[:, :k] * parts[k : 2 * k] - basis[:, k : 2 * k] * parts[:k])
         matrix, residual = np.column_stack([slopes, basis]), values - basis @ parts
-        if rounds == _ROUNDS or np.abs(moved).max() * len(n) < settled:
+        if rounds == _MAX_ROUNDS or np.abs(moved).max() * len(n) < settled:
             return turns, parts, matrix, residual
         moved = solve(matrix, residual)[:k]
         turns, rounds = turns + moved, rounds + 1
 
 
 def fit_sine(values: np.ndarray) -> SineFit:
-    """Fit a sine with four parameters to values, shape (n,)."""
+    """Fit a four-parameter sine to values, shape (n,)."""
     n = np.arange(len(values)) - 0.5 * (len(values) - 1)
-    turns, (cosine, sine, _), matrix, residual = fit_tones(n, values, np.array([_peak(values)]), _SAME_TURNS)
+    turns, (cosine, sine, _), matrix, residual = fit_tones(n, values, np.array([_peak(values)]), _PHASE_ROUNDING)
     spread = np.sqrt(np.diag(inverse_square(matrix)) * float(residual @ residual) / (len(n) - 4))
     return SineFit(
         (float(turns[0]), float(spread[0])), (math.hypot(cosine, sine), float(max(spread[1], spread[2]))), residual
@@ -89,7 +89,7 @@ def fit_sine(values: np.ndarray) -> SineFit:
 
 
 def _peak(values: np.ndarray) -> float:
-    """Frequency of the largest line [cycles a sample]: with a Hann window, between two lines as the window has it."""
+    """Return the frequency of the largest line [cycles/sample], interpolated between two lines with a Hann window."""
     lines = np.abs(spectrum((values - values.mean()) * periodic_hann(len(values))))
     k = int(np.argmax(lines[1:-1])) + 1
     side = 1 if lines[k + 1] > lines[k - 1] else -1
@@ -98,24 +98,24 @@ def _peak(values: np.ndarray) -> float:
 
 
 def is_sine(values: np.ndarray, noise: float) -> bool:
-    """Whether a signal is a sine, and what else is in it is no more than noise of some rms [unit]."""
+    """Return whether a signal is a sine plus noise of at most the given rms [unit]."""
     spread = float(np.var(values))
     if len(values) < 64 or not spread > 0.0:
         return False
     fit = fit_sine(values)
-    pure = fit.nad < max(noise, _PURE * fit.amplitude[0])
+    pure = fit.nad < max(noise, _MAX_SINE_RESIDUAL * fit.amplitude[0])
     return pure and fit.amplitude[0] > fit.nad and 2.0 / len(values) < fit.frequency[0] < 0.49
 
 
 @dataclass(frozen=True)
 class Quality:
-    """What a sine record tells of a converter, each with its 95 % interval: value, low, high.
+    """Quality of a converter from a sine record, each with its 95 % interval: value, low, high.
 
     Attributes:
-        sinad_db: Sine over noise and distortion.
-        enob: Effective bits of that ratio, (SINAD - 1.76) / 6.02.
-        thd_db: Harmonics 2 to 10 over the sine; folded ones are counted where they fall.
-        sfdr_db: Sine over the largest line besides it.
+        sinad_db: Ratio of the sine to noise and distortion.
+        enob: Effective number of bits, (SINAD - 1.76) / 6.02.
+        thd_db: Ratio of harmonics 2 to 10, including aliased ones, to the sine.
+        sfdr_db: Ratio of the sine to the largest other line.
     """
 
     sinad_db: tuple[float, float, float]
@@ -125,16 +125,16 @@ class Quality:
 
 
 def quality(fit: SineFit) -> Quality:
-    """Judge a converter by a sine.
+    """Compute the quality of a converter from a sine fit.
 
-    Intervals: SINAD by chi squared, with the degrees of freedom of the residual's spectrum; THD and SFDR by the noise
-    around each harmonic, or line (delta method, with none the noise's own).
+    The interval of SINAD is chi squared, with the degrees of freedom of the residual's spectrum. Those of THD and SFDR
+    follow from the noise around each harmonic or line by the delta method; without one, from the noise itself.
     """
     n, amplitude, nad = len(fit.residual), fit.amplitude[0], fit.nad
     ratio = 20.0 * math.log10(amplitude / math.sqrt(2.0) / nad)
     rows, lines = np.arange(n), power(fit.residual) * (2.0 / n)
     floor = _noise_floor(fit.residual)
-    # A line of noise spreads as its own power, and one that stands out by twice the product of its power and the noise.
+    # The power of a noise line has its own value as spread; a distinct line adds twice its product with the noise.
     spread = max(float(floor @ (2.0 * lines - floor)), 0.5 * float(floor @ floor))
     freedom = (1.0 - 4.0 / n) * 2.0 * float(lines.sum()) ** 2 / spread
     ends = [10.0 * math.log10(end) for end in chi2_mean_ends(freedom)]
@@ -147,7 +147,7 @@ def quality(fit: SineFit) -> Quality:
             continue
         phase = 2.0 * math.pi * folded * rows
         parts = 2.0 / n * np.array([np.cos(phase) @ fit.residual, np.sin(phase) @ fit.residual])
-        # Variance of one part of a line's amplitude.
+        # Variance of one component of a line's amplitude.
         line, each = float(floor[round(folded * n)]), float(parts @ parts)
         distortion, variance = distortion + each - 2.0 * line, variance + 4.0 * line * each + 4.0 * line**2
     thd = decibels(distortion / amplitude**2, 1.96 * math.sqrt(variance) / amplitude**2)
@@ -155,30 +155,30 @@ def quality(fit: SineFit) -> Quality:
     shown = (np.abs(spectrum(fit.residual * window)) * 2.0 / window.sum()) ** 2
     at = 3 + int(np.argmax(shown[3:])) if n > 8 else 0
     largest = _crest(shown[at - 1 : at + 2]) if n > 8 else 0.0
-    # A window widens lines: of a line's noise it lets through 1.73 times as much power as none.
+    # The window widens lines: the noise of a line contains 1.73 times the power without a window.
     wide = 1.96 * math.sqrt(4.0 * 1.73 * float(floor[at]) * largest)
     value, low, high = decibels(largest / amplitude**2, wide / amplitude**2)
     return Quality(sinad, enob, thd, (-value, -high, -low))
 
 
 def _crest(powers: np.ndarray) -> float:
-    """Return the power of a line between those of a window's spectrum, of which the largest is the middle one."""
+    """Return the peak power of a line from three lines of a windowed spectrum, the largest in the middle."""
     if len(powers) < 3 or not powers.min() > 0.0:
         return float(powers.max())
     return float(powers[1]) * math.exp(parabola_top(*np.log(powers))[1])
 
 
 def _noise_floor(residual: np.ndarray) -> np.ndarray:
-    """Return the noise's power at each line of a residual's spectrum [unit^2], by the median of its neighbours."""
+    """Return the noise power at each line of a residual's spectrum [unit^2], as the median of neighbouring lines."""
     from scipy.ndimage import median_filter
 
-    # Behind a window, lines that stand out do not leak to their neighbours.
+    # With a window, distinct lines do not leak into their neighbours.
     lines = power(residual, periodic_hann(len(residual))) * (2.0 / len(residual))
     # The median of chi squared with two degrees of freedom is ln 2 times its mean; the ends are mirrored.
     return median_filter(lines, size=_NEIGHBOURS, mode="mirror") / math.log(2.0)
 
 
 def decibels(power: float, half: float) -> tuple[float, float, float]:
-    """Return a ratio of powers and its half interval in dB: value, low, high."""
-    least = 1e-30
-    return tuple(10.0 * math.log10(max(least, each)) for each in (power, power - half, power + half))  # type: ignore[return-value]
+    """Return a power ratio and its interval in dB: value, low, high."""
+    floor = 1e-30
+    return tuple(10.0 * math.log10(max(floor, each)) for each in (power, power - half, power + half))  # type: ignore[return-value]

@@ -1,4 +1,4 @@
-"""Spectra of real signals, their use as filters and correlations, and the peak of a curve between its samples.
+"""Spectra of real signals, filters and correlations, and interpolation of a peak between samples.
 
 The two-sided spectrum of an orbit x + j y is `rig.channels.orbit.full_spectrum`.
 """
@@ -11,33 +11,33 @@ import numpy as np
 
 
 def spectrum(values: np.ndarray, size: int | None = None) -> np.ndarray:
-    """Return the one-sided spectrum along the last axis, complex, with zeros appended up to `size` rows."""
+    """Return the one-sided complex spectrum along the last axis, zero-padded to `size` rows."""
     return np.fft.rfft(values, size)
 
 
 def power(values: np.ndarray, window: np.ndarray | float = 1.0) -> np.ndarray:
-    """Return the power of each line along the last axis: of white noise, its variance [unit^2]."""
+    """Return the power of each line along the last axis; for white noise, its variance [unit^2]."""
     window = np.broadcast_to(window, values.shape[-1:])
     return np.abs(spectrum(values * window)) ** 2 / float(window @ window)
 
 
 def periodic_hann(rows: int) -> np.ndarray:
-    """Return a Hann window whose second zero comes after its last row, shape (rows,)."""
+    """Return a periodic Hann window, shape (rows,)."""
     return np.hanning(rows + 1)[:-1]
 
 
 def correlation(values: np.ndarray, spectra: np.ndarray, size: int) -> np.ndarray:
-    """Return the circular correlation of values with the signals of some spectra, by lag, shape (signals, size)."""
+    """Return the circular correlation of values with signals given by their spectra, by lag, shape (signals, size)."""
     return np.fft.irfft(np.conj(spectrum(values, size)) * spectra, size)
 
 
 class Spectrum(NamedTuple):
-    """A signal by its frequencies, to be passed through filters.
+    """Spectrum of a signal for filtering.
 
     Attributes:
-        lines: Its one-sided spectrum, shape (rows // 2 + 1,).
+        lines: One-sided spectrum, shape (rows // 2 + 1,).
         turn: 2 pi i times the frequencies [rad/s], of the same shape.
-        rows: Rows of the signal.
+        rows: Number of samples of the signal.
     """
 
     lines: np.ndarray
@@ -46,25 +46,25 @@ class Spectrum(NamedTuple):
 
     @classmethod
     def of(cls, values: np.ndarray, step_s: float) -> Spectrum:
-        """Take the spectrum of even samples, shape (n,)."""
+        """Compute the spectrum of evenly spaced samples, shape (n,)."""
         return cls(spectrum(values), 2j * np.pi * np.fft.rfftfreq(len(values), step_s), len(values))
 
     def through(self, response: np.ndarray | float) -> np.ndarray:
-        """Return the signal behind a filter with a response at each line, shape (rows,)."""
+        """Return the signal filtered with a response at each line, shape (rows,)."""
         return np.fft.irfft(self.lines * response, self.rows)
 
 
 def transfer(x: np.ndarray, y: np.ndarray, rate_hz: float, rows: int) -> tuple[np.ndarray, ...]:
-    """Estimate a transfer function by Welch's cross spectra, Hann windows overlapping by half.
+    """Estimate a transfer function by Welch's method with Hann windows and 50 % overlap.
 
     Args:
-        x: What goes in, shape (n,).
-        y: What comes out, shape (n,).
+        x: Input signal, shape (n,).
+        y: Output signal, shape (n,).
         rate_hz: Sample rate [Hz].
-        rows: Rows of a segment.
+        rows: Samples per segment.
 
     Returns:
-        Frequencies [Hz], power density of x, amount of y over x, and coherence, each shape (rows // 2 + 1,).
+        Frequencies [Hz], power density of x, magnitude of y over x, and coherence, each of shape (rows // 2 + 1,).
     """
     from scipy.signal import csd, welch
 
@@ -78,10 +78,11 @@ def transfer(x: np.ndarray, y: np.ndarray, rate_hz: float, rows: int) -> tuple[n
 
 
 def parabola_top(before: float, middle: float, after: float) -> tuple[float, float]:
-    """Return the top of a parabola through three equally spaced values, the largest in the middle.
+    """Return the vertex of a parabola through three equally spaced values, the largest in the middle.
 
     Returns:
-        Place of the top from the middle value [samples], and its height above that value; both 0 where they are level.
+        Position of the vertex relative to the middle value [samples], and its height above it; both 0 if the values are
+        level.
     """
     bend = before - 2.0 * middle + after
     if not bend < 0.0:

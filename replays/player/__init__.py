@@ -1,6 +1,6 @@
-"""A recording played again to whoever listens, as if it were the rig.
+"""Replay of a recording on the wire, as if the rig were running.
 
-`track` reads the files, `timeline` puts the payloads in the order of their deadlines, `readahead` reads while others
-wait, `edit` changes keys, channels and numbers, `outlet` publishes and counts, `playhead` keeps the time of the play,
-`play_range` says which part is played how often, and `player` serves it and obeys.
+`track` reads the files, `timeline` orders the payloads by deadline, `readahead` reads on its own thread, `edit` changes
+keys, channels and numbers, `outlet` publishes and counts, `playhead` keeps the time of the replay, `play_range` selects
+the part and the number of passes, and `player` serves the replay and executes commands.
 """

@@ -1,6 +1,6 @@
-"""What is changed between the recording and the wire: keys, channels, and the numbers of rows and ticks.
+"""Changes between the recording and the wire: keys, channels, row numbers and ticks.
 
-Without options nothing is, and a payload keeps its bytes.
+Without options, payloads are published unchanged, byte for byte.
 """
 
 from __future__ import annotations
@@ -15,17 +15,17 @@ from rig.channels.table import ChannelTable
 
 
 class Edit:
-    """Which payloads go out, on which key, and which columns they have.
+    """Selection and renaming of published payloads and of their columns.
 
     Args:
-        catalogue: The recorded catalogue document.
-        keys: New key of each key that is to go elsewhere; the payloads stay the same.
-        channels: Only these channels go out, in this order within their groups; None: all.
-        names: New name of each channel that is to have another; its calibration stays.
-        truth: Whether the truth goes out.
+        catalogue: Recorded catalogue document.
+        keys: New keys by recorded key; payloads stay the same.
+        channels: Channels to publish, in this order within their groups; None: all.
+        names: New channel names by recorded name; calibrations stay the same.
+        truth: Whether to publish the truth.
 
     Raises:
-        InputError: There is no such channel, or two things would get the same key or name.
+        InputError: If a channel does not exist, or a key or name would occur twice.
     """
 
     def __init__(
@@ -57,21 +57,21 @@ class Edit:
             if after.count(key) > 1:
                 raise InputError("remap", "to a key that nothing else has", key)
         self.catalogue = self._edited(catalogue, table, channels, dict(names or {}))
-        """The catalogue that goes with what is published."""
+        """Catalogue that matches the published payloads."""
 
     @property
     def changes(self) -> bool:
-        """Whether anything is changed or left out."""
+        """True if anything is changed or left out."""
         return bool(self._keys or self._columns or self._dropped or not self._truth)
 
     def key(self, key: str) -> str | None:
-        """Key on which a payload goes out; None where it does not."""
+        """Return the key on which a payload is published, or None if it is not."""
         if key in self._dropped or (not self._truth and key.startswith(f"{wire.TRUTH}/")):
             return None
         return self._keys.get(key, key)
 
     def block(self, key: str, block: wire.Block) -> wire.Block:
-        """A block of a recorded key with the columns that go out; the same object where it keeps all."""
+        """Return a block with the selected columns; the same object if all are selected."""
         columns = self._columns.get(key)
         if columns is None or block.values.shape[1] <= max(columns):
             return block
@@ -108,10 +108,10 @@ class Edit:
 
 
 class Stamp:
-    """Numbers rows and ticks anew, so that they run on where the recording jumps (a loop, a seek) and begin at 0.
+    """Renumbering of rows and ticks: they begin at 0 and stay continuous when the recording jumps (a loop or a seek).
 
-    All streams are moved by the same time, so rows of different streams that belong together still have the same
-    number, and what the recording itself lacks is still a gap.
+    All streams are shifted by the same time, so simultaneous samples of different streams keep the same number, and
+    gaps of the recording stay gaps.
     """
 
     def __init__(self) -> None:
@@ -122,16 +122,16 @@ class Stamp:
 
     @property
     def moves(self) -> bool:
-        """Whether numbers differ from the recorded ones."""
+        """True if numbers differ from the recorded ones."""
         return self._shift != 0 or bool(self._edges_shift)
 
     def jump(self, tick: int) -> None:
-        """What comes next begins at this tick of the recording; it follows on what went out before."""
+        """Set the tick of the recording with which the numbering continues."""
         self._shift = self._end - tick
         self._edges_shift = None
 
     def block(self, key: str, block: wire.Block) -> wire.Block:
-        """A block with its new numbers; the same object where they are the old ones."""
+        """Return a block with its new numbers; the same object if they do not change."""
         if key == wire.EDGES:
             if self._edges_shift is None:
                 self._edges_shift = self._edges - block.index
@@ -146,7 +146,7 @@ class Stamp:
         return replace(block, tick=block.tick + self._shift, index=block.index + rows)
 
     def document(self, document: dict[str, Any], tick_rate_hz: float) -> dict[str, Any]:
-        """A document with its new time; the same object where it is the old one or has none."""
+        """Return a document with its new time; the same object if it does not change or has none."""
         tick = document.get("tick")
         if not self._shift or not isinstance(tick, int):
             return document

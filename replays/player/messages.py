@@ -1,4 +1,4 @@
-"""The messages of one recording or of its parts, chunk by chunk: what a player reads from."""
+"""Messages of a recording, or of its parts, read chunk by chunk for a player."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from rig.channels.table import ChannelTable
 
 
 class Message(NamedTuple):
-    """One payload as it was recorded.
+    """One recorded payload.
 
     Attributes:
-        key: Key that it came on.
-        time_ns: Simulated time [ns]: of a block's first row, or of a document.
+        key: Key of the payload.
+        time_ns: Simulated time [ns] of a block's first sample, or of a document.
         arrival_ns: Wall time of its arrival [unix ns].
-        payload: Its bytes.
+        payload: Recorded bytes.
     """
 
     key: str
@@ -30,15 +30,15 @@ class Message(NamedTuple):
 
 
 class Track:
-    """What a rig published, from one recording or from the parts of one.
+    """The rig's messages in one recording, or in the parts of one.
 
-    Only the positions of chunks are kept in memory. What the recorder added of its own is passed over.
+    Only the positions of chunks are kept in memory. Messages added by the recorder are skipped.
 
     Args:
-        paths: Files, finished or cut off; parts are put in their order.
+        paths: Complete or truncated files; parts are sorted.
 
     Raises:
-        InputError: A file cannot be read, is no recording, or is of another run than the others.
+        InputError: If a file cannot be read, is no recording, or belongs to another run.
     """
 
     def __init__(self, paths: Sequence[Path]) -> None:
@@ -48,33 +48,33 @@ class Track:
         if not self.chunks:
             raise InputError("file", "a recording with messages", str(self.paths[0]))
         self.begin_ns = min(chunk.begin_ns for chunk in self.chunks)
-        """Least simulated time of all messages [ns]."""
+        """Smallest simulated time of all messages [ns]."""
         self.end_ns = max(chunk.end_ns for chunk in self.chunks)
-        """Greatest simulated time of all messages [ns]; the last blocks begin there, and end a little later."""
+        """Largest simulated time of all messages [ns]; the last blocks begin there and end slightly later."""
         self.commands = self._commands()
-        """The commands that the rig took, in order, as its scene document lists them (`taken`)."""
+        """Commands accepted by the rig, in order, as listed in its scene document (`taken`)."""
 
     @property
     def complete(self) -> bool:
-        """Whether all files were finished."""
+        """True if all files are complete."""
         return self._recording.complete
 
     @property
     def table(self) -> ChannelTable:
-        """What the rig measured."""
+        """Channels of the rig."""
         return self._recording.table
 
     @property
     def documents(self) -> dict[str, dict[str, Any]]:
-        """What the rig answered: catalogue, parameters and scene, by key."""
+        """Documents of the rig by key: catalogue, parameters and scene."""
         one = self._recording
         return {wire.CATALOGUE: one.catalogue, wire.PARAMETERS: one.parameters, wire.SCENE: one.scene}
 
     def read(self, chunk: Chunk) -> Iterator[Message]:
-        """The rig's messages of one chunk, in the order of the file.
+        """Yield the rig's messages of one chunk, in the order of the file.
 
         Raises:
-            InputError: The file has changed or cannot be read any more.
+            InputError: If the file has changed or can no longer be read.
         """
         for message in self._recording.read(chunk):
             if message[0].startswith(f"{wire.ROOT}/"):

@@ -1,4 +1,4 @@
-"""What goes out of a play: changed as asked for, counted, and with the recorded end kept for the end of the play."""
+"""Output of a replay: changes, counts and publishes payloads, and holds the recorded end until the replay ends."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from rig.serve.transport import Server
 
 
 class Outlet:
-    """Publishes what is due.
+    """Publishes payloads that are due.
 
     Args:
         server: Transport.
-        edit: What is changed.
+        edit: Changes to the payloads.
         tick_rate_hz: Ticks per simulated second [Hz].
-        renumber: Whether ticks and row numbers are given anew.
+        renumber: Whether to renumber ticks and rows.
     """
 
     def __init__(self, server: Server, edit: Edit, tick_rate_hz: int, *, renumber: bool) -> None:
@@ -29,25 +29,25 @@ class Outlet:
         self._pass = 0
         self._rows = wire.Continuity()
         self._held: dict[str, list[bytes]] = {wire.EVENTS: [], wire.STATUS: []}
-        """What tells that the recorded run has ended, until the play has."""
+        """Payloads that mark the end of the recorded run, held until the replay ends."""
         groups = list(edit.catalogue["table"]["groups"])
         counted = wire.sensor_key("probes" if "probes" in groups else groups[0])
         self._counted = edit.key(counted) or counted
         self.rate_hz = 0.0
-        """Rate of the stream that clients report on [Hz]; 0 before its first block."""
+        """Rate of the stream that clients acknowledge [Hz]; 0 before its first block."""
         self.block_rows = 0
-        """Rows of the last block of that stream."""
+        """Samples in the last block of that stream."""
         self.recorded_status: dict[str, Any] = {}
-        """The last one that went out."""
+        """Last published status of the recording."""
         self.payloads = self.blocks = self.rows = self.left_out = 0
 
     @property
     def published(self) -> int:
-        """Row after the last one published, of the stream that clients report on."""
+        """Number of published rows of the stream that clients acknowledge."""
         return self._rows.next.get(self._counted, 0)
 
     def begin(self, number: int, tick: int) -> None:
-        """A pass begins, or what follows a seek, at this tick of the recording; its numbers may follow on."""
+        """Start a pass, or continue after a seek, at this tick of the recording."""
         self._pass = number
         self.left_out += sum(map(len, self._held.values()))
         for waiting in self._held.values():
@@ -68,17 +68,17 @@ class Outlet:
             self._publish(key, item.payload)
 
     def tell(self, event: dict[str, Any]) -> None:
-        """Publish an event that the recording does not have."""
+        """Publish an event that is not in the recording."""
         if self._stamp is not None:
             event = self._stamp.document(event, self._tick_rate_hz)
         if (key := self._edit.key(wire.EVENTS)) is not None:
             self._publish(key, wire.encode_document(finite(self._rows.tell(event))))
 
     def end(self, *, as_recorded: bool) -> bool:
-        """Publish the recorded end; returns whether there was one.
+        """Publish the recorded end and return whether there was one.
 
         Args:
-            as_recorded: What went out is the recording itself, so that the row numbers in its end are right.
+            as_recorded: Whether the recording was published unchanged, so that the row numbers in its end are valid.
         """
         for payload in self._held[wire.EVENTS]:
             if not as_recorded:
@@ -87,7 +87,7 @@ class Outlet:
         return bool(self._held[wire.EVENTS])
 
     def end_status(self) -> None:
-        """Publish the recorded status that the run has ended, where there is one."""
+        """Publish the recorded status of the ended run, if there is one."""
         for payload in self._held[wire.STATUS]:
             self._publish(self._edit.key(wire.STATUS) or wire.STATUS, payload)
 
@@ -103,7 +103,7 @@ class Outlet:
             self.rate_hz, self.block_rows = block.rate_hz, len(block.values)
 
     def _send_document(self, key: str, item: Item) -> None:
-        """Events and status as they came; what ends the run waits for the end of the play."""
+        """Publish an event or status; hold one that ends the run until the replay ends."""
         payload = item.payload
         try:
             document = wire.decode_document(payload)
@@ -120,7 +120,7 @@ class Outlet:
         if document.get("event") == "end" or document.get("state") == "ended":
             waiting.append(payload)
             return
-        while waiting:  # It went on, so that was not its end.
+        while waiting:  # The run continued, so the held payloads did not end it.
             self._publish(key, waiting.pop(0))
         if item.key == wire.STATUS:
             self.recorded_status = document

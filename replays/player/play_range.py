@@ -1,4 +1,4 @@
-"""Passes through a recording: which part of it is played, how often, and what of it comes next."""
+"""Part of a recording to play, number of passes, and the sequence of batches."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from rig.base.errors import InputError
 
 @dataclass(frozen=True)
 class Part:
-    """What is played of a recording; times are simulated ones of the recording [s].
+    """Part of a recording to play; times are simulated times of the recording [s].
 
     Attributes:
-        from_s: Where a pass begins; None: at the beginning.
-        to_s: Where it ends; None: at the end.
-        start_s: Where the first pass begins; None: where each does.
-        loops: Number of passes; None: endless.
+        from_s: Begin of a pass; None: begin of the recording.
+        to_s: End of a pass; None: end of the recording.
+        start_s: Begin of the first pass; None: `from_s`.
+        loops: Number of passes; None: unlimited.
     """
 
     from_s: float | None = None
@@ -30,13 +30,13 @@ class Part:
 
 @dataclass(frozen=True, slots=True)
 class Mark:
-    """A pass begins here, or what follows a seek.
+    """Begin of a pass, or of the data after a seek.
 
     Attributes:
-        number: Of the pass, from 1.
+        number: Number of the pass, counted from 1.
         from_ns: Position in the recording [ns of simulated time].
         due_ns: First deadline [ns, on the scale of the timeline].
-        tick: Of the first block [ticks], or where there is none, of the position.
+        tick: Tick of the first block, or of the position if there is no block.
     """
 
     number: int
@@ -46,21 +46,21 @@ class Mark:
 
 
 class Passes:
-    """What is played of a recording.
+    """Passes through a part of a recording.
 
     Args:
         timeline: The recording.
-        part: Which part of it, and how often.
+        part: The part, and the number of passes.
         tick_rate_hz: Ticks per simulated second [Hz].
 
     Attributes:
         part: As given.
         timeline: As given.
-        from_ns: Where a pass begins [ns of simulated time].
-        start_ns: Where the first pass begins [ns of simulated time].
+        from_ns: Begin of a pass [ns of simulated time].
+        start_ns: Begin of the first pass [ns of simulated time].
 
     Raises:
-        InputError: The recording has no such part.
+        InputError: If the recording has no such part.
     """
 
     def __init__(self, timeline: Timeline, part: Part, tick_rate_hz: int) -> None:
@@ -86,15 +86,15 @@ class Passes:
 
     @property
     def end_ns(self) -> int:
-        """Where a pass ends, as far as it is known beforehand [ns of simulated time]."""
+        """End of a pass, as far as it is known in advance [ns of simulated time]."""
         return self.timeline.track.end_ns if self._to_ns is None else self._to_ns
 
     def play(self, from_ns: int, number: int) -> Iterator[Batch | Mark]:
-        """What is to come: for each pass a mark, and its batches.
+        """Yield a mark for each pass, followed by its batches.
 
         Args:
-            from_ns: Where it goes on [ns of simulated time].
-            number: Of the pass that this is in.
+            from_ns: Position at which to continue [ns of simulated time].
+            number: Number of the current pass.
         """
         while self.part.loops is None or number <= self.part.loops:
             batches = self.timeline.play(from_ns, self._to_ns)
@@ -114,7 +114,7 @@ class Passes:
 
 
 def has_block(batch: Batch) -> bool:
-    """Whether a block of samples or of the truth is among what is due; edges come with those."""
+    """Return whether a batch contains a block of samples or of the truth; edges are published with those."""
     return any(map(_is_block, batch))
 
 
@@ -123,5 +123,5 @@ def _is_block(item: Item) -> bool:
 
 
 def size_of(read: Batch | Mark) -> int:
-    """Payload of what was read ahead [bytes]."""
+    """Return the payload size of a batch or mark [bytes]."""
     return sum(len(item.payload) for item in read) if isinstance(read, list) else 0

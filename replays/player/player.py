@@ -1,8 +1,8 @@
-"""Serves a recording as a rig serves its run: the same keys, documents, token and reports, at the recorded spacing.
+"""Service of a replay with the keys, documents, token and reports of a live rig, at the recorded spacing.
 
-Clients cannot tell the difference from what is published. Only who asks for the status learns that it is a recording,
-how far it is, and how late. Deadlines are absolute, from one origin; the operator's pauses, seeks and changes of the
-rate set a new one. Nothing is ever left out for lateness.
+Published data are the same as from a rig; only the status document identifies a recording and gives its position and
+lateness. Deadlines are absolute from one origin; pauses, seeks and changes of the rate set a new origin. No payload is
+ever dropped because it is late.
 """
 
 from __future__ import annotations
@@ -30,21 +30,21 @@ from rig.serve.service import COMMANDS, REPLAY_COMMANDS
 from rig.serve.transport import Server
 from rig.serve.waiting import Deadline
 
-_OWN = (*REPLAY_COMMANDS, "step", "stop")
-_AHEAD_S = 30.0
-_AHEAD_BLOCKS = 2000
-"""How far a burst may be ahead of the slowest client that reports: below what the transport keeps of a key (3000) and
-what a recorder can take in (90 s of the default streams)."""
-_LOOK_S = 0.1
-_CROWDED_S = 2e-3
-_HELD_S = 5.0
-_STEP_S = 3600
+_ACCEPTED_COMMANDS = (*REPLAY_COMMANDS, "step", "stop")
+_MAX_AHEAD_S = 30.0
+_MAX_AHEAD_BLOCKS = 2000
+"""Lead of a burst over the slowest client that acknowledges: below the depth of the transport per key (3000 blocks) and
+the buffer of a recorder (90 s of the default streams)."""
+_POLL_S = 0.1
+_BURST_POLL_S = 2e-3
+_MIN_WAIT_REPORTED_S = 5.0
+_MAX_STEP_S = 3600
 """Longest single step [s of simulated time]."""
 
 
 @dataclass(slots=True)
 class _Step:
-    """A step that is under way: until an instant [ns of the play], or for a number of blocks."""
+    """A step in progress: until an instant [ns of the replay], or for a number of blocks."""
 
     reply: Pending
     until_ns: int | None = None
@@ -56,22 +56,22 @@ class Player(ServedRun):
 
     Args:
         track: The recording.
-        server: Transport; stays open when the play ends.
-        clock: `RealTime` for the recorded spacing, `FreeRun` for a burst: as fast as the clients take it, by what they
-            report and by the transport, which must wait for them.
-        part: What is played.
-        edit: What is changed; None: nothing.
-        by: What the spacing follows.
-        rate: Recorded seconds a second, without a burst.
-        renumber: Give ticks and row numbers anew, from 0 and without a step at loops and seeks; False leaves them as
-            recorded, where a loop or seek is a step of the row number.
-        paused: Wait for `resume`, `step` or `seek` before anything is published.
-        wait_for: Wait for so many clients that report before anything is published; `resume` and `pause` end that.
-        wait_s: Fail where they are not there in this time [s].
-        linger_s: At the end, wait at most this long [s] until clients have recovered what they missed.
+        server: Transport; stays open when the replay ends.
+        clock: `RealTime` for the recorded spacing, or `FreeRun` for a burst, limited by the acknowledgements of the
+            clients and by the transport, which must wait for them.
+        part: Part of the recording to play.
+        edit: Changes to the payloads; None: none.
+        by: Time that determines the spacing.
+        rate: Recorded seconds per second, without a burst.
+        renumber: Renumber ticks and rows from 0, without a step at loops and seeks. If False, numbers stay as recorded
+            and step at loops and seeks.
+        paused: Wait for `resume`, `step` or `seek` before publishing.
+        wait_for: Number of acknowledging clients to wait for before publishing; `resume` and `pause` end the wait.
+        wait_s: Longest wait for these clients before an error [s].
+        linger_s: Longest time at the end for clients to recover missing blocks [s].
 
     Raises:
-        InputError: The recording has no such part, or there is no such rate.
+        InputError: If the recording has no such part, or the rate is invalid.
     """
 
     def __init__(
@@ -96,11 +96,11 @@ class Player(ServedRun):
             clock,
             scene=documents[wire.SCENE],
             tick_rate_hz=int(documents[wire.CATALOGUE]["tick_rate_hz"]),
-            commands=_OWN,
+            commands=_ACCEPTED_COMMANDS,
             others={
-                name: f"this is a recording that is replayed, which takes no {name}; it takes {', '.join(_OWN)}"
+                name: f"a replay does not accept {name}; accepted commands: {', '.join(_ACCEPTED_COMMANDS)}"
                 for name in COMMANDS
-                if name not in _OWN
+                if name not in _ACCEPTED_COMMANDS
             },
             running="the recording plays",
             linger_s=linger_s,
@@ -114,46 +114,46 @@ class Player(ServedRun):
         self._renumber = renumber
         self._outlet = Outlet(server, self._edit, self._rate, renumber=renumber)
         self._as_recorded = self._passes.part == Part() and not self._edit.changes and not renumber
-        """What goes out is the recording itself: the row numbers that its `end` tells are right."""
+        """True if the recording is published unchanged, so that the row numbers in its `end` event are valid."""
 
         self._paused = paused or wait_for > 0
         self._awaited = wait_for
-        """Clients that it is paused for; 0 where only a command ends the pause."""
+        """Number of clients to wait for; 0 if only a command ends the pause."""
         self._wait_s = wait_s
         self._step: _Step | None = None
         self._held: tuple[str, float] | None = None
-        """Name of the client that a burst waits for, and since when [s, monotonic]."""
-        self._told: deque[str] = deque()
-        """Warnings that wait for the playing thread."""
+        """Client that limits a burst, and the time since when it does [s, monotonic]."""
+        self._pending_warnings: deque[str] = deque()
+        """Warnings for the playing thread to publish."""
         self._woken = threading.Event()
 
         self._position_ns = self._passes.start_ns
-        """Simulated time of the recording up to which everything has gone out [ns]."""
+        """Simulated time of the recording up to which everything is published [ns]."""
         self._pass = 1
         self._begun = False
         self._ahead: ReadAhead[Batch | Mark] | None = None
         self._head: Batch | Mark | None = None
         self._base_ns = 0
-        """Added to a deadline of the recording it gives the instant of the play [ns]."""
+        """Offset from deadlines of the recording to instants of the replay [ns]."""
         self._anchor_ns = 0
-        """Instant of the play at which the next pass, or what follows a seek, begins [ns]."""
+        """Instant of the replay at which the next pass, or the data after a seek, begins [ns]."""
 
-    # ---- from any thread ----
+    # ---- called from any thread ----
 
     @property
     def published(self) -> int:
-        """Row after the last one published, of the stream that clients report on."""
+        """Number of published rows of the stream that clients acknowledge."""
         return self._outlet.published
 
     @property
     def reach_s(self) -> tuple[float, float]:
-        """Where a pass begins and ends, as far as it is known beforehand [s of simulated time]."""
+        """Begin and end of a pass, as far as they are known in advance [s of simulated time]."""
         return self._passes.from_ns / NS, self._passes.end_ns / NS
 
     def status(self) -> dict[str, Any]:
-        """The status document: as a rig's, and `replay` about the play itself.
+        """Return the status document: a rig's, with `replay` for the replay itself.
 
-        Spin, energy and engine are those of the last recorded status.
+        Spin, energy and engine come from the last recorded status.
         """
         begin_s, end_s = self.reach_s
         out, play = self._outlet, self._playhead
@@ -193,36 +193,35 @@ class Player(ServedRun):
         )
 
     def _warnings(self) -> list[str]:
-        warnings = ["this is a recording that is replayed, not a rig"]
+        warnings = ["this is a replay of a recording, not a rig"]
         warnings += [f"recorded: {text}" for text in self._outlet.recorded_status.get("warnings", [])]
         if behind_s := self._playhead.behind_s:
             warnings.append(
-                f"x{self._playhead.rate:g} is more than this machine and the clients keep up with: "
-                f"{behind_s:.1f} s behind"
+                f"x{self._playhead.rate:g} is faster than this machine and its clients: {behind_s:.1f} s behind"
             )
-        if self._held is not None and (held_s := time.monotonic() - self._held[1]) > _HELD_S:
-            warnings.append(f"has waited {held_s:.0f} s for client {self._held[0]} to take what was sent")
+        if self._held is not None and (held_s := time.monotonic() - self._held[1]) > _MIN_WAIT_REPORTED_S:
+            warnings.append(f"has waited {held_s:.0f} s for client {self._held[0]} to receive the data")
         return warnings
 
     def _scene_now(self) -> dict[str, Any]:
         taken = {entry["id"]: entry for entry in self._scene.get("taken", ())}
         for entry in self._track.commands:
-            if entry["tick"] * NS < self._position_ns * self._rate and entry["command"] not in _OWN:
+            if entry["tick"] * NS < self._position_ns * self._rate and entry["command"] not in _ACCEPTED_COMMANDS:
                 taken.setdefault(entry["id"], entry)
-        told = {"taken": list(taken.values())} if taken or "taken" in self._scene else {}
-        return {**self._scene, **told, **({} if self._as_recorded else {"replayed": "in part, or changed"})}
+        commands = {"taken": list(taken.values())} if taken or "taken" in self._scene else {}
+        return {**self._scene, **commands, **({} if self._as_recorded else {"replayed": "in part, or changed"})}
 
     def _wake(self) -> None:
         self._woken.set()
         self._clock.wake()
 
     def _warn(self, text: str) -> None:
-        self._told.append(text)
+        self._pending_warnings.append(text)
 
-    # ---- on the playing thread ----
+    # ---- called on the playing thread ----
 
     def _get_ready(self) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Read what comes first."""
+        """Read the first batches; return the catalogue and the parameters."""
         self._open(self._passes.start_ns).ready(5.0)
         return self._edit.catalogue, self._parameters
 
@@ -233,46 +232,46 @@ class Player(ServedRun):
         deadline = Deadline(self._wait_s)
         while True:
             self._take_commands()
-            while self._told:
-                self._outlet.tell(self._event("warning", self._tick, text=self._told.popleft()))
+            while self._pending_warnings:
+                self._outlet.tell(self._event("warning", self._tick, text=self._pending_warnings.popleft()))
             if self._stop_requested:
                 return "stopped"
             if self._awaited and self._step is None:
-                self._look_for_clients(deadline)
+                self._check_clients(deadline)
             if not self._playhead.runs:
-                self._rest(_LOOK_S)
+                self._wait(_POLL_S)
                 continue
             if self._head is None:
-                self._head = self._ahead.take(_LOOK_S)
+                self._head = self._ahead.take(_POLL_S)
                 if self._head is None and self._ahead.ended:
                     return "completed"
             if isinstance(self._head, Mark):
                 if self._burst and self._begun and self._desk.clients.behind(self.published):
-                    # Row numbers may step back: clients must have said that they have what came before.
-                    self._rest(_CROWDED_S)
+                    # Row numbers may step back: clients must first acknowledge the earlier rows.
+                    self._wait(_BURST_POLL_S)
                     continue
                 self._begin(self._head)
                 self._head = None
             elif self._head is not None:
                 self._play_batch(self._head)
 
-    def _look_for_clients(self, deadline: Deadline) -> None:
-        """Go on once all are there that are waited for."""
+    def _check_clients(self, deadline: Deadline) -> None:
+        """Resume once all expected clients are present."""
         present = self._desk.clients.present
         if present >= self._awaited:
             self._resume()
         elif deadline.passed:
-            raise RefusedError(f"{present} of {self._awaited} clients were there after {self._wait_s:g} s")
+            raise RefusedError(f"{present} of {self._awaited} clients were present after {self._wait_s:g} s")
 
     def _play_batch(self, batch: Batch) -> None:
-        """Publish what is due next, or find that it is not time yet."""
+        """Publish the next batch if it is due."""
         step, instant_ns = self._step, self._base_ns + batch[0].due_ns
         if step is not None and step.until_ns is not None and instant_ns > step.until_ns:
             if self._playhead.release(step.until_ns):
                 self._end_step(step, step.until_ns)
             return
-        if self._burst and self._crowded():
-            self._rest(_CROWDED_S)
+        if self._burst and self._is_client_behind():
+            self._wait(_BURST_POLL_S)
             return
         if not self._playhead.release(instant_ns):
             return
@@ -289,14 +288,14 @@ class Player(ServedRun):
             if step.blocks == 0:
                 self._end_step(step, instant_ns)
 
-    def _rest(self, seconds: float) -> None:
-        """Wait, but not for longer than until a command comes."""
+    def _wait(self, seconds: float) -> None:
+        """Wait for a time or until a command arrives."""
         self._woken.wait(seconds)
         self._woken.clear()
 
-    def _crowded(self) -> bool:
-        """Whether a client that reports has too much on its way."""
-        rows = min(_AHEAD_S * self._outlet.rate_hz, _AHEAD_BLOCKS * self._outlet.block_rows)
+    def _is_client_behind(self) -> bool:
+        """Return whether the data sent exceed what a client has acknowledged by too much."""
+        rows = min(_MAX_AHEAD_S * self._outlet.rate_hz, _MAX_AHEAD_BLOCKS * self._outlet.block_rows)
         name = self._desk.clients.crowded(self.published, round(rows)) if rows > 0 else None
         if name is None:
             self._held = None
@@ -305,7 +304,7 @@ class Player(ServedRun):
         return name is not None
 
     def _open(self, from_ns: int) -> ReadAhead[Batch | Mark]:
-        """Go on from a position of the recording."""
+        """Start reading at a position of the recording."""
         if self._ahead is not None:
             self._ahead.close()
         self._head = None
@@ -313,7 +312,7 @@ class Player(ServedRun):
         return self._ahead
 
     def _begin(self, mark: Mark) -> None:
-        """What follows is due from now on; its numbers follow on those before, where they are given anew."""
+        """Start a pass or the data after a seek: set their time base and numbering."""
         first = mark.from_ns if self._passes.timeline.by is By.SIMULATED else mark.due_ns
         if mark.number > self._pass:
             self._anchor_ns = self._playhead.play_ns
@@ -322,13 +321,13 @@ class Player(ServedRun):
         self._position_ns = mark.from_ns
         self._outlet.begin(mark.number, mark.tick)
         if not self._begun and mark.from_ns > self._track.begin_ns:
-            # The recorded start is not in what is played.
+            # The recorded start event is outside the played part.
             about = {"scene": self._scene.get("name"), "seed": self._scene.get("seed"), "pace": "replay"}
             self._outlet.tell(self._event("start", self._tick, **about))
         self._begun = True
 
     def _end(self, reason: str) -> dict[str, Any]:
-        """End the stream: as it was recorded, where that belongs to what was played."""
+        """End the stream, with the recorded end event if the played part includes it."""
         self._desk.close(f"{wire.ENDED}: {reason}", [] if self._step is None else [self._step.reply])
         self._playhead.hold(self._playhead.play_ns)
         if self._ahead is not None:
@@ -337,7 +336,7 @@ class Player(ServedRun):
         if not (completed and self._outlet.end(as_recorded=self._as_recorded)):
             if completed:
                 whole = self._passes.part.to_s is None
-                reason += f", {'the recording has no more' if whole else 'the end of what was to be replayed'}"
+                reason += f", {'end of the recording' if whole else 'end of the selected part'}"
             self._outlet.tell(self._event("end", self._tick, reason=reason))
         if completed:
             self._outlet.end_status()
@@ -358,7 +357,7 @@ class Player(ServedRun):
             self._seek(asked.time_s)
         elif isinstance(asked, Rate):
             if self._burst:
-                raise InputError("rate", "sent to a replay with a rate of its own", Words("one that runs with --burst"))
+                raise InputError("rate", "sent to a replay without --burst", Words("a replay with --burst"))
             self._playhead.set_rate(asked.rate, self._now_ns())
         elif pending.command == "pause":
             self._cancel_step("a pause")
@@ -370,7 +369,7 @@ class Player(ServedRun):
                 self._cancel_step("a resume")
                 self._resume()
         else:
-            raise InputError("command", f"one of {', '.join(_OWN)}", pending.command)
+            raise InputError("command", f"one of {', '.join(_ACCEPTED_COMMANDS)}", pending.command)
         pending.answer(self._accept(pending, self._tick))
 
     def _seek(self, time_s: float) -> None:
@@ -386,8 +385,8 @@ class Player(ServedRun):
 
     def _begin_step(self, pending: Pending, asked: Step) -> None:
         if not self._paused or self._step is not None:
-            raise InputError("step", "sent to a replay that is paused", Words("one that plays"))
-        most = _STEP_S * self._rate
+            raise InputError("step", "sent to a paused replay", Words("a replay that runs"))
+        most = _MAX_STEP_S * self._rate
         for name, value in asked:
             if value is not None and value > most:
                 raise InputError(name, f"a whole number of 1 to {most}", value)
@@ -396,7 +395,7 @@ class Player(ServedRun):
         elif asked.blocks is not None and asked.ticks is None:
             self._step = _Step(pending, blocks=asked.blocks)
         else:
-            raise InputError("step", "of ticks or of blocks", sorted(pending.request))
+            raise InputError("step", "either ticks or blocks", sorted(pending.request))
         self._playhead.start()
 
     def _end_step(self, step: _Step, at_ns: int) -> None:
@@ -407,7 +406,7 @@ class Player(ServedRun):
 
     def _cancel_step(self, by: str) -> None:
         if self._step is not None:
-            self._step.reply.refuse(InputError("step", "done before anything else", by))
+            self._step.reply.refuse(InputError("step", "completed before another command", by))
             self._playhead.hold(self._now_ns())
             self._step = None
 
@@ -415,7 +414,7 @@ class Player(ServedRun):
         self._paused, self._awaited = False, 0
         self._playhead.start()
 
-    # Where it is.
+    # ---- position ----
 
     @property
     def _tick(self) -> int:
@@ -423,5 +422,5 @@ class Player(ServedRun):
         return self._position_ns * self._rate // NS
 
     def _now_ns(self) -> int:
-        """Instant of the play [ns]."""
+        """Return the current instant of the replay [ns]."""
         return self._playhead.now_ns(self._base_ns + self._head[0].due_ns if isinstance(self._head, list) else None)

@@ -1,4 +1,4 @@
-"""Where a play is in its own time, which runs by a clock and stands while it is paused."""
+"""Position of a replay in its own time, which follows a clock and stops while the replay is paused."""
 
 from __future__ import annotations
 
@@ -10,57 +10,57 @@ from rig.serve.pacing import Clock
 
 NS = 1_000_000_000
 LEAST_RATE, GREATEST_RATE = 0.01, 1000.0
-_BEHIND_S = 0.5
-"""Lateness that is told: a busy machine is late by tens of milliseconds, and catches up."""
+_MIN_LATENESS_S = 0.5
+"""Lateness from which it is reported; a busy machine is late by tens of milliseconds and catches up [s]."""
 
 
 class Playhead:
-    """Instants of a play [ns]: 0 at its beginning, never stepping back, and without its pauses.
+    """Time of a replay [ns]: 0 at its beginning, monotonic, and without its pauses.
 
-    Deadlines are absolute, from one origin; starting, jumping and another rate set a new one.
+    Deadlines are absolute from one origin; a start, a jump or a new rate sets a new origin.
 
     Args:
-        clock: What paces.
-        rate: Recorded seconds a second, where the clock is a real one.
+        clock: Clock that releases the payloads.
+        rate: Recorded seconds per second, for a real-time clock.
     """
 
     def __init__(self, clock: Clock, rate: float) -> None:
         self._clock = clock
         self.rate = check_rate(rate)
         self.play_ns = 0
-        """Instant of what went out last."""
+        """Time of the last published payload."""
         self._held_ns = 0
-        """Instant at which it stands while it does not run."""
+        """Time while stopped."""
         self._since_s: float | None = None
         self._ran_s = 0.0
 
     @property
     def runs(self) -> bool:
-        """Whether time runs."""
+        """True if time runs."""
         return self._since_s is not None
 
     @property
     def achieved_rate(self) -> float:
-        """Recorded seconds played a second, without pauses."""
+        """Recorded seconds played per second, without pauses."""
         since_s = self._since_s
         ran_s = self._ran_s + (0.0 if since_s is None else time.monotonic() - since_s)
         return self.play_ns / NS / ran_s if ran_s > 0.0 else 0.0
 
     @property
     def behind_s(self) -> float:
-        """How late the last payload was, where that is more than a passing hold-up [s]; else 0."""
+        """Lateness of the last payload [s], or 0 if it is not worth reporting."""
         late_s = self._clock.last_late_s
-        return late_s if late_s > _BEHIND_S else 0.0
+        return late_s if late_s > _MIN_LATENESS_S else 0.0
 
     def release(self, at_ns: int) -> bool:
-        """Return True when it is that instant, False before that after a `wake` of the clock."""
+        """Return True at that time, or False if the clock is woken before."""
         return self._clock.release(at_ns)
 
     def now_ns(self, due_ns: int | None) -> int:
-        """The instant that it is now, never past what is still to go out.
+        """Return the current time, limited to the deadline of the next payload.
 
         Args:
-            due_ns: When that is due; None where it is not known.
+            due_ns: Deadline of the next payload; None if it is not known.
         """
         if not self.runs:
             return self._held_ns
@@ -68,44 +68,44 @@ class Playhead:
         return now_ns if due_ns is None else min(now_ns, due_ns)
 
     def start(self) -> None:
-        """Let time run on from where it stands."""
+        """Start or resume time."""
         self._go(self._held_ns)
         if self._since_s is None:
             self._since_s = time.monotonic()
 
     def hold(self, at_ns: int) -> None:
-        """Stand at an instant."""
+        """Stop time at an instant."""
         self._held_ns = at_ns
         since_s, self._since_s = self._since_s, None
         if since_s is not None:
             self._ran_s += time.monotonic() - since_s
 
     def jump(self, at_ns: int) -> None:
-        """What comes next begins at this instant; it runs on, or stands there."""
+        """Set the time to an instant; it keeps running or stays stopped."""
         self.play_ns = self._held_ns = at_ns
         if self.runs:
             self._go(at_ns)
 
     def set_rate(self, rate: Any, at_ns: int) -> None:
-        """Go by another rate from this instant on.
+        """Set a new rate from this instant.
 
         Raises:
-            InputError: There is no such rate.
+            InputError: If the rate is invalid.
         """
         self.rate = check_rate(rate)
         if self.runs:
             self._go(at_ns)
 
     def _go(self, at_ns: int) -> None:
-        # A tick of this clock is a nanosecond of the recording: a rate is so many of them a second.
+        # One tick of this clock is 1 ns of the recording, so its tick rate is the replay rate times 1e9.
         self._clock.start(at_ns, round(self.rate * NS))
 
 
 def check_rate(rate: Any) -> float:
-    """The rate, if it is one.
+    """Return a valid rate.
 
     Raises:
-        InputError: It is no number, or too small or too great.
+        InputError: If it is not a number, or out of range.
     """
     number = isinstance(rate, float | int) and not isinstance(rate, bool)
     if not number or not LEAST_RATE <= rate <= GREATEST_RATE:

@@ -1,4 +1,4 @@
-"""Reads ahead of who paces, on a thread of its own: the disk and the unpacking must not make a payload late."""
+"""Read-ahead on a separate thread, so that disk access and decompression do not delay payloads."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ from typing import Generic, TypeVar
 
 from rig.serve.waiting import BoundedQueue
 
-_BYTES = 16 << 20
-"""What may wait: about 5 s of the default streams."""
+_BUFFER_BYTES = 16 << 20
+"""Buffer size, about 5 s of the default streams [bytes]."""
 T = TypeVar("T")
 
 
 class ReadAhead(Generic[T]):
-    """Takes from an iterator what fits, until it is closed.
+    """Buffers items of an iterator up to a size, until it is closed.
 
     Args:
-        batches: What is read.
-        size: How many bytes one of them takes.
+        batches: Iterator to read.
+        size: Function that returns the size of an item [bytes].
     """
 
     def __init__(self, batches: Iterator[T], *, size: Callable[[T], int]) -> None:
-        self._waiting: BoundedQueue[T] = BoundedQueue(_BYTES, size=lambda batch: min(size(batch), _BYTES))
+        self._waiting: BoundedQueue[T] = BoundedQueue(_BUFFER_BYTES, size=lambda batch: min(size(batch), _BUFFER_BYTES))
         self._error: BaseException | None = None
         self._thread = threading.Thread(target=self._read, args=(batches,), name="read-ahead", daemon=True)
         self._thread.start()
@@ -32,25 +32,25 @@ class ReadAhead(Generic[T]):
 
     @property
     def ended(self) -> bool:
-        """Nothing is left.
+        """True if all items have been taken.
 
         Raises:
-            BaseException: What ended the reading, once all that came before it was taken.
+            BaseException: The error that ended reading, after all items before it have been taken.
         """
         if self._waiting.ended and self._error is not None:
             raise self._error
         return self._waiting.ended
 
     def ready(self, timeout_s: float) -> bool:
-        """Whether something can be taken, at the latest after the time [s]."""
+        """Wait up to a time [s] and return whether an item is ready."""
         return self._waiting.wait_for_item(timeout_s)
 
     def take(self, timeout_s: float = 0.0) -> T | None:
-        """The next, or None where there is none in time [s]."""
+        """Return the next item, or None if there is none within a time [s]."""
         return self._waiting.take(timeout_s)
 
     def close(self) -> None:
-        """Read no more."""
+        """Stop reading."""
         self._waiting.close()
         self._thread.join(timeout=5.0)
 
@@ -59,7 +59,7 @@ class ReadAhead(Generic[T]):
             for batch in batches:
                 if not self._waiting.put(batch):
                     return
-        except BaseException as error:  # raised where it is taken
+        except BaseException as error:  # raised by `ended`
             self._error = error
         finally:
             self._waiting.close()

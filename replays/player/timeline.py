@@ -1,4 +1,4 @@
-"""The payloads of a recording in the order of their deadlines; knows no clock and no transport."""
+"""Payloads of a recording in order of their deadlines, independent of clock and transport."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from itertools import accumulate
 from replays.player.messages import Message, Track
 from rig.base import wire
 
-_NS = 1_000_000_000
+_NS_PER_S = 1_000_000_000
 
 
 class By(StrEnum):
-    """What decides when a payload is due."""
+    """Time that determines the deadlines."""
 
     SIMULATED = "simulated"
     ARRIVAL = "arrival"
@@ -26,11 +26,11 @@ class Item:
     """A payload with its deadline.
 
     Attributes:
-        due_ns: When it is due, on the scale that `By` names [ns].
-        position_ns: Simulated time at which it was there: of a block the end, of a document its own [ns].
-        key: Key that it came on.
-        payload: Its bytes, as recorded.
-        block: What it holds, where it is a block.
+        due_ns: Deadline, on the scale selected by `By` [ns].
+        position_ns: Simulated time of the end of a block, or of a document [ns].
+        key: Key of the payload.
+        payload: Recorded bytes.
+        block: Decoded block; None if the payload is none.
     """
 
     due_ns: int
@@ -41,22 +41,22 @@ class Item:
 
 
 Batch = list[Item]
-"""What is due at the same instant."""
+"""Payloads with the same deadline."""
 
 
 class Timeline:
-    """Payloads by deadline, from any position on.
+    """Payloads in order of deadline, from any position.
 
-    By simulated time a block is due at its end, as a rig has it no sooner, and a document at its own time. By arrival
-    everything is due when the recorder had got it. Within a key the order is the recorded one in any case: what would
-    be due before its predecessor is due with it.
+    By simulated time, a block is due at its end, when a rig has it, and a document at its own time. By arrival, each
+    payload is due when the recorder received it. The recorded order within a key is always kept: a payload is never due
+    before its predecessor.
 
-    A recorder may have got one key after the other (`rig record --history`), so chunks are read as far as something
-    in them could be due next.
+    A recorder may have received one key after the other (`rig record --history`), so chunks are read until no later
+    chunk can contain the next payload.
 
     Args:
-        track: Where the messages are.
-        by: What the deadlines follow.
+        track: Source of the messages.
+        by: Time that determines the deadlines.
     """
 
     def __init__(self, track: Track, by: By = By.SIMULATED) -> None:
@@ -64,11 +64,11 @@ class Timeline:
         self.by = by
 
     def play(self, from_ns: int, to_ns: int | None = None) -> Iterator[Batch]:
-        """Batches in order, without what is not whole between two positions.
+        """Yield batches in order, limited to payloads that lie entirely between two positions.
 
         Args:
-            from_ns: Blocks begin and documents stand here or later [ns of simulated time].
-            to_ns: Blocks end and documents stand here or earlier [ns of simulated time]; None: at the end.
+            from_ns: Earliest begin of a block or time of a document [ns of simulated time].
+            to_ns: Latest end of a block or time of a document [ns of simulated time]; None: no limit.
         """
         batch: Batch = []
         for item in self._in_order(from_ns, to_ns):
@@ -81,10 +81,10 @@ class Timeline:
 
     def _in_order(self, from_ns: int, to_ns: int | None) -> Iterator[Item]:
         chunks = self.track.chunks
-        # Nothing that begins earlier than this stands in a chunk or in any after it.
+        # Earliest begin of a message in each chunk and all chunks after it.
         beginnings = list(accumulate((chunk.begin_ns for chunk in reversed(chunks)), min))[::-1]
         waiting: list[tuple[int, int, Item]] = []
-        ages = _Ages(self.by)
+        deadlines = _Deadlines(self.by)
         number = 0
         for chunk, beginning_ns in zip(chunks, beginnings, strict=True):
             if to_ns is not None and beginning_ns > to_ns:
@@ -95,7 +95,7 @@ class Timeline:
                 while waiting and waiting[0][0] <= beginning_ns:
                     yield heapq.heappop(waiting)[2]
             for message in self.track.read(chunk):
-                item = ages.item(message)
+                item = deadlines.item(message)
                 if message.time_ns < from_ns or (to_ns is not None and item.position_ns > to_ns):
                     continue
                 if self.by is By.ARRIVAL:
@@ -107,8 +107,8 @@ class Timeline:
             yield heapq.heappop(waiting)[2]
 
 
-class _Ages:
-    """Finds when each message is due, in the order of the file."""
+class _Deadlines:
+    """Computes the deadline of each message, in the order of the file."""
 
     def __init__(self, by: By) -> None:
         self._by = by
@@ -120,12 +120,12 @@ class _Ages:
         block, key = _block(message), message.key
         position_ns = message.time_ns
         if block is not None and block.rate_hz > 0.0:
-            length_ns = round(len(block.values) * _NS / block.rate_hz)
+            length_ns = round(len(block.values) * _NS_PER_S / block.rate_hz)
             position_ns += length_ns
             if key.startswith(f"{wire.SENSORS}/"):
                 self._length_ns = length_ns
         elif key == wire.EDGES:
-            # A block of edges does not tell its length; the rig publishes it together with the samples.
+            # A block of edges does not contain its length; the rig publishes it together with the samples.
             position_ns += self._length_ns
         if self._by is By.ARRIVAL:
             due_ns = self._arrived_ns = max(self._arrived_ns, message.arrival_ns)
@@ -141,5 +141,5 @@ def _block(message: Message) -> wire.Block | None:
     try:
         return wire.decode_block(message.payload, schema)
     except ValueError:
-        # Not what its key promises; it goes out as it came.
+        # The payload does not match its key; publish it as recorded.
         return None

@@ -1,4 +1,4 @@
-"""Reports: headings, paragraphs, tables and pictures in one file, as HTML that needs nothing beside it, or as PDF."""
+"""Reports: headings, paragraphs, tables and pictures in one self-contained HTML or PDF file."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Where pictures are drawn: figures without a window, files that are whole or not there, one style and one palette.
+"""Drawing: figures without a window, atomic file writes, one style and one palette.
 
-All figures are as wide as a page shows them, so that one size of letters reads the same in all. A drawing is a function
-under `@house_style()`, which sets matplotlib's defaults while it runs and leaves the caller's own as they were.
+All figures have the width of a page, so that letters have the same size everywhere. Drawing functions are decorated
+with `@house_style()`, which sets matplotlib's defaults while they run and restores the caller's own.
 """
 
 from __future__ import annotations
@@ -20,23 +20,23 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from PIL.Image import Image
 
-# Okabe and Ito's colours, which colour-blind readers can tell apart.
+# Okabe and Ito's palette, suitable for colour-blind readers.
 BLACK, ORANGE, SKY, GREEN, BLUE, RED, PINK = (
     "#000000", "#E69F00", "#56B4E9", "#009E73", "#0072B2", "#D55E00", "#CC79A7",
 )  # fmt: skip
 
 WIDTH = 10.0
-"""Of every figure [inch]: where a page shows it at 850 pixels, letters of 9.5 points are 11 pixels high."""
+"""Width of every figure [inch]; at 850 pixels, letters of 9.5 points are 11 pixels high."""
 DPI = 140
-"""Dots an inch of a PNG: sharp where a page shows it smaller, or a screen has two dots a pixel."""
+"""Resolution of a PNG [dots/inch], sharp on a scaled-down page and on a high-resolution screen."""
 _PALETTE_ROUNDS = 2
-"""Rounds of k-means for the palette of a PNG: with more, no colour moves by a step that is seen."""
-_PLACES = np.array([1 << 16, 1 << 8, 1])
-"""Of red, green and blue in the number of a colour."""
-_PERIODS, _STRETCHES = 80, 240
-"""A signal of so many periods is drawn as a band, which shows the extremes of at most so many stretches of time."""
+"""Rounds of k-means for the palette of a PNG; further rounds change no colour visibly."""
+_CHANNEL_WEIGHTS = np.array([1 << 16, 1 << 8, 1])
+"""Weights of red, green and blue in the number of a colour."""
+_MIN_BAND_PERIODS, _MAX_SLICES = 80, 240
+"""Periods from which a signal is drawn as a band, and the largest number of time slices in the band."""
 _SALT = "rotor-stator-rig"
-"""What the names inside an SVG are made of, beside what they name."""
+"""Salt of the identifiers in an SVG, so that they are reproducible."""
 _STYLE: Any = {
     "font.family": "DejaVu Sans",
     "font.size": 10,
@@ -70,7 +70,7 @@ _STYLE: Any = {
 
 @contextmanager
 def house_style() -> Iterator[None]:
-    """Matplotlib's defaults for every figure, as a block or as a decorator of what draws."""
+    """Apply matplotlib's defaults for every figure, as a context manager or as a decorator of a drawing function."""
     import matplotlib
 
     with matplotlib.rc_context(_STYLE):
@@ -80,12 +80,12 @@ def house_style() -> Iterator[None]:
 def new_figure(
     height: float | None = None, title: str = "", *, layout: Literal["constrained"] | None = "constrained"
 ) -> Figure:
-    """A figure of its own, without pyplot and its windows, as wide as all are.
+    """Create a figure of the common width, without pyplot or a window.
 
     Args:
-        height: [inch]; None where the drawing sets it later.
-        title: Above all panels.
-        layout: None where the drawing places its panels itself.
+        height: Height [inch]; None if the drawing sets it later.
+        title: Title above all panels.
+        layout: None if the drawing places its panels itself.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -98,25 +98,25 @@ def new_figure(
 
 
 def draw_signals(axes: Any, times: np.ndarray, *signals: tuple[np.ndarray, str, str]) -> None:
-    """Signals of any length: as lines, or each as its mean in the band from its least to its largest.
+    """Draw signals of any length, as lines or as the mean within a band from minimum to maximum.
 
-    A line with more periods than a panel has room for is a solid block, in which nothing is seen. Bands are faint, so
-    that a second one shows through.
+    A line with more periods than a panel can show would be a solid block. Bands are faint, so that a second one remains
+    visible.
 
     Args:
-        axes: Where to.
-        times: Shape (n,).
-        signals: Values, shape (n,), colour and name of each.
+        axes: Axes to draw on.
+        times: Times, shape (n,).
+        signals: Values, shape (n,), colour and name of each signal.
     """
     periods = max(np.count_nonzero(np.diff(values > values.mean())) // 2 for values, _, _ in signals)
-    # A stretch holds two periods, else the band would show where they are cut.
-    stretches = min(_STRETCHES, periods // 2)
-    whole = len(times) // max(1, stretches) * stretches
+    # Each slice holds two periods; otherwise the band would depend on the position of its limits.
+    slices = min(_MAX_SLICES, periods // 2)
+    whole = len(times) // max(1, slices) * slices
     for values, colour, label in signals:
-        if periods < _PERIODS or len(times) < 4 * stretches:
+        if periods < _MIN_BAND_PERIODS or len(times) < 4 * slices:
             axes.plot(times, values, color=colour, lw=1.0, label=label)
             continue
-        folded, middle = values[:whole].reshape(stretches, -1), times[:whole].reshape(stretches, -1).mean(axis=1)
+        folded, middle = values[:whole].reshape(slices, -1), times[:whole].reshape(slices, -1).mean(axis=1)
         low, high = folded.min(axis=1), folded.max(axis=1)
         axes.fill_between(middle, low, high, color=colour, alpha=0.13, lw=0)
         for edge in (low, high):
@@ -125,12 +125,12 @@ def draw_signals(axes: Any, times: np.ndarray, *signals: tuple[np.ndarray, str, 
 
 
 def label_of(name: str, unit: str) -> str:
-    """What stands along the axis of a channel."""
+    """Return the axis label of a channel."""
     return f"{name} [{unit.replace('^2', '²')}]"
 
 
 def legend_below(figure: Figure, *panels: Any, columns: int = 4) -> None:
-    """One legend for some panels, or all, under the figure, where it hides no data; each name once."""
+    """Draw one legend for some panels, or all, below the figure; each name occurs once."""
     found = {}
     for axes in panels or figure.axes:
         found |= {label: handle for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
@@ -138,33 +138,33 @@ def legend_below(figure: Figure, *panels: Any, columns: int = 4) -> None:
 
 
 def check_suffix(path: Path, *, field: str = "picture") -> None:
-    """Refuse a file that no picture is written to, before it is drawn.
+    """Check that a picture can be written to a file of this name, before it is drawn.
 
     Args:
         path: The file.
-        field: What the user knows it by.
+        field: Name of the option in errors.
 
     Raises:
-        InputError: It is neither .png nor .svg.
+        InputError: If it is neither .png nor .svg.
     """
     if path.suffix not in (".png", ".svg"):
         raise InputError(field, "a .png or .svg file", str(path))
 
 
 def save(figure: Figure, *paths: Path, source: str = "") -> list[Path]:
-    """Write a figure to files that are whole or not there: the same numbers give the same bytes.
+    """Write a figure to files atomically; equal data give equal bytes.
 
     Args:
         figure: The figure.
-        paths: Each .png or .svg.
-        source: What its numbers come from, for the files' metadata.
+        paths: Files that end in .png or .svg.
+        source: Source of the data, for the files' metadata.
 
     Returns:
         The files.
 
     Raises:
-        InputError: A file is neither .png nor .svg.
-        DiskError: The disk refused; what stood in the file before stands there still.
+        InputError: If a file is neither .png nor .svg.
+        DiskError: If a file cannot be written; an existing file stays unchanged.
     """
     for path in paths:
         check_suffix(path)
@@ -176,12 +176,12 @@ def save(figure: Figure, *paths: Path, source: str = "") -> list[Path]:
 
 
 def png(figure: Figure, *, dpi: int = DPI, source: str = "") -> bytes:
-    """A figure as PNG with a palette: a line drawing looks the same in a third of the size.
+    """Return a figure as PNG with a palette, which reduces a line drawing to a third of its size.
 
     Args:
         figure: The figure.
-        dpi: Dots an inch.
-        source: What its numbers come from, for the field Source of its metadata.
+        dpi: Dots per inch.
+        source: Source of the data, for the metadata field Source.
     """
     from PIL import Image
     from PIL.PngImagePlugin import PngInfo
@@ -193,15 +193,15 @@ def png(figure: Figure, *, dpi: int = DPI, source: str = "") -> bytes:
     buffer, small = io.BytesIO(), io.BytesIO()
     figure.savefig(buffer, format="png", dpi=dpi)
     with Image.open(buffer) as image:
-        _with_palette(image.convert("RGB")).save(small, format="png", optimize=True, pnginfo=about)
+        _apply_palette(image.convert("RGB")).save(small, format="png", optimize=True, pnginfo=about)
     return small.getvalue()
 
 
-def _with_palette(image: Image) -> Image:
+def _apply_palette(image: Image) -> Image:
     """Return an image with a palette of at most 256 colours.
 
-    Chosen in this way, faint tints stay as they are, and the steps of a colour scale are too small to be seen. It is
-    k-means as `quantize(kmeans=...)` of Pillow, but over the few thousand colours instead of two million pixels.
+    This choice preserves faint tints, and steps of a colour scale stay invisible. It is the k-means of Pillow's
+    `quantize(kmeans=...)`, applied to a few thousand colours instead of two million pixels.
 
     Args:
         image: An RGB image.
@@ -219,23 +219,23 @@ def _with_palette(image: Image) -> Image:
         sums = np.stack([np.bincount(nearest, counts * part, len(means)) for part in colours.T], axis=1)
         means = np.where(weights[:, None] > 0.0, sums / np.maximum(weights, 1.0)[:, None], means)
     means = np.rint(means)
-    places = np.zeros(1 << 24, np.uint8)
-    places[colours @ _PLACES] = _nearest(colours, means)
-    found = Image.fromarray(places[np.asarray(image, dtype=np.int32) @ _PLACES])
+    indices = np.zeros(1 << 24, np.uint8)
+    indices[colours @ _CHANNEL_WEIGHTS] = _nearest(colours, means)
+    found = Image.fromarray(indices[np.asarray(image, dtype=np.int32) @ _CHANNEL_WEIGHTS])
     found.putpalette(means.astype(np.uint8).tobytes())
     return found
 
 
 def _nearest(colours: np.ndarray, means: np.ndarray) -> np.ndarray:
-    """Return the place of the mean nearest to each colour, shape (n,); both shape (n, 3)."""
+    """Return the index of the nearest mean for each colour, shape (n,); both arguments have shape (n, 3)."""
     squares = np.sum(means**2, axis=1)
-    parts = np.array_split(colours, len(colours) // 10_000 + 1)  # a picture with a scale of colours has 100,000 of them
+    parts = np.array_split(colours, len(colours) // 10_000 + 1)  # a picture with a colour scale has 100,000 colours
     return np.concatenate([(squares - 2.0 * part @ means.T).argmin(axis=1) for part in parts])
 
 
 @house_style()
 def _svg(figure: Figure, source: str) -> bytes:
     buffer = io.BytesIO()
-    # Without a date and with fixed names, the same numbers give the same file.
+    # Without a date and with fixed identifiers, equal data give an equal file.
     figure.savefig(buffer, format="svg", dpi=DPI, metadata={"Date": None, "Source": source or None})
     return buffer.getvalue()

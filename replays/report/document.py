@@ -1,4 +1,4 @@
-"""What a report holds, whatever it is written as."""
+"""Content of a report, independent of the file format."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ if TYPE_CHECKING:
 
 
 Mark = Literal["good", "bad", "open", "plain"]
-"""What a row of a table says: as it must be, not so, undecided, or nothing to be judged."""
+"""Mark of a table row: good, bad, inconclusive, or not judged."""
 OUTCOME_MARKS: dict[str, Mark] = {Outcome.PASS: "good", Outcome.FAIL: "bad", Outcome.INCONCLUSIVE: "open"}
 _NUMBER = re.compile(r"[<>≤≥~±+− -]*\d")
-_WORD = re.compile(r"[^\W\d_]{4}")
-_SET = re.compile(r"`([^`]+)`|_\{([^}]+)\}|\^\{([^}]+)\}")
-_PLAIN = re.compile(r"[−+-]?\d+(\.\d+)?")
+_LETTERS = re.compile(r"[^\W\d_]{4}")
+_MARKUP = re.compile(r"`([^`]+)`|_\{([^}]+)\}|\^\{([^}]+)\}")
+_PLAIN_NUMBER = re.compile(r"[−+-]?\d+(\.\d+)?")
 
 Style = Literal["", "code", "sub", "sup"]
 
 
 def fragments(text: str) -> list[tuple[str, Style]]:
-    """Pieces of a text as they are set: code between backticks, what is lowered in _{}, what is raised in ^{}."""
+    """Split a text into fragments and their styles: code in backticks, subscripts in _{}, superscripts in ^{}."""
     styles: tuple[Style, ...] = ("", "code", "sub", "sup")
     found: list[tuple[str, Style]] = []
-    for n, piece in enumerate(_SET.split(text)):
+    for n, piece in enumerate(_MARKUP.split(text)):
         style = styles[n % len(styles)]
         if piece:
             found.append((piece if style else piece.replace("m/s^2", "m/s²"), style))
@@ -38,13 +38,13 @@ def fragments(text: str) -> list[tuple[str, Style]]:
 
 
 def unset(text: str) -> str:
-    """A text where nothing can be set: without backticks, what is lowered after an underscore."""
+    """Return a text without styles: backticks are removed, subscripts follow an underscore, superscripts a caret."""
     return "".join({"sub": "_", "sup": "^"}.get(style, "") + piece for piece, style in fragments(text))
 
 
 @dataclass(frozen=True)
 class Row:
-    """One row of a table."""
+    """A row of a table."""
 
     cells: tuple[str, ...]
     mark: Mark = "plain"
@@ -52,7 +52,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Heading:
-    """A heading; level 1 opens a part, level 2 a section in it; the note stands beside it in the contents."""
+    """A heading: level 1 for a part, level 2 for a section; the contents show the note next to it."""
 
     text: str
     level: int = 1
@@ -68,7 +68,7 @@ class Paragraph:
 
 @dataclass(frozen=True)
 class Table:
-    """A table with headings; the first column is text, further ones may be numbers."""
+    """A table with headings; the first column is text, the others may be numbers."""
 
     headings: tuple[str, ...]
     rows: tuple[Row, ...]
@@ -76,18 +76,18 @@ class Table:
 
     @property
     def numeric(self) -> tuple[bool, ...]:
-        """Whether each column holds numbers, with or without units, and what stands where there is none."""
+        """True if each column holds numbers, with or without units, or placeholders for missing ones."""
         columns = [[row.cells[n] for row in self.rows] for n in range(len(self.headings))]
         return tuple(
             any(map(_NUMBER.match, cells))
-            and all(len(cell) < 5 or (_NUMBER.match(cell) and not _WORD.search(cell)) for cell in cells)
+            and all(len(cell) < 5 or (_NUMBER.match(cell) and not _LETTERS.search(cell)) for cell in cells)
             for cells in columns
         )
 
     @property
     def tails(self) -> tuple[tuple[str, ...], ...]:
-        """What a plain number lacks to be as long behind its point as the longest of a column of numbers, by row."""
-        columns = [[_PLAIN.fullmatch(row.cells[n]) for row in self.rows] for n in range(len(self.headings))]
+        """Characters to append to plain numbers so that all decimal points of a column line up, by row."""
+        columns = [[_PLAIN_NUMBER.fullmatch(row.cells[n]) for row in self.rows] for n in range(len(self.headings))]
         decimals = [[match[1] or "" if match else None for match in found] for found in columns]
         longest = [max((each for each in found if each is not None), key=len, default="") for found in decimals]
         tails = [
@@ -101,9 +101,8 @@ class Table:
 class Picture:
     """A picture with a caption.
 
-    Attributes:
-        png: Its bytes.
-        caption: Says what it shows, and how it was made.
+    png: Bytes of a PNG file.
+    caption: Content of the picture and how it was made.
     """
 
     png: bytes
@@ -114,14 +113,14 @@ ReportPart = Heading | Paragraph | Table | Picture
 
 
 class Report:
-    """A report that grows part by part and is written once; texts of others, such as a file's name, come out printable.
+    """A report that is built part by part and written once; texts from outside, such as file names, are made printable.
 
     Attributes:
-        title: Its title.
-        lead: What it is and what comes out of it, in a sentence or two.
-        origin: What it is made of and by, each by name: file, command, version, date.
-        mark: Whether what comes out is as it must be.
-        parts: What has been added, in order.
+        title: Title.
+        lead: Subject and result in a sentence or two.
+        origin: Sources by name: file, command, version, date.
+        mark: Mark of the overall result.
+        parts: Parts in order.
     """
 
     def __init__(
@@ -134,7 +133,7 @@ class Report:
         self.parts: list[ReportPart] = []
 
     def heading(self, text: str, *, level: int = 1, note: str = "") -> None:
-        """Add a heading; level 1 or 2; with a note beside it in the contents."""
+        """Add a heading of level 1 or 2, with a note for the contents."""
         self.parts.append(Heading(printable(text), level, printable(note)))
 
     def text(self, text: str) -> None:
@@ -145,12 +144,12 @@ class Report:
         """Add a table.
 
         Args:
-            headings: Of the columns.
-            rows: Each with as many cells as there are headings; a bare sequence is a row without a mark.
-            caption: Said above it.
+            headings: Headings of the columns.
+            rows: Rows with one cell per heading; a bare sequence is a row without a mark.
+            caption: Caption above the table.
 
         Raises:
-            ValueError: A row of another length.
+            ValueError: If a row has another length.
         """
         given = (row if isinstance(row, Row) else Row(tuple(row)) for row in rows)
         whole = tuple(Row(tuple(map(printable, row.cells)), row.mark) for row in given)
@@ -160,5 +159,5 @@ class Report:
         self.parts.append(Table(tuple(map(printable, headings)), whole, printable(caption)))
 
     def picture(self, figure: Figure, caption: str, *, dpi: int = DPI) -> None:
-        """Add a figure of matplotlib as a picture."""
+        """Add a matplotlib figure as a picture."""
         self.parts.append(Picture(png(figure, dpi=dpi), printable(caption)))

@@ -1,4 +1,4 @@
-"""A report as one HTML file: pictures inside, no script, nothing fetched."""
+"""HTML output of a report: one file with embedded pictures, without scripts or external resources."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ if TYPE_CHECKING:
 
 
 def render(report: Report) -> bytes:
-    """The report as a page."""
+    """Return the report as a page."""
     from replays.report.document import Heading
 
     contents = [(number, part) for number, part in enumerate(report.parts) if isinstance(part, Heading)]
-    # What comes before the first heading is read before the contents: what comes out of it, and its picture.
+    # Parts before the first heading come before the contents: the result and its picture.
     first = contents[0][0] if contents else None
     page = _template().render(
         report=report, contents=contents, contents_at=first, kind=lambda part: type(part).__name__
@@ -28,7 +28,7 @@ def render(report: Report) -> bytes:
 
 
 def _marked(text: str) -> Markup:
-    """A text as markup: code, what is lowered and what is raised, all else as it is."""
+    """Return a text as markup with code, subscripts and superscripts."""
     from markupsafe import Markup, escape
 
     from replays.report.document import fragments

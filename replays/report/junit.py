@@ -1,4 +1,4 @@
-"""JUnit's XML as Jenkins and others read it: suites with their properties, and cases with their outcomes."""
+"""JUnit XML, as read by Jenkins and other CI servers: suites with properties, and cases with outcomes."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ Outcome = Literal["passed", "failure", "error", "inconclusive", "skipped"]
 
 @dataclass(frozen=True)
 class Case:
-    """One case.
+    """A test case.
 
     Attributes:
-        classname: What it belongs to, with dots between.
-        name: Its name there.
-        outcome: What came of it.
-        message: Why, in a line.
-        text: More of that; of one that passed, what it says.
-        time_s: How long it took [s].
+        classname: Dotted name of the module or class.
+        name: Name within it.
+        outcome: Outcome.
+        message: Reason on one line.
+        text: Details; for a passed case, its output.
+        time_s: Duration [s].
     """
 
     classname: str
@@ -38,13 +38,13 @@ class Case:
 
 @dataclass(frozen=True)
 class Suite:
-    """Cases under a name, with properties of all of them.
+    """Cases with a common name and properties.
 
     Attributes:
-        name: The name.
-        cases: The cases.
-        properties: By name.
-        timestamp: When it began, ISO 8601 without a zone; empty: left out.
+        name: Name of the suite.
+        cases: Cases.
+        properties: Names and values.
+        timestamp: Start in ISO 8601 without a zone; empty: left out.
     """
 
     name: str
@@ -56,10 +56,10 @@ class Suite:
 def write_junit(path: Path, suites: Sequence[Suite], *, name: str = "") -> None:
     """Write suites as XML.
 
-    Properties stand in suites: in a case, where some write them, the common schema has none.
+    Properties belong to suites, since the common schema has none in cases.
 
     Raises:
-        DiskError: The disk refused.
+        DiskError: If the file cannot be written.
     """
     from xml.etree.ElementTree import Element, ElementTree, SubElement, indent
 
@@ -90,8 +90,8 @@ def write_junit(path: Path, suites: Sequence[Suite], *, name: str = "") -> None:
 def _counts(cases: Sequence[Case]) -> dict[str, str]:
     found = Counter(case.outcome for case in cases)
     errors = found["error"] + found["inconclusive"]
-    told = {"tests": len(cases), "failures": found["failure"], "errors": errors, "skipped": found["skipped"]}
-    return {**{key: str(count) for key, count in told.items()}, "time": _seconds(sum(case.time_s for case in cases))}
+    totals = {"tests": len(cases), "failures": found["failure"], "errors": errors, "skipped": found["skipped"]}
+    return {**{key: str(count) for key, count in totals.items()}, "time": _seconds(sum(case.time_s for case in cases))}
 
 
 def _seconds(time_s: float) -> str:
@@ -99,5 +99,5 @@ def _seconds(time_s: float) -> str:
 
 
 def _xml(text: str) -> str:
-    """A text without what XML 1.0 cannot hold."""
+    """Return a text without characters that XML 1.0 does not allow."""
     return _NOT_XML.sub("", text)

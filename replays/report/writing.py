@@ -1,4 +1,4 @@
-"""Reports to files, by the suffix."""
+"""Output of reports, by file suffix."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ SUFFIXES = (".html", ".pdf")
 
 
 def write_report(report: Report, path: Path) -> None:
-    """Write a report to a file that is whole or not there; the same report gives the same bytes.
+    """Write a report to a file atomically; equal reports give equal bytes.
 
     Raises:
-        InputError: The file is neither .html nor .pdf.
-        DiskError: The disk refused; what stood in the file before stands there still.
+        InputError: If the file is neither .html nor .pdf.
+        DiskError: If the file cannot be written; an existing file stays unchanged.
     """
     check_suffix(path)
     if path.suffix == ".html":
@@ -28,19 +28,19 @@ def write_report(report: Report, path: Path) -> None:
 
 
 def check_suffix(path: Path) -> None:
-    """Refuse a file that no report is written to.
+    """Check the suffix of a report file.
 
     Raises:
-        InputError: It is neither .html nor .pdf.
+        InputError: If it is neither .html nor .pdf.
     """
     if path.suffix not in SUFFIXES:
         raise InputError("report", f"a file name that ends in {' or '.join(SUFFIXES)}", str(path))
 
 
 def check_report(path: Path, *, force: bool, field: str = "report") -> None:
-    """Refuse a file that no report can be written to, before anything is computed.
+    """Check that a report can be written to a file, before anything is computed.
 
     Raises:
-        InputError: Another suffix, a folder that is missing or read-only, or an existing file.
+        InputError: If the suffix is another, the folder is missing or read-only, or the file exists.
     """
     check_new_file(path, field=field, suffixes=SUFFIXES, force=force)

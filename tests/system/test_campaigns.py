@@ -92,7 +92,7 @@ def test_fixtures(bench, dut, record, measure):
 
 @pytest.mark.bench(scene="stable-run", pace="real-time")
 def test_behind(bench, measure):
-    (rig,) = psutil.Process(bench._program._kept.pid).children()
+    (rig,) = psutil.Process(bench._program._supervisor.pid).children()
     rig.suspend()
     time.sleep(0.1)
     rig.resume()
@@ -126,13 +126,13 @@ def test_a_device_in_lockstep_is_judged_alike_each_time(folder: Path) -> None:
     assert told["time to trip"]["resolution"] == "1 tick, 1 us; 10 ms blocks, in lockstep"
     assert 1e3 * told["time to trip"]["at_s"] % 10.0 == 0.0  # the end of a block
     assert "exit status of protection must be == 0; instead received 1 (its last line: out of order)" in out
-    assert "\n      time to trip must be <= 20 ms; instead received nothing (no note tags=trip came)" in out
+    assert "\n      time to trip must be <= 20 ms; instead received nothing (no note tags=trip occurred)" in out
     assert dies["reason"].startswith("exit status of protection must be == 0")
     assert [each["good"] for each in fixtures["measurements"]] == [True, True, False]
     assert fixtures["reason"].startswith("force must be <= 1 N; instead received ")
     assert fixtures["resolution"] == "20 ms blocks, in lockstep"
     # A rig that was stopped for a tenth of a second judges no device.
-    assert behind["reason"].startswith("not judged, as the rig fell behind real time in ")
+    assert behind["reason"].startswith("not judged because the rig fell behind real time in ")
     assert behind["reason"].partition(": ")[2].startswith("time to trip must be <= 1 ms; instead received 2 ms")
     # The evidence: of the case that failed, about the moment where it did.
     logs = folder / "out/evidence/test_x.py_test_fixtures"
@@ -280,7 +280,7 @@ def test_a_campaign_runs_on_a_recording_and_on_a_rig_that_is_there(folder: Path)
         rig.communicate(timeout=60.0)
     assert [(case["outcome"], case["reason"]) for case in there["cases"]] == [
         ("passed", ""),
-        ("skipped", "the rig there has scene stable-run, not hammer"),
+        ("skipped", "the existing rig has scene stable-run, not hammer"),
     ]
     median_ms, longest_ms = there["wall"]["cases"]["there.campaign.toml::stable-run"]["floor_ms"]
     assert 0.0 < median_ms <= longest_ms

@@ -195,7 +195,7 @@ def test_clients_that_do_not_come_end_the_command(path: Path, capsys: pytest.Cap
     with pytest.raises(SystemExit) as end:
         main(["replay", str(path), "--wait-for", "2", "--wait-s", "0.1", "--listen", free_endpoint()])
     assert end.value.code == 2
-    assert capsys.readouterr().err.endswith("rig: 0 of 2 clients were there after 0.1 s\n")
+    assert capsys.readouterr().err.endswith("rig: 0 of 2 clients were present after 0.1 s\n")
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from replays.campaigns.files.campaign import Campaign, campaign_path, load_campaign, shipped, title_of
+from replays.campaigns.files.campaign import Campaign, campaign_path, load_campaign, read_title, shipped
 from replays.campaigns.files.line_numbers import lines_of
 from rig.base.errors import InputError
 from tests.commands import said
@@ -73,7 +73,7 @@ WRONG = {
         4,
         "steps.at_s must be greater than or equal to 0",
     ),
-    "window turned round": (HEAD + PEAK + "from_s = 1.5\nto_s = 1.0\n", 7, "expect.to_s must be behind from_s, 1.5 s"),
+    "window turned round": (HEAD + PEAK + "from_s = 1.5\nto_s = 1.0\n", 7, "expect.to_s must be after from_s, 1.5 s"),
     "window behind the end": (
         HEAD + PEAK + "from_s = 3.0\n",
         6,
@@ -103,7 +103,7 @@ WRONG = {
     "two cases of one name": (
         HEAD + '[matrix]\nscene = ["hammer", "hammer"]\n' + PEAK,
         3,
-        "of cases with different names",
+        "cases with different names",
     ),
     "missing program": (
         HEAD + '[device]\ncommand = "protction {url}"\n' + PEAK,
@@ -114,12 +114,12 @@ WRONG = {
     "unknown place": (
         HEAD + '[device]\ncommand = "python -m json.tool {danger}"\n' + PEAK,
         4,
-        "with names of [limits] or [matrix.device] between braces, such as",
+        "a text with names of [limits] or [matrix.device] between braces, such as",
     ),
     "misspelt place": (
         HEAD + '[limits]\ndanger = "2 mm"\n' + PEAK.replace("2 mm", "{dangr}"),
         7,
-        "expect.must must be with names of [limits] or [matrix.device] between braces, such as danger; instead",
+        "expect.must must be a text with names of [limits] or [matrix.device] between braces, such as danger; instead",
     ),
     "limit that is a number": (
         HEAD + "[limits]\ndanger = 2\n" + PEAK,
@@ -240,8 +240,8 @@ def test_what_ships_is_listed_by_name_and_loads(capsys: pytest.CaptureFixture[st
         else:
             assert len(load_campaign(path).cases) == count, name
         assert f"{name}: " in out
-        assert title_of(path)[:30] in " ".join(out.split())
-    with pytest.raises(InputError, match="one of the campaigns that ship, such as hammer"):
+        assert read_title(path)[:30] in " ".join(out.split())
+    with pytest.raises(InputError, match="a file or a shipped campaign, such as hammer"):
         campaign_path("hamer")
 
 

@@ -15,13 +15,13 @@ import numpy as np
 import pytest
 
 from recorder.reader import Recording
-from replays.campaigns.equipment.bench import Target, check_replay
+from replays.campaigns.equipment.bench import Target, validate_replay
 from replays.campaigns.evidence import Trial
 from replays.campaigns.files.campaign import load_campaign, shipped
-from replays.campaigns.files.case_results import Seen
+from replays.campaigns.files.case_results import CaseRecording
 from replays.campaigns.files.expectation import KINDS
 from replays.campaigns.files.run import end_device, measure_end
-from replays.campaigns.measurement import Measurement, Must, measured
+from replays.campaigns.measurement import Measurement, Must, judge_value
 from replays.campaigns.reporting.page import changes, make_page
 from replays.campaigns.reporting.picture import draw
 from replays.campaigns.reporting.results import Results, load_results, write_junit
@@ -36,18 +36,18 @@ from tests.score_daqs import counts_of, write_parquet, write_session
 
 
 @pytest.fixture(scope="module")
-def seen() -> Seen:
+def seen() -> CaseRecording:
     """A hammer at 0.02 s, 0.6 s at 5 kHz."""
-    return Seen(Recording.open(ROOT / "replays/sessions/hammer-6.2.mcap"), Path())
+    return CaseRecording(Recording.open(ROOT / "replays/sessions/hammer-6.2.mcap"), Path())
 
 
-def one(seen: Seen, **given: Any) -> Measurement:
+def one(seen: CaseRecording, **given: Any) -> Measurement:
     kind = next(key for key in KINDS if key in given)
     (found,) = check(KINDS[kind], given, field="").measure(seen, seen.units)
     return found
 
 
-def test_values_of_signals_are_those_of_their_rows(seen: Seen) -> None:
+def test_values_of_signals_are_those_of_their_rows(seen: CaseRecording) -> None:
     rows = seen.recording.samples("disk_x", "disk_y", "P_E")
     x, y, times_s = rows["disk_x"], rows["disk_y"], rows.times_s
     late = (times_s >= 0.3) & (times_s < 0.5)
@@ -79,11 +79,11 @@ def test_values_of_signals_are_those_of_their_rows(seen: Seen) -> None:
     force = one(seen, signal="normal_force", truth="contact", take="max", must=">= 0.1 kN")
     assert force.value == pytest.approx(1e-3 * seen.recording.truth("contact")["normal_force"].max())
     never = one(seen, signal="disk_x", take="first beyond", beyond="9 mm", must="<= 1 s")
-    assert (math.isnan(never.value), never.good, never.note) == (True, False, "it never is beyond 9 mm")
+    assert (math.isnan(never.value), never.good, never.note) == (True, False, "it never exceeds 9 mm")
     assert "nothing" in never.line
 
 
-def test_events_come_or_not_in_time_and_in_order(seen: Seen) -> None:
+def test_events_come_or_not_in_time_and_in_order(seen: CaseRecording) -> None:
     assert one(seen, event="hammer").value == 1.0
     assert not one(seen, event="hammer", appears=False).good
     assert one(seen, event="note", appears=False).good
@@ -92,17 +92,17 @@ def test_events_come_or_not_in_time_and_in_order(seen: Seen) -> None:
     assert one(seen, event="hammer", where={"force_n": 100.0}, take="count", must="== 1").good
     assert one(seen, event="hammer", where={"force_n": 50.0}, take="count", must="== 0").good
     late = one(seen, event="hammer", since={"at_s": 0.1}, must="<= 1 s")
-    assert (late.good, late.note) == (False, "no hammer came")
+    assert (late.good, late.note) == (False, "no hammer occurred")
     level = {"signal": "disk_x", "beyond": "99 mm"}
-    assert one(seen, event="hammer", since=level, must="<= 1 s").note == "what it is counted from never came"
+    assert one(seen, event="hammer", since=level, must="<= 1 s").note == "the origin of the time never occurred"
     start, hammer = {"event": "start"}, {"event": "hammer", "where": {"direction": "x"}}
     assert one(seen, order=[start, hammer]).good
     turned = one(seen, order=[hammer, start])
     assert (turned.good, turned.value) == (False, 1.0)
 
 
-def test_a_scorecard_is_an_expectation(seen: Seen) -> None:
-    itself = Seen(seen.recording, seen.recording.path.parent)
+def test_a_scorecard_is_an_expectation(seen: CaseRecording) -> None:
+    itself = CaseRecording(seen.recording, seen.recording.path.parent)
     assert one(itself, score="missing rows", file="hammer-6.2.mcap").good
     assert one(itself, score="all", file="hammer-6.2.mcap").good
     absent = one(itself, score="all", file="nothing.csv")
@@ -112,7 +112,7 @@ def test_a_scorecard_is_an_expectation(seen: Seen) -> None:
 
 def test_rows_that_have_to_be_missing_are_an_expectation(tmp_path: Path) -> None:
     counts = counts_of("probes", np.cumsum(np.random.default_rng(1).normal(size=(4000, 4)), axis=0) * 1e-3, None)
-    session = Seen(Recording.open(write_session(tmp_path / "sent.mcap", {"probes": counts})), tmp_path)
+    session = CaseRecording(Recording.open(write_session(tmp_path / "sent.mcap", {"probes": counts})), tmp_path)
     names = default_table().groups["probes"].names
     kept = np.delete(counts, slice(1000, 1100), axis=0)
     write_parquet(tmp_path / "daq.parquet", dict(zip(names, kept.T, strict=True)))
@@ -129,7 +129,7 @@ def test_rows_that_have_to_be_missing_are_an_expectation(tmp_path: Path) -> None
 
 def test_all_asks_for_every_channel_and_row_that_was_sent_but_for_what_is_granted(tmp_path: Path) -> None:
     counts = counts_of("probes", np.cumsum(np.random.default_rng(1).normal(size=(4000, 4)), axis=0) * 1e-3, None)
-    session = Seen(Recording.open(write_session(tmp_path / "sent.mcap", {"probes": counts})), tmp_path)
+    session = CaseRecording(Recording.open(write_session(tmp_path / "sent.mcap", {"probes": counts})), tmp_path)
     names, times_s = default_table().groups["probes"].names, np.arange(4000) / 20_000
 
     def told(rows: slice, columns: list[str], **more: Any) -> tuple[bool, str]:
@@ -165,7 +165,7 @@ def test_a_run_that_is_stopped_before_the_case_is_over_fails_unless_that_is_expe
     case = next(iter(load_campaign(shipped()["hammer"]).cases))
 
     def told(*events: dict[str, Any], **expected: Any) -> list[str]:
-        trial, session = Trial("a", folder=tmp_path), Seen(recording, tmp_path)
+        trial, session = Trial("a", folder=tmp_path), CaseRecording(recording, tmp_path)
         session.events = [(event["time_s"], event) for event in events]
         expects = (check(KINDS["event"], expected, field=""),) if expected else ()
         measure_end(session, trial, replace(case, duration_s=0.5, expects=expects))
@@ -196,14 +196,14 @@ def test_a_device_that_has_to_be_killed_fails_and_one_that_ends_when_it_is_told_
     ("!=", 3.0, 3.0, 0.0, False), ("between", (1.0, 3.0), 2.5, 0.5, True), ("between", (1.0, 3.0), 0.5, -0.5, False),
 ])  # fmt: skip
 def test_margin_and_verdict(op: str, limit: Any, value: float, margin: float, good: bool) -> None:
-    told = measured("time", value, "ms", op, limit)
+    told = judge_value("time", value, "ms", op, limit)
     assert (told.good, told.document()["margin"]) == (good, margin)
     text = f"{limit[0]} to {limit[1]} ms" if op == "between" else f"{op} {limit} ms"
     assert Must.parse(text, field="") == told.must
 
 
 def test_a_measurement_takes_units_and_refuses_wrong_ones() -> None:
-    told = measured("gap", 0.15, "mm", "<=", 200, unit_of_limit="um", source="datasheet")
+    told = judge_value("gap", 0.15, "mm", "<=", 200, unit_of_limit="um", source="datasheet")
     assert (told.good, told.must.limit, told.document()["margin"]) == (True, pytest.approx(0.2), pytest.approx(0.05))
     assert dict(told.properties())["gap.source"] == "datasheet"
     for given, says in (
@@ -213,14 +213,14 @@ def test_a_measurement_takes_units_and_refuses_wrong_ones() -> None:
         (("gap", 0.15, "mm", "<=", "much", None), "limit must be a number"),
     ):
         with pytest.raises(InputError, match=re.escape(says)):
-            measured(*given[:5], unit_of_limit=given[5])
-    assert not measured("gap", math.nan, "mm", "<=", 1.0).good
+            judge_value(*given[:5], unit_of_limit=given[5])
+    assert not judge_value("gap", math.nan, "mm", "<=", 1.0).good
 
 
 def results(**margins: float) -> dict[str, Any]:
     cases = []
     for name, margin in margins.items():
-        told = measured("peak", 1.0 - margin, "mm", "<=", 1.0, source="a datasheet", note="a <note>\x1b", at_s=0.3)
+        told = judge_value("peak", 1.0 - margin, "mm", "<=", 1.0, source="a datasheet", note="a <note>\x1b", at_s=0.3)
         outcome = "passed" if told.good else "failed"
         cases.append({
             "id": f"x.campaign.toml::{name}", "outcome": outcome, "reason": "" if told.good else told.line,
@@ -304,7 +304,7 @@ def test_the_page_says_first_what_failed_then_what_changed(tmp_path: Path) -> No
     folder = tmp_path / "evidence/bad"
     folder.mkdir(parents=True)
     session = Recording.open(ROOT / "replays/sessions/hammer-6.2.mcap")
-    failed = measured("peak", 1.5, "mm", "<=", 1.0, channels=("disk_x",))
+    failed = judge_value("peak", 1.5, "mm", "<=", 1.0, channels=("disk_x",))
     draw(session, folder / "event.png", [failed], origin_s=0.0, channels=["disk_x", "none"], about_s=0.03)
     now["cases"][1]["evidence"] = ["evidence/bad/event.png"]
     write_report(make_page(now, tmp_path, then), tmp_path / "index.html")
@@ -312,7 +312,8 @@ def test_the_page_says_first_what_failed_then_what_changed(tmp_path: Path) -> No
     order = (
         "1 failed, 1 error, 1 skipped, 1 passed.", "</a>: no rig</li>", "failed: x.campaign.toml::bad</h2>",
         "it is 1.25 mm", "<img",
-        "rig campaign x.campaign.toml::bad", "Against the earlier campaign</h2>", "Measurements</h2>", "median 0.3 ms",
+        "rig campaign x.campaign.toml::bad", "Comparison with the earlier campaign</h2>",
+        "Measurements</h2>", "median 0.3 ms",
     )  # fmt: skip
     places = [page.index(words) for words in order]
     assert places == sorted(places)
@@ -321,15 +322,15 @@ def test_the_page_says_first_what_failed_then_what_changed(tmp_path: Path) -> No
 def test_a_recording_that_was_cut_off_is_no_bench(tmp_path: Path) -> None:
     data, half = (ROOT / "replays/sessions/hammer-6.2.mcap").read_bytes(), tmp_path / "half.mcap"
     half.write_bytes(data[: len(data) // 2])
-    check_replay(ROOT / "replays/sessions/hammer-6.2.mcap")
-    with pytest.raises(InputError, match=r"^--replay must be a recording that was finished; instead.*half.mcap, which"):
-        check_replay(half)
+    validate_replay(ROOT / "replays/sessions/hammer-6.2.mcap")
+    with pytest.raises(InputError, match=r"^--replay must be a complete recording; instead.*half.mcap, which"):
+        validate_replay(half)
 
 
 def test_two_campaigns_do_not_write_into_one_folder(tmp_path: Path) -> None:
     config = cast("Any", SimpleNamespace())
     first = Results(tmp_path / "out", None, config)
-    with pytest.raises(InputError, match=r"^--output must be a folder that no other campaign writes to now; instead"):
+    with pytest.raises(InputError, match=r"^--output must be a folder that no other running campaign writes to"):
         Results(tmp_path / "out", None, config)
     first.pytest_sessionfinish(cast("Any", None))
     Results(tmp_path / "out", None, config).pytest_sessionfinish(cast("Any", None))
@@ -340,7 +341,7 @@ def test_results_that_are_none_are_told(tmp_path: Path) -> None:
     file.write_text(json.dumps(results(good=0.4)), encoding="utf-8")
     assert load_results(tmp_path) == load_results(file)
     file.write_text('{"format": 7}', encoding="utf-8")
-    with pytest.raises(InputError, match="results of a campaign by this version"):
+    with pytest.raises(InputError, match="campaign results written by this version"):
         load_results(tmp_path)
     with pytest.raises(InputError, match="a file that can be read"):
         load_results(tmp_path / "nowhere")

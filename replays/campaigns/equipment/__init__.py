@@ -1,1 +1,1 @@
-"""Equipment of a test: bench, device under test, recorder, and their processes."""
+"""Test equipment: bench, device under test, recorder, and their processes."""

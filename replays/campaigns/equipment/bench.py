@@ -1,4 +1,4 @@
-"""A bench: a rig of one test's own, in a process and at a port of its own; or a recording, or the rig at a URL."""
+"""Bench of a test: a rig in its own process on its own port, a played recording, or an existing rig at a URL."""
 
 from __future__ import annotations
 
@@ -30,34 +30,34 @@ if TYPE_CHECKING:
     from rig.run.commands.table import TimedCommand
 
 START_S = 300.0
-"""Longest that a rig takes to be there, where nothing is compiled yet [s]."""
+"""Longest start of a rig, including a first compilation of the kernels [s]."""
 JOIN_S = 30.0
-"""Longest that a device takes to join a rig in lockstep [s]."""
+"""Longest time for a device to join a rig in lockstep [s]."""
 _LIVE_S = 86_400.0
-"""Length of a run in real time, which the test ends [s]."""
+"""Nominal length of a run in real time; the test ends it earlier [s]."""
 _ROUND_TRIPS = 20
 Pace = Literal["lockstep", "real-time"]
 
 
 class BenchError(RuntimeError):
-    """The bench or the device under test failed, which is no verdict on a measurement; one line."""
+    """Failure of the bench or of the device under test rather than of a measurement; the message is one line."""
 
 
-class BehindError(BenchError, InconclusiveError):
-    """The rig did not keep real time: what is not as it must be may be of this machine, and not of the device."""
+class LateRigError(BenchError, InconclusiveError):
+    """Error of a rig that fell behind real time: a failed limit may be due to this machine instead of the device."""
 
 
-class NotThereError(RuntimeError):
-    """What a test needs cannot be done on this bench; the message says why."""
+class UnsupportedError(RuntimeError):
+    """Error of a bench that cannot do what a test needs; the test is skipped with this message."""
 
 
 @dataclass(frozen=True)
 class Target:
-    """On what tests run, if not on rigs of their own.
+    """The rig or recording that tests run on, unless each test starts its own rig.
 
     Attributes:
-        url: The rig there.
-        replay: A recording.
+        url: URL of an existing rig.
+        replay: Recording to play.
     """
 
     url: str | None = None
@@ -65,24 +65,24 @@ class Target:
 
     @property
     def own(self) -> bool:
-        """Each test has a rig of its own."""
+        """True if each test starts its own rig."""
         return self.url is None and self.replay is None
 
 
 @dataclass(frozen=True)
 class BenchSettings:
-    """What a test needs of its bench.
+    """Requirements of a test on its bench.
 
     Attributes:
-        scene: A scene, by name or path; None: any.
-        pace: What decides when a block runs.
-        block_ms: Length of a block [ms]: in lockstep what a device's reaction is exact to.
-        set: Changes of the scene or its parameters, by dotted key.
-        channels: Channels that `connect` reads unless it is told.
-        commands: Commands and faults at times of the scene, as `[[commands]]` there; beside its own.
-        duration_s: Length of the run [s]; None: the scene's, or without an end in real time.
-        table: A channel table of the user's own.
-        can: Whether it is a node of a CAN bus, too.
+        scene: Scene, by name or path; None accepts any.
+        pace: Clock of the run: lockstep or real time.
+        block_ms: Length of a block [ms], which in lockstep is the resolution of a device's reaction time.
+        set: Changes to the scene or its parameters, by dotted key.
+        channels: Channels that `connect` reads by default.
+        commands: Commands and faults at scene times, added to `[[commands]]` of the scene.
+        duration_s: Length of the run [s]; None: as in the scene, or unlimited in real time.
+        table: The user's own channel table.
+        can: Whether the rig is also a node on a CAN bus.
     """
 
     scene: str | None = None
@@ -96,7 +96,7 @@ class BenchSettings:
     can: bool = False
 
     def document(self) -> dict[str, Any]:
-        """As a document for JSON."""
+        """Return the settings as a JSON document."""
         commands = [each.model_dump(mode="json", exclude_none=True) for each in self.commands]
         return {
             "scene": self.scene, "pace": self.pace, "block_ms": self.block_ms, "set": dict(self.set),
@@ -104,29 +104,29 @@ class BenchSettings:
         }  # fmt: skip
 
 
-def check_replay(path: Path) -> None:
-    """Refuse what no campaign is run on, before anything runs.
+def validate_replay(path: Path) -> None:
+    """Raise an error unless a file is a complete recording, before any test runs.
 
     Raises:
-        InputError: It is no recording, or was cut off: what is not in it would be taken for what did not happen.
+        InputError: If it is no recording or was cut off; events missing from it would count as not having occurred.
     """
     from recorder.reader import Recording
 
     if not Recording.open(path).complete:
-        raise InputError("--replay", "a recording that was finished", Words(f"{path}, which was cut off"))
+        raise InputError("--replay", "a complete recording", Words(f"{path}, which was cut off"))
 
 
 class Bench(Closing):
-    """A bench that is there; close it, or use it as a context manager.
+    """A running bench; close it, or use it as a context manager.
 
     Args:
-        settings: What it has to be.
-        folder: Where its output goes.
-        target: What it is, if no rig of its own.
+        settings: Requirements of the test.
+        folder: Folder for the output of the rig.
+        target: Existing rig or recording to use; by default the bench starts its own rig.
 
     Raises:
-        BenchError: The rig did not start.
-        NotThereError: The target is not what the settings ask for.
+        BenchError: If the rig does not start.
+        UnsupportedError: If the target does not meet the settings.
     """
 
     def __init__(self, settings: BenchSettings, folder: Path, target: Target = Target()) -> None:
@@ -136,22 +136,22 @@ class Bench(Closing):
         self._clients: list[Rig] = []
         self._late = self._late_before = 0
         self.can_url: str | None = None
-        """Where the rig is on a CAN bus, for `rig.connect` and `Daq.open`; None without one."""
+        """Address of the rig on a CAN bus, for `rig.connect` and `Daq.open`; None without a bus."""
         if target.url is not None:
             self.url = target.url
         else:
             self._program = Program(self._command(), folder / "rig.log")
             line = self._program.wait_for("listening on", START_S)
             if line is None:
-                said = self._program.last_line
+                last_line = self._program.last_line
                 self._program.end()
-                raise BenchError(f"the rig did not start: {said}")
+                raise BenchError(f"the rig did not start: {last_line}")
             self.url = f"zenoh:{line.partition('listening on ')[2].split()[0].rstrip(';')}"
         try:
             self._console = self.connect(name="campaign", channels=())
             self.pace: str = self._console.pace
             if not target.own:
-                self._check_alike()
+                self._check_target()
         except BaseException:
             self.close()
             raise
@@ -179,7 +179,7 @@ class Bench(Closing):
         return [*rig, "run", settings.scene or DEFAULT_SCENE, *pace, *listen, *sets, *table]
 
     def begin(self) -> float:
-        """Let a recording play; returns when, in simulated time of the run, the test begins [s]."""
+        """Start a recording, if one is played, and return the simulated time at which the test begins [s]."""
         if self.target.replay is not None:
             self._console.resume()
             return 0.0
@@ -190,21 +190,21 @@ class Bench(Closing):
         return float(status["time_s"])
 
     def late_blocks(self) -> int:
-        """Blocks of a rig in real time that were not ready when they were due, since the test began."""
+        """Return the number of blocks that missed their deadline in real time since the test began."""
         if self.target.own and self.pace == "real-time":
-            with contextlib.suppress(RefusedError, ConnectionError):  # it has ended: as many as were seen last
+            with contextlib.suppress(RefusedError, ConnectionError):  # the rig has ended; the last count remains
                 self._late = self.status()["overruns"] - self._late_before
         return self._late
 
     # ---- what tests use ----
 
     def connect(self, *, name: str | None = None, wait_s: float = 30.0, **settings: Any) -> Rig:
-        """A client of the rig, as `rig.connect`; closed with the bench.
+        """Return a client of the rig, as `rig.connect` does; it is closed with the bench.
 
         Args:
-            name: Who asks.
-            wait_s: How long to wait for it to be there [s].
-            settings: `channels` (those of the bench unless given), `rate_hz`, `truth`, ...
+            name: Name of the client.
+            wait_s: Longest wait for the rig [s].
+            settings: `channels` (default: those of the bench), `rate_hz`, `truth`, ...
         """
         from drivers.client import connect
 
@@ -213,41 +213,41 @@ class Bench(Closing):
         return client
 
     def status(self) -> dict[str, Any]:
-        """The rig's status document."""
+        """Return the rig's status document."""
         return self._console.status()
 
     @property
     def links(self) -> int:
-        """How many links clients have to the rig."""
+        """Number of client connections to the rig."""
         return int(self.status()["congestion"].get("links", 0))
 
     @property
     def joined(self) -> list[str]:
-        """Devices that take part in lockstep, by what the rig calls them."""
+        """Names, as the rig knows them, of the devices that take part in lockstep."""
         return [row["name"] for row in self.status().get("devices", []) if row["state"] == "joined"]
 
     def wait_for(self, device: str, *, timeout_s: float = JOIN_S) -> None:
-        """Wait until a device under test takes part in lockstep, whoever has started it.
+        """Wait until a device under test takes part in lockstep, even if another program started it.
 
         Raises:
-            BenchError: It does not in time.
+            BenchError: If it does not join in time.
         """
-        self.first_joined(lambda name: name == device, device, timeout_s=timeout_s)
+        self.wait_for_joined(lambda name: name == device, device, timeout_s=timeout_s)
 
-    def first_joined(
+    def wait_for_joined(
         self, fits: Callable[[str], bool], device: str, *, timeout_s: float = JOIN_S,
         look: Callable[[], object] = lambda: None,
     ) -> str:  # fmt: skip
-        """Wait until a device that fits takes part in lockstep; returns what the rig calls it.
+        """Wait until a matching device takes part in lockstep, and return the rig's name for it.
 
         Args:
-            fits: Whether one of that name is it.
-            device: What it is called in errors.
-            timeout_s: How long [s].
-            look: Called meanwhile.
+            fits: Predicate on the name of a device.
+            device: Name of the device in error messages.
+            timeout_s: Longest wait [s].
+            look: Function called while waiting, for example to check that the device still runs.
 
         Raises:
-            BenchError: None does in time.
+            BenchError: If no such device joins in time.
         """
         now: list[str] = []
         for _ in Deadline(timeout_s).polls():
@@ -255,14 +255,14 @@ class Bench(Closing):
             if found := next(filter(fits, now), None):
                 return found
             look()
-        others = ", ".join(now) or "nobody"
-        raise BenchError(f"device {device} did not join in {timeout_s:g} s; what has: {others}")
+        others = ", ".join(now) or "none"
+        raise BenchError(f"device {device} did not join within {timeout_s:g} s; joined devices: {others}")
 
     def advance_to(self, time_s: float) -> None:
-        """Let the rig go on to a time [s] or to its end: step it in lockstep, to whole blocks, or wait.
+        """Advance the rig to a time [s] or to its end: step it by whole blocks in lockstep, or wait in real time.
 
         Raises:
-            BenchError: It does not go on.
+            BenchError: If the rig does not advance.
         """
         client = self._console
         if self.pace != "lockstep":
@@ -273,94 +273,94 @@ class Bench(Closing):
                 time.sleep(min(0.2, max(0.002, left)))
             return
         status = client.status()
-        tick, block, end_s = status["tick"], _ticks(1e-3 * status["block_ms"]), status["end_s"]
-        end = math.inf if end_s is None else _ticks(end_s)
-        last = min(_ticks(time_s), end)
+        tick, block, end_s = status["tick"], _to_ticks(1e-3 * status["block_ms"]), status["end_s"]
+        end = math.inf if end_s is None else _to_ticks(end_s)
+        last = min(_to_ticks(time_s), end)
         while tick < last:
-            ticks = min(-(-min(last - tick, _PIECE) // block) * block, end - tick)
+            ticks = min(-(-min(last - tick, _TICKS_PER_STEP) // block) * block, end - tick)
             try:
                 reply = self._step(int(ticks))
             except RefusedError as error:
                 if f"{wire.ENDED}: stopped" in str(error):
-                    return  # as a device may
-                raise BenchError(f"the rig does not go on: {error}") from None
+                    return  # a device may stop the rig
+                raise BenchError(f"the rig does not advance: {error}") from None
             tick = reply.tick
 
     def _step(self, ticks: int) -> AcceptedStep:
         """Step the rig.
 
         Raises:
-            BenchError: It has died, or waits for a device for too long.
-            RefusedError: It refuses to.
+            BenchError: If the rig has ended, or waits too long for a device.
+            RefusedError: If the rig refuses to step.
         """
         try:
             return self._console.step(ticks, timeout_s=_STEP_S)
         except ConnectionError as error:
-            if self._program is not None and (status := self._program.wait(_DIES_S)) is not None:
-                raise BenchError(f"the rig has died (status {status}): {self._program.last_line}") from None
-            raise BenchError(f"the rig does not go on: {error}") from None
+            if self._program is not None and (status := self._program.wait(_EXIT_S)) is not None:
+                raise BenchError(f"the rig exited with status {status}: {self._program.last_line}") from None
+            raise BenchError(f"the rig does not advance: {error}") from None
 
     def floor_ms(self) -> tuple[float, float]:
-        """Round trips of a request to the rig: median and longest [ms], what a command's latency cannot be below."""
-        took = []
+        """Return the median and maximum round-trip time of a request [ms], the lower limit of any command latency."""
+        round_trips_ms = []
         for _ in range(_ROUND_TRIPS):
             begun = time.perf_counter()
             self._console.status()
-            took.append(1e3 * (time.perf_counter() - begun))
-        return statistics.median(took), max(took)
+            round_trips_ms.append(1e3 * (time.perf_counter() - begun))
+        return statistics.median(round_trips_ms), max(round_trips_ms)
 
     @property
     def resolution(self) -> str:
-        """What a device's reaction is exact to, in words; the same for each run in lockstep."""
-        block = f"{self.settings.block_ms:g} ms blocks" if self.target.own else "the blocks of the rig that is there"
-        return f"{block}, in lockstep" if self.pace == "lockstep" else f"{block}, and the measured floor"
+        """Resolution of a device's reaction time in words; the same for every run in lockstep."""
+        block = f"{self.settings.block_ms:g} ms blocks" if self.target.own else "blocks of the existing rig"
+        return f"{block}, in lockstep" if self.pace == "lockstep" else f"{block}, and the measured round trip"
 
     def close(self) -> None:
-        """Close the clients, and end the rig if it is the bench's own."""
+        """Close the clients, and stop the rig if the bench started it."""
         for client in self._clients:
             client.close()
         self._clients.clear()
         if self._program is not None:
             self._program.end()
 
-    # ---- on a rig that is there ----
+    # ---- on an existing rig or a recording ----
 
-    def _check_alike(self) -> None:
-        """Refuse a rig that is there, and is another one than the test is about.
+    def _check_target(self) -> None:
+        """Check that an existing rig or recording is the one that the test needs.
 
         Raises:
-            NotThereError: Scene or values differ; the message tells the first that does.
+            UnsupportedError: If the scene or a value differs; the message names the first difference.
         """
-        what = "the recording" if self.target.replay else "the rig there"
+        what = "the recording" if self.target.replay else "the existing rig"
         scene = self.scene_document()
         settings = self.settings
         if settings.scene is not None and Path(settings.scene).stem != scene.get("name"):
-            raise NotThereError(f"{what} has scene {scene.get('name')}, not {settings.scene}")
+            raise UnsupportedError(f"{what} has scene {scene.get('name')}, not {settings.scene}")
         for key, wanted in settings.set.items():
             place: Any = scene
             for part in key.split("."):
                 place = place.get(part) if isinstance(place, Mapping) else None
             place = scene.get("set", {}).get(key) if place is None else place
             if json.dumps(place) != json.dumps(wanted) and place != wanted:
-                raise NotThereError(f"{what} has {key} = {place}, not {wanted}")
+                raise UnsupportedError(f"{what} has {key} = {place}, not {wanted}")
         end_s = self.status()["end_s"]
         if (
             self.target.replay is not None
             and settings.duration_s is not None
-            and end_s < settings.duration_s - _SHORT_S
+            and end_s < settings.duration_s - _MAX_MISSING_S
         ):
-            raise NotThereError(f"{what} ends at {end_s:g} s, before the test at {settings.duration_s:g} s")
+            raise UnsupportedError(f"{what} ends at {end_s:g} s, before the test at {settings.duration_s:g} s")
         if settings.can:
-            raise NotThereError(f"whether {what} is on a CAN bus, and where, is not told")
+            raise UnsupportedError(f"the CAN bus address of {what} is not available")
         if self.target.replay is not None:
-            done = {_key(each) for each in scene.get("commands", ())}
+            done = {_command_key(each) for each in scene.get("commands", ())}
             for each in settings.commands:
-                if _key(each.model_dump(mode="json")) not in done:
+                if _command_key(each.model_dump(mode="json")) not in done:
                     what = f"{each.request.command} at {each.at_s:g} s"
-                    raise NotThereError(f"a recording takes no commands, and this one has no {what}")
+                    raise UnsupportedError(f"a recording accepts no commands, and this one has no {what}")
 
     def scene_document(self) -> dict[str, Any]:
-        """The scene of the rig that is there, with its name."""
+        """Return the scene of an existing rig or recording, with its name."""
         from rig.serve.transport.zenoh import client_of
 
         with client_of(self.url, wait_s=30.0) as client:
@@ -370,31 +370,30 @@ class Bench(Closing):
 
 DEFAULT_SCENE = "stable-run"
 _NUMBERS = itertools.count(1)
-_SHORT_S = 0.01
-"""A recording may lack this of a run [s]: the rows behind its last one."""
-_PIECE = 1_000_000
-"""Ticks that are stepped at a time."""
+_MAX_MISSING_S = 0.01
+"""Longest part of a run that a recording may lack, as it ends at its last sample [s]."""
+_TICKS_PER_STEP = 1_000_000
 _STEP_S = 600.0
-"""Longest that a step takes, where it waits for devices that are patient [s]."""
-_DIES_S = 2.0
-"""How soon a rig whose link has gone has ended, if it has [s]."""
+"""Longest duration of a step, during which the rig may wait for slow devices [s]."""
+_EXIT_S = 2.0
+"""Longest time between the loss of the connection and the exit of the rig's process [s]."""
 
 
-def _ticks(time_s: float) -> int:
+def _to_ticks(time_s: float) -> int:
     return round(time_s * TICKS_HZ)
 
 
-def _key(command: Mapping[str, Any]) -> str:
+def _command_key(command: Mapping[str, Any]) -> str:
     return json.dumps({"at_s": command.get("at_s"), **command.get("request", {})}, sort_keys=True)
 
 
 def toml_value(value: Any) -> str:
-    """A value as TOML on one line."""
+    """Return a value as TOML on one line."""
     if isinstance(value, Mapping):
         inner = ", ".join(f"{json.dumps(str(key))} = {toml_value(each)}" for key, each in value.items())
         return f"{{ {inner} }}"
     if isinstance(value, Sequence) and not isinstance(value, str):
         return f"[{', '.join(map(toml_value, value))}]"
     if value is None or not isinstance(value, str | bool | int | float):
-        raise InputError("set", "of numbers, texts, lists and tables", Words(type(value).__name__))
+        raise InputError("set", "numbers, texts, lists and tables", Words(type(value).__name__))
     return json.dumps(value)

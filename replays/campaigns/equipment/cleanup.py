@@ -1,7 +1,7 @@
-"""Runs a program, and ends it with all that it has started when its own input ends: with whoever started both.
+"""Program that runs a test's child process and terminates its process group when standard input closes.
 
-What comes in before that kills it at once. A program of its own, `python cleanup.py PROGRAM ...`, of the standard
-library alone: a test run that is killed leaves nothing running.
+Usage: `python cleanup.py PROGRAM ...`. Standard input closes when the test process ends, however it ends, so a killed
+test run leaves nothing running. Any byte on standard input kills the group at once. Uses the standard library only.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ import sys
 import threading
 
 PATIENCE_S = 5.0
-"""How long a program may take to end by itself [s]."""
+"""Time between SIGTERM and SIGKILL [s]."""
 KILLED = 128 + signal.SIGKILL
-"""Exit status of one that did not."""
+"""Exit status of a program that had to be killed."""
 
 
-def keep(command: list[str]) -> int:
-    """Run a program in a session of its own; returns its exit status, as a shell would."""
+def supervise(command: list[str]) -> int:
+    """Run a program in its own session and return its exit status as a shell reports it."""
     try:
         child = subprocess.Popen(command, stdin=subprocess.DEVNULL, start_new_session=True)
     except OSError as error:
@@ -27,12 +27,12 @@ def keep(command: list[str]) -> int:
         return 127
     threading.Thread(target=_watch, args=(child,), daemon=True).start()
     status = child.wait()
-    _signal(child.pid, signal.SIGKILL)  # what it has left behind
+    _signal(child.pid, signal.SIGKILL)  # remaining processes of the group
     return status if status >= 0 else 128 - status
 
 
 def _watch(child: subprocess.Popen[bytes]) -> None:
-    while os.read(0, 4096):  # not through Python's own buffer, whose lock nobody could take at the end
+    while os.read(0, 4096):  # sys.stdin's lock might be held by this thread at exit
         _signal(child.pid, signal.SIGKILL)
     _signal(child.pid, signal.SIGTERM)
     try:
@@ -49,4 +49,4 @@ def _signal(group: int, number: int) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(keep(sys.argv[1:]))
+    sys.exit(supervise(sys.argv[1:]))

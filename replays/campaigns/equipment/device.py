@@ -1,4 +1,4 @@
-"""A device under test: a program that is started with the addresses of its bench."""
+"""Device under test: a program that receives the addresses of its bench on the command line."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ from rig.base.errors import InputError
 from rig.serve.waiting import Deadline
 
 _LINK_S = 10.0
-"""Longest that is waited for a device's link [s]."""
+"""Longest wait for a device's connection [s]."""
 PLACES = ("url", "can", "name", "folder")
-"""What stands between braces in a command, and is filled in when it is started."""
+"""Placeholders of a command line that are filled in at the start."""
 
 
 class Device:
-    """A device under test that runs.
+    """A running device under test.
 
     Args:
-        command: Its command line, with places as `{url}`: where the rig is, `{can}`: the same on its CAN bus, `{name}`:
-            what it calls itself, `{folder}`: where it may leave files.
-        name: What it is called.
-        bench: What it is tested on.
+        command: Command line. Placeholders: `{url}` (address of the rig), `{can}` (its address on the CAN bus),
+            `{name}` (name of the device) and `{folder}` (folder for its files).
+        name: Name of the device.
+        bench: Bench that it is tested on.
         log: File for its output.
-        where: Folder that it works in.
+        where: Working directory.
         files: Folder for `{folder}`.
 
     Raises:
-        InputError: There is no such program or place.
+        InputError: If the program or a placeholder does not exist.
     """
 
     def __init__(
@@ -44,26 +44,29 @@ class Device:
             words = [word.replace(f"{{{place}}}", places[place]) for word in words]
         check_program(words, where, field="command")
         self.name, self.log, self._bench = name, log, bench
-        self.joined_as = name
-        """What the rig calls it, which over CAN is a number."""
+        self.rig_name = name
+        """The rig's name for the device; a number on CAN."""
         self._others = bench.joined
         self.program = Program(words, log, folder=where)
 
     def wait_until_joined(self) -> None:
-        """Wait until it takes part in lockstep.
+        """Wait until the device takes part in lockstep.
 
         Raises:
-            BenchError: It ended, or does not in time.
+            BenchError: If it ends, or does not join in time.
         """
-        self.joined_as = self._bench.first_joined(
+        self.rig_name = self._bench.wait_for_joined(
             lambda name: name not in self._others, self.name, look=self.check_running
         )
 
     def wait_until_linked(self, before: int) -> None:
-        """Wait until there is one link more to the rig than before; not for long, as on a CAN bus it has none.
+        """Wait briefly until the rig has more connections than before; a device on a CAN bus never adds one.
+
+        Args:
+            before: Number of connections before the device was started.
 
         Raises:
-            BenchError: It has ended.
+            BenchError: If the device has ended.
         """
         for _ in Deadline(_LINK_S).polls():
             if self._bench.links > before:
@@ -71,20 +74,20 @@ class Device:
             self.check_running()
 
     def check_running(self) -> None:
-        """Refuse one that has ended.
+        """Raise an error if the device has ended.
 
         Raises:
-            BenchError: It has.
+            BenchError: If it has.
         """
         if (status := self.program.status) is not None:
             raise BenchError(f"device {self.name} ended with status {status}: {self.program.last_line}")
 
 
 def check_program(words: Sequence[str], where: Path, *, field: str) -> None:
-    """Refuse a command line without a program that can be run.
+    """Check that a command line names a program that can be run.
 
     Raises:
-        InputError: It has none, or its script is not there.
+        InputError: If the program or its script does not exist.
     """
     if not words:
         raise InputError(field, "a command line", "")

@@ -1,4 +1,4 @@
-"""A program that a test starts, under a keeper that ends it with the test, whatever becomes of that."""
+"""Program started by a test, under a supervisor that ends it together with the test process."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from pathlib import Path
 from rig.base.errors import DiskError
 from rig.serve.waiting import Deadline
 
-_KEEPER = Path(__file__).with_name("cleanup.py")
+_SUPERVISOR = Path(__file__).with_name("cleanup.py")
 
 
 class Program:
-    """A program that runs; its output goes to a file.
+    """A running program whose output is written to a file.
 
     Args:
-        command: Its words.
-        log: The file.
-        folder: Where it works.
+        command: Words of the command line.
+        log: Output file.
+        folder: Working directory.
     """
 
     def __init__(self, command: Sequence[str], log: Path, *, folder: Path | None = None) -> None:
@@ -30,40 +30,40 @@ class Program:
         environment = {**os.environ, "PATH": path, "PYTHONUNBUFFERED": "1"}
         try:
             with log.open("wb") as output:
-                self._kept = subprocess.Popen(
-                    [sys.executable, "-I", "-S", str(_KEEPER), *self.command],
+                self._supervisor = subprocess.Popen(
+                    [sys.executable, "-I", "-S", str(_SUPERVISOR), *self.command],
                     stdin=subprocess.PIPE, stdout=output, stderr=subprocess.STDOUT, cwd=folder, env=environment,
-                    start_new_session=True,  # Ctrl-C is the test's, which ends one thing after the other
+                    start_new_session=True,  # Ctrl-C goes to the test only, which ends its programs in order
                 )  # fmt: skip
         except OSError as error:
             raise DiskError(f"{self.command[0]} could not be started: {error}") from None
 
     @property
     def status(self) -> int | None:
-        """Its exit status, 128 and the signal's number where one has ended it; None while it runs."""
-        return self._kept.poll()
+        """Exit status (128 plus the signal number if killed), or None while it runs."""
+        return self._supervisor.poll()
 
-    def said(self) -> str:
-        """What it has printed so far."""
+    def read_output(self) -> str:
+        """Return the output printed until now."""
         return self.log.read_text(encoding="utf-8", errors="replace")
 
     @property
     def last_line(self) -> str:
-        """The last line that it has printed."""
-        return next((line for line in reversed(self.said().splitlines()) if line.strip()), "nothing")
+        """Last line of the output."""
+        return next((line for line in reversed(self.read_output().splitlines()) if line.strip()), "nothing")
 
     def wait(self, timeout_s: float) -> int | None:
-        """Its exit status once it has ended; None where it has not."""
+        """Wait for the end of the program; return its exit status, or None if it still runs."""
         try:
-            return self._kept.wait(timeout_s)
+            return self._supervisor.wait(timeout_s)
         except subprocess.TimeoutExpired:
             return None
 
     def wait_for(self, words: str, timeout_s: float) -> str | None:
-        """The line with these words, once it is printed; None where it ends before, or does not print it."""
+        """Wait for a line that contains `words` and return it, or None if the program ends or the time runs out."""
         for _ in Deadline(timeout_s).polls():
             ended = self.status is not None
-            for line in self.said().splitlines(keepends=True):
+            for line in self.read_output().splitlines(keepends=True):
                 if words in line and line.endswith("\n"):
                     return line.strip()
             if ended:
@@ -71,15 +71,15 @@ class Program:
         return None
 
     def kill(self) -> None:
-        """Kill it, as a power cut would, and wait until it is gone."""
-        assert self._kept.stdin is not None
-        with contextlib.suppress(BrokenPipeError):  # it has ended already
-            self._kept.stdin.write(b"kill")
-            self._kept.stdin.flush()
-        self._kept.wait()
+        """Terminate the program without a grace period, like a power cut, and wait until it has ended."""
+        assert self._supervisor.stdin is not None
+        with contextlib.suppress(BrokenPipeError):  # it has ended
+            self._supervisor.stdin.write(b"kill")
+            self._supervisor.stdin.flush()
+        self._supervisor.wait()
 
     def end(self) -> None:
-        """End it: first by SIGTERM, and at the latest after some seconds."""
-        assert self._kept.stdin is not None
-        self._kept.stdin.close()
-        self._kept.wait()
+        """End the program by SIGTERM, or by SIGKILL after a few seconds."""
+        assert self._supervisor.stdin is not None
+        self._supervisor.stdin.close()
+        self._supervisor.wait()

@@ -1,4 +1,4 @@
-"""A recording of a bench, made beside the test."""
+"""Recording of a bench during a test."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ if TYPE_CHECKING:
     from replays.campaigns.equipment.bench import Bench
 
 _BEGIN_S, _END_S = 30.0, 60.0
-"""Longest that a recording takes to begin, and to end [s]."""
+"""Longest start and longest end of a recording [s]."""
 
 
 class Record:
-    """Records a bench from now on, or from the start of its run where the bench is the test's own.
+    """Records a bench: from the start of the run if the test started the rig, otherwise from now on.
 
     Args:
         bench: The bench.
-        path: The file, ends in .mcap.
+        path: Output file, ending in .mcap.
     """
 
     def __init__(self, bench: Bench, path: Path) -> None:
@@ -34,7 +34,7 @@ class Record:
         self.path, self._bench = path, bench
         self._client = client_of(bench.url, wait_s=_BEGIN_S)
         own = bench.target.own
-        # Plots are made of the evidence alone, so none are kept of the whole.
+        # Plots come from the evidence, so the whole recording needs no data for views.
         self._session: RecordingSession = RecordingSession(
             self._client, path, name="campaign", view_rate_hz=0.0, history=own, force=True
         )
@@ -46,38 +46,38 @@ class Record:
 
     def _run(self) -> None:
         try:
-            self._summary = self._session.run(self._tell)
-        except BaseException as error:  # told by whoever waits for the recording
+            self._summary = self._session.run(self._update_progress)
+        except BaseException as error:  # reported by `stop` and `wait_until_there`
             self._error = error
         finally:
             self._client.close()
 
-    def _tell(self, progress: Progress) -> None:
+    def _update_progress(self, progress: Progress) -> None:
         self._progress = progress
 
-    def wait_until_there(self) -> None:
-        """Wait until it listens.
+    def wait_until_connected(self) -> None:
+        """Wait until the recorder is connected.
 
         Raises:
-            BenchError: It does not.
+            BenchError: If it does not connect.
         """
         for _ in Deadline(_BEGIN_S).polls():
             if "campaign" in self._bench.status()["clients"]:
                 return
             if not self._thread.is_alive():
                 break
-        raise BenchError(f"nothing is recorded: {self._error or 'the rig does not hear of it'}")
+        raise BenchError(f"the recording did not start: {self._error or 'the rig does not list the recorder'}")
 
     def stop(self) -> Recording:
-        """End it, and open what was recorded; rows that the rig has sent are waited for.
+        """Stop recording after all published samples have arrived, and open the recording.
 
         Raises:
-            BenchError: Rows are missing that no fault took, or the disk refused.
+            BenchError: If samples are missing that no fault removed, or the disk failed.
         """
         from recorder.reader import Recording
 
         if self._summary is None and self._error is None:
-            self._wait_for_the_rest()
+            self._wait_for_samples()
             self._session.stop("the test's end")
             self._thread.join(_END_S)
         summary = self._summary
@@ -88,21 +88,21 @@ class Record:
         return Recording.open(self.path)
 
     def wait(self) -> None:
-        """Wait until it has ended by itself, with the rig's run."""
+        """Wait until the recording has ended with the rig's run."""
         self._thread.join(_END_S)
 
-    def _wait_for_the_rest(self) -> None:
-        """Wait for what a rig in lockstep has published: it is done with the step before its rows are here."""
+    def _wait_for_samples(self) -> None:
+        """Wait for the last published samples: a rig in lockstep completes a step before they arrive."""
         if self._bench.pace != "lockstep" or not self._thread.is_alive():
             return
         time_s = self._bench.status()["time_s"]
 
         def all_here() -> bool:
-            return self._progress is not None and self._progress.time_s >= time_s - _LAST_S
+            return self._progress is not None and self._progress.time_s >= time_s - _MAX_INTERVAL_S
 
         if time_s > 0.0:
             wait_until(lambda: all_here() or not self._thread.is_alive(), 5.0)
 
 
-_LAST_S = 2e-3
-"""No stream has rows further apart than this [s]."""
+_MAX_INTERVAL_S = 2e-3
+"""Largest interval between two samples of any stream [s]."""

@@ -1,4 +1,4 @@
-"""A campaign's file, `*.campaign.toml`: read, checked down to its signals and units, and multiplied into its cases."""
+"""Campaign files, `*.campaign.toml`: parsing, checks of signals and units, and expansion of the matrix into cases."""
 
 from __future__ import annotations
 
@@ -32,35 +32,35 @@ from rig.run.scenes import Scene, load_scene
 
 SUFFIX = ".campaign.toml"
 FOLDER = Path(__file__).parents[1]
-"""Where the campaigns are that come with the rig."""
-_PLACE = re.compile(r"\{(\w+)(?::([^{}]*))?\}")
-_MOST_CASES = 10_000
+"""Folder of the shipped campaigns."""
+_PLACEHOLDER = re.compile(r"\{(\w+)(?::([^{}]*))?\}")
+_MAX_CASES = 10_000
 _BLOCK_MS = (1.0, 1000.0)
 Line = Annotated[str, Field(min_length=1, max_length=1000)]
 
 
-def _a_name(text: str) -> str:
+def _check_name(text: str) -> str:
     if not re.fullmatch(r"[\w.-]{1,50}", text):
         raise ValueError("1 to 50 letters, digits, dots, dashes and underscores")
     return text
 
 
-def _a_quantity(given: Any) -> str:
+def _check_quantity(given: Any) -> str:
     if not isinstance(given, str):
         raise ValueError("a number with its unit as a text, such as '0.2 mm'")
     return given
 
 
-Quantity = Annotated[str, BeforeValidator(_a_quantity)]
+Quantity = Annotated[str, BeforeValidator(_check_quantity)]
 
 
 class _Device(Written):
     command: Line
-    name: Annotated[str, AfterValidator(_a_name)] = "device"
+    name: Annotated[str, AfterValidator(_check_name)] = "device"
     joins: bool = True
-    """Whether it takes part in lockstep; without, the rig does not wait for it."""
+    """True if it takes part in lockstep; if not, the rig does not wait for it."""
     commands: bool = True
-    """Whether it commands the rig, which a recording does not take."""
+    """True if it sends commands, which a recording does not accept."""
 
 
 class _Matrix(Written):
@@ -90,11 +90,11 @@ class _File(Written):
 
 @dataclass(frozen=True)
 class Step:
-    """What is done at a time of the case.
+    """A command or note at a time of the case.
 
     Attributes:
-        at_s: When [s].
-        command: A command or a fault; None: a note.
+        at_s: Time from the start of the case [s].
+        command: A command or fault; None for a note.
         note, tags: The note.
     """
 
@@ -109,15 +109,15 @@ class Case:
     """One case of a campaign.
 
     Attributes:
-        id: Its name among them: its values on the matrix's axes.
-        title: Of the campaign.
-        file: The file.
-        bench: What it needs of the bench.
-        duration_s: How long it runs [s].
-        steps: What is done, in order of time.
-        device: The device under test; None: the rig alone.
-        expects: What is expected.
-        axes: Its values on the matrix's axes, by axis.
+        id: Name of the case, unique within the campaign: its values on the axes of the matrix.
+        title: Title of the campaign.
+        file: Campaign file.
+        bench: Settings of the bench.
+        duration_s: Length of the case [s].
+        steps: Steps in order of time.
+        device: Device under test; None runs the rig alone.
+        expects: Expectations.
+        axes: Values on the axes of the matrix, by axis.
     """
 
     id: str
@@ -133,7 +133,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Campaign:
-    """A file with its cases."""
+    """A campaign file and its cases."""
 
     title: str
     about: str
@@ -141,14 +141,14 @@ class Campaign:
 
 
 def shipped() -> dict[str, Path]:
-    """Files of the campaigns that come with the rig, in TOML or for pytest, by name."""
+    """Return the files of the shipped campaigns, in TOML or for pytest, by name."""
     found = {file.name.removesuffix(SUFFIX): file for file in FOLDER.glob(f"*{SUFFIX}")}
     found |= {file.stem.removeprefix("test_").replace("_", "-"): file for file in FOLDER.glob("test_*.py")}
     return dict(sorted(found.items()))
 
 
-def title_of(path: Path) -> str:
-    """What a campaign that comes with the rig is called."""
+def read_title(path: Path) -> str:
+    """Return the title of a shipped campaign."""
     text = path.read_text("utf-8")
     if path.suffix == ".toml":
         return str(tomllib.loads(text)["title"])
@@ -156,28 +156,28 @@ def title_of(path: Path) -> str:
 
 
 def campaign_path(name_or_path: str) -> Path:
-    """The file of a campaign that comes with the rig, by its name, or of a user's own.
+    """Return the path of a shipped campaign, by its name, or of a user's campaign.
 
     Raises:
-        UnknownNameError: It looks like a name, is none, and no file either.
+        UnknownNameError: If the argument looks like a name but is neither a shipped campaign nor a file.
     """
     known, path = shipped(), Path(name_or_path)
     if name_or_path not in known and re.fullmatch(r"[\w-]+", name_or_path) and not path.exists():
-        raise UnknownNameError("FILE", "a file, or one of the campaigns that ship", name_or_path, known)
+        raise UnknownNameError("FILE", "a file or a shipped campaign", name_or_path, known)
     return known.get(name_or_path, path)
 
 
 def load_campaign(path: Path) -> Campaign:
-    """Read a campaign.
+    """Read and check a campaign file.
 
     Raises:
-        InputError: The first thing that is wrong, with the file and the line.
+        InputError: For the first error, with the file and line.
     """
     try:
         with open_file(path) as file:
             text = file.read().decode("utf-8-sig")
     except UnicodeDecodeError:
-        raise InputError(str(path), "a TOML file", Words("bytes that are no UTF-8")) from None
+        raise InputError(str(path), "a TOML file", Words("bytes that are not UTF-8")) from None
     except OSError as error:
         raise unreadable(path, error) from None
     try:
@@ -193,7 +193,7 @@ def load_campaign(path: Path) -> Campaign:
         seen: set[str] = set()
         for case in cases:
             if case.id in seen:
-                raise InputError("matrix", "of cases with different names (an id of a fault's own helps)", case.id)
+                raise InputError("matrix", "cases with different names (give the faults an id)", case.id)
             seen.add(case.id)
     return Campaign(file.title, file.about, cases)
 
@@ -215,8 +215,8 @@ def _cases(path: Path, file: _File) -> Iterator[Case]:
     count = 1
     for _, values in axes:
         count *= len(values)
-    if count > _MOST_CASES:
-        raise InputError("matrix", f"of at most {_MOST_CASES} cases", count)
+    if count > _MAX_CASES:
+        raise InputError("matrix", f"at most {_MAX_CASES} cases", count)
     scenes: dict[str, Scene] = {}
     stem = path.name.removesuffix(SUFFIX)
     for chosen in itertools.product(*(values for _, values in axes)):
@@ -229,7 +229,7 @@ _Picked = Mapping[str, tuple[str, Any]]
 
 
 def _axes(file: _File) -> Iterator[tuple[str, list[tuple[str, Any]]]]:
-    """Axes of the matrix, each with its values and how a person names them."""
+    """Yield the axes of the matrix, each with the label and value of every entry."""
     matrix = file.matrix
     if matrix.scene:
         yield "scene", [(Path(each).stem, each) for each in matrix.scene]
@@ -314,7 +314,7 @@ def _scene(
         try:
             scenes[key] = load_scene(name, {**changes, **({"channels": table} if table else {})})
         except InputError as error:
-            # Whose it is: of the file's own changes, or of the matrix's.
+            # Name the place of the change that causes the error: the file's own table or the matrix.
             place = error.field
             if place in file.matrix.set:
                 place = f"matrix.set.{place}"
@@ -336,12 +336,12 @@ def _field(name: str) -> Iterator[None]:
         raise InputError(f"{name}.{error.field}", error.must, error.received) from None
 
 
-def _filled(value: Any, places: Mapping[str, str], field: str, kept: tuple[str, ...] = ()) -> Any:
-    """The same with what stands between braces filled in: `{danger}`, or `{danger:um}` as a bare number of um."""
+def _fill_placeholders(value: Any, places: Mapping[str, str], field: str, kept: tuple[str, ...] = ()) -> Any:
+    """Fill in the placeholders of a value: `{danger}`, or `{danger:um}` as a number in um without its unit."""
     if isinstance(value, dict):
-        return {key: _filled(each, places, f"{field}.{key}", kept) for key, each in value.items()}
+        return {key: _fill_placeholders(each, places, f"{field}.{key}", kept) for key, each in value.items()}
     if isinstance(value, list):
-        return [_filled(each, places, f"{field}.{n}", kept) for n, each in enumerate(value)]
+        return [_fill_placeholders(each, places, f"{field}.{n}", kept) for n, each in enumerate(value)]
     if not isinstance(value, str):
         return value
 
@@ -350,7 +350,7 @@ def _filled(value: Any, places: Mapping[str, str], field: str, kept: tuple[str, 
         if name in kept:
             return match[0]
         if name not in places:
-            must = "with names of [limits] or [matrix.device] between braces"
+            must = "a text with names of [limits] or [matrix.device] between braces"
             raise InputError(field, such_as(must, name, [*places, *kept]), match[0])
         if unit is None:
             return places[name]
@@ -359,13 +359,13 @@ def _filled(value: Any, places: Mapping[str, str], field: str, kept: tuple[str, 
             raise InputError(field, f"with {name} in a unit of {units.kind(own) or own}", match[0])
         return f"{number * units.size_si(own) / units.size_si(unit):.12g}"
 
-    return _PLACE.sub(fill, value)
+    return _PLACEHOLDER.sub(fill, value)
 
 
 def _step(
     given: Mapping[str, Any], field: str, places: Mapping[str, str], duration_s: float, scene: Scene, file: _File
 ) -> Step:  # fmt: skip
-    one = _filled(dict(given), places, field)
+    one = _fill_placeholders(dict(given), places, field)
     if "note" in one:
         note = check(_Note, one, field=field)
         step = Step(note.at_s, None, note.note, tuple(note.tags))
@@ -418,19 +418,19 @@ def _expect(
     if len(kinds) != 1:
         found = Words(" and ".join(kinds) or "none of them")
         raise InputError(field, f"about one of {', '.join(KINDS)}", found)
-    expect = check(KINDS[kinds[0]], _filled(dict(given), places, field), field=field)
+    expect = check(KINDS[kinds[0]], _fill_placeholders(dict(given), places, field), field=field)
     expect.check(known, where=field)
     times = {name: getattr(expect, name, None) for name in ("from_s", "at_s", "to_s")}
     for name, time_s in times.items():
         if time_s is not None and time_s > duration_s:
             raise InputError(f"{field}.{name}", f"within the case, which ends at {duration_s:g} s", time_s)
     if times["to_s"] is not None and not times["from_s"] < times["to_s"]:
-        raise InputError(f"{field}.to_s", f"behind from_s, {times['from_s']:g} s", times["to_s"])
+        raise InputError(f"{field}.to_s", f"after from_s, {times['from_s']:g} s", times["to_s"])
     return expect
 
 
 def _when(expect: Expect) -> Iterator[tuple[str, list[str]]]:
-    """Axes that an expectation is kept to, each with its values as cases are named by them."""
+    """Yield the axes that restrict an expectation, each with the labels of its values."""
     for axis, given in expect.when.items():
         labels = [_short(each) for each in (given if isinstance(given, list) else [given])]
         short = "" if axis in ("scene", "fault") else f"{axis.rpartition('.')[2]}="
@@ -448,7 +448,7 @@ def _check_when(expect: Expect, field: str, axes: Mapping[str, list[str]]) -> No
 
 def _device(file: _File, places: Mapping[str, str], path: Path) -> _Device:
     assert file.device is not None
-    command = _filled(file.device.command, places, "device.command", PLACES)
+    command = _fill_placeholders(file.device.command, places, "device.command", PLACES)
     if "{can}" in command and not file.can:
         raise InputError("device.command", "without {can} unless can = true", command)
     try:

@@ -1,4 +1,4 @@
-"""What a case has left, and what all expectations share: names, sources, limits with units."""
+"""Recording of a case, and what all expectations share: names, sources, limits with units."""
 
 from __future__ import annotations
 
@@ -21,25 +21,25 @@ if TYPE_CHECKING:
 
 Time = Annotated[FiniteFloat, Field(ge=0.0, le=86_400.0)]
 Units = Mapping[str, Mapping[str, str]]
-"""Units of columns by table: "" for the channels, else a table of the truth."""
+"""Units of columns by table: "" for the channels, otherwise the name of a truth table."""
 
 
 class Expected(Written):
-    """What every expectation may say."""
+    """Fields that every expectation has."""
 
     name: str = ""
     source: str = ""
     when: dict[str, Any] = Field(default={})
-    """Only in the cases that have these values, or one of several, on the matrix's axes."""
+    """Restricts the expectation to cases with these values on the axes of the matrix: one value or a list per axis."""
 
 
 @dataclass
-class Seen:
-    """What a case has left: its recording, in time of the case.
+class CaseRecording:
+    """The recording of a case, and the files of the device under test.
 
     Attributes:
         recording: All that the rig sent.
-        folder: Where the device under test has put its files.
+        folder: Folder with the files of the device under test.
         origin_s: Simulated time at which the case began [s].
     """
 
@@ -51,16 +51,16 @@ class Seen:
 
     @property
     def tick_rate_hz(self) -> float:
-        """Ticks a simulated second [Hz]."""
+        """Ticks per simulated second [Hz]."""
         return float(self.recording.catalogue["tick_rate_hz"])
 
     def tick(self, time_s: float) -> int:
-        """A time of the case to the nearest tick of the case."""
+        """Return the tick nearest to a time, both counted from the start of the case."""
         return round(time_s * self.tick_rate_hz)
 
     @cached_property
     def units(self) -> Units:
-        """Units of the channels, and of the tables of the truth, that were recorded."""
+        """Units of the recorded channels and truth tables."""
         tables = self.recording.catalogue.get("truth", {})
         channels = {name: channel.unit for name, channel in self.recording.table.channels.items()}
         truth = {name: {one["name"]: one["unit"] for one in table["columns"]} for name, table in tables.items()}
@@ -68,13 +68,13 @@ class Seen:
 
     @cached_property
     def events(self) -> list[tuple[float, dict[str, Any]]]:
-        """Events with their times, in order of these [s of the case]."""
+        """Events with their times from the start of the case [s], in order of time."""
         rate, origin = self.tick_rate_hz, round(self.origin_s * self.tick_rate_hz)
         timed = [(event["tick"] - origin, event) for event in self.recording.events if event.get("tick") is not None]
         return [(tick / rate, event) for tick, event in sorted(timed, key=lambda each: each[0])]
 
     def rows(self, truth: str, names: tuple[str, ...]) -> Samples:
-        """Rows of channels, or of a table of the truth."""
+        """Return samples of channels, or of a truth table."""
         key = truth, names
         if key not in self._rows:
             found = self.recording.truth(truth) if truth else self.recording.samples(*names)
@@ -85,28 +85,28 @@ class Seen:
         self, file: str, limits: str | None, path: Literal["digital", "analogue"] | None,
         channels: tuple[str, ...] | None = None,
     ) -> Scorecard:  # fmt: skip
-        """The scorecard of a file in the folder."""
+        """Return the scorecard of a file in the folder."""
         from replays.score.card.limits import load_limits
         from replays.score.judgement import judge
 
         key = file, limits, path, channels
         if key not in self._cards:
             sent = [part.path for part in self.recording.parts]
-            asked = load_limits(limits)
-            self._cards[key] = judge(self.folder / file, sent, limits=asked, path=path, channels=channels)
+            parse_limit = load_limits(limits)
+            self._cards[key] = judge(self.folder / file, sent, limits=parse_limit, path=path, channels=channels)
         return self._cards[key]
 
 
-def asked(text: str, unit: str, *, where: str, of: str) -> Must:
-    """What is asked, kept in the unit that it is asked in where that says more, such as ms of a time."""
+def parse_limit(text: str, unit: str, *, where: str, of: str) -> Must:
+    """Parse a limit and check its unit; the limit keeps the unit of the text."""
     field = f"{where}.must"
-    asked = Must.parse(text, field=field)
-    asked.within(unit, field=field, of=of)
-    return asked
+    parse_limit = Must.parse(text, field=field)
+    parse_limit.within(unit, field=field, of=of)
+    return parse_limit
 
 
-def in_unit(value: float, unit: str, must: Must) -> float:
-    """A value in the unit that it is asked in; without the last digits, which conversions and times leave."""
+def convert_unit(value: float, unit: str, must: Must) -> float:
+    """Convert a value to the unit of its limit; rounds off the errors of the conversion."""
     same = units_of.canonical(unit) == units_of.canonical(must.unit)
     scale = 1.0 if same else units_of.size_si(unit) / units_of.size_si(must.unit)
     return float(f"{value * scale:.12g}")

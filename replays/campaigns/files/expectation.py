@@ -1,4 +1,4 @@
-"""What a campaign's file expects, and what a recording shows of it: signals, events, order, a scorecard's rows."""
+"""Expectations of a campaign file about a recording: signals, events, order of events, scorecards."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from replays.campaigns.files.case_results import Expected, Seen, Time, Units, asked, in_unit
+from replays.campaigns.files.case_results import CaseRecording, Expected, Time, Units, convert_unit, parse_limit
 from replays.campaigns.files.scored import ExpectScore
 from replays.campaigns.measurement import Measurement, Must, quantity
 from rig.base.checks import Written
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     EventName = str
 else:
     EventName = Literal[*EVENT_KINDS, *REPLAY_COMMANDS]
-    """What a rig or a replay tells of."""
+    """Events of a rig or a replay."""
 
 
 class _Signal(Written):
@@ -38,10 +38,10 @@ class _Signal(Written):
         return (self.signal,) if isinstance(self.signal, str) else tuple(self.signal)
 
     def unit(self, units: Units, *, where: str) -> str:
-        """Unit of the signal, or of both of an orbit.
+        """Return the unit of the signal, or of both signals of an orbit.
 
         Raises:
-            InputError: There is no such signal, or the two cannot be of one orbit.
+            InputError: If the signal is unknown, or the two signals have different units.
         """
         if self.truth and self.truth not in units:
             tables = [name for name in units if name]
@@ -58,15 +58,15 @@ class _Signal(Written):
             raise InputError(f"{where}.signal", "two of one unit", found)
         return known[self.names[0]]
 
-    def values(self, seen: Seen) -> tuple[np.ndarray, np.ndarray]:
-        """Times of the case [s] and values, of an orbit its radius, each shape (n,)."""
+    def values(self, seen: CaseRecording) -> tuple[np.ndarray, np.ndarray]:
+        """Return times from the start of the case [s] and values, for an orbit its radius, each of shape (n,)."""
         rows = seen.rows(self.truth, self.names)
         columns = [rows[name] for name in self.names]
         return rows.times_s - seen.origin_s, columns[0] if len(columns) == 1 else np.hypot(*columns)
 
 
 class EventOf(Written):
-    """An event by its name and by what stands in it: `where` compares fields, and looks into lists."""
+    """An event, selected by its name and its fields: `where` compares fields and searches lists."""
 
     event: EventName
     where: dict[str, Any] = Field(default={})
@@ -76,8 +76,8 @@ class EventOf(Written):
         about = [f"{name}={value}" for name, value in self.where.items()] + [self.text]
         return " ".join([self.event, *filter(None, about)])
 
-    def times_s(self, seen: Seen) -> list[float]:
-        """When it came, in time of the case [s]."""
+    def times_s(self, seen: CaseRecording) -> list[float]:
+        """Return the times of the event, from the start of the case [s]."""
         return [time_s for time_s, event in seen.events if self._is(event)]
 
     def _is(self, event: Mapping[str, Any]) -> bool:
@@ -93,7 +93,7 @@ class EventOf(Written):
 
 
 class Since(_Signal):
-    """A moment that times are counted from: one of the case, an event, or the first row beyond a level."""
+    """Origin of a time: a time of the case, an event, or the first sample beyond a level."""
 
     at_s: Time | None = None
     event: EventName | Literal[""] = ""
@@ -102,10 +102,10 @@ class Since(_Signal):
     beyond: str = ""
 
     def check(self, units: Units, *, where: str) -> None:
-        """Refuse what names no moment, or more than one.
+        """Check that exactly one origin is given.
 
         Raises:
-            InputError: It does, or its level has no unit or a wrong one.
+            InputError: If it is not, or if the unit of the level is missing or wrong.
         """
         given = [name for name in ("at_s", "event", "signal") if getattr(self, name) not in (None, "", [])]
         if len(given) != 1:
@@ -114,8 +114,8 @@ class Since(_Signal):
             unit = self.unit(units, where=where)
             quantity(self.beyond, unit, field=f"{where}.beyond", of=_name(self.names))
 
-    def time_s(self, seen: Seen, units: Units, *, from_s: float) -> float:
-        """When it is, in time of the case [s]; nan where it never is."""
+    def time_s(self, seen: CaseRecording, units: Units, *, from_s: float) -> float:
+        """Return the time of the origin, from the start of the case [s]; NaN if it does not occur."""
         if self.at_s is not None:
             return self.at_s
         if self.event:
@@ -133,7 +133,7 @@ class _Within(Expected):
 
 
 class ExpectSignal(_Signal, _Within):
-    """A value taken of a signal between two times."""
+    """A value computed from a signal between two times."""
 
     take: Take = "peak"
     at_s: Time | None = None
@@ -142,10 +142,10 @@ class ExpectSignal(_Signal, _Within):
     must: str
 
     def check(self, units: Units, *, where: str) -> Must:
-        """What is asked, in the unit of what is taken.
+        """Return the limit and check that its unit fits the computed value.
 
         Raises:
-            InputError: Signal, level or limit cannot be.
+            InputError: If the signal, level or limit is invalid.
         """
         unit = self.unit(units, where=where)
         if (self.take in _TIMES) != bool(self.beyond):
@@ -165,26 +165,26 @@ class ExpectSignal(_Signal, _Within):
             if self.take not in ("first beyond", "last beyond"):
                 raise InputError(f"{where}.since", "left out, but where take is first beyond or last beyond", self.take)
             self.since.check(units, where=f"{where}.since")
-        return asked(self.must, unit, where=where, of=self.label)
+        return parse_limit(self.must, unit, where=where, of=self.label)
 
     @property
     def label(self) -> str:
-        """What is measured, in words."""
+        """Name of the measurement."""
         level = f" {self.beyond}" if self.beyond else ""
         at = f" at {self.at_s:g} s" if self.at_s is not None else ""
         return self.name or f"{self.take}{level} of {_name(self.names)}{at}"
 
-    def measure(self, seen: Seen, units: Units) -> Iterator[Measurement]:
-        """What the recording shows of it."""
+    def measure(self, seen: CaseRecording, units: Units) -> Iterator[Measurement]:
+        """Yield the measurement from the recording."""
         must = self.check(units, where="expect")
         value, at_s, note = self._value(seen, units)
         row_s = 1.0 / seen.rows(self.truth, self.names).rate_hz
         unit = "s" if self.beyond else "Hz" if self.take == "whirl frequency" else self.unit(units, where="expect")
         exact = f"1 row, {1e6 * row_s:g} us" if self.beyond else ""
         channels = () if self.truth else self.names
-        yield Measurement(self.label, in_unit(value, unit, must), must, self.source, exact, note, at_s, channels)
+        yield Measurement(self.label, convert_unit(value, unit, must), must, self.source, exact, note, at_s, channels)
 
-    def _value(self, seen: Seen, units: Units) -> tuple[float, float | None, str]:
+    def _value(self, seen: CaseRecording, units: Units) -> tuple[float, float | None, str]:
         times_s, values = self.values(seen)
         if self.at_s is not None:
             row = int(np.argmin(np.abs(times_s - self.at_s)))
@@ -205,12 +205,12 @@ class ExpectSignal(_Signal, _Within):
                 rate = seen.rows(self.truth, self.names).rate_hz
                 return len(rows) / rate, float(times_s[rows[0]]) if len(rows) else None, ""
             if not len(rows):
-                return math.nan, None, f"it never is beyond {self.beyond}"
+                return math.nan, None, f"it never exceeds {self.beyond}"
             at_s = float(times_s[rows[0] if self.take == "first beyond" else rows[-1]])
             if self.since is None:
                 return at_s, at_s, ""
             since_s = self.since.time_s(seen, units, from_s=self.from_s)
-            note = "" if math.isfinite(since_s) else "what it is counted from never came"
+            note = "" if math.isfinite(since_s) else "the origin of the time never occurred"
             return at_s - since_s, at_s, note
         row = {"max": part.argmax, "min": part.argmin}.get(self.take, np.abs(part).argmax)()
         value = _STATISTICS[self.take](part)
@@ -229,7 +229,7 @@ _STATISTICS: dict[str, Callable[[np.ndarray], Any]] = {
 
 
 class ExpectEvent(_Within):
-    """An event that comes, does not come, or comes in time."""
+    """An event that must occur, must not occur, or must occur at a certain time."""
 
     event: EventName
     where: dict[str, Any] = Field(default={})
@@ -240,10 +240,10 @@ class ExpectEvent(_Within):
     must: str = ""
 
     def check(self, units: Units, *, where: str) -> Must:
-        """What is asked: of its time, or of how often it comes.
+        """Return the limit of the event's time or of the number of its occurrences.
 
         Raises:
-            InputError: The limit, or what its time is counted from, cannot be.
+            InputError: If the limit or the origin of the time is invalid.
         """
         if self.since is not None:
             self.since.check(units, where=f"{where}.since")
@@ -253,21 +253,21 @@ class ExpectEvent(_Within):
             return Must("==" if not self.appears else ">=", 0.0 if not self.appears else 1.0, "1")
         if not self.appears:
             raise InputError(f"{where}.appears", "left out with must", False)
-        return asked(self.must, "1" if self.take == "count" else "s", where=where, of=self.label)
+        return parse_limit(self.must, "1" if self.take == "count" else "s", where=where, of=self.label)
 
     @property
     def of(self) -> EventOf:
-        """The event."""
+        """Selector of the event."""
         return EventOf(event=self.event, where=self.where, text=self.text)
 
     @property
     def label(self) -> str:
-        """What is measured, in words."""
+        """Name of the measurement."""
         what = "time" if self.must and self.take == "time" else "number"
         return self.name or f"{what} of {self.of}"
 
-    def measure(self, seen: Seen, units: Units) -> Iterator[Measurement]:
-        """What the recording shows of it."""
+    def measure(self, seen: CaseRecording, units: Units) -> Iterator[Measurement]:
+        """Yield the measurement from the recording."""
         must = self.check(units, where="expect")
         to_s = math.inf if self.to_s is None else self.to_s
         times_s = [each for each in self.of.times_s(seen) if self.from_s <= each < to_s]
@@ -277,41 +277,41 @@ class ExpectEvent(_Within):
             return
         exact = "1 tick, 1 us"
         since_s = 0.0 if self.since is None else self.since.time_s(seen, units, from_s=self.from_s)
-        # What it is counted from is what makes it come: what was there before that is another one.
+        # The origin causes the event, so an event before the origin is a different one.
         at_s = next((each for each in times_s if not each < since_s), math.nan)
-        note = "" if math.isfinite(at_s) else f"no {self.of} came"
-        note = "what it is counted from never came" if math.isnan(since_s) else note
+        note = "" if math.isfinite(at_s) else f"no {self.of} occurred"
+        note = "the origin of the time never occurred" if math.isnan(since_s) else note
         value = math.nan
         if math.isfinite(at_s - since_s):
             value = (seen.tick(at_s) - seen.tick(since_s)) / seen.tick_rate_hz
         about = at_s if math.isfinite(at_s) else since_s
         channels = () if self.since is None or self.since.truth or not self.since.signal else self.since.names
         at_s = about if math.isfinite(about) else None
-        yield Measurement(self.label, in_unit(value, "s", must), must, self.source, exact, note, at_s, channels)
+        yield Measurement(self.label, convert_unit(value, "s", must), must, self.source, exact, note, at_s, channels)
 
 
 class ExpectOrder(_Within):
-    """Events that come one behind the other."""
+    """Events that must occur in a certain order."""
 
     order: Annotated[list[EventOf], Field(min_length=2)]
 
     def check(self, units: Units, *, where: str) -> Must:
-        """All of them, in this order."""
+        """Return the limit: all events in order."""
         return Must("==", float(len(self.order)), "1")
 
     @property
     def label(self) -> str:
-        """What is measured, in words."""
+        """Name of the measurement."""
         return self.name or f"events in order: {', then '.join(map(str, self.order))}"
 
-    def measure(self, seen: Seen, units: Units) -> Iterator[Measurement]:
-        """How many of them came in their place."""
+    def measure(self, seen: CaseRecording, units: Units) -> Iterator[Measurement]:
+        """Yield the number of events that occurred in order."""
         at_s, count, note = self.from_s, 0, ""
         to_s = math.inf if self.to_s is None else self.to_s
         for each in self.order:
             later = [time_s for time_s in each.times_s(seen) if at_s <= time_s < to_s]
             if not later:
-                note = f"no {each} came from {at_s:g} s on"
+                note = f"no {each} occurred after {at_s:g} s"
                 break
             at_s, count = later[0], count + 1
         yield Measurement(self.label, float(count), self.check(units, where=""), self.source, note=note, at_s=at_s)
@@ -321,11 +321,11 @@ Expect = ExpectSignal | ExpectEvent | ExpectOrder | ExpectScore
 KINDS: dict[str, type[Expect]] = {
     "signal": ExpectSignal, "event": ExpectEvent, "order": ExpectOrder, "score": ExpectScore,
 }  # fmt: skip
-"""What an expectation is about, by the key that says so."""
+"""Expectations by the key that selects them."""
 
 
 def expected_events(expects: Iterable[Expect]) -> Iterator[EventOf]:
-    """Events that are expected, alone or in order."""
+    """Yield the expected events, single or in an order."""
     for expect in expects:
         if isinstance(expect, ExpectOrder):
             yield from expect.order

@@ -1,4 +1,4 @@
-"""On which line of a TOML text each key stands, which its parser does not tell."""
+"""Line numbers of the keys of a TOML text, which the TOML parser does not provide."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ _Token = tuple[str, int]
 
 
 def lines_of(text: str) -> dict[str, int]:
-    r"""Line of each key and of each element of a list, by its path with dots between, counted from 1.
+    r"""Return the line, counted from 1, of each key and list element by its dotted path.
 
     Args:
-        text: A text that is TOML.
+        text: A valid TOML text.
 
     Example:
         >>> lines_of('a = 1\n[[b]]\nc = [\n  2,\n  { d = 3 },\n]')
@@ -48,7 +48,7 @@ def lines_of(text: str) -> dict[str, int]:
 
 
 def line_of(field: str, lines: Mapping[str, int]) -> int | None:
-    """Line of a field, or of the nearest thing that it stands in; None where nothing of it is there."""
+    """Return the line of a field or of the innermost enclosing table; None if there is none."""
     while field not in lines and "." in field:
         field = field.rpartition(".")[0]
     return lines.get(field)
@@ -67,7 +67,7 @@ class _Tokens:
         return self._all[self._at - 1] if self._at <= len(self._all) else None
 
     def key(self, ends: tuple[str, ...], word: str = "") -> list[str]:
-        """Parts of a key up to what ends it, which is taken."""
+        """Read the parts of a key up to and including its end token."""
         parts = _parts(word)
         while (token := self.next()) is not None and token[0] not in ends:
             parts += _parts(token[0]) if token[0] != "[" else []
@@ -94,7 +94,7 @@ def _joined(parts: list[str]) -> str:
 
 
 def _real(counts: Mapping[str, int], parts: list[str]) -> list[str]:
-    """A heading's path with the number of the latest table of each list that it stands in."""
+    """Return the path of a heading, with the index of the latest table of each enclosing list."""
     found: list[str] = []
     for number, part in enumerate(parts):
         found.append(part)
@@ -105,7 +105,7 @@ def _real(counts: Mapping[str, int], parts: list[str]) -> list[str]:
 
 
 def _value(tokens: _Tokens, path: str, found: dict[str, int]) -> None:
-    """Pass over a value, with the lines of what is in it."""
+    """Skip a value and store the lines of its elements."""
     opening = tokens.next()
     if opening is None or opening[0] not in "[{":
         return

@@ -1,13 +1,13 @@
-"""One case of a campaign's file: its bench, its device, its steps, and what its recording shows."""
+"""Run of one case of a campaign file: bench, device, steps, and evaluation of the recording."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from replays.campaigns.equipment.bench import NotThereError
+from replays.campaigns.equipment.bench import UnsupportedError
 from replays.campaigns.equipment.cleanup import KILLED, PATIENCE_S
-from replays.campaigns.files.case_results import Seen
+from replays.campaigns.files.case_results import CaseRecording
 from replays.campaigns.files.expectation import EventOf, expected_events
 from replays.campaigns.measurement import Measurement, Must
 from rig.base import wire
@@ -22,18 +22,18 @@ if TYPE_CHECKING:
     from replays.campaigns.files.campaign import Case, Step
 
 _LAST_S = 5.0
-"""How long a device may take to end behind the run [s]."""
+"""Longest time for a device to end after the run [s]."""
 
 
 def run_case(case: Case, trial: Trial) -> None:
-    """Run a case and judge it; what was measured is in the trial, whatever comes of it.
+    """Run a case and judge it; the trial keeps the measurements even if an error is raised.
 
-    In lockstep, commands are given to the rig before it begins, and take effect at their very tick. In real time, and
-    on a rig that is there already, the case begins when its device is there, and commands are sent when they are due.
+    In lockstep, the rig receives all commands before it starts, and they take effect at their exact ticks. In real time
+    and on an existing rig, the case begins once its device is connected, and each command is sent when it is due.
 
     Raises:
-        BenchError: Rig, device or recording failed.
-        NotThereError: What the case needs cannot be done on this bench.
+        BenchError: If the rig, the device or the recording fails.
+        UnsupportedError: If the bench cannot do what the case needs.
     """
     settings, live, steps = case.bench, [step for step in case.steps if step.command is None], case.steps
     timed = tuple(step.command for step in steps if step.command is not None)
@@ -49,9 +49,9 @@ def run_case(case: Case, trial: Trial) -> None:
         settings = replace(settings, commands=timed, duration_s=case.duration_s)
     bench = trial.start_bench(settings)
     if case.device is not None and trial.target.replay is not None and case.device.commands:
-        raise NotThereError(f"a recording takes no commands of {case.device.name}")
+        raise UnsupportedError(f"a recording takes no commands of {case.device.name}")
     record = trial.start_record()
-    record.wait_until_there()
+    record.wait_until_connected()
     device: Device | None = None
     if case.device is not None:
         joins = None if case.device.joins else False
@@ -63,21 +63,21 @@ def run_case(case: Case, trial: Trial) -> None:
             _send(machine, step)
         bench.advance_to(trial.origin_s + case.duration_s)
         if trial.target.own:
-            bench.late_blocks()  # while it can be asked
+            bench.late_blocks()  # while the rig still responds
             _stop(machine)
             record.wait()
     trial.recording = record.stop()
     if device is not None:
         end_device(device, trial)
-    seen = Seen(trial.recording, trial.folder, trial.origin_s)
+    seen = CaseRecording(trial.recording, trial.folder, trial.origin_s)
     _measure_device(seen, trial)
     measure_end(seen, trial, case)
     for expect in case.expects:
         for measurement in expect.measure(seen, seen.units):
             exact = measurement.resolution
-            # Times that a device has a part in are exact to its reaction.
-            told = f"{exact}; {trial.resolution}" if exact and case.device is not None else exact
-            trial.take(replace(measurement, resolution=told))
+            # Times that depend on the device have the resolution of its reaction.
+            resolution = f"{exact}; {trial.resolution}" if exact and case.device is not None else exact
+            trial.take(replace(measurement, resolution=resolution))
 
 
 def _step(command: TimedCommand) -> Step:
@@ -95,19 +95,19 @@ def _send(machine: Rig, step: Step) -> None:
         machine.send(request.command, **request.request())
     except RefusedError as error:
         if wire.ENDED in str(error):
-            return  # the verdict is of the run's end
-        raise NotThereError(f"the rig refuses a step at {step.at_s:g} s: {error}") from None
+            return  # `measure_end` judges the end of the run
+        raise UnsupportedError(f"the rig refuses a step at {step.at_s:g} s: {error}") from None
 
 
 def _stop(machine: Rig) -> None:
     try:
         machine.stop()
     except (RefusedError, ConnectionError):
-        return  # it has come to its end
+        return  # the run has ended
 
 
 def end_device(device: Device, trial: Trial) -> None:
-    """Let a device end by itself, as the run has ended, and judge how it did."""
+    """Wait for a device to end after the run, and judge its exit status."""
     wait_until(lambda: device.program.status is not None or not trial.target.own, _LAST_S)
     status = device.program.status
     device.program.end()
@@ -119,8 +119,8 @@ def end_device(device: Device, trial: Trial) -> None:
         trial.take(Measurement(f"exit status of {device.name}", float(status), must, note=note))
 
 
-def measure_end(seen: Seen, trial: Trial, case: Case) -> None:
-    """A run that was stopped before the case was over has shown nothing of the rest, but where that is expected."""
+def measure_end(seen: CaseRecording, trial: Trial, case: Case) -> None:
+    """Add a failed measurement if the run was stopped early although no expectation allows it."""
     ended = next(((at_s, event) for at_s, event in seen.events if event["event"] == "end"), None)
     if ended is None or ended[1].get("reason") == "completed" or ended[0] >= case.duration_s - 1e-6:
         return
@@ -131,15 +131,15 @@ def measure_end(seen: Seen, trial: Trial, case: Case) -> None:
         trial.take(Measurement("end of the run", at_s, Must(">=", case.duration_s, "s"), note=note, at_s=at_s))
 
 
-def _measure_device(seen: Seen, trial: Trial) -> None:
-    """A device that hung, died or answered late in lockstep is a verdict, with the rig's reason."""
+def _measure_device(seen: CaseRecording, trial: Trial) -> None:
+    """Add a measurement for each device in lockstep: it fails, with the rig's reason, if the device was lost."""
     for device in trial.devices:
-        lost = EventOf(event="device", where={"device": device.joined_as, "state": "lost"})
+        lost = EventOf(event="device", where={"device": device.rig_name, "state": "lost"})
         times_s = lost.times_s(seen)
         if trial.bench is not None and trial.bench.pace == "lockstep":
             reasons = [
                 str(event.get("reason", "")) for _, event in seen.events
-                if (event.get("event"), event.get("device"), event.get("state")) == ("device", device.joined_as, "lost")
+                if (event.get("event"), event.get("device"), event.get("state")) == ("device", device.rig_name, "lost")
             ]  # fmt: skip
             at_s = times_s[0] if times_s else None
             name = f"times that {device.name} was lost"

@@ -1,4 +1,4 @@
-"""What a campaign expects of the scorecard of a DAQ under test: a quantity, or that all is there that was sent."""
+"""Expectation about the scorecard of a DAQ under test: one quantity, or completeness of the record."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field
 
-from replays.campaigns.files.case_results import Expected, Seen, Time, Units, asked, in_unit
+from replays.campaigns.files.case_results import CaseRecording, Expected, Time, Units, convert_unit, parse_limit
 from replays.campaigns.measurement import Measurement, Must
 from rig.base.errors import InputError, UnknownNameError
 from rig.base.outcome import Outcome
@@ -19,37 +19,37 @@ if TYPE_CHECKING:
 
 
 class ExpectScore(Expected):
-    """Rows of the scorecard of what a DAQ under test has written: a quantity, or `all`.
+    """Rows of the scorecard of a file that the DAQ under test has written: a quantity, or `all`.
 
-    With `must` a quantity's own value is held against that with its whole interval, and not against limits of the card:
-    also for what none ask about, such as the trigger row, and for rows that have to be missing. `all` asks for every
-    channel and row that was sent, but for what is granted.
+    `must` compares the quantity's value and its whole interval with a limit, instead of the limits of the card. It also
+    applies to quantities without limits there, such as the trigger row, and to rows that are expected to be missing.
+    `all` requires every channel and sample that was sent, with the exceptions given by the fields.
     """
 
     score: str
     channel: str | list[str] = ""
     channels: Annotated[tuple[str, ...], Field(min_length=1)] | None = None
-    """Channels that the device was to record, as `rig score --channels`; all of the session unless given."""
+    """Channels that the device was to record, as in `rig score --channels`; default: all channels of the session."""
     file: Annotated[str, Field(min_length=1)]
     limits: str | None = None
     path: Literal["digital", "analogue"] | None = None
     must: str = ""
     begins_s: Time = 0.0
-    """How much later than the case the DAQ may begin, ..."""
+    """Longest allowed delay of the DAQ's first sample after the start of the case [s]."""
     ends_s: Time = 0.0
-    """... and how much earlier it may end."""
+    """Longest allowed gap between the DAQ's last sample and the end of the case [s]."""
     every: Annotated[int, Field(ge=1)] = 1
-    """It takes every so many rows."""
+    """Decimation factor of the DAQ."""
 
     @property
     def _channels(self) -> tuple[str, ...]:
         return (*filter(None, [self.channel]),) if isinstance(self.channel, str) else tuple(self.channel)
 
     def check(self, units: Units, *, where: str) -> Must:
-        """Nothing fails, or what is asked of the quantity's values.
+        """Return the limit of the quantity, or "no failing rows" if there is none.
 
         Raises:
-            InputError: There is no such quantity, or limits, or it has no values in the unit of what is asked.
+            InputError: If the quantity or limits are unknown, or the unit does not fit the quantity.
         """
         from replays.score.card.limits import load_limits
         from replays.score.card.scorecard import QUANTITIES
@@ -71,10 +71,10 @@ class ExpectScore(Expected):
         if not (unit := known[self.score].unit or units[""].get(" ".join(self._channels), "")):
             what = f"one of the channels with must, as {self.score} is in the unit of its channel"
             raise UnknownNameError(f"{where}.channel", what, " ".join(self._channels), units[""])
-        return asked(self.must, unit, where=where, of=self.score)
+        return parse_limit(self.must, unit, where=where, of=self.score)
 
-    def measure(self, seen: Seen, units: Units) -> Iterator[Measurement]:
-        """A measurement for each row that is not as asked, or that shows nothing; else one for all of them."""
+    def measure(self, seen: CaseRecording, units: Units) -> Iterator[Measurement]:
+        """Yield a measurement per failing or inconclusive row, or one for all rows."""
         from replays.score.card.scorecard import FAIL, INCONCLUSIVE, PASS
 
         must = self.check(units, where="expect")
@@ -90,7 +90,7 @@ class ExpectScore(Expected):
             return
         found = list(self._missing(card, rows, seen)) if self.score == "all" else []
         for row in rows:
-            # One quantity that is asked for must be shown; of all, some never are.
+            # A single quantity must have a verdict; with `all`, some quantities never have one.
             if row.verdict == FAIL or (row.verdict == INCONCLUSIVE and self.score != "all"):
                 text = " ".join(filter(None, (*row.cells(), row.note)))
                 found.append((row.channel, text, Outcome(row.verdict)))
@@ -101,7 +101,7 @@ class ExpectScore(Expected):
         shown, hidden = (sum(row.verdict == verdict for row in rows) for verdict in (PASS, INCONCLUSIVE))
         note = f"{card.path} path, {shown} quantities pass, {hidden} inconclusive"
         if not shown and not failing and not reasons:
-            reasons.append("no quantity of it has a verdict")
+            reasons.append("no row of this quantity has a verdict")
         yield Measurement(
             what, float(len(failing)), must, self.source or ", ".join(dict.fromkeys(limits)),
             note="; ".join([text for _, text in failing][:4]) or note,
@@ -109,8 +109,8 @@ class ExpectScore(Expected):
             open_reason="" if failing else "; ".join(reasons[:4]),
         )  # fmt: skip
 
-    def _about(self, card: Scorecard, seen: Seen) -> Iterator[ScoreRow]:
-        """Rows of the quantity, of the channels, and of groups with them."""
+    def _about(self, card: Scorecard, seen: CaseRecording) -> Iterator[ScoreRow]:
+        """Yield the rows of the quantity that concern the channels or their groups."""
         groups = _sent(seen)
         wanted = {name for each in self._channels for name in (each, *groups.get(each, ()))}
         wires = {row.channel: str(row.value) for row in card.rows if row.quantity == "mapping"}
@@ -120,8 +120,10 @@ class ExpectScore(Expected):
             if self.score in ("all", row.quantity) and (not wanted or own & wanted):
                 yield row
 
-    def _missing(self, card: Scorecard, rows: Sequence[ScoreRow], seen: Seen) -> Iterator[tuple[str, str, Outcome]]:
-        """Yield what was sent and is not in the record, or not shown to be: channel if it is of one, text, outcome."""
+    def _missing(
+        self, card: Scorecard, rows: Sequence[ScoreRow], seen: CaseRecording
+    ) -> Iterator[tuple[str, str, Outcome]]:
+        """Yield channel (if known), text and outcome of what was sent but is not shown to be in the record."""
         from replays.score.card.scorecard import INCONCLUSIVE, PASS
 
         groups = _sent(seen)
@@ -130,10 +132,10 @@ class ExpectScore(Expected):
         for name in [name for each in self._channels or groups for name in groups.get(each, [each])]:
             wire = wires.get(name)
             if wire is None:
-                if name in found:  # otherwise the quantity `recorded` fails, or the channel was not to be recorded
-                    yield name, f"nothing of {name} is found in the file", Outcome.FAIL
+                if name in found:  # otherwise `recorded` fails already, or the channel was not to be recorded
+                    yield name, f"no data of {name} are in the file", Outcome.FAIL
             elif wire.verdict == INCONCLUSIVE:
-                text = f"whether {wire.channel} is {name} is inconclusive; to show it: {wire.run}"
+                text = f"whether {wire.channel} is {name} is inconclusive; to find out, run {wire.run}"
                 yield name, text, Outcome.INCONCLUSIVE
             elif not any(row.verdict == PASS for row in rows if row.channel == wire.channel and row is not wire):
                 yield name, f"no quantity of {name} has a verdict", Outcome.INCONCLUSIVE
@@ -149,12 +151,12 @@ class ExpectScore(Expected):
                     yield "", about, Outcome.FAIL
 
     def _values(self, rows: Sequence[ScoreRow], must: Must) -> Iterator[Measurement]:
-        """Of each row that end of the interval, or the value, which is nearest to what it must not be."""
+        """Yield a measurement per row: the value or the end of its interval with the smallest margin."""
         for row in rows:
             what = self.name or f"{row.quantity} {row.channel}".strip()
-            ends = [in_unit(float(each), row.unit, must) for each in (row.value, row.low, row.high)]
+            ends = [convert_unit(float(each), row.unit, must) for each in (row.value, row.low, row.high)]
             value = min(ends, key=must.margin) if all(map(math.isfinite, ends)) else math.nan
-            reason = "" if math.isfinite(value) else row.note or f"this run does not show it; to show it: {row.run}"
+            reason = "" if math.isfinite(value) else row.note or f"not shown by this run; to find out, run {row.run}"
             yield Measurement(
                 what, value, must, self.source, note=row.note, channels=(row.channel,), open_reason=reason
             )
@@ -163,7 +165,7 @@ class ExpectScore(Expected):
             yield Measurement(what, math.nan, must, self.source, open_reason="the scorecard has no such quantity")
 
 
-def _sent(seen: Seen) -> dict[str, tuple[str, ...]]:
-    """Channels that were sent, by group."""
+def _sent(seen: CaseRecording) -> dict[str, tuple[str, ...]]:
+    """Return the channels that were sent, by group."""
     groups = seen.recording.table.groups
     return {name: tuple(group.names) for name, group in groups.items() if sensor_key(name) in seen.recording.streams}

@@ -1,4 +1,4 @@
-"""The page of a campaign: first what failed and why, with pictures; then what changed, and all that was measured."""
+"""Page of a campaign: failures with their reasons and pictures first, then changes, then all measurements."""
 
 from __future__ import annotations
 
@@ -14,30 +14,30 @@ Document = Mapping[str, Any]
 _MARKS: dict[str, Mark] = {
     "failed": "bad", "error": "bad", "inconclusive": "open", "interrupted": "open", "skipped": "open", "passed": "good",
 }  # fmt: skip
-_SMALL = 1e-9
-"""Part of a margin that is no change."""
+_UNCHANGED_MARGIN = 1e-9
+"""Relative change of a margin below which it counts as unchanged."""
 
 
 def make_page(results: Document, folder: Path, earlier: Document | None = None) -> Report:
-    """The page of a campaign's results.
+    """Return the page of a campaign's results.
 
     Args:
-        results: As results.json.
-        folder: Where its evidence is.
-        earlier: Those of an earlier campaign.
+        results: Content of results.json.
+        folder: Folder that holds the evidence.
+        earlier: Results of an earlier campaign to compare with.
     """
     counts, cases = results["counts"], results["cases"]
     bad = [case for case in cases if _MARKS[case["outcome"]] == "bad"]
     unsure = [case for case in cases if case["outcome"] == "inconclusive"]
     mark: Mark = "bad" if bad else "open" if unsure or counts["interrupted"] or not counts["passed"] else "good"
-    told = ", ".join(f"{count} {outcome}" for outcome, count in counts.items() if count) or "no case"
+    summary = ", ".join(f"{count} {outcome}" for outcome, count in counts.items() if count) or "no case"
     wall = results["wall"]
     origin = {
         "begun": f"{wall['begun']} UTC, {wall['duration_s']:.1f} s",
         "machine": wall["machine"],
         "rig": wall["rig"],
     }
-    report = Report("; ".join(results["titles"]) or "Campaign", f"{told}.", origin=origin, mark=mark)
+    report = Report("; ".join(results["titles"]) or "Campaign", f"{summary}.", origin=origin, mark=mark)
     for case in [*bad, *unsure]:
         _failure(report, case, folder)
     if earlier is not None:
@@ -69,25 +69,25 @@ def _failure(report: Report, case: Document, folder: Path) -> None:
     for each in failed:
         limit, value = _limit(each), _number(each["value"], each["unit"], "nothing")
         margin = f", margin {_number(each['margin'], each['unit'])}" if each["margin"] is not None else ""
-        told = f" Source: {each['source']}." if each["source"] else ""
+        source = f" Source: {each['source']}." if each["source"] else ""
         note = f" ({each['note']})" if each["note"] else ""
         verdict = "inconclusive" if each["outcome"] == "inconclusive" else f"it is {value}{margin}"
-        report.text(f"{each['name']} must be {limit}; {verdict}{note}.{told}")
+        report.text(f"{each['name']} must be {limit}; {verdict}{note}.{source}")
     for file in case["evidence"]:
         path = folder / file
         if path.suffix == ".png" and path.is_file():
-            caption = "The signals about the moment where it failed, with the events there."
+            caption = "Signals and events around the failure."
             report.parts.append(Picture(path.read_bytes(), caption))
     for trouble in case["troubles"]:
         report.text(trouble)
     files = ", ".join(f"`{file}`" for file in case["evidence"])
-    report.text(f"Again: `{case['repeat']}`" + (f". Evidence: {files}" if files else ""))
+    report.text(f"Repeat with: `{case['repeat']}`" + (f". Evidence: {files}" if files else ""))
 
 
 def _measurements(report: Report, results: Document, case: Document) -> None:
     floor = results["wall"]["cases"].get(case["id"], {}).get("floor_ms")
-    measured = "" if floor is None else f" Floor of a round trip: median {floor[0]:g} ms, longest {floor[1]:g} ms."
-    caption = f"Reactions are exact to {case['resolution']}.{measured}" if case["resolution"] else ""
+    judge_value = "" if floor is None else f" Round trip: median {floor[0]:g} ms, maximum {floor[1]:g} ms."
+    caption = f"Resolution of reaction times: {case['resolution']}.{judge_value}" if case["resolution"] else ""
     rows = [
         Row((
             each["name"], _number(each["value"], each["unit"], "nothing"), _limit(each),
@@ -112,18 +112,18 @@ def _limit(each: Document) -> str:
 
 
 def _trend(report: Report, results: Document, earlier: Document) -> None:
-    report.heading("Against the earlier campaign")
+    report.heading("Comparison with the earlier campaign")
     rows = sorted(changes(earlier, results), key=lambda row: ("worse", "gone", "new", "better").index(row.cells[-1]))
     begun = earlier.get("wall", {}).get("begun", "")
     if not rows:
-        report.text(f"Nothing changed since that of {begun}.")
+        report.text(f"Nothing changed since the campaign of {begun}.")
         return
-    caption = f"What changed since that of {begun}: outcomes, and margins to the limits."
-    report.table(("case", "of", "then", "now", "change"), rows, caption=caption)
+    caption = f"Changes of outcomes and margins since the campaign of {begun}."
+    report.table(("case", "quantity", "earlier", "now", "change"), rows, caption=caption)
 
 
 def changes(then: Document, now: Document) -> Iterator[Row]:
-    """What got better or worse from one campaign to another, what is new in it, and what is gone."""
+    """Yield a row for each case or margin that got better or worse, is new, or is gone."""
     old, new = ({case["id"]: case for case in each["cases"]} for each in (then, now))
     for name in [*new, *(name for name in old if name not in new)]:
         if name not in old or name not in new:
@@ -142,7 +142,7 @@ def changes(then: Document, now: Document) -> Iterator[Row]:
             if past is None or each["unit"] != past["unit"] or None in (past["margin"], each["margin"]):
                 continue
             moved = each["margin"] - past["margin"]
-            if abs(moved) > _SMALL * max(abs(each["margin"]), abs(past["margin"])):
+            if abs(moved) > _UNCHANGED_MARGIN * max(abs(each["margin"]), abs(past["margin"])):
                 shown = (_number(one["margin"], one["unit"]) for one in (past, each))
                 yield _row(name, f"margin of {each['name']}", *shown, better=moved > 0.0)
 

@@ -1,4 +1,4 @@
-"""The picture of a failure: the signals about it, the events there, and the limit that was not kept."""
+"""Picture of a failure: the signals around it, their events, and the limit that was exceeded."""
 
 from __future__ import annotations
 
@@ -12,10 +12,9 @@ if TYPE_CHECKING:
     from recorder.reader import Recording
     from replays.campaigns.measurement import Measurement
 
-_MOST = 4
-"""Panels."""
-_QUIET = ("command", "end")
-"""Events that others tell already."""
+_MAX_PANELS = 4
+_HIDDEN_EVENTS = ("command", "end")
+"""Events that repeat what other events already show."""
 
 
 @house_style()
@@ -23,24 +22,24 @@ def draw(
     recording: Recording, path: Path, failed: Sequence[Measurement], *, origin_s: float, channels: Sequence[str],
     about_s: float,
 ) -> None:  # fmt: skip
-    """Draw a piece of a recording and write it as PNG or SVG.
+    """Draw an excerpt of a recording and write it as PNG or SVG.
 
     Args:
-        recording: The piece.
-        path: The file.
-        failed: What was not as it must be.
+        recording: The excerpt.
+        path: Output file.
+        failed: Measurements that are outside their limits.
         origin_s: Simulated time at which the test began [s].
-        channels: What to draw; none: the first two that were recorded.
-        about_s: The moment that it is about [s].
+        channels: Channels to draw; if empty, the first two recorded channels.
+        about_s: Simulated time of the failure [s].
     """
     known = recording.table.channels
-    names = [name for name in channels if name in known][:_MOST] or list(known)[:2]
+    names = [name for name in channels if name in known][:_MAX_PANELS] or list(known)[:2]
     figure = new_figure(1.0 + 1.9 * len(names))
-    marks = [event for event in recording.events if event["event"] not in _QUIET and event.get("tick") is not None]
+    marks = [e for e in recording.events if e["event"] not in _HIDDEN_EVENTS and e.get("tick") is not None]
     for axes, name in zip(figure.subplots(len(names), squeeze=False)[:, 0], names, strict=True):
         rows = recording.samples(name)
         draw_signals(axes, rows.times_s - origin_s, (rows[name], BLUE, ""))
-        axes.axvline(about_s - origin_s, color=RED, lw=1.2, label="where it failed")
+        axes.axvline(about_s - origin_s, color=RED, lw=1.2, label="failure")
         for event in marks:
             text = event["event"] if event["event"] != "note" else f"note {event.get('text', '')[:20]}"
             time_s = event["tick"] / recording.catalogue["tick_rate_hz"] - origin_s
@@ -50,6 +49,6 @@ def draw(
                 limits = each.must.limit if isinstance(each.must.limit, tuple) else (each.must.limit,)
                 for limit in limits:
                     axes.axhline(limit, color=RED, lw=0.9, ls="--", label="limit")
-        axes.set(xlabel="time of the test [s]", ylabel=label_of(name, known[name].unit))
+        axes.set(xlabel="test time [s]", ylabel=label_of(name, known[name].unit))
     legend_below(figure)
     save(figure, path)

@@ -1,6 +1,6 @@
-"""What is handed in of a campaign: results.json, junit.xml, index.html and the evidence, in one folder.
+"""Results of a campaign: results.json, junit.xml, index.html and the evidence, in one folder.
 
-The same campaign in lockstep gives the same results.json, byte for byte, but for what stands under `wall`.
+In lockstep, repeated runs of a campaign write the same results.json byte for byte, except for the `wall` section.
 """
 
 from __future__ import annotations
@@ -25,57 +25,57 @@ if TYPE_CHECKING:
 
 FORMAT = 1
 OUTCOMES = ("failed", "error", "interrupted", "inconclusive", "skipped", "passed")
-"""What may become of a case, the worst first."""
+"""Possible outcomes of a case, worst first."""
 _JUNIT: dict[str, junit.Outcome] = {
     "failed": "failure", "error": "error", "interrupted": "error", "inconclusive": "inconclusive",
     "skipped": "skipped", "passed": "passed",
 }  # fmt: skip
-_LONGEST = 2000
-_UNFINISHED = "it was ended while it ran"
+_MAX_REASON_LENGTH = 2000
+_UNFINISHED = "the run ended before this case was finished"
 
 
 class Results:
-    """Gathers what the tests report, and writes it at the end; a plugin of pytest.
+    """pytest plugin that collects the test reports and writes the results at the end.
 
     Args:
-        folder: Where to; made if it is not there.
+        folder: Output folder, created if missing.
         against: Results of an earlier campaign.
-        config: Of the run.
+        config: Configuration of the pytest run.
 
     Raises:
-        InputError: Another campaign writes there, or the results of the earlier one are none.
-        DiskError: The folder cannot be made.
+        InputError: If another campaign writes to the folder, or the earlier results cannot be read.
+        DiskError: If the folder cannot be created.
     """
 
     def __init__(self, folder: Path, against: Path | None, config: pytest.Config) -> None:
         self._lock = _locked(folder)
         self._folder, self._config = folder, config
         self._earlier = None if against is None else load_results(against)
-        if (folder / "results.json").is_file():  # what is written anew has none of the old evidence
+        if (folder / "results.json").is_file():  # evidence of the results that are about to be overwritten
             shutil.rmtree(folder / "evidence", ignore_errors=True)
         self._cases: dict[str, dict[str, Any]] = {}
         self._planned: dict[str, None] = {}
         self._begun_s = time.time()
 
     def pytest_collection_finish(self, session: pytest.Session) -> None:
-        """What is to be run."""
+        """Record the collected tests."""
         self._planned |= {item.nodeid: None for item in session.items}
 
     def pytest_xdist_node_collection_finished(self, node: Any, ids: list[str]) -> None:
-        """The same where several processes run it."""
+        """Record the tests that a worker process of pytest-xdist collected."""
         self._planned |= dict.fromkeys(ids)
 
     def pytest_collectreport(self, report: pytest.CollectReport) -> None:
-        """What could not be collected."""
+        """Record a collection error."""
         if report.failed:
             self._case(report.nodeid).update(outcome="error", reason=_line(str(report.longrepr)))
 
     def pytest_runtest_logstart(self, nodeid: str) -> None:
-        """A test begins."""
+        """Mark a test as started."""
         self._case(nodeid)["reason"] = _UNFINISHED
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        """What came of a phase of a test."""
+        """Record the outcome of one phase of a test."""
         case = self._case(report.nodeid)
         case["duration_s"] += report.duration
         case |= getattr(report, "rig", {})
@@ -95,7 +95,7 @@ class Results:
         })  # fmt: skip
 
     def pytest_sessionfinish(self, session: pytest.Session) -> None:
-        """Write all of it."""
+        """Write all result files."""
         if hasattr(self._config, "workerinput"):
             return
         document = self.document()
@@ -108,15 +108,15 @@ class Results:
         os.close(self._lock)
 
     def document(self) -> dict[str, Any]:
-        """All of it as a document for JSON."""
+        """Return the results as a JSON document."""
         cases, wall = [], {}
-        # Several at once come in any order; what was planned has one.
+        # Parallel workers finish in any order; the planned order is always the same.
         for name in [*self._planned, *(name for name in self._cases if name not in self._planned)]:
             if name not in self._cases:
-                self._case(name)["reason"] = "it was not run"
+                self._case(name)["reason"] = "not run"
             case = self._cases[name]
-            told = {key: value for key, value in case.items() if key not in ("duration_s", "floor_ms")}
-            cases.append({"id": name, **told, "repeat": self._repeat(name)})
+            reported = {key: value for key, value in case.items() if key not in ("duration_s", "floor_ms")}
+            cases.append({"id": name, **reported, "repeat": self._repeat(name)})
             wall[name] = {"duration_s": round(case["duration_s"], 3), "floor_ms": case["floor_ms"]}
         counts = {outcome: sum(case["outcome"] == outcome for case in cases) for outcome in OUTCOMES}
         titles = list(dict.fromkeys(case["title"] for case in cases if case["title"]))
@@ -131,11 +131,11 @@ class Results:
         })  # fmt: skip
 
     def _repeat(self, name: str) -> str:
-        """The command that runs this one case again."""
+        """Return the command that repeats this case."""
         path, colons, rest = name.partition("::")
         whole = self._config.rootpath / path
         file = os.path.relpath(whole, self._config.invocation_params.dir)
-        if whole.parent == Path(__file__).parents[1]:  # one that comes with the rig has a name
+        if whole.parent == Path(__file__).parents[1]:  # a shipped campaign has a name
             file = whole.name.partition(".")[0]
         more = [("--url", self._config.getoption("rig_url")), ("--replay", self._config.getoption("rig_replay"))]
         options = [word for option, value in more if value for word in (option, value)]
@@ -143,7 +143,7 @@ class Results:
 
 
 def _locked(folder: Path) -> int:
-    """A folder, made if it is not there, that nobody else writes to until this is closed."""
+    """Create a folder if necessary and lock it; return the handle that holds the lock."""
     import fcntl
 
     try:
@@ -155,35 +155,38 @@ def _locked(folder: Path) -> int:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:
         os.close(handle)
-        raise InputError("--output", "a folder that no other campaign writes to now", str(folder)) from None
+        raise InputError("--output", "a folder that no other running campaign writes to", str(folder)) from None
     return handle
 
 
 def outcome_of(report: Any) -> str:
-    """Return what a failing phase of a test makes of it: failed, error or inconclusive."""
+    """Return the outcome of a failed test phase: failed, error or inconclusive."""
     if getattr(report, "rig_inconclusive", False):
         return "inconclusive"
     return "failed" if report.when == "call" else "error"
 
 
 def reason_of(report: Any) -> str:
-    """Why a phase of a test failed, or was skipped, in a line."""
-    told = report.longrepr
-    if isinstance(told, tuple):  # of a skip: file, line, reason
-        return _line(str(told[2]).removeprefix("Skipped: "))
-    crash = getattr(told, "reprcrash", None)
-    return _line(str(told) if crash is None else crash.message.split(": ", 1)[-1])
+    """Return why a test phase failed or was skipped, on one line."""
+    longrepr = report.longrepr
+    if isinstance(longrepr, tuple):  # a skip: file, line, reason
+        return _line(str(longrepr[2]).removeprefix("Skipped: "))
+    crash = getattr(longrepr, "reprcrash", None)
+    return _line(str(longrepr) if crash is None else crash.message.split(": ", 1)[-1])
 
 
 def _line(text: str) -> str:
-    return printable(next((line for line in text.splitlines() if line.strip()), ""), _LONGEST)
+    return printable(next((line for line in text.splitlines() if line.strip()), ""), _MAX_REASON_LENGTH)
 
 
 def load_results(folder: Path) -> dict[str, Any]:
-    """Results of an earlier campaign, in a folder or in the file itself.
+    """Read the results of an earlier campaign.
+
+    Args:
+        folder: Folder of the campaign, or its results.json.
 
     Raises:
-        InputError: They are none.
+        InputError: If the file is missing or has another format.
     """
     path = folder if folder.suffix == ".json" else folder / "results.json"
     try:
@@ -196,21 +199,21 @@ def load_results(folder: Path) -> dict[str, Any]:
         isinstance(case, dict) and {"id", "outcome", "measurements"} <= set(case) for case in cases
     )
     if document.get("format") != FORMAT or not good:
-        raise InputError(str(path), "results of a campaign by this version of rig", document.get("format"))
+        raise InputError(str(path), "campaign results written by this version of rig", document.get("format"))
     return document
 
 
 def write_junit(document: dict[str, Any], path: Path) -> None:
-    """Write results as JUnit's XML: a suite a case, as its measurements are properties of a suite.
+    """Write the results as JUnit XML, one suite per case because only a suite can hold a case's measurements.
 
     Raises:
-        DiskError: The disk refused.
+        DiskError: If the file cannot be written.
     """
     suites = []
     for case in document["cases"]:
         file, _, name = case["id"].partition("::")
         wall = document["wall"]["cases"].get(case["id"], {})
-        lines = [_told(each) for each in case["measurements"]] + [f"repeat: {case['repeat']}"]
+        lines = [_measurement_line(each) for each in case["measurements"]] + [f"repeat: {case['repeat']}"]
         one = junit.Case(
             file.replace("/", "."), name or file, _JUNIT[case["outcome"]], case["reason"], "\n".join(lines),
             wall.get("duration_s", 0.0),
@@ -229,5 +232,5 @@ def _properties(case: dict[str, Any]) -> Any:
         yield "evidence", file
 
 
-def _told(each: dict[str, Any]) -> str:
+def _measurement_line(each: dict[str, Any]) -> str:
     return f"{each['outcome']}: {each['name']}: {each['value']} {each['unit']}, {each['op']} {each['limit']}"

@@ -75,10 +75,10 @@ def campaign(
 
 
 def _list() -> None:
-    from replays.campaigns.files.campaign import FOLDER, shipped, title_of
+    from replays.campaigns.files.campaign import FOLDER, read_title, shipped
 
     for name, path in shipped().items():
-        echo(textwrap.fill(f"{name}: {title_of(path)}", 80, subsequent_indent="  "))
+        echo(textwrap.fill(f"{name}: {read_title(path)}", 80, subsequent_indent="  "))
     echo(f"files in {FOLDER}")
 
 
@@ -103,9 +103,9 @@ def _checked(files: list[str], against: Path | None, replay: Path | None) -> lis
     if against is not None:
         load_results(against)
     if replay is not None:
-        from replays.campaigns.equipment.bench import check_replay
+        from replays.campaigns.equipment.bench import validate_replay
 
-        check_replay(replay)
+        validate_replay(replay)
     return paths
 
 
