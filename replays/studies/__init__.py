@@ -1,1 +1,1 @@
-"""Studies of the methods: accuracy against speed, stability, model levels, laws, and the paper made again."""
+"""Studies of methods: accuracy and speed, stability, model levels, contact laws, reproduction of the paper."""

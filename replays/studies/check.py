@@ -1,4 +1,4 @@
-"""How far a run can be trusted: the same scene again, finer, held against it."""
+"""Accuracy check of a run: comparison with the same scene at a finer tolerance or step."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from rig.run.scenes import Scene, parse_scene
 from rig.run.simulation import Simulation
 
 ANOTHER_BRANCH = 0.1
-"""Scaled error from which the two runs are no longer the same motion."""
-_FINER = 0.1
-"""The tolerance of an engine that has one is multiplied by this; steps of one that has none are halved."""
+"""Scaled error from which two runs no longer describe the same motion."""
+_TOLERANCE_FACTOR = 0.1
+"""Factor on the tolerance of an adaptive engine; steps of a fixed-step engine are halved instead."""
 
 
 @dataclass(frozen=True)
 class Check:
-    """Two runs of a scene, compared.
+    """Comparison of two runs of a scene.
 
     Attributes:
-        finer: What the second run was made with, in words.
+        finer: Engine and setting of the second run, in words.
         error: RMS distance of the scaled states at the truth's rate, as in the charts.
-        parted_s: First instant at which a scaled state is off by `ANOTHER_BRANCH`, or None.
-        contacts: Contacts in the run and in the finer one.
+        parted_s: First time at which a scaled state differs by `ANOTHER_BRANCH`, or None.
+        contacts: Contacts in the run and in the finer run.
     """
 
     finer: str
@@ -38,30 +38,30 @@ class Check:
 
     @property
     def wrong_branch(self) -> bool:
-        """Whether the run must be suspected to follow another branch than the model."""
+        """True if the run probably follows another branch of motion than the model."""
         return self.error > ANOTHER_BRANCH or abs(self.contacts[0] - self.contacts[1]) > 0.2 * max(self.contacts)
 
     def line(self) -> str:
-        """The result in one line."""
+        """Return the result on one line."""
         if self.wrong_branch:
             since = f" after {self.parted_s:g} s" if self.parted_s is not None else ""
             return (
-                f"a wrong branch is suspected{since}: {self.finer} goes another way "
+                f"a wrong branch is suspected{since}: {self.finer} follows another motion "
                 f"(error {self.error:.1e}, {self.contacts[0]} against {self.contacts[1]} contacts)"
             )
         return f"error {self.error:.1e} of 1 against {self.finer}; {self.contacts[0]} and {self.contacts[1]} contacts"
 
 
 def finer(scene: Scene) -> dict[str, float]:
-    """What to change of a scene's engine to have it finer.
+    """Return changes to a scene's engine that make it more accurate.
 
     Raises:
-        InputError: There is no finer step.
+        InputError: If there is no finer step.
     """
     scene.check_physics()
     engine = scene.engine
     if ENGINES[engine.name].tolerance:
-        return {"tolerance": engine.tolerance * _FINER}
+        return {"tolerance": engine.tolerance * _TOLERANCE_FACTOR}
     if engine.step_us < 2:
         raise InputError("engine.step_us", "at least 2, for a check by finer steps", engine.step_us)
     sample_us = 1_000_000 // scene.sensors.truth_rate_hz
@@ -69,13 +69,13 @@ def finer(scene: Scene) -> dict[str, float]:
 
 
 def check(scene: Scene) -> Check:
-    """Run a scene twice without sensors, as it is and finer.
+    """Run a scene twice without sensors, as it is and with a more accurate engine.
 
     Args:
         scene: The scene.
 
     Raises:
-        InputError: There is no finer step.
+        InputError: If there is no finer step.
     """
     changes = finer(scene)
     setting = f"tolerance {changes['tolerance']:.2g}" if "tolerance" in changes else f"{changes['step_us']} us"
@@ -92,7 +92,7 @@ def check(scene: Scene) -> Check:
 
 
 def _states(scene: Scene, changes: dict[str, float]) -> tuple[np.ndarray, int]:
-    """States at the truth's rate, shape (n, N_STATE), and the number of contacts."""
+    """Return states at the truth's rate, shape (n, N_STATE), and the number of contacts."""
     document = scene.model_dump()
     document["sensors"] |= bare_sensors(scene.sensors.truth_rate_hz)
     document["channels"] = None

@@ -1,4 +1,4 @@
-"""The normal contact laws side by side: what each returns, how hard it hits, how stiff it is, and how it is drawn."""
+"""Comparison of the normal contact laws: returned restitution, impact force, stiffness, and a picture."""
 
 from __future__ import annotations
 
@@ -45,13 +45,13 @@ from rig.physics.model import contact_pair, normal_law, reference_impact
 from rig.physics.parameters import ParameterSet
 
 LEAST = 0.05
-"""Smallest restitution compared, the smallest that `contact.restitution` takes."""
+"""Smallest restitution compared, equal to the smallest `contact.restitution`."""
 SPEEDS = (1e-4, 1.0)
-"""Approach speeds compared [m/s]."""
+"""Range of approach speeds compared [m/s]."""
 DEPTHS_UM = (5, 10)
-"""Penetrations at which the stiffness laws are compared [µm]."""
+"""Penetrations at which stiffness laws are compared [µm]."""
 
-# A dash for each law beside its colour.
+# Each law has a dash pattern in addition to its colour.
 _STYLES: dict[str, tuple[str, Any]] = {
     "exact": (BLACK, "-"),
     KELVIN_VOIGT: (SKY, (0, (5, 4))),
@@ -74,22 +74,22 @@ _STYLES: dict[str, tuple[str, Any]] = {
     "liu-cylinder": (SKY, "-"),
 }
 _OTHER = ("#882255", (0, (3, 1)))
-"""Of a law that has no style of its own."""
+"""Style of a law without an entry above."""
 _UNDER: dict[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.47, -0.13), "ncols": 2}
-"""Where a legend hides no curve."""
+"""Legend position below the axes."""
 
 
 def compare(parameters: ParameterSet) -> dict[str, Any]:
-    """Every damping law and every stiffness law at the parameters' restitution and ring.
+    """Compare all damping laws and all stiffness laws at the parameters' restitution and ring.
 
-    Damping laws are run on the parameters' own stiffness law, in one free impact of the reference masses.
+    Damping laws use the parameters' own stiffness law in one free impact of the reference masses.
 
     Returns:
-        A JSON document: `impact`, `damping` and `stiffness` (a list each, one entry a law), `wanted` and `returned`
-        (restitution over 0.05 to 1), `speed` and `returned_over_speed`, `lean`.
+        A JSON document: `impact`, `damping` and `stiffness` (lists with one entry per law), `wanted` and `returned`
+        (restitution from 0.05 to 1), `speed` and `returned_over_speed`, `lean`.
 
     Raises:
-        InputError: The parameters' own laws do not hold.
+        InputError: If the parameters' own laws are invalid.
     """
     pair, impact = contact_pair(parameters), reference_impact(parameters)
     restitution, floor = parameters["contact.restitution"], parameters["contact.speed_floor"]
@@ -140,11 +140,11 @@ def compare(parameters: ParameterSet) -> dict[str, Any]:
 
 
 def over_speed(parameters: ParameterSet, speeds: list[float]) -> dict[str, list[float]]:
-    """Restitution returned over the approach speed [m/s], for the three ways of damping.
+    """Return the restitution over the approach speed [m/s] for three kinds of damping.
 
-    Memory of v0 (c from the exact rule) returns the same at any speed above the lower limit of v0, and more below it. A
-    linear law (Kelvin-Voigt) has no speed of its own. A constant D on Hertz's force, set at the reference impact,
-    returns less the slower the impact.
+    A law with v0 (c from the exact rule) returns the same restitution above the lower limit of v0, and more below it. A
+    linear law (Kelvin-Voigt) does not depend on speed. A constant D with Hertz's force, set at the reference impact,
+    returns less at lower speeds.
     """
     pair, impact = contact_pair(parameters), reference_impact(parameters)
     restitution, floor = parameters["contact.restitution"], parameters["contact.speed_floor"]
@@ -163,10 +163,10 @@ def over_speed(parameters: ParameterSet, speeds: list[float]) -> dict[str, list[
 
 @house_style()
 def draw(parameters: ParameterSet, path: Path) -> None:
-    """Draw returned against wanted restitution, their difference, the same over speed, and the stiffness laws.
+    """Draw returned against set restitution, their difference, the restitution over speed, and the stiffness laws.
 
     Raises:
-        InputError: The file is neither .png nor .svg, or the parameters' own laws do not hold.
+        InputError: If the file is neither .png nor .svg, or the parameters' own laws are invalid.
     """
     check_suffix(path, field="--plot")
     normal_law(parameters)
@@ -188,7 +188,7 @@ def _draw_restitution(wanted: Any, difference: Any, parameters: ParameterSet) ->
         name: np.array([_returned(law, float(e)) for e in asked], float)
         for name, law in damping_laws(parameters).items()
     }
-    # From the most elastic down, as the curves stand in the picture at half.
+    # Sorted by the height of the curves at 0.5.
     for name in sorted(curves, key=lambda name: -float(curves[name][90])):
         color, dash = _STYLES.get(name, _OTHER)
         style = {"color": color, "ls": dash, "lw": 3.4 if name == "exact" else 1.8, "label": name}
@@ -268,7 +268,7 @@ def _draw_stiffness(axes: Any, parameters: ParameterSet) -> None:
 def _resolved(
     parameters: ParameterSet, pair: ContactPair, impact: ReferenceImpact, damping: str, restitution: float
 ) -> NormalLaw:
-    """The parameters' own stiffness with another damping law; as deep, where that one is linear."""
+    """Return the parameters' own stiffness with another damping law; for a linear one, the stiffness of equal depth."""
     stiffness = parameters.rule("contact.stiffness") or parameters["contact.stiffness"]
     exponent = parameters.rule("contact.exponent") or parameters["contact.exponent"]
     if damping == KELVIN_VOIGT:
@@ -288,21 +288,21 @@ def _resolved(
 
 
 def damping_laws(parameters: ParameterSet) -> dict[str, DampingLaw]:
-    """The rig's damping laws by name, and the one that the parameters give as a formula."""
+    """Return the rig's damping laws by name, with the one that the parameters define by a formula."""
     chosen = parameters.rule("contact.damping_factor")
     return DAMPING | ({} if chosen is None else {chosen: damping_law(chosen)})
 
 
 def stiffness_laws(parameters: ParameterSet) -> dict[str, StiffnessLaw]:
-    """The rig's stiffness laws by name, and the one that the parameters give as a formula."""
+    """Return the rig's stiffness laws by name, with the one that the parameters define by a formula."""
     chosen = parameters.rule("contact.stiffness")
     return STIFFNESS | ({} if chosen is None else {chosen: stiffness_law(chosen)})
 
 
 def _returned(law: DampingLaw, restitution: float) -> float | None:
-    """What a damping law returns at any speed above the lower limit of v0: Kelvin-Voigt's D is set to return it.
+    """Return the restitution of a damping law above the lower limit of v0; that of Kelvin-Voigt equals the setting.
 
-    None where a formula gives no c for this restitution.
+    Returns None if a formula gives no c for this restitution.
     """
     try:
         return restitution if law.factor is None else returned_restitution(law.factor(restitution))
@@ -321,7 +321,7 @@ def _impact(law: NormalLaw, impact: ReferenceImpact, floor: float) -> dict[str, 
 
 
 def _constant_damping(law: NormalLaw, impact: ReferenceImpact, restitution: float) -> NormalLaw:
-    """The same elastic force with the constant D that returns the restitution in the reference impact."""
+    """Return the same elastic force with the constant D that gives the restitution in the reference impact."""
     from scipy.optimize import brentq
 
     if restitution == 1.0:

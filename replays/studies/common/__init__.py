@@ -1,1 +1,1 @@
-"""Common parts of the studies: scenes, runs of engines, journals, provenance of numbers."""
+"""Common parts of the studies: scenes, runs of engines, journals, provenance of results."""

@@ -1,4 +1,4 @@
-"""What the trials are held against: closed forms, quadratures and small linear problems, none of it the rig's code."""
+"""Reference solutions for the trials, independent of the rig: closed forms, quadratures and small linear problems."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 
 class Impact(NamedTuple):
-    """One central impact on a fixed wall."""
+    """A central impact on a fixed wall."""
 
     restitution: float
     impulse: float  # [N s]
@@ -21,14 +21,14 @@ class Impact(NamedTuple):
 def impact(
     *, mass: float, speed: float, stiffness: float, exponent: float, factor: float, speed_floor: float
 ) -> Impact:
-    """A mass hits F = K d^n (1 + c d'/v0), v0 = max(speed, speed_floor), and nothing else acts on it.
+    """Return the impact of a free mass on F = K d^n (1 + c d'/v0), v0 = max(speed, speed_floor).
 
-    m v dv = -K d^n (1 + g v) dd with g = c/v0 separates: K d^(n+1)/(n+1) = m G(v) with
-    G(v) = int_v^speed u/(1 + g u) du, elementary. The end is the other zero of G; the time is int m dv/F.
+    m v dv = -K d^n (1 + g v) dd with g = c/v0 separates: K d^(n+1)/(n+1) = m G(v) with the elementary
+    G(v) = int_v^speed u/(1 + g u) du. The impact ends at the other zero of G; its duration is int m dv/F.
 
     Args:
         mass: m [kg].
-        speed: Approach [m/s].
+        speed: Approach speed [m/s].
         stiffness: K [N/m^n].
         exponent: n.
         factor: c [1].
@@ -43,7 +43,7 @@ def impact(
         a = g * (speed - v) / (1.0 + g * v)
         if abs(g * speed) < 1e-9:
             return 0.5 * (speed * speed - v * v)
-        # a - log(1 + a), without cancellation where it is small.
+        # a - log(1 + a), without cancellation for small a.
         rest = a * a * (0.5 - a * (1.0 / 3.0 - a * (0.25 - 0.2 * a))) if abs(a) < 1e-4 else a - math.log1p(a)
         return (a * g * v + rest) / (g * g)
 
@@ -61,7 +61,7 @@ def impact(
     peak: Any = minimize_scalar(
         lambda v: -force(v), bounds=(-rebound, speed), method="bounded", options={"xatol": 1e-12}
     )
-    # F goes as s^(n/(n+1)) at both ends, with s the distance in speed from there: s = u^(n+1) takes that out.
+    # At both ends F is proportional to s^(n/(n+1)), with s the speed from the end; s = u^(n+1) removes the singularity.
     power = exponent + 1.0
     middle = 0.5 * (speed - rebound)
 
@@ -73,7 +73,7 @@ def impact(
 
     duration = 0.0
     for part, end in ((before, speed - middle), (after, middle + rebound)):
-        # The ends themselves, where force and u both vanish, are left to the quadrature's open rule.
+        # F and u vanish at the ends, where the integrand is extrapolated.
         value: Any = quad(part, 1e-3 * end ** (1.0 / power), end ** (1.0 / power), epsabs=0.0, epsrel=1e-10)
         first: Any = part(1e-3 * end ** (1.0 / power)) * 1e-3 * end ** (1.0 / power)
         duration += float(value[0]) + float(first)
@@ -89,9 +89,9 @@ def impact(
 def pushed_contact(
     *, mass: float, load: Any, stiffness: float, exponent: float, factor: float, onset_speed: float, times: np.ndarray
 ) -> np.ndarray:
-    """Depth and its rate of a mass that a load pushes into F = K d^n max(0, 1 + c d'/v0), from rest at d = 0.
+    """Return depth and its rate of a mass pushed by a load into F = K d^n max(0, 1 + c d'/v0), from rest at d = 0.
 
-    Radau at a tolerance of 1e-10: implicit, so that a stale, small v0 may make the law as stiff as it likes.
+    Uses Radau at a tolerance of 1e-10; an implicit method, because a small old v0 makes the law very stiff.
 
     Args:
         mass: m [kg].
@@ -99,11 +99,11 @@ def pushed_contact(
         stiffness: K [N/m^n].
         exponent: n.
         factor: c [1].
-        onset_speed: v0 [m/s], held.
-        times: Instants wanted [s], shape (n,).
+        onset_speed: v0 [m/s], constant.
+        times: Output times [s], shape (n,).
 
     Returns:
-        Shape (n, 2) [m, m/s].
+        Depth and rate, shape (n, 2) [m, m/s].
     """
     from scipy.integrate import solve_ivp
 
@@ -119,15 +119,15 @@ def pushed_contact(
 
 
 class Mode(NamedTuple):
-    """One undamped mode of the houses."""
+    """An undamped mode of the houses."""
 
     frequency_hz: float
-    inner: float  # displacement of the inner house, largest of both 1
+    inner: float  # displacement of the inner house; the larger of the two is 1
     outer: float
 
 
 def stiffest_mode(*, inner: float, outer: float, link: float, support: float) -> Mode:
-    """The faster mode of two masses on a line: inner - link - outer - support - ground [kg, kg, N/m, N/m]."""
+    """Return the faster mode of two masses on a line: inner - link - outer - support - ground [kg, kg, N/m, N/m]."""
     stiffness = np.array([[link, -link], [-link, link + support]])
     mass = np.array([inner, outer])
     values, vectors = np.linalg.eigh(stiffness / np.sqrt(mass[:, None] * mass[None, :]))
@@ -137,14 +137,14 @@ def stiffest_mode(*, inner: float, outer: float, link: float, support: float) ->
 
 
 RUNGE_KUTTA_4_LIMIT = 2.0 * math.sqrt(2.0)
-"""h w up to which |R(i h w)| <= 1: |R|^2 = 1 - z^6/72 + z^8/576, so z^2 = 8. (2.785 is the limit on the real axis.)"""
+"""Stability limit of h w, where |R(i h w)| = 1: |R|^2 = 1 - z^6/72 + z^8/576, so z^2 = 8 (on the real axis 2.785)."""
 RUNGE_KUTTA_4_REAL_LIMIT = 2.7852935634
-"""h lambda up to which R(-h lambda) = 1 - z + z^2/2 - z^3/6 + z^4/24 stays below 1: what damping must keep."""
+"""Stability limit of h lambda, where R(-h lambda) = 1 - z + z^2/2 - z^3/6 + z^4/24 reaches 1: the limit for damping."""
 VERLET_LIMIT = 2.0
 
 
 def linear_motion(rates: np.ndarray, constant: np.ndarray, z0: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """Z' = A z + b by the exponential of the bordered matrix, shape (n, len(z0))."""
+    """Return the solution of Z' = A z + b by the exponential of the bordered matrix, shape (n, len(z0))."""
     from scipy.linalg import expm
 
     size = len(z0)

@@ -1,7 +1,7 @@
-"""What the studies know of each engine beside what `rig.physics.engines` tells: one row an engine, read by every study.
+"""Properties of the engines for the studies, in addition to `rig.physics.engines`: one row per engine.
 
-A new engine needs no row here. Without one it is drawn in grey, charted about its own default, and held to what every
-engine is held to; what theory or measurement says of it comes with its row.
+A new engine needs no row. Without one it is drawn in grey, charted around its own default, and tested by the general
+criteria; a row adds what theory or measurement predicts for it.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from replays.studies.common.closed_forms import (
 from rig.physics.engines import ENGINES
 
 Steps = tuple[tuple[int, float], ...]
-"""Pairs of a step [µs] and a tolerance (0: fixed steps), the coarsest first."""
+"""Pairs of a step [µs] and a tolerance (0: fixed steps), coarsest first."""
 FIXED_STEPS = (50, 40, 25, 20, 10, 5, 2)
-"""Steps at which an engine of fixed step is charted [µs]."""
+"""Steps at which a fixed-step engine is charted [µs]."""
 
 
 def _fixed(*steps_us: int) -> Steps:
@@ -32,30 +32,30 @@ def _tolerances(step_us: int, *exponents: int) -> Steps:
 
 
 class Traits(NamedTuple):
-    """One row."""
+    """Properties of an engine."""
 
     colour: str = "#333333"
     marker: str = "d"
     settings: Steps = ()
-    """Charted in full; empty: about its own default."""
+    """Settings of a full chart; empty: around the engine's own default."""
     quick: Steps = ()
-    """Charted in a quick chart; empty: every second of the full ones."""
+    """Settings of a quick chart; empty: every second one of the full chart."""
     oscillator_limit: float | None = None
-    """Largest h w of an undamped oscillator that stays bounded [1]; infinite where there is none, None if unknown."""
+    """Largest stable h w of an undamped oscillator [1]; infinite if there is none, None if unknown."""
     damping_limit: float | None = None
-    """Largest h lambda of a damping rate that its fixed step takes [1]; None if unknown."""
+    """Largest stable h lambda of a damping rate at fixed steps [1]; None if unknown."""
     damping_because: str = "explicit, and nothing shortens its steps"
     on_real_axis: bool = False
-    """Whether that limit is the theory's on the real axis."""
+    """True if that limit is the theoretical one on the real axis."""
     allowance: float = 1.0
-    """By how much an engine of low order without corrections may be further off at its own step."""
+    """Factor on the allowed error of a low-order engine without corrections at its own step."""
     coarse_bounce: tuple[bool | None, str] = (None, "")
-    """Whether it keeps an impact's energy at a step of 200 µs, and why."""
+    """Whether it preserves an impact's energy at a step of 200 µs, and the reason."""
     warned_within_ticks: int = 60_000
-    """How long a run with a step far too long goes on before it must have warned."""
+    """Longest run with a much too long step before the engine must have warned [ticks]."""
 
     def limit(self) -> float:
-        """Largest h w of an oscillator by theory; nan where there is none that is known."""
+        """Return the theoretical limit of h w of an oscillator; NaN if none is known."""
         return math.nan if self.oscillator_limit is None or math.isinf(self.oscillator_limit) else self.oscillator_limit
 
 
@@ -96,12 +96,12 @@ _ROWS = {
 
 
 def traits(engine: str) -> Traits:
-    """The row of an engine, or what holds for one that has none."""
+    """Return the properties of an engine, or the defaults."""
     return _ROWS.get(engine, Traits())
 
 
 def settings(engine: str, *, quick: bool) -> Steps:
-    """Steps and tolerances at which an engine is charted."""
+    """Return the steps and tolerances at which an engine is charted."""
     own, method = traits(engine), ENGINES[engine]
     if method.tolerance:
         about = tuple((method.step_us, method.tolerance * 10.0**n) for n in (3, 2, 1, 0, -1, -2))
@@ -112,10 +112,10 @@ def settings(engine: str, *, quick: bool) -> Steps:
 
 
 def is_adaptive(engine: str) -> bool:
-    """Whether error control chooses its steps."""
+    """Return whether error control chooses the engine's steps."""
     return ENGINES[engine].tolerance > 0.0
 
 
 def friction_of(engine: str) -> str:
-    """The most exact friction law that an engine takes."""
+    """Return the most exact friction law that an engine supports."""
     return next(law for law in ("exact", "smoothed", "switch", "none") if law in ENGINES[engine].frictions)

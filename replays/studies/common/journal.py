@@ -1,4 +1,4 @@
-"""A journal of what has been measured: a line a result, on the disk as it comes, so that a study can go on."""
+"""Journal of results: one JSON line per result, written to disk at once, so that a study can be resumed."""
 
 from __future__ import annotations
 
@@ -11,40 +11,40 @@ from rig.base.errors import InputError, Words
 
 
 def prepare_folder(folder: Path) -> None:
-    """Make a folder where it is missing.
+    """Create a folder if it is missing.
 
     Raises:
-        InputError: It cannot be made or written, or is a file.
+        InputError: If it cannot be created or written, or is a file.
     """
     if folder.exists() and not folder.is_dir():
         raise InputError("output", "a folder", Words(f"{folder}, which is a file"))
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError("output", "a folder that can be made", Words(f"{folder} ({error.strerror})")) from None
+        raise InputError("output", "a folder that can be created", Words(f"{folder} ({error.strerror})")) from None
     if not os.access(folder, os.W_OK):
         raise InputError("output", "a folder that can be written", str(folder))
 
 
 class Journal:
-    """A file of JSON lines in a folder, of which those count that the same code has measured.
+    """A file of JSON lines in a folder; only lines measured by the same code count.
 
     Attributes:
-        rows: What counts, in the order in which it came.
-        outdated: How many lines are of other code.
+        rows: Valid lines, in the order of the file.
+        outdated: Number of lines of other code.
     """
 
     def __init__(self, folder: Path, name: str, code: str, *, fresh: bool = False) -> None:
-        """Open it in a folder, which is made where it is missing.
+        """Open the journal in a folder, which is created if missing.
 
         Args:
             folder: The folder.
-            name: Of the file.
-            code: Digest of the code; the field `code` of a line must be the same.
-            fresh: Start over.
+            name: Name of the file.
+            code: Digest of the code; must equal the field `code` of a line.
+            fresh: Delete earlier results.
 
         Raises:
-            InputError: It cannot be written, or is a file.
+            InputError: If the folder cannot be written, or is a file.
         """
         prepare_folder(folder)
         self.path = folder / name
@@ -57,7 +57,7 @@ class Journal:
 
     def _load(self, code: str) -> None:
         text = self.path.read_text(encoding="utf-8")
-        if text and not text.endswith("\n"):  # the last line of a run that was killed
+        if text and not text.endswith("\n"):  # an incomplete last line of a killed run
             text = text[: text.rfind("\n") + 1]
             self.path.write_text(text, encoding="utf-8")
         lines = [json.loads(line) for line in text.splitlines()]
@@ -65,7 +65,7 @@ class Journal:
         self.outdated = len(lines) - len(self.rows)
 
     def add(self, row: dict[str, Any]) -> None:
-        """Keep a line; it is on the disk when this returns."""
+        """Append a line; it is written to disk before this returns."""
         with self.path.open("a", encoding="utf-8") as file:
             file.write(json.dumps(row, allow_nan=False) + "\n")
         self.rows.append(row)

@@ -1,4 +1,4 @@
-"""The hammer scene with a user's contact law, in addition to the twelve scenes that methods are compared on."""
+"""Hammer scene with a user's contact law, added to the twelve scenes of the method comparison."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from rig.physics.model import build_model
 
 
 def add_law_scene(path: Path) -> str:
-    """Add the scene of a law's file to those that this process compares methods on.
+    """Add the scene of a law file to the scenes on which this process compares methods.
 
-    Its name has a digest of the law, so that a table never takes points of one law for those of another.
+    The scene's name contains a digest of the law, so that points of different laws are never mixed in a table.
 
     Args:
         path: The file (`rig.physics.law_file`).
@@ -23,7 +23,7 @@ def add_law_scene(path: Path) -> str:
         The scene's name.
 
     Raises:
-        InputError: The file is no law, or the model does not take it.
+        InputError: If the file is no law, or the model does not accept it.
     """
     law = read_law(path)
     mark = hashlib.sha256(json.dumps(law.changes(), sort_keys=True).encode()).hexdigest()[:6]
@@ -33,5 +33,5 @@ def add_law_scene(path: Path) -> str:
     build_model(scene.load().load_parameters())
     others = dict(TWELVE_SCENES)
     TWELVE_SCENES.clear()
-    TWELVE_SCENES.update({scene.name: scene} | others)  # the first, as there may not be time for all
+    TWELVE_SCENES.update({scene.name: scene} | others)  # first, as there may not be time for all scenes
     return scene.name

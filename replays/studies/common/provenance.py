@@ -1,4 +1,4 @@
-"""What a number was measured with: date, commit, machine, versions of libraries."""
+"""Provenance of a result: date, commit, machine, versions of libraries."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ RIG = "rotor-stator-rig"
 
 
 def today() -> str:
-    """The date in UTC."""
+    """Return the date in UTC."""
     return datetime.now(UTC).strftime("%Y-%m-%d")
 
 
 def digest(sources: Iterable[Path]) -> str:
-    """Digest of what Python files do: of their syntax trees, without docstrings, comments, places and names of files.
+    """Return a digest of Python code, independent of docstrings, comments, positions and file names.
 
     Args:
         sources: Files, in any order.
@@ -28,18 +28,18 @@ def digest(sources: Iterable[Path]) -> str:
     trees = []
     for path in sources:
         tree = ast.parse(path.read_bytes())
-        # What is imported counts, and not where from or in which order.
+        # The imported names count, but not their modules or their order.
         imported = [name for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) for name in node.names]
         for node in ast.walk(tree):
             if isinstance(node, ast.Module | ast.FunctionDef | ast.ClassDef):
-                # A text that stands alone says something of what is before it.
+                # A bare string documents the preceding statement.
                 node.body = [each for each in node.body if not _is_text(each) and not isinstance(each, ast.ImportFrom)]
         trees.append(hashlib.sha256(repr((sorted(map(ast.dump, imported)), _fields(tree))).encode()).digest())
     return hashlib.sha256(b"".join(sorted(trees))).hexdigest()[:16]
 
 
 def _fields(node: object) -> object:
-    """A syntax tree as tuples, without empty fields: `ast.dump` differs from one version of Python to the next."""
+    """Convert a syntax tree to tuples without empty fields, since `ast.dump` differs between versions of Python."""
     if isinstance(node, ast.AST):
         found = ((name, _fields(value)) for name, value in ast.iter_fields(node) if value not in (None, []))
         return (type(node).__name__, *found)
@@ -51,7 +51,7 @@ def _is_text(node: ast.stmt) -> bool:
 
 
 def commit() -> str:
-    """Commit of the sources, "+" behind it where they have changed since; empty outside a repository."""
+    """Return the commit of the sources, followed by "+" if they have changed; empty outside a repository."""
     command = ["git", "describe", "--always", "--abbrev=12", "--dirty=+", "--exclude", "*"]
     here = Path(__file__).resolve().parent
     try:
@@ -62,7 +62,7 @@ def commit() -> str:
 
 
 def processor() -> str:
-    """Its name, as far as the system tells."""
+    """Return the name of the processor, if the system provides it."""
     try:
         for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
             if line.startswith("model name"):
@@ -73,12 +73,12 @@ def processor() -> str:
 
 
 def machine() -> str:
-    """Processor and system."""
+    """Return processor and operating system."""
     return f"{processor()}, {platform.system()}"
 
 
 def versions(*libraries: str) -> dict[str, str]:
-    """Versions of those libraries that are installed."""
+    """Return the versions of those libraries that are installed."""
     found = {}
     for library in libraries:
         try:

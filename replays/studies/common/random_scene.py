@@ -1,6 +1,6 @@
-"""Random scenes: numbered draws, wide over every parameter, law, set and level, and over what happens in a run.
+"""Random scenes: numbered draws over all parameters, laws, sets and levels, and over the events of a run.
 
-Scene k of a seed is drawn by itself, whatever other scenes are, so that any one can be repeated by its number.
+Scene k of a seed does not depend on other scenes, so each can be repeated by its number.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from rig.physics.model import build_model
 from rig.physics.parameters import load_parameters, set_names
 from rig.run.scenes import Scene, parse_scene
 
-_AFTER_S = (0.1, 0.5)
-"""A scene goes on so long after its first blow [s]."""
-_APART_MS = 2.0
-"""Least time between two blows [ms]."""
-_TRIES = 20
-_SHAFT = {
+_RUN_AFTER_S = (0.1, 0.5)
+"""Range of the run length after the first hammer pulse [s]."""
+_MIN_PAUSE_MS = 2.0
+"""Shortest pause between two hammer pulses [ms]."""
+_MAX_TRIES = 20
+_SCALES = {
     "shaft.mass": (0.5, 2.0),
     "shaft.transverse_inertia": (0.6, 3.0),
     "shaft.polar_inertia": (0.3, 3.0),
@@ -35,55 +35,55 @@ _SHAFT = {
     "drive.torque_gain": (0.1, 10.0),
     "contact.reference_speed": (0.1, 5.0),
 }
-"""Other numbers, by what the set's own may be multiplied with."""
+"""Range of factors on other parameters of the set."""
 
 
 class _Dice(NamedTuple):
-    """Draws of one scene, in numbers of four digits."""
+    """Random draws of one scene, rounded to four digits."""
 
     rng: np.random.Generator
 
     def even(self, low: float, high: float) -> float:
-        """Evenly between two numbers."""
+        """Draw uniformly between two numbers."""
         return float(f"{self.rng.uniform(low, high):.4g}")
 
     def wide(self, low: float, high: float) -> float:
-        """Evenly in the logarithm."""
+        """Draw uniformly in the logarithm."""
         return float(f"{np.exp(self.rng.uniform(np.log(low), np.log(high))):.4g}")
 
     def often(self, chance: float) -> bool:
-        """True with this chance."""
+        """Return True with the given probability."""
         return bool(self.rng.random() < chance)
 
     def of(self, weights: dict[str, float]) -> str:
-        """One of some names, by their weights."""
+        """Draw one of several names by weight."""
         shares = np.array(list(weights.values()))
         return str(self.rng.choice(list(weights), p=shares / shares.sum()))
 
     def one(self, *names: str) -> str:
-        """One of some names, each as likely."""
+        """Draw one of several names with equal probability."""
         return self.of(dict.fromkeys(names, 1.0))
 
     def at_s(self, low: float, high: float) -> float:
-        """A time on any microsecond [s]."""
+        """Draw a time in whole microseconds [s]."""
         return round(float(self.rng.uniform(low, high)), 6)
 
 
 def draw_scene(seed: int, number: int) -> Scene:
-    """The scene of this number.
+    """Return the scene of a number.
 
-    A draw that the model refuses (a ring that the shaft does not rest in, a law that breaks down) is drawn anew.
+    A draw that the model rejects (a ring in which the shaft does not rest, an invalid law) is repeated.
 
     Args:
-        seed: Of all numbers.
-        number: From 0.
+        seed: Seed common to all numbers.
+        number: Number of the scene, from 0.
 
     Example:
         >>> draw_scene(1, 0) == draw_scene(1, 0), draw_scene(1, 0) == draw_scene(1, 1)
         (True, False)
     """
     dice = _Dice(np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(number,))))
-    for _ in range(_TRIES - 1):
+    for _ in range(_MAX_TRIES - 1):
         try:
             return _draw(dice, f"random-{seed}-{number}")
         except InputError:
@@ -96,13 +96,13 @@ def _draw(dice: _Dice, name: str) -> Scene:
     levels = _levels(dice)
     changes = _rotor(dice) | _contact(dice) | _houses(dice, parameters)
     own = load_parameters(parameters)
-    for key, (low, high) in _SHAFT.items():
+    for key, (low, high) in _SCALES.items():
         if dice.often(0.12):
             changes[key] = float(f"{float(own.entries[key].value) * dice.wide(low, high):.4g}")
     clearance = changes.get("ring.clearance", 0.926)
     magnets = not dice.often(0.1)
     position = dice.of({"equilibrium": 8.0 * magnets, "given": 1.5, "top": 1.0, "bottom": 1.0})
-    if dice.often(0.5):  # a ring off the shaft's centre
+    if dice.often(0.5):  # ring not centred on the shaft
         angle, far = dice.even(0.0, 2.0 * np.pi), dice.even(0.0, 0.8 * clearance)
         sag = 1e3 * build_model(own.override(changes), ModelLevels(**levels)).sag
         changes["ring.offset_x"] = round(far * float(np.cos(angle)), 6)
@@ -112,7 +112,7 @@ def _draw(dice: _Dice, name: str) -> Scene:
         angle, far = dice.even(0.0, 2.0 * np.pi), dice.even(0.0, 0.99 * clearance)
         initial |= {"x_mm": round(far * float(np.cos(angle)), 6), "y_mm": round(far * float(np.sin(angle)), 6)}
     first_s = dice.at_s(0.001, 0.02)
-    duration_s = round(first_s + dice.even(*_AFTER_S), 3)
+    duration_s = round(first_s + dice.even(*_RUN_AFTER_S), 3)
     commands = _blows(dice, first_s, duration_s, needed=position == "equilibrium")
     if magnets and dice.often(0.1):
         commands.append({"at_s": dice.at_s(0.0, duration_s), "command": "release"})
@@ -126,7 +126,7 @@ def _draw(dice: _Dice, name: str) -> Scene:
             "set": changes,
             "duration_s": duration_s,
             "model": levels,
-            # Every engine that takes the law is asked; this one takes all but the friction laws of the state alone.
+            # Every engine that supports the law is tested; this one supports all except state-only friction laws.
             "engine": {"name": "rk8" if levels["contact"] == "compliant" else "split"},
             "initial": initial,
             "drive": _drive(dice, duration_s),
@@ -167,7 +167,7 @@ def _contact(dice: _Dice) -> dict[str, Any]:
     if dice.often(0.7):
         changes["contact.damping_factor"] = dice.even(0.0, 1.5) if dice.often(0.1) else dice.one(*DAMPING)
     if changes.get("contact.damping_factor") != KELVIN_VOIGT and dice.often(0.25):
-        # The unit of a stiffness in numbers goes with the exponent: it stays near what it is meant for.
+        # The unit of a numeric stiffness depends on the exponent, so the exponent stays close to 1.5.
         changes["contact.exponent"] = dice.even(1.0, 2.5) if named else dice.even(1.4, 1.6)
     if dice.often(0.08):
         changes["contact.viscous_damping"] = dice.wide(1.0, 1e4)
@@ -229,5 +229,5 @@ def _blows(dice: _Dice, first_s: float, duration_s: float, *, needed: bool) -> l
                 "direction": direction,
             }
         )
-        at_s = round(at_s + 1e-3 * (length_ms + _APART_MS) + dice.at_s(0.0, 0.15), 6)
+        at_s = round(at_s + 1e-3 * (length_ms + _MIN_PAUSE_MS) + dice.at_s(0.0, 0.15), 6)
     return blows

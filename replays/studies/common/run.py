@@ -1,4 +1,4 @@
-"""How every study runs: one engine on a bare system, or one scene to its end, each with the time that it took."""
+"""Runs for the studies: one engine on a bare system, or one scene to its end, with processor times."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from rig.run.simulation import Simulation
 
 
 def bare_sensors(rate_hz: int = 1_000) -> dict[str, Any]:
-    """Sensors that leave the engine alone: ideal ones, of the hammer alone, with rows at a rate [Hz]."""
+    """Return sensor settings with little effect on the engine: ideal hammer channels only, with rows at a rate [Hz]."""
     return {"chain": "ideal", "groups": ["hammer"], "rate_hz": rate_hz, "truth_rate_hz": rate_hz}
 
 
 class Course:
-    """One engine on one system, without scene, sensors or commands.
+    """An engine on a system without scene, sensors or commands.
 
     Attributes:
-        y: State and integrals now, shape (N_VECTOR,).
-        memory: The engine's memory now, shape (memory_size,).
-        tick: Present time, in ticks of the inputs.
-        step: Ticks a step.
+        y: Current state and integrals, shape (N_VECTOR,).
+        memory: Current memory of the engine, shape (memory_size,).
+        tick: Current time in ticks of the inputs.
+        step: Ticks per step.
     """
 
     def __init__(
@@ -44,12 +44,12 @@ class Course:
         """Start an engine.
 
         Args:
-            engine: Its name.
+            engine: Name of the engine.
             constants: The model.
-            inputs: What acts on it.
-            y0: State at the start, shape (N_STATE,) or, with integrals, (N_VECTOR,).
-            step: Ticks a step; 0 for the engine's own (in ticks of 1 µs).
-            tolerance: Of an adaptive engine; 0 for its own.
+            inputs: Inputs of the model.
+            y0: Initial state, shape (N_STATE,) or, with integrals, (N_VECTOR,).
+            step: Ticks per step; 0 for the engine's own (in ticks of 1 µs).
+            tolerance: Tolerance of an adaptive engine; 0 for its own.
         """
         method = ENGINES[engine]
         self._engine, self._constants, self._inputs = load_chosen_engine(engine), constants, inputs
@@ -60,12 +60,12 @@ class Course:
         self._engine.start(constants, inputs, self.y, self.memory, float(self.step), tolerance)
 
     def advance(self, steps: int, stride: int, rows: np.ndarray) -> None:
-        """Go on.
+        """Advance by a number of steps.
 
         Args:
-            steps: How many steps.
-            stride: Steps between rows, the first of which is now.
-            rows: Where observed rows go, shape (steps / stride, N_ROW).
+            steps: Number of steps.
+            stride: Steps between output rows; the first row is the current state.
+            rows: Output rows, shape (steps / stride, N_ROW).
         """
         self._engine.advance(
             self._constants, self._inputs, self.y, self.memory, self.tick, self.step, steps, stride, rows
@@ -73,17 +73,17 @@ class Course:
         self.tick += steps * self.step
 
     def look(self, rows: np.ndarray) -> None:
-        """Write the row of now, shape (1, N_ROW), and stay."""
+        """Write the row of the current state, shape (1, N_ROW), without advancing."""
         y, memory = self.y.copy(), self.memory.copy()
         self._engine.advance(self._constants, self._inputs, y, memory, self.tick, self.step, 1, 1, rows)
 
 
 class Timed(NamedTuple):
-    """A scene that was run to an end.
+    """A completed run of a scene.
 
     Attributes:
-        rows: Observed rows, shape (n, N_ROW): of the whole run, or of its last block where they were not kept.
-        cpu_s: Processor time of this thread for the steps [s]: other load on the machine does not count.
+        rows: Observed rows, shape (n, N_ROW): of the whole run, or of its last block if they were not kept.
+        cpu_s: Processor time of this thread for the steps [s], unaffected by other load on the machine.
     """
 
     rows: np.ndarray
@@ -96,14 +96,14 @@ def run_scene(
     """Run a simulation to the end of its scene.
 
     Args:
-        simulation: What to run.
-        block_ticks: Ticks a call, a whole multiple of the simulation's own blocks.
-        every: Rows between those that are kept.
-        keep: Whether the rows of the whole run are kept.
-        limit_s: Processor time allowed [s].
+        simulation: The simulation.
+        block_ticks: Ticks per call, a multiple of the simulation's own blocks.
+        every: Decimation factor of the rows.
+        keep: Whether to keep the rows of the whole run.
+        limit_s: Allowed processor time [s].
 
     Raises:
-        SimulationError: It takes too long: an engine may stall.
+        SimulationError: If it takes too long, as when an engine stalls.
     """
     kept: list[np.ndarray] = []
     cpu_s = 0.0
@@ -120,7 +120,7 @@ def run_scene(
 
 
 def end_with_parent() -> None:
-    """A worker would wait for work for ever when the process that started it was killed."""
+    """Exit when the parent process ends; otherwise a worker would wait for work forever."""
     import os
     from multiprocessing import parent_process
     from threading import Thread

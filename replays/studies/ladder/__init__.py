@@ -1,5 +1,5 @@
-"""The ladder of models: what each level of the model costs and errs by, and the cheapest that is good enough.
+"""Ladder of model levels: error and cost of each level, and the cheapest sufficient combination.
 
-`measurement` runs one candidate, `quantity` says what is read off a run, `search` goes down the ladder, `chart` draws
-it, `pick` writes what was found into a scene's file.
+`measurement` runs one candidate, `quantity` evaluates a run, `search` tests combinations, `chart` draws the result, and
+`pick` writes it into a scene file.
 """

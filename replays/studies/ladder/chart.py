@@ -1,4 +1,4 @@
-"""The ladder drawn: what each level errs by and costs, and which engine and step carry the pick, with the evidence."""
+"""Picture of a search: error and cost of each level, and the engines and steps that run the pick."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from replays.studies.ladder.document import python_line
 from replays.studies.ladder.quantity import QUANTITIES
 from replays.studies.ladder.search import Ladder, Step
 
-_MOST = 3
-"""Quantities drawn; the document has them all."""
+_MAX_QUANTITIES = 3
+"""Number of quantities drawn; the document contains all."""
 _GOOD, _BAD, _OWN = "0.2", "#b00020", "#8a6fae"
-"""Within the tolerance, beyond it, and how far the reference itself is to be trusted: colours that no engine has."""
+"""Colours for errors within and beyond the tolerance and for the reference's own error; no engine uses them."""
 
 
 @house_style()
 def draw(ladder: Ladder, folder: Path) -> list[Path]:
-    """Draw a search into ladder.png and ladder.svg of a folder that is made where needed."""
-    names = list(ladder.tolerances)[:_MOST]
+    """Draw a search to ladder.png and ladder.svg in a folder, which is created if missing."""
+    names = list(ladder.tolerances)[:_MAX_QUANTITIES]
     columns = len(names) + 1
     figure = new_figure(
-        10.4 + 0.8 * len(names),  # the evidence has room above the legend
+        10.4 + 0.8 * len(names),  # leaves room for the evidence above the legend
         f"No more model than scene {ladder.scene.name} needs\n({ladder.scene.duration_s:g} s; parameters: "
         f"{ladder.scene.parameters}, not validated on a rig)",
     )
@@ -43,7 +43,7 @@ def draw(ladder: Ladder, folder: Path) -> list[Path]:
 
 
 def _range(ladder: Ladder, name: str) -> tuple[float, float]:
-    """Errors drawn: what is smaller stands at the left edge, what is infinite at the right."""
+    """Return the range of errors drawn; smaller ones are drawn at the left edge, infinite ones at the right."""
     own, tolerance = ladder.reference_errors[name], ladder.tolerances[name]
     seen = [
         value
@@ -117,9 +117,9 @@ def _draw_work(axes: Any, levels: list[Step]) -> None:
         spent = cost.cpu_s * 1e3
         axes.barh(row, spent, height=0.6, color=traits(cost.candidate.engine).colour, zorder=2)
         axes.plot([cost.spread_s[0] * 1e3, cost.spread_s[1] * 1e3], [row, row], color="0.2", lw=1.4, zorder=3)
-        told = f"{float(f'{spent:.3g}'):g}  ({cost.candidate.label})"
+        text = f"{float(f'{spent:.3g}'):g}  ({cost.candidate.label})"
         axes.annotate(
-            told, (max(spent, cost.spread_s[1] * 1e3), row), xytext=(4, 0),
+            text, (max(spent, cost.spread_s[1] * 1e3), row), xytext=(4, 0),
             textcoords="offset points", va="center", fontsize=9,
         )  # fmt: skip
     spans = [spent * 1e3 for step in levels if step.cost for spent in step.cost.spread_s]
@@ -172,7 +172,7 @@ def _draw_cost(axes: Any, ladder: Ladder, name: str, *, first: bool) -> None:
 
 
 def _write_evidence(axes: Any, ladder: Ladder) -> None:
-    """The pick, what it gives and what it costs, as text."""
+    """Draw the pick, its values and its cost as text."""
     picked, errors = ladder.picked, ladder.picked_errors
     axes.axis("off")
     levels = ", ".join(f"{level} {choice}" for level, choice in picked.candidate.model.items())
@@ -193,7 +193,7 @@ def _write_evidence(axes: Any, ladder: Ladder) -> None:
 
 
 def _caption(ladder: Ladder) -> str:
-    """What was held against what, and where."""
+    """Return the caption: reference, costs and environment."""
     names = ", ".join(name.replace("_", " ") for name in ladder.tolerances)
     pick, given, full = (run.cpu_s * 1e3 for run in (ladder.picked, ladder.given, ladder.full))
     text = (

@@ -1,4 +1,4 @@
-"""What a search has found, with its evidence: a JSON document, and the pick as a scene stores it."""
+"""Result of a search with its evidence: a JSON document, and the pick as stored in a scene."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _PACKAGES = ("numba", "numpy", "scipy")
 
 
 def ladder_document(ladder: Ladder) -> dict[str, Any]:
-    """The whole search as a JSON document; what is infinite or has no value is null."""
+    """Return the search as a JSON document; infinite or missing values are null."""
     scene = ladder.scene
     return {
         "scene": scene.name,
@@ -67,7 +67,7 @@ def ladder_document(ladder: Ladder) -> dict[str, Any]:
 
 
 def pick_of(ladder: Ladder) -> Pick:
-    """The pick as a scene stores it."""
+    """Return the pick as stored in a scene."""
     scene, picked, errors = ladder.scene, ladder.picked, ladder.picked_errors
     candidate = picked.candidate
     scene_digest, parameters_digest, code_digest = pick_digests(scene)
@@ -111,7 +111,7 @@ def pick_of(ladder: Ladder) -> Pick:
 
 
 def versions() -> dict[str, str]:
-    """Date, machine, commit, and the versions that figures hang on."""
+    """Return date, machine, commit, and the versions that affect the numbers."""
     found = provenance.versions(provenance.RIG, *_PACKAGES)
     return {
         "date": provenance.today(),
@@ -150,7 +150,7 @@ def _number(value: Value) -> Value | None:
 
 
 def _digits(value: float) -> float:
-    # The platform's last digits are no evidence.
+    # Later digits depend on the platform.
     return float(f"{value:.3g}")
 
 
@@ -159,7 +159,7 @@ def _short(value: Value) -> Value:
 
 
 def python_line() -> str:
-    """The machine in one line, for the chart."""
+    """Return the environment on one line, for the chart."""
     found = versions()
     packages = ", ".join(f"{name} {found[name]}" for name in _PACKAGES)
     commit = f", commit {found['commit']}" if found["commit"] else ""

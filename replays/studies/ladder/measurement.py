@@ -1,4 +1,4 @@
-"""One candidate measured: a scene run on a model, an engine and a step, with its quantities and its cost."""
+"""Measurement of one candidate: a scene run with a model, an engine and a step, its quantities and its cost."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ from rig.run.scenes import Scene, parse_scene
 from rig.run.simulation import Simulation
 
 GRID_TICKS = 1_000
-"""Quantities are read every 1 ms."""
+"""Ticks between the rows from which quantities are computed, 1 ms."""
 _FINEST_ROW_US = 25
-"""Instants are looked for on rows this far apart, or a fixed step apart [us]."""
-_ENOUGH_S = 1.0
-"""No further run is timed once this much processor time is spent on one candidate."""
-_LEAST_S = 0.1
-"""Two candidates are compared for at least this much processor time."""
+"""Largest spacing of rows, or a fixed step, for locating instants [us]."""
+_MAX_CPU_S = 1.0
+"""Processor time after which no further run of a candidate is timed [s]."""
+_MIN_COMPARISON_S = 0.1
+"""Least processor time of a comparison of two candidates [s]."""
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A model, an engine and its step: all that a pick is about."""
+    """A model, an engine and its step, as stored in a pick."""
 
     levels: ModelLevels
     drive: str
@@ -39,7 +39,7 @@ class Candidate:
     step_us: int
     tolerance: float = 0.0
     companion: bool = False
-    """Only where a scene as given has one: of all others the search itself tells the error."""
+    """Whether a companion run is used, only for a scene as given; the search itself determines all other errors."""
 
     @property
     def method(self) -> str:
@@ -49,33 +49,33 @@ class Candidate:
 
     @property
     def label(self) -> str:
-        """The same with its unit as a figure shows it."""
+        """Engine and step with the unit as in a figure."""
         return self.method.replace(" us", " µs")
 
     @property
     def model(self) -> dict[str, str]:
-        """The levels by name, the drive among them."""
+        """Levels by name, including the drive."""
         return {**self.levels.model_dump(), "drive": self.drive}
 
     def with_model(self, **levels: str) -> Candidate:
-        """The same with some levels changed."""
+        """Return the candidate with some levels changed."""
         drive = levels.pop("drive", self.drive)
         changed = ModelLevels.model_validate({**self.levels.model_dump(), **levels})
         return replace(self, levels=changed, drive=drive)
 
     def with_engine(self, engine: str, step_us: int, tolerance: float) -> Candidate:
-        """The same on another engine, without a companion."""
+        """Return the candidate on another engine, without a companion run."""
         return replace(self, engine=engine, step_us=step_us, tolerance=tolerance, companion=False)
 
     def scene(self, scene: Scene, *, sensors: dict[str, Any] | None = None) -> Scene:
-        """The scene on this candidate.
+        """Return the scene for this candidate.
 
         Args:
-            scene: As it is given.
-            sensors: Its sensors, changed; None for as good as none.
+            scene: The scene as given.
+            sensors: Changes to its sensors; None for the minimum of sensors.
 
         Raises:
-            InputError: The engine cannot take the model, or its step does not fit the rates of the sensors.
+            InputError: If the engine does not support the model, or its step does not fit the sample rates.
         """
         data = scene.model_dump()
         engine = {"name": self.engine, "step_us": self.step_us, "tolerance": self.tolerance}
@@ -95,18 +95,18 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Measurement:
-    """What a candidate gave.
+    """Result of a candidate.
 
     Attributes:
-        candidate: Which one.
-        values: By quantity; nan where it has none, or cannot give it.
-        ending: How the run ends.
-        cpu_s: Processor time of a simulated second, median of the runs, compiling apart [s].
-        spread_s: Least and largest of the same.
-        runs: Runs timed.
+        candidate: The candidate.
+        values: Values by quantity; NaN if there is none.
+        ending: Outcome of the run.
+        cpu_s: Processor time per simulated second, median of the runs without compilation [s].
+        spread_s: Minimum and maximum of the same.
+        runs: Number of timed runs.
         steps: Steps of the engine.
-        residual_share: Energy residual as a part of what was dissipated.
-        failure: Why there is no result; empty where there is one.
+        residual_share: Energy residual as a part of the dissipated energy.
+        failure: Reason for a missing result; otherwise empty.
     """
 
     candidate: Candidate
@@ -120,7 +120,7 @@ class Measurement:
     failure: str = ""
 
     def step_ns(self, simulated_s: float) -> float:
-        """Processor time of a step [ns]."""
+        """Return the processor time per step [ns]."""
         return self.cpu_s * simulated_s / max(self.steps, 1) * 1e9
 
 
@@ -133,23 +133,23 @@ def measure(
     sensors: dict[str, Any] | None = None,
     limit_s: float = math.inf,
 ) -> Measurement:
-    """Run a candidate, and time it.
+    """Run a candidate and time it.
 
     Args:
-        scene: The scene as it is given.
-        candidate: What to run it on.
-        quantities: What to read.
-        runs: Runs to time, fewer where they take long; 1 for values alone, whose time is a rough one.
+        scene: The scene as given.
+        candidate: Model, engine and step to run.
+        quantities: Quantities to compute.
+        runs: Number of timed runs, reduced for long runs; 1 if only values matter and a rough time is sufficient.
         sensors: Changes to the scene's own sensors; None to leave the sensors out.
-        limit_s: Processor time after which a run is given up as a failure [s].
+        limit_s: Processor time after which a run counts as failed [s].
     """
     placed = candidate.scene(scene, sensors=sensors)
-    Simulation(placed).warm_up()  # compiling is no part of the cost
+    Simulation(placed).warm_up()  # excludes compilation from the cost
     simulated_s = Simulation(placed).end_tick * 1e-6
     spent: list[float] = []
     trace, health = None, {}
     try:
-        while len(spent) < runs and (not spent or sum(spent) < _ENOUGH_S):
+        while len(spent) < runs and (not spent or sum(spent) < _MAX_CPU_S):
             first = trace is None
             simulation, done = _run(placed, limit_s, first=first)
             if not first or runs == 1:
@@ -183,15 +183,15 @@ def measure(
 def saving(
     scene: Scene, simpler: Candidate, fuller: Candidate, *, runs: int, sensors: dict[str, Any], limit_s: float
 ) -> float:
-    """Part of the processor time of a fuller candidate that a simpler one saves, as both will run [1].
+    """Return the part of a fuller candidate's processor time that a simpler one saves, with the scene's sensors [1].
 
-    Medians of runs that take turns, so that what else the machine does falls on both; more than `runs` where they are
-    short. Both have been measured before, and are compiled.
+    Compares medians of alternating runs, so that other load affects both; short runs are repeated more than `runs`
+    times. Both candidates must have been measured before, so that they are compiled.
     """
     placed = [candidate.scene(scene, sensors=sensors) for candidate in (simpler, fuller)]
     spent: list[list[float]] = []
     total_s = 0.0
-    while total_s < (_ENOUGH_S if len(spent) < runs else _LEAST_S):
+    while total_s < (_MAX_CPU_S if len(spent) < runs else _MIN_COMPARISON_S):
         turn = [_run(each, limit_s)[1].cpu_s for each in placed]
         spent.append(turn)
         total_s += sum(turn)
@@ -200,7 +200,7 @@ def saving(
 
 
 def _run(placed: Scene, limit_s: float, *, first: bool = False) -> tuple[Simulation, Timed]:
-    """Run a scene: at first in short blocks, which cost, to notice a stall, and with its rows; else for the time."""
+    """Run a scene: the first time with rows and in short blocks, which detect a stall; later only for timing."""
     simulation = Simulation(placed)
     _ = simulation.first_row
     blocks = max(1, (GRID_TICKS if first else 100_000) // simulation.block_ticks)
@@ -231,7 +231,7 @@ def _trace(
 
 
 def _finely(scene: Scene, candidate: Candidate) -> Iterator[tuple[Simulation, int, np.ndarray]]:
-    """A run of its own with a row at every step, of an adaptive engine every 25 us: blocks, with the tick of each."""
+    """Yield blocks of a separate run, with their start ticks: a row per step, or every 25 us for an adaptive engine."""
     adaptive = ENGINES[candidate.engine].tolerance > 0.0
     step_us = min(candidate.step_us, _FINEST_ROW_US) if adaptive else candidate.step_us
     rate = 1_000_000 // step_us
@@ -243,7 +243,7 @@ def _finely(scene: Scene, candidate: Candidate) -> Iterator[tuple[Simulation, in
 
 
 def _rolls_from(scene: Scene, candidate: Candidate) -> float:
-    """When it begins to roll for good [s], nan where it does not."""
+    """Return the begin of lasting rolling [s]; NaN if there is none."""
     rolls = end = 0
     for simulation, start, rows in _finely(scene, candidate):
         loose = slides(rows, simulation.model.constants.shaft.radius) | (rows[:, COLUMN["penetration"]] <= 0.0)
@@ -254,7 +254,7 @@ def _rolls_from(scene: Scene, candidate: Candidate) -> float:
 
 
 def first_impact(scene: Scene, candidate: Candidate) -> float:
-    """Instant of the first contact [s], nan where there is none: from the gap, its rate and its acceleration before."""
+    """Return the time of first contact [s], extrapolated from gap, gap rate and acceleration; NaN if none."""
     last: np.ndarray | None = None
     for simulation, start, rows in _finely(scene, candidate):
         gap = rows[:, COLUMN["penetration"]]
@@ -268,7 +268,7 @@ def first_impact(scene: Scene, candidate: Candidate) -> float:
 
 
 def _crossing(rows: np.ndarray, tick: int, row_ticks: int) -> float:
-    """Where the gap closes after the last of some rows [s]."""
+    """Return the time at which the gap closes after the last row [s]."""
     if len(rows) == 0:
         return 0.0
     gap, rate = (float(rows[-1, COLUMN[name]]) for name in ("penetration", "penetration_rate"))
@@ -282,10 +282,10 @@ def _crossing(rows: np.ndarray, tick: int, row_ticks: int) -> float:
 
 
 def check_reads(scene: Scene, measured: Measurement) -> None:
-    """Check that a scene has the quantities asked for.
+    """Check that a scene has the requested quantities.
 
     Raises:
-        InputError: It has not.
+        InputError: If a quantity is missing.
     """
     for name, value in measured.values.items():
         if not isinstance(value, str) and not math.isfinite(value):

@@ -1,4 +1,4 @@
-"""A pick in a scene's file: only the table [pick] is replaced or added, all else stays as its author wrote it."""
+"""Pick in a scene file: the table [pick] is replaced or added, and the rest of the file stays unchanged."""
 
 from __future__ import annotations
 
@@ -16,27 +16,27 @@ _COMMENT = '# Written by `rig ladder`: what it measured. In force where the scen
 
 
 def check_target(path: Path, scene_name: str, scene: Scene) -> None:
-    """Check, before a long search, that a pick can be written into a file.
+    """Check, before a long search, that a pick can be written to a file.
 
     Raises:
-        InputError: It is no .toml file, or holds another scene than the one that is searched.
+        InputError: If it is no .toml file, or holds another scene than the one of the search.
     """
     if path.suffix != ".toml":
         raise InputError("--write", "a .toml file", str(path))
     source = path if path.is_file() else scene_path(scene_name)
     if pick_digests(_as_given(source)) != pick_digests(scene):
-        must = "the file of this very scene (changes by --set have to be in it)"
+        must = "the file of the same scene (it must contain the changes by --set)"
         raise InputError("--write", must, str(path))
 
 
 def write_pick(path: Path, scene_name: str, pick: Pick) -> None:
-    """Put a pick into a scene's file; a file that is not there yet becomes a copy of the scene's.
+    """Write a pick to a scene file; a file that does not exist becomes a copy of the scene's file.
 
     Raises:
-        InputError: The file cannot be edited safely.
+        InputError: If the file cannot be edited safely.
     """
     source = path if path.is_file() else scene_path(scene_name)
-    # newline="": line ends stay as they are.
+    # newline="" preserves line endings.
     with source.open(encoding="utf-8", newline="") as file:
         old = file.read()
     new = with_pick(old, pick)
@@ -45,10 +45,10 @@ def write_pick(path: Path, scene_name: str, pick: Pick) -> None:
 
 
 def with_pick(text: str, pick: Pick) -> str:
-    """A scene's text with the pick in it.
+    """Return a scene's text with the pick.
 
     Raises:
-        InputError: Something else than the table would change.
+        InputError: If anything outside the table would change.
     """
     tables: list[tuple[str, list[str]]] = [("", [])]
     for line in text.splitlines():
@@ -61,7 +61,7 @@ def with_pick(text: str, pick: Pick) -> str:
     kept = before
     for name, lines in tables:
         if name == "pick":
-            # Comments and blank lines behind its last entry are the next table's.
+            # Comments and blank lines after the last entry belong to the next table.
             last = max(n for n, line in enumerate(lines) if not _is_loose(line))
             kept, lines = after, lines[last + 1 :]
         kept += lines
@@ -76,7 +76,7 @@ def with_pick(text: str, pick: Pick) -> str:
     except tomllib.TOMLDecodeError:
         new_data = {}
     if new_data.pop("pick", None) is None or old_data != new_data:
-        raise InputError("--write", "a file whose [pick] stands in a table of its own", Words("text that hides it"))
+        raise InputError("--write", "a file with [pick] as a table of its own", Words("another form of the table"))
     return new
 
 
@@ -85,7 +85,7 @@ def _is_loose(line: str) -> bool:
 
 
 def pick_table(pick: Pick) -> str:
-    """The pick as TOML, with a table for each quantity."""
+    """Return the pick as TOML, with a table for each quantity."""
     data = pick.model_dump(mode="json")
     quantities = data.pop("quantities")
     lines = ["[pick]", _COMMENT, *_entries(data)]
@@ -95,7 +95,7 @@ def pick_table(pick: Pick) -> str:
 
 
 def _entries(data: dict[str, str | float | bool]) -> list[str]:
-    # Words, numbers and truth are written alike in both languages.
+    # JSON and TOML write strings, numbers and booleans in the same way.
     return [f"{key} = {json.dumps(value, ensure_ascii=False)}" for key, value in data.items()]
 
 

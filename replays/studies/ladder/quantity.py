@@ -1,4 +1,4 @@
-"""Quantities that a model can be judged by: each one number (or a word) of a run, with its unit and its phase."""
+"""Quantities that models are compared by: one number or word per run, with unit and phase."""
 
 from __future__ import annotations
 
@@ -15,49 +15,49 @@ from rig.physics.kernels.signals import COLUMN
 from rig.run.motion import DISSIPATED
 
 SETTLED = 0.25
-"""The settled phase is this last part of a run."""
+"""Part of a run, at its end, that is the settled phase."""
 ROLLS = 0.02
-"""A contact rolls while it slides by less than this part of the surface's speed ..."""
+"""Largest ratio of sliding speed to surface speed of a rolling contact."""
 STILL = 1e-4
-"""... or than this, as where the shaft stands and both are rounding [m/s]."""
+"""Sliding speed below which a contact counts as rolling even if the shaft stands still [m/s]."""
 LASTS = 0.5
-"""Contact lasts where it is more than this part of the settled phase: then it turns, or rests, and rolls or slides."""
+"""Part of the settled phase with contact above which the motion is a whirl or rest instead of bouncing."""
 STAYS = 0.95
-"""... and is for good from here on: a partial rub below."""
+"""Part of the settled phase with contact below which the motion is a partial rub."""
 SAME_SHARE = 0.1
-"""Parts of the settled phase in contact that are this close are the same outcome."""
+"""Largest difference of contact shares of equal outcomes."""
 Value = float | str
 
 
 class Trace(NamedTuple):
-    """What is kept of a run: rows on a grid of 1 ms, and what the engine has accumulated."""
+    """Record of a run: rows on a grid of 1 ms, and values accumulated by the engine."""
 
     times_s: np.ndarray
-    """Shape (n,)."""
+    """Times, shape (n,)."""
     rows: np.ndarray
-    """Shape (n, N_ROW)."""
+    """Rows, shape (n, N_ROW)."""
     peak_force: float
-    """By the engine's own steps [N]."""
+    """Largest contact force at the engine's own steps [N]."""
     clearance: float
-    """r0 [m]."""
+    """Clearance r0 [m]."""
     surface_radius: float
-    """R_S [m]."""
+    """Surface radius R_S [m]."""
     first_impact_s: float
-    """Located between steps [s]; nan where there is none or where nobody asked."""
+    """First impact, located between steps [s]; NaN if there is none or it was not requested."""
     rolls_s: float = math.nan
-    """When it begins to roll for good [s]; nan alike."""
+    """Begin of lasting rolling [s]; NaN likewise."""
 
     def column(self, name: str) -> np.ndarray:
-        """One signal, shape (n,)."""
+        """Return one signal, shape (n,)."""
         return self.rows[:, COLUMN[name]]
 
     def settled(self, name: str) -> np.ndarray:
-        """One signal in the settled phase."""
+        """Return one signal in the settled phase."""
         return self.column(name)[-self.settled_rows :]
 
     @property
     def settled_rows(self) -> int:
-        """Rows of the settled phase."""
+        """Number of rows in the settled phase."""
         return max(2, round(SETTLED * len(self.times_s)))
 
     @property
@@ -67,7 +67,7 @@ class Trace(NamedTuple):
 
 
 class Ending(NamedTuple):
-    """How a run ends: what its settled phase is like. A simpler model has to keep that, whatever it is asked for."""
+    """Outcome of a run in its settled phase, which a simpler model has to preserve."""
 
     touches: bool
     contact_share: float
@@ -79,7 +79,7 @@ class Ending(NamedTuple):
 
     @property
     def word(self) -> str:
-        """Flight, bounces, partial rub, resting, or a rolling or sliding whirl of either direction."""
+        """Outcome in words: flight, bounces, partial rub, resting, or rolling or sliding whirl of either direction."""
         if not self.touches or self.contact_share <= LASTS:
             return "bounces" if self.touches else "flight"
         if self.contact_share < STAYS:
@@ -88,7 +88,7 @@ class Ending(NamedTuple):
         return f"{rolls} {'forward' if self.turns > 0.0 else 'backward'} whirl" if abs(self.turns) >= 1.0 else "resting"
 
     def alike(self, other: Ending) -> bool:
-        """Whether both are one outcome; what lies on both sides of a word's limit, but close, is."""
+        """Return whether two outcomes are equal, allowing small differences across the limit between two names."""
         if self.touches != other.touches or abs(self.contact_share - other.contact_share) > SAME_SHARE:
             return False
         if min(self.contact_share, other.contact_share) <= LASTS:
@@ -99,21 +99,21 @@ class Ending(NamedTuple):
 
 
 def slides(rows: np.ndarray, surface_radius: float) -> np.ndarray:
-    """In which of some rows it slides, were it in contact."""
+    """Return for each row whether the shaft would slide if it were in contact."""
     surface_speed = surface_radius * np.abs(rows[:, COLUMN["theta_rate"]])
     return np.abs(rows[:, COLUMN["sliding_speed"]]) > np.maximum(ROLLS * surface_speed, STILL)
 
 
 def rolls_from(times_s: np.ndarray, rows: np.ndarray, surface_radius: float) -> float:
-    """When it begins to roll for good, by the rows of a whole run [s]; nan where it does not."""
+    """Return the begin of lasting rolling in the rows of a whole run [s]; NaN if there is none."""
     loose = np.flatnonzero(slides(rows, surface_radius) | (rows[:, COLUMN["penetration"]] <= 0.0))
     first = int(loose[-1]) + 1 if len(loose) else 0
     return float(times_s[first]) if first < len(times_s) else math.nan
 
 
 def ending(trace: Trace) -> Ending:
-    """How a run ends."""
-    # By the impulse: an impact law touches without being in contact at any instant.
+    """Return the outcome of a run."""
+    # Contact by the impulse: with an impact law, no instant lies within a contact.
     pushed = np.diff(trace.settled("contact_impulse")) > 0.0
     angle = phase(trace.settled("ring_x"), trace.settled("ring_y"))
     rolls = ~slides(trace.rows[-trace.settled_rows :], trace.surface_radius)
@@ -127,16 +127,16 @@ def ending(trace: Trace) -> Ending:
 
 @dataclass(frozen=True)
 class Quantity:
-    """One quantity.
+    """A quantity of a run.
 
     Attributes:
-        name: Its name on the command line.
+        name: Name on the command line.
         unit: Unit, "" for a word.
-        phase: Part of the run that it belongs to.
-        title: What it is and how it is read.
-        read: Reads it off a run; nan where the run has none.
-        needs_force: True where a rigid impact, which has no force over time, cannot give it.
-        resolution: Of the reading itself [unit].
+        phase: Part of the run that it is computed from.
+        title: Definition.
+        read: Function that computes it from a run; NaN if the run has none.
+        needs_force: True if a rigid impact, which has no force over time, cannot provide it.
+        resolution: Resolution of the evaluation [unit].
     """
 
     name: str
@@ -148,7 +148,7 @@ class Quantity:
     resolution: float = 0.0
 
     def error(self, value: Value, reference: Value) -> float:
-        """Distance of a value from the reference's as a part of the latter; infinite where one of them has none."""
+        """Return the relative distance of a value from the reference's; infinite if one of them is missing."""
         if isinstance(value, str) or isinstance(reference, str):
             return 0.0 if value == reference else math.inf
         if value == reference:

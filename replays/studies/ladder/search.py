@@ -1,9 +1,9 @@
-"""Down the ladder: one level at a time from the full model, then what passes together, then the cheapest engine.
+"""Search down the ladder: single levels below the full model, then the passing ones together, then the cheapest engine.
 
-Never all combinations, and never the sum of single errors: what is picked has been run. Model errors compare converged
-runs; numerical errors compare one model on two engines; the total compares the pick with the full model's reference.
-Whatever is asked for, a pick ends as the full model does, and leaves out only what saves more than a tenth of its cost:
-processor time as it will run, with the scene's sensors.
+The search never runs all combinations and never adds single errors; the pick itself has been run. Model errors compare
+converged runs, numerical errors compare one model on two engines, and the total error compares the pick with the
+reference of the full model. Every pick has the same outcome as the full model, and omits only what saves more than a
+tenth of its cost: processor time with the scene's sensors.
 """
 
 from __future__ import annotations
@@ -26,27 +26,27 @@ LEVELS: dict[str, tuple[str, ...]] = {
     **{name: get_args(entry.annotation) for name, entry in ModelLevels.model_fields.items()},
     "drive": ("ideal", "torque"),
 }
-"""Choices of every level, the simplest first."""
+"""Choices of every level, simplest first."""
 SENSORS = "sensors"
 KEEPABLE = (*LEVELS, SENSORS)
 STAND_INS = ("smoothed", "switch")
-"""Friction laws that stand in for the exact one: measured, not picked, for they spare no work."""
+"""Friction laws that approximate the exact one: measured but not picked, because they save no work."""
 WORTH = 0.1
-"""What is left out saves more than this part of the cost; costs this close are the same."""
+"""Part of the cost that a simpler level must save; smaller differences of cost count as equal."""
 _SPARE = 0.2
-"""Part of the budget that is left to the verification."""
+"""Part of the budget that is reserved for the verification."""
 
 
 @dataclass(frozen=True)
 class Errors:
-    """Errors of one candidate by quantity, as parts of their scales; empty where a part was not asked for."""
+    """Relative errors of one candidate by quantity; empty for kinds of error that were not computed."""
 
     model: dict[str, float] = field(default_factory=dict)
     numerical: dict[str, float] = field(default_factory=dict)
     total: dict[str, float] = field(default_factory=dict)
 
     def worst(self, tolerances: dict[str, float]) -> float:
-        """The largest of all in units of the tolerance, infinite where a quantity cannot be given."""
+        """Return the largest error in units of the tolerance; infinite if a quantity is missing."""
         ratios = [
             value / tolerances[name]
             for errors in (self.model, self.numerical, self.total)
@@ -58,7 +58,7 @@ class Errors:
 
 @dataclass(frozen=True)
 class Step:
-    """One thing tried."""
+    """One candidate of the search and its verdict."""
 
     stage: str
     label: str
@@ -66,30 +66,30 @@ class Step:
     errors: Errors
     passes: bool
     cost: Measurement | None = None
-    """As it will run, where `measured` is a converged run."""
+    """Measurement with the scene's sensors, if `measured` is a converged run."""
     note: str = ""
 
 
 @dataclass(frozen=True)
 class Ladder:
-    """What a search has found.
+    """Result of a search.
 
     Attributes:
-        scene: The scene as it is given.
-        tolerances: By quantity.
-        reference: The full model, converged.
-        unlike: The same by the unlike engine.
-        reference_errors: Their distance.
-        steps: Everything tried, in order.
-        picked: What is picked, as it will run.
-        picked_errors: Its errors.
-        savings: By level left out, the part of the cost that this saves.
-        given: The scene as it is given.
-        given_errors: Its total errors.
-        full: The full model on the engine of the reference, with the scene's own sensors.
-        sensors: The chain that is picked.
+        scene: The scene as given.
+        tolerances: Tolerances by quantity.
+        reference: Converged run of the full model.
+        unlike: The same on the cross-check engine.
+        reference_errors: Distance between the two.
+        steps: All candidates in order.
+        picked: The pick, with the scene's sensors.
+        picked_errors: Errors of the pick.
+        savings: Part of the cost saved by each omitted level.
+        given: The scene as given.
+        given_errors: Total errors of the scene as given.
+        full: The full model on the reference engine, with the scene's own sensors.
+        sensors: Sensor chain of the pick.
         spent_s: Wall time of the search [s].
-        complete: False where the budget ended the search of engines.
+        complete: False if the budget ended the search of engines.
     """
 
     scene: Scene
@@ -121,15 +121,15 @@ def search(
     """Find the cheapest model, engine and step that meets every tolerance.
 
     Args:
-        scene: The scene as it is given.
-        tolerances: Error allowed to each quantity, as a part of its scale.
+        scene: The scene as given.
+        tolerances: Allowed relative error of each quantity.
         keep: Levels that stay as full as they are.
         runs: Timed runs of each candidate.
         budget_s: Wall time [s].
-        progress: Told what is tried.
+        progress: Function that receives each candidate's name.
 
     Raises:
-        InputError: The scene has no such quantity or ends in no certain way, the tolerance is below the reference's own
+        InputError: If the scene has no such quantity or no certain outcome, the tolerance is below the reference's own
             error, no combination meets it, or the budget ends before there is a pick.
     """
     for name in keep:
@@ -178,7 +178,7 @@ def search(
 
 @dataclass
 class _Work:
-    """A search under way: what is asked, and everything tried so far."""
+    """State of a search: settings, and all candidates until now."""
 
     scene: Scene
     tolerances: dict[str, float]
@@ -186,62 +186,62 @@ class _Work:
     budget_s: float
     progress: Callable[[str], None]
     sensors: dict[str, Any]
-    """As the pick will run."""
+    """Sensor settings of the pick."""
     steps: list[Step] = field(default_factory=list)
     _begin: float = field(default_factory=time.perf_counter)
 
     @property
     def spent_s(self) -> float:
-        """Wall time so far [s]."""
+        """Wall time spent [s]."""
         return time.perf_counter() - self._begin
 
     @property
     def left_s(self) -> float:
-        """What is left of the budget [s]."""
+        """Remaining part of the budget [s]."""
         return self.budget_s - self.spent_s
 
     def run(self, candidate: Candidate, **options: Any) -> Measurement:
-        """Measure a candidate while there is time."""
+        """Measure a candidate if there is time left."""
         if self.left_s <= 0.0:
-            raise InputError("--budget-s", "longer: it ended before there was a pick", self.budget_s)
+            raise InputError("--budget-s", "longer: the time ended before there was a pick", self.budget_s)
         options = {"runs": self.runs, "limit_s": self.left_s, **options}
         return measure(self.scene, candidate, list(self.tolerances), **options)
 
     def cost(self, candidate: Candidate) -> Measurement:
-        """A model as it will run, on the first engine that takes it, at that engine's own step."""
+        """Measure a model with the scene's sensors, on the first engine that supports it, at its own step."""
         return self.run(self.usual(candidate), sensors=self.sensors)
 
     def usual(self, candidate: Candidate) -> Candidate:
-        """A model on the first engine that takes it."""
+        """Return a model on the first engine that supports it."""
         engine = next(engine for engine in ENGINES if settings.takes(engine, candidate))
         return candidate.with_engine(*settings.usual(self.scene, candidate, engine))
 
     def saving(self, simpler: Candidate, fuller: Candidate) -> float:
-        """Part of the cost of the fuller one that the simpler one saves."""
+        """Return the part of the fuller candidate's cost that the simpler one saves."""
         return saving(self.scene, simpler, fuller, runs=self.runs, sensors=self.sensors, limit_s=self.left_s)
 
 
 class _Standard(NamedTuple):
-    """What everything is held against."""
+    """Reference that candidates are compared with."""
 
     full: Candidate
     reference: Measurement
     unlike: Measurement
     errors: dict[str, float]
-    """What the reference itself may be wrong by."""
+    """Error of the reference itself."""
     allowed: dict[str, float]
-    """The tolerances less that."""
+    """Tolerances minus the reference's own error."""
 
     def against(self, values: dict[str, Value], others: dict[str, Value]) -> dict[str, float]:
-        """Errors of some values against others."""
+        """Return the errors of values against others."""
         return {name: QUANTITIES[name].error(values[name], others[name]) for name in values}
 
     def model_errors(self, converged: Measurement) -> Errors:
-        """Errors of a model by a converged run of it."""
+        """Return the errors of a model from its converged run."""
         return Errors(model=self.against(converged.values, self.reference.values))
 
     def all_errors(self, done: Measurement, best: Measurement) -> Errors:
-        """Errors of an engine's run of the picked model."""
+        """Return the errors of an engine's run of the picked model."""
         return Errors(
             self.against(best.values, self.reference.values),
             self.against(done.values, best.values),
@@ -258,7 +258,7 @@ class _Standard(NamedTuple):
         cost: Measurement | None = None,
         note: str = "",
     ) -> Step:
-        """One thing tried, with its verdict: errors within the tolerances, and the outcome of the full model."""
+        """Return a candidate with its verdict: errors within the tolerances, and the outcome of the full model."""
         alike = _alike(measured, self.reference)
         passes = not measured.failure and errors.worst(self.allowed) <= 1.0 and alike
         if not alike and measured.ending is not None:
@@ -267,17 +267,17 @@ class _Standard(NamedTuple):
 
 
 def _standard(work: _Work) -> _Standard:
-    """The full model by two unlike engines.
+    """Run the full model on two different engines.
 
     Raises:
-        InputError: One of them fails, they end in different ways or hardly agree on a quantity, the scene has no such,
-            or a tolerance is finer than their distance.
+        InputError: If one fails, the outcomes differ, a quantity is missing or uncertain, or a tolerance is below the
+            distance between them.
     """
-    # Of model levels the last choice is full, of the drive the scene's own.
+    # For model levels the last choice is the full one; the drive stays the scene's own.
     levels: Any = {name: choices[-1] for name, choices in LEVELS.items() if name != "drive"}
     full = Candidate(ModelLevels(**levels), work.scene.drive.mode, *settings.REFERENCE)
     other = full.with_engine(*settings.finest(settings.UNLIKE))
-    work.progress(f"full model, {full.method}, and {other.method} beside it")
+    work.progress(f"full model, {full.method}, and {other.method} for comparison")
     reference = work.run(full)
     unlike = work.run(other, runs=1)
     for measured in (reference, unlike):
@@ -287,7 +287,7 @@ def _standard(work: _Work) -> _Standard:
     check_reads(work.scene, reference)
     if not _alike(reference, unlike):
         endings = [measured.ending.word for measured in (reference, unlike) if measured.ending]
-        must = f"one that two accurate engines end alike ({' and '.join(endings)} are chance)"
+        must = f"one with the same outcome on two accurate engines ({' and '.join(endings)} depend on chance)"
         raise InputError("scene", must, work.scene.name)
     standard = _Standard(full, reference, unlike, {}, {})
     distances = standard.against(unlike.values, reference.values)
@@ -303,7 +303,7 @@ def _standard(work: _Work) -> _Standard:
 
 
 def _resolution(name: str, reference: Measurement) -> float:
-    """What the reading itself leaves open, as a part of the scale."""
+    """Return the resolution of a quantity, relative to its value."""
     quantity, value = QUANTITIES[name], reference.values[name]
     if quantity.resolution == 0.0 or isinstance(value, str) or value == 0.0:
         return 0.0
@@ -311,7 +311,7 @@ def _resolution(name: str, reference: Measurement) -> float:
 
 
 def _one_at_a_time(work: _Work, standard: _Standard, keep: tuple[str, ...]) -> dict[str, dict[str, float]]:
-    """Lower every level alone; by level, the choices that pass, each with its worst error."""
+    """Lower every level alone, and return for each level the choices that pass, with their largest errors."""
     full, steps = standard.full, work.steps
     top = work.cost(full)
     steps.append(standard.step("full", "full model", standard.reference, Errors(total=standard.errors), cost=top))
@@ -334,7 +334,7 @@ def _one_at_a_time(work: _Work, standard: _Standard, keep: tuple[str, ...]) -> d
 def _together(
     work: _Work, standard: _Standard, single: dict[str, dict[str, float]], chosen: dict[str, str]
 ) -> tuple[dict[str, str], Measurement]:
-    """Lower some levels together; while they fail together the worst goes back up. What is left, and it converged."""
+    """Lower some levels together, raising the worst one while they fail; return the rest and its converged run."""
     while True:
         combined = standard.full.with_model(**chosen)
         label = ", ".join(f"{level} {choice}" for level, choice in chosen.items()) or "full model"
@@ -349,13 +349,13 @@ def _together(
 
 
 def _above(single: dict[str, dict[str, float]], chosen: dict[str, str], level: str) -> list[str]:
-    """What passes alone of a level and is fuller than what is chosen, but for the full choice."""
+    """Return the passing choices of a level that are fuller than the chosen one, without the full choice."""
     choices = list(single[level])
     return choices[choices.index(chosen[level]) + 1 :]
 
 
 def _raised(chosen: dict[str, str], level: str, choice: str | None) -> dict[str, str]:
-    """The same with a fuller choice of a level, None for the full one, which is not left out."""
+    """Return the chosen levels with a fuller choice of one level; None selects the full choice."""
     others = {name: other for name, other in chosen.items() if name != level}
     return others if choice is None else {**chosen, level: choice}
 
@@ -367,17 +367,17 @@ def _put_back(
     chosen: dict[str, str],
     setting: Candidate | None,
 ) -> tuple[dict[str, str], dict[str, float]]:
-    """Put back what saves no more than a tenth: of each level the fullest choice that costs as good as the same.
+    """Put back levels that save no more than a tenth of the cost, each at the fullest choice of equal cost.
 
     Args:
         work: The search.
-        standard: What everything is held against.
-        single: By level, what passes alone.
-        chosen: By level, what is left out now.
-        setting: Engine and step that are picked; None for the usual ones.
+        standard: Reference of the comparison.
+        single: Choices that pass alone, by level.
+        chosen: Lowered levels.
+        setting: Engine and step of the pick; None for the default ones.
 
     Returns:
-        What is still left out, and how much of the cost each of that saves.
+        Levels that stay lowered, and the part of the cost that each saves.
     """
     savings: dict[str, float] = {}
 
@@ -401,10 +401,10 @@ def _put_back(
 
 
 def _engines(work: _Work, standard: _Standard, best: Measurement) -> tuple[list[tuple[Step, int]], bool]:
-    """Engines and steps, the finest first: a setting holds only if every finer one of its engine holds.
+    """Run engines and steps, finest first; a setting passes only if all finer ones of its engine pass.
 
     Returns:
-        What passes, with the engine's place among all, and whether every engine was tried.
+        Passing steps, each with the engine's index, and whether every engine was tried.
     """
     passing: list[tuple[Step, int]] = []
     complete = True
@@ -415,7 +415,8 @@ def _engines(work: _Work, standard: _Standard, best: Measurement) -> tuple[list[
                 break
             candidate = best.candidate.with_engine(engine, step_us, tolerance)
             work.progress(candidate.method)
-            # What takes far longer than the reference may be a stall; the finest of small fixed steps takes five times.
+            # A run much longer than the reference may be a stall; the finest of small fixed steps takes five times as
+            # long.
             limit_s = max(1.0, 10.0 * standard.reference.cpu_s * work.scene.duration_s)
             done = work.run(candidate, sensors=work.sensors, limit_s=limit_s)
             step = standard.step("engine", candidate.method, done, standard.all_errors(done, best))
@@ -427,13 +428,13 @@ def _engines(work: _Work, standard: _Standard, best: Measurement) -> tuple[list[
 
 
 def _cheapest(work: _Work, passing: list[tuple[Step, int]]) -> Step:
-    """The cheapest of what passes.
+    """Return the cheapest passing step.
 
     Raises:
-        InputError: Nothing does.
+        InputError: If none passes.
     """
     if not passing:
-        must = "wider: no engine meets it on the levels that do"
+        must = "wider: no engine meets it on the passing levels"
         raise InputError("--tolerance", must, list(work.tolerances.values()))
     least = min(step.measured.cpu_s for step, _ in passing)
     near = [entry for entry in passing if (1.0 - WORTH) * entry[0].measured.cpu_s <= least]
@@ -441,7 +442,7 @@ def _cheapest(work: _Work, passing: list[tuple[Step, int]]) -> Step:
 
 
 def _as_given(work: _Work, standard: _Standard) -> Step:
-    """The scene's own model, engine and step, as they would run in the place of the pick."""
+    """Run the scene's own model, engine and step for comparison with the pick."""
     own = settings.as_given(work.scene)
     work.progress("the scene as it is given")
     converged, done = work.run(settings.converged(own), runs=1), work.run(own, sensors=work.sensors)
@@ -450,7 +451,7 @@ def _as_given(work: _Work, standard: _Standard) -> Step:
 
 
 def _preference(entry: tuple[Step, int]) -> tuple[float, ...]:
-    """Among equals the earlier engine, then the longer step, then the wider tolerance."""
+    """Return the sort key of equally cheap steps: earlier engine, longer step, wider tolerance."""
     step, place = entry
     return place, -step.measured.candidate.step_us, -step.measured.candidate.tolerance
 

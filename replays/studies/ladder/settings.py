@@ -1,4 +1,4 @@
-"""Engines and steps for a candidate: the reference's, those that stand beside it, those that are tried."""
+"""Engines and steps for a candidate: the reference's, the cross-check's, and those of the search."""
 
 from __future__ import annotations
 
@@ -9,39 +9,39 @@ from rig.run.scenes import Scene
 
 REFERENCE = ("rk8", 25, 1e-10)
 UNLIKE = "split"
-"""Another method at its finest; it converges the models that the reference's cannot take."""
+"""Engine for the cross-check, at its finest setting; also converges models that the reference engine cannot run."""
 _FINEST = 1e-3
-"""Of an engine's own tolerance; an engine without one is at its finest with steps of 1 us."""
+"""Factor on an engine's own tolerance for its finest setting; a fixed-step engine uses steps of 1 us."""
 _GRIDS = (1000, 500, 250, 200, 125, 100, 50, 25, 20, 10, 5)
 _STEPS = (1, 2, 5, 10, 20, 25, 40, 50, 100)
 
 
 def takes(engine: str, candidate: Candidate) -> bool:
-    """Whether an engine takes a model."""
+    """Return whether an engine supports a model."""
     method = ENGINES[engine]
     return candidate.levels.friction in method.frictions and candidate.levels.contact in method.contacts
 
 
 def converged(candidate: Candidate) -> Candidate:
-    """A model on the engine of the reference, or on the unlike one at its finest where that cannot take it."""
+    """Return a model on the reference engine, or on the cross-check engine if the former does not support it."""
     return candidate.with_engine(*(REFERENCE if takes(REFERENCE[0], candidate) else finest(UNLIKE)))
 
 
 def finest(engine: str) -> tuple[str, int, float]:
-    """An engine at its finest."""
+    """Return an engine at its finest setting."""
     method = ENGINES[engine]
     return (engine, method.step_us, _FINEST * method.tolerance) if method.tolerance else (engine, 1, 0.0)
 
 
 def usual(scene: Scene, candidate: Candidate, engine: str) -> tuple[str, int, float]:
-    """An engine at its own tolerance, and its own step or the longest below it that fits the sample rates."""
+    """Return an engine at its own tolerance and step, or at the longest shorter step that fits the sample rates."""
     method = ENGINES[engine]
     steps = (step for step in _GRIDS if step <= method.step_us and _fits(scene, candidate, engine, step))
     return engine, next(steps, method.step_us), method.tolerance
 
 
 def as_given(scene: Scene) -> Candidate:
-    """The scene's own model, engine and step."""
+    """Return the scene's own model, engine and step."""
     engine = scene.engine
     return Candidate(
         scene.model, scene.drive.mode, engine.name, engine.step_us, engine.tolerance, companion=engine.companion
@@ -49,7 +49,7 @@ def as_given(scene: Scene) -> Candidate:
 
 
 def tried(scene: Scene, candidate: Candidate) -> dict[str, list[tuple[int, float]]]:
-    """Steps, or tolerances, of every engine that takes a model and fits the sample rates, the finest first."""
+    """Return steps and tolerances, finest first, of every engine that supports a model and fits the sample rates."""
     found: dict[str, list[tuple[int, float]]] = {}
     for engine, method in ENGINES.items():
         if not takes(engine, candidate):

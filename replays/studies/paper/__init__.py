@@ -1,1 +1,1 @@
-"""The paper's figures, tables and claims, made again by the rig and judged by number."""
+"""Reproduction of the paper: its figures, tables and claims, computed by the rig and compared by number."""

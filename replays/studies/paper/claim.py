@@ -1,4 +1,4 @@
-"""The paper's conclusion as a claim: what moves the force toward the measured one, and what does not."""
+"""The paper's conclusion as a claim: which changes move the force toward the measured one."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ CORRECTIONS = {
     "house.pair_stiffness_horizontal": "E/W pair of eq. 24",
     "house.gap_counts_outer": "gap of eqs. 13, 14, 40",
 }
-"""What each parameter in which `corrected` differs from `as-printed` puts right."""
+"""Corrections by parameter in which `corrected` differs from `as-printed`."""
 SCALES = (0.1, 0.3, 1.0, 3.0, 10.0)
-"""Factors on the stiffness and damping of the houses' supports: more is less mobile."""
+"""Factors on stiffness and damping of the houses' supports; larger ones reduce the mobility."""
 BANDWIDTHS_HZ = (50.0, 100.0, 200.0, 500.0, 1000.0, 4900.0)
 ENDS = ("low", "high")
 LAWS = ("exact", "lankarani-nikravesh", "none", "hunt-crossley", "flores", "kelvin-voigt")
@@ -39,16 +39,16 @@ Results = dict[str, list[Outcome]]
 
 
 def correction_keys() -> list[str]:
-    """Parameters in which `corrected` differs from `as-printed`."""
+    """Return the parameters in which `corrected` differs from `as-printed`."""
     printed, corrected = (load_parameters(name).entries for name in ("as-printed", "corrected"))
     return [key for key, entry in corrected.items() if entry.value != printed[key].value]
 
 
 def claim_groups(*, ensemble: int) -> Groups:
-    """Every pulse that the claim is tested with, by group; a group of one thing holds it at `ensemble` phases.
+    """Return every pulse for testing the claim, by group; a group of one change contains it at `ensemble` shaft phases.
 
     Args:
-        ensemble: Places of the shaft's turn.
+        ensemble: Number of shaft phases.
     """
     corrected = load_parameters("corrected").entries
     base = Pulse(label="corrected")
@@ -69,7 +69,7 @@ def claim_groups(*, ensemble: int) -> Groups:
         groups[f"law {law}"] = phases(replace(base, label=law, changes=changes), ensemble)
     groups["bandwidth"] = [replace(base, label=f"{hz:g} Hz", changes={BANDWIDTH: hz}) for hz in BANDWIDTHS_HZ]
     for entry, low, high in one_at_a_time():
-        # Where the pulse falls in the turn is a value of its own: with phases it would be lost.
+        # The phase of the pulse is itself an assumed value, so it is not varied here.
         alone = entry.key == "hammer.at"
         groups[f"low {entry.key}"] = [low] if alone else phases(low, ensemble)
         groups[f"high {entry.key}"] = [high] if alone else phases(high, ensemble)
@@ -77,18 +77,18 @@ def claim_groups(*, ensemble: int) -> Groups:
 
 
 def supports(scale: float) -> dict[str, Any]:
-    """Stiffness and damping of all supports of the houses, scaled."""
+    """Return scaled stiffness and damping of all supports of the houses."""
     corrected = load_parameters("corrected").entries
     return {key: float(corrected[key].value) * scale for key in HOUSE_KEYS}
 
 
 def less_mobile() -> dict[str, dict[str, Any]]:
-    """Houses that give way less, by name."""
+    """Return less mobile houses by name."""
     return {"× 3": supports(3.0), "× 10": supports(10.0), "rigid": {"model.stator": "rigid"}}
 
 
 def alternatives() -> dict[str, Pulse]:
-    """Other readings of the model and of printed values."""
+    """Return other readings of the model and of printed values."""
     return {
         "house rigid": Pulse(changes={"model.stator": "rigid"}),
         "outer house fixed": Pulse(changes={"model.stator": "inner-house"}),
@@ -100,7 +100,7 @@ def alternatives() -> dict[str, Pulse]:
 
 
 def median(results: list[Outcome], name: str) -> float:
-    """Over a group, of the runs that have the number; nan where none has."""
+    """Return the median over the runs of a group that have the number; NaN if none has."""
     values = column(results, name)
     values = values[np.isfinite(values)]
     return float(np.median(values)) if len(values) else math.nan
@@ -108,7 +108,7 @@ def median(results: list[Outcome], name: str) -> float:
 
 @dataclass(frozen=True)
 class Bar:
-    """One line of the tornado: what the force becomes by a change, or at both ends of a range."""
+    """A bar of the tornado chart: the force after a change, or at both ends of a range."""
 
     name: str
     kind: str
@@ -116,21 +116,21 @@ class Bar:
 
     @property
     def width(self) -> float:
-        """Between the ends and the base, given with them."""
+        """Distance between the smallest and the largest value, including the base."""
         there = [value for value in self.values if math.isfinite(value)]
         return max(there) - min(there) if there else 0.0
 
 
-_MOST_BARS = 16
+_MAX_BARS = 16
 _ENDS = (("white", "low end, or as printed"), (BLACK, "high end, or put right"))
-"""Fill of the mark at either end of a line, and what the end is."""
+"""Fill colour and meaning of the marks at the ends of a bar."""
 COLOURS = {"assumed value": ORANGE, "correction": BLUE, "house": GREEN, "other reading": SKY}
 
 
 def bars(results: Results, quantity: str) -> list[Bar]:
-    """All lines of the tornado for one number, widest first.
+    """Return all bars of the tornado chart for one number, widest first.
 
-    A correction goes from `as-printed` to it alone put right; all else from `corrected`.
+    A correction starts from `as-printed` and changes one parameter; all other bars start from `corrected`.
     """
     base, printed = (median(results[f"base {name}"], quantity) for name in ("corrected", "as-printed"))
 
@@ -150,13 +150,13 @@ def bars(results: Results, quantity: str) -> list[Bar]:
 
 
 def toward_measured(found: list[Bar]) -> list[Bar]:
-    """Lines of which an end is no higher than the last label of the measured axis."""
+    """Return the bars with an end below the last label of the measured axis."""
     return [bar for bar in found if any(value <= MEASURED_N for value in bar.values)]
 
 
 @house_style()
 def draw_tornado(results: Results, spread: list[Outcome]) -> Figure:
-    """What each change makes of the force in whirl and of the highest reaction."""
+    """Draw the effect of each change on the force in whirl and on the highest reaction."""
     from matplotlib.patches import Patch
 
     figure = new_figure(11.6, "What moves the force: one change at a time (ranges of assumed values are assumed)")
@@ -170,13 +170,13 @@ def draw_tornado(results: Results, spread: list[Outcome]) -> Figure:
         ),
     }
     for axes, (quantity, (label, level, text)) in zip(panels, shown.items(), strict=True):
-        _draw_bars(axes, bars(results, quantity)[:_MOST_BARS][::-1], level)
+        _draw_bars(axes, bars(results, quantity)[:_MAX_BARS][::-1], level)
         values = column(spread, quantity)
         values = values[np.isfinite(values)]
         if len(values):
             low, middle, high = np.percentile(values, [5, 50, 95])
-            told = f"all assumed values at once:\n{low:.0f} to {high:.0f} N (5 to 95 %)"
-            axes.axvspan(low, high, color="0.93", zorder=0, label=told)
+            text_5_95 = f"all assumed values at once:\n{low:.0f} to {high:.0f} N (5 to 95 %)"
+            axes.axvspan(low, high, color="0.93", zorder=0, label=text_5_95)
             axes.axvline(middle, color="0.6", lw=1.0, zorder=0)
         axes.axvline(median(results["base corrected"], quantity), color=BLACK, lw=1.2, label="corrected")
         axes.axvline(median(results["base as-printed"], quantity), color=BLUE, lw=1.4, ls=":", label="as-printed")
@@ -190,14 +190,14 @@ def draw_tornado(results: Results, spread: list[Outcome]) -> Figure:
 
 
 def _draw_bars(axes: Any, widest: list[Bar], level: float) -> None:
-    """The lines of a tornado, with the ends that a change leads from and to."""
+    """Draw the bars of a tornado chart, with marks at the ends of each change."""
     ends = [level, *(value for bar in widest for value in bar.values if math.isfinite(value))]
     room = 0.05 * (max(ends) - min(ends))
     for row, bar in enumerate(widest):
         there = [value for value in bar.values if math.isfinite(value)]
         if not there:
             continue
-        # A little width for a bar that does not move at all.
+        # A minimum width keeps bars without an effect visible.
         axes.barh(row, max(bar.width, 0.05 * room), left=min(there), height=0.62, color=COLOURS[bar.kind])
         for end, (fill, _) in zip((bar.values[0], bar.values[-1]), _ENDS, strict=True):
             if bar.kind != "other reading" and math.isfinite(end):
@@ -208,7 +208,7 @@ def _draw_bars(axes: Any, widest: list[Bar], level: float) -> None:
 
 @house_style()
 def draw_spread(parts: np.ndarray, spread: list[Outcome]) -> Figure:
-    """Distributions with all assumed values spread at once, and what each value has to do with them."""
+    """Draw the distributions with all assumed values varied together, and the rank correlation of each value."""
     figure = new_figure(8.4, f"All assumed values at once: Latin hypercube, {len(spread)} runs")
     panels = figure.subplots(2, 2).ravel()
     shown = {
@@ -245,7 +245,7 @@ def draw_spread(parts: np.ndarray, spread: list[Outcome]) -> Figure:
 
 @house_style()
 def draw_mobility(results: Results) -> Figure:
-    """Peak force, impacts, time to roll and whirl force over the stiffness of the houses' supports."""
+    """Draw peak force, impacts, time to roll and whirl force over the stiffness of the houses' supports."""
     figure = new_figure(7.2, "Mobility of the houses: stiffness and damping of all supports scaled")
     panels = figure.subplots(2, 2, sharex=True)
     shown = {

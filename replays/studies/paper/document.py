@@ -1,7 +1,6 @@
-"""The report: everything is run, then judged, then written down; no number in it is written by hand.
+"""Report of the reproduction: runs, verdicts, and text whose numbers are all computed.
 
-What it says stands in `report.jinja`, beside the statements that it judges; here are the numbers, tables and pictures
-that the text names.
+The text is in `report.jinja`, next to the statements it discusses; this module provides numbers, tables and pictures.
 """
 
 from __future__ import annotations
@@ -57,18 +56,18 @@ _PRINT = (
     (re.compile(r"\^(\w)"), r"^{\1}"),
     (re.compile(r"(?<=\d) count$"), ""),
 )
-"""As in print: R_S with its letter lowered, but no parameter's name; powers; minus signs; a count has no unit."""
+"""Typesetting: subscripts (R_S, but not names of parameters), powers, minus signs; a count has no unit."""
 _CELLS = " | "
-"""Between the cells of a table in the text."""
+"""Separator of table cells in the text."""
 
 
 def write_up(findings: Findings, *, quick: bool, origin: Mapping[str, str] | None = None) -> Report:
-    """The report of what was found.
+    """Return the report on the findings.
 
     Args:
-        findings: What was found.
-        quick: Whether in few, short runs.
-        origin: What the report is made by, each by name.
+        findings: The findings.
+        quick: Whether they come from few, short runs.
+        origin: Sources of the report by name.
     """
     import jinja2
 
@@ -98,7 +97,7 @@ def write_up(findings: Findings, *, quick: bool, origin: Mapping[str, str] | Non
 
 
 def in_print(text: str) -> str:
-    """Lines as one, with symbols, powers of ten and signs as they are set in print."""
+    """Join the lines of a text and typeset its symbols, powers of ten and signs."""
     words = " ".join(text.split())
     for written, printed in _PRINT:
         words = written.sub(printed, words)
@@ -106,13 +105,13 @@ def in_print(text: str) -> str:
 
 
 def _printed(content: Content) -> Content:
-    """The same of a table's cells."""
+    """Typeset the cells of a table."""
     rows = [Row(tuple(map(in_print, row.cells)), row.mark) for row in content.rows]
     return Content(tuple(map(in_print, content.headings)), rows)
 
 
 def _add_table(report: Report, block: str) -> None:
-    """A table that stands in the text: caption, headings, rows; an indented line goes on with the one before."""
+    """Add a table from the text: caption, headings, rows; an indented line continues the previous one."""
     lines = re.sub(r"\n\s+", " ", block).split("\n")
     first = next(n for n, line in enumerate(lines) if _CELLS in line)
     headings, *rows = ([in_print(cell) for cell in line.split(_CELLS)] for line in lines[first:])
@@ -120,7 +119,7 @@ def _add_table(report: Report, block: str) -> None:
 
 
 def _place(report: Report, findings: Findings, placed: re.Match[str]) -> None:
-    """Put a picture, a table, or the statements on some quantities, where the text names it."""
+    """Insert a picture, a table or statements at their place in the text."""
     name, caption = placed["name"], placed["caption"]
     if placed["kind"] == "picture":
         report.picture(_PICTURES[name](findings), caption)
@@ -152,17 +151,17 @@ _PICTURES: dict[str, Callable[[Findings], Figure]] = {
 
 
 def draw_pictures(findings: Findings, folder: Path) -> list[Path]:
-    """Write the pictures that tell most, as PNG files in a folder.
+    """Write the most important pictures as PNG files to a folder.
 
     Raises:
-        OSError: The disk refused.
+        OSError: If a file cannot be written.
     """
     drawn = {name: _PICTURES[name](findings) for name in ("verdicts", "tornado", "conditions", "drop")}
     return [path for name, each in drawn.items() for path in save(each, folder / f"paper-{name}.png")]
 
 
 def _numbers(findings: Findings) -> dict[str, Any]:
-    """What the text is filled with."""
+    """Return the values for the template."""
     results, found = findings.results, findings.found
     return {
         "judged_by": JUDGED_BY,
@@ -192,7 +191,7 @@ def _numbers(findings: Findings) -> dict[str, Any]:
 
 
 def _moves(findings: Findings) -> dict[str, Any]:
-    """What moves the force toward the measured one."""
+    """Return the changes that move the force toward the measured one."""
     results = findings.results
 
     def of(group: str, quantity: str = "reaction_x_n") -> float:
@@ -221,7 +220,7 @@ def _moves(findings: Findings) -> dict[str, Any]:
 
 
 def _ring_forces(findings: Findings) -> dict[str, Any]:
-    """Force on a rigid ring in whirl by closed form [N], by the drive's speed [Hz], at the simulated spin."""
+    """Return the force on a rigid ring in whirl by closed form [N], by drive speed [Hz], at the simulated spin."""
     constants = findings.constants
     own, closed = condition.oscillator(constants), {}
     for speed, run in findings.found["corrected"].speeds.items():
@@ -232,7 +231,7 @@ def _ring_forces(findings: Findings) -> dict[str, Any]:
 
 
 def _spread(findings: Findings) -> dict[str, Any]:
-    """What comes of all assumed values at once."""
+    """Return the distributions with all assumed values varied together."""
     shown = {
         "E − W in whirl [N]": "reaction_x_n",
         "N − S in whirl [N]": "reaction_y_n",
@@ -253,12 +252,12 @@ def _spread(findings: Findings) -> dict[str, Any]:
 
 
 def _whirl(findings: Findings) -> dict[str, Any]:
-    """When it whirls, and how fast."""
+    """Return the conditions of whirl and its frequency."""
     constants, fastest = findings.constants, findings.least[-1]
     own = condition.oscillator(constants)
     modal = constants.shaft.transverse_inertia / constants.shaft.arm_magnet**2
     magnet, friction = constants.magnet, constants.contact.friction
-    # Eq. 43 letter by letter.
+    # Eq. 43 taken literally.
     literal = condition.Oscillator(constants.shaft.mass, math.sqrt(magnet.stiffness / constants.shaft.mass), math.nan)
     eq_10 = magnet.damping_x, magnet.damping_y
     spin = 2.0 * math.pi * fastest.spin_hz

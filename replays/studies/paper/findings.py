@@ -1,7 +1,7 @@
-"""Everything that the report is made of: what is run, what is measured, and the verdict on each statement.
+"""Runs, results and verdicts of the report.
 
-A number of ours is a distribution: over the phases of the shaft at the pulse, over all assumed values at once, and over
-the readings that the paper's words allow.
+Each of our numbers is a distribution over the phases of the shaft at the pulse, over all assumed values at once, and
+over the possible readings of the paper's text.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from rig.physics.model import build_model
 from rig.physics.parameters import load_parameters
 
 MARKS: dict[str, Mark] = {"agrees": "good", "differs": "bad", "cannot be judged": "open"}
-"""Verdicts, and how a table shows them."""
+"""Verdicts and their marks in a table."""
 SWEEP_HZ = (2.0, 3.2, 4.2, 5.2, 6.2, 8.0, 10.0, 12.0)
 START_FORCES_N = (60.0, 100.0, 180.0)
 
@@ -38,8 +38,8 @@ class Line:
     """One line of the summary.
 
     Attributes:
-        statement: What is stated.
-        values: Ours by parameter set, each shape (n,); a claim has `corrected` alone.
+        statement: Statement of the paper.
+        values: Our values by parameter set, each of shape (n,); a claim has only `corrected`.
     """
 
     statement: Statement
@@ -47,11 +47,11 @@ class Line:
 
     @property
     def verdicts(self) -> dict[str, str]:
-        """By parameter set."""
+        """Verdicts by parameter set."""
         return {name: self.statement.verdict(values) for name, values in self.values.items()}
 
     def row(self) -> Row:
-        """As a row of a table: the verdict is on the corrected rig."""
+        """Return the line as a table row, with the verdict on the corrected rig."""
         said, best = self.statement, SETS[-1]
         share = said.inside(self.values[best])
         ours = [distribution(self.values[name]) if name in self.values else "–" for name in SETS]
@@ -68,16 +68,16 @@ class Findings:
     Attributes:
         found: The paper's runs by parameter set.
         results: Outcomes of the scans by group.
-        parts: Of the hypercube, shape (samples, values).
+        parts: Points of the hypercube, shape (samples, values).
         spread: Its outcomes with the corrected set.
         sweep: Outcomes of the speed sweep by speed [Hz].
-        starts: Friction needed to start, by pulse.
-        slowest: Slowest sliding whirl that gains speed.
-        least: Least friction that keeps up whirl.
-        slips: From a sliding whirl to rolling.
-        constants: Of the corrected rig.
+        starts: Friction required to start a whirl, by pulse.
+        slowest: Slowest sliding whirl that accelerates.
+        least: Least friction that sustains whirl.
+        slips: Transitions from sliding whirl to rolling.
+        constants: Constants of the corrected rig.
         lines: The summary.
-        claims: The part of it that scans tell.
+        claims: Lines of the summary from scans.
     """
 
     found: dict[str, Reproduction]
@@ -99,13 +99,13 @@ JUDGED_BY = (
     "be judged between; assumed: a curve fills more than 2/5 of what its axis' labels span and ends before the next "
     "would come, a number in the text is met to 1 %"
 )
-"""What agrees, in a line."""
+"""Criterion of agreement, in a line."""
 LENGTHS_MS = (4.0, 5.0, 6.0)
-"""Lengths of the pulse at which the impacts of Fig. 15 are shown over the phases."""
+"""Pulse lengths for which the impacts of Fig. 15 are shown over the phases [ms]."""
 
 
 def planned_groups(*, quick: bool) -> Groups:
-    """Every pulse that is run, by group."""
+    """Return every pulse to run, by group."""
     ensemble, few = (2, 4) if quick else (9, 40)
     groups = {**claim_groups(ensemble=ensemble), **question_groups(ensemble=ensemble)}
     for name in SETS:
@@ -125,13 +125,13 @@ def planned_groups(*, quick: bool) -> Groups:
 
 
 def steps(*, quick: bool) -> int:
-    """How many steps `find` tells of."""
+    """Return the number of progress reports of `find`."""
     each = len(SETS) * (len(SPEEDS_HZ) + 4)
     return each + sum(len(group) for group in planned_groups(quick=quick).values()) + len(_forces(quick=quick)) + 3
 
 
 def _forces(*, quick: bool) -> tuple[float, ...]:
-    """Hammer pulses over which friction is scanned [N]; the paper's is one of them."""
+    """Return the hammer forces for which friction is scanned [N]; the paper's is one of them."""
     return START_FORCES_N[1:2] if quick else START_FORCES_N
 
 
@@ -139,9 +139,9 @@ def find(*, quick: bool = False, processes: int = 2, progress: Callable[[str], N
     """Run and measure everything.
 
     Args:
-        quick: Fewer and shorter runs.
-        processes: How many at a time in the scans.
-        progress: Told what is done, `steps` times.
+        quick: Use fewer and shorter runs.
+        processes: Number of parallel processes for the scans.
+        progress: Function that receives a text for each step, `steps` times in all.
     """
     tell = progress or (lambda _: None)
     found = {name: reproduce(name, quick=quick, progress=tell) for name in SETS}
@@ -189,18 +189,18 @@ def find(*, quick: bool = False, processes: int = 2, progress: Callable[[str], N
 
 
 def claim_numbers(findings: Findings) -> dict[str, np.ndarray]:
-    """What each claim asks for, of all runs and readings that have it, each shape (n,)."""
+    """Return the numbers for each claim from all relevant runs and readings, each of shape (n,)."""
     results = findings.results
 
     def stiffer(houses: Iterable[str], *quantities: str) -> np.ndarray:
-        """Numbers of less mobile houses over those of the same run with the corrected ones; all are readings."""
+        """Return ratios of less mobile houses to the corrected ones in the same run; all are readings."""
         found = []
         for each in (results[f"spread {name}"] for name in houses):
             found += [column(each, name) / column(findings.spread[: len(each)], name) for name in quantities]
         return np.concatenate(found)
 
     def laws(name: str, *groups: str) -> np.ndarray:
-        """Medians of other contact laws over the default one's."""
+        """Return medians with other contact laws relative to the default one."""
         return np.array([median(results[group], name) for group in groups]) / median(results["base corrected"], name)
 
     other = [f"law {law}" for law in LAWS[1:]]
@@ -222,7 +222,7 @@ def claim_numbers(findings: Findings) -> dict[str, np.ndarray]:
 
 
 def conditions(constants: Constants, whirl_hz: float) -> tuple[float, ...]:
-    """Both sides of eqs. 42 and 43, and eigenfrequency and whirl frequency, the one over the other."""
+    """Return ratios of both sides of eqs. 42 and 43, and of eigenfrequency and whirl frequency."""
     own, r0, whirl = condition.oscillator(constants), constants.contact.clearance, 2.0 * math.pi * abs(whirl_hz)
     restoring = own.mass * own.natural * r0 * (own.natural + 2.0 * own.ratio * whirl)
     friction = constants.contact.friction

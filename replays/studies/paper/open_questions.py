@@ -1,4 +1,4 @@
-"""What the paper leaves open, each with the numbers that there are on it; the report's template says what they mean."""
+"""Numbers on the questions that the paper leaves open; the report's template interprets them."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from rig.run.scenes import load_scene
 PAPER_DROP_N = 100.0
 OUTER_MASSES_KG = (7.18, 8.88, 10.58)
 PAIR_STIFFNESS = (0.5, 1.0, 2.0)
-"""Of one transducer's K_ft."""
+"""Factors on the stiffness K_ft of one transducer."""
 K_FT = 8.88e7
 STIFFNESSES_KN_M = (0.74, 1.0, 1.3, 1.7, 2.5)
 _LENGTHS_MM = (10.0, 16.9, 25.0, 35.0, 50.0)
@@ -33,7 +33,7 @@ Numbers = dict[str, Any]
 
 
 def question_groups(*, ensemble: int) -> Groups:
-    """Hammer pulses for the questions on the houses."""
+    """Return hammer pulses for the questions on the houses."""
     groups: Groups = {}
     for mass in OUTER_MASSES_KG:
         pulse = Pulse(label=f"M_oh {mass:g} kg", changes={"house.outer_mass": mass})
@@ -46,9 +46,9 @@ def question_groups(*, ensemble: int) -> Groups:
 
 
 def fall(constants: Constants) -> tuple[float, float]:
-    """Time [s] and speed at the ring [m/s] of a fall through the whole clearance, from rest, small angles.
+    """Return time [s] and speed at the ring [m/s] of a fall through the whole clearance, from rest, for small angles.
 
-    About the pivot I_xx Gamma'' = M g l_0C: the ring's height falls by a = M g l_0C l_0A / I_xx.
+    About the pivot I_xx Gamma'' = M g l_0C, so the height at the ring decreases with a = M g l_0C l_0A / I_xx.
     """
     shaft = constants.shaft
     a = shaft.mass * shaft.gravity * shaft.arm_centre * shaft.arm_ring / shaft.transverse_inertia
@@ -57,13 +57,13 @@ def fall(constants: Constants) -> tuple[float, float]:
 
 
 def weight_at_ring(constants: Constants) -> float:
-    """What the shaft weighs on the ring [N]: all that a drop pushes with, on the mean from release to rest."""
+    """Return the shaft's weight at the ring [N], the mean force of a drop from release to rest."""
     shaft = constants.shaft
     return shaft.mass * shaft.gravity * shaft.arm_centre / shaft.arm_ring
 
 
 def drop_numbers(found: dict[str, Reproduction]) -> Numbers:
-    """The drop's 100 N against the momentum that must be turned round."""
+    """Return the numbers that compare the drop's 100 N with the change of momentum."""
     model = found["corrected"].drop.simulation.model
     contact, masses = model.constants.contact, reference_impact(model.parameters)
     time_s, speed = fall(model.constants)
@@ -114,7 +114,7 @@ def _drop_run(one: Reproduction) -> Numbers:
 
 
 def _amplified(run: Run) -> Numbers:
-    """The largest reaction over its own contact force, and over that of a rigid house."""
+    """Return the largest reaction relative to its own contact force and to that of a rigid house."""
     reaction = float((run["P_S"] - run["P_N"]).max())
     rigid = bare_drop({"model.stator": "rigid"})
     return {
@@ -124,7 +124,7 @@ def _amplified(run: Run) -> Numbers:
 
 
 def _where_peak_is_printed(peak: Callable[[float], float], low: float, high: float) -> float:
-    """Where a peak that rises [N] reaches the printed one, between logarithms."""
+    """Return the argument at which an increasing peak [N] equals the printed one, by a logarithmic search."""
     from scipy.optimize import brentq
 
     root: Any = brentq(
@@ -134,17 +134,17 @@ def _where_peak_is_printed(peak: Callable[[float], float], low: float, high: flo
 
 
 class Reading(NamedTuple):
-    """One reading of the houses' masses and springs."""
+    """A variant of the houses' masses and springs."""
 
     value: float
     mode_hz: float
     """Stiffest vertical mode [Hz]."""
     forces: tuple[int, ...]
-    """E - W and N - S in whirl, then the highest of each [N]."""
+    """E - W and N - S in whirl, then the largest value of each [N]."""
 
 
 def house_numbers(results: Results) -> dict[str, Numbers]:
-    """Is 8.88 kg the outer house alone or both houses (`mass`)? K_ft / 2 or 2 K_ft (`pair`)?"""
+    """Compare variants: 8.88 kg as the outer house or both houses (`mass`); K_ft / 2 or 2 K_ft (`pair`)."""
     p = load_parameters("corrected")
 
     def reading(group: str, value: float, *, mass: float, link: float) -> Reading:
@@ -174,7 +174,7 @@ def house_numbers(results: Results) -> dict[str, Numbers]:
 
 
 def magnet_numbers() -> Numbers:
-    """Can the magnets give the stiffness?"""
+    """Return stiffnesses for possible numbers and lengths of the magnets."""
     base = load_parameters("corrected")
     used = base["magnet.stiffness"] / 1e3
     most = int(math.pi / math.asin(base["magnet.bearing_magnet_radius"] / base["magnet.bearing_radius"]))
@@ -193,7 +193,7 @@ def magnet_numbers() -> Numbers:
 
 
 def running_numbers() -> Numbers:
-    """Which stiffness does running free of contact ask for? By stiffness [kN/m], w_n [Hz] and the least gap [mm]."""
+    """Return w_n [Hz] and the smallest gap [mm] by stiffness [kN/m], to find those without contact."""
     tried = {}
     for stiffness in STIFFNESSES_KN_M:
         changes = {"duration_s": 3.0, "magnet.stiffness": stiffness, "sensors.chain": "ideal", "sensors.rate_hz": 2000}
@@ -204,18 +204,18 @@ def running_numbers() -> Numbers:
 
 
 class Axis(NamedTuple):
-    """One axis of the paper, and which clearance it allows."""
+    """An axis of the paper and the clearances that it allows."""
 
     name: str
     ours: float
     low: float
     high: float
     allowed_mm: tuple[float, float]
-    """Clearances at which the curve would fill it and stay inside [mm]."""
+    """Clearances at which the curve fills the axis and stays inside [mm]."""
 
 
 def clearance_numbers(found: dict[str, Reproduction]) -> Numbers:
-    """Which clearance does each axis of the paper allow?"""
+    """Return the clearances allowed by each axis of the paper."""
     one = found["corrected"]
     constants, n = one.whirl.simulation.model.constants, one.numbers
     r0 = constants.contact.clearance * 1e3
@@ -224,7 +224,7 @@ def clearance_numbers(found: dict[str, Reproduction]) -> Numbers:
     stated = {each.quantity: (each.low, each.high) for each in statements()}
 
     def axis(name: str, ours: float, quantity: str) -> Axis:
-        # Lengths and forces of the whirl go with r0 at equal spin and R_S / r0.
+        # At equal spin and R_S / r0, lengths and forces of the whirl are proportional to r0.
         low, high = stated[quantity]
         return Axis(name, ours, low, high, (r0 * low / ours, r0 * high / ours))
 

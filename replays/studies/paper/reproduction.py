@@ -1,4 +1,4 @@
-"""The paper's runs, made again with one parameter set, and every number that a statement asks for."""
+"""The paper's runs with one parameter set, and the numbers for its statements."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ from rig.run.offline import Run, simulate
 from rig.run.scenes import load_scene
 
 SPEEDS_HZ = (3.2, 4.2, 5.2, 6.2)
-"""Fig. 17's."""
+"""Speeds of Fig. 17 [Hz]."""
 FIG_7_M = 0.010
 PULSE_S = 0.5
-"""When the pulse comes in the long run [s]."""
+"""Time of the pulse in the long run [s]."""
 _RATE_HZ = 20_000
 G = 9.80665
 """Standard gravity [m/s^2]."""
 _RESTS = 0.01
-"""A drop has settled when it leaves the ring by less than this part of the clearance."""
+"""Distance from the ring, relative to the clearance, below which a drop counts as settled."""
 
 
 @dataclass(frozen=True)
@@ -46,11 +46,11 @@ class Reproduction:
 
     Attributes:
         parameters: The set.
-        drop: Section 6.1, all sensors on.
-        whirl: Sections 6.2 and 6.3, all sensors on; the pulse comes at `PULSE_S`.
-        held: The same on a drive that holds its speed, truth alone.
-        speeds: Section 6.4 by speed of the drive [Hz], truth alone.
-        numbers: Of these runs, each in its statement's unit.
+        drop: Section 6.1, with all sensors.
+        whirl: Sections 6.2 and 6.3, with all sensors; the pulse is at `PULSE_S`.
+        held: The same with a drive at constant speed, truth only.
+        speeds: Section 6.4 by speed of the drive [Hz], truth only.
+        numbers: Numbers from these runs, in the units of their statements.
     """
 
     parameters: str
@@ -62,12 +62,12 @@ class Reproduction:
 
 
 def reproduce(parameters: str, *, quick: bool = False, progress: Callable[[str], None] | None = None) -> Reproduction:
-    """Run all of it.
+    """Run the paper's experiments.
 
     Args:
         parameters: The set.
-        quick: Shorter runs.
-        progress: Told what is done.
+        quick: Use shorter runs.
+        progress: Function that receives the name of each completed run.
     """
     tell = progress or (lambda _: None)
     sensed = {"parameters": parameters, "sensors.rate_hz": _RATE_HZ}
@@ -94,16 +94,17 @@ def reproduce(parameters: str, *, quick: bool = False, progress: Callable[[str],
 
 
 def magnet_force(run: Run) -> float:
-    """Largest force of the magnets over Fig. 7's axis [N]."""
+    """Return the largest magnet force over the axis of Fig. 7 [N]."""
     line = np.linspace(0.0, FIG_7_M, 101)
     return float(np.abs(map_force(line, np.zeros_like(line), run.simulation.model.constants.magnet)[:, 0]).max())
 
 
 def drop_spread(parameters: str, samples: int) -> dict[str, np.ndarray]:
-    """Numbers of the drop with all assumed values spread at once, by statement, each shape (n,).
+    """Return numbers of the drop with all assumed values varied together, by statement, each of shape (n,).
 
-    Where the paper can be read in two ways, both are in: the path in the ring or at the probes; the acceleration in
-    m/s² or in g; the reaction over its own contact force or over that of a rigid house.
+    Ambiguous statements contribute both readings: the path in the ring or at the probes, the acceleration in m/s² or in
+        g,
+    the reaction relative to its own contact force or to that of a rigid house.
     """
     found: dict[str, list[float]] = {}
     own = load_parameters(parameters).entries
@@ -123,15 +124,15 @@ def drop_spread(parameters: str, samples: int) -> dict[str, np.ndarray]:
 
 
 def bare_drop(changes: dict[str, Any]) -> Run:
-    """A drop seen by ideal sensors."""
+    """Run a drop with ideal sensors."""
     ideal = {"sensors.chain": "ideal", "sensors.groups": ["hammer"], "sensors.rate_hz": _RATE_HZ}
     return simulate(load_scene("drop", {**changes, **ideal, "duration_s": 0.4}))
 
 
 def drop_impact(run: Run) -> tuple[float, float]:
-    """When the shaft first reaches the ring [s], and how fast [m/s].
+    """Return the time [s] and speed [m/s] at which the shaft first reaches the ring.
 
-    The fall before is a parabola to within 1e-5 (the shaft turns by some mrad): fitted, and carried on to the ring.
+    The fall is a parabola to within 1e-5 (the shaft turns by some mrad); it is fitted and extrapolated to the ring.
     """
     first = int(np.argmax(run["contact_impulse"] > 0.0))
     height = run["ring_y"] + run.simulation.model.constants.contact.clearance
@@ -142,7 +143,7 @@ def drop_impact(run: Run) -> tuple[float, float]:
 
 
 def drop_impulse(run: Run) -> float:
-    """Impulse of the first contact [N s]."""
+    """Return the impulse of the first contact [N s]."""
     impulse = run["contact_impulse"]
     first = int(np.argmax(impulse > 0.0))
     still = np.flatnonzero(np.diff(impulse[first:]) == 0.0)
@@ -150,7 +151,7 @@ def drop_impulse(run: Run) -> float:
 
 
 def drop_numbers(run: Run, *, bandwidth_hz: float = 4900.0) -> dict[str, float]:
-    """Numbers of a drop, after its start at the top; what is measured comes through a low-pass."""
+    """Return numbers of a drop from the top of the ring; measured ones pass a low-pass filter."""
     contact = run.simulation.model.constants.contact
     leaves = np.flatnonzero(run["penetration"] < -_RESTS * contact.clearance)
     south = run["P_S"] - run["P_N"]
@@ -167,12 +168,12 @@ def drop_numbers(run: Run, *, bandwidth_hz: float = 4900.0) -> dict[str, float]:
 
 
 def pulse_spread(spread: list[Outcome], slow: list[Outcome], lasting: list[Outcome]) -> dict[str, np.ndarray]:
-    """Numbers of the pulse with all assumed values spread at once, by statement, each shape (n,).
+    """Return numbers of the pulse with all assumed values varied together, by statement, each of shape (n,).
 
     Args:
-        spread: At 6.2 Hz. Numbers of the whirl are of those that whirl.
+        spread: Runs at 6.2 Hz; numbers of the whirl come from those that whirl.
         slow: The first of these at 3.2 Hz.
-        lasting: The first of these for 20 s, as long as Fig. 13 shows.
+        lasting: The first of these for 20 s, as long as Fig. 13.
     """
     whirling = [one for one in spread if one.whirls]
     pairs = [(low, high) for low, high in zip(slow, spread, strict=False) if low.whirls and high.whirls]
@@ -183,7 +184,7 @@ def pulse_spread(spread: list[Outcome], slow: list[Outcome], lasting: list[Outco
     return {
         "backward": np.array([float(one.whirls and one.whirl_hz < 0.0) for one in spread]),
         "roll": of("roll_s", 1e3),
-        # Of the disk, but in the clearance: either reading.
+        # Two readings: at the disk, or in the clearance.
         "orbit_ring": np.concatenate([of("ring_m", 1e3), of("disk_m", 1e3)]),
         "orbit_disk": of("disk_m", 1e3),
         "spin_lowest": column(spread, "slowest_hz"),
@@ -194,7 +195,7 @@ def pulse_spread(spread: list[Outcome], slow: list[Outcome], lasting: list[Outco
         "peak_sensed": np.maximum(column(spread, "peak_x_n"), column(spread, "peak_y_n")),
         "steady": of("ripple_n", 100.0) / of("normal_n"),
         "east": of("reaction_x_n"),
-        # A line at the spin takes a long window.
+        # A spectral line at the spin requires a long window.
         "imbalance": 100.0 * column([one for one in lasting if one.whirls], "imbalance"),
         "measured": of("reaction_x_n", 1.0 / MEASURED_N),
         "bouncing": of("true_peak_x_n") / of("reaction_x_n"),
@@ -218,12 +219,12 @@ def _whirl_numbers(run: Run) -> dict[str, float]:
 
 
 def spectra(run: Run) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Full spectra of the disk's probes over time, as `rig.channels.orbit.waterfall` gives them [mm]."""
+    """Return the full spectra of the disk's probes over time, as `rig.channels.orbit.waterfall` [mm]."""
     return waterfall(run.samples["disk_x"], run.samples["disk_y"], float(_RATE_HZ), run.times_s)
 
 
 def fine_spectrum(run: Run) -> tuple[np.ndarray, np.ndarray]:
-    """Full spectrum of the orbit at the disk over the last half of a run [Hz], [mm]: of 2 s, which parts 1 Hz."""
+    """Return the full spectrum of the orbit at the disk over the last half of a run [Hz], [mm]; 2 s resolve 1 Hz."""
     half = len(run.times_s) // 2
     x, y = (run[name][half:] * 1e3 for name in ("disk_x", "disk_y"))
     return full_spectrum(x, y, float(_RATE_HZ), lines=8 * len(x))

@@ -1,4 +1,4 @@
-"""What the paper states, as data, and the verdict of our numbers on it."""
+"""Statements of the paper as data, and their verdicts."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from rig.physics.parameters import ParameterSet
 
 Verdict = Literal["agrees", "differs", "cannot be judged"]
 SETS = ("as-printed", "corrected")
-"""The parameter sets that are held against the paper, in the order of the tables."""
+"""Parameter sets compared with the paper, in the order of the tables."""
 SURE = 0.95
-"""Share of ours that must lie in, or out of, what the paper states for a verdict."""
+"""Share of our values inside, or outside, the stated range that is required for a verdict."""
 _TEXT = 5e-3
-"""How far a printed value may be off as it is rounded."""
+"""Relative rounding error of a printed value."""
 
 
 class Statement(BaseModel, frozen=True, extra="forbid"):
-    """One thing that the paper states."""
+    """A statement of the paper."""
 
     quantity: str
     place: str
@@ -37,13 +37,13 @@ class Statement(BaseModel, frozen=True, extra="forbid"):
     why: str = ""
 
     def inside(self, values: np.ndarray) -> float:
-        """Share of ours that agrees; nan where there is nothing to judge by. A motion that did not come is outside."""
+        """Return the share of values inside the stated range; NaN without a range. Missing motions count as outside."""
         if not math.isfinite(self.low) or not math.isfinite(self.high):
             return math.nan
         return float(np.mean((self.low <= values) & (values <= self.high))) if len(values) else 0.0
 
     def verdict(self, values: np.ndarray) -> Verdict:
-        """Of ours, shape (n,), as far as phases of the shaft, assumed values and readings spread them."""
+        """Return the verdict on our values, shape (n,), spread by shaft phases, assumed values and readings."""
         share = self.inside(values)
         if share >= SURE:
             return "agrees"
@@ -51,7 +51,7 @@ class Statement(BaseModel, frozen=True, extra="forbid"):
 
 
 class Printed(BaseModel, frozen=True, extra="forbid"):
-    """One printed value of a parameter, in SI."""
+    """A printed value of a parameter, in SI."""
 
     key: str
     symbol: str
@@ -60,7 +60,7 @@ class Printed(BaseModel, frozen=True, extra="forbid"):
     unit: str
 
     def verdict(self, parameters: ParameterSet) -> Verdict:
-        """Whether a set takes the printed value."""
+        """Return whether a parameter set uses the printed value."""
         return "agrees" if abs(parameters[self.key] / self.value - 1.0) < _TEXT else "differs"
 
 
@@ -70,22 +70,22 @@ def _document() -> dict[str, list[dict[str, object]]]:
 
 
 def statements() -> tuple[Statement, ...]:
-    """All statements on figures and text."""
+    """Return all statements on figures and text."""
     return tuple(Statement.model_validate(entry) for entry in _document()["statement"])
 
 
 def claims() -> tuple[Statement, ...]:
-    """Claims that scans of the corrected rig test."""
+    """Return the claims that are tested by scans of the corrected rig."""
     return tuple(Statement.model_validate(entry) for entry in _document()["claim"])
 
 
 def printed_values() -> tuple[Printed, ...]:
-    """Tables 1 and 2, and the values in the text."""
+    """Return the values of tables 1 and 2 and of the text."""
     return tuple(Printed.model_validate(entry) for entry in _document()["printed"])
 
 
 def number(value: float) -> str:
-    """A number as the tables show it."""
+    """Format a number for the tables."""
     if not math.isfinite(value):
         return "none"
     if value != 0.0 and not 1e-3 <= abs(value) < 1e5:
@@ -96,7 +96,7 @@ def number(value: float) -> str:
 
 
 def distribution(values: np.ndarray) -> str:
-    """Median, and 5 to 95 % where they differ, as the tables show them: to three figures, four where it is narrow."""
+    """Format the median and, if they differ, the 5 and 95 % percentiles, with 3 or 4 digits."""
     low, middle, high = percentiles(values)
     if not high - low > 1e-3 * abs(middle):
         return number(middle)

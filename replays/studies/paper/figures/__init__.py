@@ -1,1 +1,1 @@
-"""The report's pictures and tables."""
+"""Pictures and tables of the report."""

@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 
     from replays.studies.paper.findings import Line
 
-_FAR = 0.6
-"""How far outside what is allowed a value is still drawn at its place, in parts of the allowed range."""
+_EDGE_DISTANCE = 0.6
+"""Largest distance from the allowed range that is drawn to scale, relative to the range."""
 _VERDICTS = {"agrees": GREEN, "differs": RED, "cannot be judged": ORANGE}
 
 
@@ -37,7 +37,7 @@ _VERDICTS = {"agrees": GREEN, "differs": RED, "cannot be judged": ORANGE}
 def draw_conditions(
     slowest: list[Threshold], least: list[Threshold], starts: list[Start], constants: Constants
 ) -> Figure:
-    """Thresholds in the plane of friction and whirl frequency, and what becomes of a pulse over friction."""
+    """Draw thresholds in the plane of friction and whirl frequency, and outcomes of a pulse over friction."""
     figure = new_figure(5.8, "Bartha's second condition (eq. 43)")
     plane, scan = figure.subplots(1, 2)
     own = oscillator(constants)
@@ -72,7 +72,7 @@ def draw_conditions(
 
 @house_style()
 def draw_verdicts(lines: list[Line]) -> Figure:
-    """How much of ours lies in what the paper states, and where, for every statement that can be held against it."""
+    """Draw the share and the position of our values in the stated range, for every statement with a range."""
     judged = [line for line in lines if math.isfinite(line.statement.low)]
     figure = new_figure(0.27 * len(judged) + 1.9, "What the paper states, and how ours spreads")
     inside, where = figure.subplots(1, 2, sharey=True, width_ratios=(0.7, 1.0))
@@ -87,9 +87,9 @@ def draw_verdicts(lines: list[Line]) -> Figure:
                         mew=1.5, clip_on=False)  # fmt: skip
             if 0.0 < said.low < said.high < 20.0 * said.low:
                 places = (np.array(percentiles(values)) - said.low) / (said.high - said.low)
-                # What is farther off stands at the edge.
-                low, middle, high = np.clip(places, -_FAR, 1.0 + _FAR)
-                ends = "<" if places[1] < -_FAR else ">" if places[1] > 1.0 + _FAR else marker
+                # Values farther away are drawn at the edge.
+                low, middle, high = np.clip(places, -_EDGE_DISTANCE, 1.0 + _EDGE_DISTANCE)
+                ends = "<" if places[1] < -_EDGE_DISTANCE else ">" if places[1] > 1.0 + _EDGE_DISTANCE else marker
                 where.plot((low, high), (row - up, row - up), color=colour, lw=2.2, alpha=0.55)
                 where.plot(middle, row - up, ends, color=colour, mfc=fill or colour, ms=6.5, mew=1.5)
     for name, (_, marker, fill) in looks.items():
@@ -99,7 +99,7 @@ def draw_verdicts(lines: list[Line]) -> Figure:
     inside.set_yticks(range(len(judged)), [_label(line) for line in judged])
     inside.set(xlim=(-3, 103), ylim=(len(judged) - 0.4, -0.6), xlabel="inside what the paper states [%]")
     where.set(
-        xlim=(-1.1 * _FAR, 1.0 + 1.1 * _FAR),
+        xlim=(-1.1 * _EDGE_DISTANCE, 1.0 + 1.1 * _EDGE_DISTANCE),
         xlabel="5 to 95 % of ours between the paper's\nleast (0) and largest (1) [1]",
     )
     legend_below(figure, columns=5)
@@ -107,14 +107,14 @@ def draw_verdicts(lines: list[Line]) -> Figure:
 
 
 def _label(line: Line) -> str:
-    """Where it stands and what it is, short."""
+    """Return the place and a short form of a statement."""
     place = line.statement.place.replace("sections ", "§").replace("section ", "§").removesuffix(", measured")
     return shorten(f"{place}: {line.statement.says}".replace("_", ""), 66, placeholder=" …")
 
 
 @house_style()
 def draw_law(sweep: dict[float, Outcome]) -> Figure:
-    """Whirl frequency over spin, simulated and by closed form, and its error."""
+    """Draw the whirl frequency over spin, simulated and by closed form, and its error."""
     figure = new_figure(5.0, "Whirl frequency over spin")
     whirl, error = figure.subplots(1, 2)
     speeds = np.array(list(sweep))

@@ -1,4 +1,4 @@
-"""The paper's figures drawn again: `as-printed` beside `corrected`, each with the axis that the paper has."""
+"""The paper's figures, drawn with `as-printed` and `corrected` parameters and with the limits of the paper's axes."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _BEFORE, _IMPACTS, _SETTLED = GREEN, RED, BLUE
 
 
 def _axis_lines(axes: Any, *levels: float, text: str = "the paper's labels", measured: bool = False) -> None:
-    """Dashed lines at the last labels of the paper's axis."""
+    """Draw dashed lines at the last labels of the paper's axis."""
     look = {**_PAPER, "color": PINK, "lw": 1.5, "ls": (0, (1, 1.5))} if measured else _PAPER
     for level in levels:
         axes.axhline(level, **look)
@@ -40,7 +40,7 @@ def _axis_lines(axes: Any, *levels: float, text: str = "the paper's labels", mea
 
 
 def _since_rise_ms(times_s: np.ndarray, force: np.ndarray) -> np.ndarray:
-    """Time from where a force first rises through 0 [ms], as the paper's figures begin."""
+    """Return the time from the first rise of a force through 0 [ms], as in the paper's figures."""
     rises = np.flatnonzero((force[:-1] < 0.0) & (force[1:] >= 0.0))
     return (times_s - times_s[int(rises[0]) if len(rises) else 0]) * 1e3
 
@@ -48,7 +48,7 @@ def _since_rise_ms(times_s: np.ndarray, force: np.ndarray) -> np.ndarray:
 def _columns(
     found: dict[str, Reproduction], title: str, height: float, *, heights: tuple[float, ...] = (1.0,)
 ) -> tuple[Figure, list[tuple[Reproduction, Any]]]:
-    """A column of panels for each parameter set, on the same scales, so that the two can be told apart."""
+    """Return a figure with a column of panels for each parameter set, on the same scales for comparison."""
     figure = new_figure(height, title)
     panels = figure.subplots(len(heights), len(found), squeeze=False, sharey="row", height_ratios=heights)
     for one, axes in zip(found.values(), panels[0], strict=True):
@@ -57,21 +57,21 @@ def _columns(
 
 
 def _name_first(columns: list[tuple[Reproduction, Any]], *labels: str) -> None:
-    """Labels of the vertical axes, at the first column."""
+    """Label the vertical axes of the first column."""
     for axes, label in zip(columns[0][1], labels, strict=True):
         axes.set_ylabel(label)
 
 
 @house_style()
 def draw_magnets(one: Reproduction) -> Figure:
-    """Figure 7: both components over the plane, and the line through the centre."""
+    """Draw figure 7: both components over the plane, and the line through the centre."""
     model = one.whirl.simulation.model
     axis = np.linspace(-FIG_7_M, FIG_7_M, 81)
     x, y = (grid.ravel() for grid in np.meshgrid(axis, axis))
     force = map_force(x, y, model.constants.magnet)
     figure = new_figure(4.2, "Fig. 7: force of the magnets on the shaft (the same in both sets)")
     panels = figure.subplots(1, 3)
-    # The map holds to 10 mm from the centre; the corners of the square are farther out.
+    # The map is valid to 10 mm from the centre, which excludes the corners of the square.
     inside = np.hypot(x, y) <= FIG_7_M
     filled: Any = None
     for axes, component, name in zip(panels[:2], force.T, ("x", "y"), strict=True):
@@ -94,11 +94,11 @@ def draw_magnets(one: Reproduction) -> Figure:
 
 
 def first_impacts(penetration: np.ndarray, times_ms: np.ndarray) -> tuple[float, float]:
-    """A stretch of time [ms] from just before the first contact, short enough that ringing houses show as waves.
+    """Return a time range [ms] from just before the first contact, short enough to resolve the houses' vibration.
 
     Args:
         penetration: Depth of contact [m], shape (n,).
-        times_ms: When [ms], shape (n,).
+        times_ms: Times [ms], shape (n,).
     """
     touching = np.flatnonzero(penetration > 0.0)
     start = float(times_ms[touching[0]]) if len(touching) else float(times_ms[0])
@@ -107,7 +107,7 @@ def first_impacts(penetration: np.ndarray, times_ms: np.ndarray) -> tuple[float,
 
 @house_style()
 def draw_drop(found: dict[str, Reproduction]) -> Figure:
-    """Figures 10 and 11: trajectory, y(t), SOUTH reaction, inner house."""
+    """Draw figures 10 and 11: trajectory, y(t), SOUTH reaction, inner house."""
     figure, columns = _columns(
         found, "Figs. 10, 11: drop at standstill from the top of the ring, magnets out", 11.4, heights=(1.25, 1, 1, 1)
     )
@@ -140,7 +140,7 @@ def draw_drop(found: dict[str, Reproduction]) -> Figure:
 
 
 def _phases(one: Reproduction) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Before the pulse, impacts, whirl: masks over the rows."""
+    """Return masks over the rows for the time before the pulse, the impacts, and the whirl."""
     run = one.whirl
     t = run.times_s
     touching = run["penetration"] > 0.0
@@ -151,7 +151,7 @@ def _phases(one: Reproduction) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 @house_style()
 def draw_hammer(found: dict[str, Reproduction]) -> Figure:
-    """Figures 12 and 13: orbit, spin, x(t), y(t)."""
+    """Draw figures 12 and 13: orbit, spin, x(t), y(t)."""
     figure, columns = _columns(
         found, "Figs. 12, 13: hammer pulse of 100 N, 5 ms (shape assumed) at 6.2 Hz", 11.4, heights=(1.5, 0.9, 1, 1)
     )
@@ -178,7 +178,7 @@ def draw_hammer(found: dict[str, Reproduction]) -> Figure:
 
 @house_style()
 def draw_waterfall(found: dict[str, Reproduction]) -> Figure:
-    """Figure 14: full spectrum over time, and of the settled whirl in lines that tell 81.7 from 83.7 Hz."""
+    """Draw figure 14: full spectrum over time, and that of the settled whirl with a resolution of 81.7 from 83.7 Hz."""
     figure, columns = _columns(found, "Fig. 14: full spectrum at the disk", 7.4, heights=(1.2, 1.0))
     mesh: Any = None
     for one, (axes, lines) in columns:
@@ -202,7 +202,7 @@ def draw_waterfall(found: dict[str, Reproduction]) -> Figure:
 
 @house_style()
 def draw_reactions(found: dict[str, Reproduction]) -> Figure:
-    """Figure 15: horizontal and vertical reactions, the impacts and the whirl on scales of their own."""
+    """Draw figure 15: horizontal and vertical reactions, with separate scales for impacts and whirl."""
     figure, columns = _columns(
         found, "Fig. 15: reactions, the difference of opposed transducers", 11.0, heights=(1, 1, 1, 1)
     )
@@ -226,7 +226,7 @@ def draw_reactions(found: dict[str, Reproduction]) -> Figure:
 
 @house_style()
 def draw_east(found: dict[str, Reproduction]) -> Figure:
-    """Figure 16: EAST in full annular whirl, over a turn and a half."""
+    """Draw figure 16: EAST in full annular whirl, over a turn and a half."""
     figure, columns = _columns(found, "Fig. 16: EAST in full annular whirl", 4.9)
     for one, (axes,) in columns:
         run = one.whirl
@@ -248,7 +248,7 @@ def draw_east(found: dict[str, Reproduction]) -> Figure:
 
 @house_style()
 def draw_speeds(found: dict[str, Reproduction]) -> Figure:
-    """Figure 17: EAST at four speeds."""
+    """Draw figure 17: EAST at four speeds."""
     figure, columns = _columns(found, "Fig. 17: EAST (E − W) in full annular whirl at four speeds", 4.6)
     for one, (axes,) in columns:
         for speed, colour in zip(SPEEDS_HZ, (SKY, GREEN, ORANGE, PINK), strict=True):

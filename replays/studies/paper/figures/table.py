@@ -1,4 +1,4 @@
-"""The report's tables whose rows carry a verdict, each by the name that its template places it by."""
+"""Tables of the report with verdicts, by the names used in its template."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from replays.studies.paper.statement import SETS, distribution, number, printed_
 from rig.physics.parameters import load_parameters
 
 IDLE_N = 1.0
-"""What moves both forces by less has no line of its own in the table [N]."""
+"""Change of both forces below which a change is omitted from the table [N]."""
 
 
 class Content(NamedTuple):
-    """What a table holds."""
+    """Content of a table."""
 
     headings: tuple[str, ...]
     rows: list[Row]
 
 
 def summary(lines: list[Line]) -> Content:
-    """Statements with their verdicts."""
+    """Return statements with their verdicts."""
     headings = ("statement", "where", "the paper", "unit", *SETS, "inside", "verdict")
     return Content(headings, [line.row() for line in lines])
 
@@ -51,7 +51,7 @@ def _printed(findings: Findings) -> Content:
 
 
 def _worked_out(findings: Findings) -> Content:
-    """Numbers that the text derives from its own."""
+    """Return the numbers that the text derives from its own."""
     p = load_parameters("corrected")
     printed_outer = next(entry.value for entry in printed_values() if entry.key == "house.outer_mass")
 
@@ -59,7 +59,7 @@ def _worked_out(findings: Findings) -> Content:
         return 2 * zeta * math.sqrt(p[stiffness] * mass)
 
     inner, outer, support = p["house.inner_mass"], p["house.outer_mass"], "house.outer_beam_stiffness"
-    # A free decay is of the mass that the magnets see, not of M.
+    # A free decay depends on the mass at the magnets, not on M.
     modal = p["shaft.transverse_inertia"] / p["shaft.arm_magnet"] ** 2
     zetas = {axis: p[f"shaft.damping_ratio_{axis}"] for axis in "xy"}
     worked: list[tuple[str, float | None, float]] = [
@@ -89,7 +89,7 @@ def _worked_out(findings: Findings) -> Content:
 
 
 def idle_changes(findings: Findings) -> list[str]:
-    """Changes that move neither the force in whirl nor the highest one by `IDLE_N`."""
+    """Return the changes that move neither the force in whirl nor the highest one by `IDLE_N`."""
     peaks = {bar.name: bar for bar in bars(findings.results, "peak_x_n")}
     found = bars(findings.results, "reaction_x_n")
     return [bar.name for bar in found if max(bar.width, peaks[bar.name].width) < IDLE_N]
@@ -112,14 +112,14 @@ def _tornado(findings: Findings) -> Content:
 
 
 def _range(values: tuple[float, ...]) -> str:
-    """The ends and what is between; of many the lowest and the highest."""
+    """Format the values; of more than three, only the lowest and the highest."""
     if len(values) > 3:
         values = (min(values), max(values))
     return " / ".join("none" if not math.isfinite(value) else f"{value:.0f}" for value in values)
 
 
 def _lengths(findings: Findings) -> Content:
-    """Highest reactions of Fig. 15 over the pulse's length, spread by the phases of the shaft."""
+    """Return the highest reactions of Fig. 15 by pulse length, distributed over the phases of the shaft."""
     rows = []
     for name in SETS:
         for length_ms in LENGTHS_MS:

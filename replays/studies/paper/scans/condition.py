@@ -1,10 +1,11 @@
-"""When the shaft whirls backward, and how fast: closed forms, and the rig beside them.
+"""Conditions and frequency of backward whirl: closed forms, and the rig for comparison.
 
-A point mass m on an orbit of radius r that touches the ring, at the whirl frequency w, on a spring K and a damper D:
-radially N = m r (w^2 - w_n^2), so that w must be above w_n (the paper's eq. 42); along the ring friction drives with at
-most mu N and damping brakes with D r w. So whirl is kept up, and a sliding whirl gains speed, where
-mu (w^2 - w_n^2) >= 2 zeta w_n w, that is |w| >= w_n [zeta/mu + sqrt(1 + (zeta/mu)^2)]. This is eq. 43, whose "<=" is
-of two negative frequencies (the sentence after it speaks of the sign), with the ratio zeta for its D, which has a unit.
+A point mass m on a circular orbit of radius r touches the ring at the whirl frequency w, with a spring K and a damper
+D. Radially N = m r (w^2 - w_n^2), so w must be above w_n (the paper's eq. 42). Along the ring, friction drives with at
+most mu N and damping brakes with D r w. So a whirl is sustained, and a sliding whirl accelerates, if
+mu (w^2 - w_n^2) >= 2 zeta w_n w, that is |w| >= w_n [zeta/mu + sqrt(1 + (zeta/mu)^2)]. This is eq. 43, whose "<="
+refers to two negative frequencies (the next sentence mentions the sign), with the ratio zeta for its D, which has a
+unit.
 """
 
 from __future__ import annotations
@@ -27,17 +28,17 @@ from rig.physics.levels import ModelLevels
 
 ENGINE = "split"
 FRICTIONS = (0.05, 0.08, 0.12, 0.18, 0.25, 0.35)
-"""Frictions at which the slowest whirl that gains speed is looked for."""
+"""Frictions for which the slowest accelerating whirl is computed."""
 SPINS_HZ = (3.2, 6.2, 9.0)
-"""Spins at which the least friction that keeps up whirl is looked for [Hz]."""
+"""Spins for which the least sustaining friction is computed [Hz]."""
 _TICKS_S = 1e6
-_SLOWER = 1e-3
-"""Part by which the whirl frequency may fall in half a second and still be steady."""
+_MAX_SLOWDOWN = 1e-3
+"""Largest relative decrease of a steady whirl frequency in half a second."""
 _NONE = (math.nan, math.nan)
 
 
 class Oscillator(NamedTuple):
-    """The shaft at the ring as a mass on a spring and a damper."""
+    """The shaft at the ring as a mass with spring and damper."""
 
     mass: float
     """m = I_xx / l_0A^2 [kg]."""
@@ -48,9 +49,9 @@ class Oscillator(NamedTuple):
 
 
 def oscillator(constants: Constants) -> Oscillator:
-    """The shaft referred to the ring; damping is the mean of both directions.
+    """Return the shaft referred to the ring, with the mean damping of both directions.
 
-    On a circle the damper of x and that of y brake in turn, so the mean over a turn is that of their mean.
+    On a circle the dampers in x and y act alternately, so their mean over a turn is that of the two values.
     """
     shaft, magnet = constants.shaft, constants.magnet
     mass = pivoted_mass(constants)
@@ -61,22 +62,22 @@ def oscillator(constants: Constants) -> Oscillator:
 
 
 def critical_whirl(own: Oscillator, friction: float) -> float:
-    """Slowest whirl that friction keeps up against damping [rad/s], eq. 43."""
+    """Return the slowest whirl that friction sustains against damping [rad/s], eq. 43."""
     share = own.ratio / friction
     return own.natural * (share + math.sqrt(1.0 + share * share))
 
 
 def least_friction(own: Oscillator, whirl: float) -> float:
-    """Least friction that keeps up a whirl [1]: eq. 43 solved for mu; infinite below the natural frequency."""
+    """Return the least friction that sustains a whirl [1], eq. 43; infinite below the natural frequency."""
     excess = whirl * whirl - own.natural**2
     return 2.0 * own.ratio * own.natural * whirl / excess if excess > 0.0 else math.inf
 
 
 def friction_with_houses(constants: Constants, spin: float) -> float:
-    """Least friction that keeps up whirl where the houses' beams dissipate as well [1].
+    """Return the least friction that sustains whirl with dissipation in the houses' beams [1].
 
-    The normal force turns with the whirl and shakes inner and outer house, two masses on a line in x and in y (eqs.
-    22-25), each at its amplitude of forced vibration; what their dampers take on the mean, friction must bring.
+    The rotating normal force excites the inner and outer house, two masses on a line in x and in y (eqs. 22-25), at
+    their amplitudes of forced vibration; friction must supply the mean power of their dampers.
     """
     own = oscillator(constants)
     whirl, radius = rolling_circle(constants, spin)
@@ -87,7 +88,7 @@ def friction_with_houses(constants: Constants, spin: float) -> float:
 
 
 def _ring_motion(constants: Constants, whirl: float, force: float) -> tuple[complex, complex]:
-    """Complex amplitudes of the ring's centre in x and in y under a force that turns [m]."""
+    """Return the complex amplitudes of the ring's centre in x and y under a rotating force [m]."""
     house = constants.house
     lines = (
         (house.inner_beam_stiffness + 1j * whirl * house.inner_beam_damping, complex(house.pair_stiffness_horizontal)),
@@ -106,11 +107,12 @@ def _ring_motion(constants: Constants, whirl: float, force: float) -> tuple[comp
 
 
 def friction_swing(constants: Constants, spin: float) -> float:
-    """Amplitude of the friction, about its mean, that a rolling whirl in moving houses takes [N].
+    """Return the amplitude of the friction about its mean in a rolling whirl with moving houses [N].
 
-    They give way more across than up, so the ring's centre goes on an ellipse with half axes X and Y: a circle along
-    with the whirl, and one of radius |X - Y|/2 against it. Seen from the shaft the latter turns at twice the whirl
-    frequency and so hurries and brakes it along the ring, by m w^2 |X - Y| / 2.
+    The houses are more compliant horizontally than vertically, so the ring's centre moves on an ellipse with half axes
+    X
+    and Y: a circle in the direction of whirl, and one of radius |X - Y|/2 against it. Relative to the shaft, the latter
+    rotates at twice the whirl frequency and accelerates and brakes it along the ring by m w^2 |X - Y| / 2.
     """
     own = oscillator(constants)
     whirl, radius = rolling_circle(constants, spin)
@@ -120,14 +122,15 @@ def friction_swing(constants: Constants, spin: float) -> float:
 
 
 def normal_force(own: Oscillator, whirl: float, radius: float) -> float:
-    """Force on the ring in a circular whirl [N]: m r (w^2 - w_n^2)."""
+    """Return the force on the ring in a circular whirl [N]: m r (w^2 - w_n^2)."""
     return own.mass * radius * (whirl * whirl - own.natural**2)
 
 
 def rolling_whirl(constants: Constants, spin: float) -> tuple[float, float]:
-    """Whirl frequency of rolling [rad/s, negative] and penetration [m]: w = -spin R_S / (r0 + delta).
+    """Return the whirl frequency of rolling [rad/s, negative] and the penetration [m]: w = -spin R_S / (r0 + delta).
 
-    delta is Hertz's at the force of the circular whirl; a fixed point, contracting by about delta/r0.
+    delta is Hertz's penetration at the force of the circular whirl, by fixed-point iteration with a rate of about
+    delta/r0.
     """
     own, contact = oscillator(constants), constants.contact
     depth = 0.0
@@ -139,13 +142,13 @@ def rolling_whirl(constants: Constants, spin: float) -> tuple[float, float]:
 
 
 def rolling_circle(constants: Constants, spin: float) -> tuple[float, float]:
-    """Whirl frequency [rad/s] and radius [m] of rolling at a spin [rad/s]."""
+    """Return whirl frequency [rad/s] and radius [m] of rolling at a spin [rad/s]."""
     whirl, depth = rolling_whirl(constants, spin)
     return whirl, constants.contact.clearance + depth
 
 
 def bare_rig(friction: float) -> Constants:
-    """The system of the closed forms: a mass on linear magnets in a rigid, centred ring, damped alike both ways."""
+    """Return the system of the closed forms: linear magnets, a rigid centred ring, equal damping in both directions."""
     constants = base_model(ModelLevels(magnet="linear", shaft="planar", stator="rigid")).constants
     damping = 0.5 * (constants.magnet.damping_x + constants.magnet.damping_y)
     return constants._replace(
@@ -156,7 +159,7 @@ def bare_rig(friction: float) -> Constants:
 
 
 def _whirling(constants: Constants, whirl: float, spin: float) -> np.ndarray:
-    """On the ring to the EAST of its centre, whirling backward [rad/s, taken as positive]."""
+    """Return a state on the ring EAST of its centre, whirling backward [rad/s, as a positive number]."""
     arm = constants.shaft.arm_ring
     radius = constants.contact.clearance
     # y = -arm Gamma: Gamma' > 0 moves down, which at EAST is backward.
@@ -169,8 +172,8 @@ def _whirling(constants: Constants, whirl: float, spin: float) -> np.ndarray:
 
 
 def gains_speed(constants: Constants, whirl: float) -> bool:
-    """Whether a sliding whirl gets faster, on a spin above that of rolling."""
-    # Three times what rolling needs: far more, and the gyroscopic moment that the closed form leaves out would show.
+    """Return whether a sliding whirl accelerates at a spin above that of rolling."""
+    # Three times the spin of rolling; a larger one would show the gyroscopic moment, which the closed form neglects.
     spin = 3.0 * whirl * constants.contact.clearance / constants.shaft.radius
     motion = move(
         ENGINE,
@@ -188,9 +191,9 @@ def gains_speed(constants: Constants, whirl: float) -> bool:
 
 
 def keeps_whirling(constants: Constants, y0: np.ndarray, spin: float) -> bool:
-    """Whether a whirl touches the ring throughout 1 s at a held spin, and is no slower at its end than in its middle.
+    """Return whether a whirl stays in contact for 1 s at a constant spin without slowing down in the second half.
 
-    It may slip for part of each turn, and then is a little slower than one that rolls, and steady.
+    It may slip during part of each turn; it is then steady, but slightly slower than one that rolls.
     """
     inputs = quiet_inputs(spin=spin, magnets=True, ideal=True)
     motion = move(ENGINE, constants, inputs, y0, ticks=round(1.0 * _TICKS_S), every=500)
@@ -202,11 +205,11 @@ def keeps_whirling(constants: Constants, y0: np.ndarray, spin: float) -> bool:
         part = (motion.times > begin_s) & (motion.times <= begin_s + 0.1)
         return whirl_frequency(x[part], y[part], motion.times[part], about=0.0)
 
-    return whirl_hz(0.9) < (1.0 - _SLOWER) * whirl_hz(0.4)  # both are negative
+    return whirl_hz(0.9) < (1.0 - _MAX_SLOWDOWN) * whirl_hz(0.4)  # both are negative
 
 
 def bisect(holds: Callable[[float], bool], low: float, high: float) -> float:
-    """Where a test turns from false (at `low`) to true (at `high`), between logarithms; nan where it does not."""
+    """Return where a test changes from false (at `low`) to true (at `high`), on a logarithmic scale; NaN if nowhere."""
     if holds(low) or not holds(high):
         return math.nan
     for _ in range(10):
@@ -216,7 +219,7 @@ def bisect(holds: Callable[[float], bool], low: float, high: float) -> float:
 
 
 class Threshold(NamedTuple):
-    """One threshold, simulated and by closed form."""
+    """A threshold, simulated and by closed form."""
 
     friction: float
     spin_hz: float
@@ -225,16 +228,16 @@ class Threshold(NamedTuple):
     full: float
     with_houses: float
     used: tuple[float, float]
-    """Friction over normal force in the full rig at mu = 0.25, where it rolls: mean, and highest."""
+    """Mean and maximum of friction over normal force in the full rig at mu = 0.25, rolling."""
 
     @property
     def error(self) -> float:
-        """Of the bare rig against the closed form."""
+        """Relative deviation of the bare rig from the closed form."""
         return self.bare / self.closed - 1.0
 
 
 def start_thresholds(frictions: tuple[float, ...] = FRICTIONS) -> list[Threshold]:
-    """Slowest sliding whirl that gains speed [Hz], over friction; `full` is nan, the rig's magnets are no spring."""
+    """Return the slowest accelerating sliding whirl [Hz], by friction; `full` is NaN, as its magnets are not linear."""
     found = []
     for mu in frictions:
         constants = bare_rig(mu)
@@ -245,7 +248,7 @@ def start_thresholds(frictions: tuple[float, ...] = FRICTIONS) -> list[Threshold
 
 
 def sustain_thresholds(spins_hz: tuple[float, ...] = SPINS_HZ) -> list[Threshold]:
-    """Least friction that keeps up whirl, over spin: a rolling whirl, and the friction lowered under it."""
+    """Return the least friction that sustains a rolling whirl, by spin."""
     found = []
     for spin_hz in spins_hz:
         spin = 2.0 * math.pi * spin_hz
@@ -260,32 +263,32 @@ def sustain_thresholds(spins_hz: tuple[float, ...] = SPINS_HZ) -> list[Threshold
 
 
 class Slip(NamedTuple):
-    """A sliding whirl that friction turns into rolling, on the bare rig without damping or drive."""
+    """Transition of a sliding whirl to rolling, on the bare rig without damping or drive."""
 
     whirl_hz: float
-    """With what it begins [Hz]."""
+    """Initial whirl frequency [Hz]."""
     kept: float
-    """Spin after over spin before [1]."""
+    """Final spin over initial spin [1]."""
     kept_closed: float
     time_s: float
     time_closed_s: float
 
 
 def spin_kept(constants: Constants) -> float:
-    """Part of its spin that a shaft keeps which slips from rest on the ring until it rolls [1], on a rigid ring.
+    """Return the part of its spin that a shaft keeps after slipping from rest on a rigid ring until it rolls [1].
 
-    Friction's impulse J gives m v = J along the ring and takes R_S J = I_zz (spin before - after); it rolls when
-    v = R_S spin.
+    The friction impulse J gives m v = J along the ring and R_S J = I_zz (spin before - after); rolling means v = R_S
+    spin.
     """
     shaft = constants.shaft
     return shaft.polar_inertia / (shaft.polar_inertia + pivoted_mass(constants) * shaft.radius**2)
 
 
 def slips_to_rolling() -> list[Slip]:
-    """From a sliding whirl to rolling: simulated, and by closed form.
+    """Return transitions from sliding whirl to rolling, simulated and by closed form.
 
-    m r w' = mu N with N = m r (w^2 - w_n^2), so the time is an integral of dw / (mu (w^2 - w_n^2)), elementary; the
-    ring is taken as rigid in the contact too, so that r = r0.
+    m r w' = mu N with N = m r (w^2 - w_n^2), so the time is the elementary integral of dw / (mu (w^2 - w_n^2)). The
+    contact is also assumed to be rigid, so r = r0.
     """
     constants = bare_rig(0.25)
     constants = constants._replace(magnet=constants.magnet._replace(damping_x=0.0, damping_y=0.0), torque_gain=0.0)
@@ -294,7 +297,7 @@ def slips_to_rolling() -> list[Slip]:
     found = []
     for whirl_hz in (12.0, 20.0, 40.0):
         begin = 2.0 * math.pi * whirl_hz
-        # Its whirl adds to what friction gives: I_zz spin + m R_S v is kept.
+        # The initial whirl adds to the momentum from friction: I_zz spin + m R_S v is conserved.
         after = kept + (1.0 - kept) * r0 * begin / (radius * spin)
         high, low = (math.log((w - own.natural) / (w + own.natural)) for w in (after * spin * radius / r0, begin))
         inputs = quiet_inputs(spin=spin, magnets=True)
@@ -308,7 +311,7 @@ def slips_to_rolling() -> list[Slip]:
 
 
 def friction_used(constants: Constants, spin: float) -> tuple[float, float]:
-    """Friction over normal force in a rolling whirl: mean, and highest [1]."""
+    """Return mean and maximum of friction over normal force in a rolling whirl [1]."""
     inputs = quiet_inputs(spin=spin, magnets=True, ideal=True)
     motion = move(ENGINE, constants, inputs, rolled(constants, spin), ticks=round(0.5 * _TICKS_S), every=100)
     normal, friction = (motion.column(name)[1000:] for name in ("normal_force", "friction_force"))
@@ -317,7 +320,7 @@ def friction_used(constants: Constants, spin: float) -> tuple[float, float]:
 
 
 def _holder(constants: Constants, spin: float) -> Callable[[float], bool]:
-    """Whether a rolling whirl goes on at a friction."""
+    """Return a test of whether a rolling whirl persists at a friction."""
     begun = rolled(constants, spin)
 
     def holds(mu: float) -> bool:
@@ -328,7 +331,7 @@ def _holder(constants: Constants, spin: float) -> Callable[[float], bool]:
 
 
 def rolled(constants: Constants, spin: float) -> np.ndarray:
-    """A settled rolling whirl of a rig, as state and integrals."""
+    """Return a settled rolling whirl of a rig, as state and integrals."""
     whirl, _ = rolling_whirl(constants, spin)
     inputs = quiet_inputs(spin=spin, magnets=True, ideal=True)
     y0 = _whirling(constants, -whirl, spin)
@@ -337,12 +340,12 @@ def rolled(constants: Constants, spin: float) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Start:
-    """What becomes of one pulse over friction.
+    """Outcome of one pulse over friction.
 
     Attributes:
         force_n: Peak of the pulse [N].
-        frictions: Shape (n,).
-        classes: Of `replays.studies.stability.trials.boundary`, shape (n,).
+        frictions: Frictions, shape (n,).
+        classes: Classes of `replays.studies.stability.trials.boundary`, shape (n,).
     """
 
     force_n: float
@@ -351,20 +354,20 @@ class Start:
 
     @property
     def first(self) -> float:
-        """Least friction scanned that ends in a rolling whirl; nan where none does."""
+        """Least scanned friction that ends in a rolling whirl; NaN if none does."""
         rolls = np.flatnonzero(self.classes == ROLLING)
         return float(self.frictions[rolls[0]]) if len(rolls) else math.nan
 
     @property
     def always(self) -> float:
-        """Least friction scanned above which all do; nan where the highest does not."""
+        """Least scanned friction above which all runs do; NaN if the highest does not."""
         other = np.flatnonzero(self.classes != ROLLING)
         after = int(other[-1]) + 1 if len(other) else 0
         return float(self.frictions[after]) if after < len(self.frictions) else math.nan
 
     @property
     def words(self) -> str:
-        """How many end how."""
+        """Number of runs per class, in words."""
         return ", ".join(f"{n} {NAMES[k]}" for k in range(len(NAMES)) if (n := int(np.sum(self.classes == k))))
 
 
@@ -376,7 +379,7 @@ def start_by_pulse(force_n: float, *, points: int) -> Start:
 
 
 def pulse_whirl(constants: Constants, *, force_n: float, duration_s: float) -> float:
-    """Whirl frequency if all of a half-sine pulse at the disk became motion along the ring [rad/s]."""
+    """Return the whirl frequency if a half-sine pulse at the disk became motion along the ring [rad/s]."""
     shaft = constants.shaft
     impulse = force_n * duration_s * 2.0 / math.pi
     speed = impulse * shaft.arm_disk * shaft.arm_ring / shaft.transverse_inertia
@@ -384,18 +387,18 @@ def pulse_whirl(constants: Constants, *, force_n: float, duration_s: float) -> f
 
 
 def sweep_pulses(speeds_hz: tuple[float, ...]) -> list[Pulse]:
-    """A pulse at each speed, on a drive that holds it: what the whirl frequency law is held against."""
+    """Return a pulse for each speed with a drive at constant speed, for testing the law of the whirl frequency."""
     pulse = Pulse(changes={"drive.mode": "ideal"}, force_n=150.0)
     return [replace(pulse, label=f"{speed:g} Hz", speed_hz=speed) for speed in speeds_hz]
 
 
 def law_hz(speed_hz: float) -> tuple[float, float]:
-    """Whirl frequency of rolling in the corrected rig [Hz], and of a rigid ring."""
+    """Return the whirl frequency of rolling in the corrected rig [Hz], and with a rigid ring."""
     constants = base_model(ModelLevels()).constants
     whirl, _ = rolling_whirl(constants, 2.0 * math.pi * speed_hz)
     return whirl / (2.0 * math.pi), -speed_hz * constants.shaft.radius / constants.contact.clearance
 
 
 def law_error(result: Outcome, speed_hz: float) -> float:
-    """Of the simulated whirl frequency against the closed form."""
+    """Return the relative deviation of the simulated whirl frequency from the closed form."""
     return result.whirl_hz / law_hz(speed_hz)[0] - 1.0

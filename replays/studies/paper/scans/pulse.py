@@ -1,4 +1,4 @@
-"""A hammer pulse on a changed rig, and the numbers that come of it: what every scan of the report is made of."""
+"""Hammer pulse on a modified rig, and its results: the basis of all scans in the report."""
 
 from __future__ import annotations
 
@@ -20,32 +20,32 @@ if TYPE_CHECKING:
     from rig.physics.model import Model
 
 FORCE_N = 100.0
-"""Peak of the pulse: the paper, section 6.2."""
+"""Peak of the pulse [N], section 6.2 of the paper."""
 SPEED_HZ = 6.2
 CENTRED_BY = "ring.off_centre_y"
-"""A name of this report alone [mm]: the ring's height over where it is centred on the shaft at rest."""
+"""Pseudo-parameter of this report [mm]: height of the ring above its position centred on the shaft at rest."""
 BANDWIDTH = "transducer.bandwidth"
-"""A name of this report alone [Hz]: corner of a low-pass of order 2 on the reactions; left out, there is none."""
+"""Pseudo-parameter of this report [Hz]: corner of a second-order low-pass on the reactions; without it, none."""
 HAMMER_MS = "hammer.duration"
-"""A name of this report alone [ms]: length of the pulse."""
+"""Pseudo-parameter of this report [ms]: length of the pulse."""
 PULSE_AT = "hammer.at"
-"""A name of this report alone [s]: when it comes; the shaft's turn at the pulse decides which bounces follow."""
+"""Pseudo-parameter of this report [s]: time of the pulse; the shaft angle at the pulse determines the bounces."""
 RATE_HZ = 10_000
 MEASURED_N = 500.0
-"""Last label of the axis of the measured forces, Fig. 15(c, d): the only number that the text has of them."""
+"""Last label of the axis of the measured forces, Fig. 15(c, d), the only number on them in the paper."""
 
 
 @dataclass(frozen=True)
 class Pulse:
-    """What is run.
+    """A run with a hammer pulse.
 
     Attributes:
-        label: Names the run in a table.
-        parameters: The parameter set.
-        changes: Of scene or parameters by dotted key in their own units, or of the names above.
+        label: Name of the run in a table.
+        parameters: Parameter set.
+        changes: Changes to scene or parameters by dotted key in their own units, or by the pseudo-parameters above.
         speed_hz: Speed of the drive [Hz].
         force_n: Peak of the half-sine [N].
-        duration_s: Of the run [s].
+        duration_s: Length of the run [s].
     """
 
     label: str = ""
@@ -58,30 +58,30 @@ class Pulse:
 
 @dataclass(frozen=True)
 class Outcome:
-    """The numbers of a pulse; those of the whirl are nan where it does not whirl.
+    """Results of a pulse; those of the whirl are NaN without whirl.
 
     Attributes:
-        outcome: The motion at the end, in a word.
+        outcome: Final motion in a word.
         whirl_hz: Phase slope of the shaft in the ring [Hz], backward negative.
-        spin_hz: Of the shaft while it whirls [Hz].
-        normal_n: Mean normal force while it whirls [N].
-        ripple_n: RMS of the normal force about that [N].
-        reaction_x_n: Amplitude of P_E - P_W while it whirls [N], through the low-pass if there is one.
-        reaction_y_n: Amplitude of P_N - P_S while it whirls [N], likewise.
-        depth_m: Mean penetration while it whirls [m].
-        ring_m: Mean radius of the orbit in the ring while it whirls [m].
-        disk_m: Largest |x| at the disk while it whirls [m].
-        peak_normal_n: Largest normal force of the whole run, by the engine's own steps [N].
-        peak_x_n: Largest |P_E - P_W| of the whole run [N], through the low-pass if there is one.
+        spin_hz: Spin in whirl [Hz].
+        normal_n: Mean normal force in whirl [N].
+        ripple_n: RMS of the normal force about its mean [N].
+        reaction_x_n: Amplitude of P_E - P_W in whirl [N], after the low-pass if there is one.
+        reaction_y_n: Amplitude of P_N - P_S in whirl [N], likewise.
+        depth_m: Mean penetration in whirl [m].
+        ring_m: Mean radius of the orbit in the ring in whirl [m].
+        disk_m: Largest |x| at the disk in whirl [m].
+        peak_normal_n: Largest normal force of the whole run, at the engine's own steps [N].
+        peak_x_n: Largest |P_E - P_W| of the whole run [N], after the low-pass if there is one.
         peak_y_n: Largest |P_N - P_S| of the whole run [N], likewise.
-        true_peak_x_n: Largest |P_E - P_W| without it [N].
-        true_peak_y_n: Largest |P_N - P_S| without it [N].
-        contacts: Contacts begun.
-        rebound_m_s: Fastest that the shaft flies off the ring, seen from the ring [m/s].
+        true_peak_x_n: Largest |P_E - P_W| without the low-pass [N].
+        true_peak_y_n: Largest |P_N - P_S| without the low-pass [N].
+        contacts: Number of contacts.
+        rebound_m_s: Largest rebound speed relative to the ring [m/s].
         slowest_hz: Lowest spin of the whole run [Hz].
-        roll_s: From the pulse until it rolls for good [s].
-        slope_n_s: Largest rate of P_E - P_W while it whirls [N/s].
-        imbalance: Line of the reactions at the spin over that at the whirl frequency [1].
+        roll_s: Time from the pulse to lasting rolling [s].
+        slope_n_s: Largest rate of P_E - P_W in whirl [N/s].
+        imbalance: Spectral line of the reactions at the spin over that at the whirl frequency [1].
     """
 
     outcome: str
@@ -108,12 +108,12 @@ class Outcome:
 
     @property
     def whirls(self) -> bool:
-        """Whether it ends in full annular backward whirl."""
+        """True if it ends in full annular backward whirl."""
         return self.outcome == "backward whirl"
 
 
 def pulse_scene(pulse: Pulse) -> Scene:
-    """The scene of a pulse: ideal sensors, few rows."""
+    """Return the scene of a pulse, with ideal sensors at a low rate."""
     changes = dict(pulse.changes)
     hammer_ms, at_s = float(changes.pop(HAMMER_MS, 5.0)), float(changes.pop(PULSE_AT, 0.02))
     changes.pop(BANDWIDTH, None)
@@ -137,7 +137,7 @@ def pulse_scene(pulse: Pulse) -> Scene:
 
 
 def pulse_model(pulse: Pulse, changes: dict[str, Any]) -> Model:
-    """The model of a pulse with these changes, those that are not of its parameters left out."""
+    """Return the model of a pulse with those changes that concern its parameters."""
     from rig.physics.model import build_model
 
     own = load_parameters(pulse.parameters)
@@ -145,7 +145,7 @@ def pulse_model(pulse: Pulse, changes: dict[str, Any]) -> Model:
 
 
 def outcome(pulse: Pulse) -> Outcome:
-    """Run a pulse and read its numbers; a rig that cannot be built is an outcome of its own."""
+    """Run a pulse and return its results; a rig that cannot be built is a result, too."""
     try:
         scene = pulse_scene(pulse)
         run = simulate(scene)
@@ -155,7 +155,7 @@ def outcome(pulse: Pulse) -> Outcome:
 
 
 def trace_of(run: Run) -> Trace:
-    """A run as the ladder's quantities read it."""
+    """Return a run in the form used by the ladder's quantities."""
     contact, radius = run.simulation.model.constants.contact, run.simulation.model.constants.shaft.radius
     return Trace(
         times_s=run.times_s,
@@ -169,12 +169,12 @@ def trace_of(run: Run) -> Trace:
 
 
 def read(run: Run, *, at_s: float, bandwidth_hz: float | None = None) -> Outcome:
-    """The numbers of a finished run.
+    """Return the results of a finished run.
 
     Args:
         run: The run.
-        at_s: When the pulse came [s].
-        bandwidth_hz: Corner of the low-pass on the reactions [Hz]; None: they are read as they are.
+        at_s: Time of the pulse [s].
+        bandwidth_hz: Corner of the low-pass on the reactions [Hz]; None: no low-pass.
     """
     trace = trace_of(run)
 
@@ -215,14 +215,14 @@ def read(run: Run, *, at_s: float, bandwidth_hz: float | None = None) -> Outcome
 
 
 def _line(run: Run, hz: float, rows: slice) -> float:
-    """Height of the line of the reactions, as they turn, at a frequency, backward negative."""
+    """Return the amplitude of the rotating reactions at a frequency, backward negative."""
     forces = (run["P_E"] - run["P_W"] + 1j * (run["P_N"] - run["P_S"]))[rows]
     weights = np.hanning(len(forces)) * np.exp(-2j * math.pi * hz * run.times_s[rows])
     return float(abs(np.sum((forces - forces.mean()) * weights)))
 
 
 def rebound(run: Run) -> float:
-    """Fastest that the shaft flies off the ring, seen from the ring [m/s]; nan where it never touched."""
+    """Return the largest rebound speed relative to the ring [m/s]; NaN without contact."""
     touched = np.logical_or.accumulate(run["penetration"] > 0.0)
     flies = touched & (run["penetration"] <= 0.0)
     inward = -np.diff(np.hypot(run["ring_x"], run["ring_y"])) / np.diff(run.times_s)
@@ -230,20 +230,20 @@ def rebound(run: Run) -> float:
 
 
 def reaction(run: Run, plus: str, minus: str, *, bandwidth_hz: float | None = None) -> np.ndarray:
-    """Reaction of a direction: the difference of its opposed transducers [N], shape (n,).
+    """Return the reaction in a direction: the difference of opposed transducers [N], shape (n,).
 
     Args:
         run: The run.
-        plus: One transducer.
-        minus: The opposed one.
-        bandwidth_hz: Corner of a Butterworth low-pass of order 2 [Hz], or None.
+        plus: Positive transducer.
+        minus: Opposed transducer.
+        bandwidth_hz: Corner of a second-order Butterworth low-pass [Hz], or None.
     """
     pair = run[plus] - run[minus]
     return pair if bandwidth_hz is None else low_passed(run, pair, bandwidth_hz)
 
 
 def low_passed(run: Run, signal: np.ndarray, bandwidth_hz: float) -> np.ndarray:
-    """A signal of a run through a Butterworth low-pass of order 2, shape (n,)."""
+    """Return a signal of a run after a second-order Butterworth low-pass, shape (n,)."""
     from scipy.signal import butter, sosfilt
 
     rate_hz = 1.0 / (run.times_s[1] - run.times_s[0])
@@ -254,12 +254,12 @@ def low_passed(run: Run, signal: np.ndarray, bandwidth_hz: float) -> np.ndarray:
 def outcomes(
     pulses: Iterable[Pulse], *, processes: int, progress: Callable[[str], None] | None = None
 ) -> Iterator[Outcome]:
-    """Run many pulses, in order.
+    """Run many pulses and yield their outcomes in order.
 
     Args:
-        pulses: What to run.
-        processes: How many at a time; 1 for this process alone.
-        progress: Told each label when it is done.
+        pulses: The pulses.
+        processes: Number of parallel processes; 1 uses this process.
+        progress: Function that receives the label of each completed pulse.
     """
     pulses = list(pulses)
     tell = progress or (lambda _: None)

@@ -1,4 +1,4 @@
-"""How far the assumed values may be off together: a Latin hypercube over all of them, and what comes of it."""
+"""Joint variation of the assumed values: a Latin hypercube over all of them, and its results."""
 
 from __future__ import annotations
 
@@ -18,33 +18,33 @@ SEED = 2013
 
 
 class Assumed(BaseModel, frozen=True, extra="forbid"):
-    """One assumed value and the range that it may be in, assumed as well."""
+    """An assumed value and its range, which is assumed as well."""
 
     key: str
     called: str
-    """In words, as pictures and tables have it."""
+    """Name in pictures and tables."""
     name: str = Field(default="", alias="as")
-    """What a pulse takes it by, where that is not the key."""
+    """Name in a pulse's changes, if it differs from the key."""
     low: float = math.nan
     high: float = math.nan
     log: bool = False
     whole: bool = False
     tied: str = ""
-    """Follows another value."""
+    """Key of the value that it is proportional to."""
     ratio: float = 1.0
     """That value over this one."""
     unit: str = ""
     value: float | None = None
-    """What the report takes elsewhere, where no parameter set says it."""
+    """Value in the rest of the report, if no parameter set defines it."""
     why: str
 
     @property
     def taken_as(self) -> str:
-        """The name in a pulse's changes."""
+        """Name in a pulse's changes."""
         return self.name or self.key
 
     def at(self, part: float) -> float:
-        """The value at a part of the range, 0 to 1."""
+        """Return the value at a fraction of the range, 0 to 1."""
         if self.log:
             return float(self.low * (self.high / self.low) ** part)
         value = self.low + part * (self.high - self.low)
@@ -53,7 +53,7 @@ class Assumed(BaseModel, frozen=True, extra="forbid"):
 
 @cache
 def assumed_values() -> tuple[Assumed, ...]:
-    """All of them, from the data file."""
+    """Return all assumed values from the data file."""
     import tomllib
 
     document = tomllib.loads(files("replays.studies.paper").joinpath("spread.toml").read_text(encoding="utf-8"))
@@ -61,12 +61,12 @@ def assumed_values() -> tuple[Assumed, ...]:
 
 
 def free_values() -> tuple[Assumed, ...]:
-    """Those that no other ties."""
+    """Return the values that are not tied to another."""
     return tuple(entry for entry in assumed_values() if not entry.tied)
 
 
 def present(entry: Assumed) -> str:
-    """What the default set, or this report, takes, with its unit."""
+    """Return the value of the default set, or of this report, with its unit."""
     known = load_parameters(DEFAULT_SET).entries.get(entry.key)
     value = known.value if known else entry.value
     unit = known.unit if known and not entry.unit else entry.unit
@@ -74,7 +74,7 @@ def present(entry: Assumed) -> str:
 
 
 def changes(values: dict[str, float]) -> dict[str, Any]:
-    """The changes of a pulse for free values by key, the tied ones with them."""
+    """Return the changes of a pulse from free values by key, including tied values."""
     found: dict[str, Any] = {}
     for entry in assumed_values():
         if entry.tied and entry.tied in values:
@@ -85,7 +85,7 @@ def changes(values: dict[str, float]) -> dict[str, Any]:
 
 
 def one_at_a_time() -> list[tuple[Assumed, Pulse, Pulse]]:
-    """Each value at both ends of its range, the others as they are."""
+    """Return each value with pulses at both ends of its range, the others unchanged."""
     return [
         (
             entry,
@@ -97,7 +97,7 @@ def one_at_a_time() -> list[tuple[Assumed, Pulse, Pulse]]:
 
 
 def hypercube(samples: int, *, parameters: str = DEFAULT_SET) -> tuple[np.ndarray, list[Pulse]]:
-    """Latin hypercube over all free values: parts of their ranges, shape (samples, values), and the pulses."""
+    """Return a Latin hypercube over all free values: fractions of their ranges, shape (samples, values), and pulses."""
     from scipy.stats import qmc
 
     entries = free_values()
@@ -114,18 +114,18 @@ def hypercube(samples: int, *, parameters: str = DEFAULT_SET) -> tuple[np.ndarra
 
 
 def phases(pulse: Pulse, count: int) -> list[Pulse]:
-    """The same pulse at `count` places of the shaft's turn: impacts are chaotic, one run of them says little."""
+    """Return a pulse at `count` shaft phases; impacts are chaotic, so a single run is not representative."""
     at_s = [round(0.02 + k / count / pulse.speed_hz, 4) for k in range(count)]
     return [replace(pulse, changes={**pulse.changes, PULSE_AT: each}) for each in at_s]
 
 
 def column(results: list[Outcome], name: str) -> np.ndarray:
-    """One number of many outcomes, nan where they have none, shape (n,)."""
+    """Return one number of many outcomes, NaN where it is missing, shape (n,)."""
     return np.array([float(getattr(result, name)) for result in results])
 
 
 def rank_correlation(parts: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Spearman's rank correlation of each input with a number, over the runs that have one, shape (inputs,)."""
+    """Return Spearman's rank correlation of each input with a number, over runs that have one, shape (inputs,)."""
     from scipy.stats import spearmanr
 
     there = np.isfinite(values)
@@ -136,7 +136,7 @@ def rank_correlation(parts: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def percentiles(values: np.ndarray) -> tuple[float, float, float]:
-    """5, 50 and 95 % of the finite values, nan where there are none."""
+    """Return the 5, 50 and 95 % percentiles of the finite values; NaN if there are none."""
     there = values[np.isfinite(values)]
     if not len(there):
         return math.nan, math.nan, math.nan
