@@ -1,7 +1,7 @@
-"""Speed of the rig with its error beside it: simulated over processor time, cases in turn in one process.
+"""Benchmark of the rig: simulated over processor time, with errors; cases alternate in one process.
 
-The processor time of the thread that simulates: other load on the machine does not count. So are single frames: what
-real time makes of them is the rig's own lateness (`rig status`).
+Measures the processor time of the simulating thread, unaffected by other load, also for single frames; the resulting
+lateness in real time is shown by `rig status`.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ from rig.run.scenes import Scene, load_scene
 from rig.run.simulation import Simulation
 from rig.serve.pacing import short_collections
 
-ALONE = {**{f"sensors.{name}": value for name, value in bare_sensors().items()}, "model.friction": "exact"}
-"""The engine alone: a row every 1 ms, no sensor chain to speak of."""
+ENGINE_ONLY = {**{f"sensors.{name}": value for name, value in bare_sensors().items()}, "model.friction": "exact"}
+"""Settings for the engine alone: a row every 1 ms and almost no sensor chain."""
 _BLOCK_TICKS = 10_000
 _FRAME_TICKS = 1000
 FRAME_GOAL_US = 100.0
-"""Processor time that 99.9 % of frames are meant to stay below [us]: a tenth of their length."""
+"""Goal for the processor time of 99.9 % of frames [us]: a tenth of their length."""
 
 
 @dataclass(frozen=True)
@@ -47,9 +47,9 @@ class Case:
         scene: Scene.
         changes: Changes to it.
         simulated_s: Length of a run [s].
-        goal: Times real time that it is meant to reach; None: no goal.
-        error_goal: Largest total error against exact Coulomb that counts as reaching it; None: not compared.
-        blocks: Whole run in one call, or in blocks of 10 ms as the service makes them.
+        goal: Target speed as a multiple of real time; None: no target.
+        error_goal: Largest total error against exact Coulomb for reaching the goal; None: not compared.
+        blocks: Whether the run is made in blocks of 10 ms, as by the service, instead of one call.
     """
 
     name: str
@@ -62,7 +62,7 @@ class Case:
 
 
 def _engine(name: str, step_us: int, **changes: Any) -> dict[str, Any]:
-    return {**ALONE, "engine.name": name, "engine.step_us": step_us, **changes}
+    return {**ENGINE_ONLY, "engine.name": name, "engine.step_us": step_us, **changes}
 
 
 def _split(tolerance: float, **changes: Any) -> dict[str, Any]:
@@ -70,7 +70,7 @@ def _split(tolerance: float, **changes: Any) -> dict[str, Any]:
 
 
 def _faults(kind: str, **numbers: float) -> list[dict[str, Any]]:
-    """Commands of the scene `hammer`, and one fault on each of its channels from the begin on."""
+    """Return the commands of the scene `hammer`, and one fault on each of its channels from the start."""
     pulse = [command.model_dump() for command in load_scene("hammer").commands]
     names = load_scene("hammer").table.channels
     return [*pulse, *({"at_s": 0.0, "command": "fault", "channel": one, "kind": kind, **numbers} for one in names)]
@@ -126,20 +126,20 @@ CASES = (
     Case("split, stable run, all sensors at 20 kHz", "stable-run", {}, blocks=True),
     Case("rk8 25 us, hammer, all sensors at 20 kHz", "hammer", {"engine.name": "rk8"}, blocks=True),
 )
-"""The first is what the others are compared with."""
+"""Cases; the first one is the basis of the ratios."""
 
 PEER_CASES = (("cvode-bdf", 2e-3), ("cvode-adams", 2e-3), ("heyoka", 2e-3), ("heyoka", 1e-6))
-"""Peer, and the total error at which it is timed: at the cheapest setting of its ladder that reaches it."""
+"""Peer, and the total error at which it is timed, with the cheapest sufficient setting of its ladder."""
 
 
 def measure(*, runs: int, peers: bool, frames: int, progress: Callable[[str], None]) -> dict[str, Any]:
-    """Run every case several times, one after the other in turn.
+    """Run every case several times, alternating between cases.
 
     Args:
         runs: Runs of each case.
-        peers: Time other people's solvers in the same rounds, where they are installed.
-        frames: How many frames of 1 ms are timed one by one; 0 for none.
-        progress: Told what is measured.
+        peers: Time installed other solvers in the same rounds.
+        frames: Number of frames of 1 ms that are timed separately; 0 for none.
+        progress: Function that receives the name of each measurement.
 
     Returns:
         A JSON document: machine, time until the kernels were ready [s], per case times real time (median, min, max,
@@ -206,7 +206,7 @@ def measure(*, runs: int, peers: bool, frames: int, progress: Callable[[str], No
 def _judged(
     case: Case, rows: np.ndarray, simulation: Simulation, reference: np.ndarray, summary: dict[str, Any]
 ) -> dict[str, Any]:
-    """A case's speeds with its error, residual and goal beside them."""
+    """Return a case's speeds with its error, residual and goal."""
     error = None
     if case.scene == "hammer" and not case.blocks and case.simulated_s == CASES[0].simulated_s:
         count = min(len(rows), len(reference))
@@ -225,7 +225,7 @@ def _judged(
 
 
 def _run(scene: Scene, case: Case) -> tuple[float, np.ndarray, Simulation]:
-    """Times real time, the observed rows (of the last block where there are blocks), and the simulation at its end."""
+    """Return times real time, observed rows (of the last block if there are blocks), and the simulation at its end."""
     simulation = Simulation(scene)
     _ = simulation.first_row
     done = run_scene(simulation, block_ticks=_BLOCK_TICKS if case.blocks else simulation.end_tick, keep=False)
@@ -233,7 +233,7 @@ def _run(scene: Scene, case: Case) -> tuple[float, np.ndarray, Simulation]:
 
 
 def _reference(problem: Problem) -> tuple[np.ndarray, float | None, str]:
-    """States at every 1 ms, the distance of the two codes behind it, and which they are."""
+    """Return states at every 1 ms, the distance between the two codes of the reference, and their names."""
     found = find_reference(problem, quick=True)
     if found is not None:
         return found.solution.states, found.error, " and ".join(found.names)
@@ -246,7 +246,7 @@ def _reference(problem: Problem) -> tuple[np.ndarray, float | None, str]:
 def _cheapest(
     name: str, wanted: float, problem: Problem, reference: np.ndarray
 ) -> list[tuple[str, float, Setting, float]]:
-    """The quickest setting of a peer's ladder, with steps between, whose error is at most the one wanted, if any."""
+    """Return the fastest setting of a peer's refined ladder whose error is at most the given one, if any."""
     found: tuple[float, Setting, float] | None = None
     for setting in _with_steps_between(PEERS[name].ladder):
         solution = PEERS[name].solve(problem, setting, budget_s=30.0)
@@ -259,7 +259,7 @@ def _cheapest(
 
 
 def _with_steps_between(ladder: tuple[Setting, ...]) -> list[Setting]:
-    """A ladder of tolerances with three steps a decade: a coarse one would hold a peer to a setting below the goal."""
+    """Return a ladder refined to three tolerances per decade, so that no peer has to use a needlessly fine one."""
     finer = list(ladder)
     for above, below in pairwise(ladder):
         if above.absolute is None and below.absolute is None:
@@ -282,13 +282,13 @@ def _summary(name: str, values: list[float], base: list[float]) -> dict[str, Any
 
 
 def _frames(frames: int, progress: Callable[[str], None]) -> dict[str, Any]:
-    """Processor time of single frames of 1 ms in a whirl [us]: engine alone, and with all sensors."""
+    """Return the processor time of single frames of 1 ms in a whirl [us], for the engine alone and with all sensors."""
     report = {}
     for name, changes in (("engine alone", _split(1e-4)), ("all sensors at 20 kHz", _SENSORS)):
         progress(f"{frames} frames of 1 ms, {name}")
         simulation = Simulation(load_scene("hammer", {**changes, "duration_s": 3600.0}))
         taken = np.empty(frames)
-        with short_collections():  # as in every paced run
+        with short_collections():  # as in every run with a pace
             for _ in range(100):
                 simulation.advance(_FRAME_TICKS)
             for n in range(frames):

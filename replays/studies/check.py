@@ -14,7 +14,7 @@ from rig.physics.kernels.signals import N_STATE
 from rig.run.scenes import Scene, parse_scene
 from rig.run.simulation import Simulation
 
-ANOTHER_BRANCH = 0.1
+MAX_BRANCH_ERROR = 0.1
 """Scaled error from which two runs no longer describe the same motion."""
 _TOLERANCE_FACTOR = 0.1
 """Factor on the tolerance of an adaptive engine; steps of a fixed-step engine are halved instead."""
@@ -27,7 +27,7 @@ class Check:
     Attributes:
         finer: Engine and setting of the second run, in words.
         error: RMS distance of the scaled states at the truth's rate, as in the charts.
-        parted_s: First time at which a scaled state differs by `ANOTHER_BRANCH`, or None.
+        parted_s: First time at which a scaled state differs by `MAX_BRANCH_ERROR`, or None.
         contacts: Contacts in the run and in the finer run.
     """
 
@@ -39,7 +39,7 @@ class Check:
     @property
     def wrong_branch(self) -> bool:
         """True if the run probably follows another branch of motion than the model."""
-        return self.error > ANOTHER_BRANCH or abs(self.contacts[0] - self.contacts[1]) > 0.2 * max(self.contacts)
+        return self.error > MAX_BRANCH_ERROR or abs(self.contacts[0] - self.contacts[1]) > 0.2 * max(self.contacts)
 
     def line(self) -> str:
         """Return the result on one line."""
@@ -82,7 +82,7 @@ def check(scene: Scene) -> Check:
     coarse, fine = _states(scene, {}), _states(scene, changes)
     n = min(len(coarse[0]), len(fine[0]))
     errors = np.array([scaled_error(a[None, :], b[None, :]) for a, b in zip(coarse[0][:n], fine[0][:n], strict=True)])
-    parted = np.flatnonzero(errors > ANOTHER_BRANCH)
+    parted = np.flatnonzero(errors > MAX_BRANCH_ERROR)
     return Check(
         finer=f"{scene.engine.name} at {setting}",
         error=float(np.sqrt(np.mean(errors**2))),

@@ -44,7 +44,7 @@ from rig.physics.contacts import (
 from rig.physics.model import contact_pair, normal_law, reference_impact
 from rig.physics.parameters import ParameterSet
 
-LEAST = 0.05
+MIN_RESTITUTION = 0.05
 """Smallest restitution compared, equal to the smallest `contact.restitution`."""
 SPEEDS = (1e-4, 1.0)
 """Range of approach speeds compared [m/s]."""
@@ -73,9 +73,9 @@ _STYLES: dict[str, tuple[str, Any]] = {
     "pereira-cylinder": (RED, "-"),
     "liu-cylinder": (SKY, "-"),
 }
-_OTHER = ("#882255", (0, (3, 1)))
+_DEFAULT_STYLE = ("#882255", (0, (3, 1)))
 """Style of a law without an entry above."""
-_UNDER: dict[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.47, -0.13), "ncols": 2}
+_LEGEND_BELOW: dict[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.47, -0.13), "ncols": 2}
 """Legend position below the axes."""
 
 
@@ -94,7 +94,7 @@ def compare(parameters: ParameterSet) -> dict[str, Any]:
     pair, impact = contact_pair(parameters), reference_impact(parameters)
     restitution, floor = parameters["contact.restitution"], parameters["contact.speed_floor"]
     own = normal_law(parameters)
-    wanted = [round(LEAST * n, 2) for n in range(1, 21)]
+    wanted = [round(MIN_RESTITUTION * n, 2) for n in range(1, 21)]
     speeds = [float(f"{v:.3g}") for v in np.geomspace(*SPEEDS, 17)]
     damping = damping_laws(parameters)
     return {
@@ -129,9 +129,9 @@ def compare(parameters: ParameterSet) -> dict[str, Any]:
         ],
         "stiffness": [_stiffness(parameters, pair, name) for name in stiffness_laws(parameters)],
         "wanted": wanted,
-        "returned": {name: [_returned(law, e) for e in wanted] for name, law in damping.items()},
+        "returned": {name: [_returned_restitution(law, e) for e in wanted] for name, law in damping.items()},
         "speed": speeds,
-        "returned_over_speed": over_speed(parameters, speeds),
+        "returned_over_speed": returned_over_speeds(parameters, speeds),
         "lean": {
             "angle_mrad": pair.clearance / parameters["shaft.arm_ring"] * 1e3,
             "over_width_um": pair.clearance / parameters["shaft.arm_ring"] * pair.width * 1e6,
@@ -139,7 +139,7 @@ def compare(parameters: ParameterSet) -> dict[str, Any]:
     }
 
 
-def over_speed(parameters: ParameterSet, speeds: list[float]) -> dict[str, list[float]]:
+def returned_over_speeds(parameters: ParameterSet, speeds: list[float]) -> dict[str, list[float]]:
     """Return the restitution over the approach speed [m/s] for three kinds of damping.
 
     A law with v0 (c from the exact rule) returns the same restitution above the lower limit of v0, and more below it. A
@@ -183,14 +183,14 @@ def draw(parameters: ParameterSet, path: Path) -> None:
 
 
 def _draw_restitution(wanted: Any, difference: Any, parameters: ParameterSet) -> None:
-    asked = np.linspace(LEAST, 1.0, 191)
+    asked = np.linspace(MIN_RESTITUTION, 1.0, 191)
     curves = {
-        name: np.array([_returned(law, float(e)) for e in asked], float)
+        name: np.array([_returned_restitution(law, float(e)) for e in asked], float)
         for name, law in damping_laws(parameters).items()
     }
     # Sorted by the height of the curves at 0.5.
     for name in sorted(curves, key=lambda name: -float(curves[name][90])):
-        color, dash = _STYLES.get(name, _OTHER)
+        color, dash = _STYLES.get(name, _DEFAULT_STYLE)
         style = {"color": color, "ls": dash, "lw": 3.4 if name == "exact" else 1.8, "label": name}
         style["zorder"] = 1 if name == "exact" else 2
         wanted.plot(asked, curves[name], **style)
@@ -204,7 +204,7 @@ def _draw_restitution(wanted: Any, difference: Any, parameters: ParameterSet) ->
         ha="right", va="bottom", rotation=90, color="0.4",
     )  # fmt: skip
     wanted.set(title="Restitution that each damping law returns", ylabel="restitution returned [1]", ylim=(0, 1.02))
-    wanted.legend(**_UNDER, title="from the top down at 0.5")
+    wanted.legend(**_LEGEND_BELOW, title="from the top down at 0.5")
     difference.set(
         title="The same less what was asked for, close up", ylabel="returned − asked for [1]", ylim=(-0.06, 0.06)
     )
@@ -214,7 +214,7 @@ def _draw_speed(axes: Any, parameters: ParameterSet) -> None:
     impact, restitution = reference_impact(parameters), parameters["contact.restitution"]
     floor = parameters["contact.speed_floor"]
     speeds = [float(v) for v in np.geomspace(*SPEEDS, 41)]
-    curves = over_speed(parameters, speeds)
+    curves = returned_over_speeds(parameters, speeds)
     for (name, values), style in zip(
         curves.items(),
         ({"color": BLACK, "lw": 3.4}, {"color": SKY, "ls": (0, (5, 4))}, {"color": RED}),
@@ -235,7 +235,7 @@ def _draw_speed(axes: Any, parameters: ParameterSet) -> None:
         title=f"Restitution returned over speed, {restitution:g} asked for", xlabel="approach speed [m/s]",
         ylabel="restitution returned [1]", xlim=SPEEDS, ylim=(low, 1.01),
     )  # fmt: skip
-    axes.legend(**_UNDER)
+    axes.legend(**_LEGEND_BELOW)
 
 
 def _draw_stiffness(axes: Any, parameters: ParameterSet) -> None:
@@ -245,7 +245,7 @@ def _draw_stiffness(axes: Any, parameters: ParameterSet) -> None:
         entry = _stiffness(parameters, pair, name)
         if entry["refused"]:
             continue
-        color, dash = _STYLES.get(name, _OTHER)
+        color, dash = _STYLES.get(name, _DEFAULT_STYLE)
         forces = np.array([law.force(float(depth), pair) for depth in depths])
         axes.loglog(depths * 1e6, forces / depths * 1e-6, color=color, ls=dash, lw=1.8, label=name)
         if entry["fit_error"]:
@@ -262,7 +262,7 @@ def _draw_stiffness(axes: Any, parameters: ParameterSet) -> None:
         title=f"Stiffness laws, ring {pair.width * 1e3:g} mm wide (assumed)", xlabel="penetration [µm]",
         ylabel="force / penetration [N/µm]", xlim=(0.3, 30), ylim=(2, 700),
     )  # fmt: skip
-    axes.legend(**_UNDER)
+    axes.legend(**_LEGEND_BELOW)
 
 
 def _resolved(
@@ -299,7 +299,7 @@ def stiffness_laws(parameters: ParameterSet) -> dict[str, StiffnessLaw]:
     return STIFFNESS | ({} if chosen is None else {chosen: stiffness_law(chosen)})
 
 
-def _returned(law: DampingLaw, restitution: float) -> float | None:
+def _returned_restitution(law: DampingLaw, restitution: float) -> float | None:
     """Return the restitution of a damping law above the lower limit of v0; that of Kelvin-Voigt equals the setting.
 
     Returns None if a formula gives no c for this restitution.

@@ -1,4 +1,4 @@
-"""The magnet models side by side: their forces, their errors, and how they are drawn (in the manner of Fig. 7)."""
+"""Comparison of the magnet models: forces, errors, and a picture in the manner of Fig. 7."""
 
 from __future__ import annotations
 
@@ -26,24 +26,24 @@ from rig.physics.magnets import (
 from rig.physics.model import Model
 
 FRACTIONS = (0.1, 0.2, 0.4, 0.6, 0.8, 1.0)
-"""Displacements compared, of the reach."""
+"""Displacements compared, as fractions of the reach."""
 
 Force = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
 class MagnetModel(NamedTuple):
-    """One of the family."""
+    """A magnet model."""
 
     name: str
     force: Force
-    """[N], shape (n, 2), at x, y [m], shape (n,)."""
+    """Force [N], shape (n, 2), at x, y [m], shape (n,)."""
     stiffness: float
-    """At the centre, with these magnets [N/m]."""
+    """Stiffness at the centre with these magnets [N/m]."""
     runs_as: str
 
 
 def family(geometry: MagnetGeometry) -> tuple[MagnetModel, ...]:
-    """The models from the cheapest to the best, each with these magnets."""
+    """Return the models for these magnets, from the simplest to the most exact."""
 
     def mapped(name: str, fitted: MagnetMap, runs_as: str) -> MagnetModel:
         return MagnetModel(name, lambda x, y: map_force(x, y, fitted), fitted.stiffness, runs_as)
@@ -62,11 +62,12 @@ def family(geometry: MagnetGeometry) -> tuple[MagnetModel, ...]:
 
 
 def compare(model: Model) -> dict[str, Any]:
-    """Every model's force and error.
+    """Compare force and error of the models.
 
     Returns:
-        A JSON document: `geometry`, `stiffness_used_n_m`, `reach_mm`, `travel_mm` (how far the ring lets the shaft get
-        from the magnets' centre), `quadrature_error`, `overstated` (far-field sum over exact cylinders, at
+        A JSON document: `geometry`, `stiffness_used_n_m`, `reach_mm`, `travel_mm` (largest distance of the shaft from
+            the
+        magnets' centre in the ring), `quadrature_error`, `overstated` (far-field sum over exact cylinders, at
         `displacement_mm` toward a magnet and at the centre), `models` (a list: stiffness with these magnets, force
         toward a magnet and toward the gap between two, with these magnets and at the stiffness used), `errors`.
     """
@@ -108,7 +109,7 @@ def draw(model: Model, path: Path) -> None:
     """Draw force over displacement with these magnets and at the stiffness used, the errors, and the ripple.
 
     Raises:
-        InputError: The file is neither .png nor .svg.
+        InputError: If the file is neither .png nor .svg.
     """
     check_suffix(path, field="--plot")
     geometry = model.magnets
@@ -132,18 +133,18 @@ _STYLES: dict[str, dict[str, Any]] = {
     "cylinder map": {"color": SKY, "lw": 2.0, "ls": (0, (5, 3)), "zorder": 4},
     "exact cylinders": {"color": BLACK, "lw": 2.6},
 }
-_OTHER = {"color": "#882255", "lw": 1.6}
-"""Of a model that has no style of its own."""
-_UNDER: dict[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.47, -0.13)}
-"""Where a legend hides no curve."""
+_DEFAULT_STYLE = {"color": "#882255", "lw": 1.6}
+"""Style of a model without an entry above."""
+_LEGEND_BELOW: dict[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.47, -0.13)}
+"""Legend position below the axes."""
 
 
 def _draw_same_magnets(axes: Any, model: Model) -> None:
-    """Force over a line through the centre, from one magnet to the opposite side, each model with the same magnets."""
+    """Draw the force over a line through the centre, from a magnet to the opposite side, with the same magnets."""
     geometry = model.magnets
     line = np.linspace(-geometry.reach, geometry.reach, 201)
     for each in family(geometry)[1:]:
-        style = _STYLES.get(each.name, _OTHER)
+        style = _STYLES.get(each.name, _DEFAULT_STYLE)
         toward = -_inward(each.force, geometry, line, 0.0)
         axes.plot(line * 1e3, toward, label=f"{each.name}, K = {each.stiffness / 1e3:.3f} kN/m", **style)
         if each.name in ("far-field sum", "exact cylinders"):
@@ -155,27 +156,27 @@ def _draw_same_magnets(axes: Any, model: Model) -> None:
         xlabel="displacement toward a magnet [mm]", ylabel="force along the displacement [N]",
         xlim=(line[0] * 1e3, line[-1] * 1e3),
     )  # fmt: skip
-    axes.legend(**_UNDER)
+    axes.legend(**_LEGEND_BELOW)
 
 
 def _draw_same_stiffness(axes: Any, model: Model) -> None:
-    """The same with every model scaled to the stiffness that the rig uses."""
+    """Draw the force over the same line with every model scaled to the stiffness of the rig."""
     geometry, used = model.magnets, model.constants.magnet.stiffness
     line = np.linspace(-geometry.reach, geometry.reach, 201)
     _shade_travel(axes, model, both=True)
     for each in family(geometry):
         force = -_inward(each.force, geometry, line, 0.0) * used / each.stiffness
-        axes.plot(line * 1e3, force, label=each.name, **_STYLES.get(each.name, _OTHER))
+        axes.plot(line * 1e3, force, label=each.name, **_STYLES.get(each.name, _DEFAULT_STYLE))
     axes.set(
         title=f"At the rig's stiffness at the centre, {used / 1e3:.3g} kN/m",
         xlabel="displacement toward a magnet [mm]", ylabel="force along the displacement [N]",
         xlim=(line[0] * 1e3, line[-1] * 1e3),
     )  # fmt: skip
-    axes.legend(**_UNDER, ncols=2)
+    axes.legend(**_LEGEND_BELOW, ncols=2)
 
 
 def _draw_errors(axes: Any, model: Model) -> None:
-    """Largest deviation of each model from the next better one at each radius."""
+    """Draw the largest deviation of each model from the next better one, by radius."""
     geometry = model.magnets
     radii = np.linspace(geometry.reach / 60, geometry.reach, 60)
     angles = np.linspace(0.0, np.pi / geometry.number, 9)
@@ -201,11 +202,11 @@ def _draw_errors(axes: Any, model: Model) -> None:
         title="Deviation from the better model, largest direction", xlabel="radius [mm]",
         ylabel="deviation / force there [1]", xlim=(0.0, geometry.reach * 1e3), ylim=(1e-8, 1e1),
     )  # fmt: skip
-    axes.legend(**_UNDER)
+    axes.legend(**_LEGEND_BELOW)
 
 
 def _draw_ripple(axes: Any, model: Model) -> None:
-    """Force over direction on circles: the magnets one by one."""
+    """Draw the force over the direction on circles, which shows the single magnets."""
     geometry = model.magnets
     angle = np.linspace(0.0, 4.0 * np.pi / geometry.number, 121)
     peak = 0.0
@@ -229,7 +230,7 @@ def _draw_ripple(axes: Any, model: Model) -> None:
         ylabel="force / mean over directions − 1 [1]", xlim=(0.0, float(np.degrees(angle[-1]))),
         ylim=(-1.1 * peak, 1.1 * peak),
     )  # fmt: skip
-    axes.legend(**_UNDER, ncols=2)
+    axes.legend(**_LEGEND_BELOW, ncols=2)
 
 
 def _shade_travel(axes: Any, model: Model, *, both: bool = False) -> None:
@@ -238,6 +239,6 @@ def _shade_travel(axes: Any, model: Model, *, both: bool = False) -> None:
 
 
 def _inward(force: Force, geometry: MagnetGeometry, radii: np.ndarray, angle: float) -> np.ndarray:
-    """Force toward the centre [N] at signed radii [m], each of shape (n,), on a line at an angle from a magnet's."""
+    """Return the force toward the centre [N] at signed radii [m], shapes (n,), on a line at an angle to a magnet."""
     outward = np.array([np.sin(angle), -np.cos(angle)])
     return -force(radii * outward[0], radii * outward[1]) @ outward

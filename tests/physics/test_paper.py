@@ -27,7 +27,7 @@ import numpy as np
 import pytest
 
 from replays.studies.paper.findings import conditions
-from replays.studies.paper.open_questions import fall, weight_at_ring
+from replays.studies.paper.open_questions import compute_fall, weight_at_ring
 from replays.studies.paper.reproduction import drop_impact, drop_impulse
 from replays.studies.paper.scans import condition
 from replays.studies.paper.scans.pulse import Outcome, Pulse, outcome
@@ -83,7 +83,7 @@ def test_drop_reaches_the_ring_as_a_body_falls(parameters):
     time_s, speed = drop_impact(drop(parameters))
     assert time_s == pytest.approx(math.sqrt(4 * R0 / acceleration), rel=1e-4)
     assert speed == pytest.approx(math.sqrt(4 * R0 * acceleration), rel=1e-4)
-    assert fall(drop(parameters).simulation.model.constants) == pytest.approx((time_s, speed), rel=1e-4)
+    assert compute_fall(drop(parameters).simulation.model.constants) == pytest.approx((time_s, speed), rel=1e-4)
     assert (time_s, speed) == (pytest.approx(25.6e-3, abs=0.05e-3), pytest.approx(0.145, abs=0.001))
 
 
@@ -153,7 +153,7 @@ def test_start_and_sustain_are_one_condition():
 def test_houses_take_what_forced_vibration_takes():
     constants, spin = base_model(ModelLevels()).constants, 2 * math.pi * 6.2
     whirl, depth = condition.rolling_whirl(constants, spin)
-    begun = condition.rolled(constants, spin)
+    begun = condition.settle_rolling(constants, spin)
     run = move("split", constants, quiet_inputs(spin=spin, magnets=True, ideal=True), begun, ticks=500_000, every=100)
     lost = run.column("house_loss")
     power = (lost[-1] - lost[0]) / (run.times[-1] - run.times[0])
@@ -176,7 +176,7 @@ def test_friction_swings_as_the_ring_goes_on_an_ellipse(stator, share):
         magnet=constants.magnet._replace(damping_x=damping, damping_y=damping),
         contact=constants.contact._replace(offset_x=0.0, offset_y=0.0),
     )
-    begun = condition.rolled(constants, spin)
+    begun = condition.settle_rolling(constants, spin)
     run = move("split", constants, quiet_inputs(spin=spin, magnets=True, ideal=True), begun, ticks=500_000, every=50)
     friction, normal = (run.column(name)[2000:] for name in ("friction_force", "normal_force"))
     times = run.times[2000:]

@@ -20,8 +20,8 @@ import pytest
 from replays.studies.common.journal import Journal
 from replays.studies.common.random_scene import draw_scene
 from replays.studies.stability.scenes.sweep import NAME, chosen_numbers, summary, sweep
-from replays.studies.stability.scenes.truth import CHAOTIC, NUDGE, measure
-from replays.studies.stability.scenes.worker import Run, Task, Worker, end_after, nudged, run_task
+from replays.studies.stability.scenes.truth import CHAOTIC_GROWTH, INITIAL_SHIFT, measure
+from replays.studies.stability.scenes.worker import Run, Task, Worker, end_after, run_task, shift_start
 from rig.base.errors import InputError
 from rig.cli.main import main
 from rig.physics.contacts import DAMPING, STIFFNESS
@@ -69,7 +69,7 @@ def stub(shifts: dict[str, float], own: dict[str, dict[str, Any]] | None = None,
         states = np.zeros((100, N_STATE))
         states[:] = shifts.get(task.engine, 0.0) * STATE_SCALE
         if task.nudge:
-            states += NUDGE * np.geomspace(1.0, grows, 100)[:, None] * STATE_SCALE
+            states += INITIAL_SHIFT * np.geomspace(1.0, grows, 100)[:, None] * STATE_SCALE
         health = {"peak_normal_force_n": 100.0, "contacts": 3, "energy": {"residual_share": 0.0}, "warnings": []}
         fields: dict[str, Any] = {"states": states, "cpu_s": 0.01, "reached_s": 0.1, "health": health}
         changes = (own or {}).get(task.engine, {})
@@ -88,7 +88,7 @@ def stub(shifts: dict[str, float], own: dict[str, dict[str, Any]] | None = None,
         ({"taylor": 0.5}, 1.0, "undecided", "taylor"),
         ({"rk8": 0.5}, 1.0, "undecided", "rk8"),
         ({"rk8": 0.5, "tsit5": 1.5}, 1.0, "undecided", None),
-        ({"taylor": 0.5}, 2.0 * CHAOTIC, "chaotic", None),
+        ({"taylor": 0.5}, 2.0 * CHAOTIC_GROWTH, "chaotic", None),
     ],
 )
 def test_status_of_a_scene(shifts: dict[str, float], grows: float, status: str, odd: str | None) -> None:
@@ -169,7 +169,7 @@ def test_the_kept_scene_is_the_scene() -> None:
 @pytest.mark.parametrize("position", ["equilibrium", "top", "bottom"])
 def test_a_nudge_is_small_and_inside_the_ring(position: str) -> None:
     scene = change_scene(SCENE, {"initial.position": position})
-    simulation, moved = Simulation(scene), Simulation(nudged(scene, 1e-3))
+    simulation, moved = Simulation(scene), Simulation(shift_start(scene, 1e-3))
     apart = np.abs(moved.first_row[:2] - simulation.first_row[:2]) * simulation.model.constants.shaft.arm_ring
     clearance = simulation.model.constants.contact.clearance
     assert 0.99e-3 * clearance < apart.max() < 3.01e-3 * clearance

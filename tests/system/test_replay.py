@@ -161,7 +161,7 @@ def test_the_command_is_led_from_elsewhere_and_stopped(path: Path) -> None:
         until(lambda: console.status()["replay"]["paused"], of=child)
         assert console.step(20_000).time_s == pytest.approx(0.02)
         assert console.seek(0.5).time_s == pytest.approx(0.5)
-        with pytest.raises(RefusedError, match="takes no hammer"):
+        with pytest.raises(RefusedError, match="does not accept hammer"):
             console.hammer()
         console.rate(0.01)
         console.resume()

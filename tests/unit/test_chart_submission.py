@@ -14,7 +14,7 @@ import pytest
 from replays.studies.chart import session
 from replays.studies.chart.drawing import figure
 from replays.studies.chart.measure import Budget, point, run_engine
-from replays.studies.chart.methods import ADDED, competitors
+from replays.studies.chart.methods import ADDED_FAMILY, competitors
 from replays.studies.chart.phases import problem_of
 from replays.studies.chart.store import Store, read_table
 from replays.studies.chart.submission import write_problem
@@ -88,7 +88,7 @@ def test_results_of_an_engine_land_where_the_engine_does(tmp_path: Path) -> None
     assert [rows[name]["failure"] for name in versions] == ["", "contacts", "branch"]
     row = rows["right"]
     assert (row["cpu_s"], row["speed"], row["tolerance"], row["rung"]) == (0.25, pytest.approx(0.2), 1e-4, "1e-4")
-    assert {rows[name]["family"] for name in versions} == {ADDED}
+    assert {rows[name]["family"] for name in versions} == {ADDED_FAMILY}
     # The same solver, setting and phase again: the later file counts, beside what there was.
     (tmp_path / "right.csv").write_text(text_of(problem.times, states, solver="right", cpu_s="0.5"), encoding="utf-8")
     session.add_solvers(folder, [tmp_path / "right.csv"])
@@ -120,7 +120,7 @@ def change_line(number: int, change: Callable[[str], str]) -> Callable[[str], st
         ({}, lambda _: "", "solver must be in one line"),
         ({}, lambda _: "\0\x89PNG", "solver must be in one line"),
         ({"phase": "rub"}, str, "phase must be one of first-impacts, transient, whirl, drop"),
-        ({"solver": "tsit5"}, str, "solver must be of 1 to 40 ASCII characters"),
+        ({"solver": "tsit5"}, str, "solver must be 1 to 40 ASCII characters"),
         ({"solver": "heyoka"}, str, "solver must be of"),
         ({"solver": "reference"}, str, "solver must be of"),
         ({"solver": r"$\frac$"}, str, "solver must be of"),
@@ -184,7 +184,7 @@ def test_a_chart_of_other_code_is_not_added_to(capsys: pytest.CaptureFixture[str
 def test_an_added_solver_is_drawn_and_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("replays.report.canvas.png", lambda _figure, **_about: b"")
     store = Store(tmp_path)
-    columns: dict[str, Any] = {"mode": "quick", "panel": "exact", "phase": "whirl", "case": "", "family": ADDED}
+    columns: dict[str, Any] = {"mode": "quick", "panel": "exact", "phase": "whirl", "case": "", "family": ADDED_FAMILY}
     good = {"error": 1e-4, "speed": 1.0, "speed_min": 1.0, "speed_max": 1.0}
     store.add({**columns, **good, "method": "mine", "title": "mine", "rung": "1e-6"})
     store.add({**columns, "method": "mine", "title": "mine", "rung": "1e-2", "speed": 2.0, "failure": "branch"})
@@ -192,7 +192,7 @@ def test_an_added_solver_is_drawn_and_named(tmp_path: Path, monkeypatch: pytest.
     drawn = (tmp_path / "chart.svg").read_text(encoding="utf-8")
     assert 'id="mine"' in drawn
     assert 'id="failure-mine-1e-2"' in drawn
-    assert ADDED in drawn
+    assert ADDED_FAMILY in drawn
     assert "Solvers added" in drawn, "in the words under the picture"
 
 

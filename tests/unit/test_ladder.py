@@ -17,7 +17,7 @@ from replays.studies.ladder.document import ladder_document, pick_of
 from replays.studies.ladder.measurement import Candidate, Measurement, measure
 from replays.studies.ladder.pick import with_pick, write_pick
 from replays.studies.ladder.quantity import QUANTITIES, Ending, Trace, ending, parse_quantities
-from replays.studies.ladder.search import LEVELS, WORTH, Ladder, search
+from replays.studies.ladder.search import LEVELS, MIN_SAVING, Ladder, search
 from rig.base.errors import InputError
 from rig.cli.commands.ladder import engines_table, levels_table
 from rig.cli.main import main
@@ -226,7 +226,7 @@ def test_rungs_are_the_models_own_and_are_tried_one_at_a_time(found: Ladder) -> 
     assert singles == [f"{level} {rung}" for level, rungs in LEVELS.items() for rung in rungs[:-1]]
     # Far fewer than all combinations of levels.
     assert len([step for step in found.steps if step.stage == "together"]) <= 2 * len(LEVELS)
-    assert all(part > WORTH for part in found.savings.values())
+    assert all(part > MIN_SAVING for part in found.savings.values())
 
 
 def test_a_pick_meets_its_tolerance_as_it_will_run(found: Ladder) -> None:

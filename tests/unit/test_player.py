@@ -207,7 +207,7 @@ def test_documents_are_answered_from_the_file_and_the_status_says_what_it_is(tra
     assert status["pace"] == "replay"
     assert status["replay"]["paused"] is True
     assert status["replay"]["files"] == [str(track.paths[0])]
-    assert "replayed" in status["warnings"][0]
+    assert "replay of a recording" in status["warnings"][0]
     player.stop()
     player.run()
 
@@ -490,7 +490,7 @@ def test_a_stop_ends_the_stream_well(track: Track) -> None:
 
 
 def test_a_burst_waits_for_what_clients_report(track: Track, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(player_module, "_AHEAD_BLOCKS", 10)
+    monkeypatch.setattr(player_module, "_MAX_AHEAD_BLOCKS", 10)
     with running(track, clock=FreeRun(), paused=True) as (_, heard, console):
         client = heard.client
         client.report(f"{wire.CLIENTS}/slow", b'{"received_index": 0}')

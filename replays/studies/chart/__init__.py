@@ -1,5 +1,5 @@
-"""Work-precision charts: our engines and other people's solvers on the same windows, by speed and by error.
+"""Work-precision charts: our engines and other solvers on the same windows, by speed and error.
 
-`session.make_chart` runs the whole; `phases` says what is compared on which windows, `methods` who takes part,
-`measure` makes one point, `profile` compares over random scenes, `store` keeps what was measured, `figure` draws it.
+`session.make_chart` runs the chart, `phases` defines windows and points, `methods` the engines and peers, `measure`
+measures one point, `profile` compares methods over random scenes, `store` keeps the results, and `figure` draws them.
 """

@@ -1,4 +1,4 @@
-"""Who takes part in a chart: our engines and the peers, each with its ladder of settings."""
+"""Methods of a chart: our engines and the peers, each with its ladder of settings."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from replays.studies.common.engines import settings as engine_settings
 from replays.studies.peers import PEERS, Setting
 from rig.physics.engines import ENGINES
 
-OURS = "rig"
+RIG_FAMILY = "rig"
 """Family of our own engines."""
-ADDED = "added by file"
-"""Family of solvers that are not part of the project, as `rig chart --add` adds them."""
+ADDED_FAMILY = "added by file"
+"""Family of solvers outside the project, as added by `rig chart --add`."""
 
 
 @dataclass(frozen=True)
 class Competitor:
-    """A method and its ladder of settings, the coarsest first."""
+    """A method and its ladder of settings, coarsest first."""
 
     name: str
     title: str
@@ -27,22 +27,22 @@ class Competitor:
 
     @property
     def ours(self) -> bool:
-        """Whether it is an engine of the rig."""
-        return self.family == OURS
+        """True for an engine of the rig."""
+        return self.family == RIG_FAMILY
 
     def takes(self, friction: str) -> bool:
-        """Whether it can run a friction law."""
+        """Return whether the method supports a friction law."""
         if self.ours:
             return friction in ENGINES[self.name].frictions
         return friction != "exact" or PEERS[self.name].exact_friction
 
 
 _QUICK_PEERS = 3
-"""Settings of a peer in a quick chart."""
+"""Number of settings of a peer in a quick chart."""
 
 
 def competitors(*, peers: bool = True) -> dict[str, Competitor]:
-    """Our engines, then the peers that are installed, by name."""
+    """Return our engines and the installed peers by name."""
     found = {name: _engine(name) for name in ENGINES}
     if peers:
         found |= {name: _peer(name) for name, peer in PEERS.items() if peer.installed}
@@ -50,7 +50,7 @@ def competitors(*, peers: bool = True) -> dict[str, Competitor]:
 
 
 def missing_peers() -> list[str]:
-    """Libraries of peers that are not installed."""
+    """Return the libraries of peers that are not installed."""
     return sorted({peer.module for peer in PEERS.values() if not peer.installed})
 
 
@@ -61,12 +61,12 @@ def _engine(name: str) -> Competitor:
             for step, tolerance in engine_settings(name, quick=quick)
         )
 
-    return Competitor(name, name, OURS, settings(quick=False), settings(quick=True))
+    return Competitor(name, name, RIG_FAMILY, settings(quick=False), settings(quick=True))
 
 
 def _peer(name: str) -> Competitor:
     peer = PEERS[name]
-    # The coarsest, one in the middle, and the finest that is worth its time.
+    # The coarsest setting, one in the middle, and the finest with a reasonable run time.
     picks = sorted({0, len(peer.ladder) // 2, max(len(peer.ladder) - 2, 0)})
     quick = tuple(peer.ladder[i] for i in picks[:_QUICK_PEERS]) if peer.quick else ()
     title = peer.title.replace(", plain Python", ", as installed")

@@ -1,4 +1,4 @@
-"""One making of a chart: what is missing is measured, point by point, then everything is drawn."""
+"""Creation of a chart: missing points are measured one by one, then everything is drawn."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 
 from replays.studies.chart import profile
 from replays.studies.chart.measure import Budget, point, run_engine, statistics_point
-from replays.studies.chart.methods import OURS, Competitor, competitors, missing_peers
+from replays.studies.chart.methods import RIG_FAMILY, Competitor, competitors, missing_peers
 from replays.studies.chart.phases import (
     PANELS,
     PHASES,
@@ -36,10 +36,10 @@ from replays.studies.peers.common.reference import Reference, find_reference
 from rig.base.errors import InputError, SimulationError
 
 TOTAL_S = {"quick": 95.0, "full": 3300.0}
-"""Wall time for all points, compile time apart [s]; what does not fit is left to the next run."""
+"""Wall time for all points without compilation [s]; remaining points are left to the next run."""
 BUDGETS = {"quick": Budget(2.0, 3, 0.4), "full": Budget(20.0, 3)}
 _WALK_SHARE = 0.3
-"""Share of the time that the profile, and the twelve scenes, may each take where other panels are made as well."""
+"""Largest share of the time for the profile, and for the twelve scenes, if other panels are made as well."""
 _RUB_S = {"quick": 12.0, "full": 60.0}
 """Simulated time of the chaotic rub [s]."""
 _RUB_BUDGET_S = {"quick": 4.0, "full": 120.0}
@@ -47,7 +47,7 @@ _RUB_BUDGET_S = {"quick": 4.0, "full": 120.0}
 
 @dataclass
 class Progress:
-    """Told what is under way; the command line shows it."""
+    """Receiver of progress reports, displayed by the command line."""
 
     begin: Callable[[int], None] = lambda _total: None
     step: Callable[[str], None] = lambda _text: None
@@ -55,14 +55,14 @@ class Progress:
 
 @dataclass
 class Outcome:
-    """What a making of a chart came to."""
+    """Result of a chart run."""
 
     files: list[Path] = field(default_factory=list)
     measured: int = 0
     resumed: int = 0
     outdated: int = 0
     left: int = 0
-    """Points for which there was no time."""
+    """Points that were not measured for lack of time."""
     failures: int = 0
     missing: list[str] = field(default_factory=list)
     """Libraries of peers that are not installed."""
@@ -82,22 +82,22 @@ def make_chart(
     command: str = "rig chart",
     progress: Progress | None = None,
 ) -> Outcome:
-    """Measure what is missing and draw.
+    """Measure missing points and draw the chart.
 
     Args:
         folder: Folder for pictures and data.
-        mode: How many points, and for how long.
-        only: One phase only.
+        mode: Extent of the chart.
+        only: A single phase.
         panels: Panels; None for all.
-        peers: False leaves the peers out.
-        fresh: Start over instead of going on.
-        end_s: Shorten every window to this [s] (for tests).
-        methods: Only these methods.
-        command: Said in the figures.
-        progress: Told what is under way.
+        peers: Whether to include the peers.
+        fresh: Delete earlier points.
+        end_s: Upper limit of every window [s] (for tests).
+        methods: Methods; None for all.
+        command: Command named in the figures.
+        progress: Receiver of progress reports.
 
     Raises:
-        InputError: Wrong choice, or a folder that cannot be written.
+        InputError: If a choice is invalid, or the folder cannot be written.
     """
     chosen, only = select(only, panels)
     progress = progress or Progress()
@@ -128,10 +128,10 @@ def make_chart(
 
 
 def draw_again(folder: Path, *, only: str | None = None, panels: list[str] | None = None) -> Outcome:
-    """Draw the table of an earlier chart once more, and measure nothing.
+    """Draw the table of an earlier chart again without measuring.
 
     Raises:
-        InputError: Wrong choice, or no such table in the folder.
+        InputError: If a choice is invalid, or the folder has no such table.
     """
     from replays.studies.chart.drawing.figure import draw
 
@@ -144,16 +144,16 @@ def draw_again(folder: Path, *, only: str | None = None, panels: list[str] | Non
 
 
 def add_solvers(folder: Path, paths: list[Path], *, progress: Progress | None = None) -> Outcome:
-    """Add solvers that are not part of the project to a chart by their results, and draw; measure nothing else.
+    """Add solvers outside the project to a chart by their results, and draw it without measuring other points.
 
     Args:
-        folder: Folder of the chart; a new one gets a chart of these solvers alone.
-        paths: Files of results, one a solver, setting and phase; the same three replace an earlier file's.
-        progress: Told what is under way.
+        folder: Folder of the chart; a new one gets a chart of these solvers only.
+        paths: Files of results, one per solver, setting and phase; they replace earlier ones of the same three.
+        progress: Receiver of progress reports.
 
     Raises:
-        InputError: A wrong file, or a chart that other code has measured.
-        SimulationError: No two codes solved the problem, so there is no reference.
+        InputError: If a file is invalid, or the chart was measured by other code.
+        SimulationError: If no two codes solved the problem, so that there is no reference.
     """
     from replays.studies.chart.drawing.figure import draw
 
@@ -185,7 +185,7 @@ def _command(mode: str) -> str:
 
 
 def own_reference(problem: Problem) -> Reference | None:
-    """Where no second peer is installed: scipy's DOP853 and our rk8, which share the equations but not the code."""
+    """Return a reference without a second peer, from scipy's DOP853 and our rk8, which share only the equations."""
     first = PEERS["scipy-dop853"].solve(problem, Setting("1e-13", 1e-13), budget_s=300.0)
     second = run_engine("rk8", Setting("1e-12", 1e-12, step_us=25), problem, Budget(300.0, 1)).solution
     if first.failure is not None or second.failure is not None:
@@ -196,7 +196,7 @@ def own_reference(problem: Problem) -> Reference | None:
 
 @dataclass
 class _Work:
-    """What the points of one making share."""
+    """Common state of the points of one chart run."""
 
     store: Store
     contenders: dict[str, Competitor]
@@ -208,11 +208,11 @@ class _Work:
 
     @property
     def compile_s(self) -> float:
-        """What compiling has taken so far [s], which no budget is charged with."""
+        """Compile time until now [s], which is not charged to any budget."""
         return sum(self.compiled.values())
 
     def compiling(self, what: str, seconds: float, *, again: bool) -> None:
-        """Note compile time; a library tells the same figure with every solve, an engine of ours each its own."""
+        """Note a compile time; a library reports the same time with every solve, our engines a new one each."""
         before = self.compiled.get(what, 0.0)
         self.compiled[what] = before + seconds if again else max(before, seconds)
 
@@ -225,7 +225,7 @@ class _Work:
         return self.problems[key]
 
     def reference(self, panel: str, phase: str, case: str) -> Reference | None:
-        # A smoothed law on the exact panel is held against exact Coulomb.
+        # A smoothed law on the exact panel is compared with exact Coulomb.
         case = "" if panel == "exact" else case
         key = (panel, phase, case)
         if key not in self.references:
@@ -236,12 +236,12 @@ class _Work:
         reference = find_reference(problem, quick=self.mode == "quick") or own_reference(problem)
         if reference is not None:
             for name, seconds in zip(reference.names, reference.compile_s, strict=True):
-                self.compiling(PEERS[name].family if name in PEERS else OURS, seconds, again=False)
+                self.compiling(PEERS[name].family if name in PEERS else RIG_FAMILY, seconds, again=False)
         return reference
 
     def keep(self, row: Row, columns: Row) -> None:
         self.store.add(row | columns)
-        self.compiling(row["family"], float(columns.get("compile_s") or 0.0), again=row["family"] == OURS)
+        self.compiling(row["family"], float(columns.get("compile_s") or 0.0), again=row["family"] == RIG_FAMILY)
 
     def base(self, panel: str, phase: str, case: str, contender: Competitor, setting: Setting | None) -> Row:
         return {
@@ -265,7 +265,7 @@ def _measure(work: _Work, panels: list[str], only: str | None, outcome: Outcome,
     windows = {(task.panel, task.phase, task.case) for task in tasks if task.panel != RUB}
     progress.begin(len(tasks) + len(windows) + sum(walks.values()))
     total = TOTAL_S[work.mode]
-    # The profile and the twelve scenes have their share of the time, and stand before the slow peers.
+    # The profile and the twelve scenes have their share of the time before the slow peers.
     early = [task for task in tasks if work.contenders[task.method].ours]
     late = [task for task in tasks if not work.contenders[task.method].ours]
     for panel, phase, case in sorted(windows):
@@ -283,7 +283,7 @@ def _measure(work: _Work, panels: list[str], only: str | None, outcome: Outcome,
 
 
 def _references(work: _Work, panel: str, phase: str, case: str) -> None:
-    """The reference and, on the exact panel, how far the smoothed laws are from it."""
+    """Add the reference and, on the exact panel, the distances of the smoothed laws."""
     own = {"mode": work.mode, "panel": panel, "phase": phase, "case": case or "exact", "family": "reference"}
     own |= {"method": "reference", "rung": ""}
     if work.store.has(own):
@@ -338,7 +338,7 @@ def _point(work: _Work, task: Task, outcome: Outcome, progress: Progress, deadli
 
 
 def _walks(work: _Work) -> dict[str, tuple[dict[str, Callable[[], Problem]], tuple[float, ...]]]:
-    """Return problems by phase, and targets, of each panel whose methods walk down their ladders."""
+    """Return problems by phase, and targets, of each panel whose methods search their ladders."""
     draws = {f"scene-{seed:03d}": partial(profile.draw_problem, seed) for seed in range(profile.SCENES[work.mode])}
     scenes = {name: partial(scene_problem, name, end_s=work.end_s) for name in TWELVE_SCENES}
     return {"profile": (draws, (profile.TARGET,)), "scenes": (scenes, SCENE_TARGETS)}
@@ -356,7 +356,7 @@ def _walk_ladders(work: _Work, panel: str, outcome: Outcome, progress: Progress,
     budget = BUDGETS[work.mode]._replace(solve_s=1.0 if work.mode == "quick" else 5.0)
     for phase, make in problems.items():
         progress.step(f"{panel}, {phase}")
-        # The setting found is no part of the key: a scene, a target and a method are one point.
+        # The setting found is not part of the key: one point per scene, target and method.
         cases = {"" if panel == "profile" else f"{target:g}": target for target in targets}
         rows = [(one, case, work.base(panel, phase, case, one, None)) for one in rivals for case in cases]
         waiting = [(one, case, row) for one, case, row in rows if not work.store.has(row | {"rung": "cheapest"})]

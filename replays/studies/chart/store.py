@@ -1,4 +1,4 @@
-"""Points that have been measured, kept as they come, so that a chart that was stopped goes on where it was."""
+"""Storage of measured points, written one by one, so that an interrupted chart can be resumed."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from replays.studies.common.journal import Journal
 from rig.base.errors import InputError
 
 KEY = ("mode", "panel", "phase", "case", "method", "rung")
-"""Columns that tell one point from another."""
+"""Columns that identify a point."""
 COLUMNS = (
     *KEY, "title", "family", "known_failure", "friction", "smoothing_speed", "step_us", "tolerance", "simulated_s",
     "runs", "cpu_s", "cpu_min_s", "cpu_max_s", "compile_s", "own_cpu_s", "speed", "speed_min", "speed_max", "error",
@@ -23,29 +23,29 @@ COLUMNS = (
     "rms_force_low", "rms_force_high", "impacts_per_s", "impacts_per_s_low", "impacts_per_s_high", "failure",
     "message", "code", "commit", "date", "machine", "versions",
 )  # fmt: skip
-"""Columns of the table; speeds are times real time, forces newtons. `own_cpu_s` is a bound: the time inside a library's
-own calls alone, where a Python loop of ours drives it."""
-_LATER = {"own_cpu_s"}
-"""Columns that tables of earlier versions lack."""
+"""Columns of the table; speeds are multiples of real time, forces newtons. `own_cpu_s` is a bound: the time within a
+library's own calls only, if a Python loop of ours drives it."""
+_OPTIONAL_COLUMNS = {"own_cpu_s"}
+"""Columns that tables of earlier versions do not have."""
 _TEXT = {*KEY, "title", "family", "known_failure", "friction", "reference", "failure", "message", "code", "commit",
          "date", "machine", "versions"}  # fmt: skip
 _LIBRARIES = (provenance.RIG, "numba", "numpy", "scipy", "heyoka", "scikit-sundae", "mujoco", "diffrax")
-_MEASURING = ("measure.py", "phases.py", "profile.py")
+_MEASUREMENT_FILES = ("measure.py", "phases.py", "profile.py")
 
 Row = dict[str, Any]
 
 
 class Store:
-    """Points in a folder: a journal that grows with every point, and at the end Parquet and CSV.
+    """Points in a folder: a journal that grows with every point, and finally Parquet and CSV.
 
-    A point counts as measured only for the code that it was measured with.
+    A point is valid only for the code that measured it.
     """
 
     def __init__(self, folder: Path, *, fresh: bool = False) -> None:
-        """Open a folder, which is made where it is missing.
+        """Open a folder, which is created if missing.
 
         Raises:
-            InputError: It cannot be written, or is a file.
+            InputError: If it cannot be written, or is a file.
         """
         self.folder = folder
         self.stamp = stamp()
@@ -54,18 +54,18 @@ class Store:
         self._rows = {_key(row): row for row in self._journal.rows}
 
     def has(self, row: Row) -> bool:
-        """Whether the point of a row has been measured."""
+        """Return whether the point of a row has been measured."""
         return _key(row) in self._rows
 
     def rows(self, mode: str) -> list[Row]:
-        """All points of a mode."""
+        """Return all points of a mode."""
         return [row for row in self._rows.values() if row["mode"] == mode]
 
     def add(self, row: Row) -> None:
-        """Keep a point; it is on the disk when this returns."""
+        """Store a point; it is written to disk before this returns."""
         whole: Row = {name: row.get(name, "" if name in _TEXT else None) for name in COLUMNS} | self.stamp
         for name, value in whole.items():
-            # JSON has no words for what is not finite; an empty field says the same.
+            # JSON has no representation of values that are not finite; an empty field is equivalent.
             if isinstance(value, float) and not math.isfinite(value):
                 whole[name] = None
         self._journal.add(whole)
@@ -97,38 +97,38 @@ def _key(row: Row) -> tuple[Any, ...]:
 
 
 def _digits(value: float) -> float:
-    # What follows is no evidence, and half of the file.
+    # Further digits are not significant and would double the size of the file.
     return float(f"{value:.6g}")
 
 
 def read_table(folder: Path) -> list[Row]:
-    """The points of a table that a making of a chart has left in a folder.
+    """Return the points of an earlier chart's table in a folder.
 
     Raises:
-        InputError: There is none, or it is no such table.
+        InputError: If there is no such table.
     """
     path = folder / "chart.csv"
     try:
         with path.open(encoding="utf-8", newline="") as file:
             return [
                 {key: row[key] if key in _TEXT else float(value) if (value := row[key]) else None for key in COLUMNS}
-                for row in ({**dict.fromkeys(_LATER), **row} for row in csv.DictReader(file))
+                for row in ({**dict.fromkeys(_OPTIONAL_COLUMNS), **row} for row in csv.DictReader(file))
             ]
     except (OSError, KeyError, ValueError, TypeError, csv.Error):
         raise InputError("output", f"a folder with {path.name} of an earlier chart", str(folder)) from None
 
 
 def code_digest() -> str:
-    """Digest of the engines, kernels and peers' drivers that a chart measures, and of how it does."""
+    """Return the digest of the engines, kernels and peers that a chart measures, and of the measurement."""
     here, simulator = Path(__file__).parent, Path(str(rig.__file__)).parent
     folders = (simulator / "physics" / "engines", simulator / "physics" / "kernels", here.parent / "peers")
     sources = [path for folder in folders for path in folder.rglob("*.py")]
     scenes = here.parent / "common" / "twelve_scenes.py"
-    return provenance.digest([*sources, scenes, *(here / name for name in _MEASURING)])
+    return provenance.digest([*sources, scenes, *(here / name for name in _MEASUREMENT_FILES)])
 
 
 def stamp() -> dict[str, str]:
-    """What a point is measured with: code, commit, date, machine, versions of libraries."""
+    """Return the provenance of a point: code, commit, date, machine, versions of libraries."""
     found = {"Python": platform.python_version(), **provenance.versions(*_LIBRARIES)}
     return {
         "code": code_digest(),

@@ -1,7 +1,7 @@
-"""A solver that is not part of the project: the problem that its author gets, and the results that come back.
+"""Solvers outside the project: the problem file for an author, and the file of results.
 
-`docs/charts.md` describes both files. The solver itself is not run here, so its processor time and its number of
-contacts are those that its file states.
+`docs/charts.md` describes both files. The solver is not run here, so its processor time and its number of contacts are
+taken from its file.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from replays.studies.chart.measure import Budget, point
-from replays.studies.chart.methods import ADDED, Competitor
+from replays.studies.chart.methods import ADDED_FAMILY, Competitor
 from replays.studies.chart.phases import PHASES, RUB, problem_of
 from replays.studies.common.journal import prepare_folder
 from replays.studies.peers import PEERS, Library, Peer, Setting
@@ -30,31 +30,31 @@ from rig.physics.kernels.signals import STATE
 PANEL = "exact"
 """Panel of the problems: total error against exact Coulomb friction."""
 _PHASES = tuple(name for name in PHASES if name != RUB)
-"""Phases with an error at each instant; the chaotic rub has statistics only."""
+"""Phases with an error at each instant; the chaotic rub has only statistics."""
 _KEYS = ("solver", "phase", "setting", "cpu_s", "contacts")
 _COLUMNS = ("time [s]", *(f"{STATE[column].name} [{STATE[column].unit}]" for column in ERROR_COLUMNS))
 _MAX_BYTES = 1 << 24
-"""Many times the longest phase at full precision; what follows is not read."""
+"""Largest size of a file, many times the longest phase at full precision; the rest is not read."""
 _INSTANT_TOLERANCE_S = 1e-9
-"""A thousandth of the model's tick: instants may be rounded in text."""
-_LARGEST = 1e9
-"""No state in SI units and no processor time [s] reaches it."""
+"""Tolerance for rounded times, a thousandth of the model's tick."""
+_MAX_VALUE = 1e9
+"""Upper limit of states in SI units and of processor times [s]."""
 _LABEL = re.compile(r"[A-Za-z0-9][ -#%-~]{0,39}")
-"""A name that fits into a legend; between dollar signs, matplotlib would read a formula."""
+"""Pattern of names that fit a legend, without dollar signs, which start a formula in matplotlib."""
 _UNIT = re.compile(r"^    (\w+): \w+  # .*?\[(.+?)\]", re.MULTILINE)
 """Name and unit of a field of `rig.physics.kernels.constants`, whose comments hold the unit in brackets."""
 
 
 def write_problem(phase: str, folder: Path) -> Path:
-    """Write a problem as FOLDER/problem-PHASE.json, without anything of its solution, and return the path.
+    """Write a problem without its solution to FOLDER/problem-PHASE.json, and return the path.
 
     Args:
         phase: One of `_PHASES`.
-        folder: Made where it is missing.
+        folder: Output folder, created if missing.
 
     Raises:
-        InputError: Any other phase, or a folder that cannot be made or written.
-        DiskError: The file could not be written.
+        InputError: If the phase is another, or the folder cannot be created or written.
+        DiskError: If the file cannot be written.
     """
     problem = _exact_problem(phase)
     constants = problem.constants
@@ -80,7 +80,7 @@ def write_problem(phase: str, folder: Path) -> Path:
 
 
 class Submission(NamedTuple):
-    """One solver at one setting on one phase, with the states, contacts and processor time of its file."""
+    """A solver at one setting on one phase, with states, contacts and processor time from its file."""
 
     contender: Competitor
     phase: str
@@ -88,13 +88,13 @@ class Submission(NamedTuple):
     solution: Solution
 
     def point(self, reference: Reference) -> dict[str, Any]:
-        """Return the columns of the point, judged as any peer's.
+        """Return the columns of the point, computed as for any peer.
 
         Args:
             reference: Reference of the problem.
         """
         name, settings = self.contender.name, self.contender.settings
-        PEERS[name] = _RecordedPeer(name, name, Library(ADDED, ""), settings, {"solution": self.solution})
+        PEERS[name] = _RecordedPeer(name, name, Library(ADDED_FAMILY, ""), settings, {"solution": self.solution})
         try:
             return point(self.contender, settings[0], self.problem, reference, Budget(np.inf, 1))
         finally:
@@ -102,7 +102,7 @@ class Submission(NamedTuple):
 
 
 class _RecordedPeer(Peer):
-    """A peer whose solution is on file."""
+    """A peer whose solution comes from a file."""
 
     def solve(self, problem: Problem, setting: Setting | None = None, *, budget_s: float = 60.0) -> Solution:
         """Return the solution of the file."""
@@ -113,10 +113,10 @@ def read_submission(path: Path) -> Submission:
     """Read a file of a solver's results.
 
     Args:
-        path: Comment lines `# KEY: VALUE`, a line of column names with units, a row at each instant of the problem.
+        path: File with comment lines `# KEY: VALUE`, a line of column names with units, and a row per instant.
 
     Raises:
-        InputError: The file cannot be read, or a key, a column or a row is missing or wrong.
+        InputError: If the file cannot be read, or a key, a column or a row is missing or wrong.
     """
     try:
         with open_file(path) as file:
@@ -134,10 +134,10 @@ def read_submission(path: Path) -> Submission:
     problem, solver, label = _exact_problem(keys["phase"]), keys["solver"], keys["setting"]
     for key in ("solver", "setting"):
         if not _LABEL.fullmatch(keys[key]) or keys[key] in {*ENGINES, *PEERS, "reference"}:
-            must = "of 1 to 40 ASCII characters without $, a letter or digit first, and no name that the chart has"
+            must = "1 to 40 ASCII characters without $, a letter or digit first, and no name used in the chart"
             raise InputError(key, must, keys[key])
     solution = Solution(problem.times, np.inf)
-    solution.cpu_s = _number("cpu_s", keys, 1e-9, _LARGEST)
+    solution.cpu_s = _number("cpu_s", keys, 1e-9, _MAX_VALUE)
     if not re.fullmatch(r"\d{1,5}", keys["contacts"]):
         raise InputError("contacts", "a whole number from 0 to 99999", keys["contacts"])
     solution.onsets = [(np.nan, np.nan)] * int(keys["contacts"])
@@ -147,7 +147,7 @@ def read_submission(path: Path) -> Submission:
     )
     tolerance = float(label) if re.fullmatch(r"\d+(\.\d+)?(e-?\d+)?", label) else 0.0
     setting = (Setting(label, tolerance),)
-    return Submission(Competitor(solver, solver, ADDED, setting, setting), keys["phase"], problem, solution)
+    return Submission(Competitor(solver, solver, ADDED_FAMILY, setting, setting), keys["phase"], problem, solution)
 
 
 def _exact_problem(phase: str) -> Problem:
@@ -167,7 +167,7 @@ def _number(key: str, texts: dict[str, str], least: float, most: float, place: s
 
 
 def _states(lines: list[str], times: np.ndarray) -> np.ndarray:
-    """States by their columns' names at the problem's instants, shape (n, 7)."""
+    """Return states by column names at the problem's instants, shape (n, 7)."""
     headings = [name.strip(' "') for name in lines[0].split(",")] if lines else []
     if any(headings.count(name) != 1 for name in _COLUMNS):
         raise InputError("columns", f"{', '.join(_COLUMNS)}, each once", Words(", ".join(headings)))
@@ -176,7 +176,7 @@ def _states(lines: list[str], times: np.ndarray) -> np.ndarray:
     values = np.empty((len(times), len(_COLUMNS)))
     for i, time_s in enumerate(times.tolist()):
         fields, place = dict(zip(headings, lines[i + 1].split(","), strict=False)), f" in row {i + 1}"
-        values[i] = [_number(name, fields, -_LARGEST, _LARGEST, place) for name in _COLUMNS]
+        values[i] = [_number(name, fields, -_MAX_VALUE, _MAX_VALUE, place) for name in _COLUMNS]
         if abs(values[i, 0] - time_s) > _INSTANT_TOLERANCE_S:
             raise InputError(_COLUMNS[0] + place, f"{time_s:.9g}, as in the problem", float(values[i, 0]))
     return values[:, 1:]

@@ -50,7 +50,7 @@ class Traits(NamedTuple):
     allowance: float = 1.0
     """Factor on the allowed error of a low-order engine without corrections at its own step."""
     coarse_bounce: tuple[bool | None, str] = (None, "")
-    """Whether it preserves an impact's energy at a step of 200 µs, and the reason."""
+    """Expectation: True if it preserves an impact's energy at a step of 200 µs, and the reason."""
     warned_within_ticks: int = 60_000
     """Longest run with a much too long step before the engine must have warned [ticks]."""
 

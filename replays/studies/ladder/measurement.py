@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from replays.studies.common.run import Timed, bare_sensors, run_scene
-from replays.studies.ladder.quantity import QUANTITIES, Ending, Trace, Value, ending, slides
+from replays.studies.ladder.quantity import QUANTITIES, Ending, Trace, Value, ending, find_sliding
 from rig.base.errors import InputError, SimulationError
 from rig.physics.engines import ENGINES
 from rig.physics.kernels.signals import COLUMN
@@ -39,7 +39,7 @@ class Candidate:
     step_us: int
     tolerance: float = 0.0
     companion: bool = False
-    """Whether a companion run is used, only for a scene as given; the search itself determines all other errors."""
+    """True with a companion run, only for a scene as given; the search itself determines all other errors."""
 
     @property
     def method(self) -> str:
@@ -226,11 +226,11 @@ def _trace(
         clearance=constants.contact.clearance,
         surface_radius=constants.shaft.radius,
         first_impact_s=first_impact(scene, candidate) if "first_impact_time" in quantities else math.nan,
-        rolls_s=_rolls_from(scene, candidate) if "time_to_roll" in quantities else math.nan,
+        rolls_s=_find_rolling_start(scene, candidate) if "time_to_roll" in quantities else math.nan,
     )
 
 
-def _finely(scene: Scene, candidate: Candidate) -> Iterator[tuple[Simulation, int, np.ndarray]]:
+def _run_every_step(scene: Scene, candidate: Candidate) -> Iterator[tuple[Simulation, int, np.ndarray]]:
     """Yield blocks of a separate run, with their start ticks: a row per step, or every 25 us for an adaptive engine."""
     adaptive = ENGINES[candidate.engine].tolerance > 0.0
     step_us = min(candidate.step_us, _FINEST_ROW_US) if adaptive else candidate.step_us
@@ -242,11 +242,11 @@ def _finely(scene: Scene, candidate: Candidate) -> Iterator[tuple[Simulation, in
         yield simulation, start, simulation.advance(min(block, simulation.end_tick - start)).rows
 
 
-def _rolls_from(scene: Scene, candidate: Candidate) -> float:
+def _find_rolling_start(scene: Scene, candidate: Candidate) -> float:
     """Return the begin of lasting rolling [s]; NaN if there is none."""
     rolls = end = 0
-    for simulation, start, rows in _finely(scene, candidate):
-        loose = slides(rows, simulation.model.constants.shaft.radius) | (rows[:, COLUMN["penetration"]] <= 0.0)
+    for simulation, start, rows in _run_every_step(scene, candidate):
+        loose = find_sliding(rows, simulation.model.constants.shaft.radius) | (rows[:, COLUMN["penetration"]] <= 0.0)
         if loose.any():
             rolls = start + (int(np.flatnonzero(loose)[-1]) + 1) * simulation.row_ticks
         end = simulation.end_tick
@@ -256,18 +256,18 @@ def _rolls_from(scene: Scene, candidate: Candidate) -> float:
 def first_impact(scene: Scene, candidate: Candidate) -> float:
     """Return the time of first contact [s], extrapolated from gap, gap rate and acceleration; NaN if none."""
     last: np.ndarray | None = None
-    for simulation, start, rows in _finely(scene, candidate):
+    for simulation, start, rows in _run_every_step(scene, candidate):
         gap = rows[:, COLUMN["penetration"]]
         touched = np.flatnonzero((gap >= 0.0) | (rows[:, COLUMN["contact_impulse"]] > 0.0))
         hit = int(touched[0]) if len(touched) else len(rows)
         if len(touched) or simulation.health()["contacts"]:
             known = rows[:hit] if last is None else np.concatenate([last[None], rows[:hit]])
-            return _crossing(known, start + (hit - 1) * simulation.row_ticks, simulation.row_ticks)
+            return _find_crossing(known, start + (hit - 1) * simulation.row_ticks, simulation.row_ticks)
         last = rows[-1].copy()
     return math.nan
 
 
-def _crossing(rows: np.ndarray, tick: int, row_ticks: int) -> float:
+def _find_crossing(rows: np.ndarray, tick: int, row_ticks: int) -> float:
     """Return the time at which the gap closes after the last row [s]."""
     if len(rows) == 0:
         return 0.0

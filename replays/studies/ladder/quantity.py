@@ -14,17 +14,17 @@ from rig.channels.orbit import phase, whirl_frequency
 from rig.physics.kernels.signals import COLUMN
 from rig.run.motion import DISSIPATED
 
-SETTLED = 0.25
+SETTLED_SHARE = 0.25
 """Part of a run, at its end, that is the settled phase."""
-ROLLS = 0.02
+MAX_ROLLING_SLIP = 0.02
 """Largest ratio of sliding speed to surface speed of a rolling contact."""
-STILL = 1e-4
+MIN_SLIDING_SPEED = 1e-4
 """Sliding speed below which a contact counts as rolling even if the shaft stands still [m/s]."""
-LASTS = 0.5
+MIN_CONTACT_SHARE = 0.5
 """Part of the settled phase with contact above which the motion is a whirl or rest instead of bouncing."""
-STAYS = 0.95
+PERMANENT_CONTACT_SHARE = 0.95
 """Part of the settled phase with contact below which the motion is a partial rub."""
-SAME_SHARE = 0.1
+MAX_SHARE_DIFFERENCE = 0.1
 """Largest difference of contact shares of equal outcomes."""
 Value = float | str
 
@@ -58,7 +58,7 @@ class Trace(NamedTuple):
     @property
     def settled_rows(self) -> int:
         """Number of rows in the settled phase."""
-        return max(2, round(SETTLED * len(self.times_s)))
+        return max(2, round(SETTLED_SHARE * len(self.times_s)))
 
     @property
     def settled_s(self) -> float:
@@ -80,33 +80,33 @@ class Ending(NamedTuple):
     @property
     def word(self) -> str:
         """Outcome in words: flight, bounces, partial rub, resting, or rolling or sliding whirl of either direction."""
-        if not self.touches or self.contact_share <= LASTS:
+        if not self.touches or self.contact_share <= MIN_CONTACT_SHARE:
             return "bounces" if self.touches else "flight"
-        if self.contact_share < STAYS:
+        if self.contact_share < PERMANENT_CONTACT_SHARE:
             return "partial rub"
         rolls = "rolling" if self.rolling_share > 0.5 else "sliding"
         return f"{rolls} {'forward' if self.turns > 0.0 else 'backward'} whirl" if abs(self.turns) >= 1.0 else "resting"
 
     def alike(self, other: Ending) -> bool:
         """Return whether two outcomes are equal, allowing small differences across the limit between two names."""
-        if self.touches != other.touches or abs(self.contact_share - other.contact_share) > SAME_SHARE:
+        if self.touches != other.touches or abs(self.contact_share - other.contact_share) > MAX_SHARE_DIFFERENCE:
             return False
-        if min(self.contact_share, other.contact_share) <= LASTS:
+        if min(self.contact_share, other.contact_share) <= MIN_CONTACT_SHARE:
             return True
         one, two = (math.copysign(abs(turns) >= 1.0, turns) for turns in (self.turns, other.turns))
         turned = one == two or abs(self.turns - other.turns) < 0.5
         return turned and abs(self.rolling_share - other.rolling_share) <= 0.5
 
 
-def slides(rows: np.ndarray, surface_radius: float) -> np.ndarray:
+def find_sliding(rows: np.ndarray, surface_radius: float) -> np.ndarray:
     """Return for each row whether the shaft would slide if it were in contact."""
     surface_speed = surface_radius * np.abs(rows[:, COLUMN["theta_rate"]])
-    return np.abs(rows[:, COLUMN["sliding_speed"]]) > np.maximum(ROLLS * surface_speed, STILL)
+    return np.abs(rows[:, COLUMN["sliding_speed"]]) > np.maximum(MAX_ROLLING_SLIP * surface_speed, MIN_SLIDING_SPEED)
 
 
-def rolls_from(times_s: np.ndarray, rows: np.ndarray, surface_radius: float) -> float:
+def find_rolling_start(times_s: np.ndarray, rows: np.ndarray, surface_radius: float) -> float:
     """Return the begin of lasting rolling in the rows of a whole run [s]; NaN if there is none."""
-    loose = np.flatnonzero(slides(rows, surface_radius) | (rows[:, COLUMN["penetration"]] <= 0.0))
+    loose = np.flatnonzero(find_sliding(rows, surface_radius) | (rows[:, COLUMN["penetration"]] <= 0.0))
     first = int(loose[-1]) + 1 if len(loose) else 0
     return float(times_s[first]) if first < len(times_s) else math.nan
 
@@ -116,7 +116,7 @@ def ending(trace: Trace) -> Ending:
     # Contact by the impulse: with an impact law, no instant lies within a contact.
     pushed = np.diff(trace.settled("contact_impulse")) > 0.0
     angle = phase(trace.settled("ring_x"), trace.settled("ring_y"))
-    rolls = ~slides(trace.rows[-trace.settled_rows :], trace.surface_radius)
+    rolls = ~find_sliding(trace.rows[-trace.settled_rows :], trace.surface_radius)
     return Ending(
         touches=bool(pushed.any()),
         contact_share=float(np.mean(pushed)),
@@ -223,26 +223,26 @@ def _fraction(trace: Trace) -> float:
     return float(np.mean(trace.column("penetration") > 0.0))
 
 
-def _whole(name: str) -> Callable[[Trace], float]:
+def _read_final(name: str) -> Callable[[Trace], float]:
     return lambda trace: float(trace.column(name)[-1])
 
 
-_LAST = f"last {SETTLED:.0%} of the run"
+_SETTLED = f"last {SETTLED_SHARE:.0%} of the run"
 QUANTITIES = {
     quantity.name: quantity
     for quantity in (
         Quantity(
-            "whirl_frequency", "Hz", _LAST, "slope of the phase of the shaft in the ring; negative is backward",
+            "whirl_frequency", "Hz", _SETTLED, "slope of the phase of the shaft in the ring; negative is backward",
             _whirl_frequency,
         ),
-        Quantity("spin", "Hz", _LAST, "turns of the shaft over time", _spin),
-        Quantity("mean_normal_force", "N", _LAST, "the engine's own contact impulse over time", _mean_force),
+        Quantity("spin", "Hz", _SETTLED, "turns of the shaft over time", _spin),
+        Quantity("mean_normal_force", "N", _SETTLED, "the engine's own contact impulse over time", _mean_force),
         Quantity(
-            "force_ripple", "N", _LAST, "RMS of the normal force about its mean, every 1 ms", _ripple,
+            "force_ripple", "N", _SETTLED, "RMS of the normal force about its mean, every 1 ms", _ripple,
             needs_force=True,
         ),
         Quantity(
-            "reaction_amplitude", "N", _LAST, "sqrt(2) RMS of P_E - P_W about its mean, every 1 ms", _reaction,
+            "reaction_amplitude", "N", _SETTLED, "sqrt(2) RMS of P_E - P_W about its mean, every 1 ms", _reaction,
             needs_force=True,
         ),
         Quantity(
@@ -250,11 +250,11 @@ QUANTITIES = {
             lambda trace: trace.peak_force, needs_force=True,
         ),
         Quantity("contact_impulse", "N s", "whole run", "the engine's own integral of the normal force",
-                 _whole("contact_impulse")),
+                 _read_final("contact_impulse")),
         Quantity("dissipated_energy", "J", "whole run", "the engine's own integrals of all losses", _dissipated),
         Quantity("contact_fraction", "1", "whole run", "share of instants in contact, every 1 ms", _fraction),
         Quantity(
-            "time_to_roll", "s", "transient", f"until it rolls for good (slip below {ROLLS:.0%}), to 50 us",
+            "time_to_roll", "s", "transient", f"until it rolls for good (slip below {MAX_ROLLING_SLIP:.0%}), to 50 us",
             lambda trace: trace.rolls_s, resolution=50e-6,
         ),
         Quantity(
@@ -263,16 +263,16 @@ QUANTITIES = {
         Quantity(
             "rebound_height", "m", "first impact", "top of the first rebound above the ring's lowest point", _rebound
         ),
-        Quantity("outcome", "", _LAST, "no contact, bouncing, resting, forward whirl or backward whirl", _outcome),
+        Quantity("outcome", "", _SETTLED, "no contact, bouncing, resting, forward whirl or backward whirl", _outcome),
     )
 }  # fmt: skip
 
 
 def parse_quantities(names: list[str], tolerances: list[float]) -> dict[str, float]:
-    """Quantities and the error allowed to each; one tolerance serves all.
+    """Parse quantities and their allowed errors; a single tolerance applies to all.
 
     Raises:
-        InputError: No such quantity, one given twice, or a tolerance that is none.
+        InputError: If a quantity is unknown or repeated, or a tolerance is invalid.
     """
     for name in names:
         if name not in QUANTITIES:

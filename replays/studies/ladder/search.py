@@ -31,9 +31,9 @@ SENSORS = "sensors"
 KEEPABLE = (*LEVELS, SENSORS)
 STAND_INS = ("smoothed", "switch")
 """Friction laws that approximate the exact one: measured but not picked, because they save no work."""
-WORTH = 0.1
+MIN_SAVING = 0.1
 """Part of the cost that a simpler level must save; smaller differences of cost count as equal."""
-_SPARE = 0.2
+_VERIFICATION_SHARE = 0.2
 """Part of the budget that is reserved for the verification."""
 
 
@@ -136,26 +136,27 @@ def search(
         if name not in KEEPABLE:
             raise InputError("--keep", f"one of {', '.join(KEEPABLE)}", name)
     chain = scene.sensors.chain if SENSORS in keep else "ideal"
-    work = _Work(scene, tolerances, runs, budget_s, progress, {"chain": chain})
-    standard = _standard(work)
-    single = _one_at_a_time(work, standard, keep)
-    chosen, best = _together(work, standard, single, {level: next(iter(choices)) for level, choices in single.items()})
+    work = _Search(scene, tolerances, runs, budget_s, progress, {"chain": chain})
+    standard = _run_reference(work)
+    single = _lower_each(work, standard, keep)
+    simplest = {level: next(iter(choices)) for level, choices in single.items()}
+    chosen, best = _lower_together(work, standard, single, simplest)
     picked, complete = None, True
     while True:
-        fuller, savings = _put_back(work, standard, single, chosen, picked.measured.candidate if picked else None)
+        fuller, savings = _restore_levels(work, standard, single, chosen, picked.measured.candidate if picked else None)
         if fuller != chosen:
-            chosen, best = _together(work, standard, single, fuller)
+            chosen, best = _lower_together(work, standard, single, fuller)
             picked = None
         elif picked is None:
             work.steps = [step for step in work.steps if step.stage != "engine"]
-            passing, complete = _engines(work, standard, best)
-            picked = _cheapest(work, passing)
+            passing, complete = _search_engines(work, standard, best)
+            picked = _select_cheapest(work, passing)
         else:
             break
     given = work.run(settings.as_given(scene), sensors={})
     full = work.run(standard.full.with_engine(*settings.usual(scene, standard.full, settings.REFERENCE[0])), sensors={})
-    own = _as_given(work, standard)
-    if own.passes and work.saving(picked.measured.candidate, own.measured.candidate) <= WORTH:
+    own = _run_as_given(work, standard)
+    if own.passes and work.saving(picked.measured.candidate, own.measured.candidate) <= MIN_SAVING:
         picked, savings = own, savings if own.measured.candidate == picked.measured.candidate else {}
     return Ladder(
         scene=scene,
@@ -177,7 +178,7 @@ def search(
 
 
 @dataclass
-class _Work:
+class _Search:
     """State of a search: settings, and all candidates until now."""
 
     scene: Scene
@@ -221,7 +222,7 @@ class _Work:
         return saving(self.scene, simpler, fuller, runs=self.runs, sensors=self.sensors, limit_s=self.left_s)
 
 
-class _Standard(NamedTuple):
+class _Reference(NamedTuple):
     """Reference that candidates are compared with."""
 
     full: Candidate
@@ -259,14 +260,14 @@ class _Standard(NamedTuple):
         note: str = "",
     ) -> Step:
         """Return a candidate with its verdict: errors within the tolerances, and the outcome of the full model."""
-        alike = _alike(measured, self.reference)
+        alike = _have_same_outcome(measured, self.reference)
         passes = not measured.failure and errors.worst(self.allowed) <= 1.0 and alike
         if not alike and measured.ending is not None:
             note = f"another outcome: {measured.ending.word}"
         return Step(stage, label, measured, errors, passes, cost=cost, note=measured.failure or note)
 
 
-def _standard(work: _Work) -> _Standard:
+def _run_reference(work: _Search) -> _Reference:
     """Run the full model on two different engines.
 
     Raises:
@@ -285,11 +286,11 @@ def _standard(work: _Work) -> _Standard:
             must = f"one that the reference can run ({measured.failure})"
             raise InputError("scene", must, measured.candidate.method)
     check_reads(work.scene, reference)
-    if not _alike(reference, unlike):
+    if not _have_same_outcome(reference, unlike):
         endings = [measured.ending.word for measured in (reference, unlike) if measured.ending]
         must = f"one with the same outcome on two accurate engines ({' and '.join(endings)} depend on chance)"
         raise InputError("scene", must, work.scene.name)
-    standard = _Standard(full, reference, unlike, {}, {})
+    standard = _Reference(full, reference, unlike, {}, {})
     distances = standard.against(unlike.values, reference.values)
     own = {name: max(error, _resolution(name, reference)) for name, error in distances.items()}
     for name, error in own.items():
@@ -310,7 +311,7 @@ def _resolution(name: str, reference: Measurement) -> float:
     return quantity.resolution / abs(value)
 
 
-def _one_at_a_time(work: _Work, standard: _Standard, keep: tuple[str, ...]) -> dict[str, dict[str, float]]:
+def _lower_each(work: _Search, standard: _Reference, keep: tuple[str, ...]) -> dict[str, dict[str, float]]:
     """Lower every level alone, and return for each level the choices that pass, with their largest errors."""
     full, steps = standard.full, work.steps
     top = work.cost(full)
@@ -331,8 +332,8 @@ def _one_at_a_time(work: _Work, standard: _Standard, keep: tuple[str, ...]) -> d
     return passing
 
 
-def _together(
-    work: _Work, standard: _Standard, single: dict[str, dict[str, float]], chosen: dict[str, str]
+def _lower_together(
+    work: _Search, standard: _Reference, single: dict[str, dict[str, float]], chosen: dict[str, str]
 ) -> tuple[dict[str, str], Measurement]:
     """Lower some levels together, raising the worst one while they fail; return the rest and its converged run."""
     while True:
@@ -345,24 +346,24 @@ def _together(
         if work.steps[-1].passes:
             return chosen, converged
         worst = max(chosen, key=lambda level: single[level][chosen[level]])
-        chosen = _raised(chosen, worst, next(iter(_above(single, chosen, worst)), None))
+        chosen = _raise_level(chosen, worst, next(iter(_fuller_choices(single, chosen, worst)), None))
 
 
-def _above(single: dict[str, dict[str, float]], chosen: dict[str, str], level: str) -> list[str]:
+def _fuller_choices(single: dict[str, dict[str, float]], chosen: dict[str, str], level: str) -> list[str]:
     """Return the passing choices of a level that are fuller than the chosen one, without the full choice."""
     choices = list(single[level])
     return choices[choices.index(chosen[level]) + 1 :]
 
 
-def _raised(chosen: dict[str, str], level: str, choice: str | None) -> dict[str, str]:
+def _raise_level(chosen: dict[str, str], level: str, choice: str | None) -> dict[str, str]:
     """Return the chosen levels with a fuller choice of one level; None selects the full choice."""
     others = {name: other for name, other in chosen.items() if name != level}
     return others if choice is None else {**chosen, level: choice}
 
 
-def _put_back(
-    work: _Work,
-    standard: _Standard,
+def _restore_levels(
+    work: _Search,
+    standard: _Reference,
     single: dict[str, dict[str, float]],
     chosen: dict[str, str],
     setting: Candidate | None,
@@ -388,11 +389,11 @@ def _put_back(
         return both[0].with_engine(setting.engine, setting.step_us, setting.tolerance)
 
     for level in list(chosen):
-        for choice in (None, *reversed(_above(single, chosen, level))):
-            fuller = _raised(chosen, level, choice)
+        for choice in (None, *reversed(_fuller_choices(single, chosen, level))):
+            fuller = _raise_level(chosen, level, choice)
             work.progress(f"what {level} {chosen[level]} saves")
             part = work.saving(placed(chosen, fuller), placed(fuller, chosen))
-            if part <= WORTH:
+            if part <= MIN_SAVING:
                 chosen = fuller
                 savings.pop(level, None)
                 break
@@ -400,7 +401,7 @@ def _put_back(
     return chosen, savings
 
 
-def _engines(work: _Work, standard: _Standard, best: Measurement) -> tuple[list[tuple[Step, int]], bool]:
+def _search_engines(work: _Search, standard: _Reference, best: Measurement) -> tuple[list[tuple[Step, int]], bool]:
     """Run engines and steps, finest first; a setting passes only if all finer ones of its engine pass.
 
     Returns:
@@ -410,7 +411,7 @@ def _engines(work: _Work, standard: _Standard, best: Measurement) -> tuple[list[
     complete = True
     for place, (engine, tried) in enumerate(settings.tried(work.scene, best.candidate).items()):
         for step_us, tolerance in tried:
-            if work.left_s <= _SPARE * work.budget_s and passing:
+            if work.left_s <= _VERIFICATION_SHARE * work.budget_s and passing:
                 complete = False
                 break
             candidate = best.candidate.with_engine(engine, step_us, tolerance)
@@ -427,7 +428,7 @@ def _engines(work: _Work, standard: _Standard, best: Measurement) -> tuple[list[
     return passing, complete
 
 
-def _cheapest(work: _Work, passing: list[tuple[Step, int]]) -> Step:
+def _select_cheapest(work: _Search, passing: list[tuple[Step, int]]) -> Step:
     """Return the cheapest passing step.
 
     Raises:
@@ -437,11 +438,11 @@ def _cheapest(work: _Work, passing: list[tuple[Step, int]]) -> Step:
         must = "wider: no engine meets it on the passing levels"
         raise InputError("--tolerance", must, list(work.tolerances.values()))
     least = min(step.measured.cpu_s for step, _ in passing)
-    near = [entry for entry in passing if (1.0 - WORTH) * entry[0].measured.cpu_s <= least]
-    return min(near, key=_preference)[0]
+    near = [entry for entry in passing if (1.0 - MIN_SAVING) * entry[0].measured.cpu_s <= least]
+    return min(near, key=_sort_key)[0]
 
 
-def _as_given(work: _Work, standard: _Standard) -> Step:
+def _run_as_given(work: _Search, standard: _Reference) -> Step:
     """Run the scene's own model, engine and step for comparison with the pick."""
     own = settings.as_given(work.scene)
     work.progress("the scene as it is given")
@@ -450,11 +451,11 @@ def _as_given(work: _Work, standard: _Standard) -> Step:
     return work.steps[-1]
 
 
-def _preference(entry: tuple[Step, int]) -> tuple[float, ...]:
+def _sort_key(entry: tuple[Step, int]) -> tuple[float, ...]:
     """Return the sort key of equally cheap steps: earlier engine, longer step, wider tolerance."""
     step, place = entry
     return place, -step.measured.candidate.step_us, -step.measured.candidate.tolerance
 
 
-def _alike(one: Measurement, other: Measurement) -> bool:
+def _have_same_outcome(one: Measurement, other: Measurement) -> bool:
     return one.ending is not None and other.ending is not None and one.ending.alike(other.ending)

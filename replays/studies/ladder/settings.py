@@ -10,7 +10,7 @@ from rig.run.scenes import Scene
 REFERENCE = ("rk8", 25, 1e-10)
 UNLIKE = "split"
 """Engine for the cross-check, at its finest setting; also converges models that the reference engine cannot run."""
-_FINEST = 1e-3
+_FINEST_FACTOR = 1e-3
 """Factor on an engine's own tolerance for its finest setting; a fixed-step engine uses steps of 1 us."""
 _GRIDS = (1000, 500, 250, 200, 125, 100, 50, 25, 20, 10, 5)
 _STEPS = (1, 2, 5, 10, 20, 25, 40, 50, 100)
@@ -30,7 +30,7 @@ def converged(candidate: Candidate) -> Candidate:
 def finest(engine: str) -> tuple[str, int, float]:
     """Return an engine at its finest setting."""
     method = ENGINES[engine]
-    return (engine, method.step_us, _FINEST * method.tolerance) if method.tolerance else (engine, 1, 0.0)
+    return (engine, method.step_us, _FINEST_FACTOR * method.tolerance) if method.tolerance else (engine, 1, 0.0)
 
 
 def usual(scene: Scene, candidate: Candidate, engine: str) -> tuple[str, int, float]:

@@ -37,9 +37,9 @@ from replays.studies.paper.scans.pulse import MEASURED_N
 from replays.studies.paper.scans.spread import (
     assumed_values,
     column,
+    format_value,
     free_values,
     percentiles,
-    present,
     rank_correlation,
 )
 from replays.studies.paper.statement import number
@@ -105,7 +105,7 @@ def in_print(text: str) -> str:
 
 
 def _printed(content: Content) -> Content:
-    """Typeset the cells of a table."""
+    """Format the cells of a table as in print."""
     rows = [Row(tuple(map(in_print, row.cells)), row.mark) for row in content.rows]
     return Content(tuple(map(in_print, content.headings)), rows)
 
@@ -184,7 +184,7 @@ def _numbers(findings: Findings) -> dict[str, Any]:
         "spread": _spread(findings),
         **_whirl(findings),
         "assumed": [
-            (entry, present(entry), entry.unit or load_parameters("corrected").entries[entry.key].unit)
+            (entry, format_value(entry), entry.unit or load_parameters("corrected").entries[entry.key].unit)
             for entry in assumed_values()
         ],
     }

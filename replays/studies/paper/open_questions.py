@@ -45,7 +45,7 @@ def question_groups(*, ensemble: int) -> Groups:
     return groups
 
 
-def fall(constants: Constants) -> tuple[float, float]:
+def compute_fall(constants: Constants) -> tuple[float, float]:
     """Return time [s] and speed at the ring [m/s] of a fall through the whole clearance, from rest, for small angles.
 
     About the pivot I_xx Gamma'' = M g l_0C, so the height at the ring decreases with a = M g l_0C l_0A / I_xx.
@@ -66,7 +66,7 @@ def drop_numbers(found: dict[str, Reproduction]) -> Numbers:
     """Return the numbers that compare the drop's 100 N with the change of momentum."""
     model = found["corrected"].drop.simulation.model
     contact, masses = model.constants.contact, reference_impact(model.parameters)
-    time_s, speed = fall(model.constants)
+    time_s, speed = compute_fall(model.constants)
 
     def hit(mass: float, at: float = speed, stiffness: float = contact.stiffness) -> Impact:
         return impact(

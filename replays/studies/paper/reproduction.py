@@ -17,7 +17,7 @@ from replays.studies.paper.scans.pulse import (
     SPEED_HZ,
     Outcome,
     Pulse,
-    low_passed,
+    apply_low_pass,
     pulse_scene,
     read,
 )
@@ -162,8 +162,8 @@ def drop_numbers(run: Run, *, bandwidth_hz: float = 4900.0) -> dict[str, float]:
         "drop_settled": settled * 1e3,
         "drop_reaction": float(south.max()),
         "drop_acceleration": float(np.abs(run["inner_ay"]).max()),
-        "drop_sensed": float(low_passed(run, south, bandwidth_hz).max()),
-        "drop_sensed_acceleration": float(np.abs(low_passed(run, run["inner_ay"], bandwidth_hz)).max()),
+        "drop_sensed": float(apply_low_pass(run, south, bandwidth_hz).max()),
+        "drop_sensed_acceleration": float(np.abs(apply_low_pass(run, run["inner_ay"], bandwidth_hz)).max()),
     }
 
 

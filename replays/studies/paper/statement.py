@@ -17,9 +17,9 @@ from rig.physics.parameters import ParameterSet
 Verdict = Literal["agrees", "differs", "cannot be judged"]
 SETS = ("as-printed", "corrected")
 """Parameter sets compared with the paper, in the order of the tables."""
-SURE = 0.95
+VERDICT_SHARE = 0.95
 """Share of our values inside, or outside, the stated range that is required for a verdict."""
-_TEXT = 5e-3
+_ROUNDING_ERROR = 5e-3
 """Relative rounding error of a printed value."""
 
 
@@ -45,9 +45,9 @@ class Statement(BaseModel, frozen=True, extra="forbid"):
     def verdict(self, values: np.ndarray) -> Verdict:
         """Return the verdict on our values, shape (n,), spread by shaft phases, assumed values and readings."""
         share = self.inside(values)
-        if share >= SURE:
+        if share >= VERDICT_SHARE:
             return "agrees"
-        return "differs" if share <= 1.0 - SURE else "cannot be judged"
+        return "differs" if share <= 1.0 - VERDICT_SHARE else "cannot be judged"
 
 
 class Printed(BaseModel, frozen=True, extra="forbid"):
@@ -61,7 +61,7 @@ class Printed(BaseModel, frozen=True, extra="forbid"):
 
     def verdict(self, parameters: ParameterSet) -> Verdict:
         """Return whether a parameter set uses the printed value."""
-        return "agrees" if abs(parameters[self.key] / self.value - 1.0) < _TEXT else "differs"
+        return "agrees" if abs(parameters[self.key] / self.value - 1.0) < _ROUNDING_ERROR else "differs"
 
 
 @cache

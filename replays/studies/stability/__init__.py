@@ -1,3 +1,3 @@
-"""Where methods fail: trials of every engine with the verdict that theory expects, and maps of where they hold."""
+"""Stability of methods: trials of every engine against theory, and maps of stable steps."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What other people's solvers are known to get wrong without an error, cheap enough to show every time."""
+"""Known silent errors of other solvers, in cases short enough to run every time."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from rig.run.scenes import load_scene
 
 
 def peer_cells(trial: str) -> Iterator[Cell]:
-    """Cells of other people's solvers in one trial; those not installed are skipped with a reason."""
+    """Yield the cells of other solvers in one trial; those not installed are skipped with a reason."""
     for name, case, tolerance, expected, because in _KNOWN.get(trial, ()):
         peer = PEERS[name]
         value = _RUNS[trial](name, tolerance) if peer.installed else math.nan
@@ -27,7 +27,7 @@ def peer_cells(trial: str) -> Iterator[Cell]:
 
 
 def _ring_down(name: str, tolerance: float) -> float:
-    """|E/E0 - 1| of the undamped house mode after 0.2 s."""
+    """Return |E/E0 - 1| of the undamped house mode after 0.2 s."""
     constants, mode = house_oscillator()
     y0 = state(y_ih=1e-5 * mode.inner, y_oh=1e-5 * mode.outer)
     problem = _problem("ring-down", constants, quiet_inputs(), y0, 0.2)
@@ -37,7 +37,7 @@ def _ring_down(name: str, tolerance: float) -> float:
 
 
 def _hammer(name: str, tolerance: float) -> float:
-    """1 - part of the pulse's work that is seen: the rig at a standstill is hit at 0.5 s."""
+    """Return the missing part of the pulse's work for a pulse at 0.5 s on a rig at a standstill."""
     scene = load_scene("hammer", {"drive.speed_hz": 0.0, "duration_s": 0.6})
     command = scene.commands[0].model_copy(update={"at_s": 0.5})
     scene = scene.model_copy(update={"commands": (command,)})
@@ -73,4 +73,4 @@ _KNOWN: dict[str, tuple[tuple[str, str, float, bool, str], ...]] = {
         ("scipy-bdf", "stops at the corners", 1e-6, True, "restarts at the pulse's corners"),
     ),
 }
-"""Peer, case, tolerance, whether it holds, and why; by trial."""
+"""Peer, case, tolerance, expected verdict and its reason, by trial."""

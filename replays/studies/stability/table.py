@@ -1,4 +1,4 @@
-"""All trials of all engines, one cell after the other, with what is known of other people's solvers."""
+"""Table of trials: one cell per case and engine, followed by known errors of other solvers."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ from rig.physics.engines import ENGINES
 
 
 def chosen_trials(only: str | None) -> list[str]:
-    """Trials by names joined by commas; None for all.
+    """Return the trials of a comma-separated list; None selects all.
 
     Raises:
-        InputError: There is no such trial.
+        InputError: If a trial does not exist.
     """
     return choose_names("--only", only, list(TRIALS))
 
 
 def chosen_engines(names: str | None) -> list[str]:
-    """Engines by names joined by commas; None for all.
+    """Return the engines of a comma-separated list; None selects all.
 
     Raises:
-        InputError: There is no such engine.
+        InputError: If an engine does not exist.
     """
     return choose_names("--engines", names, list(ENGINES))
 
 
 def run_trials(trials: list[str], engines: list[str], *, quick: bool) -> Iterator[Cell]:
-    """Cells as they come, trial by trial: first the engines, then the peers."""
+    """Yield the cells trial by trial: first the engines, then the peers."""
     for trial in trials:
         for engine in engines:
             yield from TRIALS[trial].run(engine, quick)
@@ -38,10 +38,10 @@ def run_trials(trials: list[str], engines: list[str], *, quick: bool) -> Iterato
 
 
 def choose_names(field: str, names: str | None, known: list[str]) -> list[str]:
-    """Return the known names that are joined by commas, in their own order; None for all.
+    """Return the known names of a comma-separated list, in their own order; None selects all.
 
     Raises:
-        InputError: There is no such name, or none is given.
+        InputError: If a name does not exist, or the list is empty.
     """
     if names is None:
         return known

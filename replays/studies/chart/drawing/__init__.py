@@ -1,1 +1,1 @@
-"""The pictures of a chart."""
+"""Pictures of a chart."""

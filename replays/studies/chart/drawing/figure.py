@@ -1,4 +1,4 @@
-"""The pictures of a chart, drawn from its table alone."""
+"""Pictures of a chart, drawn from its table only."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from replays.studies.chart.drawing.panel import (
     window,
 )
 from replays.studies.chart.drawing.scene_panel import draw_markers, draw_scenes
-from replays.studies.chart.methods import ADDED, OURS
+from replays.studies.chart.methods import ADDED_FAMILY, RIG_FAMILY
 from replays.studies.chart.phases import MEMORY_CASES, PHASES, RUB, SCENE_TARGETS, SMOOTHING
 from replays.studies.chart.profile import TARGET
 
@@ -34,10 +34,10 @@ def draw(rows: list[Row], folder: Path, panels: list[str], *, command: str, note
 
     Args:
         rows: The table.
-        folder: Where to.
-        panels: Panels that are wanted.
-        command: The command that makes these pictures, for the caption.
-        note: What the reader must know besides, for the caption.
+        folder: Output folder.
+        panels: Panels to draw.
+        command: Command that makes these pictures, for the caption.
+        note: Additional remark for the caption.
 
     Returns:
         The files.
@@ -79,7 +79,7 @@ def _caption(figure: Any, rows: list[Row], said: str, command: str, note: str) -
 
 
 def _grid(figure: Any, height: float, title: str, *, down: int = 1, across: int = 2, left: float = 0.7) -> Any:
-    """Panels under the figure's title and above its caption, with a column for the legend; lengths in inches."""
+    """Return a grid of panels between title and caption, with a column for the legend; lengths in inches."""
     figure.set_size_inches(WIDTH, height)
     figure.text(0.01, 1.0 - 0.38 / height, title, fontsize=13, fontweight="bold", color=INK)
     return figure.add_gridspec(
@@ -88,16 +88,16 @@ def _grid(figure: Any, height: float, title: str, *, down: int = 1, across: int 
     )  # fmt: skip
 
 
-_HOW = (
+_NOTE = (
     "Points: median of at least 3 runs (in a quick chart, long runs count alone), bars from least to "
     "greatest, compile time apart; same equations, same corners of the hammer, right-hand sides compiled unless said. "
     "scipy's steps are Python. Error: RMS over 1 ms instants of 7 scaled states."
 )
 
 
-def _led(rows: list[Row], panel: str) -> str:
-    """Remarks on points whose time is not measured as the others' is: added by file, or driven by a Python loop."""
-    added = {row["title"] for row in rows if row["panel"] == panel and row["family"] == ADDED}
+def _timing(rows: list[Row], panel: str) -> str:
+    """Return remarks on points timed in another way: added by file, or driven by a Python loop."""
+    added = {row["title"] for row in rows if row["panel"] == panel and row["family"] == ADDED_FAMILY}
     stated = " Solvers added by file: time and number of contacts as their authors' files state." if added else ""
     led = sorted({row["method"] for row in rows if row["panel"] == panel and row["own_cpu_s"]})
     if not led:
@@ -135,7 +135,7 @@ def _hero(figure: Any, rows: list[Row]) -> str:
         draw_profile(right, rows)
     else:
         draw_frames(right, chosen, rows)
-    return _HOW + _led(rows, "exact")
+    return _NOTE + _timing(rows, "exact")
 
 
 def _exact(figure: Any, rows: list[Row]) -> str:
@@ -152,7 +152,7 @@ def _smoothed(figure: Any, rows: list[Row]) -> str:
 def _windows(figure: Any, rows: list[Row], panel: str, title: str, *, smoothed: bool = False) -> str:
     phases = _phases(rows, panel)
     down, across = math.ceil(len(phases) / 2), min(2, len(phases))
-    # Beside one row of windows the legend is the taller.
+    # Next to a single row of windows, the legend is taller.
     grid = _grid(figure, 3.1 + 3.6 * down + (3.4 if down == 1 else 0.0), title, down=down, across=across)
     if across == 1:
         grid.set_width_ratios((1.0, 0.45))
@@ -163,7 +163,7 @@ def _windows(figure: Any, rows: list[Row], panel: str, title: str, *, smoothed: 
         if i % across:
             axes.set_ylabel("")
     draw_legend(figure, rows, (panel,), figure.add_subplot(grid[:, across]), smoothed=smoothed)
-    return _HOW + _led(rows, panel)
+    return _NOTE + _timing(rows, panel)
 
 
 def _memory(figure: Any, rows: list[Row]) -> str:
@@ -178,7 +178,7 @@ def _memory(figure: Any, rows: list[Row]) -> str:
             axes.set_ylabel("")
     draw_legend(figure, rows, ("memory",), figure.add_subplot(grid[0, 2]))
     return (
-        f"{_HOW}{_led(rows, 'memory')} Friction is left out here, so that every method runs. 'No events': v₀ is "
+        f"{_NOTE}{_timing(rows, 'memory')} Friction is left out here, so that every method runs. 'No events': v₀ is "
         "latched at a step's end, not where the contact begins."
     )
 
@@ -192,7 +192,7 @@ def _profile_figure(figure: Any, rows: list[Row]) -> str:
     return (
         f"Each method walks down its ladder to the first setting that comes within {TARGET:g} of the scene's own "
         "reference, exact Coulomb, 0.15 s, and is timed there; curves that end below 100 % did not get "
-        f"there.{chaos}{_led(rows, 'profile')}"
+        f"there.{chaos}{_timing(rows, 'profile')}"
     )
 
 
@@ -207,7 +207,7 @@ def _scenes(figure: Any, rows: list[Row]) -> str:
     short = " A quick chart leaves out scipy's methods." if points[0]["mode"] == "quick" else ""
     return (
         "Each method is timed at its coarsest setting whose error against the scene's own reference is below the "
-        f"target.{short}{_led(rows, 'scenes')}"
+        f"target.{short}{_timing(rows, 'scenes')}"
     )
 
 
@@ -236,8 +236,8 @@ def _rub(figure: Any, rows: list[Row]) -> str:
     grid.set_width_ratios((1.0, 1.0, 1.0, 1.0))
     grid.update(wspace=0.14, right=0.975)
     good = [row for row in points if row["rms_force"] is not None]
-    # The tightest setting of an unlike code is what the others are held against.
-    unlike = [row for row in good if row["family"] != OURS] or good
+    # The others are compared with the tightest setting of another code.
+    unlike = [row for row in good if row["family"] != RIG_FAMILY] or good
     tight = min(unlike, key=lambda row: row["tolerance"] or math.inf) if unlike else None
     columns = (("contact_fraction", "time in contact\n[%]", 100.0), ("rms_force", "RMS elastic force\n[N]", 1.0),
                ("impacts_per_s", "impacts a second\n[1/s]", 1.0))  # fmt: skip
@@ -274,5 +274,5 @@ def _rub(figure: Any, rows: list[Row]) -> str:
     return (
         f"Ring moved sideways by 0.8 mm, unbalance 0.3 mm, 12 Hz, {points[0]['simulated_s']:g} s: two runs that begin "
         f"5e-10 rad apart are wholly apart after 0.4 s. Means with 95 % bootstrap bars over blocks of 0.5 s; "
-        f"the band is {against}.{_led(rows, RUB)}"
+        f"the band is {against}.{_timing(rows, RUB)}"
     )

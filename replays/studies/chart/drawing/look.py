@@ -1,19 +1,19 @@
-"""How a method looks on every chart, and the legend that says so."""
+"""Line styles of the methods on all charts, and their legend."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from replays.studies.chart.methods import ADDED, OURS
+from replays.studies.chart.methods import ADDED_FAMILY, RIG_FAMILY
 from replays.studies.chart.phases import SMOOTHING
 from replays.studies.common.engines import traits
 from rig.physics.engines import ENGINES
 
 Row = dict[str, Any]
 
-# Peers stand in quiet tones by family, behind the strong colours of our engines.
+# Peers have muted colours by family, so that our engines stand out.
 _FAMILIES = {"heyoka": ("#111111", "*"), "SUNDIALS": ("#6e6e6e", "s"), "scipy": ("#a98a66", "o"),
-             "MuJoCo": ("#a08cc0", "X"), ADDED: ("#7a8500", "P")}  # fmt: skip
+             "MuJoCo": ("#a08cc0", "X"), ADDED_FAMILY: ("#7a8500", "P")}  # fmt: skip
 _DASHES: tuple[Any, ...] = ("-", (0, (5, 1.6)), (0, (1.4, 1.2)), (0, (6, 1.5, 1.4, 1.5)), (0, (2.5, 1)), (0, (8, 3)),
                             (0, (1, 3)), (0, (9, 2, 3, 2)))  # fmt: skip
 FAILURES = {
@@ -23,13 +23,13 @@ FAILURES = {
     "budget": ("T", "out of time"),
     "error": ("E", "gave up"),
 }
-"""Letter and words by kind of failure."""
+"""Letter and description by kind of failure."""
 INK, QUIET, ALARM = "#222222", "#777777", "#b00020"
 
 
 def look(row: Row, rows: list[Row]) -> dict[str, Any]:
-    """Line and marker of a method: bold in its own colour if ours, thin in its family's if not."""
-    if row["family"] == OURS:
+    """Return the style of a method: bold in its own colour for our engines, thin in the family's colour for peers."""
+    if row["family"] == RIG_FAMILY:
         own, main = traits(row["method"]), row["method"] == next(iter(ENGINES))
         width, size, order = (3.0, 7.5, 8) if main else (1.9, 6.0, 7)
         return {"color": own.colour, "marker": own.marker, "ls": "-", "lw": width, "ms": size, "mec": "white",
@@ -37,13 +37,13 @@ def look(row: Row, rows: list[Row]) -> dict[str, Any]:
     color, marker = _FAMILIES.get(row["family"], ("#999999", "d"))
     family = list(dict.fromkeys(other["method"] for other in rows if other["family"] == row["family"]))
     dash = _DASHES[family.index(row["method"]) % len(_DASHES)]
-    strong = row["family"] in ("heyoka", ADDED)
+    strong = row["family"] in ("heyoka", ADDED_FAMILY)
     return {"color": color, "marker": marker, "ls": dash, "lw": 1.0, "ms": 7.5 if strong else 4.0, "mec": color,
             "mew": 0.5, "zorder": 5 if strong else 4}  # fmt: skip
 
 
 def look_of_bound(row: Row, rows: list[Row]) -> dict[str, Any]:
-    """Line and marker of what a library would reach if the Python loop that drives it cost nothing."""
+    """Return line and marker of a library's bound, without the time of the Python loop that drives it."""
     style = look(row, rows)
     return style | {"ls": (0, (1, 1.4)), "lw": 0.9, "mfc": "white", "mew": 0.8}
 
@@ -58,14 +58,14 @@ def draw_legend(
     failures: bool = True,
     bounds: bool = True,
 ) -> None:
-    """Our engines first, then peers by family, then what the marks mean."""
+    """Draw the legend: our engines, then peers by family, then the marks."""
     from matplotlib.lines import Line2D
 
     entries: list[tuple[Any, Any]] = []
     shown = {row["method"]: row for row in rows if row["panel"] in panels and row["family"] != "reference"}
-    order = [OURS, ADDED, "heyoka", "SUNDIALS", "scipy", "MuJoCo"]
+    order = [RIG_FAMILY, ADDED_FAMILY, "heyoka", "SUNDIALS", "scipy", "MuJoCo"]
     blank = Line2D([], [], ls="none")
-    headings = {OURS: "engines of the rig"}
+    headings = {RIG_FAMILY: "engines of the rig"}
     for family in [*order, *sorted({row["family"] for row in shown.values()} - set(order))]:
         members = [row for row in shown.values() if row["family"] == family]
         if not members:
@@ -78,7 +78,7 @@ def draw_legend(
             if bounds and any(one["own_cpu_s"] for one in points):
                 style = {key: value for key, value in look_of_bound(row, rows).items() if key != "zorder"}
                 entries.append((Line2D([], [], **style), f"{row['method']} alone: a bound"))
-        if smoothed and family == OURS:
+        if smoothed and family == RIG_FAMILY:
             color, dash = traits("tsit5").colour, (0, (1, 1.4))
             handle = Line2D([], [], color=color, ls=dash, marker=traits("tsit5").marker, mfc="white", ms=5.5)
             entries.append((handle, f"tsit5, smoothed, {SMOOTHING * 1e3:g} mm/s"))

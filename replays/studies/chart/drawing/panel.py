@@ -1,4 +1,4 @@
-"""One panel of a chart: speed against error, energy, frames, work, or a performance profile."""
+"""Panels of a chart: speed against error, energy, frames, work, performance profile."""
 
 from __future__ import annotations
 
@@ -9,26 +9,26 @@ from typing import Any
 import numpy as np
 
 from replays.studies.chart.drawing.look import ALARM, FAILURES, Row, look, look_of_bound
-from replays.studies.chart.methods import ADDED, OURS
+from replays.studies.chart.methods import ADDED_FAMILY, RIG_FAMILY
 from replays.studies.chart.profile import TARGET, shares
 
-_RIGHT, _EDGE = 2.0, 60.0
-"""Error at which the strip of failures begins and ends."""
-_LEFT = 1e-9
-_ERROR, _SPEED = "scaled error against the reference [1]", "times real time [s/s]"
+_STRIP_BEGIN, _STRIP_END = 2.0, 60.0
+"""Begin and end of the strip of failures on the error axis."""
+_MIN_DRAWN_ERROR = 1e-9
+_ERROR_LABEL, _SPEED_LABEL = "scaled error against the reference [1]", "times real time [s/s]"
 
 
 def _inside(error: float) -> float:
-    return max(error, 1.2 * _LEFT)
+    return max(error, 1.2 * _MIN_DRAWN_ERROR)
 
 
 def _placed(row: Row) -> float:
-    """Where a point's error is drawn."""
+    """Return the position of a point on the error axis."""
     return _inside(row["error"])
 
 
 def own_speed(row: Row) -> float | None:
-    """Times real time by a library's own time alone, where a Python loop drives it and that was measured."""
+    """Return times real time by a library's own time only, if a Python loop drives it and that time was measured."""
     return row["speed"] * row["cpu_s"] / row["own_cpu_s"] if row["own_cpu_s"] and row["speed"] else None
 
 
@@ -37,13 +37,13 @@ def _fineness(row: Row) -> float:
 
 
 def window(axes: Any, rows: list[Row], all_rows: list[Row], *, title: str) -> None:
-    """Speed against error in one window: lines of methods, failures on the strip at the right, the reference's bar.
+    """Draw speed against error in one window: lines of methods, failures on the strip, the reference's own error.
 
     Args:
-        axes: Where to.
+        axes: Axes to draw on.
         rows: Points of this window.
-        all_rows: The whole table, for looks that stay the same over all panels.
-        title: Said above.
+        all_rows: The whole table, for styles that are equal on all panels.
+        title: Title above.
     """
     points = [row for row in rows if row["family"] != "reference"]
     lines: dict[tuple[str, str], list[Row]] = {}
@@ -53,8 +53,8 @@ def window(axes: Any, rows: list[Row], all_rows: list[Row], *, title: str) -> No
     speeds = [own_speed(row) or row["speed"] for row in points if row["speed"] and row["error"]]
     speeds += [row["speed"] for row in points if row["speed"] and row["error"]] or [1.0, 100.0]
     low, high = 0.45 * min(speeds), 2.2 * max(speeds)
-    axes.set(xlim=(_LEFT, _EDGE), ylim=(low, high))
-    axes.axvspan(_RIGHT, _EDGE, color="#f4ecec", zorder=0, lw=0)
+    axes.set(xlim=(_MIN_DRAWN_ERROR, _STRIP_END), ylim=(low, high))
+    axes.axvspan(_STRIP_BEGIN, _STRIP_END, color="#f4ecec", zorder=0, lw=0)
     for (method, case), line in lines.items():
         style = look(line[0], all_rows)
         smoothed = case == "smoothed"
@@ -81,19 +81,19 @@ def window(axes: Any, rows: list[Row], all_rows: list[Row], *, title: str) -> No
     axes.set_title(title)
     axes.set_xticks([10.0**n for n in range(-8, 1, 2)])
     axes.minorticks_off()
-    axes.set(xlabel=_ERROR, ylabel=_SPEED)
+    axes.set(xlabel=_ERROR_LABEL, ylabel=_SPEED_LABEL)
     axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
 
 
 def _failures(axes: Any, points: list[Row], all_rows: list[Row]) -> None:
-    """Every failed point, at its speed, as a letter on the strip."""
+    """Draw every failed point as a letter on the strip, at its speed."""
     kinds = list(FAILURES)
-    places = np.geomspace(_RIGHT, _EDGE, 2 * len(kinds) + 1)[1::2]
+    places = np.geomspace(_STRIP_BEGIN, _STRIP_END, 2 * len(kinds) + 1)[1::2]
     for row in points:
         if row["failure"] not in FAILURES:
             continue
         color = look(row, all_rows)["color"]
-        # What has got nowhere stands on the frame.
+        # Points without progress are drawn at the frame.
         bottom, top = axes.get_ylim()
         speed = min(max(row["speed"] or 0.0, 1.12 * bottom), top / (top / bottom) ** 0.05)
         axes.text(
@@ -101,23 +101,23 @@ def _failures(axes: Any, points: list[Row], all_rows: list[Row]) -> None:
             va="center", fontsize=9, fontweight="bold", zorder=9, gid=f"failure-{row['method']}-{row['rung']}",
             clip_on=False,
         )  # fmt: skip
-    axes.text(math.sqrt(_RIGHT * _EDGE), 1.0, "failed", transform=axes.get_xaxis_transform(), ha="center", va="bottom",
-              fontsize=9, color="#a06060")  # fmt: skip
+    axes.text(math.sqrt(_STRIP_BEGIN * _STRIP_END), 1.0, "failed", transform=axes.get_xaxis_transform(), ha="center",
+              va="bottom", fontsize=9, color="#a06060")  # fmt: skip
 
 
 def _reference_bar(axes: Any, rows: list[Row]) -> None:
     bars = [row["reference_error"] for row in rows if row["method"] == "reference" and row["reference_error"]]
     if not bars:
         return
-    axes.axvspan(_LEFT, max(max(bars), 1.3 * _LEFT), color="#e4ebf2", zorder=0, lw=0)
-    axes.text(max(max(bars), 1.3 * _LEFT) * 1.15, 0.012, f"reference ±{max(bars):.0e}".replace("e-0", "e-"),
+    axes.axvspan(_MIN_DRAWN_ERROR, max(max(bars), 1.3 * _MIN_DRAWN_ERROR), color="#e4ebf2", zorder=0, lw=0)
+    axes.text(max(max(bars), 1.3 * _MIN_DRAWN_ERROR) * 1.15, 0.012, f"reference ±{max(bars):.0e}".replace("e-0", "e-"),
               transform=axes.get_xaxis_transform(), fontsize=9, color="#56687a", va="bottom")  # fmt: skip
 
 
 def _limits(axes: Any, rows: list[Row]) -> None:
-    """How far the smoothed laws are from the exact one, where that was measured."""
+    """Draw the distances of the smoothed laws from the exact one, where measured."""
     for row in rows:
-        if row["case"] == "floor" and row["error"] and _LEFT < row["error"] < _RIGHT:
+        if row["case"] == "floor" and row["error"] and _MIN_DRAWN_ERROR < row["error"] < _STRIP_BEGIN:
             axes.axvline(row["error"], color="#8a6fae", lw=1.0, ls=(0, (4, 3)), zorder=2)
             label = row["rung"].replace("v_s", "vₛ")
             axes.text(row["error"], 0.06, label, rotation=90, transform=axes.get_xaxis_transform(), fontsize=9,
@@ -125,7 +125,7 @@ def _limits(axes: Any, rows: list[Row]) -> None:
 
 
 def mark_better(axes: Any) -> None:
-    """An arrow to the upper left."""
+    """Draw an arrow to the upper left."""
     x, y = 0.045, 0.97
     axes.annotate(
         "", (x, y), (x + 0.06, y - 0.07), xycoords="axes fraction",
@@ -136,9 +136,9 @@ def mark_better(axes: Any) -> None:
 
 
 def label_lines(axes: Any, rows: list[Row], all_rows: list[Row]) -> None:
-    """Names beside the true end of each line of ours, and of the best peers, kept apart."""
+    """Label the accurate end of each line of our engines and of the best peers, without overlaps."""
     ends: list[tuple[float, float, str, str]] = []
-    for method in dict.fromkeys(row["method"] for row in rows if row["family"] in (OURS, ADDED, "heyoka")):
+    for method in dict.fromkeys(row["method"] for row in rows if row["family"] in (RIG_FAMILY, ADDED_FAMILY, "heyoka")):
         line = [row for row in rows if row["method"] == method and row["case"] == "" and row["error"]]
         line = [row for row in line if row["failure"] in ("", "contacts")]
         if line:
@@ -156,7 +156,7 @@ def label_lines(axes: Any, rows: list[Row], all_rows: list[Row]) -> None:
         taken.append((x, y))
         place = scale.inverted().transform((x, y))
         # At the frame there is room only above the line.
-        outside = place[0] < 30 * _LEFT
+        outside = place[0] < 30 * _MIN_DRAWN_ERROR
         axes.text(
             _inside(error) * (1.3 if outside else 1.0),
             place[1] * (1.1 if outside else 1.0),
@@ -167,8 +167,8 @@ def label_lines(axes: Any, rows: list[Row], all_rows: list[Row]) -> None:
 
 
 def _lines(rows: list[Row], *needed: str, ours: bool) -> Iterator[list[Row]]:
-    """Points of each method on the panel's own law, by setting, without those that lack a column that is needed."""
-    taking_part = [row for row in rows if row["family"] == OURS or (not ours and row["family"] != "reference")]
+    """Yield the points of each method on the panel's own law, by setting, without those that lack a needed column."""
+    taking_part = [row for row in rows if row["family"] == RIG_FAMILY or (not ours and row["family"] != "reference")]
     for method in dict.fromkeys(row["method"] for row in taking_part):
         line = [row for row in taking_part if row["method"] == method and row["case"] == ""]
         line = sorted((row for row in line if all(row[name] for name in needed)), key=_fineness)
@@ -177,7 +177,7 @@ def _lines(rows: list[Row], *needed: str, ours: bool) -> Iterator[list[Row]]:
 
 
 def draw_energy(axes: Any, rows: list[Row], all_rows: list[Row]) -> None:
-    """Energy residual: an error that needs no reference. Peers keep no ledger."""
+    """Draw the energy residual, an error that needs no reference; peers have none."""
     axes.set(xscale="log", yscale="log")
     least = 1.0
     for line in _lines(rows, "energy_residual", ours=True):
@@ -187,37 +187,37 @@ def draw_energy(axes: Any, rows: list[Row], all_rows: list[Row]) -> None:
     axes.set_xlim(min(0.3 * least, 1e-4), 0.1)
     axes.axvline(1e-3, color=ALARM, lw=1.0, ls=(0, (4, 3)))
     axes.text(1e-3, 0.02, " alarm", transform=axes.get_xaxis_transform(), color=ALARM, fontsize=9, va="bottom")
-    axes.set(xlabel="energy residual over energy dissipated [1]", ylabel=_SPEED)
+    axes.set(xlabel="energy residual over energy dissipated [1]", ylabel=_SPEED_LABEL)
     axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
     axes.minorticks_off()
     axes.set_title("Energy ledger: needs no reference")
 
 
 def draw_frames(axes: Any, rows: list[Row], all_rows: list[Row]) -> None:
-    """The worst 1 ms frame against the error."""
+    """Draw the worst 1 ms frame against the error."""
     axes.set(xscale="log", yscale="log")
     for line in _lines(rows, "worst_frame_ms", "error", ours=True):
         walls_us = [row["worst_frame_ms"] * 1e3 for row in line]
         axes.plot([_placed(row) for row in line], walls_us, **look(line[0], all_rows))
     slowest = max((row["worst_frame_ms"] or 0.0 for row in rows), default=0.0) * 1e3
-    axes.set(xlim=(_LEFT, _RIGHT), ylim=(10.0, max(2.0 * slowest, 2e3)))
+    axes.set(xlim=(_MIN_DRAWN_ERROR, _STRIP_BEGIN), ylim=(10.0, max(2.0 * slowest, 2e3)))
     axes.axhline(1e3, color=ALARM, lw=1.0, ls=(0, (4, 3)))
-    axes.set(xlabel=_ERROR, ylabel="worst 1 ms frame [µs]")
+    axes.set(xlabel=_ERROR_LABEL, ylabel="worst 1 ms frame [µs]")
     axes.set_title("Worst frame of 1 ms:\nlower left is better")
 
 
 def draw_work(axes: Any, rows: list[Row], all_rows: list[Row]) -> None:
-    """Evaluations of the equations against the error."""
-    axes.set(xscale="log", yscale="log", xlim=(_LEFT, _RIGHT))
+    """Draw evaluations of the equations against the error."""
+    axes.set(xscale="log", yscale="log", xlim=(_MIN_DRAWN_ERROR, _STRIP_BEGIN))
     for line in _lines(rows, "error", "evaluations", ours=False):
         evaluations = [row["evaluations"] / row["simulated_s"] for row in line]
         axes.plot([_placed(row) for row in line], evaluations, **look(line[0], all_rows))
-    axes.set(xlabel=_ERROR, ylabel="evaluations a simulated second [1/s]")
+    axes.set(xlabel=_ERROR_LABEL, ylabel="evaluations a simulated second [1/s]")
     axes.set_title("Evaluations of the equations:\nlower left is better")
 
 
 def draw_profile(axes: Any, rows: list[Row]) -> int:
-    """Share of scenes solved against the cost ratio to the best; how many scenes count."""
+    """Draw the share of solved scenes against the relative cost; return the number of excluded scenes."""
     points = [row for row in rows if row["panel"] == "profile"]
     fair = [row for row in points if row["failure"] != "reference"]
     scenes = len({row["phase"] for row in fair})
@@ -233,7 +233,7 @@ def draw_profile(axes: Any, rows: list[Row]) -> int:
     for method, (ratios, share) in (shares(fair, column="own_cpu_s") if fair else {}).items():
         row = next(one for one in fair if one["method"] == method)
         style = look_of_bound(row, rows)
-        # What would be quicker than the best of all stands at its cost.
+        # A bound below the best cost is drawn at that cost.
         x = np.concatenate([[1.0], ratios.clip(1.0), [top]])
         y = np.concatenate([[0.0], share, [share[-1] if len(share) else 0.0]])
         axes.step(x, 100.0 * y, where="post", gid=f"profile-{method}-bound", color=style["color"], ls=style["ls"],

@@ -1,4 +1,4 @@
-"""The twelve scenes drawn: speed of each method at a target error, and the default engine against the best peer."""
+"""Picture of the twelve scenes: speeds at a target error, and the default engine against the best peer."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from replays.studies.chart.drawing.look import ALARM, INK, QUIET, Row, look
 from replays.studies.chart.drawing.panel import own_speed
-from replays.studies.chart.methods import OURS
+from replays.studies.chart.methods import RIG_FAMILY
 from replays.studies.common.twelve_scenes import TWELVE_SCENES
 from replays.studies.peers import PEERS
 from rig.physics.engines import ENGINES
@@ -19,22 +19,22 @@ from rig.physics.engines import ENGINES
 _PEER_MARKERS = dict(
     zip([name for name in reversed(PEERS) if not PEERS[name].known_failure], "*21Xp>3x+|4_8Hd", strict=False)
 )
-"""Shapes that no engine of the rig has; filled for heyoka and CVODE."""
+"""Marker shapes that no engine of the rig uses; filled for heyoka and CVODE."""
 _STRIP = 0.35
-"""Width of the strip of methods without a speed, over that of the range of speeds."""
+"""Width of the strip of methods without a speed, relative to the range of speeds."""
 _SLOTS = 12
-"""Methods that the strip has room for before its markers move closer."""
+"""Methods for which the strip has room before its markers move closer."""
 _MAIN = next(iter(ENGINES))
 """The default engine."""
 
 
 class Ratio(NamedTuple):
-    """Speed of the default engine in a scene, over that of the best peer."""
+    """Speed of the default engine in a scene relative to the best peer."""
 
     best: float
-    """Infinite where no peer reached the target, 0 where the engine did not."""
+    """Infinite if no peer reached the target, 0 if the engine did not."""
     library: float
-    """The same with each peer's time inside its own library alone, where that was measured."""
+    """The same for the peers' time within their own libraries, where measured."""
 
 
 def compare(rows: list[Row], case: str) -> dict[str, Ratio]:
@@ -48,7 +48,7 @@ def compare(rows: list[Row], case: str) -> dict[str, Ratio]:
     for scene in TWELVE_SCENES:
         points = [row for row in rows if row["phase"] == scene and row["case"] == case]
         ours = next((row for row in points if row["method"] == _MAIN), None)
-        peers = [row for row in points if row["family"] != OURS]
+        peers = [row for row in points if row["family"] != RIG_FAMILY]
         if ours is None or ours["failure"] == "reference" or not peers:
             continue
         reached = [row for row in peers if not row["failure"]]
@@ -60,7 +60,7 @@ def compare(rows: list[Row], case: str) -> dict[str, Ratio]:
 
 
 def _style(row: Row, rows: list[Row]) -> dict[str, Any]:
-    """Return the marker of a method, of a shape that no other has."""
+    """Return the unique marker of a method."""
     style = {name: value for name, value in look(row, rows).items() if name in ("color", "marker", "zorder")}
     style["marker"] = _PEER_MARKERS.get(row["method"], style["marker"])
     main = row["method"] == _MAIN
@@ -68,10 +68,10 @@ def _style(row: Row, rows: list[Row]) -> dict[str, Any]:
 
 
 def draw_scenes(axes: Any, rows: list[Row], case: str) -> None:
-    """Draw a row for each scene: methods by speed, at the left those without one, at the right the ratios.
+    """Draw a row per scene: methods by speed, those without a speed on the left, the ratios on the right.
 
     Args:
-        axes: Where to.
+        axes: Axes to draw on.
         rows: Points of the twelve scenes.
         case: Target.
     """
@@ -117,7 +117,7 @@ def draw_scenes(axes: Any, rows: list[Row], case: str) -> None:
 
 
 def draw_markers(place: Any, rows: list[Row]) -> None:
-    """Draw the legend: each method's marker, then how methods without a speed are marked."""
+    """Draw the legend: the markers of the methods, then the marks of methods without a speed."""
     from matplotlib.lines import Line2D
 
     entries = []

@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from replays.studies.ladder.quantity import rolls_from
+from replays.studies.ladder.quantity import find_rolling_start
 from replays.studies.paper.scans.pulse import Outcome, Pulse
 from replays.studies.stability.trials.boundary import NAMES, ROLLING, whirl_class
 from replays.studies.stability.trials.motion import base_model, move, pivoted_mass, quiet_inputs, state
@@ -34,7 +34,7 @@ SPINS_HZ = (3.2, 6.2, 9.0)
 _TICKS_S = 1e6
 _MAX_SLOWDOWN = 1e-3
 """Largest relative decrease of a steady whirl frequency in half a second."""
-_NONE = (math.nan, math.nan)
+_NAN = (math.nan, math.nan)
 
 
 class Oscillator(NamedTuple):
@@ -158,7 +158,7 @@ def bare_rig(friction: float) -> Constants:
     )
 
 
-def _whirling(constants: Constants, whirl: float, spin: float) -> np.ndarray:
+def _whirl_state(constants: Constants, whirl: float, spin: float) -> np.ndarray:
     """Return a state on the ring EAST of its centre, whirling backward [rad/s, as a positive number]."""
     arm = constants.shaft.arm_ring
     radius = constants.contact.clearance
@@ -179,7 +179,7 @@ def gains_speed(constants: Constants, whirl: float) -> bool:
         ENGINE,
         constants,
         quiet_inputs(spin=spin, magnets=True, ideal=True),
-        _whirling(constants, whirl, spin),
+        _whirl_state(constants, whirl, spin),
         ticks=round(0.4 * _TICKS_S),
         every=500,
     )
@@ -243,7 +243,7 @@ def start_thresholds(frictions: tuple[float, ...] = FRICTIONS) -> list[Threshold
         constants = bare_rig(mu)
         closed = critical_whirl(oscillator(constants), mu)
         bare = bisect(partial(gains_speed, constants), 0.6 * closed, 2.0 * closed)
-        found.append(Threshold(mu, math.nan, closed / (2 * math.pi), bare / (2 * math.pi), math.nan, math.nan, _NONE))
+        found.append(Threshold(mu, math.nan, closed / (2 * math.pi), bare / (2 * math.pi), math.nan, math.nan, _NAN))
     return found
 
 
@@ -256,7 +256,7 @@ def sustain_thresholds(spins_hz: tuple[float, ...] = SPINS_HZ) -> list[Threshold
         whirl, _ = rolling_whirl(bare, spin)
         closed = least_friction(oscillator(bare), -whirl)
         full = base_model(ModelLevels()).constants
-        bare_mu, full_mu = (bisect(_holder(each, spin), 0.3 * closed, 6.0 * closed) for each in (bare, full))
+        bare_mu, full_mu = (bisect(_make_test(each, spin), 0.3 * closed, 6.0 * closed) for each in (bare, full))
         with_houses, used = friction_with_houses(full, spin), friction_used(full, spin)
         found.append(Threshold(math.nan, spin_hz, closed, bare_mu, full_mu, with_houses, used))
     return found
@@ -302,9 +302,9 @@ def slips_to_rolling() -> list[Slip]:
         high, low = (math.log((w - own.natural) / (w + own.natural)) for w in (after * spin * radius / r0, begin))
         inputs = quiet_inputs(spin=spin, magnets=True)
         motion = move(
-            ENGINE, constants, inputs, _whirling(constants, begin, spin), ticks=round(0.5 * _TICKS_S), every=50
+            ENGINE, constants, inputs, _whirl_state(constants, begin, spin), ticks=round(0.5 * _TICKS_S), every=50
         )
-        rolls_s = rolls_from(motion.times, motion.rows, radius)
+        rolls_s = find_rolling_start(motion.times, motion.rows, radius)
         spin_end = float(motion.column("theta_rate")[motion.times >= rolls_s].mean())
         found.append(Slip(whirl_hz, spin_end / spin, after, rolls_s, (high - low) / (2.0 * mu * own.natural)))
     return found
@@ -313,15 +313,15 @@ def slips_to_rolling() -> list[Slip]:
 def friction_used(constants: Constants, spin: float) -> tuple[float, float]:
     """Return mean and maximum of friction over normal force in a rolling whirl [1]."""
     inputs = quiet_inputs(spin=spin, magnets=True, ideal=True)
-    motion = move(ENGINE, constants, inputs, rolled(constants, spin), ticks=round(0.5 * _TICKS_S), every=100)
+    motion = move(ENGINE, constants, inputs, settle_rolling(constants, spin), ticks=round(0.5 * _TICKS_S), every=100)
     normal, friction = (motion.column(name)[1000:] for name in ("normal_force", "friction_force"))
     there = normal > 0.0
     return abs(float(friction.mean() / normal.mean())), float(np.max(np.abs(friction[there] / normal[there])))
 
 
-def _holder(constants: Constants, spin: float) -> Callable[[float], bool]:
+def _make_test(constants: Constants, spin: float) -> Callable[[float], bool]:
     """Return a test of whether a rolling whirl persists at a friction."""
-    begun = rolled(constants, spin)
+    begun = settle_rolling(constants, spin)
 
     def holds(mu: float) -> bool:
         changed = constants._replace(contact=constants.contact._replace(friction=mu))
@@ -330,11 +330,11 @@ def _holder(constants: Constants, spin: float) -> Callable[[float], bool]:
     return holds
 
 
-def rolled(constants: Constants, spin: float) -> np.ndarray:
+def settle_rolling(constants: Constants, spin: float) -> np.ndarray:
     """Return a settled rolling whirl of a rig, as state and integrals."""
     whirl, _ = rolling_whirl(constants, spin)
     inputs = quiet_inputs(spin=spin, magnets=True, ideal=True)
-    y0 = _whirling(constants, -whirl, spin)
+    y0 = _whirl_state(constants, -whirl, spin)
     return move(ENGINE, constants, inputs, y0, ticks=round(0.5 * _TICKS_S), every=10_000).end
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from replays.studies.common.run import end_with_parent
-from replays.studies.ladder.quantity import QUANTITIES, Trace, rolls_from
+from replays.studies.ladder.quantity import QUANTITIES, Trace, find_rolling_start
 from rig.base.errors import InputError
 from rig.physics.parameters import DEFAULT_SET, load_parameters
 from rig.run.offline import Run, simulate
@@ -164,7 +164,7 @@ def trace_of(run: Run) -> Trace:
         clearance=contact.clearance,
         surface_radius=radius,
         first_impact_s=math.nan,
-        rolls_s=rolls_from(run.times_s, run.signals, radius),
+        rolls_s=find_rolling_start(run.times_s, run.signals, radius),
     )
 
 
@@ -239,10 +239,10 @@ def reaction(run: Run, plus: str, minus: str, *, bandwidth_hz: float | None = No
         bandwidth_hz: Corner of a second-order Butterworth low-pass [Hz], or None.
     """
     pair = run[plus] - run[minus]
-    return pair if bandwidth_hz is None else low_passed(run, pair, bandwidth_hz)
+    return pair if bandwidth_hz is None else apply_low_pass(run, pair, bandwidth_hz)
 
 
-def low_passed(run: Run, signal: np.ndarray, bandwidth_hz: float) -> np.ndarray:
+def apply_low_pass(run: Run, signal: np.ndarray, bandwidth_hz: float) -> np.ndarray:
     """Return a signal of a run after a second-order Butterworth low-pass, shape (n,)."""
     from scipy.signal import butter, sosfilt
 

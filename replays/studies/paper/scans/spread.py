@@ -32,7 +32,7 @@ class Assumed(BaseModel, frozen=True, extra="forbid"):
     tied: str = ""
     """Key of the value that it is proportional to."""
     ratio: float = 1.0
-    """That value over this one."""
+    """Ratio of that value to this one."""
     unit: str = ""
     value: float | None = None
     """Value in the rest of the report, if no parameter set defines it."""
@@ -65,7 +65,7 @@ def free_values() -> tuple[Assumed, ...]:
     return tuple(entry for entry in assumed_values() if not entry.tied)
 
 
-def present(entry: Assumed) -> str:
+def format_value(entry: Assumed) -> str:
     """Return the value of the default set, or of this report, with its unit."""
     known = load_parameters(DEFAULT_SET).entries.get(entry.key)
     value = known.value if known else entry.value

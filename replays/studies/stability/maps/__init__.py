@@ -1,1 +1,1 @@
-"""Maps of the steps and stiffnesses at which engines hold and fail."""
+"""Maps of the steps and stiffnesses at which engines are stable."""

@@ -1,7 +1,7 @@
-"""The map of every engine over step and stiffness: what becomes of an undamped oscillator's energy in 60 periods.
+"""Stability map of every engine over step and stiffness: energy of an undamped oscillator after 60 periods.
 
-Two oscillators. The inner house on its beam, and the shaft that lies in the ring on a linear contact. For engines of
-fixed step theory draws a line h w = const across the map.
+Two oscillators are used: the inner house on its beam, and the shaft in the ring on a linear contact. For fixed-step
+engines, theory predicts a line h w = const.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from rig.physics.levels import ModelLevels
 
 PERIODS = 60
 _DEPTH = 20e-6
-"""Depth at rest in the contact [m]."""
+"""Static depth of the contact [m]."""
 GROWN = 3.0
 """Energy ratio above which a run counts as unstable."""
 
@@ -27,12 +27,12 @@ class Map(NamedTuple):
     """Map of one engine on one oscillator.
 
     Attributes:
-        engine: Its name.
+        engine: Name of the engine.
         oscillator: "house" or "contact".
-        steps_us: Shape (n,) [us].
-        stiffness: Shape (m,) [N/m].
-        mass: [kg].
-        ratio: Energy at the end over that at the start, shape (m, n); inf where it is not finite.
+        steps_us: Steps, shape (n,) [us].
+        stiffness: Stiffnesses, shape (m,) [N/m].
+        mass: Mass [kg].
+        ratio: Final over initial energy, shape (m, n); inf if it is not finite.
     """
 
     engine: str
@@ -44,12 +44,12 @@ class Map(NamedTuple):
 
     @property
     def limit(self) -> float:
-        """Largest h w by theory; nan where there is none."""
+        """Theoretical limit of h w; NaN if there is none."""
         return traits(self.engine).limit()
 
 
 def house_ratio(engine: str, step_s: float, stiffness: float, *, periods: int = PERIODS) -> float:
-    """Energy ratio of the inner house on its undamped beam, the outer house fixed."""
+    """Return the energy ratio of the inner house on its undamped beam, with the outer house fixed."""
     constants = base_model(ModelLevels(magnet="linear", shaft="planar", stator="inner-house")).constants
     house = constants.house._replace(inner_beam_damping=0.0, inner_beam_stiffness=stiffness)
     constants = constants._replace(house=house, contact=constants.contact._replace(clearance=1e200))
@@ -58,10 +58,10 @@ def house_ratio(engine: str, step_s: float, stiffness: float, *, periods: int = 
 
 
 def contact_ratio(engine: str, step_s: float, stiffness: float, *, periods: int = PERIODS) -> float:
-    """Energy ratio of a small oscillation of the shaft on an undamped linear contact, pressed on by its weight.
+    """Return the energy ratio of a small oscillation of the shaft on an undamped linear contact, loaded by its weight.
 
-    The weight is such that the depth is 20 µm, and the oscillation 1/100 of that: with less, error control has nothing
-    to control.
+    The weight is scaled to a depth of 20 µm, and the oscillation is 1/100 of that; with a smaller one, error control
+    would have no effect.
     """
     constants = bare_shaft(damping_factor=0.0, exponent=1.0, stiffness=stiffness, gravity=True)
     shaft = constants.shaft
@@ -80,13 +80,13 @@ OSCILLATORS = {"house": house_ratio, "contact": contact_ratio}
 
 
 def chart(engine: str, oscillator: str, *, points: int, periods: int = PERIODS) -> Map:
-    """The map of one engine on one oscillator.
+    """Return the map of one engine on one oscillator.
 
     Args:
-        engine: Its name.
+        engine: Name of the engine.
         oscillator: "house" or "contact".
-        points: Along each axis.
-        periods: How long each run is.
+        points: Points along each axis.
+        periods: Length of each run.
     """
     steps = np.geomspace(2.0, 1000.0, points)
     stiffness = np.geomspace(1e5, 1e10, points)
@@ -95,7 +95,7 @@ def chart(engine: str, oscillator: str, *, points: int, periods: int = PERIODS) 
     ratio = np.full((points, points), np.nan)
     for i, k in enumerate(stiffness):
         for j, h in enumerate(steps):
-            # Below, nothing happens but long runs; above, all is settled.
+            # Smaller products only take long runs; for larger ones the result is certain.
             if 5e-2 < h * 1e-6 * math.sqrt(k / mass) < (30.0 if oscillator == "house" else 5.0):
                 ratio[i, j] = run(engine, h * 1e-6, float(k), periods=periods)
     return Map(engine, oscillator, steps, stiffness, mass, ratio)
@@ -105,13 +105,13 @@ def _ratio(
     engine: str, constants: Constants, y0: np.ndarray, step_s: float, stiffness: float, mass: float,
     columns: tuple[str, str], arm: float, periods: int, rest: float = 0.0,
 ) -> float:  # fmt: skip
-    """Energy in the last quarter over that in the first part; `rest` is the angle or place of rest.
+    """Return the energy in the last quarter relative to that in the first part; `rest` is the equilibrium.
 
-    The first part is a quarter; for the contact a fortieth, before growth lifts the shaft off. In the contact
-    `split` first settles, and its rest is where its mean is.
+    The first part is a quarter; for the contact a fortieth, before growth lifts the shaft off. In the contact `split`
+    first settles, and its position of rest is its mean.
     """
     angular = math.sqrt(stiffness / mass)
-    # Beyond every limit a few steps tell, and more would only follow numbers without meaning.
+    # Beyond every limit, a few steps suffice; more would only overflow.
     longest = 40 if angular * step_s > 3.6 else 10**9
     ticks = min(longest, max(40, math.ceil(periods * 2.0 * math.pi / (angular * step_s))))
     with np.errstate(all="ignore"):
@@ -119,7 +119,7 @@ def _ratio(
             motion = move(
                 engine, constants, quiet_inputs(tick_s=step_s), y0, ticks=ticks, step=1, every=max(1, ticks // 997)
             )
-        except ZeroDivisionError:  # numbers so large that a force over their distance is none
+        except ZeroDivisionError:  # overflow of a force over its distance
             return math.inf
         place, speed = arm * (motion.column(columns[0]) - rest), arm * motion.column(columns[1])
         part = len(place) // 4

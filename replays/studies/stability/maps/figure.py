@@ -1,4 +1,4 @@
-"""Pictures of where engines hold and fail: step against stiffness, the v_s and v0 ladders, whirl or no whirl."""
+"""Pictures of stability: step and stiffness, ladders of v_s and v0, boundary of whirl."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from replays.studies.stability.trials.impacts import first_impact, pushed
 from rig.physics.engines import ENGINES
 
 _LEAST, _GROWS = 1e-14, 10.0
-"""Changes of the energy [1]: the least drawn, and where one stands that grows without end."""
+"""Smallest change of energy drawn [1], and position of unlimited growth [1]."""
 
 
 def draw_all(folder: Path, engines: list[str], *, quick: bool) -> list[Path]:
-    """Draw all pictures into a folder, each as PNG and SVG.
+    """Draw all pictures to a folder, as PNG and SVG.
 
     Args:
-        folder: Made if it is not there.
-        engines: Which engines.
-        quick: Coarse maps and short ladders.
+        folder: Output folder, created if missing.
+        engines: Engines to draw.
+        quick: Draw coarse maps and short ladders.
 
     Returns:
         The files.
@@ -41,7 +41,7 @@ def draw_all(folder: Path, engines: list[str], *, quick: bool) -> list[Path]:
 
 @house_style()
 def draw_map(engines: list[str], *, quick: bool) -> Any:
-    """Energy of an undamped oscillator after 60 periods over step times frequency, a line an engine."""
+    """Draw the energy of an undamped oscillator after 60 periods over step times frequency, with a line per engine."""
     figure = new_figure(5.4, "What becomes of an undamped oscillator's energy in 60 periods")
     panels = figure.subplots(1, 2, sharey=True)
     titles = {"house": "Inner house on its beam", "contact": "Shaft on a linear contact"}
@@ -59,7 +59,7 @@ def draw_map(engines: list[str], *, quick: bool) -> Any:
 
 
 def _draw_oscillator(ax: Any, found: atlas.Map) -> None:
-    """One engine on one oscillator: median over all stiffnesses, and their spread; what grows stands at the top."""
+    """Draw one engine on one oscillator: median over all stiffnesses and spread; growth is drawn at the top."""
     run = np.isfinite(found.ratio) | (found.ratio == np.inf)
     product = (found.steps_us * 1e-6 * np.sqrt(found.stiffness / found.mass)[:, None])[run]
     change = np.where(found.ratio <= atlas.GROWN, np.maximum(np.abs(found.ratio - 1.0), _LEAST), np.inf)[run]
@@ -74,7 +74,7 @@ def _draw_oscillator(ax: Any, found: atlas.Map) -> None:
     lasts = np.isfinite(middle)
     ax.fill_between(x[lasts], low[lasts], np.minimum(high[lasts], _GROWS), color=own.colour, alpha=0.15, lw=0)
     drawn = np.where(lasts, middle, _GROWS)
-    # Beyond the first that grows nothing is told by more of them.
+    # Points beyond the first growing one add no information.
     drawn = drawn[: int(np.argmin(lasts)) + 1] if not lasts.all() else drawn
     ax.plot(x[: len(drawn)], drawn, color=own.colour, marker=own.marker, ms=5, lw=1.6, label=found.engine)
     if np.isfinite(found.limit):
@@ -83,7 +83,7 @@ def _draw_oscillator(ax: Any, found: atlas.Map) -> None:
 
 @house_style()
 def draw_ladders(engines: list[str], *, quick: bool) -> Any:
-    """Smoothing speed against the set-valued limit; approach speed; v0 gone stale in a lasting contact."""
+    """Draw smoothing speed against the exact limit, approach speed, and outdated v0 in a lasting contact."""
     figure = new_figure(5.6, "Small speeds: every engine at its own step and tolerance")
     smooth, graze, stale = figure.subplots(1, 3)
     speeds = np.geomspace(1e-2, 1e-5, 7).tolist() if quick else np.geomspace(1e-2, 1e-9, 15).tolist()
@@ -91,7 +91,7 @@ def draw_ladders(engines: list[str], *, quick: bool) -> Any:
         own = traits(engine)
         style = {"color": own.colour, "marker": own.marker, "lw": 1.5, "ms": 5, "label": engine}
         if "smoothed" in ENGINES[engine].frictions:
-            # Error control at a v_s far below its need costs minutes and shows nothing new.
+            # With error control, a v_s far below its need takes minutes and shows nothing new.
             reach = [v for v in speeds if not is_adaptive(engine) or v > LEAST_SMOOTHING]
             smooth.loglog(reach, [smoothing_distance(engine, v) for v in reach], **style)
         places = np.geomspace(1e-5, 1.0, 11 if quick else 21)
@@ -129,7 +129,7 @@ def draw_ladders(engines: list[str], *, quick: bool) -> Any:
 
 @house_style()
 def draw_whirl(engines: list[str], *, quick: bool) -> Any:
-    """Class of the run over friction and the pulse's impulse, and where any engine tells another."""
+    """Draw the class of the run over friction and impulse, and the points at which an engine gives another class."""
     from matplotlib.colors import BoundaryNorm, ListedColormap
 
     able = [engine for engine in engines if friction_of(engine) == "exact"]

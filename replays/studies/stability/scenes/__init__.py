@@ -1,1 +1,1 @@
-"""Whole scenes: random ones by number, and the twelve of the chart."""
+"""Whole scenes: random ones by number, and the twelve scenes of the chart."""

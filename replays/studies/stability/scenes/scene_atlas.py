@@ -1,7 +1,7 @@
-"""The twelve scenes' atlas: what becomes of each at every step or tolerance of each engine and peer.
+"""Atlas of the twelve scenes: the outcome at every step or tolerance of each engine and peer.
 
-Held against `taylor` at 1e-11, where `rk8` agrees. A run of ours is a whole simulation with its companion, so that it
-can warn; a peer has no warning but to give up.
+The reference is `taylor` at 1e-11, confirmed by `rk8`. Runs of our engines are whole simulations with a companion,
+which can warn; a peer can only give up.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from replays.studies.chart.store import code_digest
 from replays.studies.common.twelve_scenes import TWELVE_SCENES
 from replays.studies.peers import Setting
 from replays.studies.peers.common.problem import scaled_error
-from replays.studies.stability.scenes.truth import AGREE, WRONG, doubted
+from replays.studies.stability.scenes.truth import AGREE_ERROR, WRONG_ERROR, doubted
 from replays.studies.stability.scenes.worker import Task, run_task
 from replays.studies.stability.table import choose_names
 from rig.base.errors import SimulationError
@@ -36,17 +36,17 @@ OUTCOMES = {
     "ended": ("0.1", "gives up, or takes more than 20 s"),
     "refused": ("0.88", "cannot take the friction law"),
 }
-"""Kinds of outcome with a colour and what they are."""
+"""Kinds of outcome with colour and description."""
 HATCHES = {"told": "..", "silent": "///", "gained": "xxx"}
-"""Hatches that mark wrong runs in grey."""
+"""Hatches that mark wrong runs in print."""
 _LIMIT_S = 20.0
-"""Processor time of a run [s]."""
+"""Processor time per run [s]."""
 _GAINED = 0.01
-"""Part of what was dissipated above which an open energy ledger counts as energy gained."""
+"""Energy residual, relative to the dissipated energy, above which energy counts as gained."""
 
 
 class Outcome(NamedTuple):
-    """One run."""
+    """Outcome of one run."""
 
     scene: str
     method: str
@@ -54,24 +54,24 @@ class Outcome(NamedTuple):
     kind: str
     """Key of `OUTCOMES`."""
     error: float | None
-    """Scaled error [1]; None where a run has not come to its end."""
+    """Scaled error [1]; None for an incomplete run."""
 
     def document(self) -> dict[str, Any]:
-        """The outcome by field."""
+        """Return the outcome by field."""
         return self._asdict()
 
 
 def chosen_scenes(only: str | None) -> list[str]:
-    """Return scenes by names joined by commas, each once, in the order of the study; None for all.
+    """Return the scenes of a comma-separated list, in the order of the study; None selects all.
 
     Raises:
-        InputError: There is no such scene, or no name.
+        InputError: If a scene does not exist, or the list is empty.
     """
     return choose_names("--only", only, list(TWELVE_SCENES))
 
 
 def is_silent(one: Outcome) -> bool:
-    """Whether a run is wrong and says nothing of it."""
+    """Return whether a run is wrong without a warning."""
     return one.kind in ("silent", "gained")
 
 
@@ -79,11 +79,11 @@ def exact_states(scene: Scene) -> np.ndarray:
     """Return the states of a scene every millisecond, shape (n, N_STATE).
 
     Raises:
-        SimulationError: `taylor` and `rk8` do not agree on them.
+        SimulationError: If `taylor` and `rk8` do not agree.
     """
     first, second = (run_task(Task(scene, name, asked)) for name, asked in (("taylor", 1e-11), ("rk8", 1e-11)))
     failed = first.failure or second.failure
-    if failed or scaled_error(first.states, second.states) > AGREE:
+    if failed or scaled_error(first.states, second.states) > AGREE_ERROR:
         raise SimulationError(f"no two accurate engines agree on scene {scene.name}")
     return first.states
 
@@ -94,10 +94,10 @@ def outcomes(scenes: list[str], methods: list[str] | None = None, *, peers: bool
     Args:
         scenes: Names of scenes.
         methods: Names of methods; None for all.
-        peers: Whether peers that are installed take part.
+        peers: Whether to include the installed peers.
 
     Raises:
-        SimulationError: No two accurate engines agree on a scene.
+        SimulationError: If no two accurate engines agree on a scene.
     """
     for name in scenes:
         study = TWELVE_SCENES[name]
@@ -134,15 +134,15 @@ def _peer(one: Competitor, setting: Setting, name: str, exact: np.ndarray) -> tu
 
 
 def _kind(error: float, *, warns: bool, gained: float) -> str:
-    if not math.isfinite(error) or error > WRONG:
+    if not math.isfinite(error) or error > WRONG_ERROR:
         silent = "gained" if gained > _GAINED else "silent"
         return "told" if warns else silent
-    return "right" if error <= AGREE else "near"
+    return "right" if error <= AGREE_ERROR else "near"
 
 
 @house_style()
 def draw_scene_atlas(folder: Path, found: list[Outcome]) -> list[Path]:
-    """Draw a row for each method and a column for each scene: its settings, the coarsest first, by outcome.
+    """Draw a row per method and a column per scene: outcomes of its settings, coarsest first.
 
     Returns:
         The files: PNG and SVG.

@@ -1,4 +1,4 @@
-"""The truth sweep: random scenes by number, each measured once and kept, and what they show of every engine."""
+"""Truth sweep: random scenes by number, each measured once and stored, and a summary for every engine."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from replays.studies.common.journal import Journal
 from replays.studies.common.provenance import commit, machine
 from replays.studies.common.random_scene import draw_scene
-from replays.studies.stability.scenes.truth import CHAOTIC, WRONG, measure
+from replays.studies.stability.scenes.truth import CHAOTIC_GROWTH, WRONG_ERROR, measure
 from replays.studies.stability.scenes.worker import Run, Task, Worker
 from rig.base.errors import InputError
 from rig.physics.kernels import source_digest
@@ -19,17 +19,17 @@ from rig.physics.kernels import source_digest
 Row = dict[str, Any]
 QUANTILES = (0.10, 0.25, 0.50, 0.75, 0.90, 0.95)
 NAME = "sweep.jsonl"
-_WITHIN = 10.0
-"""An error is kept within so many times what was asked for."""
+_TOLERANCE_MARGIN = 10.0
+"""Factor on the requested error up to which an error counts as kept."""
 _LIMIT_S = 20.0
-"""Processor time of one run [s]."""
+"""Processor time per run [s]."""
 
 
 def chosen_numbers(only: str | None, count: int) -> list[int]:
-    """Numbers joined by commas; None for all from 0.
+    """Return the numbers of a comma-separated list; None selects all from 0.
 
     Raises:
-        InputError: No whole numbers from 0.
+        InputError: If the list contains anything but whole numbers from 0.
     """
     if only is None:
         return list(range(count))
@@ -47,17 +47,17 @@ def sweep(
     folder: Path | None = None,
     run: Callable[[Task], Run] | None = None,
 ) -> Iterator[Row]:
-    """Scenes as they are measured, those that are in the folder's journal first.
+    """Yield the measured scenes, those in the folder's journal first.
 
     Args:
-        numbers: Of the scenes.
-        seed: Of the scenes.
+        numbers: Numbers of the scenes.
+        seed: Seed of the scenes.
         engines: Engines under test.
-        folder: Where the journal is kept; None for none.
-        run: Does a run; None for a process of its own.
+        folder: Folder of the journal; None for no journal.
+        run: Function that executes a run; None uses a separate process.
 
     Raises:
-        InputError: The folder cannot be written.
+        InputError: If the folder cannot be written.
     """
     code = source_digest()
     journal = None if folder is None else Journal(folder, NAME, code)
@@ -80,11 +80,11 @@ def sweep(
 
 
 def summary(rows: list[Row], engines: list[str]) -> Row:
-    """What the scenes show.
+    """Return a summary of the scenes.
 
     Returns:
-        `scenes`: how many of each status; `undecided`: those that accurate runs tell differently though they are not
-        chaotic; `distance` of the accurate runs; `engines`: of each, and of the accurate ones as "NAME (accurate)".
+        `scenes`: number of each status; `undecided`: scenes on which accurate runs differ without being chaotic;
+        `distance` of the accurate runs; `engines`: a summary of each, with the accurate ones as "NAME (accurate)".
     """
     statuses = [row["status"] for row in rows]
     by_name = {name: [(row, one) for row in rows for one in row["tested"] if one["engine"] == name] for name in engines}
@@ -105,24 +105,24 @@ def summary(rows: list[Row], engines: list[str]) -> Row:
 
 
 def silent(one: Row) -> bool:
-    """Whether a run is wrong and says nothing of it."""
-    return one["error"] is not None and one["error"] > WRONG and not one["doubted"]
+    """Return whether a run is wrong without a warning."""
+    return one["error"] is not None and one["error"] > WRONG_ERROR and not one["doubted"]
 
 
 def false_alarm(one: Row) -> bool:
-    """Whether a run doubts itself and has kept what was asked for."""
-    return bool(one["error"] is not None and one["doubted"] and one["error"] < _WITHIN * one["asked"])
+    """Return whether a run warns although it has kept the requested error."""
+    return bool(one["error"] is not None and one["doubted"] and one["error"] < _TOLERANCE_MARGIN * one["asked"])
 
 
 def _engine(runs: list[tuple[Row, Row]]) -> Row:
-    """One engine over all scenes; a list of scenes is one of their numbers."""
+    """Return the summary of one engine over all scenes; lists contain numbers of scenes."""
 
     def scenes(kind: Callable[[Row], bool]) -> list[int]:
         return [row["number"] for row, one in runs if kind(one) and row["status"] != "unbounded"]
 
     ran = [(row, one) for row, one in runs if one["failure"] != "refused"]
     told = [(row, one) for row, one in ran if one["error"] is not None]
-    calm = [one for row, one in told if not (row["growth"] and row["growth"] >= CHAOTIC)]
+    calm = [one for row, one in told if not (row["growth"] and row["growth"] >= CHAOTIC_GROWTH)]
     speeds = [one["speed"] for _, one in ran if one["speed"]]
     refused: dict[str, int] = {}
     for _, one in runs:
@@ -134,8 +134,8 @@ def _engine(runs: list[tuple[Row, Row]]) -> Row:
         "asked": max((one["asked"] for _, one in runs), default=None),
         "error": _quantiles([one["error"] for _, one in told]),
         "calm": len(calm),
-        "within": sum(one["error"] <= _WITHIN * one["asked"] for one in calm) / len(calm) if calm else None,
-        "wrong": scenes(lambda one: one["error"] is not None and one["error"] > WRONG),
+        "within": sum(one["error"] <= _TOLERANCE_MARGIN * one["asked"] for one in calm) / len(calm) if calm else None,
+        "wrong": scenes(lambda one: one["error"] is not None and one["error"] > WRONG_ERROR),
         "silent": scenes(silent),
         "false_alarms": scenes(false_alarm),
         "crashes": scenes(lambda one: one["failure"] == "crash"),

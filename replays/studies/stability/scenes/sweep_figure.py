@@ -1,4 +1,4 @@
-"""The truth sweep as a picture: how wrong and how fast every engine is over random scenes."""
+"""Picture of the truth sweep: error and speed of every engine over random scenes."""
 
 from __future__ import annotations
 
@@ -10,23 +10,23 @@ import numpy as np
 from replays.report.canvas import RED, house_style, legend_below, new_figure, save
 from replays.studies.common.engines import traits
 from replays.studies.stability.scenes.sweep import summary
-from replays.studies.stability.scenes.truth import WRONG
+from replays.studies.stability.scenes.truth import WRONG_ERROR
 from rig.physics.engines import ENGINES
 
-_LEAST, _MOST = 1e-10, 10.0
-"""Errors drawn [1]; what is beyond stands at the edge, ..."""
-_SLOWEST = 1e-3
-"""... as do speeds below this."""
+_MIN_ERROR, _MAX_ERROR = 1e-10, 10.0
+"""Range of errors drawn [1]; values beyond it are drawn at the edge."""
+_MIN_SPEED = 1e-3
+"""Lowest speed drawn; lower ones are drawn at the edge."""
 
 
 @house_style()
 def draw_sweep(folder: Path, rows: list[dict[str, Any]], engines: list[str]) -> list[Path]:
-    """Share of scenes over error and over speed, a line an engine, as PNG and SVG.
+    """Draw the share of scenes over error and over speed, with a line per engine, as PNG and SVG.
 
     Args:
-        folder: Where to.
-        rows: Scenes as measured.
-        engines: Which engines.
+        folder: Output folder.
+        rows: Measured scenes.
+        engines: Engines to draw.
 
     Returns:
         The files.
@@ -38,24 +38,24 @@ def draw_sweep(folder: Path, rows: list[dict[str, Any]], engines: list[str]) -> 
         f"{len(rows)} random scenes: {scenes['decided']} where two accurate engines agree, {scenes['chaotic']} chaotic",
     )
     errors, speeds = figure.subplots(1, 2, sharey=True, width_ratios=(1.25, 1.0))
-    errors.axvspan(WRONG, _MOST, color=RED, alpha=0.10, lw=0)
-    errors.text(WRONG * 1.15, 2.0, "wrong", color="#A04000", fontsize=9.5)
+    errors.axvspan(WRONG_ERROR, _MAX_ERROR, color=RED, alpha=0.10, lw=0)
+    errors.text(WRONG_ERROR * 1.15, 2.0, "wrong", color="#A04000", fontsize=9.5)
     for engine in engines:
         ran = [(row, one) for row in rows for one in row["tested"] if one["engine"] == engine]
         ran = [(row, one) for row, one in ran if one["failure"] != "refused"]
-        # What has not come to its end is beyond every error.
+        # An incomplete run counts as an infinite error.
         wrong = [
-            one["error"] or (np.inf if one["failure"] else _LEAST) for row, one in ran if row["status"] == "decided"
+            one["error"] or (np.inf if one["failure"] else _MIN_ERROR) for row, one in ran if row["status"] == "decided"
         ]
         silent = len(found["engines"][engine]["silent"])
         main_one = engine == main
         style = {"color": traits(engine).colour, "lw": 3.0 if main_one else 1.6, "zorder": 8 if main_one else 5}
         _shares(errors, wrong, label=f"{engine}: {silent} of {len(wrong)}", **style)
-        _shares(speeds, [max(one["speed"] or 0.0, _SLOWEST) for _, one in ran], **style)
+        _shares(speeds, [max(one["speed"] or 0.0, _MIN_SPEED) for _, one in ran], **style)
     distance = [row["distance"] for row in rows if row["status"] == "decided"]
     _shares(errors, distance, color="0.6", lw=5.0, alpha=0.5, zorder=1, label="the two accurate ones, from each other")
     errors.set(
-        xscale="log", xlim=(_LEAST, _MOST), ylim=(0.0, 102.0), xlabel="scaled error [1]",
+        xscale="log", xlim=(_MIN_ERROR, _MAX_ERROR), ylim=(0.0, 102.0), xlabel="scaled error [1]",
         ylabel="scenes with no more [%]",
         title="Error at its own step and tolerance; in the legend:\nwrong without a warning",
     )  # fmt: skip
@@ -71,5 +71,7 @@ def draw_sweep(folder: Path, rows: list[dict[str, Any]], engines: list[str]) -> 
 
 
 def _shares(axes: Any, values: list[float], **style: Any) -> None:
-    """Share of values up to each, as a staircase [%]."""
-    axes.step(np.sort(values).clip(_LEAST), 100.0 * np.arange(1, len(values) + 1) / len(values), where="post", **style)
+    """Draw the cumulative share of values as a step function [%]."""
+    axes.step(
+        np.sort(values).clip(_MIN_ERROR), 100.0 * np.arange(1, len(values) + 1) / len(values), where="post", **style
+    )

@@ -1,4 +1,4 @@
-"""One run of a scene by one engine, in a process of its own: a run that hangs or dies is a result like any other."""
+"""Execution of one run in a separate process, so that a hang or a crash is a result."""
 
 from __future__ import annotations
 
@@ -22,53 +22,53 @@ from rig.run.scenes import Scene, change_scene
 from rig.run.simulation import Simulation
 
 RATE_HZ = 1_000
-"""Instants at which runs are compared [Hz]."""
+"""Rate at which runs are compared [Hz]."""
 _CHUNK_TICKS = 10_000
-"""How far a run goes between two looks at the clock [ticks]."""
-_BEYOND_S = 2.0
-"""So much longer than a run may take, its process goes on: where it does not come back to the clock [s]."""
+"""Ticks between two checks of the processor time."""
+_GRACE_S = 2.0
+"""Additional processor time after which the process is ended if the run does not check its own time [s]."""
 _COMPILING_S = 300.0
-"""What the beginning of a run may take [s]."""
+"""Processor time for the compilation before a run [s]."""
 
 
 class Task(NamedTuple):
-    """One run."""
+    """Settings of one run."""
 
     scene: Scene
     engine: str
     tolerance: float = 0.0
-    """Of an adaptive engine; 0: its own."""
+    """Tolerance of an adaptive engine; 0: its own."""
     nudge: float = 0.0
-    """By how many clearances the shaft starts farther along x."""
+    """Shift of the initial position along x, in clearances."""
     limit_s: float = 20.0
-    """Processor time it may take [s]."""
+    """Allowed processor time [s]."""
     step_us: int = 0
-    """Of the engine's steps or grid; 0: its own."""
+    """Step or grid of the engine; 0: its own."""
 
 
 @dataclass
 class Run:
-    """What became of it."""
+    """Result of a run."""
 
     failure: str = ""
-    """"", or its kind: refused, crash, hang."""
+    """Kind of failure: refused, crash, hang; empty if there is none."""
     message: str = ""
     states: np.ndarray = field(default_factory=lambda: np.empty((0, N_STATE)))
-    """At `RATE_HZ`, as far as it got, shape (n, N_STATE)."""
+    """States at `RATE_HZ` until the end or failure, shape (n, N_STATE)."""
     cpu_s: float = 0.0
-    """Processor time of its steps [s]."""
+    """Processor time of the steps [s]."""
     reached_s: float = 0.0
-    """Simulated time [s]."""
+    """Simulated time reached [s]."""
     health: dict[str, Any] = field(default_factory=dict)
-    """What `Simulation.health` tells at its end."""
+    """`Simulation.health` at the end."""
 
 
 def run_task(task: Task, begun: Callable[[], None] = lambda: None) -> Run:
-    """Do a run, in this process.
+    """Execute a run in this process.
 
     Args:
         task: The run.
-        begun: Called where its first step is due, the engine being compiled.
+        begun: Function called after compilation, before the first step.
     """
     done, kept = Run(), []
     asked = {"name": task.engine, "tolerance": task.tolerance, "step_us": task.step_us}
@@ -76,7 +76,7 @@ def run_task(task: Task, begun: Callable[[], None] = lambda: None) -> Run:
         changes: dict[str, Any] = {f"sensors.{key}": value for key, value in bare_sensors(RATE_HZ).items()}
         changes |= {f"engine.{key}": value for key, value in asked.items() if value}
         scene = change_scene(task.scene, changes)
-        simulation = Simulation(nudged(scene, task.nudge) if task.nudge else scene)
+        simulation = Simulation(shift_start(scene, task.nudge) if task.nudge else scene)
         _ = simulation.first_row  # compiles
         begun()
     except InputError as error:
@@ -92,7 +92,7 @@ def run_task(task: Task, begun: Callable[[], None] = lambda: None) -> Run:
                 done.failure, done.message = "hang", f"{done.cpu_s:.0f} s of processor time up to {done.reached_s:g} s"
                 break
         done.health = simulation.health()
-    except Exception as error:  # whatever it is, it is what this study is about
+    except Exception as error:  # any error is a result of this study
         done.failure, done.message = "crash", f"{type(error).__name__}: {error}"
         if not isinstance(error, SimulationError):
             done.message += " (no SimulationError)"
@@ -103,8 +103,8 @@ def run_task(task: Task, begun: Callable[[], None] = lambda: None) -> Run:
     return done
 
 
-def nudged(scene: Scene, clearances: float) -> Scene:
-    """The scene with its shaft a little farther along x, and toward the ring's centre, at the start."""
+def shift_start(scene: Scene, clearances: float) -> Scene:
+    """Return the scene with the shaft shifted slightly along x and toward the ring's centre at the start."""
     simulation = Simulation(scene)
     row, clearance = simulation.first_row, simulation.model.constants.contact.clearance
     x, y = ((1.0 - 3.0 * clearances) * float(row[COLUMN[name]]) for name in ("ring_x", "ring_y"))
@@ -113,7 +113,7 @@ def nudged(scene: Scene, clearances: float) -> Scene:
 
 
 class Worker:
-    """A process that does runs, one after the other; another takes its place where it hangs or dies."""
+    """Process that executes runs one after the other; it is replaced when it hangs or crashes."""
 
     def __enter__(self) -> Self:
         self._start()
@@ -123,7 +123,7 @@ class Worker:
         self._end()
 
     def run(self, task: Task) -> Run:
-        """Do a run there."""
+        """Execute a run in the process."""
         try:
             self._pipe.send(task)
             return self._pipe.recv()
@@ -150,15 +150,15 @@ class Worker:
 
 
 def _serve(pipe: Connection) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the terminal's Ctrl-C is for the process that asks
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is handled by the parent process
     end_with_parent()
     while True:
         task = pipe.recv()
         end_after(_COMPILING_S)
-        pipe.send(run_task(task, partial(end_after, task.limit_s + _BEYOND_S)))
+        pipe.send(run_task(task, partial(end_after, task.limit_s + _GRACE_S)))
 
 
 def end_after(limit_s: float) -> None:
-    """Have the system end this process when it has taken so much more processor time [s]; others' does not count."""
+    """Limit the further processor time of this process [s], unaffected by other load."""
     most = resource.getrlimit(resource.RLIMIT_CPU)[1]
     resource.setrlimit(resource.RLIMIT_CPU, (math.ceil(time.process_time() + limit_s), most))

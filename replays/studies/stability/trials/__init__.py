@@ -1,1 +1,1 @@
-"""Trials of an engine on small systems, with the verdict that theory expects."""
+"""Trials of an engine on small systems, compared with theory."""

@@ -1,4 +1,4 @@
-"""One cell of the table of trials: what was measured, what it shows, and what it should show."""
+"""Cell of the table of trials: measured value, verdict and expected verdict."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ class Cell(NamedTuple):
     """One case of a trial on one method.
 
     Attributes:
-        case: Which one.
-        value: What was measured.
-        limit: The largest value that still holds.
-        because: Why it should hold or fail.
-        expected: Whether it should hold; None where nobody has said so: then the value alone stands.
+        case: Name of the case.
+        value: Measured value.
+        limit: Largest passing value.
+        because: Reason for the expected verdict.
+        expected: Expected verdict; None if there is no expectation.
         unit: Unit of value and limit.
-        trial: T1 to T14, once it stands in the table.
-        method: Engine, or peer, likewise.
-        skipped: Why it was not run; empty where it was.
+        trial: T1 to T14, in the table.
+        method: Engine or peer, in the table.
+        skipped: Reason why it was not run; empty if it was.
     """
 
     case: str
@@ -37,15 +37,15 @@ class Cell(NamedTuple):
 
     @property
     def holds(self) -> bool:
-        """Whether the value is within its limit; what is not finite never is."""
+        """True if the value is within its limit; never if it is not finite."""
         return math.isfinite(self.value) and self.value <= self.limit
 
     @property
     def agrees(self) -> bool:
-        """Whether the verdict is the expected one, or nothing was expected."""
+        """True if the verdict is the expected one, or there is no expectation."""
         return bool(self.skipped) or self.expected is None or self.holds == self.expected
 
     def document(self) -> dict[str, Any]:
-        """As a JSON document; a value that is not finite is a string."""
+        """Return the cell as a JSON document; a value that is not finite is a string."""
         value: float | str = self.value if math.isfinite(self.value) else str(self.value)
         return {name: getattr(self, name) for name in _DOCUMENT} | {"value": value}

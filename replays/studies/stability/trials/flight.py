@@ -1,4 +1,4 @@
-"""Trials out of contact (T1, T5, T6): an undamped mode of the houses, a hammer pulse, free flight of the whole rig."""
+"""Trials without contact (T1, T5, T6): an undamped house mode, a hammer pulse, free flight of the whole rig."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from rig.physics.kernels.constants import Constants
 from rig.physics.kernels.signals import COLUMN
 from rig.physics.levels import ModelLevels
 
-_WIDE = 1e200
+_UNREACHED_CLEARANCE = 1e200
 """Clearance of a ring that is never reached [m]."""
 
 
 def house_oscillator() -> tuple[Constants, Mode]:
-    """The rig at rest out of contact, nothing damped, and its stiffest house mode (vertical)."""
+    """Return the rig at rest without contact or damping, and its stiffest house mode (vertical)."""
     constants = base_model(ModelLevels(magnet="linear", shaft="planar")).constants
     house = constants.house._replace(inner_beam_damping=0.0, outer_beam_damping=0.0, preload=1e7)
-    # With the transducers' true preload a growing mode would lose it, soften and stay bounded.
-    contact = constants.contact._replace(clearance=_WIDE)
+    # With the true preload of the transducers, a growing mode would unload them, soften and stay bounded.
+    contact = constants.contact._replace(clearance=_UNREACHED_CLEARANCE)
     mode = stiffest_mode(
         inner=house.inner_mass, outer=house.outer_mass, link=house.pair_stiffness_vertical,
         support=house.outer_beam_stiffness,
@@ -35,7 +35,7 @@ def house_oscillator() -> tuple[Constants, Mode]:
 
 
 def house_energy(constants: Constants, states: np.ndarray) -> np.ndarray:
-    """Energy of the houses' vertical motion [J], shape (n,), of states or rows, shape (n, 14 or more)."""
+    """Return the energy of the houses' vertical motion [J], shape (n,), from states or rows, shape (n, 14 or more)."""
     house = constants.house
     inner, outer, inner_rate, outer_rate = (states[:, COLUMN[name]] for name in ("y_ih", "y_oh", "vy_ih", "vy_oh"))
     return 0.5 * (
@@ -47,7 +47,7 @@ def house_energy(constants: Constants, states: np.ndarray) -> np.ndarray:
 
 
 def _ring_down(engine: str, duration_s: float, hw: float = 0.0) -> float:
-    """E/E0 of the stiffest house mode, E the mean over the last 5 %; h w sets the step if above 0."""
+    """Return E/E0 of the stiffest house mode, E averaged over the last 5 %; h w > 0 sets the step."""
     constants, mode = house_oscillator()
     angular = 2.0 * math.pi * mode.frequency_hz
     step_s = hw / angular if hw else ENGINES[engine].step_us * 1e-6
@@ -59,12 +59,12 @@ def _ring_down(engine: str, duration_s: float, hw: float = 0.0) -> float:
         motion = move(engine, constants, quiet_inputs(tick_s=tick_s), y0, ticks=ticks, step=step, every=step)
         energy = house_energy(constants, motion.rows)
         window = max(1, len(energy) // 20)
-        # It starts at rest, where the first-order method's own energy is the true one.
+        # The initial state is at rest, where a first-order method's own energy equals the true one.
         return float(np.mean(energy[-window:]) / energy[0])
 
 
 def ring_down_cases(engine: str, quick: bool) -> Iterator[Cell]:
-    """T1: an undamped mode at the engine's own step, and at steps about the limits of theory."""
+    """Yield T1: an undamped mode at the engine's own step, and at steps around the theoretical limits."""
     yield Cell("own step, 0.2 s", abs(_ring_down(engine, 0.2) - 1.0), 0.01,
                "an undamped mode keeps its energy within 1 %")  # fmt: skip
     limit = traits(engine).oscillator_limit
@@ -76,32 +76,32 @@ def ring_down_cases(engine: str, quick: bool) -> Iterator[Cell]:
             boundless = math.isinf(limit)
             because = "no limit: exact flow, error control, or implicit" if boundless else ""
             because = because or f"h w = {hw:g} against its limit of {limit:.4g}"
-        # It must not grow without end: near the limit energy swings by 1/(1 - h w/2), beyond it by powers of ten. That
-        # a coarse step damps is the atlas's affair.
+        # The test is for unlimited growth: near the limit energy varies by 1/(1 - h w/2), beyond it by powers of ten.
+        # Damping by a coarse step is shown in the atlas.
         yield Cell(f"step of h w = {hw:g}", growth, 100.0, because, expected)
 
 
 def pulse_cases(engine: str, quick: bool) -> Iterator[Cell]:
-    """T5: a shaft at rest is hit for 5 ms, on the engine's own step and on the longest that a scene takes."""
+    """Yield T5: a pulse of 5 ms on a shaft at rest, at the engine's own step and at the longest step of a scene."""
     constants = bare_shaft()
-    constants = constants._replace(contact=constants.contact._replace(clearance=_WIDE))
+    constants = constants._replace(contact=constants.contact._replace(clearance=_UNREACHED_CLEARANCE))
     force, start, end = 100.0, 100_000, 105_000
     right = constants.shaft.arm_disk * force * (end - start) * 1e-6 * 2.0 / math.pi
     for case, step in (("own step", 0), ("longest step a scene takes, 1 ms", 1000)):
-        # Nothing else moves, so an adaptive engine comes along in its longest steps.
+        # Nothing else moves, so an adaptive engine reaches the pulse with its longest steps.
         motion = move(engine, constants, quiet_inputs(pulse=(force, start, end)), state(), ticks=200_000, step=step)
         got = float(motion.end_of("beta_rate")) * constants.shaft.transverse_inertia
         allowance = traits(engine).allowance
-        # An engine of low order sees it, if badly: the trapezoidal rule of five steps.
+        # A low-order engine resolves the pulse poorly: the trapezoidal rule with five steps.
         limit = 0.5 if step and allowance > 1.0 else 1e-3 * allowance
         yield Cell(case, abs(got / right - 1.0), limit,
                    "no step is longer than the grid's, which is shorter than the pulse")  # fmt: skip
 
 
 def free_flight(engine: str) -> float:
-    """Scaled error of 0.2 s of free flight of the planar rig on linear magnets against the matrix exponential."""
+    """Return the scaled error of 0.2 s of free flight (planar rig, linear magnets) against the matrix exponential."""
     c = base_model(ModelLevels(magnet="linear", shaft="planar")).constants
-    c = c._replace(contact=c.contact._replace(clearance=_WIDE), shaft=c.shaft._replace(unbalance=0.0))
+    c = c._replace(contact=c.contact._replace(clearance=_UNREACHED_CLEARANCE), shaft=c.shaft._replace(unbalance=0.0))
     spin = 2.0 * math.pi * 6.2
     y0 = state(
         Gamma=3e-3, beta=-2e-3, Gamma_rate=0.2, beta_rate=0.5, theta_rate=spin, x_ih=5e-6, y_ih=-4e-6, vx_oh=0.01,
@@ -114,10 +114,10 @@ def free_flight(engine: str) -> float:
 
 
 def _linear_rates(c: Constants, spin: float) -> tuple[np.ndarray, np.ndarray]:
-    """A and b of z' = A z + b with z = Gamma, beta, theta, x_ih, y_ih, x_oh, y_oh and their rates.
+    """Return A and b of z' = A z + b with z = Gamma, beta, theta, x_ih, y_ih, x_oh, y_oh and their rates.
 
     Returns:
-        Shapes (14, 14) and (14,).
+        Arrays of shapes (14, 14) and (14,).
     """
     s, m, h = c.shaft, c.magnet, c.house
     # y = -l Gamma, x = l beta.
@@ -141,6 +141,6 @@ def _linear_rates(c: Constants, spin: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def free_flight_cases(engine: str, quick: bool) -> Iterator[Cell]:
-    """T6: free flight against the matrix exponential."""
+    """Yield T6: free flight against the matrix exponential."""
     limit = 1e-4 * traits(engine).allowance
     yield Cell("0.2 s", free_flight(engine), limit, "a smooth linear problem")

@@ -1,4 +1,4 @@
-"""Trials of the full rig under a hammer pulse (T3, T7, T9, T11): rolling, friction, whirl or no whirl."""
+"""Trials of the full rig under a hammer pulse (T3, T7, T9, T11): rolling, friction, boundary of whirl."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from rig.physics.engines import ENGINES
 from rig.physics.kernels.signals import COLUMN
 
 WINDOW_TICKS = 60_000
-"""First impacts after a pulse at time zero: the first contacts slide, turn and roll."""
+"""Length of the first impacts after a pulse at time zero; contacts slide, reverse and roll."""
 LEAST_SMOOTHING = 0.9e-6
-"""Below this v_s [m/s] error control costs minutes, for what no run needs."""
+"""Value of v_s below which error control takes minutes without need [m/s]."""
 
 
 @cache
@@ -31,21 +31,21 @@ def _whirl(engine: str, friction: str) -> Motion:
 
 
 def _slip(motion: Motion) -> float:
-    """RMS of the sliding speed over the last 0.1 s, in contact [m/s]; nan without contact."""
+    """Return the RMS sliding speed in contact over the last 0.1 s [m/s]; NaN without contact."""
     part = motion.rows[motion.times > motion.times[-1] - 0.1]
     part = part[part[:, COLUMN["penetration"]] > 0.0]
     return float(np.sqrt(np.mean(part[:, COLUMN["sliding_speed"]] ** 2))) if len(part) else math.nan
 
 
 def rolling_cases(engine: str, quick: bool) -> Iterator[Cell]:
-    """T3: rolling is a constraint; a smoothed law creeps."""
+    """Yield T3: exact rolling has no slip; a smoothed law creeps."""
     if friction_of(engine) == "exact":
         yield Cell("exact Coulomb", _slip(_whirl(engine, "exact")), 2e-5, "rolling is a constraint: no slip",
                    unit="m/s")  # fmt: skip
     if "smoothed" in ENGINES[engine].frictions:
         slip = _slip(_whirl(engine, "smoothed"))
         yield Cell("tanh, v_s = 5 mm/s", slip, 2e-5, "a smoothed law creeps by v_s atanh(needed / mu)", False, "m/s")
-        # What rolling needs, by an engine that rolls: the smoothed law must creep by just so much.
+        # Friction needed for rolling, from an engine that rolls exactly; it determines the creep of the smoothed law.
         exact = _whirl("rk8", "exact")
         part = exact.rows[exact.times > exact.times[-1] - 0.1]
         contact = hammer_run("smoothed")[0].contact
@@ -56,7 +56,7 @@ def rolling_cases(engine: str, quick: bool) -> Iterator[Cell]:
 
 
 def first_impacts(engine: str, law: str, *, step: int = 0, tolerance: float = 0.0, **contact: float) -> Motion:
-    """The full rig under a friction law, hit at time zero; `contact` as of `hammer_run`."""
+    """Return the first impacts of the full rig under a friction law; `contact` as in `hammer_run`."""
     constants, inputs, y0 = hammer_run(law, **contact)
     inputs = inputs._replace(hammer_start=0, hammer_end=5000)
     return move(engine, constants, inputs, y0, ticks=WINDOW_TICKS, step=step, every=1000, tolerance=tolerance)
@@ -64,18 +64,18 @@ def first_impacts(engine: str, law: str, *, step: int = 0, tolerance: float = 0.
 
 @cache
 def sharp_impacts(friction: str) -> Motion:
-    """The same as sharply as can be had; "exact" is Coulomb's set-valued law."""
+    """Return the first impacts at the highest accuracy; "exact" is Coulomb's set-valued law."""
     return first_impacts("rk8", friction, step=25, tolerance=1e-12)
 
 
 def smoothing_distance(engine: str, smoothing_speed: float) -> float:
-    """Distance of the smoothed law from the set-valued limit."""
+    """Return the distance of the smoothed law from the set-valued limit."""
     motion = first_impacts(engine, "smoothed", smoothing_speed=smoothing_speed)
     return scaled_error(motion.states, sharp_impacts("exact").states)
 
 
 def least_smoothing_speed(engine: str) -> float:
-    """v_s below which a step of Runge-Kutta's, at its own length, is too long for mu F_n / (v_s m_t) [m/s]."""
+    """Return v_s below which a step of Runge-Kutta's is too long for mu F_n / (v_s m_t) [m/s]."""
     constants = hammer_run("smoothed")[0]
     s, h = constants.shaft, constants.house
     mobility = s.arm_ring**2 / s.transverse_inertia + 1.0 / h.inner_mass + s.radius**2 / s.polar_inertia
@@ -84,14 +84,14 @@ def least_smoothing_speed(engine: str) -> float:
 
 
 def smoothing_cases(engine: str, quick: bool) -> Iterator[Cell]:
-    """T7: the exact law, and smoothed ones ever nearer to it."""
+    """Yield T7: the exact law, and smoothed ones that approach it."""
     allowance = traits(engine).allowance
     if friction_of(engine) == "exact":
         distance = scaled_error(first_impacts(engine, "exact").states, sharp_impacts("exact").states)
         yield Cell("exact law", distance, 5e-4 * allowance, "the set-valued limit itself")
     if "smoothed" not in ENGINES[engine].frictions:
         return
-    # Far above the limit of any step the distance is the law's own: linear in v_s.
+    # Far above the limit of any step, the distance is due to the law and linear in v_s.
     slope = smoothing_distance("rk8", 1e-3) / 1e-3
     least = least_smoothing_speed(engine) if traits(engine).on_real_axis else 0.0
     for v_s in (1e-2, 1e-3, 1e-4, 1e-5) if quick else (1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9):
@@ -105,13 +105,13 @@ def smoothing_cases(engine: str, quick: bool) -> Iterator[Cell]:
             expected, because = True, "error control shortens the steps"
         elif v_s < 0.3 * least:
             expected, because = False, f"its step is beyond 2.785 on the real axis below v_s = {least:.1e} m/s"
-        # Within twice the linear law and what the engine itself can do.
+        # Twice the linear law plus the error of the engine itself.
         limit = 2.0 * slope * v_s + 1e-4 * (allowance if v_s >= 1e-3 else 1.0)
         yield Cell(f"v_s = {v_s:.0e} m/s", distance, limit, because, expected)
 
 
 def boundary_cases(engine: str, quick: bool) -> Iterator[Cell]:
-    """T9: points on either side of the boundary between whirl and none."""
+    """Yield T9: points on both sides of the boundary of whirl."""
     if friction_of(engine) != "exact":
         return
     wrong = sum(whirl_class(engine, mu, force) != right for mu, force, right in QUICK_POINTS)
@@ -120,11 +120,11 @@ def boundary_cases(engine: str, quick: bool) -> Iterator[Cell]:
 
 
 REFERENCE_ERROR = 1e-10
-"""Scaled error below which the reference's own, 7e-11, decides."""
+"""Scaled error below which the reference's own error, 7e-11, dominates."""
 
 
 def ladder(engine: str) -> list[float]:
-    """Errors of the first impacts at ever finer steps or tolerances."""
+    """Return the errors of the first impacts at increasingly fine steps or tolerances."""
     friction = friction_of(engine)
     if is_adaptive(engine):
         tolerances = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8)
@@ -135,11 +135,11 @@ def ladder(engine: str) -> list[float]:
 
 
 def ladder_cases(engine: str, quick: bool) -> Iterator[Cell]:
-    """T11: a finer setting gives less error."""
-    # Where the error is larger it is another motion altogether, and a finer step may be no nearer.
+    """Yield T11: a finer setting reduces the error."""
+    # A larger error means another motion, for which a finer step need not be better.
     errors = [max(error, REFERENCE_ERROR) for error in ladder(engine) if error < 0.2]
     worst = max(fine / coarse for coarse, fine in pairwise(errors))
     yield Cell("worst rung over the one before", worst, 1.5, "asking for more gives more")
-    # An engine whose grid alone is fine enough has nowhere to go.
+    # An engine whose grid is fine enough by itself cannot improve.
     gain = errors[-1] / max(errors[0], 1e-6)
     yield Cell("last rung over the first", gain, 0.1, "the ladder leads somewhere")

@@ -1,4 +1,4 @@
-"""Trials of impacts on the ring (T2, T4, T8, T10, T14), mostly of a shaft that is a mass on one line."""
+"""Trials of impacts on the ring (T2, T4, T8, T10, T14), mostly with the shaft as a mass on one line."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from rig.physics.engines.common.memory import CEILING, FLOORED
 from rig.physics.levels import ModelLevels
 
 ONSET_SPEEDS = (1e-5, 1e-4, 1e-3, 1e-2, 0.1, 1.0)
-"""[m/s]"""
+"""Approach speeds [m/s]."""
 PUSH_N = 1000.0
-"""Peak of the push at the disk in `pushed` [N]."""
+"""Peak force at the disk in `pushed` [N]."""
 
 
 def bounce(engine: str, step: int = 0) -> tuple[float, Motion]:
-    """Largest energy drift in flight over 25 elastic, frictionless impacts across the ring, and the motion."""
+    """Return the largest energy drift in flight over 25 elastic, frictionless impacts, and the motion."""
     constants = bare_shaft(damping_factor=0.0)
     shaft, magnet = constants.shaft, constants.magnet
     y0 = state(beta_rate=0.5 / shaft.arm_ring)
@@ -45,7 +45,7 @@ def bounce(engine: str, step: int = 0) -> tuple[float, Motion]:
 
 
 def bounce_cases(engine: str, quick: bool) -> Iterator[Cell]:
-    """T2: elastic, frictionless impacts."""
+    """Yield T2: elastic, frictionless impacts."""
     drift, motion = bounce(engine)
     yield Cell("own step", drift, 1e-4 * traits(engine).allowance, "nothing takes energy out")
     missing = float(max(0, 24 - motion.contacts))
@@ -55,14 +55,14 @@ def bounce_cases(engine: str, quick: bool) -> Iterator[Cell]:
 
 
 def first_impact(engine: str, speed: float, *, tolerance: float = 0.0) -> dict[str, float]:
-    """Relative errors of one impact on the rigid ring against its quadrature: restitution, impulse, peak, duration."""
+    """Return relative errors of one impact on the rigid ring against quadrature."""
     constants = bare_shaft()
     shaft, contact = constants.shaft, constants.contact
     right = impact(
         mass=pivoted_mass(constants), speed=speed, stiffness=contact.stiffness, exponent=contact.exponent,
         factor=contact.damping_factor, speed_floor=contact.speed_floor,
     )  # fmt: skip
-    # The onset falls on no engine's grid.
+    # The contact begins off every engine's grid.
     onset = 1.01371e-3
     y0 = state(beta=(contact.clearance - speed * onset) / shaft.arm_ring, beta_rate=speed / shaft.arm_ring)
     ticks = 1000 * math.ceil(2.0 + 2e3 * right.duration)
@@ -80,7 +80,7 @@ def first_impact(engine: str, speed: float, *, tolerance: float = 0.0) -> dict[s
 
 
 def first_impact_cases(engine: str, quick: bool) -> Iterator[Cell]:
-    """T4: one impact at 0.3 m/s."""
+    """Yield T4: one impact at 0.3 m/s."""
     errors = first_impact(engine, 0.3)
     limit = 1e-3 * traits(engine).allowance
     for name in ("impulse", "peak", "duration"):
@@ -88,7 +88,7 @@ def first_impact_cases(engine: str, quick: bool) -> Iterator[Cell]:
 
 
 def grazing_cases(engine: str, quick: bool) -> Iterator[Cell]:
-    """T8: impacts from grazing to hard."""
+    """Yield T8: impacts from grazing to hard."""
     errors = [first_impact(engine, speed) for speed in ONSET_SPEEDS]
     worst = max(error["restitution"] for error in errors)
     yield Cell("restitution, 1e-5 to 1 m/s", worst, 2e-3 * traits(engine).allowance,
@@ -103,7 +103,7 @@ def grazing_cases(engine: str, quick: bool) -> Iterator[Cell]:
 
 
 def drop_cases(engine: str, quick: bool) -> Iterator[Cell]:
-    """T10: the full rig dropped from the top of the ring."""
+    """Yield T10: a drop of the full rig from the top of the ring."""
     model = base_model(ModelLevels.model_validate({"friction": friction_of(engine)}))
     constants = model.constants
     constants = constants._replace(contact=constants.contact._replace(damping_factor=1.4328))  # e = 0.5
@@ -118,16 +118,16 @@ def drop_cases(engine: str, quick: bool) -> Iterator[Cell]:
 
 
 def pushed(engine: str, *, speed_floor: float) -> float:
-    """A shaft that touches the ring at rest is pushed into it for 20 ms: error of its depth over the deepest.
+    """Return the relative error of the depth of a shaft that is pushed from rest into the ring for 20 ms.
 
-    v0 is at its lower limit, latched when nothing moved, and stays while the force grows to some 1.6 kN: as stale as
-    can be.
+    v0 is latched at its lower limit, when nothing moves, and stays constant while the force grows to about 1.6 kN, so
+    it is outdated to the greatest extent.
     """
     constants = bare_shaft(speed_floor=speed_floor)
     shaft, contact = constants.shaft, constants.contact
     length = 20_000
     y0 = state(beta=contact.clearance / shaft.arm_ring)
-    ticks = round(0.9 * length)  # to where the force still pushes
+    ticks = round(0.9 * length)  # until the end of the push
     inputs = quiet_inputs(pulse=(PUSH_N, 0, length))
     with np.errstate(all="ignore"):
         motion = move(engine, constants, inputs, y0, ticks=ticks, every=1000)
@@ -144,7 +144,7 @@ def pushed(engine: str, *, speed_floor: float) -> float:
 
 
 def stale_stiffness(engine: str, speed_floor: float) -> float:
-    """Value of h lambda of the stale damping at an engine's own step: c F/(v0 m) h at the peak of `pushed`."""
+    """Return h lambda of the damping with outdated v0 at an engine's own step: c F/(v0 m) h at the peak of `pushed`."""
     constants = bare_shaft(speed_floor=speed_floor)
     load = PUSH_N * constants.shaft.arm_disk / constants.shaft.arm_ring
     rate = constants.contact.damping_factor * load / speed_floor / pivoted_mass(constants)
@@ -152,7 +152,7 @@ def stale_stiffness(engine: str, speed_floor: float) -> float:
 
 
 def stale_cases(engine: str, quick: bool) -> Iterator[Cell]:
-    """T14: contact that lasts on a v0 long out of date."""
+    """Yield T14: lasting contact with an outdated v0."""
     own = traits(engine)
     yield Cell("v0 = 1e-2 m/s", pushed(engine, speed_floor=1e-2), 2e-2,
                f"h lambda = {stale_stiffness(engine, 1e-2):.2g} and less: not stiff")  # fmt: skip

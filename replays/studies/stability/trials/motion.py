@@ -1,4 +1,4 @@
-"""One engine on one small system: what a trial sets going and reads off, without scenes, sensors or commands."""
+"""Run of one engine on one small system, without scenes, sensors or commands."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from rig.physics.model import Model, build_model
 from rig.physics.parameters import load_parameters
 
 TICK_S = 1e-6
-"""Length of a tick [s], unless a trial says otherwise."""
+"""Default length of a tick [s]."""
 
 
 @cache
 def base_model(levels: ModelLevels) -> Model:
-    """The default parameters on a level of the model; a fit of the magnets' map is made once."""
+    """Return the model with default parameters at the given levels; cached, because the magnets' map is fitted."""
     return build_model(load_parameters(), levels)
 
 
@@ -33,13 +33,13 @@ def quiet_inputs(
     ideal: bool = False,
     pulse: tuple[float, int, int] = (0.0, 0, 0),
 ) -> Inputs:
-    """Nothing happens but, perhaps, one pulse along x.
+    """Return inputs without commands except for an optional pulse along x.
 
     Args:
         tick_s: Length of a tick [s].
-        spin: What the drive aims at [rad/s].
-        magnets: Whether they hold.
-        ideal: The drive prescribes the spin instead of a torque.
+        spin: Set speed of the drive [rad/s].
+        magnets: Whether the magnets are engaged.
+        ideal: Whether the drive prescribes the spin instead of a torque.
         pulse: Peak force [N], first tick and end of the pulse.
     """
     return Inputs(
@@ -50,11 +50,11 @@ def quiet_inputs(
 
 @dataclass(frozen=True)
 class Motion:
-    """What an engine made of a system.
+    """Motion of a system computed by an engine.
 
     Attributes:
-        times: Instants of the rows [s], shape (n,).
-        rows: Observed rows, shape (n, N_ROW); the end has none.
+        times: Times of the rows [s], shape (n,).
+        rows: Observed rows, shape (n, N_ROW), without the end.
         end: State and integrals at the end, shape (N_VECTOR,).
         memory: The engine's memory at the end, shape (MEMORY,).
     """
@@ -70,21 +70,21 @@ class Motion:
         return np.vstack([self.rows[:, :N_STATE], self.end[None, :N_STATE]])
 
     def column(self, name: str) -> np.ndarray:
-        """One column of the rows, shape (n,)."""
+        """Return one column of the rows, shape (n,)."""
         return self.rows[:, COLUMN[name]]
 
     def end_of(self, name: str) -> float:
-        """One state or integral at the end."""
+        """Return one state or integral at the end."""
         return float(self.end[COLUMN[name]])
 
     @property
     def contacts(self) -> int:
-        """Contacts begun."""
+        """Number of contacts."""
         return int(self.memory[CONTACTS])
 
     @property
     def peak_force(self) -> float:
-        """Largest normal force by the engine's own steps [N]."""
+        """Largest normal force at the engine's own steps [N]."""
         return float(self.memory[PEAK_FORCE])
 
 
@@ -99,17 +99,17 @@ def move(
     every: int = 0,
     tolerance: float = 0.0,
 ) -> Motion:
-    """Let an engine loose on a system.
+    """Run an engine on a system.
 
     Args:
-        engine: Its name.
+        engine: Name of the engine.
         constants: The model.
-        inputs: What acts on it.
-        y0: State and integrals at the start, shape (N_VECTOR,).
-        ticks: How long, in ticks of `inputs`; cut to whole rows.
-        step: Ticks a step; 0 for the engine's own (in ticks of 1 us).
-        every: Ticks between rows, at least one step; 0 for one row only.
-        tolerance: Of an adaptive engine; 0 for its own.
+        inputs: Inputs of the model.
+        y0: Initial state and integrals, shape (N_VECTOR,).
+        ticks: Length in ticks of `inputs`, truncated to whole rows.
+        step: Ticks per step; 0 for the engine's own (in ticks of 1 us).
+        every: Ticks between rows, at least one step; 0 for a single row.
+        tolerance: Tolerance of an adaptive engine; 0 for its own.
     """
     course = Course(engine, constants, inputs, y0, step=step, tolerance=tolerance)
     stride = max(1, (every or ticks) // course.step)
@@ -121,7 +121,7 @@ def move(
 
 
 def state(**values: float) -> np.ndarray:
-    """State and integrals, 0 but for the columns named, shape (N_VECTOR,)."""
+    """Return state and integrals, 0 except for the named columns, shape (N_VECTOR,)."""
     y = np.zeros(N_VECTOR)
     for name, value in values.items():
         y[COLUMN[name]] = value
@@ -129,16 +129,16 @@ def state(**values: float) -> np.ndarray:
 
 
 def pivoted_mass(constants: Constants) -> float:
-    """Effective mass of the shaft at the ring [kg]."""
+    """Return the effective mass of the shaft at the ring [kg]."""
     return constants.shaft.transverse_inertia / constants.shaft.arm_ring**2
 
 
 def bare_shaft(*, gravity: bool = False, **contact: float) -> Constants:
-    """Planar shaft in a rigid, centred, frictionless ring: along x it is a mass on one line.
+    """Return a planar shaft in a rigid, centred, frictionless ring; along x it is a mass on one line.
 
     Args:
-        gravity: Whether there is any.
-        contact: What the contact has otherwise than the rig's with Hertz's exponent, by field.
+        gravity: Whether gravity acts.
+        contact: Contact parameters that differ from the rig's with Hertz's exponent, by field.
     """
     levels = ModelLevels(magnet="linear", shaft="planar", stator="rigid", friction="none")
     own = base_model(levels).constants
@@ -151,12 +151,12 @@ def bare_shaft(*, gravity: bool = False, **contact: float) -> Constants:
 
 
 def hammer_run(law: str, *, force_n: float = 100.0, **contact: float) -> tuple[Constants, Inputs, np.ndarray]:
-    """The full rig running at 6.2 Hz, hit for 5 ms along x at 20 ms: the scene `hammer` under a friction law.
+    """Return the full rig at 6.2 Hz with a pulse of 5 ms along x at 20 ms, as in scene `hammer`, with a friction law.
 
     Args:
-        law: Of friction.
+        law: Friction law.
         force_n: Peak of the pulse [N].
-        contact: What the contact has otherwise than the rig's, by field.
+        contact: Contact parameters that differ from the rig's, by field.
     """
     model = base_model(ModelLevels.model_validate({"friction": law}))
     spin = 2.0 * np.pi * 6.2

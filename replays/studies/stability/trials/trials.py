@@ -1,8 +1,8 @@
-"""The trials T1 to T14, each a small system on which one engine is measured and judged both ways.
+"""Trials T1 to T14, each a small system on which one engine is measured and compared with an expected verdict.
 
-A trial gives one cell a case. Its value is a distance from what is right (0 is right), its limit what still counts as
-right, and its expectation what theory says of that method: engines must hold, and known failures must fail. Engines
-of which `replays.studies.common.engines` has no row are held to what everybody is held to, and to nothing else.
+A trial yields one cell per case. Its value is a distance from the correct result, its limit the largest passing value,
+and its expectation follows from theory: engines must pass, and known failures must fail. Engines without a row in
+`replays.studies.common.engines` are tested by the general criteria only.
 """
 
 from __future__ import annotations
@@ -15,19 +15,19 @@ from replays.studies.stability.trials.cell import Cell
 
 
 class Trial(NamedTuple):
-    """One trial."""
+    """A trial."""
 
     name: str
-    """T1 to T14."""
+    """Name, T1 to T14."""
     title: str
-    """What is done."""
+    """Title."""
     value: str
-    """What is measured, in words."""
+    """Measured quantity, in words."""
     cases: Callable[[str, bool], Iterator[Cell]]
-    """Gives the cases of one engine; the flag asks for few of them."""
+    """Function that yields the cases of an engine; the flag selects a few of them."""
 
     def run(self, engine: str, quick: bool) -> Iterator[Cell]:
-        """The cells of one engine."""
+        """Yield the cells of one engine."""
         for cell in self.cases(engine, quick):
             yield cell._replace(trial=self.name, method=engine)
 

@@ -1,4 +1,4 @@
-"""Trials of whole simulations (T12, T13): a run does not depend on how it is cut, and says what goes wrong in it."""
+"""Trials of whole simulations (T12, T13): independence of block lengths, and warnings."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from rig.run.simulation import Simulation
 
 
 def engine_scene(name: str, **choice: float) -> Scene:
-    """The hammer's scene for an engine at its own step and tolerance unless given others, with bare sensors."""
+    """Return the hammer scene for an engine, by default at its own step and tolerance, with minimal sensors."""
     scene = load_scene("hammer")
     method = ENGINES[name]
     settings = {"name": name, "step_us": method.step_us, "tolerance": method.tolerance, **choice}
@@ -30,7 +30,7 @@ def engine_scene(name: str, **choice: float) -> Scene:
 
 
 def bit_cases(engine: str, quick: bool) -> Iterator[Cell]:
-    """T12: the same bits however a run is cut, and after a restart."""
+    """Yield T12: equal bits for any block length and after a restart."""
     scene = engine_scene(engine)
     total = 200 if quick else 1000
     whole = Simulation(scene).advance(total * 1000).rows
@@ -49,7 +49,7 @@ def bit_cases(engine: str, quick: bool) -> Iterator[Cell]:
 
 
 def _is_poisoned(engine: str) -> bool:
-    """Whether a force law that turns to nan ends the run with an error."""
+    """Return whether a force law that turns to NaN ends the run with an error."""
     simulation = Simulation(engine_scene(engine))
     constants = simulation.model.constants
     shaft = constants.shaft._replace(gravity=math.nan)
@@ -63,10 +63,10 @@ def _is_poisoned(engine: str) -> bool:
 
 
 def warnings_of(scene: Scene, ticks: int) -> list[str]:
-    """What the health of a run warns of at its end, or the error that ended it."""
+    """Return the warnings of a run at its end, or the error that ended it."""
     simulation = Simulation(scene)
     try:
-        # By the millisecond: what is not finite ends the run where it happens.
+        # In blocks of 1 ms, so that a value that is not finite ends the run at once.
         with np.errstate(all="ignore"):
             for _ in range(ticks // 1000):
                 simulation.advance(1000)
@@ -76,14 +76,14 @@ def warnings_of(scene: Scene, ticks: int) -> list[str]:
 
 
 def _silent(warnings: list[str], *words: str) -> float:
-    """0 where a warning has one of the words, 1 for silence."""
+    """Return 0 if a warning contains one of the words, otherwise 1."""
     return float(not any(word in warning for warning in warnings for word in words))
 
 
 def warning_cases(engine: str, quick: bool) -> Iterator[Cell]:
-    """T13: a run says what goes wrong in it."""
+    """Yield T13: a run warns of problems."""
     yield Cell("nan", float(not _is_poisoned(engine)), 0.0, "the state is checked", unit="silent")
-    # A step of 1 ms is far too long for anything but error control; with that, a tolerance that cannot be met.
+    # A step of 1 ms is much too long without error control; with it, use a tolerance that cannot be met.
     if is_adaptive(engine):
         warnings = warnings_of(engine_scene(engine, step_us=500, tolerance=1e-30), 1000)
         yield Cell("tolerance out of reach", _silent(warnings, "engine.tolerance"), 0.0,
