@@ -169,7 +169,7 @@ class Measurement:
 
 
 def quantity(text: str, unit: str, *, field: str, of: str) -> float:
-    """Parse a number with a unit, such as "0.2 mm", and return it in the unit of what it applies to.
+    """Parse a number with a unit, such as "0.2 mm", and return it in a given unit.
 
     Raises:
         InputError: If the text has another form, or its unit is missing or of another kind.

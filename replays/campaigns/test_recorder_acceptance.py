@@ -27,7 +27,7 @@ OUTPUT_FILE = "daq.mcap.part"
 """File that the recorder writes to; it exists once recording has begun."""
 JUDGED_FILE = "daq.recovered.mcap"
 """File that is judged afterwards, in any format that `rig import` reads."""
-REASON_WORDS = ("disk", "space", "too large")
+REASONS = ("disk", "space", "too large")
 """Words, one of which must be in the line that reports the reason for the end."""
 
 SCENE = "test-sine"
@@ -53,7 +53,7 @@ def start(dut: Start, record: Record, command: str | Sequence[str]) -> Device:
 
 
 def lost_s(record: Record, measure: Measure, until_s: float) -> float:
-    """Return the length missing at the end of what was sent before a time [s]; compare the rest with what was sent."""
+    """Return the length missing at the end of the data sent before a time [s]; compare the rest with the data sent."""
     sent, folder = record.stop(), record.path.parent
     if RECOVER_COMMAND:
         program = Program([word.format(folder=folder) for word in shlex.split(RECOVER_COMMAND)], folder / "recover.log")
@@ -113,6 +113,5 @@ def test_a_full_disk_ends_it_with_a_reason_and_what_is_there_reads(
     measure("exit status", status, "1", "between", (1, 127), source="0 would mean a complete recording")
     lines = recorder.program.read_output().splitlines()
     measure("tracebacks", sum("Traceback" in line for line in lines), "1", "==", 0)
-    reasons = sum(any(word in line for word in REASON_WORDS) for line in lines)
-    measure("lines that report the reason", reasons, "1", ">=", 1)
+    measure("lines that report the reason", sum(any(word in line for word in REASONS) for line in lines), "1", ">=", 1)
     assert lost_s(record, measure, 3.0) > 0.0, "the disk was not full"

@@ -38,7 +38,7 @@ class Track:
         paths: Complete or truncated files; parts are sorted.
 
     Raises:
-        InputError: If a file cannot be read, is no recording, or belongs to another run.
+        InputError: If a file cannot be read, is not a recording, or belongs to another run.
     """
 
     def __init__(self, paths: Sequence[Path]) -> None:

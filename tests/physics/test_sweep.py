@@ -20,7 +20,7 @@ import pytest
 from replays.studies.common.journal import Journal
 from replays.studies.common.random_scene import draw_scene
 from replays.studies.stability.scenes.sweep import NAME, chosen_numbers, summary, sweep
-from replays.studies.stability.scenes.truth import CHAOTIC_GROWTH, INITIAL_SHIFT, measure
+from replays.studies.stability.scenes.truth import CHAOS_GROWTH, INITIAL_SHIFT, measure
 from replays.studies.stability.scenes.worker import Run, Task, Worker, end_after, run_task, shift_start
 from rig.base.errors import InputError
 from rig.cli.main import main
@@ -88,7 +88,7 @@ def stub(shifts: dict[str, float], own: dict[str, dict[str, Any]] | None = None,
         ({"taylor": 0.5}, 1.0, "undecided", "taylor"),
         ({"rk8": 0.5}, 1.0, "undecided", "rk8"),
         ({"rk8": 0.5, "tsit5": 1.5}, 1.0, "undecided", None),
-        ({"taylor": 0.5}, 2.0 * CHAOTIC_GROWTH, "chaotic", None),
+        ({"taylor": 0.5}, 2.0 * CHAOS_GROWTH, "chaotic", None),
     ],
 )
 def test_status_of_a_scene(shifts: dict[str, float], grows: float, status: str, odd: str | None) -> None:

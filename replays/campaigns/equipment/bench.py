@@ -108,7 +108,7 @@ def validate_replay(path: Path) -> None:
     """Raise an error unless a file is a complete recording, before any test runs.
 
     Raises:
-        InputError: If it is no recording or was cut off; events missing from it would count as not having occurred.
+        InputError: If it is not a recording or was cut off; events missing from it would count as not having occurred.
     """
     from recorder.reader import Recording
 

@@ -33,7 +33,7 @@ class Program:
                 self._supervisor = subprocess.Popen(
                     [sys.executable, "-I", "-S", str(_SUPERVISOR), *self.command],
                     stdin=subprocess.PIPE, stdout=output, stderr=subprocess.STDOUT, cwd=folder, env=environment,
-                    start_new_session=True,  # Ctrl-C goes to the test only, which ends its programs in order
+                    start_new_session=True,  # Ctrl-C is sent to the test only, which ends its programs in order
                 )  # fmt: skip
         except OSError as error:
             raise DiskError(f"{self.command[0]} could not be started: {error}") from None

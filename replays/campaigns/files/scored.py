@@ -88,7 +88,7 @@ class ExpectScore(Expected):
         if self.must:
             yield from self._values(rows, must)
             return
-        found = list(self._missing(card, rows, seen)) if self.score == "all" else []
+        found = list(self._losses(card, rows, seen)) if self.score == "all" else []
         for row in rows:
             # A single quantity must have a verdict; with `all`, some quantities never have one.
             if row.verdict == FAIL or (row.verdict == INCONCLUSIVE and self.score != "all"):
@@ -120,10 +120,8 @@ class ExpectScore(Expected):
             if self.score in ("all", row.quantity) and (not wanted or own & wanted):
                 yield row
 
-    def _missing(
-        self, card: Scorecard, rows: Sequence[ScoreRow], seen: CaseRecording
-    ) -> Iterator[tuple[str, str, Outcome]]:
-        """Yield channel (if known), text and outcome of what was sent but is not shown to be in the record."""
+    def _losses(self, card: Scorecard, rows: list[ScoreRow], seen: CaseRecording) -> Iterator[tuple[str, str, Outcome]]:
+        """Yield channel (if known), text and outcome of sent data that are not shown to be in the record."""
         from replays.score.card.scorecard import INCONCLUSIVE, PASS
 
         groups = _sent(seen)

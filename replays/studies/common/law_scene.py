@@ -23,7 +23,7 @@ def add_law_scene(path: Path) -> str:
         The scene's name.
 
     Raises:
-        InputError: If the file is no law, or the model does not accept it.
+        InputError: If the file is not a law, or the model does not accept it.
     """
     law = read_law(path)
     mark = hashlib.sha256(json.dumps(law.changes(), sort_keys=True).encode()).hexdigest()[:6]

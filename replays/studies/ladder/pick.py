@@ -19,7 +19,7 @@ def check_target(path: Path, scene_name: str, scene: Scene) -> None:
     """Check, before a long search, that a pick can be written to a file.
 
     Raises:
-        InputError: If it is no .toml file, or holds another scene than the one of the search.
+        InputError: If it is not a .toml file, or holds another scene than the one of the search.
     """
     if path.suffix != ".toml":
         raise InputError("--write", "a .toml file", str(path))

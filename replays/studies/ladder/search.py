@@ -139,8 +139,7 @@ def search(
     work = _Search(scene, tolerances, runs, budget_s, progress, {"chain": chain})
     standard = _run_reference(work)
     single = _lower_each(work, standard, keep)
-    simplest = {level: next(iter(choices)) for level, choices in single.items()}
-    chosen, best = _lower_together(work, standard, single, simplest)
+    chosen, best = _lower_together(work, standard, single, {level: next(iter(each)) for level, each in single.items()})
     picked, complete = None, True
     while True:
         fuller, savings = _restore_levels(work, standard, single, chosen, picked.measured.candidate if picked else None)

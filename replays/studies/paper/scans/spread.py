@@ -120,7 +120,7 @@ def phases(pulse: Pulse, count: int) -> list[Pulse]:
 
 
 def column(results: list[Outcome], name: str) -> np.ndarray:
-    """Return one number of many outcomes, NaN where it is missing, shape (n,)."""
+    """Return one number of many outcomes, NaN if missing, shape (n,)."""
     return np.array([float(getattr(result, name)) for result in results])
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from replays.studies.common.journal import Journal
 from replays.studies.common.provenance import commit, machine
 from replays.studies.common.random_scene import draw_scene
-from replays.studies.stability.scenes.truth import CHAOTIC_GROWTH, WRONG_ERROR, measure
+from replays.studies.stability.scenes.truth import CHAOS_GROWTH, WRONG_ERROR, measure
 from replays.studies.stability.scenes.worker import Run, Task, Worker
 from rig.base.errors import InputError
 from rig.physics.kernels import source_digest
@@ -122,7 +122,7 @@ def _engine(runs: list[tuple[Row, Row]]) -> Row:
 
     ran = [(row, one) for row, one in runs if one["failure"] != "refused"]
     told = [(row, one) for row, one in ran if one["error"] is not None]
-    calm = [one for row, one in told if not (row["growth"] and row["growth"] >= CHAOTIC_GROWTH)]
+    calm = [one for row, one in told if not (row["growth"] and row["growth"] >= CHAOS_GROWTH)]
     speeds = [one["speed"] for _, one in ran if one["speed"]]
     refused: dict[str, int] = {}
     for _, one in runs:

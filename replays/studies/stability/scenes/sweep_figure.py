@@ -13,7 +13,7 @@ from replays.studies.stability.scenes.sweep import summary
 from replays.studies.stability.scenes.truth import WRONG_ERROR
 from rig.physics.engines import ENGINES
 
-_MIN_ERROR, _MAX_ERROR = 1e-10, 10.0
+_FLOOR, _CEILING = 1e-10, 10.0
 """Range of errors drawn [1]; values beyond it are drawn at the edge."""
 _MIN_SPEED = 1e-3
 """Lowest speed drawn; lower ones are drawn at the edge."""
@@ -38,14 +38,14 @@ def draw_sweep(folder: Path, rows: list[dict[str, Any]], engines: list[str]) -> 
         f"{len(rows)} random scenes: {scenes['decided']} where two accurate engines agree, {scenes['chaotic']} chaotic",
     )
     errors, speeds = figure.subplots(1, 2, sharey=True, width_ratios=(1.25, 1.0))
-    errors.axvspan(WRONG_ERROR, _MAX_ERROR, color=RED, alpha=0.10, lw=0)
+    errors.axvspan(WRONG_ERROR, _CEILING, color=RED, alpha=0.10, lw=0)
     errors.text(WRONG_ERROR * 1.15, 2.0, "wrong", color="#A04000", fontsize=9.5)
     for engine in engines:
         ran = [(row, one) for row in rows for one in row["tested"] if one["engine"] == engine]
         ran = [(row, one) for row, one in ran if one["failure"] != "refused"]
         # An incomplete run counts as an infinite error.
         wrong = [
-            one["error"] or (np.inf if one["failure"] else _MIN_ERROR) for row, one in ran if row["status"] == "decided"
+            one["error"] or (np.inf if one["failure"] else _FLOOR) for row, one in ran if row["status"] == "decided"
         ]
         silent = len(found["engines"][engine]["silent"])
         main_one = engine == main
@@ -55,7 +55,7 @@ def draw_sweep(folder: Path, rows: list[dict[str, Any]], engines: list[str]) -> 
     distance = [row["distance"] for row in rows if row["status"] == "decided"]
     _shares(errors, distance, color="0.6", lw=5.0, alpha=0.5, zorder=1, label="the two accurate ones, from each other")
     errors.set(
-        xscale="log", xlim=(_MIN_ERROR, _MAX_ERROR), ylim=(0.0, 102.0), xlabel="scaled error [1]",
+        xscale="log", xlim=(_FLOOR, _CEILING), ylim=(0.0, 102.0), xlabel="scaled error [1]",
         ylabel="scenes with no more [%]",
         title="Error at its own step and tolerance; in the legend:\nwrong without a warning",
     )  # fmt: skip
@@ -72,6 +72,4 @@ def draw_sweep(folder: Path, rows: list[dict[str, Any]], engines: list[str]) -> 
 
 def _shares(axes: Any, values: list[float], **style: Any) -> None:
     """Draw the cumulative share of values as a step function [%]."""
-    axes.step(
-        np.sort(values).clip(_MIN_ERROR), 100.0 * np.arange(1, len(values) + 1) / len(values), where="post", **style
-    )
+    axes.step(np.sort(values).clip(_FLOOR), 100.0 * np.arange(1, len(values) + 1) / len(values), where="post", **style)

@@ -28,7 +28,7 @@ UNBOUNDED_N = 1e9
 """Accurate peak force above which the model itself generates energy, as a gap counted for both houses can [N]."""
 INITIAL_SHIFT = 1e-7
 """Shift of the initial position, in clearances, for testing the sensitivity."""
-CHAOTIC_GROWTH = 1e5
+CHAOS_GROWTH = 1e5
 """Growth of that shift from which a scene is chaotic: accurate runs differ by as much as they can."""
 _NO_DOUBT = ("would have pulled", "lie after its end", "contacts began slower")
 """Parts of warnings that do not concern the accuracy of a run."""
@@ -73,8 +73,7 @@ def measure(scene: Scene, engines: list[str], run: Callable[[Task], Run], *, lim
     growth = _growth(*good[0], run) if good else None
     status = "untold"
     if distance is not None:
-        chaotic = growth and growth >= CHAOTIC_GROWTH
-        status = "decided" if distance <= AGREE_ERROR else "chaotic" if chaotic else "undecided"
+        status = "decided" if distance <= AGREE_ERROR else "chaotic" if (growth or 0.0) >= CHAOS_GROWTH else "undecided"
     peak = min((done.health["peak_normal_force_n"] for _, done in good), default=None)
     if peak is not None and not peak <= UNBOUNDED_N:
         status = "unbounded"
