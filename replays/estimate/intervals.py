@@ -169,7 +169,7 @@ def draw_normal(covariance: np.ndarray, generator: np.random.Generator, draws: i
     return size * (white * np.sqrt(np.maximum(powers, 0.0)) @ directions.T)
 
 
-def simultaneous(values: np.ndarray, spread: np.ndarray, freedom: ArrayLike = math.inf) -> tuple[float, float, float]:
+def bound_maximum(values: np.ndarray, spread: np.ndarray, freedom: ArrayLike = math.inf) -> tuple[float, float, float]:
     """Return the largest of several estimates with a simultaneous 95 % interval (Bonferroni): value, low, high.
 
     Args:
@@ -181,24 +181,24 @@ def simultaneous(values: np.ndarray, spread: np.ndarray, freedom: ArrayLike = ma
     return float(values.max()), float((values - half).max()), float((values + half).max())
 
 
-def about(value: float, half: float, size: float = 1.0) -> tuple[float, float, float]:
+def make_interval(value: float, half: float, size: float = 1.0) -> tuple[float, float, float]:
     """Return value, low and high of an interval of a half width, all multiplied by `size`."""
     return size * value, size * (value - half), size * (value + half)
 
 
-def scaled(estimate: tuple[float, float, float], size: float) -> tuple[float, float, float]:
+def scale_interval(estimate: tuple[float, float, float], size: float) -> tuple[float, float, float]:
     """Return value, low and high of an interval, multiplied by `size`."""
     return estimate[0] * size, estimate[1] * size, estimate[2] * size
 
 
-def pooled(values: np.ndarray, weights: np.ndarray, *, alike: bool) -> tuple[float, float]:
+def pool_estimates(values: np.ndarray, weights: np.ndarray, *, equal_errors: bool) -> tuple[float, float]:
     """Return the weighted mean of estimates and half of its 95 % interval.
 
     Args:
         values: Estimates, shape (n,).
         weights: Inverse squares of the half widths of their intervals, or 0, shape (n,).
-        alike: True if the errors may be equal, as rounding errors are, and so do not average out.
+        equal_errors: True if the errors may be equal, as rounding errors are, and so do not average out.
     """
     whole = weights.sum()
-    half = np.sqrt(weights).sum() / whole if alike else whole**-0.5
+    half = np.sqrt(weights).sum() / whole if equal_errors else whole**-0.5
     return float(weights @ values / whole), float(half)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from replays.estimate.intervals import about, pooled, sandwich, scaled, student
+from replays.estimate.intervals import make_interval, pool_estimates, sandwich, scale_interval, student
 from replays.estimate.least_squares import solve
 from replays.estimate.sine import fit_sine, is_sine, quality
 from replays.score.alignment.alignment import align
@@ -198,7 +198,7 @@ def _fit(
     if parts is not None:
         at_s = clean.times_s + low.late_at(clean.times_s)
         alias, amounts = _folded(clean, [each(at_s)[0] for each in parts[1:]])
-        folds = scaled(amounts, 1.0 / abs(low.gain))
+        folds = scale_interval(amounts, 1.0 / abs(low.gain))
         clean = replace(clean, residual=clean.residual - alias)
     if known and isinstance(stimulus, Sampled):
         known = replace(known, values=stimulus.nearest(clean.times_s + low.late_at(clean.times_s)))
@@ -348,19 +348,19 @@ def _score_time(card: Scorecard, found: list[Fitted], ambiguous: set[str]) -> No
     bends = np.array([one.low.bend for one in found])
     for quantity, values, half, others in (("clock", drifts, halves, own), ("clock drift", bends, bend_halves, own)):
         weights = np.where(others, 0.0, half**-2.0)
-        told = [("", *pooled(values, weights, alike=any(one.rounding for one in found)))]
+        told = [("", *pool_estimates(values, weights, equal_errors=any(one.rounding for one in found)))]
         told += [(found[n].name, values[n], half[n]) for n in np.flatnonzero(others) if quantity == "clock"]
         for name, value, wide in told:
             # Its clock runs fast where the session's time goes slowly over its own.
             note = "off the clock of the others" if name else ""
             slow = value / (1.0 + value) if quantity == "clock" else value
-            card.add(quantity, name, about(-slow, wide, 1e6), note=note)
+            card.add(quantity, name, make_interval(-slow, wide, 1e6), note=note)
     open_ = reference.name in ambiguous
     note = _AMBIGUOUS if open_ else ""
     # To time zero of the file, at its own clock.
     back = np.array([0.0, 0.0, 1.0, -low.middle_s, 0.5 * low.middle_s**2 - low.half_s**2 / 6.0])
     spread = math.sqrt(back @ low.covariance @ back)
-    start = about(float(low.late_at(np.zeros(1))[0]), float(student(low.freedom[2:].min())) * spread)
+    start = make_interval(float(low.late_at(np.zeros(1))[0]), float(student(low.freedom[2:].min())) * spread)
     card.add("start", reference.name, start, of=reference.channel, note=note)
     if open_:
         card.rows[-1] = replace(card.rows[-1], verdict=INCONCLUSIVE, run=ANALOGUE["start"].run)
@@ -371,7 +371,7 @@ def _score_time(card: Scorecard, found: list[Fitted], ambiguous: set[str]) -> No
             odd = _ODD if one.odd or reference.odd else ""
             filtered = "" if _same_corner(one, reference) else _OTHER_CORNER
             said = "; ".join(each for each in (f"against {reference.name}", note, odd or filtered) if each)
-            skew = None if odd else about(apart, both, 1e9)
+            skew = None if odd else make_interval(apart, both, 1e9)
             card.add("skew", one.name, skew, of=one.channel, note=said)
             # A skew that fails does so from each of the begins.
             if (open_ and card.rows[-1].verdict != FAIL) or (filtered and card.rows[-1].verdict == FAIL):
@@ -442,13 +442,13 @@ def _score_fit(card: Scorecard, one: Fitted) -> None:
         card.add(quantity, one.name, estimate, of=channel, unit=channel.unit, note=note)
 
     note = _ODD if one.odd else "" if one.good else f"what was sent explains {max(0.0, one.clean.likeness):.1%} of it"
-    add("gain", None if note else about(abs(low.gain) - 1.0, low.half[0], 1e6), note or one.rounded)
-    add("offset", about(low.offset, low.half[1]) if one.good else None, one.rounded)
+    add("gain", None if note else make_interval(abs(low.gain) - 1.0, low.half[0], 1e6), note or one.rounded)
+    add("offset", make_interval(low.offset, low.half[1]) if one.good else None, one.rounded)
     # Nothing tells whether the rig's own noise, which is in its samples, was in what the DAQ was given.
     split = split_noise(one.clean, floor=one.known_noise, steps=bool(one.rounding))
     noise = split.noise if one.good else split.left
     add("noise", noise)
-    add("jitter", scaled(split.jitter_s, 1e9) if one.good and split.jitter_s is not None else None)
+    add("jitter", scale_interval(split.jitter_s, 1e9) if one.good and split.jitter_s is not None else None)
     full = channel.adc_v / abs(channel.sensitivity_v)
     left = split_noise(replace(one.clean, residual=one.clean.residual + one.alias), floor=one.known_noise).left
     bits = [math.log2(full / max(left[n], 1e-12 * full) / math.sqrt(3.0)) for n in (0, 2, 1)]

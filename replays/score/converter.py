@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from replays.estimate.intervals import scaled
+from replays.estimate.intervals import scale_interval
 from replays.score.analogue import Fitted
 from replays.score.card.scorecard import Scorecard
 from replays.score.quantities.crosstalk import find_crosstalk
@@ -53,8 +53,8 @@ def _score_steps(card: Scorecard, one: Fitted) -> None:
     rise = settling = overshoot = None
     note = "too few steps with plateaus that are long enough"
     if response is not None:
-        rise, overshoot = scaled(response.rise_rows, row_s), response.overshoot
-        settling = None if response.settling_rows is None else scaled(response.settling_rows, row_s)
+        rise, overshoot = scale_interval(response.rise_rows, row_s), response.overshoot
+        settling = None if response.settling_rows is None else scale_interval(response.settling_rows, row_s)
         note = f"of {response.steps} steps"
     card.add("rise time", one.name, rise, of=channel, note=note)
     card.add("overshoot", one.name, overshoot, of=channel, note=note)

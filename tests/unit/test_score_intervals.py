@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from replays.estimate.intervals import pooled, refine, sandwich, student
+from replays.estimate.intervals import pool_estimates, refine, sandwich, student
 from replays.estimate.sine import fit_sine, quality
 from replays.score.alignment.stamps import Stamps
 from replays.score.card.limits import load_limits
@@ -197,6 +197,6 @@ def test_limits_made_of_the_table_are_closed_forms() -> None:
 @pytest.mark.parametrize(("alike", "expected"), [(False, 1.0), (True, 2.0)])
 def test_errors_of_rounding_do_not_average_out_over_channels(alike: bool, expected: float) -> None:
     """Channels of one rotor are rounded alike: a 14-bit stable run had its clock drift red by a mean of four."""
-    value, half = pooled(np.array([-3.0, -1.0, -3.0, -1.0]), np.full(4, 0.25), alike=alike)
+    value, half = pool_estimates(np.array([-3.0, -1.0, -3.0, -1.0]), np.full(4, 0.25), equal_errors=alike)
     assert value == pytest.approx(-2.0)
     assert half == pytest.approx(expected)

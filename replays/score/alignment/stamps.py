@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from replays.estimate.clock import fit_line
-from replays.estimate.intervals import about, chi2_mean_ends, student
+from replays.estimate.intervals import chi2_mean_ends, make_interval, student
 from replays.score.card.scorecard import Interval
 from replays.score.records.recorded import Table
 
@@ -67,11 +67,11 @@ class Stamps:
         whole = np.array(self._means[: len(self._means) // several * several])
         since, late = whole.reshape(-1, several, 2).mean(axis=1).T
         line = fit_line(since, late)
-        found["stamp rate"] = about(line.slope, line.half[0], 1e6)
-        found["stamp offset"] = about(line.at_zero, line.half[1])
+        found["stamp rate"] = make_interval(line.slope, line.half[0], 1e6)
+        found["stamp offset"] = make_interval(line.at_zero, line.half[1])
         if wall_s is not None and abs(late.mean() - wall_s) < apart_s:
             value, wide = late.mean() - wall_s, student(len(late) - 1) * late.std(ddof=1) / math.sqrt(len(late))
-            found["latency"] = about(float(value), float(wide))
+            found["latency"] = make_interval(float(value), float(wide))
         jitter_s, (low, high) = math.sqrt(self._squares / self._freedom), chi2_mean_ends(self._freedom)
         found["stamp jitter"] = jitter_s, jitter_s / math.sqrt(high), jitter_s / math.sqrt(low)
         return found

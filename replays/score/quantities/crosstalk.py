@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from replays.estimate.intervals import sandwich, simultaneous
+from replays.estimate.intervals import bound_maximum, sandwich
 from replays.estimate.least_squares import solve
 from replays.score.card.scorecard import Interval
 
@@ -47,7 +47,7 @@ def find_crosstalk(
     covariance, freedom = sandwich(matrix, left - matrix @ parts)
     held, own_size = slice(len(sources)), sizes[len(sources)]
     sizes, parts = sizes[held], np.abs(parts[held] / sizes[held])
-    value, low, high = simultaneous(parts, np.sqrt(np.diag(covariance)[held]) / sizes, freedom[held])
+    value, low, high = bound_maximum(parts, np.sqrt(np.diag(covariance)[held]) / sizes, freedom[held])
     # Noise of the own signal, which is in the residual, is in what of a source is not like that signal, too.
     likest = np.abs(likeness[held, len(sources)]) * sizes / own_size
     wrong = _NOISE_DOUBT * noise**2 * likest / (own_part * sizes**2)

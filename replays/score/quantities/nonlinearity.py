@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from replays.estimate.clock import fit_line
-from replays.estimate.intervals import simultaneous
+from replays.estimate.intervals import bound_maximum
 from replays.estimate.least_squares import inverse_of, solve
 from replays.estimate.runs import block_means, split_at
 from replays.estimate.sine import decibels, fit_sine, fit_tones, tone_columns
@@ -160,7 +160,7 @@ def transfer_curve(times_s: np.ndarray, known: np.ndarray, values: np.ndarray, s
     left = line.residual - hats @ curve
     block = max(1, len(x) // (8 * _KNOTS))  # noise of a colour has means of blocks that spread more
     variance = max(float(np.var(left)), block * float(np.var(block_means(left, block))))
-    inl = simultaneous(np.abs(curve), np.sqrt(np.diag(inverse) * variance))
+    inl = bound_maximum(np.abs(curve), np.sqrt(np.diag(inverse) * variance))
     coverage = float(high - low) / span
     dnl, samples = _code_widths(y, line(x), float(np.std(left)))
     size = 1e6 / span
@@ -187,5 +187,5 @@ def _code_widths(values: np.ndarray, line: np.ndarray, noise: float) -> tuple[In
     there, due = there[full], due[full]
     # A transition in noise moves the count by 0.564 noise a sample (IEEE 1241, ramp); two bound a code.
     spread = np.sqrt(2.0 * 0.564 * noise / step / due)
-    value, low, high = simultaneous(np.abs(there / due - 1.0), spread)
+    value, low, high = bound_maximum(np.abs(there / due - 1.0), spread)
     return (value, max(0.0, low - 1.0 / samples), high + 1.0 / samples), samples

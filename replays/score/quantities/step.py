@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from replays.estimate.intervals import simultaneous
+from replays.estimate.intervals import bound_maximum
 from replays.estimate.spectra import parabola_top
 from replays.score.card.scorecard import Interval
 
@@ -88,7 +88,7 @@ def step_response(known: np.ndarray, values: np.ndarray) -> StepResponse | None:
     apart = np.var(responses, axis=0, ddof=1)
     spread = np.sqrt(np.maximum(apart, np.median(apart)) / count)
     after = slice(_BEFORE_ROWS - 1, None)
-    over = simultaneous(mean[after] - 1.0, spread[after])
+    over = bound_maximum(mean[after] - 1.0, spread[after])
     before, peak, behind = mean[np.clip(np.argmax(mean), 1, len(mean) - 2) + np.arange(-1, 2)]
     _, between = parabola_top(before, peak, behind)
     overshoot = 100.0 * (over[0] + between), 100.0 * over[1], 100.0 * (over[2] + 2.0 * between)
@@ -106,7 +106,7 @@ def step_response(known: np.ndarray, values: np.ndarray) -> StepResponse | None:
     rise, half = high - low, math.hypot(low_half, high_half)
     resolved = rise >= _RESOLVED_ROWS
     rise_rows = rise, rise - half if resolved else 0.0, rise + half if resolved else max(1.0, rise) + 1.0
-    limits = [0.0, *(simultaneous(np.zeros(rows), spread[_BEFORE_ROWS:])[2] * sign for sign in (-1.0, 1.0))]
+    limits = [0.0, *(bound_maximum(np.zeros(rows), spread[_BEFORE_ROWS:])[2] * sign for sign in (-1.0, 1.0))]
     ends = []
     for limit in limits:
         out = np.flatnonzero(np.abs(mean - 1.0) + limit > BAND)
