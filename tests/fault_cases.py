@@ -7,6 +7,10 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+from rig.channels.faults import KINDS
+from rig.channels.faults.defects import DEFECTS
+from rig.channels.table import default_table
+
 EXAMPLES: dict[str, dict[str, Any]] = {
     "gain": {"factor": 1.1}, "offset": {"value": 0.05}, "drift": {"rate": 5.0}, "polarity": {}, "stuck": {},
     "nonlinear": {"end": 0.01}, "open": {"level_v": 1.0}, "short": {}, "intermittent": {"part": 0.5, "slot_s": 0.002},
@@ -67,65 +71,61 @@ MONITORED_PULSES: dict[str, tuple[dict[str, Any], set[str]]] = {
     "edge-jitter": ({"rms_us": 100.0}, set()),
 }
 
-LEFT = {"noise", "effective bits", "dynamic range"}
+DEFECT_OF = {kind: name for name, each in DEFECTS.items() for kind in each.faults}
+"""Name in the table of defects of each kind of fault."""
+
+
+def size_of(kind: str, numbers: dict[str, Any], channel: str) -> float | None:
+    """Return the size of a fault in the unit that its defect has on a channel; None where it has no size."""
+    defect, about = DEFECTS[DEFECT_OF[kind]], default_table().channels[channel]
+    name = defect.faults[kind]
+    if not name:
+        return None
+    scale = 1e-6 if name.endswith("_us") else 1.0
+    if name.endswith("_v") and defect.unit != "V":
+        scale = 1.0 / abs(about.sensitivity_v)
+    return scale * (numbers.get(name, KINDS[kind].model_fields[name].default) - defect.neutral)
 
 
 class Declared(NamedTuple):
-    """A fault, and what it turns red where the DAQ samples by itself; where it takes counts, that they are altered."""
+    """A fault on a channel; the table of defects has the quantities of a scorecard that it makes fail."""
 
     channel: str
     numbers: dict[str, Any]
-    red: set[str]
 
 
 SCORED = {
-    "gain": Declared("disk_x", {"factor": 1.001}, {"gain"}),
-    "offset": Declared("disk_y", {"value": 0.01}, {"offset"}),
-    # Over a run its mean is an offset, and the rest of it is left.
-    "drift": Declared("ring_x", {"rate": 0.1}, {"offset", *LEFT}),
-    "polarity": Declared("P_N", {}, {"polarity"}),
-    "resonance": Declared("P_W", {"frequency_hz": 800.0, "quality": 5.0}, {"corner", *LEFT}),
-    "stuck": Declared("P_S", {}, {"mapping"}),
-    "nonlinear": Declared("P_E", {"end": 4000.0}, {"gain", *LEFT}),
-    "open": Declared("outer_y", {}, {"mapping"}),
-    "short": Declared("inner_x", {}, {"mapping"}),
-    "intermittent": Declared("inner_y", {"slot_s": 0.002}, LEFT),
-    "hum": Declared("outer_x", {"amplitude_v": 0.02}, LEFT),
-    "crosstalk": Declared("P_W", {"source": "disk_x", "db": -30.0}, {"crosstalk", *LEFT}),
-    "saturation": Declared("disk_x", {"part": 0.2}, {"gain", *LEFT}),
-    "swap": Declared("disk_y", {"other": "ring_x"}, {"mapping"}),
-    # The filter was in what was sent: without it, all is earlier, and more of high frequencies.
-    "no-filter": Declared("P_N", {}, {"gain", "skew", *LEFT}),
-    # The same of another one in its place.
-    "bandwidth": Declared("P_S", {"corner_hz": 500.0}, {"corner"}),
-    "late": Declared("P_E", {"late_us": 3.0}, {"skew"}),
-    "clock": Declared("P_W", {"ppm": 500.0}, {"clock", "skew"}),
-    # None can be early, so that the mean of the next two is a delay; what they leave goes with the slope.
-    "jitter": Declared("ring_y", {"rms_us": 0.5}, {"jitter", "skew", "effective bits"}),
-    "wander": Declared("inner_y", {"amplitude_us": 1.0, "period_s": 0.1}, {"effective bits"}),
-    "noise": Declared("outer_x", {"factor": 3.0}, LEFT),
-    "spikes": Declared("outer_y", {"rate_hz": 50.0, "size_v": 0.5}, LEFT),
-    # Rounded down, and set, are on the mean an offset.
-    "bits": Declared("disk_x", {"lost": 13}, {"offset", *LEFT}),
-    "stuck-bit": Declared("disk_y", {"bit": 14}, {"offset", *LEFT}),
-    "clip": Declared("ring_x", {"part": 0.55}, {"gain", "offset", *LEFT}),
-    "freeze": Declared("P_N", {}, {"mapping"}),
-    "miss-pulses": Declared("keyphasor", {"part": 1.0}, {"mapping"}),
-    "extra-pulses": Declared("keyphasor", {"part": 1.0}, LEFT),
-    "edge-jitter": Declared("keyphasor", {"rms_us": 300.0}, set()),
+    "gain": Declared("disk_x", {"factor": 1.001}),
+    "offset": Declared("disk_y", {"value": 0.01}),
+    "drift": Declared("ring_x", {"rate": 0.1}),
+    "polarity": Declared("P_N", {}),
+    "resonance": Declared("P_W", {"frequency_hz": 800.0, "quality": 5.0}),
+    "stuck": Declared("P_S", {}),
+    "nonlinear": Declared("P_E", {"end": 4000.0}),
+    "open": Declared("outer_y", {}),
+    "short": Declared("inner_x", {}),
+    "intermittent": Declared("inner_y", {"slot_s": 0.002}),
+    "hum": Declared("outer_x", {"amplitude_v": 0.02}),
+    "crosstalk": Declared("P_W", {"source": "disk_x", "db": -30.0}),
+    "saturation": Declared("disk_x", {"part": 0.2}),
+    "swap": Declared("disk_y", {"other": "ring_x"}),
+    "no-filter": Declared("P_N", {}),
+    "bandwidth": Declared("P_S", {"corner_hz": 500.0}),
+    "late": Declared("P_E", {"late_us": 3.0}),
+    "clock": Declared("P_W", {"ppm": 500.0}),
+    "jitter": Declared("ring_y", {"rms_us": 0.5}),
+    "wander": Declared("inner_y", {"amplitude_us": 1.0, "period_s": 0.1}),
+    "noise": Declared("outer_x", {"factor": 3.0}),
+    "spikes": Declared("outer_y", {"rate_hz": 50.0, "size_v": 0.5}),
+    "bits": Declared("disk_x", {"lost": 13}),
+    "stuck-bit": Declared("disk_y", {"bit": 14}),
+    "clip": Declared("ring_x", {"part": 0.55}),
+    "freeze": Declared("P_N", {}),
+    "miss-pulses": Declared("keyphasor", {"part": 1.0}),
+    "extra-pulses": Declared("keyphasor", {"part": 1.0}),
+    "edge-jitter": Declared("keyphasor", {"rms_us": 300.0}),
 }
 
-BLIND_CLASSES = {
-    # Names by which a kind goes that is right: what looks alike in what is recorded is one class.
-    "late": {"delay", "other noise"}, "clock": {"clock", "delay", "other noise"},
-    "wander": {"wander", "delay", "other noise"}, "jitter": {"jitter", "delay", "other noise"},
-    "open": {"open", "open or saturation", "open or short", "short", "open, short or stuck", "stuck"},
-    "short": {"open or short", "open", "short", "open, short or stuck"}, "stuck": {"stuck", "open, short or stuck"},
-    "saturation": {"saturation", "open or saturation"}, "clip": {"clip", "freeze"}, "freeze": {"freeze", "clip"},
-    "intermittent": {"intermittent", "open", "short", "open or short", "open, short or stuck"},
-    "miss-pulses": {"miss-pulses", "open, short or miss-pulses"}, "edge-jitter": {"edge-jitter", "delay"},
-    "crosstalk": {"crosstalk", "offset"}, "swap": {"swapped"},
-}  # fmt: skip
 BLIND_SIZES: dict[str, tuple[str, list[dict[str, Any]]]] = {
     "gain": ("P_E", [{"factor": 1.005}, {"factor": 1.5}]), "offset": ("ring_x", [{"value": 0.002}, {"value": 0.2}]),
     "drift": ("P_N", [{"rate": 2.0}, {"rate": 200.0, "tau_s": 0.05}]), "polarity": ("inner_y", [{}]),

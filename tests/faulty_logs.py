@@ -201,20 +201,20 @@ CASES = tuple(
        Case("forces as lbf for N", r"gain .*as lbf for N", before=_gain(FORCES, 1.0 / 4.4482)),
        Case("houses as g for m/s^2", r"gain .*as g for m/s\^2", before=_gain(HOUSES, 1.0 / 9.80665))]
     + [Case(f"clock {ppm:+g} ppm", r"clock: [-+]", ppm=ppm) for ppm in (600.0, 2000.0, -5000.0)]
-    + [Case("P_N stuck for 10 ms", "P_N stuck", behind=_held("P_N", 0.9, 0.01)),
-       Case("P_N stuck for 50 ms", "P_N stuck", behind=_held("P_N", 0.9, 0.05)),
-       Case("ring_y stuck from 0.3 s", "ring_y stuck", behind=_held("ring_y", 0.3, 9.0))]
-    + [Case("disk_x drops out for 5 ms", "disk_x stuck", behind=_held("disk_x", 0.9, 0.005, 0.0)),
-       Case("disk_x drops out for 20 ms", "disk_x stuck", behind=_held("disk_x", 0.9, 0.02, 0.0)),
-       Case("P_W drops out for 100 ms", "P_W stuck", behind=_held("P_W", 0.82, 0.1, 0.0))]
-    + [Case("P_E clipped", "P_E clipped", behind=_clipped("P_E", -1e9, 3800.0)),
-       Case("inner_y clipped", "inner_y clipped", behind=_clipped("inner_y", -100.0, 100.0)),
-       Case("ring_x clipped", "ring_x clipped", behind=_clipped("ring_x", -0.8, 0.8))]
+    + [Case("P_N stuck for 10 ms", "P_N freeze", behind=_held("P_N", 0.9, 0.01)),
+       Case("P_N stuck for 50 ms", "P_N freeze", behind=_held("P_N", 0.9, 0.05)),
+       Case("ring_y stuck from 0.3 s", "ring_y freeze", behind=_held("ring_y", 0.3, 9.0))]
+    + [Case("disk_x drops out for 5 ms", "disk_x freeze", behind=_held("disk_x", 0.9, 0.005, 0.0)),
+       Case("disk_x drops out for 20 ms", "disk_x freeze", behind=_held("disk_x", 0.9, 0.02, 0.0)),
+       Case("P_W drops out for 100 ms", "P_W freeze", behind=_held("P_W", 0.82, 0.1, 0.0))]
+    + [Case("P_E clipped", "P_E clip:", behind=_clipped("P_E", -1e9, 3800.0)),
+       Case("inner_y clipped", "inner_y clip:", behind=_clipped("inner_y", -100.0, 100.0)),
+       Case("ring_x clipped", "ring_x clip:", behind=_clipped("ring_x", -0.8, 0.8))]
     + [Case(f"{name} noise x {times:g}", f"{name} noise", behind=_noisy(name, times))
        for name, times in (("P_S", 5.0), ("P_S", 15.0), ("disk_y", 10.0))]
-    + [Case("pulses missing, a fifth", "keyphasor pulses", behind=_pulses(without=5)),
-       Case("pulses missing, a third", "keyphasor pulses", behind=_pulses(without=3)),
-       Case("pulses twice a turn", "keyphasor pulses", behind=_pulses(doubled=True))]
+    + [Case("pulses missing, a fifth", "keyphasor miss-pulses", behind=_pulses(without=5)),
+       Case("pulses missing, a third", "keyphasor miss-pulses", behind=_pulses(without=3)),
+       Case("pulses twice a turn", "keyphasor extra-pulses", behind=_pulses(doubled=True))]
     + [Case(f"{name} dead", f"{name} signal missing", behind=_dead(name, level))
        for name, level in (("ring_x", 0.0), ("P_E", 3000.0), ("inner_y", 0.0))]
     + [Case(f"hammer {ms:g} ms late", "hammer delay|time: shifted", before=_late(("hammer",), ms * 1e-3))
@@ -236,7 +236,7 @@ CASES = tuple(
     + [Case(f"P_N {us} us late with gain {gain}", "P_N gain and delay",
             before=lambda v, hz, us=us, gain=gain: _late(("P_N",), us * 1e-6)(v | {"P_N": gain * v["P_N"]}, hz))
        for us, gain in ((200, 1.1), (100, 0.5), (1000, 2.0))]
-    + [Case(f"{rows} rows lost at {at_s:g} s", "time rows|clock: [-+]", behind=_lost(at_s, rows))
+    + [Case(f"{rows} rows lost at {at_s:g} s", "time lost samples|clock: [-+]", behind=_lost(at_s, rows))
        for at_s, rows in ((0.5, 20), (0.5, 200), (0.81, 100))]
     + [Case(f"{a} and {b} swapped, inverted", f"{a} and {b} swapped and both inverted",
             before=lambda v, _, a=a, b=b: v | {a: -v[b], b: -v[a]}) for a, b in (("ring_x", "ring_y"), PROBES[:2])]

@@ -23,6 +23,7 @@ from replays.recordings.formats.exporting.export import FormatWriter
 from replays.recordings.formats.source import FORMATS
 from replays.score.card.scorecard import QUANTITIES
 from rig.channels import faults
+from rig.channels.faults.defects import DEFECTS, alternatives, defects_in
 from rig.cli import app
 from rig.cli.commands import requests
 from rig.physics.contacts import DAMPING, STIFFNESS
@@ -33,6 +34,7 @@ from tests import fault_cases
 from tests.generated import missing_in_generated_files
 
 ROOT = Path(__file__).parents[2]
+DEFECT_TABLE = "rig/channels/faults/defects.toml"
 SHARED = {"common", "tape", "split", "taylor"}
 """Folders in rig/physics/engines; the last two are engines and are looked at by their names."""
 
@@ -118,6 +120,9 @@ def test_a_kind_of_fault_is_in_the_union_and_on_the_page() -> None:
     missing += [f"kind of fault {name}: docs/hardware.md, Faults on command, must list it under {kind.stage}"
                 for name, kind in faults.KINDS.items()
                 if name not in listed.partition(f"{kind.stage} (")[2].partition(")")[0].split(", ")]  # fmt: skip
+    injected = {kind for each in DEFECTS.values() for kind in each.faults}
+    missing += [f"kind of fault {name}: `faults` of a row in {DEFECT_TABLE} must name it, and which number is its size"
+                for name in faults.KINDS if name not in injected]  # fmt: skip
     of_channels = {name for name, kind in faults.KINDS.items() if not kind.of_blocks}
     unfiltered = {name for name, kind in faults.KINDS.items() if kind.stage == "filter"}  # test signals have no filter
     for table, needed, has in (
@@ -129,6 +134,48 @@ def test_a_kind_of_fault_is_in_the_union_and_on_the_page() -> None:
         where = f"{table} in tests/fault_cases.py"
         missing += [f"kind of fault {name}: {where} needs a case of it" for name in needed - {*has}]
         missing += [f"kind of fault {name}: {where} has a case of no such kind" for name in {*has} - needed]
+    require(missing)
+
+
+def test_a_defect_is_injected_sized_and_recognised_or_says_why_not() -> None:
+    calls = [
+        node for path in (ROOT / "replays/recordings/validation/explanations").glob("*.py")
+        for node in ast.walk(ast.parse(path.read_text()))
+    ]  # fmt: skip
+    said = {each for node in calls if isinstance(node, ast.Constant) and isinstance(node.value, str)
+            for text in (node.value, node.value.split()[-1:] and node.value.split()[-1])
+            for each in alternatives(str(text))}  # fmt: skip
+    missing = []
+    for name, row in DEFECTS.items():
+        where = f"defect {name}: {DEFECT_TABLE}"
+        names = row.validation or [name]
+        readers = {"validation": row.doubts or said & {name, *names}, "score": row.score or row.digital}
+        for reader, recognises in readers.items():
+            if not recognises and reader not in row.undetected:
+                missing.append(
+                    f"{where} must say how {reader} recognises it, or in `undetected.{reader}` why it cannot"
+                )
+            if recognises and reader in row.undetected:
+                missing.append(f"{where} has `undetected.{reader}`, and {reader} recognises it")
+        missing += [f"{where}: {each} of `{part}` is no quantity of the {path} scorecard"
+                    for part, path in (("score", "analogue"), ("digital", "digital"))
+                    for each in getattr(row, part) if each not in QUANTITIES[path]]  # fmt: skip
+        for kind, number in row.faults.items():
+            if kind not in faults.KINDS:
+                missing.append(f"{where}: {kind} of `faults` is no kind of fault")
+            elif number and number not in faults.KINDS[kind].model_fields:
+                missing.append(f"{where}: {number} of `faults` is no number of {kind}")
+            elif number and not row.size:
+                missing.append(f"{where} needs `size`: what {number} of {kind} means")
+        if not row.text.endswith("."):
+            missing.append(f"{where} needs `text`: a sentence")
+    for call in calls:
+        if isinstance(call, ast.Call) and ast.unparse(call.func) in ("one.law", "SignalFault"):
+            name = call.args[ast.unparse(call.func) == "SignalFault"]
+            missing += [f"defect {each}: {DEFECT_TABLE} has no row of it, and explanations/ reports it"
+                        for part in ([name.body, name.orelse] if isinstance(name, ast.IfExp) else [name])
+                        if isinstance(part, ast.Constant) for each in alternatives(str(part.value))
+                        if not defects_in(each)]  # fmt: skip
     require(missing)
 
 

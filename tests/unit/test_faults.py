@@ -132,9 +132,9 @@ def test_what_signals_show_by_themselves() -> None:
     values[4000:4005, 3] = values[:, 3].max() + 1.0  # one short peak
     values[:, 2] += 8.0 * part.floor[2] * np.random.default_rng(0).standard_normal(ROWS)
     found = {(one.channel, one.what): one for one in signal_faults({"forces": replace(part, values=values)})}
-    assert set(found) == {("P_N", "stuck"), ("P_S", "clipped"), ("P_E", "noise"), ("P_W", "clipped")}
-    stuck = found["P_N", "stuck"]
-    assert (stuck.from_s, stuck.to_s) == (pytest.approx(0.1), pytest.approx(0.11495))
+    assert set(found) == {("P_N", "freeze"), ("P_S", "clip"), ("P_E", "noise"), ("P_W", "clip")}
+    frozen = found["P_N", "freeze"]
+    assert (frozen.from_s, frozen.to_s) == (pytest.approx(0.1), pytest.approx(0.11495))
 
 
 def test_coarse_numbers_are_not_stuck() -> None:
@@ -147,12 +147,12 @@ def test_coarse_numbers_are_not_stuck() -> None:
 def test_pulses() -> None:
     edges_s = np.arange(40) / 6.2
     assert edge_faults(edges_s, 6.0, 6.2) == []
-    assert "missing in 1 of" in edge_faults(np.delete(edges_s, 7), 6.0, 6.2)[0].line
-    assert "2 pulses a turn" in edge_faults(np.arange(40) / 12.4, 6.0, 6.2)[0].line
+    assert "miss-pulses: in 1 of" in edge_faults(np.delete(edges_s, 7), 6.0, 6.2)[0].line
+    assert "extra-pulses: 2 pulses a turn" in edge_faults(np.arange(40) / 12.4, 6.0, 6.2)[0].line
 
 
 @pytest.mark.parametrize(("change_s", "line"), [
-    (0.5, "pulses too many in 2 of"), (0.05, "is -8.065 ms long beside the others: samples are missing in it"),
+    (0.5, "extra-pulses: in 2 of"), (0.05, "is -8.065 ms long beside the others: samples are missing in it"),
     (-0.05, "is +8.065 ms long beside the others: its time jumps"),
 ])  # fmt: skip
 def test_a_pulse_at_the_wrong_time_has_one_name(change_s: float, line: str) -> None:

@@ -374,5 +374,5 @@ def test_a_pulse_that_is_missing_is_told_wherever_it_is() -> None:
     assert not edge_faults(edges, 0.5, 6.25)
     for gone in (1, 2, 3, 12):
         (told,) = edge_faults(np.delete(edges, gone), 0.5, 6.25)
-        assert told.line.startswith("keyphasor pulses: ")
+        assert told.line.startswith("keyphasor miss-pulses: ")
         assert (told.from_s, told.to_s) == (pytest.approx(edges[gone - 1]), pytest.approx(edges[gone + 1]))

@@ -14,6 +14,7 @@ from recorder.reader import Recording
 from replays.score.card.scorecard import FAIL, Scorecard
 from replays.score.judgement import judge
 from replays.sessions.session import FOLDER
+from rig.channels.faults.defects import DEFECTS
 from rig.channels.faults.kind import Setting
 from rig.channels.sensors.conditioning import Conditioner
 from rig.channels.table import default_table
@@ -21,7 +22,7 @@ from rig.physics.kernels.observe import EDGE, KEYPHASOR_WIDTH
 from rig.physics.kernels.signals import COLUMN, N_ROW
 from rig.run.commands.table import FaultCommand
 from rig.run.fault_injection import Faulty
-from tests.fault_cases import SCORED
+from tests.fault_cases import DEFECT_OF, SCORED, size_of
 from tests.score_daqs import Tones, write_parquet, write_session
 
 RATE_HZ, ROWS_HZ, SECONDS, TURN_HZ = 20_000, 100_000, 0.5, 15.0
@@ -30,6 +31,8 @@ CHANNELS = [channel for group in GROUPS for channel in group.channels if channel
 DUE = [channel.name for channel in CHANNELS]
 
 
+SIZED = ("gain", "offset", "late", "clock", "jitter", "crosstalk")
+"""Kinds whose size is that of a quantity of the scorecard."""
 Sessions = dict[bool, tuple[Path, dict[str, np.ndarray]]]
 
 
@@ -77,7 +80,7 @@ def red(card: Scorecard) -> set[tuple[str, str]]:
 
 
 def declared(kinds: tuple[str, ...], what: set[str] | None = None) -> set[tuple[str, str]]:
-    return {(name, row) for kind in kinds for name in names_of(kind) for row in what or SCORED[kind].red}
+    return {(name, row) for kind in kinds for name in names_of(kind) for row in what or DEFECTS[DEFECT_OF[kind]].score}
 
 
 def daq(
@@ -122,6 +125,15 @@ def test_a_daq_that_samples_by_itself(kinds: tuple[str, ...], rig: Rig, sessions
         channels=DUE,
     )
     assert red(card) == declared(kinds)
+    for kind in kinds:
+        name, numbers = SCORED[kind]
+        defect = DEFECTS[DEFECT_OF[kind]]
+        if defect.score:
+            assert DEFECT_OF[kind] in card.defects[name], f"{kind} of {name}"
+            row, size = card.row(defect.score[0], name), size_of(kind, numbers, name)
+            if size is not None and kind in SIZED:
+                size *= {("", "ppm"): 1e6, ("s", "ns"): 1e9}.get((defect.unit, row.unit), 1.0)
+                assert row.low <= size <= row.high, f"{kind} of {name}"
 
 
 @pytest.mark.parametrize("kinds", together(5), ids=len)

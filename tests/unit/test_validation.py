@@ -19,6 +19,7 @@ from replays.recordings.validation import load_criteria, outcome, validate
 from replays.recordings.validation.bits import Bits
 from replays.recordings.validation.criteria import DEFAULT, Criteria
 from replays.recordings.validation.explanations.attribution import Explained, Explanation, attribute, conclude
+from replays.recordings.validation.explanations.signals import SignalFault
 from replays.recordings.validation.phases import View, find_phases, quantities, spectrum_distance
 from rig.base.errors import InputError
 from rig.base.outcome import Outcome
@@ -246,6 +247,22 @@ def test_another_seed_changes_sensors_and_not_the_motion(hammer: Recording) -> N
     assert {key.split("/")[1] for key, one in found.bits.items() if not one.equal} == {"sensors"}
     assert found.good
     assert "truth is equal to the bit" in found.bits_line
+
+
+def test_json_of_an_imported_log_keeps_earlier_words_beside_the_names_of_defects(hammer: Recording) -> None:
+    found = validate(hammer)
+    law = Explanation.of(np.zeros(1), kind="sensor", name="P_N freeze", change="", value=0.0, explained=1.0, to_s=1.0)
+    faults = [
+        SignalFault("P_N", what, 0.0, 1.0, "") for what in ("freeze", "clip", "miss-pulses", "lost samples", "hum")
+    ]
+    explained = Explained(0.0, 1.0, (law,), "", (law.name,))
+    log = replace(found, bits={}, faults=tuple(faults), explained=explained).document()
+    assert [one["what"] for one in log["faults"]] == ["stuck", "clipped", "pulses", "rows", "hum"]
+    assert [one["defects"] for one in log["faults"]] == [[one.what] for one in faults]
+    (ranked,) = log["explained"]["ranked"]
+    assert (ranked["name"], ranked["defects"], log["explained"]["best"]) == ("P_N stuck", ["freeze"], ["P_N stuck"])
+    own = replace(found, faults=tuple(faults), explained=explained).document()
+    assert [one["what"] for one in own["faults"]] == [one.what for one in faults]
 
 
 def test_few_channels_and_no_truth_are_enough(tmp_path: Path) -> None:

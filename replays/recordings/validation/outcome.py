@@ -20,6 +20,7 @@ from replays.recordings.validation.trajectory import ChannelResidual
 from replays.recordings.validation.truth import TruthResult
 from rig.base.outcome import Outcome
 from rig.base.wire import TRUTH as TRUTH_KEY
+from rig.channels.faults.defects import defects_in, earlier_name
 
 _MIN_JUDGED = 0.99
 """Part of a recording's rows that must have been compared for a pass."""
@@ -228,6 +229,11 @@ class Validation:
 
     def document(self) -> dict[str, Any]:
         """All of it but the samples, as a JSON document."""
+        json_name = str if self.bits else earlier_name
+        explained = None
+        if (found := self.explained) is not None:
+            ranked = [{**asdict(one), "name": json_name(one.name), "defects": one.defects} for one in found.ranked]
+            explained = {**asdict(found), "ranked": ranked, "best": [json_name(name) for name in found.best]}
         return _plain(
             {
                 "file": str(self.path),
@@ -240,7 +246,10 @@ class Validation:
                 "bits": {key: {**asdict(one), "equal": one.equal} for key, one in self.bits.items()},
                 "rows_lost": self.skipped,
                 "doubts": list(self.doubts),
-                "faults": [one._asdict() for one in self.faults],
+                "faults": [
+                    {**one._asdict(), "what": json_name(one.what), "defects": defects_in(one.what)}
+                    for one in self.faults
+                ],
                 "fitted": [one.line for one in self.fitted],
                 "calibration": list(self.calibration),
                 "window": {"from_s": self.window_s[0], "to_s": self.window_s[1], "reason": self.window_reason},
@@ -249,7 +258,7 @@ class Validation:
                 "phases": [asdict(one) for one in self.phases],
                 "statistics": [{**asdict(one), "good": one.good} for one in self.statistics],
                 "failures": [asdict(one) for one in self.failures],
-                "explained": None if self.explained is None else asdict(self.explained),
+                "explained": explained,
             }
         )
 

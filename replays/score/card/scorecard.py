@@ -13,6 +13,7 @@ from replays.report import junit
 from rig.base.errors import UnknownNameError
 from rig.base.outcome import Outcome
 from rig.base.text import finite
+from rig.channels.faults.defects import defects_shown
 
 PASS, FAIL, INCONCLUSIVE, NO_LIMIT = "pass", "fail", "inconclusive", "no limit"
 Verdict = Literal["pass", "fail", "inconclusive", "no limit"]
@@ -291,6 +292,21 @@ class Scorecard:
             reason = f"; {self.doubts[0]}{more}" if self.doubts else "; no quantity passes"
         return f"{self.path} path: {self.outcome}: {', '.join(parts)}{reason}"
 
+    @property
+    def defects(self) -> dict[str, list[str]]:
+        """Names in the table of defects, by channel, of those that make its failing quantities fail."""
+        failed: dict[str, set[str]] = {}
+        for row in self.rows:
+            if row.verdict == FAIL:
+                failed.setdefault(row.channel, set()).add(row.quantity)
+        found = {name: defects_shown(each, digital=self.path == "digital") for name, each in failed.items()}
+        return {name: each for name, each in found.items() if each}
+
+    @property
+    def findings(self) -> list[str]:
+        """The remarks, and the defects of each channel, as lines."""
+        return [*self.remarks, *(f"{name or 'all'}: {' or '.join(each)}" for name, each in self.defects.items())]
+
     def row(self, quantity: str, channel: str = "") -> ScoreRow:
         """One of the rows.
 
@@ -311,7 +327,7 @@ class Scorecard:
         return finite({
             "title": self.title, "path": self.path, "outcome": self.outcome.value, "good": self.outcome is Outcome.PASS,
             "verdict": self.verdict_line, "doubts": self.doubts, "limits": self.limits, "rows": rows,
-            "remarks": self.remarks, "runs": self.runs,
+            "defects": self.defects, "remarks": self.remarks, "runs": self.runs,
         })  # fmt: skip
 
 

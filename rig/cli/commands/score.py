@@ -172,7 +172,7 @@ def _show(card: Scorecard, console: Console, *, wide: bool) -> None:
             console.print(shown(f"{quantity:<22}{cells}".rstrip()))
     if lines:
         console.print("+ pass, X fail, ? inconclusive\n")
-    for line in (*card.doubts[1:], *card.remarks):
+    for line in (*card.doubts[1:], *card.findings):
         console.print(shown(line))
     table = new_table(
         "", "quantity", "channel", ">value", "95 %", "unit", "limit", "verdict", "note", "to show it", "source",

@@ -421,10 +421,10 @@ def _scale(each: Guess, unit: str, usual_v: float) -> None:
     low, high = view.extent
     if each.channel == "hammer" and view.blows and view.mean - low > high - view.mean:
         each.sign = -1
-        each.reasons.append("its pulses point down")
+        each.reasons.append("polarity: its pulses point down")
     if each.channel.startswith("P_") and not each.volts and view.mean < -3.0 * view.spread:
         each.sign = -1
-        each.reasons.append("its preload is negative")
+        each.reasons.append("polarity: its preload is negative")
     text = f"{each.entry.name} {each.entry.label}"
     if unit == "1":
         return

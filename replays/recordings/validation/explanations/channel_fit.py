@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from replays.estimate.least_squares import solve
+from rig.channels.faults.defects import DEFECTS, size_text, unit_of
 from rig.channels.table import Channel
 
 if TYPE_CHECKING:
@@ -26,13 +27,6 @@ _PART = 0.05
 """Of what is left, by which another number makes it smaller where all but the channel is known to the bit."""
 _ABOUT = 4.5
 """Rows about the one that differs first."""
-_UNITS = {
-    25.4: "as mm for inch", 1.0 / 25.4: "as inch for mm", 1e3: "a thousand", 1e-3: "a thousandth",
-    9.80665: "as m/s^2 for g", 1.0 / 9.80665: "as g for m/s^2", 4.4482: "as N for lbf", 1.0 / 4.4482: "as lbf for N",
-    60.0: "as 1/min for Hz", 1.0 / 60.0: "as Hz for 1/min", 2.0: "twice", 0.5: "half", 10.0: "tenfold",
-    0.1: "a tenth",
-}  # fmt: skip
-"""Gains that slips with units and ranges make."""
 OFF = 6.0
 """A sample so many floors off is no noise."""
 
@@ -186,18 +180,26 @@ class Shown:
         found = least_squares(left, best, method="lm", max_nfev=60)
         return found.x * scale, found.fun
 
+    def law(
+        self, name: str, value: float, left: np.ndarray, count: int = 1, change: str = "", *, unit: str | None = None,
+        numbers: Mapping[str, float] | None = None, sure: bool = True,
+    ) -> Law:  # fmt: skip
+        """Return a law of this channel, with the unit and, unless it is given, the text of the table of defects."""
+        unit = unit_of(name, self.unit) if unit is None else unit
+        return Law(name, change or size_text(name, value, self.unit), value, left, count, unit, numbers or {}, sure)
+
 
 @dataclass(frozen=True)
 class Law:
     """One law, as it fits best.
 
     Attributes:
-        name: As it is called.
-        change: By how much, in words.
-        value: The same as a number.
+        name: Name in the table of defects, or several: "gain and delay", "open or short".
+        change: Size as text.
+        value: Size in `unit`.
         left: What it leaves, over the floor, shape (n,) or fewer.
         count: Numbers that it has.
-        unit: Of the value.
+        unit: Unit of the size, by the table of defects.
         numbers: A gain less 1 and a delay [s], where it has one: several channels may share it.
         sure: Whether what it leaves is as good as nothing.
     """
@@ -227,9 +229,9 @@ def least_at(cost: Callable[[float], float], low: float, high: float) -> float:
 
 def gain_words(gain: float) -> tuple[str, str]:
     """What a factor is called, and how large it is, in words."""
-    known = next((text for factor, text in _UNITS.items() if abs(gain / factor - 1.0) < 0.02), "")
+    known = next((text for factor, text in DEFECTS["gain"].slips if abs(gain / factor - 1.0) < 0.02), "")
     if abs(gain + 1.0) < 0.1:
-        return "polarity", "turned round"
+        return "polarity", DEFECTS["polarity"].words
     if abs(gain) < 0.05 and not known:
         return "signal", "missing"
-    return "gain", f"{100.0 * (gain - 1.0):+.3g} %" + (f" ({known})" if known else "")
+    return "gain", size_text("gain", gain - 1.0) + (f" ({known})" if known else "")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 from typing import Literal
 
@@ -10,11 +11,14 @@ import numpy as np
 
 from replays.recordings.resimulation.prediction import Measured
 from replays.recordings.validation.trajectory import scaled
+from rig.channels.faults.defects import defects_in
 
 Kind = Literal["sensor", "time", "command", "model"]
 
 _SIGMAS = 6.0
 """Residuals are noise while their sum of squares is above its mean by less than so many standard deviations."""
+_NAMES = re.compile(r"((?:\w+(?:, | and ))*\w+) ?(.*)")
+"""Channels of a name, and the defects that follow."""
 _UNTIMED = ("keyphasor",)
 """A pulse is no smooth function of anything."""
 
@@ -67,6 +71,17 @@ class Explanation:
         """One that leaves residuals over their floors, shape (n,)."""
         squares, n = float(residuals @ residuals), max(1, len(residuals))
         return cls(kind, name, change, value, unit, explained, math.sqrt(squares / n), squares, n, to_s)
+
+    @property
+    def channels_and_defect(self) -> tuple[str, str]:
+        """Names of the channels and of their defects in `name`; the second is empty where `change` has them."""
+        channels, defect = _NAMES.fullmatch(self.name).groups()  # pyrefly: ignore[missing-attribute]
+        return channels, defect
+
+    @property
+    def defects(self) -> tuple[str, ...]:
+        """Names in the table of defects; none where a model, a command or the time of all channels is the cause."""
+        return defects_in(self.channels_and_defect[1] or self.change) if self.kind == "sensor" else ()
 
     @property
     def at_floor(self) -> bool:

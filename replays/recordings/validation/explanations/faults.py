@@ -22,6 +22,7 @@ from replays.recordings.validation.explanations.explanation import (
 )
 from replays.recordings.validation.explanations.laws import law_of
 from replays.recordings.validation.trajectory import floors
+from rig.channels.faults.defects import DEFECTS, size_text
 from rig.channels.table import Channel
 
 _TURNED_OFF = 0.02
@@ -176,9 +177,9 @@ def late_together(found: Sequence[Explanation], parts: Mapping[str, Measured]) -
     """
     units = {channel.name: channel.unit for part in parts.values() for channel in part.channels}
     for one in found:
-        names = one.name.removesuffix(" delay").split(", ")
+        names = one.channels_and_defect[0].split(", ")
         kind = [name for name, unit in units.items() if unit == units.get(names[0])]
-        if one.name.endswith(" delay") and len(kind) / 2.0 <= len(names) < len(kind) > 2:
+        if one.channels_and_defect[1] == "delay" and len(kind) / 2.0 <= len(names) < len(kind) > 2:
             return dict.fromkeys(kind, one.value)
     return {}
 
@@ -230,7 +231,7 @@ def _swapped(a: Shown, b: Shown, told: _Telling) -> Explanation | None:
         return None
     if len(signs) > 1:
         return None  # one of them inverted, which is a quarter of a turn
-    change = "swapped" if signs == {1.0} else "swapped and both inverted"
+    change = DEFECTS["swap"].validation[signs != {1.0}]
     return told(f"{a.name} and {b.name}", change, 0.0, crossed, before)
 
 
@@ -247,7 +248,7 @@ def _turned(a: Shown, b: Shown, told: _Telling) -> Explanation | None:
     if not is_noise(left) and excess(left) > 0.01 * (excess(a.apart) + excess(b.apart)):
         return None
     before = np.concatenate([a.apart, b.apart])
-    return told(f"{a.name} and {b.name} angle", f"{math.degrees(angle):+.3g} degrees", angle, left, before, "rad")
+    return told(f"{a.name} and {b.name} angle", size_text("angle", angle), angle, left, before, "rad")
 
 
 @dataclass(frozen=True)
@@ -304,15 +305,15 @@ def _together(alone: list[_Alone], told: _Telling, moving: list[str]) -> list[Ex
                 continue
             alone = [one for one in alone if one not in group]
             left = np.concatenate([one.by(kind, value)[1] for one in group])
-            change = gain_words(1.0 + value)[1] if kind == "gain" else f"{value * 1e6:+.4g} µs"
-            names, unit = [one.shown.name for one in group], "s" if kind == "delay" else ""
+            change = gain_words(1.0 + value)[1] if kind == "gain" else size_text(kind, value)
+            names = [one.shown.name for one in group]
             others = [name for name in moving if name not in names]
             if kind == "delay" and len(others) < len(names) and group[0].shown.counts is None:
                 if not others:
                     continue
-                names, value, change = others, -value, f"{-value * 1e6:+.4g} µs"
+                names, value, change = others, -value, size_text(kind, -value)
             before = np.concatenate([one.shown.apart for one in group])
-            found.append(told(f"{', '.join(names)} {kind}", change, value, left, before, unit))
+            found.append(told(f"{', '.join(names)} {kind}", change, value, left, before, DEFECTS[kind].unit))
     return found + [one.told for one in alone]
 
 

@@ -24,6 +24,7 @@ from replays.recordings.validation.explanations.channel_fit import (
 from replays.recordings.validation.explanations.explanation import excess, is_noise
 from replays.recordings.validation.explanations.signals import steady_rows
 from replays.recordings.validation.explanations.timing import delayed_by, filtered, late, ringing
+from rig.channels.faults.defects import DEFECTS, size_text
 
 _EXACTLY = 0.01
 """The same where all else is known to the bit."""
@@ -73,7 +74,7 @@ def law_of(one: Shown) -> Law:
     held = steady_rows(one.values) if one.noise > 0.0 and one.counts is None else np.zeros(len(before), dtype=bool)
     if held.any() and excess(before[held]) > 0.5 * excess(before):
         times_s = one.times_s[held]
-        return Law("stuck", f"from {times_s[0]:.4f} s, {len(times_s)} rows", 0.0, before[~held])
+        return one.law("freeze", 0.0, before[~held], 1, f"from {times_s[0]:.4f} s, {len(times_s)} rows")
     laws = [*_of_level(one), *_of_time(one)]
     if one.moves or one.counts is not None:
         laws += _of_others(one)
@@ -130,21 +131,22 @@ def _by_counts(one: Shown, counts: np.ndarray) -> Iterator[Law]:
     said, sound = counts.T
     none = np.zeros(len(said))
     if (said == said[0]).all() and one.noise > 0.0 and one.at_begin(said[0] * one.channel.scale + one.channel.offset):
-        yield Law("freeze", f"at {one.channel.scale * said[0] + one.channel.offset:.6g} {one.unit}", 0.0, none)
+        level = one.channel.scale * said[0] + one.channel.offset
+        yield one.law("freeze", 0.0, none, 1, f"at {level:.6g} {one.unit}")
         return
     for bit in range(one.channel.adc_bits - 1):
         mask = 1 << bit
         for value, shown in ((1, sound | mask), (0, sound & ~mask)):
             if (said == shown).all():
-                yield Law("stuck-bit", f"bit {bit} is {value}", float(bit), none)
+                yield one.law("stuck-bit", float(bit), none, 1, f"bit {bit} is {value}")
         if bit and (said == sound >> bit << bit).all():
-            yield Law("bits", f"the lowest {bit} lost", float(bit), none)
+            yield one.law("bits", float(bit), none)
     low, high = int(said.min()), int(said.max())
     ends = (sound > high).any() or (sound < low).any()
     if ends and (said == np.clip(sound, low, high)).all() and (one.noise > 0.0 or (said == sound).any()):
         part = max(abs(low), abs(high) + 1) / 2.0 ** (one.channel.adc_bits - 1)
         if part < 1.0:  # every converter has its own ends
-            yield Law("clip", f"at {part:.4g} of the converter's range", part, none)
+            yield one.law("clip", part, none)
     off = said != sound
     sizes = np.abs(said - sound)[off]
     if off.mean() < _SPARSE and len(sizes) and sizes.min() == sizes.max() > _ROUNDED:
@@ -158,21 +160,21 @@ def _in_steps(one: Shown) -> Iterator[Law]:
     left = (apart - np.clip(apart, -0.5 * step, 0.5 * step)) / one.floor
     ragged = np.abs((levels - levels[0]) / step % 1.0 - 0.5) < 0.5 - _SLACK
     if len(levels) > 1 and step > OFF * one.noise and not ragged.any() and is_noise(left):
-        yield Law("bits", f"in steps of {step:.4g} {one.unit}", step, left, 1, one.unit)
+        yield one.law("bits", step, left, 1, f"in steps of {step:.4g} {one.unit}", unit=one.unit)
 
 
 def _spikes(one: Shown, rows: np.ndarray, left: np.ndarray) -> Law:
     size = float(np.median(np.abs(one.values - one.foretold)[rows]))
     rate = rows.sum() / max(float(one.times_s[-1] - one.times_s[0]), 1e-9)
-    return Law("spikes", f"{rows.sum()} of {size:.4g} {one.unit}, {rate:.3g} a second", size, left, 2, one.unit)
+    return one.law("spikes", size, left, 2, f"{rows.sum()} of {size:.4g} {one.unit}, {rate:.3g} a second")
 
 
 def _of_level(one: Shown) -> Iterator[Law]:
     """Offset, gain and what is left of a signal."""
-    ones, e, unit = one.level, one.foretold, one.unit
+    ones, e = one.level, one.foretold
     coupled = one.counts is not None and one.channel.highpass_hz > 0.0
     (shift,), left = one.left([ones], one.values - e)
-    yield Law("offset", f"{shift:+.4g} {unit}", float(shift), left, 1, unit)
+    yield one.law("offset", float(shift), left)
     rests = not one.moves
     if rests and one.counts is None:
         return
@@ -183,9 +185,9 @@ def _of_level(one: Shown) -> Iterator[Law]:
         if (what == "signal" and one.counts is not None) or (rests and abs(float(e.mean())) < one.noise):
             continue  # the level says more
         if len(columns) > 1 and what == "gain" and not coupled:
-            what, change = "gain and offset", f"{change}, {factors[1]:+.4g} {unit}"
+            what, change = "gain and offset", f"{change}, {size_text('offset', factors[1], one.unit)}"
         numbers = {"gain": gain - 1.0} if "gain" in what else {}
-        yield Law(what, change, gain - 1.0, left, len(columns), "", numbers)
+        yield one.law(what, gain - 1.0, left, len(columns), change, unit="", numbers=numbers)
     if one.counts is not None:
         (level,), left = one.left([ones])
         yield _level_law(one, float(level), left)
@@ -195,14 +197,14 @@ def _level_law(one: Shown, level: float, left: np.ndarray) -> Law:
     """Nothing but a level."""
     e, volts = one.foretold, one.channel.bias_v + one.channel.sensitivity_v * level
     if one.channel.highpass_hz > 0.0:
-        return Law("open, short or stuck", "nothing", 0.0, left)
+        return one.law("open, short or stuck", 0.0, left, 1, "nothing")
     if abs(volts) < 1e-3 * np.ptp(one.channel.range_v):
-        return Law("open or short", "0 V", 0.0, left, 1, "V")
+        return one.law("open or short", 0.0, left, 1, DEFECTS["short"].words)
     if one.at_begin(level):
-        return Law("stuck", f"at {level:.5g} {one.unit}", level, left, 1, one.unit)
+        return one.law("stuck", level, left)
     middle = (np.mean(one.channel.range_v) - one.channel.bias_v) / one.channel.sensitivity_v
     beyond = bool(((e - middle) / (level - middle) > 1.0).all())
-    return Law("open or saturation" if beyond else "open", f"{volts:.4g} V", volts, left, 1, "V")
+    return one.law("open or saturation" if beyond else "open", volts, left, 1, size_text("open", volts))
 
 
 def _of_time(one: Shown) -> Iterator[Law]:
@@ -213,7 +215,7 @@ def _of_time(one: Shown) -> Iterator[Law]:
     ones, length_s = one.level, float(one.times_s[-1] - one.times_s[0])
     held = 2.0 * math.pi * one.channel.highpass_hz if one.counts is not None else 0.0
     (rate, _), left = one.left([(1.0 - ones) / held if held else t, ones], d)
-    yield Law("drift", f"{rate:+.4g} {one.unit}/s", float(rate), left, 2, f"{one.unit}/s")
+    yield one.law("drift", float(rate), left, 2)
 
     def levelling(log_s: float) -> tuple[np.ndarray, np.ndarray]:
         return one.left([-np.exp(-t / math.exp(log_s)), ones], d)
@@ -221,7 +223,8 @@ def _of_time(one: Shown) -> Iterator[Law]:
     ends = math.log(0.01 * length_s), math.log(3.0 * length_s)
     log_s = least_at(lambda log_s: rms_of(levelling(log_s)[1]), *ends)
     (far, _), left = levelling(log_s)
-    yield Law("drift", f"{far:+.4g} {one.unit} in {math.exp(log_s):.3g} s", float(far), left, 3, one.unit)
+    change = f"{far:+.4g} {one.unit} in {math.exp(log_s):.3g} s"
+    yield one.law("drift", float(far), left, 3, change, unit=one.unit)
     if not one.uniform:
         return
     period_s = length_s / (len(t) - 1)
@@ -247,8 +250,8 @@ def _of_time(one: Shown) -> Iterator[Law]:
         amplitude = math.hypot(factors[1], factors[2])
         if alone and math.hypot(*own[1:]) > _OWN * amplitude and not is_noise(left):
             continue
-        change = f"{f:.5g} Hz, {amplitude:.4g} {one.unit}"
-        yield Law("hum", change + (" with its third" if third else ""), amplitude, left, 6 if third else 4, one.unit)
+        change = f"{f:.5g} Hz, {amplitude:.4g} {one.unit}" + (" with its third" if third else "")
+        yield one.law("hum", amplitude, left, 6 if third else 4, change)
 
 
 def _of_others(one: Shown) -> Iterator[Law]:
@@ -263,7 +266,7 @@ def _of_others(one: Shown) -> Iterator[Law]:
             continue  # none is louder there than at home
         if one.counts is not None and through > 0.0:
             change = f"{20.0 * math.log10(through):.3g} dB of {other.name}"
-        found.append(Law("crosstalk", change, float(part), left, count))
+        found.append(one.law("crosstalk", float(part), left, count, change, unit=""))
     if found:
         # Channels that show the same, as two sides of a ring, are one source.
         best = min(found, key=lambda law: one.cost(law.left, count))
@@ -283,7 +286,7 @@ def _bent(one: Shown) -> Iterator[Law]:
         (end,), left = one.fitted(lambda p, at=about: at + p[0] * np.tanh((e - at) / p[0]), starts, [reach])
         plain = min(excess(one.left(line)[1]) for line in ([e], [e - about + one.level])) if log else math.inf
         if abs(end) > _NOTHING * reach and excess(left) < _CLEARLY * plain:
-            yield Law("nonlinear", f"end at {abs(end):.4g} {one.unit}", abs(float(end)), left, 1, one.unit)
+            yield one.law("nonlinear", abs(float(end)), left)
     low, high = float(one.values.min()), float(one.values.max())
     for _ in range(8):  # the ends of what it shows, less what noise adds to them
         over, under = e > high, e < low
@@ -293,7 +296,8 @@ def _bent(one: Shown) -> Iterator[Law]:
     cut = (e > high).any() or (e < low).any()
     if one.counts is not None and cut and max(abs(low), abs(high)) > _NOTHING * reach:
         left = (one.values - np.clip(e, low, high)) / one.floor
-        yield Law("saturation", f"from {low:.4g} to {high:.4g} {one.unit}", max(abs(low), abs(high)), left, 2, one.unit)
+        change = f"from {low:.4g} to {high:.4g} {one.unit}"
+        yield one.law("saturation", max(abs(low), abs(high)), left, 2, change, unit=one.unit)
 
 
 def _at_random(one: Shown) -> Iterator[Law]:
@@ -311,7 +315,7 @@ def _at_random(one: Shown) -> Iterator[Law]:
         loud = np.abs(e) > 5.0 * near
         gone, sound = (float((np.abs(left) < near)[loud].mean()) if loud.any() else 0.0 for left in (one.values, d))
         if gone + sound > _ALL and min(gone, sound) > _FADING:
-            yield Law("intermittent", f"{gone:.2g} of the time nothing", gone, one.apart[~off], 2)
+            yield one.law("intermittent", gone, one.apart[~off], 2, f"{gone:.2g} of the time nothing")
             return
     if one.counts is not None and off.any() and not off.all() and one.moves:
         level = float(np.median(one.values[off]))
@@ -325,11 +329,12 @@ def _at_random(one: Shown) -> Iterator[Law]:
                 return
             part, beyond = float(there.mean()), (e - level) * np.sign(float((e - level)[there].mean()))
             if (beyond[there] > -slack[there]).all() and (beyond[~off] < slack[~off]).all():
-                yield Law("saturation", f"at {level:.4g} {one.unit}", level, one.apart[~off], 2, one.unit)
+                change = f"at {level:.4g} {one.unit}"
+                yield one.law("saturation", level, one.apart[~off], 2, change, unit=one.unit)
                 return
             volts = one.channel.bias_v + one.channel.sensitivity_v * level
             change = f"{part:.2g} of the time at {level:.4g} {one.unit} ({volts:.3g} V)"
-            yield Law("intermittent", change, part, one.apart[~off], 2)
+            yield one.law("intermittent", part, one.apart[~off], 2, change)
             return
     (_,), rest = one.left([np.ones(len(d))], d)
     if one.moves and one.even and (one.counts is not None or _white(rest)):
@@ -343,7 +348,8 @@ def _at_random(one: Shown) -> Iterator[Law]:
         gain = float(np.sum(np.log(plain / width))) + 0.5 * float(rest @ rest / rest.var() - z @ z)
         seen = rms_s * rms_of(slope) > 2.0 * one.noise
         if gain > DECIDES and seen and (one.counts is None or _white(z)):
-            yield Law("jitter", f"{1e6 * rms_s:.4g} µs about {1e6 * late_s:.4g} µs", rms_s, z / z.std(), 2, "s")
+            change = f"{1e6 * rms_s:.4g} µs about {1e6 * late_s:.4g} µs"
+            yield one.law("jitter", rms_s, z / z.std(), 2, change)
             return
     tied = one.moves and abs(float(np.corrcoef(rest, e)[0, 1])) > 0.1
     # Noise is loud all the time: what is off at impacts alone is none.
@@ -351,11 +357,12 @@ def _at_random(one: Shown) -> Iterator[Law]:
     if _white(rest) and not tied and loud:
         ratio = float(rest.std())
         if one.counts is None:
-            yield Law("noise", f"x {ratio:.2f}", ratio, rest / ratio)
+            yield one.law("noise", ratio, rest / ratio)
             return
         said = (one.channel.scale * one.counts[:, 0] + one.channel.offset - one.foretold).std() / one.noise
         times = math.hypot(1.0, ratio * float(one.floor[0]) / one.noise)
         if abs(said - 1.0) < abs(said - times) and times > _ANOTHER:
-            yield Law("other noise", "as loud as told: samples are taken at other times", float(said), rest / ratio)
+            change = "as loud as told: samples are taken at other times"
+            yield one.law("other noise", float(said), rest / ratio, 1, change, unit="")
         else:
-            yield Law("noise", f"x {times:.2f}", times, rest / ratio)
+            yield one.law("noise", times, rest / ratio)

@@ -1,4 +1,4 @@
-"""Faults that signals show by themselves, wherever in a log: stuck, clipped, loud, pulses that are missing."""
+"""Defects that a signal shows without a model, anywhere in a log: freeze, clip, noise, pulses and lost samples."""
 
 from __future__ import annotations
 
@@ -30,7 +30,15 @@ _LOUD = 3.0
 
 
 class SignalFault(NamedTuple):
-    """One fault of one channel."""
+    """One defect of one channel.
+
+    Attributes:
+        channel: Name of the channel, or "time" for all channels of a group.
+        what: Name in the table of defects, as in `Law`.
+        from_s: Begin [s].
+        to_s: End [s].
+        text: Size, and where it is.
+    """
 
     channel: str
     what: str
@@ -92,7 +100,7 @@ def _jumps(part: Measured) -> list[SignalFault]:
     text = (
         f"probes jump at once in {len(rows)} rows, the first behind {begin:.4f} s: samples are missing there, or double"
     )
-    return [SignalFault("time", "rows", begin, end, text)]
+    return [SignalFault("time", "lost samples", begin, end, text)]
 
 
 def edge_faults(edges_s: np.ndarray, until_s: float, speed_hz: float) -> list[SignalFault]:
@@ -110,26 +118,27 @@ def edge_faults(edges_s: np.ndarray, until_s: float, speed_hz: float) -> list[Si
     # No shaft is that much slower for a turn, and fast again.
     for at in np.flatnonzero(later > _MISSED * beside) + max(0, even - 1):
         begin, end = float(edges_s[at]), float(edges_s[at + 1])
-        text = f"missing between {begin:.3f} and {end:.3f} s"
-        found.append(SignalFault("keyphasor", "pulses", begin, end, text))
+        text = f"none between {begin:.3f} and {end:.3f} s"
+        found.append(SignalFault("keyphasor", "miss-pulses", begin, end, text))
     if not even:
         return found
     turns = steps / np.median(steps)
     a_turn = 1.0 / (float(np.median(steps)) * speed_hz) if speed_hz > 0.0 else 1.0
     if abs(a_turn - 1.0) > _ANOTHER:
         begin, end = float(edges_s[0]), float(edges_s[len(steps)])
-        found.append(SignalFault("keyphasor", "pulses", begin, end, f"{a_turn:.3g} pulses a turn"))
-    for what, rows in (("missing", turns > 1.5), ("too many", turns < 0.7)):
+        what = "extra-pulses" if a_turn > 1.0 else "miss-pulses"
+        found.append(SignalFault("keyphasor", what, begin, end, f"{a_turn:.3g} pulses a turn"))
+    for what, rows in (("miss-pulses", turns > 1.5), ("extra-pulses", turns < 0.7)):
         at = np.flatnonzero(rows)
         if len(at):
             begin, end = float(edges_s[at[0]]), float(edges_s[at[-1] + 1])
-            text = f"pulses {what} in {len(at)} of {len(steps)} turns, the first at {begin:.3f} s"
-            found.append(SignalFault("keyphasor", "pulses", begin, end, text))
+            text = f"in {len(at)} of {len(steps)} turns, the first at {begin:.3f} s"
+            found.append(SignalFault("keyphasor", what, begin, end, text))
     off_s = np.where(np.abs(turns - 1.0) < 0.3, steps - np.median(steps), 0.0)
     for at in np.flatnonzero(np.abs(off_s) > max(_UNEVEN * 1.5 * float(np.median(np.abs(off_s))), _UNEVEN_S)):
         text = f"the turn that ends at {edges_s[at + 1]:.4f} s is {1e3 * off_s[at]:+.4g} ms long beside the others: "
         text += "samples are missing in it, or double" if off_s[at] < 0.0 else "its time jumps"
-        found.append(SignalFault("time", "rows", float(edges_s[at]), float(edges_s[at + 1]), text))
+        found.append(SignalFault("time", "lost samples", float(edges_s[at]), float(edges_s[at + 1]), text))
     return found
 
 
@@ -147,12 +156,12 @@ def _held(name: str, unit: str, times_s: np.ndarray, values: np.ndarray) -> list
         if at.sum() >= _AT_RAIL and (len(runs) > 1 or at.sum() < _HELD):
             rails |= at
             text = f"{at.sum()} rows at its {side}, {level:.6g} {unit}, the first at {times_s[runs[0][0]]:.4f} s"
-            found.append(SignalFault(name, "clipped", *_span(times_s, runs), text))
+            found.append(SignalFault(name, "clip", *_span(times_s, runs), text))
     runs = true_runs(steady & ~rails)
     if runs:
         begin, end = _span(times_s, runs)
         text = f"one and the same number in {sum(b - a for a, b in runs)} rows, from {begin:.4f} to {end:.4f} s"
-        found.append(SignalFault(name, "stuck", begin, end, text))
+        found.append(SignalFault(name, "freeze", begin, end, text))
     return found
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -17,6 +16,7 @@ from replays.recordings.validation.explanations.explanation import Explanation
 from replays.recordings.validation.explanations.faults import SOME, around, beside, channels_in, told_of
 from replays.recordings.validation.explanations.laws import law_of
 from replays.recordings.validation.explanations.signals import SignalFault
+from rig.channels.faults.defects import alternatives, size_text, unit_of
 from rig.channels.table import Channel
 
 _HELD_S = 0.011
@@ -29,8 +29,6 @@ _AT_END, _ENOUGH = 1e-3, 0.2
 """Rows so near to an end of what its conditioner puts out tell nothing, where this part of the rows is not."""
 _NO_FILTER = 1e4
 """A corner so many times its own is none."""
-_NAMES = re.compile(r"((?:\w+(?:, | and ))*\w+) ?(.*)")
-"""Channels, and what they have."""
 _MOVES = 0.1
 """Of a turn, by which an edge may move."""
 _EVEN_S = 1e-5
@@ -149,22 +147,23 @@ def _own_edges(recorded_s: np.ndarray, made_s: np.ndarray, *, late: bool) -> Exp
     moved_s = more - lacking if len(more) == len(lacking) else np.empty(0)
     turns = np.count_nonzero((made_s >= off[0]) & (made_s <= off[-1])) if len(off) else 0
     if len(moved_s) == 1 and late:  # of one, nobody can tell
-        what, value, unit = "delay or edge-jitter", float(moved_s[0]), "s"
-        change = f"{1e6 * value:+.4g} µs, one edge"
+        what, value = "delay or edge-jitter", float(moved_s[0])
+        change = f"{size_text('delay', value)}, one edge"
     elif len(moved_s) > 1 and moved_s.std() > _EVEN_S:
-        what, value, unit = "edge-jitter", float(moved_s.std()), "s"
+        what, value = "edge-jitter", float(moved_s.std())
         change = f"{1e6 * value:.4g} µs about {1e6 * moved_s.mean():.4g} µs"
     elif len(moved_s) or not len(off):
         return None
     elif len(lacking) < turns and not len(more):
-        what, value, unit, change = "miss-pulses", len(lacking) / turns, "", f"{len(lacking)} of {turns}"
+        what, value, change = "miss-pulses", len(lacking) / turns, f"{len(lacking)} of {turns}"
     elif len(more) > len(lacking):
-        what, value, unit, change = "extra-pulses", len(more) / max(1, turns), "", f"{len(more)} beside {turns}"
+        what, value, change = "extra-pulses", len(more) / max(1, turns), f"{len(more)} beside {turns}"
     else:
-        what, value, unit, change = "open, short or miss-pulses", 1.0, "", f"{len(lacking)} of {turns}"
+        what, value, change = "open, short or miss-pulses", 1.0, f"{len(lacking)} of {turns}"
+    unit = unit_of(alternatives(what)[-1], "")
     found = Explanation.of(
-        np.empty(0), kind="sensor", name=f"keyphasor {what}", change=change, value=value, unit=unit, explained=0.0,
-        to_s=float(off[-1]),
+        np.empty(0), kind="sensor", name=f"keyphasor {what}", change=change, value=value, unit=unit,
+        explained=0.0, to_s=float(off[-1]),
     )  # fmt: skip
     return replace(found, from_s=float(off[0]))
 
@@ -173,7 +172,7 @@ def as_faults(own: Sequence[Explanation]) -> tuple[SignalFault, ...]:
     """What channels have by themselves, as faults that signals show."""
     found = []
     for one in own:
-        names, what = _NAMES.fullmatch(one.name).groups()  # pyrefly: ignore[missing-attribute]
+        names, what = one.channels_and_defect
         text = one.change if one.sure else f"by no law that has a name here; nearest is {what} {one.change}"
         what, text = (what if one.sure else "differs", f"{text}, ") if what else (one.change, "")
         text += f"from {one.from_s:.4f} to {one.to_s:.4f} s"

@@ -12,6 +12,7 @@ from replays.estimate.clock import fit_line, time_error
 from replays.estimate.least_squares import solve
 from replays.estimate.spectra import Spectrum
 from replays.recordings.validation.explanations.channel_fit import FEW, Law, Shown, gain_words, least_at, rms_of
+from rig.channels.faults.defects import size_text
 from rig.channels.sensors.filters import channel_poles
 
 _LATEST_S = 4e-3
@@ -50,10 +51,11 @@ def late(one: Shown) -> Iterator[Law]:
     earliest_s, latest_s = (-_LATEST_S, _LATEST_S) if one.counts is None else (_EARLIEST_S, _HELD_S)
     if earliest_s <= late_s <= latest_s + 2.0 * one.period_s:  # else it is the search's end
         (shift,), left = one.left([ones], one.values - delayed)
-        change, of = f"{late_s * 1e6:+.4g} µs", {"delay": late_s}
-        yield Law("delay", change, late_s, (one.values - delayed) / one.floor, 1, "s", of)
+        change, of = size_text("delay", late_s), {"delay": late_s}
+        yield one.law("delay", late_s, (one.values - delayed) / one.floor, numbers=of)
         if abs(shift) > one.noise:
-            yield Law("delay and offset", f"{change}, {shift:+.4g} {one.unit}", late_s, left, 2, "s", of)
+            text = f"{change}, {size_text('offset', shift, one.unit)}"
+            yield one.law("delay and offset", late_s, left, 2, text, numbers=of)
         if one.counts is not None and abs(late_s) < -_EARLIEST_S:
             return  # there is no delay in it
         for columns in [[delayed], [delayed, ones]][one.counts is not None :]:
@@ -61,7 +63,7 @@ def late(one: Shown) -> Iterator[Law]:
             what, also = gain_words(gain := float(factors[0]))
             if what == "signal":
                 continue  # what is not there is not late
-            yield Law(f"{what} and delay", f"{also}, {change}", gain - 1.0, left, 1 + len(columns), "", of)
+            yield one.law(f"{what} and delay", gain - 1.0, left, 1 + len(columns), f"{also}, {change}", numbers=of)
     if one.counts is None or one.channel.signal == "keyphasor":
         return  # of a log, the time of all is fitted before; pulses tell by their edges
     at, delays = _delays(one)
@@ -72,7 +74,7 @@ def late(one: Shown) -> Iterator[Law]:
         lambda p: spline(one.times_s - p[0] - p[1] * t), [[line.at_zero, line.slope], [0.0, line.slope]], [1e-6, 1e-6]
     )
     if min(start, start + rate * t[-1]) > _EARLIEST_S:
-        yield Law("clock", f"{1e6 * rate:+.5g} ppm", 1e6 * float(rate), left, 2, "ppm")
+        yield one.law("clock", 1e6 * float(rate), left, 2)
     length_s = float(t[-1])
     starts = []
     for period_s in 2.0 * length_s / np.arange(1.0, 2.0 * _SEGMENTS / 3.0):
@@ -87,7 +89,7 @@ def late(one: Shown) -> Iterator[Law]:
     )  # fmt: skip
     size = math.hypot(a, b)
     if mean_s - size > _EARLIEST_S:
-        yield Law("wander", f"{1e6 * size:.4g} µs in {abs(period_s):.4g} s", size, left, 4, "s")
+        yield one.law("wander", size, left, 4, f"{1e6 * size:.4g} µs in {abs(period_s):.4g} s")
 
 
 def _delays(one: Shown) -> tuple[np.ndarray, np.ndarray]:
@@ -145,7 +147,7 @@ def filtered(one: Shown) -> Iterator[Law]:
         slope = one.foretold_at.derivative()(one.times_s)
         factors, left = one.left([slope, np.gradient(slope, one.times_s)], one.values - one.foretold)
         lower = "lower" if factors[1] > 0.0 else "higher"
-        yield Law("bandwidth", f"{lower} than told", float(factors[1]), left, 2)
+        yield one.law("bandwidth", float(factors[1]), left, 2, f"{lower} than told", unit="")
     channel = one.channel
     if not one.uniform or not channel.bandwidth_hz:
         return
@@ -189,14 +191,14 @@ def filtered(one: Shown) -> Iterator[Law]:
         passed = float((one.values - left * one.floor).std())
         # Of what is slow beside it, a low-pass makes a delay; and what lets nothing pass is none.
         if max(1.0, rms_of(left)) < _CLEARLY * rms_of(delayed) and passed > _PASSES * float(one.foretold.std()):
-            yield Law("bandwidth", f"lower than told: {corner_hz:.3g} Hz", corner_hz, left, 1, "Hz")
+            yield one.law("bandwidth", corner_hz, left, 1, f"lower than told: {corner_hz:.3g} Hz")
         return
     if rms_of(left) < _SAME * max(1.0, one.noise / float(one.floor[0])):  # else noise of another time is in it
         seen = rms_of(differs) > _SEEN * rms_of(one.apart)
-        yield Law("bandwidth", f"{corner_hz:.4g} Hz", corner_hz, left, 1, "Hz", sure=seen)
+        yield one.law("bandwidth", corner_hz, left, sure=seen)
     if one.bare is not None and (rms_of(left_by(1.0)) < _HARDLY * rms_of(one.apart)):
         _, left = one.left([one.level] if channel.highpass_hz else [np.zeros(len(one.values))], one.values - one.bare())
-        yield Law("no-filter", "what is above half of the rate folds back", 0.0, left, 1)
+        yield one.law("no-filter", 0.0, left)
 
 
 def _wave(one: Shown) -> tuple[int, Spectrum]:
@@ -241,4 +243,4 @@ def ringing(one: Shown) -> Iterator[Law]:
     found: Any = minimize(cost, min(starts, key=cost), method="Nelder-Mead", options=close)
     hz, quality = math.exp(found.x[0]), 0.5 + math.exp(found.x[1])
     if 0.5 * _RINGS_HZ[0] < hz < 2.0 * _RINGS_HZ[1] and quality < _RINGS_LONGEST:
-        yield Law("resonance", f"at {hz:.4g} Hz, quality {quality:.3g}", hz, left(found.x), 4, "Hz")
+        yield one.law("resonance", hz, left(found.x), 4, f"at {hz:.4g} Hz, quality {quality:.3g}")
