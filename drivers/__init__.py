@@ -1,4 +1,4 @@
-"""Programs that talk to a running rig: they know the channel table, the wire and the transport, never the model."""
+"""Clients of a running rig. They use the channel table, the wire format and the transport, never the model."""
 
 from rig.base.import_paths import find_our_modules
 

@@ -1,4 +1,4 @@
-"""The operator's console of a running rig: hammer, speed, magnet release, stop, lockstep, status."""
+"""Operator console of a running rig: hammer, speed, magnet release, stop, lockstep, status."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from rig.serve.transport import DEFAULT_ENDPOINT, Client, NoReplyError
 
 @dataclass(frozen=True, slots=True)
 class Accepted:
-    """The rig's reply to a command that it took.
+    """Acknowledgement of a command.
 
     Attributes:
         command: Name of the command.
-        id: Number of the command in this run; the stream's event `command` carries it too.
-        tick: Simulated time at which it takes effect [ticks]; for a step, at which it was done.
-        time_s: The same [s].
+        id: Number of the command in this run; the event `command` of the stream carries it too.
+        tick: Effective tick; for a step, the tick at its end.
+        time_s: The same as simulated time [s].
     """
 
     command: str
@@ -36,12 +36,12 @@ class Accepted:
 
 @dataclass(frozen=True, slots=True)
 class AcceptedFault(Accepted):
-    """The reply to a fault.
+    """Acknowledgement of a fault.
 
     Attributes:
-        fault: Its number.
-        channels: Its channels.
-        first_row: Number of the first row that it changes, by group.
+        fault: Number of the fault, for `clear`.
+        channels: Channels that it affects.
+        first_row: Number of the first affected sample, by channel group.
     """
 
     fault: int
@@ -51,25 +51,26 @@ class AcceptedFault(Accepted):
 
 @dataclass(frozen=True, slots=True)
 class AcceptedStep(Accepted):
-    """The reply to a step.
+    """Acknowledgement of a step.
 
     Attributes:
-        lost: Devices under test that were put out meanwhile, with the reason.
+        lost: Devices under test that the rig removed during the step, with the reason.
     """
 
     lost: Mapping[str, str]
 
 
 class Console(Closing):
-    """Sends commands to one rig.
+    """Sends commands to one rig, and returns its acknowledgements.
 
     Args:
-        client: Transport to the rig.
-        name: Who asks; appears in the stream's events.
-        timeout_s: How long to wait for a reply [s].
+        client: Transport to the rig; `close` closes it too.
+        name: Name of this console in the stream's events; by default it contains the process id.
+        timeout_s: Longest wait for a reply [s].
 
     Example:
-        Of a rig that runs: `with Console.open("zenoh:127.0.0.1:7460") as console`. Here of one that takes everything:
+        With a rig that runs: `with Console.open("zenoh:127.0.0.1:7460") as console`. Here with a stand-in that accepts
+        every command:
 
         >>> class Rig:
         ...     def request(self, key, payload=b"", *, timeout_s):
@@ -89,52 +90,62 @@ class Console(Closing):
 
     @classmethod
     def open(cls, url: str = "zenoh:" + DEFAULT_ENDPOINT, *, name: str | None = None, wait_s: float = 3.0) -> Self:
-        """A console of the rig at a URL, as for `Daq.open`; close it, or use it as a context manager.
+        """Connect to the rig at a URL, as `Daq.open` does; close the console, or use it as a context manager.
+
+        Args:
+            url: `zenoh:HOST:PORT`, or the name of a rig on this computer.
+            name: Name of this console in the stream's events.
+            wait_s: Longest wait for a rig to reply [s].
 
         Raises:
             InputError: The URL is malformed.
-            ConnectionError: Nothing is there.
+            ConnectionError: No rig replies.
         """
         from rig.serve.transport.zenoh import client_of
 
         return cls(client_of(url, wait_s=wait_s), name=name)
 
     def close(self) -> None:
-        """Close the client."""
+        """Disconnect; the rig continues."""
         self._client.close()
 
     def send(self, command: str, timeout_s: float | None = None, /, **fields: Any) -> Accepted:
-        """Send a command by its name, with its fields as rig/KEYS.md lists them.
+        """Send a command by name, with its fields as listed in rig/KEYS.md.
 
         Args:
             command: Name of the command.
-            timeout_s: How long to wait for the reply [s]; that of the console unless given.
+            timeout_s: Longest wait for the reply [s]; by default that of the console.
             fields: Fields of the command.
 
         Raises:
-            RefusedError: The rig refused, for the reason in the message.
+            InputError: A field is not a finite number.
+            NoReplyError: The rig did not reply in time.
+            RefusedError: The rig refused the command, for the reason in the message.
         """
-        reply = self._reply(command, timeout_s, **fields)
+        reply = self._request(command, timeout_s, **fields)
         return Accepted(command=command, id=reply["id"], tick=reply["tick"], time_s=reply["time_s"])
 
     def hammer(self, *, force_n: float = 100.0, duration_ms: float = 5.0, direction: str | float = "x") -> Accepted:
-        """Hit the shaft at the disk.
+        """Apply an impact to the shaft at the disk with the hammer.
 
         Args:
-            force_n: Peak force [N].
-            duration_ms: Length of the half sine [ms].
-            direction: "x", "y", "-x", "-y" or an angle from x towards y [degrees].
+            force_n: Peak force [N], above 0.
+            duration_ms: Length of the half-sine pulse [ms], above 0.
+            direction: "x", "y", "-x", "-y", or the angle from x towards y [degrees].
 
         Raises:
-            RefusedError: The rig refused, for the reason in the message.
+            RefusedError: The rig refused the command, for the reason in the message.
         """
         return self.send("hammer", force_n=force_n, duration_ms=duration_ms, direction=direction)
 
     def speed(self, hz: float) -> Accepted:
-        """Set the speed that the drive holds [Hz].
+        """Set the speed set point of the drive.
+
+        Args:
+            hz: Shaft speed [Hz].
 
         Raises:
-            RefusedError: The rig refused, for the reason in the message.
+            RefusedError: The rig refused the command, for the reason in the message.
         """
         return self.send("speed", speed_hz=hz)
 
@@ -142,32 +153,38 @@ class Console(Closing):
         """Release the magnet that holds the shaft.
 
         Raises:
-            RefusedError: The rig refused, for the reason in the message.
+            RefusedError: The rig refused the command, for the reason in the message.
         """
         return self.send("release")
 
     def fault(self, channel: str, kind: str, *, for_s: float | None = None, **numbers: Any) -> AcceptedFault:
-        """Make a channel misbehave; `rig fault --list` has the kinds and their numbers.
+        """Inject a fault into a channel; `rig fault --list` lists the kinds and their fields.
 
         Args:
-            channel: A channel, or a group for all of its channels.
-            kind: What it does.
-            for_s: How long [s]; until it is cleared unless given.
-            numbers: Of the kind, such as `factor=1.05` of a gain.
+            channel: Name of a channel, or of a channel group for all of its channels.
+            kind: Kind of fault, such as `gain`.
+            for_s: Duration [s]; by default until it is cleared.
+            numbers: Fields of the kind, such as `factor=1.05` of `gain`.
+
+        Returns:
+            The acknowledgement, with the number of the fault for `clear`.
 
         Raises:
-            RefusedError: The rig refused, for the reason in the message.
+            RefusedError: The rig refused the command, for the reason in the message.
         """
-        given = {} if for_s is None else {"for_s": for_s}
-        reply = self._reply("fault", channel=channel, kind=kind, **given, **numbers)
-        told = {name: reply[name] for name in ("id", "tick", "time_s", "fault", "first_row")}
-        return AcceptedFault(command="fault", channels=tuple(reply["channels"]), **told)
+        duration = {} if for_s is None else {"for_s": for_s}
+        reply = self._request("fault", channel=channel, kind=kind, **duration, **numbers)
+        values = {name: reply[name] for name in ("id", "tick", "time_s", "fault", "first_row")}
+        return AcceptedFault(command="fault", channels=tuple(reply["channels"]), **values)
 
     def clear(self, number: int | str = "all") -> Accepted:
-        """End a fault by its number, or all.
+        """Clear one fault, or all.
+
+        Args:
+            number: Number of the fault, or "all".
 
         Raises:
-            RefusedError: There is no such fault.
+            RefusedError: The fault does not exist.
         """
         return self.send("clear", id=number)
 
@@ -175,118 +192,140 @@ class Console(Closing):
         """End the run.
 
         Raises:
-            RefusedError: The rig refused, for the reason in the message.
+            RefusedError: The rig refused the command, for the reason in the message.
         """
         return self.send("stop")
 
     def step(self, ticks: int, *, timeout_s: float = 600.0) -> AcceptedStep:
-        """Let a rig in lockstep run this many ticks; returns when they were published and all devices are done.
+        """Step a rig in lockstep; return when the ticks are published and all devices have processed them.
 
         Args:
-            ticks: A whole multiple of the simulation's block.
-            timeout_s: How long to wait for that [s].
+            ticks: Length of the step [ticks], a whole multiple of the simulation's block.
+            timeout_s: Longest wait for the end of the step [s].
 
         Raises:
-            RefusedError: The rig refused, for the reason in the message.
+            RefusedError: The rig is not in lockstep, or the number is not a whole multiple of the block.
         """
-        reply = self._reply("step", timeout_s, ticks=ticks)
-        told = {name: reply[name] for name in ("id", "tick", "time_s")}
-        return AcceptedStep(command="step", lost=reply.get("lost", {}), **told)
+        reply = self._request("step", timeout_s, ticks=ticks)
+        values = {name: reply[name] for name in ("id", "tick", "time_s")}
+        return AcceptedStep(command="step", lost=reply.get("lost", {}), **values)
 
     def join(self, device: str | None = None, *, patience_s: float = 10.0) -> Accepted:
-        """Make a rig in lockstep wait, after each block from now on, until a device under test is `done` with it.
+        """Register a device under test, for which a rig in lockstep then waits after each block (see `done`).
 
         Args:
-            device: Its name; that of this console unless given.
-            patience_s: How long it may take over a block, wall time [s]; then it is put out, and the rig goes on.
+            device: Name of the device; by default that of this console.
+            patience_s: Longest time for a block [s of wall time]. A device that needs longer is removed, and the rig
+                continues without it.
 
         Raises:
-            RefusedError: The rig is not in lockstep, or such a device has joined.
+            RefusedError: The rig is not in lockstep, or a device of this name has joined.
         """
         return self.send("join", device=device or self._name, patience_s=float(patience_s))
 
     def done(self, tick: int, device: str | None = None) -> Accepted:
-        """Say that a device has dealt with everything up to the end of a block [ticks].
+        """Report that a device has processed all blocks up to a tick.
+
+        Args:
+            tick: End of the last processed block [ticks].
+            device: Name of the device; by default that of this console.
 
         Raises:
-            RefusedError: The device was put out, or is by this: there is no such block.
+            RefusedError: The device was removed, or no block ends at this tick and the device is removed now.
         """
         return self.send("done", device=device or self._name, tick=tick)
 
     def leave(self, device: str | None = None) -> Accepted:
-        """Make the rig wait for a device no longer.
+        """Unregister a device: the rig no longer waits for it.
+
+        Args:
+            device: Name of the device; by default that of this console.
 
         Raises:
-            RefusedError: It has not joined.
+            RefusedError: The device has not joined.
         """
         return self.send("leave", device=device or self._name)
 
     def step_blocks(self, blocks: int, *, timeout_s: float = 600.0) -> Accepted:
-        """Let a recording whose replay is paused go on by so many blocks; returns when they have been published.
+        """Play a number of blocks of a paused replay; return when they are published.
+
+        Args:
+            blocks: Number of blocks, at least 1.
+            timeout_s: Longest wait for the last block [s].
 
         Raises:
-            RefusedError: It is no replay that is paused, or the number is none.
+            RefusedError: No replay is paused, or the number is below 1.
         """
         return self.send("step", timeout_s, blocks=blocks)
 
     def pause(self) -> Accepted:
-        """Hold the replay of a recording.
+        """Pause the replay of a recording.
 
         Raises:
-            RefusedError: A rig cannot be held.
+            RefusedError: This is a rig, not a replay.
         """
         return self.send("pause")
 
     def resume(self) -> Accepted:
-        """Let the replay of a recording go on.
+        """Resume the replay of a recording.
 
         Raises:
-            RefusedError: It is no replay.
+            RefusedError: This is a rig, not a replay.
         """
         return self.send("resume")
 
     def seek(self, time_s: float) -> Accepted:
-        """Let the replay of a recording go on from another position [s of its simulated time].
+        """Move the replay of a recording to another position.
+
+        Args:
+            time_s: Position [s of the recording's simulated time].
 
         Raises:
-            RefusedError: It is no replay, or it has no such position.
+            RefusedError: This is a rig, not a replay, or the recording has no such position.
         """
         return self.send("seek", time_s=time_s)
 
     def rate(self, rate: float) -> Accepted:
-        """Set how many recorded seconds a replay plays a second.
+        """Set the speed of a replay.
+
+        Args:
+            rate: Recorded seconds per second.
 
         Raises:
-            RefusedError: It is no replay with a rate, or there is no such rate.
+            RefusedError: The replay has no rate, or the rate is out of range.
         """
         return self.send("rate", rate=rate)
 
     def note(self, text: str, *, tags: list[str] | None = None) -> Accepted:
-        """Put a note into the stream's events, and so into every recording of it.
+        """Add a note to the stream's events, and so to every recording of the stream.
+
+        Args:
+            text: The note.
+            tags: Words to search for it by.
 
         Raises:
-            RefusedError: The rig refused, for the reason in the message.
+            RefusedError: The rig refused the command, for the reason in the message.
         """
         return self.send("note", text=text, tags=tags or [])
 
     def status(self) -> dict[str, Any]:
-        """The rig's status document, as published twice a second."""
+        """Return the rig's status document, which is also published twice a second."""
         return wire.decode_document(self._client.request(wire.STATUS, timeout_s=self._timeout_s))
 
     @property
     def connection(self) -> str | None:
-        """By which certificates the rig and this console know each other; None without TLS."""
+        """Certificates by which rig and console have authenticated each other; None without TLS."""
         return getattr(self._client, "connection", None)
 
-    def _waited_for(self) -> str:
-        """Devices that a rig which is there waits for, in words."""
+    def _describe_wait(self) -> str:
+        """Return the devices that the rig waits for, as the end of an error message."""
         with contextlib.suppress(NoReplyError):
             rows = self.status().get("devices", ()) if self._client.rig is not None else ()
-            if late := [f"{row['name']} ({row['behind_s']:.0f} s)" for row in rows if row.get("behind_s")]:
-                return f"; it waits for {', '.join(late)}"
+            if behind := [f"{row['name']} ({row['behind_s']:.0f} s)" for row in rows if row.get("behind_s")]:
+                return f"; it waits for {', '.join(behind)}"
         return ""
 
-    def _reply(self, command: str, timeout_s: float | None = None, /, **fields: Any) -> dict[str, Any]:
+    def _request(self, command: str, timeout_s: float | None = None, /, **fields: Any) -> dict[str, Any]:
         for name, value in fields.items():
             if isinstance(value, float) and not math.isfinite(value):
                 raise InputError(name, "a finite number", value)
@@ -294,7 +333,7 @@ class Console(Closing):
         try:
             payload = self._client.request(wire.command_key(command), request, timeout_s=timeout_s or self._timeout_s)
         except NoReplyError as error:
-            raise NoReplyError(f"{error}{self._waited_for()}") from None
+            raise NoReplyError(f"{error}{self._describe_wait()}") from None
         reply = wire.decode_document(payload)
         if not reply.get("accepted"):
             raise RefusedError(str(reply.get("error", f"the rig refused {command} without a reason")))

@@ -1,10 +1,11 @@
-"""The DAQ client: chosen channels of a rig, aligned on their sample number, in engineering units.
+"""DAQ client: selected channels of a rig, aligned by sample number, in engineering units.
 
     with Daq.open("zenoh:127.0.0.1:7460", channels=["disk_x", "P_N"]) as daq:
         for samples in daq.blocks(2000):
             print(samples.times_s[0], samples.gap, samples["P_N"].max())
 
-`blocks` is the iterator form, `call` the callback form, and `async for samples in daq.ablocks(2000)` the asyncio form.
+Data can be read by an iterator (`blocks`), by a callback (`call`) or with asyncio (`async for samples in
+daq.ablocks(2000)`).
 """
 
 from __future__ import annotations
@@ -19,22 +20,22 @@ import numpy as np
 
 from drivers.link import LinkTimeoutError
 from drivers.sources import Source, open_source
-from drivers.sources.samples import Pile, RowReader, Samples, StreamEndedError, follow
+from drivers.sources.samples import RowBuffer, RowReader, Samples, StreamEndedError, follow
 from rig.base.closeable import Closing
 from rig.base.errors import InputError, UnknownNameError, Words
 from rig.base.wire import Continuity, Gap
 
-_GAPS = 1000
-"""Gaps that are remembered; all are counted."""
+_MAX_GAPS = 1000
+"""Number of gaps that are kept in detail; all are counted."""
 
 
 class Aligner:
-    """Makes rows of some streams one row, by their number; sans-IO.
+    """Merges the rows of several streams by their number; does no input or output itself.
 
     Args:
-        columns: Which columns of each stream are wanted.
-        order: Where each of these columns goes, stream after stream.
-        room: Rows of a stream that wait for the others; beyond, the oldest go.
+        columns: Columns to take from each stream.
+        order: Position of each of these columns in the merged row, stream after stream.
+        room: Largest number of rows of a stream that wait for the other streams; the oldest are dropped.
     """
 
     def __init__(self, columns: Mapping[str, Sequence[int]], order: Sequence[int], room: int) -> None:
@@ -43,18 +44,18 @@ class Aligner:
         self._room = room
         self._rows = Continuity()
         self._waiting: dict[str, deque[Samples]] = {name: deque() for name in columns}
-        self._joint = Continuity()
-        self.gaps: deque[Gap] = deque(maxlen=_GAPS)
+        self._merged_rows = Continuity()
+        self.gaps: deque[Gap] = deque(maxlen=_MAX_GAPS)
         self.unmatched = 0
-        """Rows that were dropped because those of another stream were not there."""
+        """Rows dropped because the row of another stream was missing."""
 
     @property
     def lost(self) -> dict[str, int]:
-        """Rows of each stream that never came."""
+        """Missing rows of each stream."""
         return {name: self._rows.lost.get(name, 0) for name in self._columns}
 
     def feed(self, stream: str, samples: Samples) -> list[Samples]:
-        """Take rows of one stream; returns the rows that are complete now."""
+        """Add rows of one stream, and return the rows that are now complete."""
         runs = self._runs(stream)
         new = follow(self._rows, samples, stream)
         if new is None:
@@ -75,8 +76,8 @@ class Aligner:
         return self._rows.runs.get(stream, 0)
 
     def _complete(self) -> list[Samples]:
-        made = []
-        # Numbers of different runs do not belong together: the streams that are behind must first have begun anew.
+        complete = []
+        # Row numbers of different runs do not match: wait until every stream has reached the newest run.
         newest = max(map(self._runs, self._columns))
         for name, waiting in self._waiting.items():
             if self._runs(name) < newest:
@@ -91,52 +92,52 @@ class Aligner:
             if any(head.index != start for head in heads.values()):
                 continue
             rows = min(map(len, heads.values()))
-            made.append(self._join(heads, rows))
+            complete.append(self._merge(heads, rows))
             for waiting in self._waiting.values():
                 self._trim(waiting, start + rows)
-        return made
+        return complete
 
     @staticmethod
     def _trim(waiting: deque[Samples], start: int) -> None:
-        """Forget rows before a number."""
+        """Drop the rows before a number."""
         while waiting and waiting[0].index + len(waiting[0]) <= start:
             waiting.popleft()
         if waiting and waiting[0].index < start:
             waiting[0] = waiting[0].rows(start - waiting[0].index, len(waiting[0]))
 
-    def _join(self, heads: dict[str, Samples], rows: int) -> Samples:
+    def _merge(self, heads: dict[str, Samples], rows: int) -> Samples:
         first = next(iter(heads.values()))
         chosen = [heads[name].values[:rows, columns] for name, columns in self._columns.items()]
         names = [heads[name].names[n] for name, columns in self._columns.items() for n in columns]
         units = [heads[name].units[n] for name, columns in self._columns.items() for n in columns]
-        joint = replace(
+        merged = replace(
             first,
             names=tuple(names[n] for n in self._order),
             units=tuple(units[n] for n in self._order),
             values=np.concatenate(chosen, axis=1)[:, self._order],
             gap=0,
         )
-        followed = follow(self._joint, joint)
-        assert followed is not None
-        return followed
+        new_rows = follow(self._merged_rows, merged)
+        assert new_rows is not None
+        return new_rows
 
 
 class Daq(RowReader, Closing):
-    """Chosen channels as blocks without a gap inside; each tells how many rows are missing right before it.
+    """Reader of selected channels: blocks without gaps inside, with the number of samples missing before each.
 
     Args:
-        source: Closed with this.
-        channels: Names, which come in this order; all where none are given.
-        rate_hz: Rows per second [Hz]: a whole fraction of what the source has; every n-th row is taken, without a
-            further filter. None is the source's own.
-        buffer_s: Rows that wait to be read, and rows of a stream that wait for those of another [s]; beyond, the oldest
-            are dropped and counted.
+        source: Source of the samples; `close` closes it too.
+        channels: Names of the channels, in the order of the columns; by default all of the source.
+        rate_hz: Sample rate [Hz]: the source's own rate (default) divided by a whole number. Samples are decimated
+            without a filter.
+        buffer_s: Size of the buffer for unread samples [s], and for samples of a stream that wait for another stream.
+            When it is full, the oldest samples are dropped and counted.
 
     Raises:
-        InputError: There is no such channel or rate.
+        InputError: The source has no such channel or rate.
 
     Example:
-        Of a rig that runs: `Daq.open("zenoh:127.0.0.1:7462", channels=["P_E"])`. Here of a source of our own:
+        With a rig that runs: `Daq.open("zenoh:127.0.0.1:7462", channels=["P_E"])`. Here with a stand-in source:
 
         >>> class Rows:
         ...     def streams(self):
@@ -144,7 +145,7 @@ class Daq(RowReader, Closing):
         ...     def start(self, streams, rate_hz, on_samples, on_end):
         ...         self.on_samples, self.on_end = on_samples, on_end
         ...         return 1000.0
-        ...     def taken(self, index, *, room, lost): ...
+        ...     def report_position(self, index, *, room, lost): ...
         ...     def close(self): ...
         >>> source = Rows()
         >>> with Daq(source, channels=["P_N"]) as daq:
@@ -172,28 +173,28 @@ class Daq(RowReader, Closing):
         self._thread: threading.Thread | None = None
         self._error: BaseException | None = None
         available = source.streams()
-        home = {channel: name for name, names in available.items() for channel in names}
-        self.channels = tuple(home if channels is None else channels)
+        stream_of_channel = {channel: name for name, names in available.items() for channel in names}
+        self.channels = tuple(stream_of_channel if channels is None else channels)
         if not self.channels or len(set(self.channels)) != len(self.channels):
             raise InputError("channels", "at least one, each once", list(self.channels))
         for channel in self.channels:
-            if channel not in home:
-                raise UnknownNameError("channel", "one of the source's", channel, home)
+            if channel not in stream_of_channel:
+                raise UnknownNameError("channel", "one of the source's", channel, stream_of_channel)
         wanted = {name: [channel for channel in names if channel in self.channels] for name, names in available.items()}
         wanted = {name: chosen for name, chosen in wanted.items() if chosen}
         columns = {name: [list(available[name]).index(channel) for channel in wanted[name]] for name in wanted}
         order = [self.channels.index(channel) for chosen in wanted.values() for channel in chosen]
         self._running = set(wanted)
-        self._begun = False
+        self._has_samples = False
         self._early: list[tuple[str, Samples]] | None = []
-        # What arrives before the rate is known waits.
+        # Samples that arrive before the rate is known wait in `_early`.
         self.rate_hz = source.start(list(wanted), rate_hz, self._on_samples, self._on_end)
         self._room = max(1, round(buffer_s * self.rate_hz))
         with self._changed:
             self._aligner = Aligner(columns, order, self._room)
-            self._pile = Pile(self._room)
-            # It listens now: a replay may wait for that.
-            source.taken(None, room=self._room, lost=0)
+            self._buffer = RowBuffer(self._room)
+            # Report that this client listens: a replay may wait for it.
+            source.report_position(None, room=self._room, lost=0)
             early, self._early = self._early or [], None
             for name, samples in early:
                 self._feed(name, samples)
@@ -208,11 +209,18 @@ class Daq(RowReader, Closing):
         buffer_s: float = 10.0,
         wait_s: float = 3.0,
     ) -> Self:
-        """Channels at a URL: `zenoh:127.0.0.1:7460` or `can:zenoh:can0`; waits for a rig to be there.
+        """Connect to the source at a URL.
+
+        Args:
+            url: `zenoh:127.0.0.1:7460`, or `can:zenoh:can0` for a CAN bus.
+            channels: Names of the channels, in the order of the columns; by default all of the source.
+            rate_hz: Sample rate [Hz]; by default the source's own rate.
+            buffer_s: Size of the buffer for unread samples [s].
+            wait_s: Longest wait for a rig to reply [s].
 
         Raises:
-            InputError: The URL is malformed, or there is no such channel or rate.
-            ConnectionError: Nothing is there.
+            InputError: The URL is malformed, or the source has no such channel or rate.
+            ConnectionError: No rig replies.
         """
         source = open_source(url, wait_s=wait_s)
         try:
@@ -223,27 +231,27 @@ class Daq(RowReader, Closing):
 
     @property
     def ended(self) -> str | None:
-        """Why nothing more comes, once that is so; what has come can still be read."""
+        """Reason for the end of the stream, or None; samples that have arrived can still be read."""
         return self._ended
 
     @property
     def dropped(self) -> int:
-        """Rows that were dropped because nobody read them in time."""
-        return self._pile.dropped
+        """Samples dropped because they were not read in time."""
+        return self._buffer.dropped
 
     @property
     def unmatched(self) -> int:
-        """Rows that were dropped because those of another stream were not there."""
+        """Samples dropped because the sample of another stream was missing."""
         return self._aligner.unmatched
 
     @property
     def lost(self) -> dict[str, int]:
-        """Rows of each stream that never came."""
+        """Missing samples of each stream."""
         return self._aligner.lost
 
     @property
     def gaps(self) -> list[Gap]:
-        """The last gaps, with the stream that they were in."""
+        """The most recent gaps, with their streams."""
         with self._changed:
             return list(self._aligner.gaps)
 
@@ -251,7 +259,15 @@ class Daq(RowReader, Closing):
         return self.blocks()
 
     def call(self, function: Callable[[Samples], object], *, rows: int | None = None) -> None:
-        """Call a function with each block, on a thread of its own; one that is slow loses rows, which are counted."""
+        """Call a function with each block, on a separate thread; a slow function loses samples, which are counted.
+
+        Args:
+            function: Called with the samples of each block.
+            rows: Samples per block; by default all that have arrived.
+
+        Raises:
+            InputError: A function was given before.
+        """
         if self._thread is not None:
             raise InputError("call", "made once", Words("a second function"))
 
@@ -273,10 +289,16 @@ class Daq(RowReader, Closing):
         self._thread.start()
 
     def wait(self, *, timeout_s: float | None = None) -> bool:
-        """Wait until `call` has handed on everything; returns whether it has.
+        """Wait until `call` has passed on all samples of a stream that has ended.
+
+        Args:
+            timeout_s: Longest wait [s]; by default no limit.
+
+        Returns:
+            Whether all samples were passed on in time.
 
         Raises:
-            BaseException: What the function raised, which ended the calls.
+            BaseException: The function's exception, which ended the calls.
         """
         if self._thread is None:
             raise InputError("wait", "called after call", Words("no function"))
@@ -286,7 +308,7 @@ class Daq(RowReader, Closing):
         return not self._thread.is_alive()
 
     async def aread(self, rows: int | None = None, *, timeout_s: float = 5.0) -> Samples:
-        """As `read`, for asyncio."""
+        """Read samples with asyncio; arguments and errors as for `read`."""
         import asyncio
 
         self._check(rows)
@@ -312,7 +334,7 @@ class Daq(RowReader, Closing):
                 self._wakers.discard(wake)
 
     async def ablocks(self, rows: int | None = None, *, timeout_s: float = 5.0) -> AsyncIterator[Samples]:
-        """Read until the end, for asyncio."""
+        """Yield blocks to the end of the stream, with asyncio."""
         while True:
             try:
                 samples = await self.aread(rows, timeout_s=timeout_s)
@@ -324,13 +346,13 @@ class Daq(RowReader, Closing):
         return self.ablocks()
 
     def _take(self, rows: int | None, *, whole: bool = True) -> Samples | None:
-        """Rows that are ready; the lock is held."""
+        """Return the rows that are ready; the caller holds the lock."""
         if self._closed:
             raise StreamEndedError("the client was closed")
         ready = super()._take(rows, whole=whole)
         if ready is not None:
             lost = sum(self._aligner.lost.values())
-            self._source.taken(ready.index + len(ready), room=self._room, lost=lost)
+            self._source.report_position(ready.index + len(ready), room=self._room, lost=lost)
         return ready
 
     def _on_samples(self, stream: str, samples: Samples) -> None:
@@ -343,14 +365,14 @@ class Daq(RowReader, Closing):
     def _feed(self, stream: str, samples: Samples) -> None:
         if self._ended is not None:
             return
-        if not self._begun:
-            # What is to come will be measured from here.
-            self._begun = True
-            self._source.taken(samples.index, room=self._room, lost=0)
-        made = self._aligner.feed(stream, samples)
-        for joint in made:
-            self._pile.add(joint)
-        if made:
+        if not self._has_samples:
+            # Positions are reported relative to the first sample.
+            self._has_samples = True
+            self._source.report_position(samples.index, room=self._room, lost=0)
+        complete = self._aligner.feed(stream, samples)
+        for merged in complete:
+            self._buffer.add(merged)
+        if complete:
             self._notify()
 
     def _on_end(self, stream: str, reason: str) -> None:
@@ -366,7 +388,7 @@ class Daq(RowReader, Closing):
             wake()
 
     def close(self) -> None:
-        """Close the source; may be called again."""
+        """Close the source; further calls have no effect."""
         with self._changed:
             self._closed = True
             self._notify()

@@ -1,6 +1,6 @@
-"""The DBC of the rig, made from the table of messages.
+"""DBC file of the rig, generated from the message table.
 
-`rig can dbc -o FILE` writes it; drivers/can/rig.dbc is its committed copy.
+`rig can dbc -o FILE` writes it; drivers/can/rig.dbc is the committed copy.
 """
 
 from __future__ import annotations
@@ -9,14 +9,14 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from drivers.can.message import Message, MessageTable, Signal
+from drivers.can.message import CanMessage, MessageTable, Signal
 from drivers.can.signals import CONTROLLER, RIG, default_messages
 
 if TYPE_CHECKING:
     from cantools.database.can import Database
 
 COPY = Path(__file__).with_name("rig.dbc")
-"""The committed copy."""
+"""Path of the committed copy."""
 
 _COMMENT = (
     "Virtual rotor-stator test rig. Made from the channel table by rig can dbc; do not edit by hand. Calibrations of "
@@ -34,76 +34,76 @@ _FRAME_FORMATS = (
     "StandardCAN_FD",
     "ExtendedCAN_FD",
 )
-"""As Vector's attribute VFrameFormat numbers them."""
+"""Frame formats in the order of Vector's attribute VFrameFormat."""
 
 
 def text(table: MessageTable | None = None) -> str:
-    """The DBC file."""
+    """Return the text of the DBC file."""
     rows = (table or default_messages()).messages
-    return "\n".join([*_head(), *_messages(rows), *_comments(rows), *_attributes(rows), *_values(rows), ""])
+    return "\n".join([*_header(), *_messages(rows), *_comments(rows), *_attributes(rows), *_values(rows), ""])
 
 
-def _plain(text: str) -> str:
-    """A text that fits between two quotes, in the characters that readers of DBC files take."""
+def _sanitise_text(text: str) -> str:
+    """Replace quotes, backslashes and characters that readers of DBC files reject."""
     return text.replace('"', "'").replace("\\", "/").encode("cp1252", "replace").decode("cp1252")
 
 
 def database(table: MessageTable | None = None) -> Database:
-    """The messages as a cantools database."""
+    """Load the messages as a cantools database."""
     from cantools.database import load_string
     from cantools.database.can import Database
 
-    made = load_string(text(table), "dbc")
-    assert isinstance(made, Database)
-    return made
+    loaded = load_string(text(table), "dbc")
+    assert isinstance(loaded, Database)
+    return loaded
 
 
-def _head() -> Iterator[str]:
+def _header() -> Iterator[str]:
     yield from ('VERSION "1"', "", "NS_ :", "", "BS_:", "", f"BU_: {' '.join(_NODES)}", "")
 
 
-def _messages(rows: tuple[Message, ...]) -> Iterator[str]:
-    several = []
+def _messages(rows: tuple[CanMessage, ...]) -> Iterator[str]:
+    multiplexed = []
     for row in rows:
         yield f"BO_ {row.identifier} {row.name}: {row.length} {row.sender}"
         selector = next((signal.name for signal in row.signals if signal.selects), "")
         for signal in row.signals:
-            yield _signal(row, signal)
+            yield _format_signal(row, signal)
             if signal.selected_by:
                 spans = ", ".join(f"{value}-{value}" for value in signal.selected_by)
-                several.append(f"SG_MUL_VAL_ {row.identifier} {signal.name} {selector} {spans};")
+                multiplexed.append(f"SG_MUL_VAL_ {row.identifier} {signal.name} {selector} {spans};")
         yield ""
-    yield from (*several, "")
+    yield from (*multiplexed, "")
 
 
-def _signal(row: Message, signal: Signal) -> str:
+def _format_signal(row: CanMessage, signal: Signal) -> str:
     selection = " M" if signal.selects else f" m{int(signal.selected_by[0])}" if signal.selected_by else ""
     low, high = (raw * signal.scale + signal.offset for raw in signal.raw_range)
     receiver = CONTROLLER if row.sender == RIG else RIG
     return (
         f" SG_ {signal.name}{selection} : {signal.start}|{signal.bits}@1{'-' if signal.signed else '+'} "
         f"({_number(signal.scale)},{_number(signal.offset)}) [{_number(low)}|{_number(high)}] "
-        f'"{_plain(signal.unit)}" {receiver}'
+        f'"{_sanitise_text(signal.unit)}" {receiver}'
     )
 
 
 def _number(value: float) -> str:
-    """All digits of a float, so that decoded values are those of the channel table; 1 for 1.0."""
+    """Format a float with all its digits, so that decoded values equal the channel table's; 1 for 1.0."""
     return f"{int(value)}" if value == int(value) else repr(float(value))
 
 
-def _comments(rows: tuple[Message, ...]) -> Iterator[str]:
+def _comments(rows: tuple[CanMessage, ...]) -> Iterator[str]:
     yield f'CM_ "{_COMMENT}";'
     for name, label in _NODES.items():
         yield f'CM_ BU_ {name} "{label}.";'
     for row in rows:
-        yield f'CM_ BO_ {row.identifier} "{_plain(row.label)}.";'
+        yield f'CM_ BO_ {row.identifier} "{_sanitise_text(row.label)}.";'
         for signal in row.signals:
             if signal.label:
-                yield f'CM_ SG_ {row.identifier} {signal.name} "{_plain(signal.label)}.";'
+                yield f'CM_ SG_ {row.identifier} {signal.name} "{_sanitise_text(signal.label)}.";'
 
 
-def _attributes(rows: tuple[Message, ...]) -> Iterator[str]:
+def _attributes(rows: tuple[CanMessage, ...]) -> Iterator[str]:
     names = ",".join(f'"{name}"' for name in _FRAME_FORMATS)
     yield 'BA_DEF_ "BusType" STRING ;'
     yield f'BA_DEF_ BO_ "VFrameFormat" ENUM {names};'
@@ -118,12 +118,12 @@ def _attributes(rows: tuple[Message, ...]) -> Iterator[str]:
         if row.fd:
             yield f'BA_ "VFrameFormat" BO_ {row.identifier} {_FRAME_FORMATS.index("StandardCAN_FD")};'
             yield f'BA_ "CANFD_BRS" BO_ {row.identifier} 1;'
-        # The attribute counts whole milliseconds; the faster frames have their period in the comment.
+        # The attribute has whole milliseconds; faster frames have their period in the comment.
         if row.periodic and row.period_s >= 1e-3:
             yield f'BA_ "GenMsgCycleTime" BO_ {row.identifier} {round(1e3 * row.period_s)};'
 
 
-def _values(rows: tuple[Message, ...]) -> Iterator[str]:
+def _values(rows: tuple[CanMessage, ...]) -> Iterator[str]:
     for row in rows:
         for signal in row.signals:
             if signal.choices:

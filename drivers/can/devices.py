@@ -1,6 +1,6 @@
-"""Devices under test in lockstep, in frames: a block is over, a device joins, is done, leaves, and what becomes of it.
+"""Frames of devices under test in lockstep: end of a block, join, done, leave, and the resulting state.
 
-A node number stands for a name: the rig knows the device 7 of a bus as "CAN 7".
+A node number represents the name: the rig calls device 7 of a bus "CAN 7".
 """
 
 from __future__ import annotations
@@ -12,24 +12,24 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
 
-from drivers.can.message import KEY, Message, Signal, checksum
+from drivers.can.message import KEY, CanMessage, Signal, checksum
 from rig.base.errors import InputError
 
-_NAME = re.compile(r"CAN (\d{1,3})")
+_DEVICE_NAME = re.compile(r"CAN (\d{1,3})")
 _WORD_32 = 0xFFFFFFFF
 _PATIENCE_STEP_S = 0.1
 
 
 class DeviceKind(IntEnum):
-    """What a device says; any two differ in at least four bits."""
+    """Kind of a device's frame; any two differ in at least four bits."""
 
     JOIN = 0x0F
     DONE = 0xF0
     LEAVE = 0x33
 
 
-class Standing(IntEnum):
-    """How the rig holds with a device."""
+class DeviceState(IntEnum):
+    """State of a device for the rig."""
 
     JOINED = 1
     LEFT = 2
@@ -38,12 +38,12 @@ class Standing(IntEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Said:
-    """What a device said.
+class DeviceRequest:
+    """Content of a device's frame.
 
     Attributes:
-        kind: What.
-        node: Its number, 0 to 255; what answers are told to.
+        kind: Join, done or leave.
+        node: Number of the device, 0 to 255.
         values: Fields of the rig's command of that name.
     """
 
@@ -53,16 +53,16 @@ class Said:
 
     @property
     def counter(self) -> int:
-        """What an Acknowledge of a frame that could not be read names: where a command has its counter."""
+        """Counter for the Acknowledge of an unreadable frame: the byte that holds a command's counter."""
         return self.node
 
 
-def device_messages(rig: str, controller: str, time: str) -> list[Message]:
-    """The messages, given the names of both senders and what a time is."""
+def device_messages(rig: str, controller: str, time: str) -> list[CanMessage]:
+    """Return the messages, with the names of the two sending nodes and the label of a time."""
     join, done, leave = ((int(kind),) for kind in DeviceKind)
     node = Signal("node", 8, 8, label="The device; any number that no other device on the bus has")
     return [
-        Message(
+        CanMessage(
             "Device", 0x023, 8, False, math.inf, False, controller,
             "A device under test, to a rig in lockstep: no block is run before all that have joined are done with the "
             "one before. Not counted, and harmless to repeat; DeviceState answers join and leave",
@@ -86,20 +86,20 @@ def device_messages(rig: str, controller: str, time: str) -> list[Message]:
                 ),
             ),
         ),
-        Message(
+        CanMessage(
             "DeviceState", 0x024, 8, False, math.inf, False, rig,
             "The rig waits for a device from now on, or no longer; lost: not done in time, or with another block",
             (
                 Signal("node", 0, 8, label="The device"),
                 Signal(
                     "state", 8, 8, label="How the rig holds with it",
-                    choices={member.value: member.name.lower() for member in Standing},
+                    choices={member.value: member.name.lower() for member in DeviceState},
                 ),
                 Signal("reserved", 16, 16, label="Always 0"),
                 Signal("time", 32, 32, unit="us", label=f"Since when. {time}"),
             ),
         ),
-        Message(
+        CanMessage(
             "Block", 0x320, 8, False, math.inf, False, rig,
             "In lockstep, while a device has joined: a block is over, and all frames of it went before. A command that "
             "was acknowledged before the last device is done takes effect at its end",
@@ -112,19 +112,19 @@ def device_messages(rig: str, controller: str, time: str) -> list[Message]:
 
 
 def device_frame(
-    message: Message, kind: DeviceKind, node: int, *, block: int = 0, patience_s: float = 0.0
+    message: CanMessage, kind: DeviceKind, node: int, *, block: int = 0, patience_s: float = 0.0
 ) -> tuple[int, bytes]:
-    """Identifier and data of what a device says.
+    """Encode a device's frame; return its identifier and data.
 
     Args:
-        message: `Device` of a table.
-        kind: What.
-        node: Its number, 0 to 255.
-        block: The block that it is done with.
-        patience_s: How long the rig waits when it joins, to 0.1 [s]; 0 is 10 s.
+        message: The message `Device` of a table.
+        kind: Join, done or leave.
+        node: Number of the device, 0 to 255.
+        block: Number of the block that it is done with.
+        patience_s: When it joins, how long the rig waits for it, in steps of 0.1 [s]; 0 for 10 s.
 
     Raises:
-        InputError: A value finds no room.
+        InputError: A value does not fit.
     """
     raw: dict[str, int] = {}
     if kind is DeviceKind.JOIN:
@@ -134,32 +134,32 @@ def device_frame(
     try:
         data = message.encode(kind=int(kind), node=node, key=KEY, **raw)
     except ValueError as error:
-        raise InputError("device", "of a node from 0 to 255 and a patience up to 6553.5 s", str(error)) from None
+        raise InputError("device", "one with a node from 0 to 255 and a patience up to 6553.5 s", str(error)) from None
     return message.identifier, data[:7] + bytes([checksum(message.identifier, data)])
 
 
-def said_in(raw: Mapping[str, int]) -> Said | None:
-    """What a device said, of a frame whose length, key and checksum are right; None where it is nothing."""
+def parse_device_frame(raw: Mapping[str, int]) -> DeviceRequest | None:
+    """Decode a device's frame with valid length, key and checksum; return None if its content is invalid."""
     try:
         kind = DeviceKind(raw["kind"])
     except ValueError:
         return None
     if raw.get("reserved", 0) or raw.get("reserved_join", 0):
         return None
-    values: dict[str, Any] = {"device": name_of(raw["node"])}
+    values: dict[str, Any] = {"device": device_name(raw["node"])}
     if kind is DeviceKind.JOIN and raw["patience"]:
         values["patience_s"] = round(raw["patience"] * _PATIENCE_STEP_S, 6)
     if kind is DeviceKind.DONE:
         values["block"] = raw["block"]
-    return Said(kind, raw["node"], values)
+    return DeviceRequest(kind, raw["node"], values)
 
 
-def name_of(node: int) -> str:
-    """What the rig calls a device of a bus."""
+def device_name(node: int) -> str:
+    """Return the rig's name for a device on a bus."""
     return f"CAN {node}"
 
 
-def node_of(name: object) -> int | None:
-    """Number of the device that the rig calls so; None of one that is not on a bus."""
-    match = _NAME.fullmatch(str(name))
+def device_node(name: object) -> int | None:
+    """Return the number of a device on a bus from its name; None for another device."""
+    match = _DEVICE_NAME.fullmatch(str(name))
     return int(match[1]) if match and int(match[1]) < 256 else None

@@ -1,11 +1,11 @@
-"""Faults in the four bytes of a CAN command: which, where, and its main number to three digits."""
+"""Faults in the four bytes of a CAN command: kind, target, and the main number with three digits."""
 
 from __future__ import annotations
 
 from enum import IntEnum
 from typing import Any
 
-from drivers.can.message import Message, Signal
+from drivers.can.message import CanMessage, Signal
 from rig.base.errors import InputError, UnknownNameError
 from rig.channels.faults import KINDS
 from rig.channels.table import ChannelTable
@@ -23,8 +23,8 @@ _FAULT, _CLEAR = (int(FaultKind.FAULT),), (int(FaultKind.CLEAR),)
 
 
 def fault_signals(channels: ChannelTable) -> tuple[Signal, ...]:
-    """What stands in the first six bytes, beside the counter."""
-    named = ", ".join(f"{name}: {kind.main()}" for name, kind in KINDS.items() if kind.main())
+    """Return the signals of the first six bytes, except the counter."""
+    main_numbers = ", ".join(f"{name}: {kind.main()}" for name, kind in KINDS.items() if kind.main())
     targets = [*channels.groups, *channels.channels]
     return (
         Signal(
@@ -32,7 +32,7 @@ def fault_signals(channels: ChannelTable) -> tuple[Signal, ...]:
             choices={member.value: member.name.lower() for member in FaultKind},
         ),
         Signal(
-            "fault", 16, 8, label=f"Which; its main number is, of {named}", selected_by=_FAULT,
+            "fault", 16, 8, label=f"Which; its main number is, of {main_numbers}", selected_by=_FAULT,
             choices=dict(enumerate(KINDS, start=1)),
         ),
         Signal(
@@ -48,31 +48,31 @@ def fault_signals(channels: ChannelTable) -> tuple[Signal, ...]:
     )  # fmt: skip
 
 
-def fault_raw(message: Message, channel: str, kind: str, number: float | str | None) -> dict[str, int]:
-    """Raw values that ask for a fault.
+def fault_raw(message: CanMessage, channel: str, kind: str, number: float | str | None) -> dict[str, int]:
+    """Return the raw values of a request for a fault.
 
     Raises:
-        InputError: There is none such, or its number finds no room.
+        InputError: The fault or channel does not exist, or its number does not fit.
     """
     if kind not in KINDS:
         raise UnknownNameError("fault.kind", "one of the kinds", kind, KINDS)
     targets = _targets(message)
-    raw = {"kind": int(FaultKind.FAULT), "fault": [*KINDS].index(kind) + 1, "target": _of(channel, targets)}
+    raw = {"kind": int(FaultKind.FAULT), "fault": [*KINDS].index(kind) + 1, "target": _find_target(channel, targets)}
     if number is None:
         return raw
     main = KINDS[kind].main()
     if not main:
-        raise InputError("number", f"left out: {kind} has none", number)
+        raise InputError("number", f"left out: {kind} has no main number", number)
     if isinstance(number, str):
-        return raw | {"number": _of(number, targets)}
+        return raw | {"number": _find_target(number, targets)}
     exponent = next((e for e in range(-8, 8) if abs(round(number / 10.0**e)) <= 2047), None)
     if exponent is None:
         raise InputError(main, "at most 2.047e10 in a CAN frame", number)
     return raw | {"number": round(number / 10.0**exponent), "exponent": exponent}
 
 
-def fault_request(message: Message, raw: dict[str, int]) -> dict[str, Any] | None:
-    """The request in raw values, as the rig takes it; None where there is no such fault or target."""
+def fault_request(message: CanMessage, raw: dict[str, int]) -> dict[str, Any] | None:
+    """Convert raw values to the rig's request; None if the fault or target does not exist."""
     if raw["kind"] == FaultKind.CLEAR:
         return {"id": raw["id"] or "all"}
     targets, kinds = _targets(message), dict(enumerate(KINDS, start=1))
@@ -92,12 +92,12 @@ def fault_request(message: Message, raw: dict[str, int]) -> dict[str, Any] | Non
     return request
 
 
-def _targets(message: Message) -> dict[int, str]:
+def _targets(message: CanMessage) -> dict[int, str]:
     return dict(next(signal for signal in message.signals if signal.name == "target").choices or {})
 
 
-def _of(name: str, targets: dict[int, str]) -> int:
+def _find_target(name: str, targets: dict[int, str]) -> int:
     found = next((value for value, other in targets.items() if other == name), None)
     if found is None:
-        raise UnknownNameError("fault.channel", "one of the channels, or of their groups", name, targets.values())
+        raise UnknownNameError("fault.channel", "the name of a channel or channel group", name, targets.values())
     return found

@@ -1,6 +1,6 @@
-"""Python-can's way onto the virtual CAN: `can.Bus(interface="zenoh", channel="can0")` from any process of this machine.
+"""Python-can interface of the virtual CAN: `can.Bus(interface="zenoh", channel="can0")` in any local process.
 
-`ZenohBus` reaches a hub in another process, `HubBus` one in this process.
+`ZenohBus` connects to a hub in another process, `HubBus` to one in this process.
 """
 
 from __future__ import annotations
@@ -23,21 +23,21 @@ if TYPE_CHECKING:
 
     from drivers.can.bus.hub import Hub
 
-_JOIN_S = 2.0
+_REQUEST_TIMEOUT_S = 2.0
 
 
 class ZenohBus(NodeBus):
-    """A node of a virtual CAN bus whose hub runs in another process of this machine.
+    """A node of a virtual CAN bus whose hub runs in another process of this computer.
 
     Args:
         channel: Name of the bus.
-        endpoint: HOST:PORT of the hub, on 127.0.0.1; one of another machine is reached by `ssh -L`.
-        connect_s: How long to wait for the hub to be there [s].
-        **settings: Those of every bus here: can_filters, receive_own_messages, fd, listen_only, rx_queue_size, bitrate,
+        endpoint: HOST:PORT of the hub, on 127.0.0.1; use `ssh -L` for a hub on another computer.
+        connect_s: Longest wait for the hub [s].
+        **settings: Settings of `NodeBus`: can_filters, receive_own_messages, fd, listen_only, rx_queue_size, bitrate,
             data_bitrate, timing.
 
     Raises:
-        CanInitializationError: No hub of that channel is there, or it has another bus than was asked for.
+        CanInitializationError: No hub of that channel replies, or its bus has other settings.
     """
 
     def __init__(
@@ -50,7 +50,7 @@ class ZenohBus(NodeBus):
     ) -> None:
         self._address, self._connect_s = str(endpoint), connect_s
         super().__init__(channel, **settings)
-        # Only now: a hub that comes back is joined anew, which must not meet the first time.
+        # Last, so that rejoining a restarted hub cannot coincide with the first join.
         self.client.watch(codec.alive_key(self.channel), self._watch)
         self.channel_info = f"zenoh {self.channel} at {self._address}"
 
@@ -67,17 +67,17 @@ class ZenohBus(NodeBus):
         try:
             self.client = ZenohClient(self._address, wait_s=self._connect_s)
         except NoReplyError:
-            raise can.CanInitializationError(self._nobody()) from None
+            raise can.CanInitializationError(self._describe_missing_hub()) from None
         self.client.announce(codec.node_key(self.channel, self.name))
         self.client.subscribe(
             codec.bus_key(self.channel),
-            lambda _, payload: self._hear(payload),
+            lambda _, payload: self._receive(payload),
             on_miss=lambda _, count: self._missed(count),
         )
 
-    def _nobody(self) -> str:
+    def _describe_missing_hub(self) -> str:
         return (
-            f"no hub for CAN channel {self.channel} answers at {self._address}; name where it listens "
+            f"no hub for CAN channel {self.channel} replies at {self._address}; give its address "
             f"(endpoint=HOST:PORT), or start one with: rig can hub {self.channel} (or with the rig: rig run --can "
             f"zenoh:{self.channel})"
         )
@@ -90,13 +90,13 @@ class ZenohBus(NodeBus):
 
         payload = json.dumps({"endpoint": self.name, **document}).encode()
         try:
-            answer = self.client.request(codec.request_key(self.channel, name), payload, timeout_s=_JOIN_S)
+            answer = self.client.request(codec.request_key(self.channel, name), payload, timeout_s=_REQUEST_TIMEOUT_S)
         except NoReplyError as error:
             if name != "join":
-                raise can.CanOperationError(f"{self._where()} does not answer: {error}") from None
+                raise can.CanOperationError(f"{self._where()} does not reply: {error}") from None
             others = [key.split("/")[2] for key in self.client.tokens(codec.ALIVE)]
-            also = f" (channels there: {', '.join(others)})" if others else ""
-            raise can.CanInitializationError(self._nobody() + also) from None
+            known_channels = f" (channels there: {', '.join(others)})" if others else ""
+            raise can.CanInitializationError(self._describe_missing_hub() + known_channels) from None
         document = read_json(answer, field="hub")
         if "error" in document:
             raise RefusedError(str(document["error"]))
@@ -106,24 +106,24 @@ class ZenohBus(NodeBus):
         payload = bytes.fromhex(secret) + codec.encode(records)
         self.client.report(codec.offer_key(self.channel, self.name), payload)
 
-    def _hear(self, payload: bytes) -> None:
-        """A message of the hub, on the thread of the connection."""
+    def _receive(self, payload: bytes) -> None:
+        """Process a message of the hub, on the thread of the connection."""
         try:
-            said = codec.decode(payload)
+            message = codec.decode(payload)
         except codec.CodecError:
             self.malformed += 1
         else:
-            self.hear(said)
+            self.receive(message)
 
     def _watch(self, there: bool) -> None:
-        """The hub has gone, or is there again."""
+        """Handle the hub's token: the hub has stopped or restarted."""
         if not there:
             self._lost()
         elif not self._there and not self._is_shutdown:
             try:
                 self._join()
             except can.CanError:
-                # A hub of another kind, or gone again: the bus stays without one, which its state and send tell.
+                # Another kind of hub, or stopped again: the bus stays without one, as its state and `send` report.
                 self._lost()
 
     def _leave(self) -> None:
@@ -131,7 +131,7 @@ class ZenohBus(NodeBus):
 
     @staticmethod
     def _detect_available_configs() -> Sequence[AutoDetectedConfig]:
-        """Channels of the hub at the default endpoint; none where no hub runs."""
+        """Return the channels of the hub at the default endpoint; none without a hub."""
         from rig.serve.transport import NoReplyError
         from rig.serve.transport.zenoh import ZenohClient
 
@@ -144,11 +144,11 @@ class ZenohBus(NodeBus):
 
 
 class HubBus(NodeBus):
-    """A node of a virtual CAN bus whose hub runs in this very process.
+    """A node of a virtual CAN bus whose hub runs in this process.
 
     Args:
         hub: The hub.
-        **settings: As those of `ZenohBus`.
+        **settings: As for `ZenohBus`.
     """
 
     def __init__(self, hub: Hub, **settings: Any) -> None:
@@ -157,7 +157,7 @@ class HubBus(NodeBus):
         self.channel_info = f"{hub.channel} of this process"
 
     def _connect(self) -> None:
-        self.secret = self._hub.connect(self.name, self.hear, self._lost)
+        self.secret = self._hub.connect(self.name, self.receive, self._lost)
 
     def _where(self) -> str:
         return f"the hub of CAN channel {self.channel} in this process"
@@ -169,16 +169,17 @@ class HubBus(NodeBus):
         self._hub.offer_records(self.name, secret, records, due_ns)
 
     def schedule_records(self, records: np.ndarray, due_ns: np.ndarray, timeout: float | None = None) -> None:
-        """Hand frames to the hub before they are due, so that nobody has to wake up for each.
+        """Pass frames to the hub before they are due, so that no thread has to wake for each frame.
 
         Args:
-            records: As for `send_records`, at most a transmit queue of them.
-            due_ns: When the controller gets each by the hub's clock, usually `time.monotonic_ns` [ns], shape of
-                `records`; a time that has passed is now.
-            timeout: How long to wait for room in the transmit queue, which frames that are not due take as well [s].
+            records: As for `send_records`, at most as many as a transmit queue holds.
+            due_ns: Time at which the controller receives each frame [ns of the hub's clock, usually
+                `time.monotonic_ns`],
+                shape of `records`; a time in the past means now.
+            timeout: Longest wait for room in the transmit queue [s]; frames that are not due take room as well.
 
         Raises:
-            CanOperationError: As `send_records`.
+            CanOperationError: As for `send_records`.
         """
         self._check_open()
         self._reserve(len(records), timeout)

@@ -1,4 +1,4 @@
-"""What a CAN message is: its signals bit by bit, how samples lie in it, and its bytes."""
+"""CAN messages: their signals bit by bit, the layout of samples, and encoding."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ import numpy as np
 from rig.channels.table import Channel
 
 KEY = 0x9D
-"""What every command carries."""
+"""Constant key of every command."""
 ABSENT = -32768
-"""Value of a channel that a run does not have, in a classic frame; counts stop one above it."""
+"""Value of an absent channel in a classic frame; counts stop one above it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,16 +24,16 @@ class Signal:
     Attributes:
         name: Unique in its message.
         start: Position of its lowest bit in the little-endian message.
-        bits: Width.
-        signed: Two's complement.
+        bits: Width [bits].
+        signed: Whether it is in two's complement.
         scale: Unit per step.
         offset: Value at 0.
         unit: Engineering unit.
-        label: What it is.
+        label: Description.
         choices: Names of values.
-        selects: It tells which of the signals with `selected_by` are there.
-        selected_by: Value of the selecting signal with which this one is there.
-        channel: Channel that it carries a sample of, or None.
+        selects: Whether it selects which of the signals with `selected_by` are present.
+        selected_by: Values of the selecting signal with which this signal is present.
+        channel: Channel of which it carries a sample, or None.
     """
 
     name: str
@@ -51,18 +51,18 @@ class Signal:
 
     @property
     def raw_range(self) -> tuple[int, int]:
-        """Least and largest value that the bits can hold."""
+        """Smallest and largest value that the bits can hold."""
         return (-(1 << self.bits - 1), (1 << self.bits - 1) - 1) if self.signed else (0, (1 << self.bits) - 1)
 
 
 @dataclass(frozen=True, slots=True)
-class Samples:
-    """How samples lie in a message: a running number, then instant after instant, channel after channel.
+class SampleLayout:
+    """Layout of samples in a message: a running number, then instant after instant, channel after channel.
 
     Attributes:
-        channels: What is in it, in order.
-        rows: Instants a frame.
-        width: Bytes a value.
+        channels: Channels, in order.
+        rows: Instants per frame.
+        width: Bytes per value.
         index_width: Bytes of the running number.
     """
 
@@ -73,21 +73,21 @@ class Samples:
 
     @property
     def groups(self) -> tuple[str, ...]:
-        """Sensor groups that the channels come from."""
+        """Channel groups of the channels."""
         return tuple(dict.fromkeys(channel.group for channel in self.channels))
 
     @property
     def shifts(self) -> np.ndarray:
-        """Lower bits of the recorded counts that are left out, shape (channels,)."""
+        """Number of low bits of the recorded counts that are left out, shape (channels,)."""
         return np.array([max(0, channel.adc_bits - 8 * self.width) for channel in self.channels])
 
     def pack(self, numbers: np.ndarray, counts: np.ndarray, length: int) -> np.ndarray:
-        """Data of frames.
+        """Encode samples as data of frames.
 
         Args:
-            numbers: Running number of each frame's first instant; what does not fit is cut off, shape (frames,).
+            numbers: Running number of each frame's first instant, truncated to `index_width`, shape (frames,).
             counts: Recorded counts, int32, shape (frames * rows, channels).
-            length: Bytes of a frame.
+            length: Bytes per frame.
 
         Returns:
             uint8, shape (frames, length).
@@ -104,14 +104,14 @@ class Samples:
         return out
 
     def unpack(self, data: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Running numbers and values of frames.
+        """Decode running numbers and values of frames.
 
         Args:
             data: uint8, shape (frames, length).
 
         Returns:
-            Number of each frame's first instant, int64, shape (frames,), and the values as they are in the frames,
-            int32, shape (frames * rows, channels).
+            Number of each frame's first instant, int64, shape (frames,), and the values as in the frames, int32, shape
+            (frames * rows, channels).
         """
         frames, size = len(data), self.rows * len(self.channels)
         head = np.zeros((frames, 8), np.uint8)
@@ -123,7 +123,7 @@ class Samples:
         return head.view("<i8").reshape(frames), values
 
     def engineering(self, values: np.ndarray) -> np.ndarray:
-        """Values of `unpack` in each channel's unit, float64, shape (instants, channels); nan where it is absent."""
+        """Convert values of `unpack` to the channels' units, float64, shape (instants, channels); nan if absent."""
         scale = np.array([channel.scale for channel in self.channels]) * 2.0**self.shifts
         out = values * scale + np.array([channel.offset for channel in self.channels])
         if self.width == 2:
@@ -132,21 +132,21 @@ class Samples:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Message:
-    """A kind of frame.
+class CanMessage:
+    """A message: identifier, length, period and signals.
 
     Attributes:
-        name: Unique.
+        name: Unique name.
         identifier: 11 bits.
-        length: Bytes.
-        fd: A CAN FD frame with bit rate switch.
-        period_s: How often it is sent, or at most sent where nothing but events sends it [s]; infinite: in lockstep
-            alone, where the samples wait for it, so that it takes no share of the bus.
-        periodic: Whether it is sent by the clock.
-        sender: Node.
-        label: What it is.
-        signals: What is in it.
-        samples: Where it carries samples, how.
+        length: Length [bytes].
+        fd: Whether it is a CAN FD frame with bit rate switch.
+        period_s: Period, or shortest period of a message sent by events [s]; infinite for one that is sent in lockstep
+            only, where the samples wait for it, so that it takes no share of the bus.
+        periodic: Whether it is sent periodically.
+        sender: Sending node.
+        label: Description.
+        signals: Signals.
+        samples: Layout of its samples, if any.
     """
 
     name: str
@@ -158,10 +158,10 @@ class Message:
     sender: str
     label: str
     signals: tuple[Signal, ...]
-    samples: Samples | None = None
+    samples: SampleLayout | None = None
 
     def encode(self, **raw: int) -> bytes:
-        """Data with these raw values; signals that are not named are 0.
+        """Encode raw values; signals that are not named are 0.
 
         Raises:
             ValueError: A value does not fit its bits.
@@ -177,7 +177,7 @@ class Message:
         return total.to_bytes(self.length, "little")
 
     def decode(self, data: bytes) -> dict[str, int]:
-        """Raw values by name; of signals that take turns, those that are there."""
+        """Decode raw values by name; of multiplexed signals, those that are present."""
         total = int.from_bytes(data, "little")
         values: dict[str, int] = {}
         selected = None
@@ -196,9 +196,9 @@ class Message:
 class MessageTable:
     """All messages of a rig."""
 
-    messages: tuple[Message, ...]
-    by_name: dict[str, Message] = field(init=False)
-    by_identifier: dict[int, Message] = field(init=False)
+    messages: tuple[CanMessage, ...]
+    by_name: dict[str, CanMessage] = field(init=False)
+    by_identifier: dict[int, CanMessage] = field(init=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "by_name", {message.name: message for message in self.messages})
@@ -207,18 +207,18 @@ class MessageTable:
             raise ValueError("names and identifiers of CAN messages must be unique")
 
     @property
-    def classic(self) -> tuple[Message, ...]:
+    def classic(self) -> tuple[CanMessage, ...]:
         """Messages of the classic sample layout."""
         return tuple(row for row in self.messages if row.samples is not None and not row.fd)
 
     @property
-    def fd(self) -> tuple[Message, ...]:
+    def fd(self) -> tuple[CanMessage, ...]:
         """Messages of the FD sample layout."""
         return tuple(row for row in self.messages if row.samples is not None and row.fd)
 
     @property
     def layout(self) -> int:
-        """A number for how samples lie in the messages, 1 to 255, by which two sides can tell that theirs differ."""
+        """Fingerprint of the sample messages, 1 to 255, by which two sides detect different layouts."""
         said = [
             (
                 row.name,
@@ -231,16 +231,16 @@ class MessageTable:
         return zlib.crc32(repr(said).encode()) % 255 + 1
 
     @property
-    def others(self) -> tuple[Message, ...]:
+    def others(self) -> tuple[CanMessage, ...]:
         """Messages without samples."""
         return tuple(row for row in self.messages if row.samples is None)
 
-    def schedule(self, *, classic_hz: float | None = None, fd_hz: float | None = None) -> dict[Message, float]:
-        """What is on the bus, and how often [s].
+    def schedule(self, *, classic_hz: float | None = None, fd_hz: float | None = None) -> dict[CanMessage, float]:
+        """Return the messages on the bus, and their periods [s].
 
         Args:
-            classic_hz: Rate of the classic layout [Hz], or None where it is not sent.
-            fd_hz: Rate of the FD layout [Hz], or None where it is not sent.
+            classic_hz: Rate of the classic layout [Hz], or None if it is not sent.
+            fd_hz: Rate of the FD layout [Hz], or None if it is not sent.
         """
         rows = {row: row.period_s for row in self.others if row.period_s < math.inf}
         for messages, rate in ((self.classic, classic_hz), (self.fd, fd_hz)):
@@ -262,7 +262,7 @@ _CRC = _crc_table()
 
 
 def crc8(data: bytes) -> int:
-    """CRC-8 SAE J1850: polynomial 0x1D, initial value and final xor 0xFF; 0x4B for b"123456789"."""
+    """Calculate CRC-8 SAE J1850: polynomial 0x1D, initial value and final xor 0xFF; 0x4B for b"123456789"."""
     value = 0xFF
     for byte in data:
         value = _CRC[value ^ byte]
@@ -270,5 +270,5 @@ def crc8(data: bytes) -> int:
 
 
 def checksum(identifier: int, data: bytes) -> int:
-    """What the last byte of a command must be, from its identifier and its first seven bytes."""
+    """Return the last byte of a command from its identifier and its first seven bytes."""
     return crc8(identifier.to_bytes(2, "little") + data[:7])

@@ -1,4 +1,4 @@
-"""Which messages a rig has on a bus, how often, and what load and latency that makes."""
+"""Schedule of a rig's messages on a bus: rates, load and latency."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ from dataclasses import dataclass, field
 
 from drivers.can import analysis
 from drivers.can.bus.timing import Speed
-from drivers.can.message import Message, MessageTable
+from drivers.can.message import CanMessage, MessageTable
 from drivers.can.signals import CLASSIC_HZ, CLASSIC_SHARE, FD_HZ, default_messages
 from rig.base.errors import InputError, Words
 
 SLOT_S = 1e-3
-"""The gateway hands over frames once in this time: that much later than due they may be queued [s]."""
+"""Period in which the gateway passes frames to the bus [s]: a frame may be queued this much later than it is due."""
 SAMPLE_DEADLINE_S = 10e-3
 """Longest time that a sample frame may wait for the bus [s]."""
 
@@ -21,24 +21,24 @@ class Schedule:
     """Rates of the two sample layouts.
 
     Attributes:
-        classic_hz: Rate of the classic layout [Hz]; None: not sent.
-        fd_hz: Rate of the FD layout [Hz]; None: not sent.
-        table: Messages; those of the rig's own channel table unless given.
+        classic_hz: Rate of the classic layout [Hz]; None if it is not sent.
+        fd_hz: Rate of the FD layout [Hz]; None if it is not sent.
+        table: Messages; by default those of the standard channel table.
     """
 
     classic_hz: int | None = CLASSIC_HZ
     fd_hz: int | None = None
     table: MessageTable = field(default_factory=default_messages, compare=False)
 
-    def messages(self) -> dict[Message, float]:
-        """Every message and its period [s]."""
+    def messages(self) -> dict[CanMessage, float]:
+        """Return every message and its period [s]."""
         return self.table.schedule(classic_hz=self.classic_hz, fd_hz=self.fd_hz)
 
-    def response_times(self, speed: Speed) -> list[tuple[Message, analysis.Response]]:
-        """Worst case of every message on a bus of that speed, the highest priority first.
+    def response_times(self, speed: Speed) -> list[tuple[CanMessage, analysis.Response]]:
+        """Return the worst case of every message on a bus of that speed, the highest priority first.
 
-        The load of a message is `transmission_s / message.period_s`. What events send is taken at its most frequent.
-        Delays of the gateway's process by the operating system are not in it.
+        The load of a message is `transmission_s / message.period_s`. Messages sent by events count at their shortest
+        period. Delays of the gateway's process by the operating system are not included.
 
         Raises:
             InputError: FD frames on a bus for classic CAN only.
@@ -48,14 +48,14 @@ class Schedule:
         return [(table[row.message.identifier], row) for row in analysis.worst_case(self._shapes(), speed)]
 
     def load(self, speed: Speed) -> float:
-        """Largest share of the bus that all messages together can take, with the most stuff bits there can be."""
+        """Return the largest share of the bus that all messages can take, with the maximum number of stuff bits."""
         return analysis.load(self._shapes(), speed)
 
     def check(self, speed: Speed) -> float:
-        """The load, where the bus can carry it.
+        """Return the load if the bus can carry it.
 
         Raises:
-            InputError: It cannot; the message has the load.
+            InputError: It exceeds 100 %; the message gives the load.
         """
         self._check_fd(speed)
         share = self.load(speed)
@@ -65,11 +65,11 @@ class Schedule:
         return share
 
     def warnings(self, speed: Speed) -> list[str]:
-        """What a person should know of a bus that is fuller than the classic layout was made for, in one line."""
+        """Return a warning if the bus is fuller than the classic layout was designed for."""
         share = self.load(speed)
         if self.classic_hz is None or self.fd_hz is not None or share <= CLASSIC_SHARE:
             return []
-        must = f"at most {100 * CLASSIC_SHARE:g} % of {speed} with classic frames, so that others find room beside them"
+        must = f"at most {100 * CLASSIC_SHARE:g} % of {speed} with classic frames, to leave room for other nodes"
         received = Words(f"{100 * share:.1f} % with {len(self.table.classic)} frames an instant")
         return [f"{InputError('CAN load', must, received)} (a lower --can-rate or --can-fd helps)"]
 
@@ -77,14 +77,14 @@ class Schedule:
         if self.fd_hz is not None and not speed.fd:
             raise InputError("--can-bitrate", "two rates for CAN FD, such as 1M/8M", str(speed))
 
-    def _shapes(self) -> list[analysis.Message]:
+    def _shapes(self) -> list[analysis.PeriodicMessage]:
         return [
-            analysis.Message(
+            analysis.PeriodicMessage(
                 row.identifier,
                 period_s,
                 row.length,
                 jitter_s=SLOT_S if row.periodic else 0.0,
-                # Samples may wait behind others: their number says which they are, and a controller queues them.
+                # Samples may wait for others: they are numbered, and a controller queues them.
                 deadline_s=period_s if row.samples is None else SAMPLE_DEADLINE_S,
                 fd=row.fd,
                 brs=row.fd,
@@ -94,16 +94,16 @@ class Schedule:
 
 
 def schedule_from(*, classic: bool, fd: bool, rate_hz: int | None, table: MessageTable | None = None) -> Schedule:
-    """The schedule of the options of `rig run` and `rig can load`.
+    """Return the schedule for the options of `rig run` and `rig can load`.
 
     Args:
-        classic: Send the classic layout; also where neither is asked for.
+        classic: Send the classic layout; also sent if neither is requested.
         fd: Send the FD layout.
-        rate_hz: Rate of the samples [Hz], for classic frames at most their usual one; None: the usual ones.
-        table: Messages; those of the rig's own channel table unless given.
+        rate_hz: Sample rate [Hz], for classic frames at most their usual one; None for the usual rates.
+        table: Messages; by default those of the standard channel table.
 
     Raises:
-        InputError: A rate that is none.
+        InputError: The rate is out of range.
     """
     if rate_hz is not None and not 1 <= rate_hz <= 20_000:
         raise InputError("--can-rate", "between 1 and 20000 Hz", rate_hz)

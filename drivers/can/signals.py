@@ -1,19 +1,19 @@
-"""The one table of CAN messages, made from the channel table, and their bytes.
+"""Table of the rig's CAN messages, generated from the channel table, and encoding of commands.
 
-Identifiers, lengths, bit positions, scaling and units of everything that the rig has on a bus stand here; the DBC, the
-gateway, the load and the drivers derive from it. All is little-endian ("Intel"), identifiers have 11 bits, and the
-lower wins the bus: commands, then the time base, then waveforms, then slow messages.
+This module defines identifiers, lengths, bit positions, scaling and units of all messages; the DBC, the gateway, the
+load and the drivers are derived from it. Everything is little-endian ("Intel"), and identifiers have 11 bits. The lower
+identifier wins the bus: commands, then the time base, then waveforms, then slow messages.
 
-Two layouts carry samples. `classic` has all channels at 1 kHz in 16 bits (the upper bits of the recorded counts), three
-channels and a running number a frame: five frames of 8 bytes an instant, below 70 % of 1 Mbit/s. `fd` has the counts as
-recorded in 24 bits at 10 kHz, one sensor group a message, as many instants as fill 64 bytes, with the number of the
-first one in the recording. Both pick every n-th sample of the stream as it is: what lies above half the slower rate
-folds back, which is the receiver's to know.
+Two layouts carry samples. `classic` has all channels at 1 kHz in 16 bits (the upper bits of the recorded counts), with
+three channels and a running number per frame: five frames of 8 bytes per instant, below 70 % of 1 Mbit/s. `fd` has the
+counts as recorded in 24 bits at 10 kHz, one channel group per message, with as many instants as fill 64 bytes, and the
+number of the first instant in the recording. Both decimate the stream without a filter: frequencies above half the
+slower rate are aliased, and the receiver must allow for that.
 
-A command must not arise from noise. It has a kind (4 of 256 values), a counter that goes on by 1 to 15 from that of
-the last command that reached the rig, a constant key, reserved bits at zero, and a CRC-8 over identifier and data; a
-hammer pulse is also limited in force and duration; faults have an identifier of their own. Of random frames of 8 bytes
-on the very identifier of commands, one of `ODDS` passes all that.
+Noise must not produce a command. A command has a kind (4 of 256 values), a counter that is 1 to 15 above that of the
+last command that reached the rig, a constant key, reserved bits at zero, and a CRC-8 over identifier and data; a hammer
+pulse is also limited in force and duration, and faults have their own identifier. Of random frames of 8 bytes with the
+identifier of commands, one in `ODDS` passes all these checks.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from functools import cache
 from typing import Any
 
 from drivers.can.bus.frame import FD_LENGTHS
-from drivers.can.devices import Said, device_messages, said_in
+from drivers.can.devices import DeviceRequest, device_messages, parse_device_frame
 from drivers.can.faults import FaultKind, fault_raw, fault_request, fault_signals
-from drivers.can.message import ABSENT, KEY, Message, MessageTable, Samples, Signal, checksum
+from drivers.can.message import ABSENT, KEY, CanMessage, MessageTable, SampleLayout, Signal, checksum
 from rig.base.errors import InputError
 from rig.channels.table import Channel, ChannelTable, default_table
 from rig.run.commands.table import COMMANDS
@@ -37,15 +37,16 @@ CLASSIC_HZ = 1_000
 FD_HZ = 10_000
 """Usual rates of the two layouts [Hz]."""
 CLASSIC_SHARE = 0.7
-"""Most that the classic layout is to take of its bus, with everything that goes with it; beyond, a start warns."""
+"""Largest share of its bus for the classic layout with all other messages; beyond it, the start warns."""
 
 _FD_CHANNELS = 20
-"""As many of 24 bits fit into a frame with their number."""
-AHEAD = 15
-"""How far the counter of a command may be ahead of that of the last one that reached the rig."""
+"""Number of 24-bit channels that fit into a frame with their running number."""
+MAX_LEAD = 15
+"""Largest lead of a command's counter over that of the last command that reached the rig."""
 ODDS = 2.7e9
-"""Random frames of 8 bytes on the identifier of commands for one that is taken: a hammer pulse by nearly all of
-it, 256 kinds x 256 / 15 counters x 256 keys x 256 checksums x 1 / (0.15 forces x 0.78 durations x 0.94 directions)."""
+"""Number of random frames of 8 bytes with the identifier of commands per accepted one, which is nearly always a hammer
+pulse: 256 kinds x 256 / 15 counters x 256 keys x 256 checksums x 1 / (0.15 forces x 0.78 durations x 0.94 directions).
+"""
 
 RIG = "Rig"
 CONTROLLER = "Controller"
@@ -58,20 +59,24 @@ _SIGNALS = {
     name: {field: each.quantity.can for field, each in fields.items() if each.quantity.can is not None}
     for name, fields in _COMMANDS.items()
 }
-"""Signals of their fields, in their order in the frame."""
+"""Signals of their fields, in the order of the frame."""
 EVENT_VALUES = {name: COMMANDS[name].SHOWN_FIELD for name, frame in _FRAMES.items() if frame.shown}
 """Field of an event that its frame carries, by command."""
 
 
-class Kind(IntEnum):
+class CommandKind(IntEnum):
     """Kind of a command of the message Command, or Stop; any two differ in at least four bits."""
 
     STOP = 0xC7
     vars().update({name.upper(): _FRAMES[name].kind for name in _COMMANDS})
 
 
+Kind = CommandKind
+"""Former name."""
+
+
 class Result(IntEnum):
-    """What became of a command."""
+    """Result of a command."""
 
     ACCEPTED = 0
     BAD_LENGTH = 1
@@ -87,14 +92,14 @@ class Result(IntEnum):
 
 
 class Field(IntEnum):
-    """Which value of a command was out of range."""
+    """Field of a command that was out of range."""
 
     NONE = 0
     vars().update({each.name.upper(): each.number for signals in _SIGNALS.values() for each in signals.values()})
 
 
-class State(IntEnum):
-    """What the rig does."""
+class RigState(IntEnum):
+    """State of the rig."""
 
     PREPARING = 0
     RUNNING = 1
@@ -103,7 +108,7 @@ class State(IntEnum):
 
 
 class EventKind(IntEnum):
-    """What has happened."""
+    """Kind of an event."""
 
     START = 1
     COMMAND = 2
@@ -121,12 +126,12 @@ def _choices(names: type[IntEnum]) -> dict[int, str]:
 _TIME = "Simulated time, modulo 2^32 us (71.6 min)"
 
 _HEAD = (
-    Signal("counter", 8, 8, label=f"1 to {AHEAD} above that of the last one that reached the rig, modulo 256"),
+    Signal("counter", 8, 8, label=f"1 to {MAX_LEAD} above that of the last one that reached the rig, modulo 256"),
     Signal("key", 48, 8, label=f"Always {KEY:#x}"),
     Signal("checksum", 56, 8, label="CRC-8 (SAE J1850) over identifier, low byte first, and the other seven bytes"),
 )
 _STOP_SIGNALS = (
-    Signal("kind", 0, 8, label="What to do", choices={int(Kind.STOP): "stop"}),
+    Signal("kind", 0, 8, label="What to do", choices={int(CommandKind.STOP): "stop"}),
     Signal("reserved", 16, 32, label="Always 0"),
     *_HEAD,
 )
@@ -136,16 +141,16 @@ LIMITS = {
     for field, each in fields.items()
     if not each.takes_text and math.isfinite(each.high)
 }
-"""Least and largest value of a command's field that the rig takes [N], [ms]; the drive's top speed is its parameter."""
+"""Range of a command's field [N], [ms]; the drive's top speed is a parameter of the rig."""
 _VALUE_BITS = range(16, 48)
-"""Bits of the fields in the frame of a command."""
+"""Bits of the fields in a command's frame."""
 
 
 def _field_signals() -> Iterator[Signal]:
-    """Give the signals of each command's fields one after another, and a reserved one for the bits that are left."""
-    bare = tuple(int(Kind[name.upper()]) for name, signals in _SIGNALS.items() if not signals)
+    """Yield the signals of each command's fields in order, and a reserved signal for the remaining bits."""
+    bare = tuple(int(CommandKind[name.upper()]) for name, signals in _SIGNALS.items() if not signals)
     for name, signals in _SIGNALS.items():
-        start, kind = _VALUE_BITS.start, (int(Kind[name.upper()]),)
+        start, kind = _VALUE_BITS.start, (int(CommandKind[name.upper()]),)
         for field, each in signals.items():
             unit = each.unit or _COMMANDS[name][field].quantity.unit
             label = "{}, {:g} to {:g}".format(each.label, *LIMITS[field]) if field in LIMITS else each.label
@@ -159,14 +164,14 @@ def _field_signals() -> Iterator[Signal]:
 _COMMAND_SIGNALS = (
     Signal(
         "kind", 0, 8, label="What to do", selects=True,
-        choices={value: name for value, name in _choices(Kind).items() if value != Kind.STOP},
+        choices={value: name for value, name in _choices(CommandKind).items() if value != CommandKind.STOP},
     ),
     *_field_signals(),
     *_HEAD,
 )  # fmt: skip
 
 
-def _other_messages() -> list[Message]:
+def _other_messages() -> list[CanMessage]:
     command = (
         "A command: 8 bytes; kind, counter, key, checksum are checked, bits that the kind does not use must be 0. "
         "The rig checks ranges and says at which simulated time it takes effect (Acknowledge)"
@@ -176,9 +181,9 @@ def _other_messages() -> list[Message]:
         "spin", 8, 16, scale=0.001, unit="Hz", label="Spin speed of the shaft, as the status has it; 65.535: more"
     )
     return [
-        Message("Stop", 0x010, 8, False, 0.1, False, CONTROLLER, f"Ends the run. {command}", _STOP_SIGNALS),
-        Message("Command", 0x020, 8, False, 0.1, False, CONTROLLER, command, _COMMAND_SIGNALS),
-        Message(
+        CanMessage("Stop", 0x010, 8, False, 0.1, False, CONTROLLER, f"Ends the run. {command}", _STOP_SIGNALS),
+        CanMessage("Command", 0x020, 8, False, 0.1, False, CONTROLLER, command, _COMMAND_SIGNALS),
+        CanMessage(
             "Acknowledge", 0x021, 8, False, 0.05, False, RIG,
             "What became of a command; beyond a burst of 20, at most 50 refusals a second are acknowledged",
             (
@@ -189,7 +194,7 @@ def _other_messages() -> list[Message]:
                 Signal("limit", 48, 16, scale=0.1, label="Limit passed, or number of the fault that began"),
             ),
         ),
-        Message(
+        CanMessage(
             "Event", 0x310, 8, False, 0.1, False, RIG, "Something took effect; behind all samples before it",
             (
                 Signal("event", 0, 8, label="What", choices=_choices(EventKind)),
@@ -198,7 +203,7 @@ def _other_messages() -> list[Message]:
                 Signal("value", 48, 16, scale=0.1, label=shown[0].upper() + shown[1:]),
             ),
         ),
-        Message(
+        CanMessage(
             "Sync", 0x080, 8, False, 0.1, True, RIG,
             "Ties bus time to the stream: sent when the sample of this number is due, Rates.latency after its time",
             (
@@ -206,7 +211,7 @@ def _other_messages() -> list[Message]:
                 Signal("time", 32, 32, unit="us", label=f"Its time. {_TIME}"),
             ),
         ),
-        Message(
+        CanMessage(
             "Keyphasor", 0x300, 8, False, 0.02, False, RIG,
             "An exact edge of the keyphasor (the load assumes at most 50 a second)",
             (
@@ -215,14 +220,14 @@ def _other_messages() -> list[Message]:
                 Signal("fraction", 48, 16, scale=1.0 / 65536, unit="us", label="Rest of the time"),
             ),
         ),
-        Message(
+        CanMessage(
             "Clock", 0x6FF, 8, False, 1.0, True, RIG, "How often the times and the index of other frames have wrapped",
             (Signal("seconds", 0, 32, unit="s", label="End of the last block, whole seconds of simulated time"),),
         ),
-        Message(
+        CanMessage(
             "Status", 0x700, 8, False, 0.5, True, RIG, "How the rig does; rig/status has it all",
             (
-                Signal("state", 0, 4, label="What the rig does", choices=_choices(State)),
+                Signal("state", 0, 4, label="What the rig does", choices=_choices(RigState)),
                 Signal("warnings", 4, 4, label="Number of warnings; 15: more"),
                 spin,
                 Signal("lateness", 24, 16, scale=0.01, unit="ms", label="p99 of the lateness of blocks; 655.35: more"),
@@ -230,17 +235,17 @@ def _other_messages() -> list[Message]:
                 Signal("refused", 52, 12, label="Commands refused, modulo 4096"),
             ),
         ),
-        Message(
+        CanMessage(
             "Heartbeat", 0x701, 8, False, 1.0, True, RIG, "The rig is there; without it for 3 s, it has gone",
             (
-                Signal("state", 0, 8, label="What the rig does", choices=_choices(State)),
+                Signal("state", 0, 8, label="What the rig does", choices=_choices(RigState)),
                 Signal("beat", 8, 8, label="Running number, modulo 256"),
                 Signal("counter", 16, 8, label="Of the last command that reached the rig; the next has one more"),
                 Signal("time", 24, 32, unit="us", label=f"End of the last block. {_TIME}"),
                 Signal("layout", 56, 8, label="Which sample messages these are; another number: another DBC"),
             ),
         ),
-        Message(
+        CanMessage(
             "Rates", 0x702, 8, False, 1.0, True, RIG, "How samples were picked",
             (
                 Signal("rate", 0, 24, unit="Hz", label="Rate of the recording"),
@@ -259,7 +264,7 @@ def _decimation(channel: Channel) -> str:
     )
 
 
-def _sample_signals(samples: Samples, index_label: str) -> tuple[Signal, ...]:
+def _sample_signals(samples: SampleLayout, index_label: str) -> tuple[Signal, ...]:
     width = 8 * samples.width
     rows = [Signal("index", 0, 8 * samples.index_width, label=index_label)]
     for row in range(samples.rows):
@@ -274,15 +279,15 @@ def _sample_signals(samples: Samples, index_label: str) -> tuple[Signal, ...]:
     return tuple(rows)
 
 
-def _fault_message(table: ChannelTable) -> Message:
+def _fault_message(table: ChannelTable) -> CanMessage:
     about = (
         "A fault of a channel or a stream begins, or ends: 8 bytes, checked as those of Command. Acknowledge tells its "
         "number, and when its first row is; rig/KEYS.md has the equations"
     )
-    return Message("Fault", 0x022, 8, False, 0.1, False, CONTROLLER, about, (*fault_signals(table), *_HEAD))
+    return CanMessage("Fault", 0x022, 8, False, 0.1, False, CONTROLLER, about, (*fault_signals(table), *_HEAD))
 
 
-def _fd_messages(table: ChannelTable) -> list[Message]:
+def _fd_messages(table: ChannelTable) -> list[CanMessage]:
     found, taken = [], {row.name for row in _other_messages()}
     parts = [
         (group, group.channels[first : first + _FD_CHANNELS])
@@ -297,7 +302,7 @@ def _fd_messages(table: ChannelTable) -> list[Message]:
             if channel.adc_bits > 24:
                 raise InputError(f"channel {channel.name}.adc_bits", "at most 24 on a CAN bus", channel.adc_bits)
         rows = 60 // (3 * len(channels))
-        samples = Samples(channels, rows, 3, 4)
+        samples = SampleLayout(channels, rows, 3, 4)
         name = group.name.capitalize()
         if len(channels) < len(group.channels) or name in taken:
             name = f"{name}_{position}"
@@ -309,7 +314,7 @@ def _fd_messages(table: ChannelTable) -> list[Message]:
         index = "Number of the first instant in the recording, modulo 2^32; the others follow by Rates.fd_step"
         length = next(size for size in FD_LENGTHS[8:] if size >= 4 + 3 * rows * len(channels))
         found.append(
-            Message(
+            CanMessage(
                 name, 0x100 + spacing * position, length, True, rows / FD_HZ, True, RIG, label,
                 _sample_signals(samples, index), samples,
             )
@@ -317,11 +322,11 @@ def _fd_messages(table: ChannelTable) -> list[Message]:
     return found
 
 
-def _classic_messages(table: ChannelTable) -> list[Message]:
+def _classic_messages(table: ChannelTable) -> list[CanMessage]:
     channels = tuple(table.channels.values())
     found = []
     for number, first in enumerate(range(0, len(channels), 3), start=1):
-        samples = Samples(channels[first : first + 3], 1, 2, 2)
+        samples = SampleLayout(channels[first : first + 3], 1, 2, 2)
         step = samples.channels[0].rate_hz // CLASSIC_HZ
         label = (
             f"{', '.join(channel.name for channel in samples.channels)}: upper 16 bits of counts; {ABSENT}: not there. "
@@ -330,7 +335,7 @@ def _classic_messages(table: ChannelTable) -> list[Message]:
         )
         index = "Number in the recording divided by Rates.classic_step, modulo 65536"
         found.append(
-            Message(
+            CanMessage(
                 f"Samples_{number}", 0x200 + number, 2 + 2 * len(samples.channels), False, 1.0 / CLASSIC_HZ, True, RIG,
                 label, _sample_signals(samples, index), samples,
             )
@@ -339,7 +344,7 @@ def _classic_messages(table: ChannelTable) -> list[Message]:
 
 
 def make_table(channels: ChannelTable) -> MessageTable:
-    """All messages for a channel table."""
+    """Build all messages for a channel table."""
     devices = device_messages(RIG, CONTROLLER, _TIME)
     samples = [*_fd_messages(channels), *_classic_messages(channels)]
     rows = [*_other_messages(), _fault_message(channels), *devices, *samples]
@@ -347,16 +352,16 @@ def make_table(channels: ChannelTable) -> MessageTable:
 
 
 def messages_for(channels: ChannelTable) -> MessageTable:
-    """The rig's own messages where these channels are among them as they are, else messages of their own.
+    """Return the standard messages if they carry these channels, otherwise messages for this table.
 
     Raises:
-        InputError: They do not fit into messages.
+        InputError: The channels do not fit into messages.
     """
-    return default_messages() if unlike(channels, default_table().channels) is None else make_table(channels)
+    return default_messages() if find_mismatch(channels, default_table().channels) is None else make_table(channels)
 
 
-def unlike(channels: ChannelTable, known: Mapping[str, Channel]) -> str | None:
-    """Name of the first channel that is not among those known, with the same calibration and unit."""
+def find_mismatch(channels: ChannelTable, known: Mapping[str, Channel]) -> str | None:
+    """Return the name of the first channel that is not known with the same calibration and unit."""
     for name, channel in channels.channels.items():
         like = known.get(name)
         if like is None or (like.scale, like.offset, like.unit) != (channel.scale, channel.offset, channel.unit):
@@ -366,22 +371,22 @@ def unlike(channels: ChannelTable, known: Mapping[str, Channel]) -> str | None:
 
 @cache
 def default_messages() -> MessageTable:
-    """The messages of the rig's own channel table."""
+    """Return the messages of the standard channel table."""
     return make_table(default_table())
 
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """A command as it travels.
+    """A decoded command.
 
     Attributes:
-        kind: What to do.
-        counter: 0 to 255.
-        values: Values in the units of the rig's own commands: `force_n` [N], `duration_ms` [ms], `direction` [degrees],
-            `speed_hz` [Hz]; of a fault the fields of `rig.run.commands.FaultCommand`, with its kind's main number.
+        kind: Kind of the command.
+        counter: Counter, 0 to 255.
+        values: Fields in the units of the rig's commands: `force_n` [N], `duration_ms` [ms], `direction` [degrees],
+            `speed_hz` [Hz]; for a fault the fields of `rig.run.commands.FaultCommand`, with its kind's main number.
     """
 
-    kind: Kind | FaultKind
+    kind: CommandKind | FaultKind
     counter: int
     values: dict[str, Any]
 
@@ -389,19 +394,19 @@ class Command:
 FIELDS = {field: Field(each.number) for signals in _SIGNALS.values() for field, each in signals.items()}
 
 
-def command_frame(kind: Kind, counter: int, **values: float | str | None) -> tuple[int, bytes]:
-    """Identifier and data of a command, as a controller sends it. Whether the rig takes its values, the rig says.
+def command_frame(kind: CommandKind, counter: int, **values: float | str | None) -> tuple[int, bytes]:
+    """Encode a command as a controller sends it; return identifier and data. The rig itself checks the ranges.
 
     Args:
-        kind: What to do.
-        counter: One more than that of the last one (see Heartbeat), modulo 256; the first has 1.
+        kind: Kind of the command.
+        counter: One more than that of the last command (see Heartbeat), modulo 256; 1 for the first.
         values: Fields of the rig's command of that name, in their units, rounded to the steps of the frame; an angle
-            is 0 unless given.
+            is 0 by default.
 
     Raises:
-        InputError: A value is missing, is one of another kind, or finds no room in the frame.
+        InputError: A value is missing, has the wrong type, or does not fit into the frame.
     """
-    message = default_messages().by_name["Stop" if kind is Kind.STOP else "Command"]
+    message = default_messages().by_name["Stop" if kind is CommandKind.STOP else "Command"]
     signals = {signal.name: signal for signal in message.signals}
     raw = {}
     for name, each in _SIGNALS.get(kind.name.lower(), {}).items():
@@ -415,7 +420,7 @@ def command_frame(kind: Kind, counter: int, **values: float | str | None) -> tup
             value = (value or 0.0) % (each.full_turn * each.scale)
         most = signal.raw_range[1] * signal.scale
         if value is None or not 0.0 <= value <= most:
-            raise InputError(name, f"given for {kind.name}, from 0 to {most:g} {signal.unit}", value)
+            raise InputError(name, f"a value for {kind.name} from 0 to {most:g} {signal.unit}", value)
         raw[each.name] = round(value / signal.scale)
         if each.full_turn:
             raw[each.name] %= each.full_turn
@@ -428,17 +433,17 @@ def command_frame(kind: Kind, counter: int, **values: float | str | None) -> tup
 def fault_frame(
     channel: str, kind: str, counter: int, *, number: float | str | None = None, table: MessageTable | None = None
 ) -> tuple[int, bytes]:
-    """Identifier and data of a command that begins a fault.
+    """Encode a command that injects a fault; return identifier and data.
 
     Args:
-        channel: A channel, or a group.
-        kind: What it does: `rig fault --list`.
-        counter: As of `command_frame`.
-        number: Its main number (`rig.dbc` names it), or the channel that it is with; None where it needs none.
-        table: Messages; those of the rig's own channel table unless given.
+        channel: Name of a channel or channel group.
+        kind: Kind of fault; `rig fault --list` lists them.
+        counter: As for `command_frame`.
+        number: Main number of the kind (named in `rig.dbc`), or the other channel; None if the kind needs none.
+        table: Messages; by default those of the standard channel table.
 
     Raises:
-        InputError: There is no such fault or channel, or no room for the number.
+        InputError: The fault or channel does not exist, or the number does not fit.
 
     Example:
         >>> fault_frame("P_E", "gain", 1, number=1.05)[1].hex()
@@ -449,25 +454,25 @@ def fault_frame(
 
 
 def clear_frame(counter: int, *, number: int = 0) -> tuple[int, bytes]:
-    """Identifier and data of a command that ends a fault by its number, or all by 0."""
+    """Encode a command that clears a fault by its number, or all by 0; return identifier and data."""
     return _signed(default_messages().by_name["Fault"], counter, kind=int(FaultKind.CLEAR), id=number)
 
 
-def _signed(message: Message, counter: int, **raw: int) -> tuple[int, bytes]:
+def _signed(message: CanMessage, counter: int, **raw: int) -> tuple[int, bytes]:
     data = message.encode(counter=counter & 0xFF, key=KEY, **raw)
     return message.identifier, data[:7] + bytes([checksum(message.identifier, data)])
 
 
 def parse_command(
     identifier: int, data: bytes, last_counter: int, table: MessageTable | None = None
-) -> Command | Said | Result:
-    """A command from the bus, or why it is none.
+) -> Command | DeviceRequest | Result:
+    """Decode a command from the bus, or return the reason for refusing it.
 
     Args:
-        identifier: Of Stop, Command, Fault or Device.
-        data: What came.
+        identifier: Identifier of Stop, Command, Fault or Device.
+        data: Data of the frame.
         last_counter: Counter of the last command that reached the rig.
-        table: Messages; those of the rig's own channel table unless given.
+        table: Messages; by default those of the standard channel table.
     """
     if len(data) != 8:
         return Result.BAD_LENGTH
@@ -477,23 +482,23 @@ def parse_command(
         return Result.BAD_KEY
     message = (table or default_messages()).by_identifier[identifier]
     if message.name == "Device":
-        return said_in(message.decode(data)) or Result.BAD_KIND
+        return parse_device_frame(message.decode(data)) or Result.BAD_KIND
     try:
-        kind = FaultKind(data[0]) if message.name == "Fault" else Kind(data[0])
+        kind = FaultKind(data[0]) if message.name == "Fault" else CommandKind(data[0])
     except ValueError:
         return Result.BAD_KIND
-    if (message.name == "Stop") != (kind is Kind.STOP):
+    if (message.name == "Stop") != (kind is CommandKind.STOP):
         return Result.BAD_KIND
     raw = message.decode(data)
     fields = _SIGNALS.get(kind.name.lower(), {})
     turned = [each for each in fields.values() if each.full_turn and raw[each.name] >= each.full_turn]
     if turned or any(raw[name] for name in raw if name.startswith("reserved")):
         return Result.RESERVED_BITS
-    if not 1 <= (data[1] - last_counter) % 256 <= AHEAD:
+    if not 1 <= (data[1] - last_counter) % 256 <= MAX_LEAD:
         return Result.STALE_COUNTER
     if isinstance(kind, FaultKind):
         request = fault_request(message, raw)
         return Result.OUT_OF_RANGE if request is None else Command(kind, data[1], request)
-    # Rounded to the steps of the wire, so that 0.1 N x 800 is 80 N.
+    # Rounded to the steps of the frame, so that 0.1 N x 800 is 80 N.
     values = {field: round(raw[each.name] * each.scale, 6) for field, each in fields.items()}
     return Command(kind, data[1], values)

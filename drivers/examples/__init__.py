@@ -1,4 +1,4 @@
-"""Programs of about ten lines that use drivers and DAQ client; each runs as `python -m drivers.examples.NAME`."""
+"""Examples of about ten lines for the instrument drivers and the DAQ client: `python -m drivers.examples.NAME`."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from typing import Any
 from rig.base.errors import InputError
 
 
-def run(main: Callable[..., Any], most: int = 1) -> None:
-    """Run an example with the URLs of the command line; a rig or an instrument that is not there is told in one line.
+def run_example(main: Callable[..., Any], max_urls: int = 1) -> None:
+    """Run an example with the URLs of the command line, and print a missing rig or instrument as one line.
 
     Args:
         main: The example.
-        most: URLs that it takes.
+        max_urls: Largest number of URLs.
     """
     try:
-        if len(sys.argv) > most + 1:
-            raise InputError("arguments", f"at most {most}: the URLs of rig and instruments", sys.argv[1:])
-        done = main(*sys.argv[1:])
-        if asyncio.iscoroutine(done):
-            asyncio.run(done)
+        if len(sys.argv) > max_urls + 1:
+            raise InputError("arguments", f"at most {max_urls}: the URLs of rig and instruments", sys.argv[1:])
+        result = main(*sys.argv[1:])
+        if asyncio.iscoroutine(result):
+            asyncio.run(result)
     except (ConnectionError, EOFError, InputError) as error:
         print(error, file=sys.stderr)
         sys.exit(2)

@@ -1,13 +1,13 @@
-"""Have a function called with each block while the program does something else."""
+"""Process each block in a callback while the program does something else."""
 
 import time
 
 from drivers.daq import Daq
-from drivers.examples import run
+from drivers.examples import run_example
 
 
 def main(url: str = "zenoh:127.0.0.1:7460", seconds: float = 1.0) -> int:
-    """Count rows for a while."""
+    """Count the samples of a period."""
     rows: list[int] = []
     with Daq.open(url, channels=["P_N", "P_E"], rate_hz=1000) as daq:
         daq.call(lambda samples: rows.append(len(samples)))
@@ -17,4 +17,4 @@ def main(url: str = "zenoh:127.0.0.1:7460", seconds: float = 1.0) -> int:
 
 
 if __name__ == "__main__":
-    run(main)
+    run_example(main)

@@ -1,11 +1,11 @@
-"""Calibrated peak of each force transducer in a second, with what the amplifier says about its calibration."""
+"""Print each force transducer's peak in one second, with its calibration from the amplifier."""
 
-from drivers.examples import run
+from drivers.examples import run_example
 from drivers.instruments.force.driver import Force
 
 
 def main(url: str = "zenoh:127.0.0.1:7462", seconds: float = 1.0) -> dict[str, tuple[float, float]]:
-    """Read once, and tell the largest compression."""
+    """Read once, and print the largest compression of each transducer."""
     with Force.open(url) as force:
         force.start()
         samples = force.read(round(seconds * force.datasheet.rate_hz), timeout_s=seconds + 5.0)
@@ -18,4 +18,4 @@ def main(url: str = "zenoh:127.0.0.1:7462", seconds: float = 1.0) -> dict[str, t
 
 
 if __name__ == "__main__":
-    run(main)
+    run_example(main)

@@ -1,15 +1,15 @@
-"""Hit the shaft and capture from 50 ms before to 200 ms after the impact."""
+"""Strike the shaft and capture from 50 ms before to 200 ms after the impact."""
 
 import numpy as np
 
 from drivers.daq import Daq
-from drivers.examples import run
+from drivers.examples import run_example
 from drivers.instruments.hammer.driver import Hammer
 from drivers.sources.samples import Samples
 
 
 def main(rig: str = "zenoh:127.0.0.1:7460", instruments: str = "zenoh:127.0.0.1:7462") -> list[Samples]:
-    """Trigger on the simulated time that the hammer's controller answers with."""
+    """Trigger on the simulated time of the impact that the hammer controller reports."""
     with Daq.open(rig, channels=["hammer", "disk_x", "disk_y"]) as daq, Hammer.open(instruments) as hammer:
         captured = [daq.read(round(0.05 * daq.rate_hz))]
         done = hammer.trigger(force_n=200.0, direction="y")
@@ -21,4 +21,4 @@ def main(rig: str = "zenoh:127.0.0.1:7460", instruments: str = "zenoh:127.0.0.1:
 
 
 if __name__ == "__main__":
-    run(main, 2)
+    run_example(main, 2)

@@ -1,11 +1,11 @@
-"""Print the shaft's largest excursion in each tenth of a second, block after block."""
+"""Print the shaft's largest displacement in each tenth of a second."""
 
 from drivers.daq import Daq
-from drivers.examples import run
+from drivers.examples import run_example
 
 
 def main(url: str = "zenoh:127.0.0.1:7460", blocks: int = 10) -> None:
-    """Read some blocks from a rig."""
+    """Read blocks from a rig."""
     with Daq.open(url, channels=["ring_x", "ring_y"]) as daq:
         for _, samples in zip(range(blocks), daq.blocks(round(daq.rate_hz / 10)), strict=False):
             furthest = abs(samples["ring_x"] + 1j * samples["ring_y"]).max()
@@ -13,4 +13,4 @@ def main(url: str = "zenoh:127.0.0.1:7460", blocks: int = 10) -> None:
 
 
 if __name__ == "__main__":
-    run(main)
+    run_example(main)

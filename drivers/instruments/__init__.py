@@ -1,1 +1,1 @@
-"""The rig's instruments: a folder each, and what they share."""
+"""Instruments of the rig: one folder each, and `common` for the code that they share."""

@@ -1,4 +1,4 @@
-"""All twins of a running rig, at once and on any number of links."""
+"""All instrument twins of a running rig, on any number of links."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ TWINS: tuple[type[Twin], ...] = (ProximityTwin, ForceTwin, AccelerometerTwin, Ha
 
 
 class Twins(Closing):
-    """Serves instruments of one rig; each link has instruments of its own, which know nothing of the others.
+    """Serves the instruments of one rig; each link has its own, independent instruments.
 
     Args:
-        client: Transport to the rig; stays open, and is closed by its owner.
+        client: Transport to the rig; its owner closes it.
     """
 
     def __init__(self, client: Client) -> None:
@@ -34,17 +34,17 @@ class Twins(Closing):
         self.twins: list[Twin] = []
 
     def serve(self, kind: type[Twin], port: Port) -> Twin:
-        """One instrument at a port, which is closed with the others."""
+        """Serve one instrument at a port; `close` closes the port."""
         twin = kind(self._stream, Console(self._client, name=f"{kind.CODEC.address.name} twin"), port)
         self._closing.callback(twin.close)
         self.twins.append(twin)
         return twin
 
     def serve_zenoh(self, endpoint: str) -> None:
-        """All instruments at one address.
+        """Serve all instruments at one zenoh address.
 
         Raises:
-            InputError: It cannot be listened on, or is not of this machine alone.
+            InputError: The address cannot be used, or can be reached from other computers.
         """
         from drivers.link.zenoh import ZenohPort
         from rig.serve.transport.zenoh import ZenohServer
@@ -54,7 +54,7 @@ class Twins(Closing):
             self.serve(kind, ZenohPort(server, kind.CODEC.address, f"zenoh:{endpoint}"))
 
     def serve_pty(self) -> None:
-        """Each instrument at a pseudo-terminal of its own."""
+        """Serve each instrument at its own pseudo-terminal."""
         from drivers.link.port import MessagePort
         from drivers.link.serial import open_pty
 
@@ -63,14 +63,14 @@ class Twins(Closing):
             self.serve(kind, MessagePort(link, f"pty:{path}"))
 
     def serve_can(self, spec: str, *, kinds: tuple[type[Twin], ...] = TWINS) -> None:
-        """Instruments at one node of a bus, by their identifiers.
+        """Serve instruments at one node of a CAN bus; their identifiers differ.
 
         Args:
             spec: INTERFACE:CHANNEL?NAME=VALUE&... of python-can's bus.
-            kinds: Which instruments; all by default.
+            kinds: Classes of the instruments; by default all.
 
         Raises:
-            InputError: There is no such bus.
+            InputError: The bus does not exist.
         """
         from drivers.link.can import TO_INSTRUMENT, CanLink, CanNode
         from drivers.link.port import MessagePort
@@ -82,5 +82,5 @@ class Twins(Closing):
             self.serve(kind, MessagePort(link, f"can:{spec}"))
 
     def close(self) -> None:
-        """Switch all instruments off; may be called again."""
+        """Switch all instruments off; further calls have no effect."""
         self._closing.close()

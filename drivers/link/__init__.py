@@ -1,7 +1,7 @@
-"""What carries an instrument's messages: a link at the host's end, a port at the instrument's, one module a transport.
+"""Transports of instrument messages: links at the host's end, ports at the instrument's; a module for each.
 
-A message is whole or lost, never cut: what is made of bytes (a serial line) or of short frames (CAN) is put together
-below. No module here looks inside a message; those are `drivers.instruments.common.protocol`'s.
+A message arrives complete or is lost, never cut: this package assembles what is sent as bytes (serial line) or as short
+frames (CAN). No module here reads the content of a message; that is done by `drivers.instruments.common.protocol`.
 """
 
 from __future__ import annotations
@@ -12,32 +12,32 @@ from typing import NamedTuple, Protocol
 from rig.base.errors import InputError
 
 DEFAULT_ENDPOINT = "127.0.0.1:7462"
-"""Where instruments on zenoh listen unless told otherwise."""
+"""Default address of instruments on zenoh."""
 FORMS = "zenoh:HOST:PORT, pty:PATH, serial:PATH[@BAUD], can:INTERFACE:CHANNEL[?NAME=VALUE&...]"
-ROOM = 500
-"""Messages that wait at either end: at least 5 s of blocks of 10 ms."""
-FAREWELL_S = 0.5
-"""How long a port that is closed tries to send what waits."""
+QUEUE_MESSAGES = 500
+"""Messages that wait at either end: at least 5 s of 10 ms blocks."""
+FLUSH_TIMEOUT_S = 0.5
+"""Longest time for which a port that is closed continues to send waiting data [s]."""
 
 
 class LinkError(ConnectionError):
-    """The bytes do not get through."""
+    """The connection to an instrument failed."""
 
 
 class LinkTimeoutError(LinkError, TimeoutError):
-    """Nothing came in time, or nothing could be sent in time."""
+    """No message arrived, or none could be sent, in time."""
 
 
 class LinkClosedError(LinkError):
-    """The link was closed, by this end or the other."""
+    """The link was closed by this end or the other."""
 
 
 class Address(NamedTuple):
-    """Where an instrument is found on a link that many share.
+    """Address of an instrument on a link that several share.
 
     Attributes:
-        name: Name, which keys hold.
-        number: Number of 1 to 31, which CAN identifiers hold.
+        name: Name, part of the keys.
+        number: Number from 1 to 31, part of the CAN identifiers.
     """
 
     name: str
@@ -45,7 +45,7 @@ class Address(NamedTuple):
 
 
 class Link(Protocol):
-    """The host's end of the way to one instrument (and either end of a way that is the same from both)."""
+    """Host's end of a connection to one instrument, or either end of a symmetric connection."""
 
     @property
     def max_bytes(self) -> int:
@@ -54,37 +54,41 @@ class Link(Protocol):
 
     @property
     def lost(self) -> int:
-        """Messages that were dropped or spoilt at this end."""
+        """Messages that were dropped or corrupted at this end."""
         ...
 
     def send(self, message: bytes, *, timeout_s: float) -> None:
         """Send one message.
 
+        Args:
+            message: At most `max_bytes` long.
+            timeout_s: Longest wait for the connection to accept it [s].
+
         Raises:
-            LinkTimeoutError: It was not taken in time.
-            LinkClosedError: There is no other end any more.
+            LinkTimeoutError: The message was not accepted in time.
+            LinkClosedError: The link is closed, or the other end has disconnected.
         """
         ...
 
     def receive(self, *, timeout_s: float) -> bytes | None:
-        """The next message, or None where none came in time.
+        """Return the next message, or None if none arrived in time.
 
         Raises:
-            LinkClosedError: There is no other end any more, and nothing is left of what came before.
+            LinkClosedError: The link is closed, or the other end has disconnected and all messages were read.
         """
         ...
 
     def close(self) -> None:
-        """Close; may be called again."""
+        """Close the link; further calls have no effect."""
         ...
 
 
 class Port(Protocol):
-    """The instrument's end: answers requests, and pushes data."""
+    """Instrument's end of a connection: replies to requests and pushes data."""
 
     @property
     def url(self) -> str:
-        """What a host opens."""
+        """URL for the host to open."""
         ...
 
     @property
@@ -93,43 +97,43 @@ class Port(Protocol):
         ...
 
     def serve(self, answer: Callable[[bytes], bytes], on_idle: Callable[[], None]) -> None:
-        """Answer requests from now on.
+        """Start to reply to requests.
 
         Args:
-            answer: Makes the reply to a request; called for one request after another.
-            on_idle: Called when all data that were pushed have left.
+            answer: Returns the reply to a request; called for one request after another.
+            on_idle: Called when all pushed data have been sent.
         """
         ...
 
     @property
     def idle(self) -> bool:
-        """Whether all data that were pushed have left: what is pushed now leaves at once."""
+        """Whether all pushed data have been sent, so that new data are sent at once."""
         ...
 
     def push(self, message: bytes) -> bool:
-        """Send data without waiting; False where there is no room and it was dropped."""
+        """Queue data without waiting; return False if the queue is full and the data were dropped."""
         ...
 
     def discard(self) -> None:
-        """Forget data that wait to be sent."""
+        """Discard data that wait to be sent."""
         ...
 
     def close(self) -> None:
-        """Close; may be called again."""
+        """Close the port; further calls have no effect."""
         ...
 
 
 def open_link(url: str, address: Address) -> Link:
-    """The way to an instrument.
+    """Open the link to an instrument.
 
     Args:
         url: `zenoh:127.0.0.1:7462`, `pty:/dev/pts/3`, `serial:/dev/ttyUSB0@921600`, `can:socketcan:can0`, or, with
             settings of python-can's bus, `can:zenoh:can0?endpoint=127.0.0.1:7461`.
-        address: The instrument among those that share a link.
+        address: The instrument, on a link that several share.
 
     Raises:
-        InputError: The text is none of that.
-        LinkError: Nothing is there.
+        InputError: The URL has none of these forms.
+        LinkError: No instrument replies.
     """
     kind, colon, rest = url.partition(":")
     if not colon or not rest or kind not in ("zenoh", "pty", "serial", "can"):

@@ -1,8 +1,8 @@
-"""Instruments over CAN: messages cut into frames and put together by ISO 15765-2 (ISO-TP), by the library can-isotp.
+"""Instruments over CAN: messages in ISO 15765-2 (ISO-TP) frames, by the library can-isotp.
 
-Identifiers are of 11 bits: 0x600 + number to the instrument, 0x640 + number from it. They lose arbitration against
-everything else on the rig's bus. A message is limited to 4095 bytes, which every ISO-TP implementation takes. On a bus
-with CAN FD the frames are of up to 64 bytes. Rates beyond what a bus carries do not fit: see `rate_hz` of `configure`.
+Identifiers have 11 bits: 0x600 + number to the instrument, 0x640 + number from it. They lose arbitration against all
+other messages of the rig. A message has at most 4095 bytes, which every ISO-TP implementation accepts. On a CAN FD bus
+the frames have up to 64 bytes. If the bus is too slow for the data, reduce the rate by `rate_hz` of `configure`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import threading
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from drivers.link import FORMS, ROOM, Address, LinkClosedError, LinkTimeoutError
+from drivers.link import FORMS, QUEUE_MESSAGES, Address, LinkClosedError, LinkTimeoutError
 from rig.base.errors import InputError
 from rig.serve.request_handler import one_line
 from rig.serve.waiting import BoundedQueue, Deadline
@@ -26,12 +26,12 @@ if TYPE_CHECKING:
 TO_INSTRUMENT = 0x600
 FROM_INSTRUMENT = 0x640
 _MAX_BYTES = 4095
-_SEND_S = 0.5
-"""How long a frame may wait for room in the transmit queue."""
+_SEND_TIMEOUT_S = 0.5
+"""Longest wait of a frame for space in the transmit queue [s]."""
 
 
 _LOGGER = "drivers.link.can"
-# What the library would warn of is counted as lost; it is logged where a program has set up logging.
+# Messages that the library warns about count as lost; they are logged if the program has set up logging.
 logging.getLogger(_LOGGER).addHandler(logging.NullHandler())
 
 
@@ -40,7 +40,7 @@ class CanNode:
 
     Args:
         spec: INTERFACE:CHANNEL, and `?NAME=VALUE&...` with further settings of python-can's bus.
-        receive: Identifiers that are listened to.
+        receive: Identifiers to receive.
 
     Raises:
         InputError: python-can has no such bus.
@@ -57,11 +57,11 @@ class CanNode:
         self._notifier = can.Notifier(self.bus, [self._take], timeout=0.1)
 
     def listen(self, identifier: int, take: Callable[[can.Message], None]) -> None:
-        """Hand the frames of one identifier to a function, which must not wait."""
+        """Call a function with each frame of one identifier; it must not block."""
         self._receivers[identifier] = take
 
     def leave(self, identifier: int) -> None:
-        """Hand on no more of them."""
+        """Stop passing on frames of one identifier."""
         self._receivers.pop(identifier, None)
 
     def _take(self, message: can.Message) -> None:
@@ -76,10 +76,16 @@ class CanNode:
 
 
 def open_bus(spec: str, interface: str, channel: str, **settings: Any) -> can.BusABC:
-    """One of python-can's buses; the specification is what an error names.
+    """Open a bus of python-can.
+
+    Args:
+        spec: Specification to name in an error.
+        interface: Name of python-can's interface.
+        channel: Channel of the interface.
+        settings: Further settings of the bus.
 
     Raises:
-        InputError: There is no such bus, or it cannot be opened.
+        InputError: The bus does not exist, or cannot be opened.
     """
     import can
 
@@ -90,10 +96,10 @@ def open_bus(spec: str, interface: str, channel: str, **settings: Any) -> can.Bu
 
 
 def parse_spec(spec: str) -> tuple[str, str, dict[str, Any]]:
-    """Split INTERFACE:CHANNEL?NAME=VALUE&...; values as python-can reads them.
+    """Split INTERFACE:CHANNEL?NAME=VALUE&...; values are converted as by python-can.
 
     Raises:
-        InputError: It is not of that form.
+        InputError: The text has another form.
     """
     from can.util import cast_from_string
 
@@ -106,16 +112,16 @@ def parse_spec(spec: str) -> tuple[str, str, dict[str, Any]]:
 
 
 class CanLink:
-    """One end of the way between a host and an instrument.
+    """One end of the connection between a host and an instrument.
 
     Args:
-        spec: The bus, as `CanNode` takes it.
+        spec: Bus, as for `CanNode`.
         address: The instrument.
-        node: A node to share instead of one of its own.
+        node: Node to share; by default the link has its own.
         instrument: Whether this is the instrument's end.
 
     Raises:
-        InputError: There is no such bus.
+        InputError: The bus does not exist.
     """
 
     def __init__(self, spec: str, address: Address, *, node: CanNode | None = None, instrument: bool = False) -> None:
@@ -123,7 +129,7 @@ class CanLink:
 
         down, up = TO_INSTRUMENT + address.number, FROM_INSTRUMENT + address.number
         send, receive = (up, down) if instrument else (down, up)
-        self._own = node is None
+        self._owns_node = node is None
         self._node = CanNode(spec, [receive]) if node is None else node
         fd = self._node.fd
         self._name = address.name
@@ -147,8 +153,8 @@ class CanLink:
         )
         self._sending = threading.Lock()
         self._closing = threading.Lock()
-        # The library's own queue has no bound.
-        self._messages: BoundedQueue[bytes] = BoundedQueue(ROOM)
+        # The library's own queue is unbounded.
+        self._messages: BoundedQueue[bytes] = BoundedQueue(QUEUE_MESSAGES)
         self._closed = False
         self._spoilt = 0
         self.max_bytes = _MAX_BYTES
@@ -159,14 +165,14 @@ class CanLink:
 
     @property
     def lost(self) -> int:
-        """Messages that were spoilt, found no room, or did not get onto the bus."""
+        """Messages that were corrupted, found no space, or did not get onto the bus."""
         return self._spoilt + self._messages.dropped
 
     def _count_spoilt(self, _: Exception) -> None:
         self._spoilt += 1
 
     def _receive_frame(self, _: float) -> isotp.CanMessage | None:
-        """The next frame for the library; waits longer than asked, and is woken by `close`."""
+        """Return the next frame to the library. It ignores the library's time-out; `close` wakes it."""
         import isotp
 
         message = None if self._closed else self._frames.get()
@@ -175,7 +181,7 @@ class CanLink:
         return isotp.CanMessage(arbitration_id=message.arbitration_id, data=bytes(message.data), is_fd=message.is_fd)
 
     def _send_frame(self, message: isotp.CanMessage) -> None:
-        """Send a frame of the library's; one that the bus does not take spoils its message, which times out."""
+        """Send a frame of the library; if the bus does not accept it, its message is spoilt and times out."""
         import can
 
         frame = can.Message(
@@ -186,7 +192,7 @@ class CanLink:
             bitrate_switch=message.bitrate_switch,
         )
         try:
-            self._node.bus.send(frame, timeout=_SEND_S)
+            self._node.bus.send(frame, timeout=_SEND_TIMEOUT_S)
         except can.CanError:
             self._spoilt += 1
 
@@ -197,11 +203,11 @@ class CanLink:
                 self._messages.push(bytes(message))
 
     def send(self, message: bytes, *, timeout_s: float) -> None:
-        """Send one message; returns when its last frame has been handed to the bus."""
+        """Send one message; return when the bus has accepted its last frame."""
         import isotp
 
         if len(message) > _MAX_BYTES:
-            raise InputError("message", f"of at most {_MAX_BYTES} bytes", len(message))
+            raise InputError("message", f"at most {_MAX_BYTES} bytes long", len(message))
         deadline = Deadline(timeout_s)
         with self._sending:
             if self._closed:
@@ -213,27 +219,27 @@ class CanLink:
                     self._stack.stop_sending()
                 if self._closed:
                     raise LinkClosedError("the link is closed") from None
-                raise LinkTimeoutError(f"no {self._name} takes messages on this bus") from None
+                raise LinkTimeoutError(f"the {self._name} on this bus accepts no messages; is it running?") from None
 
     def receive(self, *, timeout_s: float) -> bytes | None:
-        """The next message, or None where none came in time."""
+        """Return the next message, or None if none arrived in time."""
         message = self._messages.take(timeout_s)
         if self._closed:
             raise LinkClosedError("the link is closed")
         return message
 
     def close(self) -> None:
-        """Close; leaves the bus where the node is its own."""
+        """Close the link, and leave the bus if the node is its own."""
         with self._closing:
             if self._closed:
                 return
             self._closed = True
         self._messages.close()
         self._node.leave(self._receive_identifier)
-        # Both wake their readers.
+        # Wake both readers.
         self._frames.put(None)
         self._stack.rx_queue.put(bytearray())
         self._reader.join(timeout=2.0)
         self._stack.stop()
-        if self._own:
+        if self._owns_node:
             self._node.close()

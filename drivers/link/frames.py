@@ -1,9 +1,10 @@
-"""Messages in a stream of bytes, sans-IO: consistent overhead byte stuffing and a CRC-16.
+"""Messages in a stream of bytes: consistent overhead byte stuffing and a CRC-16; does no input or output itself.
 
-A frame is a zero byte, the message and its CRC-16 (CCITT polynomial 0x1021, start 0, as XMODEM; most significant byte
-first) without any zero byte, and a zero byte. A reader that comes in the middle, or meets a spoilt frame, is in step
-again at the next zero. Stuffing: S. Cheshire and M. Baker, "Consistent overhead byte stuffing", IEEE/ACM Transactions
-on Networking 7 (1999) 159-172.
+A frame is a zero byte, the message and its CRC-16 (CCITT polynomial 0x1021, initial value 0, as XMODEM; most
+significant
+byte first), both stuffed to contain no zero byte, and a zero byte. A reader that starts in the middle, or receives a
+corrupted frame, resynchronises at the next zero. Stuffing: S. Cheshire and M. Baker, "Consistent overhead byte
+stuffing", IEEE/ACM Transactions on Networking 7 (1999) 159-172.
 """
 
 from __future__ import annotations
@@ -11,20 +12,20 @@ from __future__ import annotations
 import binascii
 import struct
 
-_RUN = 254
+_MAX_RUN = 254
 _CRC = struct.Struct(">H")
 
 
 def stuff(data: bytes) -> bytes:
-    """The same data without a zero byte, at most 1 byte in 254 longer, and one."""
+    """Return the data encoded without zero bytes; the result is longer by one byte, and by at most 1 byte in 254."""
     out = bytearray()
     parts = data.split(b"\0")
     for number, part in enumerate(parts):
-        while len(part) >= _RUN:
-            out.append(_RUN + 1)
-            out += part[:_RUN]
-            part = part[_RUN:]
-            # A full run stands for no zero; where the data ends with it, nothing need follow.
+        while len(part) >= _MAX_RUN:
+            out.append(_MAX_RUN + 1)
+            out += part[:_MAX_RUN]
+            part = part[_MAX_RUN:]
+            # A full run implies no zero, so nothing follows it at the end of the data.
             if not part and number == len(parts) - 1:
                 return bytes(out)
         out.append(len(part) + 1)
@@ -33,10 +34,10 @@ def stuff(data: bytes) -> bytes:
 
 
 def unstuff(data: bytes) -> bytes:
-    """The data of what `stuff` made.
+    """Return the data that `stuff` encoded.
 
     Raises:
-        ValueError: It was not made by `stuff`.
+        ValueError: The bytes are not an output of `stuff`.
     """
     out = bytearray()
     position = 0
@@ -47,37 +48,37 @@ def unstuff(data: bytes) -> bytes:
             raise ValueError(f"stuffed bytes must hold whole runs; instead received one of {code} at {position}")
         out += data[position + 1 : end]
         position = end
-        if code <= _RUN and position < len(data):
+        if code <= _MAX_RUN and position < len(data):
             out.append(0)
     return bytes(out)
 
 
-def frame(message: bytes) -> bytes:
-    """A message as it goes over the line."""
+def encode_frame(message: bytes) -> bytes:
+    """Encode a message as a frame."""
     return b"\0" + stuff(message + _CRC.pack(binascii.crc_hqx(message, 0))) + b"\0"
 
 
 class Deframer:
-    """Takes bytes in portions of any size, gives messages.
+    """Extracts messages from bytes that arrive in portions of any size.
 
     Args:
-        max_bytes: Length of the longest message [bytes]; a longer one is spoilt, and no memory is spent on it.
+        max_bytes: Length of the longest message [bytes]; longer ones count as spoilt and are not stored.
     """
 
     def __init__(self, max_bytes: int) -> None:
         self._max_bytes = max_bytes
-        self._longest = max_bytes + 2 + (max_bytes + 2) // _RUN + 1
+        self._max_stuffed_bytes = max_bytes + 2 + (max_bytes + 2) // _MAX_RUN + 1
         self._part = bytearray()
         self._too_long = False
         self.spoilt = 0
         """Frames that were cut, too long, or had a wrong CRC."""
 
     def __len__(self) -> int:
-        """Bytes that wait for the rest of their frame."""
+        """Return the number of bytes of the incomplete frame."""
         return len(self._part)
 
     def feed(self, data: bytes) -> list[bytes]:
-        """The messages that these bytes complete."""
+        """Add bytes, and return the messages that they complete."""
         messages = []
         *ended, rest = data.split(b"\0")
         for part in ended:
@@ -88,7 +89,7 @@ class Deframer:
         return messages
 
     def _append(self, part: bytes) -> None:
-        if len(self._part) + len(part) > self._longest:
+        if len(self._part) + len(part) > self._max_stuffed_bytes:
             self._too_long = True
             self._part.clear()
         elif not self._too_long:

@@ -1,4 +1,4 @@
-"""A serial line, real or a pseudo-terminal: frames of `drivers.link.frames` in a stream of bytes (POSIX)."""
+"""Serial line or pseudo-terminal: frames of `drivers.link.frames` in a stream of bytes (POSIX)."""
 
 from __future__ import annotations
 
@@ -12,27 +12,27 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from drivers.link import FORMS, LinkClosedError, LinkTimeoutError
-from drivers.link.frames import Deframer, frame
+from drivers.link.frames import Deframer, encode_frame
 from rig.base.errors import InputError
 from rig.serve.waiting import Deadline
 
 _MAX_BYTES = 1 << 16
-_PORTION = 1 << 16
+_READ_BYTES = 1 << 16
 
 
 class SerialLink:
-    """One end of a line.
+    """One end of a serial line.
 
     Args:
-        descriptor: Of an open terminal; closed with the link.
-        keep: Another descriptor to hold open for as long.
+        descriptor: File descriptor of an open terminal; closed with the link.
+        keep: Another descriptor to keep open as long as the link.
     """
 
     def __init__(self, descriptor: int, *, keep: int | None = None) -> None:
         os.set_blocking(descriptor, False)
         self._descriptor = descriptor
         self._keep = keep
-        # Wakes who waits for the line when it is closed.
+        # Wakes threads that wait for the line when it is closed.
         self._wake_read, self._wake = os.pipe()
         self._sending = threading.Lock()
         self._receiving = threading.Lock()
@@ -44,23 +44,23 @@ class SerialLink:
 
     @property
     def lost(self) -> int:
-        """Frames that came spoilt."""
+        """Frames that arrived corrupted."""
         return self._deframer.spoilt
 
     def send(self, message: bytes, *, timeout_s: float) -> None:
-        """Write one frame; one that the line does not take in time stays cut, and the other end skips it."""
+        """Write one frame. A frame that the line does not accept in time stays cut, and the other end skips it."""
         if len(message) > _MAX_BYTES:
-            raise InputError("message", f"of at most {_MAX_BYTES} bytes", len(message))
+            raise InputError("message", f"at most {_MAX_BYTES} bytes long", len(message))
         deadline = Deadline(timeout_s)
-        rest = memoryview(frame(message))
+        rest = memoryview(encode_frame(message))
         with self._sending:
             while rest:
-                self._wait(select.POLLOUT, deadline, f"the line took nothing for {timeout_s:g} s")
+                self._wait(select.POLLOUT, deadline, f"the line accepted no data for {timeout_s:g} s")
                 with self._errors(), contextlib.suppress(BlockingIOError):
                     rest = rest[os.write(self._descriptor, rest) :]
 
     def receive(self, *, timeout_s: float) -> bytes | None:
-        """The next message, or None where none came in time."""
+        """Return the next message, or None if none arrived in time."""
         deadline = Deadline(timeout_s)
         with self._receiving:
             while not self._messages:
@@ -69,7 +69,7 @@ class SerialLink:
                 except LinkTimeoutError:
                     return None
                 with self._errors(), contextlib.suppress(BlockingIOError):
-                    data = os.read(self._descriptor, _PORTION)
+                    data = os.read(self._descriptor, _READ_BYTES)
                     if not data:
                         raise LinkClosedError("the other end of the line has gone")
                     self._messages = self._deframer.feed(data)
@@ -100,7 +100,7 @@ class SerialLink:
             raise LinkClosedError(f"the line has gone: {error.strerror}") from None
 
     def close(self) -> None:
-        """Close; whoever waits to send or receive stops waiting first."""
+        """Close the line, after waking the threads that send or receive."""
         with self._closing:
             if self._closed:
                 return
@@ -113,21 +113,21 @@ class SerialLink:
 
 
 def open_serial(text: str, *, field: str = "serial") -> SerialLink:
-    """The host's end of a line.
+    """Open the host's end of a serial line.
 
     Args:
-        text: Path of a terminal, with `@` and a bit rate where it has one.
-        field: What to call it in an error.
+        text: Path of a terminal, with `@` and a bit rate for a real serial line.
+        field: Name of the value in an error.
 
     Raises:
-        InputError: It is no terminal, or has no such bit rate.
+        InputError: The path is not a terminal, or the system has no such bit rate.
     """
     path, at, baud = text.rpartition("@") if "@" in text else (text, "", "")
     speed = getattr(termios, f"B{baud}", None) if at else None
     if at and (not baud.isdecimal() or speed is None):
-        raise InputError(field, "PATH@BAUD with a bit rate that the system knows, such as 115200 or 921600", text)
+        raise InputError(field, "PATH@BAUD with a bit rate of this system, such as 115200 or 921600", text)
     if not Path(path).is_char_device():
-        raise InputError(field, f"a terminal that is there ({FORMS})", text)
+        raise InputError(field, f"an existing terminal ({FORMS})", text)
     try:
         descriptor = os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
     except OSError as error:
@@ -138,7 +138,7 @@ def open_serial(text: str, *, field: str = "serial") -> SerialLink:
             settings = termios.tcgetattr(descriptor)
             settings[4] = settings[5] = speed
             termios.tcsetattr(descriptor, termios.TCSANOW, settings)
-        # What was sent to another before us.
+        # Discard what was sent to an earlier reader.
         termios.tcflush(descriptor, termios.TCIFLUSH)
     except termios.error:
         os.close(descriptor)
@@ -147,8 +147,8 @@ def open_serial(text: str, *, field: str = "serial") -> SerialLink:
 
 
 def open_pty() -> tuple[SerialLink, str]:
-    """The instrument's end of a new pseudo-terminal, and the path of the host's end."""
+    """Open a pseudo-terminal; return the instrument's end, and the path of the host's end."""
     master, slave = os.openpty()
     tty.setraw(slave, termios.TCSANOW)
-    # Held open, or the line would seem gone whenever no host has it open.
+    # Kept open: otherwise the line would count as disconnected while no host has it open.
     return SerialLink(master, keep=slave), os.ttyname(slave)

@@ -1,11 +1,11 @@
-"""Instruments over zenoh: a request is a query, data is published; the keys are `rig/instruments/NAME/...`."""
+"""Instruments over zenoh: a request is a query, data are published; the keys are `rig/instruments/NAME/...`."""
 
 from __future__ import annotations
 
 import threading
 from collections.abc import Callable
 
-from drivers.link import ROOM, Address, LinkClosedError, LinkTimeoutError
+from drivers.link import QUEUE_MESSAGES, Address, LinkClosedError, LinkTimeoutError
 from drivers.link.port import Outbox, OutboxPort
 from rig.serve.transport import NoReplyError, Server
 from rig.serve.waiting import BoundedQueue, take_first
@@ -15,26 +15,26 @@ _MAX_BYTES = 1 << 16
 
 
 def request_key(name: str) -> str:
-    """Key on which an instrument answers."""
+    """Return the key of an instrument's requests."""
     return f"{_ROOT}/{name}/request"
 
 
 def data_key(name: str) -> str:
-    """Key of an instrument's data."""
+    """Return the key of an instrument's data."""
     return f"{_ROOT}/{name}/data"
 
 
 class ZenohLink:
-    """The host's end.
+    """Host's end of a connection to one instrument.
 
     Args:
         endpoint: HOST:PORT where the instruments listen.
         address: The instrument.
-        wait_s: How long to wait for them to be there [s].
+        wait_s: Longest wait for the instruments [s].
 
     Raises:
         InputError: The endpoint is malformed.
-        LinkClosedError: Nobody is there.
+        LinkClosedError: No instruments reply.
     """
 
     def __init__(self, endpoint: str, address: Address, *, wait_s: float = 1.0) -> None:
@@ -45,9 +45,9 @@ class ZenohLink:
         self._name = address.name
         self._endpoint = endpoint
         self._changed = threading.Condition()
-        self._replies: BoundedQueue[bytes] = BoundedQueue(ROOM, changed=self._changed)
-        # Never waits: a host that does not read loses the oldest, and sees it in the numbers of the rows.
-        self._data: BoundedQueue[bytes] = BoundedQueue(ROOM, changed=self._changed)
+        self._replies: BoundedQueue[bytes] = BoundedQueue(QUEUE_MESSAGES, changed=self._changed)
+        # Never waits: a host that does not read loses the oldest data, and sees the gap in the row numbers.
+        self._data: BoundedQueue[bytes] = BoundedQueue(QUEUE_MESSAGES, changed=self._changed)
         self._missed = 0
         self.max_bytes = _MAX_BYTES
         try:
@@ -59,12 +59,12 @@ class ZenohLink:
                 raise
         except NoReplyError:
             raise LinkClosedError(
-                f"no instruments answer at {endpoint}; start them with: rig twins (see rig twins --help)"
+                f"no instruments reply at {endpoint}; start them with: rig twins (see rig twins --help)"
             ) from None
 
     @property
     def lost(self) -> int:
-        """Messages that did not come, or found no room."""
+        """Messages that did not arrive, or found no space."""
         return self._missed + self._data.dropped
 
     def _take(self, _: str, payload: bytes) -> None:
@@ -74,17 +74,17 @@ class ZenohLink:
         self._missed += count
 
     def send(self, message: bytes, *, timeout_s: float) -> None:
-        """Ask; when this returns, the reply is there to be received."""
+        """Send a request; when this returns, its reply can be received."""
         if self._replies.closed:
             raise LinkClosedError("the link is closed")
         try:
             reply = self._client.request(request_key(self._name), message, timeout_s=timeout_s)
         except NoReplyError:
-            raise LinkTimeoutError(f"no {self._name} answers at {self._endpoint}") from None
+            raise LinkTimeoutError(f"no {self._name} replies at {self._endpoint}") from None
         self._replies.push(reply)
 
     def receive(self, *, timeout_s: float) -> bytes | None:
-        """The next reply, or else the next data, or None where none came in time."""
+        """Return the next reply, else the next data, or None if none arrived in time."""
         message = take_first(self._changed, (self._replies, self._data), timeout_s)
         if self._replies.closed:
             raise LinkClosedError("the link is closed")
@@ -100,12 +100,12 @@ class ZenohLink:
 
 
 class ZenohPort(OutboxPort):
-    """The instrument's end, on a server that many instruments share and that stays open.
+    """Instrument's end of a connection, on a server that several instruments share.
 
     Args:
-        server: Transport.
+        server: Transport; its owner closes it.
         address: The instrument.
-        url: What a host opens.
+        url: URL for the host to open.
     """
 
     def __init__(self, server: Server, address: Address, url: str) -> None:
@@ -114,7 +114,7 @@ class ZenohPort(OutboxPort):
         super().__init__(Outbox(self._publish, f"{url} {address.name} publishes"), url, _MAX_BYTES)
 
     def serve(self, answer: Callable[[bytes], bytes], on_idle: Callable[[], None]) -> None:
-        """Answer requests from now on."""
+        """Start to reply to requests."""
         self._outbox.start(on_idle)
         self._server.answer(request_key(self._address.name), answer)
 
@@ -123,5 +123,5 @@ class ZenohPort(OutboxPort):
         return True
 
     def close(self) -> None:
-        """Publish what waits, and nothing more; the server is closed by its owner."""
+        """Publish what waits, for at most FAREWELL_S; the server stays open."""
         self._outbox.close()

@@ -1,4 +1,4 @@
-"""A machinery protection monitor of one pair of probes and the keyphasor, which trips the rig."""
+"""Machinery protection monitor for one pair of probes and the keyphasor, which trips the rig."""
 
 from drivers.protection.monitor import Action, Protection
 from drivers.protection.settings import Settings

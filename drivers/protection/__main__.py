@@ -1,7 +1,8 @@
 """Protect a rig: `python -m drivers.protection URL --alert-um 500 --danger-um 1500`; Ctrl-C ends it.
 
-One line for each alarm, with its simulated time. What it says is a note in the stream too, with the tags `protection`
-and its kind, such as `danger` and `trip`: a contact that others read. A note of others with the tag `reset` resets it.
+Prints one line for each action, with its simulated time. Each is also written to the stream as a note with the tag
+`protection` and its kind, such as `danger` or `trip`, as a contact that other programs can read. A note of another
+program with the tag `reset` resets the monitor.
 """
 
 from __future__ import annotations
@@ -24,16 +25,16 @@ def protect(machine: Any, protection: Protection, show: Callable[[str], object] 
     Args:
         machine: A `drivers.client.Rig` that reads the settings' channels.
         protection: The monitor.
-        show: Is told each line.
+        show: Called with each line.
     """
     for samples in machine.blocks():
         if any("reset" in event.get("tags", ()) and "protection" not in event["tags"] for event in _events(machine)):
             protection.reset()
-        obey(machine, protection.settings, protection.feed(samples), show)
+        act(machine, protection.settings, protection.feed(samples), show)
 
 
-def obey(machine: Any, settings: Settings, actions: Iterable[Action], show: Callable[[str], object] = print) -> None:
-    """Do what the monitor says: the trip, then the notes, and the end of the run last, as it ends the notes too."""
+def act(machine: Any, settings: Settings, actions: Iterable[Action], show: Callable[[str], object] = print) -> None:
+    """Perform the monitor's actions: the trip first, then the notes. A stop comes last, as it ends the notes too."""
     actions = list(actions)
     trips = [action for action in actions if action.kind == "trip"]
     if trips and settings.trip == "speed 0":
@@ -46,7 +47,7 @@ def obey(machine: Any, settings: Settings, actions: Iterable[Action], show: Call
 
 
 def _events(machine: Any) -> list[dict[str, Any]]:
-    """What has come since the last time."""
+    """Return the events since the last call."""
     found = []
     try:
         while True:
@@ -56,10 +57,13 @@ def _events(machine: Any) -> list[dict[str, Any]]:
 
 
 def parse(arguments: Sequence[str]) -> tuple[str, Settings]:
-    """URL and settings of a command line: each setting is an option.
+    """Parse a command line into URL and settings; each setting is an option.
+
+    Args:
+        arguments: Command line without the program's name.
 
     Raises:
-        InputError: A setting has a value that it must not have.
+        InputError: A setting is out of range.
     """
     parser = argparse.ArgumentParser(
         prog="python -m drivers.protection", description=(__doc__ or "").partition("\n")[0]
@@ -75,8 +79,8 @@ def parse(arguments: Sequence[str]) -> tuple[str, Settings]:
         elif get_origin(kind) is tuple:
             option = {"action": "append", "metavar": "CHANNEL"}
         parser.add_argument("--" + name.replace("_", "-"), default=argparse.SUPPRESS, **option)
-    given = vars(parser.parse_args(arguments))
-    return given.pop("url"), check(Settings, given, field="")
+    options = vars(parser.parse_args(arguments))
+    return options.pop("url"), check(Settings, options, field="")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -86,7 +90,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     try:
         url, settings = parse(sys.argv[1:] if arguments is None else arguments)
         with connect(url, channels=settings.channels, name="protection") as machine:
-            machine.note(f"protection of {settings.x}, {settings.y} is on", tags=["protection", "on"])
+            machine.note(f"protection of {settings.x}, {settings.y} started", tags=["protection", "on"])
             print(f"Connected to {url}: {', '.join(settings.channels)}; Ctrl-C ends it", flush=True)
             protect(machine, Protection(settings), lambda line: print(line, flush=True))
     except KeyboardInterrupt:

@@ -1,13 +1,14 @@
-"""The monitor: rows in, what it does out, without a clock, a wire or a thread.
+"""Protection monitor: rows in, actions out, without clock, connection or thread.
 
-Its level is the peak-to-peak of each probe, or Smax of the orbit, over the last `window_s`, above `corner_hz`. A level
-above a set point for the delay is an alarm; its cause is over where the level falls below the set point by the
-hysteresis. Dangers, by the vote, are a trip. A probe whose output leaves the OK limits is NOT OK from that row on,
-until it was within them for `ok_recovery_s`; meanwhile it raises no alarm, and `not_ok` says how it votes.
+The level is the peak-to-peak value of each probe, or Smax of the orbit, in the last `window_s`, above `corner_hz`. An
+alarm begins when a level has exceeded its set point for the delay, and its cause ends when the level falls below the
+set point by the hysteresis. Dangers trip the rig according to the vote. A probe whose output leaves the OK limits is
+NOT OK from that row, until it has been within the limits for `ok_recovery_s`. Meanwhile it raises no alarm, and
+`not_ok` determines its vote.
 
-Rows that are missing, up to a window of them, are taken as the last that came, and those that come late or twice are
-left out; where more are missing, or the numbers of rows begin anew, all begins anew with both probes NOT OK. Every
-state is that of a row: how rows are cut into blocks changes nothing.
+Missing rows, up to one window, are filled with the last row; late and duplicate rows are dropped. After a larger gap,
+or when the row numbers restart, the monitor restarts with both probes NOT OK. Each state belongs to a row: the result
+does not depend on how the rows are divided into blocks.
 """
 
 from __future__ import annotations
@@ -26,24 +27,24 @@ from rig.base.units import factor
 from rig.base.wire import Continuity, row_tick, row_times_s
 
 Alarm = tuple[str, str]
-"""Its kind, and its channel."""
+"""Kind and channel of an alarm."""
 TRIP: Alarm = ("trip", "")
 _PULSE = (0.6, 0.4)
-"""A pulse of the keyphasor, 0 to 1, begins above the first, and the next one can where it was below the second."""
+"""Keyphasor levels, 0 to 1: a pulse begins above the first, after the signal was below the second."""
 
 
 @dataclass(frozen=True, slots=True)
 class Action:
-    """What the monitor says or does at a row.
+    """An alarm, the end of one, or another action at one row.
 
     Attributes:
-        kind: alert, danger, overspeed, speed-lost, not-ok or trip, where it comes; clear, where an alarm goes by
-            itself; reset; rows-lost.
-        name: Its channel; of a trip, the alarm that was first; of a clear and a reset, the alarm.
+        kind: alert, danger, overspeed, speed-lost, not-ok or trip at its beginning; clear when an alarm ends without a
+            reset; reset; rows-lost.
+        name: Channel; for a trip the first alarm, for clear and reset the alarm.
         row: Number of the row since the start of the stream.
-        tick: Its simulated time, to the nearest [ticks].
-        time_s: The same, exact [s].
-        value: The level [um], the speed [Hz], a probe's output [V], or the number of rows.
+        tick: Simulated time, rounded [ticks].
+        time_s: Simulated time, exact [s].
+        value: Level [um], speed [Hz], output of a probe [V], or number of rows.
     """
 
     kind: str
@@ -58,14 +59,14 @@ class Action:
 
 
 class Protection:
-    """A monitor of one pair of probes.
+    """Protection monitor for one pair of probes.
 
     Attributes:
-        settings: What it is set to.
-        multiply: Factor of the set points (a trip multiply), from the next row on.
+        settings: Its settings.
+        multiply: Factor of the set points (trip multiply), from the next row on.
         bypassed: Channels without alarms, from the next row on.
-        active: Alarms that stand, and the trip, with what they came with.
-        first_out: Alarms in the order in which they came, since they were reset.
+        active: Active alarms, and the trip, with the actions at their beginning.
+        first_out: Alarms since their last reset, in the order of their beginning.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -75,30 +76,30 @@ class Protection:
         self._latching = {"trip"}
         self._latching |= {"danger", "overspeed"} if settings.latch_danger else set()
         self._latching |= {"alert", "speed-lost"} if settings.latch_alert else set()
-        self._came = Continuity()
+        self._received = Continuity()
         self._next: int | None = None
         self._to_reset = False
 
     @property
     def tripped(self) -> bool:
-        """Whether it tripped, and was not reset."""
+        """Whether the monitor has tripped, and was not reset since."""
         return TRIP in self.active
 
     def reset(self) -> None:
-        """Acknowledge at the next row: alarms whose cause is over go, and the trip if no danger stays."""
+        """Reset at the next row: alarms without a cause end, and the trip ends if no danger remains."""
         self._to_reset = True
 
     def feed(self, samples: Samples) -> list[Action]:
-        """What comes of the next rows, in their order.
+        """Process the next rows, and return the actions in order.
 
         Raises:
-            InputError: A channel is missing, its unit is no length, or the rate changes.
+            InputError: A channel is missing, its unit is not a length, or the rate changes.
         """
-        fresh = follow(self._came, samples) if len(samples) else None
+        fresh = follow(self._received, samples) if len(samples) else None
         if fresh is None:
             return []
         samples = fresh
-        signals, missing = self._continued(samples)
+        signals, missing = self._fill_missing(samples)
         first = samples.index + len(samples) - signals.shape[1]
 
         def action(kind: str, name: str, row: int, value: float) -> Action:
@@ -106,8 +107,8 @@ class Protection:
             time_s = float(row_times_s(tick, samples.rate_hz, samples.tick_rate_hz, 1)[0])
             return Action(kind, name, row, tick, time_s, float(value))
 
-        told = [action("rows-lost", "", samples.index, missing)] if missing else []
-        told += [action("reset", " ".join(alarm).strip(), first, 0.0) for alarm in self._acknowledged()]
+        actions = [action("rows-lost", "", samples.index, missing)] if missing else []
+        actions += [action("reset", " ".join(alarm).strip(), first, 0.0) for alarm in self._end_acknowledged()]
         states = self._states(signals, first)
         changes = [
             (int(row), place, alarm)
@@ -119,26 +120,26 @@ class Protection:
             kind, name = alarm
             if not on[row]:
                 del self.active[alarm]
-                told.append(action("clear", " ".join(alarm), first + row, values[row]))
+                actions.append(action("clear", " ".join(alarm), first + row, values[row]))
                 continue
             if alarm == TRIP:
                 name = next((" ".join(each) for each in self.first_out if each[0] != "alert"), "")
             elif alarm not in self.first_out:
                 self.first_out.append(alarm)
-            told.append(action(kind, name, first + row, values[row]))
-            self.active[alarm] = told[-1]
-        return told
+            actions.append(action(kind, name, first + row, values[row]))
+            self.active[alarm] = actions[-1]
+        return actions
 
-    def _continued(self, samples: Samples) -> tuple[np.ndarray, int]:
-        """Probes [um] and keyphasor, shape (signals, rows), with the rows that are missing; and how many those are."""
-        known = self._next is not None
-        if known and samples.rate_hz != self._rate_hz:
+    def _fill_missing(self, samples: Samples) -> tuple[np.ndarray, int]:
+        """Return probes [um] and keyphasor, shape (signals, rows), and the number of rows filled."""
+        started = self._next is not None
+        if started and samples.rate_hz != self._rate_hz:
             raise InputError("rate_hz", f"{self._rate_hz:g} Hz as before", samples.rate_hz)
         probes = [self.settings.x, self.settings.y]
         scale = [factor(samples.unit(name), "um", field=f"unit of {name}") for name in probes] + [1.0]
         signals = np.vstack([samples[name] * by for name, by in zip(self.settings.channels, scale, strict=False)])
         missing = samples.index - self._next if self._next is not None else 0
-        if not known or not 0 <= missing <= self._window:
+        if not started or not 0 <= missing <= self._window:
             self._begin(samples.index, samples.rate_hz)
         elif missing:
             signals = np.hstack([np.repeat(self._last, missing, axis=1), signals])
@@ -146,11 +147,11 @@ class Protection:
         return signals, missing
 
     def _begin(self, first: int, rate_hz: float) -> None:
-        """Forget all rows; probes are OK at power-up, and not where rows are lost."""
+        """Forget all rows. Probes are OK at the first start, and NOT OK after a loss of rows."""
         settings, self._rate_hz = self.settings, rate_hz
-        known, probes = self._next is not None, (settings.x, settings.y)
-        self._armed = self._armed if known else first + self._rows(settings.startup_s)
-        self._runs = {("ok", name): 0 if known else self._rows(settings.ok_recovery_s) for name in probes}
+        started, probes = self._next is not None, (settings.x, settings.y)
+        self._armed = self._armed if started else first + self._rows(settings.startup_s)
+        self._runs = {("ok", name): 0 if started else self._rows(settings.ok_recovery_s) for name in probes}
         self._window = max(2, self._rows(settings.window_s))
         self._part = 1.0 - math.exp(-2.0 * math.pi * settings.corner_hz / rate_hz)
         self._means: list[float] = []
@@ -161,8 +162,8 @@ class Protection:
     def _rows(self, duration_s: float) -> int:
         return math.ceil(duration_s * self._rate_hz - 1e-6)
 
-    def _acknowledged(self) -> list[Alarm]:
-        """Alarms that a reset takes away."""
+    def _end_acknowledged(self) -> list[Alarm]:
+        """Remove and return the alarms that a requested reset ends."""
         if not self._to_reset:
             return []
         self._to_reset = False
@@ -174,7 +175,7 @@ class Protection:
         return gone
 
     def _states(self, signals: np.ndarray, first: int) -> dict[Alarm, tuple[np.ndarray, np.ndarray]]:
-        """Of each alarm, whether it is on at each row, and its value there; in the order of their ranks at one row."""
+        """Return for each alarm whether it is on at each row, and its value there; in order of rank for one row."""
         settings, index = self.settings, np.arange(first, first + signals.shape[1])
         probes, armed = (settings.x, settings.y), index >= self._armed
         levels, volts = self._levels(signals[:2]), settings.bias_v + 1e-3 * settings.scale_v_per_mm * signals[:2]
@@ -183,7 +184,7 @@ class Protection:
         good = np.array([self._run(("ok", name), each) > recovery for name, each in zip(probes, inside, strict=True)])
         causes = {("not-ok", name): (~good[place], volts[place]) for place, name in enumerate(probes)}
         if settings.measure == "smax":
-            good[:] = good.all(axis=0)  # an orbit takes both
+            good[:] = good.all(axis=0)  # an orbit needs both probes
         for kind, set_um, delay_s in (
             ("alert", settings.alert_um, settings.alert_delay_s),
             ("danger", settings.danger_um, settings.danger_delay_s),
@@ -207,7 +208,7 @@ class Protection:
         return states
 
     def _levels(self, probes: np.ndarray) -> np.ndarray:
-        """Measure of each probe over the window that ends at each row [um], shape (2, rows)."""
+        """Return the measure of each probe over the window that ends at each row [um], shape (2, rows)."""
         part = self._part
         means = [
             list(accumulate(probe.tolist(), lambda mean, value: mean + part * (value - mean), initial=mean))
@@ -230,7 +231,7 @@ class Protection:
             self._fast = self._fast + 1 if self._speed_hz > settings.overspeed_hz else 0
             self._pulse, self._turning = int(index[row]), True
             speed_hz[row:], fast[row:], pulse[row:] = self._speed_hz, self._fast, self._pulse
-        # A turn that lasts already longer than one at the limit is not too fast: a shaft that stands has no pulse.
+        # The current turn already lasts longer than one at the limit: a shaft at rest has no pulses.
         over = (fast >= settings.overspeed_turns) & ((index - pulse) * settings.overspeed_hz < self._rate_hz)
         lost = index - np.maximum(pulse, self._armed) >= self._rows(settings.speed_lost_s)
         return {
@@ -239,7 +240,7 @@ class Protection:
         }
 
     def _vote(self, dangers: list[np.ndarray], bad: np.ndarray) -> np.ndarray:
-        """Whether dangers of the two probes, of which some are NOT OK, trip at each row."""
+        """Return at which rows the dangers of the two probes, some of which may be NOT OK, trip."""
         off = np.array([[name in self.bypassed] for name in (self.settings.x, self.settings.y)])
         votes, out = np.array(dangers), off | bad
         if self.settings.not_ok == "for":
@@ -251,14 +252,14 @@ class Protection:
         return np.logical_and(*(votes | out)) & ~np.logical_and(*out)
 
     def _run(self, what: Alarm, truth: np.ndarray) -> np.ndarray:
-        """How many rows in a row, up to each, a thing has been true."""
+        """Return the number of consecutive true rows that end at each row; continues from the previous call."""
         rows = np.arange(len(truth))
         run = rows - np.maximum.accumulate(np.where(truth, -1 - self._runs.get(what, 0), rows))
         self._runs[what] = int(run[-1])
         return run
 
     def _above(self, what: Alarm, values: np.ndarray, high: float, low: float) -> np.ndarray:
-        """Whether values were last above `high`, not below `low`, at each row."""
+        """Return for each row whether the value is above `high`, or was and has not fallen below `low` since."""
         outside = (values > high) | (values < low)
         last = np.maximum.accumulate(np.where(outside, np.arange(len(values)), -1))
         above = np.where(last >= 0, values[last] > high, self._over.get(what, False))
@@ -267,12 +268,12 @@ class Protection:
 
 
 def _changes(on: np.ndarray, before: bool) -> np.ndarray:
-    """Rows at which a truth is another one than at the row before, shape (changes,)."""
+    """Return the rows at which a state differs from that of the row before, shape (changes,)."""
     return np.flatnonzero(np.diff(on, prepend=before))
 
 
 def _sliding(extreme: Callable[..., np.ndarray], values: np.ndarray, window: int) -> np.ndarray:
-    """The extreme of each so many values in a row: of twice as many by each pass, shape (..., values - window + 1)."""
+    """Return the extreme over a sliding window, shape (..., values - window + 1). Each pass doubles the span."""
     span = 1
     while 2 * span <= window:
         values, span = extreme(values[..., :-span], values[..., span:]), 2 * span

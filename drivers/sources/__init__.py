@@ -1,4 +1,4 @@
-"""Where the DAQ client's samples come from: the rig's own keys, or a CAN bus, one module each."""
+"""Sources of the DAQ client's samples: the rig's own keys, or a CAN bus; one module each."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ FORMS = "zenoh:HOST:PORT[?tls=DIR], the name of a rig, can:INTERFACE:CHANNEL[?NA
 
 
 class Source(Protocol):
-    """Streams of samples: each has some channels, all can be had at one rate."""
+    """A set of streams, each with its own channels, that can be read at one common rate."""
 
     def streams(self) -> Mapping[str, Sequence[str]]:
-        """Names of the streams that there are, and the channels of each.
+        """Return the channels of each stream by name.
 
         Raises:
-            ConnectionError: Nothing answers.
+            ConnectionError: No rig replies.
         """
         ...
 
@@ -29,45 +29,45 @@ class Source(Protocol):
         on_samples: Callable[[str, Samples], None],
         on_end: Callable[[str, str], None],
     ) -> float:
-        """Begin; returns the rate [Hz].
+        """Start the streams, and return the sample rate [Hz].
 
         Args:
-            streams: Names of those that are wanted.
-            rate_hz: Rows per second [Hz]; None is the fastest that all have.
-            on_samples: Takes the name of a stream and its samples, on any thread; must not wait.
-            on_end: Takes the name of a stream, and the reason for which no more comes.
+            streams: Names of the streams to start.
+            rate_hz: Sample rate [Hz]; None for the highest rate that all these streams have.
+            on_samples: Called with the name of a stream and its samples, on any thread; must not block.
+            on_end: Called with the name of a stream and the reason for its end.
 
         Raises:
-            InputError: That rate cannot be had.
+            InputError: The streams do not have this rate.
         """
         ...
 
-    def taken(self, index: int | None, *, room: int, lost: int) -> None:
-        """Take note of what was read; must not wait, and may be of no use.
+    def report_position(self, index: int | None, *, room: int, lost: int) -> None:
+        """Receive the position of the reader. Must not block; a source may ignore it.
 
         Args:
-            index: Number of the row after the last that was read; None where nothing has come yet.
-            room: How many rows find room beyond that.
-            lost: How many never came.
+            index: Number of the row after the last one read; None if nothing has arrived yet.
+            room: Number of rows that the reader can buffer after it.
+            lost: Number of rows that never arrived.
         """
         ...
 
     def close(self) -> None:
-        """End; may be called again."""
+        """Stop; further calls have no effect."""
         ...
 
 
 def open_source(url: str, *, wait_s: float = 3.0) -> Source:
-    """The source at a URL.
+    """Open the source at a URL.
 
     Args:
-        url: `zenoh:127.0.0.1:7460`, `zenoh:lab.example:7463?tls=keys/viewer` for a rig that is exposed, the name of a
-            rig of this machine, or `can:zenoh:can0` with settings of python-can's bus as `?NAME=VALUE&...`.
-        wait_s: How long to wait for a rig to be there [s].
+        url: `zenoh:127.0.0.1:7460`; `zenoh:lab.example:7463?tls=keys/viewer` for a rig served with TLS; the name of a
+            rig on this computer; or `can:zenoh:can0`, with settings of python-can's bus as `?NAME=VALUE&...`.
+        wait_s: Longest wait for a rig to reply [s].
 
     Raises:
         InputError: The URL is malformed.
-        ConnectionError: Nothing is there.
+        ConnectionError: No rig replies.
     """
     kind, colon, rest = url.partition(":")
     if (kind == "zenoh" and rest) or (url and not colon):

@@ -1,8 +1,8 @@
-"""Samples from a CAN bus: one stream a message of `drivers.can.signals`, in the FD layout where it is sent.
+"""Samples from a CAN bus: one stream for each sample message of `drivers.can.signals`, in the FD layout if it is sent.
 
-Numbers in the frames wrap. Rates contains the decimation, Sync the sample number that is due now, and Clock the
-simulated time, which gives the number in full. Frames that come before Rates and Sync wait for them. Nothing is sent:
-the client takes part in the bus only by acknowledging.
+Sample numbers in frames wrap. The message Rates gives the decimation, Sync the number of the sample that is due, and
+Clock the simulated time, which determines the complete number. Frames that arrive before Rates and Sync wait for them.
+The source only acknowledges frames; it sends what `send` receives.
 """
 
 from __future__ import annotations
@@ -16,52 +16,55 @@ from typing import Any
 
 import numpy as np
 
-from drivers.can.message import Message, MessageTable
-from drivers.can.signals import State, default_messages, messages_for
+from drivers.can.message import CanMessage, MessageTable
+from drivers.can.signals import RigState, default_messages, messages_for
 from drivers.link import LinkTimeoutError
 from drivers.sources.samples import Samples
-from drivers.sources.stream import RIG_GONE, whole_step
+from drivers.sources.stream import RIG_GONE, decimation_factor
 from rig.base.errors import InputError
 from rig.channels.channel_file import read_channels
 from rig.channels.table import default_table
 from rig.serve.waiting import Deadline
 
-_PATIENCE_S = 3.0
-"""A bus that is silent for so long has no rig any more, whose heart beats once a second."""
-_PORTION_S = 0.01
-_SETTLED_S = 0.05
-"""When nothing new was seen for so long, all that there is has been seen."""
-_EARLY = 50_000
-"""Frames that wait for Rates and Sync: about 5 s of everything."""
+_SILENCE_TIMEOUT_S = 3.0
+"""A bus that is silent for longer has no rig any more: the rig sends a heartbeat every second."""
+_BATCH_S = 0.01
+_QUIET_S = 0.05
+"""Silence after which no further kind of sample message is expected."""
+_MAX_EARLY_FRAMES = 50_000
+"""Buffered frames before Rates and Sync: about 5 s of all messages."""
 _TICK_RATE_HZ = 1e6
 _WRAP = 1 << 32
-"""The index in a Sync is modulo this number of samples: 59.7 h at 20 kHz."""
+"""The index in a Sync wraps after this number of samples: 59.7 h at 20 kHz."""
 
 
-class Layout:
-    """Puts frames of samples together; sans-IO.
+class SampleDecoder:
+    """Decodes sample frames into samples; does no input or output itself.
 
     Args:
-        messages: Those whose samples are wanted, by name.
-        thinned: Every so many instants of those in the frames are taken.
+        messages: The sample messages to decode, by name.
+        decimation: Decimation: every n-th instant in the frames is returned.
     """
 
-    def __init__(self, messages: dict[str, Message], thinned: int = 1) -> None:
+    def __init__(self, messages: dict[str, CanMessage], decimation: int = 1) -> None:
         self._messages = messages
-        self._thinned = thinned
+        self._decimation = decimation
         self._expected: dict[str, int] = {}
-        """Number of the instant that comes next, in the recording."""
+        """Sample number of the next instant at the recording rate, by message."""
         self.malformed = 0
 
-    def decode(self, name: str, frames: list[bytes], rate_hz: int, step: int, about: int) -> list[Samples]:
-        """Samples of frames of one message, in the order in which they came.
+    def decode(self, name: str, frames: list[bytes], rate_hz: int, step: int, near_index: int) -> list[Samples]:
+        """Decode frames of one message, in the order of their arrival.
 
         Args:
-            name: Of the message.
-            frames: Data.
-            rate_hz: Rate of the recording [Hz].
-            step: Samples of the recording from one instant to the next.
-            about: Number in the recording that is near those of the first frame.
+            name: Name of the message.
+            frames: Data fields of the frames.
+            rate_hz: Recording rate of the rig [Hz].
+            step: Distance between two instants in the frames [samples at the recording rate].
+            near_index: A sample number near that of the first frame.
+
+        Returns:
+            One piece for each run of frames without a gap.
         """
         message = self._messages[name]
         form = message.samples
@@ -70,9 +73,9 @@ class Layout:
         self.malformed += len(frames) - len(whole)
         if not whole:
             return []
-        short, values = form.unpack(np.frombuffer(b"".join(whole), np.uint8).reshape(-1, message.length))
+        low_bits, values = form.unpack(np.frombuffer(b"".join(whole), np.uint8).reshape(-1, message.length))
         unit = step if form.index_width < 4 else 1
-        numbers = _lengthen(short, 8 * form.index_width, self._expected.get(name, about) // unit) * unit
+        numbers = _unwrap_numbers(low_bits, 8 * form.index_width, self._expected.get(name, near_index) // unit) * unit
         span = form.rows * step
         self._expected[name] = int(numbers[-1]) + span
         engineering = form.engineering(values)
@@ -80,50 +83,56 @@ class Layout:
         for run in np.split(np.arange(len(numbers)), np.flatnonzero(np.diff(numbers) != span) + 1):
             index = int(numbers[run[0]]) // step
             rows = engineering[run[0] * form.rows : (run[-1] + 1) * form.rows]
-            first = -index % self._thinned
+            first = -index % self._decimation
             if len(rows) > first:
                 found.append(
                     Samples(
-                        index=(index + first) // self._thinned,
+                        index=(index + first) // self._decimation,
                         tick=round((index + first) * step * _TICK_RATE_HZ / rate_hz),
-                        rate_hz=rate_hz / step / self._thinned,
+                        rate_hz=rate_hz / step / self._decimation,
                         tick_rate_hz=_TICK_RATE_HZ,
                         names=tuple(channel.name for channel in form.channels),
                         units=tuple(channel.unit for channel in form.channels),
-                        values=rows[first :: self._thinned],
+                        values=rows[first :: self._decimation],
                     )
                 )
         return found
 
 
-def _lengthen(short: np.ndarray, bits: int, about: int) -> np.ndarray:
-    """Whole numbers whose last bits are given, the first near `about`, each next near the one before."""
+def _unwrap_numbers(low_bits: np.ndarray, bits: int, near_index: int) -> np.ndarray:
+    """Restore numbers of which only the low bits are known.
+
+    Args:
+        low_bits: The low bits, shape (frames,).
+        bits: Number of known bits.
+        near_index: A number near the first one; each following number is the one nearest to its predecessor.
+    """
     modulus = 1 << bits
-    first = about + (int(short[0]) - about + modulus // 2) % modulus - modulus // 2
-    steps = (np.diff(short) + modulus // 2) % modulus - modulus // 2
+    first = near_index + (int(low_bits[0]) - near_index + modulus // 2) % modulus - modulus // 2
+    steps = (np.diff(low_bits) + modulus // 2) % modulus - modulus // 2
     return first + np.concatenate([[0], np.cumsum(steps)])
 
 
-def full_index(short: int, near: int) -> int:
-    """Return the number of a sample of which the last 32 bits are known, within 2^31 samples of another one."""
-    return near + (short - near + _WRAP // 2) % _WRAP - _WRAP // 2
+def full_index(low_bits: int, near: int) -> int:
+    """Return the sample number with these low 32 bits that is nearest to `near`."""
+    return near + (low_bits - near + _WRAP // 2) % _WRAP - _WRAP // 2
 
 
 class CanSource:
-    """The rig's sample messages on a bus.
+    """Sample messages of the rig on a bus.
 
     Args:
-        spec: INTERFACE:CHANNEL?NAME=VALUE&... of python-can's bus; `layout=fd` or `layout=classic` chooses one where
-            both are sent, `channels=FILE.toml` says which channel table the rig runs with, and `node=N` is the number
-            as a device under test.
-        wait_s: How long to wait for a rig to be there [s]; it tells of itself once a second.
-        table: Messages; by default those of the rig's own channel table.
-        on_frame: Takes name and raw values of each frame of the rig that carries no samples, behind those that came
-            before it; on the thread that reads. Of a Sync it receives `index` without the wrap, and `rate`, once Rates
-            has come.
+        spec: INTERFACE:CHANNEL?NAME=VALUE&... of python-can's bus. `layout=fd` or `layout=classic` selects one where
+            both
+            are sent, `channels=FILE.toml` is the rig's channel table, and `node=N` the number as a device under test.
+        wait_s: Longest wait for a rig [s]; a rig announces itself once a second.
+        table: Messages; by default those of the standard channel table.
+        on_frame: Called with name and raw values of each frame of the rig that carries no samples, after the samples
+            that arrived before it, on the reading thread. For a Sync it receives the unwrapped `index`, and `rate`,
+            once Rates has arrived.
 
     Raises:
-        InputError: There is no such bus.
+        InputError: The bus does not exist.
     """
 
     def __init__(
@@ -137,13 +146,13 @@ class CanSource:
         from drivers.link.can import open_bus, parse_spec
 
         interface, channel, settings = parse_spec(spec)
-        self._wish = settings.pop("layout", None)
-        if self._wish not in (None, "fd", "classic"):
-            raise InputError("layout", "fd or classic", self._wish)
+        self._layout_name = settings.pop("layout", None)
+        if self._layout_name not in (None, "fd", "classic"):
+            raise InputError("layout", "fd or classic", self._layout_name)
         self.node = settings.pop("node", 1)
         """Number as a device under test."""
         self.channels = default_table()
-        """The channel table that is believed."""
+        """Channel table that the frames are decoded with."""
         if (channels := settings.pop("channels", None)) is not None:
             self.channels = read_channels(Path(channels))
             table = messages_for(self.channels)
@@ -154,65 +163,65 @@ class CanSource:
         self._bus = open_bus(spec, interface, channel, **settings)
         self._lock = threading.RLock()
         self.rates: dict[str, int] | None = None
-        """How samples are picked, as the rig tells it last."""
+        """Raw values of the last Rates: how samples are decimated."""
         self.lockstep = False
-        """Whether the rig runs in lockstep, where nothing comes before it is stepped."""
+        """Whether the rig runs in lockstep, in which nothing is sent before the first step."""
         self._started = (0, 0)
         self._sync: int | None = None
         self._new_sync: int | None = None
-        """Index of the latest Sync, as it is in the frame, until Rates has come."""
+        """Index of the latest Sync as sent, while Rates is missing."""
         self._clock_s: int | None = None
         """Simulated time of the latest Clock [s]."""
         self._end_us = 0
-        self._known = threading.Event()
-        self._early: deque[tuple[int, bytes]] = deque(maxlen=_EARLY)
-        self._portion: dict[int, list[bytes]] = {}
-        self._layout: Layout | None = None
+        self._rates_known = threading.Event()
+        self._early: deque[tuple[int, bytes]] = deque(maxlen=_MAX_EARLY_FRAMES)
+        self._batch: dict[int, list[bytes]] = {}
+        self._decoder: SampleDecoder | None = None
         self._wanted: dict[int, str] = {}
         self._on_samples: Callable[[str, Samples], None] | None = None
         self._on_end: Callable[[str, str], None] | None = None
         self._closed = False
         self._identifiers = {name: row.identifier for name, row in self._table.by_name.items()}
-        self._seen: dict[int, None] = {}
-        self._sampled = {row.identifier for row in (*self._table.fd, *self._table.classic)}
+        self._seen_identifiers: dict[int, None] = {}
+        self._sample_identifiers = {row.identifier for row in (*self._table.fd, *self._table.classic)}
         self._thread = threading.Thread(target=self._read, name=f"can {channel} reads", daemon=True)
         self._thread.start()
 
     def streams(self) -> dict[str, tuple[str, ...]]:
-        """The sample messages of the layout that is sent.
+        """Return the channels of each sample message in the layout that is sent.
 
         Raises:
-            InputError: No rig is on that bus.
+            InputError: The bus has no rig, or its rig has another channel table or layout.
         """
         self.wait()
         assert self.rates is not None
         if self._other_layout:
-            must = f"a rig with the sample messages {self._table.layout} (?channels=FILE.toml tells of others)"
+            must = f"a rig with the sample messages {self._table.layout} (?channels=FILE.toml for another table)"
             raise InputError("can", must, self._other_layout)
-        layout = self._wish or ("fd" if self.rates["fd_step"] else "classic")
+        layout = self._layout_name or ("fd" if self.rates["fd_step"] else "classic")
         if not self.rates[f"{layout}_step"]:
             raise InputError("layout", "one that the rig sends", layout)
-        self._wish = layout
+        self._layout_name = layout
         rows = self._table.fd if layout == "fd" else self._table.classic
-        # A run may lack groups: only what has been seen is there; of lockstep, all that may come.
+        # A run may lack groups: list the messages that have been seen; in lockstep, all that may come.
         count = -1
-        for _ in Deadline(_PATIENCE_S).polls(_SETTLED_S):
-            if self.lockstep or count >= max(1, len(self._seen)):
+        for _ in Deadline(_SILENCE_TIMEOUT_S).polls(_QUIET_S):
+            if self.lockstep or count >= max(1, len(self._seen_identifiers)):
                 break
-            count = len(self._seen)
+            count = len(self._seen_identifiers)
         return {
             row.name: tuple(channel.name for channel in row.samples.channels)
             for row in rows
-            if row.samples and (self.lockstep or row.identifier in self._seen)
+            if row.samples and (self.lockstep or row.identifier in self._seen_identifiers)
         }
 
     def wait(self) -> None:
-        """Wait until a rig is there, and it is known how samples are picked.
+        """Wait for a rig's Rates and Sync.
 
         Raises:
             InputError: No rig is on that bus.
         """
-        if not self._known.wait(self._wait_s) or self.rates is None:
+        if not self._rates_known.wait(self._wait_s) or self.rates is None:
             must = f"a bus with a rig on it (no Rates and Sync in {self._wait_s:g} s)"
             raise InputError("can", must, self._bus.channel_info)
 
@@ -220,14 +229,14 @@ class CanSource:
         """Send one classic frame.
 
         Raises:
-            LinkTimeoutError: The bus does not take it.
+            LinkTimeoutError: The bus did not accept the frame within 1 s.
         """
         import can
 
         try:
             self._bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False), timeout=1.0)
         except (can.CanError, OSError, ValueError) as error:
-            raise LinkTimeoutError(f"can: the bus does not take a frame ({error})") from None
+            raise LinkTimeoutError(f"can: the bus did not accept a frame ({error})") from None
 
     def start(
         self,
@@ -236,59 +245,59 @@ class CanSource:
         on_samples: Callable[[str, Samples], None],
         on_end: Callable[[str, str], None],
     ) -> float:
-        """Begin with what has come since the source was opened."""
+        """Start the streams, with the frames that have arrived since the source was opened."""
         rates = self.rates
         assert rates is not None
-        self._started = (rates["rate"], rates[f"{self._wish}_step"])
-        native = rates["rate"] / rates[f"{self._wish}_step"]
-        thinned = 1 if rate_hz is None else whole_step(native, rate_hz)
+        self._started = (rates["rate"], rates[f"{self._layout_name}_step"])
+        native = rates["rate"] / rates[f"{self._layout_name}_step"]
+        decimation = 1 if rate_hz is None else decimation_factor(native, rate_hz)
         with self._lock:
-            self._layout = Layout({name: self._table.by_name[name] for name in streams}, thinned)
+            self._decoder = SampleDecoder({name: self._table.by_name[name] for name in streams}, decimation)
             self._wanted = {self._identifiers[name]: name for name in streams}
             self._on_samples, self._on_end = on_samples, on_end
             early, self._early = self._early, deque(maxlen=1)
             for identifier, data in early:
                 if identifier in self._wanted:
-                    self._portion.setdefault(identifier, []).append(data)
-            self.hand_on()
-        return native / thinned
+                    self._batch.setdefault(identifier, []).append(data)
+            self.deliver()
+        return native / decimation
 
     def _read(self) -> None:
         import can
 
-        heard = handed = time.monotonic()
+        last_frame_s = last_delivery_s = time.monotonic()
         beat = None
         while not self._closed:
             try:
-                message = self._bus.recv(_PORTION_S)
+                message = self._bus.recv(_BATCH_S)
             except (can.CanError, OSError, ValueError):
                 break
             now = time.monotonic()
             if message is not None:
                 if not (message.is_error_frame or message.is_remote_frame or message.is_extended_id):
-                    heard = now
+                    last_frame_s = now
                     state = self.take(message.arbitration_id, bytes(message.data))
                     beat = beat if state is None else state
-            elif self._on_samples is not None and now - heard > _PATIENCE_S:
+            elif self._on_samples is not None and now - last_frame_s > _SILENCE_TIMEOUT_S:
                 break
-            if now - handed > _PORTION_S:
-                handed = now
-                self.hand_on()
-            if beat == State.ENDED and message is None:
-                # The bus is silent, so nothing of the run is still to come.
+            if now - last_delivery_s > _BATCH_S:
+                last_delivery_s = now
+                self.deliver()
+            if beat == RigState.ENDED and message is None:
+                # The bus is silent, so all frames of the run have arrived.
                 self._finish("the rig's run has ended")
                 return
         self._finish(RIG_GONE)
 
     def take(self, identifier: int, data: bytes) -> int | None:
-        """A frame; returns the state in a heartbeat."""
-        if identifier in self._sampled:
+        """Process a frame; return the state if it is a heartbeat."""
+        if identifier in self._sample_identifiers:
             with self._lock:
                 if self._on_samples is None:
-                    self._seen[identifier] = None
+                    self._seen_identifiers[identifier] = None
                     self._early.append((identifier, data))
                 elif identifier in self._wanted:
-                    self._portion.setdefault(identifier, []).append(data)
+                    self._batch.setdefault(identifier, []).append(data)
             return None
         row = self._table.by_identifier.get(identifier)
         if row is None or len(data) != row.length:
@@ -304,7 +313,7 @@ class CanSource:
         elif row.name == "Heartbeat":
             state = raw["state"]
             self._other_layout = raw["layout"] if raw["layout"] not in (0, self._table.layout) else 0
-            self.lockstep |= state == State.LOCKSTEP
+            self.lockstep |= state == RigState.LOCKSTEP
             self._end_us = raw["time"]
         if self._new_sync is not None and self.rates is not None and (rate_hz := self.rates["rate"]):
             near = (self._sync or 0) if self._clock_s is None else self._clock_s * rate_hz
@@ -312,34 +321,34 @@ class CanSource:
             if self._on_frame is not None:
                 self._on_frame("Sync", {"index": self._sync, "rate": rate_hz})
         if self.lockstep and self._sync is None and self.rates is not None:
-            # No Sync before the first step: what comes next is behind the last block.
+            # No Sync before the first step: the next samples follow the last block.
             self._sync = self._end_us * self.rates["rate"] // 1_000_000
         if self._on_frame is not None and row.name != "Sync":
-            self.hand_on()
+            self.deliver()
             self._on_frame(row.name, raw)
         if self._sync is not None and self.rates is not None and self.rates["rate"]:
-            self._known.set()
+            self._rates_known.set()
         return state
 
-    def hand_on(self) -> None:
-        """Give what has come to whoever takes it."""
+    def deliver(self) -> None:
+        """Pass the decoded frames to the reader."""
         with self._lock:
-            rates, layout, take = self.rates, self._layout, self._on_samples
-            if layout is None or take is None or rates is None or self._sync is None:
+            rates, decoder, take = self.rates, self._decoder, self._on_samples
+            if decoder is None or take is None or rates is None or self._sync is None:
                 return
-            portion, self._portion = self._portion, {}
-            step = rates[f"{self._wish}_step"]
+            batch, self._batch = self._batch, {}
+            step = rates[f"{self._layout_name}_step"]
             if (rates["rate"], step) != self._started:
-                # Another run, of which the numbers mean something else.
+                # Frames of another run, whose numbers count something else.
                 return
-            for identifier, frames in portion.items():
+            for identifier, frames in batch.items():
                 name = self._wanted[identifier]
-                for samples in layout.decode(name, frames, rates["rate"], step, self._sync):
+                for samples in decoder.decode(name, frames, rates["rate"], step, self._sync):
                     take(name, samples)
 
     def _finish(self, reason: str) -> None:
         with self._lock:
-            self.hand_on()
+            self.deliver()
             end, names = self._on_end, list(self._wanted.values())
         for name in names:
             if end is not None:
@@ -347,14 +356,14 @@ class CanSource:
 
     @property
     def statistics(self) -> dict[str, Any]:
-        """Frames that were no samples though their identifier says so."""
-        return {"malformed": 0 if self._layout is None else self._layout.malformed}
+        """Count of sample frames with a wrong length (`malformed`)."""
+        return {"malformed": 0 if self._decoder is None else self._decoder.malformed}
 
-    def taken(self, index: int | None, *, room: int, lost: int) -> None:
-        """A bus does not ask how far its nodes are."""
+    def report_position(self, index: int | None, *, room: int, lost: int) -> None:
+        """Ignore the reader's position, for which frames do not exist."""
 
     def close(self) -> None:
-        """Leave the bus; may be called again."""
+        """Leave the bus; further calls have no effect."""
         if self._closed:
             return
         self._closed = True

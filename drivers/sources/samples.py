@@ -1,4 +1,4 @@
-"""Samples in engineering units, as drivers and the DAQ client hand them out."""
+"""Samples in engineering units, as returned by the drivers and the DAQ client."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ from rig.serve.waiting import Deadline
 
 
 class StreamEndedError(EOFError):
-    """Nothing more will come; the message says why."""
+    """The stream has ended; the message gives the reason."""
 
 
 @dataclass(frozen=True, slots=True, repr=False)
 class Samples(Columns):
-    """Consecutive rows of some channels: `samples["disk_x"]` in its `samples.unit("disk_x")`, `samples.to_si()` in SI.
+    """Consecutive samples of channels: `samples["disk_x"]` in `samples.unit("disk_x")`, or `samples.to_si()`.
 
     Attributes:
         index: Number of the first row since the start of the rig's stream, at `rate_hz`.
-        tick: Time of the first row, to the nearest [ticks of the simulated clock]; `times_s` is exact.
-        rate_hz: Rows per second [Hz].
+        tick: Time of the first row, rounded [ticks of the simulated clock]; `times_s` is exact.
+        rate_hz: Sample rate [Hz].
         tick_rate_hz: Ticks per second [Hz].
-        names: Names of the columns, which are channels.
+        names: Channel of each column.
         units: Unit of each column.
         values: Engineering values, float64, shape (rows, columns).
-        gap: Rows that are missing right before the first one.
+        gap: Number of rows missing before the first one.
     """
 
     index: int
@@ -47,13 +47,12 @@ class Samples(Columns):
     gap: int = 0
 
     @classmethod
-    def of(cls, block: Block, names: tuple[str, ...], units: tuple[str, ...], values: np.ndarray | None = None) -> Self:
-        """Return the rows of a block, with its values unless others are given, as columns."""
-        chosen = block.values if values is None else values
-        return cls(block.index, block.tick, block.rate_hz, block.tick_rate_hz, names, units, chosen)
+    def from_block(cls, block: Block, names: tuple[str, ...], units: tuple[str, ...], values: np.ndarray) -> Self:
+        """Return the rows of a block as columns, with these values in these units."""
+        return cls(block.index, block.tick, block.rate_hz, block.tick_rate_hz, names, units, values)
 
     def __repr__(self) -> str:
-        missing = f"; {self.gap} missing before them)" if self.gap else ")"
+        missing = f"; {self.gap} missing before)" if self.gap else ")"
         return Columns.__repr__(self).removesuffix(")") + missing
 
     @property
@@ -62,7 +61,7 @@ class Samples(Columns):
         return row_times_s(self.tick, self.rate_hz, self.tick_rate_hz, len(self.values))
 
     def rows(self, start: int, stop: int) -> Samples:
-        """Some of the rows."""
+        """Return the rows from `start` to before `stop`."""
         return replace(
             self,
             index=self.index + start,
@@ -72,48 +71,48 @@ class Samples(Columns):
         )
 
 
-RESTART_S = 5.0
-"""Rows that are further behind than this belong to another run, not to a block that came twice or late."""
+_MAX_LATENESS_S = 5.0
+"""Rows that are older than this belong to another run; younger ones are duplicates or late."""
 
 
 def follow(rows: Continuity, samples: Samples, key: str = "") -> Samples | None:
-    """Follow one stream of rows that may come late or twice.
+    """Return the new rows of a stream in which rows may come late or twice.
 
     Args:
-        rows: What has come; gets the new rows.
-        samples: The next ones.
-        key: The stream.
+        rows: Record of the rows received before; updated.
+        samples: The next rows.
+        key: Name of the stream.
 
     Returns:
-        The same rows without those that came before, with the gap before them; None where nothing is new.
+        The rows that were not received before, with the gap before them; None without new rows.
     """
     stale, lost = rows.stale, rows.lost.get(key, 0)
-    rows.follow(key, samples.index, len(samples), late_rows=RESTART_S * samples.rate_hz)
+    rows.follow(key, samples.index, len(samples), late_rows=_MAX_LATENESS_S * samples.rate_hz)
     stale = rows.stale - stale
     if stale == len(samples):
         return None
     return replace(samples.rows(stale, len(samples)), gap=rows.lost[key] - lost)
 
 
-class Pile:
-    """Rows that wait to be read.
+class RowBuffer:
+    """Buffer of rows that wait to be read.
 
     Args:
-        most: Number of rows that are kept; beyond, the oldest go, and the next ones tell of the gap.
+        max_rows: Capacity [rows]; beyond it the oldest are dropped, and the next ones report the gap. None: no limit.
     """
 
-    def __init__(self, most: int | None = None) -> None:
-        self._most = most
+    def __init__(self, max_rows: int | None = None) -> None:
+        self._max_rows = max_rows
         self._parts: deque[Samples] = deque()
         self.rows = 0
         self.dropped = 0
-        """Rows that went unread."""
+        """Rows dropped unread."""
 
     def add(self, samples: Samples) -> None:
-        """Put rows on top."""
+        """Append rows."""
         self._parts.append(samples)
         self.rows += len(samples)
-        while self._most is not None and self.rows > self._most and len(self._parts) > 1:
+        while self._max_rows is not None and self.rows > self._max_rows and len(self._parts) > 1:
             oldest = self._parts.popleft()
             self.rows -= len(oldest)
             self.dropped += len(oldest)
@@ -122,23 +121,25 @@ class Pile:
                 self._parts[0] = replace(following, gap=following.gap + len(oldest) + oldest.gap)
 
     def take(self, rows: int | None, *, ended: bool) -> Samples | None:
-        """The lowest rows, if there are as many as asked for, or all that there will be before a gap or the end.
+        """Remove and return the oldest rows, or None if there are too few.
+
+        Fewer rows are returned before a gap and at the end.
 
         Args:
-            rows: How many; None takes a part as it came.
-            ended: Whether nothing more will be added.
+            rows: Number of rows; None for one part as it was added.
+            ended: Whether no more rows will be added.
         """
         parts = self._parts
         if not parts:
             return None
         run, count = 1, len(parts[0])
         if rows is not None:
-            while count < rows and run < len(parts) and _follows(parts[run - 1], parts[run]):
+            while count < rows and run < len(parts) and _is_contiguous(parts[run - 1], parts[run]):
                 count += len(parts[run])
                 run += 1
             if count < rows and run == len(parts) and not ended:
                 return None
-        whole = joined(*[parts.popleft() for _ in range(run)])
+        whole = merge_samples(*[parts.popleft() for _ in range(run)])
         if rows is not None and count > rows:
             parts.appendleft(whole.rows(rows, count))
             whole = whole.rows(0, rows)
@@ -146,56 +147,58 @@ class Pile:
         return whole
 
     def put_back(self, samples: Samples) -> None:
-        """Put rows that were taken below all others."""
+        """Put rows back in front of all others."""
         self._parts.appendleft(samples)
         self.rows += len(samples)
 
     def clear(self) -> None:
-        """Forget all."""
+        """Remove all rows."""
         self._parts.clear()
         self.rows = 0
 
 
-ALL = sys.maxsize
-"""Number of rows for `RowReader.read`, without `whole`: all that have come."""
+ALL_AVAILABLE = sys.maxsize
+"""Number of rows for `RowReader.read` with `whole=False`: all that have arrived."""
 
 
 class RowReader:
-    """Rows of one stream, read in order by one thread, while they come in on another or during the read.
+    """Reader of one stream; another thread, or the read itself, adds the rows.
 
     Args:
         name: Name of the reader in errors.
-        most: Number of rows that wait to be read; beyond, the oldest are dropped. None: any number.
+        max_rows: Capacity [rows]; beyond it the oldest rows are dropped. None: no limit.
     """
 
-    def __init__(self, name: str, most: int | None = None) -> None:
+    def __init__(self, name: str, max_rows: int | None = None) -> None:
         self._reader_name = name
         self._changed = threading.Condition()
-        self._pile = Pile(most)
+        self._buffer = RowBuffer(max_rows)
         self._ended: str | None = None
 
     def add(self, samples: Samples) -> None:
-        """Add rows behind all others."""
+        """Append rows."""
         with self._changed:
-            self._pile.add(samples)
+            self._buffer.add(samples)
             self._changed.notify_all()
 
     def put_back(self, samples: Samples) -> None:
         """Put back rows that were read: they are read next."""
         with self._changed:
-            self._pile.put_back(samples)
+            self._buffer.put_back(samples)
 
     def read(self, rows: int | None = None, *, timeout_s: float = 5.0, whole: bool = True) -> Samples:
-        """Return the next rows, without a gap inside; `gap` is the number of rows missing right before them.
+        """Return the next rows, without a gap inside; `gap` is the number of rows missing before them.
 
         Args:
-            rows: Number of rows; None takes what comes next, at least one. Fewer come before a gap and at the end.
+            rows: Number of rows, at least 1; None for the next part as it arrives. Fewer are returned before a gap and
+                at
+                the end.
             timeout_s: Longest wait [s].
-            whole: Whether to wait for all of them; False takes what has come, at least one.
+            whole: Whether to wait for all of them; False returns what has arrived, at least one row.
 
         Raises:
-            LinkTimeoutError: They did not come in time; those that did can still be read.
-            StreamEndedError: The stream has ended and everything was read.
+            LinkTimeoutError: The rows did not arrive in time; those that did can still be read.
+            StreamEndedError: The stream has ended, and everything was read.
         """
         self._check(rows)
         deadline = Deadline(timeout_s)
@@ -206,15 +209,15 @@ class RowReader:
             return ready
 
     def ready(self) -> Iterator[Samples]:
-        """Yield the rows that have come, in pieces without a gap inside."""
+        """Yield the rows that have arrived, in pieces without a gap inside."""
         try:
             while True:
-                yield self.read(ALL, timeout_s=0.0, whole=False)
+                yield self.read(ALL_AVAILABLE, timeout_s=0.0, whole=False)
         except (LinkTimeoutError, StreamEndedError):
             return
 
     def blocks(self, rows: int | None = None, *, timeout_s: float = 5.0) -> Iterator[Samples]:
-        """Read until the end."""
+        """Yield blocks of `rows` rows to the end of the stream; arguments and errors as for `read`."""
         while True:
             try:
                 yield self.read(rows, timeout_s=timeout_s)
@@ -227,26 +230,26 @@ class RowReader:
             raise InputError("rows", "at least 1", rows)
 
     def _take(self, rows: int | None, *, whole: bool = True) -> Samples | None:
-        """Rows that are ready; the lock is held."""
-        ready = self._pile.take(rows, ended=not whole or self._ended is not None)
+        """Return the rows that are ready, or None; the caller holds the lock."""
+        ready = self._buffer.take(rows, ended=not whole or self._ended is not None)
         if ready is None and self._ended is not None:
             raise StreamEndedError(self._ended)
         return ready
 
     def _wait(self, deadline: Deadline) -> bool:
-        """Wait for more to happen; False once the deadline has passed. The lock is held."""
+        """Wait for more rows, and return False once the deadline has passed; the caller holds the lock."""
         return deadline.wait(self._changed)
 
     def _late(self, rows: int | None, timeout_s: float) -> LinkTimeoutError:
-        wanted = "any" if rows in (None, ALL) else rows
-        return LinkTimeoutError(f"{self._reader_name}: {self._pile.rows} of {wanted} rows came in {timeout_s:g} s")
+        wanted = "any" if rows in (None, ALL_AVAILABLE) else rows
+        return LinkTimeoutError(f"{self._reader_name}: {self._buffer.rows} of {wanted} rows came in {timeout_s:g} s")
 
 
-def _follows(one: Samples, other: Samples) -> bool:
+def _is_contiguous(one: Samples, other: Samples) -> bool:
     same = one.names == other.names and one.rate_hz == other.rate_hz
     return same and other.gap == 0 and other.index == one.index + len(one)
 
 
-def joined(*parts: Samples) -> Samples:
-    """Return rows, and those that follow them, as one."""
+def merge_samples(*parts: Samples) -> Samples:
+    """Merge samples that follow each other into one piece."""
     return parts[0] if len(parts) == 1 else replace(parts[0], values=np.concatenate([part.values for part in parts]))

@@ -1,7 +1,7 @@
-"""The blocks of one rig for any number of listeners in this process: what twins and the DAQ client read from.
+"""Blocks of one rig for any number of listeners in this process, such as instrument twins and the DAQ client.
 
-Only the keys that are listened to, the catalogue, the events and the rig's token are asked for: whoever listens to
-sensors cannot see the truth.
+It subscribes only to the keys that have listeners, to events and to the rig's token: a listener to sensors cannot see
+the truth.
 """
 
 from __future__ import annotations
@@ -19,16 +19,19 @@ from rig.serve.stream_check import Catalogue, Intake, Taken, event_in
 from rig.serve.transport import Client, NoReplyError
 
 GRACE_S = 2.0
-"""After an end that does not tell the number of rows, and after the last block: silence that ends the stream; and how
-long a rig that is gone may take to be there again [s]."""
+"""Silence that ends a stream after an end event without row counts, and longest absence of the rig [s]."""
 RIG_GONE = "the rig has gone"
 
 
-def whole_step(native_hz: float, rate_hz: float) -> int:
-    """Every so many rows make a rate.
+def decimation_factor(native_hz: float, rate_hz: float) -> int:
+    """Return the whole number by which a rate must be divided to give another.
+
+    Args:
+        native_hz: Rate of the stream [Hz].
+        rate_hz: Requested rate [Hz].
 
     Raises:
-        InputError: The rate is not a whole fraction of the native one.
+        InputError: The native rate is not a multiple of the requested one.
     """
     ratio = native_hz / rate_hz if rate_hz > 0.0 else 0.0
     step = round(ratio) if ratio < 1e9 else 0
@@ -37,8 +40,8 @@ def whole_step(native_hz: float, rate_hz: float) -> int:
     return step
 
 
-def thin(block: wire.Block, step: int) -> wire.Block:
-    """Every so many rows of a block: those whose number is a multiple of `step`; they are numbered anew."""
+def decimate(block: wire.Block, step: int) -> wire.Block:
+    """Return the rows of a block whose number is a multiple of `step`, renumbered."""
     if step == 1:
         return block
     first = -block.index % step
@@ -58,38 +61,38 @@ class _Listener:
 
 
 class RigStream:
-    """Hands each block of a stream to whoever listens to its key.
+    """Passes each block of a stream to the listeners of its key.
 
     Args:
-        client: Transport to the rig; stays open, and is closed by its owner.
+        client: Transport to the rig; its owner closes it.
     """
 
     def __init__(self, client: Client) -> None:
         self._client = client
         self._lock = threading.Lock()
         self._order = threading.RLock()
-        """Held from taking rows until they are handed on: blocks and events come on threads of their own, and an end
-        must not overtake the rows before it."""
+        """Held while rows are passed on: blocks and events arrive on separate threads, and an end must not overtake the
+        rows before it."""
         self._listeners: dict[str, list[_Listener]] = {}
         self._subscribed: set[str] = set()
         self._intake: Intake | None = None
         self._rig: str | None = None
         self._gone = False
         self._ends: dict[str, tuple[int, str]] = {}
-        """Keys of which the run's end was announced: number of rows in all, and the reason."""
-        self._heard_s = 0.0
-        """When the last block came [s, monotonic]."""
+        """Announced end of the run by key: total number of rows, and the reason."""
+        self._last_block_s = 0.0
+        """Time of arrival of the last block [s, monotonic]."""
         self.malformed = 0
-        """Payloads that were not what their key and the rig's catalogue promise."""
+        """Payloads that do not match their key and the rig's channel table."""
         self.missed = 0
-        """Messages that the transport could not bring back; the rows show the gaps too."""
+        """Messages that the transport could not recover; the row numbers show the gaps too."""
 
     def table(self) -> ChannelTable:
-        """The channel table as the rig runs it.
+        """Return the channel table of the rig.
 
         Raises:
-            NoReplyError: No rig answers.
-            InputError: What answers is no rig of this version.
+            NoReplyError: No rig replies.
+            InputError: The reply is not from a rig of this version.
         """
         return self._catalogue().table
 
@@ -97,27 +100,30 @@ class RigStream:
         return Catalogue.read(wire.decode_document(self._client.request(wire.CATALOGUE)))
 
     def group(self, name: str) -> Group:
-        """One group of the table.
+        """Return one channel group of the table.
 
         Raises:
-            NoReplyError: No rig answers.
+            NoReplyError: No rig replies.
             InputError: This rig does not publish that group.
         """
         groups = self.table().groups
         if name not in groups:
-            raise InputError("group", f"one that this rig publishes ({', '.join(groups)})", name)
+            raise InputError("group", f"a group of this rig ({', '.join(groups)})", name)
         return groups[name]
 
     def listen(
         self, key: str, on_block: Callable[[wire.Block], None], on_end: Callable[[str], None]
     ) -> Callable[[], None]:
-        """Take all blocks of a stream from now on; returns what ends that.
+        """Subscribe to a stream from now on.
 
         Args:
-            key: Of a sensor group, or of a table of the truth.
-            on_block: Takes blocks in order, on a thread of the transport; must not wait.
-            on_end: Takes the reason for which nothing more comes: the run has ended, or the rig has gone. Where another
-                run begins, its blocks come, numbered from 0.
+            key: Key of a channel group or of a truth table.
+            on_block: Called with each block in order, on a thread of the transport; must not block.
+            on_end: Called with the reason when the run has ended or the rig has stopped. A further run follows,
+                numbered from 0.
+
+        Returns:
+            A function that ends the subscription.
         """
         listener = _Listener(on_block, on_end)
         intake = self._intake or Intake(self._catalogue())
@@ -146,9 +152,9 @@ class RigStream:
 
     def _on_block(self, key: str, payload: bytes) -> None:
         with self._order:
-            self._take(key, payload)
+            self._take_block(key, payload)
 
-    def _take(self, key: str, payload: bytes) -> None:
+    def _take_block(self, key: str, payload: bytes) -> None:
         with self._lock:
             intake = self._intake
             assert intake is not None
@@ -160,9 +166,9 @@ class RigStream:
                 return
             self.malformed += intake.refused - refused
             if taken:
-                self._heard_s = time.monotonic()
+                self._last_block_s = time.monotonic()
             if intake.next.get(key, 0) < due:
-                # Another run.
+                # The run has been replaced by another.
                 self._ends.pop(key, None)
             ending = self._ends.get(key)
             if ending is not None:
@@ -170,9 +176,9 @@ class RigStream:
             done = ending is not None and intake.next.get(key, 0) >= ending[0]
             if done:
                 del self._ends[key]
-        self._hand_on(key, taken, ending[1] if done and ending else None)
+        self._deliver(key, taken, ending[1] if done and ending else None)
 
-    def _hand_on(self, key: str, taken: list[Taken], reason: str | None) -> None:
+    def _deliver(self, key: str, taken: list[Taken], reason: str | None) -> None:
         with self._lock:
             listeners = list(self._listeners.get(key, ()))
         for listener in listeners:
@@ -191,39 +197,39 @@ class RigStream:
             return
         rows, reason = event.get("rows"), f"the rig's run has ended: {event.get('reason') or 'without a reason'}"
         if rows is None:
-            # A recording that does not tell what there was: whatever may still come has its time.
-            self._heard_s = time.monotonic()
+            # A recording without row counts: later blocks are accepted until the stream is silent.
+            self._last_block_s = time.monotonic()
             self._end_in_silence(GRACE_S, reason)
             return
         for key in list(self._subscribed):
             with self._order:
                 with self._lock:
                     assert self._intake is not None
-                    # Blocks and events travel apart: the last blocks may be still to come.
+                    # Blocks and events arrive separately: the last blocks may still be in transit.
                     taken, total = self._intake.rest(rows, key), rows.get(key, 0)
                     done = self._intake.next.get(key, 0) >= total
                     if not done:
                         self._ends[key] = (total, reason)
-                self._hand_on(key, taken, reason if done else None)
+                self._deliver(key, taken, reason if done else None)
 
     def _end_in_silence(self, wait_s: float, reason: str) -> None:
-        """End all streams once no block has come for so long; look again at the earliest time at which that can be."""
+        """End all streams after a silence of GRACE_S; check first after `wait_s`."""
 
-        def look() -> None:
-            rest_s = GRACE_S - (time.monotonic() - self._heard_s)
-            if rest_s > 0.0:
-                self._end_in_silence(rest_s, reason)
+        def check_silence() -> None:
+            left_s = GRACE_S - (time.monotonic() - self._last_block_s)
+            if left_s > 0.0:
+                self._end_in_silence(left_s, reason)
             else:
                 self._end(reason)
 
-        timer = threading.Timer(wait_s, look)
+        timer = threading.Timer(wait_s, check_silence)
         timer.daemon = True
         timer.start()
 
     def _on_alive(self, alive: bool) -> None:
         self._gone = not alive
         if not alive:
-            # A process that was stopped for longer than its link lives is linked again at once.
+            # A process that was stopped for longer than its connection lasts reconnects at once.
             timer = threading.Timer(GRACE_S, self._give_up)
             timer.daemon = True
             timer.start()
@@ -244,4 +250,4 @@ class RigStream:
                 with self._lock:
                     self._ends.pop(key, None)
                     taken = self._intake.rest(None, key) if self._intake is not None else []
-                self._hand_on(key, taken, reason)
+                self._deliver(key, taken, reason)

@@ -1,4 +1,4 @@
-"""Turns of the shaft in rows of channels: what machinery protection shows of each."""
+"""Shaft turns in samples, with the values that a machinery protection monitor shows for each."""
 
 from __future__ import annotations
 
@@ -10,22 +10,21 @@ import numpy as np
 from drivers.sources.samples import Samples
 from rig.channels.orbit import synchronous
 
-HALF = 0.5
-"""A keyphasor's pulse begins where its signal, 0 to 1, rises through this."""
+PULSE_LEVEL = 0.5
+"""Keyphasor signal, 0 to 1, at whose rise a pulse begins."""
 
 
 @dataclass(frozen=True, slots=True)
 class Turn:
-    """One turn of the shaft, from pulse to pulse of the keyphasor.
+    """One turn of the shaft, from one keyphasor pulse to the next.
 
     Attributes:
-        begin_s: Simulated time at which it begins [s].
-        speed_hz: Turns a second in it [Hz].
-        peak_to_peak: Largest less smallest value of each channel, in its unit.
-        gap: Mean of each channel, in its unit.
-        once: What goes once around with the shaft (1X) of each channel: amplitude in its unit, with the phase from the
-            pulse on (negative lags).
-        samples: Its rows.
+        begin_s: Simulated time of its start [s].
+        speed_hz: Mean speed [Hz].
+        peak_to_peak: Peak-to-peak value of each channel, in its unit.
+        gap: Mean of each channel, in its unit (DC gap of a probe).
+        once: 1X vector of each channel: amplitude in its unit, phase relative to the pulse (negative: lag).
+        samples: Samples of the turn.
     """
 
     begin_s: float
@@ -36,16 +35,16 @@ class Turn:
     samples: Samples
 
 
-def edges(samples: Samples) -> np.ndarray:
-    """When the keyphasor's pulses begin [s], between rows by a straight line, shape (edges,)."""
+def find_pulses(samples: Samples) -> np.ndarray:
+    """Return the times at which keyphasor pulses begin [s], interpolated between samples, shape (pulses,)."""
     signal, times_s = samples["keyphasor"], samples.times_s
-    rows = np.flatnonzero((signal[:-1] < HALF) & (signal[1:] >= HALF))
-    part = (HALF - signal[rows]) / (signal[rows + 1] - signal[rows])
-    return times_s[rows] + part / samples.rate_hz
+    rows = np.flatnonzero((signal[:-1] < PULSE_LEVEL) & (signal[1:] >= PULSE_LEVEL))
+    fraction = (PULSE_LEVEL - signal[rows]) / (signal[rows + 1] - signal[rows])
+    return times_s[rows] + fraction / samples.rate_hz
 
 
-def turn_in(samples: Samples, begin_s: float, end_s: float) -> Turn:
-    """The turn of the shaft between two times [s]."""
+def measure_turn(samples: Samples, begin_s: float, end_s: float) -> Turn:
+    """Return the turn of the shaft between two pulse times [s]."""
     first, last = np.searchsorted(samples.times_s, [begin_s, end_s])
     rows = samples.rows(int(first), int(last))
     once = {}

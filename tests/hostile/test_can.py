@@ -23,7 +23,7 @@ import numpy as np
 import pytest
 
 from drivers.can.bus import codec, endpoints
-from drivers.can.bus.frame import fault_of, packed
+from drivers.can.bus.frame import find_fault, pack_records
 from drivers.can.bus.hub import Hub
 from drivers.can.bus.model import BusModel
 from drivers.can.bus.outlets import slcan, socketcand
@@ -32,11 +32,11 @@ from drivers.can.bus.outlets.socketcand import SocketcandServer
 from drivers.can.gateway import Gateway
 from drivers.can.interface import HubBus
 from drivers.can.schedule import Schedule
-from drivers.can.signals import AHEAD, KEY, Kind, checksum, command_frame, default_messages
+from drivers.can.signals import KEY, MAX_LEAD, CommandKind, checksum, command_frame, default_messages
 from drivers.instruments.common.protocol import Codec, ProtocolError
 from drivers.instruments.twins import TWINS, Twins
 from drivers.link.can import TO_INSTRUMENT, CanLink, CanNode
-from drivers.link.frames import Deframer, frame, unstuff
+from drivers.link.frames import Deframer, encode_frame, unstuff
 from drivers.link.port import MessagePort
 from drivers.sources.can import CanSource
 from rig.base import wire
@@ -85,7 +85,7 @@ class Rig:
         self._reply = reply
         document = {"table": default_table().model_dump(mode="json"), "tick_rate_hz": 1_000_000}
         self.server.answer(wire.CATALOGUE, lambda _: wire.encode_document(document))
-        for kind in Kind:
+        for kind in CommandKind:
             name = kind.name.lower()
             self.server.answer(wire.command_key(name), lambda payload, name=name: self._take(name, payload))
 
@@ -100,23 +100,26 @@ def is_command(message: can.Message, last: int) -> bool:
     if message.is_extended_id or message.is_remote_frame or message.is_error_frame or message.is_fd or len(data) != 8:
         return False
     force, duration, direction = int.from_bytes(data[2:4], "little"), data[4], data[5]
-    values: dict[Kind, dict[str, float]] = {
-        Kind.HAMMER: {"force_n": force * 0.1, "duration_ms": duration * 0.25, "direction": direction * 1.5},
-        Kind.SPEED: {"speed_hz": int.from_bytes(data[2:5], "little") * 0.001},
-        Kind.RELEASE: {},
-        Kind.STOP: {},
+    values: dict[CommandKind, dict[str, float]] = {
+        CommandKind.HAMMER: {"force_n": force * 0.1, "duration_ms": duration * 0.25, "direction": direction * 1.5},
+        CommandKind.SPEED: {"speed_hz": int.from_bytes(data[2:5], "little") * 0.001},
+        CommandKind.RELEASE: {},
+        CommandKind.STOP: {},
     }
-    if data[0] not in set(Kind) or not 1 <= (data[1] - last) % 256 <= AHEAD:
+    if data[0] not in set(CommandKind) or not 1 <= (data[1] - last) % 256 <= MAX_LEAD:
         return False
-    kind = Kind(data[0])
+    kind = CommandKind(data[0])
     return (message.arbitration_id, data) == command_frame(kind, data[1], **values[kind])
 
 
 def a_frame(random: np.random.Generator, last: int) -> can.Message:
     """A frame that is a command, nearly one, or anything else."""
-    kind = tuple(Kind)[random.integers(len(Kind))]
-    counter = (last + int(random.integers(-3, AHEAD + 4))) % 256
-    most = {Kind.HAMMER: {"force_n": 6500, "duration_ms": 63, "direction": 360}, Kind.SPEED: {"speed_hz": 16_000}}
+    kind = tuple(CommandKind)[random.integers(len(CommandKind))]
+    counter = (last + int(random.integers(-3, MAX_LEAD + 4))) % 256
+    most = {
+        CommandKind.HAMMER: {"force_n": 6500, "duration_ms": 63, "direction": 360},
+        CommandKind.SPEED: {"speed_hz": 16_000},
+    }
     values = {name: float(random.uniform(0, end)) for name, end in most.get(kind, {}).items()}
     identifier, data = command_frame(kind, counter, **values)
     flags: dict[str, Any] = {"is_extended_id": False}
@@ -185,7 +188,7 @@ def test_a_command_is_carried_out_only_where_its_frame_is_exactly_valid() -> Non
         before = len(rig.taken)
         time.sleep(0.3)
         until(lambda: not gateway.commands.waiting)
-        identifier, data = command_frame(Kind.SPEED, gateway.commands.counter + 1, speed_hz=5.0)
+        identifier, data = command_frame(CommandKind.SPEED, gateway.commands.counter + 1, speed_hz=5.0)
         other.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
         until(lambda: rig.taken[-1][1].get("speed_hz") == 5.0)
 
@@ -236,7 +239,7 @@ def an_offer(random: np.random.Generator, secret: bytes) -> tuple[bytes, list[co
         length = int(random.choice((0, 1, 7, 8, 9, 12, 48, 63, 64, 200)))
         flags = int(random.choice((0, 0, 0, 1, 3, 7, 2, 16, 255)))
         rows.append(codec.Record(0, word, length, flags, int(random.integers(1 << 16)), random.bytes(min(length, 64))))
-    message = codec.encode(packed(rows))
+    message = codec.encode(pack_records(rows))
     kind = random.integers(8)
     if kind == 0:
         return mutated(random, secret + message), []
@@ -278,7 +281,7 @@ def test_messages_and_requests_to_the_hub_stop_nobody_and_forge_nothing() -> Non
                     got.append(int.from_bytes(item.data, "big"))
                 else:
                     strangers += 1
-                    assert fault_of(codec.record_of(item)) is None
+                    assert find_fault(codec.make_record(item)) is None
 
         for number, request in enumerate(requests):
             payload, _ = an_offer(random, secret)
@@ -292,7 +295,7 @@ def test_messages_and_requests_to_the_hub_stop_nobody_and_forge_nothing() -> Non
             hub.reply(("join", "set", "flush", "status")[random.integers(4)], request)
             hub.watch(f"rig/can/can0/node/{names[random.integers(3, 7)]}{random.integers(3000)}", random.random() < 0.7)
             with contextlib.suppress(codec.CodecError):
-                villain.hear(codec.decode(payload[16:]))
+                villain.receive(codec.decode(payload[16:]))
             if number % 20 == 0:
                 sender.send(
                     can.Message(arbitration_id=1, data=sent.to_bytes(4, "big"), is_extended_id=False), timeout=5.0
@@ -438,7 +441,7 @@ def test_text_to_a_socketcand_server_stops_nobody() -> None:
                         texts = [b"<" + a_command(random) + b">" for _ in range(10)]
                         flood.write(mutated(random, b"".join(texts)) if random.random() < 0.3 else b"".join(texts))
                         while (item := other.recv(0)) is not None:
-                            assert item.is_error_frame or fault_of(codec.record_of(item)) is None
+                            assert item.is_error_frame or find_fault(codec.make_record(item)) is None
                     flood.quiet()
                     flood.write(b">< statistics 0 ><>< echo >")
                     assert flood.quiet().endswith(b"< echo >")
@@ -498,7 +501,7 @@ def test_lines_to_an_slcan_port_make_a_frame_only_where_they_stand_for_one() -> 
             for _ in range(inputs(1500) // 10):
                 flood.write(b"\r".join(a_line(random) for _ in range(10)) + b"\r")
                 while (item := other.recv(0)) is not None:
-                    assert item.is_error_frame or fault_of(codec.record_of(item)) is None
+                    assert item.is_error_frame or find_fault(codec.make_record(item)) is None
             flood.write(b"\r\rC\r")
             flood.quiet()
             flood.write(b"V\r")
@@ -566,7 +569,7 @@ def test_frames_of_a_serial_line_are_whole_or_dropped() -> None:
     taken = 0
     for _ in range(inputs(3000)):
         message = random.bytes(int(random.integers(0, 1200)))
-        line = frame(message) if random.random() < 0.3 else mutated(random, frame(message))
+        line = encode_frame(message) if random.random() < 0.3 else mutated(random, encode_frame(message))
         good = []
         for part in line.split(b"\0"):
             with contextlib.suppress(ValueError):
@@ -661,12 +664,12 @@ def test_frames_that_lie_to_a_daq_stop_nothing_and_are_counted() -> None:
                 if number % 50 == 0:
                     say("Sync", index=0, time=0)  # else it takes the rig for gone
                     source.take(int(random.integers(1 << 11)), random.bytes(8))
-                    source.hand_on()
+                    source.deliver()
                     taken.clear()
             for _ in range(200):
                 source.take(table.by_name["Rates"].identifier, random.bytes(8))
                 source.take(table.by_name["Samples_1"].identifier, random.bytes(table.by_name["Samples_1"].length))
-                source.hand_on()
+                source.deliver()
             assert source.statistics["malformed"] > 10
             say("Rates", rate=20_000, fd_step=0, classic_step=20, latency=0)
             until(lambda: source.rates is not None and source.rates["rate"] == 20_000)

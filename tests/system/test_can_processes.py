@@ -134,7 +134,7 @@ def test_stock_logger_and_player_keep_every_frame(hub: Bench, tmp_path: Path) ->
 
     def has_all() -> bool:
         """Whether the logger has written the last message; more of it make it empty its buffer."""
-        sender.send_records(codec.records_of(messages(count)[-1:] * 100), timeout=PATIENCE_S)
+        sender.send_records(codec.make_records(messages(count)[-1:] * 100), timeout=PATIENCE_S)
         return path.exists() and path.read_text(encoding="utf-8").count("\n") >= count
 
     until(has_all, of=logger, every_s=0.05)
@@ -247,7 +247,7 @@ def test_an_endpoint_that_stalls_or_dies_slows_nobody(hub: Bench, how: signal.Si
                 )
                 for number in range(first, first + 100)
             ]
-            sender.send_records(codec.records_of(rows), timeout=10.0)
+            sender.send_records(codec.make_records(rows), timeout=10.0)
             while (item := receiver.recv(0)) is not None:
                 found.append(item)
         found += take(receiver, count - len(found))

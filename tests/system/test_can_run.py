@@ -15,7 +15,7 @@ import pytest
 from drivers.can import dbc
 from drivers.can.gateway import Gateway
 from drivers.can.schedule import Schedule
-from drivers.can.signals import Kind, Result, command_frame, default_messages
+from drivers.can.signals import CommandKind, Result, command_frame, default_messages
 from drivers.console import Console
 from recorder.reader import Recording
 from recorder.session import RecordingSession
@@ -137,14 +137,14 @@ class InProcess:
 def test_a_hammer_pulse_from_the_bus_causes_the_whirl_and_wrong_ones_do_nothing(tmp_path: Path) -> None:
     with InProcess(tmp_path / "run.mcap", Schedule(1000, 10_000), "stable-run") as rig:
         rig.console.step(200_000)
-        identifier, good = command_frame(Kind.HAMMER, 1, force_n=100.0, duration_ms=5.0)
+        identifier, good = command_frame(CommandKind.HAMMER, 1, force_n=100.0, duration_ms=5.0)
         bad = good[:7] + bytes([good[7] ^ 0xFF])
         assert rig.ask(identifier, bad)["result"] == Result.BAD_CHECKSUM
-        strong = rig.ask(*command_frame(Kind.HAMMER, 1, force_n=1500.0, duration_ms=5.0))
+        strong = rig.ask(*command_frame(CommandKind.HAMMER, 1, force_n=1500.0, duration_ms=5.0))
         assert (strong["result"], strong["field"], strong["limit"]) == (Result.OUT_OF_RANGE, 1, 10_000)
         assert rig.ask(identifier, good)["result"] == Result.STALE_COUNTER
         rig.console.step(200_000)
-        pulse = command_frame(Kind.HAMMER, 2, force_n=100.0, duration_ms=5.0)
+        pulse = command_frame(CommandKind.HAMMER, 2, force_n=100.0, duration_ms=5.0)
         reply = rig.ask(*pulse)
         assert (reply["result"], reply["counter"]) == (Result.ACCEPTED, 2)
         assert rig.ask(*pulse)["result"] == Result.STALE_COUNTER
@@ -214,7 +214,7 @@ def test_rig_run_on_a_virtual_bus_between_processes(tmp_path: Path, options: lis
                 frames.setdefault(message.arbitration_id, []).append(bytes(message.data))
                 if message.arbitration_id == TABLE.by_name["Sync"].identifier and not asked:
                     asked = True
-                    identifier, data = command_frame(Kind.HAMMER, 1, force_n=100.0, duration_ms=5.0)
+                    identifier, data = command_frame(CommandKind.HAMMER, 1, force_n=100.0, duration_ms=5.0)
                     bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
                 if message.arbitration_id == TABLE.by_name["Status"].identifier and asked:
                     links = links or console.status()["congestion"]

@@ -51,11 +51,11 @@ def test_a_program_reads_the_same_rows_as_the_model_makes() -> None:
         behind = machine.advance(0.01)
         assert behind.index == hit.index + 1
         contact = machine.truth("contact", to_s=0.4)
-        with pytest.raises(NotSeenError, match=r"no row met the condition from 0\.\d+ to 0\.\d+ s"):
+        with pytest.raises(NotSeenError, match=r"no sample met the condition from 0\.\d+ to 0\.\d+ s"):
             machine.until(lambda rows: rows["disk_x"] > 99.0, within_s=0.1)
-        with pytest.raises(NotSeenError, match="no such event in 0 s; what came: "):
+        with pytest.raises(NotSeenError, match="no such event in 0 s; received instead: "):
             machine.event("nothing", timeout_s=0.0)
-        with pytest.raises(InputError, match="condition must be one truth value a row"):
+        with pytest.raises(InputError, match="condition must be one boolean per sample"):
             machine.until(lambda rows: True, within_s=0.1)
         machine.stop()
         with pytest.raises(StreamEndedError, match="stopped"):
@@ -100,7 +100,7 @@ def test_rows_that_are_read_between_turns_are_of_none() -> None:
             if len(speeds) == 2:
                 break
         assert speeds == pytest.approx([12.0, 12.0], rel=2e-3)
-        with pytest.raises(InputError, match="condition must be one truth value a row"):
+        with pytest.raises(InputError, match="condition must be one boolean per sample"):
             machine.until(lambda rows: rows["disk_x"], within_s=0.1)
 
 
@@ -132,9 +132,9 @@ def test_what_the_rig_does_not_have_is_told(settings: dict[str, Any], says: str,
 
 def test_a_client_without_channels_says_so(unstepped: str) -> None:
     with rig.connect(unstepped, wait_s=PATIENCE_S) as machine:
-        with pytest.raises(InputError, match="channels must be named where the rig is connected to"):
+        with pytest.raises(InputError, match=r"channels must be given to rig\.connect"):
             machine.advance(0.1)
-        with pytest.raises(UnknownNameError, match="table must be one that was named"):
+        with pytest.raises(UnknownNameError, match="table must be a table named in `truth`"):
             machine.truth("contact")
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from drivers.link import ROOM, LinkClosedError, LinkTimeoutError
+from drivers.link import QUEUE_MESSAGES, LinkClosedError, LinkTimeoutError
 from rig.serve.waiting import BoundedQueue
 
 _MAX_BYTES = 1 << 16
@@ -42,7 +42,7 @@ class MemoryLink:
         self._outbox.close()
 
 
-def pair(*, room: int = ROOM) -> tuple[MemoryLink, MemoryLink]:
+def pair(*, room: int = QUEUE_MESSAGES) -> tuple[MemoryLink, MemoryLink]:
     """Two ends of one link.
 
     Args:

@@ -33,7 +33,7 @@ class Mutant:
         assert text.count(self.text) == 1, f"{self.name}: its text stands there {text.count(self.text)} times"
         module = ModuleType(self.source.__name__)
         exec(compile(text.replace(self.text, self.instead), self.name, "exec"), module.__dict__)
-        made = {name: getattr(module, name) for name in ("Protection", "obey", "protect") if hasattr(module, name)}
+        made = {name: getattr(module, name) for name in ("Protection", "act", "protect") if hasattr(module, name)}
         return SimpleNamespace(**{**vars(sound()), **made})
 
     def fails(self, scenario: str) -> bool:
@@ -148,7 +148,7 @@ MUTANTS = [
     ),
     Mutant(
         "state of each block", "blocks_change_nothing",
-        "if not known or not 0 <= missing", "if missing == 0 or not 0 <= missing",
+        "if not started or not 0 <= missing", "if missing == 0 or not 0 <= missing",
     ),
     Mutant(
         "delay of each block", "blocks_change_nothing",
@@ -165,11 +165,11 @@ MUTANTS = [
     ),
     Mutant("missing rows left out", "rows_that_are_missing_are_taken_as_the_last", "elif missing:", "elif False:"),
     Mutant(
-        "rows that come twice", "rows_that_come_twice_count_once", "fresh = follow(self._came, samples)",
+        "rows that come twice", "rows_that_come_twice_count_once", "fresh = follow(self._received, samples)",
         "fresh = samples",
     ),
     Mutant(
-        "OK where rows are lost", "where_too_many_rows_are_missing_no_probe_is_ok", "0 if known else self._rows",
+        "OK where rows are lost", "where_too_many_rows_are_missing_no_probe_is_ok", "0 if started else self._rows",
         "self._rows",
     ),
 ]  # fmt: skip

@@ -19,7 +19,7 @@ from drivers.sources.samples import Samples
 
 RATE = 1000.0
 SCENARIOS: dict[str, Callable[[Any], None]] = {}
-"""By name: each takes a device (`Protection`, `obey`, `protect`), and raises AssertionError if that is not right."""
+"""By name: each takes a device (`Protection`, `act`, `protect`), and raises AssertionError if that is not right."""
 
 
 def scenario(function: Callable[[Any], None]) -> Callable[[Any], None]:
@@ -342,7 +342,7 @@ def a_trip_is_sent_once_and_first(device: Any) -> None:
         monitor = device.Protection(given)
         for first in (0, 200, 400):
             x = swing(200, (100 if first == 0 else 0, 1200.0))
-            device.obey(machine, given, monitor.feed(samples(first, disk_x=x, disk_y=0.0)), lines.append)
+            device.act(machine, given, monitor.feed(samples(first, disk_x=x, disk_y=0.0)), lines.append)
         assert machine.asked == expected
         assert lines[1] == "0.101000 s  danger  disk_x  1200"
 
@@ -444,6 +444,6 @@ def where_too_many_rows_are_missing_no_probe_is_ok(device: Any) -> None:
 
 def sound() -> Any:
     from drivers.protection import Protection
-    from drivers.protection.__main__ import obey, protect
+    from drivers.protection.__main__ import act, protect
 
-    return SimpleNamespace(Protection=Protection, obey=obey, protect=protect)
+    return SimpleNamespace(Protection=Protection, act=act, protect=protect)

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
-from drivers.can.analysis import Errors, Message, load, worst_bits, worst_case
+from drivers.can.analysis import Errors, PeriodicMessage, load, worst_bits, worst_case
 from drivers.can.bus.frame import FD_LENGTHS, Frame
 from drivers.can.bus.model import BusModel
 from drivers.can.bus.timing import frame_bits, speed
@@ -23,9 +23,9 @@ def test_three_messages_that_the_old_analysis_gets_wrong():
     The old analysis looks at the first only, finds 3 ms, and calls the set schedulable.
     """
     messages = [
-        Message(1, 2.5e-3, 7, deadline_s=2.5e-3),
-        Message(2, 3.5e-3, 7, deadline_s=3.25e-3),
-        Message(3, 3.5e-3, 7, deadline_s=3.25e-3),
+        PeriodicMessage(1, 2.5e-3, 7, deadline_s=2.5e-3),
+        PeriodicMessage(2, 3.5e-3, 7, deadline_s=3.25e-3),
+        PeriodicMessage(3, 3.5e-3, 7, deadline_s=3.25e-3),
     ]
     a, b, c = worst_case(messages, "125k")
     assert [row.transmission_s for row in (a, b, c)] == [1e-3] * 3
@@ -61,9 +61,10 @@ def test_sae_benchmark():
         return 47 + 8 * n + (34 + 8 * n) // 5, 0
 
     messages = [
-        Message(k, period * 1e-3, n, jitter * 1e-3, bits=bits(n)) for k, (n, jitter, period, _) in enumerate(SAE)
+        PeriodicMessage(k, period * 1e-3, n, jitter * 1e-3, bits=bits(n))
+        for k, (n, jitter, period, _) in enumerate(SAE)
     ]
-    blocking = Message(0x7FF, 1.0, 8, bits=bits(8))
+    blocking = PeriodicMessage(0x7FF, 1.0, 8, bits=bits(8))
     rows = worst_case([*reversed(messages), blocking], "125k")
     assert [row.message.identifier for row in rows] == [*range(9), 0x7FF]
     for row, (_, jitter, _, expected) in zip(rows[:9], SAE, strict=True):
@@ -74,13 +75,13 @@ def test_sae_benchmark():
 def test_longest_frames():
     """Davis et al. 2007, equations 2 and 3: (55 + 10 n) and (80 + 10 n) bit times."""
     for n in range(9):
-        assert worst_bits(Message(0, 1.0, n)) == (55 + 10 * n, 0)
-        assert worst_bits(Message(0, 1.0, n, extended=True)) == (80 + 10 * n, 0)
+        assert worst_bits(PeriodicMessage(0, 1.0, n)) == (55 + 10 * n, 0)
+        assert worst_bits(PeriodicMessage(0, 1.0, n, extended=True)) == (80 + 10 * n, 0)
 
 
 def test_error_overhead():
     """One message alone: each error costs 31 bits and the frame once more (Davis et al. 2007, section 4.3)."""
-    message = Message(1, 10e-3, 8)
+    message = PeriodicMessage(1, 10e-3, 8)
     (clean,) = worst_case([message], "1M")
     assert clean.worst_s == pytest.approx(135e-6, abs=1e-15)
     (one,) = worst_case([message], "1M", errors=Errors(burst=1))
@@ -118,7 +119,7 @@ def run(rate: str, contents: list[Frame], releases: Releases, **faults: float) -
 
 
 @st.composite
-def schedules(draw: st.DrawFn) -> tuple[str, list[Message], list[Frame]]:
+def schedules(draw: st.DrawFn) -> tuple[str, list[PeriodicMessage], list[Frame]]:
     fd = draw(st.booleans())
     rate = draw(st.sampled_from(("500k/2M", "1M/5M"))) if fd else draw(st.sampled_from(("125k", "500k", "1M")))
     count = draw(st.integers(2, 8))
@@ -133,14 +134,16 @@ def schedules(draw: st.DrawFn) -> tuple[str, list[Message], list[Frame]]:
         period = round(period * 1e6) * 1e-6
         jitter = round(draw(st.sampled_from((0.0, 0.0, 0.3, 1.0, 2.5))) * period * 1e6) * 1e-6
         bits = frame_bits(content) if draw(st.booleans()) else None
-        messages.append(Message(identifier, period, length, jitter, fd=flexible, brs=flexible, bits=bits))
+        messages.append(PeriodicMessage(identifier, period, length, jitter, fd=flexible, brs=flexible, bits=bits))
         contents.append(content)
     return rate, messages, contents
 
 
 @settings(deadline=None, max_examples=150, suppress_health_check=[HealthCheck.filter_too_much, HealthCheck.too_slow])
 @given(schedules(), st.data())
-def test_no_simulation_is_worse_than_the_analysis(case: tuple[str, list[Message], list[Frame]], data: st.DataObject):
+def test_no_simulation_is_worse_than_the_analysis(
+    case: tuple[str, list[PeriodicMessage], list[Frame]], data: st.DataObject
+):
     rate, messages, contents = case
     bounds = {row.message.identifier: row for row in worst_case(messages, rate)}
     assume(load(messages, rate) < 0.98)
@@ -176,7 +179,7 @@ def test_the_worst_case_is_reached(name: str):
     rate = "125k"
     contents = [Frame(0x100 + k, bytes(range(length))) for k, (_, length, _) in enumerate(SETS[name])]
     messages = [
-        Message(frame.identifier, period, len(frame.data), jitter, bits=frame_bits(frame))
+        PeriodicMessage(frame.identifier, period, len(frame.data), jitter, bits=frame_bits(frame))
         for frame, (period, _, jitter) in zip(contents, SETS[name], strict=True)
     ]
     bounds = worst_case(messages, rate)
@@ -200,7 +203,7 @@ def test_the_worst_case_is_reached(name: str):
 
 
 def test_errors_of_the_model_cost_no_more_than_the_analysis_allows():
-    messages = [Message(0x100 + k, 10e-3, 8) for k in range(5)]
+    messages = [PeriodicMessage(0x100 + k, 10e-3, 8) for k in range(5)]
     contents = [Frame(0x100 + k, bytes([k] * 8)) for k in range(5)]
     releases: Releases = [[(n * 10 * MS, n * 10 * MS) for n in range(300)] for _ in contents]
     # 1500 frames of about 120 bits at 3e-5 a bit: some 5 errors, never two within one busy period with this seed.
@@ -216,7 +219,9 @@ def test_errors_of_the_model_cost_no_more_than_the_analysis_allows():
 
 def test_measured_load_is_the_predicted_one():
     frames = [Frame(0x100 + k, bytes(range(k, k + 32)), fd=True, brs=True) for k in range(10)]
-    messages = [Message(frame.identifier, 1e-3, 32, fd=True, brs=True, bits=frame_bits(frame)) for frame in frames]
+    messages = [
+        PeriodicMessage(frame.identifier, 1e-3, 32, fd=True, brs=True, bits=frame_bits(frame)) for frame in frames
+    ]
     bus = BusModel("1M/5M")
     node, _ = bus.attach(), bus.attach()
     for n in range(200):
@@ -229,7 +234,7 @@ def test_measured_load_is_the_predicted_one():
 
 
 def test_schedule_beyond_what_the_bus_carries_has_messages_that_never_come():
-    messages = [Message(0x100 + k, 1e-3) for k in range(8)]
+    messages = [PeriodicMessage(0x100 + k, 1e-3) for k in range(8)]
     assert load(messages, "1M") == pytest.approx(8 * 0.135)
     assert all(not math.isfinite(row.worst_s) for row in worst_case(messages, "1M")[7:])
     assert [row.schedulable for row in worst_case(messages, "1M")] == [True] * 6 + [False] * 2
@@ -237,11 +242,16 @@ def test_schedule_beyond_what_the_bus_carries_has_messages_that_never_come():
 
 def test_refusals():
     with pytest.raises(InputError, match="one message only"):
-        worst_case([Message(1, 1.0), Message(1, 2.0)], "1M")
+        worst_case([PeriodicMessage(1, 1.0), PeriodicMessage(1, 2.0)], "1M")
     with pytest.raises(InputError, match="bus of 1M"):
-        load([Message(1, 1.0, fd=True)], "1M")
-    for message in (Message(1, 0.0), Message(1, math.inf), Message(1, 1.0, jitter_s=-1.0), Message(0x800, 1.0)):
+        load([PeriodicMessage(1, 1.0, fd=True)], "1M")
+    for message in (
+        PeriodicMessage(1, 0.0),
+        PeriodicMessage(1, math.inf),
+        PeriodicMessage(1, 1.0, jitter_s=-1.0),
+        PeriodicMessage(0x800, 1.0),
+    ):
         with pytest.raises(InputError):
             worst_case([message], "1M")
     with pytest.raises(InputError):
-        load([Message(1, 1.0, 9)], "1M")
+        load([PeriodicMessage(1, 1.0, 9)], "1M")

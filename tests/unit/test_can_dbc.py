@@ -17,7 +17,7 @@ from drivers.can.signals import (
     CLASSIC_HZ,
     FD_HZ,
     Command,
-    Kind,
+    CommandKind,
     command_frame,
     default_messages,
     parse_command,
@@ -53,7 +53,7 @@ def test_a_bus_that_gets_too_full_is_told_in_one_line(tmp_path: Path, capsys: py
     more = ", ".join(f'{{ name = "P_N_{side}", signal = "P_N" }}' for side in "ab")
     path.write_text(f"[groups.forces]\nchannels = [{more}]")
     warning = (
-        "rig: warning: CAN load must be at most 70 % of 1M with classic frames, so that others find room beside them; "
+        "rig: warning: CAN load must be at most 70 % of 1M with classic frames, to leave room for other nodes; "
         "instead received 80.7 % with 6 frames an instant (a lower --can-rate or --can-fd helps)\n"
     )
     for command in (["can", "load"], ["can", "dbc"]):
@@ -123,13 +123,13 @@ def test_a_command_made_by_cantools_alone_is_taken() -> None:
     values = {"kind": "hammer", "counter": 3, "force": 80, "duration": 5, "direction": 0, "key": 0x9D, "checksum": 0}
     data = DATABASE.encode_message("Command", values)
     data = data[:7] + bytes([checksum(0x020, data)])
-    expected = Command(Kind.HAMMER, 3, {"force_n": 80.0, "duration_ms": 5.0, "direction": 0.0})
+    expected = Command(CommandKind.HAMMER, 3, {"force_n": 80.0, "duration_ms": 5.0, "direction": 0.0})
     assert parse_command(0x020, data, 2) == expected
 
 
 def test_cantools_decodes_every_command() -> None:
-    for kind in Kind:
-        fields = {} if kind is Kind.STOP else COMMANDS[kind.name.lower()].quantities()
+    for kind in CommandKind:
+        fields = {} if kind is CommandKind.STOP else COMMANDS[kind.name.lower()].quantities()
         values = {name: max(1.0, field.low) for name, field in fields.items() if not field.takes_text}
         decoded = DATABASE.decode_message(*command_frame(kind, 9, **values))
         assert str(decoded["kind"]) == kind.name.lower()
@@ -140,7 +140,7 @@ def test_cantools_decode_reads_a_log(capsys: pytest.CaptureFixture[str], monkeyp
     probes = TABLE.by_name["Probes"]
     assert probes.samples is not None
     data = probes.samples.pack(np.array([10]), np.full((5, 4), 0x1000, np.int32), 64).tobytes()
-    hammer = command_frame(Kind.HAMMER, 1, force_n=50.0, duration_ms=5.0)[1]
+    hammer = command_frame(CommandKind.HAMMER, 1, force_n=50.0, duration_ms=5.0)[1]
     lines = [
         f"(1700000000.000000) can0 {probes.identifier:03X}##1{data.hex().upper()}",
         f"(1700000000.000100) can0 {0x020:03X}#{hammer.hex().upper()}",

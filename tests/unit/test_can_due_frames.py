@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from drivers.can.bus import codec
-from drivers.can.bus.frame import FD_WIDTH, joined, octets, packed, record_of
+from drivers.can.bus.frame import FD_WIDTH, join_records, make_record, octets, pack_records
 from drivers.can.bus.frame import Frame as Wire
 from drivers.can.bus.hub import Hub
 from drivers.can.bus.model import BusModel
@@ -31,13 +31,13 @@ class Counting(HubBus):
 
     heard = 0
 
-    def hear(self, said: codec.Said) -> None:
+    def receive(self, said: codec.HubMessage) -> None:
         self.heard += isinstance(said, np.ndarray)
-        super().hear(said)
+        super().receive(said)
 
 
 def make(identifiers: Any) -> np.ndarray:
-    return packed([record_of(Wire(each, bytes(range(1, 9)))) for each in identifiers], FD_WIDTH)
+    return pack_records([make_record(Wire(each, bytes(range(1, 9)))) for each in identifiers], FD_WIDTH)
 
 
 def identifiers(bus: can.BusABC) -> list[int]:
@@ -217,5 +217,5 @@ def test_a_full_bus_loses_the_oldest_frames_and_no_more_than_find_no_room() -> N
 
 def test_arrays_of_frames_are_joined_in_their_order() -> None:
     parts = [make([1, 2]), make([3, 4, 5])[::2], make([])]
-    assert joined(parts).tolist() == np.concatenate(parts).tolist()
-    assert joined(parts).flags.writeable
+    assert join_records(parts).tolist() == np.concatenate(parts).tolist()
+    assert join_records(parts).flags.writeable

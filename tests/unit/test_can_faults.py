@@ -14,8 +14,8 @@ from drivers.can.message import checksum
 from drivers.can.schedule import Schedule
 from drivers.can.signals import (
     Command,
+    CommandKind,
     EventKind,
-    Kind,
     Result,
     clear_frame,
     fault_frame,
@@ -67,16 +67,16 @@ def test_clear_and_what_is_none() -> None:
     assert change(2, len(KINDS) + 1) is Result.OUT_OF_RANGE
     assert change(3, 0) is Result.OUT_OF_RANGE
     assert change(4, 1) is Result.OUT_OF_RANGE  # freeze has no number
-    assert change(0, Kind.HAMMER) is Result.BAD_KIND
-    others = (*FaultKind, Kind.HAMMER, Kind.SPEED, Kind.RELEASE, Kind.STOP)
+    assert change(0, CommandKind.HAMMER) is Result.BAD_KIND
+    others = (*FaultKind, CommandKind.HAMMER, CommandKind.SPEED, CommandKind.RELEASE, CommandKind.STOP)
     assert min((one ^ other).bit_count() for one in FaultKind for other in others if one != other) >= 4
     for given, line in (
-        (("P_Q", "freeze", 1), "fault.channel must be one of the channels"),
+        (("P_Q", "freeze", 1), "fault.channel must be the name of a channel"),
         (("P_E", "frieze", 1), "fault.kind must be one of the kinds, such as freeze"),
     ):
         with pytest.raises(InputError, match=line):
             fault_frame(*given)
-    with pytest.raises(InputError, match="left out: freeze has none"):
+    with pytest.raises(InputError, match="left out: freeze has no main number"):
         fault_frame("P_E", "freeze", 1, number=3.0)
 
 
@@ -84,7 +84,7 @@ def test_a_channel_table_of_ones_own_has_its_own_targets() -> None:
     table = messages_for(load_scene("stable-run", {"channels": str(ROOT / "docs/daq24.toml")}).table)
     frame = fault_frame("end_u", "freeze", 1, table=table)
     assert parse_command(*frame, 0, table) == Command(FaultKind.FAULT, 1, {"channel": "end_u", "kind": "freeze"})
-    with pytest.raises(InputError, match=r"fault\.channel must be one of the channels"):
+    with pytest.raises(InputError, match=r"fault\.channel must be the name of a channel"):
         fault_frame("end_u", "freeze", 1)
 
 

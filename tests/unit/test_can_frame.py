@@ -21,9 +21,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.can.analysis import Message, best_bits, worst_bits
+from drivers.can.analysis import PeriodicMessage, best_bits, worst_bits
 from drivers.can.bus import frame as frames
-from drivers.can.bus.frame import FD_LENGTHS, RECORD, Frame, record_of, records, sendable
+from drivers.can.bus.frame import FD_LENGTHS, RECORD, Frame, make_record, records, sendable
 from drivers.can.bus.timing import encode, frame_bits, speed
 from rig.base.errors import InputError
 
@@ -263,7 +263,7 @@ def test_lengths_are_those_of_the_encoding_and_within_the_formulas(frame: Frame)
     nominal, fast = frame_bits(frame)
     assert (nominal, fast) == (int((~encoded.fast).sum()), int(encoded.fast.sum()))
     n = 0 if frame.remote else len(frame.data)
-    shape = Message(frame.identifier, 1.0, n, extended=frame.extended, fd=frame.fd, brs=frame.brs)
+    shape = PeriodicMessage(frame.identifier, 1.0, n, extended=frame.extended, fd=frame.fd, brs=frame.brs)
     stuffed = int(encoded.stuff.sum())
     assert nominal + fast == sum(best_bits(shape)) + stuffed
     most = worst_bits(shape)
@@ -277,14 +277,14 @@ def test_lengths_are_those_of_the_encoding_and_within_the_formulas(frame: Frame)
 
 def test_lengths_without_stuff_bits_counted_by_hand():
     """Field by field, ISO 11898-1:2015, figures 12 to 17; the fast part of BRS and of the CRC delimiter as one bit."""
-    assert best_bits(Message(0, 1.0, 0)) == (1 + 12 + 6 + 15 + 1 + 2 + 7 + 3, 0) == (47, 0)
-    assert best_bits(Message(0, 1.0, 8)) == (111, 0)
-    assert best_bits(Message(0, 1.0, 8, extended=True)) == (131, 0)
+    assert best_bits(PeriodicMessage(0, 1.0, 0)) == (1 + 12 + 6 + 15 + 1 + 2 + 7 + 3, 0) == (47, 0)
+    assert best_bits(PeriodicMessage(0, 1.0, 8)) == (111, 0)
+    assert best_bits(PeriodicMessage(0, 1.0, 8, extended=True)) == (131, 0)
     # FD, base: SOF 1, identifier 11, RRS, IDE, FDF, res, BRS; ESI 1, DLC 4, data, count 4, CRC, fixed, delimiter.
-    assert best_bits(Message(0, 1.0, 8, fd=True, brs=True)) == (17 + 12, 5 + 64 + 4 + 17 + 6 + 1)
-    assert best_bits(Message(0, 1.0, 64, fd=True, brs=True)) == (17 + 12, 5 + 512 + 4 + 21 + 7 + 1)
-    assert best_bits(Message(0, 1.0, 64, fd=True)) == (17 + 12 + 5 + 512 + 4 + 21 + 7 + 1, 0)
-    assert best_bits(Message(0, 1.0, 0, extended=True, fd=True, brs=True)) == (36 + 12, 5 + 4 + 17 + 6 + 1)
+    assert best_bits(PeriodicMessage(0, 1.0, 8, fd=True, brs=True)) == (17 + 12, 5 + 64 + 4 + 17 + 6 + 1)
+    assert best_bits(PeriodicMessage(0, 1.0, 64, fd=True, brs=True)) == (17 + 12, 5 + 512 + 4 + 21 + 7 + 1)
+    assert best_bits(PeriodicMessage(0, 1.0, 64, fd=True)) == (17 + 12 + 5 + 512 + 4 + 21 + 7 + 1, 0)
+    assert best_bits(PeriodicMessage(0, 1.0, 0, extended=True, fd=True, brs=True)) == (36 + 12, 5 + 4 + 17 + 6 + 1)
 
 
 @pytest.mark.parametrize("identifier", [0x000, 0x078, 0x555, 0x7FF, 0x0F0, 0x3E0])
@@ -292,21 +292,21 @@ def test_lengths_without_stuff_bits_counted_by_hand():
 def test_worst_fd_length_is_reached_by_some_content(identifier: int, brs: bool):
     every = [Frame(identifier, bytes([v]), fd=True, brs=brs, esi=esi) for v in range(256) for esi in (False, True)]
     nominal, fast = np.transpose([frame_bits(frame) for frame in every])
-    most = worst_bits(Message(identifier, 1.0, 1, fd=True, brs=brs))
+    most = worst_bits(PeriodicMessage(identifier, 1.0, 1, fd=True, brs=brs))
     assert nominal.max() == most[0]
     assert (nominal + fast).max() == sum(most)
 
 
 def test_worst_fd_length_of_long_frames_is_reached():
     """After the header, 1111 and 0000 in turn make a stuff bit in every four bits."""
-    most = worst_bits(Message(0x000, 1.0, 64, fd=True, brs=True))
+    most = worst_bits(PeriodicMessage(0x000, 1.0, 64, fd=True, brs=True))
     best = 0
     for phase in range(8):
         pattern = (0x0F0F << phase | 0x0F0F >> (8 - phase)) & 0xFF
         best = max(best, *(sum(frame_bits(Frame(0, bytes([first]) + bytes([pattern]) * 63, fd=True, brs=True, esi=esi)))
                            for first in range(256) for esi in (False, True)))  # fmt: skip
     assert best == sum(most)
-    nominal, fast = best_bits(Message(0x000, 1.0, 64, fd=True, brs=True))
+    nominal, fast = best_bits(PeriodicMessage(0x000, 1.0, 64, fd=True, brs=True))
     # Two in the arbitration field of ten dominant bits, then one in every four bits.
     assert sum(most) - nominal - fast == 2 + 128
 
@@ -329,8 +329,8 @@ def test_arrays_and_single_frames_agree():
         (Frame(-1), "instead received -1"),
         (Frame(1 << 29, extended=True), "instead received 536870912"),
         (Frame(0, bytes(9)), "9 bytes in a classic frame"),
-        (Frame(0, bytes(9), fd=True), "no length of a CAN FD frame"),
-        (Frame(0, bytes(65), fd=True), "no length of a CAN FD frame"),
+        (Frame(0, bytes(9), fd=True), "no CAN FD length"),
+        (Frame(0, bytes(65), fd=True), "no CAN FD length"),
         (Frame(0, remote=True, fd=True), "remote frame"),
         (Frame(0, brs=True), "bit rate switch"),
         (Frame(0, esi=True), "error state indicator"),
@@ -338,7 +338,7 @@ def test_arrays_and_single_frames_agree():
 )
 def test_frames_that_no_controller_sends(frame: Frame, why: str):
     with pytest.raises(InputError, match=why):
-        record_of(frame)
+        make_record(frame)
     if len(frame.data) > 64 or not 0 <= frame.identifier < 1 << 29:
         return
     word = frame.identifier | (frames.EXTENDED if frame.extended else 0) | (frames.REMOTE if frame.remote else 0)

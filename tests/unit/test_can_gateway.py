@@ -20,7 +20,16 @@ import pytest
 from drivers.can import dbc
 from drivers.can.gateway import Gateway
 from drivers.can.schedule import Schedule
-from drivers.can.signals import ABSENT, LIMITS, Field, Kind, Result, State, command_frame, default_messages
+from drivers.can.signals import (
+    ABSENT,
+    LIMITS,
+    CommandKind,
+    Field,
+    Result,
+    RigState,
+    command_frame,
+    default_messages,
+)
 from rig.base import wire
 from rig.base.errors import InputError
 from rig.channels.table import default_table
@@ -184,7 +193,7 @@ def test_every_sample_is_there_in_both_layouts(paced: bool) -> None:
     assert [row["time"] for row in setup.tap.decoded("Sync")] == [0, 100_000, 200_000, 300_000]
     events = [TABLE.by_name["Event"].signals[0].choices[row["event"]] for row in setup.tap.decoded("Event")]  # type: ignore[index]
     assert events == ["start", "end"]
-    until(lambda: setup.tap.decoded("Heartbeat")[-1]["state"] == State.ENDED)
+    until(lambda: setup.tap.decoded("Heartbeat")[-1]["state"] == RigState.ENDED)
     names = [TABLE.by_identifier[row.arbitration_id].name for row in setup.tap.frames]
     last_beat = len(names) - 1 - names[::-1].index("Heartbeat")
     last_sample = max(n for n, name in enumerate(names) if TABLE.by_name[name].samples is not None)
@@ -387,7 +396,7 @@ def test_a_hammer_pulse_is_acknowledged_with_its_time() -> None:
     with rig(Fake(duration_s=None), paced=True) as setup:
         setup.start()
         until(lambda: bool(setup.tap.of("Probes")))
-        reply = setup.tap.ask(*command_frame(Kind.HAMMER, 1, force_n=100.0, duration_ms=5.0))
+        reply = setup.tap.ask(*command_frame(CommandKind.HAMMER, 1, force_n=100.0, duration_ms=5.0))
         assert (reply["counter"], reply["result"]) == (1, Result.ACCEPTED)
         until(lambda: any(row["event"] == 3 for row in setup.tap.decoded("Event")))
         pulse = next(row for row in setup.tap.decoded("Event") if row["event"] == 3)
@@ -401,7 +410,7 @@ def test_the_acknowledge_does_not_wait_for_the_end_of_a_block() -> None:
     with rig(Fake(duration_s=None), paced=True, block_ticks=500_000) as setup:
         setup.start()
         until(lambda: bool(setup.tap.of("Probes")))
-        commands = [command_frame(Kind.SPEED, counter, speed_hz=6.2) for counter in range(1, 11)]
+        commands = [command_frame(CommandKind.SPEED, counter, speed_hz=6.2) for counter in range(1, 11)]
         times = [setup.tap.ask(*command)["time"] for command in commands]
     # One after another: each would wait for a block of its own.
     assert len(set(times)) <= 2
@@ -411,16 +420,16 @@ def test_refusals_name_their_reason_and_are_counted() -> None:
     with rig(Fake(duration_s=None), paced=True) as setup:
         setup.start()
         until(lambda: bool(setup.tap.of("Probes")))
-        identifier, good = command_frame(Kind.HAMMER, 1, force_n=100.0, duration_ms=5.0)
+        identifier, good = command_frame(CommandKind.HAMMER, 1, force_n=100.0, duration_ms=5.0)
         assert setup.tap.ask(identifier, good[:7] + b"\0")["result"] == Result.BAD_CHECKSUM
         assert setup.tap.ask(identifier, good[:7])["result"] == Result.BAD_LENGTH
         assert setup.tap.ask(identifier, good)["result"] == Result.ACCEPTED
         assert setup.tap.ask(identifier, good)["result"] == Result.STALE_COUNTER
-        reply = setup.tap.ask(*command_frame(Kind.HAMMER, 2, force_n=5000.0, duration_ms=5.0))
+        reply = setup.tap.ask(*command_frame(CommandKind.HAMMER, 2, force_n=5000.0, duration_ms=5.0))
         assert (reply["result"], reply["field"], reply["limit"]) == (Result.OUT_OF_RANGE, 1, 10_000)
         # Used up by the refusal.
         assert (
-            setup.tap.ask(*command_frame(Kind.HAMMER, 2, force_n=50.0, duration_ms=5.0))["result"]
+            setup.tap.ask(*command_frame(CommandKind.HAMMER, 2, force_n=50.0, duration_ms=5.0))["result"]
             == Result.STALE_COUNTER
         )
         assert dict(setup.gateway.commands.refused) == {
@@ -433,14 +442,14 @@ def test_refusals_name_their_reason_and_are_counted() -> None:
 @pytest.mark.parametrize(
     ("kind", "values", "field", "limit"),
     [
-        (Kind.HAMMER, {"force_n": 0.5, "duration_ms": 5.0}, Field.FORCE, 1.0),
-        (Kind.HAMMER, {"force_n": 1000.1, "duration_ms": 5.0}, Field.FORCE, 1000.0),
-        (Kind.HAMMER, {"force_n": 10.0, "duration_ms": 0.25}, Field.DURATION, 0.5),
-        (Kind.HAMMER, {"force_n": 10.0, "duration_ms": 60.0}, Field.DURATION, 50.0),
-        (Kind.SPEED, {"speed_hz": 5000.0}, Field.SPEED, 61.5),
+        (CommandKind.HAMMER, {"force_n": 0.5, "duration_ms": 5.0}, Field.FORCE, 1.0),
+        (CommandKind.HAMMER, {"force_n": 1000.1, "duration_ms": 5.0}, Field.FORCE, 1000.0),
+        (CommandKind.HAMMER, {"force_n": 10.0, "duration_ms": 0.25}, Field.DURATION, 0.5),
+        (CommandKind.HAMMER, {"force_n": 10.0, "duration_ms": 60.0}, Field.DURATION, 50.0),
+        (CommandKind.SPEED, {"speed_hz": 5000.0}, Field.SPEED, 61.5),
     ],
 )
-def test_a_refusal_says_which_limit_was_passed(kind: Kind, values: Any, field: Field, limit: float) -> None:
+def test_a_refusal_says_which_limit_was_passed(kind: CommandKind, values: Any, field: Field, limit: float) -> None:
     class Checked(Fake):
         """Refuses as the rig's own simulation does."""
 
@@ -456,7 +465,11 @@ def test_a_refusal_says_which_limit_was_passed(kind: Kind, values: Any, field: F
     with rig(Checked(duration_s=None), paced=True) as setup:
         setup.start()
         reply = setup.tap.ask(*command_frame(kind, 1, **values))
-        assert (reply["result"], reply["field"], reply["limit"]) == (Result.OUT_OF_RANGE, field, round(10 * limit))
+        assert (reply["result"], reply["field"], reply["limit"]) == (
+            Result.OUT_OF_RANGE,
+            field,
+            round(10 * limit),
+        )
 
 
 def test_limits_of_commands_are_those_of_the_rig() -> None:
@@ -468,12 +481,12 @@ def test_limits_of_commands_are_those_of_the_rig() -> None:
 def test_other_frames_on_the_identifier_of_commands_are_ignored() -> None:
     with rig(Fake(duration_s=None), paced=True) as setup:
         setup.start()
-        identifier, data = command_frame(Kind.STOP, 1)
+        identifier, data = command_frame(CommandKind.STOP, 1)
         setup.tap.bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=True))
         setup.tap.bus.send(can.Message(arbitration_id=identifier, is_remote_frame=True, dlc=8, is_extended_id=False))
         setup.tap.bus.send(can.Message(arbitration_id=identifier, is_error_frame=True, data=data))
         setup.tap.send(0x011, data)
-        assert setup.tap.ask(*command_frame(Kind.SPEED, 1, speed_hz=5.0))["result"] == Result.ACCEPTED
+        assert setup.tap.ask(*command_frame(CommandKind.SPEED, 1, speed_hz=5.0))["result"] == Result.ACCEPTED
         assert setup.gateway.commands.refused.total() == 0
 
 
@@ -481,10 +494,10 @@ def test_a_stop_ends_the_run() -> None:
     with rig(Fake(duration_s=None), paced=True) as setup:
         setup.start()
         until(lambda: bool(setup.tap.of("Probes")))
-        assert setup.tap.ask(*command_frame(Kind.STOP, 1))["result"] == Result.ACCEPTED
+        assert setup.tap.ask(*command_frame(CommandKind.STOP, 1))["result"] == Result.ACCEPTED
         setup.join()
         assert setup.summary["reason"] == "stopped"
-        until(lambda: setup.gateway.state == State.ENDED)
+        until(lambda: setup.gateway.state == RigState.ENDED)
 
 
 class Silent(MemoryClient):
@@ -510,7 +523,7 @@ def test_a_command_that_the_rig_does_not_answer_times_out_and_too_many_are_refus
     try:
         with Gateway(client, own, Schedule(), command_timeout_s=0.3) as gateway:
             for counter in range(1, 18):
-                tap.send(*command_frame(Kind.SPEED, counter, speed_hz=5.0))
+                tap.send(*command_frame(CommandKind.SPEED, counter, speed_hz=5.0))
             until(lambda: len(tap.of("Acknowledge")) == 17)
             results = [(row["counter"], Result(row["result"])) for row in tap.decoded("Acknowledge")]
             assert results[0] == (17, Result.BUSY)
@@ -535,7 +548,7 @@ def test_threads_of_a_gateway_outlive_what_fails_in_them_and_a_command_is_asked_
             raise ZeroDivisionError("spoilt")
 
         monkeypatch.setattr(setup.client, "request", bad)
-        assert setup.tap.ask(*command_frame(Kind.SPEED, 1, speed_hz=5.0))["result"] == Result.TIMED_OUT
+        assert setup.tap.ask(*command_frame(CommandKind.SPEED, 1, speed_hz=5.0))["result"] == Result.TIMED_OUT
         assert len(asked) == 1
         gateway = setup.gateway
         for owner, name in ((gateway, "unpack"), (gateway.commands, "take_message"), (gateway.outbox, "send_due")):
@@ -547,7 +560,7 @@ def test_threads_of_a_gateway_outlive_what_fails_in_them_and_a_command_is_asked_
         monkeypatch.undo()
         count = len(setup.tap.of("Probes"))
         until(lambda: len(setup.tap.of("Probes")) > count + 100)
-        assert setup.tap.ask(*command_frame(Kind.SPEED, 2, speed_hz=5.0))["result"] == Result.ACCEPTED
+        assert setup.tap.ask(*command_frame(CommandKind.SPEED, 2, speed_hz=5.0))["result"] == Result.ACCEPTED
 
 
 def test_100_000_random_frames_are_no_command_and_few_are_answered() -> None:
@@ -569,7 +582,7 @@ def test_100_000_random_frames_are_no_command_and_few_are_answered() -> None:
     [
         (lambda table: table.only(("probes",), 16_000), "--can-rate must be a divisor of the samples' rate, 16000 Hz"),
         (lambda table: _calibrated(table), "channel disk_x must be calibrated as in the channel table"),
-        (lambda table: _mixed(table), "sample rates must be the same for all sensor groups"),
+        (lambda table: _mixed(table), "sample rates must be the same for all channel groups"),
     ],
 )
 def test_a_rig_that_does_not_fit_the_messages_is_refused(change: Any, message: str) -> None:
@@ -651,7 +664,7 @@ def test_a_serial_converter_works_as_well() -> None:
         with rig(Fake(duration_s=None), schedule=Schedule(), paced=True, bus=own) as setup:
             setup.start()
             until(lambda: len(firmware.of("Samples_5")) >= 100)
-            firmware.send(*command_frame(Kind.HAMMER, 1, force_n=100.0, duration_ms=5.0))
+            firmware.send(*command_frame(CommandKind.HAMMER, 1, force_n=100.0, duration_ms=5.0))
             until(lambda: bool(firmware.of("Acknowledge")))
         (reply,) = [TABLE.by_name["Acknowledge"].decode(data) for data in firmware.of("Acknowledge")]
         assert (reply["counter"], reply["result"]) == (1, Result.ACCEPTED)

@@ -339,7 +339,7 @@ def test_error_frames_reach_the_client(hub_bench: Bench) -> None:
     other, server = hub_bench.bus(), hub_bench.serve()
     client = hub_bench.socketcand(server)
     (outlet,) = server.clients
-    outlet.put(outlet.show_frame(codec.message_of(codec.error_record(10**9, codec.BUS_OFF))) or b"")
+    outlet.put(outlet.show_frame(codec.make_message(codec.error_record(10**9, codec.BUS_OFF))) or b"")
     other.send(CLASSIC[0])
     first, second = read(client, 2)
     assert first.is_error_frame
@@ -591,12 +591,12 @@ def test_status_flags_tell_what_error_frames_say(bench: Bench) -> None:
     with Terminal(port) as terminal:
         terminal.ask("O")
         for record, flags in [
-            (codec.overflow(0), 0x09),
+            (codec.make_overflow(0), 0x09),
             (codec.error_record(0, codec.CONTROLLER, data=bytes((0, 0x20, 0, 0, 0, 0, 0, 0))), 0x20),
             (codec.error_record(0, codec.BUS_ERROR | codec.PROTOCOL), 0x80),
             (codec.error_record(0, codec.BUS_OFF), 0xA0),
         ]:
-            assert port.show_frame(codec.message_of(record)) is None
+            assert port.show_frame(codec.make_message(record)) is None
             assert terminal.ask("F") == b"F%02X\r" % flags
             assert terminal.ask("F") == b"F00\r"
 

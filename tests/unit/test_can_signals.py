@@ -10,18 +10,18 @@ import pytest
 
 from drivers.can import analysis
 from drivers.can.bus.timing import speed
-from drivers.can.devices import DeviceKind, Said, device_frame
+from drivers.can.devices import DeviceKind, DeviceRequest, device_frame
 from drivers.can.message import checksum, crc8
 from drivers.can.schedule import Schedule, schedule_from
 from drivers.can.signals import (
     ABSENT,
-    AHEAD,
     CLASSIC_SHARE,
     KEY,
+    MAX_LEAD,
     ODDS,
+    CanMessage,
     Command,
-    Kind,
-    Message,
+    CommandKind,
     Result,
     command_frame,
     default_messages,
@@ -70,7 +70,7 @@ def test_classic_frames_take_at_most_their_share_of_1_mbit() -> None:
     assert Schedule().load(speed("1M")) == pytest.approx(by_hand, rel=1e-9)
     assert 0.675 < by_hand <= CLASSIC_SHARE
     # The frame that is that long exists.
-    assert analysis.worst_bits(analysis.Message(0x201, 1e-3)) == (135, 0)
+    assert analysis.worst_bits(analysis.PeriodicMessage(0x201, 1e-3)) == (135, 0)
 
 
 def test_all_channels_at_10_khz_need_more_than_5_mbit_and_8_carry_them() -> None:
@@ -101,7 +101,7 @@ def test_rates_of_the_options() -> None:
 
 
 @pytest.mark.parametrize("message", SAMPLED, ids=lambda row: row.name)
-def test_packing_agrees_with_the_positions_of_the_signals(message: Message) -> None:
+def test_packing_agrees_with_the_positions_of_the_signals(message: CanMessage) -> None:
     samples = message.samples
     assert samples is not None
     random = np.random.default_rng(message.identifier)
@@ -176,18 +176,20 @@ def test_crc8_is_that_of_sae_j1850() -> None:
     assert crc8(b"123456789") == 0x4B
 
 
-HAMMER = command_frame(Kind.HAMMER, 8, force_n=123.4, duration_ms=5.25, direction=90.0)
+HAMMER = command_frame(CommandKind.HAMMER, 8, force_n=123.4, duration_ms=5.25, direction=90.0)
 
 
 def test_commands_come_back_as_they_were() -> None:
     assert parse_command(*HAMMER, 7) == Command(
-        Kind.HAMMER, 8, {"force_n": 123.4, "duration_ms": 5.25, "direction": 90.0}
+        CommandKind.HAMMER, 8, {"force_n": 123.4, "duration_ms": 5.25, "direction": 90.0}
     )
-    assert parse_command(*command_frame(Kind.SPEED, 1, speed_hz=6.2), 0) == Command(Kind.SPEED, 1, {"speed_hz": 6.2})
-    assert parse_command(*command_frame(Kind.RELEASE, 0), 255) == Command(Kind.RELEASE, 0, {})
-    identifier, data = command_frame(Kind.STOP, 1)
+    assert parse_command(*command_frame(CommandKind.SPEED, 1, speed_hz=6.2), 0) == Command(
+        CommandKind.SPEED, 1, {"speed_hz": 6.2}
+    )
+    assert parse_command(*command_frame(CommandKind.RELEASE, 0), 255) == Command(CommandKind.RELEASE, 0, {})
+    identifier, data = command_frame(CommandKind.STOP, 1)
     assert identifier == 0x010
-    assert parse_command(identifier, data, 0) == Command(Kind.STOP, 1, {})
+    assert parse_command(identifier, data, 0) == Command(CommandKind.STOP, 1, {})
 
 
 def _signed(identifier: int, data: bytes) -> tuple[int, bytes]:
@@ -207,32 +209,44 @@ def test_each_way_of_being_wrong_has_its_result() -> None:
     assert parse_command(*_signed(0x010, data), 7) is Result.BAD_KIND
     assert parse_command(*change(6, KEY ^ 1), 7) is Result.BAD_KEY
     assert parse_command(*change(0, 0), 7) is Result.BAD_KIND
-    assert parse_command(*change(0, Kind.STOP), 7) is Result.BAD_KIND
+    assert parse_command(*change(0, CommandKind.STOP), 7) is Result.BAD_KIND
     assert parse_command(*change(5, 240), 7) is Result.RESERVED_BITS
-    for kind in (Kind.RELEASE, Kind.STOP):
+    for kind in (CommandKind.RELEASE, CommandKind.STOP):
         place, plain = command_frame(kind, 8)
         assert parse_command(*_signed(place, plain[:3] + b"\x01" + plain[4:]), 7) is Result.RESERVED_BITS
-    place, plain = command_frame(Kind.SPEED, 8, speed_hz=5.0)
+    place, plain = command_frame(CommandKind.SPEED, 8, speed_hz=5.0)
     assert parse_command(*_signed(place, plain[:5] + b"\x01" + plain[6:]), 7) is Result.RESERVED_BITS
 
 
 @pytest.mark.parametrize(
     ("kind", "values", "line"),
     [
-        (Kind.SPEED, {}, "speed_hz must be given for SPEED, from 0 to 16777.2 Hz; instead received nothing"),
-        (Kind.SPEED, {"speed_hz": 5.0, "force_n": 10.0}, "force_n must be left out: SPEED has no such value; instead"),
-        (Kind.HAMMER, {"force_n": 1e6, "duration_ms": 5.0}, "force_n must be given for HAMMER, from 0 to 6553.5 N; "),
-        (Kind.HAMMER, {"force_n": 1.0, "duration_ms": 5.0, "direction": np.nan}, "direction must be given for HAMMER"),
+        (CommandKind.SPEED, {}, "speed_hz must be a value for SPEED from 0 to 16777.2 Hz; instead received nothing"),
+        (
+            CommandKind.SPEED,
+            {"speed_hz": 5.0, "force_n": 10.0},
+            "force_n must be left out: SPEED has no such value; instead",
+        ),
+        (
+            CommandKind.HAMMER,
+            {"force_n": 1e6, "duration_ms": 5.0},
+            "force_n must be a value for HAMMER from 0 to 6553.5 N; ",
+        ),
+        (
+            CommandKind.HAMMER,
+            {"force_n": 1.0, "duration_ms": 5.0, "direction": np.nan},
+            "direction must be a value for",
+        ),
     ],
 )
-def test_a_frame_has_the_values_of_its_kind(kind: Kind, values: dict[str, float], line: str) -> None:
+def test_a_frame_has_the_values_of_its_kind(kind: CommandKind, values: dict[str, float], line: str) -> None:
     with pytest.raises(InputError, match=re.escape(line)):
         command_frame(kind, 1, **values)
 
 
 def test_only_a_counter_that_goes_on_is_taken() -> None:
     taken = [last for last in range(256) if isinstance(parse_command(*HAMMER, last), Command)]
-    assert sorted((8 - last) % 256 for last in taken) == list(range(1, AHEAD + 1))
+    assert sorted((8 - last) % 256 for last in taken) == list(range(1, MAX_LEAD + 1))
     assert parse_command(*HAMMER, 8) is Result.STALE_COUNTER
 
 
@@ -246,14 +260,14 @@ def test_every_error_of_one_or_two_bits_is_found() -> None:
 
 
 def test_kinds_differ_in_four_bits() -> None:
-    kinds = list(Kind)
+    kinds = list(CommandKind)
     assert min((one ^ other).bit_count() for one in kinds for other in kinds if one != other) >= 4
 
 
 def test_the_odds_of_noise_are_as_stated() -> None:
-    hammer = 1 / 256 * AHEAD / 256 / 256 / 256 * (9991 / 65536) * (199 / 256) * (240 / 256)
+    hammer = 1 / 256 * MAX_LEAD / 256 / 256 / 256 * (9991 / 65536) * (199 / 256) * (240 / 256)
     # No limit on the speed; 8 reserved bits.
-    other = 1 / 256 * AHEAD / 256 / 256 / 256 * (1 / 256 + 1 / 2**32)
+    other = 1 / 256 * MAX_LEAD / 256 / 256 / 256 * (1 / 256 + 1 / 2**32)
     assert 1 / (hammer + other) == pytest.approx(ODDS, rel=0.1)
     assert 100_000 / ODDS < 1e-4
 
@@ -271,9 +285,9 @@ def test_what_a_device_says_is_read_as_it_was_said_and_nothing_else_is() -> None
     message = TABLE.by_name["Device"]
     said = {kind: parse_command(*device_frame(message, kind, 7, block=300, patience_s=2.5), 0) for kind in DeviceKind}
     assert said == {
-        DeviceKind.JOIN: Said(DeviceKind.JOIN, 7, {"device": "CAN 7", "patience_s": 2.5}),
-        DeviceKind.DONE: Said(DeviceKind.DONE, 7, {"device": "CAN 7", "block": 300}),
-        DeviceKind.LEAVE: Said(DeviceKind.LEAVE, 7, {"device": "CAN 7"}),
+        DeviceKind.JOIN: DeviceRequest(DeviceKind.JOIN, 7, {"device": "CAN 7", "patience_s": 2.5}),
+        DeviceKind.DONE: DeviceRequest(DeviceKind.DONE, 7, {"device": "CAN 7", "block": 300}),
+        DeviceKind.LEAVE: DeviceRequest(DeviceKind.LEAVE, 7, {"device": "CAN 7"}),
     }
     assert all((one ^ other).bit_count() >= 4 for one in DeviceKind for other in DeviceKind if one != other)
     identifier, data = device_frame(message, DeviceKind.LEAVE, 7)
@@ -282,5 +296,5 @@ def test_what_a_device_says_is_read_as_it_was_said_and_nothing_else_is() -> None
         assert parse_command(identifier, changed + bytes([checksum(identifier, changed)]), 0) is result
     assert parse_command(identifier, data[:7] + bytes([data[7] ^ 1]), 0) is Result.BAD_CHECKSUM
     assert parse_command(identifier, data[:7], 0) is Result.BAD_LENGTH
-    with pytest.raises(InputError, match="device must be of a node from 0 to 255"):
+    with pytest.raises(InputError, match="device must be one with a node from 0 to 255"):
         device_frame(message, DeviceKind.JOIN, 256)

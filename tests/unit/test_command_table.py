@@ -14,7 +14,7 @@ from pydantic import Field, FiniteFloat
 
 from drivers.can.devices import DeviceKind
 from drivers.can.faults import FaultKind
-from drivers.can.signals import EventKind, Kind, command_frame, default_messages, parse_command
+from drivers.can.signals import CommandKind, EventKind, command_frame, default_messages, parse_command
 from drivers.can.signals import Field as CanFieldNumber
 from drivers.console import Console
 from drivers.instruments.twins import TWINS
@@ -59,7 +59,7 @@ def missing_in(name: str, entry: type[SceneCommand]) -> Iterator[str]:
             key: other.CAN.kind for key, other in COMMANDS.items()
             if key != name and getattr(other, "CAN", entry.CAN).message == entry.CAN.message and hasattr(other, "CAN")
         }  # fmt: skip
-        kinds["stop"] = int(Kind.STOP)
+        kinds["stop"] = int(CommandKind.STOP)
         near = sorted(key for key, kind in kinds.items() if (kind ^ entry.CAN.kind).bit_count() < 4)
         if near:
             good = (k for k in range(1, 256) if all((k ^ other).bit_count() >= 4 for other in kinds.values()))
@@ -135,7 +135,7 @@ class TiltCommand(SceneCommand):
 FORCE = Quantity("N", "Force, in N.", CanField("tilt", 15, 16, 0.1, "Force"))
 FIELD = Annotated[FiniteFloat, Field(ge=0.0, le=10.0), FORCE]
 EVENT = max(EventKind) + 1
-KIND = next(kind for kind in range(256) if all((kind ^ other).bit_count() >= 4 for other in Kind))
+KIND = next(kind for kind in range(256) if all((kind ^ other).bit_count() >= 4 for other in CommandKind))
 WHOLE: dict[str, Any] = {
     "__doc__": "Tilt the foundation.", "CAN": CanFrame(KIND, event=EVENT),
     "take_effect": lambda self, run: [{}],
@@ -164,7 +164,7 @@ def sized(**quantity: Any) -> Any:
         (half(CAN=CanFrame(KIND, event=3)), "CAN event 3 of tilt is taken by hammer; "),
         (half(CAN=CanFrame(KIND, event=10)), "CAN event 10 of tilt is taken by device; "),
         (
-            half(CAN=CanFrame(Kind.HAMMER ^ 1, event=EVENT)),
+            half(CAN=CanFrame(CommandKind.HAMMER ^ 1, event=EVENT)),
             "of tilt differs from that of hammer in fewer than four bits; 0x",
         ),
         (half(CAN=CanFrame(KIND, event=EVENT, shown="tilt, deg")), "SHOWN_FIELD is missing"),
@@ -213,7 +213,7 @@ def test_every_list_of_commands_follows() -> None:
     assert names <= set(service.COMMANDS)
     assert names <= set(EVENT_KINDS) <= set(get_args(EventName))
     assert set(get_args(EventName)) == {*EVENT_KINDS, *service.REPLAY_COMMANDS}
-    assert names | {"stop"} == {kind.name.lower() for kind in (*Kind, *FaultKind)}
+    assert names | {"stop"} == {kind.name.lower() for kind in (*CommandKind, *FaultKind)}
     assert {kind.name.lower() for kind in EventKind} - {"other"} == set(EVENT_KINDS) - {"note"}
     assert set(TRIGGERS) == set(EVENT_NAMES) - {"note", "warning"}
     (trigger,) = (each for each in app.rig().get_command(None, "record").params if each.name == "trigger")
@@ -249,22 +249,22 @@ def test_a_command_is_the_same_behind_its_can_frame(name: str) -> None:
     quantities = COMMANDS[name].quantities()
     values = {field: max(1.0, each.low) for field, each in quantities.items() if not each.takes_text}
     words = {field: "y" for field, each in quantities.items() if each.takes_text}
-    found = parse_command(*command_frame(Kind[name.upper()], 7, **values, **words), 6)
+    found = parse_command(*command_frame(CommandKind[name.upper()], 7, **values, **words), 6)
     degrees = {field: quantities[field].quantity.can.words["y"] for field in words}
-    assert found.kind is Kind[name.upper()]
+    assert found.kind is CommandKind[name.upper()]
     assert found.values == pytest.approx({**values, **degrees})
     for field in words:
         with pytest.raises(InputError, match=f"{field} must be x, y, -x, -y, or an angle; instead received 'z'"):
-            command_frame(Kind[name.upper()], 7, **values, **{field: "z"})
+            command_frame(CommandKind[name.upper()], 7, **values, **{field: "z"})
 
 
 def test_all_bits_of_a_can_frame_belong_to_one_signal_of_each_kind() -> None:
     message = default_messages().by_name["Command"]
-    for kind in {int(kind) for kind in Kind} - {int(Kind.STOP)}:
+    for kind in {int(kind) for kind in CommandKind} - {int(CommandKind.STOP)}:
         bits = [bit for signal in message.signals if not signal.selected_by or kind in signal.selected_by
                 for bit in range(signal.start, signal.start + signal.bits)]  # fmt: skip
         assert sorted(bits) == list(range(64))
-    for kinds in (Kind, FaultKind, DeviceKind):
+    for kinds in (CommandKind, FaultKind, DeviceKind):
         assert min((one ^ other).bit_count() for one, other in combinations(kinds, 2)) >= 4
 
 

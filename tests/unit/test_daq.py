@@ -27,9 +27,9 @@ from drivers.instruments.force.driver import AsyncForce
 from drivers.instruments.twins import Twins
 from drivers.link import LinkTimeoutError
 from drivers.sources import stream
-from drivers.sources.can import CanSource, Layout
+from drivers.sources.can import CanSource, SampleDecoder
 from drivers.sources.rig import RigSource
-from drivers.sources.samples import Pile, Samples, StreamEndedError, follow
+from drivers.sources.samples import RowBuffer, Samples, StreamEndedError, follow
 from rig.base import wire
 from rig.base.errors import InputError
 from rig.base.wire import Continuity
@@ -66,7 +66,7 @@ def test_rows_that_are_missing_late_or_twice_are_counted() -> None:
 
 
 def test_a_pile_gives_what_was_asked_for_and_never_over_a_gap() -> None:
-    pile = Pile()
+    pile = RowBuffer()
     for samples in (part(0, 10), part(10, 10)):
         pile.add(samples)
     assert pile.take(25, ended=False) is None
@@ -85,7 +85,7 @@ def test_a_pile_gives_what_was_asked_for_and_never_over_a_gap() -> None:
 
 
 def test_a_pile_that_nobody_takes_from_stays_small_and_tells_what_went() -> None:
-    pile = Pile(50)
+    pile = RowBuffer(50)
     for n in range(100):
         pile.add(part(10 * n, 10))
     assert (pile.rows, pile.dropped) == (50, 950)
@@ -191,7 +191,7 @@ def test_chosen_channels_come_aligned_in_engineering_units() -> None:
             samples["disk_z"]
         shown = f"Samples(P_W [N], disk_x [mm], hammer [N]; {len(samples)} rows at 20000 Hz, 0 to"
         assert repr(samples).startswith(shown)
-        assert repr(replace(samples, gap=7)).endswith(" s; 7 missing before them)")
+        assert repr(replace(samples, gap=7)).endswith(" s; 7 missing before)")
         # Nothing of this was lost or made up on the way.
         assert (daq.lost, daq.dropped, daq.unmatched) == (dict.fromkeys(GROUPS, 0), 0, 0)
 
@@ -398,7 +398,7 @@ def test_frames_give_back_the_counts_of_the_recording(layout: str, step: int) ->
         frames = [bytes(data) for data in form.pack(numbers, counts, message.length)]
         lost, short = 7, 3
         sent = [data if n != short else data[:-1] for n, data in enumerate(frames) if n != lost]
-        decoder = Layout({message.name: message})
+        decoder = SampleDecoder({message.name: message})
         found = decoder.decode(message.name, sent[:20], 20_000, step, index + 3000)
         found += decoder.decode(message.name, sent[20:], 20_000, step, index + 3000)
         rows = Continuity()
@@ -461,7 +461,7 @@ def test_a_bus_without_a_rig_is_one_line() -> None:
 
 def test_a_bus_that_falls_silent_ends_the_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     with on_can(Schedule(classic_hz=1000), channels=["P_N"]) as (_, daq, gateway):
-        monkeypatch.setattr("drivers.sources.can._PATIENCE_S", 0.3)
+        monkeypatch.setattr("drivers.sources.can._SILENCE_TIMEOUT_S", 0.3)
         gateway.close()
         assert sum(map(len, daq.blocks(timeout_s=5.0))) == 200
         with pytest.raises(StreamEndedError, match="the rig has gone"):

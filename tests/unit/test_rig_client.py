@@ -10,7 +10,7 @@ import pytest
 
 from drivers.client import NotSeenError, Rig
 from drivers.link import LinkTimeoutError
-from drivers.sources.samples import ALL, RowReader, Samples
+from drivers.sources.samples import ALL_AVAILABLE, RowReader, Samples
 from rig.base.wire import STATUS, encode_block, encode_document, truth_key
 
 from .recorder_stream import ScriptedClient, block_of
@@ -116,7 +116,7 @@ def test_what_has_come_is_read_in_pieces_without_a_gap() -> None:
     assert [(each.index, len(each), each.gap) for each in reader.ready()] == [(0, 20, 0), (30, 15, 10)]
     assert not list(reader.ready())
     with pytest.raises(LinkTimeoutError, match="a reader: 0 of any rows came in 0 s"):
-        reader.read(ALL, timeout_s=0.0, whole=False)
+        reader.read(ALL_AVAILABLE, timeout_s=0.0, whole=False)
 
 
 def test_a_read_waits_for_rows_of_another_thread() -> None:

@@ -1,1 +1,1 @@
-"""The bus itself: its frames, the model of who sends when, the hub that lets it run, doors for other programs."""
+"""The bus itself: its frames, the model of arbitration and timing, the hub that runs it, and text protocols."""

@@ -1,9 +1,10 @@
-"""Sans-IO codec of the virtual CAN bus: frames to packed records and back, and the keys they travel under.
+"""Codec of the virtual CAN bus: frames to packed records and back, and zenoh keys; does no input or output itself.
 
-A message is a header and records of one width. Endpoints offer messages of frames to the hub of their channel; the
-hub sends all endpoints messages of frames, in the order of the bus and with its time stamps, and of node reports. The
-identifier word carries its flags as a SocketCAN frame does. Requests to the hub are JSON objects, of the models here.
-Whoever joins gets a secret; with it in front of its offers and in its requests it shows that the name is its own.
+A message is a header and records of one width. Endpoints offer messages of frames to the hub of their channel. The hub
+sends messages to all endpoints: frames in the order of the bus with its time stamps, and reports on nodes. The
+identifier word carries its flags as in a SocketCAN frame. Requests to the hub are JSON objects, of the models here.
+An endpoint receives a secret when it joins; the secret precedes its offers and is part of its requests, and proves that
+the name is its own.
 """
 
 from __future__ import annotations
@@ -26,8 +27,8 @@ from drivers.can.bus.frame import (
     RECORDS,
     REMOTE,
     Record,
-    fault_of,
-    packed,
+    find_fault,
+    pack_records,
 )
 from rig.base.checks import Count, Outside
 
@@ -35,7 +36,7 @@ if TYPE_CHECKING:
     import can
 
 DEFAULT_ENDPOINT = "127.0.0.1:7461"
-"""Where a hub listens, and endpoints look for one, unless told otherwise."""
+"""Default address of a hub."""
 
 ROOT = "rig/can"
 ALIVE = f"{ROOT}/*/alive"
@@ -54,10 +55,10 @@ TRANSMIT_PASSIVE = 0x20
 ACTIVE_AGAIN = 0x40
 
 NO_NODE = 0xFFFF
-"""Where a frame has no sender: an offer, or an error frame of the whole bus."""
+"""Node number of a frame without a sender: an offer, or an error frame of the whole bus."""
 
 MAX_RECORDS = 512
-"""Records a message may have: at most 41 kB, which one send takes and no receiver has to allocate much for."""
+"""Largest number of records per message: at most 41 kB, for which no receiver has to allocate much."""
 
 FRAMES = 0
 REPORTS = 1
@@ -68,41 +69,41 @@ _HEADER = struct.Struct("<4sBBH")
 _REPORT = struct.Struct("<HBBHHQQ")
 
 SECRET_BYTES = 16
-"""Length of what an endpoint gets when it joins."""
+"""Length of the secret that an endpoint receives when it joins."""
 Endpoint = Annotated[str, Field(pattern=rf"\A{_NAME.pattern}\z")]
 Secret = Annotated[str, Field(pattern=rf"\A[0-9a-f]{{{2 * SECRET_BYTES}}}\z")]
 
 
-class Joining(Outside):
-    """A request to join; with its secret an endpoint joins again under its name."""
+class JoinRequest(Outside):
+    """Request to join; with its secret an endpoint joins again under its name."""
 
     endpoint: Endpoint
     listen_only: bool = False
     secret: Secret | None = None
 
 
-class Flushing(Outside):
-    """A request to withdraw what waits to be sent."""
+class FlushRequest(Outside):
+    """Request to withdraw frames that wait to be sent."""
 
     endpoint: Endpoint
     secret: Secret
 
 
-class Setting(Flushing):
-    """A request to take part, or only to listen."""
+class SetRequest(FlushRequest):
+    """Request to take part, or only to listen."""
 
     listen_only: bool
 
 
-class Asking(Outside):
-    """A request for the status."""
+class StatusRequest(Outside):
+    """Request for the status."""
 
 
-REQUESTS: dict[str, type[Outside]] = {"join": Joining, "set": Setting, "flush": Flushing, "status": Asking}
+REQUESTS = {"join": JoinRequest, "set": SetRequest, "flush": FlushRequest, "status": StatusRequest}
 
 
-class Joined(Outside):
-    """The answer to one who joins."""
+class JoinReply(Outside):
+    """Reply to a request to join."""
 
     node: Annotated[int, Field(ge=1, lt=NO_NODE)]
     secret: Secret
@@ -114,18 +115,18 @@ class Joined(Outside):
 
 
 class CodecError(ValueError):
-    """A payload is not a message of this bus, or a frame none that a controller can send."""
+    """A payload is not a message of this bus, or no controller can send a frame."""
 
 
 class Report(NamedTuple):
-    """What the hub says of one node.
+    """State of one node.
 
     Args:
-        node: Its number.
+        node: Number of the node.
         state: 0 error active, 1 error passive, 2 bus off.
         transmit_errors: Transmit error counter.
         receive_errors: Receive error counter.
-        done: Frames offered by it that wait no longer: sent, dropped or withdrawn.
+        done: Frames offered by it that no longer wait: sent, dropped or withdrawn.
         dropped: Frames offered by it that were not sent.
     """
 
@@ -137,80 +138,80 @@ class Report(NamedTuple):
     dropped: int
 
 
-Said = np.ndarray | list[Report]
-"""What the hub says: frames, as an array of one of the `RECORDS` layouts, or how nodes are."""
+HubMessage = np.ndarray | list[Report]
+"""Content of a hub's message: frames, as an array of one of the `RECORDS` layouts, or states of nodes."""
 
 
 def offer_key(channel: str, endpoint: str) -> str:
-    """Key on which one endpoint offers frames; `*` for all endpoints."""
+    """Return the key on which one endpoint offers frames; `*` for all endpoints."""
     return f"{ROOT}/{channel}/offer/{endpoint}"
 
 
 def bus_key(channel: str) -> str:
-    """Key on which the hub sends what happens on the bus."""
+    """Return the key of the hub's messages."""
     return f"{ROOT}/{channel}/bus"
 
 
 def alive_key(channel: str) -> str:
-    """Key of the hub's token."""
+    """Return the key of the hub's token."""
     return f"{ROOT}/{channel}/alive"
 
 
 def node_key(channel: str, endpoint: str) -> str:
-    """Key of an endpoint's token; `*` for all endpoints."""
+    """Return the key of an endpoint's token; `*` for all endpoints."""
     return f"{ROOT}/{channel}/node/{endpoint}"
 
 
 def request_key(channel: str, name: str) -> str:
-    """Key on which the hub answers requests: `join`, `set`, `flush`, `status`."""
+    """Return the key of the hub's requests: `join`, `set`, `flush`, `status`."""
     return f"{ROOT}/{channel}/{name}"
 
 
 def is_name(text: str) -> bool:
-    """Whether a channel or endpoint can be called so: letters, digits, `-` and `_`, at most 64."""
+    """Return whether a text is a valid name of a channel or endpoint: letters, digits, `-` and `_`, at most 64."""
     return bool(_NAME.fullmatch(text))
 
 
 def error_record(time_ns: int, kind: int, *, data: bytes = bytes(8), node: int = NO_NODE) -> Record:
-    """An error frame as SocketCAN reports it.
+    """Return an error frame as in SocketCAN.
 
     Args:
-        time_ns: When, since the Unix epoch [ns].
-        kind: Its class, such as NO_ACKNOWLEDGE; several may be joined.
-        data: What the class says in detail, 8 bytes.
+        time_ns: Time since the Unix epoch [ns].
+        kind: Error class, such as NO_ACKNOWLEDGE, or several combined.
+        data: Details of the class, 8 bytes.
         node: Number of the node that failed to send.
     """
     return Record(time_ns, ERROR | kind, 8, 0, node, data)
 
 
-def overflow(time_ns: int) -> Record:
-    """The error frame of a receiver that lost frames."""
+def make_overflow(time_ns: int) -> Record:
+    """Return the error frame of a receiver that lost frames."""
     return error_record(time_ns, CONTROLLER, data=bytes((0, RECEIVE_OVERFLOW, 0, 0, 0, 0, 0, 0)))
 
 
 def encode(records: np.ndarray) -> bytes:
-    """One message of at most MAX_RECORDS frames that are an array of one of the `RECORDS` layouts."""
+    """Encode at most MAX_RECORDS frames, an array of one of the `RECORDS` layouts, as one message."""
     width = records.dtype["data"].itemsize
     return _HEADER.pack(_MAGIC, FRAMES, width, len(records)) + records.tobytes()
 
 
 def encode_reports(reports: Iterable[Report]) -> bytes:
-    """One message of node reports."""
+    """Encode node reports as one message."""
     rows = [_REPORT.pack(row.node, row.state, 0, *row[2:]) for row in reports]
     return _HEADER.pack(_MAGIC, REPORTS, _REPORT.size, len(rows)) + b"".join(rows)
 
 
-def decode(payload: bytes) -> Said:
-    """What is in a message: frames as a read-only array of one of the `RECORDS` layouts, shape (frames,), or reports.
+def decode(payload: bytes) -> HubMessage:
+    """Decode a message: frames as a read-only array of one of the `RECORDS` layouts, shape (frames,), or reports.
 
     Raises:
-        CodecError: It is no message of this bus.
+        CodecError: The payload is not a message of this bus.
     """
     if len(payload) < _HEADER.size:
-        raise CodecError(f"{len(payload)} bytes, fewer than a header has")
+        raise CodecError(f"a message must have a header; instead received {len(payload)} bytes")
     magic, kind, width, count = _HEADER.unpack_from(payload)
     if magic != _MAGIC or kind not in (FRAMES, REPORTS):
-        raise CodecError("no header of this bus")
+        raise CodecError("the header must be one of this bus")
     size = _REPORT.size if kind == REPORTS else RECORDS[width].itemsize if width in RECORDS else 0
     if not size or (kind == REPORTS and width != size):
         raise CodecError(f"records of unknown width {width}")
@@ -222,8 +223,8 @@ def decode(payload: bytes) -> Said:
     return [Report(node, state, *counts) for node, state, _, *counts in rows]
 
 
-def record_of(message: can.Message) -> Record:
-    """A python-can message as an offered frame.
+def make_record(message: can.Message) -> Record:
+    """Convert a python-can message to an offered frame.
 
     Raises:
         CodecError: Its identifier has more than 29 bits.
@@ -244,40 +245,40 @@ def record_of(message: can.Message) -> Record:
     return Record(0, word, message.dlc if message.is_remote_frame else len(data), flags, NO_NODE, data)
 
 
-def offered(message: can.Message, *, fd: bool = True) -> Record:
-    """`record_of`, if a controller can send it.
+def make_offer(message: can.Message, *, fd: bool = True) -> Record:
+    """Convert a python-can message that a controller can send to an offered frame.
 
     Args:
-        message: The frame.
-        fd: Whether the bus takes CAN FD frames.
+        message: The message.
+        fd: Whether the bus supports CAN FD frames.
 
     Raises:
-        CodecError: None can; it says why.
+        CodecError: No controller can send it, for the reason in the message.
     """
-    record = record_of(message)
-    if (fault := fault_of(record, fd=fd)) is not None:
+    record = make_record(message)
+    if (fault := find_fault(record, fd=fd)) is not None:
         raise CodecError(fault)
     return record
 
 
-def records_of(messages: Iterable[can.Message]) -> np.ndarray:
-    """Python-can messages as an array of offered frames, shape (messages,)."""
-    return packed(map(record_of, messages))
+def make_records(messages: Iterable[can.Message]) -> np.ndarray:
+    """Convert python-can messages to an array of offered frames, shape (messages,)."""
+    return pack_records(map(make_record, messages))
 
 
-def messages_of(records: np.ndarray, *, channel: Any = None, node: int = NO_NODE) -> list[can.Message]:
-    """Frames from the bus as python-can messages.
+def make_messages(records: np.ndarray, *, channel: Any = None, node: int = NO_NODE) -> list[can.Message]:
+    """Convert frames from the bus to python-can messages.
 
     Args:
         records: Array of one of the `RECORDS` layouts.
-        channel: What the messages name as their channel.
-        node: The receiver's own number: frames from it are no received ones.
+        channel: Channel to name in the messages.
+        node: The receiver's own number: frames from it are not marked as received.
     """
-    return [message_of(Record(*fields), channel=channel, node=node) for fields in records.tolist()]
+    return [make_message(Record(*fields), channel=channel, node=node) for fields in records.tolist()]
 
 
-def message_of(record: Record, *, channel: Any = None, node: int = NO_NODE) -> can.Message:
-    """One frame from the bus as a python-can message; arguments as of `messages_of`."""
+def make_message(record: Record, *, channel: Any = None, node: int = NO_NODE) -> can.Message:
+    """Convert one frame from the bus to a python-can message; arguments as for `make_messages`."""
     import can
 
     time_ns, word, length, flags, sender, data = record

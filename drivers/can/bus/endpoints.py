@@ -1,8 +1,10 @@
-"""Who takes part in a virtual bus: the endpoints by name, what is theirs, and which controller of the model each has.
+"""Endpoints of a virtual bus: their names, their counts, and the controller of the model that each one has.
 
-A name belongs to whoever has joined under it for as long as it is there: only with the secret of that join does anybody
-offer, set, flush or join again. What goes over the network does so in clear, so this keeps apart those who cannot
-read each other's messages, which access control sees to.
+A name belongs to the endpoint that has joined under it, as long as that is present: only the secret of that join
+permits
+to offer, set, flush or join again. Messages are sent unencrypted, so this separates only endpoints that cannot read
+each
+other's messages, which is the task of access control.
 """
 
 from __future__ import annotations
@@ -16,44 +18,44 @@ from dataclasses import dataclass
 import numpy as np
 
 from drivers.can.bus import codec
-from drivers.can.bus.frame import resized, sendable
+from drivers.can.bus.frame import resize_records, sendable
 from drivers.can.bus.model import BusModel
 from drivers.can.bus.results import STATES
 from rig.base.errors import InputError, Words
 
 WINDOW = 512
-"""Frames that one endpoint may have waiting; what it offers beyond is dropped and counted."""
+"""Transmit queue of one endpoint [frames]; frames beyond it are dropped and counted."""
 MAX_ENDPOINTS = 64
-"""Of other processes; those of this one always get in."""
+"""Largest number of endpoints of other processes; those of this process are always admitted."""
 MAX_TOKENLESS = 16
-"""Those of them that have shown no token; the oldest makes room for the next."""
+"""Largest number of endpoints of other processes without a token; the oldest is removed for the next."""
 MAX_TOKENS = 16 * MAX_ENDPOINTS
-"""Tokens that are remembered, the newest."""
+"""Number of tokens that are remembered, the newest."""
 
-_PARTING_S = 1.0
-"""How long frames of an endpoint that has gone may wait for the bus."""
-_TOKENLESS_S = 10.0
-"""How long an endpoint may be without a token; it comes before the request to join, but on another way."""
+_DEPARTED_TIMEOUT_S = 1.0
+"""Longest time for which frames of a departed endpoint wait for the bus [s]."""
+_TOKEN_TIMEOUT_S = 10.0
+"""Longest time without a token [s]; the token is sent before the request to join, but by another path."""
 
 
 @dataclass(slots=True)
 class Endpoint:
-    """One that has joined.
+    """An endpoint that has joined.
 
     Attributes:
-        name: What it calls itself.
-        number: What it is called on the bus; given to another only after all other numbers.
+        name: Its name.
+        number: Its number on the bus, reused only after all other numbers.
         node: Its number in the model.
-        joined_s: When it joined [s, monotonic].
-        listen_only: Whether it takes no part.
+        joined_s: Time at which it joined [s, monotonic].
+        listen_only: Whether it only listens.
         token: Whether its token has been seen, or it needs none.
-        secret: What shows that its name is its own.
-        offered: Frames that it has offered.
-        done: Those of them that wait no longer.
-        dropped: Those of these that were not sent.
-        left_s: When it was found to have gone [s, monotonic].
-        reported: What was last reported of it.
-        bus_offs: How often it had been bus-off when last reported.
+        secret: Secret that proves that its name is its own.
+        offered: Number of frames that it has offered.
+        done: Number of these that no longer wait.
+        dropped: Number of these that were not sent.
+        left_s: Time at which it was found to have left [s, monotonic].
+        reported: Its last report.
+        bus_offs: Number of its bus-off states at the last report.
     """
 
     name: str
@@ -73,20 +75,20 @@ class Endpoint:
 
 @dataclass(frozen=True, slots=True)
 class Local:
-    """An endpoint of this process: what takes messages of the bus, and what is called when the hub ends."""
+    """An endpoint of this process: callbacks for messages of the bus and for the end of the hub."""
 
-    take: Callable[[codec.Said], None]
+    take: Callable[[codec.HubMessage], None]
     lost: Callable[[], None]
     secret: str
 
 
 class Endpoints:
-    """The endpoints of a bus; whoever uses it holds the hub's lock.
+    """Registry of a bus's endpoints; the caller holds the hub's lock.
 
     Args:
         model: The bus.
-        counts: Where what is refused is counted.
-        advance: Lets the model run until now.
+        counts: Counts of refusals.
+        advance: Runs the model until now.
     """
 
     def __init__(self, model: BusModel, counts: Counter[str], advance: Callable[[], object]) -> None:
@@ -99,46 +101,46 @@ class Endpoints:
         """Number on the bus by number in the model."""
         self.locals: dict[str, Local] = {}
         self.tokens: dict[str, None] = {}
-        """The newest last."""
+        """Tokens, the newest last."""
         self.waiting = 0
-        """Frames that the model is not done with."""
+        """Number of frames that the model has not finished."""
         self._next_number = 1
 
     def __iter__(self) -> Iterator[Endpoint]:
         return iter(list(self._by_name.values()))
 
     def __len__(self) -> int:
-        """Return how many endpoints have joined and are not forgotten."""
+        """Return the number of endpoints that have joined and are not removed."""
         return len(self._by_name)
 
-    # Who is there.
+    # ---- joining and leaving ----
 
-    def connect(self, name: str, take: Callable[[codec.Said], None], lost: Callable[[], None]) -> str:
-        """Make an endpoint of this process known, before it joins; returns its secret."""
+    def connect(self, name: str, take: Callable[[codec.HubMessage], None], lost: Callable[[], None]) -> str:
+        """Register an endpoint of this process before it joins, and return its secret."""
         secret = _new_secret()
         self.locals[name] = Local(take, lost, secret)
         return secret
 
     def disconnect(self, name: str) -> None:
-        """Forget an endpoint of this process; what it has offered is still sent."""
+        """Remove an endpoint of this process; the frames that it has offered are still sent."""
         self.locals.pop(name, None)
         self._leave(name)
 
-    def join(self, request: codec.Joining) -> Endpoint:
-        """Take in an endpoint, anew where it has been here before.
+    def join(self, request: codec.JoinRequest) -> Endpoint:
+        """Register an endpoint; one that joins again gets a new number and controller.
 
         Raises:
-            InputError: The name is another's, or there is no room.
+            InputError: The name belongs to another endpoint, or all places are taken.
         """
         name = request.endpoint
-        local, known = self.locals.get(name), self._by_name.get(name)
+        local, previous = self.locals.get(name), self._by_name.get(name)
         if local is not None:
             self._check_owner(name, local.secret, request.secret)
-        elif known is not None and known.left_s is None:
-            self._check_owner(name, known.secret, request.secret)
-        if known is not None:
-            self._remove(known)
-        token = local is not None or name in self.tokens or (known is not None and known.token)
+        elif previous is not None and previous.left_s is None:
+            self._check_owner(name, previous.secret, request.secret)
+        if previous is not None:
+            self._remove(previous)
+        token = local is not None or name in self.tokens or (previous is not None and previous.token)
         if local is None:
             self._make_room(token=token)
         secret = _new_secret() if local is None else local.secret
@@ -147,49 +149,49 @@ class Endpoints:
         self._attach(endpoint)
         return endpoint
 
-    def restart(self, request: codec.Flushing) -> None:
-        """Restart an endpoint's controller, with what it asks for; what waits there is lost.
+    def restart(self, request: codec.FlushRequest) -> None:
+        """Restart an endpoint's controller with the requested settings; waiting frames are lost.
 
         Raises:
-            InputError: Whoever asks is none, or another.
+            InputError: The endpoint has not joined, or the secret is wrong.
         """
         endpoint = self._by_name.get(request.endpoint)
         if endpoint is None:
             raise InputError("endpoint", "one that has joined", request.endpoint)
         self._check_owner(endpoint.name, endpoint.secret, request.secret)
-        if isinstance(request, codec.Setting):
+        if isinstance(request, codec.SetRequest):
             endpoint.listen_only = request.listen_only
         self._detach(endpoint)
         self._attach(endpoint)
 
     def _new_number(self) -> int:
         number = self._next_number
-        # Numbers are used again only after all others: a late frame must not be taken for one's own.
+        # A number is reused only after all others, so that a late frame is not mistaken for one's own.
         while True:
             self._next_number = self._next_number % (codec.NO_NODE - 1) + 1
             if all(self._next_number != endpoint.number for endpoint in self):
                 return number
 
     def _make_room(self, *, token: bool) -> None:
-        """Room for one more endpoint of another process, where need be that of one that has shown no token."""
+        """Make room for an endpoint of another process; if necessary, remove the oldest one without a token."""
         others = [endpoint for endpoint in self if endpoint.name not in self.locals]
         tokenless = [endpoint for endpoint in others if not endpoint.token]
         if len(others) < MAX_ENDPOINTS and (token or len(tokenless) < MAX_TOKENLESS):
             return
         if not tokenless:
-            raise InputError(
-                "endpoint", f"one of at most {MAX_ENDPOINTS}", Words(f"{len(others)} that are there already")
-            )
+            raise InputError("endpoint", f"one of at most {MAX_ENDPOINTS}", Words(f"one more than {len(others)}"))
         self._counts["evicted"] += 1
         self._remove(tokenless[0])
 
-    def _check_owner(self, name: str, secret: str, given: str | None) -> None:
-        if not secrets.compare_digest(secret, given or ""):
+    def _check_owner(self, name: str, secret: str, received: str | None) -> None:
+        if not secrets.compare_digest(secret, received or ""):
             self._counts["forged"] += 1
-            raise InputError("endpoint", "one's own (another has joined under that name, and is there)", name)
+            raise InputError(
+                "endpoint", "unused, or accompanied by its secret (an endpoint of that name has joined)", name
+            )
 
     def watch(self, name: str, there: bool) -> None:
-        """A token has come or gone."""
+        """Record that a token has appeared or disappeared."""
         self.tokens.pop(name, None)
         if there:
             self.tokens[name] = None
@@ -206,13 +208,13 @@ class Endpoints:
             endpoint.token = False
 
     def forget_gone(self) -> None:
-        """Remove those that have gone and for whose frames it is not worth waiting any more."""
+        """Remove endpoints that have left and whose frames are finished, or have waited too long."""
         now_s = time.monotonic()
         for endpoint in self:
-            if not endpoint.token and endpoint.left_s is None and now_s - endpoint.joined_s > _TOKENLESS_S:
+            if not endpoint.token and endpoint.left_s is None and now_s - endpoint.joined_s > _TOKEN_TIMEOUT_S:
                 endpoint.left_s = now_s
             if endpoint.left_s is not None and (
-                endpoint.done == endpoint.offered or now_s - endpoint.left_s > _PARTING_S
+                endpoint.done == endpoint.offered or now_s - endpoint.left_s > _DEPARTED_TIMEOUT_S
             ):
                 self._remove(endpoint)
 
@@ -226,8 +228,8 @@ class Endpoints:
         self.numbers[node] = endpoint.number
 
     def _detach(self, endpoint: Endpoint) -> None:
-        """Take its controller off the bus: what waits there is lost; a frame on the wire is still sent."""
-        # What was offered a moment ago waits there as well by then, and the controller's place is free for another.
+        """Take its controller off the bus: waiting frames are lost; a frame on the wire is still sent."""
+        # Run the model first, so that frames just offered are in the queue and the controller can be reused.
         self._advance()
         waiting = self._model.node(endpoint.node).queued
         self._model.detach(endpoint.node)
@@ -237,10 +239,10 @@ class Endpoints:
         self.waiting -= lost
         endpoint.bus_offs = 0
 
-    # What they offer, and what became of it.
+    # ---- offers and results ----
 
     def owner(self, name: str, secret: str) -> Endpoint | None:
-        """The endpoint of that name, where the secret shows that it is the one who speaks."""
+        """Return the endpoint of a name if the secret is right, otherwise None."""
         endpoint = self._by_name.get(name)
         if endpoint is None or endpoint.left_s is not None:
             self._counts["strange"] += 1
@@ -251,34 +253,34 @@ class Endpoints:
         return endpoint
 
     def offer(self, endpoint: Endpoint, records: np.ndarray, now_ns: int, due_ns: np.ndarray | None = None) -> bool:
-        """Hand frames to an endpoint's controller; returns whether some were dropped.
+        """Pass frames to an endpoint's controller; return whether some were dropped.
 
         Args:
-            endpoint: Whose.
+            endpoint: Sender of the frames.
             records: Array of one of the `RECORDS` layouts.
             now_ns: Time of the bus [ns].
-            due_ns: Time of the bus at which the controller gets each frame [ns], shape of `records`; None: now.
+            due_ns: Time of the bus at which the controller receives each frame [ns], shape of `records`; None for now.
         """
-        fit = sendable(records, fd=self._model.speed.fd)
-        good = records[fit]
+        is_sendable = sendable(records, fd=self._model.speed.fd)
+        good = records[is_sendable]
         room = 0 if endpoint.listen_only else max(0, WINDOW - (endpoint.offered - endpoint.done))
-        taken = resized(good[:room])
-        taken["node"], taken["time_ns"] = endpoint.node, now_ns
+        accepted = resize_records(good[:room])
+        accepted["node"], accepted["time_ns"] = endpoint.node, now_ns
         if due_ns is not None:
-            taken["time_ns"] = np.maximum(due_ns[fit][:room], now_ns)
-        if len(taken):
-            self._model.take(taken)
+            accepted["time_ns"] = np.maximum(due_ns[is_sendable][:room], now_ns)
+        if len(accepted):
+            self._model.take(accepted)
         endpoint.offered += len(records)
-        self.waiting += len(taken)
-        dropped = len(records) - len(taken)
+        self.waiting += len(accepted)
+        dropped = len(records) - len(accepted)
         self._counts["invalid"] += len(records) - len(good)
-        self._counts["surplus"] += len(good) - len(taken)
+        self._counts["surplus"] += len(good) - len(accepted)
         endpoint.done += dropped
         endpoint.dropped += dropped
         return dropped > 0
 
     def settle(self, results: np.ndarray) -> None:
-        """Note which frames the model is done with, from an array of `drivers.can.bus.results.RESULT`."""
+        """Count the frames that the model has finished, from an array of `drivers.can.bus.results.RESULT`."""
         finals = results if results["final"].all() else results[results["final"] != 0]
         for node, outcome in zip(finals["node"].tolist(), finals["outcome"].tolist(), strict=True):
             endpoint = self._by_node.get(node)
@@ -288,7 +290,7 @@ class Endpoints:
                 endpoint.dropped += outcome != 0
 
     def report(self, endpoint: Endpoint) -> codec.Report:
-        """How an endpoint is now."""
+        """Return the state of an endpoint."""
         node = self._model.node(endpoint.node)
         state = STATES.index(node.state)
         return codec.Report(endpoint.number, state, node.tec, node.rec, endpoint.done, endpoint.dropped)

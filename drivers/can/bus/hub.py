@@ -1,8 +1,8 @@
-"""The hub of a virtual CAN bus: owns a bus model and lets it run by the wall clock, for endpoints in any process.
+"""Hub of a virtual CAN bus: owns a bus model and runs it by the wall clock, for endpoints in any process.
 
-Endpoints offer frames at any time; the model decides which is on the wire when. A frame is handed to all endpoints
-when the model says that its last bit has passed, at once where the bus is idle afterwards, else together with others
-once a tick. An endpoint that is slow or dead loses messages of its own and holds up nobody.
+Endpoints offer frames at any time; the model decides which is on the wire when. A frame is sent to all endpoints after
+its last bit: at once if the bus is idle then, otherwise in a batch once per tick. An endpoint that is slow or hangs
+loses messages and delays no other endpoint.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import numpy as np
 
 from drivers.can.bus import codec
 from drivers.can.bus.endpoints import WINDOW, Endpoints
-from drivers.can.bus.frame import CLASSIC_WIDTH, FD_WIDTH, joined, packed, resized
+from drivers.can.bus.frame import CLASSIC_WIDTH, FD_WIDTH, join_records, pack_records, resize_records
 from drivers.can.bus.model import BusModel, warm_up
 from drivers.can.bus.results import OUTCOMES
 from rig.base import wire
@@ -34,46 +34,46 @@ if TYPE_CHECKING:
     from rig.serve.transport.zenoh import ZenohServer
 
 _TICK_NS = 1_000_000
-"""How long frames of a busy bus wait for others to travel with."""
-_ALONE_TICK_NS = 10_000_000
-"""The same where one endpoint alone is there, which learns nothing but that its frames were sent: 512 may wait."""
-_MESSAGES_A_SECOND = 5000
-_BURST = 50
-"""Frames that may travel alone on a bus that is idle in between; beyond, they wait for the tick as well."""
-_ERRORS_A_SECOND = 1000
+"""Batch period of a busy bus [ns]."""
+_SINGLE_TICK_NS = 10_000_000
+"""Batch period with a single endpoint [ns], which only needs to know that its frames were sent: 512 may wait."""
+_MAX_MESSAGES_PER_S = 5000
+_MESSAGE_BURST = 50
+"""Largest burst of frames that are sent singly on a bus that is idle in between; further ones wait for the tick."""
+_MAX_ERRORS_PER_S = 1000
 _ERROR_BURST = 100
-"""Error frames that reach the endpoints; a bus that nothing works on has ten times as many."""
+"""Largest burst of error frames sent to the endpoints; a bus without acknowledgement produces ten times as many."""
 _REPORT_NS = 100_000_000
-_HASTE_NS = 10_000_000
-"""How soon a report may follow another, and how often, where something has happened."""
-_GAP_NS = 20_000
-"""When to look again at a bus on which something waits for the end of an intermission or the like."""
-_LARGEST = 8 + codec.MAX_RECORDS * codec.RECORDS[FD_WIDTH].itemsize
-_FAILED_S = 0.05
-"""How long the bus rests where its model has failed."""
+_MIN_REPORT_NS = 10_000_000
+"""Shortest time between two reports after a change [ns]; without a change the period is `_REPORT_NS`."""
+_RETRY_NS = 20_000
+"""Delay of the next step if frames wait for the end of an intermission or the like [ns]."""
+_MAX_MESSAGE_BYTES = 8 + codec.MAX_RECORDS * codec.RECORDS[FD_WIDTH].itemsize
+_FAILURE_PAUSE_S = 0.05
+"""Pause of the bus after a failure of its model [s]."""
 
-_ON_WIRE = {
+_WIRE_ERRORS = {
     "bit error": (codec.PROTOCOL | codec.BUS_ERROR, bytes((0, 0, 0x80, 0))),
     "collision of equal identifiers": (codec.PROTOCOL | codec.BUS_ERROR, bytes((0, 0, 0x80, 0))),
     "no acknowledge": (codec.PROTOCOL | codec.BUS_ERROR | codec.NO_ACKNOWLEDGE, bytes((0, 0, 0x80, 0x19))),
 }
-"""Error frames of what all nodes see: class and first bytes as SocketCAN has them (0x80: on transmission; 0x19: in the
-acknowledge slot); other outcomes are the sender's affair."""
+"""Error frames of failures that all nodes see: class and first bytes as in SocketCAN (0x80: on transmission; 0x19: in
+the acknowledge slot). Other outcomes concern only the sender."""
 _CONTROLLER_STATES = (codec.ACTIVE_AGAIN, codec.TRANSMIT_PASSIVE)
 
 
 class Hub(Closing):
-    """The one owner of a channel's bus.
+    """Owner of a channel's bus.
 
     Args:
-        model: The bus; nobody else may use it from now on.
+        model: The bus; for the exclusive use of the hub.
         channel: Name of the bus.
-        server: Where endpoints of other processes come in; None has only those of this process.
-        acknowledge: Let the hub's own node acknowledge, so that an only endpoint can send.
+        server: Transport for endpoints of other processes; None for endpoints of this process only.
+        acknowledge: Let the hub's own node acknowledge, so that a single endpoint can send.
         clock: Monotonic clock [ns].
 
     Raises:
-        InputError: The channel's name is none.
+        InputError: The channel's name is invalid.
     """
 
     def __init__(
@@ -96,28 +96,28 @@ class Hub(Closing):
         """Wall time at bus time 0 since the Unix epoch [ns]."""
         self._lock = threading.Lock()
         self._wake = threading.Event()
-        self._resting = False
-        """A frame that is offered now changes nothing before the hub looks again."""
+        self._can_wait = False
+        """Whether a frame offered now changes nothing before the next step."""
         self._stopping = False
         self._counts: Counter[str] = Counter()
         self.endpoints = Endpoints(model, self._counts, lambda: self._advance(self._now()))
         self._guard = Guard(f"CAN {channel}: the hub")
-        self._forging = Rising(f"CAN {channel}: " + "{} times somebody spoke under the name of another endpoint")
-        self._losing = Rising(f"CAN {channel}: " + "{} frames were not sent: more than the bus or a node takes")
+        self._forging = Rising(f"CAN {channel}: " + "{} times a client used the name of another endpoint")
+        self._losing = Rising(f"CAN {channel}: " + "{} frames were not sent: more than the bus or a node accepts")
         self._outbox: list[np.ndarray] = []
         self._report_due = False
         self._next_report_ns = 0
         self._last_report_ns = 0
         self._published_ns = -_TICK_NS
-        self._errors = Bucket(_ERRORS_A_SECOND, _ERROR_BURST, 0.0)
-        self._messages = Bucket(_MESSAGES_A_SECOND, _BURST, 0.0)
+        self._errors = Bucket(_MAX_ERRORS_PER_S, _ERROR_BURST, 0.0)
+        self._messages = Bucket(_MAX_MESSAGES_PER_S, _MESSAGE_BURST, 0.0)
         self._thread = threading.Thread(target=self._run, name=f"can hub {channel}", daemon=True)
         model.attach("hub", listen_only=not acknowledge)
 
-    # Life.
+    # ---- start and end ----
 
     def start(self) -> None:
-        """Take endpoints, and let the bus run on a thread of its own."""
+        """Accept endpoints, and run the bus on a separate thread."""
         warm_up()
         if self._server is not None:
             for name in codec.REQUESTS:
@@ -132,7 +132,7 @@ class Hub(Closing):
             self._server.announce(codec.alive_key(self.channel))
 
     def close(self) -> None:
-        """End the bus; the server stays open and is its owner's to close."""
+        """Stop the bus; the server stays open."""
         with self._lock:
             if self._stopping:
                 return
@@ -148,45 +148,46 @@ class Hub(Closing):
         self.start()
         return self
 
-    # Endpoints.
+    # ---- endpoints ----
 
-    def connect(self, name: str, take: Callable[[codec.Said], None], lost: Callable[[], None]) -> str:
-        """Make an endpoint of this process known, before it joins.
+    def connect(self, name: str, take: Callable[[codec.HubMessage], None], lost: Callable[[], None]) -> str:
+        """Register an endpoint of this process before it joins.
 
         Args:
-            name: Its name.
-            take: Called with what the bus says, on the hub's thread; must return at once.
+            name: Name of the endpoint.
+            take: Called with the messages of the bus, on the hub's thread; must not block.
             lost: Called when the hub ends.
 
         Returns:
-            Its secret.
+            The endpoint's secret.
         """
         with self._lock:
             return self.endpoints.connect(name, take, lost)
 
     def disconnect(self, name: str) -> None:
-        """Forget an endpoint of this process; what it has offered is still sent."""
+        """Remove an endpoint of this process; the frames that it has offered are still sent."""
         with self._lock:
             self.endpoints.disconnect(name)
 
     def offer(self, name: str, payload: bytes) -> None:
-        """Take a message of frames from an endpoint: its secret, then the message."""
+        """Accept frames from an endpoint: its secret, followed by a message."""
         records = None
         with contextlib.suppress(codec.CodecError):
-            if len(payload) <= codec.SECRET_BYTES + _LARGEST:
+            if len(payload) <= codec.SECRET_BYTES + _MAX_MESSAGE_BYTES:
                 records = codec.decode(payload[codec.SECRET_BYTES :])
         self.offer_records(name, payload[: codec.SECRET_BYTES].hex(), records)
 
     def offer_records(
-        self, name: str, secret: str, records: codec.Said | None, due_ns: np.ndarray | None = None
+        self, name: str, secret: str, records: codec.HubMessage | None, due_ns: np.ndarray | None = None
     ) -> None:
-        """`offer` within this process.
+        """Accept frames from an endpoint of this process.
 
         Args:
             name: Name of the endpoint.
             secret: Its secret.
-            records: Array of one of the `RECORDS` layouts, which is not kept; anything else is malformed.
-            due_ns: When the controller gets each frame by the hub's clock [ns], shape of `records`; None: now.
+            records: Array of one of the `RECORDS` layouts, which is not kept; anything else counts as malformed.
+            due_ns: Time at which the controller receives each frame [ns of the hub's clock], shape of `records`; None
+                for now.
         """
         with self._lock:
             endpoint = self.endpoints.owner(name, secret)
@@ -197,38 +198,38 @@ class Hub(Closing):
                 self._report_due |= self.endpoints.offer(endpoint, records, self._now(), due_ns)
             else:
                 self._counts["malformed"] += 1
-            if self._report_due or not self._resting:
+            if self._report_due or not self._can_wait:
                 self._wake.set()
 
     def answer(self, name: str, document: dict[str, Any] | bytes) -> dict[str, Any]:
-        """Answer a request: `join`, `set`, `flush`, `status`.
+        """Execute a request, and return the reply.
 
         Args:
-            name: Which.
-            document: Its arguments, as in `drivers.can.bus.codec`, or what came.
+            name: `join`, `set`, `flush` or `status`.
+            document: Its arguments, as in `drivers.can.bus.codec`, decoded or as received.
 
         Raises:
-            InputError: It is none, or not from the endpoint that it names.
+            InputError: The request is malformed, or not from the endpoint that it names.
         """
         request = check(codec.REQUESTS[name], document, field=name)
-        if isinstance(request, codec.Joining):
+        if isinstance(request, codec.JoinRequest):
             with self._lock:
                 endpoint = self.endpoints.join(request)
-                # Frames wait no longer than a listener may expect.
+                # A new listener may not wait longer than for a tick.
                 self._wake.set()
                 bus = {"window": WINDOW, **self._bus(), "epoch_ns": self.epoch_ns}
                 return {"node": endpoint.number, "secret": endpoint.secret, **bus}
-        if not isinstance(request, codec.Flushing):
+        if not isinstance(request, codec.FlushRequest):
             return self.status()
         with self._lock:
-            # Both restart the controller, as real ones must be for the one and mostly are for the other.
+            # Both restart the controller: real controllers must for one of them, and mostly do for the other.
             self.endpoints.restart(request)
             self._report_due = True
         self._wake.set()
         return {}
 
     def reply(self, name: str, payload: bytes) -> bytes:
-        """`answer` as bytes; a refusal says why."""
+        """Execute a request, and return the reply or refusal as bytes."""
         try:
             return wire.encode_document(self.answer(name, payload or b"{}"))
         except InputError as error:
@@ -237,7 +238,7 @@ class Hub(Closing):
             return wire.encode_document({"error": str(error), "field": error.field, "must": error.must})
 
     def watch(self, key: str, there: bool) -> None:
-        """The token of an endpoint of another process has come or gone."""
+        """Record that the token of an endpoint of another process has appeared or disappeared."""
         with self._lock:
             self.endpoints.watch(key.rpartition("/")[2], there)
         self._wake.set()
@@ -246,101 +247,101 @@ class Hub(Closing):
         speed = self._model.speed
         return {"fd": speed.fd, "nominal_bit_s": speed.nominal_bit_s, "data_bit_s": speed.data_bit_s}
 
-    # The bus by the clock.
+    # ---- running the bus ----
 
     def _now(self) -> int:
         return self._clock() - self._start_ns
 
     def _run(self) -> None:
-        _sharpen_sleep()
+        _reduce_timer_slack()
         while not self._stopping:
-            if self._guard(self._turn) is None:
-                time.sleep(_FAILED_S)
+            if self._guard(self._run_once) is None:
+                time.sleep(_FAILURE_PAUSE_S)
 
-    def _turn(self) -> bool:
-        """One step of the bus, and the wait for the next."""
+    def _run_once(self) -> bool:
+        """Run the bus until now, publish, and wait for the next step."""
         with self._lock:
             self._wake.clear()
             now = self._now()
-            said, wake_ns, self._resting = self._step(now)
-        for each in said:
+            messages, wake_ns, self._can_wait = self._step(now)
+        for each in messages:
             self._publish(each)
         left_s = (wake_ns - self._now()) * 1e-9
         if left_s > 0:
             self._wake.wait(left_s)
         return True
 
-    def _step(self, now: int) -> tuple[list[codec.Said], int, bool]:
-        """Let the bus run until now.
+    def _step(self, now: int) -> tuple[list[codec.HubMessage], int, bool]:
+        """Run the bus until now.
 
         Returns:
-            Messages to publish, time of the next look [ns], and whether frames that are offered meanwhile can wait.
+            Messages to publish, time of the next step [ns], and whether frames that are offered meanwhile can wait.
         """
         self._advance(now)
         next_ns = self._model.next_ns()
         waiting, may_send = self.endpoints.waiting, self._messages.left(now * 1e-9) >= 1.0
-        alone, idle = len(self.endpoints) < 2, self._model.idle
-        tick_ns = _ALONE_TICK_NS if alone else _TICK_NS
-        said: list[codec.Said] = []
-        if self._outbox and (now >= self._published_ns + tick_ns or (may_send and (not waiting if alone else idle))):
+        single, idle = len(self.endpoints) < 2, self._model.idle
+        tick_ns = _SINGLE_TICK_NS if single else _TICK_NS
+        messages: list[codec.HubMessage] = []
+        if self._outbox and (now >= self._published_ns + tick_ns or (may_send and (not waiting if single else idle))):
             self._messages.take()
             self._published_ns = now
-            said += self._empty_outbox()
-        if now >= (self._last_report_ns + _HASTE_NS if self._report_due else self._next_report_ns):
+            messages += self._empty_outbox()
+        if now >= (self._last_report_ns + _MIN_REPORT_NS if self._report_due else self._next_report_ns):
             reports = self._reports(now)
             if reports:
-                # They count what was sent before them.
-                said += [*self._empty_outbox(), reports]
+                # A report counts the frames before it.
+                messages += [*self._empty_outbox(), reports]
             self._report_due = False
             self._last_report_ns = now
             self._next_report_ns = now + _REPORT_NS
-        wake_ns = self._last_report_ns + _HASTE_NS if self._report_due else self._next_report_ns
+        wake_ns = self._last_report_ns + _MIN_REPORT_NS if self._report_due else self._next_report_ns
         tick_ns += self._published_ns
         if next_ns is not None:
-            # A frame that comes later cannot end before that.
-            next_ns = max(next_ns, now) + _GAP_NS if idle else max(next_ns, now + _GAP_NS)
-            # More than this one: they travel together.
+            # A frame that is offered later cannot end before that.
+            next_ns = max(next_ns, now) + _RETRY_NS if idle else max(next_ns, now + _RETRY_NS)
+            # More than this frame waits: send them in one batch.
             wake_ns = max(next_ns, tick_ns) if waiting > 1 or self._messages.left(now * 1e-9) < 1.0 else next_ns
         if self._outbox:
             wake_ns = min(wake_ns, tick_ns)
-        # Nothing that is offered can end before a frame that is on the wire, nor is missed by one that is alone.
-        return said, wake_ns, not idle or bool(self._outbox) or (alone and next_ns is not None)
+        # No offer can end before a frame on the wire, nor is it missed by a single endpoint.
+        return messages, wake_ns, not idle or bool(self._outbox) or (single and next_ns is not None)
 
     def _advance(self, now: int) -> None:
-        # One more: what was offered by now must have begun.
+        # One more, so that frames offered until now have started.
         results = self._model.advance_records(max(now + 1, self._model.now_ns))
         if len(results):
             self._take_results(results)
 
     def _take_results(self, results: np.ndarray) -> None:
-        """Note what the model is done with, and keep what the endpoints must hear of."""
+        """Count finished frames, and queue those that the endpoints receive."""
         self.endpoints.settle(results)
         records = results["frame"].view(codec.RECORDS[FD_WIDTH])
         records["time_ns"] += np.uint64(self.epoch_ns)
         records["node"] = self.endpoints.numbers[results["node"]]
         records["flags"] &= codec.FD | codec.BRS | codec.ESI
         if results["outcome"].any():
-            records = self._with_errors(records, results)
+            records = self._replace_failed(records, results)
         self._counts["frames"] += len(results) - int(np.count_nonzero(results["outcome"]))
         if len(records):
             self._outbox.append(records)
 
-    def _with_errors(self, records: np.ndarray, results: np.ndarray) -> np.ndarray:
-        """The same with error frames in place of those that failed on the wire, and without others that failed."""
+    def _replace_failed(self, records: np.ndarray, results: np.ndarray) -> np.ndarray:
+        """Replace frames that failed on the wire by error frames, and remove others that failed."""
         self._report_due = True
         kept = np.ones(len(records), bool)
         for row in np.flatnonzero(results["outcome"]).tolist():
             text = OUTCOMES[results["outcome"][row]]
             end_ns = int(results["end_ns"][row])
-            kept[row] = text in _ON_WIRE and self._errors.left(end_ns * 1e-9) >= 1.0
+            kept[row] = text in _WIRE_ERRORS and self._errors.left(end_ns * 1e-9) >= 1.0
             if kept[row]:
                 self._errors.take()
-            if text in _ON_WIRE:
+            if text in _WIRE_ERRORS:
                 self._counts["errors"] += 1
-                kind, data = _ON_WIRE[text]
+                kind, data = _WIRE_ERRORS[text]
                 number = int(records["node"][row])
                 error = codec.error_record(self.epoch_ns + end_ns, kind, data=data + bytes(4), node=number)
-                records[row] = packed([error], FD_WIDTH)[0]
+                records[row] = pack_records([error], FD_WIDTH)[0]
             else:
                 self._counts["unsent"] += 1
         return records[kept]
@@ -348,15 +349,15 @@ class Hub(Closing):
     def _empty_outbox(self) -> list[np.ndarray]:
         if not self._outbox:
             return []
-        records = self._outbox[0] if len(self._outbox) == 1 else joined(self._outbox)
+        records = self._outbox[0] if len(self._outbox) == 1 else join_records(self._outbox)
         self._outbox.clear()
         if records["length"].max() <= CLASSIC_WIDTH:
-            records = resized(records, CLASSIC_WIDTH)
+            records = resize_records(records, CLASSIC_WIDTH)
         size = codec.MAX_RECORDS
         return [records[first : first + size] for first in range(0, len(records), size)]
 
     def _reports(self, now: int) -> list[codec.Report]:
-        """What has changed at the endpoints; those that have gone are forgotten."""
+        """Return the reports that have changed, after removing endpoints that have left."""
         found = []
         self.endpoints.forget_gone()
         for endpoint in self.endpoints:
@@ -365,34 +366,34 @@ class Hub(Closing):
             if report == before:
                 continue
             found.append(report)
-            # A recovery may be over before anybody has looked.
+            # The node may have recovered since the last report.
             bus_offs = self._model.node(endpoint.node).bus_offs
             if bus_offs > endpoint.bus_offs:
-                self._tell(now, report, codec.BUS_OFF, 0)
+                self._queue_state_change(now, report, codec.BUS_OFF, 0)
             state = 2 if bus_offs > endpoint.bus_offs else 0 if before is None else before.state
             endpoint.bus_offs = bus_offs
             if state == 2 and report.state < 2:
-                self._tell(now, report, codec.RESTARTED, 0)
+                self._queue_state_change(now, report, codec.RESTARTED, 0)
             elif report.state != state:
-                self._tell(now, report, codec.CONTROLLER, _CONTROLLER_STATES[report.state])
+                self._queue_state_change(now, report, codec.CONTROLLER, _CONTROLLER_STATES[report.state])
         return found
 
-    def _tell(self, now: int, report: codec.Report, kind: int, detail: int) -> None:
-        """An error frame about one node's controller."""
+    def _queue_state_change(self, now: int, report: codec.Report, kind: int, detail: int) -> None:
+        """Queue an error frame about one node's controller."""
         counters = (min(report.transmit_errors, 255), min(report.receive_errors, 255))
         data = bytes((0, detail, 0, 0, 0, 0, *counters))
         change = codec.error_record(self.epoch_ns + now, kind | codec.COUNTERS, data=data, node=report.node)
-        self._outbox.append(packed([change], FD_WIDTH))
+        self._outbox.append(pack_records([change], FD_WIDTH))
 
-    def _publish(self, said: codec.Said) -> None:
+    def _publish(self, messages: codec.HubMessage) -> None:
         if self._server is not None:
-            payload = codec.encode(said) if isinstance(said, np.ndarray) else codec.encode_reports(said)
+            payload = codec.encode(messages) if isinstance(messages, np.ndarray) else codec.encode_reports(messages)
             self._guard(self._server.publish, codec.bus_key(self.channel), payload)
         for local in list(self.endpoints.locals.values()):
-            self._guard(local.take, said)
+            self._guard(local.take, messages)
 
     def status(self) -> dict[str, Any]:
-        """What goes on: endpoints, counts."""
+        """Return the state of the bus: load, counts, endpoints, warnings."""
         with self._lock:
             return {
                 "channel": self.channel,
@@ -408,7 +409,7 @@ class Hub(Closing):
             }
 
     def warnings(self) -> list[str]:
-        """What a person should know of, while it is so."""
+        """Return the current warnings for the operator."""
         return [
             *self._guard.warnings(),
             *self._forging.warnings(self._counts["forged"]),
@@ -416,7 +417,7 @@ class Hub(Closing):
         ]
 
     def figures(self) -> dict[str, int]:
-        """Frames that were not sent, and what was tried under others' names."""
+        """Return the number of frames not sent, and of attempts under another endpoint's name."""
         return {"unsent": self._counts["unsent"] + self._counts["surplus"], "forged": self._counts["forged"]}
 
 
@@ -425,7 +426,7 @@ _COUNTS = (
 )  # fmt: skip
 
 
-def _sharpen_sleep() -> None:
-    """Let this thread's sleeps end within some microseconds, not 50 late (Linux)."""
+def _reduce_timer_slack() -> None:
+    """Reduce the delay after this thread's sleeps from 50 to a few microseconds (Linux)."""
     with contextlib.suppress(AttributeError, OSError):
         ctypes.CDLL(None).prctl(29, 1, 0, 0, 0)  # PR_SET_TIMERSLACK [ns]

@@ -1,9 +1,9 @@
-"""Compiled part of the bus, in one file though it is long: numba's cache looks only at the file of what it loads.
+"""Compiled part of the bus, in one long file because numba's cache checks only the file of the kernel that it loads.
 
-A kernel that calls another file's kernel could be served stale. In order: bits of frames, arbitration, queues, faults,
-error counters. What is imported from `drivers.can.bus.frame` are numbers of the standard, which do not change. Bits
-follow ISO 11898-1:2015, 10.4 and 10.5 (classic and FD, base and extended format). Levels: 0 dominant, 1 recessive. Time
-is an integer [ns]; bit times are integers [ps].
+A kernel that calls a kernel of another file could be loaded in an outdated version. In order: bits of frames,
+arbitration, queues, faults, error counters. The imports from `drivers.can.bus.frame` are constants of the standard.
+Bits follow ISO 11898-1:2015, 10.4 and 10.5 (classic and FD, base and extended format). Levels: 0 dominant, 1 recessive.
+Time is an integer [ns]; bit times are integers [ps].
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from numba import njit
 
 from drivers.can.bus.frame import BRS, ESI, EXTENDED, FD, FD_LENGTHS, FD_WIDTH, INTERMISSION, REMOTE
 
-# Kinds of an encoded bit, added up.
+# Kinds of an encoded bit, added.
 FAST = 1
 STUFF = 2
 FIXED = 4
 
-LONGEST = 800
-"""Room for the bits of any frame, stuffed (the longest has fewer than 740)."""
+MAX_BITS = 800
+"""Upper limit for the bits of a stuffed frame (the longest has fewer than 740)."""
 
 TAIL = 10
 """CRC delimiter 1, ACK 1, ACK delimiter 1, end of frame 7."""
@@ -61,23 +61,23 @@ GOOD, BIT_ERROR, NO_ACKNOWLEDGE, COLLISION, QUEUE_FULL, BUS_OFF, DETACHED = rang
 R_SLOT, R_START, R_END, R_OUTCOME, R_ATTEMPT, R_NODE, R_AT, R_FINAL = 0, 1, 2, 3, 4, 5, 6, 7
 RESULT_COLUMNS = 8
 
-_FAR = np.int64(1) << 62
+_INFINITE = np.int64(1) << 62
 _RECESSIVE_RUN = 11
 _RECOVERY = 128
 
 
 class Bus(NamedTuple):
-    """All state of a bus, in arrays that the kernels change.
+    """State of a bus, in arrays that the kernels change.
 
     Attributes:
-        cells: One value a cell, shape (CELLS,).
-        nodes: One row a node, shape (nodes, NODE_COLUMNS).
-        queues: Slots in each node's queue, in no order, shape (nodes, capacity).
-        slots: One row a frame that is queued or will be, shape (slots, SLOT_COLUMNS).
-        store: The frames of the slots, records of `drivers.can.bus.frame.RECORD`, shape (slots,).
+        cells: Scalars, shape (CELLS,).
+        nodes: One row per node, shape (nodes, NODE_COLUMNS).
+        queues: Slots in each node's queue, unordered, shape (nodes, capacity).
+        slots: One row per frame that is queued or will be, shape (slots, SLOT_COLUMNS).
+        store: Frames of the slots, records of `drivers.can.bus.frame.RECORD`, shape (slots,).
         arrivals: Slots that are not queued yet, by time, shape (slots,).
         unused: Stack of free slots, shape (slots,).
-        senders: Slots on the wire now; more than one only where nodes send the same identifier, shape (nodes,).
+        senders: Slots on the wire; more than one only if nodes send the same identifier, shape (nodes,).
         random: State of the generator of bit errors, shape (1,).
     """
 
@@ -99,7 +99,7 @@ _CODES[list(FD_LENGTHS)] = range(len(FD_LENGTHS))
 
 @njit(cache=True, error_model="numpy")
 def _write(raw, n, value, width):
-    """Append a number to bits, its highest first; returns how many there are then."""
+    """Append a number to bits, the highest bit first; return the new number of bits."""
     for k in range(width - 1, -1, -1):
         raw[n] = (value >> k) & 1
         n += 1
@@ -108,10 +108,10 @@ def _write(raw, n, value, width):
 
 @njit(cache=True, error_model="numpy")
 def header_and_data(identifier, length, flags, data, raw):
-    """Bits from start of frame to the end of the data field, not stuffed.
+    """Write the unstuffed bits from start of frame to the end of the data field.
 
     Returns:
-        Their number, and the index of the first bit that is sent at the data rate (LONGEST where none is).
+        Their number, and the index of the first bit that is sent at the data rate (MAX_BITS without one).
     """
     fd = (flags & FD) != 0
     extended = (identifier & EXTENDED) != 0
@@ -125,7 +125,7 @@ def header_and_data(identifier, length, flags, data, raw):
     else:
         n = _write(raw, 1, identifier, 11)
         n = _write(raw, n, remote << 1, 2)  # RRS or RTR, IDE
-    switch = LONGEST
+    switch = MAX_BITS
     if fd:
         n = _write(raw, n, 2, 2)  # FDF, res
         n = _write(raw, n, 1 if (flags & BRS) != 0 else 0, 1)
@@ -143,7 +143,7 @@ def header_and_data(identifier, length, flags, data, raw):
 
 @njit(cache=True, error_model="numpy")
 def _crc(bits, n, crc, width, polynomial):
-    """The CRC register after n more bits (ISO 11898-1:2015, 10.4.2.6)."""
+    """Return the CRC register after n more bits (ISO 11898-1:2015, 10.4.2.6)."""
     mask = (1 << width) - 1
     for i in range(n):
         feed = bits[i] ^ (crc >> (width - 1))
@@ -154,24 +154,23 @@ def _crc(bits, n, crc, width, polynomial):
 
 
 @njit(cache=True, error_model="numpy")
-def _stuffed(identifier, length, flags, data, work):
-    """Bits up to the end of what is stuffed by content: of a classic frame the CRC, of an FD frame the data.
+def _write_stuffed(identifier, length, flags, data, work):
+    """Write the bits up to the end of content stuffing: of a classic frame the CRC, of an FD frame the data.
 
     Args:
         identifier: Identifier with its flags.
-        length: Bytes of data, or that a remote frame asks for.
+        length: Bytes of data, or requested by a remote frame.
         flags: FD, BRS, ESI.
         data: Bytes, at least `length`.
-        work: Out: levels, kinds, and room to work in, uint8, shape (3, LONGEST).
+        work: Out: levels, kinds, and work space, uint8, shape (3, MAX_BITS).
 
     Returns:
-        Number of bits, how many of them are sent at the nominal rate, how many are stuff bits, and the CRC of a classic
-        frame.
+        Number of bits, number of bits at the nominal rate, number of stuff bits, and the CRC of a classic frame.
     """
     bits, kinds, raw = work[0], work[1], work[2]
     n, switch = header_and_data(identifier, length, flags, data, raw)
     crc = 0
-    # After the very last bit of an FD frame's data a fixed stuff bit takes the place of one by content.
+    # After the last bit of an FD frame's data a fixed stuff bit replaces one by content.
     stop = n - 1
     if (flags & FD) == 0:
         crc = _crc(raw, n, 0, 15, 0x4599)
@@ -202,13 +201,13 @@ def _stuffed(identifier, length, flags, data, work):
 
 @njit(cache=True, error_model="numpy")
 def count_bits(identifier, length, flags, data, work):
-    """Bits of a frame with stuffing and intermission: at the nominal rate and at the data rate.
+    """Count the bits of a frame with stuffing and intermission: at the nominal rate and at the data rate.
 
-    The bit BRS and the CRC delimiter are each sent partly at one rate and partly at the other, cut at the sample
-    points; together they last exactly one nominal and one data bit time, and are counted so. Arguments as of
-    `_stuffed`.
+    The bit BRS and the CRC delimiter are each sent partly at one rate and partly at the other, divided at the sample
+    points; together they last exactly one nominal and one data bit time, and are counted so. Arguments as for
+    `_write_stuffed`.
     """
-    count, slow, _, _ = _stuffed(identifier, length, flags, data, work)
+    count, slow, _, _ = _write_stuffed(identifier, length, flags, data, work)
     if (flags & FD) == 0:
         return slow + TAIL + INTERMISSION, 0
     # Stuff count and parity 4, CRC 17 or 21, fixed stuff bits: one before, one after each fourth bit.
@@ -220,18 +219,18 @@ def count_bits(identifier, length, flags, data, work):
 
 @njit(cache=True, error_model="numpy")
 def encode(record, work):
-    """All bits of a frame as they are on the wire when it is acknowledged, with the intermission.
+    """Write all bits of an acknowledged frame on the wire, with the intermission.
 
     Args:
         record: The frame, of `drivers.can.bus.frame.RECORD`.
-        work: Out: levels; kinds FAST, STUFF, FIXED added up; room to work in; uint8, shape (3, LONGEST).
+        work: Out: levels; kinds FAST, STUFF, FIXED added; work space; uint8, shape (3, MAX_BITS).
 
     Returns:
         Number of bits, and the CRC.
     """
     bits, kinds, raw = work[0], work[1], work[2]
     length, flags = np.int64(record["length"]), np.int64(record["flags"])
-    out, _, stuffed, crc = _stuffed(np.int64(record["identifier"]), length, flags, record["data"], work)
+    out, _, stuffed, crc = _write_stuffed(np.int64(record["identifier"]), length, flags, record["data"], work)
     fd = (flags & FD) != 0
     kind = FAST if (flags & BRS) != 0 and fd else 0
     if fd:
@@ -252,7 +251,7 @@ def encode(record, work):
             kinds[out] = kind
             out += 1
     bits[out : out + TAIL + INTERMISSION] = 1
-    bits[out + 1] = 0  # ACK, behind the CRC delimiter
+    bits[out + 1] = 0  # ACK, after the CRC delimiter
     kinds[out] = kind
     kinds[out + 1 : out + TAIL + INTERMISSION] = 0
     return out + TAIL + INTERMISSION, crc
@@ -260,10 +259,10 @@ def encode(record, work):
 
 @njit(cache=True, error_model="numpy")
 def priority(identifier, flags):
-    """Arbitration field as the number that the bus compares: the lower wins.
+    """Return the arbitration field as a number; the lower wins the bus.
 
-    Base identifier, RTR or SRR, IDE, extension, RTR, in the order on the wire; bits that a base frame has not are 0,
-    because at IDE it has won already.
+    Base identifier, RTR or SRR, IDE, extension, RTR, in the order on the wire; bits that a base frame lacks are 0,
+    because it has won already at IDE.
     """
     remote = 1 if (identifier & REMOTE) != 0 and (flags & FD) == 0 else 0
     if (identifier & EXTENDED) != 0:
@@ -274,12 +273,12 @@ def priority(identifier, flags):
 
 @njit(cache=True, error_model="numpy")
 def enlist(bus, batch, count, nominal_ps, data_ps):
-    """Take `count` frames of a batch of records into free slots and the list of arrivals.
+    """Put `count` frames of a batch of records into free slots and the list of arrivals.
 
-    Frames whose time has passed are offered now. Equal times keep the order of offering. There must be room.
+    Frames with a time in the past are offered now. Equal times keep the order of offering. There must be room.
     """
     cells, slots, store, arrivals, unused = bus.cells, bus.slots, bus.store, bus.arrivals, bus.unused
-    work = np.empty((3, LONGEST), np.uint8)
+    work = np.empty((3, MAX_BITS), np.uint8)
     waiting = cells[ARRIVALS] - cells[NEXT]
     if cells[NEXT] > 0:
         for k in range(waiting):
@@ -311,8 +310,8 @@ def enlist(bus, batch, count, nominal_ps, data_ps):
 
 
 @njit(cache=True, error_model="numpy")
-def _gap(random, chance):
-    """Good bits before the next bad one: geometric, by inversion; splitmix64 (Steele, Lea, Flood 2014)."""
+def _draw_gap(random, chance):
+    """Draw the number of good bits before a bad one: geometric, by inversion; splitmix64 (Steele, Lea, Flood 2014)."""
     random[0] += np.uint64(0x9E3779B97F4A7C15)
     z = random[0]
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -326,12 +325,12 @@ def _gap(random, chance):
 
 @njit(cache=True, error_model="numpy")
 def draw_gap(bus, chance):
-    """Draw the distance to the next bit error anew; none where the chance is zero."""
-    bus.cells[GAP] = _gap(bus.random, chance) if chance > 0.0 else _FAR
+    """Draw the distance to the next bit error; it is beyond any run if the error rate is zero."""
+    bus.cells[GAP] = _draw_gap(bus.random, chance) if chance > 0.0 else _INFINITE
 
 
 @njit(cache=True, error_model="numpy")
-def _put(out, count, slot, start, end, outcome, slots, final):
+def _store_result(out, count, slot, start, end, outcome, slots, final):
     out[count, R_SLOT] = slot
     out[count, R_START] = start
     out[count, R_END] = end
@@ -345,7 +344,7 @@ def _put(out, count, slot, start, end, outcome, slots, final):
 
 @njit(cache=True, error_model="numpy")
 def _find_head(bus, node):
-    """The frame that the node would send next: by priority; equal ones keep their order."""
+    """Find the frame that the node sends next: by priority; equal ones keep their order."""
     head = np.int64(-1)
     for k in range(bus.nodes[node, COUNT]):
         s = bus.queues[node, k]
@@ -370,7 +369,7 @@ def _remove(bus, node, slot):
 
 @njit(cache=True, error_model="numpy")
 def _rejoin(bus, t, run_ns):
-    """Nodes that recover from bus-off join again when their 128 runs of 11 recessive bits were complete by t."""
+    """Release nodes from bus-off whose 128 runs of 11 recessive bits were complete by t."""
     nodes = bus.nodes
     for n in range(nodes.shape[0]):
         if nodes[n, RECOVERING] != 0 and nodes[n, QUIET] + nodes[n, LEFT] * run_ns <= t:
@@ -382,20 +381,20 @@ def _rejoin(bus, t, run_ns):
 
 @njit(cache=True, error_model="numpy")
 def _admit(bus, out, count):
-    """Put the next arrival into its node's queue; the newest frame is dropped where it is full."""
+    """Put the next arrival into its node's queue; it is dropped if the queue is full."""
     cells, nodes = bus.cells, bus.nodes
     s = bus.arrivals[cells[NEXT]]
     cells[NEXT] += 1
     n = bus.slots[s, OWNER]
     at = bus.slots[s, AT]
     if nodes[n, ATTACHED] == 0:
-        return _put(out, count, s, at, at, DETACHED, bus.slots, 1)
+        return _store_result(out, count, s, at, at, DETACHED, bus.slots, 1)
     if nodes[n, STATE] == OFF:
         nodes[n, REFUSED] += 1
-        return _put(out, count, s, at, at, BUS_OFF, bus.slots, 1)
+        return _store_result(out, count, s, at, at, BUS_OFF, bus.slots, 1)
     if nodes[n, COUNT] >= nodes[n, CAPACITY]:
         nodes[n, DROPPED] += 1
-        return _put(out, count, s, at, at, QUEUE_FULL, bus.slots, 1)
+        return _store_result(out, count, s, at, at, QUEUE_FULL, bus.slots, 1)
     bus.slots[s, SEQUENCE] = cells[SEQUENCES]
     cells[SEQUENCES] += 1
     bus.queues[n, nodes[n, COUNT]] = s
@@ -407,17 +406,17 @@ def _admit(bus, out, count):
 
 
 @njit(cache=True, error_model="numpy")
-def _fault(bus, position, nominal_ps, data_ps, receivers_active, receivers):
-    """Length of an error that the sender sees in the bit at `position` of the frame on the wire.
+def _find_error_end(bus, position, nominal_ps, data_ps, receivers_active, receivers):
+    """Return the duration of an error that the sender sees in the bit at `position` of the frame on the wire.
 
-    The sender's flag starts with the next bit. Receivers see it when six equal bits have passed and answer with theirs:
+    The sender's flag starts with the next bit. Receivers detect it after six equal bits and send their own flags:
     superposed they last 6 to 12 bits (ISO 11898-1:2015, 10.4.4). In a field of fixed form, or where the bad bit itself
-    makes six equal ones, all see it at once. Then 8 bits of delimiter.
+    completes six equal ones, all nodes detect it at once. Then 8 bits of delimiter follow.
 
     Returns:
         Time from the start of frame to the end of the delimiter [ns].
     """
-    work = np.empty((3, LONGEST), np.uint8)
+    work = np.empty((3, MAX_BITS), np.uint8)
     bits, kinds = work[0], work[1]
     total, _ = encode(bus.store[bus.senders[0]], work)
     time_ps = np.int64(0)
@@ -444,10 +443,10 @@ def _fault(bus, position, nominal_ps, data_ps, receivers_active, receivers):
 
 
 @njit(cache=True, error_model="numpy")
-def _differ(bus):
-    """First bit in which the frames on the wire differ; -1 where they are the same."""
-    work = np.empty((3, LONGEST), np.uint8)
-    other = np.empty((3, LONGEST), np.uint8)
+def _find_difference(bus):
+    """Return the first bit in which the frames on the wire differ; -1 if they are equal."""
+    work = np.empty((3, MAX_BITS), np.uint8)
+    other = np.empty((3, MAX_BITS), np.uint8)
     n, _ = encode(bus.store[bus.senders[0]], work)
     first = np.int64(-1)
     for k in range(1, bus.cells[SENDERS]):
@@ -461,10 +460,10 @@ def _differ(bus):
 
 
 @njit(cache=True, error_model="numpy")
-def _begin(bus, start, nominal_ps, data_ps, chance):
-    """Arbitrate at `start`, put the winner on the wire and decide when and how its transmission ends."""
+def _start_transmission(bus, start, nominal_ps, data_ps, chance):
+    """Start a transmission: arbitrate, put the winner on the wire, and determine when and how it ends."""
     cells, nodes, slots = bus.cells, bus.nodes, bus.slots
-    best = _FAR
+    best = _INFINITE
     for n in range(nodes.shape[0]):
         if nodes[n, COUNT] > 0 and nodes[n, SUSPENDED] <= start:
             best = min(best, slots[nodes[n, HEAD], KEY])
@@ -493,7 +492,7 @@ def _begin(bus, start, nominal_ps, data_ps, chance):
     position = np.int64(-1)
     outcome = GOOD
     if cells[SENDERS] > 1:
-        position = _differ(bus)
+        position = _find_difference(bus)
         outcome = COLLISION
     if position < 0:
         outcome = BIT_ERROR
@@ -505,7 +504,7 @@ def _begin(bus, start, nominal_ps, data_ps, chance):
     if chance > 0.0 and position < 0:
         if cells[GAP] < total:
             position = cells[GAP]
-            cells[GAP] = _gap(bus.random, chance)
+            cells[GAP] = _draw_gap(bus.random, chance)
         else:
             cells[GAP] -= total
     if position < 0 and not receivers and cells[SENDERS] == 1:
@@ -517,12 +516,12 @@ def _begin(bus, start, nominal_ps, data_ps, chance):
         cells[END] = start + slots[s, DURATION]
     else:
         cells[OUTCOME] = outcome
-        cells[END] = start + _fault(bus, position, nominal_ps, data_ps, receivers_active, receivers)
+        cells[END] = start + _find_error_end(bus, position, nominal_ps, data_ps, receivers_active, receivers)
 
 
 @njit(cache=True, error_model="numpy")
-def _settle(bus, n):
-    """State from the counters: passive above 127, bus-off above 255 (ISO 11898-1:2015, 12.1.4.2 and following)."""
+def _update_state(bus, n):
+    """Update a node's state from its counters; return whether it is newly bus-off (ISO 11898-1:2015, 12.1.4.2 ff.)."""
     nodes = bus.nodes
     if nodes[n, STATE] == OFF:
         return False
@@ -549,7 +548,7 @@ def close_windows(cells, t):
 
 @njit(cache=True, error_model="numpy")
 def _occupy(cells, start, end):
-    """Count the bus as taken from start to end, each window its part."""
+    """Count the bus as occupied from start to end, divided among the windows."""
     cells[BUSY] += end - start
     close_windows(cells, start)
     while end > cells[WINDOW] + cells[WINDOW_LENGTH]:
@@ -562,7 +561,7 @@ def _occupy(cells, start, end):
 
 @njit(cache=True, error_model="numpy")
 def _complete(bus, out, count, nominal_ps):
-    """End of what is on the wire: counters, states, queues, results."""
+    """Complete the transmission on the wire: counters, states, queues, results."""
     cells, nodes, slots = bus.cells, bus.nodes, bus.slots
     start, end, outcome = cells[START], cells[END], cells[OUTCOME]
     cells[FREE] = end + (INTERMISSION * nominal_ps + 500) // 1000
@@ -574,7 +573,7 @@ def _complete(bus, out, count, nominal_ps):
         if nodes[n, ATTACHED] == 0:
             continue
         if nodes[n, RECOVERING] != 0:
-            # The acknowledge delimiter, end of frame and intermission are 11 recessive bits, an error's end too.
+            # Acknowledge delimiter, end of frame and intermission are 11 recessive bits, as is the end of an error.
             nodes[n, LEFT] -= max(np.int64(0), start - nodes[n, QUIET]) // run_ns + 1
             nodes[n, QUIET] = cells[FREE]
         if nodes[n, STATE] == OFF or nodes[n, LISTENING] != 0:
@@ -592,7 +591,7 @@ def _complete(bus, out, count, nominal_ps):
                 nodes[n, REC] -= 1
         else:
             nodes[n, REC] = min(nodes[n, REC] + 1, 255)
-        _settle(bus, n)
+        _update_state(bus, n)
     for k in range(cells[SENDERS]):
         s = bus.senders[k]
         n = slots[s, OWNER]
@@ -601,17 +600,17 @@ def _complete(bus, out, count, nominal_ps):
         if good:
             nodes[n, SENT] += 1
             nodes[n, TEC] = max(nodes[n, TEC] - 1, 0)
-            _settle(bus, n)
+            _update_state(bus, n)
         else:
             nodes[n, ERRORS] += 1
-            # A passive node that only misses the acknowledge counts no further: a lone node never goes bus-off.
+            # A passive node that only misses the acknowledge counts no further: a lone node never becomes bus-off.
             if not (outcome == NO_ACKNOWLEDGE and nodes[n, STATE] == PASSIVE):
                 nodes[n, TEC] += 8
-            off = _settle(bus, n)
+            off = _update_state(bus, n)
             final = 1 if off else 0
         if nodes[n, ATTACHED] == 0:
             final = 1
-        count = _put(out, count, s, start, end, outcome, slots, final)
+        count = _store_result(out, count, s, start, end, outcome, slots, final)
         if final:
             _remove(bus, n, s)
         if nodes[n, STATE] == PASSIVE:
@@ -619,7 +618,7 @@ def _complete(bus, out, count, nominal_ps):
         if off:
             for j in range(nodes[n, COUNT]):
                 nodes[n, REFUSED] += 1
-                count = _put(out, count, bus.queues[n, j], end, end, BUS_OFF, slots, 1)
+                count = _store_result(out, count, bus.queues[n, j], end, end, BUS_OFF, slots, 1)
             nodes[n, COUNT] = 0
             nodes[n, HEAD] = -1
             nodes[n, SUSPENDED] = 0
@@ -632,7 +631,7 @@ def _complete(bus, out, count, nominal_ps):
 
 @njit(cache=True, error_model="numpy")
 def advance(bus, until, out, nominal_ps, data_ps, chance):
-    """Run the bus up to `until`: nothing starts just then, for a better frame may yet be offered.
+    """Run the bus up to `until`; nothing starts exactly then, as a frame of higher priority may still be offered.
 
     Args:
         bus: State.
@@ -640,10 +639,10 @@ def advance(bus, until, out, nominal_ps, data_ps, chance):
         out: Results, shape (at least the queues' room + 2 nodes, RESULT_COLUMNS).
         nominal_ps: Bit time of the arbitration [ps].
         data_ps: Bit time of the data phase [ps].
-        chance: Chance of an error a bit.
+        chance: Probability of an error per bit.
 
     Returns:
-        Number of results; `MORE` tells whether the room ran out before the time.
+        Number of results; `MORE` is set if `out` was full before the time was reached.
     """
     cells, nodes, slots = bus.cells, bus.nodes, bus.slots
     run_ns = (_RECESSIVE_RUN * nominal_ps + 500) // 1000
@@ -651,10 +650,10 @@ def advance(bus, until, out, nominal_ps, data_ps, chance):
     count = 0
     cells[MORE] = 0
     while True:
-        if count >= max(room, 1):  # without a node there is no room, and no need of any
+        if count >= max(room, 1):  # without a node the room is 0, which is enough
             cells[MORE] = 1
             return count
-        arrival = _FAR
+        arrival = _INFINITE
         if cells[NEXT] < cells[ARRIVALS]:
             arrival = slots[bus.arrivals[cells[NEXT]], AT]
         if cells[SENDERS] > 0:
@@ -665,7 +664,7 @@ def advance(bus, until, out, nominal_ps, data_ps, chance):
                 break
             count = _complete(bus, out, count, nominal_ps)
             continue
-        start = _FAR
+        start = _INFINITE
         for n in range(nodes.shape[0]):
             if nodes[n, COUNT] > 0:
                 start = min(start, max(cells[FREE], nodes[n, SUSPENDED]))
@@ -678,7 +677,7 @@ def advance(bus, until, out, nominal_ps, data_ps, chance):
             _rejoin(bus, until, run_ns)
             break
         _rejoin(bus, start, run_ns)
-        _begin(bus, start, nominal_ps, data_ps, chance)
+        _start_transmission(bus, start, nominal_ps, data_ps, chance)
     cells[NOW] = until
     close_windows(cells, cells[START] if cells[SENDERS] > 0 else until)
     return count

@@ -1,16 +1,16 @@
-"""Model of a CAN bus: who sends when, how long it takes, what fails; no clock, no wire, no thread.
+"""Model of a CAN bus: which node sends when, for how long, and what fails; without clock, connection or thread.
 
-Time is an integer that is passed in [ns]; a frame's length is rounded to it once. The same offers give the same
-results, in however many steps the time is advanced.
+Time is an argument, an integer [ns]; a frame's length is rounded to it once. The same offers give the same results,
+independent of the steps in which time is advanced.
 
 Modelled (ISO 11898-1:2015): arbitration by identifier; serialisation of exact frames; acknowledge; error flags with
 their superposition, delimiter, retransmission; error counters, error passive with suspended transmission, bus-off and
-its recovery; bounded transmit queues. Frames take part in an arbitration when they were offered by its first bit.
-A bit error is one that the sender sees: the bit is inverted for all nodes.
+its recovery; bounded transmit queues. A frame takes part in an arbitration if it was offered by its first bit. A bit
+error is one that the sender sees: the bit is inverted for all nodes.
 
 Not modelled: errors that only some nodes see, errors in error frames, overload frames, the last bit of the end of
-frame that receivers ignore, bit timing with its resynchronisation and delays of the line, and the error state
-indicator, which is sent as the frame has it.
+frame that receivers ignore, bit timing with its resynchronisation and line delays, and the error state indicator, which
+is sent as in the frame.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ _COUNTERS = {
 }
 """Column of each of a node's counters."""
 _WINDOW_NS = 100_000_000
-"""Length of the windows of the load."""
+"""Length of the windows of the load [ns]."""
 _GROWTH = 1 << 10
 
 
 def warm_up() -> None:
-    """Compile all that a bus runs, or load it from the cache: some 10 s once on a machine, so before a bus is live."""
+    """Compile the kernels, or load them from the cache: about 10 s once per computer, so before a bus is live."""
     model = BusModel("1M/5M")
     node, _ = model.attach(), model.attach()
     model.disturb(node)
@@ -50,14 +50,12 @@ def warm_up() -> None:
 
 
 class BusModel:
-    """A bus with its nodes.
+    """A bus with its nodes, for one thread at a time.
 
     Args:
-        rate: Bit rates, as `drivers.can.bus.timing.speed` takes them.
-        error_rate: Chance of an error a bit.
+        rate: Bit rates, as for `drivers.can.bus.timing.speed`.
+        error_rate: Probability of an error per bit.
         seed: Seed of these errors.
-
-    One thread at a time may use it.
     """
 
     def __init__(
@@ -67,7 +65,7 @@ class BusModel:
         error_rate: float = 0.0,
         seed: int = 0,
     ) -> None:
-        """Start with an idle bus that has no nodes."""
+        """Start with an idle bus without nodes."""
         if not 0.0 <= error_rate <= 1.0:
             raise InputError("error_rate", "between 0 and 1", error_rate)
         self.speed = speed(rate)
@@ -96,19 +94,21 @@ class BusModel:
         return int(self._bus.cells[kernels.NOW])
 
     def attach(self, name: str = "", *, queue: int = 64, listen_only: bool = False) -> int:
-        """Add a node. It sends the highest priority first, as a controller with buffers compares them.
+        """Add a node. It sends its highest priority first, as a controller with buffers does.
 
         Args:
-            name: What to call it in messages.
-            queue: Frames that can wait, the one on the wire with them; a frame beyond is dropped and counted.
-            listen_only: It sends nothing, not even acknowledges.
+            name: Name in messages.
+            queue: Capacity of the transmit queue [frames], including the one on the wire; frames beyond it are dropped
+                and
+                counted.
+            listen_only: Whether it sends nothing, not even acknowledges.
 
         Returns:
             Its number.
         """
         if not 1 <= queue <= 1 << 16:
             raise InputError("queue", "between 1 and 65536 frames", queue)
-        node = self._vacant()
+        node = self._find_free_row()
         bus = self._bus
         rows = max(len(self._names), node + 1)
         if rows > len(bus.nodes) or queue > bus.queues.shape[1]:
@@ -116,7 +116,7 @@ class BusModel:
             queues = np.zeros((rows, width), np.int64)
             queues[: len(bus.queues), : bus.queues.shape[1]] = bus.queues
             self._bus = bus = bus._replace(
-                queues=queues, nodes=_longer(bus.nodes, rows), senders=_longer(bus.senders, rows)
+                queues=queues, nodes=_extend(bus.nodes, rows), senders=_extend(bus.senders, rows)
             )
             # One step of the kernel ends at most one transmission, or empties each queue once.
             self._results = np.zeros((rows * (width + 2) + _GROWTH, kernels.RESULT_COLUMNS), np.int64)
@@ -132,7 +132,7 @@ class BusModel:
         return node
 
     def detach(self, node: int) -> None:
-        """Take a node off the bus: what waits in its queue is lost; a frame on the wire is still sent."""
+        """Remove a node: waiting frames are lost; a frame on the wire is still sent."""
         row = self._row(node)
         bus = self._bus
         on_wire = set(bus.senders[: bus.cells[kernels.SENDERS]].tolist())
@@ -146,38 +146,41 @@ class BusModel:
         row[kernels.ATTACHED] = 0
 
     def offer(self, node: int, frame: frames.Frame, at_ns: int | None = None) -> None:
-        """Hand a frame to a node's controller.
+        """Pass a frame to a node's controller.
 
         Args:
             node: Number of the node.
             frame: The frame.
-            at_ns: When [ns]; a time that has passed, or none, is now.
+            at_ns: Time of the offer [ns]; None or a time in the past means now.
         """
         if self._row(node)[kernels.LISTENING]:
             raise InputError("node", "one that may send", Words(f"{self._names[node]} (listen only)"))
         if frame.fd and not self.speed.fd:
             raise InputError("frame", f"classic on a bus of {self.speed}", frame)
-        record = frames.record_of(frame, node=node, time_ns=self.now_ns if at_ns is None else max(at_ns, 0))
-        self.take(frames.packed([record], frames.FD_WIDTH))
+        record = frames.make_record(frame, node=node, time_ns=self.now_ns if at_ns is None else max(at_ns, 0))
+        self.take(frames.pack_records([record], frames.FD_WIDTH))
 
     def take(self, offers: np.ndarray) -> None:
-        """`offer` for many frames of which it is known that their node can send them.
+        """Pass many frames to controllers; the caller has checked that their nodes can send them.
 
         Args:
-            offers: Array of `drivers.can.bus.frame.RECORD`, which is kept, best in the order of its times; `node` by
-                whom, `time_ns` when.
+            offers: Array of `drivers.can.bus.frame.RECORD`, which is kept, preferably in the order of its times; `node`
+                is the
+                sender, `time_ns` the time of the offer.
         """
         self._offers.append(offers.view(frames.RECORD))
 
     def advance(self, until_ns: int) -> list[Delivery]:
-        """Let time pass.
+        """Advance the time.
 
         Args:
-            until_ns: Up to when [ns]. A frame that could start just then waits, for a better one may yet be offered.
+            until_ns: New time [ns]. A frame that could start exactly then waits, as one of higher priority may still be
+                offered.
 
         Returns:
-            All that ended by then, in the order of time. Where several nodes sent the very same frame at once, each
-            has its delivery, with the same times.
+            Everything that ended by then, in the order of time. If several nodes sent the same frame at once, each has
+            its
+            delivery, with the same times.
         """
         results = self.advance_records(until_ns)
         if not len(results):
@@ -190,7 +193,7 @@ class BusModel:
         ]
 
     def advance_records(self, until_ns: int) -> np.ndarray:
-        """`advance` with an array of `RESULT`, shape (results,)."""
+        """Advance the time as `advance`, and return an array of `RESULT`, shape (results,)."""
         if not self.now_ns <= until_ns < 1 << 61:
             raise InputError("until_ns", f"{self.now_ns} or later, and below 2 ** 61", until_ns)
         self._take_offers()
@@ -208,7 +211,7 @@ class BusModel:
         return np.concatenate(parts) if parts else np.zeros(0, RESULT)
 
     def next_ns(self) -> int | None:
-        """Earliest time at which something can end or start [ns]; None where nothing is left to do."""
+        """Return the earliest time at which something can end or start [ns]; None if nothing is left."""
         cells = self._bus.cells
         if cells[kernels.SENDERS]:
             return int(cells[kernels.END])
@@ -220,17 +223,17 @@ class BusModel:
 
     @property
     def idle(self) -> bool:
-        """Return whether nothing is on the wire or queued; frames that are offered for later may still come."""
+        """Whether nothing is on the wire or queued; frames offered for a later time may still come."""
         bus = self._bus
         return not (bus.cells[kernels.SENDERS] or self._offers or bus.nodes[:, kernels.COUNT].any())
 
     def disturb(self, node: int, *, count: int = 1, bit: int = 24) -> None:
-        """Spoil the next frames that a node sends, each with one bit error.
+        """Insert one bit error into each of the next frames that a node sends.
 
         Args:
             node: Number of the node.
-            count: How many transmissions.
-            bit: Which bit, stuff bits counted, from the start of frame; the last one where the frame is shorter.
+            count: Number of transmissions.
+            bit: Number of the bit from the start of frame, with stuff bits; in a shorter frame the last one.
         """
         if count < 0 or bit < 0:
             raise InputError("count and bit", "not negative", (count, bit))
@@ -239,13 +242,13 @@ class BusModel:
         row[kernels.DISTURBED_BIT] = bit
 
     def node(self, node: int) -> NodeState:
-        """A node's counters, also when it has gone."""
+        """Return a node's counters, also after it was removed."""
         row = self._row(node, gone=True)
         counters = {name: int(row[column]) for name, column in _COUNTERS.items()}
         return NodeState(state=STATES[row[kernels.STATE]], **counters)
 
     def state(self) -> BusState:
-        """The bus as a whole."""
+        """Return the state of the bus."""
         cells = self._bus.cells
         passed = max(self.now_ns, int(cells[kernels.FREE]), 1)
         return BusState(
@@ -260,8 +263,8 @@ class BusModel:
             raise InputError("node", "the number of a node of this bus", node)
         return self._bus.nodes[node]
 
-    def _vacant(self) -> int:
-        """A row that no node, no frame on the wire and no coming frame uses any more; else a new one."""
+    def _find_free_row(self) -> int:
+        """Return a row that no node, no frame on the wire and no coming frame uses; otherwise a new one."""
         self._take_offers()
         bus = self._bus
         cells = bus.cells
@@ -272,10 +275,10 @@ class BusModel:
         return len(self._names)
 
     def _take_offers(self) -> None:
-        """Move what was offered since the last step into slots."""
+        """Move the frames that were offered since the last step into slots."""
         if not self._offers:
             return
-        batch = frames.joined(self._offers)
+        batch = frames.join_records(self._offers)
         self._offers.clear()
         cells = self._bus.cells
         missing = len(batch) - int(cells[kernels.FREE_SLOTS])
@@ -288,10 +291,10 @@ class BusModel:
         before = len(bus.slots)
         after = max(2 * before, before + missing, _GROWTH)
         self._bus = bus._replace(
-            slots=_longer(bus.slots, after),
-            store=_longer(bus.store, after),
-            arrivals=_longer(bus.arrivals, after),
-            unused=_longer(bus.unused, after),
+            slots=_extend(bus.slots, after),
+            store=_extend(bus.store, after),
+            arrivals=_extend(bus.arrivals, after),
+            unused=_extend(bus.unused, after),
         )
         self._free(np.arange(before, after))
 
@@ -317,8 +320,8 @@ class BusModel:
         cells[kernels.FREE_SLOTS] = free + len(slots)
 
 
-def _longer(array: np.ndarray, rows: int) -> np.ndarray:
-    """The same rows and more, which are zero."""
+def _extend(array: np.ndarray, rows: int) -> np.ndarray:
+    """Return the rows followed by rows of zeros."""
     found = np.zeros((rows, *array.shape[1:]), array.dtype)
     found[: len(array)] = array
     return found

@@ -1,4 +1,4 @@
-"""A node of the bus for python-can: what was received, the transmit queue as the hub reports it, filters, states."""
+"""Node of the bus for python-can: received frames, transmit queue as reported by the hub, filters, states."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import numpy as np
 from can.bus import BusState  # noqa: TID253
 
 from drivers.can.bus import codec
-from drivers.can.bus.frame import packed
+from drivers.can.bus.frame import pack_records
 from rig.base.checks import check
 from rig.base.errors import InputError
 from rig.serve.waiting import Deadline
@@ -24,28 +24,28 @@ if TYPE_CHECKING:
     from can.typechecking import CanFilters
 
 _RECEIVE_QUEUE = 100_000
-"""Frames that wait to be read, by default: about 7 s of a full bus; the oldest are dropped."""
-_PARTING_S = 1.0
-"""How long a shutdown waits for what was sent before."""
+"""Default number of frames that wait to be read: about 7 s of a full bus; the oldest are dropped."""
+_SHUTDOWN_TIMEOUT_S = 1.0
+"""Longest wait of a shutdown for frames that were sent before [s]."""
 _STATES = (BusState.ACTIVE, BusState.PASSIVE, BusState.ERROR)
-_SETTINGS = {BusState.ACTIVE: False, BusState.PASSIVE: True}
+_LISTEN_ONLY = {BusState.ACTIVE: False, BusState.PASSIVE: True}
 _numbers = itertools.count()
 
 
 class NodeBus(can.BusABC):
-    """What the ways to a hub share.
+    """Base of the connections to a hub.
 
     Args:
         channel: Name of the bus.
-        can_filters: As python-can has them; error frames pass always.
-        receive_own_messages: Deliver sent frames to this bus as well, when they have been on the wire.
-        fd: None takes what the hub's bus takes; True insists on CAN FD; False makes this a classic node, which gets no
-            FD frames and cannot send any.
-        listen_only: Take no part: send nothing, acknowledge nothing.
-        rx_queue_size: Number of frames that wait to be read; beyond, the oldest are dropped, and an error frame says
-            so.
-        bitrate: Must be that of the hub's bus, where given [bit/s].
-        data_bitrate: Must be that of the hub's bus, where given [bit/s].
+        can_filters: Filters as in python-can; error frames always pass.
+        receive_own_messages: Deliver sent frames to this bus as well, after they have been on the wire.
+        fd: None for the setting of the hub's bus; True requires CAN FD; False makes this a classic node, which receives
+            no FD frames and cannot send any.
+        listen_only: Send nothing and acknowledge nothing.
+        rx_queue_size: Number of frames that wait to be read; beyond it the oldest are dropped, and an error frame
+            reports it.
+        bitrate: If given, must equal that of the hub's bus [bit/s].
+        data_bitrate: If given, must equal that of the hub's bus [bit/s].
         timing: Bit timing instead of the bit rates.
     """
 
@@ -79,10 +79,10 @@ class NodeBus(can.BusABC):
         self.waiting = 0
         """Frames in the batches."""
         self._overflowed = False
-        """Whether frames were lost that the reader does not know of yet."""
+        """Whether frames were lost and the reader has not received an error frame yet."""
         self.node = codec.NO_NODE
         self.secret: str | None = None
-        """What shows the hub that this node's name is its own."""
+        """Secret that proves to the hub that the name is this node's own."""
         self._fd = False
         self._window = 0
         self.offered = 0
@@ -91,11 +91,11 @@ class NodeBus(can.BusABC):
         self._there = False
         self._filters = None
         self.dropped = 0
-        """Received frames that were dropped because nobody read them in time."""
+        """Received frames that were dropped because they were not read in time."""
         self.missed = 0
         """Messages of the hub that never arrived."""
         self.malformed = 0
-        """Messages that were none of a hub."""
+        """Messages that were malformed."""
         self._connect()
         try:
             self._join()
@@ -105,17 +105,17 @@ class NodeBus(can.BusABC):
         self._can_protocol = can.CanProtocol.CAN_FD if self._fd else can.CanProtocol.CAN_20
         super().__init__(channel, can_filters=can_filters)
 
-    # What a way to the hub provides.
+    # ---- provided by the connection ----
 
     def _connect(self) -> None:
         raise NotImplementedError
 
     def _ask(self, name: str, document: dict[str, Any]) -> dict[str, Any]:
-        """The hub's answer; raises InputError where it refuses."""
+        """Return the hub's reply; raises InputError if the hub refuses."""
         raise NotImplementedError
 
     def _offer(self, secret: str, records: np.ndarray) -> None:
-        """Hand frames to the hub: an array of one of the `RECORDS` layouts, at most MAX_RECORDS."""
+        """Pass frames to the hub: an array of one of the `RECORDS` layouts, at most MAX_RECORDS."""
         raise NotImplementedError
 
     def _leave(self) -> None:
@@ -124,17 +124,17 @@ class NodeBus(can.BusABC):
     def _where(self) -> str:
         raise NotImplementedError
 
-    # The connection.
+    # ---- connection ----
 
     def _join(self) -> None:
-        """Become a node of the bus.
+        """Join the bus.
 
         Raises:
-            CanInitializationError: The hub refuses, or has another bus than was asked for.
+            CanInitializationError: The hub refuses, or its bus has other settings.
         """
         again = {} if self.secret is None else {"secret": self.secret}
         try:
-            answer = check(codec.Joined, self._ask("join", {"listen_only": self._listen_only, **again}), field="hub")
+            answer = check(codec.JoinReply, self._ask("join", {"listen_only": self._listen_only, **again}), field="hub")
         except InputError as error:
             raise can.CanInitializationError(f"{self._where()} refuses another node: {error}") from None
         rates = {"bitrate": answer.nominal_bit_s, "data_bitrate": answer.data_bit_s}
@@ -154,7 +154,7 @@ class NodeBus(can.BusABC):
             self._there = True
 
     def _lost(self) -> None:
-        """The hub has gone: whoever waits to send must know."""
+        """Record that the hub has stopped, and wake waiting senders."""
         with self._lock:
             self._there = False
             self._room.notify_all()
@@ -163,14 +163,14 @@ class NodeBus(can.BusABC):
         if self._is_shutdown:
             raise can.CanOperationError(f"the bus {self.channel} has been shut down")
 
-    # Receiving.
+    # ---- receiving ----
 
-    def hear(self, said: codec.Said) -> None:
-        """What the hub says, on the thread of the connection."""
-        if isinstance(said, np.ndarray):
-            self._take_frames(said)
+    def receive(self, content: codec.HubMessage) -> None:
+        """Process a message of the hub, on the thread of the connection."""
+        if isinstance(content, np.ndarray):
+            self._take_frames(content)
         else:
-            self._take_reports(said)
+            self._take_reports(content)
 
     def _take_frames(self, records: np.ndarray) -> None:
         own = records["node"] == self.node
@@ -181,12 +181,12 @@ class NodeBus(can.BusABC):
         if confirmed and not self.receive_own_messages:
             wanted &= ~own | errors
         if errors.any():
-            # How another controller is, nobody sees.
+            # The state of another node's controller is not visible.
             wanted &= ~errors | own | (records["identifier"] & codec.BUS_ERROR != 0)
         if not self._fd:
             wanted &= (records["flags"] & codec.FD) == 0
         if filters:
-            wanted &= errors | matching(records["identifier"], filters)
+            wanted &= errors | match_filters(records["identifier"], filters)
         records = records if wanted.all() else records[wanted]
         with self._lock:
             if confirmed:
@@ -200,12 +200,12 @@ class NodeBus(can.BusABC):
             for report in reports:
                 if report.node == self.node:
                     self._report = report
-                    # Frames in between may have been missed; a report counts all that were before it.
+                    # Frames in between may have been missed; a report counts all before it.
                     self.done = report.done
                     self._room.notify_all()
 
     def _store(self, frames: np.ndarray, filters: CanFilters | None) -> None:
-        """Keep frames until they are read; the lock is held."""
+        """Keep frames until they are read; the caller holds the lock."""
         self._batches.append((frames, filters))
         self.waiting += len(frames)
         while (surplus := self.waiting - self._queue_size) > 0:
@@ -218,7 +218,7 @@ class NodeBus(can.BusABC):
         self._arrived.notify()
 
     def _missed(self, count: int) -> None:
-        """Messages of the hub never arrived."""
+        """Count messages of the hub that never arrived."""
         with self._lock:
             self.missed += count
             self._overflowed = True
@@ -227,13 +227,13 @@ class NodeBus(can.BusABC):
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
         self._check_open()
         try:
-            # The usual case, without a lock: more of the frames that came together.
+            # The usual case, without a lock: further frames of a batch.
             message = self._ready.popleft()
         except IndexError:
             message = self._next(timeout)
         if message is None:
             return None, False
-        # Where the filters were changed after the frame came, python-can filters once more.
+        # Frames that arrived before a change of the filters are filtered by python-can.
         return message, message.is_error_frame or self._ready_filters is self._filters
 
     def _next(self, timeout: float | None) -> can.Message | None:
@@ -242,46 +242,48 @@ class NodeBus(can.BusABC):
             while not self._ready:
                 if self._overflowed:
                     self._overflowed = False
-                    lost = codec.overflow(time.time_ns())
-                    return codec.message_of(lost, channel=self.channel, node=self.node)
+                    lost = codec.make_overflow(time.time_ns())
+                    return codec.make_message(lost, channel=self.channel, node=self.node)
                 if self._batches:
                     frames, self._ready_filters = self._batches.popleft()
                     self.waiting -= len(frames)
-                    self._ready.extend(codec.messages_of(frames, channel=self.channel, node=self.node))
+                    self._ready.extend(codec.make_messages(frames, channel=self.channel, node=self.node))
                     continue
                 if self._is_shutdown or not deadline.wait(self._arrived):
                     return None
             return self._ready.popleft()
 
-    # Sending.
+    # ---- sending ----
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        """Hand a frame to the hub, which sends it as soon as it wins the bus.
+        """Pass a frame to the hub, which sends it when it wins the bus.
 
         Args:
             msg: The frame.
-            timeout: How long to wait for room in the transmit queue [s]; None waits for ever, 0 not at all.
+            timeout: Longest wait for room in the transmit queue [s]; None for no limit, 0 for no wait.
 
         Raises:
-            CanOperationError: No room in time, no such frame on this bus, listening only, bus off, or no hub.
+            CanOperationError: The queue was full too long, the bus does not support the frame, the node only listens or
+                is
+                bus-off, or the hub has stopped.
         """
         self._check_open()
         try:
-            record = codec.offered(msg, fd=self._fd)
+            record = codec.make_offer(msg, fd=self._fd)
         except codec.CodecError as error:
             raise can.CanOperationError(f"{self.channel} cannot send {error}") from None
         self._reserve(1, timeout)
-        self._offer(self.secret or "", packed([record]))
+        self._offer(self.secret or "", pack_records([record]))
 
     def send_records(self, records: np.ndarray, timeout: float | None = None) -> None:
-        """Hand many frames to the hub at once.
+        """Pass many frames to the hub at once.
 
         Args:
-            records: Array of one of the layouts `drivers.can.bus.codec.RECORDS`; only what makes a frame counts.
-            timeout: How long to wait for room in the transmit queue, for each portion of the frames [s].
+            records: Array of one of the layouts `drivers.can.bus.codec.RECORDS`; time and node are ignored.
+            timeout: Longest wait for room in the transmit queue, for each portion of the frames [s].
 
         Raises:
-            CanOperationError: As `send`; a frame that the bus cannot have is dropped and counted by the hub.
+            CanOperationError: As for `send`; a frame that the bus does not support is dropped and counted by the hub.
         """
         self._check_open()
         portion = min(self._window or 1, codec.MAX_RECORDS)
@@ -291,7 +293,7 @@ class NodeBus(can.BusABC):
             self._offer(self.secret or "", part)
 
     def _reserve(self, count: int, timeout: float | None) -> None:
-        """Wait for room for some frames in the transmit queue, and take it."""
+        """Wait for room for some frames in the transmit queue, and reserve it."""
         with self._room:
             deadline = Deadline(timeout)
             while True:
@@ -311,7 +313,7 @@ class NodeBus(can.BusABC):
                     )
 
     def flush_tx_buffer(self) -> None:
-        """Withdraw what waits to be sent; the frame that is on the wire is finished."""
+        """Withdraw the frames that wait to be sent; the frame on the wire is finished."""
         self._check_open()
         self._set("flush", {})
 
@@ -321,11 +323,11 @@ class NodeBus(can.BusABC):
         except InputError as error:
             raise can.CanOperationError(f"{self._where()} refuses: {error}") from None
 
-    # State and end.
+    # ---- state and end ----
 
     @property
     def state(self) -> BusState:
-        """ACTIVE; PASSIVE: error passive, or only listening; ERROR: bus off, or the hub has gone."""
+        """ACTIVE; PASSIVE if error passive or only listening; ERROR if bus-off or without a hub."""
         if not self._there:
             return BusState.ERROR
         if self._listen_only:
@@ -334,11 +336,11 @@ class NodeBus(can.BusABC):
 
     @state.setter
     def state(self, new_state: BusState) -> None:
-        """ACTIVE takes part (again, also after bus off), PASSIVE only listens."""
-        if new_state not in _SETTINGS:
+        """Set the state: ACTIVE takes part (also after bus-off), PASSIVE only listens."""
+        if new_state not in _LISTEN_ONLY:
             raise can.CanOperationError(f"state must be ACTIVE or PASSIVE; instead received {new_state}")
         self._check_open()
-        listen_only = _SETTINGS[new_state]
+        listen_only = _LISTEN_ONLY[new_state]
         self._set("set", {"listen_only": listen_only})
         self._listen_only = listen_only
 
@@ -348,16 +350,16 @@ class NodeBus(can.BusABC):
         return self._report.transmit_errors, self._report.receive_errors
 
     def shutdown(self) -> None:
-        """Leave the bus and close the connection; may be called again."""
+        """Leave the bus and close the connection; further calls have no effect."""
         if self._is_shutdown:
             return
         super().shutdown()
         with self._lock:
             self._arrived.notify_all()
             self._room.notify_all()
-            # As from a socket, what was sent before goes out, unless the bus does not take it.
+            # As with a socket, frames that were sent before go out, unless the bus does not accept them.
             self._room.wait_for(
-                lambda: not self._there or self.offered <= self.done or self._report.state == 2, _PARTING_S
+                lambda: not self._there or self.offered <= self.done or self._report.state == 2, _SHUTDOWN_TIMEOUT_S
             )
         self._leave()
 
@@ -370,14 +372,14 @@ def _bit_rates(bitrate: int | None, data_bitrate: int | None, timing: Any) -> di
     return {"bitrate": bitrate, "data_bitrate": data_bitrate}
 
 
-def matching(words: np.ndarray, filters: CanFilters) -> np.ndarray:
-    """Which identifier words match at least one filter, shape of `words`."""
+def match_filters(words: np.ndarray, filters: CanFilters) -> np.ndarray:
+    """Return for each identifier word whether it matches at least one filter, shape of `words`."""
     extended = (words & codec.EXTENDED) != 0
     identifiers = words & np.uint32(codec.EXTENDED_MASK)
     found = np.zeros(len(words), bool)
     for entry in filters:
         wanted, mask = int(entry["can_id"]), int(entry["can_mask"])
-        # As python-can compares: bits of the mask beyond an identifier's 29 see zeros.
+        # As in python-can, the mask bits beyond an identifier's 29 bits are compared with zeros.
         if wanted & mask & ~codec.EXTENDED_MASK:
             continue
         mask &= codec.EXTENDED_MASK

@@ -1,4 +1,4 @@
-"""What a bus tells of itself: what happened to each frame, how its nodes are, and its load."""
+"""Results of a bus: the outcome of each frame, the state of its nodes, and its load."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from drivers.can.bus import kernels
 
 STATES = ("error active", "error passive", "bus-off")
 OUTCOMES = kernels.OUTCOMES
-"""What happened to a frame, by the number in `RESULT`; the empty text: it was sent."""
+"""Outcome of a frame, by its number in `RESULT`; the empty text means that it was sent."""
 
 RESULT = np.dtype(
     [
@@ -26,22 +26,22 @@ RESULT = np.dtype(
         ("frame", frames.RECORD),
     ]
 )
-"""What happened on the bus, in an array. `end_ns` is the end of frame's last bit, after an error the delimiter's last;
-`outcome` an index of `OUTCOMES`; `final` 0 where the frame will be tried again; `frame` has the end as its time."""
+"""Results of a bus in an array. `end_ns` is the end of the frame's last bit, or of the error delimiter; `outcome` an
+index of `OUTCOMES`; `final` 0 if the frame will be sent again; `frame` has the end as its time."""
 
 
 class Delivery(NamedTuple):
-    """What happened to a frame; the fields are those of `RESULT`.
+    """Result of one attempt to send a frame; the fields are those of `RESULT`.
 
     Attributes:
         frame: The frame.
-        node: Who offered it.
-        start_ns: Its first bit [ns].
+        node: Number of the node that offered it.
+        start_ns: Start of its first bit [ns].
         end_ns: End of its last bit, before the intermission; after an error, end of the error delimiter [ns].
-        error: Empty where it was sent, else one of `OUTCOMES`.
-        offered_ns: When it was offered [ns].
-        attempt: Number of this attempt, from 1; 0 where it never came to one.
-        final: Whether the model is done with it; false where it will be sent again.
+        error: Empty if it was sent, otherwise one of `OUTCOMES`.
+        offered_ns: Time of the offer [ns].
+        attempt: Number of this attempt, from 1; 0 without an attempt.
+        final: Whether the model has finished the frame; False if it will be sent again.
     """
 
     frame: frames.Frame
@@ -56,7 +56,7 @@ class Delivery(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class NodeState:
-    """A node's counters.
+    """Counters of a node.
 
     Attributes:
         state: One of `STATES`.
@@ -65,9 +65,9 @@ class NodeState:
         queued: Frames waiting.
         sent: Frames sent.
         errors: Attempts that ended in an error.
-        dropped: Frames that found the queue full.
-        refused: Frames lost because the node was or went bus-off.
-        bus_offs: How often it went bus-off.
+        dropped: Frames dropped because the queue was full.
+        refused: Frames lost because the node was or became bus-off.
+        bus_offs: Number of bus-off states.
     """
 
     state: str
@@ -83,12 +83,12 @@ class NodeState:
 
 @dataclass(frozen=True, slots=True)
 class BusState:
-    """The bus as a whole, from the start to now. What is on the wire now counts when it ends.
+    """State of the bus, from the start to now. A frame on the wire counts when it ends.
 
     Attributes:
         now_ns: Time [ns].
-        load: Share of the time that it was taken, intermissions and errors with it.
-        window_load: The same in the last window that has ended.
+        load: Share of the time in which the bus was occupied, with intermissions and errors.
+        window_load: The same in the last complete window.
         frames: Frames sent.
     """
 

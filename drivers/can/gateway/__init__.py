@@ -1,10 +1,10 @@
-"""The rig as a node of a CAN bus: samples, events and status go out, commands come in.
+"""The rig as a node of a CAN bus: sends samples, events and status, receives commands.
 
-A gateway is a client of the rig like any other; it may run in the rig's process or in another one. Threads: the rig's
-publisher leaves blocks in a bounded queue; the sender packs them and hands frames to the bus, each when its last
-sample is due, or those of a block at once to a bus that holds them until then; the receiver checks commands; a worker
-asks the rig and acknowledges. None of them can hold up the simulation: what does not fit is dropped, oldest first, and
-counted.
+A gateway is a client of the rig, in the rig's process or in another one. Threads: the rig's publisher puts blocks into
+a
+bounded queue. The sender packs them and passes each frame to the bus when its last sample is due, or all frames of a
+block at once to a bus that holds them until then. The receiver checks commands, and a worker sends them to the rig and
+acknowledges them. None of these can delay the simulation: what does not fit is dropped, oldest first, and counted.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 import pydantic
 
 from drivers.can.bus.frame import STANDARD_MASK
-from drivers.can.devices import Standing, node_of
+from drivers.can.devices import DeviceState, device_node
 from drivers.can.gateway.commands import IDENTIFIERS, Commands
 from drivers.can.gateway.outbox import Outbox
-from drivers.can.gateway.samples import sample_frames, steps
+from drivers.can.gateway.samples import find_decimations, make_sample_frames
 from drivers.can.schedule import SLOT_S, Schedule
-from drivers.can.signals import EVENT_VALUES, EventKind, State
+from drivers.can.signals import EVENT_VALUES, EventKind, RigState
 from rig.base import wire
 from rig.base.checks import DOCUMENT_BYTES, Outside, check, input_error
 from rig.base.closeable import Closing
@@ -40,53 +40,53 @@ _SYNC_S = 0.1
 _STATUS_S = 0.5
 _HEARTBEAT_S = 1.0
 _IDLE_S = 0.02
-_WAIT_S = 0.25
-"""Samples that may wait for room on the bus, after the machine had been held up [s]."""
-_FAREWELL_S = 0.5
-"""How long a bus without room is waited for at the end [s]."""
-_LONGEST_LATENCY_S = 1.0
+_MAX_BACKLOG_S = 0.25
+"""Largest number of samples that wait for room on the bus after the computer was held up, as a time [s]."""
+_FLUSH_TIMEOUT_S = 0.5
+"""Longest wait at the end for a bus without room [s]."""
+_MAX_LATENCY_S = 1.0
 """Longest further wait at the end for frames that are not due [s]: the rig waits 2 s for the gateway."""
 _WORD_32 = 0xFFFFFFFF
-_WORDS = (wire.EVENTS, wire.STATUS, wire.FAULTS, wire.BLOCK)
-"""Keys of documents, which are few, and never dropped."""
+_DOCUMENT_KEYS = (wire.EVENTS, wire.STATUS, wire.FAULTS, wire.BLOCK)
+"""Keys of documents, which are few and never dropped."""
 
 
 class _Catalogue(Outside, extra="ignore"):
-    """The rig's channels, as they come."""
+    """The rig's channel table, as received."""
 
     tick_rate_hz: Annotated[int, pydantic.Field(ge=1, le=10**12)]
     table: dict[str, Any]
 
 
-class _Stretch(Outside, extra="ignore"):
+class _RowRange(Outside, extra="ignore"):
     key: str
     row: int
     rows: int
 
 
-class _Told(Outside, extra="ignore"):
-    """What the rig tells of its faults: rows whose blocks they met."""
+class _FaultReport(Outside, extra="ignore"):
+    """The rig's report on faults: rows whose blocks were affected."""
 
-    blocks: list[_Stretch] = pydantic.Field(default=[])
+    blocks: list[_RowRange] = pydantic.Field(default=[])
 
 
 class Gateway(Closing):
-    """Sends what a rig publishes as CAN messages, and gives it the commands that come from the bus.
+    """Sends what a rig publishes as CAN messages, and passes commands from the bus to the rig.
 
     Args:
-        client: Transport to the rig, which must be ready to answer; stays the caller's to close.
-        bus: Any bus of python-can; stays the caller's to shut down.
-        schedule: Which samples, how often.
-        paced: Send each frame when its last sample is due; False: at once, and let a full queue hold up the publisher
-            (for runs that are not paced by the wall clock).
+        client: Transport to the rig, which must be ready to reply; the caller closes it.
+        bus: Any bus of python-can; the caller shuts it down.
+        schedule: Sample layouts and their rates.
+        paced: Send each frame when its last sample is due. False sends at once, and lets a full queue hold up the
+            publisher (for runs that are not paced by the wall clock).
         load: Load of the bus, for the status.
-        queue_seconds: Blocks that may wait for the sender [s of simulated time].
-        command_timeout_s: How long the rig may take for a command [s].
+        queue_seconds: Size of the queue of blocks for the sender [s of simulated time].
+        command_timeout_s: Longest time for the rig to reply to a command [s].
         now: Clock [s].
 
     Raises:
         InputError: The rig's samples cannot be sent at that rate, or have another calibration than the table.
-        NoReplyError: No rig answers.
+        NoReplyError: No rig replies.
     """
 
     def __init__(
@@ -114,41 +114,41 @@ class Gateway(Closing):
             raise input_error(error, "catalogue.table", ChannelTable) from None
         self._tick_rate_hz = catalogue.tick_rate_hz
         self._messages, self._layout = schedule.table.by_name, schedule.table.layout
-        self._rate_hz, self._steps = steps(table, schedule)
-        self._samples = sample_frames(table, schedule, self._steps)
+        self._rate_hz, self._steps = find_decimations(table, schedule)
+        self._samples = make_sample_frames(table, schedule, self._steps)
         self._groups = tuple(table.groups)
         self._queue_seconds = queue_seconds
         self._changed = threading.Condition()
         self._queue: BoundedQueue[tuple[str, bytes]] = BoundedQueue(
-            8 * len(self._groups), size=lambda entry: int(entry[0] not in _WORDS), changed=self._changed
+            8 * len(self._groups), size=lambda entry: int(entry[0] not in _DOCUMENT_KEYS), changed=self._changed
         )
         self._stopping = False
         self._end_s = math.inf
 
         self._time_us = 0
-        self.state = State.PREPARING
+        self.state = RigState.PREPARING
         self._ended = False
         self._status: dict[str, Any] = {}
-        self._beat = 0
+        self._beat_number = 0
         self._last_sync: dict[str, int] | None = None
         self._event_number = 0
         self._next_status_s = self._next_heartbeat_s = now()
 
         self.taken = 0
-        """Frames that were never made because a fault of blocks took their samples, or sent them out of turn."""
-        self._told: dict[str, int] = {}
-        """Number of the row behind the last one that such a fault met, by group."""
+        """Frames that a fault of blocks prevented: it removed their samples, or sent them out of order."""
+        self._fault_ends: dict[str, int] = {}
+        """First row number after the rows affected by such a fault, by group."""
         self.bus_errors = 0
-        """Calls of the bus that failed while receiving."""
+        """Errors of the bus while receiving."""
         self.guard = Guard("the CAN gateway")
         self.dropping = Rising("CAN: {} frames were dropped: the bus does not take them in time")
         self._falling_behind = Rising("CAN: {} blocks were dropped: the gateway does not keep up")
-        room = math.ceil(_WAIT_S * sum(1.0 / period_s for period_s in schedule.messages().values()))
+        room = math.ceil(_MAX_BACKLOG_S * sum(1.0 / period_s for period_s in schedule.messages().values()))
         self.outbox = Outbox(bus, room=room, paced=paced, now=now)
         self.commands = Commands(
             client,
             self._acknowledge,
-            lambda node: self._tell_device(node, Standing.REFUSED, self._time_us),
+            lambda node: self._send_device_state(node, DeviceState.REFUSED, self._time_us),
             timeout_s=command_timeout_s,
             now=now,
             guard=self.guard,
@@ -159,18 +159,18 @@ class Gateway(Closing):
             for name, target in (
                 ("sends", self._send_all),
                 ("receives", self._receive),
-                ("asks", self.commands.ask_all),
+                ("asks", self.commands.send_all),
             )
         ]
 
-    # Life.
+    # ---- start and end ----
 
     def start(self) -> None:
-        """Begin: from now on the gateway is a node of the bus."""
+        """Start: the gateway is a node of the bus from now on."""
         self._bus.set_filters([{"can_id": each, "can_mask": STANDARD_MASK, "extended": False} for each in IDENTIFIERS])
         for group in self._groups:
             self._client.subscribe(wire.sensor_key(group), self._take)
-        for key in (wire.EDGES, *_WORDS):
+        for key in (wire.EDGES, *_DOCUMENT_KEYS):
             self._client.subscribe(key, self._take)
         for thread in self._threads:
             thread.start()
@@ -190,7 +190,7 @@ class Gateway(Closing):
         return self
 
     def figures(self) -> dict[str, float]:
-        """Counts for the rig's status."""
+        """Return the counts for the rig's status."""
         refused = dict(self.commands.refused)
         return {
             "can_load": round(self._load, 4),
@@ -203,7 +203,7 @@ class Gateway(Closing):
         }
 
     def warnings(self) -> list[str]:
-        """What a person should know of, while it is so."""
+        """Return the current warnings for the operator."""
         return [
             *self.guard.warnings(),
             *self.dropping.warnings(self.dropped),
@@ -212,21 +212,21 @@ class Gateway(Closing):
 
     @property
     def blocks_dropped(self) -> int:
-        """Blocks that the sender had no time for."""
+        """Blocks dropped because the sender was too slow."""
         return self._queue.dropped
 
     @property
     def dropped(self) -> int:
-        """Frames that the bus did not take, or that were never made because samples were missing."""
+        """Frames that the bus did not accept, or that were never built because samples were missing."""
         return self.outbox.dropped + sum(each.skipped for each in self._samples) - self.taken
 
-    # On the publisher's thread.
+    # ---- on the publisher's thread ----
 
     def _take(self, key: str, payload: bytes) -> None:
         if self._paced or not self._queue.put((key, payload)):
             self._queue.push((key, payload))
 
-    # On the sender's thread.
+    # ---- on the sender's thread ----
 
     def _send_all(self) -> None:
         while not (done := self.guard(self._send_some)):
@@ -236,14 +236,14 @@ class Gateway(Closing):
                 time.sleep(_IDLE_S)
 
     def _send_some(self) -> bool:
-        """What is due now, and the wait for more; whether that was all."""
+        """Send what is due, and wait for more; return whether everything was sent and the gateway is stopping."""
         for key, payload in self._queue.take_many(len(self._queue), 0.0):
             self.guard(self.unpack, key, payload)
         now = self._now()
         self.outbox.send_due()
-        if self._ended and self.state != State.ENDED and not self.outbox.undue and not self.outbox.waiting:
-            # Only now: who hears it must not expect samples any more.
-            self.state = State.ENDED
+        if self._ended and self.state != RigState.ENDED and not self.outbox.undue and not self.outbox.waiting:
+            # Only now: a receiver of the state must not expect samples any more.
+            self.state = RigState.ENDED
             self._next_status_s = self._next_heartbeat_s = now
         self._send_periodic(now)
         self.commands.time_out()
@@ -251,8 +251,8 @@ class Gateway(Closing):
             if self._queue and not self._paced:
                 return False
             if self._stopping and not self._queue:
-                # A block of a lying time is due when nobody waits for it.
-                self._end_s = min(self._end_s, now + min(self.outbox.latency_s, _LONGEST_LATENCY_S) + _FAREWELL_S)
+                # A block with a false time may be due when no receiver waits for it any more.
+                self._end_s = min(self._end_s, now + min(self.outbox.latency_s, _MAX_LATENCY_S) + _FLUSH_TIMEOUT_S)
                 if now >= self._end_s or not (self.outbox.undue or self.outbox.stuck):
                     self.outbox.drop_all()
                     return True
@@ -264,21 +264,21 @@ class Gateway(Closing):
                 self._changed.wait(min(max(next_s - self._now(), 0.0), _IDLE_S))
             waiting = bool(self._queue or self.outbox.stuck)
         if waiting:
-            # On a grid of slots: what comes with the first part of a block is taken with it.
+            # Wake on a grid of slots, so that blocks that arrive together are sent together.
             time.sleep(SLOT_S - self._now() % SLOT_S)
         return False
 
     def unpack(self, key: str, payload: bytes) -> None:
-        """Make frames of what the rig has published.
+        """Convert a publication of the rig to frames.
 
         Raises:
-            ValueError: It is none of what a rig publishes.
+            ValueError: It is not a valid publication of a rig.
         """
         if key == wire.EVENTS:
             self._on_event(wire.decode_document(payload))
         elif key == wire.FAULTS:
-            told = check(_Told, payload, field="faults", most_bytes=DOCUMENT_BYTES)
-            self._told |= {one.key.rpartition("/")[2]: one.row + one.rows for one in told.blocks}
+            report = check(_FaultReport, payload, field="faults", most_bytes=DOCUMENT_BYTES)
+            self._fault_ends |= {one.key.rpartition("/")[2]: one.row + one.rows for one in report.blocks}
         elif key == wire.STATUS:
             self._status = wire.decode_document(payload)
             self._follow_pace(self._status)
@@ -297,8 +297,8 @@ class Gateway(Closing):
         if not len(block.values):
             return
         self._follow_time(block)
-        if self.state == State.PREPARING:
-            self.state = State.RUNNING
+        if self.state == RigState.PREPARING:
+            self.state = RigState.RUNNING
         for each in self._samples:
             if group not in each.columns:
                 continue
@@ -307,7 +307,7 @@ class Gateway(Closing):
                 # A frame is due with its last instant.
                 last, data = complete
                 self.outbox.put(each.message, data, last / self._rate_hz)
-            if any(block.index <= self._told.get(name, -1) for name in each.columns):
+            if any(block.index <= self._fault_ends.get(name, -1) for name in each.columns):
                 self.taken += each.skipped - skipped
         if group == self._groups[0]:
             self._sync(block)
@@ -323,7 +323,7 @@ class Gateway(Closing):
     def _sync(self, block: wire.Block) -> None:
         every = round(_SYNC_S * self._rate_hz)
         for index in range(-(-block.index // every) * every, block.index + len(block.values), every):
-            # As the block says: whoever ties bus time to the stream meets stamps that do not go on.
+            # Use the time in the block: a receiver that ties bus time to the stream must see its discontinuities.
             time_s = block.start_s + (index - block.index) / self._rate_hz
             self._last_sync = {"index": index & _WORD_32, "time": round(1e6 * time_s) & _WORD_32}
             self.outbox.put_one(self._messages["Sync"], time_s, **self._last_sync)
@@ -347,7 +347,7 @@ class Gateway(Closing):
         time_us = round(1e6 * float(event.get("time_s", 0.0)))
         value = event.get(EVENT_VALUES.get(name, ""), 0.0)
         value = value if isinstance(value, (int, float)) and math.isfinite(value) else 0.0
-        # With the samples of its time; its identifier loses against theirs, so that the end comes last.
+        # Sent with the samples of its time; its identifier loses against theirs, so that the end comes last.
         self.outbox.put_one(
             self._messages["Event"],
             time_us * 1e-6,
@@ -359,17 +359,17 @@ class Gateway(Closing):
         self._event_number += 1
         if kind is EventKind.START:
             self._follow_pace(event)
-        if kind is EventKind.DEVICE and (node := node_of(event.get("device"))) is not None:
-            self._tell_device(node, Standing[str(event["state"]).upper()], time_us)
+        if kind is EventKind.DEVICE and (node := device_node(event.get("device"))) is not None:
+            self._send_device_state(node, DeviceState[str(event["state"]).upper()], time_us)
 
-    def _tell_device(self, node: int, standing: Standing, time_us: int) -> None:
+    def _send_device_state(self, node: int, standing: DeviceState, time_us: int) -> None:
         message = self._messages["DeviceState"]
         self.outbox.put_one(message, time_us * 1e-6, node=node, state=standing, time=time_us & _WORD_32)
 
     def _follow_pace(self, document: dict[str, Any]) -> None:
-        """A rig in lockstep is told as such before its first block: whoever is to join must not wait for that."""
-        if document.get("pace") == "lockstep" and self.state in (State.PREPARING, State.RUNNING):
-            self.state = State.LOCKSTEP
+        """Report lockstep before the first block, as devices must join before it."""
+        if document.get("pace") == "lockstep" and self.state in (RigState.PREPARING, RigState.RUNNING):
+            self.state = RigState.LOCKSTEP
             self._next_heartbeat_s = self._now()
 
     def _send_periodic(self, now: float) -> None:
@@ -378,15 +378,15 @@ class Gateway(Closing):
             self._send_status()
         if now >= self._next_heartbeat_s:
             self._next_heartbeat_s = max(self._next_heartbeat_s + _HEARTBEAT_S, now)
-            self._beat = self._beat + 1 & 0xFF
-            if self.state == State.LOCKSTEP and self._last_sync is not None:
-                # Between two steps a node that joins would wait for the next Sync in vain.
+            self._beat_number = self._beat_number + 1 & 0xFF
+            if self.state == RigState.LOCKSTEP and self._last_sync is not None:
+                # Repeat Sync between steps: a node that joins then would otherwise wait for it in vain.
                 self.outbox.answer(self._messages["Sync"], **self._last_sync)
             self.outbox.answer(self._messages["Clock"], seconds=self._time_us // 1_000_000 & _WORD_32)
             self.outbox.answer(
                 self._messages["Heartbeat"],
                 state=self.state,
-                beat=self._beat,
+                beat=self._beat_number,
                 counter=self.commands.counter,
                 time=self._time_us & _WORD_32,
                 layout=self._layout,
@@ -413,7 +413,7 @@ class Gateway(Closing):
             refused=self.commands.refused.total() & 0xFFF,
         )
 
-    # Commands.
+    # ---- commands ----
 
     def _acknowledge(self, **raw: int) -> None:
         self.outbox.answer(self._messages["Acknowledge"], **{"time": self._time_us & _WORD_32, **raw})
@@ -425,10 +425,10 @@ class Gateway(Closing):
             try:
                 message = self._bus.recv(0.2)
             except Exception as error:
-                # Bus off, or no hub: it may come back, and the rig runs on meanwhile.
+                # Bus off, or no hub: it may recover, and the rig continues meanwhile.
                 self.bus_errors += 1
                 if not isinstance(error, (can.CanError, OSError, ValueError)):
-                    self.guard.tell("hearing the bus", error)
+                    self.guard.tell("receiving from the bus", error)
                 time.sleep(0.1)
                 continue
             if message is not None:

@@ -1,1 +1,1 @@
-"""An IEPE accelerometer conditioner: protocol, driver, twin."""
+"""IEPE accelerometer conditioner: protocol, driver, twin."""

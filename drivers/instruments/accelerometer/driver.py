@@ -17,7 +17,7 @@ class Accelerometer(Sampler):
 
     @staticmethod
     def rms(samples: Samples) -> dict[str, float]:
-        """Effective value of each channel [m/s^2 rms]."""
+        """Return the effective value of each channel [m/s^2 rms]."""
         values = np.sqrt(np.mean(samples.values**2, axis=0))
         return dict(zip(samples.names, map(float, values), strict=True))
 

@@ -1,4 +1,4 @@
-"""Protocol of an IEPE accelerometer conditioner: it measures, and does nothing else."""
+"""Protocol of an IEPE accelerometer conditioner, which only measures."""
 
 from __future__ import annotations
 

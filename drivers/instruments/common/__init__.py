@@ -1,1 +1,1 @@
-"""What the instruments share: their protocol, the driver's side and the twin's side of it."""
+"""Code that the instruments share: protocol, driver and twin."""

@@ -1,4 +1,4 @@
-"""The asyncio forms of the drivers: the same calls, each made on a thread that belongs to the instrument."""
+"""Asyncio forms of the drivers: the same calls, run on one thread per instrument."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ class AsyncMethod(Protocol[P, R_co]):
         ...
 
 
-def awaited(method: Callable[Concatenate[Any, P], R]) -> AsyncMethod[P, R]:
-    """Return a method of a driver as a coroutine method of its asyncio form."""
+def make_async(method: Callable[Concatenate[Any, P], R]) -> AsyncMethod[P, R]:
+    """Return a driver's method as a coroutine method of its asyncio form."""
 
     @functools.wraps(method)
     async def call(self: AsyncInstrument[Any], *args: P.args, **keywords: P.kwargs) -> R:
@@ -40,11 +40,11 @@ def awaited(method: Callable[Concatenate[Any, P], R]) -> AsyncMethod[P, R]:
 class AsyncInstrument(Generic[D]):
     """Asyncio form of a driver.
 
-    Calls are made one after another, in the order in which they were awaited; one that is cancelled is finished
-    on its thread all the same, at the latest after its time-out.
+    Calls run one after another, in the order in which they were awaited. A cancelled call is still finished on its
+    thread, at the latest after its time-out.
 
     Args:
-        driver: Closed with this.
+        driver: The driver; `close` closes it too.
     """
 
     DRIVER: ClassVar[type[Instrument]]
@@ -55,21 +55,21 @@ class AsyncInstrument(Generic[D]):
 
     @classmethod
     async def open(cls, url: str, *, timeout_s: float = 3.0) -> Self:
-        """As `Instrument.open`."""
+        """Connect to the instrument at a URL; arguments and errors as for `Instrument.open`."""
         return cls(await asyncio.to_thread(cls.DRIVER.open, url, timeout_s=timeout_s))
 
     @classmethod
-    def on(cls, link: Link, *, timeout_s: float = 3.0) -> Self:
-        """The instrument at the end of a link that is open."""
+    def from_link(cls, link: Link, *, timeout_s: float = 3.0) -> Self:
+        """Return the instrument at the end of an open link."""
         return cls(cls.DRIVER(link, timeout_s=timeout_s))
 
-    identify = awaited(Instrument.identify)
+    identify = make_async(Instrument.identify)
 
     async def _run(self, call: Callable[[], R]) -> R:
         return await asyncio.get_running_loop().run_in_executor(self._thread, call)
 
     async def close(self) -> None:
-        """Close the link; may be called again."""
+        """Close the link; further calls have no effect."""
         await asyncio.to_thread(self.driver.close)
         self._thread.shutdown(wait=False, cancel_futures=True)
 
@@ -81,15 +81,15 @@ class AsyncInstrument(Generic[D]):
 
 
 class AsyncSampler(AsyncInstrument[S]):
-    """Asyncio form of an instrument that measures."""
+    """Asyncio form of a measuring instrument."""
 
-    configure = awaited(Sampler.configure)
-    start = awaited(Sampler.start)
-    stop = awaited(Sampler.stop)
-    read = awaited(Sampler.read)
+    configure = make_async(Sampler.configure)
+    start = make_async(Sampler.start)
+    stop = make_async(Sampler.stop)
+    read = make_async(Sampler.read)
 
     async def blocks(self, rows: int | None = None, *, timeout_s: float = 5.0) -> AsyncIterator[Samples]:
-        """Read until the stream ends."""
+        """Yield blocks of `rows` rows to the end of the stream."""
         while True:
             try:
                 samples = await self.read(rows, timeout_s=timeout_s)

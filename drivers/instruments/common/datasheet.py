@@ -1,4 +1,4 @@
-"""What an instrument says about itself: a TEDS-like datasheet (after IEEE 1451.4: identification, then calibration)."""
+"""Electronic datasheet of an instrument, similar to TEDS (IEEE 1451.4): identification, then calibration."""
 
 from __future__ import annotations
 
@@ -9,26 +9,29 @@ from rig.channels.table import Channel, Group
 
 
 class Datasheet(BaseModel, frozen=True, extra="forbid"):
-    """Identification, and for each channel its complete calibration."""
+    """Identification of an instrument, and the complete calibration of each channel."""
 
     manufacturer: str
     model: str
     serial: str
     virtual: bool
-    """True for a twin: nothing here was ever calibrated against a standard."""
+    """True for a twin: its figures were never calibrated against a standard."""
     title: str
     rate_hz: int
-    """Rows per second at which it measures [Hz]; 0 where it measures nothing."""
+    """Sample rate [Hz]; 0 for an instrument that measures nothing."""
     channels: tuple[Channel, ...]
     """Sensitivity, bias, range, bandwidth, converter; `kind` is the provenance of these figures."""
     acts: tuple[str, ...]
-    """What it can be told to do."""
+    """Names of the commands that it accepts."""
 
     def group(self, names: tuple[str, ...] | None = None) -> Group:
-        """Channels as a group that converts counts; all, or those named.
+        """Return channels as a group that converts counts.
+
+        Args:
+            names: Names of the channels; by default all.
 
         Raises:
-            InputError: There is no such channel.
+            InputError: The channel does not exist.
         """
         known = {channel.name: channel for channel in self.channels}
         for name in names or ():
@@ -39,10 +42,10 @@ class Datasheet(BaseModel, frozen=True, extra="forbid"):
 
 
 def parse_datasheet(text: str) -> Datasheet:
-    """The datasheet in a JSON text.
+    """Parse a datasheet in JSON.
 
     Raises:
-        InputError: It is none.
+        InputError: The text is not a datasheet.
     """
     try:
         return Datasheet.model_validate_json(text)

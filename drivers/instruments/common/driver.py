@@ -1,6 +1,6 @@
-"""The host's side of an instrument: what a driver of a real one would look like to its user.
+"""Drivers of instruments, with the interface that a driver of a real instrument would have.
 
-`Instrument` identifies itself, `Sampler` also measures. Both are for one thread at a time;
+`Instrument` identifies itself, `Sampler` also measures. Use each from one thread at a time;
 `drivers.instruments.common.aio` has the asyncio forms.
 """
 
@@ -14,8 +14,8 @@ from typing import ClassVar, Self, TypeVar
 
 from drivers.instruments.common import protocol
 from drivers.instruments.common.datasheet import Datasheet, parse_datasheet
-from drivers.instruments.common.protocol import Codec, Message, ProtocolError
-from drivers.link import ROOM, Link, LinkError, LinkTimeoutError, open_link
+from drivers.instruments.common.protocol import Codec, InstrumentMessage, ProtocolError
+from drivers.link import QUEUE_MESSAGES, Link, LinkError, LinkTimeoutError, open_link
 from drivers.sources.samples import RowReader, Samples, follow
 from rig.base.closeable import Closing
 from rig.base.errors import InputError, RefusedError, Words
@@ -23,15 +23,15 @@ from rig.base.wire import Continuity
 from rig.channels.table import Group
 from rig.serve.waiting import Deadline
 
-M = TypeVar("M", bound=Message)
-_SLICE_S = 1.0
-_FAREWELL_S = 0.5
-"""How long closing waits for the instrument to stop."""
+M = TypeVar("M", bound=InstrumentMessage)
+_POLL_S = 1.0
+_STOP_TIMEOUT_S = 0.5
+"""Longest wait for the instrument to stop when the driver is closed [s]."""
 
 
 @dataclass(frozen=True, slots=True)
 class Configuration:
-    """What an instrument measures from its next start on."""
+    """Channels, units and sample rate of an instrument from its next start on."""
 
     channels: tuple[str, ...]
     units: tuple[str, ...]
@@ -40,12 +40,12 @@ class Configuration:
 
 @dataclass(frozen=True, slots=True)
 class Done:
-    """An act that was accepted.
+    """Acknowledgement of a command.
 
     Attributes:
         id: Number of the command in the rig's run.
-        tick: When it takes effect [ticks of the simulated clock].
-        time_s: The same [s].
+        tick: Effective tick.
+        time_s: The same as simulated time [s].
     """
 
     id: int
@@ -57,8 +57,8 @@ class Instrument(Closing):
     """One instrument at the end of a link.
 
     Args:
-        link: Closed with the instrument.
-        timeout_s: How long to wait for a reply [s].
+        link: The link; `close` closes it too.
+        timeout_s: Longest wait for a reply [s].
     """
 
     CODEC: ClassVar[Codec]
@@ -66,22 +66,26 @@ class Instrument(Closing):
     def __init__(self, link: Link, *, timeout_s: float = 3.0) -> None:
         self.link = link
         self._timeout_s = timeout_s
-        # From anywhere, so that a late reply to whoever had the line before is not taken for ours.
+        # Random, so that a late reply to an earlier user of the line is not mistaken for a reply to this driver.
         self._sequence = random.getrandbits(32)
-        self._data: deque[Message] = deque()
+        self._data: deque[InstrumentMessage] = deque()
         self._datasheet: Datasheet | None = None
         self.malformed = 0
-        """Messages that were none of this protocol."""
+        """Messages that do not follow this protocol."""
         self.dropped = 0
-        """Messages of data that came while nobody read, beyond what is kept."""
+        """Data messages dropped because they were not read in time."""
 
     @classmethod
     def open(cls, url: str, *, timeout_s: float = 3.0) -> Self:
-        """The instrument of this kind at a URL (`drivers.link.open_link`).
+        """Connect to the instrument of this kind at a URL.
+
+        Args:
+            url: One of the forms of `drivers.link.open_link`, such as `zenoh:127.0.0.1:7462`.
+            timeout_s: Longest wait for a reply [s].
 
         Raises:
             InputError: The URL is malformed.
-            LinkError: Nothing is there, or nothing answers.
+            LinkError: No instrument replies.
         """
         instrument = cls(open_link(url, cls.CODEC.address), timeout_s=timeout_s)
         try:
@@ -92,40 +96,40 @@ class Instrument(Closing):
         return instrument
 
     def identify(self) -> Datasheet:
-        """Identification and calibration, as the instrument tells them now."""
+        """Read identification and calibration from the instrument."""
         self._datasheet = parse_datasheet(self.ask(protocol.Identify(), protocol.Identity).datasheet)
         return self._datasheet
 
     @property
     def datasheet(self) -> Datasheet:
-        """Identification and calibration, as the instrument told them last."""
+        """Identification and calibration, as read last."""
         return self._datasheet or self.identify()
 
     @property
     def lost(self) -> int:
-        """Messages that were dropped or spoilt at this end of the link; lost rows show as gaps as well."""
+        """Messages that were dropped or corrupted at this end of the link; lost rows show as gaps as well."""
         return self.link.lost + self.dropped + self.malformed
 
     def close(self) -> None:
-        """Close the link; may be called again."""
+        """Close the link; further calls have no effect."""
         self.link.close()
 
     def _act(self, act: protocol.Act) -> Done:
-        """Tell the instrument to do something.
+        """Send a command.
 
         Raises:
-            RefusedError: It refuses, for the reason in the message.
-            LinkError: No reply came; whether it was done is not known.
+            RefusedError: The instrument refused the command, for the reason in the message.
+            LinkError: No reply came; the command may or may not take effect.
         """
         done = self.ask(act, protocol.Done)
         return Done(id=done.id, tick=done.tick, time_s=done.time_s)
 
-    def ask(self, request: Message, expected: type[M]) -> M:
-        """Send a request of the protocol; returns the reply, which must be of that kind.
+    def ask(self, request: InstrumentMessage, expected: type[M]) -> M:
+        """Send a request of the protocol, and return the reply, which must be of the expected class.
 
         Raises:
-            RefusedError: The instrument refuses, for the reason in the message.
-            LinkError: It could not answer, or did not in time.
+            RefusedError: The instrument refused the request, for the reason in the message.
+            LinkError: The instrument could not reply, or did not in time.
         """
         self._sequence = (self._sequence + 1) & 0xFFFFFFFF
         deadline = Deadline(self._timeout_s)
@@ -136,18 +140,18 @@ class Instrument(Closing):
                 continue
             sequence, message = received
             if isinstance(message, protocol.Rows | protocol.Ended):
-                self._keep(message)
+                self._store(message)
             elif sequence == self._sequence and isinstance(message, protocol.Refused):
                 if message.reason in (protocol.Reason.REFUSED, protocol.Reason.VALUE):
                     raise RefusedError(message.text)
-                raise LinkError(f"the {self.CODEC.address.name} could not answer: {message.text}")
+                raise LinkError(f"the {self.CODEC.address.name} could not reply: {message.text}")
             elif sequence == self._sequence and isinstance(message, expected):
                 return message
         raise LinkTimeoutError(
-            f"the {self.CODEC.address.name} did not answer {type(request).__name__} in {self._timeout_s:g} s"
+            f"the {self.CODEC.address.name} did not reply to {type(request).__name__} in {self._timeout_s:g} s"
         )
 
-    def _receive(self, timeout_s: float) -> tuple[int, Message] | None:
+    def _receive(self, timeout_s: float) -> tuple[int, InstrumentMessage] | None:
         data = self.link.receive(timeout_s=timeout_s)
         if data is None:
             return None
@@ -157,15 +161,15 @@ class Instrument(Closing):
             self.malformed += 1
             return None
 
-    def _keep(self, message: Message) -> None:
-        if len(self._data) >= ROOM:
+    def _store(self, message: InstrumentMessage) -> None:
+        if len(self._data) >= QUEUE_MESSAGES:
             self._data.popleft()
             self.dropped += 1
         self._data.append(message)
 
 
 class Sampler(Instrument, RowReader):
-    """An instrument that measures: configure, start, read."""
+    """Driver of a measuring instrument: configure, start, read."""
 
     def __init__(self, link: Link, *, timeout_s: float = 3.0) -> None:
         Instrument.__init__(self, link, timeout_s=timeout_s)
@@ -175,20 +179,23 @@ class Sampler(Instrument, RowReader):
         self._rows = Continuity()
 
     def configure(self, *, channels: tuple[str, ...] | list[str] | None = None, rate_hz: float = 0.0) -> Configuration:
-        """Choose what to measure; a stream that runs ends.
+        """Select channels and rate; ends a stream that runs.
 
         Args:
-            channels: Names from the datasheet; all of them where none are given. They come in the datasheet's order.
-            rate_hz: Rows per second [Hz], a whole fraction of the datasheet's rate; every n-th row is taken, with the
-                conditioner's own low-pass and no further filter. 0 is the datasheet's rate.
+            channels: Names from the datasheet; by default all. The columns are in the order of the datasheet.
+            rate_hz: Sample rate [Hz]: the datasheet's rate divided by a whole number. Samples are decimated after the
+                conditioner's own low-pass, without a further filter. 0 selects the datasheet's rate.
+
+        Returns:
+            The channels, units and rate that the instrument has accepted.
 
         Raises:
-            InputError: There is no such channel.
-            RefusedError: There is no such rate.
+            InputError: The channel does not exist.
+            RefusedError: The instrument does not have this rate.
         """
         datasheet = self.identify()
-        wanted = datasheet.group(tuple(channels)).names if channels else tuple(row.name for row in datasheet.channels)
-        mask = sum(1 << n for n, row in enumerate(datasheet.channels) if row.name in wanted)
+        chosen = datasheet.group(tuple(channels)).names if channels else tuple(row.name for row in datasheet.channels)
+        mask = sum(1 << n for n, row in enumerate(datasheet.channels) if row.name in chosen)
         reply = self.ask(protocol.Configure(rate_hz=float(rate_hz), channels=mask), protocol.Configured)
         names = tuple(row.name for n, row in enumerate(datasheet.channels) if reply.channels >> n & 1)
         self._group = group = datasheet.group(names)
@@ -196,27 +203,27 @@ class Sampler(Instrument, RowReader):
         return Configuration(names, tuple(row.unit for row in group.channels), reply.rate_hz)
 
     def start(self) -> None:
-        """Begin a stream, configured to all channels where nothing else was asked for.
+        """Start a stream, of all channels if `configure` was not called.
 
         Raises:
-            RefusedError: The instrument has nothing to measure.
+            RefusedError: The instrument measures nothing.
         """
         if self._group is None:
             self.configure()
-        self._pile.clear()
+        self._buffer.clear()
         self._rows = Continuity()
         self._ended = None
         self._stream = self.ask(protocol.Start(), protocol.Started).stream
 
     def stop(self) -> None:
-        """End the stream; what came before can still be read."""
+        """Stop the stream; samples that have arrived can still be read."""
         self._stop(discard=False)
 
     def close(self) -> None:
-        """Stop what runs and close the link; may be called again."""
+        """Stop the stream and close the link; further calls have no effect."""
         if self._stream is not None and self._ended is None:
             self._ended = "the driver was closed"
-            self._timeout_s = min(self._timeout_s, _FAREWELL_S)
+            self._timeout_s = min(self._timeout_s, _STOP_TIMEOUT_S)
             with contextlib.suppress(LinkError, InputError):
                 self._stop(discard=True)
         super().close()
@@ -230,7 +237,7 @@ class Sampler(Instrument, RowReader):
         return super()._take(rows, whole=whole)
 
     def _wait(self, deadline: Deadline) -> bool:
-        """Take the next message of data; False where none came in time."""
+        """Receive the next data message, and return False if none arrived in time."""
         message = self._next(deadline)
         if isinstance(message, protocol.Ended):
             if message.stream == self._stream:
@@ -239,12 +246,12 @@ class Sampler(Instrument, RowReader):
             self._add(message)
         return message is not None
 
-    def _next(self, deadline: Deadline) -> Message | None:
+    def _next(self, deadline: Deadline) -> InstrumentMessage | None:
         if self._data:
             return self._data.popleft()
         while True:
             passed = deadline.passed
-            received = self._receive(min(deadline.left_s, _SLICE_S))
+            received = self._receive(min(deadline.left_s, _POLL_S))
             if received is not None and isinstance(received[1], protocol.Rows | protocol.Ended):
                 return received[1]
             if passed:
@@ -255,7 +262,7 @@ class Sampler(Instrument, RowReader):
         if group is None or rows.columns != len(group.channels) or not len(rows.counts):
             self.malformed += 1
             return
-        came = Samples(
+        new_samples = Samples(
             index=rows.index,
             tick=rows.tick,
             rate_hz=rows.rate_hz,
@@ -264,5 +271,5 @@ class Sampler(Instrument, RowReader):
             units=tuple(channel.unit for channel in group.channels),
             values=group.engineering(rows.counts),
         )
-        if (new := follow(self._rows, came)) is not None:
-            self._pile.add(new)
+        if (new := follow(self._rows, new_samples)) is not None:
+            self._buffer.add(new)

@@ -1,8 +1,8 @@
-"""Sans-IO codec of the instruments: requests, replies and data, to bytes and back.
+"""Codec of the instrument protocol: requests, replies and data to bytes and back; does no input or output itself.
 
-A message is a head (version, number of the instrument, kind, sequence number; little-endian) and the fields of its
-kind. A reply repeats the sequence number of its request; data have a count of their own. Every request is answered, by
-`Refused` where it cannot be carried out or read; bytes that are no message raise `ProtocolError` and nothing else.
+A message is a header (version, number of the instrument, kind, sequence number; little-endian) followed by the fields
+of its kind. A reply repeats the sequence number of its request; data messages have their own count. Every request has a
+reply: `Refused` if it cannot be decoded or carried out. Bytes that are not a message raise only `ProtocolError`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _COUNTS = np.dtype("<i4")
 
 
 class Reason(IntEnum):
-    """Why a request was refused, or bytes are no message."""
+    """Reason for refusing a request, or for rejecting bytes."""
 
     VERSION = 1
     INSTRUMENT = 2
@@ -32,54 +32,54 @@ class Reason(IntEnum):
     LENGTH = 4
     VALUE = 5
     REFUSED = 6
-    """The instrument, or the rig behind it, does not allow it: the text says why."""
+    """The instrument or its rig does not allow it: the text gives the reason."""
     UNAVAILABLE = 7
-    """Nothing answers behind the instrument."""
+    """The instrument's rig does not reply."""
 
 
 class ProtocolError(ValueError):
-    """Bytes that are no message, for the reason given."""
+    """Bytes are not a message of the protocol."""
 
     def __init__(self, reason: Reason, text: str, *, sequence: int = 0) -> None:
         self.reason = reason
         self.sequence = sequence
-        """Of the message, where the bytes tell."""
+        """Sequence number of the message, if it can be read."""
         super().__init__(text)
 
 
 class Tail:
-    """What follows the fields of fixed length, to the end of the message: the last field of a message's class."""
+    """Type of a message's last field if its length varies: it extends to the end of the message."""
 
     TEXT = "text"
     COUNTS = "counts"
 
 
 @dataclass(frozen=True, slots=True)
-class Message:
-    """Base of all messages: `KIND`, the `struct` layout of the fields in their order, and what the last one is."""
+class InstrumentMessage:
+    """Base of all messages: `KIND`, the `struct` layout of the fields, and the type of a variable last field."""
 
     KIND: ClassVar[int] = 0
     LAYOUT: ClassVar[str] = "<"
     TAIL: ClassVar[str | None] = None
 
 
-# Requests, from the host.
+# ---- requests, from the host ----
 
 
 @dataclass(frozen=True, slots=True)
-class Identify(Message):
-    """Who are you, and how are you calibrated?"""
+class Identify(InstrumentMessage):
+    """Request for the datasheet."""
 
     KIND = 0x01
 
 
 @dataclass(frozen=True, slots=True)
-class Configure(Message):
-    """Choose channels and rate; ends a stream that runs.
+class Configure(InstrumentMessage):
+    """Request to select channels and rate; ends a stream that runs.
 
     Attributes:
-        rate_hz: Rows per second [Hz]; 0 is the instrument's own rate.
-        channels: Bit n is channel n of the datasheet; 0 is all.
+        rate_hz: Sample rate [Hz]; 0 for the instrument's own rate.
+        channels: Bit n is channel n of the datasheet; 0 for all.
     """
 
     KIND = 0x02
@@ -89,19 +89,19 @@ class Configure(Message):
 
 
 @dataclass(frozen=True, slots=True)
-class Start(Message):
-    """Begin a stream of data."""
+class Start(InstrumentMessage):
+    """Request to start a stream of data."""
 
     KIND = 0x03
 
 
 @dataclass(frozen=True, slots=True)
-class Stop(Message):
-    """End a stream of data; nothing happens where another one runs by now.
+class Stop(InstrumentMessage):
+    """Request to stop a stream of data; without effect if another stream runs.
 
     Attributes:
-        stream: Number of the stream; 0 is the one that runs.
-        discard: Not 0: what was measured and has not been sent yet is not wanted any more.
+        stream: Number of the stream; 0 for the current one.
+        discard: Whether to discard measured data that have not been sent (not 0).
     """
 
     KIND = 0x04
@@ -111,21 +111,21 @@ class Stop(Message):
 
 
 @dataclass(frozen=True, slots=True)
-class Act(Message):
-    """Base of what an acting instrument can be told to do; kinds from 0x40 on, each instrument's own.
+class Act(InstrumentMessage):
+    """Base of an instrument's commands; kinds from 0x40 on, which differ between instruments.
 
-    It has the fields of the rig's command `COMMAND`, with a text where that takes a word or a number.
+    It has the fields of the rig's command `COMMAND`, with a text for a field that accepts words and numbers.
     """
 
     COMMAND: ClassVar[str] = ""
 
 
-# Replies, from the instrument.
+# ---- replies, from the instrument ----
 
 
 @dataclass(frozen=True, slots=True)
-class Identity(Message):
-    """The datasheet (`drivers.instruments.common.datasheet`) as JSON."""
+class Identity(InstrumentMessage):
+    """Reply with the datasheet (`drivers.instruments.common.datasheet`) as JSON."""
 
     KIND = 0x81
     TAIL = Tail.TEXT
@@ -133,8 +133,8 @@ class Identity(Message):
 
 
 @dataclass(frozen=True, slots=True)
-class Configured(Message):
-    """What was chosen: rate [Hz] and channels as bits."""
+class Configured(InstrumentMessage):
+    """Reply with the selected rate [Hz] and channels as bits."""
 
     KIND = 0x82
     LAYOUT = "<dI"
@@ -143,8 +143,8 @@ class Configured(Message):
 
 
 @dataclass(frozen=True, slots=True)
-class Started(Message):
-    """Number of the stream that begins."""
+class Started(InstrumentMessage):
+    """Reply with the number of the new stream."""
 
     KIND = 0x83
     LAYOUT = "<I"
@@ -152,8 +152,8 @@ class Started(Message):
 
 
 @dataclass(frozen=True, slots=True)
-class Stopped(Message):
-    """Rows that the ended stream has sent, and rows that found no room on the link."""
+class Stopped(InstrumentMessage):
+    """Reply with the number of rows that the stream has sent, and of rows dropped because the link was full."""
 
     KIND = 0x84
     LAYOUT = "<IQQ"
@@ -163,8 +163,8 @@ class Stopped(Message):
 
 
 @dataclass(frozen=True, slots=True)
-class Done(Message):
-    """An act was accepted: its number in the rig's run, and when it takes effect [ticks], [s]."""
+class Done(InstrumentMessage):
+    """Acknowledgement of a command: its number in the rig's run, and when it takes effect [ticks], [s]."""
 
     KIND = 0x85
     LAYOUT = "<qqd"
@@ -174,8 +174,8 @@ class Done(Message):
 
 
 @dataclass(frozen=True, slots=True)
-class Refused(Message):
-    """A request was not carried out: a `Reason`, and one line."""
+class Refused(InstrumentMessage):
+    """Refusal of a request: a `Reason`, and one line of text."""
 
     KIND = 0x86
     LAYOUT = "<B"
@@ -184,20 +184,20 @@ class Refused(Message):
     text: str
 
 
-# Data, from the instrument, unasked while a stream runs.
+# ---- data, sent by the instrument while a stream runs ----
 
 
 @dataclass(frozen=True, slots=True)
-class Rows(Message):
+class Rows(InstrumentMessage):
     """Consecutive rows of ADC counts.
 
     Attributes:
         stream: Number of the stream.
         index: Number of the first row since the start of the rig's stream, at `rate_hz`.
         tick: Time of the first row [ticks].
-        rate_hz: Rows per second [Hz].
+        rate_hz: Sample rate [Hz].
         tick_rate_hz: Ticks per second [Hz].
-        columns: Values a row.
+        columns: Values per row.
         counts: int32, shape (rows, columns).
     """
 
@@ -217,8 +217,8 @@ ROWS_HEAD = HEAD.size + struct.calcsize(Rows.LAYOUT)
 
 
 @dataclass(frozen=True, slots=True)
-class Ended(Message):
-    """The stream has ended, for a reason."""
+class Ended(InstrumentMessage):
+    """End of a stream, with the reason."""
 
     KIND = 0xC2
     LAYOUT = "<I"
@@ -227,27 +227,27 @@ class Ended(Message):
     reason: str
 
 
-COMMON: tuple[type[Message], ...] = (
+COMMON_MESSAGES: tuple[type[InstrumentMessage], ...] = (
     Identify, Configure, Start, Stop, Identity, Configured, Started, Stopped, Done, Refused, Rows, Ended,
 )  # fmt: skip
-M = TypeVar("M", bound=Message)
+M = TypeVar("M", bound=InstrumentMessage)
 
 
 class Codec:
-    """Messages of one instrument to bytes and back.
+    """Converts messages of one instrument to bytes and back.
 
     Args:
-        address: Its name and number.
-        acts: What it can be told to do.
+        address: Name and number of the instrument.
+        acts: Classes of its commands.
     """
 
     def __init__(self, address: Address, acts: tuple[type[Act], ...] = ()) -> None:
         self.address = address
         self.acts = acts
-        self.kinds = {each.KIND: (each, struct.Struct(each.LAYOUT)) for each in (*COMMON, *acts)}
+        self.kinds = {each.KIND: (each, struct.Struct(each.LAYOUT)) for each in (*COMMON_MESSAGES, *acts)}
 
-    def encode(self, message: Message, sequence: int) -> bytes:
-        """One message as bytes."""
+    def encode(self, message: InstrumentMessage, sequence: int) -> bytes:
+        """Encode one message."""
         kind, layout = self.kinds[message.KIND]
         values = [getattr(message, each.name) for each in dataclasses.fields(kind)]
         tail = b""
@@ -258,41 +258,41 @@ class Codec:
         head = HEAD.pack(VERSION, self.address.number, kind.KIND, sequence & 0xFFFFFFFF)
         return b"".join((head, layout.pack(*values), tail))
 
-    def decode(self, data: bytes) -> tuple[int, Message]:
-        """Sequence number and message.
+    def decode(self, data: bytes) -> tuple[int, InstrumentMessage]:
+        """Decode one message; return its sequence number and the message.
 
         Raises:
-            ProtocolError: The bytes are no message of this instrument.
+            ProtocolError: The bytes are not a message of this instrument.
         """
         if len(data) < HEAD.size:
-            raise ProtocolError(Reason.LENGTH, f"a message has at least {HEAD.size} bytes; received {len(data)}")
+            raise ProtocolError(Reason.LENGTH, f"message must be at least {HEAD.size} bytes; received {len(data)}")
         version, number, code, sequence = HEAD.unpack_from(data)
 
-        def wrong(reason: Reason, text: str) -> ProtocolError:
+        def error(reason: Reason, text: str) -> ProtocolError:
             return ProtocolError(reason, text, sequence=sequence)
 
         if version != VERSION:
-            raise wrong(Reason.VERSION, f"version must be {VERSION}; instead received {version}")
+            raise error(Reason.VERSION, f"version must be {VERSION}; instead received {version}")
         if number != self.address.number:
             text = f"instrument must be {self.address.number} ({self.address.name}); instead received {number}"
-            raise wrong(Reason.INSTRUMENT, text)
+            raise error(Reason.INSTRUMENT, text)
         if code not in self.kinds:
-            raise wrong(Reason.KIND, f"kind must be one that the {self.address.name} has; instead received {code:#04x}")
+            raise error(Reason.KIND, f"kind must be a kind of the {self.address.name}; instead received {code:#04x}")
         kind, layout = self.kinds[code]
         start = HEAD.size + layout.size
         if len(data) < start or (kind.TAIL is None and len(data) != start):
-            raise wrong(Reason.LENGTH, f"{kind.__name__} must be of {start} bytes; instead received {len(data)}")
+            raise error(Reason.LENGTH, f"{kind.__name__} must be {start} bytes long; instead received {len(data)}")
         values: list[Any] = list(layout.unpack_from(data, HEAD.size))
         if any(isinstance(value, float) and not math.isfinite(value) for value in values):
-            raise wrong(Reason.VALUE, f"{kind.__name__} must hold finite numbers; instead received {values}")
+            raise error(Reason.VALUE, f"{kind.__name__} must contain finite numbers; instead received {values}")
         if kind.TAIL == Tail.TEXT:
             try:
                 values.append(data[start:].decode())
             except UnicodeDecodeError:
-                raise wrong(Reason.VALUE, f"text of {kind.__name__} must be UTF-8") from None
+                raise error(Reason.VALUE, f"text of {kind.__name__} must be UTF-8") from None
         elif kind.TAIL == Tail.COUNTS:
             columns = int(values[-1])
             if not columns or (len(data) - start) % (columns * _COUNTS.itemsize):
-                raise wrong(Reason.LENGTH, f"{kind.__name__} must hold whole rows of {columns} values")
+                raise error(Reason.LENGTH, f"{kind.__name__} must contain whole rows of {columns} values")
             values.append(np.frombuffer(data, _COUNTS, offset=start).reshape(-1, columns))
         return sequence, kind(*values)

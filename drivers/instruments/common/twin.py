@@ -1,6 +1,6 @@
-"""The instrument's side: serves the protocol from the sensor blocks of a rig, and passes commands on to its console.
+"""Twin of an instrument: serves the instrument's protocol from the rig's samples, and passes commands to its console.
 
-A twin has what an instrument of that kind has: its own channels and its own commands. It cannot see the truth.
+A twin has the channels and the commands of the real instrument. It cannot see the truth.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ import numpy as np
 from drivers.console import Accepted, Console
 from drivers.instruments.common import protocol
 from drivers.instruments.common.datasheet import Datasheet
-from drivers.instruments.common.protocol import Codec, Message, ProtocolError, Reason
+from drivers.instruments.common.protocol import Codec, InstrumentMessage, ProtocolError, Reason
 from drivers.link import Port
-from drivers.sources.stream import RigStream, thin, whole_step
+from drivers.sources.stream import RigStream, decimate, decimation_factor
 from rig.base import wire
 from rig.base.errors import InputError, Words
 from rig.channels.table import Group
@@ -30,34 +30,35 @@ MANUFACTURER = "Virtual rotor-stator rig"
 
 @dataclass(slots=True)
 class _Running:
-    """A stream on its way to the host."""
+    """State of a stream that is sent to the host."""
 
     number: int
     channels: list[int]
     step: int
-    """Every so many rows of the rig are taken."""
+    """Decimation: every n-th row of the rig is sent."""
     parts: list[np.ndarray] = field(default_factory=list)
-    """Counts that wait until they fill a message or the link is idle; a slow link gets fewer and longer messages."""
+    """Counts that wait until they fill a message or the link is idle; a slow link receives fewer and longer messages.
+    """
     first: wire.Block | None = None
-    """Where they begin."""
+    """Block with which `parts` begins."""
     messages: int = 0
     rows: int = 0
     dropped: int = 0
 
 
 class Twin:
-    """One instrument at one port; it has one state, whoever asks, as the real one would.
+    """One instrument at one port. It has one state for all its users, like the real instrument.
 
     Args:
         stream: Sensor blocks of the rig.
-        console: Where commands go.
-        port: The instrument's end of a link; closed with the twin.
+        console: Console for the commands.
+        port: Instrument's end of a link; `close` closes it too.
     """
 
     CODEC: ClassVar[Codec]
     TITLE: ClassVar[str]
     GROUP: ClassVar[str | None] = None
-    """Group of the channel table that it measures."""
+    """Channel group that it measures."""
 
     def __init__(self, stream: RigStream, console: Console, port: Port) -> None:
         self._stream = stream
@@ -72,25 +73,25 @@ class Twin:
         self._leave: Callable[[], None] | None = None
         self._closed = False
         self.refused = 0
-        """Requests that were not carried out, or were none."""
+        """Requests that were refused or malformed."""
         port.serve(self.answer, self._on_idle)
 
     @property
     def running(self) -> bool:
-        """Whether a stream is on its way to the host."""
+        """Whether a stream is being sent to the host."""
         return self._running is not None
 
     @property
     def url(self) -> str:
-        """What a host opens."""
+        """URL for the host to open."""
         return self._port.url
 
     def answer(self, data: bytes) -> bytes:
-        """The reply to a request; never raises."""
+        """Return the reply to a request; never raises."""
         sequence = 0
         try:
             sequence, request = self.CODEC.decode(data)
-            reply = self._carry_out(request)
+            reply = self._execute(request)
         except ProtocolError as error:
             sequence = error.sequence
             reply = protocol.Refused(error.reason, one_line(error))
@@ -102,16 +103,16 @@ class Twin:
         return self.CODEC.encode(reply, sequence)
 
     def act(self, act: protocol.Act) -> Accepted:
-        """Send an act of this instrument to the rig, as the command that it stands for.
+        """Send a command of this instrument to the rig.
 
         Raises:
-            InputError: The rig refuses.
-            NoReplyError: No rig answers.
+            InputError: The rig refused the command.
+            NoReplyError: No rig replies.
         """
-        given = {name: as_number(value) if isinstance(value, str) else value for name, value in asdict(act).items()}
-        return self._console.send(act.COMMAND, **given)
+        fields = {name: as_number(value) if isinstance(value, str) else value for name, value in asdict(act).items()}
+        return self._console.send(act.COMMAND, **fields)
 
-    def _carry_out(self, request: Message) -> Message:
+    def _execute(self, request: InstrumentMessage) -> InstrumentMessage:
         if isinstance(request, protocol.Identify):
             return protocol.Identity(self._datasheet().model_dump_json())
         if isinstance(request, protocol.Act):
@@ -127,7 +128,7 @@ class Twin:
 
     def _datasheet(self) -> Datasheet:
         name = self.CODEC.address.name
-        group = self._measured() if self.GROUP else None
+        group = self._read_group() if self.GROUP else None
         return Datasheet(
             manufacturer=MANUFACTURER,
             model=f"{name} (virtual)",
@@ -139,40 +140,40 @@ class Twin:
             acts=tuple(act.__name__ for act in self.CODEC.acts),
         )
 
-    def _measured(self) -> Group:
-        """The channels as the rig runs them now."""
+    def _read_group(self) -> Group:
+        """Return the measured group, as the rig runs it now."""
         if self.GROUP is None:
-            raise InputError("request", f"one that a {self.CODEC.address.name} has", Words("one for measurements"))
+            raise InputError("request", f"one of a {self.CODEC.address.name}", Words("a request for measurements"))
         return self._stream.group(self.GROUP)
 
     def _configure(self, request: protocol.Configure) -> protocol.Configured:
-        group = self._measured()
-        every = (1 << len(group.channels)) - 1
-        mask = request.channels or every
-        if mask & ~every:
+        group = self._read_group()
+        all_channels = (1 << len(group.channels)) - 1
+        mask = request.channels or all_channels
+        if mask & ~all_channels:
             raise InputError("channels", f"bits 0 to {len(group.channels) - 1}", bin(mask))
         rate = request.rate_hz or float(group.rate_hz)
-        whole_step(group.rate_hz, rate)
+        decimation_factor(group.rate_hz, rate)
         with self._lock:
-            self._end("configured anew", discard=True)
+            self._end("configured again", discard=True)
             self._mask, self._rate_hz = mask, rate
         return protocol.Configured(rate_hz=rate, channels=mask)
 
     def _start(self) -> protocol.Started:
-        group = self._measured()
-        # Both before the lock is taken: the transport may deliver a block from within.
+        group = self._read_group()
+        # Before the lock is taken: the transport may deliver a block during the call.
         if not self._listening:
             self._listening = True
             assert self.GROUP is not None
-            self._leave = self._stream.listen(wire.sensor_key(self.GROUP), self.take, self.rig_ended)
+            self._leave = self._stream.listen(wire.sensor_key(self.GROUP), self.take, self.end_run)
         rate = self._rate_hz or float(group.rate_hz)
         mask = self._mask or (1 << len(group.channels)) - 1
         chosen = [n for n in range(len(group.channels)) if mask >> n & 1]
-        step = whole_step(group.rate_hz, rate)
+        step = decimation_factor(group.rate_hz, rate)
         if not chosen:
-            raise InputError("channels", "configured anew: this rig has others", bin(mask))
+            raise InputError("channels", "configured again: this rig has other channels", bin(mask))
         with self._lock:
-            self._end("started anew", discard=True)
+            self._end("started again", discard=True)
             self._streams += 1
             self._running = _Running(self._streams, chosen, step)
             return protocol.Started(self._streams)
@@ -186,7 +187,7 @@ class Twin:
             return protocol.Stopped(running.number, running.rows, running.dropped)
 
     def _end(self, reason: str, *, discard: bool = False) -> None:
-        """End the stream that runs; the lock is held."""
+        """End the current stream; the caller holds the lock."""
         running, self._running = self._running, None
         if running is None:
             return
@@ -196,12 +197,12 @@ class Twin:
             self._flush(running, everything=True)
         self._push(running, protocol.Ended(running.number, reason))
 
-    def _push(self, running: _Running, message: Message) -> bool:
+    def _push(self, running: _Running, message: InstrumentMessage) -> bool:
         running.messages += 1
         return self._port.push(self.CODEC.encode(message, running.messages))
 
     def take(self, block: wire.Block) -> None:
-        """Send on what the host has chosen of a block; never waits."""
+        """Send the selected rows of a block; never blocks."""
         with self._lock:
             running = self._running
             if running is None:
@@ -209,13 +210,13 @@ class Twin:
             if block.values.shape[1] <= max(running.channels):
                 self._end("the rig's channels have changed")
                 return
-            block = thin(block, running.step)
+            block = decimate(block, running.step)
             if not len(block.values):
                 return
             first = running.first
             if first is not None:
-                kept = sum(map(len, running.parts))
-                if block.index != first.index + kept or block.rate_hz != first.rate_hz:
+                waiting_rows = sum(map(len, running.parts))
+                if block.index != first.index + waiting_rows or block.rate_hz != first.rate_hz:
                     self._flush(running, everything=True)
             running.first = running.first or block
             running.parts.append(block.values[:, running.channels])
@@ -227,19 +228,19 @@ class Twin:
                 self._flush(self._running)
 
     def _flush(self, running: _Running, *, everything: bool = False) -> None:
-        """Push what fills messages, and the rest as well where the link is idle; the lock is held."""
+        """Push full messages, and the rest too if the link is idle; the caller holds the lock."""
         first = running.first
         if first is None:
             return
         columns = len(running.channels)
-        most = max(1, (self._port.max_bytes - protocol.ROWS_HEAD) // (4 * columns))
+        max_rows = max(1, (self._port.max_bytes - protocol.ROWS_HEAD) // (4 * columns))
         waiting = sum(map(len, running.parts))
-        if waiting < most and not everything and not self._port.idle:
+        if waiting < max_rows and not everything and not self._port.idle:
             return
         counts = np.concatenate(running.parts) if len(running.parts) > 1 else running.parts[0]
         start = 0
-        while start < waiting and (waiting - start >= most or everything or self._port.idle):
-            part = counts[start : start + most]
+        while start < waiting and (waiting - start >= max_rows or everything or self._port.idle):
+            part = counts[start : start + max_rows]
             rows = protocol.Rows(
                 stream=running.number,
                 index=first.index + start,
@@ -260,13 +261,13 @@ class Twin:
             tick = wire.row_tick(first.tick, first.rate_hz, first.tick_rate_hz, start)
             running.first = replace(first, index=first.index + start, tick=tick, values=first.values[:0])
 
-    def rig_ended(self, reason: str) -> None:
-        """The rig publishes nothing more."""
+    def end_run(self, reason: str) -> None:
+        """End the stream: the rig publishes no more blocks."""
         with self._lock:
             self._end(reason)
 
     def close(self) -> None:
-        """Stop serving; may be called again."""
+        """Stop serving; further calls have no effect."""
         if self._closed:
             return
         self._closed = True

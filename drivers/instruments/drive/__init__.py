@@ -1,1 +1,1 @@
-"""A motor controller with tachometer and keyphasor: protocol, driver, twin."""
+"""Motor controller with tachometer and keyphasor: protocol, driver, twin."""

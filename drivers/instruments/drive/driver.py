@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
-from drivers.instruments.common.aio import AsyncSampler, awaited
+from drivers.instruments.common.aio import AsyncSampler, make_async
 from drivers.instruments.common.driver import Done, Sampler
 from drivers.instruments.drive.protocol import CODEC, SetSpeed
 
 
 class Drive(Sampler):
-    """Sets the speed that the drive holds, and reads it [Hz]."""
+    """Sets the speed set point of the drive, and reads the speed [Hz]."""
 
     CODEC = CODEC
 
     def set_speed(self, hz: float) -> Done:
-        """Set the speed that the drive holds [Hz].
+        """Set the speed set point of the drive.
+
+        Args:
+            hz: Shaft speed [Hz].
 
         Raises:
-            RefusedError: The rig refused, for the reason in the message.
-            LinkError: No reply came; whether it was set is not known.
+            RefusedError: The rig refused the command, for the reason in the message.
+            LinkError: No reply came; the speed may or may not be set.
         """
         return self._act(SetSpeed(speed_hz=float(hz)))
 
@@ -26,4 +29,4 @@ class AsyncDrive(AsyncSampler[Drive]):
     """Sets and reads the speed, for asyncio."""
 
     DRIVER = Drive
-    set_speed = awaited(Drive.set_speed)
+    set_speed = make_async(Drive.set_speed)

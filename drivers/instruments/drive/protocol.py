@@ -1,4 +1,4 @@
-"""Protocol of a motor controller: it holds a speed, and measures it."""
+"""Protocol of a motor controller, which controls a speed and measures it."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from drivers.link import Address
 
 @dataclass(frozen=True, slots=True)
 class SetSpeed(Act):
-    """Hold a speed.
+    """Command to set the speed set point.
 
     Attributes:
-        speed_hz: Turns per second [Hz].
+        speed_hz: Shaft speed [Hz].
     """
 
     KIND = 0x40

@@ -1,1 +1,1 @@
-"""A force transducer's charge amplifier: protocol, driver, twin."""
+"""Charge amplifier of the force transducers: protocol, driver, twin."""

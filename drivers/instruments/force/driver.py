@@ -1,4 +1,4 @@
-"""Driver of the force transducers' charge amplifiers; compression is positive."""
+"""Driver of the force transducers' charge amplifier; compression is positive."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ class Force(Sampler):
 
     @staticmethod
     def peaks(samples: Samples) -> dict[str, tuple[float, float]]:
-        """Largest compression of each transducer [N], and when [s of simulated time]."""
+        """Return the largest compression of each transducer [N], and its simulated time [s]."""
         rows = samples.values.argmax(axis=0)
         times = samples.times_s
         return {

@@ -1,4 +1,4 @@
-"""Protocol of a force transducer's charge amplifier: it measures, and does nothing else."""
+"""Protocol of a force transducer's charge amplifier, which only measures."""
 
 from __future__ import annotations
 

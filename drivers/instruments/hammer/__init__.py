@@ -1,1 +1,1 @@
-"""A pendulum hammer with its force transducer: protocol, driver, twin."""
+"""Pendulum hammer with its force transducer: protocol, driver, twin."""

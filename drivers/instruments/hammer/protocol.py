@@ -1,4 +1,4 @@
-"""Protocol of a pendulum hammer: it hits, and measures its own force."""
+"""Protocol of a pendulum hammer, which strikes, and measures its own force."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from drivers.link import Address
 
 @dataclass(frozen=True, slots=True)
 class Hit(Act):
-    """Hit the shaft at the disk.
+    """Command to strike the shaft at the disk.
 
     Attributes:
         force_n: Peak force [N].
-        duration_ms: Length of the half sine [ms].
-        direction: `x`, `y`, `-x`, `-y`, or an angle from x towards y [degrees].
+        duration_ms: Length of the half-sine pulse [ms].
+        direction: `x`, `y`, `-x`, `-y`, or the angle from x towards y [degrees].
     """
 
     KIND = 0x40

@@ -7,7 +7,7 @@ from drivers.instruments.hammer.protocol import CODEC
 
 
 class HammerTwin(Twin):
-    """Serves the rig's group `hammer`, and hits."""
+    """Serves the rig's group `hammer`, and triggers impacts."""
 
     CODEC = CODEC
     TITLE = "Pendulum hammer controller"

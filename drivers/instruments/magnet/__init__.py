@@ -1,1 +1,1 @@
-"""The magnet that holds the shaft until it is released: protocol, driver, twin."""
+"""Magnet that holds the shaft until it is released: protocol, driver, twin."""

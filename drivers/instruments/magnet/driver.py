@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from drivers.instruments.common.aio import AsyncInstrument, awaited
+from drivers.instruments.common.aio import AsyncInstrument, make_async
 from drivers.instruments.common.driver import Done, Instrument
 from drivers.instruments.magnet.protocol import CODEC, Release
 
@@ -16,14 +16,14 @@ class Magnet(Instrument):
         """Release the shaft.
 
         Raises:
-            RefusedError: The rig refused, for the reason in the message.
-            LinkError: No reply came; whether it was released is not known.
+            RefusedError: The rig refused the command, for the reason in the message.
+            LinkError: No reply came; the shaft may or may not be released.
         """
         return self._act(Release())
 
 
 class AsyncMagnet(AsyncInstrument[Magnet]):
-    """Releases, for asyncio."""
+    """Releases the shaft, for asyncio."""
 
     DRIVER = Magnet
-    release = awaited(Magnet.release)
+    release = make_async(Magnet.release)

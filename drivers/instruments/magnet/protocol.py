@@ -1,4 +1,4 @@
-"""Protocol of the magnet that holds the shaft: it releases, and measures nothing."""
+"""Protocol of the magnet that holds the shaft, which releases it and measures nothing."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from drivers.link import Address
 
 @dataclass(frozen=True, slots=True)
 class Release(Act):
-    """Let the shaft go."""
+    """Command to release the shaft."""
 
     KIND = 0x40
     COMMAND = "release"

@@ -7,7 +7,7 @@ from drivers.instruments.magnet.protocol import CODEC
 
 
 class MagnetTwin(Twin):
-    """Releases."""
+    """Releases the shaft."""
 
     CODEC = CODEC
     TITLE = "Magnet release"

@@ -1,1 +1,1 @@
-"""An eddy-current proximity probe conditioner: protocol, driver, twin."""
+"""Eddy-current proximity probe conditioner: protocol, driver, twin."""

@@ -1,4 +1,4 @@
-"""Protocol of an eddy-current proximity probe conditioner: it measures, and does nothing else."""
+"""Protocol of an eddy-current proximity probe conditioner, which only measures."""
 
 from __future__ import annotations
 

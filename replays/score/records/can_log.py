@@ -40,7 +40,7 @@ def open_can_log(path: Path, table: ChannelTable) -> list[Recorded]:
     import can
 
     from drivers.can.signals import messages_for
-    from drivers.sources.can import Layout
+    from drivers.sources.can import SampleDecoder
 
     messages = messages_for(table)
     frames: dict[str, tuple[list[bytes], list[float]]] = {}
@@ -68,7 +68,7 @@ def open_can_log(path: Path, table: ChannelTable) -> list[Recorded]:
         if message.fd is not fd or form is None:
             continue
         step = rates.get(f"{'fd' if fd else 'classic'}_step") or round(rates["rate"] * message.period_s / form.rows)
-        parts = Layout({name: message}).decode(name, data, rates["rate"], step, 0)
+        parts = SampleDecoder({name: message}).decode(name, data, rates["rate"], step, 0)
         values = np.concatenate([part.values for part in parts])
         times_s = np.repeat(stamps, form.rows)
         # Its stamps are those of frames: when they came, not how often samples were taken.

@@ -129,11 +129,11 @@ def _table(channels: Path | None) -> ChannelTable:
 
 def load(*, messages: CanMessages, channels: ChannelFile = None, form: Form) -> None:
     """Show every message of the rig with its period, share of the bus and longest response time."""
-    from drivers.can.gateway.samples import steps
+    from drivers.can.gateway.samples import find_decimations
 
     table = _table(channels)
     schedule, speed = messages.plan(table)
-    steps(table, schedule)
+    find_decimations(table, schedule)
     messages_found = [
         {
             "id": message.identifier,

@@ -123,9 +123,9 @@ class CanOutput:
             parse_loopback(str(self._settings["endpoint"]), field="--can")
         self.schedule, self.speed = options.messages.plan(channels)
         if channels is not None:
-            from drivers.can.gateway.samples import steps
+            from drivers.can.gateway.samples import find_decimations
 
-            steps(channels, self.schedule)
+            find_decimations(channels, self.schedule)
         if options.can_overload:
             self.load = self.schedule.load(self.speed)
         else:

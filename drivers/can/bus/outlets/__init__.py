@@ -1,1 +1,1 @@
-"""Access to the bus for programs with text protocols: socketcand and SLCAN."""
+"""Text protocols for access to the bus by other programs: socketcand and SLCAN."""

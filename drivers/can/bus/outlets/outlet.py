@@ -1,4 +1,4 @@
-"""A client of a bus that speaks in text: what it writes is taken on one thread, and whole messages leave on another."""
+"""Base of a text client of a bus: one thread reads from the client, another writes complete messages to it."""
 
 from __future__ import annotations
 
@@ -18,27 +18,28 @@ if TYPE_CHECKING:
     import can
 
 OpenBus = Callable[[], "can.BusABC"]
-"""Makes one more node on a bus."""
+"""Function that opens a new node on a bus."""
 
 ROOM = 3000
-"""Messages that may wait for one client: 0.4 s of a full classic bus at 1 Mbit/s."""
+"""Largest number of messages that wait for one client: 0.4 s of a full classic bus at 1 Mbit/s."""
 PATIENCE_S = 10.0
-"""How long a client for which text waits may take nothing before it is given up."""
+"""Longest time for which a client may read nothing of waiting text before it is given up [s]."""
 
 _SEND_S = 0.5
-"""How long a client's frame may wait for room in its transmit queue."""
-_READ = 4096
-_WRITTEN = 1024
-"""Bytes that are written together: a client that reads as many at a time meets whole messages while it keeps up."""
+"""Longest wait of a client's frame for room in its transmit queue [s]."""
+_READ_BYTES = 4096
+_WRITE_BYTES = 1024
+"""Bytes that are written together: a client that reads as many at a time receives complete messages while it keeps up.
+"""
 _POLL_S = 0.1
-_PARTING_S = 1.0
+_FLUSH_TIMEOUT_S = 1.0
 
 
-def message_of(identifier: int, data: bytes, *, length: int, extended: bool, remote: bool, **kind: bool) -> can.Message:
-    """A frame that a client has written.
+def make_message(identifier: int, data: bytes, *, length: int, extended: bool, remote: bool, **fd: bool) -> can.Message:
+    """Build a frame from a client's values.
 
     Raises:
-        CodecError: No controller can send it; it says why.
+        CodecError: No controller can send it, for the reason in the message.
     """
     import can
 
@@ -48,23 +49,23 @@ def message_of(identifier: int, data: bytes, *, length: int, extended: bool, rem
         is_remote_frame=remote,
         dlc=length,
         data=None if remote else data,
-        **kind,
+        **fd,
     )
-    codec.offered(message)
+    codec.make_offer(message)
     return message
 
 
 class Outlet:
-    """One client at a descriptor, with at most one node of a bus at a time.
+    """One client at a file descriptor, with at most one node of a bus at a time.
 
-    What waits for it is bounded, a message is never torn, and nobody ever waits for it: frames without room are
-    dropped and counted, and of a client that asks and asks and reads nothing no more is read.
+    The queue for the client is bounded, messages are never torn, and no other client waits for it: frames without room
+    are dropped and counted, and nothing more is read from a client that sends requests and reads no replies.
 
     Args:
-        descriptor: Of a socket or terminal; must not block. Its owner closes it.
-        name: What warnings call it.
-        room: Messages that may wait for the client.
-        patience_s: How long it may take nothing of what waits [s].
+        descriptor: File descriptor of a socket or terminal, non-blocking; its owner closes it.
+        name: Name in warnings.
+        room: Largest number of messages that wait for the client.
+        patience_s: Longest time for which it may read nothing of waiting text [s].
     """
 
     def __init__(self, descriptor: int, *, name: str, room: int = ROOM, patience_s: float = PATIENCE_S) -> None:
@@ -75,9 +76,9 @@ class Outlet:
         self._changed = threading.Condition()
         self._messages: deque[bytes] = deque()
         self._rest = b""
-        """What is being written."""
+        """Text that is being written."""
         self.bus: can.BusABC | None = None
-        self._hearing: threading.Thread | None = None
+        self._receiver: threading.Thread | None = None
         self._ending = False
         self._stalled = False
         self._guard = Guard(name)
@@ -85,34 +86,34 @@ class Outlet:
         self.counts: Counter[str] = Counter()
         self._writer = threading.Thread(target=self._write_all, name=f"{name} writes", daemon=True)
 
-    # What a kind of client provides.
+    # ---- provided by the kind of client ----
 
     def _take(self, data: bytes) -> None:
-        """What the client has written."""
+        """Process data from the client."""
         raise NotImplementedError
 
     def show_frame(self, message: can.Message) -> bytes | None:
-        """Text of a frame, or None where the client is not to have it."""
+        """Return the text of a frame; None if it is not for the client."""
         raise NotImplementedError
 
     def _overflow(self) -> bytes:
-        """What to tell the client of frames that found no room, when there is some again."""
+        """Return the text that reports dropped frames to the client, once there is room again."""
         raise NotImplementedError
 
     def _tick(self) -> None:
-        """Called every now and then while there is a bus."""
+        """Perform periodic work; called repeatedly while there is a bus."""
 
     def _lose(self) -> None:
-        """The bus fails."""
+        """Handle a failure of the bus."""
 
     def _give_up(self) -> None:
-        """The client has taken nothing for too long, and what waited for it was forgotten."""
+        """Give the client up: it has read nothing for too long, and the text that waited for it was discarded."""
         self._ending = True
 
-    # Life.
+    # ---- start and end ----
 
     def serve(self) -> None:
-        """Serve the client until it has gone, or `stop`."""
+        """Serve the client until it disconnects, or until `stop`."""
         self._writer.start()
         try:
             while not self._ending:
@@ -123,16 +124,16 @@ class Outlet:
             self._writer.join()
 
     def stop(self) -> None:
-        """Begin to end, without waiting."""
+        """Request the end, without waiting."""
         with self._changed:
             self._ending = True
             self._changed.notify_all()
 
     def warnings(self) -> list[str]:
-        """What a person should know of, while it is so."""
+        """Return the current warnings for the operator."""
         return [*self._guard.warnings(), *self._dropping.warnings(self.counts["dropped"])]
 
-    # From the client.
+    # ---- from the client ----
 
     def _read(self) -> None:
         if self._stalled:
@@ -142,7 +143,7 @@ class Outlet:
         if not self._ready(select.POLLIN):
             return
         try:
-            data = os.read(self._descriptor, _READ)
+            data = os.read(self._descriptor, _READ_BYTES)
         except BlockingIOError:
             return
         except OSError:
@@ -158,15 +159,15 @@ class Outlet:
         return bool(poll.poll(_POLL_S * 1000))
 
     def _answer(self, text: bytes) -> None:
-        """Put what each costs its client a question; waits for room."""
+        """Queue a reply to the client; wait for room."""
         with self._changed:
             self._changed.wait_for(lambda: len(self._messages) < self._room or self._ending)
             self.put(text)
 
-    # To the client.
+    # ---- to the client ----
 
     def put(self, text: bytes) -> bool:
-        """Add a message that must not be torn; False where there is no room."""
+        """Queue a message that must not be torn; return False if the queue is full."""
         with self._changed:
             if len(self._messages) >= self._room:
                 return False
@@ -181,13 +182,13 @@ class Outlet:
             self._changed.notify_all()
 
     def _write_all(self) -> None:
-        moved_s = time.monotonic()
+        last_write_s = time.monotonic()
         while True:
             with self._changed:
                 if not self._rest:
-                    moved_s = time.monotonic()
+                    last_write_s = time.monotonic()
                     self._changed.wait_for(lambda: self._messages or self._ending, _POLL_S)
-                    while self._messages and (not self._rest or len(self._rest + self._messages[0]) <= _WRITTEN):
+                    while self._messages and (not self._rest or len(self._rest + self._messages[0]) <= _WRITE_BYTES):
                         self._rest += self._messages.popleft()
                     self._changed.notify_all()
                 if not self._rest:
@@ -198,36 +199,36 @@ class Outlet:
                 try:
                     with self._changed, contextlib.suppress(BlockingIOError):
                         self._rest = self._rest[os.write(self._descriptor, self._rest) :]
-                        moved_s = time.monotonic()
+                        last_write_s = time.monotonic()
                 except OSError:
                     self._ending = True
                     self._forget()
-            elif time.monotonic() - moved_s > (_PARTING_S if self._ending else self._patience_s):
+            elif time.monotonic() - last_write_s > (_FLUSH_TIMEOUT_S if self._ending else self._patience_s):
                 self._forget()
                 self._stalled = True
 
-    # The bus.
+    # ---- bus ----
 
     def _enter(self, bus: can.BusABC) -> None:
-        """Hear a bus from now on, which is left and shut down with the client."""
+        """Receive from a bus from now on; it is shut down with the client."""
         self.bus = bus
-        self._hearing = threading.Thread(target=self._hear_all, args=(bus,), name=f"{self._name} hears", daemon=True)
-        self._hearing.start()
+        self._receiver = threading.Thread(target=self._receive, args=(bus,), name=f"{self._name} hears", daemon=True)
+        self._receiver.start()
 
     def _leave(self) -> None:
-        hearing, self.bus, self._hearing = self._hearing, None, None
-        if hearing is not None:
-            hearing.join(timeout=5.0)
+        receiver, self.bus, self._receiver = self._receiver, None, None
+        if receiver is not None:
+            receiver.join(timeout=5.0)
 
     def _send(self, message: can.Message) -> None:
-        """Send a frame; waits a little for room. Raises CanError where the bus does not take it."""
+        """Send a frame, after a short wait for room; raises CanError if the bus does not accept it."""
         assert self.bus is not None
         self.bus.send(message, timeout=_SEND_S)
 
-    def _hear_all(self, bus: can.BusABC) -> None:
+    def _receive(self, bus: can.BusABC) -> None:
         import can
 
-        crowded = False
+        overflowed = False
         try:
             while self.bus is bus:
                 message = bus.recv(_POLL_S / 2)
@@ -235,11 +236,11 @@ class Outlet:
                 text = None if message is None else self._guard(self.show_frame, message)
                 if text is None:
                     continue
-                crowded = not self.put(self._overflow() + text if crowded else text)
-                self.counts["dropped"] += crowded
+                overflowed = not self.put(self._overflow() + text if overflowed else text)
+                self.counts["dropped"] += overflowed
         except Exception as error:
             if not isinstance(error, (can.CanError, OSError, ValueError)):
-                self._guard.tell("hearing the bus", error)
+                self._guard.tell("receiving from the bus", error)
             self._lose()
         finally:
             self._guard(bus.shutdown)

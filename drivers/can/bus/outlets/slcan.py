@@ -1,17 +1,18 @@
-"""A pseudo terminal behind which we play an SLCAN (Lawicel) adapter: a CAN bus for any program that opens a port.
+"""SLCAN (Lawicel) adapter at a pseudo-terminal: a CAN bus for any program that opens a serial port.
 
-The commands are those of Lawicel's CAN232 and CANUSB manuals, and for CAN FD those of the CANable 2.0 firmware as
-python-can's interface `slcan` speaks them. A line ends with a carriage return; the answer is one, or a bell.
+The commands are those of Lawicel's CAN232 and CANUSB manuals, and for CAN FD those of the CANable 2.0 firmware, as in
+python-can's interface `slcan`. A line ends with a carriage return; the reply is a carriage return, or a bell.
 
-    S0-S8 sXXYY Yn   bit rate, taken where it is the bus's, which nobody can change here; Yn: n Mbit/s for FD data
+    S0-S8 sXXYY Yn   bit rate, accepted if it is the bus's, which cannot be changed here; Yn: n Mbit/s for FD data
     O L C            open, open to listen only, close the channel
     t T r R          a frame, an extended one, a remote one, an extended remote one
     d D b B          CAN FD frames: standard, extended, with bit rate switch, extended with bit rate switch
     V N F Z0 Z1      version, serial number, status flags, without or with time stamps (milliseconds of the minute)
     M00000000 mFFFFFFFF  acceptance of all frames, the only one; Un: any speed of the terminal
 
-Frames leave by themselves: polling (P, A, X0) is not there. The protocol has no error frames; they set status flags.
-It has no error state indicator either.
+Frames are sent without a request: polling (P, A, X0) is not supported. The protocol has no error frames; they set
+status
+flags. It has no error state indicator either.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from typing import TYPE_CHECKING
 from drivers.can.bus import codec
 from drivers.can.bus.codec import CodecError
 from drivers.can.bus.frame import FD_LENGTHS
-from drivers.can.bus.outlets.outlet import PATIENCE_S, ROOM, OpenBus, Outlet, message_of
+from drivers.can.bus.outlets.outlet import PATIENCE_S, ROOM, OpenBus, Outlet, make_message
 from drivers.can.bus.timing import Speed
 
 if TYPE_CHECKING:
@@ -50,42 +51,42 @@ BUS_ERROR = 1 << 7
 _RATES = (10_000, 20_000, 50_000, 100_000, 125_000, 250_000, 500_000, 800_000, 1_000_000)
 """Bit rates of S0 to S8 [bit/s]."""
 _CLOCK_HZ = 8e6
-"""Of the SJA1000 that the registers of `s` are meant for: half of its 16 MHz crystal."""
-_LONGEST = 160
-"""Characters that a line may have: the longest FD frame has 138."""
+"""Clock of the SJA1000 whose registers `s` sets [Hz]: half of its 16 MHz crystal."""
+_MAX_CHARS = 160
+"""Longest line [characters]: the longest FD frame has 138."""
 _FRAME = re.compile(r"(?:[tdbr]([0-9A-Fa-f]{3})|[TDBR]([0-9A-Fa-f]{8}))([0-9A-Fa-f])((?:[0-9A-Fa-f]{2})*)")
 _MINUTE_MS = 60_000
 
 
 class Lines:
-    """Lines out of a stream of bytes."""
+    """Splits a stream of bytes into lines."""
 
     def __init__(self) -> None:
         self._rest = b""
         self._spoilt = False
 
     def feed(self, data: bytes) -> Iterator[str | None]:
-        """The lines that are complete with this data; None stands for one that is too long or has strange bytes.
+        """Yield the lines that are complete with this data; None for one that is too long or has invalid bytes.
 
         Args:
             data: The next bytes, in portions of any size.
         """
         *lines, self._rest = (self._rest + data).split(b"\r")
         for line in lines:
-            # Terminal programs end lines with both.
+            # Terminal programs end lines with both characters.
             text = line.lstrip(b"\n").decode("ascii", errors="replace")
-            good = not self._spoilt and len(text) <= _LONGEST and text.isascii() and (text.isprintable() or not text)
+            good = not self._spoilt and len(text) <= _MAX_CHARS and text.isascii() and (text.isprintable() or not text)
             self._spoilt = False
             yield text if good else None
-        if len(self._rest) > _LONGEST:
+        if len(self._rest) > _MAX_CHARS:
             self._rest, self._spoilt = b"", True
 
 
 def parse(line: str) -> can.Message:
-    """The frame of a line.
+    """Parse the frame of a line.
 
     Raises:
-        CodecError: It is none.
+        CodecError: The line is not a frame.
     """
     match = _FRAME.fullmatch(line)
     if match is None:
@@ -97,13 +98,13 @@ def parse(line: str) -> can.Message:
     length = FD_LENGTHS[code]
     if len(data) != (0 if remote else length):
         raise CodecError("not as long as it says")
-    return message_of(
+    return make_message(
         identifier, data, length=length, extended=extended, remote=remote, is_fd=fd, bitrate_switch=kind == "b"
     )
 
 
 def show(message: can.Message, *, stamped: bool = False) -> bytes | None:
-    """The line of a frame; None: an error frame, which the protocol does not have.
+    """Format a frame as a line; None for an error frame, which the protocol does not have.
 
     Args:
         message: The frame.
@@ -124,24 +125,25 @@ def show(message: can.Message, *, stamped: bool = False) -> bytes | None:
 
 
 class SlcanPort(Outlet):
-    """A pseudo terminal with an adapter behind it. One program at a time can use it, as a real one.
+    """SLCAN adapter at a pseudo-terminal. Like a real one, it can be used by one program at a time.
 
     Args:
-        open_bus: Makes the adapter's node on the bus, each time its channel is opened.
-        speed: Bit rates of the bus; None takes any that is asked for.
-        room: Messages that may wait for the program.
-        patience_s: How long it may take nothing of what waits before the channel is closed [s].
+        open_bus: Opens the adapter's node on the bus, each time its channel is opened.
+        speed: Bit rates of the bus; None accepts any.
+        room: Largest number of messages that wait for the program.
+        patience_s: Longest time for which the program may read nothing of waiting text before the channel is closed
+            [s].
     """
 
     def __init__(
         self, open_bus: OpenBus, *, speed: Speed | None = None, room: int = ROOM, patience_s: float = PATIENCE_S
     ) -> None:
-        # Ours stays open: without, each program that closes its end would end the terminal's raw mode.
+        # Our end stays open: otherwise each program that closes its end would end the terminal's raw mode.
         self._master, self._slave = os.openpty()
         tty.setraw(self._slave)
         os.set_blocking(self._master, False)
         self.path = os.ttyname(self._slave)
-        """What programs open."""
+        """Path for programs to open."""
         super().__init__(self._master, name=f"slcan {self.path}", room=room, patience_s=patience_s)
         self._open_bus = open_bus
         self._speed = speed
@@ -159,7 +161,7 @@ class SlcanPort(Outlet):
         self.close()
 
     def close(self) -> None:
-        """Take the adapter away."""
+        """Remove the adapter."""
         self.stop()
         if self._thread.is_alive():
             self._thread.join(timeout=6.0)
@@ -168,25 +170,25 @@ class SlcanPort(Outlet):
                 os.close(descriptor)
 
     def figures(self) -> dict[str, int]:
-        """What has happened: `open` channels, `dropped` frames, `bells`, frames `refused` by the bus, `given_up`."""
+        """Return counts: `open` channels, `dropped` frames, `bells`, frames `refused` by the bus, `given_up`."""
         names = ("dropped", "bells", "refused", "given_up")
         return {"open": int(self.bus is not None), **{name: self.counts[name] for name in names}}
 
-    # From the program.
+    # ---- from the program ----
 
     def _take(self, data: bytes) -> None:
         for line in self._lines.feed(data):
             if self._ending:
                 return
-            answer = None if line is None else self._obey(line)
+            answer = None if line is None else self._execute(line)
             if answer is None:
                 answer = BELL
             if answer == BELL:
                 self.counts["bells"] += 1
             self._answer(answer)
 
-    def _obey(self, line: str) -> bytes | None:
-        """The answer to a line; None where it is no command, or not one for now."""
+    def _execute(self, line: str) -> bytes | None:
+        """Execute a line, and return the reply; None if it is not a command, or not allowed now."""
         command, rest = line[:1], line[1:]
         if command and command in "tTrRdDbB":
             return self._transmit(line)
@@ -202,7 +204,7 @@ class SlcanPort(Outlet):
             case "O" | "L" if not is_open and not rest:
                 return self._open(listen_only=command == "L")
             case "C" if not rest:
-                # Also where it is closed already, as every program begins.
+                # Also if it is closed already: every program begins with it.
                 self._close()
                 return OK
             case "Z" if not is_open and rest in ("0", "1"):
@@ -219,7 +221,7 @@ class SlcanPort(Outlet):
         return None
 
     def _is_rate(self, command: str, rest: str) -> bool:
-        """Whether a command asks for the rate that the bus has."""
+        """Return whether a command requests the rate of the bus."""
         speed = self._speed
         if command == "S" and re.fullmatch(r"[0-8]", rest):
             asked, given = _RATES[int(rest)], None if speed is None else speed.nominal_bit_s
@@ -264,7 +266,7 @@ class SlcanPort(Outlet):
             self.counts["refused"] += 1
             return BELL
         if listen_only:
-            # Others than our own buses may not know how to; then nothing is sent, but they may acknowledge.
+            # Buses of other kinds may not support it; then nothing is sent, but they may acknowledge.
             with contextlib.suppress(NotImplementedError, can.CanError):
                 bus.state = can.BusState.PASSIVE
         self._listen_only = listen_only
@@ -275,7 +277,7 @@ class SlcanPort(Outlet):
     def _close(self) -> None:
         self._leave()
         if self._messages or self._rest:
-            # Of a program that reads no more: the next one must not take it for its own.
+            # Text for a program that no longer reads: the next program must not receive it.
             self._forget()
 
     def _forget(self) -> None:
@@ -283,12 +285,12 @@ class SlcanPort(Outlet):
         with contextlib.suppress(termios.error):
             termios.tcflush(self._slave, termios.TCIFLUSH)
 
-    # To the program, on the thread that hears the bus.
+    # ---- to the program, on the thread that receives from the bus ----
 
     def show_frame(self, message: can.Message) -> bytes | None:
-        """Text of a frame, or None where the client is not to have it."""
+        """Return the text of a frame; None if it is not for the client."""
         if message.is_error_frame:
-            self._flags |= flags_of(message)
+            self._flags |= status_flags(message)
         return show(message, stamped=self._stamped)
 
     def _overflow(self) -> bytes:
@@ -296,17 +298,17 @@ class SlcanPort(Outlet):
         return b""
 
     def _lose(self) -> None:
-        # Frames are refused from now on; opened anew, the bus may be there again.
+        # Frames are refused from now on; the bus may be available when the channel is opened again.
         self._flags |= ERROR_PASSIVE | BUS_ERROR
 
     def _give_up(self) -> None:
-        # The program can begin again.
+        # The program can start again.
         self._leave()
         self._forget()
 
 
-def flags_of(message: can.Message) -> int:
-    """The status flags that an error frame sets; its classes are those of SocketCAN."""
+def status_flags(message: can.Message) -> int:
+    """Return the status flags that an error frame sets; its classes are those of SocketCAN."""
     kind, data = message.arbitration_id, bytes(message.data).ljust(8, b"\0")
     flags = 0
     if kind & codec.CONTROLLER:

@@ -1,14 +1,15 @@
-"""A socketcand server: a CAN bus for clients in any language, as text over loopback TCP.
+"""Socketcand server: a CAN bus for clients in any language, as text over loopback TCP.
 
-The protocol is that of the Linux daemon socketcand (github.com/linux-can/socketcand, doc/protocol.md), spoken by
-python-can (interface `socketcand`), Kayak and others. Each connection is a node of its own on the bus.
+The protocol is that of the Linux daemon socketcand (github.com/linux-can/socketcand, doc/protocol.md), which python-can
+(interface `socketcand`), Kayak and others use. Each connection is a separate node on the bus.
 
-Understood: open, rawmode, bcmmode, controlmode, send, sendrtr, subscribe, unsubscribe, echo, statistics. Not: cyclic
-sending (add, update, delete), content filters, ISO-TP, the settings of a bus, and the beacon, which is a broadcast.
-They are answered with an error. The protocol has no CAN FD frames: they are left out and counted.
+Supported: open, rawmode, bcmmode, controlmode, send, sendrtr, subscribe, unsubscribe, echo, statistics. Not supported,
+and refused with an error: cyclic sending (add, update, delete), content filters, ISO-TP and the settings of a bus.
+The
+beacon, a broadcast, is not sent. The protocol has no CAN FD frames: they are left out and counted.
 
-An error that is not one of the bus is told as `< error 000 TIME TEXT >`: like an error frame of no class, since
-clients such as python-can's read every error as a frame and stumble over mere text.
+An error that is not one of the bus is sent as `< error 000 TIME TEXT >`: like an error frame without a class, because
+clients such as python-can's parse every error as a frame and fail at plain text.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 from drivers.can.bus.codec import CONTROLLER, CodecError
-from drivers.can.bus.outlets.outlet import PATIENCE_S, ROOM, OpenBus, Outlet, message_of
+from drivers.can.bus.outlets.outlet import PATIENCE_S, ROOM, OpenBus, Outlet, make_message
 from rig.base.errors import InputError
 from rig.serve.health import Guard
 from rig.serve.transport.endpoint import parse_loopback
@@ -37,19 +38,20 @@ if TYPE_CHECKING:
     import can
 
 PORT = 29536
-"""Where the daemon listens unless told otherwise."""
+"""Default port of the daemon."""
 MAX_CLIENTS = 16
 
-_LONGEST = 512
-"""Characters that a command may have."""
-_SENDING = 1 << 16
-"""Bytes that the system may hold for a client beyond those that wait here."""
+_MAX_COMMAND_CHARS = 512
+"""Longest command [characters]."""
+_SEND_BUFFER_BYTES = 1 << 16
+"""Bytes that the system may buffer for a client in addition to the queue here."""
 _HOLD_S = 0.05
-"""How long frames wait after rawmode's answer: clients read that answer by itself and would lose what comes with it."""
+"""Delay of frames after the reply to rawmode [s]: clients read that reply in one piece, and would lose frames sent with
+it."""
 _POLL_S = 0.1
-_ENDING_S = 6.0
-_SHORTEST_MS = 10
-_LONGEST_MS = 3_600_000
+_CLOSE_TIMEOUT_S = 6.0
+_MIN_INTERVAL_MS = 10
+_MAX_INTERVAL_MS = 3_600_000
 _MAX_SUBSCRIPTIONS = 4096
 _HEX = re.compile(r"[0-9A-Fa-f]{1,8}")
 _BYTE = re.compile(r"[0-9A-Fa-f]{1,2}")
@@ -57,17 +59,17 @@ _NUMBER = re.compile(r"[0-9]{1,9}")
 
 
 class Splitter:
-    """Commands out of a stream of text; what is between them is dropped."""
+    """Splits a stream of text into commands; text between them is dropped."""
 
     def __init__(self) -> None:
         self._text = b""
 
     def __len__(self) -> int:
-        """Bytes that wait for the rest of their command."""
+        """Return the number of bytes of the incomplete command."""
         return len(self._text)
 
     def feed(self, data: bytes) -> Iterator[str | None]:
-        """The commands that are complete with this data, without brackets; None stands for text that is none.
+        """Yield the commands that are complete with this data, without brackets; None for invalid text.
 
         Args:
             data: The next bytes, in portions of any size.
@@ -75,48 +77,48 @@ class Splitter:
         self._text += data
         while self._text:
             start = self._text.find(b"<")
-            strange = self._text if start < 0 else self._text[:start]
+            prefix = self._text if start < 0 else self._text[:start]
             self._text = b"" if start < 0 else self._text[start:]
-            if strange.strip():
+            if prefix.strip():
                 yield None
             end = self._text.find(b">")
             if end < 0:
-                if len(self._text) > _LONGEST:
+                if len(self._text) > _MAX_COMMAND_CHARS:
                     self._text = b""
                     yield None
                 return
             command, self._text = self._text[1:end], self._text[end + 1 :]
             text = command.decode("ascii", errors="replace")
-            yield text if end < _LONGEST and text.isascii() and text.isprintable() and text.strip() else None
+            yield text if end < _MAX_COMMAND_CHARS and text.isascii() and text.isprintable() and text.strip() else None
 
 
 def parse_frame(words: list[str], *, remote: bool = False) -> can.Message:
-    """The frame of a `send` or `sendrtr` command.
+    """Parse the frame of a `send` or `sendrtr` command.
 
     Args:
-        words: Identifier, length and bytes in text: 8 digits make the identifier an extended one.
-        remote: Whether it is a remote frame, which has a length only.
+        words: Identifier, length and bytes as text: 8 digits make the identifier an extended one.
+        remote: Whether it is a remote frame, which has only a length.
 
     Raises:
-        CodecError: They make no classic frame.
+        CodecError: The words are not a classic frame.
     """
     identifier, extended = parse_identifier(words[0] if words else "")
     if len(words) < 2 or not _BYTE.fullmatch(words[1]) or int(words[1], 16) > 8:
         raise CodecError("a length of 0 to 8 must follow the identifier")
-    length, given = int(words[1], 16), words[2:]
-    if not all(_BYTE.fullmatch(byte) for byte in given):
+    length, data_words = int(words[1], 16), words[2:]
+    if not all(_BYTE.fullmatch(byte) for byte in data_words):
         raise CodecError("data must be bytes of one or two hexadecimal digits")
-    if len(given) != (0 if remote else length):
-        raise CodecError(f"{len(given)} bytes of data for a length of {length}")
-    data = bytes(int(byte, 16) for byte in given)
-    return message_of(identifier, data, length=length, extended=extended, remote=remote)
+    if len(data_words) != (0 if remote else length):
+        raise CodecError(f"{len(data_words)} bytes of data for a length of {length}")
+    data = bytes(int(byte, 16) for byte in data_words)
+    return make_message(identifier, data, length=length, extended=extended, remote=remote)
 
 
 def parse_identifier(text: str) -> tuple[int, bool]:
-    """An identifier, and whether it is an extended one.
+    """Parse an identifier; return it, and whether it is an extended one.
 
     Raises:
-        CodecError: It is none.
+        CodecError: The text is not an identifier.
     """
     extended = len(text) == 8
     if not _HEX.fullmatch(text) or not (extended or len(text) <= 3):
@@ -125,7 +127,7 @@ def parse_identifier(text: str) -> tuple[int, bool]:
 
 
 def show(message: can.Message) -> bytes | None:
-    """A frame as the server tells it; None: a CAN FD frame, which the protocol does not have."""
+    """Format a frame as text; None for a CAN FD frame, which the protocol does not have."""
     if message.is_fd:
         return None
     time_s = f"{message.timestamp:.6f}"
@@ -137,13 +139,13 @@ def show(message: can.Message) -> bytes | None:
     return f"< frame {identifier} {time_s} {message.data.hex().upper()} >".encode()
 
 
-def show_error(text: str) -> bytes:
-    """An error that is not one of the bus."""
+def format_error(text: str) -> bytes:
+    """Format an error that is not one of the bus."""
     return f"< error 000 {time.time():.6f} {text} >".encode()
 
 
 class Client(Outlet):
-    """One connection, from hi to its end."""
+    """One connection, from the greeting to its end."""
 
     def __init__(
         self, descriptor: int, buses: Mapping[str, OpenBus], *, number: int, room: int, patience_s: float
@@ -154,14 +156,14 @@ class Client(Outlet):
         self._raw = False
         self._held_until_s = 0.0
         self._subscribed: dict[tuple[int, bool], list[float]] = {}
-        """Shortest time between two frames [s], and when the next may come, by identifier."""
+        """Shortest time between two frames [s], and time of the next one [s, monotonic], by identifier."""
         self._every_s = 0.0
         self._next_s = 0.0
         self.traffic = [0, 0, 0, 0]
         """Bytes and frames received, bytes and frames sent."""
         self._answer(b"< hi >")
 
-    # From the client.
+    # ---- from the client ----
 
     def _take(self, data: bytes) -> None:
         for command in self._splitter.feed(data):
@@ -170,12 +172,12 @@ class Client(Outlet):
             try:
                 if command is None:
                     raise CodecError("a command must be words in angle brackets")
-                self._obey(command.split())
+                self._execute(command.split())
             except CodecError as error:
                 self.counts["malformed"] += 1
-                self._answer(show_error(str(error)))
+                self._answer(format_error(str(error)))
 
-    def _obey(self, words: list[str]) -> None:
+    def _execute(self, words: list[str]) -> None:
         import can
 
         word, *rest = words
@@ -192,23 +194,23 @@ class Client(Outlet):
             except can.CanError as error:
                 self.counts["refused"] += 1
                 # Brackets would end the text early.
-                self._answer(show_error(f"not sent: {' '.join(re.sub('[<>]', ' ', str(error)).split())}"))
+                self._answer(format_error(f"not sent: {' '.join(re.sub('[<>]', ' ', str(error)).split())}"))
             else:
                 self.traffic[2] += len(message.data)
                 self.traffic[3] += 1
         elif word in ("rawmode", "bcmmode", "controlmode") and not rest:
             self._held_until_s = time.monotonic() + _HOLD_S
-            # In this order: no frame before the answer, none lost after it.
+            # In this order: no frame before the reply, none lost after it.
             self._answer(b"< ok >")
             self._raw = word == "rawmode"
         elif word == "statistics":
-            self._every_s = self._number_of(rest, 1)[0] / 1000
-            if self._every_s and not _SHORTEST_MS <= self._every_s * 1000 <= _LONGEST_MS:
+            self._every_s = self._parse_numbers(rest, 1)[0] / 1000
+            if self._every_s and not _MIN_INTERVAL_MS <= self._every_s * 1000 <= _MAX_INTERVAL_MS:
                 self._every_s = 0.0
-                raise CodecError(f"an interval must be 0 or from {_SHORTEST_MS} to {_LONGEST_MS} ms")
+                raise CodecError(f"an interval must be 0 or from {_MIN_INTERVAL_MS} to {_MAX_INTERVAL_MS} ms")
             self._next_s = time.monotonic() + self._every_s
         elif word == "subscribe" and len(rest) == 3:
-            seconds, microseconds = self._number_of(rest[:2], 2)
+            seconds, microseconds = self._parse_numbers(rest[:2], 2)
             if len(self._subscribed) >= _MAX_SUBSCRIPTIONS:
                 raise CodecError(f"there may be {_MAX_SUBSCRIPTIONS} subscriptions")
             self._subscribed[parse_identifier(rest[2])] = [seconds + microseconds * 1e-6, 0.0]
@@ -228,7 +230,7 @@ class Client(Outlet):
                 raise InputError("bus", " or ".join(self._buses), " ".join(words))
             bus = open_bus()
         except (can.CanError, OSError, ValueError):
-            # As the daemon does; a bus that cannot be had now may be there at the next connection.
+            # As the daemon does; a bus that is not available now may be at the next connection.
             self.counts["malformed"] += 1
             self._answer(b"< error could not open bus >")
             self._ending = True
@@ -237,15 +239,15 @@ class Client(Outlet):
         self._enter(bus)
 
     @staticmethod
-    def _number_of(words: list[str], count: int) -> list[int]:
+    def _parse_numbers(words: list[str], count: int) -> list[int]:
         if len(words) != count or not all(_NUMBER.fullmatch(word) for word in words):
             raise CodecError(f"{count} whole numbers must follow")
         return [int(word) for word in words]
 
-    # To the client, on the thread that hears the bus.
+    # ---- to the client, on the thread that receives from the bus ----
 
     def show_frame(self, message: can.Message) -> bytes | None:
-        """Text of a frame, or None where the client is not to have it."""
+        """Return the text of a frame; None if it is not for the client."""
         text = show(message)
         if text is None:
             self.counts["fd_left_out"] += 1
@@ -278,17 +280,17 @@ class Client(Outlet):
 
 
 class SocketcandServer(socketserver.ThreadingTCPServer):
-    """Serves buses to socketcand clients, each on a thread of its own.
+    """Serves buses to socketcand clients, each on its own thread.
 
     Args:
-        buses: By name, what makes a node on the bus: one for each connection.
-        host: Where to listen.
-        port: Likewise; 0 takes a free one.
-        room: Messages that may wait for one client.
-        patience_s: How long a client may take nothing of what waits before it is disconnected [s].
+        buses: Functions that open a node on a bus, one for each connection, by the name of the bus.
+        host: Address to listen on.
+        port: Port to listen on; 0 for a free one.
+        room: Largest number of messages that wait for one client.
+        patience_s: Longest time for which a client may read nothing of waiting text before it is disconnected [s].
 
     Raises:
-        InputError: The host is not of this machine alone, or the port is taken.
+        InputError: The host can be reached from other computers, or the port is in use.
     """
 
     allow_reuse_address = True
@@ -329,7 +331,7 @@ class SocketcandServer(socketserver.ThreadingTCPServer):
         self.close()
 
     def close(self) -> None:
-        """End all connections."""
+        """Close all connections."""
         if self._thread.is_alive():
             self.shutdown()
         self.server_close()
@@ -337,22 +339,22 @@ class SocketcandServer(socketserver.ThreadingTCPServer):
             clients = list(self.clients)
         for client in clients:
             client.stop()
-        wait_until(lambda: not self.clients, _ENDING_S)
+        wait_until(lambda: not self.clients, _CLOSE_TIMEOUT_S)
 
     def counts(self) -> dict[str, int]:
-        """What has happened: `clients` now, `dropped` frames, `fd_left_out`, `malformed`, `refused`, `given_up`."""
+        """Return counts: connected `clients`, `dropped` frames, `malformed` commands, `given_up`, ..."""
         with self._lock:
             total = sum((client.counts for client in self.clients), self._ended)
             names = ("dropped", "fd_left_out", "malformed", "refused", "given_up", "turned_away")
             return {"clients": len(self.clients), **{name: total[name] for name in names}}
 
     def warnings(self) -> list[str]:
-        """What a person should know of, while it is so."""
+        """Return the current warnings for the operator."""
         with self._lock:
             return [*self._guard.warnings(), *(text for client in self.clients for text in client.warnings())]
 
     def verify_request(self, request: Any, client_address: Any) -> bool:
-        """Let a client in where there is room; on the server's thread."""
+        """Return whether there is room for a client; on the server's thread."""
         with self._lock:
             full = len(self.clients) >= MAX_CLIENTS
             self._ended["turned_away"] += full
@@ -362,10 +364,10 @@ class SocketcandServer(socketserver.ThreadingTCPServer):
         return not full
 
     def finish_request(self, request: Any, client_address: Any) -> None:
-        """Serve a connection to its end, on a thread of its own."""
+        """Serve a connection to its end, on its own thread."""
         request.setblocking(False)
         request.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        request.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SENDING)
+        request.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER_BYTES)
         with self._lock:
             client = Client(request.fileno(), self._buses, number=next(self._numbers), **self._settings)
             self.clients.append(client)
@@ -377,5 +379,5 @@ class SocketcandServer(socketserver.ThreadingTCPServer):
                 self._ended.update(client.counts)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Tell of a connection that failed."""
+        """Report a connection that failed."""
         self._guard.tell("a connection", sys.exception() or RuntimeError())
