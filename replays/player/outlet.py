@@ -67,7 +67,7 @@ class Outlet:
         else:
             self._publish(key, item.payload)
 
-    def tell(self, event: dict[str, Any]) -> None:
+    def publish_event(self, event: dict[str, Any]) -> None:
         """Publish an event that is not in the recording."""
         if self._stamp is not None:
             event = self._stamp.document(event, self._tick_rate_hz)

@@ -233,7 +233,7 @@ class Player(ServedRun):
         while True:
             self._take_commands()
             while self._pending_warnings:
-                self._outlet.tell(self._event("warning", self._tick, text=self._pending_warnings.popleft()))
+                self._outlet.publish_event(self._event("warning", self._tick, text=self._pending_warnings.popleft()))
             if self._stop_requested:
                 return "stopped"
             if self._awaited and self._step is None:
@@ -323,7 +323,7 @@ class Player(ServedRun):
         if not self._begun and mark.from_ns > self._track.begin_ns:
             # The recorded start event is outside the played part.
             about = {"scene": self._scene.get("name"), "seed": self._scene.get("seed"), "pace": "replay"}
-            self._outlet.tell(self._event("start", self._tick, **about))
+            self._outlet.publish_event(self._event("start", self._tick, **about))
         self._begun = True
 
     def _end(self, reason: str) -> dict[str, Any]:
@@ -337,7 +337,7 @@ class Player(ServedRun):
             if completed:
                 whole = self._passes.part.to_s is None
                 reason += f", {'end of the recording' if whole else 'end of the selected part'}"
-            self._outlet.tell(self._event("end", self._tick, reason=reason))
+            self._outlet.publish_event(self._event("end", self._tick, reason=reason))
         if completed:
             self._outlet.end_status()
         out = self._outlet
@@ -347,18 +347,18 @@ class Player(ServedRun):
     # Commands.
 
     def _carry_out(self, pending: Pending) -> None:
-        asked = pending.asked
-        if isinstance(asked, Step):
-            self._begin_step(pending, asked)
+        arguments = pending.asked
+        if isinstance(arguments, Step):
+            self._begin_step(pending, arguments)
             return
         if pending.command == "stop":
             self._stop_requested = True
-        elif isinstance(asked, Seek):
-            self._seek(asked.time_s)
-        elif isinstance(asked, Rate):
+        elif isinstance(arguments, Seek):
+            self._seek(arguments.time_s)
+        elif isinstance(arguments, Rate):
             if self._burst:
                 raise InputError("rate", "sent to a replay without --burst", Words("a replay with --burst"))
-            self._playhead.set_rate(asked.rate, self._now_ns())
+            self._playhead.set_rate(arguments.rate, self._now_ns())
         elif pending.command == "pause":
             self._cancel_step("a pause")
             self._awaited = 0
@@ -383,17 +383,17 @@ class Player(ServedRun):
         self._open(self._position_ns)
         self._playhead.jump(self._anchor_ns)
 
-    def _begin_step(self, pending: Pending, asked: Step) -> None:
+    def _begin_step(self, pending: Pending, arguments: Step) -> None:
         if not self._paused or self._step is not None:
             raise InputError("step", "sent to a paused replay", Words("a replay that runs"))
         most = _MAX_STEP_S * self._rate
-        for name, value in asked:
+        for name, value in arguments:
             if value is not None and value > most:
                 raise InputError(name, f"a whole number of 1 to {most}", value)
-        if asked.ticks is not None and asked.blocks is None:
-            self._step = _Step(pending, until_ns=self._now_ns() + asked.ticks * NS // self._rate)
-        elif asked.blocks is not None and asked.ticks is None:
-            self._step = _Step(pending, blocks=asked.blocks)
+        if arguments.ticks is not None and arguments.blocks is None:
+            self._step = _Step(pending, until_ns=self._now_ns() + arguments.ticks * NS // self._rate)
+        elif arguments.blocks is not None and arguments.ticks is None:
+            self._step = _Step(pending, blocks=arguments.blocks)
         else:
             raise InputError("step", "either ticks or blocks", sorted(pending.request))
         self._playhead.start()

@@ -183,9 +183,9 @@ def draw(parameters: ParameterSet, path: Path) -> None:
 
 
 def _draw_restitution(wanted: Any, difference: Any, parameters: ParameterSet) -> None:
-    asked = np.linspace(MIN_RESTITUTION, 1.0, 191)
+    settings = np.linspace(MIN_RESTITUTION, 1.0, 191)
     curves = {
-        name: np.array([_returned_restitution(law, float(e)) for e in asked], float)
+        name: np.array([_returned_restitution(law, float(e)) for e in settings], float)
         for name, law in damping_laws(parameters).items()
     }
     # Sorted by the height of the curves at 0.5.
@@ -193,20 +193,20 @@ def _draw_restitution(wanted: Any, difference: Any, parameters: ParameterSet) ->
         color, dash = _STYLES.get(name, _DEFAULT_STYLE)
         style = {"color": color, "ls": dash, "lw": 3.4 if name == "exact" else 1.8, "label": name}
         style["zorder"] = 1 if name == "exact" else 2
-        wanted.plot(asked, curves[name], **style)
-        difference.plot(asked, curves[name] - asked, **style)
+        wanted.plot(settings, curves[name], **style)
+        difference.plot(settings, curves[name] - settings, **style)
     restitution = parameters["contact.restitution"]
     for axes in (wanted, difference):
         axes.axvline(restitution, color="0.5", lw=0.9, ls=":")
-        axes.set(xlabel="restitution asked for, e [1]", xlim=(0, 1))
+        axes.set(xlabel="set restitution e [1]", xlim=(0, 1))
     wanted.annotate(
-        f"asked for here: {restitution:g}", (restitution, 0.0), xytext=(-4, 5), textcoords="offset points",
+        f"set here: {restitution:g}", (restitution, 0.0), xytext=(-4, 5), textcoords="offset points",
         ha="right", va="bottom", rotation=90, color="0.4",
     )  # fmt: skip
     wanted.set(title="Restitution that each damping law returns", ylabel="restitution returned [1]", ylim=(0, 1.02))
     wanted.legend(**_LEGEND_BELOW, title="from the top down at 0.5")
     difference.set(
-        title="The same less what was asked for, close up", ylabel="returned − asked for [1]", ylim=(-0.06, 0.06)
+        title="Deviation from the set restitution", ylabel="returned − set restitution [1]", ylim=(-0.06, 0.06)
     )
 
 
@@ -232,7 +232,7 @@ def _draw_speed(axes: Any, parameters: ParameterSet) -> None:
             color="0.4",
         )  # fmt: skip
     axes.set(
-        title=f"Restitution returned over speed, {restitution:g} asked for", xlabel="approach speed [m/s]",
+        title=f"Returned restitution over speed, set to {restitution:g}", xlabel="approach speed [m/s]",
         ylabel="restitution returned [1]", xlim=SPEEDS, ylim=(low, 1.01),
     )  # fmt: skip
     axes.legend(**_LEGEND_BELOW)

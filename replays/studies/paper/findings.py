@@ -52,13 +52,13 @@ class Line:
 
     def row(self) -> Row:
         """Return the line as a table row, with the verdict on the corrected rig."""
-        said, best = self.statement, SETS[-1]
-        share = said.inside(self.values[best])
+        entry, best = self.statement, SETS[-1]
+        share = entry.inside(self.values[best])
         ours = [distribution(self.values[name]) if name in self.values else "–" for name in SETS]
-        cells = (said.says, said.place, said.paper, "" if said.unit == "1" else said.unit, *ours)
+        cells = (entry.says, entry.place, entry.paper, "" if entry.unit == "1" else entry.unit, *ours)
         inside = f"{share:.0%} ({len(self.values[best])})" if math.isfinite(share) else "–"
         verdict = self.verdicts[best]
-        return Row((*cells, inside, f"{verdict}: {said.why}" if said.why else verdict), MARKS[verdict])
+        return Row((*cells, inside, f"{verdict}: {entry.why}" if entry.why else verdict), MARKS[verdict])
 
 
 @dataclass
@@ -143,27 +143,27 @@ def find(*, quick: bool = False, processes: int = 2, progress: Callable[[str], N
         processes: Number of parallel processes for the scans.
         progress: Function that receives a text for each step, `steps` times in all.
     """
-    tell = progress or (lambda _: None)
-    found = {name: reproduce(name, quick=quick, progress=tell) for name in SETS}
+    report = progress or (lambda _: None)
+    found = {name: reproduce(name, quick=quick, progress=report) for name in SETS}
     groups = planned_groups(quick=quick)
     pulses: list[Pulse] = [pulse for group in groups.values() for pulse in group]
-    done = list(outcomes(pulses, processes=processes, progress=tell))
+    done = list(outcomes(pulses, processes=processes, progress=report))
     ends = np.cumsum([0, *(len(group) for group in groups.values())])
     results = {name: done[a:b] for name, (a, b) in zip(groups, pairwise(ends.tolist()), strict=True)}
     starts = []
     for force in _forces(quick=quick):
         starts.append(condition.start_by_pulse(force, points=12 if quick else 39))
-        tell(f"friction over a pulse of {force:g} N")
+        report(f"friction over a pulse of {force:g} N")
     slowest = condition.start_thresholds((0.08, 0.25)) if quick else condition.start_thresholds()
-    tell("slowest whirl that friction keeps up")
+    report("slowest whirl that friction keeps up")
     least = condition.sustain_thresholds((6.2,)) if quick else condition.sustain_thresholds()
-    tell("least friction that keeps up whirl")
+    report("least friction that keeps up whirl")
     slips = condition.slips_to_rolling()
-    tell("from slipping to rolling")
+    report("from slipping to rolling")
     drops = {}
     for name in SETS:
         drops[name] = drop_spread(name, 4 if quick else 40)
-        tell(f"drops, {name}")
+        report(f"drops, {name}")
     findings = Findings(
         found=found,
         results=results,
@@ -182,9 +182,9 @@ def find(*, quick: bool = False, processes: int = 2, progress: Callable[[str], N
         | pulse_spread(*(results[f"{group} {name}"] for group in ("spread", "slow", "lasting")))
         for name, one in found.items()
     }
-    findings.lines = [Line(said, {name: ours[name][said.quantity] for name in SETS}) for said in statements()]
+    findings.lines = [Line(entry, {name: ours[name][entry.quantity] for name in SETS}) for entry in statements()]
     numbers = claim_numbers(findings)
-    findings.claims = [Line(said, {"corrected": numbers[said.quantity]}) for said in claims()]
+    findings.claims = [Line(entry, {"corrected": numbers[entry.quantity]}) for entry in claims()]
     return findings
 
 

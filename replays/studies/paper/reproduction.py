@@ -69,21 +69,21 @@ def reproduce(parameters: str, *, quick: bool = False, progress: Callable[[str],
         quick: Use shorter runs.
         progress: Function that receives the name of each completed run.
     """
-    tell = progress or (lambda _: None)
+    report = progress or (lambda _: None)
     sensed = {"parameters": parameters, "sensors.rate_hz": _RATE_HZ}
     drop = simulate(load_scene("drop", {**sensed, "duration_s": 1.5}))
-    tell(f"drop, {parameters}")
+    report(f"drop, {parameters}")
     command = {"at_s": PULSE_S, "command": "hammer", "force_n": FORCE_N, "duration_ms": 5.0, "direction": "x"}
     long = {**sensed, "duration_s": 2.0 if quick else 4.0, "drive.speed_hz": SPEED_HZ, "commands": [command]}
     whirl = simulate(load_scene("hammer", long))
-    tell(f"hammer run, {parameters}")
+    report(f"hammer run, {parameters}")
     ideal = {"drive.mode": "ideal", "sensors.chain": "ideal", "sensors.groups": ["hammer"]}
     held = simulate(load_scene("hammer", {**long, **ideal}))
-    tell(f"hammer run, drive held, {parameters}")
+    report(f"hammer run, drive held, {parameters}")
     speeds = {}
     for speed in SPEEDS_HZ:
         speeds[speed] = simulate(pulse_scene(Pulse(parameters=parameters, speed_hz=speed)))
-        tell(f"{speed:g} Hz, {parameters}")
+        report(f"{speed:g} Hz, {parameters}")
     numbers = {
         "magnet_force": magnet_force(whirl),
         "drop_reaction": drop_numbers(drop)["drop_reaction"],

@@ -79,14 +79,14 @@ def draw_verdicts(lines: list[Line]) -> Figure:
     where.axvspan(0.0, 1.0, color="0.92", lw=0)
     looks = {"as-printed": (0.2, "s", "white"), "corrected": (-0.2, "o", None)}
     for row, line in enumerate(judged):
-        said = line.statement
+        statement = line.statement
         for name, values in line.values.items():
             up, marker, fill = looks[name]
             colour = _VERDICTS[line.verdicts[name]]
-            inside.plot(100.0 * said.inside(values), row - up, marker, color=colour, mfc=fill or colour, ms=6.5,
+            inside.plot(100.0 * statement.inside(values), row - up, marker, color=colour, mfc=fill or colour, ms=6.5,
                         mew=1.5, clip_on=False)  # fmt: skip
-            if 0.0 < said.low < said.high < 20.0 * said.low:
-                places = (np.array(percentiles(values)) - said.low) / (said.high - said.low)
+            if 0.0 < statement.low < statement.high < 20.0 * statement.low:
+                places = (np.array(percentiles(values)) - statement.low) / (statement.high - statement.low)
                 # Values farther away are drawn at the edge.
                 low, middle, high = np.clip(places, -_EDGE_DISTANCE, 1.0 + _EDGE_DISTANCE)
                 ends = "<" if places[1] < -_EDGE_DISTANCE else ">" if places[1] > 1.0 + _EDGE_DISTANCE else marker

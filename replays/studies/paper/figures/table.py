@@ -36,17 +36,17 @@ def _printed(findings: Findings) -> Content:
     sets = {name: load_parameters(name) for name in SETS}
     rows = []
     for printed in printed_values():
-        said = printed.verdict(sets["corrected"])
-        if said == "agrees":
-            said = "as printed"
+        verdict = printed.verdict(sets["corrected"])
+        if verdict == "agrees":
+            verdict = "as printed"
         elif sets["corrected"].entries[printed.key].kind == "corrected":
-            said = "corrected"
+            verdict = "corrected"
         values = [number(parameters[printed.key]) for parameters in sets.values()]
         sources = [f"{name}: {each.entries[printed.key].source}" for name, each in sets.items()]
-        source = "" if said == "as printed" else "; ".join(sources)
+        source = "" if verdict == "as printed" else "; ".join(sources)
         unit = "" if printed.unit == "1" else printed.unit
-        cells = (printed.symbol, printed.place, unit, number(printed.value), *values, source, said)
-        rows.append(Row(cells, "plain" if said == "as printed" else MARKS.get(said, "open")))
+        cells = (printed.symbol, printed.place, unit, number(printed.value), *values, source, verdict)
+        rows.append(Row(cells, "plain" if verdict == "as printed" else MARKS.get(verdict, "open")))
     return Content(("symbol", "where", "unit", "printed", *SETS, "why it differs", "corrected set"), rows)
 
 
@@ -125,9 +125,9 @@ def _lengths(findings: Findings) -> Content:
         for length_ms in LENGTHS_MS:
             group = findings.results[f"length {length_ms:g} {name}"]
             cells = [f"{name}, {length_ms:g} ms"]
-            for said in (line.statement for line in findings.lines if line.statement.quantity in ("peak_x", "peak_y")):
-                values = column(group, f"true_{said.quantity}_n")
-                cells += [distribution(values), f"{round(said.inside(values) * len(values))} of {len(values)}"]
+            for entry in (line.statement for line in findings.lines if line.statement.quantity in ("peak_x", "peak_y")):
+                values = column(group, f"true_{entry.quantity}_n")
+                cells += [distribution(values), f"{round(entry.inside(values) * len(values))} of {len(values)}"]
             rows.append(Row(tuple(cells)))
     return Content(("pulse", "E − W [N]", "agree", "N − S [N]", "agree"), rows)
 

@@ -262,11 +262,11 @@ def outcomes(
         progress: Function that receives the label of each completed pulse.
     """
     pulses = list(pulses)
-    tell = progress or (lambda _: None)
+    report = progress or (lambda _: None)
     if processes == 1:
         for pulse in pulses:
             result = outcome(pulse)
-            tell(pulse.label)
+            report(pulse.label)
             yield result
         return
     from concurrent.futures import ProcessPoolExecutor
@@ -275,7 +275,7 @@ def outcomes(
     pool = ProcessPoolExecutor(processes, mp_context=get_context("spawn"), initializer=end_with_parent)
     try:
         for pulse, result in zip(pulses, pool.map(outcome, pulses, chunksize=4), strict=True):
-            tell(pulse.label)
+            report(pulse.label)
             yield result
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
