@@ -2,21 +2,21 @@
 
     import rig
     run = rig.simulate("hammer", {"drive.speed_hz": 5.2, "contact.friction": 0.3})
-    run["disk_x"].max(), run.unit("disk_x")  # all that the model has, in SI
-    run.samples["disk_x"].max(), run.samples.unit("disk_x")  # what the sensors showed
-    run.samples.to_si()["disk_x"], run.times_s  # ... in SI, and when
+    run["disk_x"].max(), run.unit("disk_x")  # all quantities of the model, in SI
+    run.samples["disk_x"].max(), run.samples.unit("disk_x")  # samples of the sensors
+    run.samples.to_si()["disk_x"], run.times_s  # samples in SI, and their times
 
-`run.names` and `run.samples.names` list what there is; a name that is none
-raises a KeyError that tells the nearest. `rig.load_scene` checks a scene
-without running it, `rig.load_parameters` gives the numbers with their sources,
-and `rig.Simulation` goes on step by step. `rig.full_spectrum`, `rig.waterfall`,
-`rig.whirl_frequency` and `rig.synchronous` (1X of a run-up) make of samples
-what is plotted of a rotor.
+`run.names` and `run.samples.names` list the names; an unknown name raises a
+KeyError that suggests similar ones. `rig.load_scene` checks a scene without
+running it, `rig.load_parameters` returns the parameters with their sources, and
+`rig.Simulation` advances step by step. `rig.full_spectrum`, `rig.waterfall`,
+`rig.whirl_frequency` and `rig.synchronous` (1X of a run-up) compute the usual
+rotordynamic plots from samples.
 
-Recordings are opened by `recorder.reader.Recording`, whose samples are of the
-same kind, and written by `replays.recordings.export.write_run`; a running rig
-is read and commanded by `rig.connect`, which is `drivers.client.connect`. The
-same objects carry the commands of `rig`.
+Recordings are opened by `recorder.reader.Recording`, with samples of the same
+type, and written by `replays.recordings.export.write_run`; `rig.connect`, which
+is `drivers.client.connect`, reads and commands a running rig. The commands of
+`rig` use the same objects.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from rig.run.simulation import Simulation
 
     def connect(url: str = "", **settings: Any) -> Any:
-        """`drivers.client.connect`, which must not be imported from below."""
+        """Connect to a running rig: `drivers.client.connect`, which must not be imported from here."""
 
 
 __all__ = [
@@ -54,10 +54,10 @@ _HOMES = {
     "run.simulation": ("Simulation",),
 }
 
-if not TYPE_CHECKING:  # a type checker knows all names by the imports above
+if not TYPE_CHECKING:  # a type checker uses the imports above
 
     def __getattr__(name: str) -> Any:
-        # Loaded on first use: `rig --help` must not wait for compiled code.
+        # Imported on first use: `rig --help` must not load compiled code.
         from importlib import import_module, metadata
 
         if name == "connect":
@@ -65,7 +65,7 @@ if not TYPE_CHECKING:  # a type checker knows all names by the imports above
 
             client = import_module("drivers.client")
             if not str(client.__file__).startswith(PLACE):
-                raise ImportError(f"drivers.client must be the rig's own, and is {client.__file__}: rename that folder")
+                raise ImportError(f"drivers.client must be the rig's own; received {client.__file__}; rename it")
             return client.connect
         if name == "__version__":
             return metadata.version("rotor-stator-rig")

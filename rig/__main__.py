@@ -1,4 +1,4 @@
-"""`python -m rig` is the command `rig`."""
+"""`python -m rig`: the command `rig`."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""The one command, `rig`: a subcommand a file; heavy libraries load inside the function that needs them."""
+"""The `rig` command: one subcommand per module; heavy libraries are imported inside the function that needs them."""

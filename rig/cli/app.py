@@ -1,4 +1,4 @@
-"""Composition of the `rig` command: which subcommands there are, and how errors reach the user."""
+"""Composition of the `rig` command: the list of subcommands, and the reporting of errors to the user."""
 
 from __future__ import annotations
 
@@ -10,100 +10,100 @@ from typing import Annotated, Any, NoReturn
 import typer
 
 from rig.base.errors import WHOLE_RIG, DiskError, InputError, SimulationError, lacks_full, need_of_full
-from rig.cli.command import Group, load_command, made_command, make_group, usage_error
+from rig.cli.command import Group, load_command, make_command, make_group, usage_error
 from rig.cli.output import provenance
 from rig.cli.output.tables import echo
 from rig.run.commands import SUMMARIES
 
-# Wrong options and arguments; typer names only these two of its own exceptions, which have moved between its versions.
+# The base class of typer's errors for wrong options and arguments. typer exports only this subclass of it.
 _UsageError: Any = typer.BadParameter.__base__
 
 _NO_READER = 141
-"""What a shell makes of a program that SIGPIPE has ended."""
+"""Exit status that a shell reports for a program ended by SIGPIPE."""
 _INTERRUPTED = 130
-"""What typer makes of Ctrl-C, and shells expect."""
+"""Exit status that shells expect, and typer returns, after Ctrl-C."""
 
 COMMANDS = {
     "Start here": {
-        "demo": "Start the service, record, hit, let it whirl, stop",
-        "scenes": "List the scenes that come with the rig, or show one",
-        "params": "Show a parameter set: value, unit, source and kind of each",
+        "demo": "Start the service, record an impact and the whirl, stop",
+        "scenes": "List the built-in scenes, or show one",
+        "params": "Show a parameter set: values, units, sources and kinds",
         "laws": "Compare all normal contact laws",
         "magnets": "Compare the magnet models",
         "keys": "Show every key, message and unit of the rig's streams",
         "completion": "Complete commands, options and names in a shell",
     },
-    "The rig as a service": {
+    "Serve the rig": {
         "run": "Run a scene in real time and publish its sensors",
         **{name: line for name, line in SUMMARIES.items() if line},
-        "step": "Let a rig that runs with --pace lockstep simulate TICKS more",
-        "note": "Put a note into every recording that is being made of a rig",
-        "status": "Show how a running rig is doing: time, pace, lateness, losses",
-        "stop": "End the run of a rig; recordings of it close",
-        "twins": "Serve the instruments of a running rig to their drivers",
-        "can": "Run virtual CAN buses, and show what the rig sends on one",
+        "step": "Advance a lockstep run or a paused replay by TICKS",
+        "note": "Add a note to every recording of a running rig",
+        "status": "Show the time, pace, lateness and losses of a running rig",
+        "stop": "End the run of a rig and close its recordings",
+        "twins": "Serve the simulated instruments of a running rig",
+        "can": "Run virtual CAN buses, and list the CAN messages of the rig",
     },
-    "A recording as the rig": {
-        "replay": "Play a recording to whoever listens, as if it were the rig",
-        "pause": "Hold the replay of a recording",
-        "resume": "Let the replay of a recording go on",
-        "seek": "Let the replay of a recording go on from another position",
-        "rate": "Set how fast the replay of a recording goes",
+    "Replay a recording": {
+        "replay": "Publish a recording as a running rig would",
+        "pause": "Pause a replay",
+        "resume": "Resume a replay",
+        "seek": "Move a replay to another time",
+        "rate": "Set the speed of a replay",
     },
     "Recordings": {
-        "record": "Record all streams of a running rig to FILE.mcap, losslessly",
+        "record": "Record all streams of a running rig to FILE.mcap, without loss",
         "view": "View a recording, or the running rig, in rerun",
-        "info": "Show what a recording holds: calibration, gaps, health, events",
-        "cut": "Cut a recording, or join several files of one run",
-        "recover": "Make finished recordings of files that were cut off or damaged",
-        "import": "Turn logs of a real rig into a recording",
+        "info": "Show the calibration, gaps, health and events of a recording",
+        "cut": "Cut a part from a recording, or join the files of a run",
+        "recover": "Recover recordings that were cut off or damaged",
+        "import": "Convert logs of a real rig to a recording",
         "export": "Write a recording as MDF4, TDMS, UFF58b, CSV, Parquet or WAV",
     },
-    "Recordings against the model": {
-        "validate": "Do a recording again and hold it against the model",
-        "identify": "Fit numbers of the rig to a recording",
-        "score": "Judge a DAQ by what it recorded, against what the rig sent",
-        "campaign": "Run scripted tests of a device in the loop, and judge them",
-        "sessions": "Make the reference sessions anew",
+    "Compare recordings with the model": {
+        "validate": "Simulate a recording again and compare it with the model",
+        "identify": "Fit parameters of the rig to a recording",
+        "score": "Score a DAQ by comparing its recording with what the rig sent",
+        "campaign": "Run scripted tests of a device in the loop",
+        "sessions": "Record the reference sessions again",
     },
-    "Without a clock": {
-        "simulate": "Simulate a scene as fast as it goes and write it to a file",
-        "bench": "Measure simulated over processor time with the error beside it",
-        "ladder": "Find the cheapest model, engine and step that are good enough",
+    "Simulate offline": {
+        "simulate": "Simulate a scene at full speed and write it to a file",
+        "bench": "Measure speed and error of the engines on this machine",
+        "ladder": "Find the cheapest model, engine and step within a tolerance",
         "chart": "Chart speed against error",
-        "stability": "Test where integration methods fail",
-        "paper": "Make the paper's figures, tables and claims again",
+        "stability": "Find where integration methods fail",
+        "paper": "Reproduce the figures, tables and claims of the paper",
     },
 }
-"""What the help says of each command, which is what its own text begins with; the command itself is the function of its
-name in the module of its name, or in that of the requests, and is imported when it is called."""
+"""Help line by command and heading; each command's docstring begins with its line. The command is the function of that
+name in the module of that name, or in `requests`, and is imported when it is called."""
 
 _REQUESTS = ("step", "note", "stop", "pause", "resume", "seek", "rate")
-"""Requests to a running rig or replay that are no scene commands."""
+"""Requests to a running rig or replay that are not scene commands."""
 _MODULES = ("fault",)
-"""Scene commands whose command line is more than their fields, in a module of its own."""
+"""Scene commands with options beyond their fields, each in a module of its own."""
 
 GROUPS = {
     "can": {
-        "hub": "Run virtual CAN buses of their own, without a rig, until Ctrl-C",
-        "dbc": "Show the DBC of the rig's messages, made from the channel table",
-        "load": "Show every message of the rig with its period, share of the bus",
+        "hub": "Run virtual CAN buses without a rig, until Ctrl-C",
+        "dbc": "Show the DBC of the rig's messages",
+        "load": "Show period and bus load of every message of the rig",
     },
-    "keys": {"init": "Make the certificates of a rig that is exposed"},
+    "keys": {"init": "Create the certificates for an exposed rig"},
 }
-"""The commands of those that are groups, whose own function is what they do without one."""
+"""Subcommands by group. Without a subcommand, the function of the group's own name runs."""
 
 
 NEED_FULL = (
     "demo", "scenes", "params", "laws", "magnets", "keys", "run", "can", "view", "import", "validate", "identify",
     "score", "campaign", "sessions", "simulate", "bench", "ladder", "chart", "stability", "paper",
 )  # fmt: skip
-"""The commands that a lean install does without; of `keys` it has `init`."""
+"""Commands that a lean install lacks; of `keys` it has `init`."""
 
 
 def rig() -> Group:
-    """The command line."""
-    about = "A virtual rotor-stator test rig: simulate, serve, hit, record, view and judge it."
+    """Return the command line."""
+    about = "A virtual rotor-stator test rig: simulate, serve, command, record, view and validate it."
     group = make_group("rig", COMMANDS, _load, _rig, about)
     if lacks_full():
         group.epilog = f"These need the whole rig, {WHOLE_RIG}: {', '.join(NEED_FULL)}."
@@ -115,7 +115,7 @@ def _load(name: str) -> Any:
         if name in SUMMARIES and name not in _MODULES:
             from rig.cli.commands.requests import scene_command
 
-            return made_command(scene_command(name), name)
+            return make_command(scene_command(name), name)
         return load_command("requests" if name in _REQUESTS else name, name)
     from importlib import import_module
 
@@ -126,7 +126,7 @@ def _load(name: str) -> Any:
 def _rig(
     context: typer.Context,
     *,
-    version: Annotated[bool, typer.Option("--version", is_eager=True, help="Show the version and end.")] = False,
+    version: Annotated[bool, typer.Option("--version", is_eager=True, help="Show the version and exit")] = False,
 ) -> None:
     if version:
         from importlib.metadata import version as installed
@@ -143,7 +143,7 @@ def start(arguments: list[str] | None = None) -> None:
 
         sys.stdout.write("".join(f"{line}\n" for line in complete(rig(), *sys.argv[2:])))
         return
-    provenance.given[:] = sys.argv[1:] if arguments is None else arguments
+    provenance.arguments[:] = sys.argv[1:] if arguments is None else arguments
     try:
         code = rig().main(arguments, prog_name="rig", standalone_mode=False)
     except InputError as error:
@@ -159,7 +159,7 @@ def start(arguments: list[str] | None = None) -> None:
             raise
         _fail(f"this {need}")
     except (BrokenPipeError, SystemExit) as error:
-        # The reader of our output has gone (`rig params | head`), of which rich and typer make a status of their own.
+        # The reader of the output has exited (`rig params | head`); rich and typer report a status of their own.
         if not isinstance(error, BrokenPipeError) and not isinstance(error.__context__, BrokenPipeError):
             raise
         sys.stderr.close()
@@ -167,7 +167,7 @@ def start(arguments: list[str] | None = None) -> None:
     except OSError as error:
         if error.errno == errno.ENAMETOOLONG:
             _fail(str(InputError("file name", "one that the system accepts", error.filename)))
-        # A disk that is full, a file system that refuses: not a fault of the program.
+        # A full disk or a refusal by the file system is not a program error.
         _fail(f"{error.filename or 'the system'}: {error.strerror or error}", status=1)
     if code == _INTERRUPTED:
         print("rig: interrupted", file=sys.stderr)

@@ -1,7 +1,7 @@
-"""What every command of `rig` has in common: its page of help, and that it is loaded only when it is called.
+"""The base of every command: a plain-text help page, and import on first use.
 
-The page is plain text that fits 80 columns. To draw it as typer does would take longer than all else that a page needs,
-and boxes do not go well through a pipe.
+The page fits 80 columns. Typer's own rendering takes longer than everything else that a page needs, and its boxes do
+not suit a pipe.
 """
 
 from __future__ import annotations
@@ -18,27 +18,27 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from rig.base.errors import InputError, RefusedError, UnknownNameError, Words
-from rig.cli.groups import grouped
+from rig.cli.groups import expand_groups
 
-_PLAIN: dict[str, Any] = {"add_completion": False, "rich_markup_mode": None}
+_APP_OPTIONS: dict[str, Any] = {"add_completion": False, "rich_markup_mode": None}
 _SETTINGS = {"help_option_names": ["-h", "--help"]}
 _NEGATIVE = re.compile(r"-\.?(\d|inf$|nan$)", re.IGNORECASE)
 _NUMBER = re.compile(r"[+-]?[\d.]+|nan|inf")
-_PLAINER = ((r"([^\s;[]+)<=x<=", r"\1 to "), (r"x>=(?=\S+\])", "at least "), (r"(\[default: )\((.+)\)", r"\1\2"))
-"""What typer says of a value, and what a person would."""
+_VALUE_TEXTS = ((r"([^\s;[]+)<=x<=", r"\1 to "), (r"x>=(?=\S+\])", "at least "), (r"(\[default: )\((.+)\)", r"\1\2"))
+"""Replacements in typer's description of a value: ranges and defaults in plain words."""
 _UNITS = {"s", "ms", "hz", "n", "mb"}
-"""What the name of an option may end in, if its value has a unit."""
+"""Unit suffixes of option names; the unit becomes the metavar."""
 
 
 class _Page:
-    """Options in sections under their panels' titles, arguments by their own names."""
+    """Help page with options under the titles of their panels, and arguments by name."""
 
     params: list[Any]
     get_params: Callable[[Any], list[Any]]
 
     def get_help_option(self, ctx: Any) -> Any:
         option = super().get_help_option(ctx)  # type: ignore[misc]
-        option.default = False  # of None, typer would have pydantic make a truth value: a tenth of a second
+        option.default = False  # typer would convert None by pydantic, which takes 0.1 s
         return option
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
@@ -56,14 +56,14 @@ class _Page:
                 title = getattr(param, "rich_help_panel", None) or f"{param.param_type_name.capitalize()}s"
                 name = shown_name(param) if param.param_type_name == "argument" else record[0]
                 says = record[1]
-                for typed, plain in _PLAINER:
+                for typed, plain in _VALUE_TEXTS:
                     says = re.sub(typed, plain, says)
                 sections.setdefault(title, []).append((name, says))
         _write(sections, formatter)
 
 
 def shown_name(param: Any) -> str:
-    """What a person knows a parameter by."""
+    """Return the name of a parameter as the user types it."""
     options = [name for name in param.opts if name.startswith("-")]
     return max(options, key=len) if options else param.metavar or param.name.upper()
 
@@ -76,21 +76,21 @@ def _write(sections: Mapping[str, list[tuple[str, str]]], formatter: Any) -> Non
 
 class _Command(_Page, TyperCommand):
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        # A negative number is a value, not an option: whoever gets it explains what is wrong with it.
+        # A negative number is a value, not an option; the command explains what is wrong with it.
         ctx.ignore_unknown_options = any(map(_NEGATIVE.match, args))
         ctx.allow_extra_args, escaped = True, "--" in args
         rest = super().parse_args(ctx, args)
         options = [name for param in self.params for name in param.opts if name.startswith("-")]
         values = {param.name: ctx.params[param.name] for param in self.params}
         given = {name: value if isinstance(value, list | tuple) else [value] for name, value in values.items()}
-        # Which is what an option that there is none has been taken for, then.
+        # An unknown option is parsed as an argument.
         arguments = [each for param in self.params if param.param_type_name == "argument" for each in given[param.name]]
         for each in map(str, [*arguments, *rest]):
             if each.startswith("--") and not escaped:
                 raise UnknownNameError("option", f"one of `{ctx.command_path} -h`", each, options)
         for param in self.params:
             for each in given[param.name]:
-                # No comparison refuses it: it would be waited for, or counted to, without end.
+                # Comparisons with NaN never fail, so a NaN would wait or count without end.
                 if isinstance(each, float) and each != each:
                     raise InputError(shown_name(param), "a number", Words("nan"))
                 if str(each) in options:
@@ -121,7 +121,7 @@ class _Command(_Page, TyperCommand):
             raise InputError(options, must, error.received) from None
 
     def _by_field(self, *kinds: str) -> dict[str, Any]:
-        """Arguments and options by what they are to whoever refuses their values: its fields."""
+        """Return arguments and options by their field name, as used in errors about their values."""
         return {
             name.lstrip("-").replace("-", "_"): param
             for param in self.params
@@ -131,25 +131,25 @@ class _Command(_Page, TyperCommand):
 
 
 class Group(_Page, TyperGroup):
-    """Commands by the titles that they stand under, each with its line of help; none is imported before it is called.
+    """Commands listed under headings, each with its help line; a command is imported when it is called.
 
     Attributes:
-        sections: Names and lines by title.
-        load: Gives the command of a name.
+       sections: Help lines by heading and command name.
+       load: Returns the command of a name.
     """
 
     sections: Mapping[str, Mapping[str, str]]
     load: Callable[[str], Any]
 
     def list_commands(self, ctx: Any) -> list[str]:
-        """Names of all commands, in the order of the help."""
+        """Return the names of all commands, in the order of the help."""
         return [name for commands in self.sections.values() for name in commands]
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """The command of a name.
+        """Return the command of a name.
 
         Raises:
-            UnknownNameError: There is none.
+           UnknownNameError: There is no command of this name.
         """
         names = self.list_commands(ctx)
         if cmd_name in names:
@@ -157,7 +157,7 @@ class Group(_Page, TyperGroup):
         raise UnknownNameError("command", f"one of `{ctx.command_path} -h`", cmd_name, names)
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
-        """The options, then the commands."""
+        """Write the options, then the commands."""
         super().format_options(ctx, formatter)
         width = max(map(len, self.list_commands(ctx)))
         for title, commands in self.sections.items():
@@ -165,15 +165,15 @@ class Group(_Page, TyperGroup):
 
 
 def load_command(module: str, name: str) -> Any:
-    """The command that is the function of its name in a module, behind which an underscore stands if need be."""
+    """Return the command `name` of a module. A Python keyword has an underscore appended in module and function."""
     name, shown = name + "_" * iskeyword(name), name
-    return made_command(getattr(import_module(f"rig.cli.commands.{module}{'_' * iskeyword(module)}"), name), shown)
+    return make_command(getattr(import_module(f"rig.cli.commands.{module}{'_' * iskeyword(module)}"), name), shown)
 
 
-def made_command(function: Callable[..., None], name: str) -> Any:
-    """Return the command of a name that calls a function."""
-    function = grouped(function)
-    app = typer.Typer(**_PLAIN)
+def make_command(function: Callable[..., None], name: str) -> Any:
+    """Return a command that calls a function."""
+    function = expand_groups(function)
+    app = typer.Typer(**_APP_OPTIONS)
     app.command(name, cls=_Command, context_settings=_SETTINGS)(function)
     command = typer.main.get_command(app)
     for param in command.params:
@@ -183,7 +183,7 @@ def made_command(function: Callable[..., None], name: str) -> Any:
 
 
 def _metavar(name: str, hint: Any) -> str:
-    """What the help calls the value of an option."""
+    """Return the placeholder for an option's value in the help."""
     kinds = get_args(hint) or (hint,)
     if isinstance(kinds[0], type) and issubclass(kinds[0], Enum):
         return "|".join(each.value for each in kinds[0])
@@ -201,18 +201,18 @@ def make_group(
     callback: Callable[..., None],
     help: str | None = None,
 ) -> Group:
-    """A group of commands.
+    """Return a group of commands.
 
     Args:
-        name: Its name.
-        sections: As for `Group`.
-        load: As for `Group`.
-        callback: What is done before a command, and without one.
-        help: Its text; without it, that of the callback.
+       name: Name of the group.
+       sections: See `Group`.
+       load: See `Group`.
+       callback: Called before a command, and without one.
+       help: Help text; by default the callback's docstring.
     """
-    app = typer.Typer(name=name, **_PLAIN)
+    app = typer.Typer(name=name, **_APP_OPTIONS)
     app.callback(cls=Group, help=help or callback.__doc__, invoke_without_command=True, context_settings=_SETTINGS)(
-        grouped(callback)
+        expand_groups(callback)
     )
     group = typer.main.get_command(app)
     assert isinstance(group, Group)
@@ -221,7 +221,7 @@ def make_group(
 
 
 def usage_error(error: Any) -> str:
-    """What was wrong with the options, in the form of every other wrong value where it has one."""
+    """Return the message for wrong options, as "X must be Y; received Z" where possible."""
     page, kind = f"`{error.ctx.command_path if error.ctx is not None else 'rig'} -h`", type(error).__name__
     wrong = error.__cause__.errors()[0] if hasattr(error.__cause__, "errors") else None
     if kind == "NoSuchOption":

@@ -1,4 +1,4 @@
-"""Options that belong together: a dataclass whose fields the command line shows as options of the command."""
+"""Option groups: dataclasses whose fields become options of a command."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ import typer
 
 
 def panel(title: str) -> Callable[..., Any]:
-    """What makes options under a heading of the help, of what they say, their names, and further settings."""
+    """Return a function that creates options under a heading of the help, from help text, names and settings."""
     return lambda says, *names, **settings: typer.Option(*names, help=says, rich_help_panel=title, **settings)
 
 
-def grouped(command: Callable[..., None]) -> Callable[..., None]:
-    """A command with the fields of its groups, and of groups in these, in the place of the groups.
+def expand_groups(command: Callable[..., None]) -> Callable[..., None]:
+    """Return a command with its option groups, nested ones too, replaced by their fields.
 
     Args:
-        command: Has parameters whose type is such a dataclass, each after the `*`; whoever calls it gives the fields.
+       command: A function whose keyword parameters may have such a dataclass as type.
     """
     hints = get_type_hints(command, include_extras=True)
     hints.pop("return", None)
@@ -55,7 +55,7 @@ def _fields(group: Any) -> list[inspect.Parameter]:
 
 
 def _build(group: Any, options: dict[str, Any]) -> Any:
-    """The group with the options that are its fields, which are taken out of them."""
+    """Return the group built from its options, which are removed from `options`."""
     hints = get_type_hints(group, include_extras=True)
     values: dict[str, Any] = {}
     for field in fields(group):

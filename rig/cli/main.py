@@ -1,4 +1,4 @@
-"""Entry of the `rig` command: listens to signals before anything else is loaded."""
+"""Entry point of the `rig` command; handles signals before anything else is imported."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from rig.cli import signals
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run the command: exit status 2 and one line for wrong input, 1 for a failed run or verdict, 130 for signals."""
+    """Run the command. Exit status: 2 for wrong input (one line), 1 for a failed run or verdict, 130 after a signal."""
     try:
         from rig.cli.app import start
     except KeyboardInterrupt:
@@ -22,15 +22,15 @@ def main(arguments: list[str] | None = None) -> None:
 
 def entry() -> None:
     """Run the command as a process of its own."""
-    # Matrices here are thin: threads of BLAS that wait for each other take half of the processor's time and give
-    # nothing back, and what they sum depends on how many there are.
+    # The matrices are small: threads of BLAS waiting for each other take half of the processor time without any gain,
+    # and the rounding of sums depends on the number of threads.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     signals.listen()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")  # what a terminal's encoding lacks is no reason to fail
+            stream.reconfigure(errors="backslashreplace")  # a character missing from the encoding is escaped
     try:
         main()
     finally:
         signals.ignore()
-        gc.freeze()  # looking for garbage in a process that ends took a quarter of a short run's processor time
+        gc.freeze()  # a final collection would take 25 % of a short run's processor time

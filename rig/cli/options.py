@@ -1,7 +1,7 @@
-"""Arguments and options that several commands take, each worded once, and how their texts are read.
+"""Arguments and options shared by several commands, and the parsing of their texts.
 
-`--output`, `-o` is what a command makes, `--report` a report beside it. Parts of a recording are `--from` and `--to` in
-s of simulated time; names are joined by commas; what is KEY=VALUE is repeated.
+`--output`, `-o` is the file or folder that a command creates, `--report` an additional report. `--from` and `--to`
+limit a recording, in s of simulated time. Names are separated by commas; KEY=VALUE options are repeated.
 """
 
 from __future__ import annotations
@@ -17,56 +17,52 @@ from rig.base.errors import InputError
 if TYPE_CHECKING:
     from rig.physics.parameters import ParameterSet
 
-SceneName = Annotated[str, typer.Argument(metavar="SCENE", help="Name of a scene, or the path of a scene file.")]
-SetName = Annotated[str, typer.Argument(metavar="[SET]", help="A parameter set, by name or path.")]
+SceneName = Annotated[str, typer.Argument(metavar="SCENE", help="Name of a scene, or path of a scene file")]
+SetName = Annotated[str, typer.Argument(metavar="[SET]", help="Parameter set, by name or path")]
 Changes = Annotated[
-    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Change one value; may be repeated.")
+    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Set a value of scene or parameters; repeatable")
 ]
 Law = Annotated[
-    Path | None, typer.Option("--law", metavar="FILE.toml", help="A contact law of your own: numbers or formulas.")
+    Path | None, typer.Option("--law", metavar="FILE.toml", help="Your own contact law: numbers or formulas")
 ]
-Parameters = Annotated[str | None, typer.Option(metavar="SET", help="Parameter set, by name or path.")]
-Engine = Annotated[str | None, typer.Option(metavar="ENGINE", help="Integration method.")]
-Plot = Annotated[Path | None, typer.Option("--plot", metavar="FILE", help="Draw them as well, to a .png or .svg file.")]
-Json = Annotated[bool, typer.Option("--json", help="As a JSON document.")]
-Wide = Annotated[bool, typer.Option("--wide", help="Every column, and a row on one line, as into a pipe.")]
-RecordingFile = Annotated[Path, typer.Argument(metavar="FILE", help="A recording (.mcap), finished or cut off.")]
-_RECORDING_FILES = typer.Argument(
-    metavar="FILE...", help="A recording (.mcap), finished or cut off, or its parts in any order."
-)
+Parameters = Annotated[str | None, typer.Option(metavar="SET", help="Parameter set, by name or path")]
+Engine = Annotated[str | None, typer.Option(metavar="ENGINE", help="Integration method")]
+Plot = Annotated[Path | None, typer.Option("--plot", metavar="FILE", help="Also draw the comparison, .png or .svg")]
+Json = Annotated[bool, typer.Option("--json", help="Print JSON")]
+Wide = Annotated[bool, typer.Option("--wide", help="Print all columns, and each row on one line")]
+RecordingFile = Annotated[Path, typer.Argument(metavar="FILE", help="Recording (.mcap), complete or cut off")]
+_RECORDING_FILES = typer.Argument(metavar="FILE...", help="Recording (.mcap), complete or cut off, or its parts")
 RecordingFiles = Annotated[list[Path], _RECORDING_FILES]
 OptionalRecordingFiles = Annotated[list[Path] | None, _RECORDING_FILES]
-FromS = Annotated[float | None, typer.Option("--from", metavar="S", help="Where to begin, in s of simulated time.")]
-ToS = Annotated[float | None, typer.Option("--to", metavar="S", help="Where to end, in s of simulated time.")]
-Channels = Annotated[str | None, typer.Option("--channels", metavar="NAME,...", help="Only these channels.")]
-ChannelFile = Annotated[
-    Path | None, typer.Option("--channels", metavar="FILE.toml", help="The sensors, from a channel table of your own.")
-]
-Force = Annotated[bool, typer.Option("--force", help="Replace what is there already.")]
+FromS = Annotated[float | None, typer.Option("--from", metavar="S", help="Begin at this simulated time in s")]
+ToS = Annotated[float | None, typer.Option("--to", metavar="S", help="End at this simulated time in s")]
+Channels = Annotated[str | None, typer.Option("--channels", metavar="NAME,...", help="Use only these channels")]
+ChannelFile = Annotated[Path | None, typer.Option("--channels", metavar="FILE.toml", help="Your own channel table")]
+Force = Annotated[bool, typer.Option("--force", help="Replace existing files")]
 ReportFile = Annotated[
-    Path | None, typer.Option("--report", metavar="FILE", help="Write a report with pictures, .html or .pdf.")
+    Path | None, typer.Option("--report", metavar="FILE", help="Write a report with pictures, .html or .pdf")
 ]
 
 
 @dataclass(frozen=True)
 class SceneChanges:
-    """What a run has in another way than its scene."""
+    """Changes of a run against its scene."""
 
     parameters: Parameters = None
     channels: ChannelFile = None
     changes: Changes = None
     law: Law = None
     engine: Engine = None
-    duration_s: Annotated[float | None, typer.Option(help="Length of the run, in s.")] = None
-    seed: Annotated[int | None, typer.Option(help="Seed of the sensors' noise.")] = None
+    duration_s: Annotated[float | None, typer.Option(help="Length of the run in s")] = None
+    seed: Annotated[int | None, typer.Option(help="Seed of the sensor noise")] = None
 
     def overrides(self) -> dict[str, str]:
-        """The changes by dotted key.
+        """Return the changes by dotted key.
 
         Raises:
-            InputError: One is not of the form KEY=VALUE, or the law's file is wrong.
+           InputError: A change is not of the form KEY=VALUE, or the law file is invalid.
         """
-        overrides = pairs("--set", self.changes, "KEY=VALUE, such as drive.speed_hz=5.2")
+        overrides = parse_pairs("--set", self.changes, "KEY=VALUE, such as drive.speed_hz=5.2")
         if self.law is not None:
             from rig.physics.law_file import read_law
 
@@ -81,21 +77,21 @@ class SceneChanges:
         return overrides | {key: str(value) for key, value in named.items() if value is not None}
 
 
-def names_of(text: str | None) -> list[str]:
-    """The names in a list that is joined by commas; none where it was not given."""
+def split_names(text: str | None) -> list[str]:
+    """Return the names of a comma-separated list; empty for None."""
     return [name.strip() for name in (text or "").split(",") if name.strip()]
 
 
-def pairs(option: str, texts: list[str] | None, form: str) -> dict[str, str]:
-    """The two sides of texts such as KEY=VALUE.
+def parse_pairs(option: str, texts: list[str] | None, form: str) -> dict[str, str]:
+    """Return the left and right sides of texts such as KEY=VALUE.
 
     Args:
-        option: Its name, for errors.
-        texts: What was given.
-        form: What each text should look like, for errors.
+       option: Name of the option, for errors.
+       texts: Values of the option.
+       form: Form of a text, for errors.
 
     Raises:
-        InputError: A text has no such form, or a left side comes twice.
+       InputError: A text has another form, or a left side occurs twice.
     """
     found: dict[str, str] = {}
     for text in texts or []:
@@ -108,19 +104,19 @@ def pairs(option: str, texts: list[str] | None, form: str) -> dict[str, str]:
     return found
 
 
-def changed_parameters(
+def override_parameters(
     name: str, changes: list[str] | None, also: dict[str, Any] | None = None, law: Path | None = None
 ) -> ParameterSet:
-    """A parameter set with changes from the command line.
+    """Return a parameter set with changes from the command line.
 
     Args:
-        name: Name or path of the set.
-        changes: Values of `--set`, each KEY=VALUE.
-        also: Values by key from options of their own; they come last.
-        law: File of a contact law.
+       name: Name or path of the set.
+       changes: Values of `--set`, each KEY=VALUE.
+       also: Values by key from other options; they override `changes`.
+       law: File of a contact law.
 
     Raises:
-        InputError: No such set or key, or a value that the model does not take.
+       InputError: The set or a key does not exist, or a value is invalid.
     """
     from rig.physics.parameters import load_parameters
     from rig.run.scenes import read_value

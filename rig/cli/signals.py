@@ -1,4 +1,4 @@
-"""Signals that end a command in good order, from its first moment to its last."""
+"""Signals that end a command cleanly, from its start to its end."""
 
 from __future__ import annotations
 
@@ -8,33 +8,33 @@ from contextlib import contextmanager
 from types import FrameType
 
 _ENDING = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
-"""SIGHUP only where it is not ignored, as under nohup."""
-_came: list[int] = []
-"""What came before anybody else listened: an exception may be swallowed by whatever it interrupts."""
+"""SIGHUP only if it is not ignored, as under nohup."""
+_received: list[int] = []
+"""Signals received before a handler was set; the code that the exception interrupts may swallow it."""
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
-    _came.append(number)
+    _received.append(number)
     raise KeyboardInterrupt
 
 
 def listen() -> None:
-    """From now on signals interrupt, until somebody else takes them."""
+    """Make the signals interrupt the command, until other handlers are set."""
     for number in _ENDING:
-        # A shell starts what runs in its background with SIGINT ignored; whoever sends it all the same means it.
+        # A shell starts background jobs with SIGINT ignored; a SIGINT sent to one is deliberate.
         if number == signal.SIGINT or signal.getsignal(number) is signal.SIG_DFL:
             signal.signal(number, _interrupt)
 
 
 def ignore() -> None:
-    """The command is over, and its exit status known: nothing is left to be interrupted."""
+    """Ignore the signals: the command has finished and its exit status is fixed."""
     for number in _ENDING:
         signal.signal(number, signal.SIG_IGN)
 
 
 @contextmanager
-def stopping_on_signals(stop: Callable[[], object]) -> Iterator[None]:
-    """SIGINT, SIGTERM and SIGHUP end the work in good order; a second SIGINT interrupts at once."""
+def stop_on_signals(stop: Callable[[], object]) -> Iterator[None]:
+    """Call `stop` on SIGINT, SIGTERM and SIGHUP; a second SIGINT interrupts at once."""
     ended: list[int] = []
 
     def handle(number: int, _: object) -> None:
@@ -44,11 +44,11 @@ def stopping_on_signals(stop: Callable[[], object]) -> Iterator[None]:
         stop()
 
     former = {number: signal.signal(number, handle) for number in _ENDING if signal.getsignal(number) != signal.SIG_IGN}
-    if _came:
+    if _received:
         stop()
     try:
         yield
     finally:
         for number, handler in former.items():
-            # Once it is ending, only a second SIGINT asks for more.
+            # While the command ends, only a second SIGINT has an effect.
             signal.signal(number, signal.SIG_IGN if ended and number != signal.SIGINT else handler)

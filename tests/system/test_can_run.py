@@ -228,7 +228,7 @@ def test_rig_run_on_a_virtual_bus_between_processes(tmp_path: Path, options: lis
     assert child.returncode == 0, errors
     sent = sum(len(rows) for rows in frames.values())
     assert int(output.rpartition("CAN: ")[2].split()[0]) >= sent
-    assert output.endswith(" dropped, commands taken 1, refused 0\n"), output
+    assert output.endswith(" dropped, commands accepted 1, refused 0\n"), output
     found = re.search(r"lateness .* max (\d+\.\d+) .*sent, (\d+) dropped", output, re.DOTALL)
     assert found is not None, output
     # A rig that was held up for longer sends more frames at once than wait for a bus: it drops some, and counts them.
@@ -245,9 +245,9 @@ def test_rig_run_on_a_virtual_bus_between_processes(tmp_path: Path, options: lis
 
 def test_a_schedule_that_the_bus_cannot_carry_is_refused_before_anything_runs() -> None:
     from rig.cli.commands.run import run as command
-    from rig.cli.groups import grouped
+    from rig.cli.groups import expand_groups
 
-    run = grouped(command)
+    run = expand_groups(command)
 
     with pytest.raises(InputError, match=r"CAN load must be .*--can-overload.*received 126\.1 % of 1M/5M"):
         run("hammer", can="virtual:x", can_fd=True, can_bitrate="1M/5M")

@@ -140,6 +140,6 @@ with zenoh.open(config) as session:
                 output, _ = rig.communicate(timeout=60.0)
     assert rig.returncode == 0
     assert max(b - a for a, b in itertools.pairwise(stamps)) < 2.0, "twice a second, but for a busy machine"
-    found = re.search(r"blocks dropped (\d+), commands taken (\d+)", output)
+    found = re.search(r"blocks dropped (\d+), commands accepted (\d+)", output)
     assert found is not None
     assert int(found[1]) == 0

@@ -123,9 +123,9 @@ def publisher(port: int) -> Iterator[Publisher]:
 def recorder(path: Path, port: int, options: str = "", *, before: str = "") -> Iterator[subprocess.Popen[str]]:
     """`rig record` in a process of its own, ended by its own id whatever happens."""
     code = before + (
-        "import sys; from pathlib import Path; from rig.cli.groups import grouped; "
+        "import sys; from pathlib import Path; from rig.cli.groups import expand_groups; "
         "from rig.cli.commands.record import record; "
-        f"grouped(record)(Path(sys.argv[1]), connect='127.0.0.1:{port}', {options})"
+        f"expand_groups(record)(Path(sys.argv[1]), connect='127.0.0.1:{port}', {options})"
     )
     with python("-c", code, str(path)) as process:
         yield process

@@ -19,11 +19,11 @@ from tests.waiting import PATIENCE_S, until
 
 PROGRAM = """
 import sys, typer
-from rig.cli.groups import grouped
+from rig.cli.groups import expand_groups
 from rig.cli.commands.run import run
 from rig.base.errors import InputError
 app = typer.Typer(add_completion=False)
-app.command()(grouped(run))
+app.command()(expand_groups(run))
 try:
     app()
 except InputError as error:
@@ -48,7 +48,7 @@ def test_a_free_run_ends_with_a_summary() -> None:
         output, errors = child.communicate(timeout=COMPILE_S)
     assert child.returncode == 0, errors
     assert output.startswith("scene hammer: completed at 0.500 s")
-    assert "10000 samples a channel published, blocks dropped 0" in output
+    assert "10000 samples per channel published, blocks dropped 0" in output
     assert "listening on 127.0.0.1" in errors
 
 

@@ -37,7 +37,7 @@ from rig.base.errors import InputError
 from rig.cli.commands.run import run
 from rig.cli.connections.can_outlets import CanOutlets
 from rig.cli.connections.can_output import CanOptions, CanOutput
-from rig.cli.groups import grouped
+from rig.cli.groups import expand_groups
 from rig.serve.transport.memory import MemoryClient, MemoryServer
 from tests.processes import free_endpoint
 from tests.waiting import until
@@ -438,10 +438,10 @@ def test_no_door_of_the_bus_is_open_to_other_machines_whatever_is_asked(place: s
         r"must be on 127\.0\.0\.1, since there is no password; from another machine: ssh -L 29536:127.0.0.1:29536 "
     )
     for opening in (
-        lambda: grouped(run)("hammer", can="virtual:x", can_socketcand=place, listen=free_endpoint()),
+        lambda: expand_groups(run)("hammer", can="virtual:x", can_socketcand=place, listen=free_endpoint()),
         lambda: CanOutput("virtual:x", CanOptions(can_socketcand=place)),
         lambda: CanOutlets({}, speed("1M"), socketcand=place),
-        lambda: grouped(run)("hammer", can=f"zenoh:can0?endpoint={place}", listen=free_endpoint()),
+        lambda: expand_groups(run)("hammer", can=f"zenoh:can0?endpoint={place}", listen=free_endpoint()),
         lambda: hub(["can0"], socketcand=place),
         lambda: hub(["can0"], listen=place),
         lambda: Twins(MemoryClient(MemoryServer())).serve_zenoh(place),
@@ -820,4 +820,4 @@ def test_outlets_of_the_command_line() -> None:
     with pytest.raises(InputError, match=r"--can must be on zenoh, virtual or socketcan with --can-socketcand"):
         CanOutput("slcan:/dev/pts/99", CanOptions(can_slcan=True))
     with pytest.raises(InputError, match="--can must be given"):
-        grouped(run)("hammer", can_slcan=True)
+        expand_groups(run)("hammer", can_slcan=True)

@@ -10,7 +10,7 @@ import pytest
 
 from drivers.sources import open_source
 from rig.base.errors import InputError
-from rig.cli.connections.connection import Serving, tell_where
+from rig.cli.connections.connection import Serving, print_addresses
 from rig.cli.main import main
 from rig.serve.transport.exposure.access import ROLES
 from rig.serve.transport.exposure.certificates import HOLDERS, SERVER, holder_in, make
@@ -115,7 +115,7 @@ def test_the_command_says_what_goes_where(tmp_path: Path, capsys: pytest.Capture
     assert end.value.code == 0
     output = capsys.readouterr().out
     assert f"rig run SCENE --expose lab.example --tls {folder}" in output
-    assert "for the role recorder, who may read the truth; copy it" in output
+    assert "for the role recorder, with access to the truth; copy it" in output
     assert "rig status --connect lab.example:7463 --tls viewer" in output
     for arguments, message in (
         ((str(folder),), "DIR must be a new folder (--force"),
@@ -149,11 +149,11 @@ def test_exposure_says_who_may_come_in(tmp_path: Path) -> None:
 
 def test_plain_exposure_says_what_is_open(capsys: pytest.CaptureFixture[str]) -> None:
     server = SimpleNamespace(endpoint="127.0.0.1:7460")
-    tell_where(server, Serving(expose="192.0.2.1", plaintext=True).exposure())  # type: ignore[arg-type]
+    print_addresses(server, Serving(expose="192.0.2.1", plaintext=True).exposure())  # type: ignore[arg-type]
     errors = capsys.readouterr().err
-    assert "WARNING: 192.0.2.1:7463 is open to everybody who reaches it, unencrypted" in errors
+    assert "WARNING: 192.0.2.1:7463 is open to everybody, unencrypted" in errors
     assert "commands, notes, truth" in errors
-    tell_where(server, None)  # type: ignore[arg-type]
+    print_addresses(server, None)  # type: ignore[arg-type]
     assert capsys.readouterr().err == "rig: listening on 127.0.0.1:7460; Ctrl-C or `rig stop` ends it\n"
 
 

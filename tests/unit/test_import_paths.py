@@ -76,5 +76,5 @@ def test_a_module_of_a_user_s_own_in_the_place_of_ours_is_named(tmp_path: Path) 
     (tmp_path / "drivers/client.py").touch()
     told = imported(tmp_path, "import rig\nrig.connect()")
     assert told == (
-        f"ImportError: drivers.client must be the rig's own, and is {tmp_path}/drivers/client.py: rename that folder"
+        f"ImportError: drivers.client must be the rig's own; received {tmp_path}/drivers/client.py: rename it"
     )

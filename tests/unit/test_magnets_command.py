@@ -52,7 +52,7 @@ def test_document_holds_the_family_and_its_errors(capsys: pytest.CaptureFixture[
 def test_tables_show_what_the_document_holds(capsys: pytest.CaptureFixture[str]) -> None:
     found, lines = document(capsys), run(capsys, "magnets").splitlines()
     same_magnets = numbers(lines, "force toward the centre, same magnets (corrected)")
-    same_stiffness = numbers(lines, "the same at 1.7 kN/m")
+    same_stiffness = numbers(lines, "force at 1.7 kN/m")
     for model in found["models"]:
         name = model["name"]
         assert same_magnets[name] == pytest.approx(
@@ -63,7 +63,7 @@ def test_tables_show_what_the_document_holds(capsys: pytest.CaptureFixture[str])
     # A unit in brackets is no markup.
     assert "K [kN/m]" in text
     assert "8 magnets of 16.9 mm: number and length are assumed" in text
-    assert "no measured force is known to us" in text
+    assert "no measured force is available" in text
     chain = next(line for line in lines if line.startswith("cylinder map") and "exact cylinders" in line)
     assert float(chain.split()[-1].rstrip("%")) < 0.2
 

@@ -18,7 +18,7 @@ from rig.channels.generators import Generator
 from rig.cli.app import COMMANDS, GROUPS, rig
 from rig.cli.command import Group
 from rig.cli.commands.completion import SCENE_KEYS, complete
-from rig.cli.options import names_of, pairs
+from rig.cli.options import parse_pairs, split_names
 from rig.physics.engine_choice import Limits
 from rig.physics.engines import ENGINES
 from rig.run.scenes import Scene
@@ -63,15 +63,15 @@ def test_the_same_thing_has_one_name() -> None:
 
 
 def test_names_and_pairs() -> None:
-    assert names_of(None) == names_of(" , ") == []
-    assert names_of("a, b,,c") == ["a", "b", "c"]
-    assert pairs("--set", None, "KEY=VALUE") == {}
-    assert pairs("--set", ["a = 1", "b=c=d"], "KEY=VALUE") == {"a": "1", "b": "c=d"}
+    assert split_names(None) == split_names(" , ") == []
+    assert split_names("a, b,,c") == ["a", "b", "c"]
+    assert parse_pairs("--set", None, "KEY=VALUE") == {}
+    assert parse_pairs("--set", ["a = 1", "b=c=d"], "KEY=VALUE") == {"a": "1", "b": "c=d"}
     for wrong in ("a", "=1", "a=", " = "):
         with pytest.raises(InputError, match="--set must be KEY=VALUE"):
-            pairs("--set", [wrong], "KEY=VALUE")
+            parse_pairs("--set", [wrong], "KEY=VALUE")
     with pytest.raises(InputError, match="--set must be given once for a"):
-        pairs("--set", ["a=1", "a=2"], "KEY=VALUE")
+        parse_pairs("--set", ["a=1", "a=2"], "KEY=VALUE")
 
 
 def test_the_help_says_what_each_command_says_of_itself() -> None:
@@ -133,7 +133,7 @@ def test_help_is_told_once_and_fits_80_columns(capsys: pytest.CaptureFixture[str
             "--can must be INTERFACE:CHANNEL such as zenoh:can0, with ?NAME=VALUE&... for more settings; "
             "instead received 'foo'",
         ),
-        ("run", "SCENE must be given: name of a scene, or the path of a scene file; instead received nothing"),
+        ("run", "SCENE must be given: name of a scene, or path of a scene file; instead received nothing"),
         ("stop now", "argument must be one that `rig stop` takes (see -h); instead received 'now'"),
         ("run x --set", "--set must be followed by a value; instead received nothing"),
         ("view --live=3", "--live must be given without a value; instead received one"),

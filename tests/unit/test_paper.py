@@ -319,7 +319,7 @@ def test_terminal_tells_every_statement_and_the_rule(findings: Findings, capsys,
         assert " ".join(line.row().cells[-2:]) in said
     assert not re.search(r"\d+ (agree|differ)", said), "no headline of counts"
     assert "more than 2/5" in said
-    assert "nothing is written" in said
+    assert "no file written" in said
 
 
 def test_a_folder_for_pictures_is_made_beside_others(findings: Findings, tmp_path, capsys, monkeypatch):

@@ -201,9 +201,7 @@ def _summary(**values: Any) -> Summary:
 
 def test_a_triggered_recording_counts_what_it_kept(capsys):
     tell(_summary(fired=0, received_s=6.4))
-    assert capsys.readouterr().out.splitlines()[0] == (
-        "no trigger came in 6.400 s; nothing was written; ended: completed"
-    )
+    assert capsys.readouterr().out.splitlines()[0] == ("no trigger in 6.400 s; nothing written; ended: completed")
     files = (Path("run.hammer-001.mcap"),)
     tell(_summary(path=files[0], files=files, fired=2, received_s=9.0, duration_s=2.5, rows={sensor_key("probes"): 50}))
     assert capsys.readouterr().out.startswith(

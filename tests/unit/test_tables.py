@@ -19,8 +19,8 @@ from replays.studies.stability.trials.cell import Cell
 from rig.cli.commands.bench import cases_table
 from rig.cli.commands.info import describe, events_table
 from rig.cli.commands.stability import peers_table, trials_table
-from rig.cli.output.display import fitted
-from rig.cli.output.tables import echo_json, facts, new_table
+from rig.cli.output.display import fit_width
+from rig.cli.output.tables import echo_json, fact_table, new_table
 from rig.physics.engines import ENGINES
 from tests.commands import check_legible, lines_of, said, shown
 
@@ -168,7 +168,7 @@ def test_rows_must_fit_their_headings() -> None:
 
 
 def test_facts_have_no_heading() -> None:
-    table = facts("rig", [("a", "b " * 60), ("longer", "c")])
+    table = fact_table("rig", [("a", "b " * 60), ("longer", "c")])
     lines = lines_of(table)
     assert lines[0] == "rig"
     assert lines[1].startswith("a       b b")
@@ -178,7 +178,7 @@ def test_facts_have_no_heading() -> None:
 
 @pytest.mark.parametrize("width", range(30, 60, 3))
 def test_a_number_and_its_unit_stay_on_one_line(width: int) -> None:
-    lines = lines_of(facts("so 3.5 kN", [("all", "it took 12.5 ms of 3 MB at 100 N s/m, " * 9)]), width=width)
+    lines = lines_of(fact_table("so 3.5 kN", [("all", "it took 12.5 ms of 3 MB at 100 N s/m, " * 9)]), width=width)
     assert len(lines) > 5
     assert not any(line.endswith(("12.5", "3", "100", "100 N")) for line in lines), lines
 
@@ -194,9 +194,9 @@ def test_a_reader_that_has_gone_is_told_by_the_status_alone(command: list[str]) 
 
 def test_a_status_line_is_one_line_of_whole_parts() -> None:
     parts = ["  599.99 of 600 s", "late p99 0.12 max 123.45 ms", "clients 2"]
-    assert fitted(parts, 80) == "  599.99 of 600 s  late p99 0.12 max 123.45 ms  clients 2"
-    assert fitted(parts, 50) == "  599.99 of 600 s  late p99 0.12 max 123.45 ms"
-    assert fitted(parts, 5) == parts[0]
+    assert fit_width(parts, 80) == "  599.99 of 600 s  late p99 0.12 max 123.45 ms  clients 2"
+    assert fit_width(parts, 50) == "  599.99 of 600 s  late p99 0.12 max 123.45 ms"
+    assert fit_width(parts, 5) == parts[0]
 
 
 def test_info_tells_a_blow_once_and_how_far_it_has_read(capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,4 +1,4 @@
-"""`rig bench`: how fast the rig is on this machine, and how accurate at that speed."""
+"""`rig bench`: speed and accuracy of the engines on this machine."""
 
 from __future__ import annotations
 
@@ -13,16 +13,14 @@ from rig.cli.output.tables import Form, Table, echo_json, new_table
 def bench(
     *,
     form: Form,
-    runs: Annotated[int, typer.Option(min=1, max=100, help="Runs of each case.")] = 5,
-    peers: Annotated[
-        bool, typer.Option(help="Time CVODE and heyoka in the same rounds, where they are installed.")
-    ] = True,
-    frames: Annotated[int, typer.Option(min=0, max=1_000_000, help="Single frames of 1 ms to time.")] = 10_000,
+    runs: Annotated[int, typer.Option(min=1, max=100, help="Timed runs of each case")] = 5,
+    peers: Annotated[bool, typer.Option(help="Also time CVODE and heyoka, if installed")] = True,
+    frames: Annotated[int, typer.Option(min=0, max=1_000_000, help="Number of 1 ms frames to time")] = 10_000,
 ) -> None:
-    """Measure simulated over processor time with the error beside it; medians of several runs, compile time apart."""
+    """Measure speed and error of the engines on this machine: medians of several runs, without compile time."""
     from replays.studies.bench import measure
 
-    with reporting(compiles=True, live=False) as reporter:  # a live line would take of the time that is measured
+    with reporting(compiles=True, live=False) as reporter:  # a live line would disturb the timing
         report = measure(runs=runs, peers=peers, frames=frames, progress=reporter.say)
     if form.as_json:
         echo_json(report)
@@ -46,7 +44,7 @@ def bench(
 
 
 def cases_table(report: dict[str, Any], *, runs: int) -> Table:
-    """What was timed, with its error and its goal."""
+    """Return a table of the timed cases with error and goal."""
     table = new_table(
         f"times real time, {runs} runs",
         *("case", ">median", ">min", ">max", ">of the first", ">error", ">energy residual", ">goal", "reached"),

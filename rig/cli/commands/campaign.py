@@ -1,4 +1,4 @@
-"""`rig campaign`: scripted tests of a device in the loop, for whoever does not know pytest, which runs them."""
+"""`rig campaign`: scripted tests of a device in the loop, run by pytest; no knowledge of pytest is needed."""
 
 from __future__ import annotations
 
@@ -23,33 +23,38 @@ def campaign(
         list[str] | None,
         typer.Argument(
             metavar="[FILE...]",
-            help="A *.campaign.toml, one of the rig's by name (hammer), or tests of pytest; FILE::CASE for one case. "
-            "Without: list the rig's.",
+            help="*.campaign.toml file, name of a built-in campaign (hammer) or pytest tests; FILE::CASE: one case; "
+            "none: list the built-in campaigns",
         ),
     ] = None,
     *,
     keyword: Annotated[
-        str | None, typer.Option("--keyword", "-k", metavar="WORDS", help="Only cases with these words in their names.")
+        str | None,
+        typer.Option("--keyword", "-k", metavar="WORDS", help="Run only cases with these words in their names"),
     ] = None,
-    jobs: Annotated[int, typer.Option("--jobs", "-j", metavar="N", min=1, help="So many cases at a time.")] = 1,
+    jobs: Annotated[
+        int, typer.Option("--jobs", "-j", metavar="N", min=1, help="Number of cases to run in parallel")
+    ] = 1,
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", metavar="FOLDER", help="For results.json, junit.xml, index.html and evidence/."),
+        typer.Option(
+            "--output", "-o", metavar="FOLDER", help="Folder for results.json, junit.xml, index.html, evidence/"
+        ),
     ] = None,
     against: Annotated[
-        Path | None, typer.Option("--against", metavar="FOLDER", help="Results of an earlier campaign to compare with.")
+        Path | None, typer.Option("--against", metavar="FOLDER", help="Compare with the results of an earlier campaign")
     ] = None,
     url: Annotated[
-        str | None, typer.Option(metavar="URL", help="Run on the rig there; what cannot be done there is skipped.")
+        str | None, typer.Option(metavar="URL", help="Use the rig at this URL; skip cases that it cannot run")
     ] = None,
     replay: Annotated[
-        Path | None, typer.Option(metavar="FILE.mcap", help="Run on a recording that is played, likewise.")
+        Path | None, typer.Option(metavar="FILE.mcap", help="Use a replayed recording; skip cases that need commands")
     ] = None,
 ) -> None:
-    """Run scripted tests of a device in the loop, and judge them.
+    """Run scripted tests of a device in the loop.
 
-    Exit status: 0 pass, 1 a case failed, 2 wrong input or nothing to run, 3 inconclusive: no case failed, and one is
-    inconclusive, or all were skipped. Ctrl-C leaves nothing running, and the results of what was done.
+    Exit status: 0 pass; 1 a case failed; 2 wrong input or nothing to run; 3 inconclusive (no case failed, and one is
+    inconclusive or all were skipped). Ctrl-C stops all processes and keeps the results of the finished cases.
     """
     if not files:
         _list()
@@ -83,7 +88,7 @@ def _list() -> None:
 
 
 def _checked(files: list[str], against: Path | None, replay: Path | None) -> list[str]:
-    """The files by their paths; what is wrong with them is refused before anything runs."""
+    """Return the paths of the files; raise an error for wrong files before anything runs."""
     from replays.campaigns.files.campaign import SUFFIX, campaign_path, load_campaign
     from replays.campaigns.reporting.results import load_results
 
@@ -110,28 +115,30 @@ def _checked(files: list[str], against: Path | None, replay: Path | None) -> lis
 
 
 def _run(files: list[str], options: list[str], output: Path | None) -> int:
-    """Run the tests; returns the exit status."""
-    # Installed, the plugin is there by its entry point; out of a checkout, it is named.
+    """Run the tests and return the exit status."""
+    # An installed plugin is found by its entry point; in a checkout it must be named.
     from importlib.metadata import entry_points
 
     import pytest
 
-    from rig.cli.output.campaign_progress import WORDS, Progress, beside_pytest
+    from rig.cli.output.campaign_progress import OUTCOME_WORDS, Progress, bypass_capture
 
     module = "replays.campaigns.plugin"
     there = any(each.value == module for each in entry_points(group="pytest11"))
     plugins = ["-p", "no:cacheprovider", *([] if there else ["-p", module])]
-    # This runs before pytest does: asserts in what is imported already are not told in pieces, and need not be.
+    # Modules imported before pytest starts do not get rewritten asserts, which is intended.
     plugins += ["-W", "ignore::pytest.PytestAssertRewriteWarning"]
-    with beside_pytest(progress_bar(transient=True)) as bar:
+    with bypass_capture(progress_bar(transient=True)) as bar:
         progress = Progress(bar)
         status = pytest.main([*plugins, *options, *files], plugins=[progress])
-    if progress.unheard:
+    if progress.reader_gone:
         raise BrokenPipeError
     if status == pytest.ExitCode.INTERNAL_ERROR:
-        echo(progress.said.getvalue().strip(), err=True)
+        echo(progress.pytest_output.getvalue().strip(), err=True)
     counts = progress.counts
-    told = ", ".join(f"{counts[outcome]} {outcome}" for outcome in WORDS if counts[outcome]) or "nothing was run"
+    told = (
+        ", ".join(f"{counts[outcome]} {outcome}" for outcome in OUTCOME_WORDS if counts[outcome]) or "nothing was run"
+    )
     left = len(progress.planned) - sum(counts.values())
     echo(f"{told}{f', {left} not run' if left > 0 else ''}")
     if output is not None and (output / "index.html").is_file():

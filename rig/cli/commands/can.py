@@ -1,4 +1,4 @@
-"""`rig can`: the virtual CAN bus."""
+"""`rig can`: virtual CAN buses."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rig.cli.connections.can_output import CanMessages, bit_rates
 from rig.cli.options import ChannelFile
 from rig.cli.output.progress import reporting
 from rig.cli.output.tables import Form, echo, echo_document, echo_json, new_table
-from rig.cli.signals import stopping_on_signals
+from rig.cli.signals import stop_on_signals
 
 if TYPE_CHECKING:
     from drivers.can.bus.timing import Speed
@@ -27,36 +27,32 @@ _SPEED = "1M/8M"
 
 
 def can(context: typer.Context) -> None:
-    """Run virtual CAN buses, and show what the rig sends on one."""
+    """Run virtual CAN buses, and list the CAN messages of the rig."""
     if context.invoked_subcommand is None:
         echo(context.get_help())
 
 
 def hub(
-    channels: Annotated[list[str], typer.Argument(metavar="CHANNEL...", help="Names of the buses, such as can0.")],
+    channels: Annotated[list[str], typer.Argument(metavar="CHANNEL...", help="Names of the buses, such as can0")],
     *,
     speed: Annotated[
-        str, typer.Option(metavar="RATE[/RATE]", help="Bit rate, and that of the data phase of CAN FD: 500k, 1M/8M.")
+        str, typer.Option(metavar="RATE[/RATE]", help="Bit rate, and CAN FD data bit rate: 500k, 1M/8M")
     ] = _SPEED,
-    listen: Annotated[str, typer.Option(metavar="HOST:PORT", help="Where to listen.")] = LISTEN,
+    listen: Annotated[str, typer.Option(metavar="HOST:PORT", help="Address to listen on")] = LISTEN,
     socketcand: Annotated[
         str | None,
-        typer.Option(
-            metavar="HOST:PORT", help="Also serve socketcand clients (classic frames), usually at 127.0.0.1:29536."
-        ),
+        typer.Option(metavar="HOST:PORT", help="Serve socketcand here (classic frames), e.g. 127.0.0.1:29536"),
     ] = None,
     slcan: Annotated[
-        bool, typer.Option("--slcan", help="Also play an SLCAN adapter on a port of its own for each bus.")
+        bool, typer.Option("--slcan", help="Open a pseudo-terminal per bus that acts as an SLCAN adapter")
     ] = False,
-    acknowledge: Annotated[
-        bool, typer.Option(help="Acknowledge frames, so that an only node on the bus can send.")
-    ] = True,
-    error_rate: Annotated[float, typer.Option(metavar="SHARE", help="Share of bits that arrive wrong.")] = 0.0,
-    seed: Annotated[int, typer.Option(help="Seed of the wrong bits.")] = 0,
+    acknowledge: Annotated[bool, typer.Option(help="Acknowledge frames, so that a single node can send")] = True,
+    error_rate: Annotated[float, typer.Option(metavar="SHARE", help="Fraction of bits received wrong, 0 to 1")] = 0.0,
+    seed: Annotated[int, typer.Option(help="Seed of the bit errors")] = 0,
 ) -> None:
-    """Run virtual CAN buses of their own, without a rig, until Ctrl-C.
+    """Run virtual CAN buses without a rig, until Ctrl-C.
 
-    Programs reach one by python-can: can.Bus(interface="zenoh", channel="can0"), or can_logger -i zenoh -c can0.
+    Connect with python-can: can.Bus(interface="zenoh", channel="can0"), or can_logger -i zenoh -c can0.
     """
     from drivers.can.bus.hub import Hub
     from drivers.can.bus.model import BusModel
@@ -73,7 +69,7 @@ def hub(
     with ZenohServer(listen) as server, ExitStack() as stack:
         hubs = [Hub(model, name, server, acknowledge=acknowledge) for model, name in zip(models, channels, strict=True)]
         stopped = threading.Event()
-        with stopping_on_signals(stopped.set):
+        with stop_on_signals(stopped.set):
             with reporting(compiles=True):
                 for one in hubs:
                     stack.enter_context(one)
@@ -101,11 +97,11 @@ def _line(status: dict[str, Any]) -> str:
 def dbc(
     *,
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", metavar="FILE.dbc", help="Write it to this file.")
+        Path | None, typer.Option("--output", "-o", metavar="FILE.dbc", help="Write the DBC to this file")
     ] = None,
     channels: ChannelFile = None,
 ) -> None:
-    """Show the DBC of the rig's messages, made from the channel table, or write it to a file."""
+    """Show the DBC of the rig's messages, generated from the channel table, or write it to a file."""
     from drivers.can.dbc import text
 
     if output is not None:
@@ -128,7 +124,7 @@ def _table(channels: Path | None) -> ChannelTable:
 
 
 def load(*, messages: CanMessages, channels: ChannelFile = None, form: Form) -> None:
-    """Show every message of the rig with its period, share of the bus and longest response time."""
+    """Show period and bus load of every message of the rig, with its longest response time."""
     from drivers.can.gateway.samples import find_decimations
 
     table = _table(channels)

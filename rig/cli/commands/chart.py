@@ -1,4 +1,4 @@
-"""`rig chart`: speed against accuracy of our engines and other people's solvers, measured and drawn here."""
+"""`rig chart`: work-precision charts of the rig's engines and of other solvers, measured on this machine."""
 
 from __future__ import annotations
 
@@ -14,33 +14,32 @@ from rig.cli.output.tables import echo
 
 def chart(
     *,
-    quick: Annotated[bool, typer.Option("--quick", help="Few points, in about two minutes (the default).")] = False,
-    full: Annotated[bool, typer.Option("--full", help="All points, within an hour.")] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="Measure few points, about 2 min (default)")] = False,
+    full: Annotated[bool, typer.Option("--full", help="Measure all points, up to 1 h")] = False,
     output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="FOLDER", help="Folder for pictures and data.")
+        Path, typer.Option("-o", "--output", metavar="FOLDER", help="Folder for pictures and data")
     ] = Path("chart"),
     only: Annotated[
-        str | None, typer.Option("--only", metavar="PHASE", help="One phase: first-impacts, transient, whirl, ...")
+        str | None,
+        typer.Option("--only", metavar="PHASE", help="Chart one phase: first-impacts, transient, whirl, ..."),
     ] = None,
     panel: Annotated[
         list[str] | None,
-        typer.Option(
-            "--panel", metavar="PANEL", help="exact, smoothed, memory, rub, profile, scenes; may be repeated."
-        ),
+        typer.Option("--panel", metavar="PANEL", help="exact, smoothed, memory, rub, profile or scenes; repeatable"),
     ] = None,
-    no_peers: Annotated[bool, typer.Option("--no-peers", help="Our engines only.")] = False,
-    fresh: Annotated[bool, typer.Option("--fresh", help="Start over instead of going on where a run ended.")] = False,
+    no_peers: Annotated[bool, typer.Option("--no-peers", help="Chart only the rig's engines")] = False,
+    fresh: Annotated[bool, typer.Option("--fresh", help="Start over instead of continuing the last run")] = False,
     law: Law = None,
     add: Annotated[
         list[Path] | None,
-        typer.Option("--add", metavar="FILE.csv", help="Add a solver by its results; may be repeated."),
+        typer.Option("--add", metavar="FILE.csv", help="Add a solver's results to the chart; repeatable"),
     ] = None,
     problem: Annotated[
-        str | None, typer.Option("--problem", metavar="PHASE", help="Write a phase's problem for a solver of yours.")
+        str | None, typer.Option("--problem", metavar="PHASE", help="Write the problem of a phase for your own solver")
     ] = None,
-    draw: Annotated[bool, typer.Option("--draw", help="Draw chart.csv of the folder again; measure nothing.")] = False,
+    draw: Annotated[bool, typer.Option("--draw", help="Redraw chart.csv of the folder without measuring")] = False,
 ) -> None:
-    """Chart speed against error: our engines against other solvers, by phase of the motion and by contact law."""
+    """Chart speed against error of the rig's engines and other solvers, by phase of the motion and contact law."""
     from replays.studies.chart.session import Progress, add_solvers, draw_again, make_chart
     from replays.studies.chart.submission import write_problem
     from replays.studies.common.law_scene import add_law_scene
@@ -72,14 +71,14 @@ def chart(
             )  # fmt: skip
     if outcome.missing:
         missing = ", ".join(outcome.missing)
-        echo(f"not installed: {missing} (pip install 'rotor-stator-rig[peers]'); charted without", err=True)
+        echo(f"not installed: {missing} (pip install 'rotor-stator-rig[peers]'); left out of the chart", err=True)
     if outcome.outdated:
-        echo(f"{outcome.outdated} points of other code were measured anew", err=True)
-    left = f", {outcome.left} left for want of time: run again to add them" if outcome.left else ""
+        echo(f"{outcome.outdated} points from an older version were measured again", err=True)
+    left = f", {outcome.left} not measured within the time limit: run again to add them" if outcome.left else ""
     counts = f"{outcome.measured} points measured, {outcome.resumed} kept, {outcome.failures} failures drawn"
     echo(counts + left, err=True)
     for path in outcome.files:
         echo(str(path))
     if outcome.interrupted:
-        echo("stopped; the same command goes on from here", err=True)
+        echo("stopped; run the same command again to continue", err=True)
         raise typer.Exit(130)

@@ -1,8 +1,8 @@
-"""`rig completion`: a shell completes commands, options, names of scenes and engines, keys of --set, and files.
+"""`rig completion`: shell completion of commands, options, scenes, engines, keys of --set, and files.
 
-The shell hands `rig __complete` the line up to the cursor and gets a line for each word that may stand there: the word,
-a tab, and what it means. A line that begins with a tab asks for files, with those endings if there are any, or for
-folders where it is a slash. Nothing is parsed as the command would parse it: only the command's own module is imported.
+The shell calls `rig __complete` with the line up to the cursor and receives one line per candidate: the word, a tab and
+its meaning. A line that begins with a tab requests file names: with the listed suffixes if there are any, or folders
+for a slash. The line is not parsed by the command itself; only the command's own module is imported.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from rig.cli.command import Group
 from rig.cli.output.tables import echo, echo_document
 
 _SHELLS = ("bash", "zsh", "fish")
-"""Each has a script beside this module."""
+"""Shells that have a completion script next to this module."""
 _RIG = Path(__file__).parents[2]
 _ENDING = re.compile(r"(?<![\w.])\.[a-z][a-z0-9]+\b")
 SCENE_KEYS = (
@@ -41,19 +41,21 @@ SCENE_KEYS = (
     *("generator.period_s", "generator.order", "generator.seed", "generator.crest", "generator.apart"),
     *("generator.file", "generator.channels"),
 )
-"""Fields of a scene that `--set` is for: the scene's own module would take half a second to tell them."""
+"""Fields of a scene that `--set` accepts, listed here because importing `rig.run.scenes` takes 0.5 s."""
 
 Choices = Iterable[tuple[str, str]]
 
 
 def completion(
-    shell: Annotated[str | None, typer.Argument(metavar="[bash|zsh|fish]", help="By default that of $SHELL.")] = None,
+    shell: Annotated[
+        str | None, typer.Argument(metavar="[bash|zsh|fish]", help="Shell; default: that of $SHELL")
+    ] = None,
     *,
-    install: Annotated[bool, typer.Option("--install", help="Set it up for every new shell of this user.")] = False,
+    install: Annotated[bool, typer.Option("--install", help="Install for every new shell of this user")] = False,
 ) -> None:
-    """Complete commands, options and names in a shell, by Tab: `rig completion --install`, then open a new shell.
+    """Complete commands, options and names in a shell by Tab: `rig completion --install`, then open a new shell.
 
-    Without --install it prints the script, for `source <(rig completion bash)` or a place of your own.
+    Without --install it prints the script, for `source <(rig completion bash)` or a file of your own.
     """
     shell = shell or Path(os.environ.get("SHELL", "")).name
     if shell not in _SHELLS:
@@ -64,11 +66,11 @@ def completion(
         return
     for path in _install(shell, script):
         echo(f"{path} written")
-    echo(f"in a new {shell}, Tab completes what begins with rig")
+    echo(f"in a new {shell}, Tab completes rig commands")
 
 
 def _install(shell: str, script: str) -> list[Path]:
-    """Write the script, and a line that reads it to what the shell reads at its start; gives what was written."""
+    """Write the script, and add a line to the shell's start file that loads it; return the files written."""
     home = Path.home()
     if shell == "fish":
         file = Path(os.environ.get("XDG_CONFIG_HOME") or home / ".config") / "fish/completions/rig.fish"
@@ -87,12 +89,12 @@ def _install(shell: str, script: str) -> list[Path]:
 
 
 def complete(root: Group, shell: str, line: str) -> list[str]:
-    """What may stand at the end of a line, as the shell's script takes it.
+    """Return the candidates for the end of a line, in the format of the shell scripts.
 
     Args:
-        root: The command line.
-        shell: Its name.
-        line: The line up to the cursor, the program's name first.
+       root: The command line.
+       shell: Name of the shell.
+       line: The line up to the cursor, beginning with the program's name.
     """
     *before, start = _words(line)
     command, option, place = _reached(root, before[1:])
@@ -112,16 +114,16 @@ def complete(root: Group, shell: str, line: str) -> list[str]:
             place = min(place, len(arguments) - 1)
         param = option or next(iter(arguments[place:]), None)
         found = [] if param is None else list(_values(command, param, start))
-    # Of a word with = or : in it, bash replaces only what is behind the last one.
+    # In a word with = or :, bash replaces only the part after the last one.
     cut = max(start.rfind("="), start.rfind(":")) + 1 if shell == "bash" else 0
     head = "" if shell == "bash" else head
     fit = [each for each in found if not each[0] or each[0].startswith(start)]
-    fit = [] if [word for word, _ in fit] == [start] != [""] else fit  # it is complete
+    fit = [] if [word for word, _ in fit] == [start] != [""] else fit  # the word is complete
     return [f"{word and head + word[cut:]}\t{printable(says)}" for word, says in fit]
 
 
 def _reached(root: Group, words: list[str]) -> tuple[Any, Any, int]:
-    """The command that words lead to, the option of it that waits for its value, and how many arguments it has."""
+    """Return the command that the words lead to, its option that waits for a value, and the number of arguments."""
     command, option, place = root, None, 0
     for word in words:
         if option is not None:
@@ -139,13 +141,13 @@ def _reached(root: Group, words: list[str]) -> tuple[Any, Any, int]:
 
 
 def _words(line: str) -> list[str]:
-    """Choices of a line that may end in the middle of one; the last is what is to be completed."""
+    """Return the words of a line that may end inside a word; the last one is to be completed."""
     reader = shlex.shlex(line, posix=True)
     reader.whitespace_split, reader.commenters = True, ""
     words: list[str] = []
     try:
         words += reader
-    except ValueError:  # it ends between quotes
+    except ValueError:  # the line ends inside quotes
         return [*words, reader.token]
     return words if line[-1:].strip() else [*words, ""]
 
@@ -156,7 +158,7 @@ def _options(command: Any) -> dict[str, Any]:
 
 
 def _values(command: Any, param: Any, start: str) -> Choices:
-    """The values that a parameter takes, each with its meaning; for files, no value and their endings."""
+    """Yield the values that a parameter accepts, with their meanings; for files, an empty value and the suffixes."""
     metavar = param.metavar or ""
     kind = metavar.strip("[]").rstrip(".")
     if "|" in kind:
@@ -200,7 +202,7 @@ def _keys(start: str) -> Choices:
         return [(f"{key}={rule}", "") for rule in parameters[key].get("rules", ())]
     return [
         *((f"{name}=", f"{entry['unit']}, {entry['source']}") for name, entry in parameters.items()),
-        *((f"{name}=", "of the scene") for name in SCENE_KEYS),
+        *((f"{name}=", "scene field") for name in SCENE_KEYS),
     ]
 
 
@@ -210,7 +212,7 @@ def _channels(start: str) -> Choices:
 
 
 def _list_of(names: Callable[[str], Choices]) -> Callable[[str], Choices]:
-    """The same names in a list that is joined by commas."""
+    """Return a completer of comma-separated names."""
 
     def joined(start: str) -> Choices:
         head = start[: start.rfind(",") + 1]
@@ -229,4 +231,4 @@ _NAMES: dict[str, Callable[[str], Choices]] = {
     "KEY,": _list_of(lambda start: [(name.rstrip("="), says) for name, says in _keys("")]),
     "NAME,": _list_of(_channels),
 }
-"""Names by how the help calls them."""
+"""Completers by the metavar of the help."""

@@ -1,4 +1,4 @@
-"""`rig cut`: a part of a recording, or the parts of one joined, to a new file."""
+"""`rig cut`: cut a part from a recording, or join its files."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from typing import Annotated
 
 import typer
 
-from rig.cli.options import Channels, Force, FromS, RecordingFiles, ToS, names_of
+from rig.cli.options import Channels, Force, FromS, RecordingFiles, ToS, split_names
 from rig.cli.output.progress import reporting
 from rig.cli.output.tables import echo
 
 
 class Only(StrEnum):
-    """Which streams are kept."""
+    """Streams that are kept."""
 
     SENSORS = "sensors"
     TRUTH = "truth"
@@ -24,14 +24,14 @@ class Only(StrEnum):
 def cut(
     files: RecordingFiles,
     *,
-    output: Annotated[Path, typer.Option("--output", "-o", help="The new file, ends in .mcap.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="New recording, .mcap")],
     from_s: FromS = None,
     to_s: ToS = None,
-    only: Annotated[Only | None, typer.Option(help="Leave the others out.")] = None,
+    only: Annotated[Only | None, typer.Option(help="Keep only these streams")] = None,
     channels: Channels = None,
     force: Force = False,
 ) -> None:
-    """Cut a recording, or join several files of one run; what is kept is kept byte for byte, trimmed at the edges."""
+    """Cut a part from a recording, or join the files of a run; payloads are copied unchanged, trimmed at the edges."""
     from recorder.files.unfinished_file import check_destination
     from recorder.reader import join
     from recorder.rewrite import cut as cut_recording
@@ -44,7 +44,7 @@ def cut(
             from_s=-math.inf if from_s is None else from_s,
             to_s=math.inf if to_s is None else to_s,
             only=None if only is None else Only(only).value,
-            channels=tuple(names_of(channels)),
+            channels=tuple(split_names(channels)),
             force=force,
             on_progress=lambda done: report.part(done, f"writing {output}"),
         )

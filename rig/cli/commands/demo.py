@@ -1,4 +1,4 @@
-"""`rig demo`: the whole rig once, from service to verdict."""
+"""`rig demo`: one complete session, from the service to the verdict."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ if TYPE_CHECKING:
 
 _STABLE_S = 3.0
 _READY_S = 60.0
-"""How long a service may take to start on a slow machine [s]."""
+"""Time limit for the start of a service on a slow machine [s]."""
 _CLOSE_S = 60.0
-"""How long service and recorder may take to close [s]."""
+"""Time limit for service and recorder to close [s]."""
 
 
 def demo(
     *,
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", metavar="FOLDER", help="New folder for the files.")
+        Path | None, typer.Option("--output", "-o", metavar="FOLDER", help="New folder for the files")
     ] = None,
-    speed_hz: Annotated[float, typer.Option(min=1.0, max=15.0, help="Spin speed, in Hz.")] = 6.2,
-    whirl_s: Annotated[float, typer.Option(min=3.0, max=600.0, help="How long it whirls, in s.")] = 15.0,
+    speed_hz: Annotated[float, typer.Option(min=1.0, max=15.0, help="Spin speed in Hz")] = 6.2,
+    whirl_s: Annotated[float, typer.Option(min=3.0, max=600.0, help="Time after the impact in s")] = 15.0,
 ) -> None:
-    """Start the service, record, hit, let it whirl, stop; then judge the recording and draw it. About half a minute."""
+    """Start the service, record an impact and the whirl, stop; then judge and draw the recording (about 30 s)."""
     import time
     from datetime import datetime
 
@@ -75,7 +75,7 @@ def demo(
 
 
 def _record_session(file: Path, *, speed_hz: float, whirl_s: float, say: Callable[[str], None]) -> None:
-    """Service and recorder in processes of their own, commanded from here, until the file is closed."""
+    """Run service and recorder as processes, and command them until the file is closed."""
     import time
 
     from drivers.console import Console
@@ -87,7 +87,7 @@ def _record_session(file: Path, *, speed_hz: float, whirl_s: float, say: Callabl
 
     with reporting(compiles=True) as reporter:
         reporter.say("loading the kernels")
-        Simulation(load_scene("stable-run")).warm_up()  # what has to be compiled is compiled where it is seen
+        Simulation(load_scene("stable-run")).warm_up()  # compiles here, where the user sees the progress
     endpoint = f"127.0.0.1:{free_port()}"
     with _processes(file.with_name("processes.log")) as start:
         say(f"starting the service: rig run stable-run --set drive.speed_hz={speed_hz:g} --listen {endpoint}")
@@ -97,7 +97,7 @@ def _record_session(file: Path, *, speed_hz: float, whirl_s: float, say: Callabl
         recorder = start("record", "-o", str(file), "--connect", endpoint, "--history")
         with ZenohClient(endpoint, wait_s=5.0) as client:
             console = Console(client, name="rig demo")
-            say(f"service up, recording to {file}; spinning contact-free for {_STABLE_S:g} s")
+            say(f"service up, recording to {file}; spinning without contact for {_STABLE_S:g} s")
             time.sleep(_STABLE_S)
             pulse = console.hammer(force_n=100.0, duration_ms=5.0, direction="x")
             effect = f"takes effect at {pulse.time_s:.3f} s of simulated time"
@@ -117,7 +117,7 @@ def _record_session(file: Path, *, speed_hz: float, whirl_s: float, say: Callabl
 
 @contextmanager
 def _processes(log: Path) -> Iterator[Callable[..., Process]]:
-    """Starts `rig` commands that write to a log and are ended with the block, whatever happens in it."""
+    """Yield a function that starts `rig` commands; their output goes to a log, and they end with the block."""
     import subprocess
     import sys
 
@@ -125,7 +125,7 @@ def _processes(log: Path) -> Iterator[Callable[..., Process]]:
     file: IO[str] = log.open("w", encoding="utf-8")
 
     def start(*arguments: str) -> Process:
-        # -P: a file of the user's own in the present folder must not be taken for a package of ours.
+        # -P: a user's file in the working directory must not shadow a package of the rig.
         command = [sys.executable, "-P", "-m", "rig", *arguments]
         started.append(subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=file, stderr=file))
         return started[-1]
@@ -157,7 +157,7 @@ def _wait_until_up(endpoint: str, service: Process) -> None:
             client.request(STATUS)
             return
     raise typer.Exit(
-        _complain(None, f"the service did not come up (status {service.poll()}); see processes.log in the folder")
+        _complain(None, f"the service did not start (status {service.poll()}); see processes.log in the folder")
     )
 
 
@@ -167,7 +167,7 @@ def _complain(log: Path | None, text: str) -> int:
 
 
 def verdict_table(verdict: Verdict) -> Table:
-    """The lines of a verdict."""
+    """Return the lines of a verdict as a table."""
     from rich.text import Text
 
     texts = ("quantity", "measured", "expected")

@@ -1,4 +1,4 @@
-"""`rig export`: a recording in other tools' formats."""
+"""`rig export`: a recording in the formats of other programs."""
 
 from __future__ import annotations
 
@@ -9,37 +9,33 @@ from typing import Annotated
 import typer
 
 from rig.base.errors import InputError
-from rig.cli.options import Force, FromS, RecordingFiles, ToS, names_of
+from rig.cli.options import Force, FromS, RecordingFiles, ToS, split_names
 from rig.cli.output.tables import echo
 
 
 def export(
     files: RecordingFiles,
     *,
-    output: Annotated[
-        Path, typer.Option("--output", "-o", help="File to write: .mf4, .tdms, .uff, .csv, .parquet or .wav.")
-    ],
+    output: Annotated[Path, typer.Option("--output", "-o", help="File: .mf4, .tdms, .uff, .csv, .parquet or .wav")],
     channels: Annotated[
         str | None,
-        typer.Option("--channels", metavar="NAME,...", help="Only these channels, groups, or truth.TABLE[.COLUMN]."),
+        typer.Option("--channels", metavar="NAME,...", help="Only these channels, groups or truth.TABLE[.COLUMN]"),
     ] = None,
-    truth: Annotated[bool, typer.Option("--truth", help="The model's true state as well.")] = False,
-    unit: Annotated[
-        str, typer.Option(metavar="engineering|volts|counts", help="What the numbers are.")
-    ] = "engineering",
+    truth: Annotated[bool, typer.Option("--truth", help="Also export the true state of the model")] = False,
+    unit: Annotated[str, typer.Option(metavar="engineering|volts|counts", help="Unit of the samples")] = "engineering",
     from_s: FromS = None,
     to_s: ToS = None,
-    rate_hz: Annotated[float | None, typer.Option(help="Bring all channels to this rate, in Hz.")] = None,
+    rate_hz: Annotated[float | None, typer.Option(help="Resample all channels to this rate in Hz")] = None,
     method: Annotated[
-        str, typer.Option(metavar="polyphase|linear", help="How that is done: polyphase is band-limited.")
+        str, typer.Option(metavar="polyphase|linear", help="Resampling method; polyphase is band-limited")
     ] = "polyphase",
     force: Force = False,
 ) -> None:
-    """Write a recording as MDF4, TDMS, UFF58b, CSV, Parquet or WAV, or its parts as one, with units and calibration.
+    """Write a recording as MDF4, TDMS, UFF58b, CSV, Parquet or WAV, with units and calibration.
 
-    Impacts, commands, notes, parameters and scene go with it: in MDF4 as events and attachments, in FILE.json beside
-    CSV and WAV; UFF58 leaves them out. CSV, Parquet and WAV hold one rate: channels of several make as many files, or
-    --rate-hz brings them to one.
+    Impacts, commands, notes, parameters and scene are included: in MDF4 as events and attachments, for CSV and WAV in
+    FILE.json; UFF58 has none of them. A CSV, Parquet or WAV file holds one rate: channels with several rates become
+    several files, unless --rate-hz resamples them.
     """
     from recorder.reader import join
     from replays.recordings.formats.exporting.export import check_output, merged
@@ -56,7 +52,13 @@ def export(
     bounds = -math.inf if from_s is None else from_s, math.inf if to_s is None else to_s
     recording = join(files, in_part=bounds != (-math.inf, math.inf)).between(*bounds)
     selection = select(
-        recording, channels=names_of(channels), truth=truth, unit=unit, from_s=from_s, to_s=to_s, merged=merged(output)
+        recording,
+        channels=split_names(channels),
+        truth=truth,
+        unit=unit,
+        from_s=from_s,
+        to_s=to_s,
+        merged=merged(output),
     )
     with reporting() as reporter:
 
@@ -64,7 +66,7 @@ def export(
             reporter.part(part, f"exporting {recording.path.name}")
 
         written = write(selection, output, rate_hz=rate_hz, method=method, force=force, progress=tell)
-    for line in recording.doubts:  # what is exported is not all, or not sure
+    for line in recording.doubts:  # the export is incomplete or uncertain
         echo(f"rig: {line}", err=True)
     for made in written:
         size = made.path.stat().st_size / 1e6

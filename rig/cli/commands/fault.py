@@ -1,4 +1,4 @@
-"""`rig fault`: make channels of a running rig misbehave, and end that."""
+"""`rig fault`: inject faults into channels of a running rig, and clear them."""
 
 from __future__ import annotations
 
@@ -8,42 +8,62 @@ from typing import Annotated, Any, get_args
 import typer
 
 from rig.base.errors import InputError, UnknownNameError, Words
-from rig.channels.faults import KINDS
+from rig.channels.faults import KINDS, OfBlocks
 from rig.cli.connections.connection import Connection, show
 from rig.cli.groups import panel
 from rig.cli.output.tables import Form, echo, echo_json, new_table
 
-_numbers = panel("Numbers of the kinds")
+_parameters = panel("Parameters of the kinds")
+_TEXTS = (
+    "factor: Factor of sensitivity or noise", "ramp_s: Time to the full effect in s",
+    "value: Offset in the channel's unit, or value of the bit", "rate: Drift in the channel's unit per s",
+    "tau_s: Time constant in s at which the drift settles", "end: End of the linear range in the channel's unit",
+    "level_v: Output of the open cable in V", "part: Fraction of time, range, turns or blocks, 0 to 1",
+    "slot_s: Duration of a single contact loss in s", "amplitude_v: Amplitude of the hum in V",
+    "frequency_hz: Frequency in Hz", "third: Third harmonic of the hum, 0 to 1", "offset_v: Offset of the hum in V",
+    "source: Channel that couples in", "db: Coupling in dB", "other: Channel at the other cable",
+    "quality: Quality factor of the resonance", "corner_hz: Corner frequency of the low-pass in Hz",
+    "late_us: Delay of the samples in us", "ppm: Error of the sampling clock in ppm", "rms_us: RMS of the jitter in us",
+    "amplitude_us: Amplitude of the time error in us", "period_s: Period of the time error in s",
+    "rate_hz: Mean rate of the spikes in Hz", "size_v: Height of the spikes in V", "lost: Number of lost lowest bits",
+    "bit: Number of the bit, 0 for the lowest", "door: Transport that is affected",
+    "block_s: Length of the blocks in s", "delay_s: Delay of the blocks in s",
+)  # fmt: skip
+"""Help of the parameters of the kinds of faults, by field."""
 
 
 def _options() -> dict[str, Any]:
-    """Return an option for each number of the kinds of faults, by name."""
-    blocks, found = {name for name, kind in KINDS.items() if kind.of_blocks}, dict[str, Any]()
+    """Return the option of each parameter of the kinds of faults, by name."""
+    found, texts = dict[str, Any](), {each.partition(": ")[0]: each.partition(": ")[2] for each in _TEXTS}
     for field in dict.fromkeys(field for kind in KINDS.values() for field in kind.model_fields if field != "kind"):
-        own = {name: kind.model_fields for name, kind in KINDS.items()}
-        hints = {name: fields[field].annotation for name, fields in own.items() if field in fields}
-        hint = next(iter(hints.values()))
+        own = {name: kind.model_fields[field] for name, kind in KINDS.items() if field in kind.model_fields}
+        hint = next(iter(own.values())).annotation
         words = get_args(hint) if field == "door" else ()
-        of = "the kinds of blocks" if hints.keys() == blocks else ", ".join(hints)
-        option = _numbers(f"Of {of}.", metavar="|".join(words) or ("CHANNEL" if hint is str else "X"))
+        values = {None if each.is_required() else each.default for each in own.values()}
+        default = "" if len(values) > 1 or None in values else f"; default {values.pop()}"
+        kinds = "all kinds of blocks" if field in OfBlocks.model_fields else ", ".join(own)
+        text = f"{texts.get(field, field)} ({kinds}{default})"
+        option = _parameters(text, metavar="|".join(words) or ("CHANNEL" if hint is str else "X"))
         found[field] = Annotated[str | None if words or hint is str else float | None, option]
     return found
 
 
 def fault(
     channel: Annotated[
-        str | None, typer.Argument(metavar="[CHANNEL|GROUP]", help="A channel, or a group for all of its channels.")
+        str | None, typer.Argument(metavar="[CHANNEL|GROUP]", help="Channel, or group for all of its channels")
     ] = None,
-    kind: Annotated[str | None, typer.Argument(metavar="[KIND]", help="What it does: see --list.")] = None,
+    kind: Annotated[str | None, typer.Argument(metavar="[KIND]", help="Kind of fault; see --list")] = None,
     *,
-    for_s: Annotated[float | None, typer.Option(metavar="S", help="How long, in s; until it is cleared.")] = None,
-    clear: Annotated[str | None, typer.Option(metavar="ID|all", help="End a fault by its number, or all.")] = None,
-    listed: Annotated[bool, typer.Option("--list", help="Show all kinds, or those that CHANNEL can have.")] = False,
+    for_s: Annotated[float | None, typer.Option(metavar="S", help="Duration in s; default: until cleared")] = None,
+    clear: Annotated[str | None, typer.Option(metavar="ID|all", help="Clear the fault of this number, or all")] = None,
+    listed: Annotated[
+        bool, typer.Option("--list", help="Show all kinds; with CHANNEL: its kinds; with KIND: that one")
+    ] = False,
     connection: Connection,
     form: Form,
     **numbers: float | str | None,
 ) -> None:
-    """Make a channel of a running rig misbehave, or end that; the reply tells the first row that changes."""
+    """Inject a fault into a channel of a running rig, or clear it; prints the first row that changes."""
     given = {name: _plain(value) for name, value in numbers.items() if value is not None}
     if listed:
         _show_kinds(channel, form)
@@ -76,7 +96,7 @@ fault.__signature__ = _own.replace(  # type: ignore[attr-defined]
 
 
 def _plain(value: Any) -> Any:
-    """Whole numbers are whole: bits are."""
+    """Return a whole number as an int, as fields for bits require."""
     return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
@@ -87,11 +107,15 @@ def _show_kinds(channel: str | None, form: Form) -> None:
     table = rig_table()
     rows = described(table)
     if channel is not None:
-        known = [*table.channels, *table.groups]
+        known = [*table.channels, *table.groups, *KINDS]
         if channel not in known:
-            raise UnknownNameError("CHANNEL", "one of the channels, or of their groups", channel, known)
+            raise UnknownNameError("CHANNEL", "a channel, a group or a kind of fault", channel, known)
         names = {channel, *(table.groups[channel].names if channel in table.groups else ())}
-        rows = [row for row in rows if any(supported(KINDS[row[0]], table).get(name) == "" for name in names)]
+        rows = [
+            row
+            for row in rows
+            if row[0] == channel or any(supported(KINDS[row[0]], table).get(name) == "" for name in names)
+        ]
     headings = ("kind", "stage", "what it does", "numbers", "on", "at")
     if form.as_json:
         echo_json([dict(zip(headings, row, strict=True)) for row in rows])

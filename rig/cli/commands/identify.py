@@ -1,4 +1,4 @@
-"""`rig identify`: numbers of the rig from a recording, with intervals, and with what cannot be told."""
+"""`rig identify`: parameters of the rig from a recording, with confidence intervals."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from rig.cli.options import (
     RecordingFiles,
     ReportFile,
     ToS,
-    names_of,
-    pairs,
+    parse_pairs,
+    split_names,
 )
 from rig.cli.output.progress import reporting
-from rig.cli.output.provenance import of_recording
+from rig.cli.output.provenance import recording_origin
 from rig.cli.output.tables import Form, echo, echo_json, new_table
 
 if TYPE_CHECKING:
@@ -35,61 +35,63 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Asked:
-    """What is asked of a recording."""
+class FitRequest:
+    """Values to fit, and the part of the recording to use."""
 
     fit: Annotated[
         list[str],
         typer.Option(
             metavar="KEY,...",
-            help="What is asked for: a parameter, a number of the scene, or of an impact (hammer.1.force_n).",
+            help="Values to fit: parameters, scene or impact (hammer.1.force_n)",
         ),
     ]
     start: Annotated[
-        list[str] | None, typer.Option(metavar="KEY=VALUE", help="Where the search begins; else as recorded.")
+        list[str] | None, typer.Option(metavar="KEY=VALUE", help="Start value of the search; default: as recorded")
     ] = None
-    bounds: Annotated[list[str] | None, typer.Option(metavar="KEY=LOW:HIGH", help="Least and largest value.")] = None
+    bounds: Annotated[
+        list[str] | None, typer.Option(metavar="KEY=LOW:HIGH", help="Lower and upper bound of a value")
+    ] = None
     prior: Annotated[
         list[str] | None,
-        typer.Option(metavar="KEY=VALUE+-SIGMA", help="What is known from elsewhere: mean and standard deviation."),
+        typer.Option(metavar="KEY=VALUE+-SIGMA", help="Prior knowledge: mean and standard deviation"),
     ] = None
     from_s: FromS = None
     to_s: ToS = None
     channels: Channels = None
     parameters: Parameters = None
     scene: Annotated[
-        str | None, typer.Option(metavar="SCENE", help="What was done, where the recording does not tell.")
+        str | None, typer.Option(metavar="SCENE", help="Scene, where the recording does not contain it")
     ] = None
     engine: Engine = None
 
-    def found(
+    def run(
         self, recording: Recording, search: Search, *, exact: bool, progress: Callable[[str], None]
     ) -> tuple[Identification, list[str]]:
-        """The fit, and what was fitted along because an imported log does not tell it.
+        """Return the fit, and the keys that were fitted in addition because an imported log does not contain them.
 
         Raises:
-            InputError: The recording, its scene or the model has no such thing.
+           InputError: The recording, its scene or the model lacks a requested value.
         """
         from replays.recordings.identification import ask
-        from replays.recordings.identification import identify as run
+        from replays.recordings.identification import identify as identify_recording
         from replays.recordings.identification.log import identify_log
         from replays.recordings.identification.nuisance import asked_along, turned
         from replays.recordings.identification.request import first_command_s
         from replays.recordings.resimulation.experiment import is_imported
         from replays.recordings.validation import load_criteria
 
-        keys = [key for part in self.fit for key in names_of(part)]
+        keys = [key for part in self.fit for key in split_names(part)]
         experiment, along = self._experiment(recording), dict[str, tuple[float, float] | None]()
-        known = pairs("--prior", self.prior, "KEY=VALUE+-SIGMA")
+        known = parse_pairs("--prior", self.prior, "KEY=VALUE+-SIGMA")
         priors = {key: _two("prior", text, "+-") for key, text in known.items()}
-        starts = {key: _number("start", text) for key, text in pairs("--start", self.start, "KEY=VALUE").items()}
+        starts = {key: _number("start", text) for key, text in parse_pairs("--start", self.start, "KEY=VALUE").items()}
         bounds = {
-            key: _two("bounds", text, ":") for key, text in pairs("--bounds", self.bounds, "KEY=LOW:HIGH").items()
+            key: _two("bounds", text, ":") for key, text in parse_pairs("--bounds", self.bounds, "KEY=LOW:HIGH").items()
         }
-        given: dict[str, Any] = {"start": starts, "bounds": bounds, "channels": names_of(self.channels) or None}
+        given: dict[str, Any] = {"start": starts, "bounds": bounds, "channels": split_names(self.channels) or None}
         if is_imported(recording) and not exact:
             if first_command_s(experiment) > 0.0:
-                search.left_out(from_s=self.from_s)
+                search.check_unused(from_s=self.from_s)
                 rules = load_criteria().imported
                 found = identify_log(
                     recording, experiment, keys, **given, priors=priors, to_s=self.to_s, bandwidth=rules.bandwidth,
@@ -102,7 +104,7 @@ class Asked:
         question = ask(
             recording, experiment, [*keys, *along], **given, priors=priors, along=along, window=(self.from_s, self.to_s)
         )
-        return run(question, **asdict(search), progress=progress), list(along)
+        return identify_recording(question, **asdict(search), progress=progress), list(along)
 
     def _experiment(self, recording: Recording) -> Experiment:
         from replays.recordings.resimulation.experiment import Experiment
@@ -117,22 +119,22 @@ class Asked:
 
 @dataclass(frozen=True)
 class Search:
-    """How the numbers are looked for."""
+    """Settings of the search."""
 
     precision: Annotated[
-        float, typer.Option(min=1e-9, help="Relative half width of the intervals that is fine enough.")
+        float, typer.Option(min=1e-9, help="Relative half-width of the intervals at which to stop")
     ] = 1e-4
-    spread: Annotated[float, typer.Option(min=1e-6, max=1.0, help="How far off the start may be, relatively.")] = 0.1
-    robust: Annotated[bool, typer.Option("--robust", help="Let single samples that are far off count less.")] = False
+    spread: Annotated[float, typer.Option(min=1e-6, max=1.0, help="Relative uncertainty of the start values")] = 0.1
+    robust: Annotated[bool, typer.Option("--robust", help="Reduce the weight of single outliers")] = False
     whole: Annotated[
-        bool, typer.Option("--whole", help="Go on as far as the model stays linear, even if it no longer fits.")
+        bool, typer.Option("--whole", help="Extend the window while the model stays linear, even without fit")
     ] = False
 
-    def left_out(self, *, from_s: float | None) -> None:
-        """Refuse what a search in a log of another system does not have.
+    def check_unused(self, *, from_s: float | None) -> None:
+        """Raise an error for settings that a fit of another system's log does not use.
 
         Raises:
-            InputError: The first such option.
+           InputError: Names the first such option.
         """
         from rig.base.errors import InputError
 
@@ -141,31 +143,29 @@ class Search:
         for option, value in given.items():
             if value != usual[option]:
                 raise InputError(
-                    option, "left out for a log of another system: it is fitted from its hammer pulse on", value
+                    option, "left out for a log of another system, which is fitted from its hammer pulse", value
                 )
 
 
 def identify(
     files: RecordingFiles,
     *,
-    asked: Asked,
+    request: FitRequest,
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", metavar="FILE.toml", help="Write the fitted parameter set.")
+        Path | None, typer.Option("--output", "-o", metavar="FILE.toml", help="Write the fitted parameter set")
     ] = None,
     report: ReportFile = None,
     search: Search,
     exact: Annotated[
         bool,
-        typer.Option(
-            "--exact", help="Of an imported log: take its clock, the shaft's angle and the impact as it tells them."
-        ),
+        typer.Option("--exact", help="Trust clock, shaft angle and impact of an imported log"),
     ] = False,
     form: Form,
     force: Force = False,
 ) -> None:
-    """Fit numbers of the rig to a recording: values, 95 % intervals, and what the recording cannot tell.
+    """Fit parameters of the rig to a recording: values, 95 % intervals, and values that it cannot determine.
 
-    Ends with 1, and writes no set, where the model does not explain the recording: then no value is a result.
+    Exit status 1, and no set is written, if the model does not explain the recording: then no value is a result.
     """
     from recorder.reader import join
     from replays.recordings.identification.document import check_set, fitted_set, identification_document, write_set
@@ -179,12 +179,12 @@ def identify(
     recording = join(files)
     name = files[0].name if len(files) == 1 else f"{files[0].name} and {len(files) - 1} more"
     with reporting(compiles=True) as reporter:
-        found, along = asked.found(recording, search, exact=exact, progress=reporter.step)
+        found, along = request.run(recording, search, exact=exact, progress=reporter.step)
     fits = found.judgement.fits
     if output is not None and fits:
         write_set(fitted_set(found, recording=name), output)
     if report is not None:
-        write_report(report_of(found, recording=name, origin=of_recording(name, recording)), report)
+        write_report(report_of(found, recording=name, origin=recording_origin(name, recording)), report)
     if form.as_json:
         echo_json(identification_document(found, recording=name))
     else:
@@ -198,7 +198,7 @@ def identify(
 
 def _tell(along: list[str], output: Path | None, report: Path | None) -> None:
     if along:
-        echo(f"fitted along, as an imported log does not tell it exactly: {', '.join(along)}")
+        echo(f"also fitted, as an imported log does not contain them exactly: {', '.join(along)}")
     if output is not None:
         echo(f"written  {output}: a parameter set, as in `rig run hammer --parameters {output}`")
     if report is not None:
@@ -228,7 +228,7 @@ def _show(found: Identification, name: str, console: Console) -> None:
 
     numbers = ("start", "result", "95 % interval")
     headings = (f">{heading}" if heading in numbers else heading for heading in HEADINGS)
-    table = new_table(f"{name}: what it tells", *headings, wrapped=HEADINGS[-1:])
+    table = new_table(f"{name}: fitted values", *headings, wrapped=HEADINGS[-1:])
     for finding in found.judgement.findings:
         table.add_row(*cells(finding), style="" if finding.standing == "identified" else "yellow")
     console.print(table)

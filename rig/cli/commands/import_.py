@@ -23,32 +23,32 @@ if TYPE_CHECKING:
 def import_(
     files: Annotated[
         list[Path] | None,
-        typer.Argument(
-            metavar="FILE...", help=".mf4, .tdms, .uff, .csv, .txt, .lvm, .parquet or .wav; several to align."
-        ),
+        typer.Argument(metavar="FILE...", help="Logs to align: .mf4, .tdms, .uff, .csv, .txt, .lvm, .parquet, .wav"),
     ] = None,
     *,
-    mapping: Annotated[Path | None, typer.Option("--mapping", "-m", help="Which signal becomes which channel.")] = None,
-    output: Annotated[Path | None, typer.Option("--output", "-o", help="Recording to write, ends in .mcap.")] = None,
+    mapping: Annotated[
+        Path | None, typer.Option("--mapping", "-m", help="TOML file that maps signals to channels")
+    ] = None,
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="Recording to write, .mcap")] = None,
     template: Annotated[
         Path | None,
         typer.Option(
             "--template",
             metavar="FILE.toml",
-            help="Write a starting mapping instead; without logs, an example with every option.",
+            help="Write a draft mapping; without logs: an example of every option",
         ),
     ] = None,
     picture: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Draw the signals of the logs as well, to a .png or .svg file.")
+        Path | None, typer.Option(metavar="FILE", help="Also draw the signals of the logs, .png or .svg")
     ] = None,
     force: Force = False,
     form: Form,
 ) -> None:
-    """Turn logs of a real rig into a recording that `rig info`, `view`, `replay`, `validate` and `identify` read.
+    """Convert logs of a real rig to a recording that `rig info`, `view`, `replay`, `validate` and `identify` read.
 
-    Without --mapping, each signal is guessed by its name, unit and numbers, and told with the reason; with -o it is
-    imported so. --template writes the guess as a mapping, to be corrected. What was done to the samples is printed, and
-    stands in the recording.
+    Without --mapping, each signal is guessed from its name, unit and samples, and the reason is printed; with -o it is
+    imported by that guess. --template writes the guess as a mapping for you to correct. Changes to the samples are
+    printed and stored in the recording.
     """
     if template is not None and mapping is not None:
         raise InputError("import", "given either --mapping or --template", Words("both"))
@@ -71,7 +71,7 @@ def import_(
 
 
 def _import(files: list[Path], mapping: Path | str, output: Path, *, force: bool, form: Form) -> None:
-    """Import by a mapping in a file, or by the text of one that was guessed."""
+    """Import by a mapping, given as a file or as the text of a guess."""
     from recorder.files.unfinished_file import check_destination
     from replays.recordings.formats.conversion import convert, write_recording
     from replays.recordings.formats.mapping import Mapping, load_mapping, parse_mapping
@@ -90,7 +90,7 @@ def _import(files: list[Path], mapping: Path | str, output: Path, *, force: bool
             )
             conversion = convert(files, checked, doubts=doubts, say=reporter.step)
         except InputError as error:
-            # What is wrong with a file is no fault of the mapping, whose table [file] has other fields.
+            # An error in a log file is not an error in the mapping, whose table [file] has other fields.
             if error.field == "file" or error.field.split(".")[0] not in Mapping.model_fields:
                 raise
             raise InputError(f"{name}: {error.field}", error.must, error.received) from None
@@ -104,13 +104,13 @@ def _import(files: list[Path], mapping: Path | str, output: Path, *, force: bool
     else:
         _tell(conversion, output, form.console())
         if isinstance(mapping, str):
-            echo("imported as guessed: --template FILE.toml writes the guess, to be corrected and given with --mapping")
+            echo("imported by the guess; to correct it: --template FILE.toml, then --mapping FILE.toml")
 
 
 def _guess(
     files: list[Path], path: Path | None, output: Path | None, picture: Path | None, *, force: bool, form: Form
 ) -> None:
-    """Guess what is in the logs, tell it, and write it as a mapping, as a picture, or import by it."""
+    """Guess the signals of the logs and print the guess; write it as a mapping or a picture, or import by it."""
     from replays.recordings.formats.guessing.template import example, guessed
 
     for wanted, field, suffixes in ((path, "--template", (".toml",)), (picture, "--picture", (".png", ".svg"))):
@@ -142,7 +142,7 @@ def _guess(
 
 
 def _asked(text: str) -> list[str]:
-    """Lines of a mapping that ask something, each with the table that it stands in."""
+    """Return the questions of a mapping, each with its table."""
     from replays.recordings.formats.guessing.template import CHECK
 
     found, table = [], ""
@@ -158,7 +158,7 @@ def _asked(text: str) -> list[str]:
 
 
 _SPARK = 12
-"""Width of a signal's course in a table."""
+"""Width of a signal's sparkline in a table [characters]."""
 
 
 def _tell_guesses(guesses: list[Guess], text: str, console: Console) -> None:
@@ -166,7 +166,7 @@ def _tell_guesses(guesses: list[Guess], text: str, console: Console) -> None:
     for guess in guesses:
         unit = f" [{guess.entry.unit}]" if guess.entry.unit else ""
         where = f"{guess.entry.group} " if len({each.entry.group for each in guesses}) > 1 else ""
-        why = guess.why if guess.channel else "none of the rig's: a channel of its own"
+        why = guess.why if guess.channel else "not a channel of the rig; kept as a new channel"
         course = guess.look.sparkline(_SPARK)
         style = "" if guess.channel and guess.sure != "ask" else "yellow"
         table.add_row(
@@ -179,7 +179,7 @@ def _tell_guesses(guesses: list[Guess], text: str, console: Console) -> None:
         )
     console.print(table)
     if questions := _asked(text):
-        echo("What the logs do not tell:")
+        echo("Not contained in the logs:")
         for question in questions:
             echo(f"  {question}")
 
@@ -194,7 +194,7 @@ def _document(guess: Guess) -> dict[str, Any]:
 
 
 _JITTER_US, _DRIFT_PPM, _DUST = 1e-3, 1e-2, 1e-6
-"""Less than this is rounding: of time stamps, of clocks, and beside a channel's largest value."""
+"""Rounding limits: time stamps [us], clocks [ppm], and relative to a channel's largest value. Less is not shown."""
 
 
 def _tell(conversion: Conversion, output: Path, console: Console) -> None:
@@ -215,11 +215,11 @@ def _tell(conversion: Conversion, output: Path, console: Console) -> None:
     for remark in conversion.remarks:
         console.print(remark)
     if conversion.experiment is None:
-        console.print("no scene: it cannot be simulated again until the mapping has an [experiment]")
+        console.print("no scene: add an [experiment] to the mapping to simulate it again")
 
 
 def _columns(conversion: Conversion) -> dict[str, list[str]]:
-    """The table's columns by heading; those in which nothing stands are left out."""
+    """Return the table's columns by heading, without empty ones."""
     channels, files = conversion.channels, conversion.document["files"]
     only = f"{files[0]['name']} " if len(files) == 1 else ""
     ends = [max(abs(channel.low), abs(channel.high)) * _DUST for channel in channels]
@@ -239,10 +239,10 @@ def _columns(conversion: Conversion) -> dict[str, list[str]]:
 
 
 def _in_common(conversion: Conversion) -> list[str]:
-    """What was done to the samples, each thing once, with the channels that it was done to."""
+    """Return one line per processing step, with the channels it applied to."""
     done: dict[str, list[str]] = {}
     for channel in conversion.channels:
-        # A count of the source's own differs from channel to channel, and stands in the recording.
+        # A count size from the source differs between channels and is stored in the recording.
         rule = channel.counts.split(",")[0] if "," in channel.counts else "a power of two of the unit"
         for text in (f"{channel.rate_hz:.9g} Hz, {channel.time}", f"one count: {rule}"):
             done.setdefault(text, []).append(channel.name)

@@ -1,4 +1,4 @@
-"""`rig info`: what a recording holds, and how sound it is."""
+"""`rig info`: contents and health of a recording."""
 
 from __future__ import annotations
 
@@ -13,28 +13,28 @@ from rig.base.outcome import Outcome
 from rig.base.text import finite
 from rig.cli.options import RecordingFiles
 from rig.cli.output.progress import reporting
-from rig.cli.output.tables import Form, Table, echo_json, facts, new_table, shown
+from rig.cli.output.tables import Form, Table, echo_json, fact_table, make_printable, new_table
 
 if TYPE_CHECKING:
     from rich.console import Console
 
     from recorder.reader import Recording
 
-_MOST_GAPS = 20
+_MAX_GAPS = 20
 _SCENE = (("", "scene"), ("seed", "seed"), ("parameters", "parameter_set"))
 
 
 def info(
     files: RecordingFiles,
     *,
-    quick: Annotated[bool, typer.Option("--quick", help="Without reading the samples.")] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="Skip the samples, and the verdict")] = False,
     form: Form,
 ) -> None:
-    """Show what a recording holds: calibration, gaps, health, events, notes and end; several files count as one.
+    """Show the calibration, gaps, health and events of a recording, its notes and end; several files count as one.
 
-    Exit status: 0 pass, 1 fail (it is not complete, rows are lost, or it contradicts itself), 2 wrong input,
-    3 inconclusive (the rig warned, or bytes could not be checked). Doubts in channels are reasons to look and do not
-    count. With --quick there is no verdict.
+    Exit status: 0 pass; 1 fail (incomplete, rows lost, or contradictory); 2 wrong input; 3 inconclusive (the rig
+    reported warnings, or bytes could not be checked). Doubts about channels do not change the verdict. With --quick
+    there is no verdict.
     """
     from recorder.reader import join
 
@@ -45,7 +45,7 @@ def info(
     if form.as_json:
         echo_json(document)
     else:
-        _print(recording, shown(document), form.console())
+        _print(recording, make_printable(document), form.console())
     if not quick and (status := Outcome(document["outcome"]).exit_status):
         raise typer.Exit(status)
 
@@ -53,7 +53,7 @@ def info(
 def describe(
     recording: Recording, *, quick: bool, progress: Callable[[float], None] = lambda _: None
 ) -> dict[str, Any]:
-    """Everything that the command shows, as a JSON document; `progress` is told which part of the samples was read."""
+    """Return what the command shows as a JSON document; `progress` receives the fraction of samples read."""
     from dataclasses import asdict
 
     from recorder.health import examine
@@ -85,7 +85,7 @@ def describe(
         "events": recording.events,
     }
     if not quick:
-        health = asdict(examine(recording, progress))  # the one pass in which the streams are counted, too
+        health = asdict(examine(recording, progress))  # this pass also counts the streams
         health["findings"] += parameter_doubts(recording)
         document["streams"] = {
             key: {**asdict(stream), "lost": stream.lost + _lost_at_ends(recording, key)}
@@ -99,14 +99,14 @@ def describe(
 
 
 def _reasons(document: dict[str, Any]) -> tuple[list[str], list[str]]:
-    """Return the reasons why a recording fails, and those why it is inconclusive otherwise."""
+    """Return the reasons for a fail, and those for an inconclusive verdict otherwise."""
     health = document["health"]
     failures = [] if document["complete"] else ["the recording is not complete"]
     failures += _lost_rows(document)
     failures += [f"{count} blocks of {key} are misplaced" for key, count in health["misplaced"].items()]
     failures += health["findings"]
     doubts = [f"not checked: {text}" for part in document["parts"] for text in part["unchecked"]]
-    doubts += [] if any(stream["rows"] for stream in document["streams"].values()) else ["there are no samples"]
+    doubts += [] if any(stream["rows"] for stream in document["streams"].values()) else ["the recording has no samples"]
     return failures, doubts + health["warnings"]
 
 
@@ -135,19 +135,19 @@ def _print(recording: Recording, document: dict[str, Any], console: Console) -> 
             if name in part:
                 rows.append((name, ", ".join(f"{key} {value}" for key, value in part[name].items() if value)))
     rows.append(("ended", document["ended"]))
-    rows.append(("checked", "every byte" + "".join(f" but {text}" for text in recording.unchecked)))
+    rows.append(("checked", "every byte" + "".join(f" except {text}" for text in recording.unchecked)))
     if "health" in document:
         rows += _verdict(document)
     if not streams:
         rows.append(("messages", ", ".join(f"{key} {count}" for key, count in document["messages"].items())))
-    tables = [facts("", rows)]
+    tables = [fact_table("", rows)]
     if len(document["parts"]) > 1:
         tables.append(_parts_table(document["parts"]))
     if streams:
         tables.append(_streams_table(streams))
     tables.append(_channels_table(recording, document.get("health")))
     if "health" in document and (told := _health(document["health"])):
-        tables.append(facts("", told, doubt="yellow"))
+        tables.append(fact_table("", told, doubt="yellow"))
     if document["events"]:
         tables.append(events_table(document["events"]))
     for table in tables:
@@ -157,16 +157,16 @@ def _print(recording: Recording, document: dict[str, Any], console: Console) -> 
     console.print(f"gaps noted by the recorder: {len(gaps) or 'none'}")
     if gaps:
         table = new_table("", ">time [s]", "stream", ">missing", "")
-        for gap in gaps[:_MOST_GAPS]:
+        for gap in gaps[:_MAX_GAPS]:
             what = "messages" if gap["index"] < 0 else f"rows from {gap['index']} on"
             table.add_row(f"{gap['time_s']:.4f}", gap["key"], str(gap["size"]), what)
         console.print(table)
-    if len(gaps) > _MOST_GAPS:
-        console.print(f"  and {len(gaps) - _MOST_GAPS} more")
+    if len(gaps) > _MAX_GAPS:
+        console.print(f"  and {len(gaps) - _MAX_GAPS} more")
 
 
 def _verdict(document: dict[str, Any]) -> list[tuple[str, str]]:
-    """Return the verdict, and what is lost and what is in doubt, in a line each."""
+    """Return the lines for the verdict, the losses and the doubts."""
     reasons = document["reasons"]
     more = f", and {len(reasons) - 1} more" if reasons[1:] else ""
     outcome = document["outcome"] + (f": {reasons[0]}{more}" if reasons else "")
@@ -175,19 +175,19 @@ def _verdict(document: dict[str, Any]) -> list[tuple[str, str]]:
     doubtful = [channel["name"] for channel in health["channels"] if channel["findings"]]
     doubts = len(health["findings"]) + len(health["warnings"])
     found = [f"doubts in {', '.join(doubtful)}"] if doubtful else []
-    found += [f"{doubts} {'doubt' if doubts == 1 else 'doubts'} on the whole"] if doubts else []
+    found += [f"{doubts} {'doubt' if doubts == 1 else 'doubts'} about the recording"] if doubts else []
     return [
         ("verdict", outcome),
         ("lost", "; ".join(_lost_rows(document)) or "nothing"),
-        *([("taken", f"{declared} rows by faults, or late by them, as the rig told")] if declared else []),
-        ("health", "; ".join(found) or f"{len(health['channels'])} channels without a doubt"),
+        *([("taken", f"{declared} rows removed or delayed by declared faults")] if declared else []),
+        ("health", "; ".join(found) or f"{len(health['channels'])} channels without doubts"),
     ]
 
 
 def _lost_rows(document: dict[str, Any]) -> list[str]:
-    """Return what is lost, in words; empty where nothing is."""
+    """Return descriptions of the losses; empty if there are none."""
     streams = document["streams"]
-    noted = bool(document["gaps"])  # what is missing and not noted is told once
+    noted = bool(document["gaps"])  # missing rows without a noted gap are reported once
     lost = sum(_lost(each) - (0 if noted else min(_lost(each), each["missing"])) for each in streams.values())
     declared = sum(each["declared"] for each in streams.values())
     gone = [f"{lost} rows in {len(document['gaps'])} gaps"] if lost or (document["gaps"] and not declared) else []
@@ -196,12 +196,12 @@ def _lost_rows(document: dict[str, Any]) -> list[str]:
 
 
 def _lost(stream: dict[str, Any]) -> int:
-    """Rows that never came, less those that a fault took."""
+    """Return the lost rows, without those that a fault removed."""
     return max(0, stream["lost"] - stream["declared"])
 
 
 def _lost_at_ends(recording: Recording, key: str) -> int:
-    """Return the rows noted as lost before the first and after the last row, less those that a fault took."""
+    """Return the rows noted as lost before the first and after the last row, without those that a fault removed."""
     stream = recording.streams[key]
     gaps = [(gap.index, gap.size) for gap in recording.gaps if gap.key == key and gap.index >= 0 < gap.size]
     lost, taken = (
@@ -212,13 +212,13 @@ def _lost_at_ends(recording: Recording, key: str) -> int:
 
 
 def _number(value: float | None, noise: float) -> str:
-    """A value to the digit in which its noise is."""
+    """Return a value to the digit of its noise."""
     if value is None:
         return ""
     digits = -math.floor(math.log10(abs(noise))) if noise else 0
     if not 0 <= digits <= 6 or abs(value) >= 1e7:
         return f"{value:.4g}"
-    return f"{round(value, digits) + 0.0:.{digits}f}"  # no minus before a zero
+    return f"{round(value, digits) + 0.0:.{digits}f}"  # avoids -0
 
 
 def _parts_table(parts: list[dict[str, Any]]) -> Table:
@@ -257,7 +257,7 @@ def _channels_table(recording: Recording, health: dict[str, Any] | None) -> Tabl
         for channel in group.channels:
             ends = sorted((volts - channel.bias_v) / channel.sensitivity_v for volts in channel.range_v)
             reach = f"{ends[0]:.4g} to {ends[1]:.4g}" if channel.has_range else "not known"
-            seen = found.get(shown(channel.name), {})
+            seen = found.get(make_printable(channel.name), {})
             numbers = [_number(seen.get(name), seen.get("noise") or channel.scale) for name in ("mean", "low", "high")]
             noise = ("" if seen.get(name) is None else f"{seen[name]:.2g}" for name in ("noise", "noise_calibrated"))
             findings = seen.get("findings", [])
@@ -271,7 +271,7 @@ def _channels_table(recording: Recording, health: dict[str, Any] | None) -> Tabl
 
 
 def _health(health: dict[str, Any]) -> list[tuple[str, str]]:
-    """The clock, and what is in doubt on the whole."""
+    """Return the lines for the clock, the engine and the doubts about the whole recording."""
     rows = []
     if health["pace"] is not None:
         real_time = abs(health["pace_ppm"]) < 1e4
@@ -296,7 +296,7 @@ def _health(health: dict[str, Any]) -> list[tuple[str, str]]:
 
 
 def events_table(events: list[dict[str, Any]]) -> Table:
-    """What happened when; a command that took effect is told once, by its effect, with who sent it."""
+    """Return a table of the events; a command and its effect share one row, with the sender."""
     from recorder.files.schemas import event_text
 
     def of(event: dict[str, Any], name: str) -> tuple[str, str]:

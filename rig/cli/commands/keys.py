@@ -1,4 +1,4 @@
-"""`rig keys`: keys, messages and units; `rig keys init`: who may connect to a rig that is exposed."""
+"""`rig keys`: keys, messages and units; `rig keys init`: certificates of an exposed rig."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ if TYPE_CHECKING:
 def keys(
     context: typer.Context,
     *,
-    markdown: Annotated[bool, typer.Option("--markdown", help="As the Markdown source of rig/KEYS.md.")] = False,
+    markdown: Annotated[bool, typer.Option("--markdown", help="Print the Markdown source of rig/KEYS.md")] = False,
     form: Form,
 ) -> None:
-    """Show every key, message and unit of the rig's streams, and who may use them; or make certificates (`init`)."""
+    """Show every key, message and unit of the rig's streams, and the roles that may use them (`init`: certificates)."""
     if context.invoked_subcommand is not None:
         return
     from rig.serve.interface import page
@@ -42,7 +42,7 @@ def keys(
 
 
 def _parts(page: str) -> Iterator[Table | Text | str]:
-    """What stands on a page of Markdown: its tables, its headings, and every other line, such as code, as it is."""
+    """Yield the parts of a Markdown page: its tables, its headings, and all other lines unchanged."""
     from rich.text import Text
 
     pieces = [piece.splitlines() for piece in re.split(r"^```.*\n", page, flags=re.MULTILINE)]
@@ -63,7 +63,7 @@ def _parts(page: str) -> Iterator[Table | Text | str]:
 
 
 def _document(page: str) -> dict[str, list[dict[str, Any]]]:
-    """The rows of a page's tables, each by its headings, under what they are of."""
+    """Return the rows of the page's tables by table title; a row maps headings to cells."""
     found, title = {}, ""
     for part in _parts(page):
         if isinstance(part, Table):
@@ -75,7 +75,7 @@ def _document(page: str) -> dict[str, list[dict[str, Any]]]:
 
 
 def _values(texts: list[str]) -> list[Any]:
-    """A column, as numbers where all of it is."""
+    """Return a column, as numbers if all its cells are numbers."""
     try:
         return [json.loads(text) for text in texts]
     except ValueError:
@@ -83,21 +83,21 @@ def _values(texts: list[str]) -> list[Any]:
 
 
 def init(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="New folder.")],
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="New folder")],
     *,
     host: Annotated[
         list[str] | None,
-        typer.Option(metavar="HOST", help="Name or address by which others reach the rig's computer; may be repeated."),
+        typer.Option(metavar="HOST", help="Name or address of the rig's computer; repeatable"),
     ] = None,
-    days: Annotated[int, typer.Option(min=1, max=3650, help="How long the certificates are valid.")] = 365,
+    days: Annotated[int, typer.Option(min=1, max=3650, help="Validity of the certificates in days")] = 365,
     truth: Annotated[
-        list[str] | None, typer.Option(metavar="ROLE", help="A role that may read the truth too; may be repeated.")
+        list[str] | None, typer.Option(metavar="ROLE", help="Role that may also read the truth; repeatable")
     ] = None,
     force: Force = False,
 ) -> None:
-    """Make the certificates of a rig that is exposed: its own, and one for each role.
+    """Create the certificates for an exposed rig: its own, and one for each role.
 
-    The roles are operator, recorder and viewer; `rig keys` shows what each may do.
+    The roles are operator, recorder and viewer; `rig keys` lists the permissions of each.
     """
     from rig.serve.transport import EXPOSED_PORT
     from rig.serve.transport.exposure.access import ROLES
@@ -107,10 +107,10 @@ def init(
     echo(f"{folder / SERVER}: stays on this computer, {', '.join(names)}:")
     echo(f"    rig run SCENE --expose {names[0]} --tls {folder}")
     for role in ROLES:
-        granted = ", who may read the truth" if role in (truth or []) else ""
-        echo(f"{folder / role}: for the role {role}{granted}; copy it to where it is used:")
+        granted = ", with access to the truth" if role in (truth or []) else ""
+        echo(f"{folder / role}: for the role {role}{granted}; copy it to the client's computer:")
         echo(f"    rig status --connect {names[0]}:{EXPOSED_PORT} --tls {role}")
     if not host:
-        echo("Without --host they hold on this computer only.")
-    echo(f"Valid for {days} days. Whoever has a folder has its role: copy it by a safe way, such as scp -r.")
-    echo("The key that signed them is not kept: to add or withdraw one, make all anew (--force).")
+        echo("Without --host the certificates are valid on this computer only.")
+    echo(f"Valid for {days} days. A folder grants its role: copy it securely, for example with scp -r.")
+    echo("The signing key is not kept: to add or revoke a certificate, create all again (--force).")

@@ -1,4 +1,4 @@
-"""`rig ladder`: the cheapest model, engine and step that give the quantities asked for within a tolerance."""
+"""`rig ladder`: the cheapest model, engine and step that give the requested quantities within a tolerance."""
 
 from __future__ import annotations
 
@@ -17,9 +17,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 
-_COUNTS = (
-    "What counts, such as whirl_frequency, mean_normal_force or outcome (any other word lists all); may be repeated."
-)
+_COUNTS = "Quantity, e.g. whirl_frequency, outcome; 'list' shows all; repeatable"
 
 
 def ladder(
@@ -28,23 +26,23 @@ def ladder(
     quantity: Annotated[list[str], typer.Option("--quantity", "-q", metavar="QUANTITY", help=_COUNTS)],
     tolerance: Annotated[
         list[float],
-        typer.Option("--tolerance", "-t", metavar="PART", help="Error allowed, as a part: one for all, or each."),
+        typer.Option("--tolerance", "-t", metavar="PART", help="Relative error allowed: one for all, or one each"),
     ],
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", metavar="FOLDER", help="For ladder.png, .svg and .json.")
+        Path | None, typer.Option("--output", "-o", metavar="FOLDER", help="Folder for ladder.png, .svg and .json")
     ] = None,
     write: Annotated[
-        Path | None, typer.Option(metavar="FILE.toml", help="Store the pick in this scene file, as [pick].")
+        Path | None, typer.Option(metavar="FILE.toml", help="Store the pick as [pick] in this scene file")
     ] = None,
     keep: Annotated[
-        list[str] | None, typer.Option(metavar="LEVEL", help="A level that stays as full as it is; may be repeated.")
+        list[str] | None, typer.Option(metavar="LEVEL", help="Level that must not be simplified; repeatable")
     ] = None,
     changes: Changes = None,
-    runs: Annotated[int, typer.Option(min=1, help="Timed runs of each candidate.")] = 5,
-    budget_s: Annotated[float, typer.Option(min=1.0, help="Wall time allowed, in s.")] = 300.0,
+    runs: Annotated[int, typer.Option(min=1, help="Timed runs of each candidate")] = 5,
+    budget_s: Annotated[float, typer.Option(min=1.0, help="Time limit in s of wall time")] = 300.0,
     form: Form,
 ) -> None:
-    """Find the cheapest model, engine and step that are good enough: what does each cost, and what does it err by?"""
+    """Find the cheapest model, engine and step within a tolerance: cost and error of each candidate."""
     import json
 
     from replays.studies.ladder.chart import draw
@@ -57,7 +55,7 @@ def ladder(
     tolerances = parse_quantities(quantity, tolerance)
     if output is not None:
         check_folder(output, field="--output")
-    # A pick is made anew from what the scene is without one.
+    # A pick starts from the scene without its stored pick.
     loaded = load_scene(scene, {**SceneChanges(changes=changes).overrides(), "fidelity": "given"})
     loaded.check_physics()
     if write is not None:
@@ -87,7 +85,7 @@ def ladder(
     for path in paths:
         echo(f"written  {path}")
     if write is not None:
-        echo(f'written  {write}: [pick], in force with fidelity = "auto" at the head of the file')
+        echo(f'written  {write}: [pick], used with fidelity = "auto" at the top of the file')
 
 
 def _show(document: dict[str, Any], console: Console) -> None:
@@ -109,23 +107,23 @@ def _show(document: dict[str, Any], console: Console) -> None:
     saved = ", ".join(f"{level} {pick[level]} saves {part:.0%}" for level, part in document["savings"].items())
     picked, given = document["picked"], document["given"]
     same = (picked["engine"], picked["model"]) == (given["engine"], given["model"])
-    none = "the scene as it is given" if same else "nothing is left out"
-    echo(f"  {saved or none}; outcome {picked['outcome']} as of the full model")
+    none = "the scene unchanged" if same else "no simplification"
+    echo(f"  {saved or none}; outcome {picked['outcome']} as in the full model")
     echo(
         f"  a simulated second takes {pick['cpu_s'] * 1e3:.3g} ms of processor time with the picked sensors, "
         f"{pick['cpu_given_s'] * 1e3:.3g} ms as the scene is given (errors {own} in {', '.join(names)}), "
         f"{pick['cpu_full_s'] * 1e3:.3g} ms on the full model by {document['full']['engine']}"
     )
     if pick["sensors"] == "ideal":
-        echo("  sensors ideal: these quantities are the model's own; --keep sensors keeps the chain")
+        echo("  sensors ideal: these quantities do not depend on the sensors; --keep sensors keeps the chain")
     if given["engine"].endswith("companion") and not pick["companion"]:
-        echo("  no companion: the errors are measured here, a run does not estimate its own")
+        echo("  no companion: a run does not estimate its error; the errors above were measured here")
     echo(
-        f"  reference: full model by {document['reference']['engine']}, its own error the distance to "
+        f"  reference: full model by {document['reference']['engine']}, its error estimated from "
         f"{document['reference']['unlike']}; seed {pick['seed']}, {pick['date']}, rig {pick['rig']} {pick['commit']}"
     )
     if not document["all_engines_tried"]:
-        echo("  the budget ended before every engine was tried")
+        echo("  the time limit ended before every engine was tried")
 
 
 def _error(value: float | None) -> str:
@@ -133,7 +131,7 @@ def _error(value: float | None) -> str:
 
 
 def levels_table(document: dict[str, Any]) -> Table:
-    """What each level of the model costs, and errs by."""
+    """Return a table of cost and model error of each level of the model."""
     names = [entry["name"] for entry in document["quantities"]]
     table = new_table(
         f"Levels of the model in scene {document['scene']}: model error, each against the full model",
@@ -158,7 +156,7 @@ def levels_table(document: dict[str, Any]) -> Table:
 
 
 def engines_table(document: dict[str, Any]) -> Table:
-    """The same of each engine and step, on the picked model."""
+    """Return a table of cost and error of each engine and step on the picked model."""
     names = [entry["name"] for entry in document["quantities"]]
     table = new_table(
         "Engines and steps on the picked model: numerical error, total error",

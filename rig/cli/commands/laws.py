@@ -1,4 +1,4 @@
-"""`rig laws`: the normal contact laws side by side, and which restitution each really returns."""
+"""`rig laws`: comparison of the normal contact laws and the restitution that each returns."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rig.cli.options import Changes, Law, Plot, SetName, changed_parameters
-from rig.cli.output.comparison import answer
+from rig.cli.options import Changes, Law, Plot, SetName, override_parameters
+from rig.cli.output.comparison import print_comparison
 from rig.cli.output.tables import Form, Table, new_table
 
 if TYPE_CHECKING:
@@ -20,41 +20,42 @@ def laws(
     changes: Changes = None,
     law: Law = None,
     restitution: Annotated[
-        float | None, typer.Option("--restitution", metavar="E", help="Restitution asked for, instead of the set's.")
+        float | None,
+        typer.Option("--restitution", metavar="E", help="Requested restitution, 0 to 1; default: that of the set"),
     ] = None,
     plot: Plot = None,
     form: Form,
 ) -> None:
-    """Compare all normal contact laws: restitution asked for and returned, force, time of contact, stiffness."""
+    """Compare all normal contact laws: requested and returned restitution, force, contact time, stiffness."""
     from replays.studies.laws import compare, draw
 
     also = {} if restitution is None else {"contact.restitution": restitution}
-    parameters = changed_parameters(name, changes, also, law)
-    answer(parameters, compare=compare, draw=draw, show=_show, plot=plot, form=form)
+    parameters = override_parameters(name, changes, also, law)
+    print_comparison(parameters, compare=compare, draw=draw, show=_show, plot=plot, form=form)
 
 
 def _show(document: dict[str, Any], console: Console) -> None:
     impact, used = document["impact"], document["in_use"]
     console.print(_damping_table(document))
     console.print(
-        f"\none free impact: {impact['shaft_mass_kg']:.3f} kg (Ixx / l0A^2) against the inner house's "
+        f"\none free impact: {impact['shaft_mass_kg']:.3f} kg (Ixx / l0A^2) against the inner housing's "
         f"{impact['house_mass_kg']:.2f} kg at {impact['speed_m_s']:.3f} m/s, no friction. A c depends on e "
-        "alone, so what it returns does not depend on mass, speed, K or n, down to the floor of v0 at "
-        f"{document['speed_floor_m_s']:g} m/s. Kelvin-Voigt's D is right for these two masses only, and its force "
+        "alone, so the returned restitution does not depend on mass, speed, K or n, down to the minimum v0 of "
+        f"{document['speed_floor_m_s']:g} m/s. Kelvin-Voigt's D holds for these two masses only, and its force "
         "jumps to D v0 at the onset.\n",
     )
     console.print(_stiffness_table(document))
     lean = document["lean"]
     console.print(
-        "\nfit: largest error of K delta^n over 5 N to 3 kN, for laws that are no power. Cylinder laws take the axes "
-        f"for parallel; here the shaft tilts by up to r0 / l0A = {lean['angle_mrad']:.1f} mrad, "
-        f"{lean['over_width_um']:.0f} µm over the ring's assumed width: none is validated on this rig.",
+        "\nfit: largest error of K delta^n over 5 N to 3 kN, for laws other than a power law. Cylinder laws assume "
+        f"parallel axes; here the shaft tilts by up to r0 / l0A = {lean['angle_mrad']:.1f} mrad, "
+        f"{lean['over_width_um']:.0f} µm over the ring's assumed width: no law is validated on this rig.",
     )
     damping = used["damping_law"] or "given number"
     console.print(
         f"in use: {used['stiffness_law'] or 'given number'} with {damping}: K = {used['stiffness']:.4g} N/m^n, "
         f"n = {used['exponent']:.4g}, c = {used['damping_factor']:.4g}, D = {used['viscous_damping']:.4g} N s/m, "
-        f"returns {used['returned']:.3f} where {document['restitution']:g} is asked",
+        f"returns {used['returned']:.3f} for {document['restitution']:g} requested",
     )
 
 

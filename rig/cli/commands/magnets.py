@@ -1,11 +1,11 @@
-"""`rig magnets`: the magnet models side by side, and how far each is from the next better one."""
+"""`rig magnets`: comparison of the magnet models, each with its error against a more accurate one."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from rig.cli.options import Changes, Plot, SetName, changed_parameters
-from rig.cli.output.comparison import answer
+from rig.cli.options import Changes, Plot, SetName, override_parameters
+from rig.cli.output.comparison import print_comparison
 from rig.cli.output.tables import Form, Table, new_table
 
 if TYPE_CHECKING:
@@ -19,12 +19,12 @@ def magnets(
     plot: Plot = None,
     form: Form,
 ) -> None:
-    """Compare the magnet models: spring, far-field sum, exact cylinders, and the maps that stand for them in a run."""
+    """Compare the magnet models: spring, far-field sum, exact cylinders, and the maps used in a run."""
     from replays.studies.magnets import compare, draw
     from rig.physics.model import build_model
 
-    model = build_model(changed_parameters(name, changes))
-    answer(model, compare=compare, draw=draw, show=_show, plot=plot, form=form)
+    model = build_model(override_parameters(name, changes))
+    print_comparison(model, compare=compare, draw=draw, show=_show, plot=plot, form=form)
 
 
 def _show(document: dict[str, Any], console: Console) -> None:
@@ -38,13 +38,15 @@ def _show(document: dict[str, Any], console: Console) -> None:
         f"at the centre and {overstated['toward_a_magnet'][-1]:.2f} times at {document['reach_mm']:.3g} mm.\n",
     )
     used = document["stiffness_used_n_m"] / 1e3
-    console.print(_force_table(document, "force_at_stiffness_used_n", f"the same at {used:.3g} kN/m, as the rig runs"))
+    console.print(
+        _force_table(document, "force_at_stiffness_used_n", f"force at {used:.3g} kN/m, the stiffness in use")
+    )
     console.print()
     console.print(_error_table(document))
     console.print(
-        "\nerror: largest deviation over largest force of the better model, in any direction. The ring lets the shaft "
-        f"get {document['travel_mm']:.2f} mm from the magnets' centre. Exact: for rigid, uniform magnetisation, "
-        f"parallel axes, no iron (quadrature to {document['quadrature_error']:.0e}); no measured force is known to us.",
+        "\nerror: largest deviation over largest force of the reference model, in any direction. The ring limits the "
+        f"shaft to {document['travel_mm']:.2f} mm from the magnets' centre. Exact: rigid, uniform magnetisation, "
+        f"parallel axes, no iron (quadrature to {document['quadrature_error']:.0e}); no measured force is available.",
     )
 
 

@@ -1,4 +1,4 @@
-"""`rig paper`: the paper's figures, tables and conclusion, made again and judged, in one report."""
+"""`rig paper`: the figures, tables and conclusions of the paper, reproduced and judged in one report."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ if TYPE_CHECKING:
 def paper(
     *,
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", metavar="FILE", help="Write the report, .html or .pdf.")
+        Path | None, typer.Option("--output", "-o", metavar="FILE", help="Write the report, .html or .pdf")
     ] = None,
     pictures: Annotated[
-        Path | None, typer.Option("--pictures", metavar="FOLDER", help="Write the main pictures as PNG files as well.")
+        Path | None, typer.Option("--pictures", metavar="FOLDER", help="Also write the main pictures as PNG files")
     ] = None,
     quick: Annotated[
-        bool, typer.Option("--quick/--full", help="Few, short runs (some seconds), or all of them (about a minute).")
+        bool, typer.Option("--quick/--full", help="Few short runs (some seconds) or all (about a minute)")
     ] = False,
-    processes: Annotated[int, typer.Option(min=1, max=64, help="Processes at a time.")] = 2,
+    processes: Annotated[int, typer.Option(min=1, max=64, help="Number of parallel processes")] = 2,
     force: Force = False,
     form: Form,
 ) -> None:
-    """Make the paper's figures, tables and claims again, as printed and corrected, each with a verdict."""
+    """Reproduce the figures, tables and claims of the paper, as printed and as corrected, each with a verdict."""
     from replays.report import check_report, write_report
     from replays.studies.paper.document import draw_pictures, write_up
     from replays.studies.paper.findings import find, steps
@@ -63,11 +63,11 @@ def paper(
     if output is not None:
         echo(f"report  {output}")
     elif not drawn:
-        echo("nothing is written; -o paper.html writes the report with all figures and tables")
+        echo("no file written; -o paper.html writes the report with all figures and tables")
 
 
 def summary(findings: Findings) -> dict[str, object]:
-    """The summary as a JSON document: of ours 5, 50 and 95 %, nan where a number does not exist."""
+    """Return the summary as a JSON document; values are the 5, 50 and 95 % percentiles, NaN if undefined."""
     from replays.studies.paper.scans.spread import percentiles
 
     return {
@@ -89,11 +89,11 @@ def _show(findings: Findings, console: Console) -> None:
     from replays.studies.paper.findings import JUDGED_BY
 
     headings = ("statement", "the paper", ">unit", ">as-printed", ">corrected", ">inside", "verdict")
-    table = new_table("the paper's statements, and ours", *headings, wrapped=("statement", "verdict"))
+    table = new_table("the paper's statements, and this model's", *headings, wrapped=("statement", "verdict"))
     colours = {"good": "green", "bad": "bold red", "open": "yellow", "plain": ""}
     for line in [*findings.lines, *findings.claims]:
         row = line.row()
         says, _, *cells, verdict = row.cells
         table.add_row(says, *cells, Text(verdict, colours[row.mark]))
     console.print(table)
-    console.print(f"median (5–95 %), inside (of how many) over phases, assumed values and readings; {JUDGED_BY}")
+    console.print(f"median (5–95 %), inside (number of cases) over phases, assumed values and readings; {JUDGED_BY}")

@@ -1,17 +1,17 @@
-"""`rig params`: the numbers of the rig, where they come from, and which of them are assumed."""
+"""`rig params`: the parameters of the rig, their sources, and which of them are assumed."""
 
 from __future__ import annotations
 
-from rig.cli.options import Changes, SetName, changed_parameters
+from rig.cli.options import Changes, SetName, override_parameters
 from rig.cli.output.tables import Form, echo_json, new_table
 
 
 def params(name: SetName = "corrected", *, changes: Changes = None, form: Form) -> None:
-    """Show a parameter set: value, unit, source and kind of each; what is assumed is marked."""
+    """Show a parameter set: values, units, sources and kinds; assumed values are marked."""
     from rig.physics.model import build_model, describe
     from rig.physics.parameters import set_names
 
-    document = describe(build_model(changed_parameters(name, changes)))
+    document = describe(build_model(override_parameters(name, changes)))
     if form.as_json:
         echo_json(document)
         return
@@ -37,8 +37,8 @@ def params(name: SetName = "corrected", *, changes: Changes = None, form: Form) 
         f"\nderived: shaft sags {-derived['sag_at_ring_mm']:.3f} mm at the ring; with these magnets eq. 35 gives "
         f"{derived['magnet_stiffness_eq35_kn_m']:.3f} kN/m at the centre, exact cylinders "
         f"{derived['magnet_stiffness_cylinders_kn_m']:.3f} kN/m; the radial map follows the field sum within "
-        f"{fit['over_reach']:.1%} over {derived['magnet_reach_mm']:.3g} mm and {fit['over_travel']:.1%} where the ring "
-        f"lets the shaft go, and exact cylinders as stiff within {shape['over_reach']:.0%} and "
+        f"{fit['over_reach']:.1%} over {derived['magnet_reach_mm']:.3g} mm and {fit['over_travel']:.1%} in the range "
+        f"that the ring allows, and exact cylinders of equal stiffness within {shape['over_reach']:.0%} and "
         f"{shape['over_travel']:.0%} (see `rig magnets`)",
     )
     if derived["contact_fit_error"]:

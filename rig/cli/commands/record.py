@@ -1,4 +1,4 @@
-"""`rig record`: everything a rig publishes, into one file, several, or one around each trigger."""
+"""`rig record`: all streams of a rig in one file, in several, or in one around each trigger."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from rig.base.text import printable
 from rig.cli.connections.connection import Connection
 from rig.cli.groups import panel
 from rig.cli.options import Force
-from rig.cli.output.display import fitted
-from rig.cli.output.tables import echo, plain, table_console
+from rig.cli.output.display import fit_width
+from rig.cli.output.tables import echo, plain_text, table_console
 from rig.run.commands import SUMMARIES
 
 if TYPE_CHECKING:
@@ -26,19 +26,19 @@ if TYPE_CHECKING:
     from rig.serve.transport.zenoh import ZenohClient
 
 _EVENTS = ", ".join([*filter(SUMMARIES.get, SUMMARIES), "note", "warning"])
-"""Events that start a capture, as `recorder.output.trigger` has them; a test compares them."""
+"""Events that start a capture, as in `recorder.output.trigger`; a test compares them."""
 _files, _triggers, _disk = panel("Several files"), panel("Around triggers"), panel("The disk")
 
 
 class WhenFull(StrEnum):
-    """What happens when there is no more room."""
+    """Action at the disk limit."""
 
     STOP = "stop"
     REMOVE_OLDEST = "remove-oldest"
 
 
 class Again(StrEnum):
-    """What a trigger does during a capture."""
+    """Effect of a trigger during a capture."""
 
     EXTEND = "extend"
     IGNORE = "ignore"
@@ -46,53 +46,51 @@ class Again(StrEnum):
 
 _PRE_S, _POST_S = 0.5, 2.0
 _SPINNER = 2
-"""Columns of the sign that something goes on, with the blank behind it."""
+"""Width of the spinner with its space [columns]."""
 
 
 @dataclass(frozen=True)
 class Rotation:
     """When a new file begins."""
 
-    rotate_mb: Annotated[float | None, _files("A new file at about this size, in MB: NAME.0000.mcap, ...")] = None
-    rotate_s: Annotated[float | None, _files("A new file after this simulated time, in s.")] = None
+    rotate_mb: Annotated[float | None, _files("Start a new file at about this size in MB: NAME.0000.mcap")] = None
+    rotate_s: Annotated[float | None, _files("Start a new file after this simulated time in s")] = None
 
 
 @dataclass(frozen=True)
 class Triggers:
-    """What it is recorded around, if not all of the time."""
+    """Triggers of captures; without triggers all is recorded."""
 
     trigger: Annotated[
         list[str] | None,
         _triggers(
-            f"Record only around this: an event ({_EVENTS}) or a level such as "
-            "'|disk_x|>0.5' or 'P_E>3200' (in the channel's unit, preload included); may be repeated. A level fires "
-            "where it is crossed, and again after 0.25 s clear of it. One file each: NAME.hammer-001.mcap, ...",
+            f"Record only around an event ({_EVENTS}) or a level such as "
+            "'|disk_x|>0.5' or 'P_E>3200' (unit of the channel, preload included); repeatable. A level triggers at a "
+            "crossing, and again after 0.25 s below it. One file each: NAME.hammer-001.mcap",
             metavar="EVENT|LEVEL",
         ),
     ] = None
     pre_s: Annotated[
-        float | None, _triggers("Simulated time kept before a trigger, in s.", show_default=f"{_PRE_S:g}")
+        float | None, _triggers("Simulated time kept before a trigger in s", show_default=f"{_PRE_S:g}")
     ] = None
     post_s: Annotated[
-        float | None, _triggers("Simulated time kept after a trigger, in s.", show_default=f"{_POST_S:g}")
+        float | None, _triggers("Simulated time kept after a trigger in s", show_default=f"{_POST_S:g}")
     ] = None
-    longest_s: Annotated[
-        float | None, _triggers("Longest length of a capture, in s of simulated time.", show_default="60")
-    ] = None
-    trigger_count: Annotated[int | None, _triggers("End after so many captures.")] = None
+    longest_s: Annotated[float | None, _triggers("Longest capture in s of simulated time", show_default="60")] = None
+    trigger_count: Annotated[int | None, _triggers("Stop after this number of captures")] = None
     again: Annotated[
         Again | None,
         _triggers(
-            "What a trigger does during a capture: make it longer, or nothing.",
+            "Effect of a trigger during a capture",
             show_default="extend for events, ignore for levels",
         ),
     ] = None
 
     def capture(self) -> Capture | None:
-        """What is recorded of a run; None: all of it.
+        """Return what to capture of a run, or None to record all of it.
 
         Raises:
-            InputError: A trigger is none, or there is none that the other options are for.
+           InputError: A trigger is invalid, or the other options are given without a trigger.
         """
         from recorder.output.trigger import Capture, Trigger
 
@@ -114,20 +112,18 @@ class Triggers:
 
 @dataclass(frozen=True)
 class Disk:
-    """What a recording may take of the disk and of memory."""
+    """Limits of disk space and memory."""
 
-    budget_mb: Annotated[float | None, _disk("What all files of this recording may take, in MB.")] = None
-    keep_free_mb: Annotated[float, _disk("Room to leave on the disk, in MB.")] = 100.0
-    when_full: Annotated[WhenFull, _disk("At the budget, or with no more room: end, or remove the oldest file.")] = (
-        WhenFull.STOP
-    )
-    backlog_mb: Annotated[float, _disk("What may wait in memory for a slow disk, in MB; more is a gap.")] = 256.0
+    budget_mb: Annotated[float | None, _disk("Limit of all files of this recording in MB")] = None
+    keep_free_mb: Annotated[float, _disk("Free disk space to leave in MB")] = 100.0
+    when_full: Annotated[WhenFull, _disk("At a disk limit: stop, or remove the oldest file")] = WhenFull.STOP
+    backlog_mb: Annotated[float, _disk("Memory for data that waits for the disk in MB; more is lost")] = 256.0
 
     def limits(self, rotation: Rotation) -> Limits:
-        """Size of the files, and what they may take.
+        """Return the limits of file size and disk space.
 
         Raises:
-            InputError: There cannot be so much memory.
+           InputError: The backlog is out of range.
         """
         from recorder.output.disk_limits import Limits
 
@@ -143,23 +139,19 @@ class Disk:
 
 
 def record(
-    output: Annotated[Path, typer.Option("--output", "-o", help="File to record to, ends in .mcap.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="File to record to, .mcap")],
     *,
     connection: Connection,
     duration_s: Annotated[
-        float | None, typer.Option(help="Simulated time to record, in s; without it until the rig's run ends.")
+        float | None, typer.Option(help="Simulated time to record in s; default: until the run ends")
     ] = None,
-    view_rate_hz: Annotated[
-        float, typer.Option(help="Rate of the messages for plots, in Hz; 0 leaves them out.")
-    ] = 500.0,
-    history: Annotated[
-        bool, typer.Option(help="From the start of the run on, as far as the rig's cache reaches.")
-    ] = False,
+    view_rate_hz: Annotated[float, typer.Option(help="Rate of the messages for plots in Hz; 0: none")] = 500.0,
+    history: Annotated[bool, typer.Option(help="Include earlier data, as far as the rig's cache has it")] = False,
     patience_s: Annotated[
         float,
         typer.Option(
             metavar="S",
-            help="How long a rig that is lost may take to be there again, in s; the same run is then recorded on.",
+            help="Time to wait for a lost rig to return in s; then continue",
             min=0.0,
         ),
     ] = 10.0,
@@ -168,10 +160,10 @@ def record(
     triggers: Triggers,
     disk: Disk,
 ) -> None:
-    """Record all streams of a running rig to FILE.mcap, losslessly; Ctrl-C ends the recording well.
+    """Record all streams of a running rig to FILE.mcap, without loss; Ctrl-C ends the recording.
 
-    Exit status 0: all that was to be recorded is in the file. 1: rows or messages were lost, the run failed, the rig
-    was lost, or the disk ended the recording; what was lost is told, and what is there is kept. 2: wrong input.
+    Exit status: 0 the recording is complete; 1 rows or messages were lost, the run failed, the rig was lost or the disk
+    was full (the losses are listed and the rest is kept); 2 wrong input.
     """
     import os
 
@@ -182,7 +174,7 @@ def record(
 
     def session_of(client: ZenohClient | None) -> RecordingSession:
         return RecordingSession(
-            client,  # type: ignore[arg-type]  # only checked, in the first of two calls
+            client,  # type: ignore[arg-type]  # None in the first call, which only checks the options
             output,
             name=f"recorder-{os.getpid()}",
             duration_s=duration_s,
@@ -195,7 +187,7 @@ def record(
             inbox_bytes=round(disk.backlog_mb * MB),
         )
 
-    session_of(None)  # whatever is wrong with the options is said before a rig is looked for
+    session_of(None)  # checks the options before it connects
     with connection.client() as client:
         summary = run_session(session_of(client))
     tell(summary)
@@ -204,7 +196,7 @@ def record(
 
 
 def run_session(session: RecordingSession) -> Summary:
-    """Record with a line of progress; the first SIGINT or SIGTERM ends it well, a second one at once."""
+    """Record with a line of progress; the first SIGINT or SIGTERM ends the recording, a second one interrupts it."""
     import signal
 
     ends = (signal.SIGINT, signal.SIGTERM)
@@ -226,7 +218,7 @@ def run_session(session: RecordingSession) -> Summary:
     more = "" if files == [session.path] else ", ..."
     name = f"recording {printable(' or '.join(file.name for file in files), 30)}{more}"
     try:
-        with console.status(plain(f"{name}: waiting for the rig")) as status:
+        with console.status(plain_text(f"{name}: waiting for the rig")) as status:
 
             def show(progress: Progress) -> None:
                 nonlocal begun
@@ -240,11 +232,11 @@ def run_session(session: RecordingSession) -> Summary:
                     f"{name}: {progress.time_s:.1f} s",
                     lost,
                     f"{progress.size_bytes / 1e6:.1f} MB",
-                    *([f"{progress.backlog_bytes / 1e6:.1f} MB wait"] if progress.backlog_bytes > 1e6 else []),
+                    *([f"{progress.backlog_bytes / 1e6:.1f} MB waiting"] if progress.backlog_bytes > 1e6 else []),
                     *([f"{progress.files} files finished"] if progress.files else []),
                     f"{progress.rows} samples",
                 ]
-                line = plain(fitted(parts, console.width - _SPINNER, ", "))
+                line = plain_text(fit_width(parts, console.width - _SPINNER, ", "))
                 line.highlight_words([lost] if progress.lost else [], "red")
                 status.update(line)
 
@@ -257,7 +249,7 @@ def run_session(session: RecordingSession) -> Summary:
 
 
 def tell(summary: Summary) -> None:
-    """What became of a recording, line by line."""
+    """Print the result of a recording."""
     from rig.base.wire import SENSORS, TRUTH
 
     sensors = [rows for key, rows in summary.rows.items() if key.startswith(SENSORS + "/")]
@@ -270,7 +262,7 @@ def tell(summary: Summary) -> None:
     triggers = "1 trigger" if summary.fired == 1 else f"{summary.fired} triggers"
     if summary.fired is not None and not summary.files:
         came = triggers if summary.fired else "no trigger"
-        echo(f"{came} came in {summary.received_s:.3f} s; nothing was written; ended: {summary.reason}")
+        echo(f"{came} in {summary.received_s:.3f} s; nothing written; ended: {summary.reason}")
     else:
         around = ""
         if summary.fired is not None:
@@ -281,22 +273,22 @@ def tell(summary: Summary) -> None:
             f"{summary.size_bytes / 1e6:.1f} MB; ended: {summary.reason}"
         )
     if summary.removed:
-        echo(f"{summary.removed} older files were removed to make room")
+        echo(f"{summary.removed} older files were removed to free disk space")
     for line in summary.losses or ("nothing",):
         echo(f"lost: {line}")
     for key, rows in summary.declared.items():
-        echo(f"not lost: {rows} rows of {key}, which a fault took before they were sent, or sent late")
+        echo(f"not lost: {rows} rows of {key}, removed or delayed by a declared fault")
     if summary.lost or summary.missed:
         inside = ", those inside a capture," if summary.fired is not None else ""
         echo(f"the gaps ({summary.gaps}){inside} are recorded in the file on recorder/gaps")
     if summary.dropped:
         echo(
-            f"{summary.dropped} blocks found no room before the disk; they are among the lost "
-            f"(at most {summary.high_water_bytes / 1e6:.1f} MB waited)"
+            f"{summary.dropped} blocks exceeded the memory limit; they are included in the losses "
+            f"(at most {summary.high_water_bytes / 1e6:.1f} MB were waiting)"
         )
     if summary.malformed:
-        echo(f"{summary.malformed} payloads were not what their key promises; they are in the file as they came")
+        echo(f"{summary.malformed} payloads did not match the schema of their key; they are recorded unchanged")
     if summary.refused:
-        echo(f"{summary.refused} messages were not from this rig, or cannot be; they were left out")
+        echo(f"{summary.refused} messages were invalid or from another rig; they were left out")
     if summary.error:
         echo(summary.error, err=True)

@@ -1,4 +1,4 @@
-"""`rig recover`: finished recordings of what a kill or a full disk left."""
+"""`rig recover`: complete recordings from files cut off by a kill or a full disk."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from rig.cli.output.tables import echo
 
 
 def recover(
-    files: Annotated[list[Path], typer.Argument(metavar="FILE.mcap.part...", help="Files that were not finished.")],
+    files: Annotated[list[Path], typer.Argument(metavar="FILE.mcap.part...", help="Unfinished files")],
     *,
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", help="The new file; without it FILE.recovered.mcap, beside the other."),
+        typer.Option("--output", "-o", help="New file; default: FILE.recovered.mcap"),
     ] = None,
     force: Force = False,
 ) -> None:
-    """Make finished recordings of files that were cut off or damaged; these stay as they are.
+    """Recover recordings that were cut off or damaged; the source files are not changed.
 
-    Of a file that is whole nothing is made, unless with --force. Ends with 1 where rows or records are lost.
+    A complete file is copied only with --force. Exit status 1 if rows or records are lost.
     """
     from recorder.files.unfinished_file import check_destination
     from recorder.rewrite import recovered_path
@@ -52,12 +52,12 @@ def _is_whole(file: Path) -> bool:
     with reporting() as report:
         whole = is_whole(file, on_progress=lambda done: report.part(done, f"reading {file}"))
     if whole:
-        echo(f"{file} is whole: nothing is to be recovered, nothing was written (--force makes a copy)")
+        echo(f"{file} is complete: nothing to recover, nothing written (--force makes a copy)")
     return whole
 
 
 def _recover(file: Path, new: Path, *, force: bool) -> bool:
-    """Recover a file; return whether nothing of it is lost."""
+    """Recover a file; return whether it is complete."""
     from recorder.rewrite import recover as recover_file
 
     with reporting() as report:

@@ -1,4 +1,4 @@
-"""`rig replay`: a recording served as if it were the rig."""
+"""`rig replay`: a recording published as a running rig would."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from rig.base.errors import InputError
 from rig.cli.connections.can_output import CanOptions
 from rig.cli.connections.connection import Serving, serve
 from rig.cli.groups import panel
-from rig.cli.options import Channels, FromS, RecordingFiles, ToS, names_of, pairs
-from rig.cli.output.display import all_lateness, lateness
+from rig.cli.options import Channels, FromS, RecordingFiles, ToS, parse_pairs, split_names
+from rig.cli.output.display import lateness_summary, lateness_text
 from rig.cli.output.tables import echo
 
 if TYPE_CHECKING:
@@ -27,79 +27,73 @@ _part, _change = panel("What is played"), panel("What is changed")
 
 
 class Spacing(StrEnum):
-    """What the spacing follows."""
+    """Time base of the replay."""
 
     SIMULATED = "simulated"
     ARRIVAL = "arrival"
 
 
 class Numbers(StrEnum):
-    """Which ticks and row numbers go out."""
+    """Numbering of ticks and rows."""
 
     ORIGINAL = "original"
     NEW = "new"
 
 
 class Only(StrEnum):
-    """What goes out."""
+    """Streams that are published."""
 
     SENSORS = "sensors"
 
 
 @dataclass(frozen=True)
-class Played:
-    """What is played, and when it begins."""
+class PlayRange:
+    """Range of the replay, and the condition for its start."""
 
     from_s: FromS = None
     to_s: ToS = None
-    start_s: Annotated[float | None, _part("Where the first pass begins, in s.", "--start", metavar="S")] = None
-    loop: Annotated[int, _part("Passes through it; 0: endless.", metavar="N", min=0)] = 1
-    pause: Annotated[bool, _part("Wait for `rig resume`, or `rig step`.", "--pause")] = False
+    start_s: Annotated[float | None, _part("Start of the first pass in s", "--start", metavar="S")] = None
+    loop: Annotated[int, _part("Number of passes; 0: endless", metavar="N", min=0)] = 1
+    pause: Annotated[bool, _part("Start paused; continue with `rig resume` or `rig step`", "--pause")] = False
     wait_for: Annotated[
         int,
-        _part(
-            "Begin once N clients listen (recorders, DAQs, viewers), so that they get all of it.", metavar="N", min=0
-        ),
+        _part("Start when N clients are connected, so that they receive all", metavar="N", min=0),
     ] = 0
-    wait_s: Annotated[float, _part("Fail where they are not there after S s.", metavar="S")] = 60.0
+    wait_s: Annotated[float, _part("Time limit for --wait-for in s", metavar="S")] = 60.0
 
     def part(self) -> Part:
-        """Which part of the recording, and how often."""
+        """Return the range to play and the number of passes."""
         from replays.player.play_range import Part
 
         return Part(from_s=self.from_s, to_s=self.to_s, start_s=self.start_s, loops=self.loop or None)
 
 
 @dataclass(frozen=True)
-class Changed:
-    """What is changed between the recording and the wire."""
+class ReplayEdit:
+    """Changes between the recording and the published data."""
 
-    time: Annotated[
-        Numbers, _change("Ticks and row numbers as recorded, or new ones that run on through loops and seeks.")
-    ] = Numbers.ORIGINAL
-    only: Annotated[Only | None, _change("Leave out what no instrument could know.")] = None
+    time: Annotated[Numbers, _change("Ticks and row numbers: as recorded, or continuous")] = Numbers.ORIGINAL
+    only: Annotated[Only | None, _change("Publish only these streams")] = None
     remap: Annotated[
-        list[str] | None, _change("The same payloads on another key; may be repeated.", metavar="KEY=KEY")
+        list[str] | None, _change("Publish a key's payloads on another key; repeatable", metavar="KEY=KEY")
     ] = None
     channels: Channels = None
-    rename: Annotated[list[str] | None, _change("Another name for a channel, as if wired so.", metavar="NAME=NAME")] = (
-        None
-    )
+    rename: Annotated[list[str] | None, _change("Rename a channel; repeatable", metavar="NAME=NAME")] = None
 
     def edit(self, track: Track) -> Edit:
-        """Which payloads go out, on which key, and which columns they have.
+        """Return the edit of a track: its payloads, their keys and their columns.
 
         Raises:
-            InputError: The recording has no such key or channel, or two would get the same.
+           InputError: The recording lacks a key or channel, or two would have the same name.
         """
         from replays.player.edit import Edit
         from rig.base.wire import CATALOGUE
 
         return Edit(
             track.documents[CATALOGUE],
-            keys=pairs("--remap", self.remap, "KEY=KEY"),
-            channels=None if self.channels is None else names_of(self.channels),
-            names=pairs("--rename", self.rename, "NAME=NAME"),
+            keys=parse_pairs("--remap", self.remap, "KEY=KEY"),
+            channels=None if self.channels is None else split_names(self.channels),
+            names=parse_pairs("--rename", self.rename, "NAME=NAME"),
             truth=self.only is None,
         )
 
@@ -107,23 +101,23 @@ class Changed:
 def replay(
     files: RecordingFiles,
     *,
-    rate: Annotated[float, typer.Option(help="Recorded seconds a second, 0.01 to 1000.")] = 1.0,
+    rate: Annotated[float, typer.Option(help="Speed, recorded over real time, 0.01 to 1000")] = 1.0,
     burst: Annotated[
-        bool, typer.Option("--burst", help="As fast as the clients take it, without loss; see --wait-for.")
+        bool, typer.Option("--burst", help="Play as fast as the clients can read; see --wait-for")
     ] = False,
     spacing: Annotated[
-        Spacing, typer.Option("--by", help="By simulated time, or as it had arrived at the recorder.")
+        Spacing, typer.Option("--by", help="Time base: simulated time, or arrival at the recorder")
     ] = Spacing.SIMULATED,
-    played: Played,
-    changed: Changed,
+    played: PlayRange,
+    changed: ReplayEdit,
     serving: Serving,
     can: CanOptions,
 ) -> None:
-    """Play a recording to whoever listens, as if it were the rig.
+    """Publish a recording as a running rig would.
 
     From another terminal: `rig pause`, `rig resume`, `rig seek S`, `rig rate X`, `rig step`, `rig stop`, `rig status`.
     """
-    serving.exposure()  # what is wrong with that is said first
+    serving.exposure()  # checks these options first
     from rig.serve.pacing import FreeRun, RealTime, rare_collections
 
     with rare_collections():
@@ -157,14 +151,14 @@ def replay(
         )
         begin_s, end_s = player.reach_s
         if not track.complete:
-            echo("rig: the recording was cut off; it is played as far as it goes", err=True)
+            echo("rig: the recording was cut off; it is played up to that point", err=True)
         what = "paused" if played.pause else "burst" if burst else f"x{rate:g}"
         if played.wait_for:
             what += f", waiting for {_clients(played.wait_for)}"
         echo(f"rig: replay of {', '.join(map(str, files))}, {begin_s:g} to {end_s:g} s, {what}", err=True)
         return player
 
-    # What the transport keeps for those who miss it lasts shorter when it goes faster, so there it waits for them.
+    # At higher rates the transport's history covers less time, so the replay waits for slow clients.
     serve(make, _words, _tell, serving=serving, bus=bus, paced=not burst, wait=burst or rate > 1.0)
 
 
@@ -180,7 +174,7 @@ def _words(status: dict[str, Any]) -> list[str]:
         pace = "paused" if play["paused"] else f"x{play['achieved_rate']:.4f}"
     if play["behind_s"]:
         pace += f" of x{play['rate']:g}, behind by {play['behind_s']:.1f} s"
-    words = [f"{status['time_s']:7.2f} of {status['end_s']:.2f} s", pace, lateness(status)]
+    words = [f"{status['time_s']:7.2f} of {status['end_s']:.2f} s", pace, lateness_text(status)]
     if play["passes"] != 1:
         words.append(f"pass {play['pass']}" + (f" of {play['passes']}" if play["passes"] else ""))
     return words
@@ -197,9 +191,9 @@ def _tell(summary: dict[str, Any]) -> None:
         f"left out {summary['left_out']} payloads"
     )
     if play["rate"] is not None:
-        echo(f"{all_lateness(summary)}, not ready when due {summary['overruns']}")
+        echo(f"{lateness_summary(summary)}, overruns {summary['overruns']}")
         if play["behind_s"]:
             echo(
-                f"warning: at the end it was {play['behind_s']:.1f} s behind; for as fast as it goes see --burst",
+                f"warning: the replay ended {play['behind_s']:.1f} s behind; for full speed use --burst",
                 err=True,
             )

@@ -1,4 +1,4 @@
-"""Requests to a running rig or to the replay of a recording, each a command: it is made, and the answer shown."""
+"""Requests to a running rig or a replay, one command each, which prints the reply."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rig.run.commands import SUMMARIES
 
 
 def scene_command(name: str) -> Callable[..., None]:
-    """Return the command line of a scene command: fields without a default are arguments, the others are options."""
+    """Return the command line of a scene command: required fields are arguments, others are options."""
     from rig.run.commands import mechanical
     from rig.run.commands.command import as_number, entries
 
@@ -47,13 +47,13 @@ def scene_command(name: str) -> Callable[..., None]:
 def step(
     ticks: Annotated[
         int | None,
-        typer.Argument(help="Microseconds of simulated time; for a rig, a whole multiple of the scene's block."),
+        typer.Argument(help="Simulated time in us; for a rig, a multiple of the block"),
     ] = None,
     *,
-    blocks: Annotated[int | None, typer.Option(help="A number of blocks instead; only for a replay.")] = None,
+    blocks: Annotated[int | None, typer.Option(help="Number of blocks instead of TICKS; replay only")] = None,
     connection: Connection,
 ) -> None:
-    """Let a rig that runs with --pace lockstep simulate TICKS more, or a paused replay play them; returns when done."""
+    """Advance a lockstep run or a paused replay by TICKS; returns when done."""
     if (ticks is None) == (blocks is None):
         raise InputError("step", "given TICKS or --blocks", Words("neither" if ticks is None else "both"))
     with connection.console("step") as rig:
@@ -62,51 +62,49 @@ def step(
 
 
 def note(
-    text: Annotated[str, typer.Argument(help="One line of text.")],
+    text: Annotated[str, typer.Argument(help="One line of text")],
     *,
-    tag: Annotated[
-        list[str] | None, typer.Option(metavar="WORD", help="A word to find it by; may be repeated.")
-    ] = None,
+    tag: Annotated[list[str] | None, typer.Option(metavar="WORD", help="Tag to find the note by; repeatable")] = None,
     connection: Connection,
 ) -> None:
-    """Put a note into every recording that is being made of a rig, with the present simulated and wall time."""
+    """Add a note to every recording of a running rig, with the current simulated and wall time."""
     with connection.console("note") as rig:
         show(rig.note(text, tags=tag or []), "note")
 
 
 def stop(*, connection: Connection) -> None:
-    """End the run of a rig; recordings of it close."""
+    """End the run of a rig and close its recordings."""
     with connection.console("stop") as rig:
         show(rig.stop(), "stop")
 
 
 def pause(*, connection: Connection) -> None:
-    """Hold the replay of a recording: nothing more goes out until `rig resume`, `rig step` or `rig seek`."""
+    """Pause a replay until `rig resume`, `rig step` or `rig seek`."""
     with connection.console("pause") as rig:
         show(rig.pause(), "pause")
 
 
 def resume(*, connection: Connection) -> None:
-    """Let the replay of a recording go on."""
+    """Resume a replay."""
     with connection.console("resume") as rig:
         show(rig.resume(), "resume")
 
 
 def seek(
-    time_s: Annotated[float, typer.Argument(metavar="SECONDS", help="Simulated time in the recording, in s.")],
+    time_s: Annotated[float, typer.Argument(metavar="SECONDS", help="Simulated time in the recording in s")],
     *,
     connection: Connection,
 ) -> None:
-    """Let the replay of a recording go on from another position; one that is paused stays so."""
+    """Move a replay to another time; a paused replay stays paused."""
     with connection.console("seek") as rig:
         show(rig.seek(time_s), "seek")
 
 
 def rate(
-    rate: Annotated[float, typer.Argument(metavar="X", help="Recorded seconds a second, 0.01 to 1000.")],
+    rate: Annotated[float, typer.Argument(metavar="X", help="Speed, recorded over real time, 0.01 to 1000")],
     *,
     connection: Connection,
 ) -> None:
-    """Set how fast the replay of a recording goes."""
+    """Set the speed of a replay."""
     with connection.console("rate") as rig:
         show(rig.rate(rate), "rate")

@@ -1,4 +1,4 @@
-"""`rig run`: simulate a scene and serve it."""
+"""`rig run`: simulate a scene and publish it."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from rig.base.errors import InputError
 from rig.cli.connections.can_output import CanOptions
 from rig.cli.connections.connection import Serving, serve
 from rig.cli.options import SceneChanges, SceneName
-from rig.cli.output.display import all_lateness, lateness
+from rig.cli.output.display import lateness_summary, lateness_text
 from rig.cli.output.progress import reporting
 from rig.cli.output.tables import echo
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 class Pace(StrEnum):
-    """What decides when the next block runs."""
+    """Timing of the blocks."""
 
     REAL_TIME = "real-time"
     LOCKSTEP = "lockstep"
@@ -33,17 +33,15 @@ def run(
     scene: SceneName,
     *,
     pace: Annotated[
-        Pace, typer.Option(help="By the wall clock, by `rig step`, or as fast as everything attached keeps up.")
+        Pace, typer.Option(help="Timing: wall clock, `rig step`, or as fast as clients read")
     ] = Pace.REAL_TIME,
-    block_ms: Annotated[
-        float, typer.Option(help="Length of a published block, in ms; the last 3000 are kept for clients that stall.")
-    ] = 10.0,
+    block_ms: Annotated[float, typer.Option(help="Length of a block in ms; the last 3000 blocks are cached")] = 10.0,
     serving: Serving,
     scene_changes: SceneChanges,
     can: CanOptions,
 ) -> None:
     """Run a scene in real time and publish its sensors, until its end, `rig stop` or Ctrl-C."""
-    serving.exposure()  # what is wrong with that is said first
+    serving.exposure()  # checks these options first
     overrides = scene_changes.overrides()
 
     from rig.serve.pacing import rare_collections
@@ -57,10 +55,10 @@ def run(
         bus = can.output(loaded.table)
         simulation = Simulation(loaded)
         block_ticks = _block_ticks(block_ms, simulation)
-        # Last: a wrong line is told as such also where another rig runs.
+        # Last, so that a wrong option is reported even while another rig runs.
         serving.check()
         echo(f"rig: scene {scene}, {pace}; preparing", err=True)
-        # Before anybody can connect: whoever does is answered at once.
+        # Before clients can connect, so that they are answered at once.
         with reporting(compiles=True):
             simulation.warm_up()
 
@@ -77,7 +75,7 @@ def run(
 def _block_ticks(block_ms: float, simulation: Any) -> int:
     ticks = block_ms * simulation.tick_rate_hz / 1000
     unit_ms = simulation.block_ticks * 1000 / simulation.tick_rate_hz
-    # Blocks of more than a second would make commands wait that long.
+    # A command waits up to one block, so blocks are limited to one second.
     if not 0 < block_ms <= 1000 or ticks % simulation.block_ticks:
         raise InputError("--block-ms", f"a positive whole multiple of {unit_ms:g} ms, at most 1000 ms", block_ms)
     return round(ticks)
@@ -95,14 +93,15 @@ def _words(status: dict[str, Any]) -> list[str]:
     end_s, spin_hz = status["end_s"], status["spin_hz"]
     end = "" if end_s is None else f" of {end_s:g}"
     spin = [] if spin_hz is None else [f"spin {spin_hz:.2f} Hz"]
-    return [f"{status['time_s']:7.2f}{end} s", *spin, f"x{status['real_time_factor']:.4f}", lateness(status)]
+    return [f"{status['time_s']:7.2f}{end} s", *spin, f"x{status['real_time_factor']:.4f}", lateness_text(status)]
 
 
 def _print_summary(summary: dict[str, Any]) -> None:
     queue = summary["queue"]
     echo(f"scene {summary['scene']}: {summary['reason']} at {summary['time_s']:.3f} s after {summary['wall_s']:.2f} s")
-    echo(f"real-time factor {summary['real_time_factor']:.6f}, {all_lateness(summary)}, overruns {summary['overruns']}")
+    late = lateness_summary(summary)
+    echo(f"real-time factor {summary['real_time_factor']:.6f}, {late}, overruns {summary['overruns']}")
     echo(
-        f"{summary['samples_published']} samples a channel published, blocks dropped {queue['dropped']},"
-        f" commands taken {summary['commands']}"
+        f"{summary['samples_published']} samples per channel published, blocks dropped {queue['dropped']},"
+        f" commands accepted {summary['commands']}"
     )

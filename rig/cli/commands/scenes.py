@@ -1,4 +1,4 @@
-"""`rig scenes`: what can be run."""
+"""`rig scenes`: the scenes that can be run."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from rig.cli.output.tables import Form, echo_document, echo_json, new_table
 
 
 def scenes(
-    name: Annotated[str | None, typer.Argument(metavar="[SCENE]", help="Show the file of this one.")] = None,
+    name: Annotated[str | None, typer.Argument(metavar="[SCENE]", help="Show the file of this scene")] = None,
     *,
     form: Form,
 ) -> None:
-    """List the scenes that come with the rig, or show one. Your own is a TOML file of the same form."""
+    """List the built-in scenes, or show one. Your own scene is a TOML file of the same form."""
     from rig.run.scenes import load_scene, scene_document, scene_names, scene_path
 
     if name is not None:

@@ -1,4 +1,4 @@
-"""`rig score`: what a DAQ under test recorded against what the rig sent."""
+"""`rig score`: the recording of a DAQ under test compared with what the rig sent."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from rig.base.errors import InputError, Words, check_new_file, check_not_among, 
 from rig.base.text import finite
 from rig.cli.connections.connection import Connection
 from rig.cli.groups import panel
-from rig.cli.options import Channels, Force, Wide, names_of
+from rig.cli.options import Channels, Force, Wide, split_names
 from rig.cli.output.provenance import origin
-from rig.cli.output.tables import echo, new_table, shown, table_console
+from rig.cli.output.tables import echo, make_printable, new_table, table_console
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -26,8 +26,9 @@ if TYPE_CHECKING:
 
 _live = panel("Live")
 _FOR_S = 10.0
+"""Default duration of a live score [s]."""
 _MATRIX_COLUMNS = 28
-"""Channels beside one another in a matrix of 80 columns."""
+"""Number of channels per matrix that fits 80 columns."""
 
 
 class _Way(StrEnum):
@@ -43,44 +44,45 @@ def score(
         Path,
         typer.Argument(
             metavar="FILE",
-            help="What the DAQ recorded: as `rig import`, .mcap, or a CAN log; - for CSV that comes in while a rig "
-            "runs.",
+            help="The DAQ's recording: a format of `rig import`, .mcap or CAN log; -: CSV from stdin",
         ),
     ],
     *,
     against: Annotated[
         list[Path] | None,
-        typer.Option("--against", metavar="SESSION.mcap", help="What the rig sent; its parts, repeated."),
+        typer.Option("--against", metavar="SESSION.mcap", help="Session that the rig sent; repeat for its parts"),
     ] = None,
     for_s: Annotated[
         float | None,
-        _live("How long, from the first line on, in s; 10 unless given. Ctrl-C ends it before.", metavar="S"),
+        _live("Duration from the first line in s, default 10; Ctrl-C ends it", metavar="S"),
     ] = None,
     connection: Connection,
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", metavar="FILE", help="Report with pictures, .html or .pdf.")
+        Path | None, typer.Option("--output", "-o", metavar="FILE", help="Write a report with pictures, .html or .pdf")
     ] = None,
     junit: Annotated[
-        Path | None, typer.Option(metavar="FILE.xml", help="JUnit's XML, a case for each quantity.")
+        Path | None, typer.Option(metavar="FILE.xml", help="Write JUnit XML, one case per quantity")
     ] = None,
-    as_json: Annotated[Path | None, typer.Option("--json", metavar="FILE.json", help="All of it as JSON.")] = None,
+    as_json: Annotated[
+        Path | None, typer.Option("--json", metavar="FILE.json", help="Write all results as JSON")
+    ] = None,
     limits: Annotated[
-        str | None, typer.Option(metavar="SET", help="as-calibrated, api-670, iso-20816, or a .toml file.")
+        str | None, typer.Option(metavar="SET", help="Limits: as-calibrated, api-670, iso-20816 or a .toml file")
     ] = None,
     channels: Channels = None,
     mapping: Annotated[
         Path | None,
-        typer.Option("--mapping", "-m", metavar="FILE.toml", help="Names, units and bits, as of `rig import`."),
+        typer.Option("--mapping", "-m", metavar="FILE.toml", help="Names, units and bits, in the form of `rig import`"),
     ] = None,
-    path: Annotated[_Way | None, typer.Option(help="How the DAQ is fed, if not as the file looks.")] = None,
+    path: Annotated[_Way | None, typer.Option(help="Input of the DAQ; default: detected from the file")] = None,
     force: Force = False,
     wide: Wide = False,
 ) -> None:
-    """Judge a DAQ by what it recorded, against what the rig sent.
+    """Score a DAQ by comparing its recording with what the rig sent.
 
-    A DAQ that took counts is judged row by row, exactly; one that sampled by itself by least squares against the known
-    signal. Where FILE is -, what comes in is judged against what the rig at --connect sends meanwhile. Exit
-    status: 0 pass, 1 fail, 2 wrong input, 3 inconclusive.
+    A DAQ with digital input is compared row by row, exactly; one that samples by itself is fitted to the known signal
+    by least squares. With FILE -, CSV from stdin is compared with what the rig at --connect sends. Exit status: 0 pass,
+    1 fail, 2 wrong input, 3 inconclusive.
     """
     from replays.recordings.formats.mapping import load_mapping
     from replays.report import check_report, write_report
@@ -96,7 +98,7 @@ def score(
             check_not_among([file, *(against or ())], made, field=field)
     asked = load_limits(limits)
     mapped = None if mapping is None else load_mapping(mapping)
-    due = None if channels is None else names_of(channels)
+    due = None if channels is None else split_names(channels)
     way = None if path is None else "digital" if path is _Way.DIGITAL else "analogue"
     live = str(file) == "-"
     if live == (against is not None):
@@ -130,7 +132,7 @@ def _judge_live(
     connection: Connection, for_s: float, limits: Limits, path: Literal["digital", "analogue"] | None,
     channels: list[str] | None, mapping: Mapping | None,
 ) -> Scorecard:  # fmt: skip
-    """Take down what comes in by standard input, and what the rig sends meanwhile, and judge that."""
+    """Collect the lines from stdin and the streams of the rig at the same time, and score them."""
     import sys
     import tempfile
     import threading
@@ -138,7 +140,7 @@ def _judge_live(
     from replays.score.judgement import judge
     from replays.score.records.live import LONGEST_S, SHORTEST_S, collect
     from rig.cli.output.progress import reporting
-    from rig.cli.signals import stopping_on_signals
+    from rig.cli.signals import stop_on_signals
 
     if not SHORTEST_S <= for_s <= LONGEST_S:
         raise InputError("--for-s", f"from {SHORTEST_S:g} to {LONGEST_S:g}", for_s)
@@ -146,13 +148,13 @@ def _judge_live(
         raise InputError("FILE", "fed by a pipe where it is -: my-daq | rig score -", Words("a terminal"))
     stopped = threading.Event()
     with tempfile.TemporaryDirectory(prefix="rig-score-") as folder:
-        with connection.client() as client, reporting() as reporter, stopping_on_signals(stopped.set):
+        with connection.client() as client, reporting() as reporter, stop_on_signals(stopped.set):
             found = collect(client, sys.stdin.fileno(), Path(folder), for_s, stopped=stopped, tell=reporter.part)
         card = judge(
             found.file, [found.session], limits=limits, path=path, arrivals=found.arrivals, channels=channels,
             mapping=mapping,
         )  # fmt: skip
-    card.title = f"what came in, against the rig at {connection.connect}"
+    card.title = f"standard input, compared with the rig at {connection.connect}"
     card.remarks[:0] = found.remarks
     return card
 
@@ -160,20 +162,20 @@ def _judge_live(
 def _show(card: Scorecard, console: Console, *, wide: bool) -> None:
     from replays.score.card.scorecard import FAIL, INCONCLUSIVE, make_matrix
 
-    console.print(shown(f"{card.title}, limits {card.limits}"))
-    console.print(shown(card.verdict_line))
+    console.print(make_printable(f"{card.title}, limits {card.limits}"))
+    console.print(make_printable(card.verdict_line))
     names, lines = make_matrix(card)
     for first in range(0, len(names) if lines else 0, _MATRIX_COLUMNS):
         part = names[first : first + _MATRIX_COLUMNS]
-        height = max(map(len, part))  # names stand upright over their marks
+        height = max(map(len, part))  # names are written vertically above their marks
         above = [("", *letters) for letters in zip(*(name.rjust(height) for name in part), strict=True)]
         for quantity, *marks in (*above, *((line[0], *line[1 + first :][: len(part)]) for line in lines)):
             cells = "".join(f" {mark:1}" for mark in marks)
-            console.print(shown(f"{quantity:<22}{cells}".rstrip()))
+            console.print(make_printable(f"{quantity:<22}{cells}".rstrip()))
     if lines:
         console.print("+ pass, X fail, ? inconclusive\n")
     for line in (*card.doubts[1:], *card.findings):
-        console.print(shown(line))
+        console.print(make_printable(line))
     table = new_table(
         "", "quantity", "channel", ">value", "95 %", "unit", "limit", "verdict", "note", "to show it", "source",
         wrapped=("note", "to show it", "source"), spare=("source", "to show it", "note", "95 %"),
@@ -184,4 +186,4 @@ def _show(card: Scorecard, console: Console, *, wide: bool) -> None:
         table.add_row(*row.cells(), row.note, row.run, source, style=_STYLES[row.verdict])
     console.print(table)
     if len(told) < len(card.rows):
-        echo("what passes, or has no limit, is in --wide, and in the report, JUnit and JSON")
+        echo("passed quantities and those without a limit: see --wide, the report, JUnit or JSON")

@@ -1,4 +1,4 @@
-"""`rig sessions`: make the reference sessions anew."""
+"""`rig sessions`: record the reference sessions again."""
 
 from __future__ import annotations
 
@@ -15,12 +15,16 @@ from rig.cli.output.tables import echo
 
 
 def sessions(
-    names: Annotated[list[str] | None, typer.Argument(metavar="[SESSION]...", help="Only these.")] = None,
+    names: Annotated[
+        list[str] | None, typer.Argument(metavar="[SESSION]...", help="Record only these sessions")
+    ] = None,
     *,
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="FOLDER", help="Where to; made if missing.")],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="FOLDER", help="Folder to write to; created if missing")
+    ],
     force: Force = False,
 ) -> None:
-    """Make the reference sessions anew: small recordings with their quantities as text, to be reviewed as a diff."""
+    """Record the reference sessions again: small recordings, with their quantities as text for review as a diff."""
     from replays.sessions import SESSIONS, make
 
     wanted = names or list(SESSIONS)
@@ -30,7 +34,7 @@ def sessions(
     check_folder(output, field="--output")
     taken = [path for name in wanted for path in (output / f"{name}.mcap", output / f"{name}.toml") if path.exists()]
     if taken and not force:
-        raise InputError("output", "a folder without them (--force replaces them)", str(taken[0]))
+        raise InputError("output", "a folder without these files (--force replaces them)", str(taken[0]))
     output.mkdir(exist_ok=True)
     with reporting() as reporter:
         reporter.begin(len(wanted))

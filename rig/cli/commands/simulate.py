@@ -1,4 +1,4 @@
-"""`rig simulate`: a scene without a clock, into a file."""
+"""`rig simulate`: a scene simulated at full speed to a file."""
 
 from __future__ import annotations
 
@@ -15,19 +15,15 @@ from rig.cli.output.tables import echo
 def simulate(
     scene: SceneName,
     *,
-    output: Annotated[
-        Path, typer.Option("--output", "-o", help="File to write: .mcap, .parquet, .csv, or .wav (sensors, volts).")
-    ],
+    output: Annotated[Path, typer.Option("--output", "-o", help="File: .mcap, .parquet, .csv or .wav (sensors in V)")],
     scene_changes: SceneChanges,
     check: Annotated[
         bool,
-        typer.Option(
-            "--check", help="Run it again, finer: tells the error; status 1 where a wrong branch is suspected."
-        ),
+        typer.Option("--check", help="Repeat with finer steps, print the error; status 1 if suspect"),
     ] = False,
     force: Force = False,
 ) -> None:
-    """Simulate a scene as fast as it goes and write it to a file: every state, force and sensor, with units."""
+    """Simulate a scene at full speed and write it to a file: every state, force and sensor, with units."""
     import time
 
     from rig.serve.pacing import rare_collections
@@ -41,7 +37,7 @@ def simulate(
         if check:
             from replays.studies.check import finer
 
-            finer(loaded)  # refused before a long run
+            finer(loaded)  # raises its errors before a long run
 
         from rig.run.simulation import Simulation
 
@@ -73,7 +69,7 @@ def simulate(
 
 
 def _moved(health: dict[str, Any]) -> str:
-    """What there is to say of the motion; nothing of test signals."""
+    """Return the contacts and the energy residual in words; empty for test signals."""
     energy = health.get("energy")
     if energy is None:
         return ""

@@ -1,4 +1,4 @@
-"""`rig stability`: trials of every engine, each with an expected verdict; maps of where they hold; random scenes."""
+"""`rig stability`: trials of every engine with expected verdicts, maps of their limits, and random scenes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rig.base.errors import InputError
-from rig.cli.options import Law, names_of
+from rig.cli.options import Law, split_names
 from rig.cli.output.progress import reporting
 from rig.cli.output.tables import Form, Table, echo, echo_json, new_table
 
@@ -26,22 +26,22 @@ def stability(
     *,
     only: Annotated[
         str | None,
-        typer.Option(
-            "--only", metavar="T3,T7", help="Only these trials; pictures stay whole. With --random or --scenes: scenes."
-        ),
+        typer.Option("--only", metavar="T3,T7", help="Run only these trials, or scenes with --random or --scenes"),
     ] = None,
-    engines: Annotated[str | None, typer.Option("--engines", metavar="ENGINE,...", help="Only these engines.")] = None,
+    engines: Annotated[
+        str | None, typer.Option("--engines", metavar="ENGINE,...", help="Test only these engines")
+    ] = None,
     full: Annotated[
-        bool, typer.Option("--full/--quick", help="Long ladders and fine maps (some minutes), or the short ones.")
+        bool, typer.Option("--full/--quick", help="Run all steps and fine maps (minutes), or short ones")
     ] = False,
     random: Annotated[
         int | None,
-        typer.Option("--random", metavar="N", min=1, help="Random scenes 0 to N-1 instead, against accurate runs."),
+        typer.Option("--random", metavar="N", min=1, help="Run N random scenes instead, against accurate runs"),
     ] = None,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Of the random scenes.")] = 1,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the random scenes")] = 1,
     scenes: Annotated[
         bool,
-        typer.Option("--scenes", help="The chart's twelve scenes instead, at every setting of each engine and peer."),
+        typer.Option("--scenes", help="Run the chart's twelve scenes with all engines and peers"),
     ] = False,
     law: Law = None,
     output: Annotated[
@@ -50,17 +50,17 @@ def stability(
             "--output",
             "-o",
             metavar="FOLDER",
-            help="Draw the maps as well, as PNG and SVG. With --random: keep what is measured, and go on from it.",
+            help="Also draw the maps (.png, .svg); with --random: continue here",
         ),
     ] = None,
     form: Form,
 ) -> None:
-    """Test where integration methods fail; exit status 1 if any does not do what theory expects.
+    """Find where integration methods fail; exit status 1 if any result differs from theory.
 
-    With --random, every engine runs random scenes, wide over all parameters, laws and levels, against two accurate
-    engines that agree: exit status 1 if the first engine is wrong without a warning, or fails. With --scenes, the same
-    in twelve scenes, from coarse settings to fine ones, peers that are installed included unless --engines leaves
-    them out; twelve minutes. --law adds the hammer scene with that law to them, which --only calls "law".
+    With --random, every engine runs random scenes, with a wide range of parameters, laws and model levels, against two
+    accurate engines that agree; exit status 1 if the first engine fails, or is wrong without a warning. With --scenes,
+    the same for twelve scenes, from coarse to fine settings, including installed peers unless --engines excludes them
+    (12 min). --law adds the hammer scene with that law to the twelve; its name for --only is "law".
     """
     from replays.studies.stability.table import chosen_engines, chosen_trials, run_trials
 
@@ -72,7 +72,7 @@ def stability(
         if not scenes:
             raise InputError("--law", "given with --scenes", str(law))
         name = add_law_scene(law)
-        only = only and ",".join(name if one == "law" else one for one in names_of(only))
+        only = only and ",".join(name if one == "law" else one for one in split_names(only))
     names = chosen_engines(engines)
     if scenes:
         _twelve(only, None if engines is None else names, output, form)
@@ -136,7 +136,7 @@ def _sweep(count: int, seed: int, only: str | None, engines: list[str], folder: 
         for path in pictures:
             echo(f"picture  {path}")
     if interrupted:
-        echo("stopped; the same command with the same -o FOLDER goes on from here", err=True)
+        echo("stopped; run the same command with the same -o FOLDER to continue", err=True)
         raise typer.Exit(130)
     own = found["engines"][engines[0]]
     if any(own[kind] for kind in ("silent", "crashes", "hangs", "absurd")):
@@ -178,7 +178,7 @@ def _twelve(only: str | None, engines: list[str] | None, folder: Path | None, fo
 
 
 def scenes_table(found: list[Outcome]) -> Table:
-    """How often each method came to each outcome."""
+    """Return a table of how often each method had each outcome."""
     from replays.studies.stability.scenes.scene_atlas import OUTCOMES
 
     scenes = len({one.scene for one in found})
@@ -192,7 +192,7 @@ def scenes_table(found: list[Outcome]) -> Table:
 
 
 def sweep_table(found: dict[str, Any], seed: int) -> Table:
-    """What each engine did in random scenes."""
+    """Return a table of each engine's results in random scenes."""
     from replays.studies.stability.scenes.sweep import QUANTILES
 
     scenes = found["scenes"]
@@ -211,12 +211,12 @@ def sweep_table(found: dict[str, Any], seed: int) -> Table:
 
 
 def _sweep_lines(found: dict[str, Any]) -> Iterator[str]:
-    """What the table's columns are, and which scenes stand behind its numbers."""
+    """Yield the explanations of the table's columns, and the scenes behind its numbers."""
     yield (
-        "\nQuantiles of the scaled error in decided scenes; within: share of those that are not chaotic with an error "
-        "of at most 10 times what was asked for; silent: wrong by more than 0.1 without a warning; false: warned, and "
-        "within; speeds: simulated s over processor s. Untold: scenes that no two accurate engines take; "
-        "unbounded: those where the model makes energy without end, in which no fault counts."
+        "\nQuantiles of the scaled error in decided scenes; within: share of non-chaotic scenes with an error "
+        "of at most 10 times the tolerance; silent: wrong by more than 0.1 without a warning; false: warned, and "
+        "within; speeds: simulated s over processor s. Untold: scenes that fewer than two accurate engines accept; "
+        "unbounded: scenes in which the model gains energy without limit; faults there do not count."
     )
     for name, one in found["engines"].items():
         for kind in ("silent", "false_alarms", "crashes", "hangs", "absurd"):
@@ -229,7 +229,7 @@ def _sweep_lines(found: dict[str, Any]) -> Iterator[str]:
         odd = f", {scene['odd']} alone" if scene["odd"] else ""
         yield (
             f"undecided: scene {scene['number']}, accurate runs differ by {scene['distance']:.1e}{odd}; "
-            f"a nudge grows {scene['growth'] or math.nan:.1e} times"
+            f"a perturbation grows {scene['growth'] or math.nan:.1e} times"
         )
 
 
@@ -239,8 +239,8 @@ def _show(cells: list[Cell], names: list[str], console: Console) -> None:
         console.print()
         console.print(peers_table(others))
     console.print(
-        "\n*: fails, as was expected by theory or by measurement (--json says why); !: does not do what was expected; "
-        "in brackets: nothing is expected; all others hold, within their limits."
+        "\n*: fails as expected from theory or measurement (--json gives the reason); !: differs from the expectation; "
+        "in brackets: no expectation; all others hold, within their limits."
     )
     for cell in cells:
         if not cell.agrees:
@@ -251,7 +251,7 @@ def _show(cells: list[Cell], names: list[str], console: Console) -> None:
 
 
 def trials_table(cells: list[Cell], names: list[str]) -> Table:
-    """What each engine of these names did in each case."""
+    """Return a table of each engine's result in each case."""
     from rich.text import Text
 
     from replays.studies.stability.trials.trials import TRIALS
@@ -268,8 +268,8 @@ def trials_table(cells: list[Cell], names: list[str]) -> Table:
 
 
 def peers_table(cells: list[Cell]) -> Table:
-    """What other people's solvers did."""
-    title = "other people's solvers, where they are known to fail or to hold"
+    """Return a table of the results of other solvers."""
+    title = "other solvers, in cases where they are known to fail or to hold"
     headings = ("trial", "case", "solver", ">measured", "because")
     table = new_table(title, *headings, wrapped=("because", "case"), keys=2)
     for cell in cells:

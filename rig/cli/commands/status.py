@@ -1,4 +1,4 @@
-"""`rig status`: how a running rig is doing."""
+"""`rig status`: the state of a running rig."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import typer
 
 from rig.cli.connections.connection import Connection
 from rig.cli.output.display import accuracy_text, engine_text, number_text
-from rig.cli.output.tables import Form, Table, echo_json, facts, new_table, shown
+from rig.cli.output.tables import Form, Table, echo_json, fact_table, make_printable, new_table
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -18,12 +18,14 @@ if TYPE_CHECKING:
 
 def status(
     *,
-    watch: Annotated[bool, typer.Option("--watch", help="Again twice a second, until Ctrl-C or the end.")] = False,
-    listed: Annotated[bool, typer.Option("--list", help="Show the rigs that run under a name (--name).")] = False,
+    watch: Annotated[
+        bool, typer.Option("--watch", help="Repeat twice a second, until Ctrl-C or the end of the run")
+    ] = False,
+    listed: Annotated[bool, typer.Option("--list", help="List the running rigs that have a name (--name)")] = False,
     form: Form,
     connection: Connection,
 ) -> None:
-    """Show how a running rig is doing: time, pace, lateness, losses, clients and doubts."""
+    """Show the time, pace, lateness and losses of a running rig, its clients and its warnings."""
     if listed:
         _list(form)
         return
@@ -70,7 +72,7 @@ def _watch(rig: Console, form: Form) -> None:
 
 
 def _documents(rig: Console) -> Iterator[dict[str, Any]]:
-    """The status twice a second until the rig has ended."""
+    """Yield the status twice a second until the rig has ended."""
     import time
 
     from rig.serve.transport import NoReplyError
@@ -84,7 +86,7 @@ def _documents(rig: Console) -> Iterator[dict[str, Any]]:
         try:
             document = _ask(rig)
         except NoReplyError:
-            # It ended, and was gone before it could be asked again.
+            # The run ended before the next request.
             return
 
 
@@ -93,8 +95,8 @@ def _ask(rig: Console) -> dict[str, Any]:
 
 
 def status_table(document: dict[str, Any]) -> Table:
-    """A status document as a table of two columns."""
-    document = shown(document)
+    """Return a status document as a table of two columns."""
+    document = make_printable(document)
     late, queue, energy = document["lateness_ms"], document["queue"], document["energy"]
     rows: list[tuple[str, str]] = []
     end = "" if document["end_s"] is None else f" of {document['end_s']:g} s"
@@ -127,11 +129,11 @@ def status_table(document: dict[str, Any]) -> Table:
         rows.append(("engine", engine_text(engine)))
         if accuracy := document.get("accuracy"):
             rows.append(("error estimate", accuracy_text(accuracy)))
-        # Reference-free: what the method makes or loses of the energy that it should account for.
+        # An error measure without a reference: energy that the method gains or loses.
         alarm = energy.get("alarm_share", 1e-3)
-        rows.append(("energy left open", f"{share:.1e} of what was dissipated (alarm at {alarm:g})"))
+        rows.append(("energy residual share", f"{share:.1e} of the dissipated energy (warning at {alarm:g})"))
     rows.append(("samples published", str(document["samples_published"])))
-    rows.append(("commands taken", str(document["commands"])))
+    rows.append(("commands accepted", str(document["commands"])))
     counts = document["congestion"]
     links = [f"{name} {value:g}" for name, value in counts.items() if not name.startswith("can_")]
     rows.append(("links", ", ".join(links) or "-"))
@@ -146,12 +148,12 @@ def status_table(document: dict[str, Any]) -> Table:
         ]
         rows.append(("CAN", ", ".join(shares)))
     for device in document.get("devices", ()):
-        reason = f": {device['reason']}" if device["reason"] else f", done with tick {device['tick']}"
+        reason = f": {device['reason']}" if device["reason"] else f", finished tick {device['tick']}"
         reason += f", behind for {behind:.1f} s" if (behind := device["behind_s"]) else ""
         rows.append((f"device {device['name']}", f"{device['state']}{reason}"))
     for name, client in document["clients"].items():
-        text = f"lag {client['lag_s']:.3f} s, heard {client['last_heard_s']:.1f} s ago, lost {client['lost']}"
+        text = f"lag {client['lag_s']:.3f} s, last message {client['last_heard_s']:.1f} s ago, lost {client['lost']}"
         rows.append((f"client {name}", text))
     for text in document["warnings"]:
         rows.append(("warning", text))
-    return facts(f"rig: {document['scene']}, {document['state']}", rows, warning="yellow")
+    return fact_table(f"rig: {document['scene']}, {document['state']}", rows, warning="yellow")

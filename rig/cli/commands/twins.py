@@ -1,4 +1,4 @@
-"""`rig twins`: the rig's instruments, as drivers find them."""
+"""`rig twins`: simulated instruments of a running rig, for their drivers."""
 
 from __future__ import annotations
 
@@ -9,27 +9,27 @@ import typer
 from drivers.link import DEFAULT_ENDPOINT as INSTRUMENTS
 from rig.cli.connections.connection import Connection
 from rig.cli.output.tables import echo
-from rig.cli.signals import stopping_on_signals
+from rig.cli.signals import stop_on_signals
 
 
 def twins(
     *,
-    zenoh: Annotated[bool, typer.Option("--zenoh", help="Serve them over zenoh, at --listen; so by default.")] = False,
-    pty: Annotated[bool, typer.Option("--pty", help="Serve each at a pseudo-terminal of its own.")] = False,
+    zenoh: Annotated[bool, typer.Option("--zenoh", help="Serve over zenoh at --listen (default)")] = False,
+    pty: Annotated[bool, typer.Option("--pty", help="Serve each instrument at a pseudo-terminal")] = False,
     can: Annotated[
-        str | None, typer.Option(metavar="SPEC", help="Serve them on a CAN bus, INTERFACE:CHANNEL, such as zenoh:can0.")
+        str | None, typer.Option(metavar="SPEC", help="Serve on a CAN bus, INTERFACE:CHANNEL, such as zenoh:can0")
     ] = None,
-    listen: Annotated[str, typer.Option(metavar="HOST:PORT", help="Where they listen with --zenoh.")] = INSTRUMENTS,
+    listen: Annotated[str, typer.Option(metavar="HOST:PORT", help="Address to listen on with --zenoh")] = INSTRUMENTS,
     connection: Connection,
 ) -> None:
-    """Serve the instruments of a running rig to their drivers; Ctrl-C switches them off."""
+    """Serve the simulated instruments of a running rig to their drivers; Ctrl-C switches them off."""
     import threading
 
     from drivers.instruments.twins import Twins
     from rig.cli.connections.can_output import parse_spec
     from rig.serve.transport.endpoint import parse_loopback
 
-    # Whatever is wrong with the options is said before a rig is looked for.
+    # Check the options before connecting to a rig.
     parse_loopback(listen, field="--listen")
     if can is not None:
         parse_spec(can)
@@ -44,5 +44,5 @@ def twins(
         for twin in serving.twins:
             echo(f"{twin.CODEC.address.name:14s}{twin.url}")
         echo("rig: open one with its driver, such as drivers.instruments.hammer.driver.Hammer; Ctrl-C ends", err=True)
-        with stopping_on_signals(done.set):
+        with stop_on_signals(done.set):
             done.wait()

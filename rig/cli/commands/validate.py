@@ -1,4 +1,4 @@
-"""`rig validate`: a recording against the model."""
+"""`rig validate`: a recording compared with the model."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import typer
 
 from rig.cli.options import Changes, Engine, Force, RecordingFiles, ReportFile, SceneChanges
 from rig.cli.output.progress import reporting
-from rig.cli.output.provenance import of_recording
-from rig.cli.output.tables import Form, Table, echo, echo_json, new_table, shown
+from rig.cli.output.provenance import recording_origin
+from rig.cli.output.tables import Form, Table, echo, echo_json, make_printable, new_table
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -19,9 +19,9 @@ if TYPE_CHECKING:
     from replays.recordings.validation import Validation
     from replays.recordings.validation.explanations.attribution import Explained, Explanation
 
-_SAID = {True: "pass", False: "FAIL", None: ""}
-_TELLING = 0.01
-"""What explains less than this part of the difference is not worth a line."""
+_VERDICTS = {True: "pass", False: "FAIL", None: ""}
+_MIN_EXPLAINED = 0.01
+"""Least fraction of a difference that a listed candidate explains."""
 
 
 def validate(
@@ -29,25 +29,21 @@ def validate(
     *,
     criteria: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE", help="Criteria of your own; start from replays/recordings/validation/default.toml"
-        ),
+        typer.Option(metavar="FILE", help="Your own criteria; see replays/recordings/validation/default.toml"),
     ] = None,
     changes: Changes = None,
     engine: Engine = None,
     declared: Annotated[
-        bool, typer.Option("--declared", help="Judge by the declared comparison even where every bit is equal.")
+        bool, typer.Option("--declared", help="Apply the declared criteria even if every bit is equal")
     ] = False,
-    blind: Annotated[
-        bool, typer.Option("--blind", help="As if nothing were known of faults that the rig was told to have.")
-    ] = False,
+    blind: Annotated[bool, typer.Option("--blind", help="Ignore the faults that the recording declares")] = False,
     report: ReportFile = None,
     force: Force = False,
     form: Form,
 ) -> None:
-    """Do a recording again and hold it against the model: bit by bit, then by declared criteria.
+    """Simulate a recording again and compare it with the model: bit by bit, then by declared criteria.
 
-    Where a criterion fails, it says what explains the difference: a sensor, the time, or which number of the model.
+    For a failed criterion, the candidate that explains the difference is named: a sensor, the time or a parameter.
     Exit status: 0 pass, 1 fail, 2 wrong input, 3 inconclusive.
     """
     from recorder.reader import join
@@ -68,7 +64,7 @@ def validate(
             from replays.recordings.validation.report import make_report
 
             reporter.step("report")
-            write_report(make_report(found, origin=of_recording(found.title, recording)), report)
+            write_report(make_report(found, origin=recording_origin(found.title, recording)), report)
     if form.as_json:
         echo_json(found.document())
     else:
@@ -81,7 +77,9 @@ def validate(
 
 def _show(found: Validation, console: Console) -> None:
     changed = ", ".join(f"{key} = {value}" for key, value in found.changes.items())
-    console.print(shown(f"{found.title}, scene {found.scene}") + (f", validated with {changed}" if changed else ""))
+    console.print(
+        make_printable(f"{found.title}, scene {found.scene}") + (f", validated with {changed}" if changed else "")
+    )
     console.print(found.verdict_line)
     for line in found.doubts[1:]:
         console.print(f"also: {line}")
@@ -89,7 +87,7 @@ def _show(found: Validation, console: Console) -> None:
         console.print(f"first difference at {found.explained.from_s:.4f} s; {found.explained.conclusion}")
     for fault in found.faults:
         if found.explained is None or fault.line not in found.explained.conclusion:
-            console.print(shown(f"signal: {fault.line}"))
+            console.print(make_printable(f"signal: {fault.line}"))
     console.print(found.bits_line)
     for one in found.fitted:
         console.print(one.line)
@@ -100,7 +98,7 @@ def _show(found: Validation, console: Console) -> None:
     if found.explained is not None and any(_counts(one) for one in found.explained.ranked):
         console.print()
         console.print(_explanations(found.explained))
-        console.print("left: RMS of the residual that remains, over the noise; 1 is noise alone")
+        console.print("left: RMS of the remaining residual over the noise; 1 is noise alone")
     begin, end = found.window_s
     console.print(f"\ntrajectory from {begin:.4f} to {end:.4f} s: {found.window_reason}\n")
     console.print(_trajectory(found))
@@ -124,16 +122,16 @@ def _trajectory(found: Validation) -> Table:
             f"{one.peak:.2f}",
             f"{one.drift:.2f}",
             "" if one.first_s is None else f"{one.first_s:.4f} s",
-            _SAID[one.good],
+            _VERDICTS[one.good],
         )
     return table
 
 
 def _truth(found: Validation) -> Table:
-    headings = ("table", "column that is off most", ">off by", ">limit", "verdict")
+    headings = ("table", "column with largest error", ">error", ">limit", "verdict")
     table = new_table("Truth: largest difference as a part of the column's largest value", *headings)
     for one in found.truth:
-        table.add_row(one.table, one.column, f"{one.relative:.1e}", f"{one.limit:.1e}", _SAID[one.good])
+        table.add_row(one.table, one.column, f"{one.relative:.1e}", f"{one.limit:.1e}", _VERDICTS[one.good])
     return table
 
 
@@ -141,17 +139,17 @@ def _statistics(found: Validation) -> Table:
     table = new_table("Phases", "phase", "quantity", ">recorded", ">predicted", ">limit", "verdict")
     for one in found.statistics:
         limit = "" if one.limit is None else f"± {one.limit:.2g}"
-        table.add_row(one.phase, one.title, f"{one.recorded:.6g}", f"{one.foretold:.6g}", limit, _SAID[one.good])
+        table.add_row(one.phase, one.title, f"{one.recorded:.6g}", f"{one.foretold:.6g}", limit, _VERDICTS[one.good])
     return table
 
 
 def _counts(one: Explanation) -> bool:
-    return one.explained >= _TELLING
+    return one.explained >= _MIN_EXPLAINED
 
 
 def _explanations(explained: Explained) -> Table:
     headings = ("kind", "what", "change", ">explains", ">left", ">seen to", "verdict")
-    title = "What explains the difference, each candidate alone"
+    title = "Candidate explanations of the difference, each alone"
     table = new_table(title, *headings, wrapped=["change"], spare=("kind", "seen to"))
     for one in [one for one in explained.ranked if _counts(one)][:12]:
         told = "named" if one.name in explained.best else ""

@@ -1,4 +1,4 @@
-"""`rig view`: a recording or the running rig in rerun."""
+"""`rig view`: a recording or the running rig in the rerun viewer."""
 
 from __future__ import annotations
 
@@ -22,26 +22,26 @@ if TYPE_CHECKING:
 
     from recorder.viewer.window import Kind, Window
 
-_EVERY_S = 5.0
-"""How often it is told how it goes, where that is no live line [s]."""
+_PROGRESS_PERIOD_S = 5.0
+"""Time between lines of progress without a live line [s]."""
 
 
 def view(
     files: OptionalRecordingFiles = None,
     *,
-    live: Annotated[bool, typer.Option("--live", help="View the running rig.")] = False,
+    live: Annotated[bool, typer.Option("--live", help="View the running rig")] = False,
     connection: Connection,
-    web: Annotated[bool, typer.Option("--web", help="Serve the viewer to a browser on this machine.")] = False,
-    save: Annotated[Path | None, typer.Option(help="Write an .rrd file instead of opening a viewer.")] = None,
-    screenshot: Annotated[Path | None, typer.Option(help="Write a .png picture instead of opening a viewer.")] = None,
+    web: Annotated[bool, typer.Option("--web", help="Serve the viewer to a browser on this computer")] = False,
+    save: Annotated[Path | None, typer.Option(help="Write an .rrd file instead of opening a viewer")] = None,
+    screenshot: Annotated[Path | None, typer.Option(help="Write a .png picture instead of opening a viewer")] = None,
     at_s: Annotated[
-        float | None, typer.Option(help="Simulated time of the picture, in s; default: the last contact, else the end.")
+        float | None, typer.Option(help="Time of the picture in s; default: last contact, or the end")
     ] = None,
     force: Force = False,
 ) -> None:
     """View a recording, or the running rig, in rerun.
 
-    Opens a window where there is a screen; otherwise serves the viewer on 127.0.0.1 and prints the address.
+    With a display it opens a window; otherwise it serves the viewer on 127.0.0.1 and prints the address.
     """
     _check(files, live=live, web=web, save=save, screenshot=screenshot, at_s=at_s, force=force)
     _hush()
@@ -67,7 +67,7 @@ def _check(
     at_s: float | None,
     force: bool,
 ) -> None:
-    """Refuse what does not go together before anything starts."""
+    """Raise an error for options that exclude each other, before anything starts."""
     if bool(files) == live:
         raise InputError("view", "given either a FILE or --live", Words("both" if live else "neither"))
     if sum((web, save is not None, screenshot is not None)) > 1:
@@ -144,7 +144,7 @@ def _view_live(connection: Connection, *, web: bool, save: Path | None) -> None:
                     def tell(text: str) -> None:
                         if shown.page is not None:
                             shown.page.title = f"rig: {text}"
-                        reporter.show(text, every_s=_EVERY_S)
+                        reporter.show(text, every_s=_PROGRESS_PERIOD_S)
 
                     reason = view.run(stop=lambda: not shown.open, tell=tell)
                 echo(reason)
@@ -174,16 +174,16 @@ def _kind(*, web: bool) -> Kind:
 
 
 def _tell(shown: Window, what: str) -> None:
-    # The address comes first, so that no terminal breaks it.
+    # The address comes first, so that no terminal wraps it.
     echo(f"{shown.address} shows {what}" if shown.address else f"viewing {what}")
     if shown.page is not None:
         shown.page.title = f"rig: {what}"
     echo("Ctrl-C ends the viewer")
-    sys.stdout.flush()  # the address is wanted now, also in a pipe
+    sys.stdout.flush()  # shows the address at once, also in a pipe
 
 
 def _wait_for_the_end(shown: Window) -> None:
-    """Until the user closes the viewer, or ends the command."""
+    """Wait until the user closes the viewer or ends the command."""
     sys.stdout.flush()
     while not shown.wait(0.5):
         pass
@@ -192,21 +192,21 @@ def _wait_for_the_end(shown: Window) -> None:
 
 
 def _hush() -> None:
-    """Keep rerun's own log off the terminal: a window that the user closes is no error here."""
+    """Keep rerun's own log off the terminal: a closed window is not an error here."""
     import os
 
     os.environ.setdefault("RUST_LOG", "off")
 
 
 def _connect(stream: rr.RecordingStream, shown: Window, plan: rrb.Blueprint) -> None:
-    """Draw to a viewer, in our layout: as a default only, it would give way to the one that was shown last."""
+    """Connect a stream to a viewer with our layout; a mere default would yield to the last layout shown."""
     stream.connect_grpc(shown.url)
     stream.send_blueprint(plan)
 
 
 def _close(stream: rr.RecordingStream, *, timeout_s: float = 5.0) -> None:
-    """Send what is buffered, as long as there is somebody to take it."""
-    with suppress(RuntimeError, ValueError):  # the viewer is gone: nobody misses the rest
+    """Send the buffered data while the viewer is there."""
+    with suppress(RuntimeError, ValueError):  # the viewer has closed
         stream.flush(timeout_sec=timeout_s)
     stream.disconnect()
 
@@ -215,30 +215,30 @@ def _close(stream: rr.RecordingStream, *, timeout_s: float = 5.0) -> None:
 def _saved(
     stream: rr.RecordingStream, path: Path, plan: rrb.Blueprint, *, until_interrupted: bool = False
 ) -> Iterator[None]:
-    """Write what is drawn inside to a file that has its name only once it is whole.
+    """Write the drawing to a file that gets its name once it is complete.
 
     Args:
-        stream: What is drawn to.
-        path: The file.
-        plan: The blueprint.
-        until_interrupted: Ctrl-C is how it ends, not a reason to throw it away.
+       stream: Stream to draw to.
+       path: The file.
+       plan: The blueprint.
+       until_interrupted: Keep the file after Ctrl-C.
     """
     with whole_file(path) as part:
         stream.save(part, default_blueprint=plan)
         with suppress(*([KeyboardInterrupt] if until_interrupted else [])):
             yield
-        stream.flush(timeout_sec=60.0)  # raises where the disk has refused, and then nothing is left to disconnect
+        stream.flush(timeout_sec=60.0)  # raises if the disk refused; then there is nothing to disconnect
         stream.disconnect()
-        # The library itself only logs what the disk refuses: a file that is whole ends with its table of contents.
+        # rerun only logs a refusal of the disk; a complete file ends with its table of contents.
         with part.open("rb") as file:
             file.seek(max(0, part.stat().st_size - 64))
             if b"RRF2FOOT" not in file.read():
-                raise DiskError(f"{path} could not be written to its end; nothing of it is kept")
+                raise DiskError(f"{path} could not be written completely; it was removed")
 
 
 @contextmanager
 def _interruptible() -> Iterator[None]:
-    """Ctrl-C and a request to terminate are both how a viewer ends: child processes go, and it is no failure."""
+    """End the viewer normally on Ctrl-C and requests to terminate, with its child processes."""
     import signal
 
     def interrupt(*_: object) -> None:

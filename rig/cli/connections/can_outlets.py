@@ -1,4 +1,4 @@
-"""Ways to a CAN bus for programs that do not speak zenoh: a socketcand server, and ports with an SLCAN adapter."""
+"""CAN access for programs without zenoh: a socketcand server, and pseudo-terminals that act as SLCAN adapters."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ if TYPE_CHECKING:
 
 
 class CanOutlets:
-    """The outlets of some buses.
+    """The outlets of the CAN buses.
 
     Args:
-        buses: By name, what makes a node on the bus.
-        speed: Bit rates of the buses.
-        socketcand: HOST:PORT of a server for all of them, or none.
-        slcan: Whether each has a port with an adapter.
+       buses: Functions that create a node, by bus.
+       speed: Bit rates of the buses.
+       socketcand: HOST:PORT of a server for all buses; None: no server.
+       slcan: Open a pseudo-terminal with an SLCAN adapter for each bus.
 
     Raises:
-        InputError: There can be no such server.
+       InputError: The server's address is invalid or in use.
     """
 
     def __init__(
@@ -58,24 +58,24 @@ class CanOutlets:
         self._stack.close()
 
     def lines(self) -> list[str]:
-        """Where each is, in a line."""
+        """Return the address of each outlet in a line."""
         found = [f"CAN {name} as an SLCAN adapter on {port.path}" for name, port in self._ports.items()]
         if self._server is not None:
             found.append(f"CAN by socketcand on {self._server.host}:{self._server.port}, classic frames only")
         return found
 
     def warnings(self) -> list[str]:
-        """What a person should know of, while it is so."""
+        """Return the current warnings."""
         doors = [*self._ports.values(), *([] if self._server is None else [self._server])]
         return [text for door in doors for text in door.warnings()]
 
     def dropped(self) -> int:
-        """Frames that clients did not read in time."""
+        """Return the number of frames dropped because clients read too slowly."""
         ports = sum(port.counts["dropped"] for port in self._ports.values())
         return ports + (0 if self._server is None else self._server.counts()["dropped"])
 
     def summary(self) -> list[str]:
-        """What became of each, in a line."""
+        """Return the counters of each outlet in a line."""
         found = {f"slcan {port.path}": port.figures() for port in self._ports.values()}
         if self._server is not None:
             found["socketcand"] = self._server.counts()

@@ -1,4 +1,4 @@
-"""`rig run --can` and `rig replay --can`: the rig as a node of a CAN bus, beside its own transport."""
+"""`rig run --can` and `rig replay --can`: the rig as a node of a CAN bus, in addition to its own transport."""
 
 from __future__ import annotations
 
@@ -29,21 +29,24 @@ _can = panel("CAN")
 
 @dataclass(frozen=True)
 class CanMessages:
-    """Which frames carry the samples, how often, at which bit rates."""
+    """Frames that carry the samples, their rate, and the bit rates."""
 
-    can_rate: Annotated[int | None, _can("Rate of samples: usually 1000 classic, 10000 FD.", metavar="HZ")] = None
-    can_classic: Annotated[bool, _can("Samples in classic frames; so by default.", "--can-classic")] = False
-    can_fd: Annotated[bool, _can("Samples in CAN FD frames, counts as recorded.", "--can-fd")] = False
+    can_rate: Annotated[int | None, _can("Sample rate in Hz; default: 1000 classic, 10000 FD", metavar="HZ")] = None
+    can_classic: Annotated[bool, _can("Send samples in classic frames (default)", "--can-classic")] = False
+    can_fd: Annotated[bool, _can("Send samples as counts in CAN FD frames", "--can-fd")] = False
     can_bitrate: Annotated[
         str | None,
-        _can("Bit rate, and that of the data phase of CAN FD; 1M and 1M/8M by default.", metavar="RATE[/RATE]"),
+        _can("Bit rate, and CAN FD data bit rate; default: 1M, 1M/8M", metavar="RATE[/RATE]"),
     ] = None
 
     def plan(self, channels: ChannelTable | None = None) -> tuple[Schedule, Speed]:
-        """What is sent of these channels, by default the rig's own, at which bit rates.
+        """Return the schedule of the messages and the bit rates.
+
+        Args:
+           channels: Channels to send; by default the rig's own.
 
         Raises:
-            InputError: There is no such rate, or no message for a channel.
+           InputError: A rate is invalid, or a channel has no message.
         """
         from drivers.can.schedule import schedule_from
         from drivers.can.signals import messages_for
@@ -56,13 +59,13 @@ class CanMessages:
 
 @dataclass(frozen=True)
 class CanOptions:
-    """A CAN bus that the rig is a node of, if any, and what it does there."""
+    """The CAN bus that the rig joins, if any, and its settings."""
 
     can: Annotated[
         str | None,
         _can(
-            "Also be a node of a CAN bus: zenoh:can0 (with its hub), virtual:rig, socketcan:vcan0, "
-            "slcan:/dev/pts/3; python-can's further settings as ?NAME=VALUE&...",
+            "Join a CAN bus: zenoh:can0 (starts a hub), virtual:rig, socketcan:vcan0, slcan:/dev/pts/3; "
+            "more python-can settings as ?NAME=VALUE&...",
             metavar="INTERFACE:CHANNEL",
         ),
     ] = None
@@ -70,21 +73,21 @@ class CanOptions:
     can_overload: Annotated[
         bool,
         _can(
-            "Run even where the bus cannot carry all: frames that find no room are dropped and counted.",
+            "Run even if the bus is overloaded; frames are dropped, counted",
             "--can-overload",
         ),
     ] = False
     can_socketcand: Annotated[
         str | None,
-        _can("Serve the bus to socketcand clients (classic frames), usually at 127.0.0.1:29536.", metavar="HOST:PORT"),
+        _can("Serve socketcand here (classic frames), e.g. 127.0.0.1:29536", metavar="HOST:PORT"),
     ] = None
-    can_slcan: Annotated[bool, _can("Play an SLCAN adapter of the bus on a port of its own.", "--can-slcan")] = False
+    can_slcan: Annotated[bool, _can("Open a pseudo-terminal that acts as an SLCAN adapter", "--can-slcan")] = False
 
     def output(self, channels: ChannelTable | None) -> CanOutput | None:
-        """The bus that is asked for, if any, for these channels; as for `CanOutput`.
+        """Return the CAN output for these channels, or None without --can; see `CanOutput`.
 
         Raises:
-            InputError: There is none such, or it is only said how it should be.
+           InputError: The bus is invalid, or options of the bus are given without --can.
         """
         if self.can is not None:
             return CanOutput(self.can, self, channels)
@@ -94,19 +97,19 @@ class CanOptions:
 
 
 _SHARED = ("zenoh", "virtual", "socketcan")
-"""Interfaces on which one process can have many nodes."""
+"""Interfaces that allow several nodes in one process."""
 
 
 class CanOutput:
-    """A CAN bus as one more transport of the rig.
+    """A CAN bus as an additional transport of the rig.
 
     Args:
-        spec: INTERFACE:CHANNEL, with ?NAME=VALUE&... for more of python-can's settings.
-        options: What the rig does there.
-        channels: What it measures; by default the rig's own.
+       spec: INTERFACE:CHANNEL, with ?NAME=VALUE&... for more of python-can's settings.
+       options: Settings of the rig's node.
+       channels: Channels of the rig; by default the rig's own.
 
     Raises:
-        InputError: What was asked for does not make a bus, or not one that can carry the messages.
+       InputError: The bus is invalid, or cannot carry the messages.
     """
 
     def __init__(self, spec: str, options: CanOptions | None = None, channels: ChannelTable | None = None) -> None:
@@ -116,7 +119,7 @@ class CanOutput:
         from rig.serve.transport.memory import MemoryServer
 
         self.interface, self.channel, self._settings = parse_spec(spec)
-        # Before anything is opened.
+        # Check all addresses before anything is opened.
         if socketcand is not None:
             parse_loopback(socketcand, field="--can-socketcand")
         if self.interface == "zenoh" and "endpoint" in self._settings:
@@ -161,18 +164,18 @@ class CanOutput:
     def __exit__(self, *_: object) -> None:
         self._stack.close()
 
-    def beside(self, server: Server) -> Server:
-        """The rig's server together with the bus."""
+    def join_server(self, server: Server) -> Server:
+        """Return a server that serves both the rig's transport and the bus."""
         from rig.serve.transport.fanout import Fanout
 
         doors: dict[str, Server] = {"zenoh": server, "can": self._memory}
         return Fanout([*doors.values()], doors=doors, figures=self._figures, warnings=self._warnings)
 
     def start(self, *, paced: bool) -> None:
-        """Begin, once the rig can be asked.
+        """Start the gateway; call it once the rig answers requests.
 
         Args:
-            paced: The rig runs by the wall clock.
+           paced: The rig runs by the wall clock.
         """
         from drivers.can.gateway import Gateway
         from rig.serve.transport.memory import MemoryClient
@@ -183,7 +186,7 @@ class CanOutput:
         self._gateway = self._stack.enter_context(gateway)
 
     def summary(self) -> str:
-        """What became of the bus, in a line."""
+        """Return the counters of the bus in a line."""
         counts = self._figures()
         reasons = ", ".join(
             f"{name.removeprefix('can_refused_').replace('_', ' ')} {count:g}"
@@ -191,7 +194,7 @@ class CanOutput:
             if name.startswith("can_refused_")
         )
         return (
-            f"CAN: {counts['can_frames']:g} frames sent, {counts['can_dropped']:g} dropped, commands taken "
+            f"CAN: {counts['can_frames']:g} frames sent, {counts['can_dropped']:g} dropped, commands accepted "
             f"{counts['can_accepted']:g}, refused {counts['can_refused']:g}" + (f" ({reasons})" if reasons else "")
         ) + "".join(f"\n{line}" for line in (self._outlets.summary() if self._outlets is not None else []))
 
@@ -246,7 +249,7 @@ class CanOutput:
 
     @contextmanager
     def _with_hub(self) -> Iterator[can.BusABC]:
-        """The hub of a virtual bus in this process, and a node on it."""
+        """Open the hub of a virtual bus in this process, and a node on it."""
         from drivers.can.bus import codec
         from drivers.can.bus.hub import Hub
         from drivers.can.bus.model import BusModel
@@ -267,10 +270,10 @@ class CanOutput:
 
 
 def bit_rates(text: str, *, field: str) -> Speed:
-    """Bit rates of a bus, such as 1M/8M, that an option gives.
+    """Return the bit rates of a bus from an option such as 1M/8M.
 
     Raises:
-        InputError: There are no such rates.
+       InputError: A rate is invalid.
     """
     from drivers.can.bus.timing import speed
 
@@ -281,10 +284,10 @@ def bit_rates(text: str, *, field: str) -> Speed:
 
 
 def parse_spec(spec: str) -> tuple[str, str, dict[str, Any]]:
-    """Interface, channel and further settings of INTERFACE:CHANNEL?NAME=VALUE&...
+    """Return interface, channel and further settings of INTERFACE:CHANNEL?NAME=VALUE&...
 
     Raises:
-        InputError: It is not of that form.
+       InputError: The text has another form.
     """
     from drivers.link.can import parse_spec as parse
 

@@ -1,4 +1,4 @@
-"""The ends of a connection to a rig: --connect and --tls of those who use one, --expose of those who serve."""
+"""Options for connections to a rig: --connect and --tls of clients, --listen and --expose of servers."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ import typer
 
 from rig.base.errors import InputError, RefusedError, Words
 from rig.cli.groups import panel
-from rig.cli.output.display import end_with, showing
-from rig.cli.output.tables import echo, plain, table_console
-from rig.cli.signals import stopping_on_signals
+from rig.cli.output.display import display_status, exit_if_failed
+from rig.cli.output.tables import echo, plain_text, table_console
+from rig.cli.signals import stop_on_signals
 from rig.serve.transport import DEFAULT_ENDPOINT, EXPOSED_PORT, NoReplyError
 
 if TYPE_CHECKING:
@@ -28,31 +28,29 @@ if TYPE_CHECKING:
 _exposure = panel("For other computers")
 _TLS = "RIG_TLS"
 _LINK_S = 1.0
-"""Time that the connection to a rig that is there may take [s]."""
+"""Time limit for the connection to a rig that is running [s]."""
 
 
 @dataclass(frozen=True)
 class Connection:
-    """Which rig a command is for."""
+    """The rig that a command connects to."""
 
-    connect: Annotated[str, typer.Option(metavar="HOST:PORT|NAME", help="Where the rig listens, or its name.")] = (
+    connect: Annotated[str, typer.Option(metavar="HOST:PORT|NAME", help="Address or name of the rig")] = (
         DEFAULT_ENDPOINT
     )
     tls: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", envvar=_TLS, help="Folder with the keys of a role, for a rig that is exposed."),
+        typer.Option(metavar="DIR", envvar=_TLS, help="Folder with the keys of a role, for an exposed rig"),
     ] = None
-    wait_s: Annotated[
-        float, typer.Option(metavar="S", min=0.0, help="Wait that long for the rig to be there, in s.")
-    ] = 0.0
+    wait_s: Annotated[float, typer.Option(metavar="S", min=0.0, help="Time to wait for the rig to start in s")] = 0.0
 
     @contextmanager
     def client(self) -> Iterator[ZenohClient]:
-        """A client of the rig, closed afterwards.
+        """Yield a client of the rig, and close it afterwards.
 
         Raises:
-            InputError: There are no such keys.
-            RefusedError: No rig answers there, or it denies this.
+           InputError: The keys do not exist.
+           RefusedError: No rig answers, or access is denied.
         """
         from rig.base.wire import ALIVE
         from rig.serve.transport.zenoh import ZenohClient
@@ -65,7 +63,7 @@ class Connection:
                 with self._waiting() if self.wait_s else nullcontext():
                     wait_s = max(_LINK_S, self.wait_s)
                     client = stack.enter_context(ZenohClient(self.connect, wait_s=wait_s, tls=self.tls))
-                    # One that is being prepared listens already.
+                    # A rig that is still starting already listens.
                     any(client.tokens(ALIVE) for _ in deadline.polls(0.1))
                 yield client
         except NoReplyError as error:
@@ -77,17 +75,17 @@ class Connection:
             raise InputError(_TLS, error.must, error.received) from None
 
     def _waiting(self) -> Any:
-        return table_console(stderr=True).status(plain(f"waiting for a rig at {self.connect}"))
+        return table_console(stderr=True).status(plain_text(f"waiting for a rig at {self.connect}"))
 
     @contextmanager
     def console(self, command: str) -> Iterator[Console]:
-        """A console connected to the rig, closed afterwards.
+        """Yield a console connected to the rig, and close it afterwards.
 
         Args:
-            command: Name of the command, which signs its requests.
+           command: Name of the command, which identifies its requests.
 
         Raises:
-            RefusedError: No rig answers there, or it denies this.
+           RefusedError: No rig answers, or access is denied.
         """
         from drivers.console import Console
 
@@ -97,34 +95,34 @@ class Connection:
 
 @dataclass(frozen=True)
 class Serving:
-    """Where a rig is served."""
+    """The addresses of a rig that is served."""
 
     listen: Annotated[
         str,
-        typer.Option("--listen", metavar="HOST:PORT", help="Where to listen, on 127.0.0.1; port 0 takes a free one."),
+        typer.Option("--listen", metavar="HOST:PORT", help="Address to listen on, on 127.0.0.1; port 0: any free port"),
     ] = DEFAULT_ENDPOINT
-    name: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Name by which commands and clients of this user find the rig.")
-    ] = None
+    name: Annotated[str | None, typer.Option(metavar="NAME", help="Name of the rig for --connect, for this user")] = (
+        None
+    )
     expose: Annotated[
         str | None,
         _exposure(
-            "Listen at this address of this computer as well, with --tls; port 7463 unless given.",
+            "Also listen at this address, with --tls; default port 7463",
             metavar="HOST[:PORT]",
         ),
     ] = None
-    tls: Annotated[Path | None, _exposure("Made by `rig keys init`: who may connect, and do what.", metavar="DIR")] = (
+    tls: Annotated[Path | None, _exposure("Folder made by `rig keys init`: roles that may connect", metavar="DIR")] = (
         None
     )
     plaintext: Annotated[
-        bool, _exposure("Instead of --tls: let everybody in, and do everything, unencrypted.", "--plaintext")
+        bool, _exposure("Instead of --tls: no encryption, full access for everybody", "--plaintext")
     ] = False
 
     def check(self) -> None:
-        """Find out early whether it can be served there, and under that name.
+        """Check early that the addresses are free and the name is valid.
 
         Raises:
-            InputError: It cannot.
+           InputError: An address is in use, or the name is invalid.
         """
         from rig.serve.transport.endpoint import check_free, parse_endpoint, parse_loopback
         from rig.serve.transport.names import check_name
@@ -136,19 +134,19 @@ class Serving:
             check_name(self.name)
 
     def exposure(self) -> Exposure | None:
-        """Where a rig is to listen beyond the loopback, if anywhere.
+        """Return the address and keys for other computers, or None without --expose.
 
         Raises:
-            InputError: It is not said who may connect there, or that without a place.
+           InputError: Neither or both of --tls and --plaintext are given, or one without --expose.
         """
         if self.expose is None:
             if self.tls is not None or self.plaintext:
                 option = "--tls" if self.tls is not None else "--plaintext"
-                raise InputError(option, "given with --expose HOST", Words("it alone"))
+                raise InputError(option, "given with --expose HOST", Words("no --expose"))
             return None
         if (self.tls is not None) == self.plaintext:
             made = f"rig keys init DIR --host {self.expose.partition(':')[0]}"
-            must = f"given with --tls DIR (made by: {made}), or --plaintext"
+            must = f"given with --tls DIR (create it: {made}), or --plaintext"
             raise InputError("--expose", must, Words("both" if self.plaintext else "neither"))
         from rig.serve.transport.exposure.certificates import holder_in
         from rig.serve.transport.zenoh import Exposure
@@ -158,7 +156,7 @@ class Serving:
 
 
 def show(accepted: Accepted, what: str) -> None:
-    """One line for a command that the rig took."""
+    """Print a line for a command that the rig accepted."""
     echo(f"{what} accepted: number {accepted.id}, at {accepted.time_s:.6f} s (tick {accepted.tick})")
 
 
@@ -172,16 +170,16 @@ def serve(
     paced: bool,
     wait: bool,
 ) -> None:
-    """Serve a run to its end, with exit status 1 where something failed that did not end it.
+    """Serve a run to its end; exit status 1 if something failed without ending the run.
 
     Args:
-        make: Makes the run, given the transports that it is served on.
-        words: What a line of progress says of a status.
-        tell: Prints the summary.
-        serving: Where it is served.
-        bus: A CAN bus that it is served on as well.
-        paced: The run goes by the wall clock.
-        wait: Whether it waits for clients that stall.
+       make: Creates the run on a server.
+       words: Returns the parts of a progress line from a status.
+       tell: Prints the summary.
+       serving: Addresses to serve at.
+       bus: CAN bus to serve on as well.
+       paced: The run follows the wall clock.
+       wait: The run waits for stalled clients.
     """
     from rig.serve.pacing import rare_collections
     from rig.serve.transport.names import registered
@@ -194,31 +192,31 @@ def serve(
         bus or nullcontext(),
     ):
         with rare_collections():
-            run = make(server if bus is None else bus.beside(server))
+            run = make(server if bus is None else bus.join_server(server))
             run.prepare()
             if bus is not None:
                 bus.start(paced=paced)
                 echo(f"rig: {bus}", err=True)
-        tell_where(server, exposed, serving.name)
-        with stopping_on_signals(run.stop), showing(run.status, words):
+        print_addresses(server, exposed, serving.name)
+        with stop_on_signals(run.stop), display_status(run.status, words):
             summary = run.run()
     tell(summary)
     if bus is not None:
         echo(bus.summary())
-    end_with(summary["troubles"])
+    exit_if_failed(summary["troubles"])
 
 
-def tell_where(server: ZenohServer, exposed: Exposure | None, name: str | None = None) -> None:
-    """Where a rig listens, and who may do what there."""
+def print_addresses(server: ZenohServer, exposed: Exposure | None, name: str | None = None) -> None:
+    """Print the addresses of a rig and the access that they give."""
     from rig.serve.transport.exposure.access import ROLES, TRUTH
 
     if exposed is not None and exposed.holder is not None:
         own = f"{exposed.holder.name} until {exposed.holder.expires:%Y-%m-%d}"
-        echo(f"rig: exposed at {exposed.endpoint} to holders of certificates (who may do what: rig keys)", err=True)
-        echo(f"rig: its own certificate is for {own}", err=True)
+        echo(f"rig: exposed at {exposed.endpoint} to holders of certificates (permissions: rig keys)", err=True)
+        echo(f"rig: certificate of the rig: {own}", err=True)
     elif exposed is not None:
         doors = ", ".join(door.what for door in (*ROLES["operator"], TRUTH))
-        echo(f"rig: WARNING: {exposed.endpoint} is open to everybody who reaches it, unencrypted:", err=True)
+        echo(f"rig: WARNING: {exposed.endpoint} is open to everybody, unencrypted:", err=True)
         echo(f"rig: WARNING: {doors}", err=True)
     called = "" if name is None else f" as {name}"
     echo(f"rig: listening on {server.endpoint}{called}; Ctrl-C or `rig stop` ends it", err=True)

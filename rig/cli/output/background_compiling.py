@@ -1,7 +1,7 @@
-"""Half of a first start's compiling, in a second process: `python -m rig.cli.output.background_compiling`.
+"""Parallel compiling at the first start, in a second process: `python -m rig.cli.output.background_compiling`.
 
-Both need about the same time: one compiles the march of the engine, with the series of flight and rolling; this one
-those of sliding, rolling by collocation and the sensors, which the other then finds in the cache.
+The main process compiles the march of the engine with the series of flight and rolling; this process compiles those of
+sliding, rolling by collocation and the sensors, which the other then loads from the cache. Both take about equal time.
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ import time
 from threading import Thread
 
 SERIES = ("rig.physics.engines.split", "rig.physics.engines.taylor")
-"""Engines that are made of series."""
+"""Engines that use Taylor series."""
 MARCH = "rig.physics.engines.split.method"
-"""What compiles last before rolling by collocation does."""
+"""Module compiled last before rolling by collocation."""
 
 
-def start_beside() -> subprocess.Popen[bytes] | None:
-    """Start it where there is a core for it. It ends by itself, or with this process."""
+def start_second_process() -> subprocess.Popen[bytes] | None:
+    """Start the process if there is a second core. It ends by itself, or with this process."""
     cores = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else range(os.cpu_count() or 1)
     if len(cores) < 2:
         return None
-    # -P: the same files as here, whatever lies in the working directory.
+    # -P: load the same files as this process, independent of the working directory.
     command, quiet = [sys.executable, "-P", "-m", __name__], subprocess.DEVNULL
     child = subprocess.Popen(command, stdin=quiet, stdout=quiet, stderr=quiet)
     atexit.register(_end, child)

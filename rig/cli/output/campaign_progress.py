@@ -1,4 +1,4 @@
-"""What `rig campaign` tells of tests that pytest runs: a line for each that is done, and a live one."""
+"""Progress of `rig campaign` while pytest runs the tests: a line per finished case, and a live line."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from typing import Any
 import pytest
 
 from rig.base.text import printable
-from rig.cli.output.tables import echo, plain
+from rig.cli.output.tables import echo, plain_text
 
-WORDS = {"passed": "pass", "failed": "FAIL", "error": "ERROR", "inconclusive": "OPEN", "skipped": "skip"}
-"""What is said of a case that came to this."""
+OUTCOME_WORDS = {"passed": "pass", "failed": "FAIL", "error": "ERROR", "inconclusive": "OPEN", "skipped": "skip"}
+"""Words printed for each outcome of a case."""
 
 
-def beside_pytest(bar: Any) -> Any:
-    """A bar that shows on the terminal while pytest holds stdout and stderr back."""
+def bypass_capture(bar: Any) -> Any:
+    """Return the bar, connected to the terminal although pytest captures stdout and stderr."""
     if bar.console.is_terminal:
         bar.console.file = os.fdopen(os.dup(sys.stderr.fileno()), "w", encoding="utf-8")
     return bar
@@ -27,7 +27,7 @@ def beside_pytest(bar: Any) -> Any:
 
 @dataclass
 class Progress:
-    """Tells how it goes, a line a case and a live one; a plugin of pytest."""
+    """Plugin of pytest that prints a line per case and updates a live line."""
 
     bar: Any
     planned: dict[str, None] = field(default_factory=dict)
@@ -37,44 +37,44 @@ class Progress:
     running: dict[str, None] = field(default_factory=dict)
     collecting_failed: bool = False
     task: Any = None
-    unheard: bool = False
-    """Whoever read what is told has gone."""
-    said: io.StringIO = field(default_factory=io.StringIO)
-    """What pytest itself would have printed."""
+    reader_gone: bool = False
+    """The reader of the output has exited."""
+    pytest_output: io.StringIO = field(default_factory=io.StringIO)
+    """Output of pytest itself, which is not shown."""
 
     @pytest.hookimpl(trylast=True)
     def pytest_configure(self, config: Any) -> None:
-        """Keep what pytest prints: this is what tells."""
+        """Capture the output of pytest's terminal reporter."""
         reporter = config.pluginmanager.get_plugin("terminalreporter")
         config.pluginmanager.unregister(reporter)
-        config.pluginmanager.register(type(reporter)(config, self.said), "terminalreporter")
+        config.pluginmanager.register(type(reporter)(config, self.pytest_output), "terminalreporter")
 
     @property
     def counts(self) -> Counter[str]:
-        """How many cases came to what."""
+        """Number of finished cases by outcome."""
         return Counter(self.outcomes[name] for name in self.done)
 
     def pytest_collection_finish(self, session: Any) -> None:
-        """What is to be run."""
+        """Store the cases to run."""
         self.planned |= {item.nodeid: None for item in session.items}
 
     def pytest_xdist_node_collection_finished(self, node: Any, ids: list[str]) -> None:
-        """The same where several processes run it."""
+        """Store the cases to run with several processes."""
         self.planned |= dict.fromkeys(ids)
 
     def pytest_collectreport(self, report: Any) -> None:
-        """What could not be collected."""
+        """Report a file that could not be collected."""
         if report.failed:
             self.collecting_failed = True
             echo(f"rig: {printable(str(report.longrepr).strip().splitlines()[-1])}", err=True)
 
     def pytest_runtest_logstart(self, nodeid: str) -> None:
-        """A case begins."""
+        """Show a case that begins."""
         self.running[nodeid] = None
         self._show()
 
     def pytest_runtest_logreport(self, report: Any) -> None:
-        """A phase of a case is over."""
+        """Record the end of a phase of a case; print the case after its last phase."""
         from replays.campaigns.reporting.results import outcome_of, reason_of
 
         name = report.nodeid
@@ -85,25 +85,25 @@ class Progress:
             before = "skipped"
         self.outcomes[name] = before
         if before != "passed" and name not in self.reasons:
-            # Of a campaign's file a line for each value that is not as it must be.
+            # A campaign file has a line for each value that fails.
             lines = report.longrepr.splitlines() if isinstance(report.longrepr, str) else ()
             self.reasons[name] = "\n      ".join([reason_of(report), *map(printable, lines[1:])])
         if report.when == "teardown":
             self.done.add(name)
             self.running.pop(name, None)
             reason = f": {self.reasons[name]}" if name in self.reasons else ""
-            for line in f"{WORDS[before]:5} {name}{reason}".split("\n"):
+            for line in f"{OUTCOME_WORDS[before]:5} {name}{reason}".split("\n"):
                 self._tell(line)
             self._show()
 
     def _tell(self, line: str) -> None:
         if self.bar.console.is_terminal and sys.stdout.isatty():
-            self.bar.console.print(plain(printable(line)))  # above what is live
+            self.bar.console.print(plain_text(printable(line)))  # above the live line
             return
         try:
             echo(line)
         except BrokenPipeError:
-            self.unheard = True
+            self.reader_gone = True
             raise
 
     def _show(self) -> None:

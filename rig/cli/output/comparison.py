@@ -1,4 +1,4 @@
-"""How a command answers that compares a family of models: as tables or JSON, and as a picture."""
+"""Output of commands that compare a family of models: tables or JSON, and a picture."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 Subject = TypeVar("Subject")
 
 
-def answer(
+def print_comparison(
     subject: Subject,
     *,
     compare: Callable[[Subject], dict[str, Any]],
@@ -23,15 +23,15 @@ def answer(
     plot: Path | None,
     form: Form,
 ) -> None:
-    """Compare, draw where that is wanted, and tell.
+    """Compare, draw if requested, and print.
 
     Args:
-        subject: Of what: a parameter set, a model.
-        compare: Makes the document.
-        draw: Makes the picture.
-        show: Prints the document as tables.
-        plot: File for the picture.
-        form: As tables, or as the document itself.
+       subject: The parameter set or model.
+       compare: Returns the document.
+       draw: Draws the picture.
+       show: Prints the document as tables.
+       plot: File for the picture.
+       form: Output as tables or as JSON.
     """
     if plot is not None:
         draw(subject, plot)

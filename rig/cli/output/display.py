@@ -1,4 +1,4 @@
-"""What the terminal shows of a run or a replay that is served here, while it lasts."""
+"""Terminal display of a run or replay that this process serves."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ Line = Callable[[dict[str, Any]], list[str]]
 
 
 @contextmanager
-def showing(status: Status, words: Line) -> Iterator[None]:
-    """Show how it goes: on a terminal one live line, else a line every 5 s.
+def display_status(status: Status, words: Line) -> Iterator[None]:
+    """Show the status during the block: a live line on a terminal, otherwise a line every 5 s.
 
     Args:
-        status: Gives the status document.
-        words: What to show of it.
+       status: Returns the status document.
+       words: Returns the parts of the line.
     """
     done = threading.Event()
-    # A thread of its own, so that a terminal that is held up (Ctrl-S) holds up nothing else.
+    # In its own thread, so that a suspended terminal (Ctrl-S) does not block the run.
     show = _show_live if sys.stderr.isatty() else _show_lines
     thread = threading.Thread(target=show, args=(status, words, done), name="display", daemon=True)
     thread.start()
@@ -40,7 +40,7 @@ def _show_live(status: Status, words: Line, done: threading.Event) -> None:
     with progress_bar(auto_refresh=False, transient=True) as bar:
         task = bar.add_task("")
         while not done.wait(0.5):
-            bar.update(task, description=fitted(_parts(status(), words), bar.console.width), refresh=True)
+            bar.update(task, description=fit_width(_parts(status(), words), bar.console.width), refresh=True)
 
 
 def _show_lines(status: Status, words: Line, done: threading.Event) -> None:
@@ -49,7 +49,7 @@ def _show_lines(status: Status, words: Line, done: threading.Event) -> None:
 
 
 def _parts(status: dict[str, Any], words: Line) -> list[str]:
-    """What to say, first what matters most; what should be none is only said where it is not."""
+    """Return the parts of the line, most important first; zero losses are left out."""
     counts = {
         "stalled links": status["congestion"].get("stalled_links", 0),
         "dropped": status["queue"]["dropped"],
@@ -59,43 +59,43 @@ def _parts(status: dict[str, Any], words: Line) -> list[str]:
     return [*words(status), *told, f"clients {len(status['clients'])}", *overruns]
 
 
-def fitted(parts: list[str], width: int, between: str = "  ") -> str:
-    """The parts on one line, without those at the end that find no room."""
+def fit_width(parts: list[str], width: int, between: str = "  ") -> str:
+    """Return the parts joined to one line, without trailing parts that exceed the width."""
     while len(between.join(parts)) > width and len(parts) > 1:
         parts = parts[:-1]
     return between.join(parts)
 
 
-def end_with(troubles: list[str]) -> None:
-    """Exit status 1 where something failed that did not end the run, told in a line each."""
+def exit_if_failed(troubles: list[str]) -> None:
+    """Print the failures that did not end the run, and exit with status 1 if there are any."""
     for text in troubles:
         echo(f"rig: {text}", err=True)
     if troubles:
         raise typer.Exit(1)
 
 
-def lateness(status: dict[str, Any]) -> str:
-    """How late it was so far, in a few words."""
+def lateness_text(status: dict[str, Any]) -> str:
+    """Return the lateness of a status in a few words."""
     late = status["lateness_ms"]
     p99, most = (f"{late[name]:.2f}" if late[name] < 10.0 else f"{late[name]:.0f}" for name in ("p99", "max"))
     return f"late p99 {p99} max {most} ms"
 
 
-def all_lateness(summary: dict[str, Any]) -> str:
-    """How late it was in the end."""
+def lateness_summary(summary: dict[str, Any]) -> str:
+    """Return the lateness of a summary."""
     late = summary["lateness_ms"]
     return "lateness " + " ".join(f"{name} {late[name]:.3f}" for name in ("p50", "p99", "max", "last")) + " ms"
 
 
 def engine_text(engine: dict[str, Any]) -> str:
-    """Return name and step of an engine, and the part of the time in which it rolled by collocation."""
+    """Return name and step of an engine, and the fraction of time in rolling by collocation."""
     share = engine.get("rolling_share")
     rolled = f", {share:.0%} of the time rolling by collocation" if isinstance(share, float) and share else ""
     return f"{engine.get('name', '?')}, {engine.get('step_us', '?')} us{rolled}"
 
 
 def accuracy_text(accuracy: dict[str, Any]) -> str:
-    """Return the error estimate of a status, each quantity in its unit; before version 0.2 it was one number."""
+    """Return the error estimate of a status, each quantity in its unit; before version 0.2 it was a single number."""
     quantities = accuracy.get("quantities")
     if not isinstance(quantities, dict):
         return number_text(accuracy.get("estimate"), "(scaled)")

@@ -1,4 +1,4 @@
-"""Folders that commands write into."""
+"""Folders for the output of commands."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from rig.base.errors import InputError
 
 
 def check_folder(path: Path, *, field: str) -> None:
-    """Refuse a folder that neither is there nor can be made, before anything is worked out.
+    """Raise an error early for a folder that neither exists nor can be created.
 
     Args:
-        path: The folder; one that is missing is made by `path.mkdir(exist_ok=True)` when there is something to write.
-        field: What the user knows it by.
+       path: The folder; the caller creates a missing one by `path.mkdir(exist_ok=True)` when it writes.
+       field: Name of the option, for errors.
 
     Raises:
-        InputError: Its parent is missing, or it is a file.
+       InputError: Its parent is missing, it is a file, or it is not writable.
     """
     if path.exists() and not path.is_dir():
         raise InputError(field, "a folder, not a file", str(path))

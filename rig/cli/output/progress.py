@@ -1,4 +1,4 @@
-"""Progress of long work on stderr: one live line on a terminal, else a line now and then."""
+"""Progress of long work on stderr: a live line on a terminal, otherwise occasional lines."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from typing import Any
 from rig.base.text import printable
 from rig.cli.output.tables import echo, progress_bar
 
-_EVERY_S = 15.0
+_LINE_PERIOD_S = 15.0
 _BAR = 12
 _CLOCK = 9
-"""Characters of the elapsed time with the blanks beside it."""
+"""Width of the elapsed time with its spaces [characters]."""
 
 
 @dataclass
 class Reporter:
-    """Told how far the work has come."""
+    """Display of the progress of a task."""
 
     bar: Any = None
     """A `rich.progress.Progress` with its one task, or None for lines."""
@@ -32,7 +32,7 @@ class Reporter:
     _printed_s: float = field(default_factory=time.monotonic)
 
     def begin(self, total: int) -> None:
-        """There are this many steps."""
+        """Set the number of steps."""
         self.total = total
         if self.bar is not None:
             from rich.progress import BarColumn
@@ -41,13 +41,13 @@ class Reporter:
             self.bar.update(self.task, total=total)
 
     def step(self, text: str) -> None:
-        """One step is done; the next one is this."""
+        """Count a finished step, and show the next one."""
         self.done += 1
         self.doing = text
         self.show(text)
 
     def part(self, done: float, text: str) -> None:
-        """So much of the whole is done, 0 to 1, of something without steps."""
+        """Show the finished fraction, 0 to 1, of work without steps."""
         percent = int(100.0 * done)
         if self.total is None:
             self._percent = True
@@ -57,12 +57,12 @@ class Reporter:
             self.step(text)
 
     def say(self, text: str) -> None:
-        """This is being done."""
+        """Show the current activity."""
         self.doing = text
         self.show(text, every_s=0.0)
 
-    def show(self, text: str, *, every_s: float = _EVERY_S) -> None:
-        """A text for the live line, or for a line of its own if the last is so old [s]."""
+    def show(self, text: str, *, every_s: float = _LINE_PERIOD_S) -> None:
+        """Show a text in the live line, or print it if the last line is older than `every_s`."""
         done = f"{self.done} %" if self._percent else f"{self.done} of {self.total}"
         line = f"{done}: {text}" if self.total else text
         if self.bar is not None:
@@ -75,11 +75,11 @@ class Reporter:
 
 @contextmanager
 def reporting(*, live: bool = True, compiles: bool = False) -> Iterator[Reporter]:
-    """Show the progress of what is done inside.
+    """Yield a `Reporter` that shows the progress of the block.
 
     Args:
-        live: With a live line, where there is a terminal.
-        compiles: Kernels may be compiled, which is told while it lasts.
+       live: Use a live line on a terminal.
+       compiles: Also show the compiling of kernels.
     """
     with _bar() if live and sys.stderr.isatty() else nullcontext(Reporter()) as reporter:
         if not compiles:

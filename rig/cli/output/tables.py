@@ -1,10 +1,10 @@
-"""What is printed goes out through here: tables, lines and progress, none of it acted on by the terminal or by rich.
+"""Terminal output: tables, lines and progress, with all control characters and markup disabled.
 
-Names of scenes, channels and clients, notes and paths are not ours: square brackets in them are no markup, and escapes,
-line breaks and marks that turn the direction of writing come out in their escaped form.
+Names of scenes, channels and clients, notes and paths come from outside: square brackets are not markup, and escapes,
+line breaks and marks for the direction of writing are printed escaped.
 
-On a terminal, tables and lines fit its width, and no value is cut. Into a pipe, and with `--wide`, a table has every
-column and a row one line, whatever the width: two blanks or more between the columns, and `-` where nothing stands.
+On a terminal, tables and lines fit its width, and no value is cut. In a pipe, and with `--wide`, a table has all
+columns and each row is one line: at least two spaces between columns, and `-` for an empty cell.
 """
 
 from __future__ import annotations
@@ -30,58 +30,60 @@ if TYPE_CHECKING:
 
     _Rows = list[tuple[list[Text], str]]
 
-_ENDLESS = 1_000_000
+_PIPE_WIDTH = 1_000_000
 """Width of a pipe [characters]."""
 _GAP = 2
-_LEAST = 20
-"""What a text is wrapped to, at the least [characters]."""
-_WORTH = 48
-"""The same of one that can be left out: in fewer it is not worth its lines."""
+_MIN_WIDTH = 20
+"""Minimum width of a wrapped column [characters]."""
+_MIN_SPARE_WIDTH = 48
+"""The same for a column that can be left out; a narrower one would take too many lines."""
 _UNIT = re.compile(r"(?<=\d)(?: (?:%|°|ppm\b|[kMGmuµn]?(?:s|m|g|N|B|V|W|J|A|Pa|Hz|rad|bit)\b))+")
-_KEPT = "\ue000"
-"""A blank at which no line is broken; unlike one of Unicode's it is none to rich."""
+_NO_BREAK = "\ue000"
+"""A space without a line break; rich would treat Unicode's own as a space."""
 
 
 @dataclass(frozen=True)
 class Form:
-    """In which form a command answers."""
+    """Output form of a command."""
 
     as_json: Json = False
     wide: Wide = False
 
     def console(self) -> Console:
-        """Where it answers, if not as JSON."""
+        """Return the console for output other than JSON."""
         return table_console(wide=self.wide)
 
 
 def _lines(text: str) -> str:
-    """The same text, each of its lines fit to be shown."""
+    """Return the text with each of its lines made printable."""
     return "\n".join(map(printable, text.split("\n")))
 
 
 def echo(text: object = "", *, err: bool = False) -> None:
-    """Print lines, which a terminal shows broken between words.
+    """Print lines; a terminal wraps them between words.
 
     Args:
-        text: They are kept apart; everything else that cannot be printed is escaped.
-        err: To stderr.
+       text: Text whose line breaks are kept; other unprintable characters are escaped.
+       err: Print to stderr.
     """
     lines = _lines(str(text)).split("\n")
     if (sys.stderr if err else sys.stdout).isatty():
         lines = [part for line in lines for part in _broken(line, shutil.get_terminal_size().columns) or [""]]
-    # Who reads what happens may have gone; what happens goes on.
+    # The reader of stderr may have exited; the work continues.
     with contextlib.suppress(*([OSError] if err else [])):
         typer.echo("\n".join(lines), err=err)
 
 
 def _broken(line: str, width: int) -> list[str]:
     indent = line[: len(line) - len(line.lstrip())]
-    parts = textwrap.wrap(_kept(line), width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
-    return [part.replace(_KEPT, " ") for part in parts]
+    parts = textwrap.wrap(
+        _bind_units(line), width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False
+    )
+    return [part.replace(_NO_BREAK, " ") for part in parts]
 
 
 def echo_document(text: str) -> None:
-    """Print a text as it stands, but for what cannot be printed, and without a line break behind it."""
+    """Print a text without a final line break; unprintable characters are escaped."""
     typer.echo(_lines(text), nl=False)
 
 
@@ -92,24 +94,24 @@ def echo_json(document: Any, *, indent: int | None = 2) -> None:
     echo_document(json.dumps(finite(document), indent=indent, allow_nan=False) + "\n")
 
 
-def shown(document: Any) -> Any:
-    """A document as it may be shown: each text on one line, as one with line breaks could pass for ours."""
+def make_printable(document: Any) -> Any:
+    """Return a document with each text on one printable line, so that no text can imitate our own lines."""
     if isinstance(document, str):
         return printable(document)
     if isinstance(document, dict):
-        return {shown(name): shown(value) for name, value in document.items()}
-    return [shown(value) for value in document] if isinstance(document, list | tuple) else document
+        return {make_printable(name): make_printable(value) for name, value in document.items()}
+    return [make_printable(value) for value in document] if isinstance(document, list | tuple) else document
 
 
 class Table:
-    """A table without lines, of cells that are texts on one line; see `new_table`.
+    """A table without borders, with cells of one line; see `new_table`.
 
     Attributes:
-        title: The title.
-        headings: Of its columns.
-        wrapped, spare: Numbers of columns that may take several lines, and that can be left out, the first first.
-        keys: How many columns say what a row is of.
-        rows: Cells and style of each; one cell alone stands across all columns.
+       title: The title.
+       headings: Headings of the columns.
+       wrapped, spare: Indices of columns that may wrap, and of those that can be left out, in order of removal.
+       keys: Number of leading columns that identify a row.
+       rows: Cells and style of each row; a single cell spans all columns.
     """
 
     def __init__(
@@ -122,7 +124,7 @@ class Table:
         self.rows: _Rows = []
 
     def add_row(self, *cells: str | Text, style: str = "") -> None:
-        """Add a row: a cell for each column, or one across all of them."""
+        """Add a row: a cell for each column, or one across all columns."""
         from rich.text import Text
 
         if len(cells) not in (1, len(self.headings)):
@@ -137,7 +139,7 @@ class Table:
         room = options.max_width
         rows = [([cell.copy() for cell in cells], style) for cells, style in self.rows]
         for cell in (cell for cells, _ in rows for cell in cells):
-            cell.plain = _kept(cell.plain)
+            cell.plain = _bind_units(cell.plain)
         blocks = self._blocks(room, rows)
         lines = list(Text(self.title, "italic").wrap(console, room)) if self.title else []
         for number, widths in enumerate(blocks):
@@ -147,7 +149,7 @@ class Table:
                 if len(cells) < len(self.headings):
                     lines += cells[0].wrap(console, room)
                     continue
-                filled = [cell if cell or room < _ENDLESS else Text("-") for cell in cells]
+                filled = [cell if cell or room < _PIPE_WIDTH else Text("-") for cell in cells]
                 wrapped = {at: list(filled[at].wrap(console, width, overflow="fold")) for at, width in widths.items()}
                 for row in range(max(map(len, wrapped.values()))):
                     parts = {at: texts[row] if row < len(texts) else Text() for at, texts in wrapped.items()}
@@ -180,7 +182,7 @@ class Table:
         return Text(" " * _GAP, style).join(parts.values())
 
     def _blocks(self, room: int, rows: _Rows) -> list[dict[int, int]]:
-        """Widths by the number of their columns: of all, or without spare ones, or in blocks below each other."""
+        """Return widths by column index: for all columns, without spare ones, or in several blocks."""
         columns = list(range(len(self.headings)))
         for spare in (None, *self.spare):
             columns = [at for at in columns if at != spare]
@@ -196,7 +198,7 @@ class Table:
         return [self._widths(block, room, rows) for block in blocks]
 
     def _widths(self, columns: Iterable[int], room: int, rows: _Rows) -> dict[int, int]:
-        """Widths of columns beside each other: as they would like to be, or as narrow as they can be."""
+        """Return the widths of columns in a block: as wanted, or reduced to fit."""
         wanted, widths = {}, {}
         for at in columns:
             cells = [cells[at] for cells, _ in rows if len(cells) == len(self.headings)]
@@ -205,12 +207,12 @@ class Table:
             wanted[at] = max(whole, len(self.headings[at]))
             if at in self.wrapped:
                 longest = max((len(word) for cell in cells for word in cell.plain.split()), default=1)
-                least = _WORTH if at in self.spare else _LEAST
+                least = _MIN_SPARE_WIDTH if at in self.spare else _MIN_WIDTH
                 whole = longest if whole <= least else max(longest, least)
-            # Names that are not ours may be of any length.
+            # External names may have any length.
             whole = min(whole, max(room // (self.keys + 1) - _GAP, 1))
             widths[at] = max([whole, *map(len, words)])
-        roomy = {at: min(width, _WORTH) if at in self.wrapped else width for at, width in wanted.items()}
+        roomy = {at: min(width, _MIN_SPARE_WIDTH) if at in self.wrapped else width for at, width in wanted.items()}
         for better in (wanted, roomy):
             if _total(better) <= room:
                 widths = better
@@ -220,13 +222,13 @@ class Table:
         return widths
 
 
-def _kept(text: str) -> str:
-    """The same text, in which a number keeps its unit beside it."""
-    return _UNIT.sub(lambda unit: unit[0].replace(" ", _KEPT), text)
+def _bind_units(text: str) -> str:
+    """Return the text with numbers bound to their units."""
+    return _UNIT.sub(lambda unit: unit[0].replace(" ", _NO_BREAK), text)
 
 
 def _stacked(heading: str, width: int) -> list[str]:
-    """The lines of a heading, as even as they can be; what stands in brackets, a unit, is not broken."""
+    """Return the lines of a heading, of similar length; units in brackets are not split."""
     text = re.sub(r"\[.*?\]", lambda unit: unit[0].replace(" ", "\u00a0"), heading)
     longest = max(map(len, textwrap.wrap(text, 1, break_long_words=False)), default=1)
     lines = [textwrap.wrap(text, width) for width in range(longest, max(width, longest) + 1)]
@@ -240,25 +242,25 @@ def _total(widths: dict[int, int]) -> int:
 def new_table(
     title: str, *headings: str, wrapped: Collection[str] = (), spare: Sequence[str] = (), keys: int = 1
 ) -> Table:
-    """A table under a title, whose cells are whole and on one line each, but for texts that may be wrapped.
+    """Return a table under a title; cells are shown whole and on one line, except wrapped ones.
 
-    Where a terminal is too narrow for all columns, spare ones are left out, which is said; what still finds no room
-    goes on below, in a block that begins with the same columns.
+    On a terminal that is too narrow, spare columns are left out, with a note; the remaining columns continue below in
+    blocks that begin with the same key columns.
 
     Args:
-        title: The title.
-        headings: Of its columns; behind a `>` stand numbers, which are aligned to the right.
-        wrapped: Of those that hold texts, which may take several lines.
-        spare: Of those that can be left out, the first to go first.
-        keys: How many columns say what a row is of.
+       title: The title.
+       headings: Headings of the columns; `>` marks a column of numbers, aligned to the right.
+       wrapped: Headings of columns that may wrap.
+       spare: Headings of columns that can be left out, in order of removal.
+       keys: Number of leading columns that identify a row.
     """
     places = {heading.removeprefix(">"): at for at, heading in enumerate(headings)}
     wrapped_at, spare_at = ([places[name] for name in names if name in places] for names in (wrapped, spare))
     return Table(title, headings, wrapped=wrapped_at, spare=spare_at, keys=keys)
 
 
-def facts(title: str, rows: Iterable[tuple[str, str]], **styles: str) -> Table:
-    """A table of names, in bold, and what is to be said of each; `styles`: of the rows of some names."""
+def fact_table(title: str, rows: Iterable[tuple[str, str]], **styles: str) -> Table:
+    """Return a table of names, in bold, and their texts; `styles`: style of a row by name."""
     from rich.text import Text
 
     table = Table(title, ("", ""), wrapped=(1,), spare=(), keys=1)
@@ -268,19 +270,19 @@ def facts(title: str, rows: Iterable[tuple[str, str]], **styles: str) -> Table:
 
 
 def table_console(*, wide: bool = False, stderr: bool = False) -> Console:
-    """Where tables are printed: on a terminal they fit it, into a pipe all lines keep their whole length.
+    """Return the console for tables: they fit a terminal, and have full length in a pipe.
 
-    Strings are text and no markup; what is styled is a `rich.text.Text` or a style.
+    Strings are printed without markup; styles need a `rich.text.Text` or a style argument.
 
     Args:
-        wide: Print on a terminal as into a pipe.
-        stderr: Print there.
+       wide: Print on a terminal as in a pipe.
+       stderr: Print to stderr.
     """
     from rich.console import Console
     from rich.segment import Segment
 
     class Screen(Console):
-        """Markup is off for every kind of string, no text leaves unescaped, and none is cropped."""
+        """A console without markup, whose texts are escaped and not cropped."""
 
         def print(self, *objects: Any, **options: Any) -> None:
             options.setdefault("crop", False)
@@ -288,30 +290,30 @@ def table_console(*, wide: bool = False, stderr: bool = False) -> Console:
 
         def render_str(self, text: str, **options: Any) -> Any:
             options.update(markup=False, emoji=False)
-            return super().render_str(_kept(_lines(text)), **options)
+            return super().render_str(_bind_units(_lines(text)), **options)
 
         def render(self, renderable: Any, options: Any = None) -> Any:
             for segment in super().render(renderable, options):
                 if segment.control or segment.text == "\n":
                     yield segment
                 else:
-                    yield Segment(_lines(segment.text.replace(_KEPT, " ")), segment.style)
+                    yield Segment(_lines(segment.text.replace(_NO_BREAK, " ")), segment.style)
 
     terminal = (sys.stderr if stderr else sys.stdout).isatty()
-    width = None if terminal and not wide else _ENDLESS
+    width = None if terminal and not wide else _PIPE_WIDTH
     return Screen(width=width, highlight=False, markup=False, emoji=False, stderr=stderr)
 
 
 def progress_bar(*columns: Any, **options: Any) -> Any:
-    """A `rich.progress.Progress` on stderr with the columns and, behind them, each task's description as it stands."""
+    """Return a `rich.progress.Progress` on stderr with the columns, followed by the description of each task."""
     from rich.progress import Progress, TextColumn
 
     console = table_console(stderr=True)
     return Progress(*columns, TextColumn("{task.description}", markup=False), console=console, **options)
 
 
-def plain(text: str) -> Any:
-    """A line for what would take a string for markup, such as the status of a console."""
+def plain_text(text: str) -> Any:
+    """Return a line as a text without markup, for functions such as the status of a console."""
     from rich.text import Text
 
     return Text(printable(text))
