@@ -134,8 +134,8 @@ class Group(_Page, TyperGroup):
     """Commands listed under headings, each with its help line; a command is imported when it is called.
 
     Attributes:
-       sections: Help lines by heading and command name.
-       load: Returns the command of a name.
+        sections: Help lines by heading and command name.
+        load: Returns the command of a name.
     """
 
     sections: Mapping[str, Mapping[str, str]]
@@ -149,7 +149,7 @@ class Group(_Page, TyperGroup):
         """Return the command of a name.
 
         Raises:
-           UnknownNameError: There is no command of this name.
+            UnknownNameError: There is no command of this name.
         """
         names = self.list_commands(ctx)
         if cmd_name in names:
@@ -204,11 +204,11 @@ def make_group(
     """Return a group of commands.
 
     Args:
-       name: Name of the group.
-       sections: See `Group`.
-       load: See `Group`.
-       callback: Called before a command, and without one.
-       help: Help text; by default the callback's docstring.
+        name: Name of the group.
+        sections: See `Group`.
+        load: See `Group`.
+        callback: Called before a command, and without one.
+        help: Help text; by default the callback's docstring.
     """
     app = typer.Typer(name=name, **_APP_OPTIONS)
     app.callback(cls=Group, help=help or callback.__doc__, invoke_without_command=True, context_settings=_SETTINGS)(

@@ -20,7 +20,7 @@ def expand_groups(command: Callable[..., None]) -> Callable[..., None]:
     """Return a command with its option groups, nested ones too, replaced by their fields.
 
     Args:
-       command: A function whose keyword parameters may have such a dataclass as type.
+        command: A function whose keyword parameters may have such a dataclass as type.
     """
     hints = get_type_hints(command, include_extras=True)
     hints.pop("return", None)

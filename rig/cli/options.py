@@ -60,7 +60,7 @@ class SceneChanges:
         """Return the changes by dotted key.
 
         Raises:
-           InputError: A change is not of the form KEY=VALUE, or the law file is invalid.
+            InputError: A change is not of the form KEY=VALUE, or the law file is invalid.
         """
         overrides = parse_pairs("--set", self.changes, "KEY=VALUE, such as drive.speed_hz=5.2")
         if self.law is not None:
@@ -86,12 +86,12 @@ def parse_pairs(option: str, texts: list[str] | None, form: str) -> dict[str, st
     """Return the left and right sides of texts such as KEY=VALUE.
 
     Args:
-       option: Name of the option, for errors.
-       texts: Values of the option.
-       form: Form of a text, for errors.
+        option: Name of the option, for errors.
+        texts: Values of the option.
+        form: Form of a text, for errors.
 
     Raises:
-       InputError: A text has another form, or a left side occurs twice.
+        InputError: A text has another form, or a left side occurs twice.
     """
     found: dict[str, str] = {}
     for text in texts or []:
@@ -110,13 +110,13 @@ def override_parameters(
     """Return a parameter set with changes from the command line.
 
     Args:
-       name: Name or path of the set.
-       changes: Values of `--set`, each KEY=VALUE.
-       also: Values by key from other options; they override `changes`.
-       law: File of a contact law.
+        name: Name or path of the set.
+        changes: Values of `--set`, each KEY=VALUE.
+        also: Values by key from other options; they override `changes`.
+        law: File of a contact law.
 
     Raises:
-       InputError: The set or a key does not exist, or a value is invalid.
+        InputError: The set or a key does not exist, or a value is invalid.
     """
     from rig.physics.parameters import load_parameters
     from rig.run.scenes import read_value

@@ -1,1 +1,1 @@
-"""Serving a run: pace, requests, devices, transport."""
+"""Serving of a run: pace, requests, devices, transport."""

@@ -9,12 +9,12 @@ from typing import Any, Protocol
 
 from rig.base.errors import InputError
 
-_MOST = 64
-"""Devices that are told of; of those that are lost, the ones lost longest ago are forgotten first."""
+_MAX_DEVICES = 64
+"""Devices kept for the status. The devices lost first are removed first."""
 
 
 class Said(Protocol):
-    """What a client has said: a command, by the name that it gives itself."""
+    """A request of a client, with the name that the client gives itself."""
 
     command: str
     sender: str
@@ -24,60 +24,60 @@ class Said(Protocol):
 class _Device:
     patience_s: float
     tick: int
-    """End of the last block that it is done with."""
+    """End of the last block that it has finished."""
     lost: str | None = None
     since_s: float = 0.0
-    """When it last had to wait for others, where that is behind the end of the block [s, monotonic]."""
+    """When it last had to wait for others, if after the end of the block [s, monotonic]."""
 
 
 class Devices:
-    """Who has joined, and up to where each is done; of one thread, but for `rows`.
+    """The devices that have joined a run, and the last block that each has finished; for one thread, except `rows`.
 
-    A run waits for all that have joined after each block: the only block that a device can be done with is the last.
+    After each block the run waits for all joined devices, so a device can only be behind by the last block.
     """
 
     def __init__(self) -> None:
         self._devices: dict[str, _Device] = {}
         self.rows: tuple[Mapping[str, Any], ...] = ()
-        """For the status, from any thread: name, state (joined, lost), tick, reason of each."""
+        """Rows for the status, readable from any thread: name, state (joined, lost), tick and reason of each device."""
         self.lost: dict[str, str] = {}
-        """Devices that were put out and not yet told of, with the reason."""
+        """Removed devices that were not yet reported, with the reasons."""
 
     def __bool__(self) -> bool:
-        """Whether any has joined and is there."""
+        """Whether any joined device is not lost."""
         return any(device.lost is None for device in self._devices.values())
 
     def join(self, name: str, patience_s: float, tick: int) -> None:
-        """Wait for a device from this tick on.
+        """Add a device, which the run waits for from this tick.
 
         Raises:
-            InputError: One of that name has joined, or there are too many.
+            InputError: The name is in use, or there are too many devices.
         """
         if name in self._devices and self._devices[name].lost is None:
             raise InputError("join.device", "a name under which no other device has joined", name)
         self._devices.pop(name, None)
-        while len(self._devices) >= _MOST:
+        while len(self._devices) >= _MAX_DEVICES:
             gone = next((other for other, device in self._devices.items() if device.lost is not None), None)
             if gone is None:
-                raise InputError("join.device", f"one of at most {_MOST} devices", name)
+                raise InputError("join.device", f"one of at most {_MAX_DEVICES} devices", name)
             del self._devices[gone]
         self._devices[name] = _Device(patience_s, tick)
         self._tell()
 
     def done(self, name: str, tick: int | None, end: int, said: str) -> str | None:
-        """Take note that a device is done with a block.
+        """Record that a device has finished a block.
 
         Args:
             name: The device.
-            tick: End of the block, as the device says; None where there was no such block.
-            end: End of the last block that was run.
-            said: What the device said.
+            tick: End of the block according to the device; None if there is no such block.
+            end: End of the last block.
+            said: The device's message, for the error.
 
         Returns:
-            Why the device was put out for that; None where it was not.
+            The reason if the device was removed for a wrong tick; otherwise None.
 
         Raises:
-            InputError: It has not joined.
+            InputError: The device has not joined.
         """
         device = self._joined("done", name)
         if tick is None or tick not in (device.tick, end):
@@ -87,24 +87,24 @@ class Devices:
         return None
 
     def leave(self, name: str) -> None:
-        """Wait for a device no longer.
+        """Remove a device; the run no longer waits for it.
 
         Raises:
-            InputError: It has not joined.
+            InputError: The device has not joined.
         """
         self._joined("leave", name)
         del self._devices[name]
         self._tell()
 
     def behind(self, end: int) -> list[str]:
-        """Those that are not yet done with the block that ends at a tick."""
+        """Return the devices that have not finished the block that ends at a tick."""
         return [name for name, device in self._devices.items() if device.lost is None and device.tick < end]
 
     def first_due(self, waiting: Sequence[Said], end: int) -> int | None:
-        """Place of the first that can be taken of what was said; None where all wait.
+        """Return the index of the first request that can be handled; None if all must wait.
 
-        Whose comes first of two devices must not be chance: what one commands is taken once those before it by name are
-        done with the block that ends at a tick. That it is done itself is taken behind what it has commanded.
+        The order of two devices must not depend on chance: a device's command is handled once all devices before it by
+        name have finished the block that ends at `end`. Its own `done` is handled after its commands.
         """
         behind = self.behind(end)
         for place, said in enumerate(waiting):
@@ -118,16 +118,16 @@ class Devices:
         return None
 
     def put_out_late(self, end: int, since_s: float, now_s: float, waiting: Set[str]) -> tuple[dict[str, str], float]:
-        """Put out who is not done in time with the block that ends at a tick.
+        """Remove the devices that have not finished in time the block that ends at a tick.
 
         Args:
             end: That tick.
-            since_s: When they were told that the block is over [s].
-            now_s: Now [s].
-            waiting: Devices that wait for others, so that their time has not begun.
+            since_s: When the devices were notified of the end of the block [s].
+            now_s: Current time [s].
+            waiting: Devices that wait for others; their time has not begun.
 
         Returns:
-            The reasons by name, and how long it is until the next one is late [s].
+            The reasons by name, and the time until the next device is late [s].
         """
         late, left_s = dict[str, str](), math.inf
         for name in self.behind(end):
@@ -143,12 +143,12 @@ class Devices:
         return late, left_s
 
     def told(self, over: int, since_s: float, now_s: float) -> list[dict[str, Any]]:
-        """Rows for the status, with how long each that is joined has been behind [s]; from any thread.
+        """Return the rows for the status, with the time that each joined device has been behind [s]; from any thread.
 
         Args:
-            over: End of the last block that they were told is over [ticks].
-            since_s: When they were told [s].
-            now_s: Now [s].
+            over: End of the last block of which the devices were notified [ticks].
+            since_s: When they were notified [s].
+            now_s: Current time [s].
         """
         return [
             {**row, "behind_s": round(now_s - since_s, 3) if row["reason"] is None and row["tick"] < over else 0.0}

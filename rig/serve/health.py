@@ -1,4 +1,4 @@
-"""What goes wrong on threads that must not end, and what is lost, as warnings while it happens."""
+"""Warnings about failures on threads that must continue, and about losses."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from typing import Any
 
 from rig.base.text import printable
 
-_LATELY_S = 5.0
+_WARNING_S = 5.0
 
 
 class Guard:
-    """Does one thing after another, of which each may fail alone.
+    """Runs a function and turns its failure into a warning.
 
     Args:
-        name: What the warning calls it.
+        name: Name of the guarded work in the warning.
     """
 
     def __init__(self, name: str) -> None:
@@ -24,7 +24,7 @@ class Guard:
         self.failures = 0
 
     def __call__(self, do: Callable[..., Any], *arguments: Any) -> Any:
-        """What it returns; None where it fails, which the warning tells from now on."""
+        """Return the result of the call; None if it fails, which is reported as a warning from then on."""
         try:
             return do(*arguments)
         except Exception as error:
@@ -32,17 +32,17 @@ class Guard:
             return None
 
     def tell(self, where: str, error: BaseException) -> None:
-        """Something failed, and goes on."""
+        """Record a failure."""
         self.failures += 1
         self._last = printable(f"{where.strip('_')}: {type(error).__name__}: {error}", 200)
 
     def warnings(self) -> list[str]:
-        """What a person should know of."""
+        """Return the current warnings."""
         return [f"{self._name} failed {self.failures} times (last {self._last})"] if self.failures else []
 
 
 class Rising:
-    """A count of which a person should know while it rises.
+    """A count that causes a warning while it rises.
 
     Args:
         text: The warning, with the count as `{}`.
@@ -56,8 +56,8 @@ class Rising:
         self._until_s = -1.0
 
     def warnings(self, count: int) -> list[str]:
-        """The warning, up to 5 s after the count was last found to be higher than before."""
+        """Return the warning, until 5 s after the last rise of the count."""
         now = self._clock()
         if count > self._count:
-            self._count, self._until_s = count, now + _LATELY_S
+            self._count, self._until_s = count, now + _WARNING_S
         return [self._text.format(count)] if now < self._until_s else []

@@ -1,4 +1,4 @@
-"""The page on keys, messages and units: `keys.jinja`, filled from the channel table, the codec and what may be done.
+"""The page of keys, messages and units: `keys.jinja`, filled from channel table, codec and access table.
 
 `rig keys` shows it; rig/KEYS.md is its committed copy.
 """
@@ -19,7 +19,7 @@ from rig.serve.transport.exposure import access
 
 
 def page() -> str:
-    """The page as Markdown."""
+    """Return the page as Markdown."""
     import jinja2
 
     environment = jinja2.Environment(
@@ -40,7 +40,7 @@ def page() -> str:
 
 
 def _fields(command: Any) -> str:
-    """The fields of a command, each with its limits and its default."""
+    """Return the fields of a command with their limits and defaults."""
     fields = "; ".join(_field(key, field) for key, field in command.model_fields.items() if key != "command")
     return fields.replace("`what`", "`kind` and its numbers, below") or "no fields"
 

@@ -1,7 +1,7 @@
-"""When the next block of simulated time may run, and when its result is due: three clocks over the same loop.
+"""Clocks that decide when the next block of simulated time may run and when its result is due.
 
-The loop is `grant` (may I run?), run, `release` (wait until the result is due). No clock changes the step of the
-simulation; the time source and the sleep are arguments.
+The loop is `grant` (wait for permission), run, `release` (wait until the result is due). No clock changes the step of
+the simulation. The time source and the sleep are arguments.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ _NS = 1_000_000_000
 
 @contextmanager
 def rare_collections() -> Iterator[None]:
-    """Few garbage collections while a start imports and builds.
+    """Reduce garbage collections while a start imports and builds.
 
-    Little of that is garbage, and looking for it took a tenth of the time.
+    Little of that is garbage; collecting it took a tenth of the time.
     """
     before = gc.get_threshold()
     gc.set_threshold(300_000, *before[1:])
@@ -32,10 +32,10 @@ def rare_collections() -> Iterator[None]:
 
 @contextmanager
 def short_collections() -> Iterator[None]:
-    """Keep what the start has left behind out of garbage collections while a paced run lasts.
+    """Exclude the objects of the start from garbage collections during a paced run.
 
-    It is never garbage, and walking it took 5 to 8 ms of a full collection. Where a process has frozen its own start
-    before, that stays as it is.
+    They are never garbage, and traversing them took 5 to 8 ms of a full collection. A process that has already frozen
+    its objects is left unchanged.
     """
     if gc.get_freeze_count():
         yield
@@ -48,48 +48,47 @@ def short_collections() -> Iterator[None]:
 
 
 class StepTimeoutError(TimeoutError):
-    """Nobody granted a step in time."""
+    """No step was granted within the time limit."""
 
 
 class Histogram:
     """Quantiles of any number of non-negative values in bounded memory.
 
-    Logarithmic bins from 1e-6 to 1e3, 50 a decade; all below and above counts as in the first and the last. A quantile
-    is the upper edge of its bin, hence up to 4.7 % too large, never too small, and never above the largest value.
-    Counts are integers: hours do not wear them out.
+    Logarithmic bins from 1e-6 to 1e3, 50 per decade; smaller and larger values count in the first and last bin. A
+    quantile is the upper edge of its bin, so it is up to 4.7 % too large, never too small, and never above the largest
+    value. Counts are integers and do not lose precision in long runs.
     """
 
-    _LOW, _HIGH, _A_DECADE = 1e-6, 1e3, 50
+    _LOW, _HIGH, _BINS_PER_DECADE = 1e-6, 1e3, 50
 
     def __init__(self) -> None:
-        self.counts = [0] * (math.ceil(math.log10(self._HIGH / self._LOW) * self._A_DECADE) + 1)
+        self.counts = [0] * (math.ceil(math.log10(self._HIGH / self._LOW) * self._BINS_PER_DECADE) + 1)
         """Values in each bin."""
         self.count = 0
         self.largest = 0.0
 
     def add(self, value: float) -> None:
         """Count one value."""
-        at = 0 if value <= self._LOW else math.ceil(math.log10(value / self._LOW) * self._A_DECADE)
+        at = 0 if value <= self._LOW else math.ceil(math.log10(value / self._LOW) * self._BINS_PER_DECADE)
         self.counts[min(at, len(self.counts) - 1)] += 1
         self.count += 1
         self.largest = max(self.largest, value)
 
     def quantile(self, fraction: float) -> float:
-        """The value that `fraction` of all values do not exceed; 0 where there are none."""
+        """Return the value that a fraction of all values does not exceed; 0 without values."""
         rank = math.ceil(fraction * self.count)
         seen = 0
         for at, count in enumerate(self.counts):
             seen += count
             if count and seen >= rank:
-                return min(self._LOW * 10 ** (at / self._A_DECADE), self.largest)
+                return min(self._LOW * 10 ** (at / self._BINS_PER_DECADE), self.largest)
         return self.largest
 
 
 class Clock:
-    """Paces a simulation; `grant` and `release` are called by the thread that runs alone.
+    """Pace of a simulation; `grant` and `release` are called by the simulation thread.
 
-    As it stands, it lets everything run at once and only measures the real-time factor; each kind says what it waits
-    for.
+    This base class never waits and only measures the real-time factor.
     """
 
     pace = "free"
@@ -107,17 +106,17 @@ class Clock:
         self._last_tick = 0
 
     def start(self, tick: int, tick_rate_hz: int) -> None:
-        """Take this tick as the origin; wall time runs from now on."""
+        """Use this tick as the origin, and start the wall time."""
         self._origin_tick = self._last_tick = tick
         self._tick_rate_hz = tick_rate_hz
         self._origin_ns = self._now_ns()
 
     def grant(self, ticks: int) -> int:
-        """How many ticks may run now, at most `ticks`; 0 after a `wake`, so that the caller can look around."""
+        """Return the number of ticks that may run now, at most `ticks`; 0 after a `wake`."""
         return ticks
 
     def release(self, tick: int) -> bool:
-        """Return True when what was simulated up to `tick` is due; False after a `wake`, and is to be called again."""
+        """Return True when the result at `tick` is due; False after a `wake`, then call it again."""
         self._measure(tick, self._now_ns())
         return True
 
@@ -125,10 +124,10 @@ class Clock:
         """Make a waiting `grant` or `release` return; from any thread."""
 
     def hold(self, seconds: float) -> None:
-        """Wait for a `wake`, at most so long; only lockstep ever waits for anybody."""
+        """Wait for a `wake`, at most this long [s]; only lockstep waits."""
 
     def position(self) -> int:
-        """The tick that it is now; without a wall clock the last that was released."""
+        """Return the current tick; without a wall clock, the last one released."""
         return self._last_tick
 
     @property
@@ -137,8 +136,8 @@ class Clock:
         return self._last_s
 
     def statistics(self) -> dict[str, object]:
-        """Real-time factor since the start, lateness of results [ms], and how many were not ready in time."""
-        # Read without a lock: a value that is one block old does no harm, and the simulation thread never waits.
+        """Return the real-time factor since the start, the lateness of results [ms] and the number of overruns."""
+        # Read without a lock: a value that is one block old is acceptable, and the simulation thread never waits.
         late = self._lateness_s
         return {
             "real_time_factor": round(self._factor, 6),
@@ -159,20 +158,20 @@ class Clock:
 
 
 class FreeRun(Clock):
-    """As fast as it goes."""
+    """No pacing: as fast as possible."""
 
 
 class RealTime(Clock):
-    """Results are due when the wall clock reaches their tick: absolute deadlines from one origin, so nothing adds up.
+    """Results are due when the wall clock reaches their tick; deadlines are absolute, so errors do not accumulate.
 
-    Where the simulation is behind, it runs on without waiting until it has caught up; each result that was not ready at
-    its deadline is an overrun. Lateness is the time from the deadline to the return of `release`.
+    A simulation that is behind runs without waiting until it has caught up. Each result that is not ready at its
+    deadline is an overrun. Lateness is the time from the deadline to the return of `release`.
 
     Args:
-        spin_s: Wake this much earlier and poll the clock [s]. Costs that much CPU a block; sleeping alone is
-            about 0.1 ms late.
+        spin_s: Poll the clock this long before a deadline [s]. Costs that much CPU per block; sleeping alone is about
+            0.1 ms late.
         now_ns: Time source [ns], monotonic.
-        sleep: Sleeps for a number of seconds; None: in a way that `wake` ends.
+        sleep: Sleeps for a number of seconds; None: a sleep that `wake` ends.
         utc_ns: The host's clock [unix ns].
     """
 
@@ -194,11 +193,11 @@ class RealTime(Clock):
         self._awaited: int | None = None
 
     def deadline_ns(self, tick: int) -> int:
-        """When a tick is due, in the time of the time source [ns]."""
+        """Return when a tick is due, on the time source [ns]."""
         return self._origin_ns + (tick - self._origin_tick) * _NS // self._tick_rate_hz
 
     def statistics(self) -> dict[str, object]:
-        """The same, and when in UTC a tick was due: by the host's clock, whose own error comes to the uncertainty."""
+        """Return the statistics, and a tick's UTC time by the host's clock, whose error adds to the uncertainty."""
         before, utc_ns = self._now_ns(), self._utc_ns()
         after = self._now_ns()
         now = (before + after) // 2
@@ -208,7 +207,7 @@ class RealTime(Clock):
         return {**super().statistics(), "utc": utc}
 
     def position(self) -> int:
-        """The tick that it is now by the wall clock."""
+        """Return the current tick by the wall clock."""
         return self._origin_tick + (self._now_ns() - self._origin_ns) * self._tick_rate_hz // _NS
 
     def wake(self) -> None:
@@ -219,7 +218,7 @@ class RealTime(Clock):
         """Return True when the wall clock has reached the tick, False before that after a `wake`."""
         deadline = self.deadline_ns(tick)
         now = self._now_ns()
-        # Once a tick: a result that was ready in time is no overrun because a command came in between.
+        # Once per tick: a result that was ready in time is not an overrun because a command arrived meanwhile.
         if now > deadline and self._awaited != tick:
             self._overruns += 1
         self._awaited = tick
@@ -238,13 +237,13 @@ class RealTime(Clock):
 
 
 class Lockstep(Clock):
-    """Runs only what was granted by `allow`.
+    """Runs only ticks granted by `allow`.
 
     Args:
-        timeout_s: A run that is granted nothing for this long ends with `StepTimeoutError` [s]: a partner that died
-            must not leave it hanging.
+        timeout_s: Time without a grant after which the run ends with `StepTimeoutError` [s], so that a failed client
+            does not block it.
         now_ns: Time source [ns], monotonic.
-        wait: Waits on a held condition for a number of seconds; tests put a clock of their own here.
+        wait: Waits on a held condition for a number of seconds; tests replace it.
     """
 
     pace = "lockstep"
@@ -277,17 +276,17 @@ class Lockstep(Clock):
             self._changed.notify()
 
     def hold(self, seconds: float) -> None:
-        """Wait for a `wake`, at most so long [s]: others are at work, and nothing may run meanwhile."""
+        """Wait for a `wake`, at most this long [s], while devices work and nothing may run."""
         with self._changed:
             if not self._woken:
                 self._wait(self._changed, seconds)
             self._woken = False
 
     def grant(self, ticks: int) -> int:
-        """Wait for an allowance and take at most `ticks` of it; 0 after a `wake`.
+        """Wait for an allowance and return at most `ticks` of it; 0 after a `wake`.
 
         Raises:
-            StepTimeoutError: Nothing was allowed in time.
+            StepTimeoutError: Nothing was granted in time.
         """
         with self._changed:
             if self._idle_since_ns is None:

@@ -1,7 +1,7 @@
-"""Where a run is asked, commanded and reported to, be it a simulation that is served or a recording that is played.
+"""Request handling of a run, for a served simulation or a replayed recording.
 
-All that clients say comes in here and is checked here: requests for documents are answered on the transport's threads,
-commands wait for the thread that runs, which takes them between two blocks.
+All client messages arrive and are checked here. Requests for documents are answered on the transport's threads.
+Commands wait for the run's thread, which takes them between two blocks.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from rig.serve.waiting import BoundedQueue
 
 REQUEST_BYTES = 10_000
 _PENDING_COMMANDS = 256
-_AT_ONCE = 64
-"""Commands that are taken between two blocks: they take some ms."""
-_TAKEN_BYTES = 500_000
-"""What is told to latecomers of the commands so far."""
-_KINDS = 100
-"""Kinds of warnings that become events; the status shows the latest of the others too."""
+_MAX_COMMANDS_PER_BLOCK = 64
+"""Commands taken between two blocks; they take some ms."""
+_HISTORY_BYTES = 500_000
+"""Size of the command history for late clients [bytes]."""
+_MAX_KINDS = 100
+"""Kinds of warnings that become events; the status shows the latest of further ones too."""
 _FIGURES = re.compile(r"\d+(\.\d+)?(e[-+]?\d+)?")
 
 
@@ -40,7 +40,7 @@ class Nothing(Outside):
 
 
 class Step(Outside):
-    """How far a run in lockstep, or a replay that is paused, goes on."""
+    """Length of a step of a lockstep run or a paused replay."""
 
     ticks: Annotated[int, Field(gt=0, le=LARGEST)] | None = None
     blocks: Annotated[int, Field(gt=0, le=LARGEST)] | None = None
@@ -53,50 +53,50 @@ def _a_word(text: str) -> str:
 
 
 class Note(Outside):
-    """A line into every recording that is being made."""
+    """A text line for all current recordings."""
 
     text: Annotated[str, a_line(1000)]
     tags: list[Annotated[str, a_line(40), AfterValidator(_a_word)]] = Field(default=[], max_length=10)
 
 
 class Join(Outside):
-    """A device under test: no block is run before it is done with the one before."""
+    """Registration of a device under test: each block waits until the device has finished the one before."""
 
     device: Name
     patience_s: Annotated[float, Field(gt=0.0, le=3600.0)] = 10.0
-    """How long it may take over a block, wall time [s]; a whole number will do."""
+    """Time limit for the device per block, wall time [s]."""
 
 
 class Done(Outside):
-    """A device has dealt with everything up to the end of a block."""
+    """Report that a device has finished a block."""
 
     device: Name
     tick: Annotated[int, Field(ge=0, le=LARGEST)] | None = None
-    """Where that block ends, or:"""
+    """End of the block; alternative to `block`."""
     block: Annotated[int, Field(ge=0, le=LARGEST)] | None = None
-    """its number."""
+    """Number of the block; alternative to `tick`."""
 
     @model_validator(mode="after")
     def _one_of_both(self) -> Done:
         if (self.tick is None) == (self.block is None):
-            raise ValueError("told by a tick or by a block")
+            raise ValueError("given by either a tick or a block")
         return self
 
 
 class Leave(Outside):
-    """A device is waited for no longer."""
+    """End of a device's registration."""
 
     device: Name
 
 
 class Seek(Outside):
-    """Another position of a replay."""
+    """New position of a replay."""
 
     time_s: float
 
 
 class Rate(Outside):
-    """Recorded seconds that a replay plays a second."""
+    """Speed of a replay: recorded over real time."""
 
     rate: float
 
@@ -113,19 +113,19 @@ REQUESTS: dict[str, type[Outside]] = {
     "seek": Seek,
     "rate": Rate,
 }
-"""Commands that are about the run itself; what is done to the rig, the simulation checks (`rig.run.scenes`)."""
+"""Commands of the run itself; commands of the rig are checked by the simulation (`rig.run.scenes`)."""
 
 
 @dataclass(slots=True)
 class Pending:
-    """A command on its way from a transport's thread to the one that runs.
+    """A command on its way from a transport's thread to the run's thread.
 
     Attributes:
         command: Its name.
-        request: Its fields as they came, within the bounds of every document.
-        asked: The same, checked, of those in `REQUESTS`.
-        sender: What the sender calls itself.
-        reply: Takes the payload of the answer.
+        request: Its fields as received, within the size limit of documents.
+        asked: The validated fields, for commands in `REQUESTS`.
+        sender: Name that the sender gives itself.
+        reply: Receives the payload of the reply.
     """
 
     command: str
@@ -139,21 +139,21 @@ class Pending:
         self.reply.set_result(wire.encode_document(dict(document)))
 
     def refuse(self, error: Exception) -> None:
-        """Reply that the command was not taken, and why."""
+        """Reply that the command was refused, with the reason."""
         self.answer(refusal(error))
 
 
 class Desk:
-    """Answers what is asked of one run, until it is closed.
+    """Answers the requests to one run, until it is closed.
 
     Args:
         server: Transport; stays open.
-        commands: Names of those that are taken.
-        others: Commands that are known and refused here, each with the line that says so.
-        running: What a command that comes too late should have been sent while, such as "the rig runs".
-        wake: Makes the thread that runs look for commands.
-        tell: Takes each new kind of trouble, on any thread, for an event.
-        limit: How many commands a second are taken, without `step` and `done`, which wait for their turn, and `stop`.
+        commands: Names of the accepted commands.
+        others: Known commands that are refused here, each with the error text.
+        running: Condition for the error of a late command, such as "the rig runs".
+        wake: Makes the run's thread check for commands.
+        tell: Receives each new kind of failure for an event, on any thread.
+        limit: Limit of commands per second, except `step` and `done`, which wait for their turn, and `stop`.
     """
 
     def __init__(
@@ -180,11 +180,11 @@ class Desk:
         self._kinds: set[str] = set()
         self._troubles: dict[str, str] = {}
         self._passing: set[str] = set()
-        """Kinds of warnings of the transports, which come and go."""
+        """Kinds of the transports' current warnings."""
         self.clients = Clients()
 
     def open(self, documents: Mapping[str, Callable[[], dict[str, Any]]]) -> None:
-        """Begin to answer, with these documents by key, and show the token."""
+        """Start answering, with these documents by key, and publish the token."""
         self._server.on_trouble(self.trouble)
         for key, make in documents.items():
             self._server.answer(key, lambda _, make=make: wire.encode_document(make()))
@@ -193,7 +193,7 @@ class Desk:
         self._server.announce()
 
     def _on_command(self, key: str, payload: bytes) -> bytes | Future[bytes]:
-        """Hand a command to the thread that runs; answered there, or when the run ends."""
+        """Queue a command for the run's thread, which answers it, at the latest when the run ends."""
         name = key.removeprefix(wire.command_key(""))
         try:
             pending = self._parse(name, payload)
@@ -219,8 +219,8 @@ class Desk:
         return Pending(name, request, None if model is None else check(model, request, field=name), sender)
 
     def taken(self) -> Iterator[Pending]:
-        """The commands that have come, oldest first, as many as may be taken between two blocks."""
-        for _ in range(_AT_ONCE):
+        """Yield the received commands, oldest first, up to the limit per block."""
+        for _ in range(_MAX_COMMANDS_PER_BLOCK):
             pending = self._pending.take(0.0)
             if pending is None:
                 return
@@ -228,11 +228,11 @@ class Desk:
         self._wake()  # there may be more
 
     def close(self, ended: str, also: list[Pending]) -> None:
-        """Refuse what is still waiting, and what comes later.
+        """Refuse all waiting and later commands.
 
         Args:
-            ended: What the command met instead of a run.
-            also: Commands that were taken and cannot be done any more.
+            ended: Reason given to the sender.
+            also: Accepted commands that can no longer be completed.
         """
         self._ended = ended
         self._pending.close()
@@ -240,31 +240,31 @@ class Desk:
             pending.refuse(InputError("command", f"sent while {self._running}", ended))
 
     def trouble(self, where: str, error: BaseException) -> None:
-        """Something failed that must not end the run, on any thread: a warning, and an event for each new kind."""
+        """Record a failure that must not end the run, from any thread: a warning, and an event for each new kind."""
         text = f"{where} failed: {type(error).__name__}: {one_line(error)}"
         with self._lock:
             known = where in self._troubles
-            if known or len(self._troubles) < _KINDS:
+            if known or len(self._troubles) < _MAX_KINDS:
                 self._troubles[where] = text
         if not known:
             self.warn(text)
 
     def warn(self, text: str) -> None:
-        """Tell a warning whose kind is new: one whose figures have moved on is not, and the status shows the latest."""
+        """Report a warning of a new kind; a text with other figures is the same kind, and only updates the status."""
         kind = _FIGURES.sub("#", text)
         with self._lock:
-            new = kind not in self._kinds and len(self._kinds) < _KINDS
+            new = kind not in self._kinds and len(self._kinds) < _MAX_KINDS
             if new:
                 self._kinds.add(kind)
         if new:
             self._tell(text)
 
     def warnings(self) -> list[str]:
-        """What went wrong here, for the status."""
+        """Return the warnings for the status."""
         told = getattr(self._server, "warnings", list)()
         kinds = {_FIGURES.sub("#", text) for text in told}
         with self._lock:
-            # What has passed is told anew when it comes again.
+            # A warning that has disappeared is reported again when it returns.
             self._kinds -= self._passing - kinds
             self._passing = kinds
         for text in told:
@@ -278,26 +278,26 @@ class Desk:
 
     @property
     def troubles(self) -> list[str]:
-        """What failed, the latest of each place."""
+        """Failures, the latest of each place."""
         return list(self._troubles.values())
 
 
 class Kept:
-    """Commands that a run took, for latecomers, within bounds: the oldest go first, and are counted."""
+    """History of accepted commands for late clients; the oldest are removed at the size limit, and counted."""
 
     def __init__(self) -> None:
         self.told: dict[str, Any] = {"taken": ()}
-        """For the scene document, from any thread: `taken`, and how many of these are `forgotten`."""
+        """Part of the scene document, readable from any thread: `taken`, and the number of `forgotten` commands."""
         self._bytes = 0
 
     def add(self, taken: dict[str, Any]) -> None:
-        """Keep one more."""
+        """Add a command."""
         rows, forgotten = (*self.told["taken"], taken), self.told.get("forgotten", 0)
         self._bytes += _size(taken)
-        while self._bytes > _TAKEN_BYTES:
+        while self._bytes > _HISTORY_BYTES:
             self._bytes -= _size(rows[0])
             rows, forgotten = rows[1:], forgotten + 1
-        # A new one, as other threads read it.
+        # A new object, as other threads read it.
         self.told = {"taken": rows, **({"forgotten": forgotten} if forgotten else {})}
 
 
@@ -310,11 +310,11 @@ class _Signed(Outside):
 
 
 def refusal(error: Exception) -> dict[str, Any]:
-    """The reply to a command that was not taken: the line, and its parts where it names a field."""
+    """Return the reply to a refused command: the error line, and its parts if it names a field."""
     parts = {"field": error.field, "must": error.must} if type(error) is InputError else {}
     return {"accepted": False, "error": one_line(error), **parts}
 
 
 def one_line(error: BaseException) -> str:
-    """What an error says, without line breaks."""
+    """Return the text of an error without line breaks."""
     return " ".join(printable(str(error), 2000).split()) or type(error).__name__

@@ -1,4 +1,4 @@
-"""A run that is served, be it of a simulation or of a recording: its documents, commands, status, and its end."""
+"""Base of served runs, for a simulation or a recording: documents, commands, status and end."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from rig.serve.pacing import Clock, StepTimeoutError, short_collections
 from rig.serve.request_handler import Desk, Pending, one_line
 from rig.serve.transport import Server
 
-_SUMMED_UP = (
+_SUMMARY_FIGURES = (
     "scene", "pace", "tick", "time_s", "real_time_factor", "lateness_ms", "overruns", "queue", "congestion",
     "samples_published", "commands", "replay",
 )  # fmt: skip
-"""Figures of the last status that are in the summary."""
+"""Values of the last status that the summary contains."""
 
 
 class ServedRun(ABC):
-    """Serves one run from its start to its end; what runs, and how it is published, its kinds say.
+    """Serves one run from its start to its end; subclasses define what runs and how it is published.
 
     Args:
         server: Transport; stays open when the run ends.
         clock: Pace.
         scene: Scene document.
         tick_rate_hz: Ticks per simulated second [Hz].
-        linger_s: At the end of a run, wait at most this long [s] until clients have recovered what they missed.
-        desk: What commands are taken, as for `Desk`.
+        linger_s: Longest wait at the end of a run until clients have recovered missed messages [s].
+        desk: Settings of the request handler.
     """
 
     def __init__(
@@ -54,48 +54,48 @@ class ServedRun(ABC):
         self._accepted = 0
         self._desk = Desk(server, wake=self._wake, tell=self._warn, **desk)
 
-    # ---- what a kind of run provides ----
+    # ---- to be implemented by subclasses ----
 
     @abstractmethod
     def status(self) -> dict[str, Any]:
-        """The status document (see rig/KEYS.md); from any thread."""
+        """Return the status document (see rig/KEYS.md); from any thread."""
 
     @property
     @abstractmethod
     def published(self) -> int:
-        """Row after the last one published, of the stream that clients report on."""
+        """Index after the last published row, of the stream that clients report on."""
 
     @abstractmethod
     def _get_ready(self) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Do what takes its time before anybody is answered; returns the catalogue and the parameters."""
+        """Do slow preparations before requests are answered; return the catalogue and the parameters."""
 
     @abstractmethod
     def _scene_now(self) -> dict[str, Any]:
-        """The scene document with the commands that were taken so far."""
+        """Return the scene document with the accepted commands."""
 
     @abstractmethod
     def _go(self) -> str:
-        """Run; returns why it ended."""
+        """Run; return the reason for the end."""
 
     @abstractmethod
     def _end(self, reason: str) -> dict[str, Any]:
-        """Close the desk and end the stream; returns what the summary has beyond the figures of the status."""
+        """Close the request handler and end the stream; return further entries of the summary."""
 
     @abstractmethod
     def _carry_out(self, pending: Pending) -> dict[str, Any] | None:
-        """Do what a command asks for, and answer it now or later; returns the event that tells of it.
+        """Execute a command, and answer it now or later; return its event.
 
         Raises:
-            InputError: It cannot be done.
+            InputError: The command cannot be executed.
         """
 
     def _arrived(self) -> Iterator[Pending]:
-        """The commands that have come, in the order in which they are taken."""
+        """Yield the received commands, in the order of execution."""
         return self._desk.taken()
 
     @abstractmethod
     def _warn(self, text: str) -> None:
-        """Put a warning into the stream; from any thread."""
+        """Publish a warning event; from any thread."""
 
     # ---- from any thread ----
 
@@ -105,7 +105,7 @@ class ServedRun(ABC):
         self._wake()
 
     def _wake(self) -> None:
-        """Make the thread that runs look around."""
+        """Make the run's thread check for commands."""
         self._clock.wake()
 
     def _status(
@@ -120,7 +120,7 @@ class ServedRun(ABC):
         health: dict[str, Any],
         warnings: list[str],
     ) -> dict[str, Any]:
-        """What every status has, of what its kind knows (units and meaning: rig/KEYS.md)."""
+        """Return the common part of every status (units and meaning: rig/KEYS.md)."""
         return finite(
             {
                 "scene": self._scene.get("name"),
@@ -148,10 +148,10 @@ class ServedRun(ABC):
     def _event(self, name: str, tick: int, **fields: Any) -> dict[str, Any]:
         return {"event": name, "tick": tick, "time_s": tick / self._rate, "wall_s": time.time(), **fields}
 
-    # ---- on the thread that runs ----
+    # ---- on the run's thread ----
 
     def prepare(self) -> None:
-        """Get ready, answer requests and show the rig's token; `run` does it where it was not done before."""
+        """Prepare, start to answer requests and publish the rig's token; `run` calls it if it was not called before."""
         if self._prepared:
             return
         catalogue, parameters = self._get_ready()
@@ -166,10 +166,10 @@ class ServedRun(ABC):
         self._prepared = True
 
     def run(self) -> dict[str, Any]:
-        """Run to the end, to a stop, or to a failure, which is raised after the stream has been ended.
+        """Run until the end, a stop, or a failure, which is raised after the stream has ended.
 
         Returns:
-            Summary: reason, wall_s, the figures of the last status, what is counted, and troubles.
+            Summary: reason, wall_s, values of the last status, counts, and troubles.
         """
         self.prepare()
         reason = "failed"
@@ -189,14 +189,14 @@ class ServedRun(ABC):
             wall_s = time.monotonic() - began_s
             self._state = "ended"
             counts = self._end(reason)
-            # The cache is kept until everybody who is connected has everything.
+            # Keep the cache until all connected clients have received everything.
             self._desk.clients.settle(self._server, self.published, patience_s=self._linger_s)
         status = self.status()
-        figures = {name: status[name] for name in _SUMMED_UP if name in status}
+        figures = {name: status[name] for name in _SUMMARY_FIGURES if name in status}
         return {"reason": reason, "wall_s": wall_s, **figures, **counts, "troubles": self._desk.troubles}
 
     def _take_commands(self) -> list[dict[str, Any]]:
-        """Carry out all commands that have arrived; returns the events that tell of them."""
+        """Execute all received commands; return their events."""
         events = []
         for pending in self._arrived():
             try:
@@ -206,17 +206,17 @@ class ServedRun(ABC):
             except InputError as error:
                 pending.refuse(error)
             except Exception as error:
-                # A request that all checks let through must not end the run.
+                # A request that passes all checks must not end the run.
                 pending.refuse(InputError(pending.command, "readable", one_line(error)))
                 self._desk.trouble(pending.command, error)
         return events
 
     def _accept(self, pending: Pending, tick: int) -> dict[str, Any]:
-        """Count a command; returns its answer.
+        """Count an accepted command; return its reply.
 
         Args:
             pending: The command.
-            tick: When it takes effect, or is done [ticks].
+            tick: When it takes effect, or is complete [ticks].
         """
         self._accepted += 1
         reply = {"accepted": True, "id": self._accepted, "command": pending.command}

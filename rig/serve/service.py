@@ -1,9 +1,9 @@
-"""The only place where a simulation, a clock and a transport meet.
+"""Service of a simulation: the only module that combines a simulation, a clock and a transport.
 
 The simulation thread (the caller of `Service.run`) takes commands at a block boundary, advances, waits until the block
-is due and puts it into a bounded queue; it never waits for another process. A publisher thread encodes and
-publishes. What does not fit into the queue of a paced run is dropped oldest first, whole blocks at a time, and counted;
-the gap also shows in the row numbers. An unpaced run waits for the publisher instead.
+is due and puts it into a bounded queue; it never waits for another process. A publisher thread encodes and publishes. A
+paced run drops the oldest blocks when the queue is full, counts them, and the gap shows in the row numbers. An unpaced
+run waits for the publisher instead.
 """
 
 from __future__ import annotations
@@ -35,26 +35,23 @@ if TYPE_CHECKING:
 
 COMMANDS = (*SUMMARIES, *SERVICE_COMMANDS)
 REPLAY_COMMANDS = ("pause", "resume", "seek", "rate")
-"""Commands that only a replayed recording takes (`replays.player`)."""
+"""Commands of a replay only (`replays.player`)."""
 
-_STEP_S = 3600
+_MAX_STEP_S = 3600
 """Longest single step [s of simulated time]."""
-_HELD_S = 0.1
-"""How long devices are waited for at a time, where none of them must be put out sooner [s]."""
-_WAITING = 256
+_DEVICE_WAIT_S = 0.1
+"""Longest single wait for devices, unless one must be removed sooner [s]."""
+_MAX_WAITING = 256
 """Commands that may wait for other devices."""
-_ANY_HZ = 1e9
-"""Commands a second of one sender in lockstep: any."""
-_HELD_UP_S = 1.0
-"""Blocks that wait to be published for longer than this are told [s]."""
+_UNLIMITED_HZ = 1e9
+"""Commands per second of one sender in lockstep: no limit."""
+_QUEUE_WARNING_S = 1.0
+"""Waiting time of blocks above which a warning is shown [s]."""
 
 
 @dataclass(slots=True)
 class _Entry:
-    """What the publisher sends in one go: events, a block of everything, events, that the block is over; then replies.
-
-    The replies have waited for it.
-    """
+    """Unit of publishing: events, a block of all streams, events, the end of the block, and the waiting replies."""
 
     before: list[dict[str, Any]]
     frame: Frame | None = None
@@ -64,7 +61,7 @@ class _Entry:
 
 
 def _inherit(dropped: _Entry, following: _Entry) -> None:
-    """Events and replies are few, and are not dropped with their block."""
+    """Pass events and replies of a dropped block to the next entry; they are few, and must not be lost."""
     following.before = [*dropped.before, *dropped.after, *following.before]
     following.replies = [*dropped.replies, *following.replies]
 
@@ -73,15 +70,15 @@ class Service(ServedRun):
     """Runs one simulation to its end and serves it.
 
     Args:
-        simulation: Advances, checks commands, describes itself.
+        simulation: The simulation.
         server: Transport; stays open when the run ends.
         clock: Pace.
         block_ticks: Length of a published block [ticks], a whole multiple of the simulation's own.
-        queue_seconds: Blocks that may wait for the publisher [s of simulated time]; more than the transport's patience
-            with one client that stalls in the middle of its recovery.
+        queue_seconds: Blocks that may wait for the publisher [s of simulated time]; longer than the transport waits for
+            a client that stalls during its recovery.
         status_period_s: Wall time between status messages [s].
-        linger_s: At the end of a run, wait at most this long [s] until clients have recovered what they missed.
-        limit: How many commands a second are taken; in lockstep any unless given.
+        linger_s: Longest wait at the end of a run until clients have recovered missed messages [s].
+        limit: Limit of commands per second; in lockstep unlimited by default.
 
     Raises:
         InputError: `block_ticks` does not fit the simulation.
@@ -113,8 +110,8 @@ class Service(ServedRun):
             },
             running="the rig runs",
             linger_s=linger_s,
-            # In lockstep nobody is held up by many, and none may be refused by the clock on the wall.
-            limit=limit or (CommandLimit(_ANY_HZ) if isinstance(clock, Lockstep) else None),
+            # In lockstep many commands delay nobody, and none may be refused because of the wall clock.
+            limit=limit or (CommandLimit(_UNLIMITED_HZ) if isinstance(clock, Lockstep) else None),
         )
         simulation.serve(tuple(doors_of(server)))
         self._simulation = simulation
@@ -134,23 +131,23 @@ class Service(ServedRun):
         self._next_health_s = 0.0
 
         self._kept = Kept()
-        """Commands that the simulation took: whoever comes later cannot run the scene again without them."""
+        """Accepted commands: a late client needs them to repeat the scene."""
         self._waiting: list[Pending] = []
-        """Commands of devices that wait for those of others."""
+        """Commands of devices that wait for other devices."""
         self._steps: list[tuple[int, Pending, dict[str, Any]]] = []
         self._step_target: int | None = None
 
         self._devices = Devices()
         self._blocks = 0
-        """Blocks that were run."""
+        """Number of blocks run."""
         self._ends: dict[int | None, int] = {}
-        """Ends of the last two [ticks], by number."""
+        """Ends of the last two blocks [ticks], by number."""
         self._over: tuple[int, float] = (-1, 0.0)
-        """End of the last block that devices were told is over [ticks], and when [s, monotonic]."""
+        """End of the last block of which devices were notified [ticks], and when [s, monotonic]."""
         self._sent: dict[str, int] = {}
-        """Messages published of each key, as zenoh numbers them."""
+        """Messages published by key, as zenoh numbers them."""
         self._sent_before: dict[str, int] = {}
-        """The same, up to the end of the last block."""
+        """The same at the end of the previous block."""
 
         self._rows = wire.Continuity()
         self._samples_rate_hz = 0.0
@@ -160,17 +157,17 @@ class Service(ServedRun):
 
     @property
     def published(self) -> int:
-        """Row after the last one published, of the stream that clients report on."""
+        """Index after the last published row, of the stream that clients report on."""
         return self._samples_published
 
     def status(self) -> dict[str, Any]:
-        """The status document (see rig/KEYS.md)."""
+        """Return the status document (see rig/KEYS.md)."""
         queue, end_tick = self._queue, self._simulation.end_tick
         warnings = list(self._health.get("warnings", []))
         if queue.dropped:
             warnings.append(f"{queue.dropped} blocks dropped: the publisher did not keep up")
         waiting_s = queue.used * self._block_ticks / self._rate
-        if self._may_drop and waiting_s > _HELD_UP_S:
+        if self._may_drop and waiting_s > _QUEUE_WARNING_S:
             warnings.append(f"{waiting_s:.1f} s of blocks wait: a client holds up the publisher")
         status = self._status(
             tick=self._tick,
@@ -195,7 +192,7 @@ class Service(ServedRun):
     # ---- on the simulation thread ----
 
     def _get_ready(self) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Compile everything."""
+        """Compile all kernels."""
         self._simulation.warm_up()
         self._health = self._simulation.health()
         return self._simulation.catalogue(), self._simulation.parameters_document()
@@ -210,13 +207,13 @@ class Service(ServedRun):
         self._publisher.start()
         self._clock.start(simulation.tick, self._rate)
         reason = self._advance_all()
-        # A recording keeps the last status: it has to be of the end, whatever the time since the one before.
+        # A recording keeps the last status, which must be that of the end.
         self._next_health_s = 0.0
         self._refresh_health()
         return reason
 
     def _advance_all(self) -> str:
-        """The loop; returns why it ended."""
+        """Advance block by block; return the reason for the end."""
         simulation, clock, queue = self._simulation, self._clock, self._queue
         end = simulation.end_tick
         while True:
@@ -231,7 +228,7 @@ class Service(ServedRun):
                 queue.push(_Entry(events, replies=replies))
                 events = []
             if not self._may_drop:
-                # Whoever is to grant the next block may wait for just that.
+                # The client that grants the next block may wait for these events.
                 self._defer(events)
                 events = []
             if end is not None and simulation.tick >= end:
@@ -251,7 +248,7 @@ class Service(ServedRun):
             frame = simulation.advance(ticks)
             answered = []
             while not clock.release(simulation.tick):
-                # A command that comes while the block is not yet due takes effect at its end, and is answered now.
+                # A command received before the block is due takes effect at its end, and is answered now.
                 answered += self._take_commands()
             self._tick = simulation.tick
             after = [{**event, "wall_s": time.time()} for event in frame.events]
@@ -263,40 +260,42 @@ class Service(ServedRun):
             self._refresh_health()
 
     def _defer(self, events: list[dict[str, Any]]) -> None:
-        """Publish events without a block, where the next block is not yet to be run."""
+        """Publish events without a block."""
         if events:
             self._queue.push(_Entry(events))
 
     def _hold(self, events: list[dict[str, Any]]) -> None:
-        """Wait for devices that are not yet done with the last block; who takes too long over it is put out."""
+        """Wait for devices that have not finished the last block; remove those that exceed their time limit."""
         tick, now_s, (over, since_s) = self._simulation.tick, time.monotonic(), self._over
-        # Their time begins when they can know that the block is over.
+        # Their time begins when they are notified of the end of the block.
         since_s = since_s if over == tick else now_s
         late, left_s = self._devices.put_out_late(tick, since_s, now_s, {each.sender for each in self._waiting})
         self._defer([*events, *(self._device(name, "lost", reason=reason) for name, reason in late.items())])
         if not late:
-            self._clock.hold(min(left_s, _HELD_S))
+            self._clock.hold(min(left_s, _DEVICE_WAIT_S))
 
     def _device(self, name: str, state: str, **more: Any) -> dict[str, Any]:
         return self._event("device", self._simulation.tick, device=name, state=state, **more)
 
     def _overflow(self, dropped: int) -> None:
-        """Say once for each time that the queue overflows; the count is in the status."""
+        """Report each overflow of the queue once; the status has the count."""
         if dropped and not self._overflowing:
             text = "the publisher does not keep up: the oldest blocks in the queue are dropped"
             self._queue.push(_Entry([self._event("warning", self._simulation.tick, text=text)]))
         self._overflowing = bool(dropped)
 
     def _arrived(self) -> Iterator[Pending]:
-        """What has come, of devices in the order of their names: whose comes first of two must not be chance.
+        """Yield the received commands, those of devices in the order of their names, independent of their arrival.
 
-        What one of them commands is taken once those before it are done with the block.
+        A device's command is executed once all devices before it have finished the block.
         """
         for pending in self._desk.taken():
-            if len(self._waiting) < _WAITING:
+            if len(self._waiting) < _MAX_WAITING:
                 self._waiting.append(pending)
             else:
-                pending.refuse(InputError("commands", f"at most {_WAITING} that wait for other devices", _WAITING + 1))
+                pending.refuse(
+                    InputError("commands", f"at most {_MAX_WAITING} that wait for other devices", _MAX_WAITING + 1)
+                )
         while (place := self._devices.first_due(self._waiting, self._simulation.tick)) is not None:
             yield self._waiting.pop(place)
 
@@ -321,13 +320,13 @@ class Service(ServedRun):
         else:
             self._steps.append((done_tick, pending, reply))
         if isinstance(asked, Note):
-            # An event of its own: it does nothing to the rig, so whoever repeats the commands can pass over it.
+            # A separate event: it does not affect the rig, so it is skipped when commands are repeated.
             return {**self._event("note", tick, id=self._accepted), **asked.model_dump(), "from": pending.sender}
         detail = {"id": self._accepted, "command": pending.command, "request": pending.request, "from": pending.sender}
         return self._event("command", tick, **detail)
 
     def _take_device(self, pending: Pending, asked: Join | Done | Leave) -> dict[str, Any] | None:
-        """A device under test joins, is done with a block, or leaves."""
+        """Handle a device that joins, has finished a block, or leaves."""
         self._need_lockstep(pending.command)
         tick, name = self._simulation.tick, asked.device
         if isinstance(asked, Done):
@@ -339,7 +338,7 @@ class Service(ServedRun):
                 must = f"with tick {tick}, the end of the last block ({self._blocks})"
                 pending.refuse(InputError("done", must, Words(word)))
                 return self._device(name, "lost", reason=reason)
-            # Not counted, and no event: there is one a block, and who of several is first is chance.
+            # Not counted, and without an event: there is one per block, and the order of several devices is random.
             pending.answer({"accepted": True, "id": 0, "command": "done", "tick": tick, "time_s": tick / self._rate})
             return None
         if isinstance(asked, Join):
@@ -356,12 +355,12 @@ class Service(ServedRun):
         raise InputError(command, "sent to a rig that runs with --pace lockstep", Words(f"--pace {self._clock.pace}"))
 
     def _check_step(self, asked: Step) -> int:
-        """Grant a step; returns the tick at which it is done."""
+        """Grant a step; return the tick of its end."""
         clock = self._need_lockstep("step")
         ticks, unit = asked.ticks, self._simulation.block_ticks
-        most = _STEP_S * self._rate
+        most = _MAX_STEP_S * self._rate
         if asked.blocks is not None:
-            raise InputError("step.blocks", "left out, but for a replay", asked.blocks)
+            raise InputError("step.blocks", "left out, except for a replay", asked.blocks)
         if ticks is None or ticks > most or ticks % unit:
             raise InputError("ticks", f"a positive whole multiple of {unit}, at most {most}", ticks)
         start = self._step_target if self._step_target is not None else self._simulation.tick
@@ -373,7 +372,7 @@ class Service(ServedRun):
         return self._step_target
 
     def _finished_steps(self) -> list[tuple[Pending, dict[str, Any]]]:
-        """Steps that the last block completed; they are answered once it is published and all devices are done."""
+        """Return the steps completed by the last block, which are answered after publishing and all devices."""
         if not self._steps or self._devices.behind(self._tick):
             return []
         lost = {"lost": dict(self._devices.lost)} if self._devices.lost else {}
@@ -386,7 +385,7 @@ class Service(ServedRun):
         return done
 
     def _refresh_health(self) -> None:
-        """Ask the simulation how it is, a few times a second; each new kind of warning becomes an event."""
+        """Update the simulation's health a few times per second; each new kind of warning becomes an event."""
         now = time.monotonic()
         if now < self._next_health_s:
             return
@@ -401,7 +400,7 @@ class Service(ServedRun):
         self._queue.close()
         if self._publisher.ident is not None:
             self._publisher.join(timeout=60.0)
-        # Where the publisher failed, nobody else answers the steps that it left.
+        # If the publisher failed, the remaining steps are answered here.
         while (entry := self._queue.take(0.0)) is not None:
             self._answer(entry)
         return {"rows": dict(self._rows.next)}
@@ -417,14 +416,14 @@ class Service(ServedRun):
             now = time.monotonic()
             if now >= next_status_s:
                 self._guarded("publishing the status", self._publish_status)
-                # Not one period after the last: a status that was held up is not followed by a burst.
+                # Not one period after the last one, so that a delayed status is not followed by a burst.
                 next_status_s = now + self._status_period_s
-        # Last of all events: what fails while the rest of the queue is published is told before it.
+        # The last event: failures while the queue is published are reported before it.
         self._guarded("publishing events", self._publish_event, self._end_event)
         self._guarded("publishing the status", self._publish_status)
 
     def _guarded(self, what: str, work: Callable[..., None], *arguments: Any) -> None:
-        """Do one thing of this thread, which fails alone: pacing and all other streams go on."""
+        """Do one task of this thread; a failure does not affect other streams or the pace."""
         try:
             work(*arguments)
         except Exception as error:
@@ -452,7 +451,7 @@ class Service(ServedRun):
         self._answer(entry)
 
     def _publish_block(self, message: Message) -> None:
-        # Whoever does not get it learns from the end what is missing.
+        # A client that misses rows learns from the end event what is missing.
         self._rows.follow(message.key, message.row, len(message.block.values), late_rows=math.inf)
         if "zenoh" in message.doors:
             self._sent[message.key] = self._sent.get(message.key, 0) + 1
@@ -463,7 +462,7 @@ class Service(ServedRun):
             server.publish(message.key, wire.encode_block(message.block))
 
     def _publish_over(self, over: dict[str, Any]) -> None:
-        """That all of a block was published, and the last message of each key that anything came of since the last."""
+        """Publish the end of a block, with the number of the last message of each key that had new messages."""
         last = {key: sent - 1 for key, sent in self._sent.items() if sent != self._sent_before.get(key)}
         self._server.publish(wire.BLOCK, wire.encode_document({**over, "messages": last}))
 
@@ -475,7 +474,7 @@ class Service(ServedRun):
         self._server.publish(wire.STATUS, wire.encode_document(self.status()))
 
     def _count_samples(self, frame: Frame) -> None:
-        """What clients are measured against: the probes, or the first group of a scene without them."""
+        """Update the reference for client lag: the probes, or the first group of a scene without probes."""
         group = "probes" if "probes" in frame.samples else next(iter(frame.samples), None)
         if group is not None:
             self._samples_rate_hz = frame.samples[group].rate_hz

@@ -1,9 +1,9 @@
-"""What is taken of a rig's streams: blocks as its catalogue promises them, in line, and events of their form.
+"""Validation of a rig's streams: blocks must match the catalogue and continue their stream, and events their schema.
 
-A forged or damaged block must neither be believed nor end anything, while a gap, a repetition and a rig that is started
-again are what happens. A block says enough to tell: columns and rates stand in the catalogue, time and row number hang
-together, and a step of the row number is believed once another block goes on from it. Until then blocks behind the step
-wait; where the old line goes on instead, they were none of it and are refused.
+A forged or damaged block must neither be accepted nor end anything, whereas gaps, repetitions and a restarted rig are
+normal. Columns and rates are in the catalogue, time and row number are related, and a jump of the row number is
+accepted once another block continues from it. Until then, blocks after the jump wait. If the old sequence continues
+instead, they are refused.
 """
 
 from __future__ import annotations
@@ -21,29 +21,29 @@ from rig.base.errors import InputError
 from rig.channels.faults.ledger import Declared
 from rig.channels.table import ChannelTable
 
-_MOST_S = 1e9
+_MAX_TIME_S = 1e9
 """Thirty years: longer than any simulated time [s]."""
-_MOST_STEP = 1 << 40
-"""Rows that a stream may step ahead at once: almost two years at 20 kHz."""
-_MOST_OTHERS = 16
-"""Streams that the catalogue does not name and that are taken nevertheless (a replay can give them other keys)."""
+_MAX_JUMP = 1 << 40
+"""Largest jump of a stream [rows]: almost two years at 20 kHz."""
+_MAX_UNKNOWN = 16
+"""Number of streams accepted although the catalogue lacks them (a replay can rename keys)."""
 _BLOCK_BYTES = 64 << 20
-_MOST_WAITING = 8
-"""Blocks of a stream that wait; with more, so much is lost that no block goes on from another, and they are taken."""
-_MOST_LEFT_OUT = 64
+_MAX_WAITING = 8
+"""Blocks of a stream that wait. With more, so much is lost that no block continues another; they are accepted."""
+_MAX_REFUSED = 64
 _EVENT_BYTES = 1 << 20
 _Text = Annotated[str, Field(max_length=10_000)]
 _Rate = Annotated[float, Field(gt=0.0, le=1e12)]
 
 
 class Event(Outside):
-    """An event of the stream: what is acted on; further fields are only shown."""
+    """An event of the stream: the fields that are used; further fields are only displayed."""
 
     model_config = ConfigDict(extra="allow")
 
     event: Name
     tick: Annotated[int, Field(ge=-(2**53), le=2**53)] | None = None
-    time_s: Annotated[float, Field(ge=-_MOST_S, le=1e10)] | None = None
+    time_s: Annotated[float, Field(ge=-_MAX_TIME_S, le=1e10)] | None = None
     wall_s: float | None = None
     reason: _Text | None = None
     text: _Text | None = None
@@ -55,31 +55,31 @@ class Event(Outside):
 
 
 class BlockEnd(Outside):
-    """The end of a block in lockstep: all of it was published before."""
+    """The end of a block in lockstep: the whole block was published before."""
 
     block: Count
-    """Its number in this run, from 1 on."""
+    """Number of the block in this run, from 1."""
     tick: Count
-    """Where it ends [ticks]: what a device says that it is done with."""
+    """End of the block [ticks], as devices report it."""
     time_s: float
     messages: dict[str, Annotated[int, Field(ge=-1)]]
-    """Number of the last message, by key, of which any was published since the block before."""
+    """Number of the last message by key, of keys with messages since the block before."""
 
 
 def block_end_in(payload: bytes) -> BlockEnd:
-    """The end of a block in a payload.
+    """Return the end of a block from a payload.
 
     Raises:
-        InputError: It is none.
+        InputError: The payload is invalid.
     """
     return check(BlockEnd, read_json(payload, field="block", most_bytes=_EVENT_BYTES), field="block")
 
 
 def event_in(payload: bytes) -> dict[str, Any]:
-    """The event in a payload.
+    """Return the event from a payload.
 
     Raises:
-        InputError: It is none.
+        InputError: The payload is invalid.
     """
     document = read_json(payload, field="event", most_bytes=_EVENT_BYTES)
     check(Event, document, field="event")
@@ -88,11 +88,11 @@ def event_in(payload: bytes) -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True)
 class Promise:
-    """What all blocks of a stream have in common.
+    """Common properties of all blocks of a stream.
 
     Attributes:
         columns: Values per row.
-        rate_hz: Rows per simulated second [Hz]; 0 for rows that come when there are any.
+        rate_hz: Rows per simulated second [Hz]; 0 for a stream without a fixed rate.
         tick_rate_hz: Ticks per simulated second [Hz].
     """
 
@@ -101,22 +101,23 @@ class Promise:
     tick_rate_hz: float
 
     def broken_by(self, block: wire.Block) -> str:
-        """What is wrong with a block; empty if nothing is."""
+        """Return the difference of a block from the catalogue; empty if there is none."""
         rows, columns = block.values.shape
         if not rows or (columns, block.rate_hz, block.tick_rate_hz) != (self.columns, self.rate_hz, self.tick_rate_hz):
             return (
                 f"{rows} rows of {columns} values at {block.rate_hz:g} Hz, {block.tick_rate_hz:g} ticks a second; "
-                f"the catalogue promises {self.columns} at {self.rate_hz:g} Hz, {self.tick_rate_hz:g} ticks a second"
+                f"the catalogue declares {self.columns} at {self.rate_hz:g} Hz, {self.tick_rate_hz:g} ticks a second"
             )
         return ""
 
     def untimely(self, block: wire.Block) -> str:
-        """What is wrong with its time, or its number; empty if nothing is."""
-        rows, most = len(block.values), _MOST_S * self.tick_rate_hz
-        if not (abs(block.tick) <= most and block.index >= 0 and block.index + rows <= _MOST_S * (self.rate_hz or 1e3)):
-            return f"row {block.index} at tick {block.tick} is beyond {_MOST_S:g} s"
+        """Return the error of a block's time or row number; empty if there is none."""
+        rows, most = len(block.values), _MAX_TIME_S * self.tick_rate_hz
+        most_rows = _MAX_TIME_S * (self.rate_hz or 1e3)
+        if not (abs(block.tick) <= most and block.index >= 0 and block.index + rows <= most_rows):
+            return f"row {block.index} at tick {block.tick} is beyond {_MAX_TIME_S:g} s"
         if self.rate_hz:
-            # Both begin at 0. A tick is rounded, and a recording that is numbered anew moves by whole rows.
+            # Both begin at 0. Ticks are rounded, and a renumbered recording is shifted by whole rows.
             ticks_a_row = self.tick_rate_hz / self.rate_hz
             if abs(block.tick - block.index * ticks_a_row) > 2.0 * ticks_a_row + 1.0:
                 return f"row {block.index} cannot be at tick {block.tick}"
@@ -129,20 +130,20 @@ class _Truth(BaseModel):
 
 
 class Catalogue(BaseModel):
-    """A rig's catalogue, as far as its streams are concerned."""
+    """The part of a rig's catalogue that describes its streams."""
 
     table: ChannelTable
     tick_rate_hz: _Rate
     truth: dict[str, _Truth] = {}
     rates_hz: dict[str, _Rate] = {}
-    """True rates by group, where the table tells them as whole numbers: those of a log of another system."""
+    """Exact rates by group, if the table has rounded ones, as for logs of other systems."""
 
     @classmethod
     def read(cls, document: Mapping[str, Any]) -> Catalogue:
-        """The catalogue in a document.
+        """Return the catalogue from a document.
 
         Raises:
-            InputError: It is none.
+            InputError: The document is not a catalogue.
         """
         try:
             return cls.model_validate(document)
@@ -152,7 +153,7 @@ class Catalogue(BaseModel):
             raise InputError("catalogue", f"that of a rig of this version ({first['msg']})", where) from None
 
     def promises(self) -> dict[str, Promise]:
-        """What its streams promise, by key."""
+        """Return the properties of the declared streams, by key."""
         ticks = self.tick_rate_hz
         found = {wire.EDGES: Promise(1, 0.0, ticks)}
         for name, group in self.table.groups.items():
@@ -165,13 +166,13 @@ class Catalogue(BaseModel):
 
 
 class Taken(NamedTuple):
-    """A block that is believed.
+    """An accepted block.
 
     Attributes:
-        key: Its stream.
-        block: What it holds.
+        key: Key of its stream.
+        block: Its decoded content.
         payload: Its bytes.
-        wall_ns: When it came, where that was told [unix ns].
+        wall_ns: Time of arrival, if known [unix ns].
     """
 
     key: str
@@ -181,41 +182,41 @@ class Taken(NamedTuple):
 
     @property
     def end(self) -> int:
-        """Number of the row after its last one."""
+        """Index after its last row."""
         return self.block.index + len(self.block.values)
 
 
 class Intake:
-    """Takes blocks of one rig's streams and gives those that are believed; the blocks of one stream on one thread.
+    """Validates the blocks of one rig's streams; the blocks of a stream must come on one thread.
 
     Args:
-        catalogue: What the rig says of its streams.
+        catalogue: The rig's catalogue.
     """
 
     def __init__(self, catalogue: Catalogue) -> None:
         self._promises = catalogue.promises()
-        self._most = len(self._promises) + _MOST_OTHERS
+        self._most = len(self._promises) + _MAX_UNKNOWN
         self._waiting: dict[str, list[Taken]] = {}
-        """Blocks behind a step, as they came, until another one tells whose line goes on."""
+        """Blocks after a jump, as received, until another block shows which sequence continues."""
         self._rows = Declared()
         self._left_out: dict[str, deque[Taken]] = {}
-        """The latest blocks that were refused: what is told of them may come behind them."""
+        """The latest refused blocks: a declaration of a fault may arrive after them."""
         self.next = self._rows.next
-        """Number of the row that is due next, by key."""
+        """Index of the next expected row, by key."""
         self.refused = 0
-        """Blocks that cannot be of this rig, or were of no line."""
+        """Number of blocks that are invalid or continue no sequence."""
         self.why = ""
-        """What was wrong with the first of them."""
+        """Reason for the first refusal."""
 
     def knows(self, key: str) -> bool:
-        """Whether there is such a stream."""
+        """Return whether the catalogue has the stream."""
         return key in self._promises
 
     def take(self, key: str, payload: bytes, wall_ns: int = 0) -> list[Taken]:
-        """Take a payload; gives the blocks that can be believed now, in order.
+        """Accept a payload; return the blocks that are valid now, in order.
 
         Raises:
-            ValueError: It is no whole message.
+            ValueError: The payload is not a complete message.
         """
         if len(payload) > _BLOCK_BYTES:
             raise InputError("block", f"at most {_BLOCK_BYTES} bytes", len(payload))
@@ -240,16 +241,16 @@ class Intake:
             return self._believe([new])
         if why := promise.untimely(block):
             return self._refuse(key, why, new)
-        if block.index - due > _MOST_STEP:
+        if block.index - due > _MAX_JUMP:
             return self._refuse(key, f"row {block.index} is {block.index - due} rows ahead")
         waiting = self._waiting.setdefault(key, [])
         place = next((n for n, each in enumerate(waiting) if each.end == block.index), None)
         if block.index != due and place is None:
             waiting.append(new)
-            return self._first(key, behind=True) if len(waiting) > _MOST_WAITING else []
+            return self._first(key, behind=True) if len(waiting) > _MAX_WAITING else []
         line = [new]
         for n, each in reversed(list(enumerate(waiting))):
-            # What the new block goes on from; with gap upon gap, also those between that and the old line.
+            # The block that the new one continues; with several gaps, also those between it and the old sequence.
             between = n != place and due <= each.block.index and each.end <= line[0].block.index
             if block.index != due and (n == place or (between and len(line) > 1)):
                 line.insert(0, each)
@@ -259,9 +260,9 @@ class Intake:
         return self._believe(line)
 
     def declare(self, document: Mapping[str, Any]) -> list[Taken]:
-        """Take note of a document on faults; gives the blocks that can be believed by it.
+        """Apply a declaration of faults; return the blocks that are valid because of it.
 
-        Blocks that a fault doubles, turns round or stamps anew are believed where that is told, and only there.
+        Blocks that a fault duplicates, reorders or stamps with other times are valid only if declared.
         """
         found = list[Taken]()
         if not self._rows.declare(document):
@@ -277,11 +278,11 @@ class Intake:
         return found
 
     def rest(self, rows: Mapping[str, int] | None, key: str | None = None) -> list[Taken]:
-        """At the end: the blocks that still wait and are part of what was published.
+        """Return the waiting blocks that were published, at the end of the stream.
 
         Args:
-            rows: Number of the row after the last one published, by key; None where that is not known.
-            key: Only of this stream.
+            rows: Index after the last published row, by key; None if unknown.
+            key: Only this stream.
         """
         found = []
         for name in list(self._waiting) if key is None else [key]:
@@ -291,7 +292,7 @@ class Intake:
         return found
 
     def _first(self, key: str, *, last: int | None = None, behind: bool = False) -> list[Taken]:
-        """Of the blocks that wait, the next one ahead, up to row `last`; else, if that may be, the first one behind."""
+        """Return the next waiting block ahead, up to row `last`; otherwise, if `behind`, the first one behind."""
         waiting, due = self._waiting.get(key, []), self.next.get(key, 0)
         ahead = [
             n
@@ -320,6 +321,6 @@ class Intake:
     def _refuse(self, key: str, why: str, block: Taken | None = None) -> list[Taken]:
         self.refused += 1
         if block is not None:
-            self._left_out.setdefault(key, deque(maxlen=_MOST_LEFT_OUT)).append(block)
+            self._left_out.setdefault(key, deque(maxlen=_MAX_REFUSED)).append(block)
         self.why = self.why or f"{key}: {why}"
         return []

@@ -1,8 +1,7 @@
-"""Waiting of one thread for others: until a deadline, and for items in a bounded queue.
+"""Waiting of threads: for a deadline, and for items in a bounded queue.
 
-Every wait with a deadline goes through `Deadline` or `wait_until`; tests/house/test_one_deadline.py finds another.
-Whoever adds an item to a queue chooses what happens where there is no room: `offer` refuses it, `push` drops the
-oldest, and `put` waits.
+Every wait with a deadline uses `Deadline` or `wait_until`; tests/house/test_one_deadline.py finds others. On a full
+queue, `offer` refuses an item, `push` drops the oldest, and `put` waits.
 """
 
 from __future__ import annotations
@@ -16,11 +15,11 @@ from typing import Generic, TypeVar
 
 T = TypeVar("T")
 POLL_S = 0.02
-"""Usual time between two looks at a condition of which no thread notifies [s]."""
+"""Default period of checking a condition that no thread notifies [s]."""
 
 
 class Deadline:
-    """An end of waiting, on the monotonic clock.
+    """A deadline on the monotonic clock.
 
     Args:
         timeout_s: Time from now to the deadline [s]; None: never.
@@ -31,7 +30,7 @@ class Deadline:
 
     @property
     def left_s(self) -> float:
-        """Time that is left [s]: 0 once the deadline has passed, infinite without one."""
+        """Remaining time [s]: 0 after the deadline, infinite without one."""
         return max(0.0, self._end_s - time.monotonic())
 
     @property
@@ -40,13 +39,13 @@ class Deadline:
         return time.monotonic() >= self._end_s
 
     def wait(self, changed: threading.Condition) -> bool:
-        """Wait until a condition is notified, at the latest until the deadline.
+        """Wait until a condition is notified, at most until the deadline.
 
         Args:
             changed: The condition, whose lock is held.
 
         Returns:
-            True: check again what is waited for. False, without a wait: the deadline has passed.
+            True: check the state again. False, without a wait: the deadline has passed.
         """
         left_s = self.left_s
         if left_s > 0.0:
@@ -68,12 +67,12 @@ class Deadline:
 
 
 def wait_until(condition: Callable[[], object], timeout_s: float, *, every_s: float = POLL_S) -> bool:
-    """Look at a condition again and again until it holds or the time is over.
+    """Check a condition repeatedly until it holds or the time is over.
 
     Args:
         condition: Returns whether it holds.
         timeout_s: Longest wait [s].
-        every_s: Time between two looks [s].
+        every_s: Time between two checks [s].
 
     Returns:
         Whether it holds.
@@ -82,21 +81,21 @@ def wait_until(condition: Callable[[], object], timeout_s: float, *, every_s: fl
 
 
 class BoundedQueue(Generic[T]):
-    """First in, first out; from any thread.
+    """A first-in first-out queue for any threads.
 
     Args:
-        room: What may wait, in the unit of `size`.
-        size: What an item takes of it.
-        holds: Whether what was taken counts until something else is taken: it is in memory while it is dealt with.
-        inherit: Called with an item that is dropped and the one after it, before anybody can take that. Without it,
-            items that take no room are never dropped.
-        changed: Condition that is shared with other queues, to wait for all of them (`take_first`).
+        room: Capacity, in the unit of `size`.
+        size: Returns the size of an item.
+        holds: Count the item taken last until the next one is taken: it is in memory while it is processed.
+        inherit: Called with a dropped item and the following one, before that can be taken. Without it, items of size 0
+            are never dropped.
+        changed: Condition shared with other queues, to wait for all of them (`take_first`).
 
     Attributes:
-        used: What waits takes of the room, and with `holds` what was taken last.
-        high_water: Most that was ever used.
-        dropped: Items that were refused or dropped for want of room, without those that take none.
-        closed: Whether `offer` and `put` add no more items; those that wait can still be taken.
+        used: Size of the waiting items and, with `holds`, of the item taken last.
+        high_water: Largest value of `used`.
+        dropped: Number of items refused or dropped because the queue was full, except those of size 0.
+        closed: Whether `offer` and `put` add no more items; waiting items can still be taken.
     """
 
     def __init__(
@@ -123,11 +122,11 @@ class BoundedQueue(Generic[T]):
 
     @property
     def ended(self) -> bool:
-        """Whether it is closed, and all was taken."""
+        """Whether it is closed and empty."""
         return self.closed and not self._items
 
     def offer(self, item: T, *, room: int | None = None) -> bool:
-        """Add an item if it fits, into another room where one is given; returns whether it did."""
+        """Add an item if it fits, in `room` if given; return whether it was added."""
         size = self._size(item)
         with self._changed:
             if self.closed:
@@ -139,9 +138,9 @@ class BoundedQueue(Generic[T]):
             return True
 
     def push(self, item: T) -> int:
-        """Add an item and drop the oldest ones until it fits; returns how many that take room were dropped.
+        """Add an item and drop the oldest ones until it fits; return how many were dropped, except those of size 0.
 
-        A closed queue takes it too: it goes out where somebody still takes what waits.
+        A closed queue accepts it too, for as long as its items are still taken.
         """
         size, dropped = self._size(item), 0
         with self._changed:
@@ -159,7 +158,7 @@ class BoundedQueue(Generic[T]):
         return dropped
 
     def put(self, item: T, timeout_s: float | None = None) -> bool:
-        """Add an item as soon as it fits; returns False where it is closed, or there was no room in time."""
+        """Add an item as soon as it fits; return False if the queue is closed, or stays full until the timeout."""
         size = self._size(item)
         with self._changed:
             self._changed.wait_for(lambda: self.closed or self.used + size <= self.room, timeout_s)
@@ -169,22 +168,22 @@ class BoundedQueue(Generic[T]):
             return True
 
     def wait_for_room(self, timeout_s: float) -> bool:
-        """Whether there is any room, at the latest after the time [s]."""
+        """Return whether the queue has room, waiting at most this long [s]."""
         with self._changed:
             return self._changed.wait_for(lambda: self.used < self.room, timeout_s)
 
     def wait_for_item(self, timeout_s: float) -> bool:
-        """Whether something can be taken, at the latest after the time [s]."""
+        """Return whether an item can be taken, waiting at most this long [s]."""
         with self._changed:
             self._changed.wait_for(lambda: self._items or self.closed, timeout_s)
             return bool(self._items)
 
     def take(self, timeout_s: float | None = None) -> T | None:
-        """The oldest item; None after the time [s], or where it is closed and empty."""
+        """Return the oldest item; None after the timeout [s], or if the queue is closed and empty."""
         return next(iter(self.take_many(1, timeout_s)), None)
 
     def take_many(self, most: int, timeout_s: float | None = None) -> list[T]:
-        """The oldest items, as soon as there are any; none after the time [s], or where it is closed and empty."""
+        """Return the oldest items, as soon as there are any; none after the timeout [s], or if closed and empty."""
         with self._changed:
             if self._held:
                 self.used, self._held = self.used - self._held, 0
@@ -201,14 +200,14 @@ class BoundedQueue(Generic[T]):
             return items
 
     def clear(self) -> None:
-        """Forget what waits."""
+        """Remove all waiting items."""
         with self._changed:
             self._items.clear()
             self.used = self._held
             self._changed.notify_all()
 
     def close(self) -> None:
-        """Nobody is to wait for it any more; whoever waits goes on."""
+        """Close the queue and wake all waiting threads."""
         with self._changed:
             self.closed = True
             self._changed.notify_all()
@@ -223,12 +222,12 @@ class BoundedQueue(Generic[T]):
 def take_first(
     changed: threading.Condition, queues: tuple[BoundedQueue[T], ...], timeout_s: float | None = None
 ) -> T | None:
-    """The oldest item of the first queue that has one; None after the time [s], or as soon as one is closed and empty.
+    """Return the oldest item of the first queue that has one; None after the timeout, or if one is closed and empty.
 
     Args:
-        changed: Condition that they share.
-        queues: The first goes before the others.
-        timeout_s: How long to wait; None: until there is one.
+        changed: Condition shared by the queues.
+        queues: The queues, in order of priority.
+        timeout_s: Longest wait [s]; None: without limit.
     """
     with changed:
         changed.wait_for(lambda: any(len(queue) or queue.closed for queue in queues), timeout_s)

@@ -301,7 +301,7 @@ def test_clients_say_why_they_are_not_let_in_and_what_is_denied(folders: Path) -
             with pytest.raises(NoReplyError, match=rf"^the rig at {exposed} does not answer rig/parameters$"):
                 viewer.request("rig/parameters", timeout_s=0.2)
         for endpoint, tls, message in (
-            (exposed, None, "without a certificate: for a rig that is exposed give --tls"),
+            (exposed, None, "without a certificate: an exposed rig needs --tls"),
             (
                 exposed,
                 folders / "others" / "viewer",
@@ -309,7 +309,7 @@ def test_clients_say_why_they_are_not_let_in_and_what_is_denied(folders: Path) -
             ),
             (plain, folders / "viewer", "as viewer, .*: no TLS is spoken there"),
         ):
-            with pytest.raises(NoReplyError, match=rf"^{endpoint} listens, but does not let us in {message}"):
+            with pytest.raises(NoReplyError, match=rf"^{endpoint} listens, but refuses this client {message}"):
                 ZenohClient(endpoint, wait_s=0.2, tls=tls)
     with pytest.raises(NoReplyError, match=f"^no rig answers at {exposed}"):
         ZenohClient(exposed, wait_s=0.2, tls=folders / "viewer")

@@ -92,9 +92,9 @@ def complete(root: Group, shell: str, line: str) -> list[str]:
     """Return the candidates for the end of a line, in the format of the shell scripts.
 
     Args:
-       root: The command line.
-       shell: Name of the shell.
-       line: The line up to the cursor, beginning with the program's name.
+        root: The command line.
+        shell: Name of the shell.
+        line: The line up to the cursor, beginning with the program's name.
     """
     *before, start = _words(line)
     command, option, place = _reached(root, before[1:])

@@ -70,7 +70,7 @@ class FitRequest:
         """Return the fit, and the keys that were fitted in addition because an imported log does not contain them.
 
         Raises:
-           InputError: The recording, its scene or the model lacks a requested value.
+            InputError: The recording, its scene or the model lacks a requested value.
         """
         from replays.recordings.identification import ask
         from replays.recordings.identification import identify as identify_recording
@@ -134,7 +134,7 @@ class Search:
         """Raise an error for settings that a fit of another system's log does not use.
 
         Raises:
-           InputError: Names the first such option.
+            InputError: Names the first such option.
         """
         from rig.base.errors import InputError
 

@@ -90,7 +90,7 @@ class Triggers:
         """Return what to capture of a run, or None to record all of it.
 
         Raises:
-           InputError: A trigger is invalid, or the other options are given without a trigger.
+            InputError: A trigger is invalid, or the other options are given without a trigger.
         """
         from recorder.output.trigger import Capture, Trigger
 
@@ -123,7 +123,7 @@ class Disk:
         """Return the limits of file size and disk space.
 
         Raises:
-           InputError: The backlog is out of range.
+            InputError: The backlog is out of range.
         """
         from recorder.output.disk_limits import Limits
 

@@ -84,7 +84,7 @@ class ReplayEdit:
         """Return the edit of a track: its payloads, their keys and their columns.
 
         Raises:
-           InputError: The recording lacks a key or channel, or two would have the same name.
+            InputError: The recording lacks a key or channel, or two would have the same name.
         """
         from replays.player.edit import Edit
         from rig.base.wire import CATALOGUE

@@ -218,10 +218,10 @@ def _saved(
     """Write the drawing to a file that gets its name once it is complete.
 
     Args:
-       stream: Stream to draw to.
-       path: The file.
-       plan: The blueprint.
-       until_interrupted: Keep the file after Ctrl-C.
+        stream: Stream to draw to.
+        path: The file.
+        plan: The blueprint.
+        until_interrupted: Keep the file after Ctrl-C.
     """
     with whole_file(path) as part:
         stream.save(part, default_blueprint=plan)

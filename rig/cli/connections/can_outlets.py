@@ -17,13 +17,13 @@ class CanOutlets:
     """The outlets of the CAN buses.
 
     Args:
-       buses: Functions that create a node, by bus.
-       speed: Bit rates of the buses.
-       socketcand: HOST:PORT of a server for all buses; None: no server.
-       slcan: Open a pseudo-terminal with an SLCAN adapter for each bus.
+        buses: Functions that create a node, by bus.
+        speed: Bit rates of the buses.
+        socketcand: HOST:PORT of a server for all buses; None: no server.
+        slcan: Open a pseudo-terminal with an SLCAN adapter for each bus.
 
     Raises:
-       InputError: The server's address is invalid or in use.
+        InputError: The server's address is invalid or in use.
     """
 
     def __init__(

@@ -43,10 +43,10 @@ class CanMessages:
         """Return the schedule of the messages and the bit rates.
 
         Args:
-           channels: Channels to send; by default the rig's own.
+            channels: Channels to send; by default the rig's own.
 
         Raises:
-           InputError: A rate is invalid, or a channel has no message.
+            InputError: A rate is invalid, or a channel has no message.
         """
         from drivers.can.schedule import schedule_from
         from drivers.can.signals import messages_for
@@ -87,7 +87,7 @@ class CanOptions:
         """Return the CAN output for these channels, or None without --can; see `CanOutput`.
 
         Raises:
-           InputError: The bus is invalid, or options of the bus are given without --can.
+            InputError: The bus is invalid, or options of the bus are given without --can.
         """
         if self.can is not None:
             return CanOutput(self.can, self, channels)
@@ -104,12 +104,12 @@ class CanOutput:
     """A CAN bus as an additional transport of the rig.
 
     Args:
-       spec: INTERFACE:CHANNEL, with ?NAME=VALUE&... for more of python-can's settings.
-       options: Settings of the rig's node.
-       channels: Channels of the rig; by default the rig's own.
+        spec: INTERFACE:CHANNEL, with ?NAME=VALUE&... for more of python-can's settings.
+        options: Settings of the rig's node.
+        channels: Channels of the rig; by default the rig's own.
 
     Raises:
-       InputError: The bus is invalid, or cannot carry the messages.
+        InputError: The bus is invalid, or cannot carry the messages.
     """
 
     def __init__(self, spec: str, options: CanOptions | None = None, channels: ChannelTable | None = None) -> None:
@@ -175,7 +175,7 @@ class CanOutput:
         """Start the gateway; call it once the rig answers requests.
 
         Args:
-           paced: The rig runs by the wall clock.
+            paced: The rig runs by the wall clock.
         """
         from drivers.can.gateway import Gateway
         from rig.serve.transport.memory import MemoryClient
@@ -273,7 +273,7 @@ def bit_rates(text: str, *, field: str) -> Speed:
     """Return the bit rates of a bus from an option such as 1M/8M.
 
     Raises:
-       InputError: A rate is invalid.
+        InputError: A rate is invalid.
     """
     from drivers.can.bus.timing import speed
 
@@ -287,7 +287,7 @@ def parse_spec(spec: str) -> tuple[str, str, dict[str, Any]]:
     """Return interface, channel and further settings of INTERFACE:CHANNEL?NAME=VALUE&...
 
     Raises:
-       InputError: The text has another form.
+        InputError: The text has another form.
     """
     from drivers.link.can import parse_spec as parse
 

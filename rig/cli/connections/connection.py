@@ -49,8 +49,8 @@ class Connection:
         """Yield a client of the rig, and close it afterwards.
 
         Raises:
-           InputError: The keys do not exist.
-           RefusedError: No rig answers, or access is denied.
+            InputError: The keys do not exist.
+            RefusedError: No rig answers, or access is denied.
         """
         from rig.base.wire import ALIVE
         from rig.serve.transport.zenoh import ZenohClient
@@ -82,10 +82,10 @@ class Connection:
         """Yield a console connected to the rig, and close it afterwards.
 
         Args:
-           command: Name of the command, which identifies its requests.
+            command: Name of the command, which identifies its requests.
 
         Raises:
-           RefusedError: No rig answers, or access is denied.
+            RefusedError: No rig answers, or access is denied.
         """
         from drivers.console import Console
 
@@ -122,7 +122,7 @@ class Serving:
         """Check early that the addresses are free and the name is valid.
 
         Raises:
-           InputError: An address is in use, or the name is invalid.
+            InputError: An address is in use, or the name is invalid.
         """
         from rig.serve.transport.endpoint import check_free, parse_endpoint, parse_loopback
         from rig.serve.transport.names import check_name
@@ -137,7 +137,7 @@ class Serving:
         """Return the address and keys for other computers, or None without --expose.
 
         Raises:
-           InputError: Neither or both of --tls and --plaintext are given, or one without --expose.
+            InputError: Neither or both of --tls and --plaintext are given, or one without --expose.
         """
         if self.expose is None:
             if self.tls is not None or self.plaintext:
@@ -173,13 +173,13 @@ def serve(
     """Serve a run to its end; exit status 1 if something failed without ending the run.
 
     Args:
-       make: Creates the run on a server.
-       words: Returns the parts of a progress line from a status.
-       tell: Prints the summary.
-       serving: Addresses to serve at.
-       bus: CAN bus to serve on as well.
-       paced: The run follows the wall clock.
-       wait: The run waits for stalled clients.
+        make: Creates the run on a server.
+        words: Returns the parts of a progress line from a status.
+        tell: Prints the summary.
+        serving: Addresses to serve at.
+        bus: CAN bus to serve on as well.
+        paced: The run follows the wall clock.
+        wait: The run waits for stalled clients.
     """
     from rig.serve.pacing import rare_collections
     from rig.serve.transport.names import registered

@@ -26,12 +26,12 @@ def print_comparison(
     """Compare, draw if requested, and print.
 
     Args:
-       subject: The parameter set or model.
-       compare: Returns the document.
-       draw: Draws the picture.
-       show: Prints the document as tables.
-       plot: File for the picture.
-       form: Output as tables or as JSON.
+        subject: The parameter set or model.
+        compare: Returns the document.
+        draw: Draws the picture.
+        show: Prints the document as tables.
+        plot: File for the picture.
+        form: Output as tables or as JSON.
     """
     if plot is not None:
         draw(subject, plot)

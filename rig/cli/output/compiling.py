@@ -22,8 +22,8 @@ class Compiling(Listener):
     busy computer needs several times as long.
 
     Args:
-       begun: Called with the first text.
-       going_on: Called with each further text, and with an empty text when compiling pauses.
+        begun: Called with the first text.
+        going_on: Called with each further text, and with an empty text when compiling pauses.
     """
 
     def __init__(self, begun: Callable[[str], None], going_on: Callable[[str], None]) -> None:

@@ -21,8 +21,8 @@ def display_status(status: Status, words: Line) -> Iterator[None]:
     """Show the status during the block: a live line on a terminal, otherwise a line every 5 s.
 
     Args:
-       status: Returns the status document.
-       words: Returns the parts of the line.
+        status: Returns the status document.
+        words: Returns the parts of the line.
     """
     done = threading.Event()
     # In its own thread, so that a suspended terminal (Ctrl-S) does not block the run.

@@ -12,11 +12,11 @@ def check_folder(path: Path, *, field: str) -> None:
     """Raise an error early for a folder that neither exists nor can be created.
 
     Args:
-       path: The folder; the caller creates a missing one by `path.mkdir(exist_ok=True)` when it writes.
-       field: Name of the option, for errors.
+        path: The folder; the caller creates a missing one by `path.mkdir(exist_ok=True)` when it writes.
+        field: Name of the option, for errors.
 
     Raises:
-       InputError: Its parent is missing, it is a file, or it is not writable.
+        InputError: Its parent is missing, it is a file, or it is not writable.
     """
     if path.exists() and not path.is_dir():
         raise InputError(field, "a folder, not a file", str(path))

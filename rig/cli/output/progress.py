@@ -78,8 +78,8 @@ def reporting(*, live: bool = True, compiles: bool = False) -> Iterator[Reporter
     """Yield a `Reporter` that shows the progress of the block.
 
     Args:
-       live: Use a live line on a terminal.
-       compiles: Also show the compiling of kernels.
+        live: Use a live line on a terminal.
+        compiles: Also show the compiling of kernels.
     """
     with _bar() if live and sys.stderr.isatty() else nullcontext(Reporter()) as reporter:
         if not compiles:

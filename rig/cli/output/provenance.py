@@ -16,7 +16,7 @@ def origin(**subject: object) -> dict[str, str]:
     """Return the lines for the head of a report, by name.
 
     Args:
-       subject: Details by name; None is left out.
+        subject: Details by name; None is left out.
     """
     from replays.studies.common import provenance
 

@@ -63,8 +63,8 @@ def echo(text: object = "", *, err: bool = False) -> None:
     """Print lines; a terminal wraps them between words.
 
     Args:
-       text: Text whose line breaks are kept; other unprintable characters are escaped.
-       err: Print to stderr.
+        text: Text whose line breaks are kept; other unprintable characters are escaped.
+        err: Print to stderr.
     """
     lines = _lines(str(text)).split("\n")
     if (sys.stderr if err else sys.stdout).isatty():
@@ -107,11 +107,11 @@ class Table:
     """A table without borders, with cells of one line; see `new_table`.
 
     Attributes:
-       title: The title.
-       headings: Headings of the columns.
-       wrapped, spare: Indices of columns that may wrap, and of those that can be left out, in order of removal.
-       keys: Number of leading columns that identify a row.
-       rows: Cells and style of each row; a single cell spans all columns.
+        title: The title.
+        headings: Headings of the columns.
+        wrapped, spare: Indices of columns that may wrap, and of those that can be left out, in order of removal.
+        keys: Number of leading columns that identify a row.
+        rows: Cells and style of each row; a single cell spans all columns.
     """
 
     def __init__(
@@ -248,11 +248,11 @@ def new_table(
     blocks that begin with the same key columns.
 
     Args:
-       title: The title.
-       headings: Headings of the columns; `>` marks a column of numbers, aligned to the right.
-       wrapped: Headings of columns that may wrap.
-       spare: Headings of columns that can be left out, in order of removal.
-       keys: Number of leading columns that identify a row.
+        title: The title.
+        headings: Headings of the columns; `>` marks a column of numbers, aligned to the right.
+        wrapped: Headings of columns that may wrap.
+        spare: Headings of columns that can be left out, in order of removal.
+        keys: Number of leading columns that identify a row.
     """
     places = {heading.removeprefix(">"): at for at, heading in enumerate(headings)}
     wrapped_at, spare_at = ([places[name] for name in names if name in places] for names in (wrapped, spare))
@@ -275,8 +275,8 @@ def table_console(*, wide: bool = False, stderr: bool = False) -> Console:
     Strings are printed without markup; styles need a `rich.text.Text` or a style argument.
 
     Args:
-       wide: Print on a terminal as in a pipe.
-       stderr: Print to stderr.
+        wide: Print on a terminal as in a pipe.
+        stderr: Print to stderr.
     """
     from rich.console import Console
     from rich.segment import Segment

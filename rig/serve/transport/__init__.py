@@ -1,7 +1,7 @@
-"""How the service and its clients reach each other: one pair of protocols, one module a transport.
+"""Transport between the service and its clients: a pair of protocols, and one module per transport.
 
-A `Server` is the rig's side, a `Client` is everybody else's. Payloads are the bytes of `rig.base.wire`; a transport
-never looks inside.
+A `Server` is the rig's side, a `Client` the other side. Payloads are the bytes of `rig.base.wire`; a transport does not
+interpret them.
 """
 
 from __future__ import annotations
@@ -11,20 +11,20 @@ from concurrent.futures import Future
 from typing import Protocol
 
 DEFAULT_ENDPOINT = "127.0.0.1:7460"
-"""Where a rig listens, and clients look for one, unless told otherwise."""
+"""Default address of a rig."""
 EXPOSED_PORT = 7463
-"""Port of a rig on a host that it is exposed on, unless told otherwise."""
+"""Default port of an exposed rig."""
 
 
 class NoReplyError(ConnectionError):
-    """Nobody answered a request in time: no rig runs there, or it hangs."""
+    """No reply to a request in time: no rig runs there, or it hangs."""
 
 
 class Server(Protocol):
     """The rig's side of a transport."""
 
     def publish(self, key: str, payload: bytes) -> None:
-        """Send one payload to all subscribers; may be slow, must never be called from the simulation thread."""
+        """Send one payload to all subscribers. May be slow; must not be called from the simulation thread."""
         ...
 
     def answer(self, key: str, handler: Callable[[bytes], bytes]) -> None:
@@ -32,23 +32,23 @@ class Server(Protocol):
         ...
 
     def answer_all(self, expression: str, handler: Callable[[str, bytes], bytes | Future[bytes]]) -> None:
-        """Answer requests on all keys that match, told key and payload; an answer may come later."""
+        """Answer requests on all matching keys by a handler of key and payload; the answer may come later."""
         ...
 
     def on_trouble(self, tell: Callable[[str, BaseException], None]) -> None:
-        """Tell where and why something failed on the transport's threads, which go on."""
+        """Set the function that receives place and error of failures on the transport's threads, which continue."""
         ...
 
     def hear(self, key: str, callback: Callable[[str, bytes], None]) -> None:
-        """Receive what clients report on keys that match `key` (for instance `rig/clients/*`)."""
+        """Receive the clients' reports on keys that match `key` (for example `rig/clients/*`)."""
         ...
 
     def announce(self) -> None:
-        """Show the rig's token to those who watch; called once everything is ready to be asked."""
+        """Publish the rig's token; called once all requests can be answered."""
         ...
 
     def congestion(self) -> dict[str, float]:
-        """What a stalled subscriber looks like from here; the names of the counts are the transport's own."""
+        """Return counters that show stalled subscribers; their names depend on the transport."""
         ...
 
     def close(self) -> None:
@@ -60,11 +60,11 @@ class Client(Protocol):
     """A client's side of a transport."""
 
     foreign: int
-    """Messages that were left out because they were not from the rig that this client is linked to."""
+    """Number of ignored messages from other rigs than the linked one."""
 
     @property
     def rig(self) -> str | None:
-        """Who the rig at the other end of the link is; another one when it is started again. None without a link."""
+        """Identity of the linked rig, which changes with a restart; None without a link."""
         ...
 
     def subscribe(
@@ -88,7 +88,7 @@ class Client(Protocol):
         ...
 
     def request(self, key: str, payload: bytes = b"", *, timeout_s: float = 2.0) -> bytes:
-        """Ask the rig and return its reply.
+        """Send a request to the rig and return its reply.
 
         Raises:
             NoReplyError: Nobody answered in time.
@@ -96,15 +96,15 @@ class Client(Protocol):
         ...
 
     def settle(self) -> None:
-        """Return when all subscriptions so far are in effect: what is published from then on arrives."""
+        """Wait until all subscriptions are in effect: whatever is published afterwards arrives."""
         ...
 
     def wait_for(self, key: str, number: int, *, timeout_s: float) -> bool:
-        """Wait until a message was handed on, by its number from 0 on; True at once of a key that is not subscribed."""
+        """Wait for the delivery of a message, by its number from 0; True at once for a key without subscription."""
         ...
 
     def watch(self, key: str, callback: Callable[[bool], None]) -> None:
-        """Call back with True / False when the rig's token appears / vanishes."""
+        """Call back with True / False when the rig's token appears / disappears."""
         ...
 
     def report(self, key: str, payload: bytes) -> None:
@@ -117,5 +117,5 @@ class Client(Protocol):
 
 
 def doors_of(server: Server) -> dict[str, Server]:
-    """The ways out of a rig, "zenoh" and "can", each with its transport."""
+    """Return the transports of a rig, by "zenoh" and "can"."""
     return getattr(server, "doors", {"zenoh": server})

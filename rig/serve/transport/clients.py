@@ -1,4 +1,4 @@
-"""What clients report about how far they have come: for the status, for the end of a run, and for a free pace."""
+"""Progress reports of clients: for the status, for the end of a run, and for an unpaced run."""
 
 from __future__ import annotations
 
@@ -15,50 +15,50 @@ from rig.serve.transport import Client, Server
 from rig.serve.waiting import Deadline
 
 SHOWN = 64
-"""Clients in the status."""
+"""Number of clients in the status."""
 MOST = 4096
-"""Names that are remembered: so many made-up ones cannot crowd out those that get on."""
+"""Number of client names remembered; enough that invented names do not displace active clients."""
 _FORGOTTEN_S = 600.0
 _GONE_S = 3.0
-"""A client that did not report for this long is not waited for; others report twice a second."""
+"""Time without a report after which a client is no longer waited for [s]; clients report twice a second."""
 _QUIET_S = 0.6
-"""At the end of a run: for how long nobody must be behind before the cache may go; two heartbeats of the transport."""
+"""Time without a lagging client before the cache may be dropped at the end of a run [s]: two heartbeats."""
 _STUCK_S = 60.0
-"""Who reports but has got nothing for this long is not waited for, in the middle of a run."""
+"""Time without progress after which a reporting client is no longer waited for, during a run [s]."""
 _STUCK_AT_END_S = 3.0
 _STRANGERS_S = 0.4
-"""At the end of a run: how much longer a link is waited for that is stalled, while all who report have everything."""
+"""Extra wait for a stalled link at the end of a run, when all reporting clients have everything [s]."""
 
 
 class Sender(Outside):
-    """Who reports: the last part of the key."""
+    """Sender of a report: the last part of the key."""
 
     name: Name
 
 
 class Report(Outside):
-    """What a client sends twice a second on `rig/clients/NAME`."""
+    """Report that a client sends twice a second on `rig/clients/NAME`."""
 
     name: Name | None = None
     received_index: Count | None
-    """Number of the row that it gets next; None: it listens, and has nothing yet."""
+    """Index of the row that it receives next; None: it is subscribed and has received nothing."""
     lost: Count = 0
-    """Rows that it knows to be lost."""
+    """Number of rows that it knows to be lost."""
     room: Count | None = None
-    """Rows that it can hold."""
+    """Number of rows that it can hold."""
     done: bool = False
-    """Whether it leaves."""
+    """Whether the client leaves."""
     wall_s: float | None = None
     secret: Annotated[str, a_line(64)] | None = None
-    """What only this client knows: who reports under its name without it is somebody else."""
+    """Secret of this client; a report under its name without it is from somebody else."""
 
 
 class Reporter:
-    """A client's own side: tells the rig how far it has come.
+    """Client side: reports the client's progress to the rig.
 
     Args:
         client: Transport to the rig.
-        name: What it is called in the status.
+        name: Name of the client in the status.
     """
 
     def __init__(self, client: Client, name: str) -> None:
@@ -67,7 +67,7 @@ class Reporter:
         self._secret = secrets.token_hex(16)
 
     def tell(self, received_index: int | None, *, lost: int, room: int | None = None, done: bool = False) -> None:
-        """Report; as of `Report`."""
+        """Send a report; arguments as of `Report`."""
         report = Report(
             name=self._name, received_index=received_index, lost=lost, room=room, done=done, secret=self._secret
         )
@@ -77,19 +77,19 @@ class Reporter:
 @dataclass(frozen=True, slots=True)
 class _Heard:
     received_index: int | None
-    """None: it listens, and has nothing yet."""
+    """None: subscribed, and nothing received."""
     lost: int
     heard_s: float
     room: int | None
     moved_s: float
-    """When it was last heard to have got on."""
+    """When it last made progress."""
     from_index: int
     from_s: float
-    """Where it stood when it was first heard, or last stepped back."""
+    """Its position at the first report, or after the last step back."""
 
     @property
     def pace(self) -> float:
-        """How fast it gets on [rows/s]."""
+        """Its progress [rows/s]."""
         return ((self.received_index or 0) - self.from_index) / max(self.heard_s - self.from_s, 1.0)
 
 
@@ -109,13 +109,13 @@ class Clients:
         self._lock = threading.Lock()
         self._reports: dict[_Who, _Heard] = {}
         self._joined: dict[_Who, int] = {}
-        """Row that was next when a client was first seen that had nothing yet: what it will be measured from."""
+        """Next row when a client without data was first seen: the reference for its lag."""
         self._swept_s = now_s()
         self.malformed = 0
-        """Reports that could not be read."""
+        """Number of invalid reports."""
 
     def take(self, key: str, payload: bytes) -> None:
-        """Take a report; on a thread of the transport."""
+        """Store a report; on a thread of the transport."""
         try:
             name = Sender(name=key.rpartition("/")[2]).name
             report = check(Report, payload, field="report")
@@ -139,7 +139,7 @@ class Clients:
             self._reports[who] = _Heard(index, report.lost, now_s, report.room, moved_s, *origin)
 
     def _make_room(self, now_s: float) -> None:
-        """For other names: forget those long silent, or where none is, a quarter, of those that did not get on."""
+        """Remove silent clients; if there are none, the slowest quarter."""
         if len(self._reports) < MOST and now_s - self._swept_s < _FORGOTTEN_S:
             return
         self._swept_s = now_s
@@ -155,19 +155,19 @@ class Clients:
 
     @property
     def present(self) -> int:
-        """How many are there: those that reported lately."""
+        """Number of clients that reported recently."""
         return len(self._live())
 
     def rows(self, published: int, rate_hz: float) -> dict[str, dict[str, Any]]:
-        """Each client for the status.
+        """Return the clients for the status.
 
         Args:
-            published: Number of the row after the last one published of the stream that clients report on.
-            rate_hz: Rate of that stream [Hz]; 0 where nothing was published yet.
+            published: Index after the last published row of the stream that clients report on.
+            rate_hz: Rate of that stream [Hz]; 0 before the first block.
         """
         now_s = self._now_s()
         with self._lock:
-            # Those that get on first: names can be made up by the thousand.
+            # The most active clients first: names can be invented in large numbers.
             first = sorted(self._reports.items(), key=lambda row: -row[1].pace)
         rows: dict[str, dict[str, Any]] = {}
         for who, report in first[:SHOWN]:
@@ -184,29 +184,29 @@ class Clients:
 
     @property
     def hidden(self) -> int:
-        """How many more there are than the status shows."""
+        """Number of clients that the status does not show."""
         return max(0, len(self._reports) - SHOWN)
 
     def behind(self, published: int, *, silent: bool = False, stuck_s: float = _STUCK_S) -> int:
-        """Rows that the slowest client still lacks, of those that are there; 0 where nobody reports.
+        """Return the lag of the slowest present client [rows]; 0 without clients.
 
         Args:
-            published: Number of the row after the last one published.
-            silent: Also of those that no longer report.
-            stuck_s: Without those that have got nothing for so long [s].
+            published: Index after the last published row.
+            silent: Include clients that no longer report.
+            stuck_s: Exclude clients without progress for this long [s].
         """
         live = self._live(silent=silent, stuck_s=stuck_s)
         return max((self._lacks(who, report, published) for who, report in live.items()), default=0)
 
     def crowded(self, published: int, most: int) -> str | None:
-        """Name of a client that is there and has more on its way than so many rows, or than half of its own room."""
+        """Return the name of a present client that lags by more than `most` rows, or than half of its own room."""
         for who, report in self._live().items():
             if self._lacks(who, report, published) > (most if report.room is None else min(most, report.room // 2)):
                 return who[0]
         return None
 
     def _lacks(self, who: _Who, report: _Heard, published: int) -> int:
-        """Rows that a client still has to get."""
+        """Return the number of rows that a client has not received."""
         has = report.received_index
         return max(0, published - (self._joined.setdefault(who, published) if has is None else has))
 
@@ -216,17 +216,17 @@ class Clients:
             return {
                 who: row
                 for who, row in self._reports.items()
-                # Whoever is silent has been stopped, not stuck: it may be about to go on.
+                # A silent client is suspended, not stuck, and may continue.
                 if (row.heard_s - row.moved_s < stuck_s and now_s - row.heard_s < _GONE_S)
                 or (silent and now_s - row.heard_s >= _GONE_S)
             }
 
     def settle(self, server: Server, published: int, *, patience_s: float) -> None:
-        """Wait until everybody who is connected has everything, so that the cache may go.
+        """Wait until all connected clients have received everything, so that the cache may be dropped.
 
         Args:
-            server: Whose links are looked at.
-            published: Number of the row after the last one published.
+            server: Transport whose links are checked.
+            published: Index after the last published row.
             patience_s: Longest wait [s].
         """
         quiet_since = strangers_since = time.monotonic()

@@ -1,4 +1,4 @@
-"""Addresses that are listened on, and what the operating system says of their links."""
+"""Addresses to listen on, and the state of their links from the operating system."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ LOOPBACK_HOSTS = ("127.0.0.1", "localhost")
 
 
 def parse_endpoint(text: str, *, field: str = "endpoint", least: int = 1) -> tuple[str, int]:
-    """Split HOST:PORT.
+    """Return host and port of HOST:PORT.
 
     Args:
-        text: What stands there.
-        field: What errors call it.
-        least: Lowest port; with 0, whoever listens takes one that is free.
+        text: The address.
+        field: Name of the option, for errors.
+        least: Lowest port; 0 allows the system to choose a free one.
 
     Raises:
-        InputError: It is not of that form.
+        InputError: The text has another form.
     """
     host, colon, port = text.rpartition(":")
     plain = "/" not in host and (":" not in host or host.startswith("["))
@@ -34,12 +34,12 @@ def parse_endpoint(text: str, *, field: str = "endpoint", least: int = 1) -> tup
 
 
 def parse_loopback(text: str, *, field: str, least: int = 1) -> tuple[str, int]:
-    """Split HOST:PORT of a door that asks nobody who they are, and so is not open to other machines.
+    """Return host and port of an address without access control, which must not be open to other computers.
 
     Arguments as of `parse_endpoint`.
 
     Raises:
-        InputError: It is not of that form, or not of this machine alone.
+        InputError: The text has another form, or is not on the loopback.
     """
     host, port = parse_endpoint(text, field=field, least=least)
     if host not in LOOPBACK_HOSTS:
@@ -50,27 +50,27 @@ def parse_loopback(text: str, *, field: str, least: int = 1) -> tuple[str, int]:
 
 
 def place_to_listen(text: str, *, field: str) -> tuple[str, int]:
-    """Split HOST:PORT as `parse_loopback` does; for port 0 one that is free now.
+    """Return host and port as `parse_loopback` does; port 0 is replaced by a free port.
 
     Raises:
-        InputError: It is not of that form, or not of this machine alone.
+        InputError: The text has another form, or is not on the loopback.
     """
     host, port = parse_loopback(text, field=field, least=0)
     return host, port or free_port()
 
 
 def free_port() -> int:
-    """A port of 127.0.0.1 that nobody listens on, as yet."""
+    """Return a port of 127.0.0.1 that is currently free."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
 
 
 def check_free(place: tuple[str, int], *, field: str) -> None:
-    """Find out early whether an address can be listened on; what takes it meanwhile is found when it is.
+    """Raise an error early for an address that cannot be listened on.
 
     Raises:
-        InputError: It is in use, or none of this machine.
+        InputError: The address is in use, or not of this computer.
     """
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -81,15 +81,15 @@ def check_free(place: tuple[str, int], *, field: str) -> None:
 
 
 def not_free(field: str, endpoint: str, *, in_use: bool) -> InputError:
-    """Why an address cannot be listened on."""
+    """Return the error for an address that cannot be listened on."""
     must = "a free address (another rig runs there, or another program)"
     return InputError(field, must if in_use else "an address of this machine that can be listened on", endpoint)
 
 
 def backlog_of(port: int) -> dict[int, int]:
-    """Bytes on their way in each established link of a listening port, by the other side's port (Linux).
+    """Return the bytes in flight of each link of a listening port, by the other side's port (Linux).
 
-    Those that our socket has not sent, and, where the other side is a process of this machine, those it has not read.
+    Counts bytes that our socket has not sent and, if the other side is on this computer, those that it has not read.
     """
     found: dict[int, int] = {}
     for table in ("/proc/net/tcp", "/proc/net/tcp6"):
@@ -108,11 +108,11 @@ def backlog_of(port: int) -> dict[int, int]:
 
 
 def hang_up(port: int, peers: set[int]) -> None:
-    """End the links of a listening port with some other sides' ports (Linux): what is on its way still arrives."""
+    """Close the links of a listening port to some peer ports (Linux); data on the way still arrives."""
     for file in Path("/proc/self/fd").iterdir() if peers else ():
         with contextlib.suppress(OSError), socket.socket(fileno=os.dup(int(file.name))) as link:
             ends = link.getsockname(), link.getpeername()
             if all(isinstance(end, tuple) for end in ends) and ends[0][1] == port and ends[1][1] in peers:
-                # Zenoh lets closing wait for what was not sent, and ours may be the last to close.
+                # Zenoh's close waits for unsent data, and our descriptor may be the last one to close.
                 link.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 0, 0))
                 link.shutdown(socket.SHUT_RDWR)

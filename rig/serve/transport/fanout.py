@@ -1,4 +1,4 @@
-"""One service on several transports at once."""
+"""One service on several transports."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from rig.serve.transport import Server
 
 
 class Fanout:
-    """The rig's side of several transports: what is published goes to all, and each may ask and report.
+    """The rig's side of several transports: publishes to all, and accepts requests and reports from each.
 
     Args:
-        servers: The transports, in the order in which they are given each payload; each stays its owner's to close.
-        doors: Which of them is which way out of the rig.
-        figures: Further counts for the status, named as `congestion` names its own.
-        warnings: What else a person should know of, while it is so.
+        servers: The transports, in the order of publishing; the caller closes them.
+        doors: The transports by name.
+        figures: Returns further counters for the status, as `congestion` does.
+        warnings: Returns further current warnings.
     """
 
     def __init__(
@@ -47,22 +47,22 @@ class Fanout:
             server.answer_all(expression, handler)
 
     def on_trouble(self, tell: Callable[[str, BaseException], None]) -> None:
-        """Tell what failed on the threads of all transports."""
+        """Report failures on the threads of all transports."""
         for server in self._servers:
             server.on_trouble(tell)
 
     def hear(self, key: str, callback: Callable[[str, bytes], None]) -> None:
-        """Receive what clients of all transports report."""
+        """Receive the reports of clients of all transports."""
         for server in self._servers:
             server.hear(key, callback)
 
     def announce(self) -> None:
-        """Show the rig's token on all transports."""
+        """Publish the rig's token on all transports."""
         for server in self._servers:
             server.announce()
 
     def congestion(self) -> dict[str, float]:
-        """The counts of all transports, and the further ones."""
+        """Return the counters of all transports, and the further ones."""
         counts: dict[str, float] = {}
         for server in self._servers:
             counts |= server.congestion()

@@ -1,4 +1,4 @@
-"""How many commands a second are taken: of one sender, and of all together."""
+"""Limit of commands per second, for one sender and for all."""
 
 from __future__ import annotations
 
@@ -8,35 +8,36 @@ from collections.abc import Callable
 
 from rig.base.errors import InputError, Words
 
-_MOST = 64
-"""Senders that are told apart. A sender is the name that it gives itself: who makes up names meets the common bound."""
-_TOGETHER = 4
+_MAX_SENDERS = 64
+"""Number of senders with a limit of their own. Senders name themselves; invented names share the common limit."""
+_COMMON_FACTOR = 4
+"""Common limit relative to that of one sender."""
 
 
 class Bucket:
-    """Room for so many at once, refilled steadily."""
+    """Token bucket: a burst, refilled at a constant rate."""
 
     def __init__(self, rate_hz: float, burst: float, now_s: float) -> None:
         self._rate_hz, self._burst = rate_hz, burst
         self._left, self._at_s = burst, now_s
 
     def left(self, now_s: float) -> float:
-        """How many there is room for now."""
+        """Return the number of tokens now."""
         self._left = min(self._burst, self._left + self._rate_hz * (now_s - self._at_s))
         self._at_s = now_s
         return self._left
 
     def take(self) -> None:
-        """One of them comes."""
+        """Remove a token."""
         self._left -= 1.0
 
 
 class CommandLimit:
-    """Refuses commands beyond a rate, at once.
+    """Refuses commands above a rate, immediately.
 
     Args:
-        rate_hz: Of one sender [1/s]; of all together four times that.
-        burst: How many may come at once; likewise.
+        rate_hz: Rate of one sender [1/s]; the common rate is four times this.
+        burst: Commands of one sender at once; the common burst is four times this.
         now_s: Clock [s], monotonic.
     """
 
@@ -45,28 +46,28 @@ class CommandLimit:
     ) -> None:
         self._rate_hz, self._burst, self._now_s = rate_hz, burst, now_s
         self._lock = threading.Lock()
-        self._all = Bucket(_TOGETHER * rate_hz, _TOGETHER * burst, now_s())
+        self._all = Bucket(_COMMON_FACTOR * rate_hz, _COMMON_FACTOR * burst, now_s())
         self.senders: dict[str, Bucket] = {}
-        """Those that are told apart, the one heard longest ago first."""
+        """Senders with a limit of their own, least recent first."""
         self.refused = 0
-        """Commands that were not let through."""
+        """Number of refused commands."""
 
     def check(self, sender: str) -> None:
-        """Let a command through.
+        """Count a command.
 
         Raises:
-            InputError: It is one too many.
+            InputError: The command exceeds the limit.
         """
         now_s = self._now_s()
         with self._lock:
             bucket = self.senders.pop(sender, None) or Bucket(self._rate_hz, self._burst, now_s)
-            if len(self.senders) >= _MOST:
-                del self.senders[next(iter(self.senders))]  # the one that was heard longest ago
+            if len(self.senders) >= _MAX_SENDERS:
+                del self.senders[next(iter(self.senders))]  # the least recent sender
             self.senders[sender] = bucket
             if bucket.left(now_s) >= 1.0 and self._all.left(now_s) >= 1.0:
                 bucket.take()
                 self._all.take()
                 return
             self.refused += 1
-        must = f"at most {self._rate_hz:g} a second from one sender, {_TOGETHER * self._rate_hz:g} from all"
+        must = f"at most {self._rate_hz:g} per second from one sender, {_COMMON_FACTOR * self._rate_hz:g} from all"
         raise InputError("commands", must, Words(f"one too many from {sender}"))

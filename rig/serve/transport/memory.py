@@ -1,4 +1,4 @@
-"""Both ends of a transport in one process, for tests: every call is done when it returns, on the caller's thread."""
+"""In-process transport, for tests: each call completes before it returns, on the caller's thread."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rig.serve.transport import NoReplyError
 
 
 def key_matches(expression: str, key: str) -> bool:
-    """Whether a key lies in an expression, where `*` is one chunk and `**` any number of chunks."""
+    """Return whether a key matches an expression: `*` is one chunk, `**` any number of chunks."""
 
     def match(pattern: list[str], chunks: list[str]) -> bool:
         if not pattern:
@@ -25,11 +25,11 @@ def key_matches(expression: str, key: str) -> bool:
 
 
 Subscription = tuple[str, Callable[[str, bytes], None], "MemoryClient"]
-"""Expression of the keys, what takes key and payload, and whose it is."""
+"""Expression of the keys, callback of key and payload, and owner."""
 
 
 class MemoryServer(Closing):
-    """The rig's side; clients are made from it: `MemoryClient(server)`.
+    """The rig's side; `MemoryClient(server)` creates a client.
 
     Args:
         cache: Number of messages kept for subscribers that ask for history.
@@ -46,34 +46,34 @@ class MemoryServer(Closing):
         self._closed = False
 
     def publish(self, key: str, payload: bytes) -> None:
-        """Hand one payload to all subscribers, in the order in which they subscribed."""
+        """Deliver one payload to all subscribers, in the order of their subscriptions."""
         with self._lock:
             self._cache.append((key, payload))
             matching = [take for expression, take, _ in self._subscriptions if key_matches(expression, key)]
             # Delivery under the lock keeps each subscriber's messages in order; the lock is re-entrant for callbacks
-            # that ask the rig something.
+            # that send a request to the rig.
             for take in matching:
                 take(key, payload)
 
     def answer(self, key: str, handler: Callable[[bytes], bytes]) -> None:
-        """Answer requests on a key; the handler is called on the asking thread."""
+        """Answer requests on a key; the handler is called on the client's thread."""
         self.answer_all(key, lambda _, payload: handler(payload))
 
     def answer_all(self, expression: str, handler: Callable[[str, bytes], bytes | Future[bytes]]) -> None:
-        """Answer requests on all keys that match; the handler is called on the asking thread."""
+        """Answer requests on all keys that match; the handler is called on the client's thread."""
         with self._lock:
             self._handlers[expression] = handler
 
     def on_trouble(self, tell: Callable[[str, BaseException], None]) -> None:
-        """There are no threads here: whoever calls meets what fails."""
+        """Ignore the function: without threads, failures reach the caller."""
 
     def hear(self, key: str, callback: Callable[[str, bytes], None]) -> None:
-        """Receive what clients report on matching keys."""
+        """Receive the clients' reports on matching keys."""
         with self._lock:
             self._listeners.append((key, callback))
 
     def announce(self) -> None:
-        """Show the rig's token to those who watch."""
+        """Publish the rig's token."""
         with self._lock:
             self._announced = True
             watchers = list(self._watchers)
@@ -83,7 +83,7 @@ class MemoryServer(Closing):
     # ---- for its clients ----
 
     def subscribe(self, subscription: Subscription, *, history: bool) -> None:
-        """Hand over what was published, where that is wanted, and what will be."""
+        """Add a subscription, and deliver the earlier payloads if `history`."""
         expression, take, _ = subscription
         with self._lock:
             for key, payload in list(self._cache) if history else ():
@@ -92,12 +92,12 @@ class MemoryServer(Closing):
             self._subscriptions.append(subscription)
 
     def handler_of(self, key: str) -> Callable[[str, bytes], bytes | Future[bytes]] | None:
-        """What answers requests on a key."""
+        """Return the handler of requests on a key."""
         with self._lock:
             return next((take for expression, take in self._handlers.items() if key_matches(expression, key)), None)
 
     def watch(self, watcher: MemoryClient, callback: Callable[[bool], None]) -> None:
-        """Call back when the token appears or vanishes."""
+        """Call back when the token appears or disappears."""
         with self._lock:
             self._watchers.append((watcher, callback))
             announced = self._announced and not self._closed
@@ -105,7 +105,7 @@ class MemoryServer(Closing):
             callback(True)
 
     def take_report(self, key: str, payload: bytes) -> None:
-        """Take what a client reports."""
+        """Deliver a client's report."""
         with self._lock:
             listeners = list(self._listeners)
         for expression, callback in listeners:
@@ -113,7 +113,7 @@ class MemoryServer(Closing):
                 callback(key, payload)
 
     def forget(self, client: MemoryClient) -> None:
-        """Forget a client's subscriptions and watches."""
+        """Remove a client's subscriptions and watches."""
         with self._lock:
             self._subscriptions = [row for row in self._subscriptions if row[2] is not client]
             self._watchers = [row for row in self._watchers if row[0] is not client]
@@ -121,11 +121,11 @@ class MemoryServer(Closing):
     # ---- for the rig ----
 
     def congestion(self) -> dict[str, float]:
-        """Nothing: a message has arrived when `publish` returns."""
+        """Return no counters: messages arrive before `publish` returns."""
         return {}
 
     def close(self) -> None:
-        """Forget all subscribers and tell the watchers."""
+        """Remove all subscribers and notify the watchers."""
         with self._lock:
             if self._closed:
                 return
@@ -157,11 +157,11 @@ class MemoryClient(Closing):
         history: bool = False,
         lossless: bool = True,
     ) -> None:
-        """Receive payloads in order; nothing is ever missed here, so `on_miss` and `lossless` change nothing."""
+        """Receive payloads in order; nothing is missed here, so `on_miss` and `lossless` have no effect."""
         self._server.subscribe((key, on_message, self), history=history)
 
     def request(self, key: str, payload: bytes = b"", *, timeout_s: float = 2.0) -> bytes:
-        """Ask the rig and return its reply.
+        """Send a request to the rig and return its reply.
 
         Raises:
             NoReplyError: Nobody answers on that key.
@@ -173,14 +173,14 @@ class MemoryClient(Closing):
         return reply.result() if isinstance(reply, Future) else reply
 
     def settle(self) -> None:
-        """Nothing is on its way here."""
+        """Return at once: nothing is in flight."""
 
     def wait_for(self, key: str, number: int, *, timeout_s: float) -> bool:
-        """A message was handed on when it was published."""
+        """Return True: a message is delivered when it is published."""
         return True
 
     def watch(self, key: str, callback: Callable[[bool], None]) -> None:
-        """Call back with True / False when the rig's token appears / vanishes."""
+        """Call back with True / False when the rig's token appears / disappears."""
         self._server.watch(self, callback)
 
     def report(self, key: str, payload: bytes) -> None:
@@ -188,5 +188,5 @@ class MemoryClient(Closing):
         self._server.take_report(key, payload)
 
     def close(self) -> None:
-        """Forget this client's subscriptions and watches."""
+        """Remove this client's subscriptions and watches."""
         self._server.forget(self)

@@ -1,7 +1,7 @@
-"""Rigs of this user on this machine by name: who is called what, where it listens, and which process it is.
+"""Names of this user's rigs on this computer, with their addresses and processes.
 
-Each rig that has a name keeps a file in a folder that is this user's alone, and holds a lock on it while it runs: the
-file of a process that is gone, however it ended, is locked by nobody, and counts as not there.
+Each named rig keeps a file in a folder that only this user can access, and holds a lock on it while it runs. A file
+without a lock is from an ended process and is ignored.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from rig.serve.waiting import Deadline
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 _SUFFIX = ".json"
-_AGAIN_S = 0.1
-"""How often a rig that is waited for is looked for [s]."""
+_POLL_S = 0.1
+"""Period of looking for a rig that has not started yet [s]."""
 
 
 class Named(Outside):
-    """A rig that runs under a name."""
+    """A running rig with a name."""
 
     name: str
     endpoint: str
@@ -40,10 +40,10 @@ class Named(Outside):
 
 
 def parse_name(text: str, *, field: str = "--name") -> str:
-    """A name that a rig can have.
+    """Return a valid name of a rig.
 
     Raises:
-        InputError: It cannot.
+        InputError: The name is invalid.
     """
     if not _NAME.fullmatch(text):
         raise InputError(
@@ -54,10 +54,10 @@ def parse_name(text: str, *, field: str = "--name") -> str:
 
 @contextmanager
 def registered(name: str, endpoint: str) -> Iterator[None]:
-    """Be found under a name, until the end of the `with` or of the process.
+    """Register a name until the end of the block or of the process.
 
     Raises:
-        InputError: A rig that runs has that name, or it cannot be one.
+        InputError: The name is invalid, or a running rig has it.
     """
     import fcntl
 
@@ -79,50 +79,50 @@ def registered(name: str, endpoint: str) -> Iterator[None]:
 
 
 def running() -> list[Named]:
-    """The rigs that run under a name, by name."""
+    """Return the running rigs that have a name, sorted by name."""
     with _alone():
         files = sorted(_folder().glob(f"*{_SUFFIX}"))
         return [entry for entry in map(_read, files) if entry is not None]
 
 
 def check_name(name: str) -> None:
-    """Find out early whether a name can be had.
+    """Raise an error early for a name that cannot be used.
 
     Raises:
-        InputError: It cannot, or a rig that runs has it.
+        InputError: The name is invalid, or a running rig has it.
     """
     with registered(name, DEFAULT_ENDPOINT):
         pass
 
 
 def endpoint_of(text: str, *, field: str, wait_s: float = 0.0) -> tuple[str, int]:
-    """Where a rig listens that is told by HOST:PORT, or by its name: the one place that knows names.
+    """Return the address of a rig given by HOST:PORT or by its name; the only place that resolves names.
 
     Args:
-        text: One of these, or a URL with one; what has a colon is no name.
-        field: What errors call it.
-        wait_s: How long to wait for a rig of that name to be there [s].
+        text: HOST:PORT, a name, or a URL with one of them; a text with a colon is not a name.
+        field: Name of the option, for errors.
+        wait_s: Longest wait for a rig of that name [s].
 
     Raises:
-        InputError: It is neither.
+        InputError: The text is neither.
     """
     text = text.removeprefix("zenoh:")
     if ":" in text:
         return parse_endpoint(text, field=field)
     found = {}
-    for _ in Deadline(wait_s).polls(_AGAIN_S):
+    for _ in Deadline(wait_s).polls(_POLL_S):
         found = {entry.name: entry.endpoint for entry in running()} if _NAME.fullmatch(text) else {}
         if text in found:
             return parse_endpoint(found[text], field=field)
-    must = f"HOST:PORT such as {DEFAULT_ENDPOINT}, or the name of a rig that runs"
-    raise UnknownNameError(field, must, text, found) if found else InputError(field, f"{must} (none does)", text)
+    must = f"HOST:PORT such as {DEFAULT_ENDPOINT}, or the name of a running rig"
+    raise (UnknownNameError(field, must, text, found) if found else InputError(field, f"{must} (none runs)", text))
 
 
 def address_in(url: str) -> str:
-    """What stands for a rig in a URL, zenoh:HOST:PORT[?tls=DIR] or zenoh:NAME; a name alone is a URL too.
+    """Return the address part of a URL: zenoh:HOST:PORT[?tls=DIR], zenoh:NAME, or a name alone.
 
     Raises:
-        InputError: It is another URL.
+        InputError: The URL has another form.
     """
     kind, colon, rest = url.partition(":")
     if not colon and url:
@@ -133,10 +133,10 @@ def address_in(url: str) -> str:
 
 
 def _folder() -> Path:
-    """The folder of this user's names, made where it is missing.
+    """Return the folder of this user's names; create it if it is missing.
 
     Raises:
-        InputError: Somebody else has made it, or may write there.
+        InputError: Another user owns it, or may access it.
     """
     runtime = Path(os.environ.get("XDG_RUNTIME_DIR") or "/nowhere")
     folder = runtime / "rig" if runtime.is_dir() else Path(tempfile.gettempdir()) / f"rig-{os.getuid()}"
@@ -144,13 +144,15 @@ def _folder() -> Path:
         folder.mkdir(mode=0o700)
     found = folder.lstat()
     if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o077:
-        raise InputError("names", f"kept in a folder that is its owner's alone (chmod 700 {folder})", Words("another"))
+        raise InputError(
+            "names", f"kept in a folder that only its owner can access (chmod 700 {folder})", Words("another")
+        )
     return folder
 
 
 @contextmanager
 def _alone() -> Iterator[None]:
-    """Look at names and change them one process at a time."""
+    """Hold the lock for reading and changing the names."""
     import fcntl
 
     handle = os.open(_folder() / ".lock", os.O_RDWR | os.O_CREAT, 0o600)
@@ -162,7 +164,7 @@ def _alone() -> Iterator[None]:
 
 
 def _read(file: Path) -> Named | None:
-    """The rig of a file; one that is gone is forgotten."""
+    """Return the rig of a file; remove the file of an ended process."""
     import fcntl
 
     with contextlib.suppress(FileNotFoundError), file.open("rb") as opened:

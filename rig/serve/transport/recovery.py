@@ -1,4 +1,4 @@
-"""What one lossless subscription has received, and the recovery of what it has not."""
+"""Received messages of a lossless subscription, and the recovery of missed ones."""
 
 from __future__ import annotations
 
@@ -9,29 +9,29 @@ from typing import Any
 
 _BLOCKS_A_SECOND = 100
 CACHE = 30 * _BLOCKS_A_SECOND
-"""Messages of each key that the rig keeps for those who missed them."""
-_PORTION = 200
-"""Messages asked for at a time, below 1 MB: while a cache answers its publisher waits, and sockets hold that much."""
+"""Number of messages that the rig keeps per key for recovery."""
+_BATCH = 200
+"""Messages requested at a time, below 1 MB: a publisher waits while its cache answers, and sockets hold that much."""
 _ATTEMPTS = 4
 _RETRY_S = 0.25
 
 Publisher = tuple[str, int]
-"""Session and number of a publisher: one a key, and new ones when a rig is started again."""
+"""Session and number of a publisher: one per key, and new ones after a restart of the rig."""
 
 
 class Recovery:
-    """What one lossless subscription has received, and the recovery of what it has not.
+    """Received messages of a lossless subscription, and the recovery of missed ones.
 
-    Publishers number their messages, keep the last ones, and tell their last number several times a second; all that is
-    zenoh's. Asking for what is missing is done here: zenoh's advanced subscriber (1.10.2) can declare a gap missed
-    without having asked for it, when the gap appears while the query of a heartbeat is open, and loses history alike.
+    Publishers number their messages, keep the last ones, and send their last number several times a second; this is
+    part of zenoh. The recovery is done here because zenoh's advanced subscriber (1.10.2) can report a gap as missed
+    without requesting it, if the gap appears while the query of a heartbeat is open, and loses history in the same way.
 
     Args:
-        ask: Selected messages of one publisher, from its cache: key, publisher, selection -> samples.
-        on_message: Takes key and payload, in order, each once.
-        on_miss: Takes key and number of messages that are nowhere to be had.
-        history: Begin with what the caches hold, not with the first message that arrives.
-        cache: Number of newest messages that each publisher keeps.
+        ask: Returns selected messages from a publisher's cache: key, publisher, selection -> samples.
+        on_message: Receives key and payload, in order, each once.
+        on_miss: Receives key and number of messages that cannot be recovered.
+        history: Begin with the content of the caches, not with the first message that arrives.
+        cache: Number of messages that each publisher keeps.
         pause: Waits for a number of seconds.
     """
 
@@ -53,21 +53,21 @@ class Recovery:
         self._pause = pause
         self._lock = threading.Lock()
         self._last: dict[Publisher, int] = {}
-        """Number of the last message of each publisher that was taken, or given up."""
+        """Number of the last message of each publisher that was delivered or given up."""
         self._floor: dict[Publisher, int] = {}
-        """Without history: last number of a publisher when it was first heard of; what came later belongs to us."""
+        """Without history: last number of a publisher when it was first seen; later messages must be delivered."""
         self._behind: dict[Publisher, int | None] = {}
-        """Where we stood at a publisher's previous heartbeat, if that was behind it."""
+        """Our last number at a publisher's previous heartbeat, if it was behind."""
         self._handed: dict[str, int] = {}
         self._news = threading.Condition()
 
     def wait_for(self, key: str, number: int, *, timeout_s: float) -> bool:
-        """Wait until the message of a key that has this number, or a later one, was handed on; False if it was not."""
+        """Wait until the message of a key with this number, or a later one, was delivered; return whether it was."""
         with self._news:
             return self._news.wait_for(lambda: self._handed.get(key, -1) >= number, timeout_s)
 
     def take(self, sample: Any) -> None:
-        """Take the next message that arrived, after all that should have come before it."""
+        """Deliver a message that arrived, after recovering those before it."""
         info = sample.source_info
         publisher, number = publisher_of(info.source_id), info.source_sn
         with self._lock:
@@ -81,7 +81,7 @@ class Recovery:
             self._deliver(publisher, number, sample)
 
     def begin(self, heads: list[Any]) -> None:
-        """Take the history of publishers of which nothing has arrived, given the newest message that each cache has."""
+        """Recover the history of publishers without a message so far, given the newest message of each cache."""
         for sample in heads:
             publisher = publisher_of(sample.source_info.source_id)
             with self._lock:
@@ -89,7 +89,7 @@ class Recovery:
                     self._recover(str(sample.key_expr), publisher, sample.source_info.source_sn)
 
     def heartbeat(self, sample: Any) -> None:
-        """Notice that the last messages of a key are missing, which no later message would show."""
+        """Detect missing last messages of a key, which no later message would show."""
         from zenoh import ext
 
         key, _, rest = str(sample.key_expr).partition("/@adv/pub/")
@@ -101,8 +101,8 @@ class Recovery:
         self.at_least(publisher, key, number)
 
     def at_least(self, publisher: Publisher, key: str, number: int) -> None:
-        """Take note that a publisher has sent a message of this number."""
-        # While a message is being handed on, others wait in the channel, and nobody knows yet whether any is missing.
+        """Record that a publisher has sent a message of this number."""
+        # While a message is delivered, others wait in the channel, so it is not known yet whether any is missing.
         if not self._lock.acquire(blocking=False):
             return
         try:
@@ -112,7 +112,7 @@ class Recovery:
             if last is not None and number <= last:
                 self._behind.pop(publisher, None)
             elif publisher in self._behind and self._behind[publisher] == last:
-                # Nothing came since the previous heartbeat: it is not merely on its way.
+                # Nothing arrived since the previous heartbeat, so the message is not just in flight.
                 del self._behind[publisher]
                 if last is not None:
                     self._last[publisher] = last
@@ -123,9 +123,9 @@ class Recovery:
             self._lock.release()
 
     def _recover(self, key: str, publisher: Publisher, until: int) -> None:
-        """Take from the cache what is missing up to a number; what it no longer has is reported and given up."""
+        """Deliver missing messages up to a number from the cache; report and give up those that it no longer has."""
         last = self._last.get(publisher)
-        # What a publisher sent before anything of it was known is history: what its cache no longer has is no loss.
+        # Messages sent before the first known one are history; those no longer in the cache are not a loss.
         known = last is not None
         missing = 0
         first = 0 if last is None else last + 1
@@ -134,7 +134,7 @@ class Recovery:
             missing += oldest - first
         first = oldest
         while first <= until:
-            end = min(until, first + _PORTION - 1)
+            end = min(until, first + _BATCH - 1)
             found = self._fetch(key, publisher, first, end)
             if found is None:
                 break
@@ -154,19 +154,19 @@ class Recovery:
             self._on_miss(key, missing)
 
     def _fetch(self, key: str, publisher: Publisher, first: int, end: int) -> dict[int, Any] | None:
-        """Samples by number that a cache has of a range; None where the cache does not answer at all."""
+        """Return the samples of a range that a cache has, by number; None if the cache does not answer."""
         found: dict[int, Any] = {}
         for attempt in range(_ATTEMPTS):
             if attempt:
-                # The link may have been lost, and be back in a moment.
+                # The link may have been lost, and return soon.
                 self._pause(_RETRY_S)
             for reply in self._ask(key, publisher, f"_sn={first}..{end}"):
                 if first <= (number := reply.source_info.source_sn) <= end:
                     found[number] = reply
             if end in found:
-                # Replies come in order: what is lacking before this one is no longer kept.
+                # Replies come in order: those missing before this one are no longer in the cache.
                 return found
-            # An empty reply can be a lost one. That these are no longer kept follows from the newest number alone.
+            # An empty reply may be a lost one. Only the newest number shows that these are no longer in the cache.
             newest = max((reply.source_info.source_sn for reply in self._ask(key, publisher, "_max=1")), default=end)
             if newest - end >= self._cache:
                 return found
@@ -182,5 +182,5 @@ class Recovery:
 
 
 def publisher_of(entity: Any) -> Publisher:
-    """Whose message it is, of the source that zenoh names."""
+    """Return the publisher from zenoh's source of a message."""
     return str(entity.zid), entity.eid

@@ -1,4 +1,4 @@
-"""A zenoh session with its receiving threads, and the settings that both sides share."""
+"""A zenoh session with its receiving threads, and the settings shared by both sides."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from typing import Any
 from rig.base import wire
 
 _LEASE_S = 60.0
-"""A stopped subscriber sends no keep-alives, and must keep its link for well over 10 s. A killed process is noticed
-by its closed socket, not by the lease."""
+"""Lease of a link [s]. A suspended subscriber sends no keep-alives, and must keep its link for well over 10 s. A
+killed process is noticed by its closed socket, not by the lease."""
 PATIENCE_S = 20.0
-"""How long a receiver waits for recovered messages [s]."""
-_HELD_S = 2.0
-"""How long recovered messages wait for room in a link whose other side does not read them [s]. Then it is closed: a
-client of ours connects again and asks again, and one that means harm holds up no longer."""
+"""Longest wait of a receiver for recovered messages [s]."""
+_BLOCKED_S = 2.0
+"""Longest wait of recovered messages for a link whose other side does not read [s]. Then the link is closed: our own
+client reconnects and requests them again, and a malicious one blocks no longer."""
 
 
 def locator(host: str, port: int, *, tls: bool = False) -> str:
-    """An address as zenoh names it."""
-    # "localhost" may resolve to ::1 first, where nobody listens.
+    """Return an address in zenoh's form."""
+    # "localhost" may resolve to ::1 first, where the rig does not listen.
     return f"{'tls' if tls else 'tcp'}/{'127.0.0.1' if host == 'localhost' else host}:{port}"
 
 
 def config_of(**settings: Any) -> Any:
-    """The settings that both sides share, and those given (`__` stands for `/`)."""
+    """Return a configuration with the shared settings and the given ones (`__` stands for `/`)."""
     import zenoh
 
     config = zenoh.Config()
@@ -37,16 +37,16 @@ def config_of(**settings: Any) -> Any:
         "mode": "peer",
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
-        # Blocks are of a few kB: shared memory saves nothing and would leave segments behind when a process is killed.
+        # Blocks are a few kB: shared memory saves nothing and would leave segments after a process is killed.
         "transport/shared_memory/enabled": False,
         "transport/unicast/compression/enabled": False,
         "adminspace/enabled": False,
         "transport/link/tx/lease": round(_LEASE_S * 1000),
         "transport/link/tx/keep_alive": 30,
-        # Recovered messages wait for room in their link, and while they do, the publisher of that key waits for its
-        # cache. After this time the link is closed instead, which can cost that client messages. It must be below the
-        # time that the service can queue [us].
-        "transport/link/tx/queue/congestion_control/block/wait_before_close": round(_HELD_S * 1e6),
+        # Recovered messages wait for a full link, and meanwhile the publisher of that key waits for its cache. After
+        # this time the link is closed, which can cost that client messages. It must be below the time that the
+        # service can queue [us].
+        "transport/link/tx/queue/congestion_control/block/wait_before_close": round(_BLOCKED_S * 1e6),
     }
     for key, value in {**shared, **{name.replace("__", "/"): value for name, value in settings.items()}}.items():
         config.insert_json5(key, json.dumps(value))
@@ -54,17 +54,17 @@ def config_of(**settings: Any) -> Any:
 
 
 class Session:
-    """A zenoh session with its receiving threads, closed for certain.
+    """A zenoh session with its receiving threads, which is always closed.
 
-    zenoh's own callback threads are not daemons: a script that forgets to close would hang on exit. So all receiving
-    is by channels, drained by daemon threads, and an exit handler closes what was left open.
+    zenoh's own callback threads are not daemons: a script that does not close its session would hang at exit. So all
+    data is received by channels that daemon threads read, and an exit handler closes open sessions.
     """
 
     def __init__(self, config: Any) -> None:
         import zenoh
 
-        # A receiving thread waits where it sends a recovery to a stalled link, or fills the channel of a slow callback.
-        # The default of two would leave none for the rest. Read when the first session of a process opens.
+        # A receiving thread blocks while it sends a recovery to a stalled link, or fills the channel of a slow
+        # callback; the default of two threads would leave none for the rest. Read at the first session of a process.
         os.environ.setdefault("ZENOH_RUNTIME", "(rx: (worker_threads: 16))")
         self.session = zenoh.open(config)
         self._threads: list[threading.Thread] = []
@@ -72,11 +72,11 @@ class Session:
         self._closed = False
         self._printed: set[str] = set()
         self.on_trouble: Callable[[str, BaseException], None] = self._print_trouble
-        """Told of what fails on a receiving thread, which goes on."""
+        """Receives failures on receiving threads, which continue."""
         atexit.register(self._close_at_exit)
 
     def _print_trouble(self, where: str, error: BaseException) -> None:
-        if where not in self._printed:  # it may fail with each message
+        if where not in self._printed:  # each message may fail
             self._printed.add(where)
             thread = threading.current_thread()
             threading.excepthook(threading.ExceptHookArgs((type(error), error, error.__traceback__, thread)))
@@ -84,9 +84,9 @@ class Session:
     def drain(
         self, channel: Any, take: Callable[[Any], None], name: str, *, first: Callable[[], None] | None = None
     ) -> None:
-        """Give all that arrives in a channel to `take`, on a thread of its own, after calling `first` there.
+        """Pass all messages of a channel to `take`, on its own thread, after calling `first` there.
 
-        What fails there fails alone: a channel that nobody empties would in the end block the whole link.
+        Failures do not end the thread: an unread channel would finally block the whole link.
         """
         import zenoh
 
@@ -113,7 +113,7 @@ class Session:
         self.close(wait_s=None)
 
     def close(self, *, wait_s: float | None = 2.0) -> None:
-        """Close, and wait so long for that [s]; None: to its end."""
+        """Close, and wait for this long [s]; None: until it is closed."""
         import zenoh
 
         with self._closing:
@@ -126,8 +126,8 @@ class Session:
             with contextlib.suppress(zenoh.ZError):
                 self.session.close()
 
-        # Takes 10 s and fails where a callback never returns. A daemon would be ended in the middle of it where the
-        # process ends meanwhile, which aborts the process.
+        # Takes 10 s and fails if a callback never returns. A daemon thread would be killed at the end of the process,
+        # which aborts the process.
         closing = threading.Thread(target=close, name="zenoh closes")
         closing.start()
         closing.join(timeout=wait_s)
@@ -137,14 +137,14 @@ class Session:
 
 
 def encoding_of(key: str, schema: str | None) -> str:
-    """Zenoh's name for what a key's payloads are."""
+    """Return zenoh's encoding for the payloads of a key."""
     if schema is not None:
         return f"application/cdr;{schema}"
     return "application/octet-stream" if key.startswith(f"{wire.ROOT}/can/") else "application/json"
 
 
 def fifo() -> Any:
-    """A channel of requests, reports or tokens that wait for their thread."""
+    """Return a channel for requests, reports or tokens."""
     import zenoh
 
     return zenoh.handlers.FifoChannel(256)

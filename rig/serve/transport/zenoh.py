@@ -1,7 +1,7 @@
-"""Server and client over zenoh: TCP on the loopback, TLS beyond it, between two peers; no router, multicast or gossip.
+"""Server and client over zenoh: TCP on the loopback, TLS beyond it, peer to peer; no router, multicast or gossip.
 
-The server publishes without waiting (a stalled subscriber must not delay it) and keeps the last messages of each key;
-a lossless client notices from the numbers of the messages what it did not get, and fetches it from there.
+The server publishes without waiting (a stalled subscriber must not delay it) and keeps the last messages of each key. A
+lossless client detects missed messages by their numbers, and fetches them from there.
 """
 
 from __future__ import annotations
@@ -31,39 +31,39 @@ if TYPE_CHECKING:
 
 _SLOW_PUT_S = 0.5e-3
 _STALLED_BYTES = 256 * 1024
-"""Unread bytes that make a link stalled: about 0.1 s of all streams; one that keeps up leaves none."""
+"""Unread bytes that indicate a stalled link: about 0.1 s of all streams; a fast subscriber leaves none."""
 _HEARTBEAT_S = 0.25
-"""How soon a subscriber learns that the last message of a key is missing."""
+"""Time until a subscriber detects that the last message of a key is missing [s]."""
 _FIFO = 20_000
-"""Messages that wait for a callback: about 20 s of all streams. Beyond that the link backs up, the rig drops (or waits,
-where it is not paced), and the rest is recovered."""
+"""Messages that wait for a callback: about 20 s of all streams. With more, the link fills, the rig drops messages (or
+waits, if it is not paced), and they are recovered."""
 _HEARTBEATS = 500
-"""Heartbeats that a subscriber holds: several of each key. A ring takes its memory as it first goes round, a long one
-for hours."""
+"""Heartbeats that a subscriber holds: several per key. A ring allocates its memory in its first round, a long ring for
+hours."""
 _RING = 2000
-"""Messages that a subscriber which may lose some holds: about 2 s of all streams."""
+"""Messages held by a subscriber that may lose some: about 2 s of all streams."""
 _FROM_CLIENTS = {
     "transport/link/rx/max_message_size": 1 << 20,
     "transport/unicast/accept_timeout": 3000,
     "transport/unicast/accept_pending": 1000,
 }
-"""The largest that a server takes: requests have at most 64 kB. What it sends is not bounded by this. And how many may
-be about to connect, for how long [ms]: whoever opens connections and says nothing must not shut out all others."""
-_FROM_AFAR = {"transport/unicast/max_sessions": 32, "transport/unicast/accept_pending": 32}
-"""Where it is exposed; a client that subscribes has two sessions."""
-_OPENING_S, _OPENING_TLS_S, _BACK_S = 0.5, 2.0, 5.0
-"""How long one attempt to connect may take: beyond the loopback it is several times there and back. And how long a
-request without a link waits for a rig that is started again."""
+"""Limits for data from clients: message size (requests have at most 64 kB; messages to clients are not limited), and
+number and time [ms] of connections in progress, so that silent ones do not shut out others."""
+_REMOTE_LIMITS = {"transport/unicast/max_sessions": 32, "transport/unicast/accept_pending": 32}
+"""Limits of an exposed rig; a client that subscribes has two sessions."""
+_OPENING_S, _OPENING_TLS_S, _RESTART_S = 0.5, 2.0, 5.0
+"""Time limits: one attempt to connect, on the loopback and beyond it (several round trips), and the wait of a request
+without a link for a restarted rig [s]."""
 _RETRY_S = 0.05
-"""Pause before a request is repeated that nobody has answered [s]."""
+"""Pause before an unanswered request is repeated [s]."""
 
 
 class Exposure(NamedTuple):
-    """Where a rig listens beyond the loopback.
+    """Address of a rig for other computers.
 
     Args:
         endpoint: HOST:PORT.
-        holder: The rig's own certificate and who may connect; None lets everybody in, unencrypted.
+        holder: The rig's certificate and authority; None accepts everybody, unencrypted.
     """
 
     endpoint: str
@@ -71,19 +71,19 @@ class Exposure(NamedTuple):
 
 
 class ZenohServer(Closing):
-    """The rig's side: listens on the loopback, and elsewhere where it is told to.
+    """The rig's side: listens on the loopback, and elsewhere if exposed.
 
-    Whoever connects may do what `rig.serve.transport.exposure.access` says.
+    Clients have the permissions in `rig.serve.transport.exposure.access`.
 
     Args:
-        endpoint: HOST:PORT to listen on, on the loopback; with port 0, one that is free.
-        exposed: Where else.
-        wait: Make `publish` wait for slow subscribers (at most 2 s, then their link is closed and they recover from
-            the cache) instead of letting them recover later. For runs that are not paced by the wall clock: there the
-            cache would hold a much shorter wall time.
+        endpoint: HOST:PORT to listen on, on the loopback; port 0: a free one.
+        exposed: Additional address.
+        wait: Make `publish` wait for slow subscribers (at most 2 s, then their link is closed and they recover from the
+            cache) instead of letting them recover later. For unpaced runs, whose cache would cover a much shorter wall
+            time.
 
     Raises:
-        InputError: An endpoint is malformed, in use, or `endpoint` not on the loopback.
+        InputError: An endpoint is malformed or in use, or `endpoint` is not on the loopback.
     """
 
     def __init__(
@@ -99,7 +99,7 @@ class ZenohServer(Closing):
             host, port = parse_endpoint(exposed.endpoint, field="expose")
             self._ports.add(port)
             locators.append(locator(host, port, tls=exposed.holder is not None))
-            settings |= _FROM_AFAR
+            settings |= _REMOTE_LIMITS
             if exposed.holder is not None:
                 settings["transport/link/tls"] = exposed.holder.settings(listens=True)
         try:
@@ -120,7 +120,7 @@ class ZenohServer(Closing):
         self._session.drain(iter(self._replies.get, None), lambda late: _reply(*late), "replies")
 
     def publish(self, key: str, payload: bytes) -> None:
-        """Send one payload to all subscribers, and keep it for those who miss it. One thread only."""
+        """Send one payload to all subscribers, and keep it for recovery; on one thread only."""
         publisher = self._publishers.get(key) or self._declare(key)
         start = time.perf_counter()
         publisher.put(payload)
@@ -145,11 +145,11 @@ class ZenohServer(Closing):
         return publisher
 
     def answer(self, key: str, handler: Callable[[bytes], bytes]) -> None:
-        """Answer requests on a key, one after another, on a thread of that key."""
+        """Answer requests on a key, one after another, on that key's thread."""
         self.answer_all(key, lambda _, payload: handler(payload))
 
     def answer_all(self, expression: str, handler: Callable[[str, bytes], bytes | Future[bytes]]) -> None:
-        """Answer requests on all keys that match, on a thread of this expression; what comes later, on one for that."""
+        """Answer requests on all matching keys, on this expression's thread; later answers on another thread."""
         queryable = self._session.session.declare_queryable(expression, fifo())
         self._declared.append(queryable)
         own = None if "*" in expression else expression
@@ -167,7 +167,7 @@ class ZenohServer(Closing):
                     raise
             else:
                 if isinstance(answer, Future):
-                    # Completed on a thread that must not wait for a link.
+                    # The future completes on a thread that must not wait for a link.
                     answer.add_done_callback(lambda done: self._replies.put((query, key, done.result())))
                 else:
                     _reply(query, key, answer)
@@ -175,21 +175,21 @@ class ZenohServer(Closing):
         self._session.drain(queryable, take, f"answers {expression}")
 
     def on_trouble(self, tell: Callable[[str, BaseException], None]) -> None:
-        """Tell where and why something failed on a receiving thread."""
+        """Set the function that receives place and error of failures on receiving threads."""
         self._session.on_trouble = tell
 
     def hear(self, key: str, callback: Callable[[str, bytes], None]) -> None:
-        """Receive what clients report on matching keys."""
+        """Receive the clients' reports on matching keys."""
         subscriber = self._session.session.declare_subscriber(key, fifo())
         self._declared.append(subscriber)
         self._session.drain(subscriber, lambda x: callback(str(x.key_expr), x.payload.to_bytes()), f"hears {key}")
 
     def announce(self, key: str = wire.ALIVE) -> None:
-        """Show the rig's token, or another: it vanishes when this process ends, however it ends."""
+        """Publish the rig's token, or another; it disappears when this process ends for any reason."""
         self._declared.append(self._session.session.liveliness().declare_token(key))
 
     def watch(self, key: str, callback: Callable[[str, bool], None]) -> None:
-        """Call back with key and True / False when tokens of clients on keys that match appear / vanish."""
+        """Call back with key and True / False when matching tokens of clients appear / disappear."""
         import zenoh
 
         subscriber = self._session.session.liveliness().declare_subscriber(key, fifo(), history=True)
@@ -199,13 +199,13 @@ class ZenohServer(Closing):
         )
 
     def congestion(self) -> dict[str, float]:
-        """What a stalled subscriber looks like from here.
+        """Return counters that show stalled subscribers.
 
-        A put waits once, for 1 ms, when a link's queue fills, and drops at once from then on: `slow_puts` counts
-        the beginnings of long stalls, not their length. What shows a stall at once and as long as it lasts is the
-        number of bytes that its link holds unread (`backlog_bytes`: the largest of all links, 0 where the operating
-        system does not tell). `stalls` counts how often a link was found stalled that was not in the call before;
-        `links_NAME` are those whose certificate has that name.
+        A put waits once, for 1 ms, when a link's queue fills, and drops at once from then on: `slow_puts` counts the
+        starts of long stalls, not their length. The unread bytes of a link show a stall at once and for its whole
+        duration (`backlog_bytes`: the largest of all links, 0 if the operating system does not report it). `stalls`
+        counts links found stalled that were not stalled at the previous call; `links_NAME` counts links whose
+        certificate has that name.
         """
         links = list(self._session.session.info.links())
         names = Counter(f"links_{link.auth_identifier}" for link in links if link.auth_identifier is not None)
@@ -224,9 +224,9 @@ class ZenohServer(Closing):
         }
 
     def close(self) -> None:
-        """Send the last replies, and close the session and with it all that was declared."""
+        """Send the last replies, then close the session with all its declarations."""
         self._replies.put(None)
-        # zenoh waits for some seconds until a stalled link takes the farewell.
+        # zenoh waits some seconds for a stalled link to accept the closing message.
         for port in self._ports:
             hang_up(port, {other for other, size in backlog_of(port).items() if size > _STALLED_BYTES})
         self._session.close()
@@ -238,19 +238,19 @@ def _reply(query: Any, key: str, payload: bytes) -> None:
 
 
 class ZenohClient(Closing):
-    """A client's side: connects to one rig and listens on nothing. Reconnects by itself when that rig is started again.
+    """A client's side: connects to one rig and does not listen. Reconnects by itself after a restart of the rig.
 
-    Subscriptions have a link of their own. It backs up when a callback is slow, and then nothing on it is read, which
-    must not hold up requests and the token, and least of all the recovery that this very subscription waits for.
+    Subscriptions have a link of their own. A slow callback fills it, and then nothing on it is read, which must not
+    delay requests, the token, or the recovery that this subscription waits for.
 
     Args:
         endpoint: HOST:PORT of the rig, or its name.
-        wait_s: How long to wait for a rig to be there [s]; may be infinite.
-        tls: Folder with the keys of a role (`rig keys init`), for a rig that is exposed; None connects without.
+        wait_s: Longest wait for a rig [s]; may be infinite.
+        tls: Folder with the keys of a role (`rig keys init`), for an exposed rig; None connects without TLS.
 
     Raises:
         InputError: The endpoint is malformed, no rig has that name, or the folder holds no keys.
-        NoReplyError: No rig was there in time, or it does not let us in.
+        NoReplyError: No rig answered in time, or it refused the client.
     """
 
     def __init__(self, endpoint: str = DEFAULT_ENDPOINT, *, wait_s: float = 1.0, tls: Path | str | None = None) -> None:
@@ -263,7 +263,7 @@ class ZenohClient(Closing):
         self.endpoint = f"{self._host}:{self._port}"
         self._declared: list[Any] = []
         self._rigs: set[str] = set()
-        """Rigs that this client is or was linked to: what they sent may still be on its way."""
+        """Rigs that this client is or was linked to: their messages may still be in flight."""
         self.foreign = 0
         self._streams: Session | None = None
         self._lossless: list[tuple[str, Recovery]] = []
@@ -271,17 +271,17 @@ class ZenohClient(Closing):
 
     @property
     def rig(self) -> str | None:
-        """Who the rig at the other end of the link is; None without a link."""
+        """Identity of the linked rig; None without a link."""
         return next(iter(self._linked()), None)
 
     def _linked(self) -> set[str]:
-        # A client listens on nothing, so that whom it is linked to is whom it has asked for.
+        # A client does not listen, so its only peer is the rig that it connected to.
         found = set(map(str, self._session.session.info.peers_zid()))
         self._rigs |= found
         return found
 
     def _is_rigs(self, publisher: str | None) -> bool:
-        """Whether a message is from the rig, by the publisher that it names; others are counted, and left out."""
+        """Return whether a message is from the rig, by its publisher; others are counted and ignored."""
         if publisher is not None and (publisher in self._rigs or publisher in self._linked()):
             return True
         self.foreign += 1
@@ -301,8 +301,8 @@ class ZenohClient(Closing):
             config = config_of(
                 listen__endpoints=[],
                 connect__endpoints=[locator(self._host, self._port, tls=self._holder is not None)],
-                # Opening waits for the link, so that the first request cannot come too early; in slices, so that
-                # Ctrl-C works meanwhile.
+                # Opening waits for the link, so that the first request is not too early; in slices, so that Ctrl-C
+                # works meanwhile.
                 connect__timeout_ms=round(1000 * min(longest_s, max(deadline.left_s, 0.05))),
                 connect__exit_on_failure=True,
                 connect__retry={"period_init_ms": 50, "period_max_ms": 500, "period_increase_factor": 2},
@@ -315,18 +315,18 @@ class ZenohClient(Closing):
                     raise self._not_let_in() from None
 
     def _not_let_in(self) -> NoReplyError:
-        """Whether nobody is there, or somebody who does not let us in."""
+        """Return the error that tells whether no rig listens or the rig refuses this client."""
         try:
             if self._holder is None:
                 socket.create_connection((self._host, self._port), timeout=1.0).close()
-                why = "without a certificate: for a rig that is exposed give --tls FOLDER; else it is no rig, or hangs"
+                why = "without a certificate: an exposed rig needs --tls FOLDER; otherwise it is not a rig, or it hangs"
             elif (said := self._holder.turned_away(self._host, self._port)) is not None:
                 why = f"as {self._holder.name}, by the keys in {self._holder.folder}: {said}"
             else:
-                why = "though its certificates are right: it has too many links, or hangs"
+                why = "although the certificates are valid: it has too many links, or hangs"
         except OSError:
             return self._no_reply()
-        return NoReplyError(f"{self.endpoint} listens, but does not let us in {why}")
+        return NoReplyError(f"{self.endpoint} listens, but refuses this client {why}")
 
     def _no_reply(self) -> NoReplyError:
         start = "start one with: rig run stable-run (--wait-s 60 waits for one that still compiles)"
@@ -334,7 +334,7 @@ class ZenohClient(Closing):
 
     @property
     def connection(self) -> str | None:
-        """By which certificates both ends know each other; None without TLS."""
+        """Certificates of both ends in words; None without TLS."""
         if self._holder is None:
             return None
         rig = next((link.auth_identifier for link in self._session.session.info.links()), None)
@@ -349,12 +349,12 @@ class ZenohClient(Closing):
         history: bool = False,
         lossless: bool = True,
     ) -> None:
-        """Receive payloads on a thread of this subscription.
+        """Receive payloads on this subscription's thread.
 
-        The messages of each key arrive in order; messages of different keys may arrive in another order than they
-        were sent in (after a stall each key is recovered for itself), so an `end` event can overtake blocks. A
-        callback that blocks stops only this subscription; the rig goes on, and what was missed is recovered.
-        `on_miss` and `on_message` are never called at the same time.
+        The messages of each key arrive in order; messages of different keys may change their order (after a stall each
+        key is recovered separately), so an `end` event can overtake blocks. A callback that blocks stops only this
+        subscription; the rig continues, and missed messages are recovered. `on_miss` and `on_message` are never called
+        at the same time.
         """
         import zenoh
 
@@ -389,8 +389,8 @@ class ZenohClient(Closing):
         def begin() -> None:
             if history:
                 heads = get(streams, f"{key}/@adv/**?_max=1")
-                # What came before these replies, over the same link, goes first: it may be older than all that the
-                # caches still have, where this process was stopped meanwhile.
+                # Messages that arrived before these replies on the same link come first: they may be older than
+                # everything in the caches if this process was suspended meanwhile.
                 while (sample := subscriber.try_recv()) is not None:
                     take(sample)
                 stream.begin(heads)
@@ -412,32 +412,32 @@ class ZenohClient(Closing):
         streams.drain(heartbeats, heartbeat, f"heartbeats {key}")
 
     def settle(self) -> None:
-        """Return when all subscriptions so far are in effect: a reply over their link is behind them."""
+        """Wait until all subscriptions are in effect: a reply on their link arrives after them."""
         if self._streams is not None:
             list(self._streams.session.get(wire.STATUS, timeout=PATIENCE_S))
 
     def wait_for(self, key: str, number: int, *, timeout_s: float) -> bool:
-        """Wait until a message was handed on, by its number; True at once of a key that is not subscribed."""
+        """Wait for the delivery of a message, by its number; True at once for a key without subscription."""
         deadline = Deadline(timeout_s)
         streams = [stream for subscribed, stream in self._lossless if subscribed == key]
         return all(each.wait_for(key, number, timeout_s=deadline.left_s) for each in streams)
 
     def request(self, key: str, payload: bytes = b"", *, timeout_s: float = 2.0) -> bytes:
-        """Ask the rig and return its reply.
+        """Send a request to the rig and return its reply.
 
         Raises:
-            NoReplyError: Nobody answered in time, or the rig failed to, or went, and may have done what was asked.
+            NoReplyError: There was no reply in time, or the rig failed or ended; it may have executed the request.
         """
         import zenoh
 
-        deadline, sooner, asked = Deadline(timeout_s), Deadline(min(timeout_s, _BACK_S)), self._linked()
+        deadline, sooner, asked = Deadline(timeout_s), Deadline(min(timeout_s, _RESTART_S)), self._linked()
         while True:
             replies: Iterator[Any] = self._session.session.get(
                 key,
                 payload=payload,
                 timeout=max(deadline.left_s, 0.01),
-                # Replies inherit both: one that waited for a stalled client would hold up all others and close its link
-                # after 5 s; and replies need not queue behind recovered blocks.
+                # Replies inherit both: one waiting for a stalled client would delay all others and close its link after
+                # 5 s, and replies need not queue after recovered blocks.
                 congestion_control=zenoh.CongestionControl.DROP,
                 priority=zenoh.Priority.INTERACTIVE_HIGH,
             )
@@ -449,7 +449,7 @@ class ZenohClient(Closing):
                     raise NoReplyError(f"the rig at {self.endpoint} could not answer {key}: {text}")
             if asked and not asked & self._linked():
                 raise NoReplyError(f"the rig at {self.endpoint} has gone, and has not answered {key}")
-            # Without a rig the reply is empty at once: it may be about to start. So it is where the rig denies this.
+            # Without a rig the reply is empty at once; the rig may be about to start. A denied request looks the same.
             late = (deadline if self._linked() else sooner).left_s <= _RETRY_S
             role = None if self._holder is None else self._holder.name
             denied = not allows(role, Verb.ASK, key)
@@ -461,7 +461,7 @@ class ZenohClient(Closing):
             time.sleep(_RETRY_S)
 
     def watch(self, key: str, callback: Callable[[bool], None]) -> None:
-        """Call back with True / False when the rig's token appears / vanishes; True at once if it is there."""
+        """Call back with True / False when the rig's token appears / disappears; True at once if it is there."""
         import zenoh
 
         subscriber = self._session.session.liveliness().declare_subscriber(key, fifo(), history=True)
@@ -469,16 +469,16 @@ class ZenohClient(Closing):
         self._session.drain(subscriber, lambda x: callback(x.kind == zenoh.SampleKind.PUT), f"watches {key}")
 
     def announce(self, key: str) -> None:
-        """Show a token of this client: it vanishes when this process ends, however it ends."""
+        """Publish a token of this client; it disappears when this process ends for any reason."""
         self._declared.append(self._session.session.liveliness().declare_token(key))
 
     def tokens(self, key: str, *, timeout_s: float = 0.5) -> list[str]:
-        """Keys of the tokens that are there now, of those that match."""
+        """Return the keys of matching tokens that exist now."""
         replies = self._session.session.liveliness().get(key, timeout=timeout_s)
         return sorted({str(reply.ok.key_expr) for reply in replies if reply.ok is not None})
 
     def report(self, key: str, payload: bytes) -> None:
-        """Send one payload to the rig; it is dropped where the link is congested."""
+        """Send one payload to the rig; it is dropped if the link is congested."""
         import zenoh
 
         self._session.session.put(
@@ -490,13 +490,13 @@ class ZenohClient(Closing):
         )
 
     def close(self) -> None:
-        """Close both links and with them all that was declared."""
+        """Close both links with all their declarations."""
         if self._streams is not None:
             self._streams.close()
         self._session.close()
 
 
 def client_of(url: str, *, wait_s: float) -> ZenohClient:
-    """A client of the rig at a URL (`names.address_in`), with the keys of a role in ?tls=DIR; errors as of these."""
+    """Return a client of the rig at a URL (see `names.address_in`), with the keys of a role in ?tls=DIR."""
     endpoint, query, folder = address_in(url).partition("?tls=")
     return ZenohClient(endpoint, wait_s=wait_s, tls=folder if query else None)

@@ -1,1 +1,1 @@
-"""Certificates and permissions of a rig that is exposed to other hosts."""
+"""Certificates and permissions of an exposed rig."""

@@ -1,7 +1,7 @@
-"""Who may say what to a rig: the one table from which zenoh's rules and their documentation are made, and are tested.
+"""Permissions of clients: the single table from which zenoh's rules and their documentation are generated.
 
-Everything not named here is denied: whoever connects may put no block, event or status, answer no request and delete
-nothing, as only the rig does. A rule holds for one direction: a key that may be received may not be put.
+Everything not listed is denied: a client may not publish blocks, events or status, answer requests or delete anything.
+A rule applies to one direction: a key that may be received may not be published.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from rig.base import wire
 
 
 class Verb(StrEnum):
-    """What a client does with a key."""
+    """Action of a client on a key."""
 
     ASK = "ask"
     RECEIVE = "receive"
@@ -24,7 +24,7 @@ class Verb(StrEnum):
 
 
 class Door(NamedTuple):
-    """Keys with what can be done there."""
+    """Keys and the action allowed on them."""
 
     what: str
     verb: Verb
@@ -55,16 +55,16 @@ CAN = (
 DOORS = (DOCUMENTS, STREAMS, PRESENCE, REPORTS, COMMANDS, TRUTH, *INSTRUMENTS, *CAN)
 
 PLAIN = "plain"
-"""Whoever connects without TLS: there is nobody to tell apart."""
+"""Connections without TLS, which cannot be distinguished."""
 _VIEWER = (DOCUMENTS, STREAMS, PRESENCE)
 ROLES: Mapping[str, tuple[Door, ...]] = {
     "operator": (*_VIEWER, REPORTS, COMMANDS),
     "recorder": (*_VIEWER, REPORTS),
     "viewer": _VIEWER,
 }
-"""Doors by the role that a certificate names."""
+"""Permissions by the role in a certificate."""
 WITH_TRUTH = "+truth"
-"""Behind a role in a certificate's name: a grant of its own."""
+"""Suffix of a role in a certificate's name that grants access to the truth."""
 
 _MESSAGES: Mapping[Verb, Mapping[str, list[str]]] = {
     Verb.ASK: {"ingress": ["query"], "egress": ["declare_queryable", "reply"]},
@@ -73,14 +73,14 @@ _MESSAGES: Mapping[Verb, Mapping[str, list[str]]] = {
     Verb.WATCH: {"ingress": ["liveliness_query", "declare_liveliness_subscriber"], "egress": ["liveliness_token"]},
     Verb.SHOW: {"ingress": ["liveliness_token"], "egress": ["declare_liveliness_subscriber"]},
 }
-"""zenoh's messages that each needs: those that come in, and those that go out."""
+"""Zenoh messages that each action needs, incoming and outgoing."""
 _ANYTHING, _CACHES = f"{wire.ROOT}/**", f"{wire.ROOT}/**/@adv/**"
 _TO_RECEIVE = {"subscribe": (["declare_subscriber"], [_ANYTHING, _CACHES]), "fetch": (["query"], [_CACHES])}
-"""Whoever may receive at all may ask for anything: what it gets is decided message by message, on the way out."""
+"""A client that may receive at all may subscribe to anything; each outgoing message is checked."""
 
 
 def doors_of(name: str | None) -> tuple[Door, ...]:
-    """What somebody may do, by the common name of a certificate; None is a connection without TLS."""
+    """Return the permissions by the common name of a certificate; None is a connection without TLS."""
     if name is None:
         return DOORS
     role = name.removesuffix(WITH_TRUTH)
@@ -88,7 +88,7 @@ def doors_of(name: str | None) -> tuple[Door, ...]:
 
 
 def allows(name: str | None, verb: Verb, key: str) -> bool:
-    """Whether somebody may do that with a key; arguments as of `doors_of`."""
+    """Return whether an action on a key is allowed; arguments as of `doors_of`."""
     import zenoh
 
     return any(
@@ -100,7 +100,7 @@ def allows(name: str | None, verb: Verb, key: str) -> bool:
 
 
 def rules() -> dict[str, Any]:
-    """The table as zenoh's `access_control`, for the rig's own session: ingress is what comes from clients."""
+    """Return the table as zenoh's `access_control` for the rig's session; ingress is data from clients."""
     rules = {
         f"{flow} {door.what}": (flow, messages, _with_cache(door))
         for door in DOORS
@@ -135,6 +135,6 @@ def rules() -> dict[str, Any]:
 
 
 def _with_cache(door: Door) -> list[str]:
-    # `**` matches no chunk that begins with `@`, as the keys of the caches and of their heartbeats do.
+    # `**` does not match chunks that begin with `@`, as in the keys of caches and their heartbeats.
     caches = [f"{key}/@adv/**" for key in door.keys] if door.verb is Verb.RECEIVE else []
     return [*door.keys, *caches]

@@ -1,7 +1,7 @@
-"""Who is who on a rig that is exposed: certificates of one authority, a folder for each holder.
+"""Certificates of an exposed rig: one authority, and a folder for each holder.
 
-The authority's own key signs them and is forgotten: nobody can add a certificate later. A holder's folder is whole in
-itself (`authority.pem`, `certificate.pem`, `key.pem`), so that it can be copied to where it is used.
+The authority's key signs the certificates and is discarded: no certificate can be added later. A holder's folder is
+complete (`authority.pem`, `certificate.pem`, `key.pem`), so that it can be copied to the client's computer.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ HOLDERS = (SERVER, *ROLES)
 _AUTHORITY, _CERTIFICATE, _KEY = "authority.pem", "certificate.pem", "key.pem"
 _LAYOUT = {Path(holder, file) for holder in HOLDERS for file in ("", _AUTHORITY, _CERTIFICATE, _KEY)}
 _SKEW = timedelta(hours=1)
-"""How far clocks may differ."""
+"""Allowed difference between clocks."""
 _HOST = re.compile(r"(?=.{1,64}\Z)[A-Za-z0-9]([A-Za-z0-9-]*[A-Za-z0-9])?(\.[A-Za-z0-9]([A-Za-z0-9-]*[A-Za-z0-9])?)*")
 
 
 class Holder(NamedTuple):
-    """One holder's folder, checked.
+    """A checked folder of one holder.
 
     Args:
-        folder: Where it is.
-        name: Common name of its certificate; a role, for a client.
-        expires: When the certificate does.
+        folder: Its path.
+        name: Common name of the certificate; a role, for a client.
+        expires: Expiry of the certificate.
     """
 
     folder: Path
@@ -48,7 +48,7 @@ class Holder(NamedTuple):
     expires: datetime
 
     def settings(self, *, listens: bool) -> dict[str, Any]:
-        """What zenoh needs to know, for the side that listens or the one that connects."""
+        """Return zenoh's TLS settings for the listening or the connecting side."""
         side = "listen" if listens else "connect"
         return {
             "root_ca_certificate": str(self.folder / _AUTHORITY),
@@ -60,10 +60,10 @@ class Holder(NamedTuple):
         }
 
     def turned_away(self, host: str, port: int, *, timeout_s: float = 1.0) -> str | None:
-        """Why a rig that listens there does not let this holder in, in TLS's own words; None where it does.
+        """Return why a rig refuses this holder, as reported by TLS; None if it accepts.
 
         Raises:
-            OSError: Nobody listens there, or nothing is said in time.
+            OSError: Nothing listens there, or there is no answer in time.
         """
         context = ssl.create_default_context(cafile=self.folder / _AUTHORITY)
         context.verify_flags &= ~getattr(ssl, "VERIFY_X509_STRICT", 0)
@@ -73,7 +73,7 @@ class Holder(NamedTuple):
             try:
                 with context.wrap_socket(plain, server_hostname=host) as link:
                     greeted = True
-                    # What the other side says about our certificate comes only now; else it waits for us to speak.
+                    # The other side's opinion of our certificate arrives only now; otherwise it waits for us to send.
                     link.recv(1)
             except (TimeoutError, ConnectionError):
                 return None if greeted else "no TLS is spoken there"
@@ -84,10 +84,10 @@ class Holder(NamedTuple):
 
 
 def holder_in(folder: Path | str, *, server: bool) -> Holder:
-    """The holder whose folder it is; of a folder that `make` has made, a server takes its own.
+    """Return the holder of a folder; from a folder created by `make`, a server uses its own.
 
     Raises:
-        InputError: There is none of that kind, or its certificate has expired.
+        InputError: The folder is not of that kind, or its certificate has expired.
     """
     from cryptography import x509
     from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
@@ -110,7 +110,9 @@ def holder_in(folder: Path | str, *, server: bool) -> Holder:
     key = where / _KEY
     if os.name == "posix" and key.stat().st_mode & 0o077:
         raise InputError(
-            "--tls", f"a folder whose key is its owner's alone (chmod 600 {key})", Words("one that others may read")
+            "--tls",
+            f"a folder whose key only its owner can read (chmod 600 {key})",
+            Words("a key that others can read"),
         )
     expires = certificate.not_valid_after_utc
     if expires <= datetime.now(UTC):
@@ -128,20 +130,20 @@ def make(
     truth: Collection[str] = (),
     force: bool = False,
 ) -> list[str]:
-    """Make an authority and a folder for each holder, all or nothing.
+    """Create an authority and a folder for each holder, all or nothing.
 
     Args:
-        folder: New, or empty.
-        hosts: Names and addresses of the rig's computer; localhost and 127.0.0.1 are always among them.
-        days: How long the certificates are valid.
-        truth: Roles that may read the truth as well.
-        force: Replace what this function had made there, or part of it.
+        folder: New or empty folder.
+        hosts: Names and addresses of the rig's computer; localhost and 127.0.0.1 are always included.
+        days: Validity of the certificates.
+        truth: Roles that may also read the truth.
+        force: Replace a folder that this function created, complete or not.
 
     Returns:
-        The names and addresses for which the rig's certificate holds.
+        The names and addresses in the rig's certificate.
 
     Raises:
-        InputError: A name is none, or the folder is something else.
+        InputError: A name is invalid, or the folder holds other files.
     """
     from cryptography import x509
     from cryptography.hazmat.primitives.asymmetric import ec
@@ -184,7 +186,7 @@ def make(
 
 
 class Issue(NamedTuple):
-    """What signs, and for how long."""
+    """The signing key and the validity of its certificates."""
 
     signing: EllipticCurvePrivateKey
     valid: timedelta
@@ -196,7 +198,7 @@ class Issue(NamedTuple):
         usage: x509.ObjectIdentifier | None,
         subjects: Sequence[x509.GeneralName],
     ) -> x509.Certificate:
-        """A certificate for a key; without a usage, the authority's own."""
+        """Return a certificate for a key; without a usage, the authority's own."""
         from cryptography import x509
         from cryptography.hazmat.primitives import hashes
         from cryptography.x509.oid import NameOID
@@ -217,7 +219,7 @@ class Issue(NamedTuple):
 
 
 def subject_of(name: str) -> x509.GeneralName:
-    """A computer's name or address, as a certificate has it."""
+    """Return a computer's name or address in the form of a certificate."""
     from cryptography import x509
 
     try:
@@ -231,7 +233,7 @@ def subject_of(name: str) -> x509.GeneralName:
 def write_holder(
     folder: Path, authority: x509.Certificate, certificate: x509.Certificate, key: EllipticCurvePrivateKey
 ) -> None:
-    """Make a holder's folder; its key is for its owner alone."""
+    """Write a holder's folder; only its owner can read the key."""
     from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
 
     folder.mkdir(mode=0o700)
