@@ -193,8 +193,8 @@ def test_a_stop_does_not_wait_for_devices() -> None:
         ("done", {"device": "b", "tick": 0}, "done.device must be one that has joined; instead received 'b'"),
         ("done", {"device": "a", "tick": -1}, "done.tick must be greater than or equal to 0"),
         ("done", {"device": "a", "tick": 1.0}, "done.tick must be a valid integer"),
-        ("done", {"device": "a"}, "done must be told by a tick or by a block"),
-        ("done", {"device": "a", "tick": 0, "block": 0}, "done must be told by a tick or by a block"),
+        ("done", {"device": "a"}, "done must be given by either a tick or a block"),
+        ("done", {"device": "a", "tick": 0, "block": 0}, "done must be given by either a tick or a block"),
         ("leave", {"device": "b"}, "leave.device must be one that has joined"),
     ],
 )

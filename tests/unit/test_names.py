@@ -61,7 +61,7 @@ def test_what_can_be_no_name_is_refused(name: str) -> None:
 
 def test_who_asks_for_a_name_that_is_not_there_is_told_those_that_are() -> None:
     with pytest.raises(
-        InputError, match=r"HOST:PORT such as 127.0.0.1:7460, or the name of a rig that runs \(none does\)"
+        InputError, match=r"HOST:PORT such as 127.0.0.1:7460, or the name of a running rig \(none runs\)"
     ):
         Console.open("bench", wait_s=0.0)
     with names.registered("bench-2", "127.0.0.1:7777"), pytest.raises(InputError, match="such as bench-2; instead"):
@@ -74,7 +74,7 @@ def test_who_asks_for_a_name_that_is_not_there_is_told_those_that_are() -> None:
 def test_a_folder_that_others_may_write_to_is_not_believed(runtime: Path) -> None:
     runtime.mkdir(mode=0o700)
     runtime.chmod(0o777)
-    with pytest.raises(InputError, match=r"a folder that is its owner's alone \(chmod 700"):
+    with pytest.raises(InputError, match=r"a folder that only its owner can access \(chmod 700"):
         names.running()
 
 

@@ -39,7 +39,7 @@ def test_a_flood_is_refused_at_once_but_for_a_burst_and_a_rate() -> None:
     clock.now_s += 1e6
     assert let_through(limit, "a", 2000) == 50
     with pytest.raises(
-        InputError, match=r"^commands must be at most 20 a second from one sender, 80 from all; .*from a"
+        InputError, match=r"^commands must be at most 20 per second from one sender, 80 from all; .*from a"
     ):
         limit.check("a")
 
