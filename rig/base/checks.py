@@ -1,7 +1,7 @@
-"""What comes from outside, a client, a file or a bus, is read and checked here, once, at the door it comes in by.
+"""Validation of input from clients, files and buses, done once where it enters.
 
-A document has a bounded size and depth, plain numbers and each key once; a model that derives from `Outside` has typed
-fields with ranges and no others. What has passed is believed behind the door, and what has not raises `InputError`.
+A document has limited size and depth, plain numbers, and each key once. A model derived from `Outside` has typed fields
+with ranges, and no others. Validated input is not checked again; invalid input raises `InputError`.
 """
 
 from __future__ import annotations
@@ -24,33 +24,33 @@ from rig.base.errors import InputError, Words, such_as
 from rig.base.text import nearest, printable
 
 DOCUMENT_BYTES = 16 << 20
-"""Largest document that a rig or a recording may hold."""
+"""Largest document of a rig or a recording [bytes]."""
 TOML_BYTES = 1 << 20
-"""Largest file that a person writes."""
+"""Largest file written by a person [bytes]."""
 DEPTH = 32
 """Deepest nesting of a document."""
 LARGEST = 2**63 - 1
-"""Largest whole number: what a tick, a row number and a seed fit into."""
+"""Largest whole number: the range of ticks, row numbers and seeds."""
 
 Count = Annotated[int, Field(ge=0, lt=2**62)]
-"""A number of rows, messages or ticks; sums of two still fit into 64 bits."""
+"""A number of rows, messages or ticks; the sum of two still fits into 64 bits."""
 
 
 class Outside(BaseModel):
-    """A document, or part of one, from outside: `"100"` and true are no numbers, and there are no further fields."""
+    """A document from outside, or part of one: `"100"` and true are not numbers; unknown fields are refused."""
 
     model_config = ConfigDict(strict=True, extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class Written(BaseModel):
-    """A table that a person writes, into a scene or another file; further fields are refused."""
+    """A table written by a person, in a scene or another file; unknown fields are refused."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     @model_validator(mode="before")
     @classmethod
     def _no_truth_for_a_number(cls, data: Any) -> Any:
-        # Python takes true for 1; a file that says so means something else.
+        # Python treats true as 1; a file with true means something else.
         for name, value in data.items() if isinstance(data, dict) else ():
             kind = cls.model_fields[name].annotation if name in cls.model_fields else bool
             if isinstance(value, bool) and bool not in (kind, *get_args(kind)):
@@ -67,7 +67,7 @@ class Written(BaseModel):
 
 
 def a_line(most: int) -> AfterValidator:
-    """Text of 1 to so many characters, not all blank, without line breaks or anything that a terminal would act on."""
+    """Return a validator for a line of 1 to `most` printable characters, not all blank."""
 
     def check_line(text: str) -> str:
         if not text.isprintable() or not text.strip() or len(text) > most:
@@ -78,20 +78,20 @@ def a_line(most: int) -> AfterValidator:
 
 
 Name = Annotated[str, a_line(100)]
-"""What a client calls itself."""
+"""Name that a client gives itself."""
 
 
 def read_json(payload: bytes, *, field: str = "payload", most_bytes: int = DOCUMENT_BYTES) -> dict[str, Any]:
-    """The JSON object in a payload.
+    """Return the JSON object in a payload.
 
     Args:
         payload: UTF-8.
-        field: What errors call it.
+        field: Name of the payload, for errors.
         most_bytes: Largest payload.
 
     Raises:
-        InputError: Too large, no UTF-8, no JSON object, nested too deep, a key twice, or a number that no double or
-            64-bit integer holds.
+        InputError: The payload is too large, not UTF-8, not a JSON object, or nested too deep, has a key twice, or a
+            number beyond a double or 64-bit integer.
     """
     if len(payload) > most_bytes:
         raise InputError(field, f"at most {most_bytes} bytes", len(payload))
@@ -101,7 +101,7 @@ def read_json(payload: bytes, *, field: str = "payload", most_bytes: int = DOCUM
             text, object_pairs_hook=_once, parse_int=_whole, parse_float=_finite, parse_constant=_finite
         )
         if "\\u" in text:
-            # An escaped half of a surrogate pair is a string that cannot be written anywhere.
+            # Half of an escaped surrogate pair cannot be written anywhere.
             json.dumps(document, ensure_ascii=False).encode("utf-8")
     except RecursionError:
         raise InputError(field, f"nested at most {DEPTH} deep", Words("a document nested deeper")) from None
@@ -117,10 +117,10 @@ def read_json(payload: bytes, *, field: str = "payload", most_bytes: int = DOCUM
 
 
 def open_file(path: Path) -> BinaryIO:
-    """Open a regular file to read it; a pipe or a device, which may never end or never begin, is none.
+    """Open a regular file for reading; pipes and devices, which may never end or begin, are refused.
 
     Raises:
-        OSError: It cannot be read, or is something else.
+        OSError: The file cannot be read, or is not a regular file.
     """
 
     def opener(name: str, flags: int) -> int:
@@ -134,7 +134,7 @@ def open_file(path: Path) -> BinaryIO:
 
 
 def unreadable(path: Path, error: OSError) -> InputError:
-    """Why a file cannot be read, with those beside it that could have been meant, such as what was not finished."""
+    """Return the error for an unreadable file, with similar names in its folder, such as an unfinished recording."""
     names: list[str] = []
     if isinstance(error, FileNotFoundError):
         with contextlib.suppress(OSError):
@@ -145,7 +145,7 @@ def unreadable(path: Path, error: OSError) -> InputError:
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """Read a TOML file that somebody wrote: a scene, a set, a mapping, criteria, a channel table.
+    """Read a TOML file written by a person: a scene, a set, a mapping, criteria, a channel table.
 
     Raises:
         InputError: The file cannot be read, is not TOML, or is out of bounds (see `parse_toml`).
@@ -161,19 +161,19 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 
 def parse_toml(text: str, *, field: str) -> dict[str, Any]:
-    """The document in a TOML text.
+    """Return the document in a TOML text.
 
     Args:
         text: The text.
-        field: What errors call it.
+        field: Name of the text, for errors.
 
     Raises:
-        tomllib.TOMLDecodeError: It is not TOML.
-        InputError: It is too large, nested too deep, or has a whole number that 64 bits do not hold.
+        tomllib.TOMLDecodeError: The text is not TOML.
+        InputError: The text is too large, nested too deep, or has a whole number beyond 64 bits.
     """
     if len(text) > TOML_BYTES:
         raise InputError(field, f"at most {TOML_BYTES} bytes", Words("a longer text"))
-    # The parser takes the square of the parts of a dotted key.
+    # The parser's time grows with the square of the number of parts of a dotted key.
     if max(map(len, map(_DOTTED.findall, re.split(r"[,=\n]", text)))) > DEPTH:
         raise InputError(field, f"keys of at most {DEPTH} parts", Words("a longer one"))
     try:
@@ -193,10 +193,10 @@ def parse_toml(text: str, *, field: str) -> dict[str, Any]:
 
 
 def check_depth(document: Any, *, field: str) -> None:
-    """Refuse what is nested deeper than `DEPTH`, or has a whole number beyond `LARGEST`, in whatever format it came.
+    """Raise an error for a document nested deeper than `DEPTH`, or with a whole number beyond `LARGEST`.
 
     Raises:
-        InputError: It is, or has.
+        InputError: The document exceeds a limit.
     """
     level = [document]
     for _ in range(DEPTH + 1):
@@ -215,10 +215,10 @@ def check_depth(document: Any, *, field: str) -> None:
 
 
 def table_in(data: Mapping[str, Any], name: str) -> dict[str, Any]:
-    """A table in a document; an empty one where there is none.
+    """Return a table in a document; an empty one if it is missing.
 
     Raises:
-        InputError: It is something else.
+        InputError: The entry is not a table.
     """
     table = data.get(name, {})
     if not isinstance(table, dict):
@@ -234,12 +234,12 @@ def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     document = dict(pairs)
     if len(document) < len(pairs):
         names = [name for name, _ in pairs]
-        raise InputError("", "without a key that comes twice", next(name for name in names if names.count(name) > 1))
+        raise InputError("", "without duplicate keys", next(name for name in names if names.count(name) > 1))
     return document
 
 
 def _whole(digits: str) -> int:
-    # Long before Python's own limit of 4300 digits, beyond which it raises.
+    # Well below Python's own limit of 4300 digits, above which it raises.
     if len(digits) > len(str(-LARGEST)) or not -LARGEST - 1 <= (number := int(digits)) <= LARGEST:
         raise InputError("", f"without whole numbers beyond +-{LARGEST}", printable(digits, 60))
     return number
@@ -247,7 +247,7 @@ def _whole(digits: str) -> int:
 
 def _finite(digits: str) -> float:
     if not math.isfinite(number := float(digits)):
-        raise InputError("", "without numbers that are not finite", printable(digits, 60))
+        raise InputError("", "with finite numbers only", printable(digits, 60))
     return number
 
 
@@ -256,16 +256,16 @@ Extension = TypeVar("Extension")
 
 
 def check(model: type[Model], document: Any, *, field: str, most_bytes: int = 10_000) -> Model:
-    """A document as its model.
+    """Return a document as its model.
 
     Args:
-        model: What it has to be.
-        document: Read already, or its payload.
-        field: What errors call it; fields in it are named behind a dot.
+        model: The model.
+        document: The document, or its payload.
+        field: Name of the document, for errors; its fields are named after a dot.
         most_bytes: Largest payload.
 
     Raises:
-        InputError: It is none; the message names the first field that is wrong.
+        InputError: The document does not fit; the message names the first wrong field.
     """
     if isinstance(document, bytes):
         document = read_json(document, field=field, most_bytes=most_bytes)
@@ -277,13 +277,13 @@ def check(model: type[Model], document: Any, *, field: str, most_bytes: int = 10
         raise input_error(error, field, model) from None
 
 
-# What pydantic puts into the place of an error beside the names that stand in the file: branches of a union.
+# Names of union branches, which pydantic adds to the location of an error.
 _BRANCH = re.compile(r"(function-\w+|tuple|list|dict|set|literal|nullable|chain)\[.*\]|constrained-\w+", re.DOTALL)
 _PLAIN_BRANCH = {"float": ("float", "finite", "greater", "less"), "int": ("int", "greater", "less"), "str": ("string",)}
 
 
 def describe_error(error: BaseException) -> str:
-    """Return class and text, on one line, of an error that another package's code has raised."""
+    """Return class and text of another package's error on one line."""
     try:
         return printable(f"{type(error).__name__}: {error}", 200)
     except Exception:  # of its __str__
@@ -291,12 +291,12 @@ def describe_error(error: BaseException) -> str:
 
 
 def load_extensions(group: str, kind: type[Extension], taken: Iterable[str]) -> tuple[dict[str, Extension], list[str]]:
-    """Return what other installed packages add to a table by entry points, by name, and why others cannot be used.
+    """Return the entries that other packages add to a table, by name, and why others are unusable.
 
     Args:
         group: Group of the entry points.
-        kind: Class that an entry must be of.
-        taken: Names that the table has already.
+        kind: Class of an entry.
+        taken: Names in the table.
     """
     from importlib.metadata import entry_points
 
@@ -305,7 +305,7 @@ def load_extensions(group: str, kind: type[Extension], taken: Iterable[str]) -> 
     for point in entry_points(group=group):
         try:
             entry = point.load()
-        except (Exception, SystemExit) as error:  # whatever other people's code raises
+        except (Exception, SystemExit) as error:  # external code may raise anything
             broken.append(f"{point.name} ({point.value} cannot be loaded: {describe_error(error)})")
             continue
         if point.name in {*taken, *found}:
@@ -322,13 +322,13 @@ def load_extensions(group: str, kind: type[Extension], taken: Iterable[str]) -> 
 
 
 def _place(parts: tuple[str | int, ...], kind: str) -> list[str]:
-    """The names that stand in the file, of the place of an error of that kind."""
+    """Return the names of an error's location that occur in the file."""
     named = kind in ("extra_forbidden", "missing")
     found = []
     for number, part in enumerate(parts):
         name, last = str(part), number == len(parts) - 1
         branch = _BRANCH.fullmatch(name) or (last and kind.startswith(_PLAIN_BRANCH.get(name, ("\0",))))
-        # A timed command's own fields stand beside its time.
+        # A timed command's own fields are next to its time.
         inner = name == "request" and number > 0 and isinstance(parts[number - 1], int)
         if (last and named) or not (branch or inner):
             found.append(printable(name, 100) or '""')
@@ -336,11 +336,11 @@ def _place(parts: tuple[str | int, ...], kind: str) -> list[str]:
 
 
 def _fields(models: list[type[BaseModel]], parts: tuple[str | int, ...]) -> list[str]:
-    """Names of the fields at a place in documents of some models; all of them where several could stand there."""
+    """Return the field names at a location in documents of the models; of all models that fit there."""
     for part in parts:
         fields = [field for each in models for name, field in each.model_fields.items() if name == part]
         models = [inner for field in fields for inner in _models(field.annotation)] or models
-        # The one of a union that its tag names.
+        # The union member selected by the tag.
         tagged = (each for each in models if get_args(next(iter(each.model_fields.values())).annotation) == (part,))
         models = list(tagged) or models
     return [name for each in models for name in each.model_fields]
@@ -353,10 +353,10 @@ def _models(annotation: Any) -> list[type[BaseModel]]:
 
 
 def input_error(error: ValidationError, where: str, model: type[BaseModel]) -> InputError:
-    """The first complaint of a validation as the one line that users see."""
+    """Return the first error of a validation in the one-line form for users."""
     first = error.errors()[0]
     cause = first.get("ctx", {}).get("error")
-    if isinstance(cause, InputError):  # a rule over several fields names its own
+    if isinstance(cause, InputError):  # a rule over several fields names them itself
         return cause
     field = ".".join(part for part in (where, *_place(first["loc"], first["type"])) if part)
     message = first["msg"].removeprefix("Value error, ").removeprefix("Input should be ").partition(", unable")[0]
@@ -368,7 +368,7 @@ def input_error(error: ValidationError, where: str, model: type[BaseModel]) -> I
         return InputError(f"{field}.{name}", f"one of {context.get('expected_tags')}", context.get("tag"))
     if first["type"] == "extra_forbidden":
         known = _fields([model], first["loc"][:-1])
-        message = such_as("a field that there is", first["loc"][-1], known) if known else "left out (it has no fields)"
+        message = such_as("a known field", first["loc"][-1], known) if known else "left out (it has no fields)"
     elif first["type"] == "missing":
         message = "given"
     return InputError(field, message, None if first["type"] == "missing" else first["input"])

@@ -1,4 +1,4 @@
-"""What is closed at the end of a `with`."""
+"""Base class of objects that are closed at the end of a `with`."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from typing import Self
 
 
 class Closing(ABC):
-    """Has a `close`, which the end of a `with` calls."""
+    """An object whose `close` is called at the end of a `with`."""
 
     @abstractmethod
     def close(self) -> None:
-        """Give up all that is held."""
+        """Release all resources."""
 
     def __enter__(self) -> Self:
         return self

@@ -1,4 +1,4 @@
-"""Errors that a user meets: wrong input, a refusal by the rig, a run that failed, a file that cannot be written."""
+"""User-facing errors: wrong input, a refusal by the rig, a failed run, a file that cannot be written."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from rig.base.text import Words as Words
 from rig.base.text import nearest, printable, shown
 
 PART_SUFFIX = ".part"
-"""What a file's name ends in while it is being written."""
+"""Suffix of a file while it is written."""
 FULL = frozenset({"scipy", "numba", "rerun", "matplotlib", "pyarrow", "jinja2", "fpdf"})
-"""What the extra `full` brings, by the names that are imported: what talks to a rig does without."""
+"""Import names of the packages in the extra `full`; clients of a rig do not need them."""
 WHOLE_RIG = "pip install 'rotor-stator-rig[full]'"
-"""How to get it."""
-_LONGEST_LINE = 5000
-_MOST_NAMES = 12
+"""Command that installs them."""
+_MAX_LINE = 5000
+_MAX_NAMES = 12
 
 
 class InputError(ValueError):
-    """A field has a value it must not have.
+    """A field has an invalid value.
 
-    The message always reads `FIELD must be MUST; instead received RECEIVED`, so that every command, service reply and
-    notebook shows the same three facts. The command line turns it into one line and exit status 2. What was received is
-    a value, which is quoted, or `Words` about it.
+    The message is always `FIELD must be MUST; instead received RECEIVED`, in every command, service reply and notebook.
+    The command line prints it on one line and exits with status 2. RECEIVED is a value, which is quoted, or `Words`
+    about it.
 
     Example:
         >>> import rig
@@ -36,15 +36,15 @@ class InputError(ValueError):
     """
 
     def __init__(self, field: str, must: str, received: object) -> None:
-        """Name the field, what it must be, and what it was."""
+        """Set the field, the requirement, and the received value."""
         self.field = field
         self.must = must
         self.received = received
-        super().__init__(printable(f"{field} must be {must}; instead received {shown(received)}", _LONGEST_LINE))
+        super().__init__(printable(f"{field} must be {must}; instead received {shown(received)}", _MAX_LINE))
 
 
 class UnknownNameError(InputError, KeyError):
-    """A name that nothing has; the message tells the nearest that there are, or all where none is near.
+    """An unknown name; the message suggests similar known names, or lists all if none is similar.
 
     Example:
         >>> import rig
@@ -56,22 +56,22 @@ class UnknownNameError(InputError, KeyError):
     """
 
     def __init__(self, field: str, must: str, name: object, known: Iterable[str]) -> None:
-        """Name the field, what it must be, the name that is none, and those that there are."""
+        """Set the field, the requirement, the unknown name, and the known names."""
         super().__init__(field, such_as(must, name, known), name)
 
-    __str__ = ValueError.__str__  # of a KeyError, it would be in quotes
+    __str__ = ValueError.__str__  # KeyError would add quotes
 
 
 def such_as(must: str, name: object, known: Iterable[str]) -> str:
-    """What a name that is none must be, with the nearest that there are, or all where none is near."""
+    """Return a requirement with known names similar to an unknown one, or all if none is similar."""
     known = list(dict.fromkeys(known))
-    shown = nearest(name, known) or known[:_MOST_NAMES]
+    shown = nearest(name, known) or known[:_MAX_NAMES]
     more = f" ({len(known)} in all)" if len(known) > len(shown) else ""
     return f"{must}, such as {', '.join(shown)}{more}" if shown else must
 
 
 class RefusedError(InputError):
-    """The rig refused a request: carries the rig's own line, which is complete as it stands."""
+    """The rig refused a request; the message is the rig's own line."""
 
     def __init__(self, line: str) -> None:
         """Keep the whole line."""
@@ -81,36 +81,36 @@ class RefusedError(InputError):
 
 
 class SimulationError(RuntimeError):
-    """The numbers have gone wrong: the state is no longer finite, and the run ends."""
+    """The state of a simulation is no longer finite, and the run ends."""
 
 
 class DiskError(RuntimeError):
-    """The disk refused in the middle of writing; the message says what is kept of it."""
+    """The disk refused during writing; the message says what is kept."""
 
 
 def need_of_full(error: ModuleNotFoundError) -> str | None:
-    """What to say where a part of the whole rig was left out on purpose; None where something else is not there."""
+    """Return the hint for a missing package of the extra `full`; None for any other."""
     if (name := (error.name or "").partition(".")[0]) not in FULL:
         return None
     return f"needs {name}, which comes with the whole rig: {WHOLE_RIG}"
 
 
 def lacks_full() -> bool:
-    """Whether a part of the whole rig is not installed; nothing is imported."""
+    """Return whether a package of the extra `full` is missing, without importing any."""
     return any(find_spec(module) is None for module in FULL)
 
 
 def check_new_file(path: Path, *, field: str, suffixes: tuple[str, ...], force: bool) -> None:
-    """Refuse a file that cannot be written, before anything is worked out.
+    """Raise an error early for a file that cannot be written.
 
     Args:
         path: The file.
-        field: What the user knows it by.
-        suffixes: Endings that it may have.
-        force: An existing file may be replaced.
+        field: Name of the option, for errors.
+        suffixes: Allowed suffixes.
+        force: Allow replacing an existing file.
 
     Raises:
-        InputError: Another ending, a folder that is missing or read-only, or an existing file.
+        InputError: The suffix is wrong, the folder is missing or read-only, or the file exists.
     """
     if path.suffix not in suffixes:  # also of a path without a name, such as "" and /
         *others, last = suffixes
@@ -127,31 +127,31 @@ def check_new_file(path: Path, *, field: str, suffixes: tuple[str, ...], force: 
     if path.exists() and not force:
         raise InputError(field, "a new file (--force replaces one)", Words(f"{path}, which exists"))
     try:
-        # Asked of the system by trying: permissions alone do not tell.
+        # Permissions alone are not sufficient: try it.
         tempfile.TemporaryFile(dir=path.parent).close()
     except OSError as error:
         raise InputError(field, "in a folder that can be written", Words(f"{path} ({error.strerror})")) from None
 
 
 def check_not_among(sources: list[Path], output: Path, *, field: str = "output") -> None:
-    """Refuse to write over what is read, by whatever name.
+    """Raise an error for an output that is one of the sources, under any name.
 
     Raises:
-        InputError: The file, or the one that it is while it is written, is among the sources.
+        InputError: The output, or its temporary file, is one of the sources.
     """
     for taken in (output, output.with_name(output.name + PART_SUFFIX)):
         for source in sources:
-            with suppress(OSError):  # one of them is not there
+            with suppress(OSError):  # one of them does not exist
                 if source.samefile(taken):
                     raise InputError(field, "another file than those that are read", str(output))
 
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """A draft beside a file, which takes its place where the block ends well and is removed where it does not.
+    """Yield a temporary file that replaces `path` if the block succeeds, and is removed otherwise.
 
     Raises:
-        DiskError: The disk refused, in whatever words the library that wrote has for it.
+        DiskError: The disk refused, whatever error the writing library raised.
     """
     draft = path.with_name(path.name + PART_SUFFIX)
     try:
@@ -159,8 +159,8 @@ def whole_file(path: Path) -> Iterator[Path]:
         draft.replace(path)
     except (InputError, SimulationError, DiskError):
         raise
-    except (OSError, RuntimeError, ValueError) as error:  # what libraries make of it; all else is a fault of ours
-        # A library that closes what has failed may fail again: the system's own word came first.
+    except (OSError, RuntimeError, ValueError) as error:  # errors of writing libraries; any other is a bug
+        # A library that closes after a failure may fail again: the system's first error is reported.
         reason, earlier = str(error) or type(error).__name__, error
         while earlier is not None:
             reason = (isinstance(earlier, OSError) and earlier.strerror) or reason

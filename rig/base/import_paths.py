@@ -1,8 +1,7 @@
-"""Imports that the usual search would not find, or would find in another place.
+"""Additional import paths: modules that have moved, and modules hidden by the user's files.
 
-Paths of version 0.1, such as `rig.scenes` for `rig.run.scenes`, work in this version, with a warning. And a folder or
-file of a user's own that is named `drivers`, `recorder` or `replays` hides no module of ours, unless the folder has one
-of the same name.
+Paths of version 0.1, such as `rig.scenes` for `rig.run.scenes`, still work, with a warning. A user's folder or file
+named `drivers`, `recorder` or `replays` does not hide our modules, except modules of the same name.
 """
 
 from __future__ import annotations
@@ -15,21 +14,21 @@ from types import ModuleType
 from typing import Any
 
 PLACE = dirname(dirname(dirname(__file__)))  # noqa: PTH120 - pathlib would take longer to load than all else here
-"""Folder that our packages are in."""
+"""Folder of our packages."""
 _FOLDERS = {
     "rig": ("base", "physics", "channels", "run", "serve"),
     "drivers": ("instruments", "sources"),
     "recorder": ("files", "contents", "output"),
     "replays": (),
 }
-"""Our packages, and where in them a module that stood at the top may be now."""
+"""Our packages, and the folders that modules of their top level may have moved to."""
 
 
 class Paths:
-    """Finds a module that has moved by its old name, and one of ours in a package of another's."""
+    """Finds moved modules by their old names, and our modules in a user's package of the same name."""
 
     def find_spec(self, fullname: str, path: Any, target: object = None) -> ModuleSpec | None:
-        """Return a spec for such a module, none for others."""
+        """Return the spec of such a module; None for others."""
         package, *rest = fullname.split(".")
         if package not in _FOLDERS:
             return None
@@ -47,10 +46,10 @@ class Paths:
         return ModuleSpec(fullname, loader, origin=".".join([package, folder, *rest]))
 
     def create_module(self, spec: ModuleSpec) -> None:
-        """Leave it to the import system: the module is replaced when it is executed."""
+        """Use the default module, which is replaced when it is executed."""
 
     def exec_module(self, module: ModuleType) -> None:
-        """Put the module of the new name in the place of the one that was made."""
+        """Replace the module with the one of the new name."""
         import warnings
         from importlib import import_module
 
@@ -61,13 +60,13 @@ class Paths:
 
 
 def _spec_of_file(package: str) -> ModuleSpec | None:
-    """Return a spec for a user's file such as `recorder.py`, by which our modules are found in it; none for folders."""
+    """Return the spec of a user's file such as `recorder.py`, extended by our modules; None for folders."""
     spec = PathFinder.find_spec(package)
     if spec is None or spec.submodule_search_locations is not None or spec.origin is None:
         return None
     main = getattr(sys.modules.get("__main__"), "__file__", None)
     if main is not None and abspath(main) == abspath(spec.origin):  # noqa: PTH100
-        return PathFinder.find_spec(package, [PLACE])  # a script that runs is not run again
+        return PathFinder.find_spec(package, [PLACE])  # not run twice
     return spec_from_file_location(package, spec.origin, submodule_search_locations=[join(PLACE, package)])  # noqa: PTH118
 
 
@@ -77,9 +76,9 @@ def _is_there(*names: str) -> bool:
 
 
 def find_our_modules() -> None:
-    """Let imports find old names, and our modules beside another's."""
+    """Install the finder of old names and of our modules in users' packages."""
     if not any(isinstance(finder, Paths) for finder in sys.meta_path):
-        # Before the usual search, which would load a second copy of what lies deeper.
+        # Before the default finders, which would load a second copy of deeper modules.
         finder: Any = Paths()
         sys.meta_path.insert(0, finder)
         for package in _FOLDERS:

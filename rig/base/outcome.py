@@ -1,6 +1,6 @@
-"""Outcome of a judgement: pass, fail or inconclusive, and the exit status of the command that judged.
+"""Outcome of a judgement: pass, fail or inconclusive, with the exit status of a command.
 
-A verdict needs evidence: where nothing failed but too little was shown, the outcome is inconclusive and not a pass.
+A pass needs evidence: without failures but with too little evidence, the outcome is inconclusive.
 """
 
 from __future__ import annotations
@@ -23,21 +23,21 @@ class Outcome(StrEnum):
 
     @classmethod
     def of(cls, *, failed: bool, shown: bool) -> Outcome:
-        """Return FAIL if something failed, else PASS if enough was shown, else INCONCLUSIVE."""
+        """Return FAIL after a failure, otherwise PASS with enough evidence, otherwise INCONCLUSIVE."""
         if failed:
             return cls.FAIL
         return cls.PASS if shown else cls.INCONCLUSIVE
 
     @classmethod
     def worst(cls, outcomes: Iterable[Outcome]) -> Outcome:
-        """Return the worst of some outcomes: FAIL before INCONCLUSIVE before PASS; INCONCLUSIVE for none at all."""
+        """Return the worst outcome: FAIL, then INCONCLUSIVE, then PASS; INCONCLUSIVE without outcomes."""
         found = set(outcomes)
         return cls.of(failed=cls.FAIL in found, shown=found == {cls.PASS})
 
 
 class InconclusiveError(Exception):
-    """A test in which nothing failed, but which shows too little for a pass; one line."""
+    """A test without failures, but with too little evidence for a pass; one line."""
 
 
 _EXIT_STATUS = {Outcome.PASS: 0, Outcome.FAIL: 1, Outcome.INCONCLUSIVE: 3}
-"""2 is wrong input, in every command."""
+"""Status 2 is wrong input, in every command."""

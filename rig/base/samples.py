@@ -1,4 +1,4 @@
-"""Columns of numbers, each with its name and unit: what a run, a recording and the DAQ client hand out."""
+"""Named columns of numbers with units, as returned by runs, recordings and the DAQ client."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from rig.base import units
 from rig.base.errors import InputError, UnknownNameError
 
 _SAME_S = 1e-6
-"""Instants that are closer are the same [s]."""
+"""Instants closer than this are equal [s]."""
 
 
 def place(name: str, names: Sequence[str], *, must: str = "one of those that there are") -> int:
-    """Where a name stands.
+    """Return the position of a name.
 
     Raises:
-        UnknownNameError: Nowhere.
+        UnknownNameError: The name does not occur.
     """
     if name not in names:
         raise UnknownNameError("name", must, name, names)
@@ -29,7 +29,7 @@ def place(name: str, names: Sequence[str], *, must: str = "one of those that the
 
 
 class Columns:
-    """Rows of named columns: `rows["disk_x"]`, its `rows.unit("disk_x")`, and `rows.to_si()` for all of them in SI.
+    """Rows of named columns: `rows["disk_x"]`, `rows.unit("disk_x")`, and `rows.to_si()` for all columns in SI.
 
     Attributes:
         names: Column names.
@@ -49,37 +49,37 @@ class Columns:
         return iter(self.names)
 
     def keys(self) -> tuple[str, ...]:
-        """Column names, as of a dictionary: `dict(rows)` has an array a column."""
+        """Return the column names, as a dictionary does: `dict(rows)` has an array per column."""
         return self.names
 
     def __getitem__(self, name: str) -> np.ndarray:
-        """Values of one column [its unit], shape (rows,).
+        """Return the values of a column [its unit], shape (rows,).
 
         Raises:
-            UnknownNameError: There is no such column; it is a KeyError.
+            UnknownNameError: The column does not exist; also a KeyError.
         """
         return self.values[:, place(name, self.names)]
 
     def unit(self, name: str) -> str:
-        """Unit of one column.
+        """Return the unit of a column.
 
         Raises:
-            UnknownNameError: There is no such column.
+            UnknownNameError: The column does not exist.
         """
         return self.units[place(name, self.names)]
 
     def only(self, *names: str) -> Self:
-        """Some of the columns, in this order.
+        """Return some of the columns, in this order.
 
         Raises:
-            UnknownNameError: There is no such column.
+            UnknownNameError: The column does not exist.
         """
         places = [place(name, self.names) for name in names]
         chosen = tuple(self.units[each] for each in places)
         return cast(Self, replace(cast(Any, self), names=names, units=chosen, values=self.values[:, places]))
 
     def to_si(self) -> Self:
-        """The same rows in SI: mm become m, Hz of a speed rad/s. A unit that is not known stays."""
+        """Return the rows in SI: mm to m, Hz of a speed to rad/s. Unknown units are unchanged."""
         names, sizes, zeros = zip(*map(units.in_si, self.units), strict=True) if self.units else ((), (), ())
         return cast(Self, replace(cast(Any, self), units=names, values=self.values * np.array(sizes) + np.array(zeros)))
 
@@ -94,10 +94,10 @@ class Columns:
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Samples(Columns):
-    """Sensors or truth as columns, each in its own unit.
+    """Samples of sensors or truth, each column in its own unit.
 
     Attributes:
-        name: Name of the sensor group or truth table; empty of several.
+        name: Name of the sensor group or truth table; empty for several.
         times_s: Simulated time of each row [s], shape (n,).
         index: Number of each row since the start of the stream, int64, shape (n,); a step other than 1 is a gap.
         values: Engineering values, shape (n, columns).
@@ -125,17 +125,17 @@ class Samples(Columns):
 
 
 def joined(parts: Sequence[Samples]) -> Samples:
-    """Columns of several as one, row by row where all have a row of that number; one alone as it is.
+    """Return the columns of several tables as one table, with the rows common to all.
 
     Raises:
-        InputError: There are none, or they were not taken at the same instants.
+        InputError: There is no table, or the instants differ.
     """
     if len(parts) == 1:
         return parts[0]
     index = reduce(np.intersect1d, [part.index for part in parts]) if parts else np.empty(0)
     rows = [np.intersect1d(part.index, index, return_indices=True)[1] for part in parts]
     times = [part.times_s[chosen] for part, chosen in zip(parts, rows, strict=True)]
-    alike = len({part.rate_hz for part in parts}) == 1  # else a stretch may have no number in common, and all be well
+    alike = len({part.rate_hz for part in parts}) == 1  # with different rates, a part may have no row in common
     if not alike or any(np.abs(each - times[0]).max(initial=0.0) > _SAME_S for each in times):
         rates = ", ".join(f"{part.name} at {part.rate_hz:g} Hz" for part in parts)
         raise InputError("groups", "sampled at the same instants", rates or None)

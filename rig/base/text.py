@@ -1,4 +1,4 @@
-"""Text that is not ours, made fit to be shown: names, notes and values that a client, a file or a bus has sent."""
+"""Text from clients, files and buses, made safe for display."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ from collections.abc import Iterable
 from typing import Any
 
 _MOST = 500
-"""Longest value that is shown whole [characters]."""
+"""Longest value shown in full [characters]."""
 _LONG_INT_BITS = 256
 
 
 class Words(str):
-    """Words of ours about what was received, which are shown as they stand; any other text is a value and quoted."""
+    """Our own description of a received value, shown as it is; other text is quoted."""
 
 
 def printable(text: str, most: int | None = None) -> str:
-    """The same text without anything that a terminal would act on.
+    """Return the text without characters that affect a terminal.
 
     Args:
-        text: White space of every kind becomes a blank, other characters that cannot be printed (escapes, marks that
-            turn the direction of writing, halves of surrogate pairs) their escaped form.
-        most: Longest result [characters]; what is left out of the middle becomes three dots.
+        text: White space becomes a space; other unprintable characters (escapes, direction marks, unpaired surrogates)
+            become escape sequences.
+        most: Longest result [characters]; the middle of longer texts is replaced by three dots.
     """
     if not text.isprintable():
         text = "".join(
@@ -35,12 +35,12 @@ def printable(text: str, most: int | None = None) -> str:
 
 
 def nearest(name: object, known: Iterable[str], *, most: int = 3) -> list[str]:
-    """Names that one which is none could have been meant for, the nearest first; upper and lower case are alike.
+    """Return known names similar to an unknown one, most similar first; case is ignored.
 
     Args:
-        name: What was given.
-        known: The names that there are.
-        most: How many at most.
+        name: The unknown name.
+        known: The known names.
+        most: Largest number of names.
 
     Example:
         >>> nearest("p_n", ["P_N", "P_S", "disk_x"], most=1)
@@ -53,7 +53,7 @@ def nearest(name: object, known: Iterable[str], *, most: int = 3) -> list[str]:
 
 
 def finite(value: Any) -> Any:
-    """The same document with None for numbers that JSON cannot carry: a diverged run must still be able to say so."""
+    """Return the document with None for numbers that JSON cannot represent, as in a diverged run."""
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, dict):
@@ -64,7 +64,7 @@ def finite(value: Any) -> Any:
 
 
 class _Shown(reprlib.Repr):
-    """A repr that is bounded in depth and length, whatever it is given."""
+    """A repr with limited depth and length for any object."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -74,14 +74,14 @@ class _Shown(reprlib.Repr):
         self.maxlong = 60
 
     def repr_int(self, x: int, level: int) -> str:
-        # Python itself refuses to write integers of more than 4300 digits.
+        # Python refuses to convert integers of more than 4300 digits.
         if x.bit_length() > _LONG_INT_BITS:
             return f"a whole number of about {round(x.bit_length() * 0.30103)} digits"
         return super().repr_int(x, level)
 
 
 def shown(value: object) -> str:
-    """A value as an error shows it: its bounded repr, and `nothing` for None, as for a field that is missing."""
+    """Return a value as shown in errors: a bounded repr, or `nothing` for None, as for a missing field."""
     if isinstance(value, Words):
         return printable(value, 2 * _MOST)
     return "nothing" if value is None else printable(_Shown().repr(value), 2 * _MOST)

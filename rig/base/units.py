@@ -1,4 +1,4 @@
-"""The table of units: what each one measures, its size in SI, and the spellings that files and people use for it."""
+"""Table of units: quantity, size in SI, and the spellings used by files and users."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ class _Unit:
     """A unit of the table.
 
     Attributes:
-        quantity: What it measures.
-        size: One of it in the SI unit of the quantity.
-        zero: Its zero in that unit; only temperatures have one.
+        quantity: The measured quantity.
+        size: Size of the unit in the SI unit of the quantity.
+        zero: Zero of the unit in that unit; only for temperatures.
     """
 
     quantity: str
@@ -38,11 +38,11 @@ _AMBIGUOUS = {
     "M": ("m", "min"), "MN": ("mN", "meganewton"), "MV": ("mV", "megavolt"), "MG": ("mg", "megagram"),
     "MA": ("mA", "megaampere"), "C": ("degC", "coulomb"), "F": ("degF", "farad"), "k": ("K", "kilo"),
 }  # fmt: skip
-"""Spellings that a log in capitals, or a careless one, uses for a unit of the table, and the SI for another one."""
+"""Spellings in capitals that some logs use for a unit of the table, while in SI they mean another one."""
 _DETECTOR = re.compile(
     r"(.+?)[\s_(,]*((?:0|zero|p|pk|peak)?[- ]?(?:to)?[- ]?(?:pk|peak)|p-p|pp|0-p|rms|eff)\)?", re.IGNORECASE
 )
-"""A unit, and the detector whose reading of a stretch of signal a value is."""
+"""A unit followed by the name of a detector, such as rms."""
 _SENSITIVITY = re.compile(r"\s*([-+0-9.eE]+)\s*([a-zA-Z\u00b5\u03bc]+)\s*/\s*(\S.*)")
 
 
@@ -54,7 +54,7 @@ _PLAIN = str.maketrans({
 
 
 def _key(spelling: str) -> str:
-    """Return a spelling without blanks, brackets and signs of multiplication and power, with u for micro."""
+    """Return a spelling without spaces, brackets and signs of multiplication and power, with u for micro."""
     text = spelling.strip().strip("[]()").translate(_PLAIN)
     return re.sub(r"\*\*|[\s^*_·⋅∙]|(?<=[A-Za-z])\.(?=[A-Za-z]|$)", "", text)
 
@@ -68,7 +68,7 @@ for _rows in _TABLE.values():
 
 
 def _find(spelling: str) -> tuple[str, ...]:
-    """Return the units that a spelling can stand for: one where it is known, several where it is ambiguous."""
+    """Return the units that a spelling can mean: one if it is known, several if it is ambiguous."""
     key = _key(spelling)
     if key in _AMBIGUOUS:
         return _AMBIGUOUS[key]
@@ -83,22 +83,22 @@ def _find(spelling: str) -> tuple[str, ...]:
 
 
 QUANTITIES = tuple(_TABLE)
-"""What units of the table measure, as `kind` returns it."""
+"""Quantities of the units, as `kind` returns them."""
 
 
 def canonical(unit: str) -> str:
-    """Return a unit as this project spells it; an unknown or ambiguous one as it stands."""
+    """Return a unit in this project's spelling; an unknown or ambiguous one unchanged."""
     found = _find(unit)
     return found[0] if len(found) == 1 else unit.strip()
 
 
 def known(unit: str) -> bool:
-    """Return whether a unit, as a file may spell it, can be converted."""
+    """Return whether a unit can be converted; any known spelling is accepted."""
     return canonical(unit) in _UNITS
 
 
 def _unknown(unit: str, also: Iterable[str] = ()) -> str:
-    """Return why a spelling is not a known unit, with a unit or another accepted name to give instead."""
+    """Return the requirement for a unit that is not known, with a suggestion."""
     found = _find(unit)
     if len(found) > 1:
         return f"unambiguous: {' or '.join(found)}"
@@ -110,15 +110,15 @@ def _unknown(unit: str, also: Iterable[str] = ()) -> str:
 
 
 def parse(unit: str, *, field: str, also: Iterable[str] = ()) -> str:
-    """Return a unit as this project spells it.
+    """Return a unit in this project's spelling.
 
     Args:
-        unit: As a file or a person spells it; empty, "-" and "none" are the number 1.
+        unit: Spelling in a file; empty, "-" and "none" are the number 1.
         field: Field that named the unit, for errors.
-        also: Other names that the field accepts, which an error can propose.
+        also: Other accepted names, for suggestions in errors.
 
     Raises:
-        InputError: It is unknown, ambiguous, or has a detector's suffix (rms, pk, pk-pk).
+        InputError: The unit is unknown or ambiguous, or has a detector's suffix (rms, pk, pk-pk).
     """
     if not known(unit):
         raise InputError(field, _unknown(unit, also), unit)
@@ -132,30 +132,30 @@ def kind(unit: str) -> str:
 
 
 def size_si(unit: str) -> float:
-    """Return one of the unit in SI; 1 for a unit that is unknown."""
+    """Return the size of a unit in SI; 1 for an unknown unit."""
     found = _UNITS.get(canonical(unit))
     return found.size if found else 1.0
 
 
 def in_si(unit: str) -> tuple[str, float, float]:
-    """Return the SI unit of what a unit measures, one of the unit in it, and the unit's zero in it.
+    """Return the SI unit of a unit's quantity, and the size and zero of the unit in it.
 
-    An unknown unit stays as it is, with 1 and 0.
+    An unknown unit is returned unchanged, with 1 and 0.
     """
     found = _UNITS.get(canonical(unit))
     return (_SI[found.quantity], found.size, found.zero) if found else (unit, 1.0, 0.0)
 
 
 def factor(unit: str, target: str, *, field: str) -> float:
-    """Return the number of `target` in one of `unit`.
+    """Return the factor that converts values in `unit` to `target`.
 
     Args:
-        unit: What the values are in.
-        target: What they are wanted in.
+        unit: Unit of the values.
+        target: Unit to convert to.
         field: Field that named the unit, for errors.
 
     Raises:
-        InputError: A unit is unknown, or the two measure different things or count from another zero.
+        InputError: A unit is unknown, or the two differ in quantity or zero.
     """
     source, wanted = canonical(unit), canonical(target)
     if source == wanted:
@@ -182,7 +182,7 @@ def sensitivity_v(text: str, target: str, *, field: str) -> float:
     """Return a sensitivity such as "200 mV/mil" in volts per `target` unit.
 
     Raises:
-        InputError: It does not read so, or is of another quantity.
+        InputError: The text has another form, or the quantity differs.
     """
     match = _SENSITIVITY.fullmatch(text)
     try:

@@ -1,9 +1,9 @@
-"""Sans-IO codec: blocks of samples and documents to bytes and back, and the keys they travel under.
+"""Codec without I/O: converts blocks of samples and documents to bytes and back, and defines their keys.
 
-A block is one CDR message (little-endian, ROS 2 message definitions below), so that any reader of ROS 2 messages
-decodes it without this project. A document is JSON. A stream is an event `start`, blocks, and an event `end` with a
-reason; any step of a block's index other than its length is a gap, counted by `Continuity` and never hidden. What of
-it comes from outside is taken by an `Intake` (`rig.serve.stream_check`).
+A block is one CDR message (little-endian, ROS 2 message definitions below), which any reader of ROS 2 messages can
+decode without this project. A document is JSON. A stream is an event `start`, blocks, and an event `end` with a reason;
+a step of a block's index other than its length is a gap, which `Continuity` counts. Messages from outside are validated
+by `rig.serve.stream_check`.
 """
 
 from __future__ import annotations
@@ -28,27 +28,27 @@ SENSORS = f"{ROOT}/sensors"
 EDGES = f"{SENSORS}/keyphasor_edges"
 TRUTH = f"{ROOT}/truth"
 FAULTS = f"{TRUTH}/faults"
-"""What is told of faults, row by row: documents, beside the blocks of truth."""
+"""Key of declarations of faults: documents, in addition to the blocks of truth."""
 BLOCK = f"{ROOT}/block"
-"""What is told behind all else of a block while devices have joined: that it is over."""
+"""Key of the end of a block, published last while devices have joined."""
 ENDED = "a run that ended"
-"""What a command that comes too late is told that it met; why it ended follows."""
+"""Received part of the error for a command after the end; the reason of the end follows."""
 COMMAND = f"{ROOT}/command"
 CLIENTS = f"{ROOT}/clients"
 
 
 def sensor_key(group: str) -> str:
-    """Key of one sensor group's blocks."""
+    """Return the key of a sensor group's blocks."""
     return f"{SENSORS}/{group}"
 
 
 def truth_key(table: str) -> str:
-    """Key of one truth table's blocks."""
+    """Return the key of a truth table's blocks."""
     return f"{TRUTH}/{table}"
 
 
 def command_key(name: str) -> str:
-    """Key on which a command is answered."""
+    """Return the key of a command."""
     return f"{COMMAND}/{name}"
 
 
@@ -74,34 +74,34 @@ _DTYPES = {SAMPLE_SCHEMA: np.dtype("<i4"), TRUTH_SCHEMA: np.dtype("<f8")}
 _ENCAPSULATION = b"\x00\x01\x00\x00"
 _HEAD = struct.Struct("<qqddII")
 _MOST = 1 << 53
-"""Ticks and row numbers up to here are exact in every number that they become: 285 years of microseconds."""
+"""Limit of ticks and row numbers, which are exact in every number type up to here: 285 years of microseconds."""
 _MOST_RATE_HZ = 1e12
 _MOST_BLOCK_S = 1e6
 
 
 def schema_of(key: str) -> str | None:
-    """Block schema of a key's payloads, or None where they are JSON documents."""
+    """Return the block schema of a key's payloads, or None for JSON documents."""
     if key == EDGES or (key.startswith(TRUTH + "/") and key != FAULTS):
         return TRUTH_SCHEMA
     return SAMPLE_SCHEMA if key.startswith(SENSORS + "/") else None
 
 
 def _row(tick: int, rate_hz: float, tick_rate_hz: float) -> float:
-    """Number of the row that is told to the nearest tick, from time zero on.
+    """Return the row number at a tick that was rounded, from time zero.
 
-    Rows of an even stream lie at whole numbers over the rate, which need not be whole ticks.
+    Rows of an even stream are at whole numbers over the rate, which need not be whole ticks.
     """
     row = tick * rate_hz / tick_rate_hz
     return round(row) if abs(round(row) * tick_rate_hz / rate_hz - tick) <= 0.5 else row
 
 
 def row_times_s(tick: int, rate_hz: float, tick_rate_hz: float, rows: int) -> np.ndarray:
-    """Times of consecutive rows of which the first is told to the nearest tick [s], shape (rows,)."""
+    """Return the times of consecutive rows, of which the first is given to the nearest tick [s], shape (rows,)."""
     return (_row(tick, rate_hz, tick_rate_hz) + np.arange(rows)) / rate_hz
 
 
 def row_tick(tick: int, rate_hz: float, tick_rate_hz: float, row: int) -> int:
-    """Tick of a row so many behind one that is told to the nearest tick: not rounded twice."""
+    """Return the tick of a row relative to one that is given to the nearest tick, without rounding twice."""
     return round((_row(tick, rate_hz, tick_rate_hz) + row) * tick_rate_hz / rate_hz)
 
 
@@ -135,7 +135,7 @@ class Block:
 
 
 def encode_block(block: Block) -> bytes:
-    """One block as a CDR message; the schema follows from the dtype of its values."""
+    """Return a block as a CDR message; the schema follows from the dtype of its values."""
     values = np.ascontiguousarray(block.values)
     if values.dtype not in (_DTYPES[SAMPLE_SCHEMA], _DTYPES[TRUTH_SCHEMA]) or values.ndim != 2 or not values.shape[1]:
         raise TypeError(f"values must be int32 or float64 in columns; instead received {values.dtype}, {values.shape}")
@@ -144,15 +144,15 @@ def encode_block(block: Block) -> bytes:
 
 
 class ImplausibleError(ValueError):
-    """A whole message that names a time, a number or a rate that no stream can have."""
+    """A complete message with a time, number or rate that no stream can have."""
 
 
 def decode_block(payload: bytes, schema: str) -> Block:
-    """The block in a CDR message.
+    """Return the block in a CDR message.
 
     Raises:
-        ValueError: The payload is not a whole message of that schema.
-        ImplausibleError: It is one that no stream can have. A rate of 0 is that of edges, which have none.
+        ValueError: The payload is not a complete message of that schema.
+        ImplausibleError: No stream can have these values. A rate of 0 is that of edges, which have no rate.
     """
     dtype = _DTYPES[schema]
     start = len(_ENCAPSULATION) + _HEAD.size
@@ -180,15 +180,15 @@ def decode_block(payload: bytes, schema: str) -> Block:
 
 
 def encode_document(document: dict[str, Any]) -> bytes:
-    """A JSON document as bytes."""
+    """Return a JSON document as bytes."""
     return json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
 
 
 def decode_document(payload: bytes) -> dict[str, Any]:
-    """The JSON document in a payload.
+    """Return the JSON document in a payload.
 
     Raises:
-        InputError: The payload is no JSON object, or one out of bounds (`rig.base.checks`).
+        InputError: The payload is not a JSON object, or exceeds a limit (`rig.base.checks`).
     """
     return read_json(payload)
 
@@ -199,8 +199,8 @@ class Gap:
 
     Attributes:
         key: The stream.
-        index: Number of the row that was due.
-        size: Rows that never arrived, from that one on; below 0 the numbers have stepped back by so many.
+        index: Index of the expected row.
+        size: Number of missing rows from there; negative if the numbers have stepped back.
     """
 
     key: str
@@ -209,14 +209,14 @@ class Gap:
 
 
 class Continuity:
-    """Follows the row numbers of any number of streams, and counts what has come and what has not.
+    """Follows the row numbers of any number of streams, and counts received and lost rows.
 
     Attributes:
-        next: Number of the row that is due next, by key.
-        received: Rows that have come, each once, by key.
-        lost: Rows that never came, by key.
-        stale: Rows that came twice, or after later ones.
-        runs: How often the numbers of a stream began anew, by key; 0 where they never did.
+        next: Index of the next expected row, by key.
+        received: Received rows, each counted once, by key.
+        lost: Rows that were not received, by key.
+        stale: Rows received twice, or after later ones.
+        runs: Number of restarts of a stream's row numbers, by key.
     """
 
     def __init__(self) -> None:
@@ -227,14 +227,14 @@ class Continuity:
         self.runs: dict[str, int] = {}
 
     def follow(self, key: str, index: int, rows: int, *, late_rows: float = 0.0) -> Gap | None:
-        """Take the next rows of a stream; return the step before them, if there is one.
+        """Count the next rows of a stream; return the step before them, if any.
 
         Args:
             key: The stream.
             index: Number of the first row.
-            rows: How many.
-            late_rows: Rows that are at most so far behind come late or a second time; with others, and with row 0, the
-                numbers begin anew.
+            rows: Number of rows.
+            late_rows: Rows that are behind by at most this are late or repeated; otherwise, and at row 0, the numbers
+               restart.
         """
         expected = self.next.get(key, index)
         size = index - expected
@@ -248,8 +248,8 @@ class Continuity:
         return Gap(key=key, index=expected, size=size) if size else None
 
     def tell(self, event: dict[str, Any]) -> dict[str, Any]:
-        """An event as it is published: an `end` with the number of the row after the last one, by key.
+        """Return an event in its published form: `end` has the index after the last row, by key.
 
-        Blocks and events travel apart: whoever has the end can tell from its `rows` what it still lacks.
+        Blocks and events travel separately: the receiver of the end can tell from its `rows` what is missing.
         """
         return {**event, "rows": dict(self.next)} if event.get("event") == "end" else event

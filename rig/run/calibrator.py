@@ -1,4 +1,4 @@
-"""What stands for engine, sensors and keyphasor in scenes of test signals (`rig.channels.generators`); not compiled."""
+"""Replacements of engine, sensors and keyphasor in scenes of test signals (`rig.channels.generators`)."""
 
 from __future__ import annotations
 
@@ -25,25 +25,27 @@ from rig.run.scenes import Scene
 def _stand_still(
     constants: Constants, inputs: Inputs, y: Any, memory: Any, tick: int, step: int, steps: int, stride: int, rows: Any
 ) -> None:
-    """Rows in which nothing moves, and the shaft has the nominal speed."""
+    """Fill rows without motion, at the nominal speed of the shaft."""
     rows[:] = 0.0
     rows[:, THETA_RATE] = rows[:, SPIN_RATE] = inputs.speed
 
 
 STILL = Engine(start=lambda *_: None, advance=_stand_still, order=0)
-"""In place of an engine."""
+"""Engine of scenes without physics."""
 
 
 class Calibrator:
-    """In place of the conditioning of all channels: volts of generators, noise, converter.
+    """Source of the counts of all channels: volts of generators, noise, converter.
+
+    Replaces the conditioning of sensors.
 
     Args:
-        groups: What is measured.
-        sources: At the converter of each channel.
-        seed: Of the noise, which is that of the sensors: a stream of its own for every channel.
-        noise: Whether there is any.
-        row_ticks: Ticks a row.
-        tick: Of the first row.
+        groups: The channel groups.
+        sources: Signal at the converter of each channel.
+        seed: Seed of the noise, which is that of the sensors: a separate stream for every channel.
+        noise: Whether to add noise.
+        row_ticks: Ticks per row.
+        tick: Tick of the first row.
     """
 
     def __init__(
@@ -63,30 +65,30 @@ class Calibrator:
         self._noise = dict(zip(names, map(_normal, noise_streams(names, seed)), strict=True)) if noise else {}
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Calibrator:
-        """With noise of its own to draw; what does not change is shared."""
+        """Return a copy with a noise state of its own; constant parts are shared."""
         other = copy.copy(self)
         other.__dict__["_noise"] = copy.deepcopy(self._noise)
         return other
 
     @property
     def columns(self) -> np.ndarray:
-        """Column of each channel's signal in the rows: none has one, shape (0,)."""
+        """Column of each channel's signal in the rows: none, shape (0,)."""
         return np.empty(0, int)
 
     def volts(self, name: str, instants: Instants) -> np.ndarray:
-        """What stands at the converter of a channel at any instants [V], shape (n,)."""
+        """Return the voltage at the converter of a channel at any instants [V], shape (n,)."""
         source = self._sources[name]
         return source.at(source.shape(instants))
 
     def counts(
         self, rows: np.ndarray, made: np.ndarray | None = None, faults: Generated | None = None
     ) -> dict[str, np.ndarray]:
-        """Samples from the first of these rows on that lie before the last one.
+        """Return the samples from the first of these rows up to the last one.
 
         Args:
-            rows: That follow those of the call before, shape (n, N_ROW); only how many they are counts.
-            made: Nothing of it counts.
-            faults: What becomes of volts and counts on faulty channels.
+            rows: Rows that follow those of the previous call, shape (n, N_ROW); only their number is used.
+            made: Ignored.
+            faults: Changes of volts and counts on faulty channels.
 
         Returns:
             ADC counts by group, int32, shape (samples, channels).
@@ -117,11 +119,11 @@ class Calibrator:
 
 
 class Generated:
-    """What faults make of test signals: of volts at the very instants of samples, and of counts.
+    """Faults of test signals: changes of the volts at the exact instants of samples, and of the counts.
 
     Args:
-        calibrator: What makes the sound ones.
-        faults: Those of faulty channels, by name.
+        calibrator: Source of the healthy signals.
+        faults: Faults of each faulty channel, by name.
     """
 
     def __init__(self, calibrator: Calibrator, faults: Mapping[str, list[Active]]) -> None:
@@ -139,7 +141,7 @@ class Generated:
             yield one.what, At(t, n, channel, draw, kept, lambda x: self._beyond(x, n, name), none, none, lambda x: x)
 
     def _conditioned(self, name: str, instants: Instants, ats: Iterable[tuple[Kind, At]]) -> np.ndarray:
-        """What comes from a sensor, with the faults of transducers [V]."""
+        """Return the output of a sensor with the faults of its transducer [V]."""
         channel = self._channels[name]
         x = (self._calibrator.volts(name, instants) - channel.bias_v) / channel.sensitivity_v
         for what, at in ats:
@@ -152,12 +154,12 @@ class Generated:
         return self._conditioned(name, instants, ()) - channel.bias_v
 
     def volts(self, name: str, n: np.ndarray) -> np.ndarray | None:
-        """At the converter in samples of these numbers [V], shape (n,); None of a sound channel."""
+        """Return the volts at the converter in the samples of these numbers, shape (n,); None for a healthy channel."""
         if name not in self._faults or not len(n):
             return None
         ats, late_s = list(self._ats(name, n)), np.zeros(len(n))
         for what, at in ats:
-            late_s += np.minimum(what.late_s(at), at.t)  # nothing from before the fault
+            late_s += np.minimum(what.late_s(at), at.t)  # not before the fault
         source = self._plugs.get(name, name)
         instants = Instants.of_samples(n, self._channels[name].rate_hz).later(late_s)
         volts = self._conditioned(source, instants, ats if source == name else self._ats(source, n))
@@ -166,14 +168,14 @@ class Generated:
         return volts
 
     def counts(self, name: str, n: np.ndarray, counts: np.ndarray) -> np.ndarray:
-        """What the converter says of that, before it is limited, shape (n,)."""
+        """Return the counts with the faults of the converter, before limiting, shape (n,)."""
         for what, at in self._ats(name, n):
             counts = what.counts(counts, at) if len(n) else counts
         return counts
 
 
 def _normal(stream: np.ndarray) -> np.random.Generator:
-    """What draws the numbers of one of the sensors' streams of noise."""
+    """Return the generator of one of the sensors' noise streams."""
     bits = np.random.SFC64(0)
     state = bits.state
     state["state"]["state"] = stream
@@ -182,11 +184,11 @@ def _normal(stream: np.ndarray) -> np.random.Generator:
 
 
 class Turns:
-    """In place of the keyphasor: edges at the whole turns of a nominal speed, none where that is 0.
+    """Replacement of the keyphasor: edges at the whole turns of a nominal speed, none at speed 0.
 
     Args:
         speed_hz: The speed [Hz].
-        tick: Of the first row.
+        tick: Tick of the first row.
     """
 
     def __init__(self, speed_hz: float, tick: int = 0) -> None:
@@ -194,14 +196,14 @@ class Turns:
         self._speed, self._tick = exact(speed_hz), tick
 
     def edges(self, rows: np.ndarray, row_ticks: int) -> np.ndarray:
-        """Edges from the first of these rows on, before the one that follows the last.
+        """Return the edges from the first of these rows up to the row after the last.
 
         Args:
-            rows: That follow those of the call before, shape (n, N_ROW); only how many they are counts.
-            row_ticks: Ticks a row.
+            rows: Rows that follow those of the previous call, shape (n, N_ROW); only their number is used.
+            row_ticks: Ticks per row.
 
         Returns:
-            Instants in ticks from the first of these rows, with their fraction, shape (edges,).
+            Instants in ticks from the first of these rows, with fractions, shape (edges,).
         """
         start, self._tick = self._tick, self._tick + len(rows) * row_ticks
         if not self._speed:
@@ -213,12 +215,12 @@ class Turns:
 
 
 def stand_ins(scene: Scene, *, row_ticks: int, tick: int) -> tuple[list[Any], Any]:
-    """In place of the conditioners, and of the keyphasor, in a scene with a generator.
+    """Return the replacements of the conditioners and of the keyphasor for a scene with a generator.
 
     Args:
         scene: The scene.
-        row_ticks: Ticks a row.
-        tick: Of the first row.
+        row_ticks: Ticks per row.
+        tick: Tick of the first row.
     """
     sensors = scene.sensors
     noise = sensors.noise and sensors.chain == "full"
@@ -228,7 +230,7 @@ def stand_ins(scene: Scene, *, row_ticks: int, tick: int) -> tuple[list[Any], An
 
 
 def health(scene: Scene) -> dict[str, Any]:
-    """What there is to say of a run with a generator: nominal speed, and who is driven beyond the converter."""
+    """Return the health of a run with a generator: nominal speed, and channels driven beyond the converter."""
     sources = scene.sources().items()
     limited = [name for name, one in sources if one.largest_v > one.channel.adc_v + one.channel.lsb_v]
     said = f"driven beyond the converter, which limits: {', '.join(limited)}"

@@ -1,7 +1,7 @@
-"""Channels that misbehave: beside the chain that goes on as if nothing were wrong, another one of the faulty channels.
+"""Fault injection: a second signal chain for faulty channels, in parallel with the healthy chain.
 
-What the sound chain says is never touched: a fault ends on the row, and what comes then is as if it had never been.
-Its twin begins with the state and the noise of the sound one, and differs from it by the faults alone.
+The healthy chain always continues unchanged. A fault therefore ends exactly on a row, and later rows are as without it.
+The twin chain starts with the state and the noise of the healthy one, and differs from it only by the faults.
 """
 
 from __future__ import annotations
@@ -43,50 +43,50 @@ from rig.physics.kernels.signals import COLUMN, N_ROW
 from rig.run.calibrator import Calibrator, Generated
 from rig.run.commands.table import ClearCommand, FaultCommand
 
-_MOST = 64
-"""Faults at a time."""
+_MAX_FAULTS = 64
+"""Largest number of simultaneous faults."""
 _NO_CORNER_HZ = 1e9
-"""Above what rows can show there is no low-pass; an AC coupling stays."""
-_FINE = 8
-"""Samples that are taken at times of their own are read off so many between two, ..."""
+"""Corner frequency that disables the low-pass, above what rows can show; an AC coupling remains."""
+_OVERSAMPLING = 8
+"""Oversampling of samples with their own instants, which are interpolated ..."""
 _NODES = 6
-"""... by the polynomial through so many."""
+"""... by the polynomial through this number of nodes."""
 _NODE_SCALES = [1.0 / math.prod(node - other for other in range(_NODES) if other != node) for node in range(_NODES)]
 _FINE_BITS = 32
 """Resolution of these samples: finer than that of any converter."""
 _OF_CONVERTER = 1
-"""Last part of the key of converter noise, which keeps it apart from a fault's own numbers."""
+"""Last part of the key of converter noise, which separates it from the fault's own random numbers."""
 _REACH_V = 1e3
-"""What a faulty cable carries is limited by the converter alone."""
+"""Range of a faulty cable [V]; only the converter limits it."""
 
 
 @dataclass
 class _Twin:
-    """Chain of some faulty channels of one conditioner: `made` of names, and how their filters were changed."""
+    """Signal chain of the faulty channels of one conditioner."""
 
     conditioner: Conditioner
     channels: dict[str, Channel]
     noise: np.ndarray
-    """Noise of each channel [counts], shape (channels,), which samples taken at times of their own have added."""
+    """Noise of each channel added to interpolated samples [counts], shape (channels,)."""
     of: tuple[tuple[str, tuple[int, ...]], ...]
     """Numbers of the faults of each channel."""
     first: int
-    """Number of its first sample."""
+    """Index of its first sample."""
     past: np.ndarray
-    """Samples that are kept, shape (n, channels), ..."""
+    """Stored samples, shape (n, channels), ..."""
     at: int
-    """... of which the first has this number."""
+    """... and the index of the first of them."""
 
 
 class Faulty:
     """All faults of a run.
 
     Args:
-        table: Its channels.
-        conditioners: Their chains.
-        seed: Of the faults' own numbers.
+        table: Channel table of the run.
+        conditioners: Signal chains of the channels.
+        seed: Seed of the faults' random numbers.
         row_ticks: Ticks between rows.
-        setting: What else decides which make sense.
+        setting: Further conditions for valid faults.
     """
 
     def __init__(
@@ -96,16 +96,16 @@ class Faulty:
         self._setting = setting
         self.sending = Sending()
         self.doors: tuple[str, ...] = DOORS
-        """Where they leave the rig."""
+        """Transports of the rig."""
         self.channels = table.channels
         """All channels by name, ..."""
         self._marks = {name for name, channel in self.channels.items() if channel.signal == "keyphasor"}
-        """... those that show pulses."""
+        """... and those with keyphasor pulses."""
         self.active: list[Active] = []
         self._begun = 0
         self._last_edge = math.nan
         self._held = np.empty(0)
-        """Edges that come later than the ones that they stand for [ticks]."""
+        """Delayed edges that are still to come [ticks]."""
         self._twins: dict[tuple[int, bool], _Twin] = {}
         self._planned: tuple[list[int], list[Plan]] = [], [Plan(each.groups, ()) for each in conditioners]
 
@@ -116,7 +116,7 @@ class Faulty:
 
     @cached_property
     def columns(self) -> dict[str, int]:
-        """Column of each channel's signal in the rows, or behind them."""
+        """Column of each channel's signal in the rows, or after them."""
         found = {}
         for conditioner in self.conditioners:
             if isinstance(conditioner, Calibrator):
@@ -126,10 +126,10 @@ class Faulty:
         return found
 
     def targets(self, command: FaultCommand, tick: int) -> tuple[str, ...]:
-        """Channels that a fault would change, or whose blocks it is about.
+        """Return the channels that a fault changes, or whose blocks it affects.
 
         Raises:
-            InputError: It makes no sense on them.
+            InputError: The fault is impossible on them.
         """
         what = command.what
         if not isinstance(what, OfBlocks):
@@ -139,13 +139,13 @@ class Faulty:
         return self.table.groups[stream_of(what, command.channel, self.table, self.doors)].names
 
     def check_all(self, timed: Iterable[tuple[int, object]]) -> None:
-        """Refuse what a scene asks for and cannot be.
+        """Raise an error for the first impossible fault of a scene.
 
         Args:
             timed: Ticks and commands.
 
         Raises:
-            InputError: The first fault that makes no sense.
+            InputError: A fault is impossible.
         """
         number = self._begun
         for tick, command in timed:
@@ -154,16 +154,16 @@ class Faulty:
                 self._check_effect(command, self.targets(command, tick), tick, number)
 
     def _check_effect(self, command: FaultCommand, names: tuple[str, ...], tick: int, number: int) -> None:
-        """Refuse a fault that could not change a count, or a block.
+        """Raise an error for a fault that could not change a count or a block.
 
         Args:
             command: The fault.
             names: Its channels.
-            tick: When it is to begin.
-            number: The number that it will have.
+            tick: Its start.
+            number: Its number.
 
         Raises:
-            InputError: It is too small, too short or too rare; the message has what would be enough.
+            InputError: The fault is too small, too short or too rare; the message has the limit.
         """
         what, places = command.what, {name: n for n, name in enumerate(self.channels)}
         for name in names[:1] if isinstance(what, OfBlocks) else names:
@@ -175,22 +175,22 @@ class Faulty:
             check_draws(what, channel.rate_hz, row, tick, command.for_s, draws)
 
     def _draws(self, number: int, what: Kind, place: int) -> Draws:
-        """Return a fault's own numbers on a channel.
+        """Return a fault's random numbers on a channel.
 
-        A hum, a clock, a loose plug and a block are one for all channels of a group; noise is each channel's own.
+        Hum, clock, loose contact and blocks are common to the channels of a group; noise is separate for each channel.
         """
         return Draws(self._seed, number, place + 1 if what.stage == "converter" else 0)
 
     def check(self, command: FaultCommand | ClearCommand, tick: int, waiting: Sequence[object]) -> dict[str, Any]:
-        """What a command that is given now will come to, as `begin` reports it.
+        """Return the effect of a command sent now, in the form of `begin`.
 
         Args:
-            command: To begin a fault, or to end some.
-            tick: Now.
-            waiting: Commands that are carried out before it.
+            command: Injects a fault, or clears some.
+            tick: Current tick.
+            waiting: Commands executed before it.
 
         Raises:
-            InputError: It cannot be carried out.
+            InputError: The command is impossible.
         """
         begun, known = self._begun, [one.id for one in self._all() if one.end > tick]
         for other in waiting:
@@ -199,26 +199,26 @@ class Faulty:
             elif isinstance(other, ClearCommand):
                 known = [number for number in known if other.id not in ("all", number)]
         if isinstance(command, FaultCommand):
-            if len(known) >= _MOST:
-                raise InputError("fault", f"one of at most {_MOST} at a time", Words("another"))
+            if len(known) >= _MAX_FAULTS:
+                raise InputError("fault", f"one of at most {_MAX_FAULTS} at a time", Words("another"))
             names = self.targets(command, tick)
             self._check_effect(command, names, tick, begun + 1)
             return self._told(begun + 1, names, tick)
         if command.id != "all" and command.id not in known:
             there = ", ".join(map(str, known)) or "none"
-            raise InputError("clear.id", f"the number of a fault that there is ({there}), or all", command.id)
+            raise InputError("clear.id", f"the number of an active fault ({there}), or all", command.id)
         return {}
 
     def clear(self, command: ClearCommand, tick: int) -> list[dict[str, Any]]:
         """End faults at the first row at or after a tick.
 
         Args:
-            command: Which faults end.
+            command: The faults to end.
             tick: Tick of the command.
 
         Returns:
-            For each fault that ends its number as `id` and in the list `fault`, its channels, and the first sound rows
-            by group. Where none ends, one entry with an empty list, as every command has an effect that is reported.
+            For each ended fault its number as `id` and in the list `fault`, its channels, and the first healthy rows by
+            group. If none ends, one entry with an empty list, as every command reports an effect.
         """
         row = self._row_at(tick)
         ended = [one for one in self._all() if command.id in ("all", one.id) and one.end > row]
@@ -235,7 +235,7 @@ class Faulty:
         Args:
             command: The fault.
             tick: Tick of the command.
-            pending: Commands that wait; the end of a fault that lasts for some time is added to them.
+            pending: Waiting commands; the end of a fault with a duration is added.
 
         Returns:
             Its number, its channels, and the first rows that it changes, by group.
@@ -275,12 +275,12 @@ class Faulty:
         return {"fault": number, "channels": list(names), "first_row": first}
 
     def counts(self, rows: np.ndarray, made: np.ndarray, tick: int) -> dict[str, np.ndarray]:
-        """Samples from the first of these rows on that lie before the last one, by group.
+        """Return the samples from the first of these rows up to the last one, by group.
 
         Args:
             rows: Observed rows, shape (n, N_ROW).
             made: Signals by formulas, shape (n, m).
-            tick: Of the first row.
+            tick: Tick of the first row.
         """
         if not self.active:
             return {name: counts for each in self.conditioners for name, counts in each.counts(rows, made).items()}
@@ -295,7 +295,7 @@ class Faulty:
         return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
     def _counts(self, rows: np.ndarray, made: np.ndarray, tick: int) -> dict[str, np.ndarray]:
-        """The same of rows between which no fault begins or ends."""
+        """Return the samples of rows between which no fault begins or ends."""
         active = [one for one in self.active if one.begin <= tick < one.end]
         if (ids := [one.id for one in active]) != self._planned[0]:
             self._planned = ids, [Plan(conditioner.groups, active) for conditioner in self.conditioners]
@@ -309,7 +309,7 @@ class Faulty:
                 self._twins = {key: twin for key, twin in self._twins.items() if key[0] != place}
                 found |= conditioner.counts(rows, made)
                 continue
-            # Twins first: they begin from the state that the sound chain has before these rows.
+            # Twins first: they start from the state of the healthy chain before these rows.
             rate = conditioner.groups[0].rate_hz
             n = np.arange(first_row(tick, rate), first_row(tick + (len(rows) - 1) * self.row_ticks, rate))
             shown = self._shown(place, conditioner, plan, volts, n, tick)
@@ -328,14 +328,14 @@ class Faulty:
         return found
 
     def edges(self, edges: np.ndarray, rows: np.ndarray, tick: int) -> np.ndarray:
-        """Keyphasor edges as they are shown [ticks from the first row], shape (edges,).
+        """Return the keyphasor edges with faults [ticks from the first row], shape (edges,).
 
         Args:
-            edges: Those that there are.
-            rows: Observed rows that they lie in.
-            tick: Of the first row.
+            edges: The true edges.
+            rows: Observed rows that contain them.
+            tick: Tick of the first row.
         """
-        # An edge may lie before the first row; what ended before that is over.
+        # An edge may lie before the first row; faults that ended earlier have no effect.
         self.active = [one for one in self.active if one.end > tick - self.row_ticks]
         before = self._last_edge
         if len(edges):
@@ -345,12 +345,12 @@ class Faulty:
         if not faults:
             return edges
         real, end = edges + tick, tick + self.row_ticks * len(rows)
-        # What has ended since shows none of them.
+        # Faults that have ended show no delayed edges.
         lasts = [(self._held >= one.begin) & (self._held < one.end) for one, _ in faults]
         self._held = self._held[np.any(lasts, axis=0)]
-        # The rate that edges tell: what rows tell there depends on where a block begins.
+        # The rate from the edges: that of the rows would depend on where a block begins.
         rate = 2e6 * math.pi / np.diff(real, prepend=before)
-        # Before the first of all there is none: the row behind it tells, wherever the block begins.
+        # Before the first edge there is none: use the row after it, independent of where the block begins.
         behind = np.ceil(edges / self.row_ticks).astype(int)
         rate = np.where(np.isnan(rate), rows[np.minimum(behind, len(rows) - 1), COLUMN["theta_rate"]], rate)
         turns = np.rint(np.interp(edges, self.row_ticks * np.arange(len(rows)), rows[:, COLUMN["theta"]]) / TURN) * TURN
@@ -360,7 +360,7 @@ class Faulty:
             here, nearest = found[inside], np.maximum(np.searchsorted(real, found[inside], side="right") - 1, 0)
             angles, rates = turns[nearest], rate[nearest]
             if tick <= one.begin < end:
-                # The turn that it begins in has pulses to come, too; its edge, as what there is then tells.
+                # The turn in which the fault begins has later pulses too; its edge follows from the angle and rate now.
                 at_rows = np.interp(one.begin, tick + self.row_ticks * np.arange(len(rows)), np.arange(len(rows)))
                 low, part = int(at_rows), at_rows % 1.0
                 theta, fast = (
@@ -376,7 +376,7 @@ class Faulty:
                 no_other, angles, rates, seen_mark,
             )  # fmt: skip
             shown = np.rint(one.what.edges(here, at) * FRACTIONS) / FRACTIONS
-            # As the signal: behind its end there is what there is.
+            # As for the signal: after the end of the fault, the true edges apply.
             shown = shown[(shown >= one.begin) & (shown < one.end)]
             found = np.sort(np.concatenate([found[~inside], shown]))
         found = np.sort(np.concatenate([self._held, found]))
@@ -386,7 +386,7 @@ class Faulty:
     def _shown(
         self, place: int, conditioner: Conditioner, plan: Plan, volts: Volts, n: np.ndarray, tick: int
     ) -> dict[str, np.ndarray]:
-        """Return the counts of channels of which something before the converter differs, each shape (samples,)."""
+        """Return the counts of channels that differ before the converter, each of shape (samples,)."""
         found: dict[str, np.ndarray] = {}
         for fine, faulty in plan.twins.items():
             twin = self._twin((place, fine), conditioner, faulty, tick)
@@ -402,7 +402,7 @@ class Faulty:
     def _twin(
         self, key: tuple[int, bool], conditioner: Conditioner, faulty: dict[str, list[Active]], tick: int
     ) -> _Twin | None:
-        """The chain of some channels, as it was, or begun from the sound one."""
+        """Return the twin chain of some channels: the existing one, or one started from the healthy chain."""
         before = self._twins.pop(key, None)
         if not faulty:
             return None
@@ -415,14 +415,14 @@ class Faulty:
         if not self._setting.noisy or self._setting.ideal:
             noise = 0.0 * noise
         if key[1]:
-            # What is read off between samples has no noise and no steps of its own; the converter's come after that.
+            # Interpolated samples have no noise or quantisation; those of the converter are added afterwards.
             fine = {"adc_bits": _FINE_BITS, "noise_v": 0.0}
             channels = {name: channel.model_copy(update=fine) for name, channel in channels.items()}
         if before is not None and before.channels == channels:
             before.of, before.noise = of, noise
             self._twins[key] = before
             return before
-        rate = conditioner.groups[0].rate_hz * (_FINE if key[1] else 1)
+        rate = conditioner.groups[0].rate_hz * (_OVERSAMPLING if key[1] else 1)
         first = first_row(tick, rate)
         made = conditioner.twin(channels, rate_hz=rate, first=first, row=tick // self.row_ticks, columns=N_ROW)
         if before is not None:
@@ -437,7 +437,7 @@ class Faulty:
         return twin
 
     def _channel(self, name: str, faults: Sequence[Active]) -> Channel:
-        """A channel as its twin's chain has it: with another filter, limited by the converter alone."""
+        """Return a channel as in its twin's chain: with its changed filter, limited only by the converter."""
         channel = self.channels[name]
         for one in faults:
             channel = one.what.chain(channel)
@@ -446,12 +446,12 @@ class Faulty:
         return channel.model_copy(update={"range_v": (-_REACH_V, _REACH_V), **more})
 
     def _late(self, twin: _Twin, counts: np.ndarray, n: np.ndarray, faulty: Sequence[Sequence[Active]]) -> np.ndarray:
-        """Return the counts of samples that are taken late, each channel with converter noise of its own.
+        """Return the counts of delayed samples, each channel with its own converter noise.
 
         Args:
-            twin: Chain of the channels, sampled `_FINE` times as often.
+            twin: Chain of the channels, sampled `_OVERSAMPLING` times as often.
             counts: Its new samples, shape (m, channels).
-            n: Numbers of the samples that are due, shape (n,).
+            n: Indices of the requested samples, shape (n,).
             faulty: Faults of each channel.
 
         Returns:
@@ -465,13 +465,13 @@ class Faulty:
             for one in late:
                 late_s[:, c] += one.what.late_s(where(one, channel, n, n / rate))
             loud[:, c] = late[0].noise[channel.name].standard_normal(len(n))
-        # Not from before the fault, and with samples enough to read between.
-        here = (n * _FINE)[:, None]
-        wanted = np.maximum(here - late_s * (rate * _FINE), np.minimum(here, twin.first + _NODES - 1))
+        # Not before the fault, and with enough samples to interpolate.
+        here = (n * _OVERSAMPLING)[:, None]
+        wanted = np.maximum(here - late_s * (rate * _OVERSAMPLING), np.minimum(here, twin.first + _NODES - 1))
         known = np.concatenate([twin.past, counts])
         whole = np.floor(wanted).astype(np.int64)
         part, width = wanted - whole, len(channels)
-        # Places outside of what is known have a weight of 0: there samples are taken where they are.
+        # Nodes outside the known samples have a weight of 0: there the instants coincide with samples.
         places = (whole - (_NODES - 1) - twin.at) * width + np.arange(width)
         # Weights of the polynomial through the nodes -5 to 0: products of the distances from all others.
         apart = [part + (_NODES - 1 - node) for node in range(_NODES)]
@@ -482,7 +482,7 @@ class Faulty:
                 if other not in (node, (node - 1) % _NODES):
                     weight *= apart[other]
             values += weight * flat.take(places + node * width, mode="clip")
-        kept = round(rate * _FINE * 0.0201) + 2 * _NODES
+        kept = round(rate * _OVERSAMPLING * 0.0201) + 2 * _NODES
         twin.at, twin.past = twin.at + max(0, len(known) - kept), known[-kept:]
         bits = np.array([channel.adc_bits for channel in channels])
         most = 2.0 ** (bits - 1)

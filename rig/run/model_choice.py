@@ -1,4 +1,4 @@
-"""What `rig ladder` picks for a scene: the cheapest model, engine and step that are good enough, and for what."""
+"""The pick of `rig ladder` for a scene: the cheapest model, engine and step within the tolerances."""
 
 from __future__ import annotations
 
@@ -14,31 +14,31 @@ from rig.physics.levels import ModelLevels
 
 _RIG = Path(__file__).parents[1]
 _WORDS = ("base/errors", "base/outside", "base/text")
-"""Modules that say what is wrong with an input, and compute nothing."""
+"""Modules that only report errors of input, and compute nothing."""
 
 
 class PickedQuantity(Written):
-    """One quantity that a pick was made for, with its errors as `rig ladder` measured them."""
+    """A quantity of a pick, with its errors as `rig ladder` measured them."""
 
     quantity: str
     unit: str = ""
     tolerance: FiniteFloat
-    """Error allowed, as a part of the quantity's scale."""
+    """Allowed error, relative to the quantity's scale."""
     value: FiniteFloat | str
-    """By the picked model and engine [unit]."""
+    """Value with the picked model and engine [unit]."""
     reference: FiniteFloat | str
-    """By the full model and the engine of the reference [unit]."""
+    """Value with the full model and the reference engine [unit]."""
     model_error: FiniteFloat
-    """Of the picked levels against the full model, both converged."""
+    """Error of the picked levels against the full model, both converged."""
     numerical_error: FiniteFloat
-    """Of the picked engine against a converged one on the picked levels."""
+    """Error of the picked engine against a converged one on the picked levels."""
     total_error: FiniteFloat
     reference_error: FiniteFloat
-    """Of the reference itself: its distance from an unlike engine."""
+    """Error of the reference: its distance from a different engine."""
 
 
 class Pick(Written):
-    """The cheapest model, engine and step that `rig ladder` found good enough, with what they were picked on."""
+    """The cheapest model, engine and step that `rig ladder` found, with the data that the pick depends on."""
 
     magnet: str
     shaft: str
@@ -51,17 +51,17 @@ class Pick(Written):
     step_us: int
     engine_tolerance: FiniteFloat = 0.0
     companion: bool | None = None
-    """None in a pick of an earlier version: what the scene has."""
+    """None in a pick of an earlier version: as in the scene."""
     quantities: tuple[PickedQuantity, ...]
     cpu_s: FiniteFloat
-    """Processor time of a simulated second of the pick, with its sensors [s]."""
+    """Processor time per simulated second of the pick, with its sensors [s]."""
     cpu_given_s: FiniteFloat
-    """The same of the scene as it is given [s]."""
+    """The same for the unchanged scene [s]."""
     cpu_full_s: FiniteFloat
-    """The same of the full model on the engine of the reference [s]."""
+    """The same for the full model with the reference engine [s]."""
     reference_engine: str = ""
     unlike_engine: str = ""
-    """Whose distance from the reference is the reference's own error."""
+    """Engine whose distance from the reference is the error of the reference."""
     date: str = ""
     rig: str = ""
     """Version of the rig."""
@@ -73,14 +73,14 @@ class Pick(Written):
     code_digest: str
 
     def apply(self, data: dict[str, Any]) -> dict[str, Any]:
-        """The fields of a scene with the pick's in their place."""
+        """Return a scene's data with the fields of the pick."""
         levels = {name: getattr(self, name) for name in ModelLevels.model_fields}
         engine: dict[str, Any] = {"name": self.engine, "step_us": self.step_us, "tolerance": self.engine_tolerance}
         if self.companion is not None:
             engine["companion"] = self.companion
         given = dict(table_in(data, "engine"))
         if self.companion is False:
-            given.pop("limits", None)  # without a companion there is no estimate to hold against them
+            given.pop("limits", None)  # without a companion there is no error estimate to limit
         return {
             **data,
             "model": levels,
@@ -91,7 +91,7 @@ class Pick(Written):
 
 
 def digest(*parts: bytes) -> str:
-    """Digest of parts in their order, hexadecimal."""
+    """Return the digest of the parts in their order, hexadecimal."""
     total = hashlib.sha256()
     for part in parts:
         total.update(len(part).to_bytes(8, "big") + part)
@@ -99,7 +99,7 @@ def digest(*parts: bytes) -> str:
 
 
 def equations_digest(rig: Path = _RIG) -> str:
-    """Digest of the code of the model, the kernels and the engines, and of every module of the rig that they use.
+    """Return the digest of the code of model, kernels and engines, and of every module of the rig that they use.
 
     Args:
         rig: Folder of the package.
@@ -120,7 +120,7 @@ def equations_digest(rig: Path = _RIG) -> str:
 
 
 def _modules_used(code: bytes) -> set[str]:
-    """Places in the rig of the modules and packages that a module imports."""
+    """Return the paths of the rig's modules and packages that a module imports."""
     names = []
     for node in ast.walk(ast.parse(code)):
         if isinstance(node, ast.Import):

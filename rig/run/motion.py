@@ -1,4 +1,4 @@
-"""The motion that an engine moves on: its start, its steps, and its energy ledger."""
+"""Motion of a run: its initial state, its steps, and its energy ledger."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ STORED = ("kinetic_energy", "gravity_energy", "magnet_energy", "house_energy", "
 SUPPLIED = ("drive_work", "hammer_work", "unbalance_work", "gap_work", "release_work")
 DISSIPATED = ("bearing_loss", "house_loss", "contact_loss", "friction_loss")
 BRANCH_ALARM = 1e-2
-"""Energy residual over dissipated energy above which a run may have missed a contact or made one up."""
+"""Energy residual over dissipated energy above which a run may have missed a contact or added a false one."""
 
 
 class Begin(NamedTuple):
-    """Where a run is taken up that was under way before: the shaft in the ring, its houses at rest."""
+    """Start of a run that continues an earlier motion: the shaft in the ring, its housings at rest."""
 
     tick: int
     ring_x: float = 0.0  # [m]
@@ -36,13 +36,13 @@ class Begin(NamedTuple):
 
 
 def initial_state(model: Model, initial: Initial, begin: Begin | None, *, spin: float) -> np.ndarray:
-    """State and integrals at the start of a run, shape (N_VECTOR,).
+    """Return state and integrals at the start of a run, shape (N_VECTOR,).
 
     Args:
         model: The model.
-        initial: What the scene says of it.
-        begin: Where it is taken up instead; None: at the scene's start.
-        spin: theta' [rad/s].
+        initial: Initial state in the scene.
+        begin: Start from an earlier motion; None: the scene's start.
+        spin: Spin rate theta' [rad/s].
 
     Raises:
         InputError: The shaft would not be inside the ring.
@@ -62,7 +62,7 @@ def initial_state(model: Model, initial: Initial, begin: Begin | None, *, spin: 
             place = f"within {r0:g} mm of the shaft at rest on its magnets, (0, {sag * 1e3:.4g}) mm"
             raise InputError("ring.offset", place, [contact.offset_x * 1e3, contact.offset_y * 1e3])
         return model.state(spin=spin)
-    # Just inside the clearance, so that rounding does not make it a contact.
+    # Just inside the clearance, so that rounding does not cause a contact.
     within = contact.clearance * (1.0 - 1e-12)
     places = {"top": (0.0, within), "bottom": (0.0, -within), "given": (initial.x_mm * 1e-3, initial.y_mm * 1e-3)}
     x, y = places[initial.position]
@@ -73,14 +73,14 @@ def initial_state(model: Model, initial: Initial, begin: Begin | None, *, spin: 
 
 @dataclass
 class Motion:
-    """State and integrals, what the engine keeps, and the grid that rows are observed on.
+    """State and integrals, memory of the engine, and the grid of observed rows.
 
     Attributes:
-        y: Shape (N_VECTOR,).
-        step_ticks: The engine's own step [ticks].
-        stride: Steps a row.
-        tolerance: That the engine is asked for.
-        memory: Shape (MEMORY,).
+        y: State and integrals, shape (N_VECTOR,).
+        step_ticks: Step of the engine [ticks].
+        stride: Steps per row.
+        tolerance: Tolerance of the engine.
+        memory: Memory of the engine, shape (MEMORY,).
     """
 
     y: np.ndarray
@@ -94,26 +94,27 @@ class Motion:
         engine.start(constants, inputs, self.y, self.memory, float(self.step_ticks), self.tolerance)
 
     def warm_up(self, engine: Engine, constants: Constants, inputs: Inputs) -> None:
-        """Compile what the engine may call later than in its first steps."""
+        """Compile the functions that the engine may call later than in its first steps."""
         if engine.warm_up is not None and len(self.memory) == engine.memory_size:
             engine.warm_up(constants, inputs)
 
     def run(
         self, engine: Engine, constants: Constants, inputs: Inputs, rows: np.ndarray, start: int, tick: int, stop: int
     ) -> None:
-        """Move on from one tick to another under the same inputs.
+        """Advance from one tick to another with constant inputs.
 
-        Commands live on ticks, rows only observe: off the rows' grid the steps are what fits, and no row is kept.
+        Commands act at any tick, rows only observe: off the grid of rows, steps are shortened to fit and no row is
+        stored.
 
         Args:
             engine: The engine.
-            constants: Of the model.
+            constants: Constants of the model.
             inputs: Hammer, drive, magnets.
-            rows: Out, one every `stride` steps from the tick `start` on, shape (n, N_ROW); also that at `stop`, before
-                anything changes there, where there is room for it.
+            rows: Output, one row every `stride` steps from the tick `start`, shape (n, N_ROW); if there is room, also
+                the row at `stop`, before any change there.
             start: Tick of the first row.
-            tick: From here.
-            stop: To here.
+            tick: Start of the advance.
+            stop: End of the advance.
         """
         row_ticks = self.stride * self.step_ticks
         while tick < stop:
@@ -136,7 +137,7 @@ class Motion:
 
 
 def energy_balance(rows: np.ndarray, first: np.ndarray) -> dict[str, np.ndarray]:
-    """The energy ledger of a run.
+    """Return the energy ledger of a run.
 
     Args:
         rows: Observed rows, shape (n, N_ROW).
@@ -144,7 +145,7 @@ def energy_balance(rows: np.ndarray, first: np.ndarray) -> dict[str, np.ndarray]
 
     Returns:
         stored (change since the start), supplied, dissipated, and residual = stored - supplied + dissipated [J], each
-        shape (n,).
+        of shape (n,).
     """
 
     def total(names: tuple[str, ...], table: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Run a scene as fast as it goes and keep everything as named arrays."""
+"""Offline runs: simulate a scene at full speed and keep the results as named arrays."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from rig.run.simulation import Frame, Simulation
 
 NAMES = tuple(COLUMN)
 _MUST = "one of the signals it keeps of the model (those of the sensors are in run.samples)"
-_MOST_ROWS = 100_000
-"""Rows of which the energy ledger is drawn up at a time."""
+_MAX_ROWS = 100_000
+"""Rows per part of the energy ledger; limits the memory."""
 
 
 class SentCommand(NamedTuple):
-    """A command that came from outside a scene, at the tick at which it was taken."""
+    """A command sent to a run from outside the scene, with the tick at which it was accepted."""
 
     tick: int
     name: str
@@ -36,17 +36,17 @@ class SentCommand(NamedTuple):
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Run:
-    """A finished run: `run["disk_x"]` is what the model had, in SI, and `run.samples["disk_x"]` what the probe showed.
+    """A finished run: `run["disk_x"]` is the model's signal in SI, `run.samples["disk_x"]` the reading of the probe.
 
     Attributes:
         simulation: The simulation at its end (model, scene, engine memory).
-        times_s: Instants of the signals [s], shape (n,); those of the samples, where rows fall on them.
+        times_s: Instants of the signals [s], shape (n,); equal to those of the samples if rows coincide with them.
         signals: States, forces and energies of the model, SI, shape (n, columns); `run["normal_force"]` is one column.
-        names: Names of the model's signals that were kept, all by default; the sensors' are `run.samples.names`.
-        sampled: What each sensor showed, in its own unit: a table for every rate.
-        counted: The same as the converter gave it, int32.
+        names: Names of the kept signals of the model, all by default; those of sensors: `run.samples.names`.
+        sampled: Readings of the sensors, each in its own unit: a table for every rate.
+        counted: The same in counts of the converter, int32.
         edges_s: Keyphasor edges [s], shape (turns,).
-        events: What took effect, each with event, tick and time_s.
+        events: Commands and warnings that took effect, each with event, tick and time_s.
 
     Example:
         >>> import rig
@@ -74,10 +74,10 @@ class Run:
     events: list[dict[str, Any]]
 
     def __getitem__(self, name: str) -> np.ndarray:
-        """One signal of the model [SI], shape (n,).
+        """Return one signal of the model [SI], shape (n,).
 
         Raises:
-            UnknownNameError: There is no such signal, or it was not kept; it is a KeyError.
+            UnknownNameError: The signal does not exist or was not kept; also a KeyError.
         """
         return self.signals[:, place(name, self.names, must=_MUST)]
 
@@ -85,7 +85,7 @@ class Run:
         return iter(self.names)
 
     def unit(self, name: str) -> str:
-        """SI unit of one signal of the model, `run[name]`."""
+        """Return the SI unit of one signal of the model, `run[name]`."""
         return ROW[COLUMN[self.names[place(name, self.names, must=_MUST)]]].unit
 
     def __repr__(self) -> str:
@@ -98,21 +98,21 @@ class Run:
 
     @property
     def samples(self) -> Samples:
-        """What each sensor showed, in its own unit; `run.samples.to_si()` has SI.
+        """Readings of the sensors, each in its own unit; `run.samples.to_si()` has SI.
 
         Raises:
-            InputError: Groups have rates of their own: `run.groups` has each.
+            InputError: Groups have different rates: use `run.groups`.
         """
         return joined(self.sampled)
 
     @property
     def counts(self) -> Samples:
-        """The same as the converter gave it, int32."""
+        """Readings of the sensors in counts of the converter, int32."""
         return joined(self.counted)
 
     @property
     def groups(self) -> dict[str, Samples]:
-        """What each sensor showed, group by group."""
+        """Readings of the sensors by group."""
         found = {}
         for name, group in self.table.groups.items():
             table = next(table for table in self.sampled if group.names[0] in table.names)
@@ -125,14 +125,14 @@ class Run:
 
     @property
     def table(self) -> ChannelTable:
-        """Channel table of the sensors that were on."""
+        """Channel table of the active sensors."""
         return self.simulation.table
 
     def energy(self) -> Samples:
-        """Energy ledger: stored, supplied, dissipated, residual [J], shape (n, 4).
+        """Return the energy ledger: stored, supplied, dissipated, residual [J], shape (n, 4).
 
         Raises:
-            InputError: The run does not keep all signals of the ledger.
+            InputError: The run did not keep all signals of the ledger.
         """
         lacking = [name for name in (*STORED, *SUPPLIED, *DISSIPATED) if name not in self.names]
         if lacking:
@@ -140,8 +140,8 @@ class Run:
         columns, parts = [COLUMN[name] for name in self.names], []
         first = np.zeros(N_ROW)
         first[columns] = self.signals[0]
-        for begin in range(0, len(self.signals), _MOST_ROWS):
-            kept = self.signals[begin : begin + _MOST_ROWS]
+        for begin in range(0, len(self.signals), _MAX_ROWS):
+            kept = self.signals[begin : begin + _MAX_ROWS]
             rows = np.zeros((len(kept), N_ROW))
             rows[:, columns] = kept
             parts.append(energy_balance(rows, first))
@@ -152,13 +152,13 @@ class Run:
 
 
 def frames(simulation: Simulation, *, chunk_s: float = 0.1, commands: Iterable[SentCommand] = ()) -> Iterator[Frame]:
-    """Advance a simulation to the end of its scene, chunk by chunk.
+    """Advance a simulation to the end of its scene, chunk by chunk, and yield the frames.
 
     Args:
-        simulation: What to advance.
+        simulation: The simulation.
         chunk_s: Longest chunk [s].
-        commands: What is sent on the way beside the scene's own commands, each at a tick that is a multiple of the
-            simulation's `block_ticks`.
+        commands: Commands in addition to those of the scene, each at a tick that is a multiple of the simulation's
+            `block_ticks`.
     """
     chunk = max(1, round(chunk_s * simulation.tick_rate_hz) // simulation.block_ticks) * simulation.block_ticks
     due = deque(sorted(commands, key=lambda command: command.tick))
@@ -180,25 +180,25 @@ def simulate(
     commands: Iterable[SentCommand] = (),
     progress: Callable[[float], None] | None = None,
 ) -> Run:
-    """Run a scene as fast as it goes.
+    """Simulate a scene at full speed.
 
     Args:
-        scene: What to run: a scene that comes with the rig by its name, the path of a .toml file, or a loaded one.
-        changes: Other values by dotted key, of the scene or of its parameters, as for `rig.load_scene`.
-        duration_s: Another duration than the scene's [s].
-        signals: Names of the model's signals to keep; all of them unless given (of test signals, there are none).
-        folder: Where signals.npy, samples.npy and counts.npy are written (a new one is made; with groups of several
-            rates, a file for each), to be read from there row by row as they are used; in memory unless given.
-        commands: What is sent on the way, as for `frames`.
-        progress: Called with the part done, 0 to 1.
+        scene: Name of a built-in scene, path of a .toml file, or a loaded scene.
+        changes: Changed values by dotted key, of the scene or of its parameters, as for `rig.load_scene`.
+        duration_s: Duration [s]; default: that of the scene.
+        signals: Names of the model's signals to keep; default: all (none for test signals).
+        folder: Folder for signals.npy, samples.npy and counts.npy (created if missing; with several rates, a file for
+            each), which are then read row by row as they are used; default: in memory.
+        commands: Additional commands, as for `frames`.
+        progress: Called with the completed fraction, 0 to 1.
 
     Returns:
-        The run; signals are kept at the sensors' rate, or at every row where samples fall between rows.
+        The run; signals are kept at the sensors' rate, or at every row if samples fall between rows.
 
     Raises:
-        InputError: There is no such scene, signal or folder, or a value is none that it can have.
+        InputError: A scene, signal or folder does not exist, or a value is invalid.
         SimulationError: The state became non-finite.
-        DiskError: The disk refused.
+        DiskError: The disk is full or refused to write.
 
     Example:
         >>> import rig
@@ -271,7 +271,7 @@ def simulate(
 
 
 def _kept_rate(simulation: Simulation) -> float:
-    """Rate of the signals that a run keeps [Hz]."""
+    """Return the rate of the signals that a run keeps [Hz]."""
     return simulation.tick_rate_hz / (simulation.kept_every * simulation.row_ticks)
 
 
@@ -286,7 +286,7 @@ def _names(signals: Iterable[str]) -> tuple[str, ...]:
 
 
 class _Rows:
-    """Rows that come block by block, into memory or into a .npy file that is then read where it lies."""
+    """Rows added block by block, in memory or in a .npy file that is memory-mapped afterwards."""
 
     def __init__(
         self, stack: ExitStack, folder: str | Path | None, name: str, shape: tuple[int, int], dtype: type
@@ -313,5 +313,5 @@ class _Rows:
             self._file.write(block.tobytes())
 
     def array(self) -> np.ndarray:
-        """All of them, when the last has come."""
+        """Return all rows, after the last block."""
         return self._values if self._file is None else np.load(self._path, mmap_mode="r")

@@ -1,4 +1,4 @@
-"""Scenes: what happens in a run. TOML in, checked and frozen out; single values may be overridden by dotted key."""
+"""Scenes: the definition of a run. Read from TOML, checked and frozen; values can be overridden by dotted key."""
 
 from __future__ import annotations
 
@@ -31,23 +31,23 @@ SCENES = Path(__file__).with_name("scenes")
 
 
 class Initial(Written):
-    """Where the shaft is at time zero, at rest but for its spin."""
+    """Position of the shaft at time zero, at rest except for its spin."""
 
     position: Literal["equilibrium", "top", "bottom", "given"] = "equilibrium"
     x_mm: FiniteFloat = 0.0
-    """Shaft in the ring, for position "given" [mm]."""
+    """Position of the shaft in the ring, for position "given" [mm]."""
     y_mm: FiniteFloat = 0.0
-    """Shaft in the ring, for position "given" [mm]."""
+    """Position of the shaft in the ring, for position "given" [mm]."""
     magnets: bool = True
-    """False: the magnets have let go already."""
+    """False: the shaft is released at the start."""
 
 
 @cache
 def rig_table() -> ChannelTable:
-    """The rig's own channel table, held against the model.
+    """Return the rig's own channel table, checked against the model.
 
     Raises:
-        InputError: A channel feels a signal that the model does not have.
+        InputError: A channel uses a signal that the model does not have.
     """
     table = default_table()
     check_signals(table.channels.values(), COLUMN)
@@ -55,10 +55,10 @@ def rig_table() -> ChannelTable:
 
 
 class Scene(Written):
-    """One run: initial state, drive, timed commands, engine, sensors, seed, and the parameters it runs on.
+    """Definition of a run: initial state, drive, timed commands, engine, sensors, seed, and parameters.
 
-    Frozen, and checked when it is made; the fields and their units are those of a scene's file, such as `duration_s`.
-    `rig.load_scene` makes one of a name or a file, with other values where they are given.
+    Frozen and checked; the fields and their units are those of a scene file, such as `duration_s`. `rig.load_scene`
+    creates one from a name or a file, with changed values if given.
 
     Example:
         >>> import rig
@@ -72,9 +72,9 @@ class Scene(Written):
     name: str = "scene"
     title: str = ""
     parameters: str = DEFAULT_SET
-    """Name of a parameter set, or the path of a file."""
+    """Name of a parameter set, or path of a file."""
     set: dict[str, Any] = Field(default={})
-    """Parameters changed for this scene, each in its own unit."""
+    """Changed parameters of this scene, each in its own unit."""
     duration_s: Annotated[FiniteFloat, Field(gt=0.0, le=86_400.0)] = 2.0
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 1
     initial: Initial = Initial()
@@ -84,13 +84,13 @@ class Scene(Written):
     engine: EngineChoice = EngineChoice()
     sensors: SensorChoice = SensorChoice()
     channels: ChannelTable | None = None
-    """The user's own channel table, of the file that a scene names (`rig.channels.channel_file`); none: the rig's."""
+    """The user's channel table, from the file in the scene (`rig.channels.channel_file`); None: the rig's own."""
     generator: Generator | None = None
     """Test signals in place of the physics (`rig.channels.generators`)."""
     fidelity: Literal["given", "auto"] = "given"
-    """Model and engine as given here, or as `rig ladder` has picked and stored them."""
+    """Model and engine as in the scene, or as picked and stored by `rig ladder`."""
     pick: Pick | None = None
-    """What `rig ladder --write` has stored; only fidelity "auto" makes use of it."""
+    """The pick stored by `rig ladder --write`; used only with fidelity "auto"."""
 
     @model_validator(mode="before")
     @classmethod
@@ -197,7 +197,7 @@ class Scene(Written):
 
     @property
     def fidelity_line(self) -> str | None:
-        """What a run says of a pick in force; None for a scene as given."""
+        """Line about the pick that a run uses; None for a scene without pick."""
         if self.fidelity == "given" or self.pick is None:
             return None
         pick = self.pick
@@ -214,22 +214,22 @@ class Scene(Written):
 
     @property
     def table(self) -> ChannelTable:
-        """Channel table of the sensors that are on, at their rates."""
+        """Channel table of the active sensors, at their rates."""
         return (self.channels or rig_table()).only(self.sensors.groups, self.sensors.rate_hz or None)
 
     @property
     def row_ticks(self) -> int:
-        """Ticks between the rows that sensors and truth see: of the channels' making, whatever the engine's step."""
+        """Ticks between the rows for sensors and truth, determined by the channels and not by the engine's step."""
         sensors = self.sensors
         return row_ticks(self.table, truth_rate_hz=sensors.truth_rate_hz, ideal=sensors.chain == "ideal")
 
     @property
     def setting(self) -> Setting:
-        """What decides which faults make sense."""
+        """Conditions that determine which faults are possible."""
         return Setting(self.sensors.chain == "ideal", self.sensors.noise, self.generator is not None)
 
     def sources(self) -> dict[str, Source]:
-        """What the generator puts at the converter of every channel that is on: `sources()["disk_x"].volts(times_s)`.
+        """Return the generator's signal at the converter of each active channel: `sources()["disk_x"].volts(times_s)`.
 
         Raises:
             InputError: The scene has no generator.
@@ -237,39 +237,39 @@ class Scene(Written):
         if self.generator is None:
             raise InputError("scene", "one with a [generator]", self.name)
         rate = self.sensors.rate_hz or None
-        # A channel's place among all of them does not hang on which are on.
+        # A channel's position among all channels does not depend on which are active.
         made = sources(self.generator, (self.channels or rig_table()).only((), rate), self.drive.speed_hz)
         return {name: made[name] for name in self.table.channels}
 
     def check_physics(self) -> None:
-        """Refuse a scene of test signals, in which nothing moves.
+        """Raise an error for a scene of test signals, in which nothing moves.
 
         Raises:
-            InputError: It is one.
+            InputError: The scene has a generator.
         """
         if self.generator is not None:
             raise InputError("scene", "one of the physics, without a [generator]", self.name)
 
     def formulas(self) -> Formulas:
-        """What the channels' formulas may use."""
+        """Return the names that formulas of channels may use."""
         return Formulas(self.load_parameters().numbers(), self.table.curves)
 
     def load_parameters(self) -> ParameterSet:
-        """The scene's parameters with its own changes applied."""
+        """Return the scene's parameters with its changes applied."""
         parameters = load_parameters(self.parameters)
         return with_changes(parameters, self.set, source=f"scene {self.name}") if self.set else parameters
 
 
 def scene_names() -> list[str]:
-    """Names of the scenes that come with the rig."""
+    """Return the names of the built-in scenes."""
     return sorted(path.stem for path in SCENES.glob("*.toml"))
 
 
 def scene_path(name_or_path: str | Path) -> Path:
-    """The file of a scene that comes with the rig, or of a user's own.
+    """Return the file of a built-in scene, or of a user's scene.
 
     Raises:
-        InputError: There is none.
+        InputError: The file does not exist.
     """
     if not isinstance(name_or_path, str | Path):
         raise InputError("scene", "a name, or the path of a .toml file", name_or_path)
@@ -286,15 +286,15 @@ def scene_path(name_or_path: str | Path) -> Path:
 
 
 def load_scene(scene: Scene | str | Path, overrides: dict[str, Any] | None = None) -> Scene:
-    """Load a scene by name, or a user's file by path; one that is loaded stays as it is, or is changed.
+    """Load a scene by name, or a user's file by path; a loaded scene is returned, with changes if given.
 
     Args:
-        scene: One of `scene_names()`, a .toml file, or a loaded one.
+        scene: One of `scene_names()`, a .toml file, or a loaded scene.
         overrides: Changes by dotted key, of the scene (`drive.speed_hz`) or of its parameters (`contact.friction`, in
-            the parameter's own unit). Strings are read as TOML values where they are such.
+            the parameter's own unit). Strings are read as TOML values if possible.
 
     Raises:
-        InputError: The one thing that is wrong, with its field, and its file unless that is among the overrides.
+        InputError: A value is wrong; the message has the field, and the file unless the value is among the overrides.
 
     Example:
         >>> scene = load_scene("hammer", {"drive.speed_hz": 5.2, "contact.friction": 0.3})
@@ -310,7 +310,7 @@ def load_scene(scene: Scene | str | Path, overrides: dict[str, Any] | None = Non
     data = {"name": path.stem, **read_toml(path)}
     for table, key in ((data, "channels"), (data.get("generator"), "file")):
         if isinstance(table, dict) and isinstance(table.get(key), str):
-            table[key] = path.parent / table[key]  # as whoever wrote the scene means it
+            table[key] = path.parent / table[key]  # relative to the scene file
     for key, value in _keyed(overrides or {}):
         _override(data, key, read_value(value, field=key) if isinstance(value, str) else value)
     try:
@@ -322,7 +322,7 @@ def load_scene(scene: Scene | str | Path, overrides: dict[str, Any] | None = Non
 
 
 def _checked(data: dict[str, Any], overrides: list[str]) -> Scene:
-    """The scene of a file with overrides, if it can run."""
+    """Return the scene of a file with overrides, if it can run."""
     scene = parse_scene({**data, "fidelity": "given"} if data.get("fidelity") == "auto" else data)
     if data.get("fidelity") == "auto":
         scene = _with_pick(scene, data, overrides)
@@ -339,13 +339,13 @@ def _checked(data: dict[str, Any], overrides: list[str]) -> Scene:
 
 
 def change_scene(scene: Scene, changes: dict[str, Any]) -> Scene:
-    """A loaded scene with other values, by dotted key as in `load_scene`.
+    """Return a loaded scene with changed values, by dotted key as in `load_scene`.
 
-    Another engine comes with its own step, tolerance and companion, and without limits. Other limits choose
-    engine.tolerance again, unless that was given.
+    A changed engine has its default step, tolerance and companion, and no limits. Changed limits select
+    engine.tolerance again, unless it was given.
 
     Raises:
-        InputError: The one thing that is wrong, with its field.
+        InputError: A value is wrong; the message has the field.
     """
     data = scene.model_dump()
     named = _keyed(changes)
@@ -359,14 +359,14 @@ def change_scene(scene: Scene, changes: dict[str, Any]) -> Scene:
 
 
 def _keyed(changes: dict[str, Any]) -> list[tuple[str, Any]]:
-    """Keys and values of changes, which come from a notebook as anything."""
+    """Return keys and values of changes; a notebook may pass any object."""
     if not isinstance(changes, dict) or not all(isinstance(key, str) for key in changes):
         raise InputError("changes", "a dictionary of values by dotted key", changes)
     return list(changes.items())
 
 
 def _with_pick(scene: Scene, data: dict[str, Any], overrides: list[str]) -> Scene:
-    """The scene with its stored pick in force, if that is of this very scene."""
+    """Return the scene with its stored pick applied, if the pick belongs to this scene."""
     by_hand = [key for key in overrides if key.split(".")[0] in ("model", "engine") or key in _PICKED]
     if by_hand:
         raise InputError("fidelity", f'"given" where {by_hand[0]} is chosen by hand', "auto")
@@ -375,7 +375,7 @@ def _with_pick(scene: Scene, data: dict[str, Any], overrides: list[str]) -> Scen
         names = ("the scene", "its parameters", "the rig's equations or engines")
         changed = [name for name, a, b in zip(names, stored, pick_digests(scene), strict=True) if a != b]
         if changed:
-            must = f'"given", or picked anew by `rig ladder --write`: {" and ".join(changed)} changed since the pick'
+            must = f'"given", or picked again by `rig ladder --write`: {" and ".join(changed)} changed since the pick'
             raise InputError("fidelity", must, "auto")
         data = scene.pick.apply(data)
     return parse_scene(data)
@@ -385,8 +385,8 @@ _PICKED = ("drive.mode", "sensors.chain")
 
 
 def pick_digests(scene: Scene) -> tuple[str, str, str]:
-    """What a pick depends on: digests of the scene as given, of its parameters, and of equations and engines."""
-    # Neither its name nor the seed of the sensors' noise changes what a scene does.
+    """Return the digests that a pick depends on: the scene, its parameters, and equations and engines."""
+    # Name and noise seed do not change the motion of a scene.
     left_out = {"name", "title", "seed", "parameters", "set", "model", "engine", "fidelity", "pick", "generator"}
     given = scene.model_dump_json(exclude=left_out)
     values = {key: [entry.value, entry.unit] for key, entry in scene.load_parameters().entries.items()}
@@ -394,7 +394,7 @@ def pick_digests(scene: Scene) -> tuple[str, str, str]:
 
 
 def parse_scene(data: dict[str, Any]) -> Scene:
-    """Check the fields of a scene.
+    """Return a scene from its fields.
 
     Raises:
         InputError: The first wrong field.
@@ -432,12 +432,12 @@ def _scene_keys(table: Any = Scene) -> list[str]:
 
 
 def _inner(annotation: Any) -> dict[str, Any]:
-    """The fields of a table, also of the one that may be left out."""
+    """Return the fields of a table, or of an optional one."""
     return getattr(Generator if Generator in get_args(annotation) else annotation, "model_fields", {})
 
 
 def read_value(text: str, *, field: str = "value") -> Any:
-    """A value from the command line: TOML where it is such, else the text itself."""
+    """Return a value from the command line: a TOML value if possible, otherwise the text itself."""
     try:
         return parse_toml(f"value = {text}", field=field)["value"]
     except tomllib.TOMLDecodeError:
@@ -445,5 +445,5 @@ def read_value(text: str, *, field: str = "value") -> Any:
 
 
 def scene_document(scene: Scene) -> dict[str, Any]:
-    """The scene as a JSON document, complete enough to run it again."""
+    """Return the scene as a JSON document that is sufficient to run it again."""
     return json.loads(scene.model_dump_json())

@@ -1,7 +1,7 @@
-"""A running simulation: scene in, frames of samples and truth out, commands on the way. No clock, no threads, no I/O.
+"""Simulation of a scene: returns frames of samples and truth, accepts commands. No clock, threads or I/O.
 
-`Simulation.advance` is the one stepper behind every way to run the rig: free, in lockstep, or in real time. Time is
-an integer tick of 1 us. How a run is cut into calls changes no bit of the result.
+`Simulation.advance` is the single stepper for all ways to run the rig: free, in lockstep, or in real time. Time is an
+integer tick of 1 us. Splitting a run into calls changes no bit of the result.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ TICK_RATE_HZ = 1_000_000
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """State of a run at one tick, to be picked up again by `Simulation.restore`."""
+    """State of a run at one tick, for `Simulation.restore`."""
 
     scene: Scene
     changing: dict[str, Any] = field(repr=False)
@@ -59,22 +59,22 @@ _CHANGING = (
 
 
 class Simulation:
-    """One run of one scene.
+    """A run of a scene.
 
     Attributes:
         scene: The scene.
-        model: The model it runs on.
-        table: Channel table of the sensors that are on.
-        tick: Present time.
-        tick_rate_hz: Ticks a second.
-        block_ticks: An advance must be a whole multiple of this.
-        end_tick: Where the scene ends.
+        model: Its model.
+        table: Channel table of the active sensors.
+        tick: Current time [ticks].
+        tick_rate_hz: Ticks per second.
+        block_ticks: `advance` takes whole multiples of this [ticks].
+        end_tick: End of the scene [ticks].
         row_ticks: Ticks between observed rows.
-        begin: Where it is taken up; None: at the scene's own start.
-        kept_every: Rows from one that samples fall on to the next; 1 where some fall between rows.
-        told: What the last command comes to beside its tick: a fault's number, channels and first faulty rows.
+        begin: Start from an earlier motion; None: the scene's start.
+        kept_every: Rows between those with samples; 1 if some samples fall between rows.
+        told: Result of the last command, except its tick: a fault's number, channels and first faulty rows.
         inputs: Inputs of the kernels that commands set.
-        pending: Commands that wait, each with its tick, in order.
+        pending: Waiting commands with their ticks, in order.
         faulty: Faults of the channels.
 
     Example:
@@ -94,7 +94,7 @@ class Simulation:
         self._engines = [calibrator.STILL if scene.generator else load_chosen_engine(scene.engine.name)]
         self._method = ENGINES[scene.engine.name]
         sensors, self.row_ticks = scene.sensors, scene.row_ticks
-        # Steps are as long as may be of those that end on the rows.
+        # The longest step that ends on the rows.
         self._step_ticks = next(
             ticks for ticks in range(min(scene.engine.step_us, self.row_ticks), 0, -1) if self.row_ticks % ticks == 0
         )
@@ -133,7 +133,7 @@ class Simulation:
         self._truth_parts = {
             name: slice(end - len(columns), end)
             for (name, columns), end in zip(S.TRUTH.items(), ends, strict=True)
-            if scene.generator is None  # else nothing of the model is true
+            if scene.generator is None  # without the model there is no truth
         }
 
         self.told: dict[str, Any] = {}
@@ -170,7 +170,7 @@ class Simulation:
 
     @cached_property
     def first_row(self) -> np.ndarray:
-        """Observed row at time zero, shape (N_ROW,). The first use starts the engine, which compiles it."""
+        """Observed row at time zero, shape (N_ROW,). The first access starts the engine, and so compiles it."""
         row, constants, inputs = np.full((1, S.N_ROW), np.nan), self.model.constants, self._inputs()
         for motion, engine in zip(self._motions(), self._engines, strict=True):
             motion.begin(engine, constants, inputs)
@@ -182,10 +182,10 @@ class Simulation:
 
     @cached_property
     def computed(self) -> tuple[str, ...]:
-        """Names of the model's signals that a stage of this run computes: those that are a number at time zero.
+        """Names of the model's signals that this run computes: those that are a number at time zero.
 
         Raises:
-            InputError: A channel or a truth table needs another one.
+            InputError: A channel or a truth table needs a signal that is not computed.
         """
         if self.scene.generator is not None:
             return tuple(COLUMN)
@@ -197,7 +197,7 @@ class Simulation:
         return [self._motion] if self._companion is None else [self._motion, self._companion]
 
     def advance(self, ticks: int) -> Frame:
-        """Move on by `ticks`.
+        """Advance by `ticks`.
 
         Raises:
             InputError: `ticks` is not a positive whole multiple of `block_ticks`.
@@ -222,7 +222,7 @@ class Simulation:
             for motion, engine, out in zip(self._motions(), self._engines, made, strict=True):
                 motion.run(engine, self.model.constants, inputs, out, start, self.tick, stop)
             self.tick = stop
-            # What changes on a row changes behind it: sensors see the row before the change, then that after it.
+            # A change on a row acts after it: sensors see the row before the change, then the one after it.
             row, beyond = divmod(stop - start, self.row_ticks)
             if not beyond:
                 counts.append(self._condition(rows[seen : row + 1], start + seen * self.row_ticks))
@@ -253,13 +253,13 @@ class Simulation:
         ]
 
     def submit(self, name: str, request: dict[str, Any]) -> int:
-        """Check a command and schedule it for the present tick.
+        """Check a command and schedule it for the current tick.
 
         Returns:
             The tick at which it takes effect.
 
         Raises:
-            InputError: Unknown, malformed, out of range, or not possible now.
+            InputError: It is unknown, malformed, out of range, or not possible now.
         """
         command, self.told = check_command(name, request), {}
         if command.MECHANICAL and self.scene.generator is not None:
@@ -271,16 +271,16 @@ class Simulation:
         return self.tick
 
     def serve(self, doors: tuple[str, ...]) -> None:
-        """Take note of where its blocks leave the rig.
+        """Set the transports of the rig.
 
         Raises:
-            InputError: The scene has a fault at a door that is not there.
+            InputError: The scene has a fault of a transport that does not exist.
         """
         self.faulty.doors = doors
         self.faulty.check_all(self.pending)
 
     def warm_up(self) -> None:
-        """Compile (or load) every kernel that `advance` will call, without moving on."""
+        """Compile (or load) every kernel that `advance` will call, without advancing."""
         if not self._warm:
             twin = Simulation(self.scene, begin=self.begin)
             twin.advance(twin.block_ticks)
@@ -288,7 +288,7 @@ class Simulation:
             self._warm = True
 
     def health(self) -> dict[str, Any]:
-        """Spin, energy ledger and doubts at the present tick, for the status."""
+        """Return spin, energy ledger and warnings at the current tick, for the status."""
         if self.scene.generator is not None:
             return calibrator.health(self.scene)
         first = self.first_row
@@ -301,7 +301,7 @@ class Simulation:
         accuracy = self._accuracy.completed()
         if text := accuracy.warning():
             warnings.append(text)
-        # Where little is dissipated, what was stored is what the ledger has to account for.
+        # If little is dissipated, the ledger must account for the stored energy.
         turned_over = max(dissipated, abs(float(balance["stored"][0])), 1e-6)
         if abs(residual) > self._method.energy * turned_over:
             text = f"energy residual {residual:.2e} J is above {self._method.energy:g} of what was turned over"
@@ -336,17 +336,17 @@ class Simulation:
         }
 
     def snapshot(self) -> Snapshot:
-        """All that changes in a run, so that `restore` goes on from here bit for bit, on this build."""
+        """Return the whole changing state of a run; `restore` continues from it bit for bit, with the same build."""
         _ = self.first_row
         return Snapshot(scene=self.scene, changing=copy.deepcopy({name: self.__dict__[name] for name in _CHANGING}))
 
     def restore(self, snapshot: Snapshot) -> None:
-        """Go back, or over, to a snapshot of the same scene; from its start also to one of the scene without commands.
+        """Continue from a snapshot of the same scene; at the start, also from one of the scene without commands.
 
-        Before the first command a run is the same without it.
+        Before its first command a run is the same without it.
 
         Raises:
-            InputError: It is of another scene, or behind the first command.
+            InputError: The snapshot is of another scene, or after the first command.
         """
         changing = copy.deepcopy(snapshot.changing)
         if snapshot.scene != self.scene:
@@ -358,7 +358,7 @@ class Simulation:
         self.__dict__.update(changing)
 
     def catalogue(self) -> dict[str, Any]:
-        """Channel table with calibrations, and the columns of the truth tables, as a JSON document."""
+        """Return the channel table with calibrations, and the columns of the truth tables, as a JSON document."""
         signals = {signal.name: signal for signal in S.ROW}
         return {
             "root": ROOT,
@@ -374,18 +374,18 @@ class Simulation:
         }
 
     def parameters_document(self) -> dict[str, Any]:
-        """The parameters as a JSON document."""
+        """Return the parameters as a JSON document."""
         return describe(self.model)
 
     def scene_document(self) -> dict[str, Any]:
-        """The scene as a JSON document."""
+        """Return the scene as a JSON document."""
         return {"name": self.scene.name, "seed": self.scene.seed, "scene": scene_document(self.scene)}
 
     def _segment(self) -> Segment:
         return next(segment for segment in reversed(self._segments) if segment.tick <= self.tick)
 
     def _speed(self) -> float:
-        """What the drive aims at now [rad/s]."""
+        """Return the current speed target of the drive [rad/s]."""
         segment = self._segment()
         return segment.speed + segment.slope * (self.tick - segment.tick) / TICK_RATE_HZ
 
@@ -397,7 +397,7 @@ class Simulation:
             events += [event | more for more in command.take_effect(self)]
 
     def ramp_to(self, speed_hz: float) -> None:
-        """Let the drive approach a speed at its ramp rate."""
+        """Ramp the drive to a speed at its ramp rate."""
         now, target = self._speed(), 2.0 * math.pi * speed_hz
         length = round(abs(target - now) / self.model.parameters["drive.ramp_rate"] * TICK_RATE_HZ)
         hold = Segment(tick=self.tick + length, speed=target, slope=0.0)
@@ -406,8 +406,8 @@ class Simulation:
 
     def release_magnets(self) -> None:
         """Switch the magnets off."""
-        # What the magnets hold is gone with them: booked, so that the ledger closes. A release that a scene has timed
-        # can find them released by hand.
+        # The energy stored in the magnets is lost: it is booked, so that the ledger closes. The magnets may already be
+        # released by a client when the scene's release follows.
         if not self.inputs["magnet_engaged"]:
             return
         shaft, magnet = self.model.constants.shaft, self.model.constants.magnet
@@ -445,7 +445,7 @@ class Simulation:
         found = {}
         for name, group in self.table.groups.items():
             values = counts[0][name] if len(counts) == 1 else np.concatenate([part[name] for part in counts])
-            # The first sample at or behind the start, to the nearest tick.
+            # The first sample at or after the start, to the nearest tick.
             index = -(-start * group.rate_hz // TICK_RATE_HZ)
             tick = round(index * TICK_RATE_HZ / group.rate_hz)
             found[name] = self._block(tick, index, group.rate_hz, values)

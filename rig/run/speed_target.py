@@ -1,4 +1,4 @@
-"""What the drive aims at, as a scene says it and as straight pieces of speed over time."""
+"""Speed target of the drive, as in a scene and as linear segments of speed over time."""
 
 from __future__ import annotations
 
@@ -12,26 +12,26 @@ from pydantic import Field, FiniteFloat, field_validator
 
 from rig.base.checks import Written
 
-_APART_S = 0.01
-"""Least time between two points of a speed profile [s]: well above any step."""
+_MIN_SPACING_S = 0.01
+"""Minimum time between two points of a speed profile [s]: well above any step."""
 
 
 class Drive(Written):
-    """What the motor aims at."""
+    """Speed target of the motor."""
 
     mode: Literal["torque", "ideal"] = "torque"
-    """A torque law (the spin can dip) or a prescribed spin."""
+    """A torque law (the spin can dip), or a prescribed spin."""
     speed_hz: Annotated[FiniteFloat, Field(ge=0.0)] = 0.0
     """Constant speed [Hz], unless a profile is given."""
     profile: tuple[tuple[FiniteFloat, FiniteFloat], ...] = ()
-    """Points (time [s], speed [Hz]), joined by straight lines; the last is held."""
+    """Points (time [s], speed [Hz]), connected linearly; the last speed is held."""
 
     @field_validator("profile")
     @classmethod
     def _ascending(cls, profile: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
         times = [time for time, _ in profile]
-        if profile and (times[0] != 0.0 or any(b < a + _APART_S - 1e-9 for a, b in pairwise(times))):
-            raise ValueError(f"points of ascending time, at least {_APART_S:g} s apart, the first at 0")
+        if profile and (times[0] != 0.0 or any(b < a + _MIN_SPACING_S - 1e-9 for a, b in pairwise(times))):
+            raise ValueError(f"points of ascending time, at least {_MIN_SPACING_S:g} s apart, the first at 0")
         if any(speed < 0.0 for _, speed in profile):
             raise ValueError("points of speed >= 0")
         return profile
@@ -39,7 +39,7 @@ class Drive(Written):
 
 @dataclass(frozen=True, slots=True)
 class Segment:
-    """The speed target from a tick on: `speed + slope (t - tick)` [rad/s]."""
+    """Speed target from a tick: `speed + slope (t - tick)` [rad/s]."""
 
     tick: int
     speed: float
@@ -47,7 +47,7 @@ class Segment:
 
 
 def segments(profile: Sequence[tuple[float, float]], tick_rate_hz: int) -> list[Segment]:
-    """The pieces between points (time [s], speed [Hz]), and the last one held."""
+    """Return the segments between points (time [s], speed [Hz]), and the last one that holds."""
     points = [(round(time_s * tick_rate_hz), 2.0 * math.pi * hz) for time_s, hz in profile]
     pieces = [Segment(t0, w0, (w1 - w0) / (t1 - t0) * tick_rate_hz) for (t0, w0), (t1, w1) in pairwise(points)]
     return [*pieces, Segment(points[-1][0], points[-1][1], 0.0)]

@@ -26,7 +26,7 @@ WRONG = {
     "unknown key": (
         HEAD + "durations_s = 3\n" + PEAK,
         3,
-        "durations_s must be a field that there is, such as duration_s",
+        "durations_s must be a known field, such as duration_s",
     ),
     "no title": ('scene = "hammer"\n' + PEAK, 1, "title must be given"),
     "unknown scene": ('title = "T"\nscene = "hamer"\n' + PEAK, 2, "scene must be one of"),

@@ -235,7 +235,7 @@ def test_faults_of_a_scene_are_recorded_and_done_again_bit_by_bit(tmp_path: Any)
     ({"channel": "disk_x", "kind": "gain"}, "factor must be given"),
     ({"channel": "disk_x", "kind": "gain", "factor": 1.0}, "factor must be other than 1"),
     ({"channel": "disk_x", "kind": "gain", "factor": "2"}, "factor must be"),
-    ({"channel": "disk_x", "kind": "gain", "factor": 2.0, "size": 1}, "size must be a field that there is"),
+    ({"channel": "disk_x", "kind": "gain", "factor": 2.0, "size": 1}, "size must be a known field"),
     ({"channel": "disk_x", "kind": "offset", "value": math.inf}, "value must be"),
     ({"channel": "disk_x", "kind": "swap", "other": "disk_x"}, "fault.swap must be with another channel"),
     ({"channel": "probes", "kind": "swap", "other": "P_N"}, "fault.channel must be one channel for swap"),
@@ -256,7 +256,7 @@ def test_only_a_fault_that_there_is_can_be_cleared() -> None:
     simulation = Simulation(SCENE)
     simulation.submit("fault", {"channel": "P_E", "kind": "open"})
     assert simulation.told == {"fault": 1, "channels": ["P_E"], "first_row": {"forces": 0}}
-    with pytest.raises(InputError, match=r"clear\.id must be the number of a fault that there is"):
+    with pytest.raises(InputError, match=r"clear\.id must be the number of an active fault"):
         simulation.submit("clear", {"id": 2})
     simulation.submit("clear", {"id": 1})
     assert {"id": "all"}

@@ -234,7 +234,7 @@ WRONG = {
     "many poles": (channel("filter_order = 12"), "channel a.filter_order must be less than or equal to 8"),
     "noise below zero": (channel("noise_v = -1"), "channel a.noise_v must be greater than or equal to 0"),
     "bandwidth beyond any row": (channel("bandwidth_hz = 1e6"), "channel a.bandwidth_hz must be at most 130000"),
-    "unknown field": (channel("sensitivty_v = 1"), "channel a.sensitivty_v must be a field that there is"),
+    "unknown field": (channel("sensitivty_v = 1"), "channel a.sensitivty_v must be a known field"),
     "name with a blank": (channel('name = "a b"'), "a name of letters, digits and _"),
     "name twice": (channel('name = "P_N"'), "channel P_N must be in the table once"),
     "rate of zero": ("[groups.probes]\nrate_hz = 0", "groups.probes.rate_hz must be greater than or equal to 1"),
@@ -245,7 +245,7 @@ WRONG = {
     "drop of nothing": ('drop = ["disk_z"]', "drop must be names of groups or channels, such as disk_y"),
     "nothing left": ('drop = ["probes", "forces", "accelerations", "drive", "hammer"]', "such that a channel is left"),
     "a group of nothing": ("[groups.g]\nrate_hz = 1000", "groups.g.channels must be given"),
-    "unknown table": ("[group.g]\nrate_hz = 1000", "group must be a field that there is, such as groups"),
+    "unknown table": ("[group.g]\nrate_hz = 1000", "group must be a known field, such as groups"),
     "unknown base": ('base = "mine"', "base must be"),
     "no curve": ('[curves]\nc = "none.csv"', "curves.c must be a file that can be read"),
     "a curve back and forth": (

@@ -148,7 +148,7 @@ def test_a_name_stands_once() -> None:
 
 
 def test_unknown_field_in_a_row_is_refused() -> None:
-    with pytest.raises(InputError, match=r"channel c\.colour must be a field that there is"):
+    with pytest.raises(InputError, match=r"channel c\.colour must be a known field"):
         parse_table(one_channel('colour = "red"'))
 
 

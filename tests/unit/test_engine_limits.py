@@ -112,7 +112,7 @@ def test_a_bad_limit_is_refused_in_one_line(
 @pytest.mark.parametrize(
     ("text", "field"),
     [
-        ("radius_mm = 1.0", "engine.limits.radius_mm must be a field that there is, such as radius_um"),
+        ("radius_mm = 1.0", "engine.limits.radius_mm must be a known field, such as radius_um"),
         ("force_n = 0", "engine.limits.force_n must be greater than 0"),
         ("force_n = true", "engine.limits.force_n must be a valid number"),
         ('force_n = "5"', "engine.limits.force_n must be a valid number"),

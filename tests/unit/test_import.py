@@ -811,7 +811,7 @@ X = '[channels.disk_x]\nsource = "x"\n'
         (X + "unit = 'N'\n", "m.toml: channels.disk_x.unit must be a unit of length"),
         (X + "unit = 'furlong'\n", "m.toml: channels.disk_x.unit must be one of m, cm, mm"),
         (X + "sign = 2\n", "m.toml: channels.disk_x.sign must be"),
-        (X + "colour = 'red'\n", "m.toml: channels.disk_x.colour must be a field that there is, such as "),
+        (X + "colour = 'red'\n", "m.toml: channels.disk_x.colour must be a known field, such as "),
         ("[channels.disk_x]\nsource = 'y'\n", "m.toml: channels.disk_x.unit must be a unit of length"),
         (
             "[channels.disk_x]\nsource = 'y'\nsensitivity = '7.87'\n",

@@ -318,7 +318,7 @@ def test_text_that_hides_a_pick_is_left_alone(found: Ladder) -> None:
 )
 def test_a_stale_pick_is_refused(found: Ladder, path: Path, change: dict[str, float], what: str) -> None:
     write_pick(path, str(path), pick_of(found))
-    with pytest.raises(InputError, match=f"picked anew .*{what} changed since the pick"):
+    with pytest.raises(InputError, match=f"picked again .*{what} changed since the pick"):
         load_scene(path, dict(change))
     load_scene(path, {**change, "fidelity": "given"})
 

@@ -53,7 +53,7 @@ CASES = [
     # Scene files.
     scene("bad TOML", "duration_s = ", "scene.toml", "a TOML file"),
     scene("not text", b"\xff\xfe\x00", "scene.toml", "a TOML file"),
-    scene("unknown field", "bogus = 1", "bogus", "a field that there is, such as "),
+    scene("unknown field", "bogus = 1", "bogus", "a known field, such as "),
     scene("unknown field in a part", "[drive]\nspeed = 1", "scene.toml: drive.speed", "such as speed_hz (3 in all)"),
     scene("part is no table", "drive = 3", "drive", "a valid dictionary"),
     scene("text for a number", 'duration_s = "long"', "duration_s", "a valid number"),
@@ -196,7 +196,7 @@ CASES = [
         "unknown field",
         'base = "corrected"\n[contact]\nfriction = { value = 0.1, colour = 1 }',
         "friction.colour",
-        "a field that there is, such as",
+        "a known field, such as",
     ),
     parameters("section is a number", 'base = "corrected"\ncontact = 3', "contact", "a table of parameters"),
     # Changes on the command line.
@@ -398,7 +398,7 @@ def simulation() -> Simulation:
         ("hammer", {"duration_ms": float("inf")}, "hammer.duration_ms", "a finite number"),
         ("hammer", {"direction": "up"}, "hammer.direction", "x, y, -x, -y, or an angle"),
         ("hammer", {"direction": 361.0}, "hammer.direction", ""),
-        ("hammer", {"colour": "red"}, "hammer.colour", "a field that there is, such as "),
+        ("hammer", {"colour": "red"}, "hammer.colour", "a known field, such as "),
         ("hammer", {1: 2}, "hammer", "a set of named fields"),
         ("hammer", None, "hammer", "a set of named fields"),
         ("hammer", [1], "hammer", "a set of named fields"),
@@ -406,7 +406,7 @@ def simulation() -> Simulation:
         ("speed", {"speed_hz": -1.0}, "speed.speed_hz", "greater than or equal to 0"),
         ("speed", {"speed_hz": 15.001}, "speed.speed_hz", "at most drive.top_speed = 15 Hz"),
         ("speed", {"speed_hz": float("inf")}, "speed.speed_hz", "a finite number"),
-        ("release", {"now": True}, "release.now", "a field that there is, such as "),
+        ("release", {"now": True}, "release.now", "a known field, such as "),
     ],
 )
 def test_command_is_refused_and_changes_nothing(

@@ -83,11 +83,11 @@ class Siren(SceneCommand):
 def test_a_command_of_the_table_only_is_refused_and_releases_no_magnets(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(commands.COMMANDS, "siren", Siren)
     simulation = rig.Simulation("stable-run")
-    with pytest.raises(InputError, match=r"command must be one that is carried out here; .* 'Siren'"):
+    with pytest.raises(InputError, match=r"command must be one that the simulation can execute; .* 'Siren'"):
         simulation.submit("siren", {})
     timed = TimedCommand.model_construct(at_s=0.0, request=Siren())
     simulation = rig.Simulation(load_scene("stable-run").model_copy(update={"commands": (timed,)}))
-    with pytest.raises(InputError, match="command must be one that is carried out here"):
+    with pytest.raises(InputError, match="command must be one that the simulation can execute"):
         simulation.advance(simulation.block_ticks)
 
 

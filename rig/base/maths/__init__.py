@@ -1,1 +1,1 @@
-"""Mathematics without a library that takes long to load: roots, and expressions that a user writes."""
+"""Mathematics without slow imports: roots, and expressions written by users."""

@@ -1,6 +1,6 @@
-"""Expressions that a user writes, such as `1.5 * (1 - e)`: read, never run as code.
+"""Expressions written by users, such as `1.5 * (1 - e)`; parsed, never executed as code.
 
-Only what is listed here, and the names that a grammar adds, has a meaning.
+Only the functions listed here, and the names of a grammar, are allowed.
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ import numpy as np
 from rig.base.errors import InputError, UnknownNameError
 
 LONGEST = 500
-"""Characters of an expression."""
+"""Longest expression [characters]."""
 _LARGEST = 1e300
-"""Numbers of an expression are below this."""
+"""Limit of the numbers in an expression."""
 _DEEPEST = 30
-"""Parts of an expression inside each other."""
+"""Deepest nesting of an expression."""
 
 Part = Callable[[Any], Any] | float
-"""Part of an expression: a function of the variables, as the grammar hands them on, or a number."""
+"""Part of an expression: a function of the variables, or a number."""
 
 
 def apply(act: Callable[..., Any], *parts: Part) -> Part:
-    """Return a function of parts as a part; it is computed once, now, if each of them is a number."""
+    """Return a function of parts as a part; it is evaluated now if all parts are numbers."""
     if not any(map(callable, parts)):
         with np.errstate(all="ignore"):
             return act(*parts)
@@ -47,7 +47,7 @@ FUNCTIONS: dict[str, tuple[int, Callable[..., Any]]] = {
     "sin": (1, np.sin),
     "sqrt": (1, np.sqrt),
 }
-"""Functions of an expression: how many arguments they take, and what they do with numbers or arrays."""
+"""Functions of an expression: number of arguments, and implementation for numbers or arrays."""
 _OPERATORS: dict[type, Callable[..., Any]] = {
     ast.Add: np.add,
     ast.Sub: np.subtract,
@@ -60,14 +60,14 @@ _OPERATORS: dict[type, Callable[..., Any]] = {
 
 
 class Grammar:
-    """What the names in an expression mean; this one knows variables, numbers, operators and functions.
+    """Meaning of the names in an expression: here variables, numbers, operators and functions.
 
     Args:
-        variables: Names of the variables, whose values come as a mapping by name.
+        variables: Names of the variables; their values are passed as a mapping.
     """
 
     what = "a formula"
-    """What a user is told to write."""
+    """Description for error messages."""
     made_of = "numbers, variables, + - * / ** and functions"
 
     def __init__(self, variables: Iterable[str] = ()) -> None:
@@ -78,15 +78,15 @@ class Grammar:
 
         Args:
             text: The expression.
-            field: What it is the value of, for errors.
+            field: Field that has the expression, for errors.
 
         Raises:
-            InputError: It is none, or has names without a meaning.
+            InputError: The expression is invalid, or has unknown names.
         """
         if len(text) > LONGEST:
             raise InputError(field, f"a formula of at most {LONGEST} characters", len(text))
         try:
-            with warnings.catch_warnings(action="ignore"):  # of what it reads, such as `1if`, and refuses below
+            with warnings.catch_warnings(action="ignore"):  # about texts such as `1if`, which are refused below
                 tree = ast.parse(text.strip(), mode="eval").body
         except (SyntaxError, ValueError, MemoryError, RecursionError):
             raise InputError(field, self.what, text) from None
@@ -96,7 +96,7 @@ class Grammar:
         """Return the meaning of a name.
 
         Raises:
-            UnknownNameError: It has none.
+            UnknownNameError: The name is unknown.
         """
         if name not in self._variables:
             raise UnknownNameError(field, f"made of {self.made_of}", name, [*self._variables, *FUNCTIONS])
@@ -106,19 +106,19 @@ class Grammar:
         """Return the meaning of a name with a dot.
 
         Raises:
-            InputError: It has none.
+            InputError: The name is unknown.
         """
         raise InputError(field, f"made of {self.made_of}", f"{table}.{key}")
 
     def functions(self) -> Mapping[str, int]:
-        """Numbers of arguments of all functions."""
+        """Return the number of arguments of each function."""
         return {name: count for name, (count, _) in FUNCTIONS.items()}
 
     def call(self, name: str, of: list[Part], field: str) -> Part:
-        """Return a function of parts, of which there are as many as it takes.
+        """Return a function of the given number of parts.
 
         Raises:
-            InputError: A part is not what the function takes.
+            InputError: A part is not a valid argument.
         """
         return apply(FUNCTIONS[name][1], *of)
 
@@ -156,6 +156,6 @@ class Grammar:
 
 
 def value_of(part: Part, **variables: float) -> float:
-    """Return the value of an expression; nan where it has none."""
+    """Return the value of an expression; NaN if undefined."""
     with np.errstate(all="ignore"):
         return float(part(variables) if callable(part) else part)

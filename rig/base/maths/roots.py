@@ -1,4 +1,4 @@
-"""Root of a function of one variable: importing a library for it takes a quarter of a second of every start."""
+"""Root of a function of one variable; importing a library for it would take 0.25 s of every start."""
 
 from __future__ import annotations
 
@@ -6,23 +6,23 @@ import math
 from collections.abc import Callable
 
 _EPSILON = 2.0**-50
-"""Part of the root within which it is found [1]."""
+"""Relative accuracy of the root."""
 _MOST_ROUNDS = 1000
 
 
 def find_root(function: Callable[[float], float], low: float, high: float, *, within: float) -> float:
-    """Where a function changes its sign, by Brent's method (Algorithms for Minimization without Derivatives, 1973).
+    """Return the root of a function by Brent's method (Algorithms for Minimization without Derivatives, 1973).
 
-    Inverse quadratic or linear interpolation where that comes nearer fast enough, else the interval is halved.
+    Uses inverse quadratic or linear interpolation if it converges fast enough, otherwise bisection.
 
     Args:
-        function: Continuous.
-        low: One end.
+        function: Continuous function.
+        low: One end of the interval.
         high: The other end, where the function has the other sign.
-        within: How near the root has to be, beside four parts in 2^52 of it.
+        within: Absolute accuracy of the root, in addition to 4 / 2^52 relative.
 
     Raises:
-        ValueError: Both ends have the same sign, or the function is no number somewhere between.
+        ValueError: Both ends have the same sign, or the function is NaN in between.
     """
     former, best = low, high
     f_former, f_best = function(former), function(best)
@@ -55,7 +55,7 @@ def find_root(function: Callable[[float], float], low: float, high: float, *, wi
                 slope = (f_former - f_best) / (former - best)
                 slope_other = (f_other - f_best) / (other - best)
                 bend = slope_other * slope * (f_other - f_former)
-                # Values that have underflowed say nothing.
+                # Differences that have underflowed give no slope.
                 trial = -f_best * (f_other * slope_other - f_former * slope) / bend if bend else math.inf
             if 2.0 * abs(trial) < min(abs(last_step), 3.0 * abs(half) - least):
                 last_step, step = step, trial

@@ -1,4 +1,4 @@
-"""Commands that act on channels: a fault begins, faults end."""
+"""Commands that act on channels: inject and clear faults."""
 
 from __future__ import annotations
 
@@ -13,31 +13,31 @@ from rig.channels.faults import KINDS, AnyKind
 from rig.run.commands.command import CanFrame, Run, SceneCommand
 
 MAX_FAULT_S = 86_400.0
-"""Longest time of a fault: a day, as no run is longer [s]."""
+"""Longest duration of a fault [s]: a day, as no run is longer."""
 
 
 class _ChannelCommand(SceneCommand):
-    """A command that the simulation's faults check."""
+    """A command that is checked against the faults of the simulation."""
 
     MECHANICAL = False
 
     def check(self, run: Run, waiting: Sequence[Any]) -> dict[str, Any]:
-        """Raise where there can be, or is, no such fault; return the number, channels and first rows of a new one."""
+        """Raise an error for an impossible fault; return the number, channels and first rows of a new one."""
         return run.faulty.check(self, run.tick, waiting)
 
 
 class FaultCommand(_ChannelCommand):
-    """A channel, or a group of them, begins to misbehave: `rig.channels.faults` has the kinds and their numbers."""
+    """Injects a fault into a channel or a group; kinds and parameters are in `rig.channels.faults`."""
 
     CAN = CanFrame(0x6B, event=8, shown="number of a fault", message="Fault")
     SHOWN_FIELD = "fault"
     command: Literal["fault"] = "fault"
     channel: str
-    """A channel, or a group: all of its channels."""
+    """A channel, or a group for all of its channels."""
     what: Annotated[AnyKind, Field(discriminator="kind")]
-    """The kind and its numbers; they stand beside `channel`."""
+    """Kind and parameters; serialised next to `channel`."""
     for_s: Annotated[FiniteFloat, Field(gt=0.0, le=MAX_FAULT_S)] | None = None
-    """How long [s]; until it is cleared unless given."""
+    """Duration [s]; None: until it is cleared."""
 
     @model_validator(mode="before")
     @classmethod
@@ -52,17 +52,17 @@ class FaultCommand(_ChannelCommand):
         return {**own, "what": check(KINDS[kind], rest, field="")}
 
     def request(self) -> dict[str, Any]:
-        """Return the fields as a client sends them: the channel and the numbers of the kind in one table."""
+        """Return the fields as a client sends them: the channel and the parameters of the kind in one table."""
         timed = {} if self.for_s is None else {"for_s": self.for_s}
         return {"channel": self.channel, **self.what.model_dump(exclude_none=True), **timed}
 
     def take_effect(self, run: Run) -> list[dict[str, Any]]:
-        """Begin the fault."""
+        """Inject the fault."""
         return [run.faulty.begin(self, run.tick, run.pending)]
 
 
 class ClearCommand(_ChannelCommand):
-    """Ends a fault, by its number, or all of them; from then on it is as if there had been none."""
+    """Clears a fault by its number, or all; afterwards the signal is as without the fault."""
 
     CAN = CanFrame(0x9A, event=9, message="Fault")
     TRIGGERS = False
@@ -70,5 +70,5 @@ class ClearCommand(_ChannelCommand):
     id: Annotated[int, Field(ge=1)] | Literal["all"] = "all"
 
     def take_effect(self, run: Run) -> list[dict[str, Any]]:
-        """End the faults; each has an event of its own."""
+        """Clear the faults; each has an event of its own."""
         return run.faulty.clear(self, run.tick)

@@ -1,6 +1,6 @@
-"""Base class of the scene commands, and what an entry says of each of its fields and of its CAN frame.
+"""Base class of the scene commands, and the annotations of their fields and CAN frames.
 
-Recorders and drivers read entries, so an entry must not import the simulation: it gets a `Run`.
+Recorders and drivers import the commands, so a command must not import the simulation: it receives a `Run`.
 """
 
 from __future__ import annotations
@@ -119,13 +119,13 @@ class SceneCommand(Written):
         command: Name of the command, and of its event.
     """
 
-    # `"100"` is no number, be it in a file or on a wire.
+    # `"100"` is not a number, in files and in messages.
     model_config = ConfigDict(strict=True)
 
     CAN: ClassVar[CanFrame]
-    """Each entry has its own; one without it is on no bus, and fails its test."""
+    """CAN frame; required for each command."""
     MECHANICAL: ClassVar[bool] = True
-    """Acts on the shaft, and not on channels: needs the model, can be identified, has a mark in the viewer."""
+    """Acts on the shaft, not on channels: needs the model, can be identified, has a mark in the viewer."""
     TRIGGERS: ClassVar[bool] = True
     """Its event can start a capture."""
     SHOWN_FIELD: ClassVar[str] = ""
@@ -149,7 +149,7 @@ class SceneCommand(Written):
         return self.model_dump(exclude={"command"})
 
     def check_in_scene(self, at_s: float, last: Mapping[str, Any], *, magnets: bool) -> None:
-        """Raise where a scene asks for what cannot be.
+        """Raise an error for a command that is impossible in a scene.
 
         Args:
             at_s: Time of the command in the scene [s].
@@ -161,14 +161,14 @@ class SceneCommand(Written):
         """
 
     def check(self, run: Run, waiting: Sequence[Any]) -> dict[str, Any]:
-        """Check whether the command is possible now.
+        """Raise an error if the command is not possible now.
 
         Args:
             run: The simulation.
             waiting: Commands that take effect before this one.
 
         Returns:
-            Fields that the reply has in addition to the tick.
+            Fields of the reply in addition to the tick.
 
         Raises:
             InputError: It is not possible now.
@@ -176,34 +176,34 @@ class SceneCommand(Written):
         return {}
 
     def take_effect(self, run: Run) -> list[dict[str, Any]]:
-        """Carry the command out.
+        """Execute the command.
 
         Returns:
-            For each of its events the fields that it has beside those of the command.
+            The additional fields of each of its events.
 
         Raises:
-            InputError: Nothing carries it out.
+            InputError: It has no implementation.
         """
         raise self.refusal()
 
     @classmethod
     def is_carried_out(cls) -> bool:
-        """Return whether the entry says how the command is carried out."""
+        """Return whether the command has an implementation."""
         return cls.take_effect is not SceneCommand.take_effect
 
     def refusal(self) -> InputError:
-        """Return the error for a command that nothing carries out."""
-        return InputError("command", "one that is carried out here", type(self).__name__)
+        """Return the error for a command without an implementation."""
+        return InputError("command", "one that the simulation can execute", type(self).__name__)
 
 
 def entries(module: ModuleType) -> dict[str, type[SceneCommand]]:
-    """Return the commands of a module by name: the classes that have one."""
+    """Return the command classes of a module by name."""
     found = {name: vars(module).get(f"{name.capitalize()}Command") for name in SUMMARIES}
     return {name: each for name, each in found.items() if each is not None}
 
 
 def as_number(text: str) -> str | float:
-    """Return the number in a text, or the text where it is none."""
+    """Return the number in a text, or the text itself if it is not a number."""
     try:
         return float(text)
     except ValueError:

@@ -1,4 +1,4 @@
-"""All scene commands by name, and what follows from all of them together."""
+"""Table of all scene commands, and the tables derived from it."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ if TYPE_CHECKING:
 else:
     Command = Union[tuple(COMMANDS.values())]
 SERVICE_COMMANDS = ("stop", "step", "note", "join", "done", "leave")
-"""Commands that the service carries out, and no simulation."""
+"""Commands executed by the service, not by a simulation."""
 EVENT_KINDS = ("start", "command", *COMMANDS, "note", "device", "warning", "end")
-"""Every `event` that a rig publishes."""
+"""All values of `event` that a rig publishes."""
 MECHANICAL = tuple(name for name, command in COMMANDS.items() if command.MECHANICAL)
 """Commands that act on the shaft."""
 TRIGGERS = tuple(name for name, command in COMMANDS.items() if command.TRIGGERS)
 """Commands whose events can start a capture."""
 QUANTITIES = {field: each for command in COMMANDS.values() for field, each in command.quantities().items()}
-"""Fields of all commands that have a unit; one name is one quantity, whatever the command."""
+"""Fields with a unit, of all commands; a name is the same quantity in every command."""
 HAMMER_BOUNDS = {
     name: (each.low, each.high) for name, each in HammerCommand.quantities().items() if not each.takes_text
 }
-"""Least and largest peak force [N] and length [ms] of a hammer pulse, by field."""
+"""Smallest and largest peak force [N] and duration [ms] of a hammer pulse, by field."""
 
 
 class TimedCommand(Written):
@@ -44,17 +44,17 @@ class TimedCommand(Written):
     @model_validator(mode="before")
     @classmethod
     def _flat(cls, data: Any) -> Any:
-        # In the file the command's own fields stand beside at_s.
+        # In the file the command's own fields are next to at_s.
         if isinstance(data, dict) and "request" not in data:
             return {"at_s": data.get("at_s"), "request": {key: value for key, value in data.items() if key != "at_s"}}
         return data
 
 
 def check_command(name: str, request: dict[str, Any]) -> SceneCommand:
-    """Check a command that came from outside.
+    """Return a command from outside after checking it.
 
     Raises:
-        InputError: No such command, an unknown field, or a value out of its range; the message names the range.
+        InputError: The command or a field is unknown, or a value is out of range; the message has the range.
     """
     if name not in COMMANDS:
         raise InputError("command", f"one of {', '.join(COMMANDS)}", name)
@@ -62,10 +62,10 @@ def check_command(name: str, request: dict[str, Any]) -> SceneCommand:
 
 
 def with_faults(scene: Any) -> Any:
-    """A scene as it is written, whose faults, under a heading of their own there, stand among its commands.
+    """Return a scene file's data with the entries of [[faults]] moved to its commands.
 
     Raises:
-        InputError: They are no tables.
+        InputError: The faults are not tables.
     """
     if not isinstance(scene, dict) or "faults" not in scene:
         return scene
