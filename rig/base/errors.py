@@ -44,7 +44,7 @@ class InputError(ValueError):
 
 
 class UnknownNameError(InputError, KeyError):
-    """An unknown name; the message suggests similar known names, or lists all if none is similar.
+    """An unknown name; the message suggests similar known names, otherwise it lists all.
 
     Example:
         >>> import rig
@@ -63,7 +63,7 @@ class UnknownNameError(InputError, KeyError):
 
 
 def such_as(must: str, name: object, known: Iterable[str]) -> str:
-    """Return a requirement with known names similar to an unknown one, or all if none is similar."""
+    """Return a requirement with known names similar to an unknown one, otherwise with all."""
     known = list(dict.fromkeys(known))
     shown = nearest(name, known) or known[:_MAX_NAMES]
     more = f" ({len(known)} in all)" if len(known) > len(shown) else ""

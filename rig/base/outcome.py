@@ -1,6 +1,6 @@
 """Outcome of a judgement: pass, fail or inconclusive, with the exit status of a command.
 
-A pass needs evidence: without failures but with too little evidence, the outcome is inconclusive.
+A pass needs evidence: without failures and with too little evidence, the outcome is inconclusive.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Outcome(StrEnum):
 
 
 class InconclusiveError(Exception):
-    """A test without failures, but with too little evidence for a pass; one line."""
+    """A test without failures and with too little evidence for a pass; one line."""
 
 
 _EXIT_STATUS = {Outcome.PASS: 0, Outcome.FAIL: 1, Outcome.INCONCLUSIVE: 3}

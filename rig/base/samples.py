@@ -13,7 +13,7 @@ import numpy as np
 from rig.base import units
 from rig.base.errors import InputError, UnknownNameError
 
-_SAME_S = 1e-6
+_SAME_INSTANT_S = 1e-6
 """Instants closer than this are equal [s]."""
 
 
@@ -128,7 +128,7 @@ def joined(parts: Sequence[Samples]) -> Samples:
     """Return the columns of several tables as one table, with the rows common to all.
 
     Raises:
-        InputError: There is no table, or the instants differ.
+        InputError: `parts` is empty, or the instants differ.
     """
     if len(parts) == 1:
         return parts[0]
@@ -136,7 +136,7 @@ def joined(parts: Sequence[Samples]) -> Samples:
     rows = [np.intersect1d(part.index, index, return_indices=True)[1] for part in parts]
     times = [part.times_s[chosen] for part, chosen in zip(parts, rows, strict=True)]
     alike = len({part.rate_hz for part in parts}) == 1  # with different rates, a part may have no row in common
-    if not alike or any(np.abs(each - times[0]).max(initial=0.0) > _SAME_S for each in times):
+    if not alike or any(np.abs(each - times[0]).max(initial=0.0) > _SAME_INSTANT_S for each in times):
         rates = ", ".join(f"{part.name} at {part.rate_hz:g} Hz" for part in parts)
         raise InputError("groups", "sampled at the same instants", rates or None)
     return Samples(

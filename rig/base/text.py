@@ -7,7 +7,7 @@ import reprlib
 from collections.abc import Iterable
 from typing import Any
 
-_MOST = 500
+_MAX_CHARACTERS = 500
 """Longest value shown in full [characters]."""
 _LONG_INT_BITS = 256
 
@@ -70,7 +70,7 @@ class _Shown(reprlib.Repr):
         super().__init__()
         self.maxlevel = 5
         self.maxlist = self.maxtuple = self.maxset = self.maxfrozenset = self.maxdict = self.maxarray = 20
-        self.maxstring = self.maxother = _MOST
+        self.maxstring = self.maxother = _MAX_CHARACTERS
         self.maxlong = 60
 
     def repr_int(self, x: int, level: int) -> str:
@@ -83,5 +83,5 @@ class _Shown(reprlib.Repr):
 def shown(value: object) -> str:
     """Return a value as shown in errors: a bounded repr, or `nothing` for None, as for a missing field."""
     if isinstance(value, Words):
-        return printable(value, 2 * _MOST)
-    return "nothing" if value is None else printable(_Shown().repr(value), 2 * _MOST)
+        return printable(value, 2 * _MAX_CHARACTERS)
+    return "nothing" if value is None else printable(_Shown().repr(value), 2 * _MAX_CHARACTERS)

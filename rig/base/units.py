@@ -46,7 +46,7 @@ _DETECTOR = re.compile(
 _SENSITIVITY = re.compile(r"\s*([-+0-9.eE]+)\s*([a-zA-Z\u00b5\u03bc]+)\s*/\s*(\S.*)")
 
 
-_PLAIN = str.maketrans({
+_ASCII_SIGNS = str.maketrans({
     "\u00b5": "u", "\u03bc": "u", "\u00b9": "1", "\u00b2": "2", "\u207b": "-", "\u2212": "-", "\u2013": "-",
     "\u2044": "/", "\u00b0": "deg", "\u00ba": "deg", "\u02da": "deg", "\u2103": "degC", "\u2109": "degF",
 })  # fmt: skip
@@ -55,7 +55,7 @@ _PLAIN = str.maketrans({
 
 def _key(spelling: str) -> str:
     """Return a spelling without spaces, brackets and signs of multiplication and power, with u for micro."""
-    text = spelling.strip().strip("[]()").translate(_PLAIN)
+    text = spelling.strip().strip("[]()").translate(_ASCII_SIGNS)
     return re.sub(r"\*\*|[\s^*_·⋅∙]|(?<=[A-Za-z])\.(?=[A-Za-z]|$)", "", text)
 
 

@@ -73,10 +73,10 @@ Keyphasor edges travel as TruthBlock rows of one column: ticks from `tick`.
 _DTYPES = {SAMPLE_SCHEMA: np.dtype("<i4"), TRUTH_SCHEMA: np.dtype("<f8")}
 _ENCAPSULATION = b"\x00\x01\x00\x00"
 _HEAD = struct.Struct("<qqddII")
-_MOST = 1 << 53
+_MAX_TICK = 1 << 53
 """Limit of ticks and row numbers, which are exact in every number type up to here: 285 years of microseconds."""
-_MOST_RATE_HZ = 1e12
-_MOST_BLOCK_S = 1e6
+_MAX_RATE_HZ = 1e12
+_MAX_BLOCK_S = 1e6
 
 
 def schema_of(key: str) -> str | None:
@@ -165,11 +165,11 @@ def decode_block(payload: bytes, schema: str) -> Block:
         )
     rows = size // columns
     if not (
-        0 <= tick <= _MOST
-        and 0 <= index <= _MOST - rows
-        and 1.0 <= tick_rate_hz <= _MOST_RATE_HZ
+        0 <= tick <= _MAX_TICK
+        and 0 <= index <= _MAX_TICK - rows
+        and 1.0 <= tick_rate_hz <= _MAX_RATE_HZ
         and (1e-6 <= rate_hz <= tick_rate_hz or (rate_hz == 0.0 and schema == TRUTH_SCHEMA))
-        and (rate_hz == 0.0 or rows <= _MOST_BLOCK_S * rate_hz)
+        and (rate_hz == 0.0 or rows <= _MAX_BLOCK_S * rate_hz)
     ):
         raise ImplausibleError(
             "payload must have times and numbers that a clock can have; "
@@ -233,7 +233,7 @@ class Continuity:
             key: The stream.
             index: Number of the first row.
             rows: Number of rows.
-            late_rows: Rows that are behind by at most this are late or repeated; otherwise, and at row 0, the numbers
+            late_rows: Rows at most this far back are late or repeated; otherwise, and at row 0, the numbers
                restart.
         """
         expected = self.next.get(key, index)
@@ -250,6 +250,6 @@ class Continuity:
     def tell(self, event: dict[str, Any]) -> dict[str, Any]:
         """Return an event in its published form: `end` has the index after the last row, by key.
 
-        Blocks and events travel separately: the receiver of the end can tell from its `rows` what is missing.
+        Blocks and events travel separately: the `rows` of the end show the receiver what is missing.
         """
         return {**event, "rows": dict(self.next)} if event.get("event") == "end" else event

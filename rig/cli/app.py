@@ -81,7 +81,7 @@ name in the module of that name, or in `requests`, and is imported when it is ca
 _REQUESTS = ("step", "note", "stop", "pause", "resume", "seek", "rate")
 """Requests to a running rig or replay that are not scene commands."""
 _MODULES = ("fault",)
-"""Scene commands with options beyond their fields, each in a module of its own."""
+"""Scene commands with options beyond their fields, each in a separate module."""
 
 GROUPS = {
     "can": {
@@ -159,7 +159,7 @@ def start(arguments: list[str] | None = None) -> None:
             raise
         _fail(f"this {need}")
     except (BrokenPipeError, SystemExit) as error:
-        # The reader of the output has exited (`rig params | head`); rich and typer report a status of their own.
+        # The reader of the output has exited (`rig params | head`); rich and typer report another status.
         if not isinstance(error, BrokenPipeError) and not isinstance(error.__context__, BrokenPipeError):
             raise
         sys.stderr.close()

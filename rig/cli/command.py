@@ -149,7 +149,7 @@ class Group(_Page, TyperGroup):
         """Return the command of a name.
 
         Raises:
-            UnknownNameError: There is no command of this name.
+            UnknownNameError: The command does not exist.
         """
         names = self.list_commands(ctx)
         if cmd_name in names:

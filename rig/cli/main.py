@@ -21,7 +21,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def entry() -> None:
-    """Run the command as a process of its own."""
+    """Run the command as a separate process."""
     # The matrices are small: threads of BLAS waiting for each other take half of the processor time without any gain,
     # and the rounding of sums depends on the number of threads.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

@@ -65,7 +65,7 @@ class Calibrator:
         self._noise = dict(zip(names, map(_normal, noise_streams(names, seed)), strict=True)) if noise else {}
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Calibrator:
-        """Return a copy with a noise state of its own; constant parts are shared."""
+        """Return a copy with a separate noise state; constant parts are shared."""
         other = copy.copy(self)
         other.__dict__["_noise"] = copy.deepcopy(self._noise)
         return other

@@ -105,7 +105,7 @@ class Faulty:
         self._begun = 0
         self._last_edge = math.nan
         self._held = np.empty(0)
-        """Delayed edges that are still to come [ticks]."""
+        """Delayed edges not yet shown [ticks]."""
         self._twins: dict[tuple[int, bool], _Twin] = {}
         self._planned: tuple[list[int], list[Plan]] = [], [Plan(each.groups, ()) for each in conditioners]
 
@@ -376,7 +376,7 @@ class Faulty:
                 no_other, angles, rates, seen_mark,
             )  # fmt: skip
             shown = np.rint(one.what.edges(here, at) * FRACTIONS) / FRACTIONS
-            # As for the signal: after the end of the fault, the true edges apply.
+            # As with the signal, the true edges apply after the end of the fault.
             shown = shown[(shown >= one.begin) & (shown < one.end)]
             found = np.sort(np.concatenate([found[~inside], shown]))
         found = np.sort(np.concatenate([self._held, found]))

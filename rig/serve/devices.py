@@ -33,7 +33,7 @@ class _Device:
 class Devices:
     """The devices that have joined a run, and the last block that each has finished; for one thread, except `rows`.
 
-    After each block the run waits for all joined devices, so a device can only be behind by the last block.
+    After each block the run waits for all joined devices, so a device can only lack the last block.
     """
 
     def __init__(self) -> None:
@@ -44,7 +44,7 @@ class Devices:
         """Removed devices that were not yet reported, with the reasons."""
 
     def __bool__(self) -> bool:
-        """Whether any joined device is not lost."""
+        """Return whether any joined device is not lost."""
         return any(device.lost is None for device in self._devices.values())
 
     def join(self, name: str, patience_s: float, tick: int) -> None:
@@ -69,7 +69,7 @@ class Devices:
 
         Args:
             name: The device.
-            tick: End of the block according to the device; None if there is no such block.
+            tick: End of the block according to the device; None if the block does not exist.
             end: End of the last block.
             said: The device's message, for the error.
 
@@ -143,10 +143,10 @@ class Devices:
         return late, left_s
 
     def told(self, over: int, since_s: float, now_s: float) -> list[dict[str, Any]]:
-        """Return the rows for the status, with the time that each joined device has been behind [s]; from any thread.
+        """Return the rows for the status, with the time that each joined device is late [s]; from any thread.
 
         Args:
-            over: End of the last block of which the devices were notified [ticks].
+            over: Last block end that the devices were notified of [ticks].
             since_s: When they were notified [s].
             now_s: Current time [s].
         """

@@ -164,7 +164,7 @@ class FreeRun(Clock):
 class RealTime(Clock):
     """Results are due when the wall clock reaches their tick; deadlines are absolute, so errors do not accumulate.
 
-    A simulation that is behind runs without waiting until it has caught up. Each result that is not ready at its
+    A late simulation runs without waiting until it has caught up. Each result that is not ready at its
     deadline is an overrun. Lateness is the time from the deadline to the return of `release`.
 
     Args:

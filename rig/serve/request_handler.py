@@ -118,7 +118,7 @@ REQUESTS: dict[str, type[Outside]] = {
 
 @dataclass(slots=True)
 class Pending:
-    """A command on its way from a transport's thread to the run's thread.
+    """A command passed from a transport's thread to the run's thread.
 
     Attributes:
         command: Its name.

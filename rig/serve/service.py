@@ -110,7 +110,7 @@ class Service(ServedRun):
             },
             running="the rig runs",
             linger_s=linger_s,
-            # In lockstep many commands delay nobody, and none may be refused because of the wall clock.
+            # In lockstep many commands cause no delay, and none may be refused because of the wall clock.
             limit=limit or (CommandLimit(_UNLIMITED_HZ) if isinstance(clock, Lockstep) else None),
         )
         simulation.serve(tuple(doors_of(server)))

@@ -29,7 +29,7 @@ _MAX_UNKNOWN = 16
 """Number of streams accepted although the catalogue lacks them (a replay can rename keys)."""
 _BLOCK_BYTES = 64 << 20
 _MAX_WAITING = 8
-"""Blocks of a stream that wait. With more, so much is lost that no block continues another; they are accepted."""
+"""Limit of waiting blocks per stream. Beyond it, too many are lost for one to continue another; they are accepted."""
 _MAX_REFUSED = 64
 _EVENT_BYTES = 1 << 20
 _Text = Annotated[str, Field(max_length=10_000)]
@@ -101,7 +101,7 @@ class Promise:
     tick_rate_hz: float
 
     def broken_by(self, block: wire.Block) -> str:
-        """Return the difference of a block from the catalogue; empty if there is none."""
+        """Return the difference of a block from the catalogue; empty for a valid block."""
         rows, columns = block.values.shape
         if not rows or (columns, block.rate_hz, block.tick_rate_hz) != (self.columns, self.rate_hz, self.tick_rate_hz):
             return (
@@ -111,7 +111,7 @@ class Promise:
         return ""
 
     def untimely(self, block: wire.Block) -> str:
-        """Return the error of a block's time or row number; empty if there is none."""
+        """Return the error of a block's time or row number; empty for a valid block."""
         rows, most = len(block.values), _MAX_TIME_S * self.tick_rate_hz
         most_rows = _MAX_TIME_S * (self.rate_hz or 1e3)
         if not (abs(block.tick) <= most and block.index >= 0 and block.index + rows <= most_rows):

@@ -15,11 +15,11 @@ import numpy as np
 
 from rig.base.errors import InputError, UnknownNameError
 
-LONGEST = 500
+MAX_LENGTH = 500
 """Longest expression [characters]."""
-_LARGEST = 1e300
+_MAX_NUMBER = 1e300
 """Limit of the numbers in an expression."""
-_DEEPEST = 30
+_MAX_DEPTH = 30
 """Deepest nesting of an expression."""
 
 Part = Callable[[Any], Any] | float
@@ -83,8 +83,8 @@ class Grammar:
         Raises:
             InputError: The expression is invalid, or has unknown names.
         """
-        if len(text) > LONGEST:
-            raise InputError(field, f"a formula of at most {LONGEST} characters", len(text))
+        if len(text) > MAX_LENGTH:
+            raise InputError(field, f"a formula of at most {MAX_LENGTH} characters", len(text))
         try:
             with warnings.catch_warnings(action="ignore"):  # about texts such as `1if`, which are refused below
                 tree = ast.parse(text.strip(), mode="eval").body
@@ -126,14 +126,14 @@ class Grammar:
         def inner(each: ast.AST) -> Part:
             return self._part(each, field, text, depth + 1)
 
-        if depth > _DEEPEST:
-            raise InputError(field, f"nested at most {_DEEPEST} deep", text[:60])
+        if depth > _MAX_DEPTH:
+            raise InputError(field, f"nested at most {_MAX_DEPTH} deep", text[:60])
         match node:
             case ast.Constant(value=bool()):
                 pass
             case ast.Constant(value=int() | float() as value):
-                if abs(value) >= _LARGEST:
-                    raise InputError(field, f"made of numbers below {_LARGEST:g}", text[:60])
+                if abs(value) >= _MAX_NUMBER:
+                    raise InputError(field, f"made of numbers below {_MAX_NUMBER:g}", text[:60])
                 return np.float64(value)
             case ast.Name(id="pi"):
                 return math.pi

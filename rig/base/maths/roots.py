@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 _EPSILON = 2.0**-50
 """Relative accuracy of the root."""
-_MOST_ROUNDS = 1000
+_MAX_ROUNDS = 1000
 
 
 def find_root(function: Callable[[float], float], low: float, high: float, *, within: float) -> float:
@@ -34,7 +34,7 @@ def find_root(function: Callable[[float], float], low: float, high: float, *, wi
         raise ValueError(f"the function must change its sign from {low:g} to {high:g}")
     other, f_other = former, f_former
     step = last_step = best - former
-    for _ in range(_MOST_ROUNDS):
+    for _ in range(_MAX_ROUNDS):
         if f_former != 0.0 and (f_former < 0.0) != (f_best < 0.0):
             other, f_other = former, f_former
             step = last_step = best - former

@@ -55,7 +55,7 @@ def completion(
 ) -> None:
     """Complete commands, options and names in a shell by Tab: `rig completion --install`, then open a new shell.
 
-    Without --install it prints the script, for `source <(rig completion bash)` or a file of your own.
+    Without --install it prints the script, for `source <(rig completion bash)` or another file.
     """
     shell = shell or Path(os.environ.get("SHELL", "")).name
     if shell not in _SHELLS:

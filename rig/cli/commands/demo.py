@@ -117,7 +117,7 @@ def _record_session(file: Path, *, speed_hz: float, whirl_s: float, say: Callabl
 
 @contextmanager
 def _processes(log: Path) -> Iterator[Callable[..., Process]]:
-    """Yield a function that starts `rig` commands; their output goes to a log, and they end with the block."""
+    """Yield a function that starts `rig` commands; their output is logged, and they end with the block."""
     import subprocess
     import sys
 

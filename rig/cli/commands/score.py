@@ -1,4 +1,4 @@
-"""`rig score`: the recording of a DAQ under test compared with what the rig sent."""
+"""`rig score`: the recording of a DAQ under test compared with the signals of the rig."""
 
 from __future__ import annotations
 
@@ -80,9 +80,9 @@ def score(
 ) -> None:
     """Score a DAQ by comparing its recording with what the rig sent.
 
-    A DAQ with digital input is compared row by row, exactly; one that samples by itself is fitted to the known signal
-    by least squares. With FILE -, CSV from stdin is compared with what the rig at --connect sends. Exit status: 0 pass,
-    1 fail, 2 wrong input, 3 inconclusive.
+    A DAQ with digital input is compared row by row, exactly; one with its own sampling clock is fitted to the known
+    signal by least squares. With FILE -, CSV from stdin is compared with the streams of the rig at --connect. Exit
+    status: 0 pass, 1 fail, 2 wrong input, 3 inconclusive.
     """
     from replays.recordings.formats.mapping import load_mapping
     from replays.report import check_report, write_report

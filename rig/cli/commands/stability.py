@@ -211,7 +211,7 @@ def sweep_table(found: dict[str, Any], seed: int) -> Table:
 
 
 def _sweep_lines(found: dict[str, Any]) -> Iterator[str]:
-    """Yield the explanations of the table's columns, and the scenes behind its numbers."""
+    """Yield the explanations of the table's columns, and the numbers of the affected scenes."""
     yield (
         "\nQuantiles of the scaled error in decided scenes; within: share of non-chaotic scenes with an error "
         "of at most 10 times the tolerance; silent: wrong by more than 0.1 without a warning; false: warned, and "

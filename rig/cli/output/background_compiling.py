@@ -20,7 +20,7 @@ MARCH = "rig.physics.engines.split.method"
 
 
 def start_second_process() -> subprocess.Popen[bytes] | None:
-    """Start the process if there is a second core. It ends by itself, or with this process."""
+    """Start the process if there is a second core. It ends when it is done, or with this process."""
     cores = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else range(os.cpu_count() or 1)
     if len(cores) < 2:
         return None

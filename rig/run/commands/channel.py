@@ -70,5 +70,5 @@ class ClearCommand(_ChannelCommand):
     id: Annotated[int, Field(ge=1)] | Literal["all"] = "all"
 
     def take_effect(self, run: Run) -> list[dict[str, Any]]:
-        """Clear the faults; each has an event of its own."""
+        """Clear the faults; each has a separate event."""
         return run.faulty.clear(self, run.tick)

@@ -55,7 +55,7 @@ class Quantity:
         can: Signal in the CAN frame.
         metavar: Placeholder on the command line; the unit unless given.
         takes: Accepted values in rig/KEYS.md, where limits do not describe them.
-        span: Least and largest value that can be fitted, where the field has no limits of its own.
+        span: Least and largest value that can be fitted, if the field has no limits.
     """
 
     unit: str
@@ -74,7 +74,7 @@ class CanFrame:
         kind: First byte of the frame; any two of a message differ in at least four bits.
         event: Number of the command's event in the frame Event.
         shown: Description of `SHOWN_FIELD` in the DBC, where the event carries it.
-        message: Message that carries it; one that has a message of its own defines its signals in `drivers.can`.
+        message: Message that carries it; a command with a separate message defines its signals in `drivers.can`.
     """
 
     kind: int

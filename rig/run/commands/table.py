@@ -13,8 +13,8 @@ from rig.run.commands.channel import ClearCommand, FaultCommand  # noqa: F401
 from rig.run.commands.command import SceneCommand, entries
 from rig.run.commands.mechanical import HammerCommand, ReleaseCommand, SpeedCommand  # noqa: F401
 
-_FOUND = entries(mechanical) | entries(channel)
-COMMANDS: dict[str, type[SceneCommand]] = {name: _FOUND[name] for name in SUMMARIES if name in _FOUND}
+_ENTRIES = entries(mechanical) | entries(channel)
+COMMANDS: dict[str, type[SceneCommand]] = {name: _ENTRIES[name] for name in SUMMARIES if name in _ENTRIES}
 if TYPE_CHECKING:
     Command = SceneCommand
 else:

@@ -91,7 +91,7 @@ class Client(Protocol):
         """Send a request to the rig and return its reply.
 
         Raises:
-            NoReplyError: Nobody answered in time.
+            NoReplyError: There was no answer in time.
         """
         ...
 

@@ -47,10 +47,10 @@ class Report(Outside):
     room: Count | None = None
     """Number of rows that it can hold."""
     done: bool = False
-    """Whether the client leaves."""
+    """The client leaves."""
     wall_s: float | None = None
     secret: Annotated[str, a_line(64)] | None = None
-    """Secret of this client; a report under its name without it is from somebody else."""
+    """Secret of this client; a report under its name without it is from another client."""
 
 
 class Reporter:
@@ -139,7 +139,7 @@ class Clients:
             self._reports[who] = _Heard(index, report.lost, now_s, report.room, moved_s, *origin)
 
     def _make_room(self, now_s: float) -> None:
-        """Remove silent clients; if there are none, the slowest quarter."""
+        """Remove silent clients, otherwise the slowest quarter."""
         if len(self._reports) < MOST and now_s - self._swept_s < _FORGOTTEN_S:
             return
         self._swept_s = now_s
@@ -199,7 +199,7 @@ class Clients:
         return max((self._lacks(who, report, published) for who, report in live.items()), default=0)
 
     def crowded(self, published: int, most: int) -> str | None:
-        """Return the name of a present client that lags by more than `most` rows, or than half of its own room."""
+        """Return the name of a present client that lags by more than `most` rows, or than half of its room."""
         for who, report in self._live().items():
             if self._lacks(who, report, published) > (most if report.room is None else min(most, report.room // 2)):
                 return who[0]

@@ -108,7 +108,7 @@ def backlog_of(port: int) -> dict[int, int]:
 
 
 def hang_up(port: int, peers: set[int]) -> None:
-    """Close the links of a listening port to some peer ports (Linux); data on the way still arrives."""
+    """Close the links of a listening port to some peer ports (Linux); data in transit still arrives."""
     for file in Path("/proc/self/fd").iterdir() if peers else ():
         with contextlib.suppress(OSError), socket.socket(fileno=os.dup(int(file.name))) as link:
             ends = link.getsockname(), link.getpeername()

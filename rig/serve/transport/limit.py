@@ -9,7 +9,7 @@ from collections.abc import Callable
 from rig.base.errors import InputError, Words
 
 _MAX_SENDERS = 64
-"""Number of senders with a limit of their own. Senders name themselves; invented names share the common limit."""
+"""Number of senders with a separate limit. Senders name themselves; invented names share the common limit."""
 _COMMON_FACTOR = 4
 """Common limit relative to that of one sender."""
 
@@ -48,7 +48,7 @@ class CommandLimit:
         self._lock = threading.Lock()
         self._all = Bucket(_COMMON_FACTOR * rate_hz, _COMMON_FACTOR * burst, now_s())
         self.senders: dict[str, Bucket] = {}
-        """Senders with a limit of their own, least recent first."""
+        """Senders with a separate limit, least recent first."""
         self.refused = 0
         """Number of refused commands."""
 

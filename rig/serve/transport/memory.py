@@ -164,7 +164,7 @@ class MemoryClient(Closing):
         """Send a request to the rig and return its reply.
 
         Raises:
-            NoReplyError: Nobody answers on that key.
+            NoReplyError: The key has no handler.
         """
         handler = self._server.handler_of(key)
         if handler is None:

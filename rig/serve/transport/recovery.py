@@ -22,7 +22,7 @@ Publisher = tuple[str, int]
 class Recovery:
     """Received messages of a lossless subscription, and the recovery of missed ones.
 
-    Publishers number their messages, keep the last ones, and send their last number several times a second; this is
+    Publishers number their messages, keep the last ones, and send their last number several times per second; this is
     part of zenoh. The recovery is done here because zenoh's advanced subscriber (1.10.2) can report a gap as missed
     without requesting it, if the gap appears while the query of a heartbeat is open, and loses history in the same way.
 
@@ -57,7 +57,7 @@ class Recovery:
         self._floor: dict[Publisher, int] = {}
         """Without history: last number of a publisher when it was first seen; later messages must be delivered."""
         self._behind: dict[Publisher, int | None] = {}
-        """Our last number at a publisher's previous heartbeat, if it was behind."""
+        """Our last number at a publisher's previous heartbeat, if it was lower."""
         self._handed: dict[str, int] = {}
         self._news = threading.Condition()
 
@@ -81,7 +81,7 @@ class Recovery:
             self._deliver(publisher, number, sample)
 
     def begin(self, heads: list[Any]) -> None:
-        """Recover the history of publishers without a message so far, given the newest message of each cache."""
+        """Recover the history of publishers without a received message, given the newest message of each cache."""
         for sample in heads:
             publisher = publisher_of(sample.source_info.source_id)
             with self._lock:

@@ -29,7 +29,7 @@ def locator(host: str, port: int, *, tls: bool = False) -> str:
 
 
 def config_of(**settings: Any) -> Any:
-    """Return a configuration with the shared settings and the given ones (`__` stands for `/`)."""
+    """Return a configuration with the shared settings and the given ones (`__` means `/`)."""
     import zenoh
 
     config = zenoh.Config()

@@ -63,7 +63,7 @@ class Exposure(NamedTuple):
 
     Args:
         endpoint: HOST:PORT.
-        holder: The rig's certificate and authority; None accepts everybody, unencrypted.
+        holder: The rig's certificate and authority; None accepts all clients, unencrypted.
     """
 
     endpoint: str
@@ -238,9 +238,9 @@ def _reply(query: Any, key: str, payload: bytes) -> None:
 
 
 class ZenohClient(Closing):
-    """A client's side: connects to one rig and does not listen. Reconnects by itself after a restart of the rig.
+    """A client's side: connects to one rig and does not listen. Reconnects after a restart of the rig.
 
-    Subscriptions have a link of their own. A slow callback fills it, and then nothing on it is read, which must not
+    Subscriptions have a separate link. A slow callback fills it, and then nothing on it is read, which must not
     delay requests, the token, or the recovery that this subscription waits for.
 
     Args:
@@ -315,7 +315,7 @@ class ZenohClient(Closing):
                     raise self._not_let_in() from None
 
     def _not_let_in(self) -> NoReplyError:
-        """Return the error that tells whether no rig listens or the rig refuses this client."""
+        """Return the error for a failed connection: no rig listens, or it refuses this client."""
         try:
             if self._holder is None:
                 socket.create_connection((self._host, self._port), timeout=1.0).close()
