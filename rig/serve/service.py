@@ -41,7 +41,7 @@ _MAX_STEP_S = 3600
 """Longest single step [s of simulated time]."""
 _DEVICE_WAIT_S = 0.1
 """Longest single wait for devices, unless one must be removed sooner [s]."""
-_MAX_WAITING = 256
+_MAX_HELD = 256
 """Commands that may wait for other devices."""
 _UNLIMITED_HZ = 1e9
 """Commands per second of one sender in lockstep: no limit."""
@@ -290,11 +290,11 @@ class Service(ServedRun):
         A device's command is executed once all devices before it have finished the block.
         """
         for pending in self._desk.taken():
-            if len(self._waiting) < _MAX_WAITING:
+            if len(self._waiting) < _MAX_HELD:
                 self._waiting.append(pending)
             else:
                 pending.refuse(
-                    InputError("commands", f"at most {_MAX_WAITING} that wait for other devices", _MAX_WAITING + 1)
+                    InputError("commands", f"at most {_MAX_HELD} that wait for other devices", _MAX_HELD + 1)
                 )
         while (place := self._devices.first_due(self._waiting, self._simulation.tick)) is not None:
             yield self._waiting.pop(place)

@@ -21,7 +21,7 @@ from rig.base.errors import InputError
 from rig.channels.faults.ledger import Declared
 from rig.channels.table import ChannelTable
 
-_MAX_TIME_S = 1e9
+_MAX_S = 1e9
 """Thirty years: longer than any simulated time [s]."""
 _MAX_JUMP = 1 << 40
 """Largest jump of a stream [rows]: almost two years at 20 kHz."""
@@ -43,7 +43,7 @@ class Event(Outside):
 
     event: Name
     tick: Annotated[int, Field(ge=-(2**53), le=2**53)] | None = None
-    time_s: Annotated[float, Field(ge=-_MAX_TIME_S, le=1e10)] | None = None
+    time_s: Annotated[float, Field(ge=-_MAX_S, le=1e10)] | None = None
     wall_s: float | None = None
     reason: _Text | None = None
     text: _Text | None = None
@@ -112,10 +112,9 @@ class Promise:
 
     def untimely(self, block: wire.Block) -> str:
         """Return the error of a block's time or row number; empty for a valid block."""
-        rows, most = len(block.values), _MAX_TIME_S * self.tick_rate_hz
-        most_rows = _MAX_TIME_S * (self.rate_hz or 1e3)
-        if not (abs(block.tick) <= most and block.index >= 0 and block.index + rows <= most_rows):
-            return f"row {block.index} at tick {block.tick} is beyond {_MAX_TIME_S:g} s"
+        rows, most = len(block.values), _MAX_S * self.tick_rate_hz
+        if not (abs(block.tick) <= most and block.index >= 0 and block.index + rows <= _MAX_S * (self.rate_hz or 1e3)):
+            return f"row {block.index} at tick {block.tick} is beyond {_MAX_S:g} s"
         if self.rate_hz:
             # Both begin at 0. Ticks are rounded, and a renumbered recording is shifted by whole rows.
             ticks_a_row = self.tick_rate_hz / self.rate_hz

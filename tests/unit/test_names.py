@@ -74,7 +74,7 @@ def test_who_asks_for_a_name_that_is_not_there_is_told_those_that_are() -> None:
 def test_a_folder_that_others_may_write_to_is_not_believed(runtime: Path) -> None:
     runtime.mkdir(mode=0o700)
     runtime.chmod(0o777)
-    with pytest.raises(InputError, match=r"a folder that only its owner can access \(chmod 700"):
+    with pytest.raises(InputError, match=r"a folder private to its owner \(chmod 700"):
         names.running()
 
 

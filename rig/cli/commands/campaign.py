@@ -29,17 +29,11 @@ def campaign(
     ] = None,
     *,
     keyword: Annotated[
-        str | None,
-        typer.Option("--keyword", "-k", metavar="WORDS", help="Run only cases with these words in their names"),
+        str | None, typer.Option("--keyword", "-k", metavar="WORDS", help="Run only cases with these words in the name")
     ] = None,
-    jobs: Annotated[
-        int, typer.Option("--jobs", "-j", metavar="N", min=1, help="Number of cases to run in parallel")
-    ] = 1,
+    jobs: Annotated[int, typer.Option("--jobs", "-j", metavar="N", min=1, help="Number of parallel cases")] = 1,
     output: Annotated[
-        Path | None,
-        typer.Option(
-            "--output", "-o", metavar="FOLDER", help="Folder for results.json, junit.xml, index.html, evidence/"
-        ),
+        Path | None, typer.Option("--output", "-o", metavar="FOLDER", help="Folder for results, reports and evidence")
     ] = None,
     against: Annotated[
         Path | None, typer.Option("--against", metavar="FOLDER", help="Compare with the results of an earlier campaign")

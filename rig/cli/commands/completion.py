@@ -47,9 +47,7 @@ Choices = Iterable[tuple[str, str]]
 
 
 def completion(
-    shell: Annotated[
-        str | None, typer.Argument(metavar="[bash|zsh|fish]", help="Shell; default: that of $SHELL")
-    ] = None,
+    shell: Annotated[str | None, typer.Argument(metavar="[bash|zsh|fish]", help="Shell; default: $SHELL")] = None,
     *,
     install: Annotated[bool, typer.Option("--install", help="Install for every new shell of this user")] = False,
 ) -> None:

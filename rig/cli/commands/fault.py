@@ -111,11 +111,8 @@ def _show_kinds(channel: str | None, form: Form) -> None:
         if channel not in known:
             raise UnknownNameError("CHANNEL", "a channel, a group or a kind of fault", channel, known)
         names = {channel, *(table.groups[channel].names if channel in table.groups else ())}
-        rows = [
-            row
-            for row in rows
-            if row[0] == channel or any(supported(KINDS[row[0]], table).get(name) == "" for name in names)
-        ]
+        kinds = {kind for kind, each in KINDS.items() if any(supported(each, table).get(name) == "" for name in names)}
+        rows = [row for row in rows if row[0] in {channel, *kinds}]
     headings = ("kind", "stage", "what it does", "numbers", "on", "at")
     if form.as_json:
         echo_json([dict(zip(headings, row, strict=True)) for row in rows])

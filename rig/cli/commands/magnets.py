@@ -38,9 +38,7 @@ def _show(document: dict[str, Any], console: Console) -> None:
         f"at the centre and {overstated['toward_a_magnet'][-1]:.2f} times at {document['reach_mm']:.3g} mm.\n",
     )
     used = document["stiffness_used_n_m"] / 1e3
-    console.print(
-        _force_table(document, "force_at_stiffness_used_n", f"force at {used:.3g} kN/m, the stiffness in use")
-    )
+    console.print(_force_table(document, "force_at_stiffness_used_n", f"force at {used:.3g} kN/m, as in use"))
     console.print()
     console.print(_error_table(document))
     console.print(

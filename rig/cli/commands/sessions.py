@@ -15,13 +15,9 @@ from rig.cli.output.tables import echo
 
 
 def sessions(
-    names: Annotated[
-        list[str] | None, typer.Argument(metavar="[SESSION]...", help="Record only these sessions")
-    ] = None,
+    names: Annotated[list[str] | None, typer.Argument(metavar="[SESSION]...", help="Record only these")] = None,
     *,
-    output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="FOLDER", help="Folder to write to; created if missing")
-    ],
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="FOLDER", help="Folder; created if missing")],
     force: Force = False,
 ) -> None:
     """Record the reference sessions again: small recordings, with their quantities as text for review as a diff."""

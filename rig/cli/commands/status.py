@@ -18,9 +18,7 @@ if TYPE_CHECKING:
 
 def status(
     *,
-    watch: Annotated[
-        bool, typer.Option("--watch", help="Repeat twice a second, until Ctrl-C or the end of the run")
-    ] = False,
+    watch: Annotated[bool, typer.Option("--watch", help="Repeat every 0.5 s, until Ctrl-C or the end")] = False,
     listed: Annotated[bool, typer.Option("--list", help="List the running rigs that have a name (--name)")] = False,
     form: Form,
     connection: Connection,

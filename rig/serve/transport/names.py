@@ -144,9 +144,7 @@ def _folder() -> Path:
         folder.mkdir(mode=0o700)
     found = folder.lstat()
     if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o077:
-        raise InputError(
-            "names", f"kept in a folder that only its owner can access (chmod 700 {folder})", Words("another")
-        )
+        raise InputError("names", f"kept in a folder private to its owner (chmod 700 {folder})", Words("another"))
     return folder
 
 

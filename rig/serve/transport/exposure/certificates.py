@@ -109,11 +109,7 @@ def holder_in(folder: Path | str, *, server: bool) -> Holder:
         raise InputError("--tls", must, str(folder))
     key = where / _KEY
     if os.name == "posix" and key.stat().st_mode & 0o077:
-        raise InputError(
-            "--tls",
-            f"a folder whose key only its owner can read (chmod 600 {key})",
-            Words("a key that others can read"),
-        )
+        raise InputError("--tls", f"a folder whose key is private to its owner (chmod 600 {key})", Words("another"))
     expires = certificate.not_valid_after_utc
     if expires <= datetime.now(UTC):
         raise InputError(
