@@ -10,6 +10,7 @@ import rerun.blueprint as rrb
 from recorder.viewer import canvas, painter
 from recorder.viewer.drawings import contact, marks, orbit, scene3d, series, spectrum
 from recorder.viewer.drawings.geometry import Geometry
+from rig.base.errors import InputError
 from rig.channels.table import ChannelTable
 
 LIVE_S = 10.0
@@ -19,8 +20,18 @@ _SMALL = ("Spin speed [Hz]", "Hammer [N]")
 """Plots that need little height."""
 
 
-def layout(table: ChannelTable, geometry: Geometry, *, live: bool) -> rrb.Blueprint:
-    """The blueprint of a file's or a live view."""
+def layout(table: ChannelTable, geometry: Geometry, *, live: bool, only: str | None = None) -> rrb.Blueprint:
+    """Return the layout of the views of a recording or of the running rig.
+
+    Args:
+        table: Channels; views without a channel are left out.
+        geometry: Clearances and arms of the rig.
+        live: Whether time series show the last `LIVE_S` seconds.
+        only: Part of the titles of the views to show, in any case; None for all views.
+
+    Raises:
+        InputError: No title contains `only`.
+    """
     curves = _curve_views(table, geometry, live=live)
     small = [curves.pop(name) for name in _SMALL if name in curves]
     planes = [plane for plane in orbit.PLANES if plane in painter.planes_in(table)]
@@ -36,6 +47,8 @@ def layout(table: ChannelTable, geometry: Geometry, *, live: bool) -> rrb.Bluepr
         motion.append((rrb.Horizontal(*small), 2.6))
     frequency += [(_marks_view(live=live), 1.8), (_events_view(), 2.6)]
     columns = [(motion, 5.2), ([(view, 1.0) for view in curves.values()], 5.0), (frequency, 4.6)]
+    if only is not None:
+        columns = [([(view, 1.0) for view in _views_titled(only, columns)], 1.0)]
     columns = [(views, share) for views, share in columns if views]
     return rrb.Blueprint(
         rrb.Horizontal(
@@ -56,6 +69,19 @@ def layout(table: ChannelTable, geometry: Geometry, *, live: bool) -> rrb.Bluepr
         auto_layout=False,
         auto_views=False,
     )
+
+
+def _views_titled(
+    text: str, columns: list[tuple[list[tuple[rrb.View | rrb.Container, float]], float]]
+) -> list[rrb.View]:
+    """Return the views whose title contains a text."""
+    rows = [row for views, _ in columns for row, _ in views]
+    views = [view for row in rows for view in (row.contents if isinstance(row, rrb.Container) else [row])]
+    titles = [str(view.name) for view in views]
+    found = [view for view, title in zip(views, titles, strict=True) if text.lower() in title.lower()]
+    if not found:
+        raise InputError("--only", f"part of a title: {'; '.join(titles)}", text)
+    return found
 
 
 def _spectrum_view() -> rrb.BarChartView:

@@ -257,14 +257,14 @@ def _end_of(timeline: str, state: ViewerState) -> int:
     return max((line.end or 0 for line in lines), default=0)
 
 
-def picture_of(path: Path, *, tell: Callable[[str], None]) -> Window:
-    """A viewer for a picture; `tell` is told in words if something takes long.
+def picture_of(path: Path, *, tell: Callable[[str], None], size: tuple[int, int]) -> Window:
+    """Start a viewer that draws a picture of a size [px]; `tell` receives a text if something takes long.
 
     Raises:
         InputError: This machine cannot draw.
     """
     try:
-        return Window("headless", tell=tell)
+        return Window("headless", tell=tell, size=size)
     except WindowError as error:
         must = "used where a Vulkan driver is installed (Debian: libvulkan1 mesa-vulkan-drivers)"
         raise InputError("--screenshot", must, Words(f"{path}; {error}")) from None

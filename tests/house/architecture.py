@@ -1,7 +1,7 @@
-"""Draws who imports whom, for the README: `python -m tests.house.architecture`.
+"""Picture of the packages and their imports for the README: `python -m tests.house.architecture`.
 
-Boxes are rooms and rows are floors, counted on the imports (`tests.house.layout`): a box may import what stands in rows
-below it. Arrows between packages are those of the import graph.
+Boxes are modules or packages, rows are floors computed from the imports (`tests.house.layout`): a box may import the
+boxes in lower rows. Arrows between packages are imports.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ OPENED = ("replays.recordings", "replays.studies")
 """Packages whose inside is drawn as well."""
 COMMANDS = "rig.cli"
 TITLES = {
-    COMMANDS: "the commands of `rig`: the only place that knows all others",
-    "replays": "two products over one kind of report",
-    "recorder": "writes, reads and shows recordings",
-    "drivers": "what a user of the instruments writes",
-    "rig": "the simulator: numbers at the bottom, wires at the top",
-    "replays.recordings": "made of recordings",
-    "replays.studies": "of methods; no recording",
+    COMMANDS: "the commands; the only package that imports all others",
+    "replays": "analysis of recordings, studies of methods",
+    "recorder": "writes, reads and displays recordings",
+    "drivers": "clients, instruments, CAN bus",
+    "rig": "the simulator",
+    "replays.recordings": "analysis of recordings",
+    "replays.studies": "studies of methods, without recordings",
 }
 FILL = {"rig": "#dfe9f5", "drivers": "#e3f1e1", "recorder": "#fbeedb", "replays": "#eee4f3"}
 STROKE = {"rig": "#3d6a9e", "drivers": "#4a8a44", "recorder": "#b9781f", "replays": "#7d559c"}

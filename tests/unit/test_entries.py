@@ -116,10 +116,10 @@ def test_a_kind_of_fault_is_in_the_union_and_on_the_page() -> None:
                for each in classes - set(get_args(faults.AnyKind))]  # fmt: skip
     missing += [f"kind of fault {each.name()}: {each.__module__} has two classes of that name"
                 for each in classes if faults.KINDS.get(each.name(), each) is not each]  # fmt: skip
-    listed = page("hardware.md").partition("## Faults on command")[2].partition("```")[0].replace("\n", " ")
-    missing += [f"kind of fault {name}: docs/hardware.md, Faults on command, must list it under {kind.stage}"
+    listed = dict(re.findall(r"^\| ([a-z]+) \| (.*) \|$", page("faults.md"), re.MULTILINE))
+    missing += [f"kind of fault {name}: docs/faults.md, Kinds of faults, must list it under {kind.stage}"
                 for name, kind in faults.KINDS.items()
-                if name not in listed.partition(f"{kind.stage} (")[2].partition(")")[0].split(", ")]  # fmt: skip
+                if name not in listed.get(kind.stage, "").split(", ")]  # fmt: skip
     injected = {kind for each in DEFECTS.values() for kind in each.faults}
     missing += [f"kind of fault {name}: `faults` of a row in {DEFECT_TABLE} must name it, and which number is its size"
                 for name in faults.KINDS if name not in injected]  # fmt: skip
@@ -220,9 +220,9 @@ def test_a_quantity_of_a_scorecard_has_an_entry_a_row_and_is_on_the_page() -> No
     missing = [f"quantity {name}: no module of replays/score adds a row of it to the {path} scorecard"
                for path, quantities in QUANTITIES.items() for name in quantities if name not in texts]  # fmt: skip
     for path, quantities in QUANTITIES.items():
-        listed = page("score.md").partition(f"\n- {path}: ")[2].partition("\n-")[0].partition("\n\n")[0]
+        listed = page("score-reference.md").partition(f"\n- {path}: ")[2].partition("\n-")[0].partition("\n\n")[0]
         names = listed.replace("\n ", "").split(", ")
-        missing += [f"quantity {name}: docs/score.md must list it under {path}"
+        missing += [f"quantity {name}: docs/score-reference.md must list it under {path}"
                     for name in quantities if name not in names]  # fmt: skip
     found = 0
     for path, tree in trees.items():

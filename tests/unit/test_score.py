@@ -386,7 +386,7 @@ def test_an_outcome_is_a_pass_only_without_a_failing_quantity_and_without_a_doub
 
 
 def test_every_quantity_stands_in_the_documentation() -> None:
-    text = " ".join((ROOT / "docs/score.md").read_text("utf-8").split())
+    text = " ".join((ROOT / "docs/score-reference.md").read_text("utf-8").split())
     for path, known in QUANTITIES.items():
         assert f"- {path}: {', '.join(known)} " in text
 

@@ -37,6 +37,9 @@ def view(
     at_s: Annotated[
         float | None, typer.Option(help="Time of the picture in s; default: last contact, or the end")
     ] = None,
+    only: Annotated[
+        str | None, typer.Option(metavar="TITLE", help="Show only views with this text in their title.")
+    ] = None,
     force: Force = False,
 ) -> None:
     """View a recording, or the running rig, in rerun.
@@ -50,9 +53,9 @@ def view(
     try:
         with _interruptible():
             if live:
-                _view_live(connection, web=web, save=save)
+                _view_live(connection, web=web, save=save, only=only)
             elif files:
-                _view_file(files, web=web, save=save, screenshot=screenshot, at_s=at_s)
+                _view_file(files, web=web, save=save, screenshot=screenshot, at_s=at_s, only=only)
     except WindowError as error:
         raise RefusedError(str(error)) from None
 
@@ -81,7 +84,9 @@ def _check(
             check_new_file(path, field=option, suffixes=(suffix,), force=force)
 
 
-def _view_file(files: list[Path], *, web: bool, save: Path | None, screenshot: Path | None, at_s: float | None) -> None:
+def _view_file(
+    files: list[Path], *, web: bool, save: Path | None, screenshot: Path | None, at_s: float | None, only: str | None
+) -> None:
     from recorder.reader import join
     from recorder.viewer import blueprint
     from recorder.viewer.canvas import Canvas, new_stream
@@ -94,14 +99,15 @@ def _view_file(files: list[Path], *, web: bool, save: Path | None, screenshot: P
     for text in not_drawn(recording.table):
         echo(f"not shown: {text}", err=True)
     stream = new_stream(name, batch_s=2.0)
-    plan = blueprint.layout(recording.table, Geometry.from_parameters(recording.parameters), live=False)
+    plan = blueprint.layout(recording.table, Geometry.from_parameters(recording.parameters), live=False, only=only)
     if save is not None:
         with _saved(stream, save, plan):
             painted = paint(recording, Canvas(stream))
         size = save.stat().st_size / 1e6
         echo(f"{save}: {size:.1f} MB, {painted.points} points of curves, {painted.end_s:.3f} s")
         return
-    with _window_of_file(screenshot, web=web) as shown:
+    size = (1920, 1080) if only is None else (1100, 620)
+    with _window_of_file(screenshot, web=web, size=size) as shown:
         _connect(stream, shown, plan)
         try:
             painted = paint(recording, Canvas(stream))
@@ -119,14 +125,14 @@ def _view_file(files: list[Path], *, web: bool, save: Path | None, screenshot: P
             _wait_for_the_end(shown)
 
 
-def _view_live(connection: Connection, *, web: bool, save: Path | None) -> None:
+def _view_live(connection: Connection, *, web: bool, save: Path | None, only: str | None) -> None:
     from recorder.viewer import blueprint, live, window
     from recorder.viewer.canvas import Canvas, new_stream
 
     with connection.client() as client:
         described = live.ask(client)
         stream = new_stream(f"rig at {connection.connect}")
-        plan = blueprint.layout(described.table, described.geometry, live=True)
+        plan = blueprint.layout(described.table, described.geometry, live=True, only=only)
         if save is not None:
             view = live.LiveView(client, Canvas(stream), described)
             with _saved(stream, save, plan, until_interrupted=True):
@@ -159,12 +165,12 @@ def _view_live(connection: Connection, *, web: bool, save: Path | None) -> None:
                     raise typer.Exit(1)
 
 
-def _window_of_file(screenshot: Path | None, *, web: bool) -> Window:
+def _window_of_file(screenshot: Path | None, *, web: bool, size: tuple[int, int]) -> Window:
     from recorder.viewer import window
 
     if screenshot is None:
         return window.Window(_kind(web=web))
-    return window.picture_of(screenshot, tell=lambda text: echo(text, err=True))
+    return window.picture_of(screenshot, tell=lambda text: echo(text, err=True), size=size)
 
 
 def _kind(*, web: bool) -> Kind:
