@@ -10,76 +10,18 @@ import io
 import re
 import sys
 import tokenize
+import tomllib
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 ROOT = Path(__file__).parents[2]
 
-BASIC = {
-    r"\b(is|are|was|were|be|been|as|what) told\b|\btells? (of|what|how|whether|which|when|where|that|it)\b": "report, give",
-    r"\b(which|that|who|what) (is|are) none\b|\bnone of (which|what|them) (is|are)\b": "say what it is not",
-    r"\bso (many|much|far|long|often|soon|late)\b(?! (as|that)\b)": "name the number",
-    r"\bgo(es|ne)? (on|with|over to|through to|out of)\b": "continue, run, belong to",
-    r"\banew\b|\bonce more\b|\bforetold\b|\balike\b|\bbeside (it|that|them|the|which)\b": "again, predicted, equal, next to",
-    r"\b(comes?|came) (of|to) (it|that|this|what|nothing)\b|\bcome of\b|\bmade of (it|them|what)\b": "results from, consists of",
-    r"\bbehind (the|it|a|its|that) (\w+ )?(s|ms|end|time|pulse|impact|hammer|command|row|sample)\b": "after",
-    r"\bwho(ever)? (asks|hangs|dies|is asked|talks|knows|reads|writes)\b|\bhears?\b": "a device that, a client that; receives",
-    r"\bput out\b|\bheld (against|to)\b|\btaken for\b|\bpassed over\b|\bat the least\b": "removed, compared with, assumed, skipped",
-    r"^(What|Where|Whether|How|Of|As|By(?! default)|That|Those|Who) [a-z].{0,120}[.:]$": "begin with a verb or a noun",
-    r"\bblows?\b|\bof which (one|none|the)\b|\ball but\b|\bnone but\b|\bnot any\b": "impact; except",
-}
-"""Turns of phrase of the first review, each with its cure."""
-
-COLLECTED = {
-    r"\b(told|telling|tells?)\b": "reported, given, known; reports, distinguishes",
-    r"\b(is|are|was|were|be|been) none\b|\b(where|if|as) none (is|are|was)\b": "'is not a valid X', 'if there is no X'",
-    r"\b(hold|holds|holding|held)\b.{0,40}\bagainst\b|\bone another\b": "compared with; each other",
-    r"\b(of|by|for|from|with|than|at|after|before|behind) what\b(?! (a|an|the)\b)": "name the thing",
-    r"\bst(and|ands|ood|anding)\b(?! still)(?!-)": "is in, is stored in, follows",
-    r"\b(done|made) again\b|\bdo(es)? it again\b": "resimulated, repeated, regenerated",
-    r"\b(whoever|nobody|somebody|anybody|everybody|everyone)\b|\bpeople'?s?\b": "a client, a device, a program, users",
-    r"\bg[eo]ts? (on|away|along|nothing|through|hold)\b|\bgot\b": "advances, receives, obtains",
-    r"\bon (the|its|their) way\b|\bby the way\b": "in transit, during the run",
-    r"\b(has|have|had|that|which|what) (come|came)\b|\bto come\b": "received, arrived, remaining",
-    r"\bma(ke|kes|de|king)\b.{0,15}\bof\b(?! (steel|paper|one))": "derived from, consists of",
-    r"\bbut (for|that|where|what|one|with|of|in|no)\b": "except, other than",
-    r"\bbesides?\b": "in addition to, next to",
-    r"\bbehind\b": "after, following",
-    r"\bsees? (to|that)\b|\blook(s|ed|ing)? (at|into|upon)\b": "ensures, checks, reads",
-    r"\b(by|of) (itself|themselves)\b|\bof (its|their|one's|our|his) own\b|\bof (ours|yours|theirs|mine)\b": "own, separate",
-    r"\b(rows?|bytes|lines?|messages|samples|steps|instants|blocks|values|frames|points|errors|times|numbers?) an? "
-    r"(second|turn|row|minute|frame|line|block|value|step|message|channel|sample|column|group|byte|signal)\b": "per",
-    r"\b(None|0|nan|empty|nothing|False|True) where\b": "if",
-    r"(?<!there )\b(is|are|was|were|be) no (?!longer|more|less|larger|smaller|greater)\w+": "is not a X; there is no X",
-    r"\b(is|was|are|were|be) asked\b|\basked (of|for|by|to)\b|\bhand(s|ed)? on\b|\bthat is so\b|\b(went|goes|gone)\b":
-        "required, requested; passes on; continues",
-}  # fmt: skip
-"""Turns of phrase collected from 30 modules (drawn by seed 39 of the state before the rewriting), each with its cure."""
-
-VERBS = frozenset("""
-    abort accept accumulate acquire add adjust advance align allocate allow analyse append apply approximate arm assemble
-    assert assign attach average bind bound build bundle calculate call cancel capture check choose classify clear clip
-    close collect combine compare compile complete compose compute configure confirm connect consume convert copy correct
-    count create cut decide declare decode decorate deduce define delay delete deliver derive describe detach detect
-    determine differentiate disable discard disconnect dispatch display divide draw drop dump emit enable encode end
-    enforce ensure enter enumerate erase estimate evaluate exclude execute exit expand expect export extend extract
-    factorise fail fetch fill filter find finish fire fit flatten flush follow forget form format forward freeze generate
-    get give group guard guess handle hash hide hold identify ignore import include increase index infer initialise inject
-    insert inspect install integrate interpolate interpret intersect invert invoke issue iterate join judge keep label
-    launch leave limit linearise link list listen load locate lock log look loop lower make map mark match measure merge
-    minimise mount move multiply name narrow negotiate normalise note notify number observe offer open order overlay
-    overwrite pack pad parse pass pause perform pick place play plot poll pop predict prepare print process produce project
-    propagate protect prune publish pull push put query queue quote raise rank read rebuild receive recognise recompute
-    record recover reduce refine refuse register reject relate release reload remember remove rename render renumber
-    reorder repeat replace replay report request require resample reserve reset resize resolve respond restart restore
-    restrict resume return reverse rewrite rotate round route run sample save scale scan schedule score search select send
-    separate serve set settle shift show shut simulate skip sleep slice smooth solve sort specify split start step stop
-    store stream strip submit subscribe subtract sum summarise suppress swap switch synchronise take terminate test time
-    tokenise toggle track transform translate transmit trigger trim try turn uncompress unite unpack unregister update use
-    validate verify visit wait walk warn watch weigh widen withdraw wrap write yield zero zoom
-""".split())  # fmt: skip
-"""First words of the docstring of a function: add a verb that is missing."""
+_RULES = tomllib.loads((Path(__file__).parent / "wording.toml").read_text(encoding="utf-8"))
+BASIC: dict[str, str] = {pattern: cure for cure, pattern in _RULES["basic"].items()}
+COLLECTED: dict[str, str] = {pattern: cure for cure, pattern in _RULES["collected"].items()}
+"""Patterns, each with its cure."""
+VERBS = frozenset(_RULES["verbs"].split())
 
 VAGUE = re.compile(
     r"^_?(ABOUT|ABOVE|ABSURD|AFTER|AHEAD|ALIKE|ALONE|ANOTHER|ANYTHING|APART|AROUND|ASKED|BAD|BEFORE|BEHIND|BESIDE|BETWEEN"
@@ -117,8 +59,13 @@ def prose_of(path: Path) -> Iterator[tuple[int, str]]:
                 yield number, line.strip()
         return
     for node in ast.walk(ast.parse(text)):
-        for each in getattr(node, "body", None) or () if not isinstance(node, ast.Lambda | ast.IfExp) else ():
-            if isinstance(each, ast.Expr) and isinstance(each.value, ast.Constant) and isinstance(each.value.value, str):
+        body = getattr(node, "body", None)
+        for each in body if isinstance(body, list) else ():
+            if (
+                isinstance(each, ast.Expr)
+                and isinstance(each.value, ast.Constant)
+                and isinstance(each.value.value, str)
+            ):
                 for offset, line in enumerate(each.value.value.splitlines()):
                     if line.strip():
                         yield each.lineno + offset, line.strip()
@@ -148,10 +95,11 @@ def check_forms(paths: Iterable[Path]) -> list[Finding]:
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
                 decorators = " ".join(map(ast.unparse, node.decorator_list))
                 text = ast.get_docstring(node)
-                if text and not re.search(r"property|setter|fixture", decorators) and not node.name.startswith("test_"):
-                    if text.split()[0].strip("`.,:;").lower() not in VERBS:
-                        cure = "begin with a verb in the imperative"
-                        findings.append(Finding(path, node.body[0].lineno, text.splitlines()[0], cure))
+                if not text or re.search(r"property|setter|fixture", decorators) or node.name.startswith("test_"):
+                    continue
+                if text.split()[0].strip("`.,:;").lower() not in VERBS:
+                    cure = "begin with a verb in the imperative"
+                    findings.append(Finding(path, node.body[0].lineno, text.splitlines()[0], cure))
             elif isinstance(node, ast.Assign | ast.AnnAssign):
                 targets = node.targets if isinstance(node, ast.Assign) else [node.target]
                 for target in targets:
