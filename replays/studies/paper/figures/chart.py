@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from textwrap import shorten
+from textwrap import fill
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -74,7 +74,8 @@ def draw_conditions(
 def draw_verdicts(lines: list[Line]) -> Figure:
     """Draw the share and the position of our values in the stated range, for every statement with a range."""
     judged = [line for line in lines if math.isfinite(line.statement.low)]
-    figure = new_figure(0.27 * len(judged) + 1.9, "What the paper states, and how ours spreads")
+    labels = [_label(line) for line in judged]
+    figure = new_figure(0.3 * len(judged) + 1.9, "Statements of the paper, and the spread of our results")
     inside, where = figure.subplots(1, 2, sharey=True, width_ratios=(0.7, 1.0))
     where.axvspan(0.0, 1.0, color="0.92", lw=0)
     looks = {"as-printed": (0.2, "s", "white"), "corrected": (-0.2, "o", None)}
@@ -96,20 +97,20 @@ def draw_verdicts(lines: list[Line]) -> Figure:
         where.plot([], [], marker, color=BLACK, mfc=fill or BLACK, ms=7, mew=1.6, ls="none", label=name)
     for verdict, colour in _VERDICTS.items():
         where.plot([], [], color=colour, lw=5, label=verdict)
-    inside.set_yticks(range(len(judged)), [_label(line) for line in judged])
-    inside.set(xlim=(-3, 103), ylim=(len(judged) - 0.4, -0.6), xlabel="inside what the paper states [%]")
+    inside.set_yticks(range(len(judged)), labels, linespacing=0.9)
+    inside.set(xlim=(-3, 103), ylim=(len(judged) - 0.4, -0.6), xlabel="within the stated range [%]")
     where.set(
         xlim=(-1.1 * _EDGE_DISTANCE, 1.0 + 1.1 * _EDGE_DISTANCE),
-        xlabel="5 to 95 % of ours between the paper's\nleast (0) and largest (1) [1]",
+        xlabel="our 5 to 95 % between the paper's\nsmallest (0) and largest (1) value [1]",
     )
     legend_below(figure, columns=5)
     return figure
 
 
 def _label(line: Line) -> str:
-    """Return the place and a short form of a statement."""
+    """Return the place and the text of a statement, in lines of at most 62 characters."""
     place = line.statement.place.replace("sections ", "§").replace("section ", "§").removesuffix(", measured")
-    return shorten(f"{place}: {line.statement.says}".replace("_", ""), 66, placeholder=" …")
+    return fill(f"{place}: {line.statement.says}".replace("_", ""), 62)
 
 
 @house_style()
