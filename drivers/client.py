@@ -34,7 +34,7 @@ from drivers.sources.stream import RigStream
 from drivers.sources.turns import PULSE_LEVEL, Turn, find_pulses, measure_turn
 from rig.base import wire
 from rig.base.errors import InputError, RefusedError, UnknownNameError, Words
-from rig.serve.stream_check import BlockEnd, Catalogue, block_end_in, event_in
+from rig.serve.stream_check import BlockEnd, Catalogue, block_end_in
 from rig.serve.transport import DEFAULT_ENDPOINT, Client
 from rig.serve.waiting import Deadline
 
@@ -133,9 +133,8 @@ class Rig(Console):
         """State as a device under test: whether the rig waits for it, and the reason if the rig removed it."""
         self._events: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
         self._other_events: list[dict[str, Any]] = []
-        client.subscribe(wire.EVENTS, self._on_event)
+        stream = RigStream(client, on_event=self._on_event)
         self._truth: dict[str, RowReader] = {}
-        stream = RigStream(client)
         for table in truth:
             known = document.get("truth", {})
             if table not in known:
@@ -143,7 +142,7 @@ class Rig(Console):
             self._truth[table] = _read_truth(stream, table, known[table]["columns"])
         self._daq: Daq | None = None
         if channels:
-            source = source or RigSource(client)
+            source = source or RigSource(client, stream=stream)
             try:
                 self._daq = Daq(source, channels=channels, rate_hz=rate_hz, buffer_s=buffer_s)
             except BaseException:
@@ -471,15 +470,13 @@ class Rig(Console):
                 return event
             self._other_events.append(event)
 
-    def _on_event(self, _: str, payload: bytes) -> None:
-        with contextlib.suppress(ValueError):
-            event = event_in(payload)
-            self._events.put(event)
-            if event["event"] == "device" and event.get("device") == self._name:
-                lost = event.get("state") == "lost"
-                self._removal = str(event.get("reason", "not done in time, or with another block")) if lost else ""
-            if self._block_ends is not None and (self._removal or event["event"] == "end"):
-                self._block_ends.put(None)
+    def _on_event(self, event: dict[str, Any]) -> None:
+        self._events.put(event)
+        if event["event"] == "device" and event.get("device") == self._name:
+            lost = event.get("state") == "lost"
+            self._removal = str(event.get("reason", "not done in time, or with another block")) if lost else ""
+        if self._block_ends is not None and (self._removal or event["event"] == "end"):
+            self._block_ends.put(None)
 
     # ---- truth tables ----
 

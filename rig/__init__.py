@@ -61,10 +61,12 @@ if not TYPE_CHECKING:  # a type checker uses the imports above
         from importlib import import_module, metadata
 
         if name == "connect":
+            from pathlib import Path
+
             from rig.base.import_paths import PLACE
 
             client = import_module("drivers.client")
-            if not str(client.__file__).startswith(PLACE):
+            if Path(str(client.__file__)).resolve().parent != Path(PLACE, "drivers").resolve():
                 raise ImportError(f"drivers.client must be the rig's own; received {client.__file__}; rename it")
             return client.connect
         if name == "__version__":

@@ -23,8 +23,14 @@ import numba
 import pytest
 
 import rig.physics.kernels  # noqa: F401 - names the cache of compiled code
+from rig.channels import table
 
 ROOT = Path(__file__).parents[1]
+SHIPPED_TABLE = "RIG_TESTS_SHIPPED_TABLE"
+"""Environment: if set, tests run with the rig's own channel table; tests.unit.test_shipped_table sets it."""
+if SHIPPED_TABLE not in os.environ:
+    assert not table.default_table.cache_info().currsize
+    table.TABLE = ROOT / "tests/channels.toml"
 COMPILING = "tests/parity/test_compiling.py"
 TOOLS = "tests/house/test_tools.py"
 WITHOUT_ENGINE = (

@@ -33,7 +33,7 @@ def fault_signals(channels: ChannelTable) -> tuple[Signal, ...]:
         ),
         Signal(
             "fault", 16, 8, label=f"Which; its main number is, of {main_numbers}", selected_by=_FAULT,
-            choices=dict(enumerate(KINDS, start=1)),
+            choices=dict(sorted((kind.number, name) for name, kind in KINDS.items())),
         ),
         Signal(
             "target", 24, 8, label="Group or channel", selected_by=_FAULT, choices=dict(enumerate(targets, start=1))
@@ -57,7 +57,7 @@ def fault_raw(message: CanMessage, channel: str, kind: str, number: float | str 
     if kind not in KINDS:
         raise UnknownNameError("fault.kind", "one of the kinds", kind, KINDS)
     targets = _targets(message)
-    raw = {"kind": int(FaultKind.FAULT), "fault": [*KINDS].index(kind) + 1, "target": _find_target(channel, targets)}
+    raw = {"kind": int(FaultKind.FAULT), "fault": KINDS[kind].number, "target": _find_target(channel, targets)}
     if number is None:
         return raw
     main = KINDS[kind].main()
@@ -75,10 +75,10 @@ def fault_request(message: CanMessage, raw: dict[str, int]) -> dict[str, Any] | 
     """Convert raw values to the rig's request; None if the fault or target does not exist."""
     if raw["kind"] == FaultKind.CLEAR:
         return {"id": raw["id"] or "all"}
-    targets, kinds = _targets(message), dict(enumerate(KINDS, start=1))
-    if raw["fault"] not in kinds or raw["target"] not in targets:
+    targets, value = _targets(message), raw["number"]
+    kind = next((each for each in KINDS.values() if each.number == raw["fault"]), None)
+    if kind is None or raw["target"] not in targets:
         return None
-    kind, value = KINDS[kinds[raw["fault"]]], raw["number"]
     request: dict[str, Any] = {"channel": targets[raw["target"]], "kind": kind.name()}
     main = kind.main()
     if not main:

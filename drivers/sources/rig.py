@@ -24,10 +24,13 @@ class RigSource:
     Args:
         client: Transport to the rig.
         close: Called when the source is closed, for example to close the client.
+        stream: Stream of that rig; a new one unless given.
     """
 
-    def __init__(self, client: Client, *, close: Callable[[], None] | None = None) -> None:
-        self._stream = RigStream(client)
+    def __init__(
+        self, client: Client, *, close: Callable[[], None] | None = None, stream: RigStream | None = None
+    ) -> None:
+        self._stream = stream or RigStream(client)
         self._client = client
         self._close = close
         self._leave: list[Callable[[], None]] = []

@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 from rig.base import wire
 from rig.base.errors import InputError
@@ -65,10 +66,12 @@ class RigStream:
 
     Args:
         client: Transport to the rig; its owner closes it.
+        on_event: Called with each event from now on, on a thread of the transport.
     """
 
-    def __init__(self, client: Client) -> None:
+    def __init__(self, client: Client, *, on_event: Callable[[dict[str, Any]], None] | None = None) -> None:
         self._client = client
+        self._event_listener = on_event
         self._lock = threading.Lock()
         self._order = threading.RLock()
         """Held while rows are passed on: blocks and events arrive on separate threads, and an end must not overtake the
@@ -86,6 +89,8 @@ class RigStream:
         """Payloads that do not match their key and the rig's channel table."""
         self.missed = 0
         """Messages that the transport could not recover; the row numbers show the gaps too."""
+        if on_event is not None:
+            client.subscribe(wire.EVENTS, self._on_event, on_miss=self._on_miss)
 
     def table(self) -> ChannelTable:
         """Return the channel table of the rig.
@@ -135,7 +140,8 @@ class RigStream:
             self._intake = self._intake or intake
         # Not under the lock: a transport may deliver at once.
         if watch:
-            self._client.subscribe(wire.EVENTS, self._on_event, on_miss=self._on_miss)
+            if self._event_listener is None:
+                self._client.subscribe(wire.EVENTS, self._on_event, on_miss=self._on_miss)
             self._client.watch(wire.ALIVE, self._on_alive)
         if new:
             self._client.subscribe(key, self._on_block, on_miss=self._on_miss)
@@ -193,6 +199,8 @@ class RigStream:
         except ValueError:
             self.malformed += 1
             return
+        if self._event_listener is not None:
+            self._event_listener(event)
         if event["event"] != "end":
             return
         rows, reason = event.get("rows"), f"the rig's run has ended: {event.get('reason') or 'without a reason'}"

@@ -20,7 +20,7 @@ from typing import Annotated, Any, BinaryIO, TypeVar, get_args
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
-from rig.base.errors import InputError, Words, such_as
+from rig.base.errors import InputError, RefusedError, Words, such_as
 from rig.base.text import nearest, printable
 
 DOCUMENT_BYTES = 16 << 20
@@ -352,13 +352,24 @@ def _models(annotation: Any) -> list[type[BaseModel]]:
     return [inner for part in get_args(annotation) for inner in _models(part)]
 
 
+def _join(place: str, field: str) -> str:
+    """Return the path of a field of a place; the field's own path may begin with the end of the place."""
+    parts = place.split(".") if place else []
+    for count in range(len(parts), 0, -1):
+        if f"{field}.".startswith(f"{'.'.join(parts[-count:])}."):
+            return ".".join([*parts[:-count], field])
+    return ".".join([*parts, field])
+
+
 def input_error(error: ValidationError, where: str, model: type[BaseModel]) -> InputError:
     """Return the first error of a validation in the one-line form for users."""
     first = error.errors()[0]
     cause = first.get("ctx", {}).get("error")
-    if isinstance(cause, InputError):  # a rule over several fields names them itself
-        return cause
     field = ".".join(part for part in (where, *_place(first["loc"], first["type"])) if part)
+    if isinstance(cause, InputError):  # a rule over several fields names its own
+        named = _join(field, cause.field)
+        whole = named == cause.field or isinstance(cause, RefusedError)
+        return cause if whole else InputError(named, cause.must, cause.received)
     message = first["msg"].removeprefix("Value error, ").removeprefix("Input should be ").partition(", unable")[0]
     message = re.sub(r"^\w+ should have ", "a value of ", message).replace("a valid tuple", "a list")
     message = message.partition(" after validation, not ")[0]

@@ -311,9 +311,9 @@ def load_scene(scene: Scene | str | Path, overrides: dict[str, Any] | None = Non
     for table, key in ((data, "channels"), (data.get("generator"), "file")):
         if isinstance(table, dict) and isinstance(table.get(key), str):
             table[key] = path.parent / table[key]  # relative to the scene file
-    for key, value in _keyed(overrides or {}):
-        _override(data, key, read_value(value, field=key) if isinstance(value, str) else value)
     try:
+        for key, value in _keyed(overrides or {}):
+            _override(data, key, read_value(value, field=key) if isinstance(value, str) else value)
         return _checked(data, list(overrides or {}))
     except InputError as error:
         if path.parent == SCENES or error.field in (overrides or {}):

@@ -136,7 +136,10 @@ def test_cantools_decodes_every_command() -> None:
         assert decoded["counter"] == 9
 
 
-def test_cantools_decode_reads_a_log(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cantools_decode_reads_a_log(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    (tmp_path / "rig.dbc").write_text(dbc.text(), encoding="utf-8")
     probes = TABLE.by_name["Probes"]
     assert probes.samples is not None
     data = probes.samples.pack(np.array([10]), np.full((5, 4), 0x1000, np.int32), 64).tobytes()
@@ -146,7 +149,7 @@ def test_cantools_decode_reads_a_log(capsys: pytest.CaptureFixture[str], monkeyp
         f"(1700000000.000100) can0 {0x020:03X}#{hammer.hex().upper()}",
     ]
     monkeypatch.setattr(sys, "stdin", io.StringIO("\n".join(lines) + "\n"))
-    monkeypatch.setattr(sys, "argv", ["cantools", "decode", str(dbc.COPY)])
+    monkeypatch.setattr(sys, "argv", ["cantools", "decode", str(tmp_path / "rig.dbc")])
     runpy.run_module("cantools", run_name="__main__")
     output = capsys.readouterr().out
     assert "Probes(" in output

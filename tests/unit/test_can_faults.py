@@ -64,7 +64,7 @@ def test_clear_and_what_is_none() -> None:
         changed = data[:place] + bytes([value]) + data[place + 1 : 7]
         return parse_command(identifier, changed + bytes([checksum(identifier, changed)]), 0)
 
-    assert change(2, len(KINDS) + 1) is Result.OUT_OF_RANGE
+    assert change(2, max(kind.number for kind in KINDS.values()) + 1) is Result.OUT_OF_RANGE
     assert change(3, 0) is Result.OUT_OF_RANGE
     assert change(4, 1) is Result.OUT_OF_RANGE  # freeze has no number
     assert change(0, CommandKind.HAMMER) is Result.BAD_KIND

@@ -15,8 +15,10 @@ from rig.base.errors import InputError
 from rig.channels.faults import KINDS
 from rig.channels.faults.kind import Draws
 from rig.cli.commands import fault as command
+from rig.run.commands.table import check_command
 from rig.run.scenes import load_scene, parse_scene, scene_document
 from rig.run.simulation import Simulation
+from tests.commands import said
 from tests.fault_cases import EXAMPLES
 from tests.physics.test_identification import recorded
 
@@ -66,6 +68,23 @@ def test_every_number_of_a_kind_is_an_option() -> None:
     numbers = {field for kind in KINDS.values() for field in kind.model_fields if field != "kind"}
     own = {"channel", "kind", "for_s", "clear", "listed", "connection", "form"}
     assert set(inspect.signature(command.fault).parameters) == numbers | own
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_number_that_a_kind_does_not_take_is_refused_with_those_that_it_takes(
+    kind: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """By a rig, and by the command without a rig; the line names the number, or option, and the kind."""
+    takes = [name for name in KINDS[kind].model_fields if name != "kind"]
+    words = f"must be left out: {kind} takes {', '.join(takes) or 'no numbers'}; instead received "
+    others = {field for each in KINDS.values() for field in each.model_fields} - {*takes, "kind"}
+    for name in others:
+        with pytest.raises(InputError) as caught:
+            check_command("fault", {"channel": "disk_x", "kind": kind, name: 1})
+        assert str(caught.value) == f"fault.{kind}.{name} {words}1"
+    option = f"--{min(others).replace('_', '-')}"
+    status, _, line = said(capsys, "fault", "disk_x", kind, option, "1")
+    assert (status, line.startswith(f"rig: {option} of {kind} {words}")) == (2, True), line
 
 
 @pytest.mark.parametrize("kind", EXAMPLES)
@@ -235,7 +254,7 @@ def test_faults_of_a_scene_are_recorded_and_done_again_bit_by_bit(tmp_path: Any)
     ({"channel": "disk_x", "kind": "gain"}, "factor must be given"),
     ({"channel": "disk_x", "kind": "gain", "factor": 1.0}, "factor must be other than 1"),
     ({"channel": "disk_x", "kind": "gain", "factor": "2"}, "factor must be"),
-    ({"channel": "disk_x", "kind": "gain", "factor": 2.0, "size": 1}, "size must be a known field"),
+    ({"channel": "disk_x", "kind": "gain", "factor": 2.0, "size": 1}, "left out: gain takes factor, ramp_s"),
     ({"channel": "disk_x", "kind": "offset", "value": math.inf}, "value must be"),
     ({"channel": "disk_x", "kind": "swap", "other": "disk_x"}, "fault.swap must be with another channel"),
     ({"channel": "probes", "kind": "swap", "other": "P_N"}, "fault.channel must be one channel for swap"),

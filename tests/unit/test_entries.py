@@ -26,6 +26,8 @@ from rig.channels import faults
 from rig.channels.faults.defects import DEFECTS, alternatives, defects_in
 from rig.cli import app
 from rig.cli.commands import requests
+from rig.cli.commands.export import EXPORTED
+from rig.cli.commands.import_ import IMPORTED
 from rig.physics.contacts import DAMPING, STIFFNESS
 from rig.physics.engines import ENGINES
 from rig.physics.parameters import load_parameters
@@ -116,6 +118,17 @@ def test_a_kind_of_fault_is_in_the_union_and_on_the_page() -> None:
                for each in classes - set(get_args(faults.AnyKind))]  # fmt: skip
     missing += [f"kind of fault {each.name()}: {each.__module__} has two classes of that name"
                 for each in classes if faults.KINDS.get(each.name(), each) is not each]  # fmt: skip
+    numbers = [kind.number for kind in faults.KINDS.values()]
+    taken = dict(enumerate(fault_cases.NUMBERED, start=1))
+    free = next(number for number in range(len(taken) + 1, 256) if number not in numbers)
+    for name, kind in faults.KINDS.items():
+        holder = taken.get(kind.number, name if numbers.count(kind.number) == 1 else "another kind")
+        if holder != name or not 1 <= kind.number <= 255:
+            was = next((number for number, each in taken.items() if each == name), None)
+            missing.append(
+                f"kind of fault {name}: {kind.__module__}: number={kind.number or 'none'} of class "
+                f"{kind.__name__} must be {was or f'one that no kind has or had; {free} is free'}"
+            )
     listed = dict(re.findall(r"^\| ([a-z]+) \| (.*) \|$", page("faults.md"), re.MULTILINE))
     missing += [f"kind of fault {name}: docs/faults.md, Kinds of faults, must list it under {kind.stage}"
                 for name, kind in faults.KINDS.items()
@@ -197,6 +210,12 @@ def test_a_file_format_has_a_row_and_a_reader() -> None:
             missing.append(f"{where} needs a class {form.writer} derived from FormatWriter")
         elif form.writer and writer.write is FormatWriter.write:
             missing.append(f"{where}: {form.writer} needs write")
+        for place, said, endings in (
+            ("IMPORTED in rig/cli/commands/import_.py", IMPORTED, form.suffixes),
+            ("EXPORTED in rig/cli/commands/export.py", EXPORTED, form.suffixes[:1] if form.writer else ()),
+        ):
+            lacking = [each for each in endings if each not in re.findall(r"\.\w+", said)]
+            missing += [f"file format {name}: {place} must name {each}" for each in lacking]
     used = {form.module for form in FORMATS.values()}
     for path in (ROOT / readers).glob("*.py"):
         if f"{readers}/{path.stem}".replace("/", ".") not in used and "\ndef look_into(" in path.read_text():

@@ -6,8 +6,12 @@ import subprocess
 import sys
 from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 
 import pytest
+
+import rig
+from rig.base import import_paths
 
 
 @pytest.mark.filterwarnings("ignore:(rig.(kernels|sensors)|drivers.force) is")
@@ -70,11 +74,22 @@ def test_a_script_with_a_name_of_ours_runs_once(package: str, tmp_path: Path) ->
     assert imported(tmp_path, code, script=f"{package}.py") == "once\nTrue"
 
 
+def test_our_client_is_known_by_its_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "link").symlink_to(import_paths.PLACE)
+    monkeypatch.setattr(import_paths, "PLACE", str(tmp_path / "link"))
+    assert rig.connect.__module__ == "drivers.client"
+    other = ModuleType("drivers.client")
+    other.__file__ = f"{tmp_path}/link-of-mine/drivers/client.py"
+    monkeypatch.setitem(sys.modules, "drivers.client", other)
+    with pytest.raises(ImportError, match=r"^drivers\.client must be the rig's own; received .*/link-of-mine/"):
+        _ = rig.connect
+
+
 def test_a_module_of_a_user_s_own_in_the_place_of_ours_is_named(tmp_path: Path) -> None:
     (tmp_path / "drivers").mkdir()
     (tmp_path / "drivers/__init__.py").touch()
     (tmp_path / "drivers/client.py").touch()
     told = imported(tmp_path, "import rig\nrig.connect()")
     assert told == (
-        f"ImportError: drivers.client must be the rig's own; received {tmp_path}/drivers/client.py: rename it"
+        f"ImportError: drivers.client must be the rig's own; received {tmp_path}/drivers/client.py; rename it"
     )

@@ -56,6 +56,22 @@ CASES = [
     scene("unknown field", "bogus = 1", "bogus", "a known field, such as "),
     scene("unknown field in a part", "[drive]\nspeed = 1", "scene.toml: drive.speed", "such as speed_hz (3 in all)"),
     scene("part is no table", "drive = 3", "drive", "a valid dictionary"),
+    scene("true for a number", "duration_s = true", "scene.toml: duration_s", "something else than true or false"),
+    scene("true in a part", "[drive]\nspeed_hz = true", "scene.toml: drive.speed_hz", "something else than true"),
+    scene("true in a list", "[[commands]]\nat_s = true\ncommand = 'hammer'", "scene.toml: commands.0.at_s", "true or"),
+    scene(
+        "a number that the fault does not take",
+        "[[faults]]\nat_s = 0.1\nchannel = 'disk_x'\nkind = 'stuck'\nvalue = 3",
+        "scene.toml: commands.0.fault.stuck.value",
+        "left out: stuck takes no numbers",
+    ),
+    Case(
+        "true in a law",
+        ("laws", "--law", "law.toml"),
+        "law.toml.stiffness",
+        "something else than true or false",
+        {"law.toml": "title = 'a'\nstiffness = true"},
+    ),
     scene("text for a number", 'duration_s = "long"', "duration_s", "a valid number"),
     scene("nan", "duration_s = nan", "duration_s", "a finite number"),
     scene("inf", "duration_s = inf", "duration_s", "a finite number"),
@@ -240,7 +256,7 @@ CASES = [
     Case("duration of nan", (*DROP, "--duration-s", "nan"), "--duration-s", "a number"),
     Case("duration of x", (*DROP, "--duration-s", "x"), "--duration-s", "valid"),
     Case("seed of x", (*DROP, "--seed", "x"), "--seed", "valid integer"),
-    Case("no output", ("simulate", "drop"), "--output", "given: file to write"),
+    Case("no output", ("simulate", "drop"), "--output", "given: file: .mcap"),
     Case("unknown option", (*DROP, "--bogus"), "option", "one of `rig simulate -h`"),
     Case("unknown command", ("fly",), "command", "one of `rig -h`"),
     Case("no such pace", ("run", "drop", "--pace", "warp"), "--pace", "lockstep"),
@@ -317,6 +333,10 @@ def check_line(line: str, case: Case) -> None:
     assert len(line) < 400, "one line that can be read"
 
 
+OF_TWO_FILES = ("outside the ring", *(f"set: {each}" for each in ("bad rule", "rule where none is", "out of range",
+                                                                  "nan", "inf")))  # fmt: skip
+
+
 def test_there_are_enough_of_them() -> None:
     assert len(CASES) >= 36
     assert len({case.what for case in CASES}) == len(CASES)
@@ -333,6 +353,9 @@ def test_is_refused_in_one_line(
     printed = capsys.readouterr()
     assert end.value.code == 2
     assert printed.out == ""
+    # A range stands in the set below the file's, and the ring in the set of the scene.
+    read = [name for name in case.files if name in case.arguments and case.what not in OF_TWO_FILES]
+    assert not read or any(name in printed.err for name in read), "the file is not named"
     check_line(printed.err, case)
     assert state(tmp_path) == before
 

@@ -77,7 +77,7 @@ class OfBlocks(Kind):
         raise NotImplementedError
 
 
-class Dropout(OfBlocks):
+class Dropout(OfBlocks, number=30):
     """No block is sent; the numbers of the rows go on."""
 
     kind: Literal["dropout"] = "dropout"
@@ -95,7 +95,7 @@ class _Random(OfBlocks):
         return "part", 1.0, self.block_s
 
 
-class LoseBlocks(_Random):
+class LoseBlocks(_Random, number=31):
     """Blocks with u(n) < part are not sent."""
 
     kind: Literal["lose-blocks"] = "lose-blocks"
@@ -105,7 +105,7 @@ class LoseBlocks(_Random):
         return [] if u < self.part else [message]
 
 
-class DuplicateBlocks(_Random):
+class DuplicateBlocks(_Random, number=32):
     """Blocks with u(n) < part are sent twice, one right behind the other."""
 
     kind: Literal["duplicate-blocks"] = "duplicate-blocks"
@@ -114,7 +114,7 @@ class DuplicateBlocks(_Random):
         return [message] * (2 if u < self.part else 1)
 
 
-class ReorderBlocks(_Random):
+class ReorderBlocks(_Random, number=33):
     """Blocks with u(n) < part are sent block_s later, behind those that are due by then."""
 
     kind: Literal["reorder-blocks"] = "reorder-blocks"
@@ -125,7 +125,7 @@ class ReorderBlocks(_Random):
         return [message._replace(due=later, behind=True) if u < self.part else message]
 
 
-class LateBlocks(OfBlocks):
+class LateBlocks(OfBlocks, number=34):
     """Blocks are sent delay_s later, in their order; what is still held back when it ends is sent then."""
 
     kind: Literal["late-blocks"] = "late-blocks"
@@ -135,7 +135,7 @@ class LateBlocks(OfBlocks):
         return [message._replace(due=message.due + round(1e6 * self.delay_s))]
 
 
-class StaleStamps(OfBlocks):
+class StaleStamps(OfBlocks, number=35):
     """The time of all blocks is that of the first row; their numbers go on. On CAN, Sync tells it, of one group."""
 
     kind: Literal["stale-stamps"] = "stale-stamps"
@@ -149,7 +149,7 @@ class StaleStamps(OfBlocks):
         return [message._replace(block=replace(message.block, tick=first[1]))]
 
 
-class Restart(OfBlocks):
+class Restart(OfBlocks, number=36):
     """Numbers and times of rows begin again at 0: index' = index - that of the first row, and the tick likewise."""
 
     kind: Literal["restart"] = "restart"

@@ -19,7 +19,7 @@ MOST_LATE_US = 10_000.0
 # ---- clock ----
 
 
-class Late(Kind):
+class Late(Kind, number=17):
     """A sample of time s shows what was at s - late_us: a multiplexer's skew. Nothing from before the fault is shown.
 
     Nothing can be early: what is not yet cannot be shown. Make all the others late instead.
@@ -36,7 +36,7 @@ class Late(Kind):
         return np.full(len(at.t), 1e-6 * self.late_us)
 
 
-class Clock(Kind):
+class Clock(Kind, number=18):
     """A clock that is fast: a sample of time t since it began is taken at t / (1 + ppm 1e-6), 10 ms late at most.
 
     One that is slow, with ppm below 0, begins 10 ms late, as none can be early, and is right 10 ms / (-1e-6 ppm) on.
@@ -55,7 +55,7 @@ class Clock(Kind):
         return np.clip(begun_s + at.t * (1.0 - 1.0 / (1.0 + 1e-6 * self.ppm)), 0.0, most_s)
 
 
-class Jitter(Kind):
+class Jitter(Kind, number=19):
     """Samples late by rms_us (4 + g(n)), white, g within 4: the mean of 4 rms_us is a delay, as none can be early."""
 
     stage = "clock"
@@ -69,7 +69,7 @@ class Jitter(Kind):
         return 1e-6 * self.rms_us * (SIGMAS + np.clip(at.draw.normal(at.n), -SIGMAS, SIGMAS))
 
 
-class Wander(Kind):
+class Wander(Kind, number=20):
     """Samples late by amplitude_us (1 - cos(2 pi t / period_s))."""
 
     stage = "clock"
@@ -88,7 +88,7 @@ class Wander(Kind):
 # ---- converter ----
 
 
-class Noise(Kind):
+class Noise(Kind, number=21):
     """c' = c + sqrt(factor^2 - 1) noise_v g(n) / step: its noise times factor."""
 
     stage = "converter"
@@ -110,7 +110,7 @@ class Noise(Kind):
         return c + np.rint(more * at.draw.normal(at.n))
 
 
-class Spikes(Kind):
+class Spikes(Kind, number=22):
     """c' = c + size_v / step with either sign, in samples whose u(n) < rate_hz / their rate."""
 
     stage = "converter"
@@ -131,7 +131,7 @@ class Spikes(Kind):
         return c + np.where(u[:, 0] < self.rate_hz / at.channel.rate_hz, size, 0.0)
 
 
-class Bits(Kind):
+class Bits(Kind, number=23):
     """The lowest bits are lost: c' = 2^lost floor(c / 2^lost)."""
 
     stage = "converter"
@@ -146,7 +146,7 @@ class Bits(Kind):
         return np.floor(c / 2.0**self.lost) * 2.0**self.lost
 
 
-class StuckBit(Kind):
+class StuckBit(Kind, number=24):
     """One bit of the counts, from 0 for the lowest, is always the same."""
 
     stage = "converter"
@@ -163,7 +163,7 @@ class StuckBit(Kind):
         return ((whole | mask) if self.value else (whole & ~mask)).astype(float)
 
 
-class Clip(Kind):
+class Clip(Kind, number=25):
     """A smaller reference: c' = c within part of the converter's range."""
 
     stage = "converter"
@@ -180,7 +180,7 @@ class Clip(Kind):
         return np.clip(c, -most, most - 1)
 
 
-class Freeze(Kind):
+class Freeze(Kind, number=26):
     """c'(n) = c(0): one and the same number, without noise."""
 
     stage = "converter"

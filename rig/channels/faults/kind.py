@@ -117,6 +117,8 @@ class Kind(Written):
 
     model_config = ConfigDict(strict=True)
 
+    number: ClassVar[int] = 0
+    """Its number in CAN frames and in rig.dbc, 1 to 255; no other kind has or had it."""
     stage: ClassVar[str]
     channel_only: ClassVar[str] = ""
     """Signal of the only channels that it is for."""
@@ -128,6 +130,11 @@ class Kind(Written):
     """Size with which it would change nothing."""
     of_blocks: ClassVar[bool] = False
     """It is about blocks, not about what stands in them (`rig.channels.faults.blocks`)."""
+
+    def __init_subclass__(cls, *, number: int = 0) -> None:
+        """Set the number of a kind: `class Gain(Kind, number=1)`."""
+        super().__init_subclass__()
+        cls.number = number
 
     @classmethod
     def name(cls) -> str:

@@ -36,7 +36,7 @@ def _grown_to(lasts_s: float, ramp_s: float) -> float:
 # ---- transducer ----
 
 
-class Gain(Kind):
+class Gain(Kind, number=1):
     """Sensitivity: x' = x (1 + (factor - 1) min(t / ramp_s, 1))."""
 
     stage = "transducer"
@@ -52,7 +52,7 @@ class Gain(Kind):
         return x * (1.0 + (self.factor - 1.0) * _grown(at, self.ramp_s))
 
 
-class Offset(Kind):
+class Offset(Kind, number=2):
     """Zero: x' = x + value min(t / ramp_s, 1); value in the channel's unit."""
 
     stage = "transducer"
@@ -67,7 +67,7 @@ class Offset(Kind):
         return x + self.value * _grown(at, self.ramp_s)
 
 
-class Drift(Kind):
+class Drift(Kind, number=3):
     """x' = x + rate t, rate in the channel's unit a second; with tau_s: x' = x + rate tau_s (1 - exp(-t / tau_s))."""
 
     stage = "transducer"
@@ -84,7 +84,7 @@ class Drift(Kind):
         return x + self.rate * far_s
 
 
-class Polarity(Kind):
+class Polarity(Kind, number=4):
     """x' = -x."""
 
     stage = "transducer"
@@ -94,7 +94,7 @@ class Polarity(Kind):
         return -x
 
 
-class Stuck(Kind):
+class Stuck(Kind, number=5):
     """x'(t) = x(0): what follows in the chain, its noise too, goes on; `freeze` holds the counts."""
 
     stage = "transducer"
@@ -107,7 +107,7 @@ class Stuck(Kind):
         return ticks[:0]
 
 
-class Nonlinear(Kind):
+class Nonlinear(Kind, number=6):
     """Ends of the linear range: x' = end tanh(x / end), end in the channel's unit."""
 
     stage = "transducer"
@@ -125,7 +125,7 @@ class Nonlinear(Kind):
         return self.end * np.tanh(x / self.end)
 
 
-class Resonance(Kind):
+class Resonance(Kind, number=14):
     """A transducer that rings: x'' = w^2 (x - x') - (w / quality) dx'/dt, w = 2 pi frequency_hz, at rest before.
 
     Between rows of the model x is a straight line, over which this is solved exactly.
@@ -164,7 +164,7 @@ class Resonance(Kind):
 # ---- cable and conditioner ----
 
 
-class Open(Kind):
+class Open(Kind, number=7):
     """An open cable: v' = level_v."""
 
     stage = "cable"
@@ -178,14 +178,14 @@ class Open(Kind):
         return ticks[:0]
 
 
-class Short(Open):
+class Short(Open, number=8):
     """A short circuit: v' = 0."""
 
     kind: Literal["short"] = "short"  # pyrefly: ignore[bad-override]
     level_v: Annotated[FiniteFloat, Field(ge=0.0, le=0.0)] = 0.0
 
 
-class Intermittent(Open):
+class Intermittent(Open, number=9):
     """A loose contact: v' = level_v in those slots of slot_s whose u(slot) < part."""
 
     first = ("part",)
@@ -206,7 +206,7 @@ class Intermittent(Open):
         return ticks[self.volts(np.full(len(ticks), np.inf), at) == np.inf] if len(ticks) else ticks
 
 
-class Hum(Kind):
+class Hum(Kind, number=10):
     """The mains: v' = v + amplitude_v (sin(2 pi f t) + third sin(6 pi f t)) + offset_v.
 
     Asked for of a group it is one hum in all its channels, as a loop through the ground makes it.
@@ -228,7 +228,7 @@ class Hum(Kind):
         return v + self.amplitude_v * (np.sin(turn) + self.third * np.sin(3.0 * turn)) + self.offset_v
 
 
-class Crosstalk(Kind):
+class Crosstalk(Kind, number=11):
     """v' = v + 10^(db / 20) (v_source - its bias)."""
 
     stage = "cable"
@@ -251,7 +251,7 @@ class Crosstalk(Kind):
         return v + 10.0 ** (self.db / 20.0) * at.other(self.source)
 
 
-class Saturation(Kind):
+class Saturation(Kind, number=12):
     """A conditioner that gives less: v' = v within part of its range about the middle."""
 
     stage = "cable"
@@ -268,7 +268,7 @@ class Saturation(Kind):
         return np.clip(v, (low + high) / 2.0 - reach, (low + high) / 2.0 + reach)
 
 
-class Swap(Kind):
+class Swap(Kind, number=13):
     """Two cables changed over: v' = v of the other channel, and the other way round; several, one after the other."""
 
     stage = "cable"
@@ -303,7 +303,7 @@ def plugged(active: Iterable[_Acting]) -> dict[str, str]:
 # ---- filter ----
 
 
-class NoFilter(Kind):
+class NoFilter(Kind, number=15):
     """No anti-alias filter: what is above half of the rate folds back."""
 
     stage = "filter"
@@ -315,7 +315,7 @@ class NoFilter(Kind):
         return none or super().needs(channel, setting)
 
 
-class Bandwidth(NoFilter):
+class Bandwidth(NoFilter, number=16):
     """Another corner of the low-pass [Hz]; its order stays."""
 
     kind: Literal["bandwidth"] = "bandwidth"  # pyrefly: ignore[bad-override]

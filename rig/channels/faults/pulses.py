@@ -15,7 +15,7 @@ MAX_TURNS_HZ = 100.0
 """No shaft here turns faster: a fault of turns has no more of them [1/s]."""
 
 
-class MissPulses(Kind):
+class MissPulses(Kind, number=27):
     """No pulse in turns whose u(turn) < part."""
 
     stage = "keyphasor"
@@ -33,7 +33,7 @@ class MissPulses(Kind):
         return ticks[~_picked(at, self.part)] if len(ticks) else ticks
 
 
-class ExtraPulses(MissPulses):
+class ExtraPulses(MissPulses, number=28):
     """A pulse half a turn behind that of turns whose u(turn) < part."""
 
     kind: Literal["extra-pulses"] = "extra-pulses"  # pyrefly: ignore[bad-override]
@@ -48,7 +48,7 @@ class ExtraPulses(MissPulses):
         return np.sort(np.concatenate([ticks, extra[_picked(at, self.part)]]))
 
 
-class EdgeJitter(Kind):
+class EdgeJitter(Kind, number=29):
     """The pulse of a turn is late by rms_us (4 + g(turn)), g within 4."""
 
     stage = "keyphasor"

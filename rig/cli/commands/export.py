@@ -12,11 +12,14 @@ from rig.base.errors import InputError
 from rig.cli.options import Force, FromS, RecordingFiles, ToS, split_names
 from rig.cli.output.tables import echo
 
+EXPORTED = "File: .mf4, .tdms, .uff, .csv, .parquet or .wav"
+"""Endings of `FORMATS`, as in `import_`."""
+
 
 def export(
     files: RecordingFiles,
     *,
-    output: Annotated[Path, typer.Option("--output", "-o", help="File: .mf4, .tdms, .uff, .csv, .parquet or .wav")],
+    output: Annotated[Path, typer.Option("--output", "-o", help=EXPORTED)],
     channels: Annotated[
         str | None,
         typer.Option("--channels", metavar="NAME,...", help="Only these channels, groups or truth.TABLE[.COLUMN]"),

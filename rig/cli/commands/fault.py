@@ -12,6 +12,7 @@ from rig.channels.faults import KINDS, OfBlocks
 from rig.cli.connections.connection import Connection, show
 from rig.cli.groups import panel
 from rig.cli.output.tables import Form, echo, echo_json, new_table
+from rig.run.commands.channel import check_fault
 
 _parameters = panel("Parameters of the kinds")
 _TEXTS = (
@@ -76,6 +77,11 @@ def fault(
         return
     if kind not in KINDS:
         raise UnknownNameError("KIND", "one of `rig fault --list`", kind or "nothing", KINDS)
+    try:
+        check_fault({"kind": kind, **given})
+    except InputError as error:
+        option = error.field.removeprefix(f"{kind}.").replace("_", "-")
+        raise InputError(f"--{option} of {kind}", error.must, error.received) from None
     with connection.console("fault") as rig:
         accepted = rig.fault(str(channel), kind, for_s=for_s, **given)
     show(accepted, "fault")

@@ -20,10 +20,14 @@ if TYPE_CHECKING:
     from replays.recordings.formats.guessing.guess import Guess
 
 
+IMPORTED = "Logs to align: .mf4, .mdf, .dat, .tdms, .uff, .unv, .csv, .txt, .asc, .tsv, .lvm, .parquet or .wav"
+"""Endings of `FORMATS`, which would take too long to import for help: tests/unit/test_entries.py compares them."""
+
+
 def import_(
     files: Annotated[
         list[Path] | None,
-        typer.Argument(metavar="FILE...", help="Logs to align: .mf4, .tdms, .uff, .csv, .txt, .lvm, .parquet, .wav"),
+        typer.Argument(metavar="FILE...", help=IMPORTED),
     ] = None,
     *,
     mapping: Annotated[

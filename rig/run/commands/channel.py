@@ -8,12 +8,29 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, FiniteFloat, model_validator
 
 from rig.base.checks import check
-from rig.base.errors import UnknownNameError
-from rig.channels.faults import KINDS, AnyKind
+from rig.base.errors import InputError, UnknownNameError
+from rig.channels.faults import KINDS, AnyKind, Kind
 from rig.run.commands.command import CanFrame, Run, SceneCommand
 
 MAX_FAULT_S = 86_400.0
 """Longest duration of a fault [s]: a day, as no run is longer."""
+
+
+def check_fault(numbers: dict[str, Any]) -> Kind:
+    """Return a fault, given its kind and numbers by name.
+
+    Raises:
+        InputError: There is no such kind, it does not take one of the numbers, or a number is missing or out of range;
+            the field is `KIND.NUMBER`.
+    """
+    kind = numbers.get("kind")
+    if not isinstance(kind, str) or kind not in KINDS:
+        raise UnknownNameError("kind", "one of the kinds", kind, KINDS)
+    takes = [name for name in KINDS[kind].model_fields if name != "kind"]
+    for name, value in numbers.items():
+        if name not in KINDS[kind].model_fields:
+            raise InputError(f"{kind}.{name}", f"left out: {kind} takes {', '.join(takes) or 'no numbers'}", value)
+    return check(KINDS[kind], numbers, field=kind)
 
 
 class _ChannelCommand(SceneCommand):
@@ -46,10 +63,7 @@ class FaultCommand(_ChannelCommand):
             return data
         own = {key: value for key, value in data.items() if key in cls.model_fields}
         rest = {key: value for key, value in data.items() if key not in own}
-        kind = rest.get("kind")
-        if not isinstance(kind, str) or kind not in KINDS:
-            raise UnknownNameError("kind", "one of the kinds", kind, KINDS)
-        return {**own, "what": check(KINDS[kind], rest, field="")}
+        return {**own, "what": check_fault(rest)}
 
     def request(self) -> dict[str, Any]:
         """Return the fields as a client sends them: the channel and the parameters of the kind in one table."""
