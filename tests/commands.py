@@ -1,4 +1,4 @@
-"""Commands of `rig`, run in this process; each table that one prints is held against a terminal and a pipe as well."""
+"""Run commands of `rig` in this process; each printed table is also checked on a terminal and in a pipe."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ TERMINAL = 80
 
 
 def lines_of(table: Table, *, width: int | None = TERMINAL) -> list[str]:
-    """What a terminal of this width shows of a table, or what comes out of a pipe."""
+    """Return the lines of a table on a terminal of this width, or in a pipe."""
     console = table_console(wide=True)
     console.file, console.width = io.StringIO(), width or console.width
     console.print(table)
@@ -24,7 +24,9 @@ def lines_of(table: Table, *, width: int | None = TERMINAL) -> list[str]:
 
 
 def check_legible(table: Table, *, width: int = TERMINAL) -> None:
-    """No cell is cut, no column vanishes unless it is said, and into a pipe a row is a line with all its cells."""
+    """Check that no cell is cut, that hidden columns are announced, and that a row in a pipe is one line with all its
+    cells.
+    """
     lines = lines_of(table, width=width)
     assert max(map(cell_len, lines), default=0) <= width, lines
     text = "\n".join(lines)
@@ -51,7 +53,7 @@ def check_legible(table: Table, *, width: int = TERMINAL) -> None:
 
 
 def run(*arguments: object) -> int:
-    """The exit status of a command."""
+    """Run a command and return its exit status."""
     shown, tables = Table.__rich_console__, []
 
     def kept(table: Table, *about: Any) -> Any:
@@ -68,14 +70,14 @@ def run(*arguments: object) -> int:
 
 
 def said(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
-    """The exit status of a command, what it printed and what it complained of."""
+    """Run a command and return its exit status, output and error output."""
     status = run(*arguments)
     captured = capsys.readouterr()
     return status, captured.out, captured.err
 
 
 def shown(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
-    """What a command prints that ends well."""
+    """Run a command that must succeed and return its output."""
     status, output, complaints = said(capsys, *arguments)
     assert status == 0, complaints
     return output

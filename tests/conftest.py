@@ -1,11 +1,10 @@
-"""How the tests are shared out where several run at once (`-n`), and what many of them use.
+"""Distribution of tests over workers (`-n`), and fixtures that many tests share.
 
-Tests that read the clock or start processes wait most of their time: the modules marked so as a whole make up two
-queues, each gone through by one worker. Those within a process come at once, the few that run an engine last; those
-that start real rigs come after them, when the engine that they run on is compiled. A second worker compiles all engines
-one after another, for two that compile at the same time both compile what engines share. A third worker has the tools
-and other modules that need no engine meanwhile, until the usual engine is compiled. All else is taken module by module,
-the longest first.
+Tests that read the clock or start processes wait most of their time. Modules marked in this way form two queues, each
+processed by one worker. Tests within a process come first, the few that run an engine last; tests that start real rigs
+follow, when their engine is compiled. A second worker compiles all engines one after another, because two that compile
+at the same time would both compile the shared parts. A third worker runs the tools and other modules that need no
+engine until the default engine is compiled. All other modules follow, the longest first.
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ WITHOUT_ENGINE = (
     "tests/house/test_sizes.py",
     "tests/house/test_contracts.py",
 )
-"""Modules that compile no engine, 28 s of processor time: rigs that started at once would compile theirs, too."""
+"""Modules that compile no engine, 28 s of processor time. Rigs started during this time would also compile theirs."""
 LONGEST = (
     "tests/unit/test_score_track.py",
     "tests/unit/test_nuisance.py",
@@ -72,7 +71,7 @@ LONGEST = (
     "tests/unit/test_lean_install.py",
     "tests/unit/test_recorder_rewrite.py",
 )
-"""Modules that take more than 8 s, for which nobody is to wait at the end."""
+"""Modules that take more than 8 s and therefore must not start last."""
 _CLOCK = re.compile(r"^pytestmark = .*\bwallclock\b", re.MULTILINE)
 _ENGINE = re.compile(r"^from rig\.simulation import .*\bSimulation\b", re.MULTILINE)
 
@@ -83,7 +82,7 @@ def _module(nodeid: str) -> str:
 
 @cache
 def _queue(module: str) -> str | None:
-    """The queue that a module waits in, if it waits."""
+    """Return the queue of a module; None if it does not wait."""
     path = ROOT / module
     if not path.is_file() or _CLOCK.search(path.read_text(encoding="utf-8")) is None:
         return None
@@ -96,7 +95,7 @@ def _runs_engine(module: str) -> bool:
 
 
 def _place(nodeid: str) -> tuple[int, int]:
-    """Where a test stands in the order: what waits, engines, what needs none, rigs, what takes long, all others."""
+    """Return the position of a test: waiting tests, engines, tests without engine, rigs, long tests, all others."""
     module = _module(nodeid)
     if _queue(module) == "clock":
         return 0, int(_runs_engine(module))
@@ -114,14 +113,16 @@ def _place(nodeid: str) -> tuple[int, int]:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    # Tests start hundreds of programs, and without stored bytecode each compiles 300 files again: 0.6 s of processor
-    # time. Only with workers, that is for the whole suite: `tests/mutants.py` needs its programs without.
+    # Tests start hundreds of programs. Without stored bytecode each compiles 300 files again: 0.6 s of processor time.
+    # Only
+    # with workers, that is for the whole suite: the programs of `tests/mutants.py` need it off.
     if getattr(config.option, "numprocesses", None):
         os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
-    # One cache for all processes that tests start: a program on a bus alone, which knows no kernels of the rig, would
-    # keep its machine code elsewhere, and 25 s of compiling would come twice.
+    # One cache for all processes that tests start. Without it, a program that uses the bus only would keep its machine
+    # code
+    # elsewhere and compile for another 25 s.
     os.environ.setdefault("NUMBA_CACHE_DIR", str(numba.config.CACHE_DIR))
-    # Whoever starts the tests in the background may have signals ignored, and what a test starts would inherit that.
+    # A shell that starts the tests in the background may have signals ignored, and child processes would inherit that.
     for number, usual in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL)):
         if signal.getsignal(number) is signal.SIG_IGN:
             signal.signal(number, usual)
@@ -133,7 +134,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_collection() -> Generator[None, object, object]:
-    # What is imported and collected stays: a million objects, and a full collection took 0.3 s to walk them.
+    # Exclude imports and collected tests from garbage collection: one full pass over a million objects took 0.3 s.
     gc.disable()
     try:
         return (yield)
@@ -148,11 +149,11 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     from xdist.scheduler import LoadScopeScheduling
 
     class ByModule(LoadScopeScheduling):
-        """Hands out a module at a time."""
+        """Distribute one module at a time."""
 
         def _split_scope(self, nodeid: str) -> str:
             module = _module(nodeid)
             return _queue(module) or module
 
-    config.option.loadscopereorder = False  # the order is ours
+    config.option.loadscopereorder = False  # keep this order
     return ByModule(config, log)

@@ -34,7 +34,7 @@ _TURN_S = 2.0
 """Processor time of the tests of one file before the next file has its turn [s]."""
 
 Record = dict[str, dict[str, Any]]
-"""By test id: `cpu_s`, processor time [s], and `lines`: by file, the lines that the test executes."""
+"""By test id: `cpu_s`, processor time [s], and `lines`, the lines that the test executes, by file."""
 
 
 class _Loader(SourceFileLoader):
@@ -83,7 +83,7 @@ class _Tracer(MetaPathFinder):
 
     @property
     def lines(self) -> set[tuple[str, int]]:
-        """Lines since the last call of `taken`, with their files."""
+        """Lines executed since the last call of `taken`, with their files."""
         return {(file, line) for file, first, last in self._seen for line in range(first, last + 1)}
 
     def taken(self) -> set[tuple[str, int]]:
@@ -115,7 +115,7 @@ class _Recording:
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_setup(self, item: pytest.Item) -> Generator[None, object, object]:
         result = yield
-        # A fixture of a module is set up by its first test and used by later ones.
+        # The first test of a module sets up the module's fixtures; later tests use them.
         self._shared.setdefault(item.nodeid.partition("::")[0], set()).update(self._tracer.lines)
         return result
 

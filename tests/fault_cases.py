@@ -28,29 +28,29 @@ EXAMPLES: dict[str, dict[str, Any]] = {
     "stuck-bit": {"bit": 8}, "clip": {"part": 1e-4}, "freeze": {}, "miss-pulses": {"part": 1.0},
     "extra-pulses": {"part": 1.0}, "edge-jitter": {"rms_us": 300.0}, "resonance": {"frequency_hz": 80.0},
 }  # fmt: skip
-"""Numbers of each kind that changes channels; each changes counts of `disk_x` or of the keyphasor."""
+"""Parameters of each kind that changes channels; each changes counts of `disk_x` or of the keyphasor."""
 BLOCKS: dict[str, dict[str, Any]] = {
     "dropout": {}, "lose-blocks": {"part": 0.5}, "duplicate-blocks": {"part": 0.5}, "reorder-blocks": {"part": 0.5},
     "late-blocks": {"delay_s": 0.033}, "stale-stamps": {}, "restart": {},
 }  # fmt: skip
-"""Numbers of each kind that changes blocks."""
+"""Parameters of each kind that changes blocks."""
 
 BENIGN, ONE, BROKEN, BLIND = ("-",) * 4, ("T", "a", "a", "T"), ("N", "N", "N", "TN"), ("N", "N", "TN", "TN")
 MONITORED: dict[str, tuple[dict[str, Any], tuple[str, ...]]] = {
-    # kind: its numbers, outcome by vote (VOTES of protection_acceptance); the signal is 200 um peak-to-peak at 10 Hz.
-    # A level of its own above 1000 um, within the OK limits: one probe in danger.
+    # kind: its parameters, result by vote (VOTES of protection_acceptance); the signal is 200 um peak-to-peak at 10 Hz.
+    # A false level above 1000 um within the OK limits: danger on one probe.
     "gain": ({"factor": 8.0}, ONE),
     "offset": ({"value": 1.2}, ONE),
     "hum": ({"amplitude_v": 2.5}, ONE),
     "stuck-bit": ({"bit": 21}, ONE),  # 2^21 of 2^24 counts over 40 V: 5 V, 1.27 mm
-    # An output at 0 V, or beyond what the converter still gives: NOT OK in time, no alarm of this probe.
+    # Output at 0 V, or outside the converter's range: NOT OK in time, no alarm of this probe.
     "open": ({}, BROKEN),
     "short": ({}, BROKEN),
     "intermittent": ({"part": 0.2}, BROKEN),
     "clip": ({"part": 0.05}, BROKEN),  # at -1 V
-    # On its way to the OK limit, 1.9 mm at 20 mm/s, it is above 500 um for longer than the delay; above 1000, not.
+    # The ramp to the OK limit, 1.9 mm at 20 mm/s, exceeds 500 um for longer than the delay; 1000 um not.
     "drift": ({"rate": 20.0}, ("aN", "aN", "aN", "TN")),
-    # What leaves the level where it is, or makes it less.
+    # Faults that keep the level or reduce it.
     **{kind: ({}, BENIGN) for kind in ("polarity", "stuck", "freeze")},
     "nonlinear": ({"end": 0.02}, BENIGN),
     "resonance": ({"frequency_hz": 200.0}, BENIGN),
@@ -64,7 +64,7 @@ MONITORED: dict[str, tuple[dict[str, Any], tuple[str, ...]]] = {
     "noise": ({"factor": 100.0}, BENIGN),  # 25 um rms
     "spikes": ({"rate_hz": 10.0, "size_v": 1.0}, BENIGN),  # 250 um
     "bits": ({"lost": 8}, BENIGN),
-    # Of blocks: half a second without any is longer than the window, and so are numbers that begin anew.
+    # Block faults: 0.5 s without a block exceeds the window, and so do renumbered rows.
     "dropout": ({"channel": "probes"}, BLIND),
     "restart": ({"channel": "probes"}, BLIND),
     **{kind: ({"channel": "probes"}, BENIGN) for kind in ("lose-blocks", "duplicate-blocks", "reorder-blocks")},
@@ -72,7 +72,7 @@ MONITORED: dict[str, tuple[dict[str, Any], tuple[str, ...]]] = {
     "stale-stamps": ({"channel": "probes"}, BENIGN),
 }
 MONITORED_PULSES: dict[str, tuple[dict[str, Any], set[str]]] = {
-    # kind: its numbers, what comes of it at 6.2 Hz, where 7 Hz for three turns are too fast, and 0.3 s without a pulse.
+    # kind: its parameters, result at 6.2 Hz. Overspeed: 7 Hz for three turns; missing pulse: 0.3 s.
     "miss-pulses": ({"part": 1.0}, {"speed-lost"}),
     "extra-pulses": ({"part": 1.0}, {"overspeed", "trip"}),
     "edge-jitter": ({"rms_us": 100.0}, set()),
@@ -83,7 +83,7 @@ DEFECT_OF = {kind: name for name, each in DEFECTS.items() for kind in each.fault
 
 
 def size_of(kind: str, numbers: dict[str, Any], channel: str) -> float | None:
-    """Return the size of a fault in the unit that its defect has on a channel; None where it has no size."""
+    """Return the size of a fault in the unit of its defect on a channel; None if it has no size."""
     defect, about = DEFECTS[DEFECT_OF[kind]], default_table().channels[channel]
     name = defect.faults[kind]
     if not name:
@@ -95,7 +95,7 @@ def size_of(kind: str, numbers: dict[str, Any], channel: str) -> float | None:
 
 
 class Declared(NamedTuple):
-    """A fault on a channel; the table of defects has the quantities of a scorecard that it makes fail."""
+    """A fault on a channel; the table of defects lists the scorecard quantities that it makes fail."""
 
     channel: str
     numbers: dict[str, Any]

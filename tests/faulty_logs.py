@@ -1,6 +1,6 @@
-"""What may be wrong with a log, each as a change of signals before a recorder's filter or of its samples behind it.
+"""Faults of a log: each changes the signals before a recorder's filter or the samples after it.
 
-Times are those of `second_rig.run` as its tests have it: the hammer pulse comes at 0.8 s.
+Times refer to `second_rig.run` with the tests' settings: the hammer pulse is at 0.8 s.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ class Case:
     """One fault.
 
     Attributes:
-        name: What it is.
-        told: Pattern of what it must be called.
-        ppm: How much faster the recorder's clock goes.
-        before: Changes signals before the recorder's filter; given a rate as well [Hz].
-        behind: Changes times and samples.
+        name: Name of the fault.
+        told: Pattern that a finding must match.
+        ppm: Clock error of the recorder [ppm]; positive: fast.
+        before: Changes signals before the recorder's filter; also receives their rate [Hz].
+        behind: Changes times and samples after it.
     """
 
     name: str
@@ -38,15 +38,15 @@ class Case:
     behind: Callable[[np.ndarray, Values], tuple[np.ndarray, Values]] | None = None
 
     def signals(self, values: Values, motion: Motion) -> Values:
-        """What the recorder's filters are given."""
+        """Return the input of the recorder's filters."""
         return values if self.before is None else self.before(dict(values), motion.rate_hz)
 
     def samples(self, own_s: np.ndarray, values: Values) -> tuple[np.ndarray, Values]:
-        """What it writes."""
+        """Return the recorded samples."""
         return (own_s, values) if self.behind is None else self.behind(own_s, dict(values))
 
     def named_by(self, found: Validation) -> bool:
-        """Whether a validation calls it by its name."""
+        """Return whether a validation names the fault."""
         said = (
             [one.line for one in found.faults]
             + found.beyond
@@ -71,7 +71,7 @@ def _late(names: tuple[str, ...], late_s: float) -> Callable[[Values, float], Va
 
 
 def _added(name: str, what: Callable[[np.ndarray], np.ndarray]) -> Callable[[Values, float], Values]:
-    """Something added that is a function of time [s]."""
+    """Add a function of time [s] to a channel."""
     return lambda values, hz: values | {name: values[name] + what(np.arange(len(values[name])) / hz)}
 
 
@@ -146,7 +146,7 @@ def _dead(name: str, level: float) -> Behind:
 
 
 def _pulses(*, without: int = 0, doubled: bool = False) -> Behind:
-    """Every so many pulses left out; or one more half way to the next."""
+    """Remove every n-th pulse, or add a pulse half way to the next."""
 
     def change(own_s: np.ndarray, values: Values) -> tuple[np.ndarray, Values]:
         shown = values["keyphasor"].copy()
@@ -164,7 +164,7 @@ def _pulses(*, without: int = 0, doubled: bool = False) -> Behind:
 
 
 def _lost(at_s: float, rows: int) -> Behind:
-    """Rows that are not there, and nothing tells it."""
+    """Remove rows without a gap in the time stamps."""
 
     def change(own_s: np.ndarray, values: Values) -> tuple[np.ndarray, Values]:
         first = int(np.searchsorted(own_s, at_s))
@@ -190,7 +190,7 @@ CASES = tuple(
     + [Case(f"P_S {us} us late", "sensor: P_S delay", before=_late(("P_S",), us * 1e-6)) for us in (20, 100, 1000)]
     + [Case(f"probes {ms:g} ms late", r"sensor: disk_x, disk_y, ring_x, ring_y delay", before=_late(PROBES, ms * 1e-3))
        for ms in (0.052, 0.2, 1.0)]
-    # Two that are preloaded against each other look the same swapped and both turned round.
+    # Two transducers preloaded against each other look the same if they are swapped and both inverted.
     + [Case(f"{a} and {b} swapped", f"{a} and {b} swapped|{a}.* polarity.*{b}.* polarity", before=_swapped(a, b))
        for a, b in (("P_N", "P_S"), ("ring_x", "ring_y"), ("P_N", "P_E"))]
     + [Case(f"{a} and {b} swapped", f"({a}.*{b}|{b}.*{a})", before=_swapped(a, b))

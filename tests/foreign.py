@@ -1,7 +1,7 @@
-"""Logs of rigs that are not ours, made of plain formulas and written by the libraries of the formats.
+"""Logs of other rigs, computed by plain formulas and written by the libraries of the formats.
 
-A shaft orbits forward at its speed; a hammer hits it, and it whirls backward in its ring, faster and wider. Transducers
-across each other are preloaded, and one is relieved as the other is loaded. Nothing of it is the product's model.
+A shaft orbits forward at its speed. After a hammer impact it whirls backward in its ring, faster and wider. Opposite
+transducers are preloaded: one is relieved as the other is loaded. None of it uses the product's model.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ SPIN_HZ, WHIRL_HZ = 6.2, 21.0
 HIT_S, BLOW_S, BLOW_N = 0.55, 5e-3, 92.0
 DURATION_S = 1.2
 RAMP, PULSE_S = 4, 8e-3
-"""Of a keyphasor pulse: rise [samples] and length; it is half way up at (k + 0.3) / SPIN_HZ."""
+"""Keyphasor pulse: rise [samples] and length [s]; half height at (k + 0.3) / SPIN_HZ."""
 PRELOAD_N = 2950.0
 
 
@@ -23,12 +23,12 @@ def instants(rate_hz: float) -> np.ndarray:
 
 
 def edges() -> np.ndarray:
-    """Where keyphasor pulses are half way up [s]."""
+    """Return the times at which keyphasor pulses cross half height [s]."""
     return (np.arange(int(SPIN_HZ * DURATION_S) + 1) + 0.3) / SPIN_HZ
 
 
 def orbit(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The disk [mm]."""
+    """Return the position of the disk [mm]."""
     wide = np.clip((t - HIT_S) / 0.2, 0.0, 1.0)
     spin, whirl = 2 * np.pi * SPIN_HZ * t, 2 * np.pi * WHIRL_HZ * (t - HIT_S)
     x = 0.11 * np.cos(spin) + wide * 0.9 * np.cos(whirl)
@@ -42,13 +42,13 @@ def hammer(t: np.ndarray) -> np.ndarray:
 
 
 def keyphasor(t: np.ndarray) -> np.ndarray:
-    """From 0 to 1."""
+    """Return the keyphasor signal, from 0 to 1."""
     since, ramp_s = t[:, None] - edges()[None, :], RAMP * t[1]
     return np.sum(np.clip(since / ramp_s + 0.5, 0, 1) - np.clip((since - PULSE_S) / ramp_s + 0.5, 0, 1), axis=1)
 
 
 def signals(rate_hz: float, *, seed: int = 0) -> dict[str, np.ndarray]:
-    """The rig's channels in its units (mm, N, m/s^2, Hz), with white noise, each shape (n,)."""
+    """Return the rig's channels in its units (mm, N, m/s^2, Hz) with white noise, each of shape (n,)."""
     t, generator = instants(rate_hz), np.random.default_rng(seed)
     x, y = orbit(t)
     wide = np.clip((t - HIT_S) / 0.2, 0.0, 1.0)
@@ -70,10 +70,10 @@ def signals(rate_hz: float, *, seed: int = 0) -> dict[str, np.ndarray]:
 
 
 def mdf_of_three_rates(path: Path) -> dict[str, tuple[float, np.ndarray]]:
-    """51.2 kHz, 20 kHz by a clock that is 80 ppm fast, and 12.5 Hz; keyphasor and speed in groups apart.
+    """Write an MDF file at 51.2 kHz, 20 kHz (clock 80 ppm fast) and 12.5 Hz; keyphasor and speed in separate groups.
 
     Returns:
-        Rate [Hz] and values as they stand in the file, by channel of the rig.
+        Rate [Hz] and values in the file, by channel of the rig.
     """
     from asammdf import MDF, Signal
 
@@ -120,7 +120,7 @@ VOLTS = {
 
 
 def tdms_in_volts(path: Path, *, rate_hz: float = 25_600.0) -> dict[str, tuple[float, np.ndarray]]:
-    """Everything in volts; what sensors do stands in properties.
+    """Write a TDMS file in volts, with the sensors' sensitivities in properties.
 
     Returns:
         Rate [Hz] and volts, by channel of the rig.
@@ -148,14 +148,14 @@ GERMAN = {
     "inner_y": ("Beschl. Innengehäuse y", "m/s²", 1.0), "speed": ("Drehzahl", "1/min", 60.0),
     "keyphasor": ("Lichtschranke", "V", 5.0), "hammer": ("Schlaghammer", "N", 1.0),
 }  # fmt: skip
-"""Heading, unit, and what one unit of the rig is in it, by channel."""
+"""Heading, unit, and factor from the rig's unit, by channel."""
 
 
 def german_csv(path: Path, *, rate_hz: float = 5000.0) -> dict[str, tuple[float, np.ndarray]]:
-    """Semicolons, decimal commas, units in the headings, umlauts in latin-1, times of day.
+    """Write a CSV file with semicolons, decimal commas, units in the headings, umlauts in latin-1 and times of day.
 
     Returns:
-        Rate [Hz] and values as they stand in the file, by channel of the rig.
+        Rate [Hz] and values in the file, by channel of the rig.
     """
     made = signals(rate_hz)
     kept = {channel: (rate_hz, np.round(made[channel] * size, 6)) for channel, (_, _, size) in GERMAN.items()}
@@ -173,10 +173,11 @@ def german_csv(path: Path, *, rate_hz: float = 5000.0) -> dict[str, tuple[float,
 def csv_without_names(
     path: Path, *, rate_hz: float = 10_000.0, ppm: float = 80.0
 ) -> dict[str, tuple[float, np.ndarray]]:
-    """Nothing but units and numbers, by a clock that is off; probes in micrometres, no place, no axis.
+    """Write a CSV file with units and numbers only, a clock that is off, and probes in micrometres without place or
+    axis.
 
     Returns:
-        True rate [Hz] and values as they stand in the file, by channel of the rig, in their order.
+        True rate [Hz] and values in the file, by channel of the rig, in their order.
     """
     rate = rate_hz * (1.0 + ppm * 1e-6)
     made = signals(rate)

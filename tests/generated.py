@@ -1,4 +1,4 @@
-"""Generated files against what the tables give now: the differing lines, and the command that writes each file."""
+"""Comparison of generated files with the present tables: the differing lines, and the command that writes each file."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ import rig
 from drivers.can import dbc
 
 MAX_LINES = 3
-"""Lines shown that a file lacks, and as many that it has in surplus; a shifted table differs in all of them."""
+"""Missing lines shown, and surplus lines shown; in a shifted table all lines differ."""
 MAX_CHARACTERS = 200
-"""Length of each; the list of all kinds of faults is one line of 1,000."""
+"""Characters shown of a line; the list of all kinds of faults is one line of 1,000."""
 
 
 def missing_in_generated_files() -> Iterator[str]:

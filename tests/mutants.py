@@ -1,14 +1,15 @@
-"""Mutants of what judges: `python -m tests.mutants [-n N] [--seed S] [--folder FOLDER] [--only NUMBER] [--list]`.
+"""Mutation tests of the judging code: `python -m tests.mutants [-n N] [--seed S] [--folder FOLDER] [--only NUMBER]
+[--list]`.
 
 Changes one place of the scorecard, the faults, the validation or the table of units in a copy of this tree, and runs
 the tests of that module until one fails, for at most 20 s of processor time. Tests that execute the place come first,
-the cheapest test file first; which these are is measured once and kept in the folder, and a test that fails without a
-mutant ends the program with status 2. A mutant that no test kills shows what the tests do not see. Hand-picked mutants
-come first; the others are drawn blindly, by a seed, from all places where a comparison can be turned, a constant
-changed, an operand of `and` or `or` dropped, an absolute value dropped, a sign turned or a branch swapped. Results
-stand in a journal, where an interrupted run continues. Status 1 where fewer than 9 of 10 are killed.
+the cheapest test file first; this is measured once and kept in the folder, and a test that fails without a mutant ends
+the program with status 2. A mutant that no test kills shows a gap in the tests. Hand-picked mutants come first; the
+others are drawn by a seed from all places where a comparison can be inverted, a constant changed, an operand of `and`
+or `or` removed, an absolute value removed, a sign inverted or a branch swapped. Results are stored in a journal, from
+which an interrupted run continues. Status 1 if fewer than 9 of 10 are killed.
 
-The copy stays in its folder, so that kernels, none of which is mutated, compile there once.
+The copy stays in its folder, so that kernels, which are not mutated, compile there once.
 """
 
 from __future__ import annotations
@@ -67,7 +68,7 @@ _TURNED = {
     ast.NotIn: "in", ast.Is: "is not", ast.IsNot: "is",
 }  # fmt: skip
 _SHOWN = ("__repr__", "__str__", "picture", "verdict_line", "describe")
-"""Functions whose places are left out: what they return is only shown."""
+"""Functions whose places are skipped: their results are only displayed."""
 PICKED = (
     ("replays/score/card/scorecard.py", "shown=PASS in verdicts and not self.doubts", "shown=not self.doubts"),
     ("replays/score/card/scorecard.py", "shown=PASS in verdicts and not self.doubts", "shown=PASS in verdicts"),
@@ -86,7 +87,7 @@ PICKED = (
     ("rig/base/units.toml", "thou = { size = 2.54e-05 }", "thou = { size = 0.0254 }"),
     ("rig/base/units.toml", "mil = { size = 2.54e-05 }", "mil = { size = 2.54e-08 }"),
 )  # fmt: skip
-"""File, what stands there once, and what takes its place."""
+"""File, text that occurs in it once, and its replacement."""
 
 
 @dataclass(frozen=True)
@@ -96,8 +97,8 @@ class Mutant:
     Attributes:
         file: Path in the tree.
         begin, end: Place in its text [characters].
-        new: What stands there then.
-        kind: What is changed.
+        new: Replacement.
+        kind: Kind of the change.
     """
 
     file: str
@@ -140,7 +141,7 @@ class _Places(ast.NodeVisitor):
         self.found.append(Mutant(self.file, *self._span(node), new, kind))
 
     def _between(self, left: ast.expr, right: ast.expr, new: str, kind: str) -> None:
-        """Replace an operator, which stands between two operands, with the brackets around them."""
+        """Replace an operator, which is between two operands, with the brackets around them."""
         begin, end = self._span(left)[1], self._span(right)[0]
         held = self.text[begin:end]
         if "#" not in held and "\n" not in held:
@@ -166,10 +167,10 @@ class _Places(ast.NodeVisitor):
             self.visit(node.value)
 
     def visit_JoinedStr(self, node: ast.JoinedStr) -> None:
-        """Leave texts out."""
+        """Skip texts."""
 
     def visit_Raise(self, node: ast.Raise) -> None:
-        """Leave messages out."""
+        """Skip messages."""
 
     def visit_Compare(self, node: ast.Compare) -> None:
         if len(node.ops) == 1:
@@ -214,7 +215,7 @@ class _Places(ast.NodeVisitor):
 
 
 def places(file: str) -> list[Mutant]:
-    """Return all mutants of a file, of which some may not be readable."""
+    """Return all mutants of a file; some may not be valid Python."""
     text = (ROOT / file).read_text(encoding="utf-8")
     visitor = _Places(file, text)
     visitor.visit(ast.parse(text))
@@ -230,7 +231,7 @@ def _parses(text: str) -> bool:
 
 
 def chosen(count: int, seed: int) -> list[Mutant]:
-    """Return so many mutants: the picked ones, then as many of each module, drawn blindly."""
+    """Return `count` mutants: the picked ones, then equally many of each module, drawn at random."""
     found = []
     for file, old, new in PICKED:
         text = (ROOT / file).read_text(encoding="utf-8")
@@ -274,14 +275,14 @@ def mutated_files() -> list[str]:
 
 
 def measured(tree: Path, tests: list[str], known: dict[str, dict[str, Any]], journal: Path) -> Record | None:
-    """Return what tests execute, from the journal or measured; None where one fails."""
+    """Return the lines that tests execute, from the journal or measured; None if a test fails."""
     files, record = mutated_files(), Record()
     own = ("mutants.py", "covering_tests.py")
     helpers = [str(p.relative_to(ROOT)) for p in sorted((ROOT / "tests").glob("*.py")) if p.name not in own]
     texts = {path: (ROOT / path).read_text(encoding="utf-8") for path in (*files, *helpers, *tests)}
     for test in tests:
         key = _key(*(texts[path] for path in (*helpers, test)))
-        # What a test executes stays the same until a file of it changes.
+        # The lines that a test executes stay the same until one of its files changes.
         if key not in known or any(_key(texts.get(path, "")) != digest for path, digest in known[key]["files"].items()):
             written = tree.parent / "record.json"
             traced = {RECORD: str(written), TRACED: json.dumps(files)}
@@ -307,7 +308,7 @@ def _keep(journal: Path, known: dict[str, dict[str, Any]], line: dict[str, Any])
 
 
 def copied(folder: Path) -> Path:
-    """Bring the copy of the tree up to date; files that are the same are left alone."""
+    """Update the copy of the tree; unchanged files are not written."""
     tree = folder / "tree"
     words = ("git", "ls-files", "--cached", "--others", "--exclude-standard", "-z")
     names = subprocess.run(words, cwd=ROOT, check=True, capture_output=True).stdout.decode().split("\0")
@@ -342,7 +343,7 @@ def run(tree: Path, tests: list[str], limit_s: int, more: dict[str, str]) -> tup
     )  # fmt: skip
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     used_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    # A test module that cannot be imported is a kill, too; a signal is that of the limit.
+    # A test module that cannot be imported also counts as a kill; a signal is that of the limit.
     return {0: "lived", 1: "killed", 2: "killed"}.get(ended.returncode, "out of time"), round(used_s, 1)
 
 
@@ -352,7 +353,7 @@ def _lines(journal: Path) -> Iterator[dict[str, Any]]:
 
 
 def main(words: list[str] | None = None) -> int:
-    """Run mutants; return 1 where too many live."""
+    """Run mutants; return 1 if too many survive."""
     parser = argparse.ArgumentParser(prog="python -m tests.mutants", description=(__doc__ or "").split("\n")[0])
     parser.add_argument("-n", type=int, default=60)
     parser.add_argument("--seed", type=int, default=1)

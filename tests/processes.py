@@ -1,4 +1,4 @@
-"""Processes that a test starts, ended for certain, and addresses for them."""
+"""Processes that a test starts and always ends, and addresses for them."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from typing import Any
 
 ROOT = Path(__file__).parents[1]
 COMPILE_S = 600.0
-"""Longest that a start takes where nothing is compiled yet: 35 s of processor time, thirty programs on two cores."""
+"""Longest start with an empty cache: 35 s of processor time, thirty programs on two cores."""
 
 
 def free_port() -> int:
-    """A port of the loopback that nobody listens at."""
+    """Return an unused port of the loopback."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return probe.getsockname()[1]
 
 
 def free_endpoint() -> str:
-    """An address of the loopback that nobody listens at."""
+    """Return an unused address of the loopback."""
     return f"127.0.0.1:{free_port()}"
 
 
 @contextmanager
 def python(*arguments: str, **settings: Any) -> Iterator[subprocess.Popen[str]]:
-    """A Python process in the tree's root, both of its outputs as pipes unless the settings say else."""
+    """Start a Python process in the tree's root, with both outputs as pipes unless the settings differ."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"}
     usual = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "env": environment, "cwd": ROOT}
     chosen: dict[str, Any] = {**usual, **settings}
@@ -42,25 +42,25 @@ def python(*arguments: str, **settings: Any) -> Iterator[subprocess.Popen[str]]:
 
 
 def rig(*arguments: str, **settings: Any) -> Any:
-    """A command of `rig` as a process."""
+    """Start a command of `rig` as a process."""
     return python("-m", "rig", *arguments, **settings)
 
 
 @contextmanager
 def running_rig(scene: str, *arguments: str, says: str = "") -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """Start `rig run` for a day, wait until it listens, and stop it when it is no longer needed.
+    """Start `rig run` for a day, wait until it listens, and stop it at the end.
 
     Args:
         scene: Name of the scene.
         *arguments: Options.
-        says: Words of a line that it must print before it listens.
+        says: Text of a line that it must print before it listens.
 
     Yields:
-        The process and where it listens.
+        The process and its address.
     """
     endpoint = free_endpoint()
     with rig("run", scene, "--listen", endpoint, "--duration-s", "86400", *arguments) as child:
-        for words in filter(None, (says, "listening on")):  # then it is compiled, and on its CAN bus
+        for words in filter(None, (says, "listening on")):  # then it is compiled and connected to its CAN bus
             line_of(child, words)
         yield child, endpoint
         child.terminate()
@@ -68,10 +68,10 @@ def running_rig(scene: str, *arguments: str, says: str = "") -> Iterator[tuple[s
 
 
 def line_of(child: subprocess.Popen[str], words: str) -> str:
-    """Return the first line of its error output that contains these words, or of its only output.
+    """Return the first line with these words from its error output, or from its only output.
 
     Raises:
-        AssertionError: It ended without such a line; the message has all that it printed.
+        AssertionError: It ended without such a line; the message contains its output.
     """
     pipe = child.stderr or child.stdout
     assert pipe is not None

@@ -1,4 +1,4 @@
-"""Changes of scenes that several tests make."""
+"""Changes of scenes for several tests."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Foreign records and perfect DAQs of a population, each case made from its number alone."""
+"""Foreign records and perfect DAQs of a population; the number of a case determines all of it."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ class Case:
     """One record of a DAQ.
 
     Attributes:
-        label: What it is.
-        file: What the DAQ wrote.
-        sent: The session that it is held against.
-        path: The path that is asked for; None: as the file looks.
-        right: Quantities of which one has to be red; empty where none is asked.
-        allowed: Further quantities that the defect changes, too.
+        label: Name of the case.
+        file: The DAQ's file.
+        sent: The session to compare it with.
+        path: The requested path; None: detected from the file.
+        right: Quantities of which one must fail; empty if none is required.
+        allowed: Further quantities that the defect changes.
         judged: Further arguments of `replays.score.judgement.judge`.
     """
 
@@ -48,7 +48,7 @@ class Case:
     judged: dict[str, Any] = field(default_factory=dict)
 
 
-# What a DAQ writes.
+# Columns of a DAQ's file.
 
 
 def in_unit(sent: Sent, counts: np.ndarray, unit: str) -> dict[str, tuple[str, np.ndarray]]:
@@ -67,16 +67,16 @@ def in_unit(sent: Sent, counts: np.ndarray, unit: str) -> dict[str, tuple[str, n
 
 @dataclass
 class Converter:
-    """How a DAQ samples by itself; what is given by channel has one value, or one for each channel.
+    """A DAQ that samples by its own clock; values by channel are one number, or one per channel.
 
     Attributes:
         begin_s: Time of the run at its first sample [s].
         rows: Samples.
         rate_hz: Nominal rate [Hz].
-        ppm, drift_ppm_s: Its clock's error, and how that changes [ppm, ppm/s].
-        gain, offset_v, skew_s, noise: Of the channels; noise times the calibrated one.
+        ppm, drift_ppm_s: Error of its clock and the drift of that error [ppm, ppm/s].
+        gain, offset_v, skew_s, noise: Of the channels; noise as a multiple of the calibrated one.
         jitter_s: rms of all sampling instants [s].
-        idle_s: Until this time of the run nothing but the bias comes in [s].
+        idle_s: Until this time of the run the input is the bias only [s].
     """
 
     begin_s: float
@@ -92,7 +92,7 @@ class Converter:
     idle_s: float = -1e9
 
     def volts(self, sent: Sent, generator: Generator, signal: Callable[..., np.ndarray] | None = None) -> np.ndarray:
-        """Return what it records [V], shape (rows, channels); `signal` is in place of the session's."""
+        """Return the recorded volts, shape (rows, channels); `signal` replaces the session's."""
         own_s = np.arange(self.rows) / self.rate_hz
         middle = own_s - 0.5 * own_s[-1]
         true_s = self.begin_s + own_s / (1.0 + 1e-6 * self.ppm) - 0.5e-6 * self.drift_ppm_s * middle**2
@@ -112,7 +112,7 @@ class Converter:
 
 
 def as_columns(sent: Sent, volts: np.ndarray, unit: str) -> dict[str, tuple[str, np.ndarray]]:
-    """Return columns of volts, as they are or in the channels' units."""
+    """Return columns of volts, unchanged or in the channels' units."""
     return {
         c.name: ("V", volts[:, n]) if unit == "V" else (c.unit, (volts[:, n] - c.bias_v) / c.sensitivity_v)
         for n, c in enumerate(sent.channels)
@@ -128,7 +128,7 @@ def perfect(number: int, seed: int, sessions: Sessions, stem: Path) -> Case:
     form = FORMATS[number % len(FORMATS)]
     kind = CYCLE[(number // len(FORMATS) + number) % len(CYCLE)]
     bits = int(g.choice([12, 14, 16, 18, 20, 24, 24, 24, 32]))
-    bits = min(bits, 24) if form in ("candump", "asc", "blf") else bits  # more do not fit into its frames
+    bits = min(bits, 24) if form in ("candump", "asc", "blf") else bits  # the limit of its frames
     digital = form in COUNTED or bool(number % 2)
     groups = str(g.choice(["two", "eight", "all"], p=[0.7, 0.2, 0.1]))
     groups = "all" if form == "asc" else groups  # a classic frame has channels of several groups
@@ -186,7 +186,7 @@ def _noise(g: Generator, rows: int, count: int) -> np.ndarray:
 
 
 def _machine(g: Generator, rows: int, count: int) -> np.ndarray:
-    """Signals of another machine, alike on no two channels."""
+    """Return signals of another machine, different on every channel."""
     t, kind = np.arange(rows) / RATE_HZ, g.integers(4)
     found = []
     for _ in range(count):
@@ -194,7 +194,7 @@ def _machine(g: Generator, rows: int, count: int) -> np.ndarray:
         wave = np.sin(2 * np.pi * hz * t + phase)
         if kind == 1:
             wave = np.sign(wave)
-        elif kind == 2:  # as an ECG: a sharp wave once a beat, and two slow ones
+        elif kind == 2:  # as an ECG: one sharp wave per beat, and two slow ones
             beat = (t * g.uniform(0.8, 3.0) + phase) % 1.0
             wave = sum(
                 a * np.exp(-(((beat - at) / w) ** 2))
@@ -213,7 +213,7 @@ FOREIGN = (
 
 
 def foreign(number: int, seed: int, sessions: Sessions, stem: Path) -> Case:
-    """Return a record that is not the session it is held against."""
+    """Return a record that differs from the session with which it is compared."""
     g = np.random.default_rng([seed, 1, number])
     kind, label = CYCLE[number // len(FOREIGN) % len(CYCLE)], FOREIGN[number % len(FOREIGN)]
     if label == "reversed" and kind in ("test-sine", "test-two-tone"):

@@ -2,9 +2,10 @@
 [--noise NAME ...]`.
 
 Fits synthetic DAQs of known gain, offset, clock and so on, whose noise is white, coloured or drifts, and counts the
-95 % intervals that hold the true value. Each fit is a line of a journal, where an interrupted run continues. It prints
-one row for each quantity and noise. Status 1 where fewer than 275 or more than 294 of 300 intervals hold, or the median
-half width is above 1.5 times 1.96 standard deviations of the error; cells of `KNOWN` are marked and do not count.
+95 % intervals that contain the true value. Each fit is a line of a journal, from which an interrupted run continues. It
+prints one row for each quantity and noise. Status 1 if fewer than 275 or more than 294 of 300 intervals contain it, or
+the median half width is above 1.5 times 1.96 standard deviations of the error; cells of `KNOWN` are marked and do not
+count.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ from tests.score_daqs import RATE_HZ, Tones
 
 ROWS = 6000
 SIGNALS = 12
-"""Known signals of each kind, which are splines that are kept."""
+"""Known signals of each kind; their splines are kept."""
 LEVEL = 3e-3
 """Noise of each record [mm rms]."""
 FITS, MIN_HELD, MAX_HELD, MAX_WIDTH = 300, 275, 294, 1.5
@@ -53,7 +54,7 @@ KNOWN = {
 CHANNELS = default_table().groups["probes"].channels[:2]
 FULL_MM = CHANNELS[0].adc_v / abs(CHANNELS[0].sensitivity_v)
 Noise = tuple[np.ndarray, float, float]
-"""Samples [mm], shape (n,), the offset that a wander adds [mm], and the true rms about the mean of a record [mm]."""
+"""Samples [mm], shape (n,), the offset added by a wander [mm], and the true rms about the mean of a record [mm]."""
 Estimate = tuple[float, float, float, float]
 """Value, low end, high end, true value."""
 
@@ -63,13 +64,13 @@ def _white(generator: np.random.Generator, rows: int) -> Noise:
 
 
 def _rising(generator: np.random.Generator, rows: int) -> Noise:
-    """White noise whose level rises threefold over the record."""
+    """Return white noise whose level rises threefold over the record."""
     level = LEVEL * np.linspace(0.5, 1.5, rows)
     return level * generator.standard_normal(rows), 0.0, float(np.sqrt(np.mean(level**2)))
 
 
 def _coloured(time_rows: float) -> Callable[[np.random.Generator, int], Noise]:
-    """Noise of first order by its correlation time in samples."""
+    """Return a generator of first-order noise with a correlation time in samples."""
 
     def noise(generator: np.random.Generator, rows: int) -> Noise:
         from scipy.signal import lfilter
@@ -85,7 +86,7 @@ def _coloured(time_rows: float) -> Callable[[np.random.Generator, int], Noise]:
 
 
 def _pink(generator: np.random.Generator, rows: int) -> Noise:
-    """Noise of 1/f, flat below ten periods a record."""
+    """Return 1/f noise, flat below ten periods per record."""
     longer = 4 * rows
     lines = np.fft.rfftfreq(longer, 1.0 / rows)
     size = np.maximum(lines, 10.0) ** -0.5
@@ -97,7 +98,7 @@ def _pink(generator: np.random.Generator, rows: int) -> Noise:
 
 
 def _wandering(wander: Callable[[np.random.Generator, np.ndarray], np.ndarray]) -> Callable[..., Noise]:
-    """White noise and, at the same level, a wander of which the true values are those of this record."""
+    """Return a generator of white noise plus a wander of the same level, with the true values of each record."""
 
     def noise(generator: np.random.Generator, rows: int) -> Noise:
         slow = LEVEL * wander(generator, (np.arange(rows) + 0.5) / rows)
@@ -118,7 +119,7 @@ NOISES: dict[str, Callable[[np.random.Generator, int], Noise]] = {
 
 @lru_cache
 def _curve(seed: int, **told: Any) -> Callable[[np.ndarray], np.ndarray]:
-    """Return a spline through tones at 5 times the rate: 30 times as fast, and itself the known signal."""
+    """Return a spline through tones at 5 times the rate: 30 times as fast, and used as the known signal itself."""
     from scipy.interpolate import make_interp_spline
 
     signal = Tones(seed, 1.0, **told)
@@ -133,7 +134,7 @@ def _slope(signal: Callable[[np.ndarray], np.ndarray], times_s: np.ndarray) -> f
 def _judged(
     values: Sequence[np.ndarray], formulas: Sequence[Callable[[np.ndarray], np.ndarray]], sent_hz: float, late_s: float
 ) -> dict[tuple[str, str], Any]:
-    """Return a scorecard's rows by quantity and channel, of one record whose signals are known by formulas."""
+    """Return a scorecard's rows by quantity and channel, of a record whose signals are known by formulas."""
     t, names = np.arange(len(values[0])) / RATE_HZ, [each.name for each in CHANNELS[: len(values)]]
     columns = np.column_stack([t, *values])
     table = Table(len(t), len(values), lambda wanted: [columns[:, [0, *(1 + n for n in wanted)]]])
@@ -149,7 +150,7 @@ def _judged(
 
 
 def _waveforms(generator: np.random.Generator, noise: Callable[..., Noise], seed: int) -> dict[str, Estimate]:
-    """Return estimates of two channels of tones: gain, times, noise and what follows from these."""
+    """Return estimates of two channels of tones: gain, times, noise and derived quantities."""
     t, signals = np.arange(ROWS) / RATE_HZ, [_curve(2 * (seed % SIGNALS) + k, high_hz=3000.0, tones=12) for k in (0, 1)]
     gain, offset, late_s = generator.uniform(0.9, 1.1), generator.normal(0.0, 0.1), generator.uniform(0.02, 0.03)
     drift, bend, skew_s = generator.normal(0.0, 50e-6), generator.normal(0.0, 1e-4), generator.normal(0.0, 1e-6)
@@ -225,14 +226,17 @@ def estimates(seed: int, noise: str, kinds: Sequence[str] = tuple(KINDS)) -> dic
 
 
 def cell(found: Sequence[Estimate]) -> tuple[int, float]:
-    """Return how many intervals hold, and their median half width over 1.96 standard deviations of the error."""
+    """Return the number of intervals that contain the truth, and their median half width over 1.96 standard deviations
+    of
+    the error.
+    """
     value, low, high, true = np.array(found).T
     spread = float(np.std(value - true))
     return int(np.sum((low <= true) & (true <= high))), float(np.median(high - low)) / (2.0 * 1.96 * spread)
 
 
 def main(words: list[str] | None = None) -> int:
-    """Print the table of coverage; return 1 where the goal is missed."""
+    """Print the table of coverage; return 1 if the goal is missed."""
     parser = argparse.ArgumentParser(prog="python -m tests.score_coverage", description=(__doc__ or "").split("\n")[0])
     parser.add_argument("-n", type=int, default=FITS, help="fits for each noise")
     parser.add_argument("--first", type=int, default=0, help="seed of the first fit")

@@ -1,4 +1,4 @@
-"""Synthetic DAQs under test: sessions of known signals, and what each kind of DAQ makes of them."""
+"""Synthetic DAQs under test: sessions of known signals, and the records of each kind of DAQ."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ RATE_HZ = 20_000
 
 
 def write_session(path: Path, groups: dict[str, np.ndarray], *, index: int = 0) -> Path:
-    """A session of counts by group, each shape (n, channels), in blocks of 10 ms."""
+    """Write a session of counts by group, each of shape (n, channels), in blocks of 10 ms."""
     told = documents()
     writer = RecordingWriter(path, catalogue=told[CATALOGUE], parameters=told[PARAMETERS], scene=told[SCENE])
     rows = RATE_HZ // 100
@@ -31,7 +31,7 @@ def write_session(path: Path, groups: dict[str, np.ndarray], *, index: int = 0) 
 
 
 def counts_of(group: str, values: np.ndarray, generator: np.random.Generator | None) -> np.ndarray:
-    """Counts of engineering values, shape (n, channels), with the channels' noise where a generator is given."""
+    """Return counts of engineering values, shape (n, channels), with the channels' noise if there is a generator."""
     channels = default_table().groups[group].channels
     volts = np.column_stack([c.bias_v + c.sensitivity_v * v for c, v in zip(channels, values.T, strict=True)])
     if generator is not None:
@@ -55,7 +55,7 @@ class Tones:
         return found
 
     def behind(self, corner_hz: float, order: int) -> Tones:
-        """The same behind an analogue Butterworth low-pass, tone by tone, by the closed form of its poles."""
+        """Return the tones after an analogue Butterworth low-pass, by the closed form of its poles."""
         poles = np.exp(1j * np.pi * (2.0 * np.arange(1, order + 1) + order - 1.0) / (2.0 * order))
         passed = copy(self)
         passed.parts = self.parts / np.prod(1.0 - 1j * self.hz[:, None] / corner_hz / poles, axis=1)
@@ -63,7 +63,7 @@ class Tones:
 
 
 def chips(seed: int, seconds: float, *, rate_hz: float = RATE_HZ) -> np.ndarray:
-    """A pseudo-random binary sequence of 1 and -1, a chip four rows long, shape (n,)."""
+    """Return a pseudo-random binary sequence of 1 and -1 with chips of four rows, shape (n,)."""
     rows = round(seconds * rate_hz)
     return np.repeat(np.random.default_rng(seed).integers(0, 2, rows // 4 + 1) * 2.0 - 1.0, 4)[:rows]
 

@@ -1,4 +1,4 @@
-"""DAQs of a population with one defect each, made from its number, with what it has to turn red and what it may."""
+"""DAQs with one defect each, derived from the case's number, with the quantities that must fail and that may fail."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from tests.score_files import WRITERS, write_values
 from tests.score_sessions import FORMULAS, RATE_HZ, Sent, Sessions
 
 _RESIDUE = frozenset({"noise", "effective bits", "dynamic range", "SINAD", "ENOB", "SFDR"})
-"""Quantities of all that the known signal leaves of a record: what is not linear and constant in time is in them."""
+"""Quantities of the residual after the known signal: all that is not linear and constant in time affects them."""
 _LOSS = frozenset({"lost samples", "doubled samples", "missing samples"})
 _ABSENT = frozenset({"mapping", "channel", "channels", "recorded", "missing channel", "missing channels", "presence"})
 _ROWS, _BEGIN_ROWS = 14_000, 900
-"""Samples of a DAQ that samples by itself, and rows of the session before its first."""
+"""Samples of a DAQ with its own clock, and rows of the session before its first."""
 Signal = Callable[[str, np.ndarray], np.ndarray]
 
 DIGITAL_DEFECTS = (
@@ -34,7 +34,7 @@ def defect(number: int, seed: int, sessions: Sessions, stem: Path, base: Callabl
     """Return a DAQ with one defect.
 
     Args:
-        number: Of the case; even ones took counts, odd ones sample by themselves.
+        number: Of the case; even ones record counts, odd ones sample by their own clock.
         seed: Of the population.
         sessions: The sessions.
         stem: Of the file.
@@ -78,7 +78,7 @@ def _digital(number: int, seed: int, sessions: Sessions, stem: Path) -> Case:
         name = sent.channels[channel].name
         told, values = columns[name]
         if what == "gain":
-            # A gain about zero volts, or about a value of zero: with a bias it moves the middle as well.
+            # A gain about zero volts, or about a value of zero: with a bias it also moves the mean.
             columns[name] = (
                 told,
                 values * (1.0 + float(g.choice([-1, 1])) * 1e-6 * float(np.exp(g.uniform(np.log(0.2), np.log(1000))))),
@@ -92,7 +92,7 @@ def _digital(number: int, seed: int, sessions: Sessions, stem: Path) -> Case:
         columns = in_unit(sent, counts, unit)
         a, b = sent.channels[channel].name, sent.channels[other].name
         columns[a], columns[b] = (columns[a][0], columns[b][1]), (columns[b][0], columns[a][1])
-        # Channels of different sensitivity that are swapped have each other's scale as well.
+        # Swapped channels of different sensitivity also have each other's scale.
         right, allowed = {"mapping"}, {"scale", "offset"} if unit == "unit" else set()
     elif what == "inverted":
         unit = "unit" if unit == "counts" else unit
@@ -103,7 +103,7 @@ def _digital(number: int, seed: int, sessions: Sessions, stem: Path) -> Case:
     elif what == "stuck bit":
         bit = int(g.integers(0, 16))
         counts[:, channel] |= 1 << bit
-        # A bit that is always set moves the mean, which a scale is found by.
+        # A bit that is always set moves the mean, from which a scale is estimated.
         right, allowed = {"altered values"}, {"offset", "scale"}
     elif what == "delayed channel":
         counts[:, channel] = sent.sent(first - int(g.integers(1, 100)), rows)[:, channel]
@@ -121,10 +121,10 @@ def _digital(number: int, seed: int, sessions: Sessions, stem: Path) -> Case:
             right = {"foreign rows", "altered values"}
     columns = in_unit(sent, counts, unit) if columns is None else columns
     if what in ("lost rows", "doubled rows", "foreign rows"):
-        # Stamps that count the DAQ's own rows jump against the session's, by 10 ms of a second.
+        # Stamps that count the DAQ's own rows jump relative to the session's, by 10 ms per second.
         allowed = {"stamp rate"}
     length = len(next(iter(columns.values()))[1])
-    # Rows that a DAQ loses are gone from its own count of time as well, or not.
+    # Rows that a DAQ loses are also missing from its own count of time, or not.
     times = np.arange(length) / RATE_HZ if g.random() < 0.7 else None
     form = str(g.choice([each for each in WRITERS if times is not None or each not in ("tdms", "uff", "mdf")]))
     text = f"digital {what}, {kind}, {form}, {unit}, {sent.channels[channel].name}, {several} at {at}"
@@ -152,12 +152,12 @@ def _tones_through(sent: Sent, corner_hz: float, order: int) -> Callable[[str, n
 
 
 def _one_channel(sent: Sent, name: str, changed: Signal) -> Signal:
-    """Return the session's signal, which is another on one channel."""
+    """Return the session's signal with one channel replaced."""
     return lambda channel, times_s: (changed if channel == name else sent.volts)(channel, times_s)
 
 
 def _folding(sent: Sent, part: Callable[[str], float]) -> Signal:
-    """Return the two tones of the session `alias`, of whose upper one a part is left on each channel."""
+    """Return the two tones of the session `alias`; of the upper one, a part remains on each channel."""
 
     def volts(channel: str, times_s: np.ndarray) -> np.ndarray:
         low = sent.table.channels[channel].bias_v + 2.0 * np.sin(2.0 * np.pi * 79.0 * times_s)
@@ -177,28 +177,28 @@ _KINDS = {
     "jitter": ("test-two-tone", "test-multisine"), "noise": FORMULAS[:4], "mapping": ("test-whirl",),
     "polarity": ("test-whirl", "test-chirp"),
 }  # fmt: skip
-"""Sessions that show a quantity, where not all of the first five do."""
+"""Sessions that show a quantity, if not all of the first five do."""
 _CONSEQUENCES: dict[str, frozenset[str]] = {
-    # Over the record the clock's error is no number, and the ends' instants are off the line by microseconds.
+    # Over the record the clock's error is not constant, and the ends' instants are off the line by microseconds.
     "clock drift": frozenset({"clock", "jitter"}) | _RESIDUE,
     "noise": _RESIDUE,
-    # Instants that are off are off in volts.
+    # Errors of instants become errors in volts.
     "jitter": _RESIDUE,
-    # From there on all is a sample late: a line through the time is tilted, and what is left grows with the slope.
+    # From there on all is one sample late: a line through the time is tilted, and the residual grows with the slope.
     "lost sample": frozenset({"clock", "clock drift", "jitter"}) | _RESIDUE,
     "doubled sample": frozenset({"clock", "clock drift", "jitter"}) | _RESIDUE,
-    # A harmonic is none of what was sent.
+    # A harmonic was not sent.
     "THD": frozenset({"jitter"}) | _RESIDUE,
-    # A tone that folds back is none of what was sent below half of the rate.
+    # A folded tone was not sent below half of the rate.
     "alias rejection": _RESIDUE | {"THD"},
     # Probes of another sensitivity have another gain, bias and noise in millimetres.
     "mapping": frozenset({"gain", "offset"}) | _RESIDUE,
 }
-"""Quantities that a defect of a DAQ that samples by itself turns red as well, with the reason."""
+"""Further quantities that fail by a defect of a DAQ with its own clock, with the reason."""
 
 
 def _beyond(what: str, sent: Sent, channel: str, rate: float, stem: Path, base: Callable[[Case], Any]) -> np.ndarray:
-    """Return the limit of a quantity and half the interval that a DAQ without a defect has, in its unit."""
+    """Return the limit of a quantity plus half the interval of a DAQ without a defect, in its unit."""
     generator = np.random.default_rng(5)
     rows = int(_ROWS * rate / RATE_HZ)
     volts = Converter((sent.first + _BEGIN_ROWS + 0.4) / RATE_HZ, rows, rate, ppm=20.0).volts(sent, generator)
@@ -229,7 +229,7 @@ def _analogue(number: int, seed: int, sessions: Sessions, stem: Path, base: Call
         signal = _folding(sent, lambda each: part if each == name else 1e-4)
 
     def beyond(quantity: str, of: str = name, times: float = 1.0) -> float:
-        """Return the limit and so many half widths."""
+        """Return the limit plus `times` half widths."""
         limit, half = _beyond(quantity, sent, of, rate, stem, base)
         return float(limit + times * halves * half)
 

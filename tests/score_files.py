@@ -1,4 +1,4 @@
-"""Files of DAQs under test, in the formats that DAQs write."""
+"""Files of DAQs under test, in common formats."""
 
 from __future__ import annotations
 
@@ -40,13 +40,13 @@ def _lines(names: list[str], units: list[str], values: list[np.ndarray], mark: s
 
 
 def _semicolon(path: Path, columns: Columns, times_s: np.ndarray | None, _: float) -> None:
-    """As a German spreadsheet writes it: decimal commas, CRLF, latin-1."""
+    """Write CSV as a German spreadsheet does: decimal commas, CRLF, latin-1."""
     text = "\r\n".join(_lines(*_texts(columns, times_s), ";", row=False)).replace(".", ",")
     path.write_bytes((text + "\r\n").encode("latin-1", "replace"))
 
 
 def _tab(path: Path, columns: Columns, times_s: np.ndarray | None, _: float) -> None:
-    """Tabs, and a line of units below the names."""
+    """Write tab-separated values with a line of units below the names."""
     path.write_text("\n".join(_lines(*_texts(columns, times_s), "\t", row=True)) + "\n", encoding="utf-8")
 
 
@@ -100,14 +100,14 @@ WRITERS: dict[str, tuple[str, Callable[..., None]]] = {
     "comma": (".csv", _comma), "semicolon": (".csv", _semicolon), "tab": (".txt", _tab),
     "parquet": (".parquet", _parquet), "mdf": (".mf4", _mdf), "tdms": (".tdms", _tdms), "uff": (".uff", _uff),
 }  # fmt: skip
-"""Suffix and writer of the formats that hold any values."""
+"""Suffix and writer of the formats for arbitrary values."""
 COUNTED = ("wav", "mcap", "candump", "asc", "blf")
-"""Formats that hold counts of a DAQ that took them."""
+"""Formats for counts of a DAQ."""
 FORMATS = (*WRITERS, *COUNTED)
 
 
 def write_values(form: str, stem: Path, columns: Columns, times_s: np.ndarray | None, rate_hz: float) -> Path:
-    """Write values in one of `WRITERS`; times are left out where the format has a start and a step."""
+    """Write values in one of `WRITERS`; times are omitted if the format has a start and a step."""
     suffix, writer = WRITERS[form]
     path = stem.with_suffix(suffix)
     path.unlink(missing_ok=True)
@@ -134,7 +134,7 @@ def write_taken(form: str, stem: Path, sent: Sent, counts: np.ndarray, first: in
 
 
 def _can_log(path: Path, sent: Sent, counts: np.ndarray, first: int, *, fd: bool) -> Path:
-    """Write what a logger of the rig's CAN bus has: each message with its own rows."""
+    """Write the log of the rig's CAN bus: each message with its own rows."""
     import can
 
     messages = messages_for(sent.table)

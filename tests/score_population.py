@@ -1,13 +1,14 @@
 """A population of DAQs under test: `python -m tests.score_population foreign|perfect|defects [-n N] [--seed S]`.
 
-Judges records that are not the session (`foreign`), DAQs without a defect (`perfect`) and DAQs with one defect
-(`defects`) by the function behind `rig score`, and with `--command EVERY` some of them by the command itself. Each case
-is a line of a journal, where an interrupted population continues; `--only NUMBER` judges one case and prints its line.
-Status 1 where the goal is missed:
+Judges records that differ from the session (`foreign`), DAQs without a defect (`perfect`) and DAQs with one defect
+(`defects`) by the function of `rig score`, and with `--command EVERY` some of them by the command itself. Each case is
+a
+line of a journal, from which an interrupted population continues; `--only NUMBER` judges one case and prints its line.
+Status 1 if the goal is missed:
 
 - foreign: none of 200 passes
 - perfect: none of 200 fails, and at most 5 % are inconclusive
-- defects: none of 300 passes, the right quantity is red in 95 %, and no other in 95 %
+- defects: none of 300 passes, the right quantity fails in 95 %, and no other fails in 95 %
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ class Population:
         self._sessions, self._bases = Sessions(folder / "sessions"), dict[str, Scorecard]()
 
     def case(self, number: int) -> Case:
-        """Return a case by its number; its file stays until the next one is asked for."""
+        """Return a case by its number; its file is kept until the next case."""
         stem = self._folder / f"case-{self.name}-{self.seed}"
         for file in self._folder.glob(f"{stem.name}.*"):
             file.unlink()
@@ -144,7 +145,7 @@ def figures(name: str, lines: list[dict[str, Any]]) -> tuple[list[str], bool]:
 
 
 def main(words: list[str] | None = None) -> int:
-    """Judge a population; return 1 where its goal is missed."""
+    """Judge a population; return 1 if its goal is missed."""
     parser = argparse.ArgumentParser(
         prog="python -m tests.score_population", description=(__doc__ or "").split("\n")[0]
     )

@@ -1,4 +1,4 @@
-"""Sessions of a population of DAQs: short recordings of all kinds of scenes, and what the rig sent around them."""
+"""Sessions of a population of DAQs: short recordings of all kinds of scenes, and the adjacent samples of the run."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ SCENES = {
     "alias": {"generator.frequencies": [79.0, 7001.0]},
     "slow-prbs": {"generator.frequency_hz": 1250.0, "generator.seed": 77},
 }  # fmt: skip
-"""What differs from each scene that comes with the rig, by kind of session."""
+"""Differences from a scene of the rig, by kind of session."""
 _SCENE_OF = {"alias": "test-two-tone", "slow-prbs": "test-prbs"}
 FORMULAS = ("test-sine", "test-two-tone", "test-multisine", "test-chirp", "test-whirl", "alias")
 """Kinds of session whose signal is known between samples."""
@@ -46,7 +46,7 @@ def scene_of(kind: str) -> Scene:
 
 @cache
 def _physics_volts(kind: str, seed: int) -> dict[str, np.ndarray]:
-    """Return what the converters received in a run of the model, without noise [V], by channel."""
+    """Return the noise-free inputs of the converters in a run of the model [V], by channel."""
     force = 80.0 + 15.0 * (seed % 5)
     changes = {"drive.speed_hz": 5.0 + 0.3 * (seed % 7)} if kind == "stable-run" else {}
     scene = load_scene(kind, {"duration_s": PHYSICS_S, "sensors.noise": False, **changes})
@@ -80,7 +80,7 @@ class Sent:
         noisy: Whether its samples have the channels' noise.
         path: The recording.
         first, rows: Number of its first row, and of its rows.
-        counts: What it has, int64, shape (rows, channels).
+        counts: Its samples, int64, shape (rows, channels).
     """
 
     kind: str
@@ -99,7 +99,7 @@ class Sent:
 
     @property
     def generated(self) -> bool:
-        """Whether a test signal stands in place of the model."""
+        """Whether a test signal replaces the model."""
         return scene_of(self.kind).generator is not None
 
     @property
@@ -108,7 +108,7 @@ class Sent:
         return list(self.table.channels.values())
 
     def clean(self, first: int, rows: int) -> np.ndarray:
-        """Return volts of rows of the run without noise, at its ends the nearest, shape (rows, channels)."""
+        """Return noise-free volts of rows of the run, extended at its ends, shape (rows, channels)."""
         numbers = np.arange(first, first + rows)
         if self.generated:
             return np.column_stack([self._sources[c.name].volts(numbers / RATE_HZ) for c in self.channels])
@@ -121,7 +121,7 @@ class Sent:
         volts = self.clean(first, rows)
         if self.noisy:
             part, parts = 1 << 14, []
-            for block in range(first // part, (first + rows - 1) // part + 1):  # so that a row has one noise
+            for block in range(first // part, (first + rows - 1) // part + 1):  # each row always has the same noise
                 parts.append(np.random.default_rng([self.seed, block + 1000]).standard_normal((part, volts.shape[1])))
             begin = first - first // part * part
             volts += np.concatenate(parts)[begin : begin + rows] * [c.noise_v for c in self.channels]
@@ -135,7 +135,7 @@ class Sent:
     def volts(self, name: str, times_s: np.ndarray) -> np.ndarray:
         """Return one channel's noise-free volts at any times of the run [s], shape (n,).
 
-        By the formula of a test signal that has no jumps, else by a windowed sinc between the samples.
+        By the formula of a test signal without jumps, otherwise by a windowed sinc between the samples.
         """
         channel = self.table.channels[name]
         if self.kind in FORMULAS:
@@ -144,7 +144,7 @@ class Sent:
         low = int(place.min()) - _HALF_TAPS - 1
         column = [c.name for c in self.channels].index(name)
         rows = self.clean(low, int(place.max()) + _HALF_TAPS + 2 - low)[:, column]
-        if self.kind.endswith("prbs"):  # its jumps have much above 97 % of half of the rate, which a rebuilt one lacks
+        if self.kind.endswith("prbs"):  # its jumps have much above 97 % of half of the rate, which interpolation loses
             from replays.score.records.stimulus import EDGE, Sampled
 
             wide = self.clean(low - EDGE, len(rows) + 2 * EDGE)[:, column]
@@ -167,7 +167,7 @@ def _between(values: np.ndarray, places: np.ndarray) -> np.ndarray:
 
 
 def write_counts(path: Path, sent: Sent, counts: np.ndarray, first: int) -> Path:
-    """Write counts as a recording of the session's scene, from a row of the run on."""
+    """Write counts as a recording of the session's scene, starting at a row of the run."""
     told = documents()
     told[CATALOGUE]["table"] = sent.table.model_dump(mode="json")
     scene = scene_of(sent.kind)
@@ -189,10 +189,10 @@ def write_counts(path: Path, sent: Sent, counts: np.ndarray, first: int) -> Path
 
 
 class Sessions:
-    """Sessions of a population, each made when it is first asked for, in a folder that is used again."""
+    """Sessions of a population, each created on first use, in a folder that is reused."""
 
     def __init__(self, folder: Path) -> None:
-        """Take the folder."""
+        """Set the folder."""
         folder.mkdir(parents=True, exist_ok=True)
         self._folder, self._made = folder, dict[tuple, Sent]()
 
@@ -200,7 +200,7 @@ class Sessions:
         self, kind: str, *, seed: int = 1, groups: str = "two", bits: int = 24, noisy: bool = True,
         first_s: float = 2.0, seconds: float = 2.0,
     ) -> Sent:  # fmt: skip
-        """Return a session: a kind of scene, which groups of channels, and which part of its run it has."""
+        """Return a session of a kind of scene, with groups of channels and a part of its run."""
         key = kind, seed, groups, bits, noisy, first_s, seconds
         if key not in self._made:
             path = self._folder / f"{'-'.join(map(str, key))}.mcap"

@@ -1,9 +1,9 @@
-"""A second rig: another programme for the same laboratory, that shares no line with the product.
+"""An independent simulator of the same laboratory, which shares no code with the product.
 
-Its logs are what validation has to judge rightly. What differs on purpose: the shaft is a direction in space with an
-angular momentum (a heavy symmetric top), no angles; friction is `mu F_n tanh(v_t / 1 mm/s)`; classical Runge-Kutta at
-steps of 2 us through contacts, whose onset is where a step first ends inside the ring; sensors behind a Butterworth
-low-pass made by scipy, with a noise, a clock and an angle of the shaft of their own.
+Its logs test validation. Deliberate differences: the shaft is a direction in space with an angular momentum (a heavy
+symmetric top), not angles; friction is `mu F_n tanh(v_t / 1 mm/s)`; classical Runge-Kutta at steps of 2 us through
+contacts, whose onset is the first step that ends inside the ring; sensors after a Butterworth low-pass of scipy, with
+independent noise, clock and shaft angle.
 
     L' = torque,  u' = L x u / Ixx,  w = L . u / Izz,  theta' = w - G' u_x,
     G' = (u_y u_z' - u_y' u_z) / (u_y^2 + u_z^2)
@@ -31,7 +31,7 @@ NOISE = dict(zip(_NAMES, [4e-4] * 2 + [2e-4] * 2 + [0.8] * 4 + [0.08] * 4 + [3e-
 
 
 class Rig(NamedTuple):
-    """The rig's numbers."""
+    """Parameters of the rig."""
 
     M: float = 1.28
     Ixx: float = 0.0771
@@ -76,7 +76,7 @@ def _pair(u, k, P0):
 
 @njit(cache=True)
 def _rates(rig, t, omega0, pulse, v0, y, dy, seen):
-    """Rates of u, L, theta and the houses; `seen` is given what the sensors feel."""
+    """Return the rates of u, L, theta and the houses; `seen` receives the sensors' inputs."""
     ux, uy, uz, Lx, Ly, Lz = y[0], y[1], y[2], y[3], y[4], y[5]
     vx, vy, vz = (Ly * uz - Lz * uy) / rig.Ixx, (Lz * ux - Lx * uz) / rig.Ixx, (Lx * uy - Ly * ux) / rig.Ixx
     w = (Lx * ux + Ly * uy + Lz * uz) / rig.Izz
@@ -88,7 +88,7 @@ def _rates(rig, t, omega0, pulse, v0, y, dy, seen):
     s = bx * bx + by * by
     k = rig.K_mag * (1.0 + s * (rig.a3 + s * (rig.a5 + s * rig.a7)))
     out = rig.M * rig.eps * turning * turning
-    # Arm times lateral force, all together.
+    # Sum of arm times lateral force.
     fx = rig.arm_magnet * (-k * bx - rig.D_x * rig.arm_magnet * vx)
     fy = rig.arm_magnet * (-k * by - rig.D_y * rig.arm_magnet * vy) - rig.arm_centre * rig.M * rig.g
     fx += rig.arm_disk * (out * math.cos(y[6] + rig.phi) + hammer)
@@ -155,12 +155,12 @@ def _run(rig, y, omega0, pulse, t0, steps, every, rows):
 
 @dataclass(frozen=True)
 class Motion:
-    """What sensors without filter, noise and clock of their own would show.
+    """Ideal sensor signals, without filter, noise and clock error.
 
     Attributes:
-        rate_hz: Rows a second.
+        rate_hz: Row rate [Hz].
         values: By channel, in its unit, each shape (n,).
-        hammer_s: When the hammer pulse begins, from the first row on [s].
+        hammer_s: Start of the hammer pulse after the first row [s].
         contacts: Contacts begun.
     """
 
@@ -182,18 +182,18 @@ def run(
     after_s: float = 0.7,
     settled_s: float = 3.0,
 ) -> Motion:
-    """A hammer pulse in the middle of a run.
+    """Simulate a hammer pulse within a run.
 
     Args:
-        rig: Its numbers.
+        rig: Its parameters.
         speed_hz: Of the shaft and of its drive.
         force_n: Of the pulse.
         duration_ms: Of the pulse.
         direction: Of the pulse, from x to y [rad].
         turned: Angle of the shaft at the start [rad].
-        before_s: What is seen before the pulse, ...
-        after_s: ... and from it on [s].
-        settled_s: How long the rig has run before that [s].
+        before_s: Recorded time before the pulse, ...
+        after_s: ... and from its start [s].
+        settled_s: Duration of the run before that [s].
     """
     rig = Rig() if rig is None else rig
     assert direction == 0.0, "along x"
@@ -230,16 +230,16 @@ def log(
     noise: float = 1.0,
     edit: Callable[[dict[str, np.ndarray]], dict[str, np.ndarray]] = lambda values: values,
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """What a recorder of another make writes: times by its own clock [s], and values by channel.
+    """Return the log of another recorder: times by its own clock [s], and values by channel.
 
     Args:
-        motion: What happened.
+        motion: Ideal signals.
         seed: Of the noise.
-        rate_hz: Samples a second by the recorder's own clock.
-        ppm: How much faster that clock goes.
-        bandwidth_hz: Of the low-pass of fourth order before the converter; the speed's is 200 Hz.
-        noise: Times what the sensors usually have.
-        edit: What happens to the signals before the filter: faults of sensors.
+        rate_hz: Sample rate by the recorder's own clock [Hz].
+        ppm: Error of that clock [ppm]; positive: fast.
+        bandwidth_hz: Of the fourth-order low-pass before the converter; the speed's is 200 Hz.
+        noise: Factor of the sensors' noise.
+        edit: Changes the signals before the filter: faults of sensors.
     """
     from scipy.signal import butter, sosfilt, sosfilt_zi
 

@@ -1,4 +1,4 @@
-"""What comes from outside, generated: each door takes it, refuses it in one line, or tells what is wrong with it."""
+"""Generated hostile input: each interface must accept it, refuse it in one line, or report what is wrong with it."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ LONGEST_S = 20.0
 
 
 def inputs(default: int) -> int:
-    """Number of inputs of a test: short in the suite, as many as RIG_FUZZ_INPUTS says in a long run."""
+    """Return the number of inputs of a test: `default` in the suite, RIG_FUZZ_INPUTS in a long run."""
     return int(os.environ.get("RIG_FUZZ_INPUTS", default))
 
 
 class Door:
-    """Counts what becomes of inputs: taken, refused in one line, or else a fault, each kept once with its place."""
+    """Counts of inputs by result: accepted, refused in one line, or a fault. Each fault is kept once with its place."""
 
     def __init__(self) -> None:
         self.taken = self.refused = 0
@@ -29,7 +29,7 @@ class Door:
 
     @contextlib.contextmanager
     def tried(self, what: object, *also: type[Exception]) -> Iterator[None]:
-        """Try one input; `what` shows it where it is a fault."""
+        """Try one input; `what` identifies it in the report of a fault."""
         begin = time.monotonic()
         try:
             yield
@@ -48,7 +48,7 @@ class Door:
 
 
 def tell(doors: dict[str, Door]) -> None:
-    """Print the counts, and fail where there is a fault."""
+    """Print the counts, and fail if there is a fault."""
     for name, door in doors.items():
         print(f"{name}: {door.taken} taken, {door.refused} refused, {len(door.faults)} kinds of faults")
     print(f"largest memory of the process {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MB")

@@ -1,4 +1,4 @@
-"""What holds of every test here: no thread dies of an exception, and memory does not grow by a gigabyte."""
+"""Checks around every test of this folder: no thread ends by an exception, and memory grows by less than a gigabyte."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def bounded() -> Iterator[None]:
     tells = Path("/proc/self/clear_refs").exists()  # Linux
     if tells:
         with contextlib.suppress(OSError):
-            Path("/proc/self/clear_refs").write_text("5")  # the peak begins anew
+            Path("/proc/self/clear_refs").write_text("5")  # reset the peak
     start_mb = _memory_mb("VmRSS") if tells else 0.0
     try:
         yield

@@ -1,4 +1,4 @@
-"""Documents that a hostile client might send: JSON that is nearly right, far out of range, deep, long, or none."""
+"""Documents of a hostile client: nearly valid JSON, values out of range, deep or long documents, and no JSON at all."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ JUNK = (
 
 
 def documents(random: np.random.Generator, count: int, examples: list[dict[str, Any]]) -> Iterator[bytes]:
-    """Payloads: each an example with one to three things done to it, or something else altogether."""
+    """Yield payloads: an example with one to three changes, or an unrelated document."""
     fields = sorted({name for example in examples for name in example})
     for _ in range(count):
         kind = random.integers(10)

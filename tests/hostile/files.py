@@ -1,4 +1,4 @@
-"""Small recordings, and ways to spoil them: bytes, documents, records and blocks."""
+"""Small recordings, and functions that corrupt their bytes, documents, records and blocks."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ PROBES = sensor_key("probes")
 
 
 def write(path: Path, *, leave: bool = False, blocks: int = 3, **changes: Any) -> Path:
-    """A short recording; with `leave` what a kill leaves of it."""
+    """Write a short recording; with `leave` in the state that a killed recorder leaves."""
     about = documents()
     session = Recording.open(SESSIONS / "hammer-5.2.mcap")
     scene = session.scene["scene"]
-    scene |= {"seed": 7, "duration_s": 1e-3 * blocks, "commands": []}  # as the stream tells it
+    scene |= {"seed": 7, "duration_s": 1e-3 * blocks, "commands": []}  # as in the stream
     scene["sensors"] |= {"rate_hz": 0, "truth_rate_hz": 2000}
     about[PARAMETERS], about[SCENE] = session.parameters, {**session.scene, "seed": 7, "scene": scene}
     about[SCENE]["taken"] = [{"id": 1, "tick": 0, "command": "hammer", "request": {"force_n": 10.0}}]
@@ -60,7 +60,7 @@ def write(path: Path, *, leave: bool = False, blocks: int = 3, **changes: Any) -
 
 
 def contents(recording: Recording) -> tuple[Any, ...]:
-    """Everything that a reader gets of a recording."""
+    """Return everything that a reader obtains from a recording."""
     rows = [recording.samples(name) for name in recording.table.groups]
     return (
         list(recording.everything()), recording.metadata, recording.attachments, recording.catalogue,
@@ -83,7 +83,7 @@ def attachments_of(data: bytes) -> list[tuple[int, int]]:
 
 
 def spoil_bytes(data: bytes, rng: Rng) -> bytes:
-    """A flipped bit, another byte, a cut, a splice, a doubled piece or zeros."""
+    """Change bytes: a flipped bit, another byte, a cut, a splice, a repeated piece or zeros."""
     spoilt = bytearray(data)
     at, to = sorted(int(n) for n in rng.integers(0, len(data), 2))
     match rng.integers(0, 7):
@@ -110,7 +110,7 @@ VALUES: tuple[Any, ...] = (
 
 
 def spoil_document(document: Any, rng: Rng) -> Any:
-    """A document with another value, a field less, one more, or one in the place of another."""
+    """Return a document with another value, a field less or more, or one field in the place of another."""
     document = copy.deepcopy(document)
     place, parent, key = document, None, None
     for _ in range(int(rng.integers(1, 9))):
@@ -140,7 +140,7 @@ def spoil_document(document: Any, rng: Rng) -> Any:
 
 
 def spoil_json(document: Any, rng: Rng) -> bytes:
-    """The same as bytes; now and then of a form that no JSON has."""
+    """Return a changed document as bytes, occasionally as invalid JSON."""
     for _ in range(int(rng.integers(1, 3))):
         document = spoil_document(document, rng)
     text = json.dumps(document)
@@ -157,7 +157,7 @@ def spoil_json(document: Any, rng: Rng) -> bytes:
 
 
 def spoil_block(payload: bytes, rng: Rng) -> bytes:
-    """A block with another head, or other bytes."""
+    """Return a block with another header, or other bytes."""
     if len(payload) < 44:
         return spoil_bytes(payload or b"x", rng)
     head = list(struct.unpack_from("<qqddII", payload, 4))
@@ -181,7 +181,7 @@ Message = tuple[str, bytes, int]
 
 
 class Layout:
-    """What a recording is put together of by the library's own writer, so that its checksums are right."""
+    """Contents of a recording, written by the library's own writer so that its checksums are right."""
 
     def __init__(self, recording: Recording) -> None:
         self.metadata = copy.deepcopy(recording.metadata)
@@ -192,7 +192,7 @@ class Layout:
         ]
 
     def spoilt(self, rng: Rng) -> Layout:
-        """The same with something wrong in it."""
+        """Return a copy with one to three faults."""
         made = copy.copy(self)
         made.metadata, made.attachments = copy.deepcopy(self.metadata), dict(self.attachments)
         made.messages = list(self.messages)
@@ -235,7 +235,7 @@ class Layout:
             self.messages[at] = (topic, spoil_block(payload, rng), time_ns)
 
     def write(self, path: Path, rng: Rng | None = None) -> Path:
-        """Put it together; with `rng` now and then on channels that are not there, or in two ways."""
+        """Write the recording; with `rng` occasionally with undeclared channels or with two settings of the writer."""
         from mcap.writer import CompressionType, IndexType, Writer
 
         strange = 0.0 if rng is None else rng.random()
@@ -273,14 +273,14 @@ class Layout:
 
 @contextlib.contextmanager
 def unheard() -> Iterator[io.StringIO]:
-    """What is printed goes nowhere."""
+    """Capture output and error output."""
     out = io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(out):
         yield out
 
 
 def far_block(tick: int, index: int) -> bytes:
-    """A block of probes at a far place."""
+    """Return a block of probes far ahead in time."""
     return encode_block(Block(tick, index, 20_000.0, 1e6, np.zeros((20, 4), np.int32)))
 
 
@@ -288,7 +288,7 @@ Use = Callable[[Path, Path], object]
 
 
 def uses() -> dict[str, Use]:
-    """What is done with a recording, each through the door that a command uses."""
+    """Return the operations on a recording, each through the function that its command uses."""
     from recorder.reader import join
     from recorder.rewrite import cut, recover
     from replays.player.messages import Track
@@ -302,7 +302,7 @@ def uses() -> dict[str, Use]:
     def told(path: Path, _: Path) -> object:
         recording = join([path])
         with unheard():
-            with contextlib.suppress(typer.Exit):  # a verdict is none of the faults looked for
+            with contextlib.suppress(typer.Exit):  # the verdict is irrelevant here
                 info.info([path], form=Form())
             return json.dumps(info.describe(recording, quick=True))
 

@@ -1,7 +1,7 @@
-"""Generated blocks, events and status documents into everything that takes a rig's streams.
+"""Generated blocks, events and status documents for everything that receives a rig's streams.
 
-A true stream comes in between. None of it may be lost, nothing of the rest may be believed where it can be told from
-the truth, and nothing may end or grow.
+A valid stream is mixed in. None of it may be lost, nothing else may be accepted if it can be distinguished from it, and
+the receiver must neither stop nor grow.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ NAMES = ("start", "command", "hammer", "speed", "note", "warning", "end")
 
 
 class Truth:
-    """The rig's own blocks, cheap to make: those of the first instant with other numbers."""
+    """Valid blocks of the rig, cheap to generate: those of the first instant, renumbered."""
 
     def __init__(self) -> None:
         self._first = {key: bytearray(wire.encode_block(block_of(key, 0))) for key in KEYS}
@@ -67,16 +67,17 @@ class Truth:
 
 
 def forged(rng: np.random.Generator, truth: Truth, number: int, near: dict[str, set[int]]) -> tuple[str, bytes]:
-    """Something on a key of the rig that the rig did not send, before its block `number` of each stream.
+    """Return key and payload of a message that the rig did not send, before its block `number` of each stream.
 
-    Two forged blocks that go on from each other, each right in all that can be seen, are a rig that was started again:
-    `near` holds the numbers of those that came since the last true one, so that this does not come.
+    Two forged blocks that follow each other and are both plausible look like a restarted rig. `near` holds the numbers
+    of
+    those since the last valid block, so that this does not occur.
     """
     key, kind = str(rng.choice(KEYS)), int(rng.integers(14))
     payload = bytearray(truth.payload(key, number))
     tick, index, rate_hz, tick_rate_hz, columns, size = HEAD.unpack_from(payload, 4)
     rows = truth.rows[key]
-    if kind == 0:  # one field of the head
+    if kind == 0:  # one field of the header
         fields: list[Any] = [tick, index, rate_hz, tick_rate_hz, columns, size]
         place = int(rng.integers(6))
         other = ODD_RATES[rng.integers(len(ODD_RATES))] if place in (2, 3) else ODD_NUMBERS[rng.integers(15)]
@@ -84,19 +85,19 @@ def forged(rng: np.random.Generator, truth: Truth, number: int, near: dict[str, 
         HEAD.pack_into(payload, 4, *fields)
         if tuple(fields) == (tick, index, rate_hz, tick_rate_hz, columns, size):
             payload.pop()
-    elif kind == 1:  # other columns, whole
+    elif kind == 1:  # other columns, complete
         columns = int(rng.choice([1, 2, 3, 5, 7, 40]))
         columns += columns == HEAD.unpack_from(payload, 4)[4]
         dtype = np.int32 if key.startswith(wire.SENSORS) else np.float64
         block = wire.Block(tick, index, rate_hz, tick_rate_hz, np.ones((rows, columns), dtype))
         return key, wire.encode_block(block)
-    elif kind in (2, 3):  # far off, and consistent in itself
+    elif kind in (2, 3):  # far away, and consistent in itself
         step = int(rng.choice([1, -1])) * int(10 ** rng.uniform(0, 12))
         far = max(0, number + step + (step > 0))
         if far == number or crowded(near[key], far):
             return key, b"\x00"
         struct.pack_into("<qq", payload, 4, far * 10_000, far * rows)
-    elif kind == 4:  # once more
+    elif kind == 4:  # repeated
         past = max(0, number - int(rng.integers(1, 50)))
         return key, truth.payload(key, past) if past < number and not crowded(near[key], past) else b"\x00"
     elif kind == 5:  # of another kind
@@ -107,7 +108,7 @@ def forged(rng: np.random.Generator, truth: Truth, number: int, near: dict[str, 
         return key, bytes(payload[: rng.integers(len(payload))])
     elif kind == 7:
         return key, rng.bytes(int(rng.integers(200)))
-    elif kind == 8:  # bits of the head, but not so few of the time that it stays likely
+    elif kind == 8:  # bits of the header, but enough of the time that it is implausible
         for place in rng.integers(4, 44, size=3):
             payload[place] ^= 1 << int(rng.integers(8))
         payload[4 + 3] ^= 0x40
@@ -131,7 +132,7 @@ def forged(rng: np.random.Generator, truth: Truth, number: int, near: dict[str, 
 
 
 def crowded(near: set[int], number: int) -> bool:
-    """Whether a block would go on from another one, or be one too many."""
+    """Return whether a block would continue another forged one, or exceed the limit of forged blocks."""
     if len(near) > 8 or near & {number - 1, number, number + 1}:
         return True
     near.add(number)
@@ -143,7 +144,7 @@ def odd(rng: np.random.Generator) -> Any:
 
 
 def odd_event(rng: np.random.Generator) -> bytes:
-    """An event with a field that it must not have; an `end` never has a form that could be the rig's."""
+    """Return an event with an invalid field; an `end` never has a form that could be the rig's."""
     document: dict[str, Any] = {"event": str(rng.choice(NAMES)), "tick": 5, "time_s": 5e-6}
     for name in rng.choice(FIELDS, size=3):
         document[str(name)] = odd(rng)
@@ -155,10 +156,10 @@ def odd_event(rng: np.random.Generator) -> bytes:
 
 
 def mixed(count: int, seed: int) -> Iterator[tuple[str, bytes, bool]]:
-    """So many forged payloads among true ones, with whether they are true, and the true end."""
+    """Yield `count` forged payloads among valid ones as (key, payload, whether valid), and the valid end."""
     truth, rng = Truth(), np.random.default_rng(seed)
     number, sent = 0, 0
-    # The first block of a stream has nothing before it that a forged one could be held against.
+    # The first block of a stream has no predecessor to compare a forged one with.
     while sent < count or number < 5:
         for key in KEYS:
             yield key, truth.payload(key, number), True
@@ -175,7 +176,7 @@ def mixed(count: int, seed: int) -> Iterator[tuple[str, bytes, bool]]:
 def fed(
     session: RecordingSession, client: ScriptedClient, count: int, seed: int
 ) -> tuple[Summary, dict[str, list[int]]]:
-    """Record what is fed from another thread; the summary, and the row numbers of the true blocks."""
+    """Record what is fed from another thread; return the summary, and the row numbers of the valid blocks."""
     true: dict[str, list[int]] = {key: [] for key in KEYS}
 
     def feed() -> None:
@@ -247,12 +248,12 @@ def test_captures_end_and_hold_only_true_rows(tmp_path: Path) -> None:
                 for _, p in recording.payloads(key)
                 if is_block(key, p)
             ]
-            # A capture around what came before the first block has none of some streams.
+            # A capture around an earlier event lacks some streams.
             assert found == list(range(found[0], found[-1] + 1, Truth().rows[key])) if found else number == 0, key
 
 
 def ready(daq: Daq) -> Samples | None:
-    """What can be read at once."""
+    """Return what can be read without waiting."""
     try:
         return daq.read(timeout_s=0.0)
     except (LinkTimeoutError, StreamEndedError):
@@ -281,7 +282,7 @@ def test_a_daq_reads_on_and_gets_the_true_rows(monkeypatch: pytest.MonkeyPatch) 
 
 
 class Still:
-    """A painter that only counts."""
+    """A painter that only counts frames."""
 
     def __init__(self, *_: Any, **__: Any) -> None:
         self.rows = 0
@@ -333,12 +334,12 @@ def test_a_step_is_believed_once_something_follows_it_and_a_lone_block_is_not() 
     truth = Truth()
     for numbers, taken, refused in (
         ([0, 1, 5, 6], [0, 1, 5, 6], 0),  # a gap
-        ([0, 1, 5, 9, 10], [0, 1, 5, 9, 10], 0),  # gap upon gap
-        ([0, *range(1, 30, 2)], [0, 1, *range(3, 15, 2)], 0),  # every other one, which takes longer
-        ([7, 8, 0, 1, 2], [7, 8, 0, 1, 2], 0),  # started again
-        ([0, 1, 2**40, 2, 3], [0, 1, 2, 3], 1),  # out of the world
+        ([0, 1, 5, 9, 10], [0, 1, 5, 9, 10], 0),  # two gaps in sequence
+        ([0, *range(1, 30, 2)], [0, 1, *range(3, 15, 2)], 0),  # every other block; detection takes longer
+        ([7, 8, 0, 1, 2], [7, 8, 0, 1, 2], 0),  # restarted
+        ([0, 1, 2**40, 2, 3], [0, 1, 2, 3], 1),  # implausible number
         ([0, 1, 900, 2, 3], [0, 1, 2, 3], 1),
-        ([5, 6, 5, 7, 8], [5, 6, 7, 8], 1),  # once more
+        ([5, 6, 5, 7, 8], [5, 6, 7, 8], 1),  # repeated
         ([5, 6, 900, 3, 900, 7, 8], [5, 6, 7, 8], 3),
     ):
         intake = Intake(Catalogue.read(documents()[wire.CATALOGUE]))
@@ -379,7 +380,7 @@ def test_a_catalogue_that_is_none_is_one_line_for_recorder_and_daq(tmp_path: Pat
 def test_what_another_session_publishes_is_left_out_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     import zenoh
 
-    # Where access control stops it, as it does by default, there is nothing to leave out.
+    # With access control, the default, the block is refused and none has to be skipped.
     monkeypatch.setattr("rig.serve.transport.zenoh.rules", lambda: {"enabled": False, "default_permission": "allow"})
     endpoint, truth = free_endpoint(), Truth()
     with ZenohServer(endpoint) as server:
@@ -390,7 +391,7 @@ def test_what_another_session_publishes_is_left_out_and_counted(monkeypatch: pyt
             for lossless, taken in got.items():
                 client.subscribe(PROBES, lambda _, p, taken=taken: taken.append(p), lossless=lossless)
             client.subscribe(wire.EVENTS, lambda _, p: events.append(p), history=True)
-            # Until both subscriptions are in effect, what the lossy one misses is not recovered.
+            # Until both subscriptions are active, blocks that the lossy one misses are not recovered.
             number = 0
 
             def reached() -> bool:

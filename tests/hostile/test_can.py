@@ -1,7 +1,8 @@
-"""Generated inputs against the doors of the CAN bus and of the instruments: frames, messages, requests, text.
+"""Generated inputs for the interfaces of the CAN bus and of the instruments: frames, messages, requests, text.
 
-What must not happen: an exception that leaves, a thread that dies, a value that is taken though it is not exactly
-valid (each door has a judge of its own here, written from the protocol), the rig's own frames held up, memory growing.
+Not allowed: an exception that escapes, a thread that ends, a value that is accepted though it is not exactly valid
+(each
+interface has an independent check here, written from the protocol), delayed frames of the rig, growing memory.
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ _channels = itertools.count()
 
 
 def mutated(random: np.random.Generator, data: bytes) -> bytes:
-    """The same with bits flipped, bytes changed, cut, added or doubled."""
+    """Return the data with bits flipped or bytes changed, cut, added or repeated."""
     found = bytearray(data)
     for _ in range(random.integers(1, 4)):
         kind, place = random.integers(6), int(random.integers(len(found) + 1))
@@ -77,7 +78,7 @@ def mutated(random: np.random.Generator, data: bytes) -> bytes:
 
 
 class Rig:
-    """What a gateway needs of a rig; takes every command and keeps it."""
+    """A rig as a gateway uses it; accepts and stores every command."""
 
     def __init__(self, reply: Callable[[], bytes]) -> None:
         self.server = MemoryServer(cache=0)
@@ -95,7 +96,7 @@ class Rig:
 
 
 def is_command(message: can.Message, last: int) -> bool:
-    """Whether a frame is exactly one that a controller makes, from the description in the DBC."""
+    """Return whether a frame is exactly one that a controller sends, from the description in the DBC."""
     data = bytes(message.data)
     if message.is_extended_id or message.is_remote_frame or message.is_error_frame or message.is_fd or len(data) != 8:
         return False
@@ -113,7 +114,7 @@ def is_command(message: can.Message, last: int) -> bool:
 
 
 def a_frame(random: np.random.Generator, last: int) -> can.Message:
-    """A frame that is a command, nearly one, or anything else."""
+    """Return a command frame, nearly a command frame, or any other frame."""
     kind = tuple(CommandKind)[random.integers(len(CommandKind))]
     counter = (last + int(random.integers(-3, MAX_LEAD + 4))) % 256
     most = {
@@ -126,7 +127,7 @@ def a_frame(random: np.random.Generator, last: int) -> can.Message:
     choice = random.integers(10)
     if choice < 4:
         data = mutated(random, data)[:64]
-    elif choice == 4:  # consistent but for one thing: fields beyond their range, reserved bits, another key
+    elif choice == 4:  # consistent except for one thing: fields outside their range, reserved bits, another key
         data = bytes([data[0], data[1], *random.bytes(4), KEY if random.random() < 0.8 else 0, 0])
         data = data[:7] + bytes([checksum(identifier, data)])
     elif choice == 5:
@@ -181,7 +182,7 @@ def test_a_command_is_carried_out_only_where_its_frame_is_exactly_valid() -> Non
         assert gateway.commands.refused.total() > number // 10
         assert {thread.name for thread in threading.enumerate()} >= THREADS
         assert gateway.warnings() == []
-        # The bus itself, and what the gateway's own thread makes of it.
+        # The bus, and how the gateway's own thread handles its traffic.
         for _ in range(2000):
             with contextlib.suppress(can.CanError, ValueError):
                 other.send(a_frame(random, gateway.commands.counter))
@@ -193,7 +194,7 @@ def test_a_command_is_carried_out_only_where_its_frame_is_exactly_valid() -> Non
         until(lambda: rig.taken[-1][1].get("speed_hz") == 5.0)
 
 
-# What the rig publishes, as a gateway in another process would get it.
+# Return the rig's publications as a gateway in another process would receive them.
 
 
 def test_blocks_events_and_states_that_lie_do_not_stop_a_gateway() -> None:
@@ -218,7 +219,7 @@ def test_blocks_events_and_states_that_lie_do_not_stop_a_gateway() -> None:
                 while other.recv(0) is not None:
                     pass
         assert {thread.name for thread in threading.enumerate()} >= THREADS
-        # A quarter of a second of what is sent.
+        # One quarter of the sending time.
         assert gateway.outbox.waiting <= 0.25 * 13_000 + 512
         identifier = default_messages().by_name["Heartbeat"].identifier
         while (found := other.recv(5.0)) is not None and found.arbitration_id != identifier:
@@ -230,7 +231,7 @@ def test_blocks_events_and_states_that_lie_do_not_stop_a_gateway() -> None:
 
 
 def an_offer(random: np.random.Generator, secret: bytes) -> tuple[bytes, list[codec.Record]]:
-    """What comes as an offer, and the frames in it, if it is one."""
+    """Return a datagram to the hub, and its frames if it is a valid offer."""
     rows = []
     for _ in range(random.integers(1, 20)):
         word = int(random.choice((0x10, 0x7FF, 0x800, 0x1FFFFFFF))) | int(
@@ -286,7 +287,8 @@ def test_messages_and_requests_to_the_hub_stop_nobody_and_forge_nothing() -> Non
         for number, request in enumerate(requests):
             payload, _ = an_offer(random, secret)
             victim = names[random.integers(len(names))]
-            # Under another's name always with a wrong secret; under its own no more than leaves the bus some room.
+            # Under another client's name always with a wrong secret; under its own name at a rate that leaves the bus
+            # some capacity.
             if victim == villain.name and hub.endpoints.waiting > 5:
                 payload = payload[1:]
             hub.offer(victim, payload)
@@ -322,7 +324,7 @@ def test_messages_and_requests_to_the_hub_stop_nobody_and_forge_nothing() -> Non
 
 
 def is_send(text: bytes) -> tuple[int, bool, bool, bytes | int] | None:
-    """The frame that socketcand's `send` or `sendrtr` stands for, from its documentation; None: it stands for none."""
+    """Return the frame of a socketcand `send` or `sendrtr`, from its documentation; None if it is not one."""
     if not text.isascii() or len(text) > 510 or not text.decode().isprintable():
         return None
     word, *rest = text.decode().split() or [""]
@@ -351,7 +353,7 @@ def fields_of(message: can.Message) -> tuple[int, bool, bool, bytes | int]:
 
 
 def a_command(random: np.random.Generator) -> bytes:
-    """Text of a command, without brackets."""
+    """Return the text of a command, without brackets."""
     word = ("send", "sendrtr", "subscribe", "unsubscribe", "echo", "statistics", "rawmode", "add", "open")[
         random.integers(9)
     ]
@@ -395,7 +397,7 @@ def test_text_to_socketcand_makes_a_frame_only_where_it_stands_for_one() -> None
 
 
 class Flood:
-    """Writes what it is given to a descriptor and throws away what comes, as fast as that goes."""
+    """Write given data to a descriptor and discard replies, as fast as possible."""
 
     def __init__(self, descriptor: int) -> None:
         self._descriptor = descriptor
@@ -414,14 +416,14 @@ class Flood:
                     rest = rest[os.write(self._descriptor, rest) :]
 
     def _read(self) -> bytes:
-        # A port that gives up what waited throws it away between `select` and here.
+        # A port that drops its queue discards it between `select` and here.
         try:
             return os.read(self._descriptor, 1 << 16)
         except BlockingIOError:
             return b""
 
     def quiet(self, timeout_s: float = 0.3) -> bytes:
-        """The last that comes."""
+        """Return the last bytes received before `timeout_s` of silence."""
         last = b""
         while select.select([self._descriptor], [], [], timeout_s)[0]:
             last = (last + self._read())[-1000:]
@@ -451,7 +453,7 @@ def test_text_to_a_socketcand_server_stops_nobody() -> None:
 
 
 def is_line(line: bytes) -> tuple[Any, ...] | None:
-    """The frame that an SLCAN line stands for, from the manuals; None: it stands for none."""
+    """Return the frame of an SLCAN line, from the manuals; None if it is not one."""
     match = re.fullmatch(
         rb"(?:([tdbr])([0-9A-Fa-f]{3})|([TDBR])([0-9A-Fa-f]{8}))([0-9A-Fa-f])((?:[0-9A-Fa-f]{2})*)", line
     )
@@ -515,7 +517,7 @@ def test_lines_to_an_slcan_port_make_a_frame_only_where_they_stand_for_one() -> 
 
 
 def a_request(random: np.random.Generator, codec: Codec) -> bytes:
-    """A request that is right but for its values, or nearly one."""
+    """Return a valid request, one with other values, or one that is nearly valid."""
     kinds = list(codec.kinds)
     code = kinds[random.integers(len(kinds))] if random.random() < 0.9 else int(random.integers(256))
     head = struct.pack("<BBBI", 1, codec.address.number, code, int(random.integers(1 << 32)))
@@ -551,7 +553,7 @@ def test_requests_to_instruments_are_answered_and_only_exact_ones_carried_out() 
                 assert type(reply).__name__ == "Refused"
                 assert len(rig.commands) == before
             else:
-                # What is read is what stands there, to the byte.
+                # The data read must equal the data stored, to the byte.
                 assert twin.CODEC.encode(message, sequence) == request
                 assert len(rig.commands) == before + (type(reply).__name__ == "Done")
             if number % 500 == 0:
@@ -585,7 +587,7 @@ def test_frames_of_a_serial_line_are_whole_or_dropped() -> None:
 
 
 def _crc(data: bytes) -> int:
-    """Long division of the data, as one number, by the polynomial of CCITT."""
+    """Divide the data, as one number, by the CCITT polynomial and return the remainder."""
     value = int.from_bytes(data, "big") << 16
     while (excess := value.bit_length() - 17) >= 0:
         value ^= 0x11021 << excess
@@ -602,7 +604,7 @@ def test_transport_frames_of_instruments_on_a_bus_leave_them_answering() -> None
         for number in range(inputs(1000)):
             data = random.bytes(int(random.integers(0, 9)))
             if data and random.random() < 0.8:
-                # Single, first, consecutive frames and flow control of ISO 15765-2, with lengths that lie.
+                # Single, first and consecutive frames and flow control of ISO 15765-2, with wrong lengths.
                 data = (
                     bytes([int(random.choice((0x00, 0x07, 0x08, 0x10, 0x1F, 0x21, 0x30, 0x31, 0x32, 0xF0)))]) + data[1:]
                 )
@@ -662,7 +664,7 @@ def test_frames_that_lie_to_a_daq_stop_nothing_and_are_counted() -> None:
                 size = row.length if random.random() < 0.7 else int(random.integers(9))
                 source.take(row.identifier, random.bytes(size))
                 if number % 50 == 0:
-                    say("Sync", index=0, time=0)  # else it takes the rig for gone
+                    say("Sync", index=0, time=0)  # otherwise it assumes that the rig has ended
                     source.take(int(random.integers(1 << 11)), random.bytes(8))
                     source.deliver()
                     taken.clear()

@@ -1,4 +1,4 @@
-"""Files whose checksums hold and that contradict themselves: each contradiction is told in a line."""
+"""Files with valid checksums that contradict themselves: each contradiction is reported in one line."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ FORCES, STATE = "rig/sensors/forces", "rig/truth/state"
 
 @pytest.fixture(scope="module")
 def layout(tmp_path_factory: pytest.TempPathFactory) -> Layout:
-    """A session, with a status and what the topics say of themselves."""
+    """A session with a status and the metadata of its topics."""
     found = Layout(Recording.open(SESSIONS / "hammer-5.2.mcap"))
     engine = {"name": "split", "levels": {"contact": "compliant"}}
     status = {"tick": 500_000, "time_s": 0.5, "scene": "hammer", "engine": engine}
@@ -51,7 +51,7 @@ def metadata(name: str, **entries: str) -> Spoil:
 
 
 def event(name: str, **fields: Any) -> Spoil:
-    """Change an event, and the time of its message with its tick; without fields it is taken out."""
+    """Change an event, and its message's time with its tick; without fields, remove it."""
 
     def spoil(layout: Layout) -> None:
         for at, (topic, payload, time_ns) in enumerate(layout.messages):
@@ -69,7 +69,7 @@ def more(topic: str, document: dict[str, Any], time_ns: int = 0) -> Spoil:
 
 
 def blocks(key: str, change: Callable[[Block, int], tuple[dict[str, Any], int]], *, number: int) -> Spoil:
-    """Change fields of one block of a stream, and the time of its message by some ns."""
+    """Change fields of one block of a stream, and shift the time of its message [ns]."""
 
     def spoil(layout: Layout) -> None:
         at = [n for n, (topic, *_) in enumerate(layout.messages) if topic == key][number]
@@ -83,7 +83,7 @@ def blocks(key: str, change: Callable[[Block, int], tuple[dict[str, Any], int]],
 
 
 def longer(layout: Layout) -> None:
-    """One more block at the end of one group, numbered and timed on, with the closing counts made to fit."""
+    """Append one block to one group, with continued numbers and times, and adapt the closing counts."""
     at = [n for n, (topic, *_) in enumerate(layout.messages) if topic == PROBES][-1]
     block = decode_block(layout.messages[at][1], schema_of(PROBES) or "")
     again = Block(block.tick + 100_000, block.index + 500, block.rate_hz, block.tick_rate_hz, block.values)
@@ -94,7 +94,7 @@ def longer(layout: Layout) -> None:
 
 
 def readme(layout: Layout) -> bytes:
-    """The README.txt of a file, in the words of this version: that of another one is not judged."""
+    """Return README.txt in the words of this version; the text of other versions is not checked."""
     documents = [json.loads(layout.attachments[f"{name}.json"]) for name in ("catalogue", "parameters", "scene")]
     return next(data for name, _, data in Head(*documents).attachments({}) if name == "README.txt")
 

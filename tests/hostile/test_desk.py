@@ -1,4 +1,4 @@
-"""Commands and reports of hostile clients against a run that is served: it goes on, and takes nothing that is wrong."""
+"""Commands and reports of hostile clients to a served run: it continues, and accepts nothing that is wrong."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ REPORTS = [
 
 
 class Checked(FakeSimulation):
-    """Takes what the rig's own check takes, and remembers it."""
+    """Accepts what the rig's own check accepts, and stores it."""
 
     def __init__(self) -> None:
         super().__init__(duration_s=None)
@@ -50,7 +50,7 @@ class Checked(FakeSimulation):
 
 @pytest.fixture
 def served() -> Any:
-    """A run in lockstep, served on a thread: simulation, client, and what its service finds."""
+    """A run in lockstep, served on a thread: simulation, client, and exceptions of its service."""
     server, simulation, unbound = MemoryServer(cache=0), Checked(), CommandLimit(1e9, 10**9)
     service = Service(
         simulation, server, Lockstep(), block_ticks=10_000, status_period_s=0.05, linger_s=0.0, limit=unbound

@@ -1,6 +1,6 @@
-"""Recordings that lie: every byte is held against a checksum, documents have models, sizes are bounded by the file.
+"""Corrupt recordings: every byte has a checksum, documents have models, sizes are bounded by the file.
 
-Truth here is the recording before it was spoilt. RIG_FUZZ_INPUTS sets the number of inputs of each test.
+The reference is the recording before it was corrupted. RIG_FUZZ_INPUTS sets the number of inputs of each test.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ def test_a_changed_calibration_is_never_recovered_as_if_it_were_whole(path: Path
     spoilt.write_bytes(flipped(data, at + 19, 1))
     with pytest.raises(InputError, match="calibration"):
         recover(spoilt)
-    # One that is not needed is left out, and counted.
+    # A record that is not needed is skipped and counted.
     at = data.index(b"A recording of the virtual")
     spoilt.write_bytes(flipped(data, at, 1))
     assert recover(spoilt).damaged == 1
@@ -119,7 +119,7 @@ def test_no_changed_byte_gives_other_contents_untold(path: Path, part: Path, fin
             if found == before and recording.complete == finished:
                 same += 1
                 continue
-            # Told: it is not complete. It holds the first messages as they were, and says what no checksum covers.
+            # Reported as incomplete. It has the first messages unchanged, and reports the parts without a checksum.
             shorter += 1
             assert not recording.complete
             sure = found[0] if not recording.unchecked else found[0][: -_unsure(recording)]
@@ -170,7 +170,7 @@ def _bomb(declared: int, packed: bytes, compression: bytes, checksum: int) -> by
 
 
 def _packed(size: int, *, told: int | None) -> bytes:
-    """A zstd frame of as many zeros, four bytes to each 128 KiB of them (RFC 8878), with or without its size told."""
+    """Return a zstd frame of `size` zeros, four bytes per 128 KiB (RFC 8878), with or without its size declared."""
     head = struct.pack("<IB", 0xFD2FB528, 0xC0 if told is not None else 0) + bytes([7 << 3])
     head += b"" if told is None else struct.pack("<Q", told)
     count = size >> 17

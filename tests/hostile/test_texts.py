@@ -1,4 +1,4 @@
-"""TOML and other systems' logs that lie, and names that a terminal would act on.
+"""Malformed TOML and logs of other systems, and names with control sequences for a terminal.
 
 RIG_FUZZ_INPUTS sets the number of inputs of each test.
 """
@@ -48,7 +48,7 @@ PIECES = (
 
 
 def spoil_toml(text: str, rng: Rng) -> bytes:
-    """TOML with other values, lines that stand elsewhere, pieces put in, or other bytes."""
+    """Return TOML with other values, moved lines, inserted pieces or other bytes."""
     for _ in range(int(rng.integers(1, 4))):
         lines = text.split("\n")
         at = int(rng.integers(0, len(lines)))
@@ -100,7 +100,7 @@ def test_toml_of_every_kind_is_taken_or_refused_in_one_line(tmp_path: Path) -> N
 
 
 def test_documents_of_another_form_are_taken_or_refused_in_one_line(tmp_path: Path) -> None:
-    """The same TOML files as documents, with values of another type and tables that are none."""
+    """The same TOML files as documents, with values of another type and values in place of tables."""
     (tmp_path / "m.toml").write_text(example())
     kinds: dict[str, tuple[list[Any], Callable[[Any], object]]] = {
         "scene": ([scene_document(load_scene(name)) for name in scene_names()], parse_scene),
@@ -155,7 +155,7 @@ X = "[channels]\ndisk_x = { source = 'x', unit = 'mm' }\n"
 
 
 def logs(folder: Path) -> dict[str, bytes]:
-    """A small log of each format, by suffix."""
+    """Return a small log of each format, by suffix."""
     import nptdms
     import pyarrow
     import pyuff
@@ -196,7 +196,7 @@ def logs(folder: Path) -> dict[str, bytes]:
     return {path.name[1:]: path.read_bytes() for path in folder.iterdir() if path.name.startswith("a.")}
 
 
-# pyuff leaves its file to the garbage collector, and asammdf what it could not open.
+# pyuff leaves its file to the garbage collector, and asammdf files that it could not open.
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning", "ignore::ResourceWarning")
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
 def test_logs_of_other_systems_are_taken_or_refused_in_one_line(tmp_path: Path) -> None:
@@ -207,7 +207,7 @@ def test_logs_of_other_systems_are_taken_or_refused_in_one_line(tmp_path: Path) 
     rng = np.random.default_rng([6, inputs(80)])
     doors = {suffix: Door() for suffix in whole}
     logging.disable(logging.CRITICAL)
-    for suffix in whole:  # each is taken as it is
+    for suffix in whole:  # the unchanged file is accepted
         if not suffix.endswith(".json"):
             convert([tmp_path / "whole" / f"a{suffix}"], mapping)
     for number in range(inputs(80)):
@@ -231,7 +231,7 @@ def test_logs_of_other_systems_are_taken_or_refused_in_one_line(tmp_path: Path) 
                 write_recording(conversion, tmp_path / "out.mcap", force=True)
                 Recording.open(tmp_path / "out.mcap")
     logging.disable(logging.NOTSET)
-    gc.collect()  # here, where what they leave open is no error
+    gc.collect()  # here, where unclosed files are no error
     tell(doors)
 
 
@@ -356,7 +356,7 @@ def test_paths_with_such_names_end_no_command(
         with pytest.raises(SystemExit) as end:
             main(arguments)
         printed = capsys.readouterr()
-        # The recording of the tests contradicts itself, which its verdict says.
+        # The tests' recording contradicts itself, as its verdict reports.
         assert end.value.code == (1 if arguments[0] == "info" else 0), printed.err
         printed_safely(printed.out + printed.err)
 
@@ -380,7 +380,7 @@ def test_a_recording_to_such_a_path_is_made(name: str, capsys: pytest.CaptureFix
 
 
 def test_nothing_is_printed_but_through_the_one_door() -> None:
-    """No command makes a console, a progress bar or a live display of its own, or prints past the door."""
+    """No command creates a console, a progress bar or a live display, or prints past the common module."""
     found = []
     for path in sorted(Path(next(iter(rig.cli.__path__))).glob("*.py")):
         if path.name in ("tables.py", "app.py", "main.py"):

@@ -1,4 +1,4 @@
-"""A contract that import-linter lacks: a list of what may be imported, where its own kinds list what may not."""
+"""Contract that import-linter lacks: an allowlist of imports; its own kinds are blocklists."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from importlinter.domain import helpers
 
 
 class AllowanceContract(Contract):
-    """Modules, and whatever of the root packages they come to import, import nothing from outside but what is allowed.
+    """Modules, and the modules of the root packages that they import, import only allowed packages from outside.
 
-    The packages that a module lies in count as imported, for Python runs their `__init__` first.
+    The packages that contain a module count as imported, because Python runs their `__init__` first.
 
     Options:
-        source_modules: Where to begin, each with all that lies below it.
-        allowed: Names of packages outside the root packages, the standard library's among them.
-        ignore_imports: Imports that are allowed in that one place, `importer -> imported`.
+        source_modules: Modules to start from, each with its submodules.
+        allowed: Names of allowed packages, those of the standard library included.
+        ignore_imports: Exceptions for one place each, `importer -> imported`.
     """
 
     type_name = "allowance"
@@ -49,7 +49,7 @@ class AllowanceContract(Contract):
         return ContractCheck(kept=not refused, metadata={"refused": refused})
 
     def render_broken_contract(self, check: ContractCheck) -> None:
-        """Print each way from a source to what is not allowed."""
+        """Print each path from a source to a forbidden import."""
         for way in sorted(check.metadata["refused"]):
             output.print_error(" -> ".join(way), bold=False)
         output.new_line()

@@ -19,7 +19,7 @@ from tests.house.layout import ROOTS, build, floors
 ROOT = Path(__file__).parents[2]
 PICTURE = ROOT / "replays/figures/architecture.svg"
 OPENED = ("replays.recordings", "replays.studies")
-"""Packages whose inside is drawn as well."""
+"""Packages whose contents are drawn."""
 COMMANDS = "rig.cli"
 TITLES = {
     COMMANDS: "the commands; the only package that imports all others",
@@ -37,13 +37,13 @@ CHARACTER, LINE, PAD, GAP, GUTTER, STEP = 7.3, 26, 12, 8, 70.0, 46.0
 
 @dataclass
 class Box:
-    """A module or package, perhaps opened.
+    """A module or package, optionally opened.
 
     Attributes:
         name: Of the module.
-        label: What is written in it.
+        label: Text in the box.
         rows: Boxes inside, from the highest layer to the lowest.
-        left, top, width, height: Where it is [px].
+        left, top, width, height: Position and size [px].
     """
 
     name: str
@@ -55,7 +55,7 @@ class Box:
     height: float = 0.0
 
     def measure(self, least: float = 0.0) -> None:
-        """Work out width and height, inside first."""
+        """Compute width and height, contents first."""
         for box in itertools.chain(*self.rows):
             box.measure()
         inner = [fsum(box.width for box in row) + GAP * (len(row) - 1) for row in self.rows]
@@ -65,7 +65,7 @@ class Box:
             self.height += fsum(max(box.height for box in row) + GAP for row in self.rows) + PAD - GAP / 2
 
     def place(self, left: float, top: float) -> None:
-        """Set where it is, and what is in it, each row in the middle."""
+        """Set the positions of the box and of its contents, each row centred."""
         self.left, self.top = left, top
         at = top + LINE
         for row in self.rows:
@@ -78,7 +78,7 @@ class Box:
             at += max(box.height for box in row) + GAP
 
     def drawn(self) -> list[str]:
-        """The box and its inside as SVG."""
+        """Return the box and its contents as SVG."""
         root = self.name.partition(".")[0]
         opened = bool(self.rows) or self.name == COMMANDS
         shape = (
@@ -93,7 +93,7 @@ class Box:
 
 
 def box_of(name: str, graph: grimp.ImportGraph) -> Box:
-    """A package with its rooms, those below opened where they are to be; of the rig's, their own rooms are named."""
+    """Build the box of a package, with packages of `OPENED` opened; the rig's own modules are named."""
     title = name.rpartition(".")[2] + ("/" if graph.find_children(name) else "")
     if name in ROOTS or name in OPENED:
         rows = [[box_of(room, graph) for room in floor if room != COMMANDS] for floor in floors(graph, name)]
@@ -105,7 +105,7 @@ def box_of(name: str, graph: grimp.ImportGraph) -> Box:
 
 
 def imports(graph: grimp.ImportGraph, importer: str, imported: str) -> bool:
-    """Whether one package imports another; the rig's commands are none of its own."""
+    """Return whether one package imports another; the commands do not count as part of `rig`."""
     below = {imported, *graph.find_descendants(imported)} if imported in graph.modules else {imported}
     if imported == "rig":
         below -= {COMMANDS, *graph.find_descendants(COMMANDS)}
@@ -113,13 +113,13 @@ def imports(graph: grimp.ImportGraph, importer: str, imported: str) -> bool:
 
 
 def arrow(*points: tuple[float, float], root: str) -> str:
-    """A line through some points, with its head at the last."""
+    """Return a line through points with an arrowhead at the last."""
     way = " ".join(f"{x:.0f},{y:.0f}" for x, y in points)
     return f'<polyline points="{way}" fill="none" stroke="{STROKE[root]}" stroke-width="2" marker-end="url(#{root})"/>'
 
 
 def picture() -> str:
-    """The whole as SVG."""
+    """Return the picture as SVG."""
     graph = build()
     commands = Box(COMMANDS, f"rig/cli/: {TITLES[COMMANDS]}")
     boxes = {name: box_of(name, graph) for name in ROOTS}
@@ -159,7 +159,7 @@ def picture() -> str:
 
 
 def arrows(graph: grimp.ImportGraph, commands: Box, boxes: dict[str, Box]) -> list[str]:
-    """Imports between the packages: straight down where nothing is between, else around the outside."""
+    """Draw imports between packages: straight down if the way is free, otherwise around the outside."""
     replays, recorder, drivers, rig = (boxes[name] for name in ("replays", "recorder", "drivers", "rig"))
     right, drawn = replays.left + replays.width, []
 

@@ -1,7 +1,7 @@
-"""Rooms and floors of every package, counted on its imports: `python -m tests.house.layout [PACKAGE]`.
+"""Rooms and floors of every package, computed from its imports: `python -m tests.house.layout [PACKAGE]`.
 
-A room is a module or a folder right inside a package. It stands one floor above the highest of the rooms beside it that
-it imports. A folder of like entries, which do not import each other, is one room for whoever looks into it.
+A room is a module or a folder directly inside a package. Its floor is one above the highest room of the same package
+that it imports. A folder of entries of one kind, which do not import each other, counts as one room.
 """
 
 from __future__ import annotations
@@ -13,16 +13,16 @@ import grimp
 ROOTS = ("rig", "drivers", "recorder", "replays")
 MOST_ROOMS, MOST_FLOORS = 10, 6
 LIKE_ENTRIES = frozenset({"rig.cli.commands"})
-"""Folders whose entries are of one kind, and any number of them."""
+"""Folders of entries of one kind, without a limit of their number."""
 
 
 def build() -> grimp.ImportGraph:
-    """All imports of the product, those inside functions too."""
+    """Build the graph of all imports of the product, those inside functions included."""
     return grimp.build_graph(*ROOTS, cache_dir=None)
 
 
 def rooms(graph: grimp.ImportGraph, package: str) -> dict[str, set[str]]:
-    """Rooms of a package, each with those beside it that it imports; `__main__`, which starts a package, is none."""
+    """Return the rooms of a package, each with the rooms of this package that it imports; without `__main__`."""
     found = sorted(name for name in graph.find_children(package) if not name.endswith(".__main__"))
     inside = {name: {name, *graph.find_descendants(name)} for name in found}
     imported = {
@@ -33,7 +33,7 @@ def rooms(graph: grimp.ImportGraph, package: str) -> dict[str, set[str]]:
 
 
 def floors(graph: grimp.ImportGraph, package: str) -> list[list[str]]:
-    """Rooms of a package by floor, the highest first.
+    """Return the rooms of a package by floor, the highest first.
 
     Raises:
         ValueError: Rooms import each other in a circle.
@@ -50,7 +50,7 @@ def floors(graph: grimp.ImportGraph, package: str) -> list[list[str]]:
 
 
 def packages(graph: grimp.ImportGraph) -> list[str]:
-    """All packages of the product."""
+    """Return all packages of the product."""
     return sorted(name for name in graph.modules if graph.find_children(name))
 
 

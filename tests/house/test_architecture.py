@@ -1,4 +1,4 @@
-"""The README's picture of who imports whom is up to date."""
+"""The README's picture of the imports is up to date."""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
-"""Who may import whom (pyproject.toml), that each contract sees its breach, and what `rig --help` does not import.
+"""Import contracts (pyproject.toml): each detects a breach; and the imports of `rig --help`.
 
-A breach is an import that is added to the graph of all imports, not to a file: so the files are read once only. One is
-written to a copy of the files, to show that a line of code comes to the same.
+A breach is an import added to the graph of all imports, so that the files are read once only. One breach is written to
+a
+copy of the files, to show that a line of code has the same effect.
 """
 
 from __future__ import annotations
@@ -57,7 +58,7 @@ TYPES: dict[str, type[Contract]] = {
     )
 }
 
-# What is added, and the word of the contract's name that must see it.
+# Added import, and a word of the name of the contract that must detect it.
 BREACHES = [
     # The rig is the bottom.
     ("rig.run.simulation", "replays.recordings.resimulation.experiment", "less its commands"),
@@ -90,7 +91,7 @@ BREACHES = [
     ("replays.studies.bench", "recorder.reader", "Studies of methods never"),
     ("replays.studies.ladder.quantity", "replays.studies.ladder.chart", "No ring"),
     ("rig.channels.sensors.noise", "rig.channels.sensors.conditioning", "No ring"),
-    # Who must not see what.
+    # Pairs of modules of which one must not import the other.
     ("recorder.contents.views", "rig.physics.kernels.signals", "cannot see the model"),
     ("drivers.console", "rig.physics.model", "cannot see the model"),
     ("drivers.instruments.hammer.driver", "drivers.instruments.hammer.twin", "does not know its twin"),
@@ -98,7 +99,7 @@ BREACHES = [
     ("drivers.daq", "drivers.can.gateway", "inside of the virtual bus"),
     ("drivers.instruments.force.driver", "drivers.can.bus.hub", "inside of the virtual bus"),
     ("recorder.reader", "drivers.can.bus.hub", "inside of the virtual bus"),
-    # Physics: other libraries, clocks, threads, processes; also by way of what it may import.
+    # Physics: other libraries, clocks, threads, processes; also through modules that it may import.
     ("rig.physics.kernels.laws.contact", "pandas", "Physics"),
     ("rig.physics.parameters", "pyarrow", "Physics"),
     ("rig.channels.table", "multiprocessing", "Physics"),
@@ -118,7 +119,7 @@ def graph() -> grimp.ImportGraph:
 
 
 def contract_named(words: str) -> Contract:
-    """The one contract with these words in its name."""
+    """Return the only contract with these words in its name."""
     found: list[dict[str, Any]] = [each for each in CONFIGURATION["contracts_options"] if words in each["name"]]
     assert len(found) == 1, (words, [each["name"] for each in found])
     return TYPES[found[0]["type"]](found[0]["name"], CONFIGURATION["session_options"], found[0])
@@ -176,7 +177,7 @@ def test_a_line_in_a_function_is_an_import(tmp_path: Path) -> None:
 
 
 def lint(folder: Path) -> subprocess.CompletedProcess[str]:
-    """Import-linter over a folder, as its command does it: what lies there is what is linted, not what is installed."""
+    """Run import-linter as its command does on a folder, not on the installed packages."""
     code = "import sys; from importlinter.cli import lint_imports; sys.exit(lint_imports(no_cache=True))"
     return subprocess.run(
         [sys.executable, "-c", code],
@@ -192,7 +193,7 @@ def lint(folder: Path) -> subprocess.CompletedProcess[str]:
 
 @pytest.mark.wallclock
 def test_help_of_every_command_imports_nothing_heavy() -> None:
-    # Options of these are the fields of the commands' and faults' own classes, which pydantic makes.
+    # These options are fields of the classes of commands and faults, which pydantic creates.
     by_fields = {"hammer", "speed", "release", "fault"}
     names = [name for commands in COMMANDS.values() for name in commands if name not in by_fields]
     assert {"run", "simulate", "record", "view", "demo"} <= set(names)

@@ -1,4 +1,4 @@
-"""The examples in docstrings give what they say, and what a notebook calls has one."""
+"""The examples in docstrings give the documented results, and functions for notebooks have one."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ CALLED = (
 
 @pytest.mark.parametrize("name", MODULES)
 def test_examples_of_a_module(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(ROOT)  # where the reference sessions are
+    monkeypatch.chdir(ROOT)  # folder of the reference sessions
     said: list[str] = []
     runner = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS)
     for example in doctest.DocTestFinder(exclude_empty=True).find(importlib.import_module(name)):
@@ -52,7 +52,7 @@ def test_examples_of_a_module(name: str, monkeypatch: pytest.MonkeyPatch) -> Non
     assert runner.failures == 0, "".join(said)
 
 
-# Layout is matplotlib's own to mend.
+# Warnings of matplotlib about its own layout.
 @pytest.mark.filterwarnings("ignore::PendingDeprecationWarning")
 def test_the_notebook_plots_what_it_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import matplotlib

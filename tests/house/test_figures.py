@@ -1,4 +1,4 @@
-"""A picture of speed or accuracy is of the engines that are here."""
+"""Pictures of speed and accuracy belong to the present engines."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""No package has more rooms or floors than one can keep in mind (`tests.house.layout` says what these are)."""
+"""No package has too many rooms or floors (defined in `tests.house.layout`)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Waiting with a deadline stands in one module, `rig.serve.waiting`: the syntax trees show no second one."""
+"""Waiting with a deadline is implemented in one module, `rig.serve.waiting`: the syntax trees show no other."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ EXCEPTIONS = {
 
 
 def _reads_clock(node: ast.AST, names: set[str]) -> bool:
-    """Return whether an expression is a reading of a clock, or one that was kept under a name."""
+    """Return whether an expression reads a clock, or a variable with a stored reading."""
     if isinstance(node, ast.NamedExpr):
         node = node.value
     if isinstance(node, ast.Call):
@@ -42,7 +42,7 @@ def _reads_clock(node: ast.AST, names: set[str]) -> bool:
 
 
 def _readings(function: ast.AST) -> set[str]:
-    """Return the names under which a function keeps readings of a clock."""
+    """Return the variables in which a function stores readings of a clock."""
     found: set[str] = set()
     for node in ast.walk(function):
         if isinstance(node, ast.NamedExpr) and _reads_clock(node.value, set()):

@@ -1,7 +1,7 @@
-"""Each mechanism of estimation has one home: a second one is found by the syntax tree, and the failure names the first.
+"""Each mechanism of estimation has one home: the syntax tree shows a second one, and the failure names the first.
 
-A module that has a reason for one of its own stands in `EXCEPTIONS`. Fits and intervals that are written out by hand,
-as a loop over residuals, are not found.
+A module with a reason for its own is listed in `EXCEPTIONS`. Fits and intervals written out by hand, as a loop over
+residuals, are not detected.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ LIBRARY = {
     ),
     **dict.fromkeys((f"{name}.{one}" for name in ("numpy.fft", "scipy.fft") for one in TRANSFORMS), SPECTRUM),
 }
-"""What a library offers of each mechanism: a name, with all that is in it."""
+"""Names of a library that belong to each mechanism, with everything below them."""
 NORMAL = "normal equations"
 EXCEPTIONS = {
     ("recorder/health.py", SPECTRUM): "the recorder is below the replays and cannot import them",
@@ -67,11 +67,11 @@ EXCEPTIONS = {
     ): "laws in closed form from many starts: MINPACK",
     ("replays/score/records/stimulus.py", SPECTRUM): "a filter by time and frequency, there and back",
 }
-"""Modules that have one of their own, each with the reason."""
+"""Modules with their own implementation, each with the reason."""
 
 
 def names_of(tree: ast.Module) -> dict[str, str]:
-    """Full names of what a module imports, by the name that it has there."""
+    """Return the full names of the imports of a module, by local name."""
     found: dict[str, str] = {}
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
@@ -83,14 +83,14 @@ def names_of(tree: ast.Module) -> dict[str, str]:
 
 
 def full_name(node: ast.AST, names: dict[str, str]) -> str:
-    """Full name of an attribute or a name; empty for anything else."""
+    """Return the full name of an attribute or a name; "" for anything else."""
     if isinstance(node, ast.Attribute):
         return f"{before}.{node.attr}" if (before := full_name(node.value, names)) else ""
     return names.get(node.id, "") if isinstance(node, ast.Name) else ""
 
 
 def is_normal(node: ast.AST, names: dict[str, str]) -> bool:
-    """Whether a call inverts or solves a matrix times its own transpose, or another's."""
+    """Return whether a call inverts or solves a product of a transposed matrix and a matrix."""
     return (
         isinstance(node, ast.Call)
         and full_name(node.func, names) in ("numpy.linalg.inv", "numpy.linalg.solve", "scipy.linalg.inv")
@@ -105,7 +105,7 @@ def is_normal(node: ast.AST, names: dict[str, str]) -> bool:
 
 
 def mechanisms(tree: ast.Module) -> Iterator[tuple[int, str, str]]:
-    """Uses of a library's mechanisms: line, mechanism, full name."""
+    """Yield uses of a library's mechanisms: line, mechanism, full name."""
     names = names_of(tree)
     for node in ast.walk(tree):
         name = full_name(node, names)
@@ -115,7 +115,7 @@ def mechanisms(tree: ast.Module) -> Iterator[tuple[int, str, str]]:
 
 
 def second_ones() -> dict[tuple[str, str], str]:
-    """Mechanisms outside their homes: by path and mechanism, the first place."""
+    """Return mechanisms outside their homes: the first place, by path and mechanism."""
     found: dict[tuple[str, str], str] = {}
     for path in paths():
         if is_generated(path):

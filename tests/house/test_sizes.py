@@ -1,8 +1,9 @@
-"""How many lines of code each folder of the product and each function may have, and that a generated file is compared.
+"""Limits of the lines of code of each folder and each function, and a check that generated files are compared.
 
-A line of code is none that is blank, a comment or a docstring. A budget is what the folder needed when it was set: a
-commit that needs more says why it raises it, and one that needs less lowers it. A file that is made by a command says
-in its docstring "Made by `command`", names the test that compares it with what the command makes, and is not counted.
+Blank lines, comments and docstrings are not counted. A budget is the size when it was set: a commit that needs more
+explains why it raises the budget, and one that needs less lowers it. The docstring of a generated file contains "Made
+by
+`command`" and names the test that compares it with the command's output; such files are not counted.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ ROOT = Path(__file__).parents[2]
 PRODUCT = ("rig", "drivers", "recorder", "replays")
 LONGEST_FUNCTION = 120
 SLACK = 50
-"""So many lines may a budget lie above the code before it has to be lowered."""
+"""Lines by which a budget may exceed the code before it must be lowered."""
 BUDGETS = {
     "drivers": 686,
     "drivers/can": 4397,
@@ -64,7 +65,7 @@ def tree_of(path: str) -> ast.Module:
 
 
 def beginning(tree: ast.Module) -> str:
-    """Summary of the docstring and the paragraph below it, on one line."""
+    """Return the summary of the docstring and the next paragraph, on one line."""
     return " ".join(" ".join((ast.get_docstring(tree) or "").split("\n\n")[:2]).split())
 
 
@@ -73,7 +74,7 @@ def is_generated(path: str) -> bool:
 
 
 def code_lines(text: str) -> int:
-    """Lines of code of a file."""
+    """Return the number of lines of code of a file."""
     texts: set[int] = set()
     for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
@@ -84,13 +85,13 @@ def code_lines(text: str) -> int:
 
 
 def folder_of(path: str) -> str:
-    """Folder of the product that a file counts for: the first two of its path, or the package alone."""
+    """Return the folder that a file counts for: the first two parts of its path, or the package alone."""
     package, *rest = Path(path).parent.parts
     return f"{package}/{rest[0]}" if rest else package
 
 
 def sizes() -> Counter[str]:
-    """Lines of code by folder."""
+    """Return the lines of code by folder."""
     found: Counter[str] = Counter()
     for path in paths():
         if not is_generated(path):
@@ -99,7 +100,7 @@ def sizes() -> Counter[str]:
 
 
 def functions(node: ast.AST, name: str = "") -> Iterator[tuple[str, int]]:
-    """Every function in a tree with its length, decorators included, one within another counted with both."""
+    """Yield every function in a tree with its length, decorators and nested functions included."""
     for child in ast.iter_child_nodes(node):
         inner = name
         if isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):

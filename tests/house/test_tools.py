@@ -1,4 +1,4 @@
-"""What else has to be clean: ruff's rules, its format, pyrefly's types. Where it is not, the tool's words are shown."""
+"""Static checks: ruff's rules and format, pyrefly's types. A failure shows the tool's output."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ def clean(*command: str | Path) -> None:
 
 
 def pyrefly() -> Path:
-    """Return the program of the package pyrefly.
+    """Return the path of pyrefly's program.
 
-    `python -m pyrefly` looks for it in this environment's own folder only, and the package may lie in another.
+    `python -m pyrefly` searches only this environment's folder, and the package may be installed in another.
     """
     files = metadata.files("pyrefly") or ()
     return next(Path(str(file.locate())) for file in files if file.parent.name in ("bin", "Scripts"))
@@ -49,7 +49,7 @@ def test_code_is_formatted() -> None:
 @pytest.mark.wallclock
 @pytest.mark.timeout(600)
 def test_types_are_right(pytestconfig: pytest.Config) -> None:
-    # A quarter of a minute of one core, so not again for what was found right before: same files, same packages.
+    # 15 s on one core, so the result is reused while files and packages are unchanged.
     said = hashlib.sha256((ROOT / "pyproject.toml").read_bytes())
     for package in ("rig", "drivers", "recorder", "replays"):
         for path in sorted((ROOT / package).rglob("*.py")):

@@ -1,6 +1,6 @@
 """Rules for plain technical English in docstrings, comments and pages: `python -m tests.house.wording [PATH...]`.
 
-Each pattern has its cure beside it. The command lists the lines that match; a test limits their share.
+Each pattern has a cure. The command lists the lines that match; a test limits their share.
 """
 
 from __future__ import annotations

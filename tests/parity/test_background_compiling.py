@@ -1,4 +1,4 @@
-"""What is compiled ahead, in another process or before a run, is what a run would compile."""
+"""Code compiled ahead, in another process or before a run, is the code that a run would compile."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_a_run_compiles_nothing_of_it_again() -> None:
 
 
 def test_nothing_is_compiled_late() -> None:
-    """A live rig would stand still for it."""
+    """A live rig would stop for it."""
     done = subprocess.run([sys.executable, "-c", LATE], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout.strip()) == (0, ""), done.stderr
 
@@ -51,7 +51,7 @@ def test_nothing_is_compiled_late() -> None:
 def test_the_second_process_takes_no_code_of_the_working_directory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The cache is found by the files' place: what it compiles of other files is compiled for nothing."""
+    """The cache is indexed by the files' paths: code compiled from other files would never be used."""
     package = tmp_path / "rig"
     package.mkdir()
     (package / "__init__.py").write_text("raise SystemExit(7)")

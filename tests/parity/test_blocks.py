@@ -1,4 +1,4 @@
-"""How a run is cut into calls changes no bit of it, and neither does running it again."""
+"""The division of a run into calls changes no bit of its results, and neither does a repetition."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ COMMANDS: dict[int, list[tuple[str, dict[str, Any]]]] = {
     205_000: [("hammer", {"force_n": 700.0, "duration_ms": 2.0, "direction": 200.0})],
     400_000: [("release", {})],
 }
-"""Sent from outside, at these ticks whatever the cuts are; the scene's own blow at 20 ms comes beside them."""
+"""Sent by a client at these ticks, independent of the cuts; the scene's own impact is at 20 ms."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Whole:
 
 
 def run(*cuts: int, scene: str = "hammer", overrides: dict[str, Any] | None = None) -> Whole:
-    """Run with advances of these lengths in turn, each shortened where a command or the end comes first."""
+    """Run with advances of these lengths in turn, each shortened to the next command or the end."""
     simulation = Simulation(load_scene(scene, {"drive.speed_hz": 6.2, **(overrides or {})}))
     lengths = cycle(cuts)
     rows, edges, events = [], [], []
@@ -90,7 +90,7 @@ def assert_same(one: Whole, other: Whole) -> None:
 
 @pytest.fixture(scope="module")
 def whole() -> Whole:
-    """As few cuts as the commands allow."""
+    """The run with the smallest number of cuts that the commands allow."""
     return run(END)
 
 
@@ -133,9 +133,10 @@ def test_cuts_change_no_bit_of_other_scenes(overrides: dict[str, Any]) -> None:
 
 
 def test_cuts_change_no_bit_of_a_doubt() -> None:
-    # Without friction the shaft bounces on, and errors grow until the estimate is in doubt, which is an event.
+    # Without friction the shaft keeps bouncing, and errors grow until the estimate exceeds its limit, which is an
+    # event.
     whole = run(END, overrides={"model.friction": "none"})
-    # A second one follows where another quantity, the whirl frequency, passes its tolerance.
+    # A second event follows when another quantity, the whirl frequency, exceeds its tolerance.
     expected = ["hammer", "speed", "hammer", "warning", "release", "warning"]
     assert [event["event"] for event in whole.events] == expected
     assert_same(whole, run(15_000, 5_000, overrides={"model.friction": "none"}))
@@ -189,7 +190,7 @@ def test_a_command_of_the_scene_is_one_sent_at_that_tick() -> None:
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_cuts_change_no_bit_with_any_engine(engine: str) -> None:
-    # Through the blow, impacts and the first rolling, in steps as long as an adaptive engine may get.
+    # Hammer impact, contacts and the first rolling, in the longest steps of an adaptive engine.
     def motion(length: int) -> tuple[bytes, ...]:
         method = ENGINES[engine]
         simulation = Simulation(

@@ -1,4 +1,4 @@
-"""Every engine compiles before a run all that it needs, once, and keeps it. With several workers this comes first."""
+"""Every engine compiles all that it needs once, before a run. With several workers this module comes first."""
 
 from __future__ import annotations
 
@@ -18,7 +18,9 @@ pytestmark = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="this pro
 
 
 def compiled() -> dict[str, int]:
-    """How many kinds of arguments each kernel of this process is compiled for. (The cache is other workers' too.)"""
+    """Return the number of compiled signatures of each kernel in this process; the cache is shared with other
+    workers.
+    """
     modules = [
         module
         for name, module in sys.modules.items()

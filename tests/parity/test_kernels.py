@@ -1,4 +1,4 @@
-"""Compiled kernels against the same Python, in a process of its own; outputs full of nan before; the cache."""
+"""Compiled kernels compared with the same Python in a separate process; outputs preset to nan; the cache."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ from rig.run.simulation import Simulation
 
 PACKAGE = Path(rig.__file__).parent
 FRICTION = {name: "exact" if "exact" in method.frictions else "smoothed" for name, method in ENGINES.items()}
-"""The friction law that every engine is tested with, ..."""
+"""Friction law with which every engine is tested, ..."""
 PAIRS = [*FRICTION.items(), ("rosenbrock", "switch"), ("verlet", "smoothed"), ("split", "none"), ("taylor", "smoothed")]
-"""... and some more."""
+"""... and further pairs."""
 
 JIT_RUN = """
 import sys
@@ -50,7 +50,7 @@ def run(engine, friction):
 
 
 def process(code: str, *, place: Path = PACKAGE.parent, **environment: str) -> str:
-    """Run Python code in a process of its own with the package at a place, every warning an error; what it printed."""
+    """Run Python code in a separate process with the package at a place and warnings as errors; return its output."""
     kept = {key: value for key, value in os.environ.items() if not key.startswith("NUMBA_")}
     done = subprocess.run(
         [sys.executable, "-W", "error", "-c", code],
@@ -98,7 +98,7 @@ def test_compiled_is_python(
 
 
 def test_no_kernel_has_its_bits_from_its_caller() -> None:
-    # numba hands an option that a function does not name on from whichever caller is compiled first.
+    # numba inherits an option that a function does not set from the caller that is compiled first.
     for engine in ENGINES:
         load_engine(engine)
     kernels = [
@@ -185,7 +185,7 @@ def test_rows_of_a_simulation_are_its_own(monkeypatch: pytest.MonkeyPatch) -> No
 
 @pytest.fixture
 def copied(tmp_path: Path) -> Path:
-    """A copy of the package to change; its folder."""
+    """Folder of a copy of the package that may be changed."""
     shutil.copytree(PACKAGE, tmp_path / "rig", ignore=shutil.ignore_patterns("__pycache__"))
     return tmp_path
 
@@ -249,7 +249,7 @@ print(repr(gap(Constants(Levels(True, True, True, True, 1), *parts, 1.0), np.ful
 
 
 def test_a_change_in_a_file_that_a_kernel_calls_reaches_it(copied: Path) -> None:
-    # numba alone looks only at the file of `gap`, and would load its old machine code.
+    # numba checks only the file of `gap`, and would load its old machine code.
     cache = copied / "cache"
     angles = copied / "rig" / "physics" / "kernels" / "frames" / "angles.py"
     text = angles.read_text()

@@ -1,7 +1,7 @@
-"""Twenty runs that are off in radius or force by more than their tolerance, and whether each warns.
+"""Twenty runs with an error of radius or force above their tolerance, and whether each warns.
 
-Run `python -m tests.physics.accuracy_runs`. Real errors are against `taylor` at 1e-12; the
-last column is how far that differs from the same at 1e-11.
+Run `python -m tests.physics.accuracy_runs`. Real errors refer to `taylor` at 1e-12; the last column is the difference
+between 1e-12 and 1e-11.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def main() -> None:
 
 
 def _errors(run: Any, exact: Any) -> tuple[float, ...]:
-    """Largest error of radius [um], force [N], frequency over the last half [Hz] and angle [deg]."""
+    """Return the largest error of radius [um], force [N], frequency over the last half [Hz] and angle [deg]."""
     orbit, other = (one["ring_x"] + 1j * one["ring_y"] for one in (run, exact))
     whirls = np.minimum(np.abs(orbit), np.abs(other)) > 0.5e-3
     half = len(orbit) // 2

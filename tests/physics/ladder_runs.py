@@ -1,9 +1,9 @@
-"""The cheapest sufficient model of twelve scenes for three questions, each pick checked against `taylor`.
+"""The cheapest sufficient model of twelve scenes for three questions, each result checked against `taylor`.
 
-Run `python -m tests.physics.ladder_runs [SCENE ...]`; each search takes 20 to 60 s of processor time, all some 25
-minutes. Rows of the table in docs/engines.md come out as they are found. The last column is the picked run's error
-against the full model by `taylor` at 1e-11, of which the search knows nothing; a pick whose error there is more than
-twice what was asked for is marked, and the status is 1.
+Run `python -m tests.physics.ladder_runs [SCENE ...]`; each search takes 20 to 60 s of processor time, about 25 minutes
+in all. Rows of the table in docs/engines.md are printed as they are found. The last column is the error of the chosen
+run against the full model by `taylor` at 1e-11, which the search does not use. A model with an error above twice the
+limit is marked, and the status is 1.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def exact(found: Ladder) -> Candidate:
 
 
 def row(study: StudyScene, name: str) -> tuple[str, bool]:
-    """Return a row of the table, and whether the pick holds what was asked for."""
+    """Return a row of the table, and whether the model meets the limit."""
     scene = study.load().model_copy(update={"duration_s": study.window_s})
     try:
         found = search(scene, {name: ASKED}, budget_s=BUDGET_S)
@@ -44,7 +44,7 @@ def row(study: StudyScene, name: str) -> tuple[str, bool]:
 
 
 def main() -> int:
-    """Print the table; 1 where a pick errs by more than twice what was asked for, 2 where a scene is unknown."""
+    """Print the table; return 1 if a model exceeds twice the limit, 2 if a scene is unknown."""
     names = sys.argv[1:] or list(TWELVE_SCENES)
     if unknown := [name for name in names if name not in TWELVE_SCENES]:
         print(f"SCENE must be one or more of {', '.join(TWELVE_SCENES)}; received {unknown[0]!r}", file=sys.stderr)

@@ -1,4 +1,4 @@
-"""The error estimate of a run: which quantity is off, in its unit, and what is only an angle."""
+"""Error estimate of a run: the quantity that exceeds its tolerance, in its unit, and errors of the angle only."""
 
 import copy
 import re
@@ -24,7 +24,7 @@ STATIC_N, RIPPLE_N, WHIRL_HZ = 350.0, 5.0, 70.0
 
 
 def whirl(n: int, *, angle: float = 0.0, radius: float = 0.0, force: float = 0.0, hz: float = 0.0) -> np.ndarray:
-    """Rows of a backward whirl whose force has a ripple of two cycles a turn, perturbed, shape (n, N_ROW)."""
+    """Return rows of a perturbed backward whirl whose force has a ripple of two cycles per turn, shape (n, N_ROW)."""
     phi = -2.0 * np.pi * (WHIRL_HZ + hz) * 1e-3 * np.arange(n) + angle
     rows = np.zeros((n, S.N_ROW))
     r = CLEARANCE + 5e-6 + radius + 1e-7 * np.cos(2.0 * phi)
@@ -128,7 +128,7 @@ def test_choice_of_a_companion(engine: str, tolerance: float, friction: str, com
 
 
 def held_against_taylor(scene: str, changes: dict[str, Any], duration_s: float) -> tuple[float, float, Simulation]:
-    """Real error of radius [m] and force [N], and the run."""
+    """Return the real errors of radius [m] and force [N], and the run."""
     given = {**BARE, **changes}
     exact = simulate(
         scene,
@@ -141,7 +141,7 @@ def held_against_taylor(scene: str, changes: dict[str, Any], duration_s: float) 
     return float(np.abs(radius - true_radius).max()), float(force), run.simulation
 
 
-# Of the first two no companion of the same engine could tell: it takes the same steps.
+# No companion of the same engine could detect the first two: it takes the same steps.
 WRONG: dict[str, tuple[str, dict[str, Any], float]] = {
     "steps of the grid": ("hammer", {"engine.name": "tsit5", "engine.tolerance": 1e-3, "engine.companion": True}, 0.1),
     "frictionless": (

@@ -35,7 +35,7 @@ from rig.run.simulation import Simulation
 
 @pytest.fixture(scope="module")
 def whirl() -> Run:
-    """The hammer scene in full, without noise."""
+    """The hammer scene with all levels, without noise."""
     return simulate(load_scene("hammer", {"sensors.noise": False}))
 
 
@@ -45,7 +45,7 @@ def whirl() -> Run:
         ("hammer", 0.1, {}),
         ("hammer", 0.1, {"drive.mode": "ideal"}),
         ("hammer", 0.1, {"parameters": "dtu-2019"}),
-        # Transducers that come loose make kinks that the engine does not locate: two impacts, at a shorter step.
+        # Transducers that open make kinks that the engine does not locate: two impacts, at a shorter step.
         ("hammer", 0.032, {"house.preload": 100.0, "engine.step_us": 5}),
         ("drop", 0.06, {}),
     ],
@@ -59,7 +59,7 @@ def test_first_impacts_against_independent_solver(scene: str, duration_s: float,
     run = simulate(given, duration_s=duration_s)
     problem = cut_window(given, end_s=float(run.times_s[-1]), sample_s=float(run.times_s[1]))
     setting = Setting("1e-11", 1e-11)
-    with np.errstate(all="ignore"):  # trial steps that overflow are the solver's own affair
+    with np.errstate(all="ignore"):  # trial steps of the solver may overflow
         solution = scipy_solvers.solve(
             problem, setting=setting, budget_s=60.0, method="DOP853", manner=Manner(plain=True)
         )
@@ -87,7 +87,7 @@ def test_contact_force_is_frame_invariant(phase: int) -> None:
         assert plain[2] > 0.0
         assert plain[4] != 0.0
         np.testing.assert_allclose(turned[:2], turn @ plain[:2], rtol=1e-9)
-        # A turn by rounding moves the penetration by 1e-19 m, one part in 1e11 of the smallest here.
+        # A rotation by rounding moves the penetration by 1e-19 m, one part in 1e11 of the smallest here.
         np.testing.assert_allclose(turned[2:-2], plain[2:-2], rtol=1e-8)
         np.testing.assert_allclose(turned[-2:], turn @ plain[-2:], rtol=1e-9)
 
@@ -95,7 +95,7 @@ def test_contact_force_is_frame_invariant(phase: int) -> None:
 def test_free_flight_follows_the_linear_solution() -> None:
     from scipy.linalg import expm
 
-    # A ring wide enough to stay clear, spinning, small motion about the centre (no gravity), no unbalance.
+    # A ring wide enough to avoid contact, spinning, small motion about the centre (no gravity), no unbalance.
     changes = {
         "gravity.acceleration": 0.0,
         "shaft.unbalance_eccentricity": 0.0,
@@ -118,7 +118,7 @@ def test_free_flight_follows_the_linear_solution() -> None:
     size = np.array([1.0, 1.0, math.sqrt(stiff), math.sqrt(stiff)]) * np.linalg.norm(start[:2])
     for n in (1, 5_000, 19_999):
         expected = expm(A * run.times_s[n]) @ start
-        # What is left is the magnets' hardening and the sines: of third order in the tilt.
+        # The remaining difference: the magnets' hardening and the sines, of third order in the tilt.
         assert np.abs((run.signals[n, [0, 1, 7, 8]] - expected) / size).max() < 1e-3
     assert run["normal_force"].max() == 0.0
 
@@ -176,7 +176,7 @@ def test_rig_of_the_paper_sags_out_of_a_centred_ring() -> None:
 
 
 def whirl_of(run: Run, *, from_s: float) -> dict[str, float]:
-    """Figures of the whirl from the model's own signals: phase slope of the shaft in the ring."""
+    """Return the figures of the whirl from the model's own signals: phase slope of the shaft in the ring."""
     kept = run.times_s >= from_s
     phase = np.unwrap(np.angle(run["ring_x"][kept] + 1j * run["ring_y"][kept]))
     times = run.times_s[kept]
@@ -204,7 +204,7 @@ def test_whirl_rolls_backward_and_its_force_grows_as_spin_squared() -> None:
         speeds.append(figures["spin_hz"])
         forces.append(figures["force"])
     slope = np.polyfit(np.log(speeds), np.log(forces), 1)[0]
-    # The magnets' pull inward lowers the smaller forces: a little above 2.
+    # The inward pull of the magnets lowers the smaller forces: slightly above 2.
     assert 1.95 < slope < 2.2
     np.testing.assert_allclose(forces, [130, 230, 361, 523], rtol=0.08)
 

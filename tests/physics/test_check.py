@@ -1,4 +1,4 @@
-"""The check by finer steps: its error is the true one's size, and a wrong branch is suspected where there is one."""
+"""The check by finer steps: its error has the size of the true one, and a wrong branch is reported as suspected."""
 
 from __future__ import annotations
 

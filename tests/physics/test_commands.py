@@ -1,4 +1,4 @@
-"""Commands take effect at their own tick: rows only observe, however far apart they are."""
+"""Commands take effect at their own tick, independent of the row rate."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ HAMMER = {"command": "hammer", "force_n": 100.0, "duration_ms": 0.5}
 SPEED = {"command": "speed", "speed_hz": 6.3}
 RELEASE = {"command": "release"}
 AT_S, LOOK_S = 0.0203, 0.03
-"""Between two rows of 500 and of 100 Hz; and on one of each."""
+"""Between two rows of 500 and of 100 Hz; and on a row of each."""
 
 
 def run_with(rate_hz: int, *commands: dict[str, Any]) -> Run:
-    # An accurate engine: what differs is the command.
+    # An accurate engine: the difference is the command's.
     changes = {
         "duration_s": 0.04, "engine.name": "rk8", "engine.tolerance": 1e-10, "sensors.chain": "ideal",
         "sensors.rate_hz": rate_hz, "sensors.truth_rate_hz": rate_hz,
@@ -29,7 +29,7 @@ def run_with(rate_hz: int, *commands: dict[str, Any]) -> Run:
 
 
 def effect(rate_hz: int, command: dict[str, Any]) -> tuple[np.ndarray, float]:
-    """What a command has changed in the scaled state, shape (N_STATE,), and the hammer's work [J]."""
+    """Return the change of the scaled state by a command, shape (N_STATE,), and the hammer's work [J]."""
     look = round(LOOK_S * rate_hz)
     given, free = run_with(rate_hz, command), run_with(rate_hz)
     change = given.signals[look, :N_STATE] - free.signals[look, :N_STATE]
@@ -42,6 +42,6 @@ def test_rows_far_apart_leave_a_command_as_it_is(rate_hz: int, command: dict[str
     change, work = effect(rate_hz, command)
     true_change, true_work = effect(20_000, command)
     assert np.abs(true_change).max() > 1e-6, "it has an effect"
-    # The impulse, by all that it has set in motion, and the energy that came with it.
+    # The impulse, by all that it has set in motion, and the energy supplied with it.
     np.testing.assert_allclose(change, true_change, rtol=0.0, atol=1e-6 * np.abs(true_change).max())
     assert work == pytest.approx(true_work, rel=1e-6)

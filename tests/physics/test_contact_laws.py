@@ -59,7 +59,9 @@ def chosen(damping: float | str, restitution: float, *, stiffness: float | str =
 
 
 def two_bodies(law: NormalLaw, masses: tuple[float, float], speed: float) -> float:
-    """Restitution of two bodies that collide, integrated in absolute coordinates until they are well apart [1]."""
+    """Return the restitution of two colliding bodies, integrated in absolute coordinates until well after separation
+    [1].
+    """
     from scipy.integrate import solve_ivp
 
     def motion(_: float, y: np.ndarray) -> list[float]:
@@ -72,7 +74,7 @@ def two_bodies(law: NormalLaw, masses: tuple[float, float], speed: float) -> flo
         return [v1, v2, -force / masses[0], force / masses[1]]
 
     start = [-1e-9, 0.0, speed, 0.0]
-    # Ten elastic contacts: a strongly damped one creeps out.
+    # Ten elastic contacts: strongly damped bodies separate slowly.
     mass = masses[0] * masses[1] / sum(masses)
     long = 40.0 * (mass * speed**2 / law.stiffness) ** (1.0 / (law.exponent + 1.0)) / speed
     end = solve_ivp(motion, (0.0, long), start, method="LSODA", rtol=1e-9, atol=1e-13, max_step=long / 400).y[:, -1]
@@ -141,7 +143,7 @@ def test_factor_and_returned_restitution_undo_each_other() -> None:
     returned = [returned_restitution(restitution_factor(float(e))) for e in wanted]
     np.testing.assert_allclose(returned, wanted, atol=1e-9)
     assert returned_restitution(100.0) == pytest.approx(0.01, rel=1e-12)
-    # A series takes over where the equation drowns in rounding: no step there.
+    # A series replaces the equation where cancellation would spoil it: no step there.
     for low, high in ((0.9999e-4, 1.0001e-4), (1e-9, 1.0002e-9)):
         steps = (
             returned_restitution(low) - returned_restitution(high),
@@ -276,7 +278,7 @@ def test_fit_is_as_far_off_as_it_says(name: str) -> None:
     assert fit.error < 0.04
     assert [law.force(depth, PAIR) for depth in (fit.low, fit.high)] == pytest.approx(list(WORKING_FORCES), rel=1e-9)
     if fit.error:
-        # No straight line in the logarithms does better: it is off by the same both ways, and thrice.
+        # No straight line in the logarithms is better: the error is equal in both directions, three times.
         assert ratio.max() == pytest.approx(1.0 / ratio.min(), rel=1e-4)
         assert ratio[0] == pytest.approx(ratio[-1], rel=1e-6)
 

@@ -1,12 +1,12 @@
-"""Intervals hold the truth as often as they say: each value alone, and five together with the factor for all at once.
+"""Coverage of intervals: each value alone, and five together with the factor for simultaneous intervals.
 
-Many fits, half a minute a seed: it runs where `RIG_COVERAGE_SEEDS` says how many seeds, and then
-prints a table (`pytest -s`).
+Many fits, half a minute per seed: set `RIG_COVERAGE_SEEDS` to the number of seeds to run it. It prints a table
+(`pytest -s`).
 
 | what | must agree with | why |
 |---|---|---|
-| share of recordings in which an interval holds the value that they were made with | 95 % | what an interval says |
-| the same of all five at once, by the wider intervals | 95 % | what `together` says |
+| share of recordings in which an interval contains the true value | 95 % | the meaning of an interval |
+| the same of all five at once, by the wider intervals | 95 % | the meaning of `together` |
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ KEYS = (
     "shaft.unbalance_eccentricity",
 )  # fmt: skip
 _OFF = 1.02
-"""The search begins so far off."""
+"""Start of the search relative to the truth."""
 _BY_CHANCE = 0.999
-"""An interval is too narrow where a share so low comes by chance less often than this leaves."""
+"""An interval is too narrow if the probability of so low a share by chance is below 1 minus this."""
 
 
 def held(recording: Recording, keys: tuple[str, ...]) -> tuple[dict[str, bool], bool | None]:
-    """Which intervals hold the value that the recording was made with, and whether all wider ones do at once.
+    """Return which intervals contain the true value, and whether all wider ones do at once.
 
     Without an interval there is no entry, and None.
     """

@@ -1,9 +1,9 @@
-"""What each engine promises: its order, its friction, and what it cannot do.
+"""Properties of each engine: its order, its friction, and its limits.
 
 | the engine's                           | must be                          | because                             |
 |----------------------------------------|----------------------------------|-------------------------------------|
 | error on a smooth problem against step | h^p with the order p it names    | definition of order                 |
-| error of split on every scene          | within 10 times what was asked   | it is asked for that                |
+| error of split on every scene          | within 10 times the tolerance    | it controls that error              |
 | sliding speed while it rolls           | 0                                | Filippov: rolling is a phase        |
 | distance of smoothed to exact friction | proportional to v_s              | creep is v_s atanh(needed / mu)     |
 | linearly implicit run at v_s = 1 um/s  | near to exact Coulomb            | L-stable                            |
@@ -35,7 +35,10 @@ EXACT = [name for name, method in ENGINES.items() if "exact" in method.frictions
 
 
 def ready(scene: str, engine: str, smoothing_speed: float | None = None, **changes: Any) -> Simulation:
-    """A simulation with rows 1 ms apart; dots of dotted keys as `__`; v_s [m/s] may be below what a scene may ask."""
+    """Prepare a simulation with rows 1 ms apart.
+
+    Dots of dotted keys are written `__`; v_s [m/s] may be below the limit of a scene.
+    """
     dotted = {key.replace("__", "."): value for key, value in changes.items()}
     simulation = Simulation(load_scene(scene, {**QUIET, "engine.name": engine, **dotted}))
     if smoothing_speed is not None:
@@ -46,30 +49,30 @@ def ready(scene: str, engine: str, smoothing_speed: float | None = None, **chang
 
 
 def motion(simulation: Simulation, duration_s: float) -> np.ndarray:
-    """Scaled states on a grid of 1 ms, shape (n, 7)."""
+    """Return scaled states on a grid of 1 ms, shape (n, 7)."""
     rows = simulation.advance(round(duration_s * 1e6)).rows
     return rows[:, _MEASURED] / S.STATE_SCALE[_MEASURED]
 
 
 def distance(one: np.ndarray, other: np.ndarray) -> float:
-    """RMS over states and time."""
+    """Return the RMS difference over states and time."""
     return float(np.sqrt(np.mean((one - other) ** 2)))
 
 
 def slope(steps: list[Any], errors: list[float]) -> float:
-    """Fitted exponent of the error against the step."""
+    """Return the fitted exponent of the error as a function of the step."""
     return float(np.polyfit(np.log(steps), np.log(errors), 1)[0])
 
 
 def of_engine(engine: str, table: dict[str, Any], what: str) -> Any:
-    """An engine's row of one of the tables here, or what a new engine must add."""
+    """Return an engine's row of a table of this module, or fail with the table that lacks it."""
     assert engine in table, f"{engine} must have a row in {what}"
     return table[engine]
 
 
 SMOOTH_STEPS = {
     "rk8": [500, 250, 200, 160],
-    "tsit5": [50, 40, 25, 20],  # at longer ones the error of order 6 is the larger
+    "tsit5": [50, 40, 25, 20],  # at longer steps the error of order 6 is the larger
     "rosenbrock": [250, 200, 160, 100],
     "rk4": [100, 50, 40, 25],
     "verlet": [100, 50, 40, 25],
@@ -77,7 +80,7 @@ SMOOTH_STEPS = {
 }
 
 
-# Series have steps of their own: test_taylor has their order; split's are the same.
+# Series choose their own steps: test_taylor checks their order; split's are the same.
 @pytest.mark.parametrize("engine", [name for name in ENGINES if name not in ("taylor", "split")])
 def test_order_on_the_smooth_problem(engine: str, monkeypatch: pytest.MonkeyPatch) -> None:
     # The order of the plain method: no error estimate may shorten a step.
@@ -137,7 +140,7 @@ def test_split_keeps_its_tolerance_on_every_scene(name: str) -> None:
     assert all(error < 10.0 * tolerance for error, tolerance in zip(errors, tolerances, strict=True)), errors
 
 
-# Where a fixed step has been wrong: hard blows, lost preload, another gap, other exponents and sets.
+# Cases in which a fixed step was wrong: hard impacts, lost preload, another gap, other exponents and sets.
 HARD: dict[str, dict[str, Any]] = {
     "300 N": {"commands": [{"at_s": 0.02, "command": "hammer", "force_n": 300.0, "duration_ms": 5.0}]},
     "lost preload": {"house.preload": 300.0},
@@ -161,8 +164,9 @@ def test_split_is_right_where_it_is_hard_and_its_estimate_says_how_far(name: str
 
 
 def test_a_minute_of_whirl_is_right_for_as_long_as_its_growth_allows() -> None:
-    # What whirls grows small differences by 0.3 a second: 20 s make 400 of one, and the ledger closes all the same, to
-    # far less than the tolerance of the motion (3e-4), by which rolling takes its steps.
+    # In whirl small differences grow by 0.3 per second: a factor of 400 in 20 s. The ledger still closes to far less
+    # than
+    # the tolerance of the motion (3e-4), which sets the steps of rolling.
     bare = {"sensors.chain": "ideal", "sensors.rate_hz": 100, "sensors.truth_rate_hz": 100}
     run = simulate("hammer", bare, duration_s=20.0)
     health = run.simulation.health()
@@ -188,7 +192,7 @@ def test_smoothed_friction_is_as_far_from_exact_as_its_smoothing_speed() -> None
     assert slope(speeds, errors) == pytest.approx(1.0, abs=0.15)
 
 
-# Error over the first 0.05 s of a hammer blow: sixteen impacts, which make small errors a thousand times larger.
+# Error over the first 0.05 s after the hammer pulse: sixteen impacts, which amplify small errors a thousand times.
 CLASS = {
     "split": ({}, 3e-4),
     "tsit5": ({"engine__tolerance": 1e-7}, 1e-3),
@@ -211,7 +215,7 @@ def test_engines_agree_on_exact_friction(engine: str) -> None:
 def test_without_a_drive_only_contact_brakes_the_shaft(engine: str) -> None:
     free = {"drive__torque_gain": 0.0, "shaft__unbalance_eccentricity": 0.0}
     spin = ready("stable-run", engine, **free).advance(100_000).rows[:, S.COLUMN["theta_rate"]]
-    np.testing.assert_allclose(spin, spin[0], rtol=1e-9)  # a shaft that sags turns as evenly, but for its tilt
+    np.testing.assert_allclose(spin, spin[0], rtol=1e-9)  # a sagging shaft turns as evenly, except for its tilt
     simulation = ready("hammer", engine, **free)
     spin = simulation.advance(100_000).rows[:, S.COLUMN["theta_rate"]]
     assert spin[-1] < spin[0] - 1.0
@@ -233,11 +237,11 @@ def test_linearly_implicit_engine_holds_at_any_smoothing_speed(smoothing_speed: 
     assert implicit._motion.memory[CEILING] == 0.0
     assert abs(implicit.health()["energy"]["residual_share"]) < 3e-5
 
-    # An explicit step of 25 us is some hundred times too long: what it adds is energy, and the ledger says so.
+    # An explicit step of 25 us is some hundred times too long: it adds energy, and the ledger reports it.
     explicit = ready("hammer", "rk4", smoothing_speed, model__friction="smoothed", engine__step_us=25)
     assert distance(motion(explicit, 0.15), exact) > 1e-2
     assert abs(explicit.health()["energy"]["residual_share"]) > 1e-2
-    # What error control makes of the same: several times the work.
+    # The same with error control: several times the work.
     if smoothing_speed == 1e-4:
         adaptive = ready("hammer", "rk8", smoothing_speed, model__friction="smoothed")
         motion(adaptive, 0.15)

@@ -1,4 +1,4 @@
-"""The compiled equations of motion against statements that are not code.
+"""The compiled equations of motion compared with analytical results.
 
 | what                             | must agree with                       | because                                  |
 |----------------------------------|---------------------------------------|------------------------------------------|
@@ -32,7 +32,7 @@ from rig.run.motion import STORED
 SPIN = 2 * math.pi * 6.2
 FREE = {"gravity": 0.0, "unbalance": 0.0}
 FAR = {"clearance": 10.0, "offset_x": 0.0, "offset_y": 0.0}
-"""A ring that is out of reach."""
+"""A ring beyond the shaft's reach."""
 UNDAMPED = {"damping_x": 0.0, "damping_y": 0.0}
 
 
@@ -45,7 +45,7 @@ def rig_of(
     house: dict[str, float] | None = None,
     gain: float = 0.0,
 ) -> Constants:
-    """The default numbers with others in their places, and this gain of the drive."""
+    """Return the default constants with the given ones replaced, and this gain of the drive."""
     base = base_model(ModelLevels.model_validate({"friction": "smoothed", **(levels or {})})).constants
     return base._replace(
         shaft=base.shaft._replace(**shaft or {}),
@@ -59,7 +59,7 @@ def rig_of(
 def rates(
     constants: Constants, inputs: Inputs, y: np.ndarray, *, t: float = 0.0, onset_speed: float | None = None
 ) -> np.ndarray:
-    """Rates of the 14 states, in a contact that began at a speed, or in flight, shape (14,)."""
+    """Return the rates of the 14 states, in a contact with an onset speed or in flight, shape (14,)."""
     phase = FLIGHT if onset_speed is None else TOUCHING
     given = Problem("state", constants, inputs, y[:14], phase, onset_speed or 1.0, np.array([0.0, 1.0]))
     return derivative(t, y[:14].copy(), pack(given))
@@ -70,13 +70,13 @@ def run(constants: Constants, inputs: Inputs, y0: np.ndarray, *, ticks: int, eve
 
 
 def axis(q: np.ndarray) -> np.ndarray:
-    """Unit vector along the shaft, in space."""
+    """Return the unit vector along the shaft, in space."""
     G, b = q[0], q[1]
     return np.array([math.sin(b), -math.sin(G) * math.cos(b), math.cos(G) * math.cos(b)])
 
 
 def slope(values: list[np.ndarray], h: float) -> np.ndarray:
-    """Fourth order, of values at -2, -1, 1 and 2 h."""
+    """Return the derivative of fourth order, from values at -2, -1, 1 and 2 h."""
     return (values[0] - 8 * values[1] + 8 * values[2] - values[3]) / (12 * h)
 
 
@@ -87,7 +87,7 @@ def axis_rate(q: np.ndarray, qd: np.ndarray) -> np.ndarray:
 
 def angular_momentum(constants: Constants, q: np.ndarray, qd: np.ndarray) -> np.ndarray:
     a, G = axis(q), q[0]
-    # The frame's turning, of its two rotations in space: G' about x, b' about the y axis that G has turned.
+    # Rotation of the frame, from its two rotations in space: G' about x, b' about the y axis rotated by G.
     turning = np.array([qd[0], qd[1] * math.cos(G), qd[1] * math.sin(G)])
     w = turning @ a + qd[2]
     return constants.shaft.transverse_inertia * (turning - (turning @ a) * a) + constants.shaft.polar_inertia * w * a
@@ -139,7 +139,7 @@ def test_angular_momentum_grows_by_the_moments_in_space(seed: int, ideal: bool) 
     F_t = law.friction * F_n * math.tanh((u @ across + shaft.radius * w) / law.smoothing_speed)
     total += moment(shaft.arm_ring, np.array([*(-F_n * n - F_t * across), 0.0])) - shaft.radius * F_t * a
 
-    rest = rate - total  # the drive is what is left, and may act along the axis only
+    rest = rate - total  # the drive's share; it may act along the axis only
     scale = np.abs(rate).max()
     assert F_n > 0.0
     assert np.linalg.norm(rest - (rest @ a) * a) < 1e-7 * scale
@@ -147,7 +147,7 @@ def test_angular_momentum_grows_by_the_moments_in_space(seed: int, ideal: bool) 
         assert out[9] == 0.0
     else:
         assert rest @ a == pytest.approx(0.1 * (50.0 - y[9]), abs=1e-7 * scale)
-    # The house gets the opposite force.
+    # The house receives the opposite force.
     x = house.inner_mass * out[10] + house.outer_mass * out[12] + house.pair_stiffness_horizontal * y[5]
     up = house.inner_mass * out[11] + house.outer_mass * out[13]
     up += house.outer_beam_damping * y[13] + house.outer_beam_stiffness * y[6]
@@ -170,7 +170,7 @@ def test_the_shaft_turns_with_its_scene(angle: float) -> None:
         h = 1e-4
         before, after = (axis_rate(y[:3] + k * h * y[7:10], y[7:10] + k * h * qdd) for k in (-1, 1))
         w = y[9] + y[7] * math.sin(y[1])
-        # The drive sees theta', which is w less the frame's own turning about the axis: it is taken out.
+        # The drive acts on theta', which is w less the frame's own rotation about the axis: this is subtracted.
         w_rate = qdd[2] + qdd[0] * math.sin(y[1]) + y[7] * y[8] * math.cos(y[1])
         w_rate -= gain / constants.shaft.polar_inertia * (aim - y[9])
         return axis(y[:3]), axis_rate(y[:3], y[7:10]), w, (after - before) / (2 * h), w_rate
@@ -191,7 +191,7 @@ def test_the_shaft_turns_with_its_scene(angle: float) -> None:
 
 
 def test_level_top_precesses_steadily_at_large_angles() -> None:
-    # An axis that stays level turns about the vertical at M g l / (Izz w), whatever the angle.
+    # An axis that stays level precesses about the vertical at M g l / (Izz w), whatever the angle.
     constants = rig_of(shaft={"unbalance": 0.0}, magnet=UNDAMPED, contact=FAR)
     shaft, w = constants.shaft, 2000.0
     rate = shaft.mass * shaft.gravity * shaft.arm_centre / (shaft.polar_inertia * w)
@@ -203,7 +203,7 @@ def test_level_top_precesses_steadily_at_large_angles() -> None:
 
 
 def lateral(motion: Motion) -> np.ndarray:
-    """x + i y of the axis at unit arm, small angles, shape (n,)."""
+    """Return x + i y of the axis at unit arm, small angles, shape (n,)."""
     return motion.column("beta") - 1j * motion.column("Gamma")
 
 
@@ -262,9 +262,9 @@ def test_sliding_impact_has_coulombs_impulse(sense: float) -> None:
     assert done.contacts == 1
     vx, vy = arm * done.end_of("beta_rate"), -arm * done.end_of("Gamma_rate")
     assert vx < 0.0
-    # Friction pushes the top of the scene down when the shaft turns forward: against the surface's motion.
+    # Friction pushes the top of the scene down if the shaft turns forward: against the surface's motion.
     assert vy / (v - vx) == pytest.approx(-sense * constants.contact.friction, rel=2e-3)
-    # The drive pays for what it holds: work = w x (R_S x tangential impulse).
+    # The drive supplies the work that holds the speed: w x (R_S x tangential impulse).
     paid = 200.0 * constants.shaft.radius * abs(vy) * pivoted_mass(constants)
     assert done.end_of("drive_work") == pytest.approx(paid, rel=2e-3)
 
@@ -290,7 +290,7 @@ def test_lost_preload_halves_the_stiffness() -> None:
     k, u0 = house.pair_stiffness_vertical, 2 * P0 / house.pair_stiffness_vertical
     for u, force in ((0.5 * u0, P0), (3 * u0, 2 * P0 + k / 2 * 2 * u0)):
         assert rates(constants, quiet_inputs(), state(y_ih=u))[11] == pytest.approx(-force / house.inner_mass)
-    # The way there and back keeps the energy: an oscillation well into the half-open range.
+    # The round trip conserves the energy: an oscillation well into the half-open range.
     y0 = state(vx_ih=0.2, vy_ih=0.3)
     motion = move("taylor", constants, quiet_inputs(), y0, ticks=10_000, every=250, tolerance=1e-12)
     for name in ("P_N", "P_S", "P_E", "P_W"):

@@ -1,12 +1,12 @@
-"""Identification: the truth comes back out of noise, and what cannot be told is not told.
+"""Identification: the truth is recovered from noise, and values that cannot be identified are not reported.
 
 | what | must agree with | why |
 |---|---|---|
-| fitted values, noisy recording, start 5 to 10 % off | the values it was made with | what the tool is for |
-| intervals of a run without contact | the scatter of fits to other noise | an interval is a claim about that scatter |
-| how two moduli make up for each other | dE_B/dE_S = -(E_B/E_S)^2 | only 1/E* = sum (1 - nu^2)/E enters |
+| fitted values, noisy recording, start 5 to 10 % off | the true values | purpose of the tool |
+| intervals of a run without contact | the scatter of fits to other noise | an interval describes that scatter |
+| trade-off of two moduli | dE_B/dE_S = -(E_B/E_S)^2 | only 1/E* = sum (1 - nu^2)/E enters |
 | friction, magnets in a drop without them | nothing | no sliding, no magnets: no information |
-| a recording of another engine | the values it was made with | both solve the same equations |
+| a recording of another engine | the true values | both solve the same equations |
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def recorded(path: Path, scene: str, **changes: Any) -> Recording:
 
 
 def off(identification: Identification, truth: dict[str, float]) -> dict[str, float]:
-    """Errors in half widths of the reported intervals."""
+    """Return the errors in half widths of the reported intervals."""
     return {
         finding.unknown.key: (finding.value - truth[finding.unknown.key]) / finding.half_width
         for finding in identification.judgement.findings
@@ -61,7 +61,7 @@ def test_truth_comes_back_from_a_hammer_recording(tmp_path: Path, truth: dict[st
     assert set(errors) == set(KEYS)
     assert max(map(abs, errors.values())) < (2.0 if engine == "split" else 3.0)
     for finding in found.judgement.findings:
-        # Orders of magnitude finer than the 5 % that the start was off.
+        # Orders of magnitude finer than the start, which was 5 % off.
         assert finding.half_width < 2e-3 * finding.unknown.scale
     if engine == "split":
         assert found.judgement.fits
@@ -114,7 +114,7 @@ def test_moduli_act_only_together(tmp_path: Path) -> None:
 
 
 def test_a_drop_tells_neither_friction_nor_magnets(tmp_path: Path) -> None:
-    """Released, the shaft has neither their stiffness nor their damping; the ring's place is given, not by the sag."""
+    """A released shaft has neither their stiffness nor their damping; the ring's place is given, not by the sag."""
     recording = recorded(tmp_path / "d.mcap", "drop", duration_s=0.06, seed=3, ring__offset_y=-1.56)
     keys = ("contact.friction", "magnet.stiffness", "contact.restitution")
     found = identify(ask(recording, Experiment.of(recording), keys))

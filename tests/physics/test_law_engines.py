@@ -1,12 +1,12 @@
-"""Every contact law in every engine that takes it, against `rk8` at a tolerance of 1e-12.
+"""Every contact law in every engine that accepts it, against `rk8` at a tolerance of 1e-12.
 
 | the engine's                               | must agree with        | because                                      |
 |--------------------------------------------|------------------------|----------------------------------------------|
 | motion through impacts, each damping law   | rk8's at 1e-12         | an engine with its own copy of a law can err |
 | motion through impacts, each stiffness law | the same               | the same                                     |
-| limits below, but for order 1              | a law stronger by 10 % | limits that it passes show nothing           |
+| limits below, except for order 1           | a law stronger by 10 % | a limit that this law passes is too wide     |
 
-A shaft that turns falls by 27 um on the ring, off its lowest point, and bounces on it 3 to 10 times in 20 ms.
+A turning shaft falls by 27 um on the ring, off its lowest point, and bounces on it 3 to 10 times in 20 ms.
 """
 
 from __future__ import annotations
@@ -29,17 +29,20 @@ FRICTIONS = {"exact": {}, "smoothed": {"contact__smoothing_speed": 10.0}, "none"
 """In the order in which they are tried; smoothing over 10 mm/s, which explicit steps follow."""
 DURATION_S = 0.02
 STEP_US = 2
-"""Of an engine of fixed steps, short enough for each; the longest that any of these impacts gives is some hundred."""
+"""Step of an engine of fixed steps; the longest that any of these impacts allows is some hundred."""
 LIMIT = 1e-3
 
 
 def limit_of(engine: str) -> float:
-    """How far an engine may be from the reference, as a share of the states' scale.
+    """Return the limit of the distance between an engine and the reference, as a share of the states' scale.
 
-    An adaptive engine's error a step is its tolerance: 300 of these leave room for some thirty steps an impact, and for
-    the impacts to make an error larger. With fixed steps of 2 us, order 1 comes within 3e-3 (10 impacts); from order 2
-    on it is the corners of a force law that count (Kelvin-Voigt's force jumps at onset and is clamped before the bodies
-    are apart, where no event is), up to 6e-4.
+    An adaptive engine's error per step is its tolerance: 300 of these allow for some thirty steps per impact, and for
+    the
+    amplification by impacts. With fixed steps of 2 us, order 1 reaches 3e-3 (10 impacts); from order 2 on the corners
+    of a
+    force law limit the accuracy (Kelvin-Voigt's force jumps at onset and is clamped before separation, where no event
+    is),
+    up to 6e-4.
     """
     if tolerance := ENGINES[engine].tolerance:
         return 300.0 * tolerance
@@ -47,7 +50,7 @@ def limit_of(engine: str) -> float:
 
 
 def falling(engine: str, field: str, law: str, friction: str, **choice: object) -> Simulation:
-    """A simulation shortly before its first impact."""
+    """Prepare a simulation shortly before its first impact."""
     return ready(
         "drop", engine, initial__position="given", initial__x_mm=0.35, initial__y_mm=-0.8, drive__speed_hz=6.2,
         contact__restitution=0.7, model__friction=friction, **{f"contact__{field}": law},
@@ -57,19 +60,21 @@ def falling(engine: str, field: str, law: str, friction: str, **choice: object) 
 
 @cache
 def reference(field: str, law: str, friction: str) -> np.ndarray:
-    """Scaled states, shape (n, 7)."""
+    """Return the scaled states of the reference, shape (n, 7)."""
     return moved(falling("rk8", field, law, friction, engine__step_us=5, engine__tolerance=1e-12))
 
 
 def moved(simulation: Simulation) -> np.ndarray:
-    """Scaled states, shape (n, 7), of a run that bounces."""
+    """Return the scaled states of a run that bounces, shape (n, 7)."""
     states = motion(simulation, DURATION_S)
     assert simulation.health()["contacts"] >= 3
     return states
 
 
 def taken(engine: str, field: str, law: str) -> tuple[Simulation, str]:
-    """The simulation by an engine, with the first friction law that it does not refuse; skips where it takes none."""
+    """Return the simulation by an engine with the first friction law that it accepts; skip the test if it accepts
+    none.
+    """
     choice = {} if ENGINES[engine].tolerance else {"engine__step_us": STEP_US}
     refusals = []
     for friction in FRICTIONS:

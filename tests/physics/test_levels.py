@@ -1,17 +1,17 @@
-"""What each level of the model must agree with, and what leaving it out costs.
+"""Agreement of each level of the model with other results, and the cost of leaving it out.
 
 | level                         | must agree with                              | because                              |
 |-------------------------------|----------------------------------------------|--------------------------------------|
 | planar against Euler          | each other, to the square of the tilt        | small-angle theory                   |
-| planar, two engines           | each other, to their own error               | one model, two ways to write it      |
+| planar, two engines           | each other, to their own error               | one model in two formulations        |
 | rigid impacts, drop           | closed form: heights r0-scaled by e^2        | Newton's restitution                 |
 | rigid impact, oblique         | closed form: Coulomb impulse, rolled or slid | Coulomb's law on impulses            |
 | rigid impacts, ledgers        | zero residual                                | first law                            |
 | rigid impacts, whirl          | rolls at R_S spin / r0, force M_eff r0 w^2   | kinematics and centrifugal force     |
-| rigid ring                    | a higher peak than on houses                 | nothing gives way (numerics: +57 %)  |
-| fixed bodies of the stator    | transducers pass the ring's force on         | statics                              |
+| rigid ring                    | a higher peak than on houses                 | nothing yields (numerics: +57 %)     |
+| fixed bodies of the stator    | transducers transmit the ring's force        | statics                              |
 | ideal drive                   | the prescribed spin                          | definition                           |
-| lowered levels                | no more steps of the engine                  | what is left out is no work          |
+| lowered levels                | no more steps of the engine                  | omitted parts cost nothing           |
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class Run:
 
 
 def difference(name: str, tilt: float) -> float:
-    """Planar less Euler in free swing from a tilt [rad], at equal tilts relative to it."""
+    """Return planar less Euler in free swing from a tilt [rad], at equal tilts relative to it."""
     x_mm = tilt * 197.0
     changes = {
         "initial.position": "given", "initial.x_mm": x_mm, "ring.clearance": 20.0, "ring.offset_y": 0.0,
@@ -84,7 +84,7 @@ def test_planar_model_is_one_model_on_two_engines(friction: str) -> None:
 
 
 def tops(run: Run) -> list[float]:
-    """Heights between impacts above the ring's lowest point [m]."""
+    """Return the heights between impacts above the ring's lowest point [m]."""
     y = run["ring_y"]
     found = []
     for i in range(1, len(y) - 1):
@@ -115,7 +115,7 @@ def test_drop_on_a_rigid_ring_rebounds_by_the_closed_form() -> None:
     rest = speed / fall + 2.0 * e * speed / fall / (1.0 - e)
     assert rest < 0.5
     weight = mass * fall
-    # There the compliant law holds it, and it still rings a little.
+    # There the compliant law carries it, and it still oscillates slightly.
     assert (impulse[-1] - impulse[-11]) / 0.01 == pytest.approx(weight, rel=1e-2)
     assert run["ring_y"][-1] == pytest.approx(-clearance, abs=1e-6)
     assert run.simulation.health()["contacts"] < 60
@@ -126,7 +126,7 @@ def test_drop_on_a_rigid_ring_rebounds_by_the_closed_form() -> None:
 
 @pytest.mark.parametrize(("friction", "sticks"), [(0.02, False), (0.25, False), (0.9, True)])
 def test_oblique_impact_has_coulombs_impulse(friction: float, *, sticks: bool) -> None:
-    """A spinning shaft dropped: w grows or falls by R_S jt / Izz, jt = min(mu jn, what brings v_t to 0)."""
+    """A spinning shaft dropped: w grows or falls by R_S jt / Izz, jt = min(mu jn, the impulse that stops v_t)."""
     e = 0.5
     run = Run(
         "drop", 0.028, **IMPACT,
@@ -144,21 +144,21 @@ def test_oblique_impact_has_coulombs_impulse(friction: float, *, sticks: bool) -
     assert run["contact_impulse"][-1] == pytest.approx(normal, rel=2e-3)
     change = spin - run["theta_rate"][-1]
     assert change == pytest.approx(shaft.radius * tangential / shaft.polar_inertia, rel=3e-3)
-    # Less what the gyroscopic moment had given it before.
+    # Less the contribution of the gyroscopic moment before.
     along = np.diff(run["ring_x"]) / 1e-3
     assert abs(along[26] - along[24]) == pytest.approx(tangential / mass, rel=0.02, abs=1e-3)
     assert abs(run.residual_share) < 1e-4
 
 
 def whirl(run: Run) -> float:
-    """Frequency of the last 0.2 s [Hz], by the slope of the phase."""
+    """Return the frequency of the last 0.2 s [Hz], from the slope of the phase."""
     phase = np.unwrap(np.arctan2(run["ring_y"], run["ring_x"]))[-200:]
     return float(np.polyfit(run.times[-200:], phase, 1)[0]) / (2.0 * math.pi)
 
 
 def test_rigid_impacts_whirl_as_the_kinematics_say() -> None:
     run = Run("hammer", 1.0, **IMPACT)
-    # Where contact lasts, the compliant law lets the shaft in as far as the force asks for.
+    # In lasting contact, the compliant law penetrates as far as the force requires.
     shaft, clearance = run.constants.shaft, run.constants.contact.clearance
     radius = np.hypot(run["ring_x"], run["ring_y"])[-200:]
     depth = float(np.mean(run["penetration"][-200:]))
@@ -222,7 +222,7 @@ def test_ideal_drive_keeps_the_spin() -> None:
     [{"model.magnet": "linear"}, {"model.shaft": "planar"}, {"model.stator": "rigid"}],
 )
 def test_a_lowered_level_takes_no_more_steps(lowered: dict[str, str]) -> None:
-    # By one method: split's steps are of several kinds.
+    # With one method: split's steps are of several kinds.
     changes = {"engine.name": "taylor"}
     full, less = (Run("hammer", 0.5, **changes, **more).simulation.health()["steps"] for more in ({}, lowered))
     assert less < 1.2 * full  # other contacts, about as many

@@ -1,4 +1,4 @@
-"""What the magnet models must agree with, and why.
+"""Agreement of the magnet models with other results.
 
 | the rig's                   | must agree with                      | because                                  |
 |-----------------------------|--------------------------------------|------------------------------------------|
@@ -13,7 +13,7 @@
 | far-field map               | field sum of eqs. 35, 38             | it is fitted to it                       |
 | cylinder map                | exact cylinders                      | it is fitted to them                     |
 | force of every map          | minus the gradient of its potential  | energy ledger                            |
-| the same                    | itself, turned by one magnet         | the magnets are alike                    |
+| the same                    | itself, turned by one magnet         | the magnets are equal                    |
 | sag                         | lever rule with exact cylinders      | statics                                  |
 | energy ledger of a run      | zero residual                        | first law                                |
 """
@@ -65,7 +65,7 @@ def model_of(level: str, **changes: float | str) -> Model:
 
 
 def disc(geometry: MagnetGeometry, radius: float, *, points: int = 400, seed: int = 5) -> tuple[np.ndarray, np.ndarray]:
-    """Places spread over a disc at random, its rim among them."""
+    """Return random places on a disc, its rim included."""
     rng = np.random.default_rng(seed)
     r = radius * np.sqrt(np.concatenate([rng.uniform(size=points), np.ones(points // 4)]))
     angle = rng.uniform(-math.pi, math.pi, size=r.size)
@@ -120,7 +120,7 @@ def test_force_is_the_bessel_integral(geometry: MagnetGeometry) -> None:
 
     value = quad(integrand, 0.0, 1e5, limit=4000, epsabs=1e-9)[0]
     force = 2 * math.pi * MU_0 * geometry.magnetisation**2 * a * b * value
-    # The integral is cut off where its tail is a few millionths.
+    # The integral is truncated where its tail is a few millionths.
     assert pair_force(distance, geometry) == pytest.approx(force, rel=1e-5)
 
 
@@ -148,7 +148,7 @@ def test_far_apart_magnets_are_dipoles() -> None:
 
 
 def test_quadrature_converges_geometrically() -> None:
-    # The narrowest gap of the family: 1 mm, at the reach.
+    # The narrowest gap of the family: 1 mm, at the end of the reach.
     distance = TABLE_1.bearing_radius - REACH
     exact = pair_force(distance, TABLE_1, nodes=96)
     errors = [abs(pair_force(distance, TABLE_1, nodes=nodes) / exact - 1) for nodes in (4, 8, 12, 16)]
@@ -174,7 +174,7 @@ def test_cylinders_add_up(geometry: MagnetGeometry) -> None:
     x, y = disc(geometry, geometry.reach, points=20)
     expected = np.zeros((x.size, 2))
     for n in range(geometry.number):
-        # The first stands straight below.
+        # The first magnet is directly below.
         place = geometry.bearing_radius * np.exp(1j * (2 * math.pi * n / geometry.number - math.pi / 2))
         for i, away in enumerate(x + 1j * y - place):
             force = pair_force(abs(away), geometry) * away / abs(away)
@@ -221,7 +221,7 @@ def test_no_length_of_eight_cylinders_reaches_the_stiffness_of_the_rig() -> None
     lengths = [5e-3, 10e-3, 20e-3, 25e-3, 30e-3, 40e-3, 60e-3, 0.2]
     stiffness = [cylinder_stiffness(TABLE_1._replace(length=length)) for length in lengths]
     assert max(stiffness) == stiffness[4] == pytest.approx(836.0, abs=1.0)
-    # The far-field sum grows on, as the length squared.
+    # The far-field sum keeps growing with the square of the length.
     long, longer = (field_sum_stiffness(TABLE_1._replace(length=length)) for length in (0.1, 0.2))
     assert longer == pytest.approx(4 * long)
 
@@ -255,7 +255,7 @@ def test_cylinder_map_follows_the_cylinders(number: int, over_reach: float, over
         errors.append(missed / np.linalg.norm(exact, axis=-1).max())
     assert errors[0] < over_reach
     assert errors[1] < over_4_mm
-    # Places of its own, all around, find no more than it says.
+    # An independent set of places, all around, shows no more than the reported error.
     assert errors[0] == pytest.approx(fitted.error, rel=0.1)
 
 
@@ -311,7 +311,7 @@ def test_force_turns_with_the_magnets(magnet_map: MagnetMap) -> None:
     there = turn * (x + 1j * y)
     turned = map_force(there.real, there.imag, magnet_map) @ [1.0, 1j]
     np.testing.assert_allclose(turned, turn * plain, atol=1e-11 * np.abs(plain).max())
-    # Half as far it is another force, unless nothing tells the magnets apart.
+    # At half the angle the force differs, unless the magnets are equal.
     half = np.sqrt(turn)
     there = half * (x + 1j * y)
     between = map_force(there.real, there.imag, magnet_map) @ [1.0, 1j]
@@ -359,7 +359,7 @@ def test_sag_on_exact_cylinders(number: int, tolerance: float) -> None:
 
 @pytest.mark.parametrize("level", LEVELS)
 def test_ledger_closes_on_every_level_and_through_a_release(level: str) -> None:
-    # Few, strong magnets and a wide ring: the ripple works.
+    # Few, strong magnets and a wide ring: the ripple does work.
     changes = {
         "model.magnet": level,
         "magnet.count": 5,
@@ -430,7 +430,7 @@ def test_model_carries_its_errors() -> None:
     assert chain["over_travel"] < 4e-4
     assert document["magnet_stiffness_cylinders_kn_m"] == pytest.approx(0.7354, abs=1e-4)
     assert document["magnet_reach_mm"] == 10.0
-    # The shaft's bottom in the ring, carried out to the magnets.
+    # The shaft's bottom in the ring, projected to the magnets.
     assert document["magnet_travel_mm"] == pytest.approx((1.619 + 0.926) * 391 / 197, abs=2e-3)
     # At equal stiffness a spring is nearer to the cylinders than the far field's hardening is.
     spring = errors["linear", "exact cylinders", "stiffness at the centre"]

@@ -136,10 +136,10 @@ def test_least_friction_that_keeps_up_whirl(spin_hz):
     (found,) = condition.sustain_thresholds((spin_hz,))
     assert found.bare == pytest.approx(drag / normal, rel=5e-3)
     assert found.closed == pytest.approx(drag / normal, rel=1e-6)
-    # The houses take their part of it; in moving houses the force is higher, and their loss goes with its square.
+    # The houses take a share of it. In moving houses the force is higher, and their loss grows with its square.
     assert found.full == pytest.approx(found.with_houses, rel=0.07)
     assert found.full == pytest.approx(found.used[0], rel=0.03)
-    # It rolls all the turn with far more only.
+    # It rolls through the whole turn only with far more friction.
     assert found.used[1] > 2.0 * found.full
 
 
@@ -161,14 +161,16 @@ def test_houses_take_what_forced_vibration_takes():
     radius = constants.contact.clearance + depth
     extra = condition.friction_with_houses(constants, spin) - condition.least_friction(own, -whirl)
     force = condition.normal_force(own, whirl, radius)
-    # The closed form takes the force of a rigid ring; in one that moves it is higher, and power goes with its square.
+    # The closed form uses the force on a rigid ring. In a moving ring it is higher, and power grows with its square.
     higher = (float(np.mean(run.column("normal_force"))) / force) ** 2
     assert power == pytest.approx(extra * force * radius * -whirl * higher, rel=0.02)
 
 
 @pytest.mark.parametrize(("stator", "share"), [("two-houses", 1.0), ("rigid", 0.0)])
 def test_friction_swings_as_the_ring_goes_on_an_ellipse(stator, share):
-    """Damping alike in x and y, no weight, no unbalance: what swings at twice the whirl is the houses' part."""
+    """Equal damping in x and y, no weight, no unbalance: the houses alone cause the swing at twice the whirl
+    frequency.
+    """
     constants, spin = base_model(ModelLevels(stator=stator)).constants, 2 * math.pi * 9.0
     damping = 0.5 * (constants.magnet.damping_x + constants.magnet.damping_y)
     constants = constants._replace(
@@ -185,12 +187,12 @@ def test_friction_swings_as_the_ring_goes_on_an_ellipse(stator, share):
     swing = 2.0 * abs(np.sum((friction - friction.mean()) * turning)) / np.sum(np.hanning(len(times)))
     expected = condition.friction_swing(base_model(ModelLevels()).constants, spin)
     force = condition.normal_force(condition.oscillator(constants), whirl, constants.contact.clearance + depth)
-    # The closed form takes the force on a rigid ring.
+    # The closed form uses the force on a rigid ring.
     assert swing == pytest.approx(share * expected * float(normal.mean()) / force, abs=0.12 * expected)
 
 
 def test_slip_to_rolling():
-    """Whole time by quadrature, spin by the momentum that friction hands over."""
+    """Total time by quadrature, spin by the momentum that friction transfers."""
     from scipy.integrate import quad
 
     polar, spin = P["shaft.polar_inertia"], 2 * math.pi * 6.2

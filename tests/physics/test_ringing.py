@@ -55,7 +55,7 @@ def matrices_of(constants: Constants) -> np.ndarray:
         {"parameters": "as-printed"},
         {"parameters": "dtu-2019"},
         {"model.stator": "inner-house"},
-        {"house.outer_beam_damping": 2e5},  # so much that one mode no longer oscillates
+        {"house.outer_beam_damping": 2e5},  # one mode is overdamped
     ],
 )
 def test_ringing_is_the_matrix_exponential(changes: dict[str, Any]) -> None:

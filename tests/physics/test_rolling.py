@@ -41,7 +41,7 @@ from tests.scenes import QUIET
 
 
 def ready(engine: str, tolerance: float, **changes: Any) -> Simulation:
-    """Return a hammer run without companion, rows 1 ms apart, `split` with collocation; `__` stands for a dot."""
+    """Return a hammer run by `split` with collocation, without companion, rows 1 ms apart; `__` represents a dot."""
     dotted = {key.replace("__", "."): value for key, value in changes.items()}
     choice = {"engine.name": engine, "engine.tolerance": tolerance, "engine.companion": False}
     rolling = {"engine.rolling": "collocation"} if engine == "split" else {}
@@ -67,7 +67,7 @@ def test_nodes_and_weights_integrate_powers() -> None:
     powers = np.arange(2 * STAGES - 1)
     at_nodes = NODES[:, None] ** powers
     assert NODES[-1] == 1.0
-    # Up to the end powers as in Gauss's rules, up to each node those of the polynomial.
+    # At the end for powers as in Gauss's rules, at each node for those of the polynomial.
     assert INTEGRALS[-1] @ at_nodes == pytest.approx(1.0 / (powers + 1.0), rel=1e-12)
     own = powers[:STAGES]
     assert INTEGRALS @ at_nodes[:, :STAGES] == pytest.approx(NODES[:, None] ** (own + 1) / (own + 1.0), rel=1e-11)
@@ -140,7 +140,7 @@ def test_linear_bodies_are_the_kernels(changes: dict[str, Any]) -> None:
             evaluate(constants, INPUTS, 0, 0.0, 1.0, FLIGHT, False, y, dy, out)
             sides.append(dy[ROWS_OF_STATE] * SIGN_OF_STATE)
         found[:, column] = (sides[0] - sides[1]) / (2.0 * small)
-    # The unbalance goes with the spin; it is no part of a linear body.
+    # The unbalance rotates with the spin; it is no part of a linear body.
     found[:4, 4:6] = 0.0
     assert np.abs(found - matrix).max() < 1e-6 * np.abs(matrix).max()
     assert found == pytest.approx(matrix, rel=1e-6, abs=1e-3)
@@ -154,7 +154,7 @@ def test_settled_whirl_is_that_of_the_series(tolerance: float, error: float) -> 
     rows = run.advance(300_000).rows
     memory = memory_of(run)
     assert scaled_error(rows, reference) < error
-    # The law of a polynomial's penetration would be newtons off.
+    # The law applied to the polynomial's penetration would err by newtons.
     forces, exact = (each[:, S.COLUMN["normal_force"]] for each in (rows, reference))
     assert np.abs(forces - exact).max() < 2.0 * tolerance * exact.max()
     assert memory[ROLLED_S] > 0.15
@@ -174,7 +174,7 @@ def test_smoothed_friction_creeps_by_collocation(smoothing_speed: float) -> None
     assert scaled_error(rows, exact) < 1e-4
     creep, friction = (S.COLUMN[name] for name in ("sliding_speed", "friction_force"))
     assert np.abs(exact[-20:, creep]).max() > 1e-3 * smoothing_speed * 1e-3
-    # Between nodes, too: the law makes newtons of a few micrometres per second.
+    # Between nodes as well: the law turns a few micrometres per second into newtons.
     assert np.abs(rows - exact)[100:, friction].max() < 1e-3 * np.abs(exact[100:, friction]).max()
     ledger = energy_balance(rows, first)
     assert np.abs(ledger["residual"]).max() < 1e-5 * ledger["dissipated"].max() + 1e-6
@@ -182,7 +182,7 @@ def test_smoothed_friction_creeps_by_collocation(smoothing_speed: float) -> None
 
 @pytest.mark.parametrize("tolerance", [1e-2, 3e-4])
 def test_the_companion_rolls_too_and_tells_the_error(tolerance: float) -> None:
-    """Its steps are shorter: else it would share the error, as it takes the same constraint."""
+    """Its steps are shorter. At equal steps it would share the error, because it uses the same constraint."""
     exact = ready("taylor", 1e-11).advance(600_000).rows
     run = ready("split", tolerance, engine__companion=True)
     rows = run.advance(600_000).rows
@@ -210,12 +210,12 @@ def test_a_command_ends_rolling_at_once() -> None:
     assert memory_of(run)[layout.PLACES] > 0
     rows = run.advance(100_000).rows
     assert scaled_error(rows, reference.advance(100_000).rows) < 1e-3
-    # A series keeps the sliding speed that it begins with, and the whirl would drift by it.
+    # A series keeps its initial sliding speed, and the whirl would drift by it.
     assert np.abs(rows[:3, S.COLUMN["sliding_speed"]]).max() < 1e-9
 
 
 def test_contact_that_slips_goes_back_to_a_series() -> None:
-    # A drive that brakes hard: the normal force falls with the whirl, until friction no longer holds.
+    # A drive that brakes hard: the normal force falls with the whirl, until friction can no longer hold.
     changes = {"drive__ramp_rate": 20.0, "drive__torque_gain": 1.0}
     reference, run = ready("taylor", 1e-11, **changes), ready("split", 1e-4, **changes)
     for simulation in (reference, run):

@@ -1,12 +1,12 @@
-"""The twelve scenes' atlas: outcomes that must hold, and those that theory or measurement says must not.
+"""Atlas of the twelve scenes: required results, and results that theory or measurement excludes.
 
 | method              | must be                                                                                    |
 |---------------------|--------------------------------------------------------------------------------------------|
 | split               | right at each tolerance up to 0.1: its step error is a ten-thousandth of it                |
-| verlet at 50 us     | wrong, and its energy ledger says so: some six steps an impact, of order 2                 |
-| verlet at 10 us     | wrong, and silent: the ledger closes to 1e-3, and the error grows a thousand times         |
+| verlet at 50 us     | wrong, shown by its energy ledger: some six steps per impact, of order 2                   |
+| verlet at 10 us     | wrong without a warning: the ledger closes to 1e-3, and the error grows a thousand times   |
 | semi-implicit-euler | refused: it takes no set-valued friction                                                   |
-| a scipy solver      | wrong at a tolerance of 1e-3, and silent: a step's error grows, and nothing estimates that |
+| a scipy solver      | wrong at a tolerance of 1e-3 without a warning: a step's error grows, with no estimate     |
 """
 
 from __future__ import annotations

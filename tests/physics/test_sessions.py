@@ -1,8 +1,8 @@
-"""The reference sessions: this build must do what they recorded, by the declared comparison.
+"""Reference sessions: this build must reproduce them, by the declared comparison.
 
-Bit-exact would be too strict: the same source gives other roundings on another machine, and impacts amplify them. The
-window that is compared sample by sample ends where that could be seen; behind it, statistics must agree within their
-measured spread.
+A bit-exact comparison would be too strict: the same source gives other roundings on another machine, and impacts
+amplify them. The window for a comparison sample by sample ends where that becomes visible; after it, statistics must
+agree within their measured spread.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def test_every_session_is_there_and_small() -> None:
 
 
 def test_the_same_build_makes_the_same_bytes(tmp_path: Path) -> None:
-    """And the end tells how many rows there are, so that a reader can see a loss at the very end."""
+    """The end event contains the number of rows, so that a reader can detect a loss at the very end."""
     twice = [make(SESSIONS["drop"], tmp_path)[0].read_bytes() for _ in range(2)]
     assert twice[0] == twice[1]
     recording = Recording.open(tmp_path / "drop.mcap")
@@ -43,7 +43,7 @@ def test_the_same_build_makes_the_same_bytes(tmp_path: Path) -> None:
 def test_a_session_is_done_again(name: str) -> None:
     found = validate(Recording.open(FOLDER / f"{name}.mcap"), declared=True)
     assert found.good, f"{found.verdict_line}; {AGAIN}"
-    # The text beside it tells the same recording.
+    # The text file next to it describes the same recording.
     phases = tomllib.loads((FOLDER / f"{name}.toml").read_text(encoding="utf-8"))["phases"]
     assert [phase["name"] for phase in phases] == [phase.name for phase in found.phases]
     for one in found.statistics:
@@ -60,14 +60,14 @@ def test_a_change_of_physics_by_2_percent_fails_and_is_named(name: str, key: str
     assert found.explained is not None
     assert found.explained.best == (key,)
     one = next(one for one in found.explained.ranked if one.name == key)
-    assert one.value == pytest.approx(1.0 / 1.02 - 1.0, rel=0.02)  # what the recording has against the changed rig
+    assert one.value == pytest.approx(1.0 / 1.02 - 1.0, rel=0.02)  # the recording relative to the changed rig
 
 
 @pytest.mark.parametrize("name", [name for name in SESSIONS if name.startswith("hammer")])
 def test_whirl_rolls(name: str) -> None:
-    """Rolling without slip: whirl = -spin R_S / radius, from three instruments that know nothing of each other.
+    """Rolling without slip: whirl = -spin R_S / radius, from three independent instruments.
 
-    The stretch is not settled yet at low speed, where it still slides: within 5 %.
+    At low speed the stretch has not settled and still slides: within 5 %.
     """
     phases = tomllib.loads((FOLDER / f"{name}.toml").read_text(encoding="utf-8"))["phases"]
     whirl = next(phase for phase in phases if phase["name"] == "whirl")

@@ -1,11 +1,11 @@
-"""Trials of the engines both ways: what must hold holds, and what theory says must fail fails.
+"""Trials of the engines in both directions: required results pass, and failures predicted by theory fail.
 
 | what                          | must agree with                                   |
 |-------------------------------|---------------------------------------------------|
 | every cell of the quick table | its expected verdict                              |
 | impact quadrature             | an integration of the equation of motion by scipy |
 | limits h w on the map         | where maps of rk4, Verlet and Euler turn unstable |
-| decay of rk4 on an oscillator | abs(R(i h w))^2 a step                            |
+| decay of rk4 on an oscillator | abs(R(i h w))^2 per step                          |
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def test_every_cell_agrees(engine, trial):
 
 
 def test_known_failures_are_expected_to_fail():
-    # The table must be able to say no: these cells exist and are expected to fail.
+    # The table must contain cells that are expected to fail.
     found = {(cell.case, cell.holds) for trial in ("T1", "T2", "T7", "T14") for cell in quick(trial, "rk4")
              if cell.expected is False}  # fmt: skip
     assert {case for case, _ in found} >= {"step of h w = 3", "step of 200 us", "v_s = 1e-05 m/s", "v0 = 1e-05 m/s"}

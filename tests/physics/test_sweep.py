@@ -1,10 +1,10 @@
-"""The truth sweep: what is drawn, who is held against whom, what counts as a fault, where a stopped sweep goes on.
+"""Truth sweep: drawn scenes, compared engines, criteria of a fault, continuation of a stopped sweep.
 
 | what                                    | must agree with                                        |
 |-----------------------------------------|--------------------------------------------------------|
 | the default engine in fixed scenes      | two accurate engines, which agree with each other      |
-| status, error, faults of stubbed runs   | what was put into the stubs                           |
-| a scene by its number                   | itself, whatever else is drawn                         |
+| status, error, faults of stubbed runs   | the values put into the stubs                          |
+| a scene by its number                   | itself, independent of other drawn scenes              |
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def test_default_engine_is_right_in_fixed_scenes(number: int) -> None:
 
 
 def test_a_law_that_is_another_is_seen() -> None:
-    # The same engines on another restitution: what the fixed scenes hold for small is large.
+    # The same engines at another restitution: a difference that the fixed scenes treat as small is large.
     scene = change_scene(draw_scene(7, 7), {"duration_s": 0.08})
 
     def other(task: Task) -> Run:
@@ -63,7 +63,7 @@ def test_a_law_that_is_another_is_seen() -> None:
 
 
 def stub(shifts: dict[str, float], own: dict[str, dict[str, Any]] | None = None, *, grows: float = 1.0):
-    """Runs that stand still, each engine's off by so much in the error's norm; `own`: other fields by engine."""
+    """Return a stub of runs at rest, each engine off by a shift in the error's norm; `own`: other fields by engine."""
 
     def run(task: Task) -> Run:
         states = np.zeros((100, N_STATE))
@@ -185,7 +185,7 @@ def test_a_stopped_sweep_goes_on(tmp_path) -> None:
     run_stub = stub({})
     first = list(sweep([0, 2], seed=1, engines=[DEFAULT, "rk4"], folder=tmp_path, run=run))
     with (tmp_path / NAME).open("a") as file:
-        file.write('{"seed": 1, "numb')  # a sweep that was killed
+        file.write('{"seed": 1, "numb')  # a killed sweep
     calls.clear()
     assert list(sweep([0, 2], seed=1, engines=[DEFAULT], folder=tmp_path, run=run)) == first
     assert calls == []
@@ -206,7 +206,7 @@ def test_a_run_over_its_limit_and_one_that_breaks_are_results(monkeypatch: pytes
 
 
 class _Hangs:
-    """No scene: whoever asks for its fields never gets them."""
+    """An invalid scene: reading its fields never returns."""
 
     def model_dump(self) -> Any:
         end_after(1.0)
@@ -215,7 +215,7 @@ class _Hangs:
 
 
 class _Dies:
-    """No scene: whoever asks for its fields ends."""
+    """An invalid scene: reading its fields ends the process."""
 
     def model_dump(self) -> Any:
         os._exit(7)

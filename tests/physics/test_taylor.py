@@ -1,18 +1,18 @@
-"""The Taylor series: its coefficients, its events, and what it is for.
+"""Taylor series: its coefficients, its events, and its uses.
 
 | what                                   | must agree with                                          |
 |----------------------------------------|----------------------------------------------------------|
 | series of a ringing house              | the cosine, and the cosine's own remainder after order 16 |
 | first coefficients of any phase        | the kernels' equations, and how those change             |
-| code of the series                     | what the equations give when it is made anew             |
-| first zero of a polynomial             | roots that the polynomial was made from                  |
+| code of the series                     | the code that the equations generate now                 |
+| first zero of a polynomial             | the roots from which it was constructed                  |
 | one impact                             | its quadrature, to 1e-9                                  |
-| first impacts under Coulomb's friction | heyoka on equations of its own                           |
+| first impacts under Coulomb's friction | heyoka on independent equations                          |
 | the two laws of a contact left open    | rk8, which steps through them in time                    |
-| blows along a line, nothing turning    | rk8's impacts, with friction and without                 |
-| rolling in a stiff, linear contact     | the friction that is needed, whatever the depth          |
-| steps of an impact                     | some 16, whatever is asked of the onset                  |
-| error over a ladder of tolerances      | falls with every rung                                    |
+| impacts along a line, nothing turning  | rk8's impacts, with friction and without                 |
+| rolling in a stiff, linear contact     | the required friction, whatever the depth                |
+| steps of an impact                     | some 16, whatever the tolerance of the onset             |
+| error over a ladder of tolerances      | falls at every rung                                      |
 | energy residual                        | 0, within some tolerances                                |
 | state at an instant                    | the same bits, however dense the rows are                |
 """
@@ -51,31 +51,31 @@ from tests.scenes import QUIET
 
 
 def ready(scene: str = "hammer", engine: str = "taylor", tolerance: float = 1e-9, **changes: Any) -> Simulation:
-    """A simulation with rows 1 ms apart; dots of dotted keys as `__`."""
+    """Prepare a simulation with rows 1 ms apart; dots of dotted keys are written `__`."""
     dotted = {key.replace("__", "."): value for key, value in changes.items()}
     choice = {"engine.name": engine, "engine.tolerance": tolerance}
     return Simulation(load_scene(scene, {**QUIET, **choice, **dotted}))
 
 
 def series_in(memory: np.ndarray) -> np.ndarray:
-    """The coefficients that an engine keeps, shape (ORDER + 1, WIDTH)."""
+    """Return the coefficients in an engine's memory, shape (ORDER + 1, WIDTH)."""
     return memory[SERIES:][: (ORDER + 1) * WIDTH].reshape(ORDER + 1, WIDTH)
 
 
 def states(simulation: Simulation, duration_s: float) -> np.ndarray:
-    """States on a grid of 1 ms, shape (n, 14)."""
+    """Return states on a grid of 1 ms, shape (n, 14)."""
     return simulation.advance(round(duration_s * 1e6)).rows[:, : S.N_STATE].copy()
 
 
 def test_series_of_a_cosine_ends_with_its_own_remainder() -> None:
     constants, mode = house_oscillator()
-    # No more preload than the transducers need: their difference is the pair's force.
+    # Exactly the preload that the transducers need: their difference is the pair's force.
     constants = constants._replace(house=constants.house._replace(preload=1e3))
     angular, amplitude = 2.0 * math.pi * mode.frequency_hz, 1e-6
     y = state(y_ih=amplitude * mode.inner, y_oh=amplitude * mode.outer)
     memory, rows = np.zeros(MEMORY), np.empty((1, S.N_ROW))
     inputs = quiet_inputs(tick_s=1e-6)
-    # Far more than is wanted, for a long series.
+    # A loose tolerance, for a long series.
     engine = load_engine("taylor")
     engine.start(constants, inputs, y, memory, 1.0, 1e-1)
     engine.advance(constants, inputs, y, memory, 0, 1, 1, 1, rows)
@@ -85,7 +85,7 @@ def test_series_of_a_cosine_ends_with_its_own_remainder() -> None:
     for time in times:
         value = np.polynomial.polynomial.polyval(time, series[:, 4])
         error = abs(value / (amplitude * mode.inner) - math.cos(angular * time))
-        # The cosine has even powers only: what is left out begins with the 18th.
+        # The cosine has even powers only: the remainder begins with the 18th.
         assert error == pytest.approx((angular * time) ** 18 / math.factorial(18), rel=0.05)
         errors.append(error)
     slope = np.polyfit(np.log(times), np.log(errors), 1)[0]
@@ -96,7 +96,7 @@ def test_series_of_a_cosine_ends_with_its_own_remainder() -> None:
 @pytest.mark.parametrize("mode", ["torque", "ideal"])
 def test_first_coefficients_are_the_equations(phase: int, mode: str) -> None:
     simulation = ready(drive__mode=mode, model__magnet="cylinders")
-    simulation.advance(22_000)  # into the blow
+    simulation.advance(22_000)  # into the impact
     constants, inputs = simulation.model.constants, simulation._inputs()
     # A state of that phase: in the ring or pushed into it, spinning either way.
     contact = constants.contact
@@ -158,9 +158,9 @@ def test_first_zero_of_a_polynomial() -> None:
     assert zero(column([1.1, 1.5])) == math.inf
     # Twice through 0 between two samples.
     assert zero(column([0.55, 0.5501])) == pytest.approx(0.55, abs=1e-12)
-    # Touches nothing.
+    # No zero.
     assert zero(column([0.55 + 1e-4j, 0.55 - 1e-4j])) == math.inf
-    # On the wrong side from the start; and at 0 by what went before, once or twice.
+    # On the wrong side from the start; and at 0 by the previous state, once or twice.
     assert zero(column([-0.5])) == math.inf
     assert zero(column([-0.5], -1.0)) == 0.0
     assert zero(column([0.0, 0.4], -1.0), 1) == pytest.approx(0.4, abs=1e-14)
@@ -181,12 +181,12 @@ def test_first_impacts_agree_with_heyoka() -> None:
     simulation = ready(tolerance=1e-12)
     assert scaled_error(states(simulation, 0.05), peer.states[:50]) < 1e-9
     assert simulation._motion.memory[CONTACTS] == len(peer.onsets) == 16
-    # Sixteen impacts, a hundred steps each by a series in time alone.
+    # Sixteen impacts of a hundred steps each, by a series in time alone.
     assert simulation._motion.memory[CONTACT_STEPS] < 30 * 16
 
 
 def scaled(motion: np.ndarray) -> np.ndarray:
-    """States over what counts as 1 in each."""
+    """Return states in units of their scales."""
     from rig.physics.engines.common.method import PER_SCALE
 
     return motion * PER_SCALE
@@ -211,7 +211,7 @@ CASES: dict[str, tuple[str, dict[str, Any]]] = {
 def test_agrees_with_rk8(case: str) -> None:
     scene, changes = CASES[case]
     one, other = ready(scene, tolerance=1e-11, **changes), ready(scene, "rk8", 1e-11, engine__step_us=5, **changes)
-    # Sixteen impacts make an error a thousand times larger: up to the fourth.
+    # Sixteen impacts amplify an error a thousand times: compare up to the fourth.
     first, second = scaled(states(one, 0.034)), scaled(states(other, 0.034))
     assert one._motion.memory[CONTACTS] == other._motion.memory[CONTACTS] > 0
     assert np.sqrt(np.mean((first - second) ** 2)) < 1e-8
@@ -239,7 +239,7 @@ def test_rows_change_no_bit_and_a_new_input_ends_a_series() -> None:
     sparse = ready()
     rows = np.concatenate([dense.advance(25).rows.copy() for _ in range(30_000 // 25)])
     assert rows[::40].tobytes() == sparse.advance(30_000).rows.tobytes()
-    # A series of a quiet flight outlives the command: it must not be believed beyond it.
+    # A series of a quiet flight extends beyond the command: it is not valid there.
     early, late = ready("stable-run"), ready("stable-run", "rk8", 1e-11)
     for simulation in (early, late):
         simulation.advance(7_000)
@@ -259,7 +259,7 @@ def test_a_long_flight_takes_few_steps() -> None:
 
 @pytest.mark.parametrize("stiffness", ["johnson-cylinder", "palmgren-cylinder", "liu-cylinder"])
 def test_the_peak_is_the_laws_own_for_every_exponent(stiffness: str) -> None:
-    # Next to an onset the series of delta^n says nothing, and a series' own force there has been 562 kN.
+    # Close to an onset the series of delta^n is useless, and a series' own force there was 562 kN.
     changes = {"contact.stiffness": stiffness, "sensors.chain": "ideal"}
     peaks = [
         simulate("hammer", {**changes, "engine.name": name}, duration_s=0.04).simulation.health()
@@ -273,7 +273,7 @@ def test_the_peak_is_the_laws_own_for_every_exponent(stiffness: str) -> None:
 @pytest.mark.parametrize("friction", [0.0, 0.22])
 @pytest.mark.parametrize("force", [300.0, 320.0, 330.0])
 def test_a_motion_along_a_line_goes_on(friction: float, force: float) -> None:
-    # Where the sliding speed is 0 to the last bit, phases that change at one depth change back at once.
+    # At a sliding speed of exactly 0, phases that change at one depth change back at once.
     blow = {"at_s": 0.018, "command": "hammer", "force_n": force, "duration_ms": 1.0, "direction": "y"}
     changes = {**QUIET, "model.stator": "rigid", "drive.speed_hz": 0.0, "ring.clearance": 0.2685, "commands": [blow]}
     changes |= {"contact.restitution": 0.9478, "contact.friction": friction}
@@ -287,7 +287,7 @@ def test_a_motion_along_a_line_goes_on(friction: float, force: float) -> None:
 
 
 def test_a_contact_that_begins_with_hardly_any_speed_goes_on() -> None:
-    # It begins deeper than it may go without friction: rolling began before the ring, where there is no force.
+    # It begins deeper than it may without friction: rolling began before the ring, where there is no force.
     run = {name: run_task(Task(draw_scene(21, 385), name, 1e-9)) for name in ("taylor", "rk8")}
     assert [done.failure for done in run.values()] == ["", ""]
     assert scaled_error(run["taylor"].states, run["rk8"].states) < 1e-5

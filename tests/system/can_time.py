@@ -1,9 +1,9 @@
 """Time over CAN late in a real run: `python -m tests.system.can_time [--minutes 40] [--scene test-quiet]`.
 
 Runs a scene at full speed as a node of a virtual CAN bus. Once it has reached the simulated time, a new CAN client
-joins and sends commands. Its time, and that of each reply, must lie between two answers of the rig over zenoh, before
+connects and sends commands. Its time, and that of each reply, must be between two replies of the rig over zenoh, before
 and after it; a heartbeat carries the time, so that the client's may be older by one. A time on the bus has 32 bits of
-microseconds, which wrap after 71.6 simulated minutes; half of that is 35.8. Status 1 where a time is wrong.
+microseconds, which wrap after 71.6 simulated minutes; half of that is 35.8. Status 1 if a time is wrong.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def main() -> int:
         right = 0
         with CanClient(bus, wait_s=30.0) as late:
             for channel in CHANNELS:
-                command = wire.encode_document({"channel": channel, "kind": "polarity"})  # any scene takes it
+                command = wire.encode_document({"channel": channel, "kind": "polarity"})  # valid in every scene
                 before_s = rig_s()
                 joined_s = wire.decode_document(late.request(wire.STATUS))["time_s"]
                 reply = wire.decode_document(late.request(wire.command_key("fault"), command, timeout_s=30.0))

@@ -1,9 +1,9 @@
 """From condition to trip in real time: `python -m tests.system.protection_latency [TRIPS [BLOCK_MS]]`.
 
-A rig and the protection monitor run in processes of their own; a third one moves a probe by 500 um by a fault, whose
-first row is in the reply, and the monitor's set point is 300 um without delay. The latency is the simulated time from
-that row to the tick at which the trip's speed command takes effect: it holds the block in which the row is, the way to
-the monitor, its work, and the way back. Nothing is asserted: it depends on the machine.
+A rig and the protection monitor run in separate processes; a third one moves a probe by 500 um by a fault, whose first
+row is in the reply, and the monitor's set point is 300 um without delay. The latency is the simulated time from that
+row to the tick at which the trip's speed command takes effect: it includes the block of the row, both transmissions and
+the monitor's work. Nothing is asserted: it depends on the machine.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ PARTS = {"p50": 50.0, "p99": 99.0, "p99.9": 99.9, "most": 100.0}
 
 
 def latencies_ms(trips: int, block_ms: str) -> tuple[np.ndarray, dict]:
-    """Of each trip [ms], shape (trips,), infinite where none came; and the rig's status at the end."""
+    """Return the latency of each trip [ms], shape (trips,), infinite if missing; and the rig's status at the end."""
     endpoint, found = processes.free_endpoint(), []
     rng = np.random.default_rng(1)
     with (
@@ -35,7 +35,7 @@ def latencies_ms(trips: int, block_ms: str) -> tuple[np.ndarray, dict]:
             stdout=None, stderr=None,
         ) as child,
         rig.connect(url := f"zenoh:{endpoint}", wait_s=processes.COMPILE_S) as machine,
-        # Nobody reads what it says: a pipe would be full one day, and it would wait.
+        # Nothing reads its output: a pipe would fill up and block it.
         processes.python("-m", "drivers.protection", url, *OPTIONS, stdout=subprocess.DEVNULL, stderr=None),
     ):  # fmt: skip
         machine.event(lambda event: "on" in event.get("tags", ()), timeout_s=60.0)
@@ -49,7 +49,7 @@ def latencies_ms(trips: int, block_ms: str) -> tuple[np.ndarray, dict]:
                 )
                 found.append(1e-3 * (trip["tick"] - tick))
             except NotSeenError:
-                # A monitor that lost rows begins anew, and may be blind just then.
+                # A monitor that lost rows restarts, and may be blind at that moment.
                 found.append(np.inf)
             time.sleep(0.1 + rng.uniform(0.0, 0.01))
             again = any(_again(machine) for _ in range(20)) or not np.isfinite(found[-1])

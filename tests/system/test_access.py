@@ -1,7 +1,7 @@
-"""Who may say what to a live rig: every row of the table, tried by everybody that it names, and by those it does not.
+"""Access control of a live rig: every row of the table, tried by every role that it names and by the others.
 
-Each subject does everything that it can with every key: it subscribes, fetches history, asks, puts, deletes, answers
-and shows tokens. What came of it, at the rig and at an honest client beside it, must be what the table says.
+Each subject does everything possible with every key: it subscribes, fetches history, requests, puts, deletes, replies
+and declares tokens. The effects at the rig and at an honest client must be those of the table.
 """
 
 from __future__ import annotations
@@ -42,14 +42,14 @@ def example(pattern: str, chunk: str = "a") -> str:
 
 
 def everything(session: zenoh.Session, selector: str) -> Iterator[zenoh.Reply]:
-    """All replies, also where several have one key."""
+    """Return all replies, also if several have one key."""
     none, anything = zenoh.ConsolidationMode.NONE, zenoh.ReplyKeyExpr.ANY
     return iter(session.get(selector, timeout=2.0, consolidation=none, accept_replies=anything))
 
 
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """One authority's certificates for every name there is, for one that is no role, and for one that has expired."""
+    """One authority's certificates for every role, for a name that is no role, and an expired one."""
     folder = tmp_path_factory.mktemp("keys")
     signing = ec.generate_private_key(ec.SECP256R1())
     issue, late = Issue(signing, timedelta(days=1)), Issue(signing, timedelta(minutes=-1))
@@ -68,7 +68,7 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def settings_in(folder: Path) -> dict[str, Any]:
-    """As `Holder.settings`, of a folder that our own checks would refuse."""
+    """Return settings as `Holder.settings` does, of a folder that our own checks would refuse."""
     return {
         "root_ca_certificate": str(folder / "authority.pem"),
         "connect_certificate": str(folder / "certificate.pem"),
@@ -79,7 +79,7 @@ def settings_in(folder: Path) -> dict[str, Any]:
 
 @contextmanager
 def hostile(locator: str, mode: str = "client", folder: Path | None = None) -> Iterator[zenoh.Session]:
-    """A session of zenoh's own, without any of our manners."""
+    """Open a plain zenoh session, without the checks of our client."""
     config = zenoh.Config()
     settings: dict[str, Any] = {
         "mode": mode,
@@ -98,7 +98,7 @@ def hostile(locator: str, mode: str = "client", folder: Path | None = None) -> I
 
 
 class Honest(ZenohClient):
-    """A client as anybody's, whose session can be asked behind its back."""
+    """A normal client whose session the test can use directly."""
 
     @property
     def session(self) -> zenoh.Session:
@@ -143,7 +143,7 @@ def receivable(doors: tuple[Door, ...]) -> set[str]:
 
 
 class Try:
-    """All that somebody does at once, and what it sees of it."""
+    """All that a subject does, and its effects as the subject observes them."""
 
     def __init__(self, session: zenoh.Session) -> None:
         self.session = session
@@ -203,10 +203,10 @@ def test_everybody_may_do_what_the_table_says_and_nothing_else(name: str | None,
         honest.subscribe("rig/**", lambda key, payload: seen.append((key, payload)), lossless=False)
         beside.declare_subscriber("rig/**", lambda sample: seen.append((str(sample.key_expr), bytes(sample.payload))))
         attempt = Try(session)
-        # What a subject may ask for is answered in the order of its link: behind the answer everything has been taken.
+        # A link keeps its order: after the reply to a request everything before it has been received.
         answers = {key: attempt.answered(key) for key in map(example, KEYS)}
         history = attempt.history()
-        # Nor is the rig's own configuration for anybody: only the session's own answers.
+        # The rig's own configuration is not accessible either: only the session's own replies.
         own = {str(session.info.zid())}
         assert {str(reply.replier_id.zid) for reply in everything(session, "@/**") if reply.replier_id} <= own
         time.sleep(0.3)
@@ -214,7 +214,7 @@ def test_everybody_may_do_what_the_table_says_and_nothing_else(name: str | None,
         allowed = receivable(doors)
         until(lambda: allowed <= attempt.received and allowed <= attempt.heartbeats)
         until(lambda: rig.heard >= keys_of(doors, Verb.SEND) and rig.shown >= keys_of(doors, Verb.SHOW))
-        # Nobody has been asked to believe anything yet: what an honest client gets is the rig's own, or nothing.
+        # Before any forged message, an honest client receives the rig's own messages or none.
         forged_tokens = {
             key for door in DOORS if door.verb is Verb.WATCH for key in honest.tokens(example(door.keys[0]))
         }
@@ -259,7 +259,7 @@ def test_without_a_valid_certificate_nobody_is_let_in(who: str | None, why: str,
         for locator in (f"tls/{exposed}", f"tcp/{exposed}"):
             with pytest.raises(zenoh.ZError), hostile(locator, folder=who and folders / who):
                 pytest.fail(f"let in by {locator}, though its certificate is {why}")
-        # And somebody who is let in still is.
+        # And an admitted client stays admitted.
         with hostile(f"tls/{exposed}", folder=folders / "viewer"):
             until(lambda: server.congestion().get("links_viewer") == 1)
 
@@ -276,7 +276,7 @@ def test_a_link_ends_when_its_certificate_does(folders: Path, tmp_path: Path) ->
 
     write("server", issue, Usage.SERVER_AUTH)
     with ZenohServer(plain, exposed=Exposure(exposed, holder_in(tmp_path, server=True))) as server:
-        for valid_s in (3, 30):  # a machine that is busy may need longer than the first to connect
+        for valid_s in (3, 30):  # on a busy machine the first connection may take longer than the shorter one
             write("viewer", Issue(signing, timedelta(seconds=valid_s)), Usage.CLIENT_AUTH)
             with contextlib.suppress(zenoh.ZError), hostile(f"tls/{exposed}", folder=tmp_path / "viewer"):
                 if server.congestion().get("links_viewer") == 1:
@@ -297,7 +297,7 @@ def test_clients_say_why_they_are_not_let_in_and_what_is_denied(folders: Path) -
             assert str(viewer.connection).endswith("; the rig is the rig")
             denied = rf"^the rig at {exposed} denies rig/command/hammer to viewer$"
             with sooner_than(PATIENCE_S), pytest.raises(NoReplyError, match=denied):
-                viewer.request("rig/command/hammer", timeout_s=2 * PATIENCE_S)  # told at once
+                viewer.request("rig/command/hammer", timeout_s=2 * PATIENCE_S)  # refused at once
             with pytest.raises(NoReplyError, match=rf"^the rig at {exposed} does not answer rig/parameters$"):
                 viewer.request("rig/parameters", timeout_s=0.2)
         for endpoint, tls, message in (

@@ -109,7 +109,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def campaign(folder: Path, *arguments: str, status: int) -> tuple[str, dict[str, Any]]:
-    """What a campaign prints, and its results by case."""
+    """Run a campaign; return its output, and its results by case."""
     with processes.rig("campaign", *arguments, "-o", "out", cwd=folder) as child:
         out, err = child.communicate(timeout=processes.COMPILE_S)
     assert child.returncode == status, out + err
@@ -131,16 +131,16 @@ def test_a_device_in_lockstep_is_judged_alike_each_time(folder: Path) -> None:
     assert [each["good"] for each in fixtures["measurements"]] == [True, True, False]
     assert fixtures["reason"].startswith("force must be <= 1 N; instead received ")
     assert fixtures["resolution"] == "20 ms blocks, in lockstep"
-    # A rig that was stopped for a tenth of a second judges no device.
+    # A rig that was stopped for a tenth of a second gives no verdict on a device.
     assert behind["reason"].startswith("not judged because the rig fell behind real time in ")
     assert behind["reason"].partition(": ")[2].startswith("time to trip must be <= 1 ms; instead received 2 ms")
-    # The evidence: of the case that failed, about the moment where it did.
+    # The evidence of the failed case, about the moment of the failure.
     logs = folder / "out/evidence/test_x.py_test_fixtures"
     assert [Path(file).name for file in fixtures["evidence"]] == ["rig.log", "watcher.log", "event.mcap", "event.png"]
     assert Recording.open(logs / "event.mcap").span_s == (0.0, pytest.approx(0.2, abs=1e-3))
     assert len(check_junit(folder / "out/junit.xml")) == 5
     assert "<img" in (folder / "out/index.html").read_text(encoding="utf-8")
-    # Another run is the same, byte for byte.
+    # A repeated run is identical, byte for byte.
     assert well["repeat"] == "rig campaign x.campaign.toml::how=well"
     assert json.dumps(again).replace("how=again", "how=well") == json.dumps(well)
 
@@ -178,7 +178,9 @@ def test_ctrl_c_leaves_nothing_running_and_tells_what_was_done(tmp_path: Path) -
         def devices() -> int:
             return sum("time.sleep" in " ".join(each.cmdline()) for each in descendants(child.pid))
 
-        waiting.until(lambda: devices() >= 4, timeout_s=processes.COMPILE_S, every_s=0.1)  # each with its keeper
+        waiting.until(
+            lambda: devices() >= 4, timeout_s=processes.COMPILE_S, every_s=0.1
+        )  # each with its cleanup process
         left = descendants(child.pid)
         os.killpg(child.pid, signal.SIGINT)
         out, err = child.communicate(timeout=60.0)

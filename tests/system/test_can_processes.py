@@ -1,4 +1,4 @@
-"""A virtual CAN hub, programs on its bus and python-can's own tools as processes of their own, over loopback."""
+"""A virtual CAN hub, programs on its bus and python-can's own tools in separate processes, over loopback."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ from tests.waiting import PATIENCE_S, until
 
 pytestmark = pytest.mark.wallclock
 process = partial(python, stdin=subprocess.PIPE, stderr=subprocess.STDOUT)
-"""Says all that it says in one stream."""
+"""Both outputs in one stream."""
 
 
 @contextmanager
 def hub_process() -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """`rig can hub` in a process of its own, and where it listens."""
+    """Start `rig can hub` in a separate process; yield it and its endpoint."""
     endpoint = free_endpoint()
     arguments = ("can", "hub", "can0", "can1", "--speed", "1M/8M", "--listen", endpoint)
     with process("-m", "rig", *arguments) as child:
-        line_of(child, "Ctrl-C ends it")  # the first start after a change compiles, and says so
+        line_of(child, "Ctrl-C ends it")  # the first start after a change compiles, with a message
         yield child, endpoint
 
 
 class Bench:
-    """A running hub, and what a test needs of it; all that it opens ends with it."""
+    """A running hub with helpers for a test; everything that it opens ends with it."""
 
     def __init__(self, stack: ExitStack, child: subprocess.Popen[str], endpoint: str) -> None:
         self.child, self.endpoint = child, endpoint
@@ -56,7 +56,7 @@ class Bench:
         return self._stack.enter_context(ZenohBus(channel, endpoint=self.endpoint, **settings))
 
     def tool(self, name: str, *arguments: str, channel: str = "can0") -> subprocess.Popen[str]:
-        """One of python-can's tools, as it is."""
+        """Start one of python-can's tools, unchanged."""
         where = ("-i", "zenoh", "-c", channel, "--bus-kwargs", f"endpoint={self.endpoint}")
         return self._stack.enter_context(process("-m", f"can.{name}", *where, *arguments))
 
@@ -69,20 +69,20 @@ def shared() -> Iterator[tuple[subprocess.Popen[str], str]]:
 
 @pytest.fixture
 def hub(shared: tuple[subprocess.Popen[str], str]) -> Iterator[Bench]:
-    """A hub that other tests use as well."""
+    """A hub shared by tests."""
     with ExitStack() as stack:
         yield Bench(stack, *shared)
 
 
 @pytest.fixture
 def own_hub() -> Iterator[Bench]:
-    """A hub to end."""
+    """A hub that a test may end."""
     with ExitStack() as stack:
         yield Bench(stack, *stack.enter_context(hub_process()))
 
 
 def end(child: subprocess.Popen[str]) -> str:
-    """End it as Ctrl-C does, and what it has said."""
+    """End it as Ctrl-C does, and return its output."""
     child.send_signal(signal.SIGINT)
     output, _ = child.communicate(timeout=PATIENCE_S)
     assert child.returncode == 0, output
@@ -90,7 +90,7 @@ def end(child: subprocess.Popen[str]) -> str:
 
 
 def messages(count: int) -> list[can.Message]:
-    """Classic, extended and FD frames, each other than all others."""
+    """Return classic, extended and FD frames, all different."""
     found = []
     for number in range(count):
         data = number.to_bytes(4, "big")
@@ -105,7 +105,7 @@ def messages(count: int) -> list[can.Message]:
 
 
 def content(found: list[can.Message]) -> list[tuple[int, bool, bool, bytes]]:
-    """What a log must keep, in the order of the numbers."""
+    """Return the fields that a log must keep, in the order of the numbers."""
     rows = [(item.arbitration_id, item.is_extended_id, item.is_fd, bytes(item.data)) for item in found]
     return sorted(rows, key=lambda row: row[3][:4])
 
@@ -133,7 +133,7 @@ def test_stock_logger_and_player_keep_every_frame(hub: Bench, tmp_path: Path) ->
     until(lambda: hub.status()["counts"]["frames"] - before["frames"] == count)
 
     def has_all() -> bool:
-        """Whether the logger has written the last message; more of it make it empty its buffer."""
+        """Return whether the logger has written the last message; repeats of it make the logger empty its buffer."""
         sender.send_records(codec.make_records(messages(count)[-1:] * 100), timeout=PATIENCE_S)
         return path.exists() and path.read_text(encoding="utf-8").count("\n") >= count
 
@@ -252,7 +252,7 @@ def test_an_endpoint_that_stalls_or_dies_slows_nobody(hub: Bench, how: signal.Si
                 found.append(item)
         found += take(receiver, count - len(found))
         assert [int.from_bytes(item.data[:4], "big") for item in found] == list(range(count))
-        # The bus was never idle: what it took is what the frames take.
+        # The bus was never idle: its load is that of the frames.
         share = (found[-1].timestamp - found[0].timestamp) / (count * 123e-6)
         assert 0.8 < share < 2.5
         assert (receiver.missed, receiver.dropped) == (0, 0)

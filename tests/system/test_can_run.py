@@ -1,4 +1,4 @@
-"""The real rig on a CAN bus: python-can alone hits the shaft, and what the bus carries is what was recorded."""
+"""The real rig on a CAN bus: python-can alone operates the hammer, and the bus carries the recorded values."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def check_against_recording(
         path: The recording.
         rates: Rate of the frames [Hz], by whether they are CAN FD.
         from_start: Whether the frames begin within the first half second of the run.
-        whole: Whether every frame from the first one to the end of the run is there.
+        whole: Whether every frame from the first one to the end of the run is present.
 
     Returns:
         Number of values compared.
@@ -174,9 +174,9 @@ def test_a_hammer_pulse_from_the_bus_causes_the_whirl_and_wrong_ones_do_nothing(
     assert pulse_n.max() == pytest.approx(100.0, rel=0.05)
     assert pulse_s[pulse_n.argmax()] == pytest.approx(0.4025, abs=0.002)
     before, after = orbit[time_s < 0.4], orbit[time_s > 1.5]
-    # Hanging free in the ring, away from it.
+    # Hanging free in the ring, without contact.
     assert np.abs(before - before.mean()).max() < 0.3
-    # Full annular backward whirl: round the ring without leaving it, against the spin, far faster than it.
+    # Full annular backward whirl: round the ring in permanent contact, against the spin, far faster than it.
     radius = np.abs(after - after.mean())
     assert radius.min() > 0.8 * radius.max()
     assert radius.min() > 3.0 * np.abs(before - before.mean()).max()
@@ -209,7 +209,7 @@ def test_rig_run_on_a_virtual_bus_between_processes(tmp_path: Path, options: lis
             while True:
                 if (message := bus.recv(20.0)) is None:
                     assert stopped, "the bus is silent"
-                    break  # the frame of the end was dropped
+                    break  # the last frame was dropped
                 assert not message.is_error_frame
                 frames.setdefault(message.arbitration_id, []).append(bytes(message.data))
                 if message.arbitration_id == TABLE.by_name["Sync"].identifier and not asked:
@@ -231,7 +231,7 @@ def test_rig_run_on_a_virtual_bus_between_processes(tmp_path: Path, options: lis
     assert output.endswith(" dropped, commands accepted 1, refused 0\n"), output
     found = re.search(r"lateness .* max (\d+\.\d+) .*sent, (\d+) dropped", output, re.DOTALL)
     assert found is not None, output
-    # A rig that was held up for longer sends more frames at once than wait for a bus: it drops some, and counts them.
+    # A rig that was delayed for longer sends more frames at once than the bus queues: it drops and counts some.
     late, dropped = float(found[1]) > 100.0, int(found[2])
     assert late or not dropped, output
     (reply,) = [TABLE.by_name["Acknowledge"].decode(data) for data in frames[TABLE.by_name["Acknowledge"].identifier]]
@@ -274,5 +274,5 @@ def test_an_overloaded_bus_drops_counts_and_does_not_slow_the_rig() -> None:
     assert "blocks dropped 0" in output
     line = output.splitlines()[-1]
     sent, dropped = (int(line.split()[place]) for place in (1, 4))
-    # 7500 frames a second come, of which 557 % fill the bus.
+    # 7500 frames per second, 557 % of the bus capacity.
     assert 0.1 < sent / (sent + dropped) < 0.4

@@ -1,4 +1,6 @@
-"""One client of a rig: the same program on a rig in lockstep has the same rows, and turns as the shaft turns."""
+"""The client of a rig: the same program on a rig in lockstep receives the same rows, and follows the shaft's
+rotation.
+"""
 
 from __future__ import annotations
 
@@ -45,7 +47,7 @@ def test_a_program_reads_the_same_rows_as_the_model_makes() -> None:
         before = machine.advance(0.3)
         assert (before.index, len(before), before.gap) == (0, 6000, 0)
         pulse = machine.hammer(force_n=150.0)
-        assert pulse.tick == 300_000  # at the row behind the last one that was read, whatever had been sent
+        assert pulse.tick == 300_000  # at the row after the last one read, whatever had been sent
         hit = machine.until(lambda rows: np.hypot(rows["disk_x"], rows["disk_y"]) > 1.2, within_s=0.5)
         assert machine.event("hammer")["tick"] == pulse.tick
         behind = machine.advance(0.01)
@@ -96,7 +98,7 @@ def test_rows_that_are_read_between_turns_are_of_none() -> None:
         speeds = []
         for turn in machine.turns():
             speeds.append(turn.speed_hz)
-            assert len(machine.advance(0.7)) == 14_000  # more than there is room for at a time
+            assert len(machine.advance(0.7)) == 14_000  # more than one buffer
             if len(speeds) == 2:
                 break
         assert speeds == pytest.approx([12.0, 12.0], rel=2e-3)

@@ -1,4 +1,4 @@
-"""How a rig ends: signals at any time, clients that are slow, and clients that were never honest."""
+"""End of a rig: signals at any time, slow clients, and hostile clients."""
 
 from __future__ import annotations
 
@@ -53,14 +53,14 @@ def test_a_slow_subscriber_does_not_hold_up_the_end_nor_break_it(mode: str) -> N
             seconds = time.monotonic() - begin
     assert rig.returncode == 0
     assert "stopped at" in output
-    # Not a speed of this machine: it was 13 to 15 s when each of two deadlines was waited for.
+    # Independent of the machine's speed: 13 to 15 s if both deadlines were waited for.
     assert seconds < 8.0
 
 
 @pytest.mark.parametrize(
     ("number", "ignored", "words"),
     [
-        (signal.SIGINT, True, "rig: scene"),  # as a shell starts what runs in its background
+        (signal.SIGINT, True, "rig: scene"),  # as a shell starts background programs
         (signal.SIGTERM, False, "rig: scene"),
         (signal.SIGHUP, False, "rig: scene"),
         (signal.SIGINT, True, "listening on"),
@@ -71,7 +71,7 @@ def test_a_slow_subscriber_does_not_hold_up_the_end_nor_break_it(mode: str) -> N
 def test_a_signal_at_any_time_ends_a_rig_in_good_order(number: signal.Signals, ignored: bool, words: str) -> None:
     ignoring = (lambda: signal.signal(number, signal.SIG_IGN)) if ignored else None
     deaf = ignored and number == signal.SIGHUP
-    # Only a rig that ignores the signal ends at its duration: another could end before the signal comes.
+    # Only a rig that ignores the signal ends at its duration: another could end before the signal arrives.
     arguments = ("run", "stable-run", "--listen", free_endpoint(), *(("--duration-s", "1") if deaf else ()))
     with command(*arguments, preexec_fn=ignoring) as rig:
         line_of(rig, words)
@@ -85,7 +85,7 @@ def test_a_signal_at_any_time_ends_a_rig_in_good_order(number: signal.Signals, i
         assert rig.returncode == 130
         assert errors.splitlines()[-1] == "rig: interrupted"
     else:
-        # 130 where it came between the line and the first block.
+        # 130 if the signal arrived between the line and the first block.
         assert (rig.returncode, "stopped at" in output) in ((0, True), (130, False))
 
 

@@ -1,4 +1,4 @@
-"""Drivers and the DAQ client on a real, short `rig run`, with `rig twins` in a process of its own."""
+"""Drivers and the DAQ client on a real, short `rig run`, with `rig twins` in a separate process."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ pytestmark = pytest.mark.wallclock
 
 @contextmanager
 def twins(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], dict[str, list[str]]]]:
-    """`rig twins`, and its URLs by instrument."""
+    """Start `rig twins`; yield it, and its URLs by instrument."""
     links = sum(name in arguments for name in ("--zenoh", "--pty"))
     with command("twins", *arguments) as child:
         assert child.stdout is not None
@@ -67,7 +67,7 @@ def test_drivers_and_daq_show_the_same_rig() -> None:
                             driver.configure()
                             driver.start()
                         rows = [driver.read(4000) for driver in (over_zenoh, over_pty)]
-                    # On a loaded machine one may be over before the other begins.
+                    # On a loaded machine one may end before the other begins.
                     for each in sorted(rows, key=lambda each: each.index):
                         direct = daq.read(200)
                         while direct.index < each.index:

@@ -1,4 +1,4 @@
-"""Devices under test in processes of their own: they react at an exact tick, however slow, and none hangs the rig."""
+"""Devices under test in separate processes: they react at an exact tick, however slow, and none blocks the rig."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def bench(*arguments: str) -> Iterator[tuple[Rig, str]]:
 
 
 def reactions(slow_s: float) -> tuple[list[str], list[dict[str, Any]]]:
-    """What two devices say that they did, over zenoh and of plain sockets over CAN, and what the stream says."""
+    """Return the reports of two devices, over zenoh and over CAN by plain sockets, and the events of the stream."""
     hub, port = processes.free_port(), processes.free_port()
     can = ("--can", f"zenoh:can0?endpoint=127.0.0.1:{hub}", "--can-socketcand", f"127.0.0.1:{port}")
     with (
@@ -135,7 +135,7 @@ def test_a_program_of_the_client_is_the_same_device_over_can() -> None:
             told: list[dict[str, Any]] = []
 
             def step() -> None:
-                # The device joins as it asks for its first rows.
+                # The device joins when it requests its first rows.
                 told.append(machine.event("device", timeout_s=PATIENCE_S))
                 stepped.append(machine.step(30_000))
 

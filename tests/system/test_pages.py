@@ -1,8 +1,8 @@
-"""README and docs say what works: their commands and Python blocks are run, a page at a time, in order.
+"""README and docs are correct: their commands and Python blocks are run, page by page, in order.
 
-A line of a block with "first terminal" in its comment goes on beside the others, until the page's next use of that
-terminal or its end; "ends with 1" is the exit status to expect. What a reader does not see stands in a comment above a
-block: `file: NAME` (save it), `long: HOW LONG` (run with RIG_LONG_PAGES=1), `elsewhere: WHY` (never run here).
+A line of a block with "first terminal" in its comment runs in parallel to the others, until the page's next use of that
+terminal or its end; "ends with 1" is the expected exit status. Directives for this test are in a comment above a block:
+`file: NAME` (save it), `long: HOW LONG` (run with RIG_LONG_PAGES=1), `elsewhere: WHY` (never run here).
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ pytestmark = [pytest.mark.wallclock, pytest.mark.timeout(600)]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 TEXTS = [*PAGES, ROOT / "CONTRIBUTING.md"]
 PORTS = (7460, 7461, 7462, 7463)
-"""Where the pages' rig, bus and instruments listen."""
+"""Ports of the pages' rig, bus and instruments."""
 _LONG = bool(os.environ.get("RIG_LONG_PAGES"))
 _BLOCK = re.compile(r"(?:^<!-- ([^\n]*) -->\n)?^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 _READY = {
@@ -44,12 +44,12 @@ _READY = {
     "-m": "Connected to",  # python -m can.logger
     "plain_device.py": "joined",
 }
-"""What a command prints that goes on, once others can count on it."""
+"""Output of a command that keeps running, from which others may rely on it."""
 
 
 @dataclass
 class Running:
-    """A command in a terminal of its own."""
+    """A command in a separate terminal."""
 
     line: str
     process: subprocess.Popen[bytes]
@@ -58,15 +58,15 @@ class Running:
 
     @property
     def ends_with_the_rig(self) -> bool:
-        """It serves a rig, or records one."""
+        """Whether it serves or records a rig, and therefore ends with it."""
         return self.line.split()[1] in ("run", "replay", "record")
 
     def said(self) -> str:
-        """What it has printed so far."""
+        """Return its output so far."""
         return Path(self.log.name).read_text(encoding="utf-8", errors="replace")
 
     def end(self, *, by_itself: bool) -> None:
-        """Wait until it has ended as the page says: by itself, or by Ctrl-C."""
+        """Wait until it has ended as the page describes: without a signal, or by Ctrl-C."""
         if not by_itself:
             self.process.send_signal(signal.SIGINT)
         status = self.process.wait(60.0)
@@ -76,15 +76,15 @@ class Running:
 
 @dataclass
 class Reader:
-    """Somebody who does what a page says, in a folder of his own."""
+    """A user who follows a page in an empty folder."""
 
     folder: Path
     terminals: dict[str, Running] = field(default_factory=dict)
     settings: list[str] = field(default_factory=list)
-    """Variables of the shell that the page has set so far."""
+    """Shell variables set by the page so far."""
 
     def do(self, directive: str, language: str, text: str) -> None:
-        """Do what one block says."""
+        """Execute one block."""
         what, _, rest = directive.partition(": ")
         if what == "elsewhere" or (what == "long" and not _LONG):
             return
@@ -152,12 +152,12 @@ class Reader:
             time.sleep(0.05)
 
     def leave(self) -> None:
-        """End what the page left running: first those that began last."""
+        """End the remaining programs of the page, the oldest first."""
         for running in reversed(self.terminals.values()):
             running.end(by_itself=False)
 
     def kill(self) -> None:
-        """Leave nothing behind, whatever happened."""
+        """End all programs, in any state."""
         for running in self.terminals.values():
             running.process.kill()
             running.process.wait()
@@ -165,13 +165,13 @@ class Reader:
 
 
 def blocks_of(page: Path) -> list[tuple[str, str, str]]:
-    """Directive, language and text of a page's blocks."""
+    """Return directive, language and text of a page's blocks."""
     return [(found[1] or "", found[2], found[3]) for found in _BLOCK.finditer(page.read_text(encoding="utf-8"))]
 
 
 @pytest.fixture
 def reader(tmp_path: Path) -> Iterator[Reader]:
-    """One reader at a time on this machine, for pages name the usual ports."""
+    """One reader at a time on this machine, because pages name the default ports."""
     with (Path(tempfile.gettempdir()) / "rig-pages.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         for port in PORTS:
@@ -187,7 +187,7 @@ def reader(tmp_path: Path) -> Iterator[Reader]:
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_a_page_says_what_works(page: Path, reader: Reader) -> None:
-    shutil.copytree(ROOT / "docs", reader.folder, dirs_exist_ok=True)  # what a page has beside it
+    shutil.copytree(ROOT / "docs", reader.folder, dirs_exist_ok=True)  # files next to the page
     blocks = [block for block in blocks_of(page) if not block[0].endswith(" command")]
     assert blocks or page.stem in ("install", "development")
     for block in blocks:
@@ -205,7 +205,7 @@ def test_the_two_commands_of_the_readme_differ_in_what_they_install_alone() -> N
 
 
 def spans_of(text: str) -> Iterator[list[str]]:
-    """Words of the commands of `rig` that a text names, in its blocks or between backticks."""
+    """Yield the words of each command of `rig` in a text, in its blocks or between backticks."""
     for span in re.findall(r"(?<!`)`(rig [^`]+)`", text) + re.findall(r"^(rig [^#|>\n]+)", text, re.MULTILINE):
         yield span.split()[1:]
 

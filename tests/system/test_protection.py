@@ -1,4 +1,6 @@
-"""The protection monitor in its own process trips a rig: at an exact tick in lockstep, with a contact in the stream."""
+"""The protection monitor in a separate process trips a rig: at an exact tick in lockstep, with a contact in the
+stream.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,7 @@ BLOCK_TICKS = 10_000
 
 
 def trip() -> tuple[list[str], list[dict[str, Any]], list[Samples]]:
-    """Lines of the monitor, events of the stream by it, and the rows before and after a blow."""
+    """Return the monitor's lines, its events in the stream, and the rows before and after an impact."""
     changes = ("--pace", "lockstep", "--set", "commands=[]", "--block-ms", str(BLOCK_TICKS // 1000))
     with processes.running_rig("hammer", *changes) as (child, endpoint):
         url = f"zenoh:{endpoint}"
@@ -32,7 +34,7 @@ def trip() -> tuple[list[str], list[dict[str, Any]], list[Samples]]:
                 said, errors = device.communicate(timeout=30.0)
                 assert (device.returncode, errors) == (0, "")
             lines = said.splitlines()[1:]
-            # A note that it is there, one for each line, and the trip's command.
+            # A note at its start, one for each line, and the trip's command.
             events = [machine.event(lambda event: event["event"] in ("speed", "note")) for _ in range(len(lines) + 2)]
         child.wait(timeout=PATIENCE_S)
     return lines, [{**event, "wall_s": 0.0} for event in events], rows
@@ -54,7 +56,7 @@ def test_a_blow_trips_the_rig_at_the_end_of_the_block_with_its_row_twice_alike()
     assert (speed["tick"], speed["speed_hz"]) == (end, 0.0)
     contact = next(event for event in events if "trip" in event.get("tags", ()))
     assert (contact["tick"], contact["tags"], contact["from"]) == (end, ["protection", "trip"], "protection")
-    # Its level passed 1500 um the delay before, a row or two apart, as the gap is taken away slowly.
+    # Its level exceeded 1500 um one delay earlier, within two rows, because the gap is removed slowly.
     level = 1e3 * (np.maximum.accumulate(whole[danger.name]) - np.minimum.accumulate(whole[danger.name]))
     assert abs(int(np.argmax(level > 1500.0)) + 246 - danger.row) <= 2
     assert (whole["speed"][tripped.row] > 5.0, whole["speed"][-1] < 5.6) == (True, True)

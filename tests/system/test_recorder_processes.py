@@ -1,4 +1,4 @@
-"""The recorder as a process of its own, over zenoh on loopback, with a publisher in the place of the rig."""
+"""The recorder in a separate process, over zenoh on loopback, with a publisher in place of the rig."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ pytestmark = pytest.mark.wallclock
 PROBES = sensor_key("probes")
 BLOCK_S = 0.01
 CYCLE = list(stream(50))[1:-1]
-"""Half a second of all streams; later halves are the same with other ticks and row numbers."""
+"""Half a second of all streams; later halves differ only in ticks and row numbers."""
 
 
 def _later(key: str, payload: bytes, cycle: int) -> bytes:
@@ -49,7 +49,7 @@ def _later(key: str, payload: bytes, cycle: int) -> bytes:
 
 
 class Publisher:
-    """Publishes at the pace of the wall clock and remembers when it published what."""
+    """Publishes in real time, and stores the time of each message."""
 
     def __init__(self, port: int) -> None:
         self.server = ZenohServer(f"127.0.0.1:{port}")
@@ -57,7 +57,7 @@ class Publisher:
             self.server.answer(key, lambda _, document=document: encode_document(document))
         self.beats: list[dict] = []
         self.reached: set[str] = set()
-        """Keys of the clients that have had a row."""
+        """Keys of the clients that have received a row."""
         self.server.hear(f"{CLIENTS}/*", self._heard)
         self.server.announce()
         self.sent: dict[str, list[bytes]] = {}
@@ -121,7 +121,7 @@ def publisher(port: int) -> Iterator[Publisher]:
 
 @contextmanager
 def recorder(path: Path, port: int, options: str = "", *, before: str = "") -> Iterator[subprocess.Popen[str]]:
-    """`rig record` in a process of its own, ended by its own id whatever happens."""
+    """Start `rig record` in a separate process, which always ends."""
     code = before + (
         "import sys; from pathlib import Path; from rig.cli.groups import expand_groups; "
         "from rig.cli.commands.record import record; "
@@ -182,7 +182,7 @@ def test_a_killed_recorder_loses_half_a_second_at_most_and_the_rest_reads(tmp_pa
             losses.append(killed_at - (start + len(payloads)))
             for key, stream_ in recording.streams.items():
                 assert stream_.lost == 0, key
-    # A recorder that gets no processor for a while had nothing to write when it was killed: not in every trial.
+    # A recorder that gets no processor time for a while had nothing to write when it was killed: not in every trial.
     half_a_second = 0.5 / BLOCK_S + 1
     assert sorted(losses)[1] <= half_a_second, f"blocks lost: {losses}"
     assert max(losses) <= 3.0 * half_a_second, f"blocks lost: {losses}"
@@ -272,7 +272,7 @@ def test_a_rotating_recorder_loses_nothing_at_its_seams(tmp_path):
 def test_a_recorder_waits_for_a_rig_that_comes_later(tmp_path):
     port = free_port()
     with recorder(tmp_path / "run.mcap", port, "wait_s=30.0, duration_s=0.3, keep_free_mb=0.0") as process:
-        time.sleep(3.0)  # longer than a recorder waits that was not told to
+        time.sleep(3.0)  # longer than a recorder waits without that option
         assert process.poll() is None
         with publisher(port):
             output, errors = process.communicate(timeout=PATIENCE_S)
@@ -286,7 +286,7 @@ def test_a_trigger_makes_a_file_of_its_own(tmp_path):
     with publisher(port) as rig, recorder(tmp_path / "run.mcap", port, options) as process:
         until(lambda: received(rig) > 0, of=process)
         begun = rig.blocks()
-        until(lambda: rig.blocks() > begun + 60)  # longer than is kept before a trigger
+        until(lambda: rig.blocks() > begun + 60)  # longer than the history before a trigger
         tick = rig.blocks() * 10_000
         rig.server.publish(EVENTS, encode_document({"event": "hammer", "tick": tick, "time_s": tick / 1e6}))
         output, errors = process.communicate(timeout=PATIENCE_S)
@@ -313,7 +313,7 @@ def test_a_recorder_that_was_stopped_for_longer_than_its_link_lives_goes_on(tmp_
         until(lambda: received(rig) > 200 * rig.blocks() - 4000, of=process)
         rig.end()
         output, errors = process.communicate(timeout=PATIENCE_S)
-    # Where the link is there again before the recorder has noticed, there is nothing to tell while nothing is lost.
+    # If the link is restored before the recorder has noticed, there is nothing to report unless rows are lost.
     assert "is back" in errors or "lost: nothing" in output, output
     assert "ended: completed" in output
     recording = Recording.open(path)
@@ -361,7 +361,7 @@ def test_a_full_disk_ends_the_command_with_what_was_kept_and_recover_finishes_it
 
     port = free_port()
     path = tmp_path / "run.mcap"
-    # A limit on the size of a file stands for the disk.
+    # A limit on the size of a file replaces a full disk.
     code = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (1_500_000, -1)); "
     with publisher(port) as rig, recorder(path, port, "keep_free_mb=0.0", before=code) as process:
         output, errors = process.communicate(timeout=PATIENCE_S)

@@ -40,7 +40,7 @@ _channels = itertools.count()
 
 
 def payloads() -> Iterator[tuple[str, bytes]]:
-    """A short run with an end as a rig tells it: with the number of rows."""
+    """Yield a short run whose end event has the number of rows."""
     rows: dict[str, int] = {}
     for key, payload in stream(BLOCKS):
         schema = wire.schema_of(key)
@@ -59,7 +59,7 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @contextmanager
 def playing(path: Path, clock: RealTime | FreeRun, **options: Any) -> Iterator[tuple[Player, str]]:
-    """A player that waits for one client, at an endpoint of its own."""
+    """Start a player that waits for one client, at a new endpoint."""
     endpoint = free_endpoint()
     with ZenohServer(endpoint, wait=not isinstance(clock, RealTime)) as server:
         player = Player(Track([path]), server, clock, wait_for=1, **options)
@@ -94,7 +94,7 @@ def _payloads(path: Path) -> Iterator[tuple[str, bytes]]:
 
 
 def test_a_daq_gets_every_row_of_a_burst(path: Path) -> None:
-    # Room for far less than the recording: it must be waited for.
+    # Capacity far below the recording: the reader must wait for it.
     with playing(path, FreeRun()) as (_, endpoint), Daq.open(f"zenoh:{endpoint}", buffer_s=0.1, wait_s=10.0) as daq:
         got = list(daq.blocks(1000))
         assert (got[0].index, sum(map(len, got))) == (0, 200 * BLOCKS)
@@ -129,7 +129,7 @@ def test_frames_on_a_bus_are_those_of_the_recording(path: Path) -> None:
     with can.Bus(channel, interface="virtual", ignore_config=True) as bus:
         with (
             ZenohServer(free_endpoint()) as server,
-            # What a bus of this speed could carry does not matter to the virtual one.
+            # The capacity of a real bus of this speed does not limit the virtual one.
             CanOutput(f"virtual:{channel}", both) as output,
         ):
             player = Player(Track([path]), output.beside(server), FreeRun())
@@ -139,7 +139,7 @@ def test_frames_on_a_bus_are_those_of_the_recording(path: Path) -> None:
         while (message := bus.recv(0.2)) is not None:
             frames.setdefault(message.arbitration_id, []).append(bytes(message.data))
     compared = check_against_recording(frames, path, rates={True: 10_000, False: 1000})
-    # Whole frames only: of a message with many rows a frame the last instants may never be sent.
+    # Full frames only: the last instants of a message with many rows per frame may never be sent.
     assert 0.95 < compared / (15 * 11 * 10 * BLOCKS) <= 1.0
 
 
@@ -178,7 +178,7 @@ def test_ctrl_c_ends_the_stream_and_says_so(path: Path) -> None:
         ZenohClient(endpoint, wait_s=PATIENCE_S) as client,
     ):
         client.subscribe(wire.EVENTS, lambda _, payload: events.append(json.loads(payload)))
-        client.settle()  # the status comes over another link
+        client.settle()  # the status uses another link
         until(lambda: Console(client).status()["state"] == "running", of=child)
         child.send_signal(signal.SIGINT)
         output, errors = child.communicate(timeout=30.0)

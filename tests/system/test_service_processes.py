@@ -1,4 +1,4 @@
-"""A rig, its clients and its commands as processes of their own, over loopback."""
+"""A rig, its clients and its commands in separate processes, over loopback."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def rig(pace: str, *duration_s: str) -> Iterator[tuple[subprocess.Popen[str], st
 
 
 class Listener:
-    """Follows a stream and notices gaps."""
+    """Follows a stream and detects gaps."""
 
     def __init__(self, client: ZenohClient) -> None:
         self.follow = wire.Continuity()
@@ -59,7 +59,7 @@ class Listener:
         self.missed += count
 
     def complete(self) -> bool:
-        """Whether all rows that the rig says it has published are here."""
+        """Return whether all rows that the rig has published are present."""
         ends = [event for event in self.events if event["event"] == "end"]
         return bool(ends) and self.follow.received == ends[0]["rows"] and not any(self.first.values())
 
@@ -139,9 +139,10 @@ print(len(numbers), numbers == sorted(set(numbers)), sum(missed))
 
 
 def stalled_subscriber(messages: int) -> tuple[str, dict[str, float]]:
-    """Stop a subscriber, publish far more than its link holds, let it go on.
+    """Stop a subscriber, publish far more than its link buffers, and let it continue.
 
-    Returns its report, and what the server saw meanwhile.
+    Returns:
+        Its report, and the server's figures meanwhile.
     """
     ready = threading.Event()
     with ZenohServer(free_endpoint()) as server:
@@ -164,12 +165,12 @@ def stalled_subscriber(messages: int) -> tuple[str, dict[str, float]]:
 
 
 def test_a_stopped_subscriber_gets_everything_afterwards_and_is_seen_meanwhile() -> None:
-    # 50 MB, and sockets hold a tenth of it; within the cache.
+    # 50 MB, ten times the sockets' buffers; within the cache.
     report, congestion = stalled_subscriber(2500)
     assert report.split() == ["2500", "True", "0"]
     if congestion["backlog_bytes"]:
         assert congestion["stalled_links"] == congestion["stalls"] == 1
-    # Waiting 1 ms in each dropped put would make nearly all slow; a busy machine makes some.
+    # Waiting 1 ms in each dropped put would make nearly all slow; a busy machine makes some slow.
     assert congestion["slow_puts"] < 2500 / 4
 
 
@@ -194,7 +195,7 @@ def test_a_script_that_never_closes_its_client_still_ends() -> None:
 
 
 class Printed(StringIO):
-    """Standard output of a command, and what to do as soon as it has printed a line."""
+    """Standard output of a command, with an action at its first line."""
 
     def __init__(self, at_first_line: Callable[[], object] = bool) -> None:
         super().__init__()
@@ -209,7 +210,7 @@ class Printed(StringIO):
 
 
 def invoke(endpoint: str, *arguments: str, at_first_line: Callable[[], object] = bool) -> str:
-    """What a command prints; raises what it raises."""
+    """Run a command and return its output; exceptions pass."""
     with redirect_stdout(Printed(at_first_line)) as printed:
         app.rig().main([*arguments, "--connect", endpoint], standalone_mode=False)
     return printed.getvalue()

@@ -35,11 +35,11 @@ def test_a_failure_ends_in_1_and_a_report_names_the_cause(
     assert code == 1
     assert "contact.restitution +2.27 %" in out
     lines = out.splitlines()
-    assert lines[1].startswith("fail, ")  # what comes out of it, before any table
+    assert lines[1].startswith("fail, ")  # the verdict, before any table
     assert "contact.restitution +2.27 %" in lines[2]
     page = report.read_text(encoding="utf-8")
     assert "Contact.restitution" in page or "contact.restitution +2.27 %" in page
-    assert page.count("data:image/png") == 7  # all at a glance, five groups, orbits and spectra
+    assert page.count("data:image/png") == 7  # overview, five groups, orbits and spectra
     assert page.index("Fail, ") < page.index("data:image/png") < page.index("<table>")
     head = page[: page.index("data:image/png")]
     for told in (recording.name, "--set contact.restitution=0.88", "corrected", "<dt>seed</dt>", "<dt>made</dt>"):

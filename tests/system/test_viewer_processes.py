@@ -1,4 +1,4 @@
-"""`rig view` as its users start it: a process, beside a rig that is another."""
+"""`rig view` as its users start it: a process, separate from the rig's."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ VIEW = ["-c", "from rig.cli.main import main; main()", "view"]
 
 
 def quiet() -> dict[str, str]:
-    """The environment of a machine without a screen."""
+    """Return the environment of a machine without a screen."""
     kept = {key: value for key, value in os.environ.items() if key not in ("DISPLAY", "WAYLAND_DISPLAY", "CI")}
     return {**kept, "PYTHONPATH": str(ROOT)}
 
 
 @contextlib.contextmanager
 def started(command: list[str]) -> Iterator[subprocess.Popen[str]]:
-    """A process of ours, ended afterwards."""
+    """Start a process, and end it afterwards."""
     with python(*command, env=quiet(), stderr=subprocess.STDOUT, bufsize=1) as process:
         yield process
 
@@ -129,7 +129,7 @@ def test_live_view_until_the_rig_ends(tmp_path: Path) -> None:
     saved = Saved(target)
     first, _ = saved["/orbit/disk/reading", "Points2D:labels"].values[-1]
     assert first == "BACKWARD whirl -83.0 Hz"
-    # Whatever part of the two seconds it saw, it saw at 25 Hz or less.
+    # All that it observed in the two seconds was at 25 Hz or less.
     frames = saved["/orbit/ring/trace", "LineStrips2D:strips"].times_s
     assert 2 <= len(frames) <= 30.0 * (frames[-1] - frames[0]) + 5
 
@@ -160,7 +160,9 @@ def test_the_web_viewer_is_on_loopback_only_and_goes_with_the_command(recorded: 
             assert "notebook=1" in page.url
             assert b"viewer_state()" in page.read()
         with urllib.request.urlopen(f"{address[0]}re_viewer.js", timeout=10) as code:
-            assert b"viewer_state()" in code.read()  # what the page's script asks, in the version that is installed
+            assert (
+                b"viewer_state()" in code.read()
+            )  # the function that the page's script calls, in the installed version
         children = psutil.Process(viewer.pid).children(recursive=True)
         listening = [
             connection.laddr
@@ -203,7 +205,7 @@ def test_a_viewer_that_cannot_start_says_why(monkeypatch: pytest.MonkeyPatch) ->
 
 
 class BusyViewer:
-    """Answers every second question; the others are not answered in rerun's own time."""
+    """Replies to every second request; the others get no reply within rerun's own time limit."""
 
     asked = 0
     picture = b"a picture"

@@ -1,4 +1,4 @@
-"""A rig of nothing but a channel table, blocks of known counts and answers to commands, on any transport."""
+"""A fake rig: a channel table, blocks of known counts and replies to commands, on any transport."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ BLOCK = 200
 
 
 def counts_of(group: str, index: int, rows: int) -> np.ndarray:
-    """Counts of 24 bits that tell their group, row and column; with zeros and negative ones among them."""
+    """Return 24-bit counts that identify their group, row and column, zeros and negative ones included."""
     columns = len(default_table().groups[group].channels)
     number = np.arange(index, index + rows, dtype=np.int64)[:, None]
     mixed = (number * 7919 + np.arange(columns) * 104_729 + len(group) * 1_299_709) % (1 << 24)
@@ -23,7 +23,7 @@ def counts_of(group: str, index: int, rows: int) -> np.ndarray:
 
 
 def values_of(group: str, index: int, rows: int, step: int = 1) -> np.ndarray:
-    """What an instrument must show for these rows, straight from the definition of a channel's scale."""
+    """Return the values that an instrument must show for these rows, from the definition of a channel's scale."""
     channels = default_table().groups[group].channels
     counts = counts_of(group, index, rows)[::step]
     columns = [
@@ -34,11 +34,11 @@ def values_of(group: str, index: int, rows: int, step: int = 1) -> np.ndarray:
 
 
 class FakeRig:
-    """Answers the catalogue and commands; publishes when told.
+    """Replies to the catalogue and to commands; publishes on request.
 
     Args:
         server: Transport; closed by its owner.
-        refusal: What commands are refused with, or None to accept them.
+        refusal: Reason to refuse commands, or None to accept them.
     """
 
     def __init__(self, server: Server, *, refusal: str | None = None) -> None:
@@ -63,7 +63,7 @@ class FakeRig:
         return wire.encode_document(reply)
 
     def publish(self, *groups: str, blocks: int = 1, skip: int = 0) -> None:
-        """Blocks of some groups, after leaving out some."""
+        """Publish blocks of some groups, after skipping some."""
         for _ in range(blocks):
             for group in groups:
                 index = self.index.get(group, 0) + skip * BLOCK
@@ -73,7 +73,7 @@ class FakeRig:
             skip = 0
 
     def end(self) -> None:
-        """The event that ends a run."""
+        """Publish the event that ends a run."""
         rows = {wire.sensor_key(group): index for group, index in self.index.items()}
         event = {"event": "end", "tick": 0, "time_s": 0.0, "reason": "completed", "rows": rows}
         self.server.publish(wire.EVENTS, wire.encode_document(event))

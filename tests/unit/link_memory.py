@@ -19,13 +19,13 @@ class MemoryLink:
         self.lost = 0
 
     def send(self, message: bytes, *, timeout_s: float) -> None:
-        """Put a message into the other end's queue, when it has room."""
+        """Put a message into the other end's queue, as soon as it has room."""
         if not self._outbox.put(message, timeout_s):
             self._check()
             raise LinkTimeoutError(f"the other end took nothing for {timeout_s:g} s")
 
     def receive(self, *, timeout_s: float) -> bytes | None:
-        """The next message, or None where none came in time."""
+        """Return the next message, or None after the timeout."""
         message = None if self._closed else self._inbox.take(timeout_s)
         if message is None or self._closed:
             self._check()
@@ -43,10 +43,10 @@ class MemoryLink:
 
 
 def pair(*, room: int = QUEUE_MESSAGES) -> tuple[MemoryLink, MemoryLink]:
-    """Two ends of one link.
+    """Return two ends of one link.
 
     Args:
-        room: Number of messages that wait at each end.
+        room: Capacity of the queue at each end [messages].
     """
     down, up = BoundedQueue[bytes](room), BoundedQueue[bytes](room)
     return MemoryLink(up, down), MemoryLink(down, up)

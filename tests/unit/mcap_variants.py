@@ -1,4 +1,4 @@
-"""A recording written again in each way that the MCAP specification allows: the dimensions of its conformance suite."""
+"""A recording rewritten in each way that the MCAP specification allows: the dimensions of its conformance suite."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def _rewrite(source: Path, target: Path, options: dict[str, Any]) -> None:
 
 
 def records(data: bytes) -> list[tuple[int, bytes]]:
-    """Opcode and body of each record outside chunks."""
+    """Return opcode and body of each record outside chunks."""
     found, position = [], len(MAGIC)
     while position < len(data) - len(MAGIC):
         opcode, length = struct.unpack_from("<BQ", data, position)
@@ -94,7 +94,7 @@ def _split(data: bytes) -> tuple[list[tuple[int, bytes]], list[tuple[int, bytes]
 
 
 def finished(data: bytes, summary: bytes = b"", *, checked: bool = True) -> bytes:
-    """A file of a data section and a summary."""
+    """Return a file of a data section and a summary."""
     body = MAGIC + data
     body += struct.pack("<BQI", Opcode.DATA_END, 4, zlib.crc32(body) if checked else 0)
     footer = struct.pack("<BQQQ", Opcode.FOOTER, 20, len(body) if summary else 0, 0)
@@ -122,7 +122,7 @@ def _private_summary(data: bytes) -> bytes:
 
 
 def _one_message_outside(data: bytes) -> bytes:
-    """Chunks, and the last of them unpacked into the data section."""
+    """Return chunks with the last of them unpacked into the data section."""
     import zstandard
 
     rows = _split(data)[0]
@@ -137,7 +137,7 @@ def _one_message_outside(data: bytes) -> bytes:
 
 
 def _without_sums(data: bytes) -> bytes:
-    """Checksums that are 0 in attachments and chunks, too."""
+    """Return a file whose attachments and chunks have checksums of 0."""
     rows = []
     for opcode, body in _split(data)[0]:
         if opcode == Opcode.ATTACHMENT:

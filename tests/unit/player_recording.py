@@ -27,7 +27,7 @@ def write_recording(
         catalogue=written[CATALOGUE],
         parameters=written[PARAMETERS],
         scene=written[SCENE],
-        # A clock that counts its readings: the file is flushed, and so a chunk closed, after so many messages.
+        # A clock that counts its readings: the file is flushed, and a chunk closed, after this number of messages.
         sync_every_s=float(chunk_messages),
         monotonic_s=lambda: float(next(ticks)),
     )
@@ -38,7 +38,7 @@ def write_recording(
 
 
 def by_key(payloads: Iterable[tuple[str, bytes]]) -> Payloads:
-    """Payloads of each key, in order."""
+    """Return the payloads of each key, in order."""
     found: Payloads = {}
     for key, payload in payloads:
         found.setdefault(key, []).append(payload)
@@ -46,7 +46,7 @@ def by_key(payloads: Iterable[tuple[str, bytes]]) -> Payloads:
 
 
 def key_by_key() -> Iterator[tuple[str, bytes]]:
-    """The same payloads, as a recorder that fetches history gets them."""
+    """Yield the same payloads in the order in which a recorder receives them from history."""
     for key, payloads in by_key(stream(BLOCKS)).items():
         for payload in payloads:
             yield key, payload

@@ -1,8 +1,8 @@
-"""What a protection monitor is accepted by, as tables: alarms, channel values, corners, OK limits, faults and votes.
+"""Acceptance tables of the protection monitor: alarms, channel values, corners, OK limits, faults and votes.
 
-Signals are test scenes, put to the converters' inputs, with the rig's own faults on the probe disk_x; expected outcomes
-are told beside each table. `python -m tests.unit.protection_acceptance [HOURS]` feeds an hour just below
-an alert: none comes.
+Signals are test scenes, fed to the converters' inputs, with the rig's own faults on the probe disk_x; expected results
+are in each table. `python -m tests.unit.protection_acceptance [HOURS]` feeds an hour just below an alert:
+there is none.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from rig.run.simulation import Simulation
 
 ALERT_UM, DANGER_UM = 500.0, 1000.0
 BEGIN_S, END_S = 0.25, 0.75
-"""When a fault acts [s]: behind the start-up, and for longer than all delays."""
+"""Start and end of a fault [s]: after the start-up, and longer than all delays."""
 
 
 def monitor(**changes: Any) -> Settings:
-    """Settings of the set: alarms after 0.1 s, over 0.25 s."""
+    """Return the monitor's settings: alarms after 0.1 s, over 0.25 s."""
     base = {
         "alert_um": ALERT_UM,
         "danger_um": DANGER_UM,
@@ -42,7 +42,7 @@ def monitor(**changes: Any) -> Settings:
 
 
 def stream(group: str, changes: dict[str, Any], scene: str = "test-sine") -> Iterator[Samples]:
-    """Blocks of a group of channels, as they are sent."""
+    """Yield blocks of a channel group as the rig sends them."""
     simulation = Simulation(load_scene(scene, {"sensors.groups": [group], "drive.speed_hz": 6.2, **changes}))
     while simulation.tick < simulation.end_tick:
         for message in simulation.advance(min(100_000, simulation.end_tick - simulation.tick)).messages:
@@ -51,7 +51,7 @@ def stream(group: str, changes: dict[str, Any], scene: str = "test-sine") -> Ite
 
 
 def samples_of(simulation: Simulation, group: str, block: Block) -> Samples:
-    """A block in engineering units."""
+    """Convert a block to engineering units."""
     table = simulation.table.groups[group]
     units = tuple(channel.unit for channel in table.channels)
     values = table.engineering(block.values)
@@ -59,13 +59,13 @@ def samples_of(simulation: Simulation, group: str, block: Block) -> Samples:
 
 
 def outcome(settings: Settings, rows: list[Samples]) -> list[Action]:
-    """What the monitor says of rows."""
+    """Feed rows to a monitor and return its actions."""
     device = Protection(settings)
     return [action for samples in rows for action in device.feed(samples)]
 
 
 def signal(peak_to_peak_um: float, frequency_hz: float, duration_s: float) -> dict[str, Any]:
-    """Changes that make `test-sine` a sine on both probes, the y one a quarter of a turn behind."""
+    """Return changes that make `test-sine` a sine on both probes, y a quarter period late."""
     return {
         "generator.amplitude_v": 3.94 * 0.5e-3 * peak_to_peak_um, "generator.frequency_hz": frequency_hz,
         "duration_s": duration_s, "generator.channels": {"disk_y": {"phase_deg": -90.0}},
@@ -73,7 +73,7 @@ def signal(peak_to_peak_um: float, frequency_hz: float, duration_s: float) -> di
 
 
 def sine(peak_to_peak_um: float, frequency_hz: float = 10.0, duration_s: float = 1.5, **changes: Any) -> list[Samples]:
-    """Rows of such a sine."""
+    """Return rows of that sine."""
     return list(stream("probes", {**signal(peak_to_peak_um, frequency_hz, duration_s), **changes}))
 
 
@@ -86,7 +86,7 @@ ALARMS = {
 }
 
 VALUES = [
-    # frequency [Hz], measure, level of a sine of 800 um peak-to-peak on x and, a quarter behind, on y [um]
+    # frequency [Hz], measure, level [um] of a sine of 800 um peak-to-peak on x and, a quarter period late, on y
     (10.0, "peak-to-peak", 800.0),
     (83.0, "peak-to-peak", 800.0),
     (997.0, "peak-to-peak", 800.0),
@@ -101,7 +101,7 @@ CORNER = [
 ]
 
 LIMITS = [
-    # volts at which disk_x is held, whether it is OK: the limits are -17.5 and -2.5 V
+    # constant voltage of disk_x, whether it is OK: the limits are -17.5 and -2.5 V
     (-17.6, False),
     (-17.4, True),
     (-2.6, True),
@@ -110,7 +110,7 @@ LIMITS = [
 
 
 def fault(kind: str, **numbers: Any) -> dict[str, Any]:
-    """A fault of disk_x as a command of a scene."""
+    """Return a fault of disk_x as a command of a scene."""
     given = {"channel": "disk_x", **numbers}
     return {"at_s": BEGIN_S, "command": "fault", "kind": kind, "for_s": END_S - BEGIN_S, **given}
 
@@ -119,7 +119,7 @@ VOTES = (("1oo2", "leaves"), ("2oo2", "leaves"), ("2oo2", "for"), ("1oo2", "for"
 
 
 def keyphasor(kind: str, **numbers: Any) -> list[Samples]:
-    """Rows of a shaft at rest between its probes that turns at 6.2 Hz, with a fault of its keyphasor."""
+    """Return rows of a shaft at rest between its probes, turning at 6.2 Hz, with a fault of its keyphasor."""
     command = {"at_s": 0.4, "command": "fault", "channel": "keyphasor", "kind": kind, **numbers}
     rows = stream("drive", {"duration_s": 1.2, "commands": [command]}, "stable-run")
     return [
@@ -130,24 +130,26 @@ def keyphasor(kind: str, **numbers: Any) -> list[Samples]:
 
 
 def judged(rows: list[Samples], vote: str, not_ok: str) -> str:
-    """T: a trip; N: NOT OK; a: an alarm without a trip; -: nothing."""
+    """Classify the actions: T, a trip; N, NOT OK; a, an alarm without a trip; -, nothing."""
     kinds = {each.kind for each in outcome(monitor(vote=vote, not_ok=not_ok), rows)}
     found = "T" if "trip" in kinds else "a" if kinds & {"alert", "danger"} else ""
     return (found + ("N" if "not-ok" in kinds else "")) or "-"
 
 
 WHIRL = [
-    # Ramp of the drive [Hz/s], delay of danger [s], whether whirl is established after a blow of 100 N at 6.2 Hz.
-    (2.0, 0.0, True),  # the rig's own drive: as fast as a monitor may be, the shaft goes on turning
+    # Ramp of the drive [Hz/s], delay of danger [s], whether whirl is established after an impact of 100 N at 6.2 Hz.
+    (2.0, 0.0, True),  # the rig's own drive: even with the fastest monitor, the shaft keeps turning
     (300.0, 0.02, False),
     (300.0, 0.1, True),
 ]
 FULL_S = 0.05
-"""Whirl is established where the contact lasts so long, but for a twentieth of it, and goes round backward [s]."""
+"""Contact time for an established whirl, a twentieth of it excepted, with backward rotation [s]."""
 
 
 def whirls(ramp_hz_s: float, delay_s: float, force_n: float = 100.0, block_ticks: int = 10_000) -> tuple[float, bool]:
-    """A blow at 0.1 s with the monitor in the loop: from the blow to the trip [s], and whether whirl is established."""
+    """Simulate an impact at 0.1 s with the monitor in the loop; return the time to the trip [s], and whether whirl is
+    established.
+    """
     blow = {"at_s": 0.1, "command": "hammer", "force_n": force_n}
     changes = {"duration_s": 0.4, "drive.ramp_rate": ramp_hz_s, "commands": [blow], "sensors.groups": ["probes"]}
     simulation = Simulation(load_scene("hammer", changes))
@@ -172,7 +174,7 @@ def whirls(ramp_hz_s: float, delay_s: float, force_n: float = 100.0, block_ticks
 
 
 def noise(hours: float) -> tuple[list[Action], float]:
-    """What the monitor says of so many hours at 98 % of its alert with the probes' noise, and how long it took [s]."""
+    """Feed hours at 98 % of the alert with the probes' noise; return the monitor's actions and the run time [s]."""
     begin = time.monotonic()
     device, actions = Protection(monitor(startup_s=2.0)), []
     for samples in stream("probes", signal(0.98 * ALERT_UM, 83.0, 3600.0 * hours)):

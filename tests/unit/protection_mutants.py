@@ -1,6 +1,6 @@
-"""Broken monitors, each with the scenario that is meant to tell it; `python -m tests.unit.protection_mutants` has all.
+"""Broken monitors, each with a scenario that must detect it; `python -m tests.unit.protection_mutants` has the matrix.
 
-A mutant is the source of the monitor, or of what obeys it, with one text in it replaced.
+A mutant is the source of the monitor, or of its actuation, with one text replaced.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from tests.unit.protection_scenarios import SCENARIOS, sound
 
 @dataclass(frozen=True)
 class Mutant:
-    """What is wrong, the scenario that tells it, and the text that stands in place of another one."""
+    """The defect, the scenario that detects it, and a text with its replacement."""
 
     name: str
     told_by: str
@@ -27,7 +27,7 @@ class Mutant:
     source: ModuleType = monitor
 
     def device(self) -> Any:
-        """It, as a scenario takes it."""
+        """Return the mutant as a device for a scenario."""
         assert self.source.__file__ is not None
         text = Path(self.source.__file__).read_text(encoding="utf-8")
         assert text.count(self.text) == 1, f"{self.name}: its text stands there {text.count(self.text)} times"
@@ -37,7 +37,7 @@ class Mutant:
         return SimpleNamespace(**{**vars(sound()), **made})
 
     def fails(self, scenario: str) -> bool:
-        """Whether a scenario tells it: it does something else, and does not just break down."""
+        """Return whether a scenario detects it: its result is wrong; an exception of its own does not count."""
         try:
             SCENARIOS[scenario](self.device())
         except AssertionError:
@@ -176,7 +176,7 @@ MUTANTS = [
 
 
 def matrix() -> dict[str, list[str]]:
-    """Of each mutant, the scenarios that tell it."""
+    """Return the scenarios that detect each mutant."""
     return {mutant.name: [name for name in SCENARIOS if mutant.fails(name)] for mutant in MUTANTS}
 
 

@@ -1,8 +1,7 @@
-"""What a protection monitor has to do: scenarios whose rows are worked out by hand, for the sound one and for mutants.
+"""Requirements of a protection monitor as scenarios with hand-computed rows, for the real one and for mutants.
 
-Rows are a millisecond. `swing` makes a signal whose peak-to-peak over two rows is told row by row, so that a level is
-above a set point exactly when it is meant to be: where its amplitude steps at row n, the level is half way at n, and
-there at n + 1.
+Rows are 1 ms apart. `swing` makes a signal whose peak-to-peak over two rows is specified row by row, so that the times
+above a set point are exact: if its amplitude steps at row n, the level is half way at n and complete at n + 1.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from drivers.sources.samples import Samples
 
 RATE = 1000.0
 SCENARIOS: dict[str, Callable[[Any], None]] = {}
-"""By name: each takes a device (`Protection`, `act`, `protect`), and raises AssertionError if that is not right."""
+"""By name: each takes a device (`Protection`, `act`, `protect`), and raises AssertionError if it is wrong."""
 
 
 def scenario(function: Callable[[Any], None]) -> Callable[[Any], None]:
@@ -36,7 +35,7 @@ def settings(**changes: Any) -> Settings:
 
 
 def swing(rows: int, *steps: tuple[int, float]) -> np.ndarray:
-    """Signal [mm] of a level [um] that is told from some rows on."""
+    """Return a signal [mm] with steps of its level, each a row and the level from there on [um]."""
     level = np.zeros(rows)
     for row, um in steps:
         level[row:] = um
@@ -68,7 +67,7 @@ def told(actions: list[Any], *kinds: str) -> list[tuple[str, str, int]]:
 
 @scenario
 def a_sine_is_measured_from_peak_to_peak(device: Any) -> None:
-    # 800 um at 10 Hz: from its peak on, the level is 800 (1 - sin); it passes 1000 where sin = -1/4, at 54.02 ms.
+    # 800 um at 10 Hz: after its peak the level is 800 (1 - sin); it passes 1000 where sin = -1/4, at 54.02 ms.
     x = 0.8 * np.sin(2.0 * math.pi * 10.0 * np.arange(200) / RATE)
     _, actions = run(device, settings(window_s=0.1), x)
     assert told(actions, "danger") == [("danger", "disk_x", 55)]
@@ -91,7 +90,7 @@ def an_alarm_is_of_its_own_probe(device: Any) -> None:
 
 @scenario
 def an_orbit_is_measured_from_its_mean(device: Any) -> None:
-    # A circle of 510 um, 700 um off the middle: after a high-pass of 1 Hz, 510 / sqrt(1 + 0.1^2) = 507.5 um.
+    # A circle of 510 um, 700 um off the centre: after a high-pass of 1 Hz, 510 / sqrt(1 + 0.1^2) = 507.5 um.
     turn = 2.0 * math.pi * 10.0 * np.arange(8000) / RATE
     for radius, expected in ((0.51, ["disk_x", "disk_y"]), (0.49, [])):
         x, y = 0.7 + radius * np.cos(turn), 0.2 + radius * np.sin(turn)
@@ -166,7 +165,7 @@ def an_alarm_ends_below_its_set_point_by_the_hysteresis(device: Any) -> None:
 
 @scenario
 def a_probe_beyond_its_ok_limits_is_not_ok(device: Any) -> None:
-    # The output is -10 V + 3.94 V/mm: -2.5 V is 1.9036 mm, -17.5 V as much the other way. Out from row 100 to 199.
+    # The output is -10 V + 3.94 V/mm: -2.5 V is 1.9036 mm, -17.5 V is -1.9036 mm. Out from row 100 to 199.
     for end_mm in (1.91, -1.91):
         x = np.zeros(1000)
         x[100:200] = end_mm
@@ -305,7 +304,7 @@ def no_alarm_while_it_starts(device: Any) -> None:
         ("alert", "disk_x", 300), ("danger", "disk_x", 350), ("trip", "danger disk_x", 350),
         ("speed-lost", "keyphasor", 400),
     ]  # fmt: skip
-    # What was above a set point then is not held by the hysteresis.
+    # The hysteresis does not hold an alarm that was above a set point only then.
     assert run(device, settings(startup_s=0.3, hysteresis=0.1), swing(600, (0, 600.0), (100, 470.0)))[1] == []
 
 
@@ -319,7 +318,7 @@ def it_trips_once(device: Any) -> None:
 
 
 class Machine:
-    """A rig that keeps what it is asked."""
+    """A rig that stores requests."""
 
     def __init__(self) -> None:
         self.asked: list[tuple[str, Any]] = []
@@ -348,7 +347,7 @@ def a_trip_is_sent_once_and_first(device: Any) -> None:
 
 
 class Watched(Machine):
-    """A rig with blocks, and events that come between them."""
+    """A rig with blocks, and events between them."""
 
     def __init__(self, *blocks: tuple[list[dict[str, Any]], Samples]) -> None:
         super().__init__()
@@ -381,7 +380,7 @@ def a_note_of_others_resets_it(device: Any) -> None:
 
 
 def eventful(rows: int = 6000) -> tuple[Settings, Samples]:
-    """Rows in which most things happen."""
+    """Return rows in which most cases occur."""
     rng = np.random.default_rng(1)
     x = 0.3 * np.sin(2.0 * math.pi * 10.0 * np.arange(rows) / RATE) * np.repeat(rng.uniform(0.2, 3.0, rows // 300), 300)
     y = 0.6 * x[::-1] + 0.02 * rng.standard_normal(rows)
@@ -416,7 +415,7 @@ def rows_that_are_missing_are_taken_as_the_last(device: Any) -> None:
     parts = [samples(0, disk_x=x[:120], disk_y=0.0), samples(180, disk_x=x[180:], disk_y=0.0)]
     monitor = device.Protection(given)
     actions = [each for part in parts for each in monitor.feed(part)]
-    # The step is in the window from row 100 to 199; danger after 50 rows, in the middle of what is missing.
+    # The step is in the window from row 100 to 199; danger after 50 rows, in the middle of the gap.
     assert told(actions, "rows-lost", "danger") == [("rows-lost", "", 180), ("danger", "disk_x", 150)]
     assert actions[-1].kind == "clear"
 
@@ -426,7 +425,7 @@ def rows_that_come_twice_count_once(device: Any) -> None:
     given, rows = eventful()
     whole, monitor = device.Protection(given).feed(rows), device.Protection(given)
     parts = [rows.rows(begin, begin + 100) for begin in range(0, 6000, 100)]
-    # Row 0 once more would be that of another run.
+    # Row 0 again would be that of another run.
     again = [part for number, part in enumerate(parts) for part in (part, parts[max(1, number - 3)])][2:]
     assert [each for part in (parts[0], *again) for each in monitor.feed(part)] == whole
 

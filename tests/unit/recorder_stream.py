@@ -1,4 +1,4 @@
-"""A rig that only publishes: documents and streams for the recorder's tests, and a client that hands them over."""
+"""A rig that only publishes: documents and streams for the recorder's tests, and a client that delivers them."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ TRUTH_COLUMNS = {"state": 28, "contact": 5}
 
 
 def documents() -> dict[str, dict[str, Any]]:
-    """Catalogue, parameters and scene by key."""
+    """Return the catalogue, parameters and scene by key."""
     truth = {
         table: {
             "columns": [{"name": f"{table}_{k}", "unit": "m", "label": f"column {k}"} for k in range(columns)],
@@ -50,7 +50,7 @@ def documents() -> dict[str, dict[str, Any]]:
 
 
 def block_of(key: str, number: int, *, block_ms: int = 10, seed: int = 1) -> Block:
-    """Block `number` of a stream, the same on every call."""
+    """Return block `number` of a stream, the same on every call."""
     tick = number * block_ms * 1000
     rng = np.random.default_rng([seed, number, len(key)])
     for table, columns in TRUTH_COLUMNS.items():
@@ -67,7 +67,10 @@ def block_of(key: str, number: int, *, block_ms: int = 10, seed: int = 1) -> Blo
 
 
 def stream(blocks: int, *, block_ms: int = 10) -> Iterator[tuple[str, bytes]]:
-    """Keys and payloads of a short run: start, blocks of everything, an edge a block, two statuses a second, end."""
+    """Yield keys and payloads of a short run: start, blocks of all streams, one edge per block, two statuses per
+    second,
+    end.
+    """
     yield EVENTS, encode_document({"event": "start", "tick": 0, "time_s": 0.0, "scene": "hammer", "seed": 7})
     keys = [sensor_key(group) for group in default_table().groups] + [truth_key(table) for table in TRUTH_COLUMNS]
     for number in range(blocks):
@@ -83,7 +86,7 @@ def stream(blocks: int, *, block_ms: int = 10) -> Iterator[tuple[str, bytes]]:
 
 
 class ScriptedClient:
-    """A client whose rig is the test: what it publishes is handed over on the caller's thread."""
+    """A client whose rig is the test: publications are delivered on the caller's thread."""
 
     foreign = 0
     rig = "a rig"

@@ -1,7 +1,7 @@
-"""A simulation without physics: as many streams and bytes as the real one, values that tell their row number.
+"""A simulation without physics: as many streams and bytes as the real one, values that encode their row number.
 
-Run as a program it is a whole rig on one port: `python -m tests.unit.service_fake PORT PACE [DURATION_S]`. With a
-duration it starts when it has read a line, so that whoever starts it can be connected before it ends.
+Run as a program it is a complete rig on one port: `python -m tests.unit.service_fake PORT PACE [DURATION_S]`. With a
+duration it starts when it has read a line, so that the parent process can be connected before it ends.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def _rows(tick: int, ticks: int, every: int, columns: int, dtype: type) -> Block
 
 
 class FakeSimulation:
-    """Counts.
+    """Counts rows instead of simulating.
 
     Args:
         duration_s: Length of the scene [s], or None.

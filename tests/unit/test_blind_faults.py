@@ -1,4 +1,4 @@
-"""Faults of channels that nobody is told of, found and named in recordings of this rig: each kind, and random ones."""
+"""Undeclared faults of channels, detected and named in recordings of this rig: each kind, and random ones."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ from tests.fault_cases import BLIND_SIZES, BLOCKS, DEFECT_OF, size_of
 from tests.physics.test_identification import recorded
 
 CHANNEL_KINDS = [name for name, kind in KINDS.items() if not kind.of_blocks]
-"""Faults of blocks leave counts as they are, and are told by what is there."""
+"""Faults of blocks keep the counts, and are detected by the rows that are present."""
 PROBES, FORCES = ("disk_x", "disk_y", "ring_x", "ring_y"), ("P_N", "P_S", "P_E", "P_W")
 ACCELERATIONS = ("inner_x", "inner_y", "outer_x", "outer_y")
 FULL = {"disk": 0.25, "ring": 0.127, "P": 1000.0, "inner": 980.0, "outer": 980.0}
-"""What a volt is of a channel [its unit]."""
+"""Units per volt of a channel."""
 REACH = {"disk": 1.5, "ring": 1.0, "P": 3500.0, "inner": 50.0, "outer": 50.0}
-"""What it shows at most, about."""
+"""Approximate range of a channel."""
 RANDOM = ("intermittent", "spikes")
-"""Kinds that come at random."""
+"""Kinds with random times."""
 
 
 def found_in(recording: Recording) -> tuple[list[Explanation], set[str]]:
-    """What is told blind, and the channels that differ."""
+    """Return the findings of a blind validation, and the channels that differ."""
     experiment = Experiment.of(recording).without_faults()
     parts, bits = measured(recording, experiment.scene), Bits(recording, experiment.simulation().table)
     nominal = predict(experiment, parts, follow=bits.follow)
@@ -49,7 +49,7 @@ def found_in(recording: Recording) -> tuple[list[Explanation], set[str]]:
 
 
 def right(told: list[Explanation], channel: str, kind: str) -> bool:
-    """Whether one thing is told with certainty, of the channel, by a name of the kind."""
+    """Return whether there is one certain finding, on the channel, with a name of the kind."""
     if len(told) != 1 or not told[0].sure:
         return False
     names, what = told[0].channels_and_defect
@@ -61,7 +61,7 @@ def right(told: list[Explanation], channel: str, kind: str) -> bool:
 def test_a_fault_has_its_name(kind: str, numbers: dict[str, Any], tmp_path: Path) -> None:
     channel = BLIND_SIZES[kind][0]
     pulse = {"at_s": 0.02, "command": "hammer", "force_n": 120.0, "duration_ms": 5.0, "direction": "x"}
-    lasts_s = 0.4 if channel == "keyphasor" else 0.2  # a pulse comes once a turn
+    lasts_s = 0.4 if channel == "keyphasor" else 0.2  # one pulse per turn
     fault = {"at_s": 0.05, "command": "fault", "channel": channel, "kind": kind, "for_s": lasts_s, **numbers}
     duration_s = 0.6 if channel == "keyphasor" else 0.3
     recording = recorded(
@@ -71,11 +71,11 @@ def test_a_fault_has_its_name(kind: str, numbers: dict[str, Any], tmp_path: Path
     assert right(told, channel, kind), [(one.name, one.change, one.left) for one in told]
     assert differ == {channel, *([numbers["other"]] if kind == "swap" else [])}
     size, defect, what = size_of(kind, numbers, channel), DEFECT_OF[kind], told[0].channels_and_defect[1]
-    # Another number of a law, such as where a drift ends, has another unit; few pulses come within 0.4 s.
+    # Another number of a law, such as the end of a drift, has another unit; there are few pulses in 0.4 s.
     unit = unit_of(defect, default_table().channels[channel].unit)
     if size is not None and (what, told[0].unit) == (defect, unit) and channel != "keyphasor":
         assert told[0].value == pytest.approx(size, rel=0.5 if kind in RANDOM else 0.05)
-    # A pulse comes once a turn; samples are there at once.
+    # There is one pulse per turn; samples are immediate.
     assert told[0].from_s == pytest.approx(0.05, abs=0.2 if channel == "keyphasor" or kind in RANDOM else 0.03)
 
 
@@ -102,7 +102,7 @@ def test_a_validation_tells_it(tmp_path: Path) -> None:
 
 
 def test_a_recording_from_inside_a_run_is_good(tmp_path: Path) -> None:
-    """Nothing lacks of what was before it."""
+    """The missing history before its start is not a fault."""
     whole = recorded(tmp_path / "a.mcap", "stable-run", duration_s=0.6, drive__speed_hz=12.0)
     cut(whole, tmp_path / "part.mcap", from_s=0.25, to_s=0.5)
     for blind in (False, True):
@@ -115,7 +115,7 @@ def test_a_recording_from_inside_a_run_is_good(tmp_path: Path) -> None:
 
 
 def some_fault(rng: random.Random) -> dict[str, Any]:
-    """A fault of random kind, size, channel and time."""
+    """Return a fault of random kind, size, channel and time."""
 
     def between(low: float, high: float) -> float:
         return math.exp(rng.uniform(math.log(low), math.log(high)))
@@ -150,7 +150,7 @@ def some_fault(rng: random.Random) -> dict[str, Any]:
 
 @pytest.mark.skipif("RIG_BLIND_FAULTS" not in os.environ, reason="RIG_BLIND_FAULTS=250: four minutes")
 def test_random_faults_have_their_names(tmp_path: Path) -> None:
-    """Those that change a count: 95 of 100 by their name, and at most one of them by another."""
+    """Of those that change a count, 95 of 100 by name, and at most one by a wrong name."""
     rng = random.Random(int(os.environ.get("RIG_BLIND_SEED", "2030")))
     seen, wrong, unnamed = 0, list[str](), list[str]()
     for n in range(int(os.environ["RIG_BLIND_FAULTS"])):
@@ -173,7 +173,9 @@ def test_random_faults_have_their_names(tmp_path: Path) -> None:
 
 
 def test_what_several_have_alike_and_what_lacks_truth_is_told(tmp_path: Path) -> None:
-    """All of a kind late are late, and not the others early; without the truth a channel alone is told as well."""
+    """If all channels of a kind are late, they are reported as late and the others not as early; a single channel is
+    reported without the truth as well.
+    """
     late = {"at_s": 0.05, "command": "fault", "channel": "forces", "kind": "late", "late_us": 200.0}
     gain = {"at_s": 0.05, "command": "fault", "channel": "disk_x", "kind": "gain", "factor": 1.1}
     pulse = {"at_s": 0.02, "command": "hammer", "force_n": 120.0, "duration_ms": 5.0, "direction": "x"}

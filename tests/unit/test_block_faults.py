@@ -1,4 +1,4 @@
-"""Faults of blocks on their way: each by its definition, on its stream and rows, and nothing else anywhere."""
+"""Faults of blocks in transit: each by its definition, on its stream and rows, and no effect elsewhere."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Sent = list[tuple[int, int, np.ndarray]]
 def run(
     *faults: dict[str, Any], cut: int = 10_000, door: str = "zenoh"
 ) -> tuple[dict[str, Sent], list[dict[str, Any]]]:
-    """Index, tick and counts of the messages of every stream, and what is told."""
+    """Return index, tick and counts of the messages of every stream, and the fault events."""
     simulation, found, told = Simulation(SCENE), dict[str, Sent](), list[Any]()
     while simulation.tick < simulation.end_tick:
         if simulation.tick == FROM * 1e6:
@@ -61,7 +61,7 @@ def test_a_fault_is_on_its_stream_and_rows_alone_and_told(kind: str, sound: dict
         for (index, tick, values), other in zip(there[key], sound[key], strict=True):
             assert (index, tick) == other[:2]
             np.testing.assert_array_equal(values, other[2])
-    # What is told gives back, row by row, what is sent: counts are those of the sound run.
+    # The events restore, row by row, the original counts.
     first, last = round(FROM * 20_000), round(TO * 20_000)
     entries = [entry for each in told if each["event"] == "blocks" for entry in each["blocks"]]
     assert [(entry["row"], entry["rows"]) for entry in entries] == [(row, 200) for row in range(first, last, 200)]
@@ -90,7 +90,7 @@ def test_how_the_run_is_cut_changes_nothing_of_it(kind: str) -> None:
         return [each for each in run(fault, *several, cut=cut)[0][PROBES] if each[1] < TO * 1e6]
 
     def joined(sent: Sent) -> list[tuple[int, int, int]]:
-        # Sound rows before and behind go in blocks of the run.
+        # Unaffected rows before and after are sent in blocks of the run.
         return [(index + n, tick, int(value)) for index, tick, values in sent for n, value in enumerate(values[:, 0])]
 
     one, other = (joined(inside(cut)) for cut in (10_000, 2_500))
@@ -113,7 +113,7 @@ def test_each_by_its_definition(sound: dict[str, Sent]) -> None:
         if n == 10:
             simulation.submit("fault", {"channel": "probes", "for_s": 0.2, "kind": "late-blocks", "delay_s": 0.033})
         came.append(sum(message.key == PROBES for message in simulation.advance(10_000).messages))
-    assert came == [*[1] * 10, 0, 0, 0, 0, *[1] * 16, 5, *[1] * 9]  # 33 ms are over in the block that ends at 40 ms
+    assert came == [*[1] * 10, 0, 0, 0, 0, *[1] * 16, 5, *[1] * 9]  # 33 ms have passed in the block that ends at 40 ms
 
 
 def test_at_one_door_the_other_has_all(sound: dict[str, Sent]) -> None:
@@ -123,7 +123,7 @@ def test_at_one_door_the_other_has_all(sound: dict[str, Sent]) -> None:
 
 
 def through(what: Any, blocks: int, seed: int = 5) -> list[int]:
-    """Numbers of the blocks that come, in their order."""
+    """Return the numbers of the received blocks, in their order."""
     sending, found = Sending(), list[int]()
     sending.active.append(Active(1, what, (), 0, {"": Draws(seed, 1, 0)}, PROBES))
     for n in range(blocks):
@@ -148,7 +148,7 @@ def test_random_ones_are_as_often_as_they_say_and_independent(part: float) -> No
     assert abs(len(twice) / n - 1.0 - part) < 4.0 * sigma
     order = through(ReorderBlocks(part=part), n)
     assert sorted(order) == list(range(n))
-    # One that waits overtakes nobody who waits too: every change of order is one that waits before one that does not.
+    # A delayed block never overtakes another delayed one: every change of order is a delayed block before another.
     swapped = sum(one > other for one, other in pairwise(order))
     assert abs(swapped / n - part * (1.0 - part)) < 4.0 * math.sqrt(part * (1.0 - part) / n)
 
@@ -176,7 +176,7 @@ def test_a_door_that_is_not_there_is_refused() -> None:
 
 @pytest.mark.parametrize("scene", ["hammer", "test-sine"])
 def test_what_is_listed_is_what_is_taken(scene: str) -> None:
-    """Every kind on every channel and group: taken where the list has it, refused where not."""
+    """Every kind on every channel and group is accepted if listed, otherwise refused."""
     simulation = Simulation(load_scene(scene))
     simulation.advance(10_000)
     table, setting = simulation.table, simulation.scene.setting

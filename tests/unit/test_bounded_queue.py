@@ -1,4 +1,4 @@
-"""The one bounded queue: what it does where there is no room, and how it ends."""
+"""The bounded queue: behaviour without room, and its end."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Campaigns in TOML: what their cases are, and that what is wrong in a file is told in a line with file and line."""
+"""Campaigns in TOML: their cases, and errors in one line with file and line number."""
 
 from __future__ import annotations
 
@@ -226,7 +226,7 @@ SHIPPED = {
     "daq-acceptance": 5, "daq-loss": 2, "fault-endurance": 10, "hammer": 2, "protection-alarms": 4,
     "protection-trip": 2, "protection-votes": 18, "recorder-acceptance": 3,
 }  # fmt: skip
-"""Campaigns that come with the rig, and how many cases each has."""
+"""Campaigns of the rig, and the number of their cases."""
 
 
 def test_what_ships_is_listed_by_name_and_loads(capsys: pytest.CaptureFixture[str]) -> None:

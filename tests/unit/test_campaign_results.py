@@ -1,4 +1,4 @@
-"""What is measured of a recording, and what becomes of measurements: JUnit, JSON, the page, what changed."""
+"""Measurements of a recording, and their output: JUnit, JSON, the page, comparison of results."""
 
 from __future__ import annotations
 
@@ -239,8 +239,7 @@ def results(**margins: float) -> dict[str, Any]:
     }  # fmt: skip
 
 
-# The common schema, that of Jenkins, as rules: of each element the attributes that must and may be there, and what may
-# stand in it.
+# The common schema, that of Jenkins, as rules: required and optional attributes of each element, and its content.
 _SCHEMA: dict[str, tuple[set[str], set[str], set[str]]] = {
     "testsuites": (set(), {"name", "time", "tests", "failures", "errors"}, {"testsuite"}),
     "testsuite": (
@@ -257,7 +256,7 @@ _SCHEMA: dict[str, tuple[set[str], set[str], set[str]]] = {
 
 
 def check_junit(path: Path) -> list[ElementTree.Element]:
-    """Hold a file against the schema; its suites."""
+    """Check a file by the schema, and return its suites."""
     root = ElementTree.parse(path).getroot()
     assert root.tag == "testsuites"
     for element in root.iter():
@@ -280,7 +279,7 @@ def test_junit_is_as_its_schema_has_it(tmp_path: Path) -> None:
     properties = {each.get("name"): each.get("value") for each in bad.iter("property")}
     assert properties["peak.margin"] == "-0.25"
     assert properties["peak.source"] == "a datasheet"
-    assert properties["peak.note"] == "a <note>"  # without what XML cannot hold
+    assert properties["peak.note"] == "a <note>"  # without the characters that XML excludes
     failure = bad.find("testcase/failure")
     assert failure is not None
     assert str(failure.get("message")).startswith("peak must be <= 1 mm; instead received 1.25 mm (a <note>")

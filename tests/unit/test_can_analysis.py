@@ -1,4 +1,4 @@
-"""Response times against worked examples of the literature, and against the bus model by brute force."""
+"""Response times compared with worked examples of the literature, and with the bus model by brute force."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MS = 1_000_000
 def test_three_messages_that_the_old_analysis_gets_wrong():
     """Davis et al. 2007, section 3.1 and table 3: 7 bytes at 125 kbit/s are 1 ms; the second C takes 3.5 ms.
 
-    The old analysis looks at the first only, finds 3 ms, and calls the set schedulable.
+    The old analysis considers the first only, finds 3 ms, and calls the set schedulable.
     """
     messages = [
         PeriodicMessage(1, 2.5e-3, 7, deadline_s=2.5e-3),
@@ -36,8 +36,9 @@ def test_three_messages_that_the_old_analysis_gets_wrong():
 
 
 # The SAE benchmark as Tindell and Burns (1994), Guaranteeing message latencies on Control Area Network (CAN), have it
-# at 125 kbit/s, quoted from memory and not held against the print: bytes, jitter [ms], period [ms], response time
-# without the jitter [ms], for the first nine messages.
+# at
+# 125 kbit/s, quoted from memory and not compared with the print: bytes, jitter [ms], period [ms], response time without
+# the jitter [ms], for the first nine messages.
 SAE = (
     (1, 0.1, 50.0, 1.544),
     (2, 0.1, 5.0, 2.128),
@@ -54,7 +55,7 @@ SAE = (
 def test_sae_benchmark():
     """With their count of stuff bits, floor((34 + 8 n) / 5), and their blocking by a frame of 130 bits.
 
-    The higher priorities leave each message done within its period, so that old and revised analysis agree.
+    The higher priorities let each message end within its period, so that old and revised analysis agree.
     """
 
     def bits(n: int) -> tuple[int, int]:
@@ -80,7 +81,7 @@ def test_longest_frames():
 
 
 def test_error_overhead():
-    """One message alone: each error costs 31 bits and the frame once more (Davis et al. 2007, section 4.3)."""
+    """One message alone: each error costs 31 bits and a repetition of the frame (Davis et al. 2007, section 4.3)."""
     message = PeriodicMessage(1, 10e-3, 8)
     (clean,) = worst_case([message], "1M")
     assert clean.worst_s == pytest.approx(135e-6, abs=1e-15)
@@ -90,7 +91,7 @@ def test_error_overhead():
     # 135 us and one error: 301 us. Within 400 us there is no second.
     assert two.worst_s == pytest.approx(301e-6, abs=1e-15)
     (three,) = worst_case([message], "1M", errors=Errors(burst=1, period_s=400e-6))
-    # Two errors: 467 us, so one more: 633 us, in which there are no more than those.
+    # Two errors: 467 us, so one more: 633 us, in which there are no further ones.
     assert three.worst_s == pytest.approx(633e-6, abs=1e-15)
     (never,) = worst_case([message], "1M", errors=Errors(burst=0, period_s=160e-6))
     assert never.worst_s == math.inf
@@ -101,7 +102,7 @@ Releases = list[list[tuple[int, int]]]
 
 
 def run(rate: str, contents: list[Frame], releases: Releases, **faults: float) -> list[float]:
-    """Longest time from event to the end of the intermission, for each message [s]; on three nodes."""
+    """Return the longest time from event to the end of the intermission, for each message [s]; on three nodes."""
     bus = BusModel(rate, **faults)
     nodes = [bus.attach(queue=1000) for _ in range(3)]
     events: dict[int, list[int]] = {}
@@ -155,8 +156,9 @@ def test_no_simulation_is_worse_than_the_analysis(
         late = data.draw(st.lists(st.sampled_from((0, jitter // 2, jitter)), min_size=1, max_size=5))
         rows: list[tuple[int, int]] = []
         while event < span:
-            # The analysis takes it that instances of one message do not overtake each other, even where their jitter is
-            # longer than the period.
+            # The analysis assumes that instances of one message do not overtake each other, even with a jitter longer
+            # than the
+            # period.
             queued = event + late[len(rows) % len(late)]
             rows.append((event, max(queued, rows[-1][1]) if rows else queued))
             event += period
@@ -175,7 +177,7 @@ SETS = {
 
 @pytest.mark.parametrize("name", SETS)
 def test_the_worst_case_is_reached(name: str):
-    """All queued at once with their full jitter behind them, just after the longest frame of lower priority began."""
+    """All are queued at the same time after their full jitter, just after the longest frame of lower priority began."""
     rate = "125k"
     contents = [Frame(0x100 + k, bytes(range(length))) for k, (_, length, _) in enumerate(SETS[name])]
     messages = [
@@ -198,7 +200,7 @@ def test_the_worst_case_is_reached(name: str):
                 rows.append((event + 10 * MS, max(event, first) + 10 * MS))
             releases.append(rows)
         worst = run(rate, contents, releases)[index]
-        # One nanosecond later than the blocking frame, of which the analysis takes all.
+        # One nanosecond later than the blocking frame, which the analysis counts in full.
         assert bound.worst_s - worst == pytest.approx(0.0 if lower is None else 1e-9, abs=1e-12)
 
 
@@ -206,7 +208,7 @@ def test_errors_of_the_model_cost_no_more_than_the_analysis_allows():
     messages = [PeriodicMessage(0x100 + k, 10e-3, 8) for k in range(5)]
     contents = [Frame(0x100 + k, bytes([k] * 8)) for k in range(5)]
     releases: Releases = [[(n * 10 * MS, n * 10 * MS) for n in range(300)] for _ in contents]
-    # 1500 frames of about 120 bits at 3e-5 a bit: some 5 errors, never two within one busy period with this seed.
+    # 1500 frames of about 120 bits at 3e-5 per bit: some 5 errors, never two within one busy period with this seed.
     worst = run("1M", contents, releases, error_rate=3e-5, seed=3)
     clean = worst_case(messages, "1M")
     bounds = worst_case(messages, "1M", errors=Errors(burst=1))

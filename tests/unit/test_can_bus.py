@@ -24,7 +24,7 @@ EMPTY = Frame(0x555)
 
 
 def duration_us(frame: Frame) -> int:
-    """Bits of a classic frame with its intermission: microseconds at 1 Mbit/s."""
+    """Return the bits of a classic frame with its intermission: microseconds at 1 Mbit/s."""
     return sum(frame_bits(frame))
 
 
@@ -72,7 +72,7 @@ def test_arbitration_follows_the_bits_on_the_wire():
         Frame(0x100, b"1"),
         Frame(0x7FF, b"1"),
     ]
-    # As the bus does it: bit by bit without stuffing, the first difference decides.
+    # As on the bus: bit by bit without stuffing, the first difference decides.
     words = []
     for frame in order:
         encoded = encode(frame)
@@ -126,7 +126,7 @@ def test_full_queue_drops_the_newest_and_counts():
 
 
 class Slow:
-    """The error-free bus in another way: a list of all frames, looked through for each transmission."""
+    """The error-free bus in another form: a list of all frames, searched for each transmission."""
 
     def __init__(self, offers: list[tuple[int, int, Frame]], capacity: int) -> None:
         self.waiting = sorted(enumerate(offers), key=lambda item: (item[1][0], item[0]))
@@ -236,7 +236,7 @@ def test_alone_on_the_bus_nobody_acknowledges():
     gaps = [(two.start_ns - one.end_ns) // US for one, two in pairwise(done)]
     assert gaps == [3] * 15 + [11] * (len(gaps) - 15)
     assert (bus.node(a).state, bus.node(a).tec, bus.node(a).errors) == ("error passive", 128, len(done))
-    # The first other node makes it good.
+    # The first other node acknowledges it.
     bus.attach()
     assert bus.advance(101 * MS)[-1].error == ""
     assert (bus.node(a).tec, bus.node(a).state) == (127, "error active")
@@ -254,7 +254,7 @@ def test_a_listener_does_not_acknowledge_nor_send():
 def test_error_frame_has_the_length_of_the_superposed_flags():
     """Identifier 0x555: 0 1 0 1 0 1 ...; the bad bit is inverted, then the sender's flag begins.
 
-    Receivers answer after six equal bits, of which the run that was there before the flag is a part.
+    Receivers respond after six equal bits, which include those before the flag.
     """
     cases = {
         1: 12 - 2,  # 0 [1 turned 0]: two dominant before the flag
@@ -262,7 +262,7 @@ def test_error_frame_has_the_length_of_the_superposed_flags():
         3: 12 - 2,
         5: 12 - 2,
         13: 12,  # RTR: the first of five dominant bits turned recessive
-        17: 6,  # the stuff bit after them turned dominant: six equal bits, all see it at once
+        17: 6,  # the stuff bit after them turned dominant: six equal bits, detected by all at once
     }
     for bit, flag in cases.items():
         bus, a, _ = pair()
@@ -360,7 +360,7 @@ def test_recovery_counts_one_for_each_frame_of_a_busy_bus():
     assert 0 < idle < 128
     for k in range(200):
         bus.offer(b, Frame(0x100), start + k * 100 * US)
-    # Between frames: what is left of 100 us after the frame, in runs of 11.
+    # Between frames: the remainder of 100 us after the frame, in runs of 11.
     rest = (100 - duration_us(Frame(0x100))) // 11
     frames_needed = -(-(128 - idle) // (1 + rest))
     bus.advance(start + (frames_needed - 1) * 100 * US)
@@ -402,7 +402,7 @@ def test_two_nodes_with_one_identifier_collide_unless_the_frames_are_the_same():
     done = bus.advance(100 * MS)
     assert done[0].error == done[1].error == "collision of equal identifiers"
     assert not sent(done)
-    # Neither gives way, so both go bus-off, a fault of the configuration that shows.
+    # Both retransmit, so both go bus-off: a visible fault of the configuration.
     assert bus.node(a).bus_offs == bus.node(b).bus_offs == 1
     assert bus.node(receiver).rec == 32
 
@@ -440,7 +440,7 @@ def test_load_is_the_time_taken_by_windows():
     bus.advance(400 * MS)
     state = bus.state()
     assert (state.load, state.window_load) == (pytest.approx(taken / 4000), 0.0)
-    # A bus that is offered more than it can take has a load of one, and no window more.
+    # An overloaded bus has a load of one, and no idle window.
     array = np.repeat(records([frame]), 6000)
     array["node"] = a
     array["time_ns"] = 400 * MS + np.arange(6000) * 50 * US

@@ -1,4 +1,4 @@
-"""The DBC: its committed copy, and cantools' own decoding of what the rig packs."""
+"""The DBC: its committed copy, and cantools' own decoding of the rig's frames."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def test_a_bus_that_gets_too_full_is_told_in_one_line(tmp_path: Path, capsys: py
         assert said(capsys, *command, "--channels", str(path))[2] == warning
     table = read_channels(path)
     assert warning in f"{CanOutput('virtual:full', channels=table)}\n"
-    # What is still carried is only told; what is not is refused.
+    # Messages that are still transmitted are only reported; missing ones are refused.
     assert (
         CanOutput("virtual:full", CanOptions(messages=CanMessages(can_rate=500)), table).schedule.warnings(speed("1M"))
         == []

@@ -1,4 +1,4 @@
-"""Frames that a bus gets before they are due: each begins when it is due, and a hub wakes up for listeners alone."""
+"""Frames sent to a bus ahead of time: each begins when it is due, and a hub wakes up only for listeners."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_a_frame_that_is_offered_now_does_not_wait_for_those_that_are_not_due() 
         message = listener.recv(30.0)
         assert message is not None
         assert message.arbitration_id == 8
-        # What is not due when its sender leaves is not sent, and nobody waits for it.
+        # Frames that are not due when their sender leaves are not sent, and delay nobody else.
         until(lambda: listener.done == 1)
         sender.flush_tx_buffer()
         assert hub.status()["counts"]["unsent"] == 0
@@ -85,9 +85,9 @@ def test_a_hub_hands_out_frames_of_a_lone_endpoint_in_few_messages_and_those_wit
         delays = np.arange(300) * MS
         sender.schedule_records(make(range(300)), time.monotonic_ns() + delays, 1.0)
         until(lambda: sender.done == 300)
-        # One a frame before; a machine that is busy makes fewer.
+        # One frame ahead; fewer on a busy machine.
         assert sender.heard <= 45
-        # Somebody who joins meanwhile gets what is sent from then on, each frame once.
+        # A client that joins meanwhile receives every later frame once.
         sender.schedule_records(make(range(300)), time.monotonic_ns() + delays, 1.0)
         listener = stack.enter_context(HubBus(hub))
         until(lambda: sender.done == 600)
@@ -121,7 +121,7 @@ def test_a_window_of_frames_that_are_not_due_is_full() -> None:
 
 
 class Holding(can.BusABC):
-    """A bus that holds frames until they are due, and notes what it gets."""
+    """A bus that holds frames until they are due, and stores them."""
 
     def __init__(self) -> None:
         self.calls: list[tuple[list[int], list[int]]] = []
@@ -148,7 +148,7 @@ SYNC, EVENT = TABLE.by_name["Sync"], TABLE.by_name["Event"]
 
 
 def outbox_at_5_s(bus: can.BusABC, room: int) -> tuple[Outbox, list[float]]:
-    """An outbox whose clock shows what the list holds, just when a block of 10 ms has come that begins at 0."""
+    """Return an outbox at the arrival of a block of 10 ms that begins at 0, and the list that sets its clock."""
     clock = [5.0001]
     outbox = Outbox(bus, room=room, paced=True, now=lambda: clock[0])
     outbox.follow(wire.Block(0, 0, 20_000.0, 1e6, np.zeros((200, 4), np.int32)))
@@ -165,7 +165,7 @@ def test_frames_of_a_block_go_to_the_bus_at_once_in_the_order_of_their_slots() -
     ((sent, due_ms),) = bus.calls
     assert sent == [SYNC.identifier] * 4 + [EVENT.identifier] + [SYNC.identifier] * 6
     assert due_ms == [5003, 5004, 5005, 5006, 5006, 5007, 5008, 5009, 5010, 5011, 5012]
-    # Who hears of the end must not expect samples any more: they are undue until the bus has sent them.
+    # A client that receives the end must not expect further samples: they are not due until the bus has sent them.
     assert outbox.undue
     clock[0] = outbox.next_s + 1e-6
     assert clock[0] == pytest.approx(5.012, abs=1e-5)

@@ -1,4 +1,4 @@
-"""Faults over CAN: asked for by a frame, and of blocks that become frames."""
+"""Faults over CAN: requested by a frame, and faults of blocks that become frames."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ pytestmark = pytest.mark.wallclock
 ROOT = Path(__file__).parents[2]
 SCENE = load_scene("hammer", {"duration_s": 0.4})
 SIMULATION = Simulation(SCENE)
-SIMULATION.tick = 10_000  # a restart is none at the first row
+SIMULATION.tick = 10_000  # at the first row there is nothing to restart
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -49,7 +49,7 @@ def test_every_kind_comes_back_with_its_main_number(kind: str) -> None:
     found = parse_command(*fault_frame(channel, kind, 7, number=numbers.get(main)), 6)
     given = {main: numbers[main]} if main in numbers else {}
     assert found == Command(FaultKind.FAULT, 7, {"channel": channel, "kind": kind, **given})
-    # What a kind must have is there: the rig takes the request as it is.
+    # The frame has all fields that a kind requires: the rig accepts the request unchanged.
     assert isinstance(found, Command)
     SIMULATION.submit("fault", found.values)
     SIMULATION.submit("clear", {})
@@ -114,13 +114,13 @@ def test_a_fault_is_acknowledged_with_its_number_and_ends() -> None:
 
 
 def frames(*faults: dict[str, Any]) -> dict[str, list[bytes]]:
-    """All frames of some messages of a run."""
+    """Return all frames of some messages of a run."""
     scene = parse_scene({**scene_document(SCENE), "commands": [], "faults": faults})
     with rig(Simulation(scene), schedule=Schedule(1000, 10_000)) as setup:  # type: ignore[arg-type]
         setup.start()
         setup.join()
         until(lambda: any(row["event"] == EventKind.END for row in setup.tap.decoded("Event")))
-        assert setup.gateway.dropped == 0  # what a fault took is not what the bus did not
+        assert setup.gateway.dropped == 0  # frames removed by a fault do not count as dropped by the bus
         return {name: setup.tap.of(name) for name in ("Probes", "Forces", "Samples_1", "Sync")}
 
 
@@ -141,7 +141,7 @@ def test_faults_of_blocks_show_on_the_bus_and_on_their_stream_alone(kind: str, s
 
 
 def test_at_one_door_only() -> None:
-    """What a fault does on CAN, those on zenoh do not see, and the other way round."""
+    """The effect of a fault on CAN is not visible on zenoh, and vice versa."""
     faults = [
         {"at_s": at_s, "channel": "probes", "kind": "dropout", "for_s": 0.1, "door": door}
         for at_s, door in ((0.0, "can"), (0.2, "zenoh"))

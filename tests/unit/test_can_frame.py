@@ -95,9 +95,9 @@ ENCODED = (
 
 
 def remainder(bits: list[int], polynomial: int, *, first: int = 0) -> int:
-    """Long division of the bits as one number, with as many zeros appended as the CRC has.
+    """Return the remainder of long division of the bits as one number, with the CRC's number of zeros appended.
 
-    `first` flips the CRC register's bits before the first bit.
+    `first` inverts the CRC register's bits before the first bit.
     """
     width = polynomial.bit_length() - 1
     number = int("".join(map(str, bits)), 2) << width
@@ -110,7 +110,7 @@ def remainder(bits: list[int], polynomial: int, *, first: int = 0) -> int:
 def decode(bits: list[int]) -> tuple[Frame, int, int]:
     """Take a frame apart: the frame, the CRC that was sent, the number of stuff bits by content.
 
-    Asserts every rule that a receiver checks, the CRC aside.
+    Asserts every rule that a receiver checks, except the CRC.
     """
     plain: list[int] = []
     stuffed = 0

@@ -63,7 +63,7 @@ class Fake(FakeSimulation):
 
 
 class Tap:
-    """A node that reads everything, on a thread of its own."""
+    """A node that reads everything, on a separate thread."""
 
     def __init__(self, channel: str) -> None:
         self.bus = can.Bus(channel, interface="virtual", ignore_config=True)
@@ -204,7 +204,7 @@ def test_slow_messages_say_how_it_goes_and_how_samples_were_picked() -> None:
     with rig(Fake(duration_s=None), paced=True) as setup:
         setup.start()
         until(lambda: len(setup.tap.of("Status")) >= 3)
-        # A run that is held up while it begins is preparing for more than one beat.
+        # A run that is delayed while it begins is preparing for more than one heartbeat.
         before = len(setup.tap.of("Heartbeat"))
         until(lambda: len(setup.tap.of("Heartbeat")) > before + 1)
     database = dbc.database()
@@ -259,7 +259,7 @@ def test_a_gap_of_the_stream_loses_whole_frames_and_is_counted() -> None:
 
 
 class Stubborn(can.BusABC):
-    """A bus that takes nothing, or takes its time."""
+    """A bus that refuses frames, or is slow."""
 
     def __init__(self, *, seconds: float = 0.0, refuse: bool = False) -> None:
         self.seconds, self.refuse = seconds, refuse
@@ -284,7 +284,7 @@ def test_a_stalled_bus_loses_the_oldest_blocks_and_does_not_slow_the_rig() -> No
         setup.join()
         assert setup.summary["reason"] == "completed"
         assert setup.summary["queue"]["dropped"] == 0
-        # A block that waits for no bus is over in 10 ms; a frame takes this one 50 ms.
+        # A block that does not wait for a bus takes 10 ms; a frame takes this one 50 ms.
         assert setup.summary["real_time_factor"] > 0.9
         assert setup.gateway.blocks_dropped > 50
         bus.seconds = 0.0
@@ -346,7 +346,7 @@ def test_what_finds_no_room_for_a_moment_is_sent_afterwards_in_its_order() -> No
     probes = TABLE.by_name["Probes"]
     numbers = [probes.decode(data)["index"] for identifier, data in bus.taken if identifier == probes.identifier]
     assert numbers == list(range(0, 10_000, 10))
-    # Answers do not wait behind samples, nor does the status.
+    # Neither replies nor the status wait for samples.
     assert bus.taken[0][0] >= 0x700
 
 
@@ -400,7 +400,7 @@ def test_a_hammer_pulse_is_acknowledged_with_its_time() -> None:
         assert (reply["counter"], reply["result"]) == (1, Result.ACCEPTED)
         until(lambda: any(row["event"] == 3 for row in setup.tap.decoded("Event")))
         pulse = next(row for row in setup.tap.decoded("Event") if row["event"] == 3)
-        # The fake carries it out at the start of the next block.
+        # The fake executes it at the start of the next block.
         assert pulse["time"] == reply["time"]
         assert reply["time"] % BLOCK == 0
         until(lambda: any(row["counter"] == 1 for row in setup.tap.decoded("Heartbeat")))
@@ -412,7 +412,7 @@ def test_the_acknowledge_does_not_wait_for_the_end_of_a_block() -> None:
         until(lambda: bool(setup.tap.of("Probes")))
         commands = [command_frame(CommandKind.SPEED, counter, speed_hz=6.2) for counter in range(1, 11)]
         times = [setup.tap.ask(*command)["time"] for command in commands]
-    # One after another: each would wait for a block of its own.
+    # In sequence: each would wait for a separate block.
     assert len(set(times)) <= 2
 
 
@@ -427,7 +427,7 @@ def test_refusals_name_their_reason_and_are_counted() -> None:
         assert setup.tap.ask(identifier, good)["result"] == Result.STALE_COUNTER
         reply = setup.tap.ask(*command_frame(CommandKind.HAMMER, 2, force_n=5000.0, duration_ms=5.0))
         assert (reply["result"], reply["field"], reply["limit"]) == (Result.OUT_OF_RANGE, 1, 10_000)
-        # Used up by the refusal.
+        # The refusal uses up the number.
         assert (
             setup.tap.ask(*command_frame(CommandKind.HAMMER, 2, force_n=50.0, duration_ms=5.0))["result"]
             == Result.STALE_COUNTER
@@ -501,7 +501,7 @@ def test_a_stop_ends_the_run() -> None:
 
 
 class Silent(MemoryClient):
-    """A rig that does not answer commands until it is told to."""
+    """A rig that replies to commands only on request."""
 
     def __init__(self, server: MemoryServer) -> None:
         super().__init__(server)

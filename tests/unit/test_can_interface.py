@@ -1,4 +1,4 @@
-"""The hub of a virtual CAN bus and python-can's way to it, over zenoh and within a process."""
+"""The hub of a virtual CAN bus and python-can's interface to it, over zenoh and within a process."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ pytestmark = pytest.mark.wallclock
 
 
 class Rig:
-    """A hub and what the tests need to make buses on it."""
+    """A hub, and buses on it for the tests."""
 
     def __init__(self, way: str, rate: str, **settings: Any) -> None:
         self.way = way
@@ -59,7 +59,7 @@ class Rig:
         return self.stack.enter_context(bus)
 
     def node(self, bus: Any) -> int:
-        """Its number in the model."""
+        """Return the number of its node in the model."""
         return next(row.node for row in self.hub.endpoints if row.name == bus.name)
 
     def __enter__(self) -> Rig:
@@ -199,7 +199,7 @@ def test_filters_match_as_python_can_matches() -> None:
             ]
             for item in messages:
                 other.send(item)
-            # Each call looks at one frame.
+            # Each call checks one frame.
             passed = [found.data[0] for _ in messages if (found := bus.recv(0)) is not None]
             words = codec.make_records(messages)["identifier"]
             assert np.flatnonzero(match_filters(words, filters)).tolist() == passed
@@ -259,7 +259,7 @@ def test_filters_hold_for_few_and_many_and_change_at_once(rig: Rig) -> None:
     sender.send(message(0x101))
     sender.send_records(codec.make_records([message(0xF0 + item % 32) for item in range(320)]))
     assert [item.arbitration_id for item in read(receiver, 21)] == [0x101] + [0x100] * 10 + [0x101] * 10
-    # What is left of them has less priority than what comes now.
+    # The remaining frames have lower priority than the new ones.
     until(lambda: sender.done == sender.offered)
     sender.send(message(0x101))
     sender.send(message(0x100))
@@ -312,7 +312,7 @@ def test_frames_that_do_not_exist_are_refused(wrong: can.Message, why: str) -> N
 
 
 def fill(bus: can.BusABC) -> None:
-    # Some go out meanwhile, more where this process is held up.
+    # Some are sent meanwhile, more if this process is delayed.
     for _ in range(10 * endpoints.WINDOW):
         bus.send(message(0x100), timeout=0)
 
