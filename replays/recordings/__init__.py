@@ -1,1 +1,1 @@
-"""What is made of recordings: validation, identification, other formats, exports, verdicts."""
+"""Recording analysis: validation, identification, import, export and verdicts."""

@@ -1,8 +1,8 @@
-"""Runs as files for other tools: MCAP, Parquet, CSV, WAV, by the suffix.
+"""Export of runs to files, by the suffix: MCAP, Parquet, CSV, WAV.
 
-Tables have one row a sample: `time [s]`, every signal of the model as `truth.NAME [unit]` (SI), and every sensor as
-`NAME [unit]`; of test signals there is no model. A WAV has the sensors' volts, for an analogue output, as `rig export`
-makes it. A file is written beside its place and moved there when it is whole.
+Tables have one row per sample: `time [s]`, every signal of the model as `truth.NAME [unit]` (SI), and every sensor as
+`NAME [unit]`; test signals have no truth. A WAV file has the sensors' volts, for an analogue output, as from `rig
+export`. A file is written to a temporary name and renamed when it is complete.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ SUFFIXES = (".mcap", ".parquet", ".csv", ".wav")
 
 
 class RunWriter(Protocol):
-    """Takes the frames of one run, in order; whole on a clean exit, nothing left behind on an error."""
+    """Writer for the frames of one run, in order; the file is complete on a clean exit, and removed on an error."""
 
     def __enter__(self) -> Self: ...
 
@@ -45,12 +45,12 @@ class RunWriter(Protocol):
     ) -> None: ...
 
     def write(self, frame: Frame) -> None:
-        """Take the next frame."""
+        """Write the next frame."""
         ...
 
 
 def check_run_output(path: Path, *, force: bool) -> None:
-    """Refuse a file that cannot be written, before anything is simulated.
+    """Check that a file can be written, before anything is simulated.
 
     Raises:
         InputError: Another suffix, a folder that is missing or read-only, or an existing file.
@@ -59,7 +59,7 @@ def check_run_output(path: Path, *, force: bool) -> None:
 
 
 def writer_for(path: Path, simulation: Simulation, *, force: bool = False) -> RunWriter:
-    """The writer that the suffix asks for."""
+    """Return the writer for the suffix of a path."""
     check_run_output(path, force=force)
     if path.suffix == ".mcap":
         return McapRun(path, simulation, force=force)
@@ -69,19 +69,19 @@ def writer_for(path: Path, simulation: Simulation, *, force: bool = False) -> Ru
         return _TableRun(path, simulation, columnar.ParquetRows)
     if path.suffix == ".csv":
         return _TableRun(path, simulation, lambda draft, schema: delimited.CsvRows(draft, schema.names))
-    raise InputError("output", "of a format that has a writer", path.suffix)
+    raise InputError("output", "a format with a writer", path.suffix)
 
 
 def write_run(
     simulation: Simulation, path: Path, *, force: bool = False, progress: Callable[[float], None] = lambda part: None
 ) -> None:
-    """Run a scene to its end as fast as it goes, into a file that grows with it; nothing is left behind on an error.
+    """Run a scene to its end at full speed, and write it to a file; remove the file on an error.
 
     Args:
-        simulation: What is run, from where it is.
-        path: File that ends in .mcap (as `rig record` would have made it), .parquet, .csv or .wav.
+        simulation: Simulation of the run.
+        path: File that ends in .mcap (as from `rig record`), .parquet, .csv or .wav.
         force: Replace an existing file.
-        progress: Told the part done, 0 to 1.
+        progress: Callback for the completed fraction, 0 to 1.
 
     Raises:
         InputError: The destination cannot be used.
@@ -102,46 +102,46 @@ def write_run(
 
 
 def table_columns(simulation: Simulation) -> list[str]:
-    """Column headings of a table of a run.
+    """Return the column headings of a table of a run.
 
     Raises:
-        InputError: Groups have rates of their own, or the scene has faults of blocks.
+        InputError: Groups have different rates, or the scene has faults of blocks.
     """
     for timed in simulation.scene.commands:
         if isinstance(timed.request, FaultCommand) and timed.request.what.of_blocks:
-            must = "an .mcap file where a scene has faults of blocks, of which a table has none"
+            must = "an .mcap file for a scene with faults of blocks, as a table has no blocks"
             raise InputError("output", must, Words(timed.request.what.name()))
     rates = {name: group.rate_hz for name, group in simulation.table.groups.items()}
     if len(set(rates.values())) > 1:
-        told = ", ".join(f"{name} {rate} Hz" for name, rate in rates.items())
-        raise InputError("output", "an .mcap file where groups have rates of their own", Words(told))
+        rates_text = ", ".join(f"{name} {rate} Hz" for name, rate in rates.items())
+        raise InputError("output", "an .mcap file where groups have different rates", Words(rates_text))
     channels = simulation.table.channels.values()
     return [
         "time [s]",
-        *(f"truth.{signal.name} [{signal.unit}]" for signal in (ROW if _on_rows(simulation) else ())),
+        *(f"truth.{signal.name} [{signal.unit}]" for signal in (ROW if _has_truth(simulation) else ())),
         *(f"{channel.name} [{channel.unit}]" for channel in channels),
     ]
 
 
-def _on_rows(simulation: Simulation) -> bool:
-    """Whether there is truth beside the samples: of a model, whose rows they fall on."""
+def _has_truth(simulation: Simulation) -> bool:
+    """Return whether a table has truth: the scene has a model, and samples fall on its rows."""
     on_rows = all(simulation.tick_rate_hz % group.rate_hz == 0 for group in simulation.table.groups.values())
     return on_rows and simulation.scene.generator is None
 
 
 def table_rows(simulation: Simulation, frame: Frame) -> np.ndarray:
-    """The rows of one frame, shape (samples, columns)."""
+    """Return the rows of one frame, shape (samples, columns)."""
     blocks = frame.samples
     first = next(iter(blocks.values()))
     times = (first.index + np.arange(len(first.values)))[:, None] / first.rate_hz
-    every = simulation.kept_every
-    truth = [frame.rows[-(frame.tick // simulation.row_ticks) % every :: every]] if _on_rows(simulation) else []
+    step = simulation.kept_every
+    truth = [frame.rows[-(frame.tick // simulation.row_ticks) % step :: step]] if _has_truth(simulation) else []
     sensors = [simulation.table.groups[group].engineering(block.values) for group, block in blocks.items()]
     return np.hstack([times, *truth, *sensors])
 
 
 class _TableRun:
-    """A table that grows frame by frame in a file of its own until it is whole."""
+    """Table that grows frame by frame in a temporary file."""
 
     def __init__(self, path: Path, simulation: Simulation, open_table: Callable[[Path, Any], Any]) -> None:
         self.path = path
@@ -151,8 +151,8 @@ class _TableRun:
 
     def __enter__(self) -> Self:
         about = {"parameters": self.simulation.parameters_document(), "scene": self.simulation.scene_document()}
-        told = {f"{name}.json": json.dumps(document) for name, document in about.items()}  # where a format has a place
-        schema = columnar.float_schema(table_columns(self.simulation)).with_metadata(told)
+        documents = {f"{name}.json": json.dumps(document) for name, document in about.items()}
+        schema = columnar.float_schema(table_columns(self.simulation)).with_metadata(documents)
         with ExitStack() as stack:
             self._writer = self._open_table(stack.enter_context(whole_file(self.path)), schema)
             stack.callback(self._writer.close)
@@ -166,7 +166,7 @@ class _TableRun:
         self._stack.__exit__(kind, error, trace)
 
     def write(self, frame: Frame) -> None:
-        """Take the next frame."""
+        """Write the next frame."""
         self._background.call(self._append, table_rows(self.simulation, frame))
 
     def _append(self, rows: np.ndarray) -> None:
@@ -174,13 +174,13 @@ class _TableRun:
 
 
 class _WavRun:
-    """A recording in a folder of its own until the run is whole, then exported."""
+    """Recording in a temporary folder, exported at the end of the run."""
 
     def __init__(self, path: Path, simulation: Simulation, *, force: bool) -> None:
         self.path, self.simulation, self._force = path, simulation, force
 
     def __enter__(self) -> Self:
-        table_columns(self.simulation)  # refused where there are several rates
+        table_columns(self.simulation)  # raises an error if there are several rates
         with ExitStack() as stack:
             folder = Path(
                 stack.enter_context(
@@ -202,12 +202,12 @@ class _WavRun:
                 export(volts, self.path, force=self._force)
 
     def write(self, frame: Frame) -> None:
-        """Take the next frame."""
+        """Write the next frame."""
         self._run.write(frame)
 
 
 class McapRun:
-    """The same file as `rig record` would have made, with the simulated clock for the wall clock."""
+    """Recording as from `rig record`, on the simulated clock."""
 
     def __init__(
         self,
@@ -218,15 +218,15 @@ class McapRun:
         view_rate_hz: float = 500.0,
         epoch_ns: int | None = None,
     ) -> None:
-        """Prepare; the file begins where the context does.
+        """Prepare the writer; the file is created on entering the context.
 
         Args:
             path: The file, ends in .mcap.
-            simulation: What is run.
+            simulation: Simulation of the run.
             force: Replace an existing file.
             view_rate_hz: Rate of the plottable messages [Hz of simulated time]; 0 writes none.
-            epoch_ns: Wall time at which the run begins [unix ns], at which the recorder's clocks stand still: the same
-                run gives the same bytes. None for now.
+            epoch_ns: Wall time of the start [unix ns], at which the recorder's clocks stand still, so that equal runs
+                give equal bytes; None: now.
         """
         self.path, self.simulation, self._force = path, simulation, force
         self._view_rate_hz, self._epoch_ns = view_rate_hz, epoch_ns
@@ -262,7 +262,7 @@ class McapRun:
             self._background.finish()
             if kind is None and not self._writer.closed:
                 self._event({"event": "end", "reason": "completed"})
-                self._tell_health()
+                self._write_status()
                 self._writer.finish("completed")
                 whole = True
         finally:
@@ -270,22 +270,22 @@ class McapRun:
                 self._writer.abandon()
 
     def write(self, frame: Frame) -> None:
-        """Take the next frame."""
+        """Write the next frame."""
         self._background.call(self._write, frame)
 
     def _write(self, frame: Frame) -> None:
         for event in frame.events:
             self._event(event)
-        for told in frame.told:
-            self._writer.write(wire.FAULTS, wire.encode_document(told), self._wall(frame.tick))
+        for fault in frame.told:
+            self._writer.write(wire.FAULTS, wire.encode_document(fault), self._wall(frame.tick))
         for message in frame.messages:
             if "zenoh" in message.doors:
                 self._writer.write(message.key, wire.encode_block(message.block), self._wall(frame.tick))
                 self._rows.follow(message.key, message.row, len(message.block.values), late_rows=math.inf)
 
-    def _tell_health(self) -> None:
-        """Write the status that a live run would end with, as far as a run without a clock has one."""
-        simulation, told = self.simulation, ("spin_hz", "energy", "engine", "accuracy", "warnings")
+    def _write_status(self) -> None:
+        """Write the final status of a live run, as far as it applies without a clock."""
+        simulation, copied = self.simulation, ("spin_hz", "energy", "engine", "accuracy", "warnings")
         health = simulation.health()
         status = {
             "scene": simulation.scene.name,
@@ -293,12 +293,12 @@ class McapRun:
             "time_s": simulation.tick / simulation.tick_rate_hz,
             "state": "ended",
             "pace": "none",
-            **{name: health[name] for name in told if name in health},
+            **{name: health[name] for name in copied if name in health},
         }
         self._writer.write(wire.STATUS, wire.encode_document(finite(status)), self._wall(simulation.tick))
 
     def _event(self, event: dict[str, Any]) -> None:
-        tick = int(event.get("tick", self.simulation.tick))  # a frame's own: the simulation is further on by now
+        tick = int(event.get("tick", self.simulation.tick))  # the frame's tick; the simulation is further ahead
         stamp = {"tick": tick, "time_s": tick / self.simulation.tick_rate_hz}
         payload = wire.encode_document(self._rows.tell({**stamp, **event}))
         self._writer.write(wire.EVENTS, payload, self._wall(tick))

@@ -1,4 +1,4 @@
-"""Recorded parameters against the rig's own sets; imports no model, for `rig info` in the install without it."""
+"""Comparison of recorded parameters with the rig's own sets. Does not import the model, so `rig info` stays light."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from rig.physics.parameters import load_parameters, set_names
 
 
 def parameter_doubts(recording: Recording) -> tuple[str, ...]:
-    """Return the parameters that differ from a set of the rig's own, of the same source, and that no scene changes.
+    """Return the parameters that differ from the rig's own set, although source, unit and scene are the same.
 
-    A set that was revised since tells another source; a user's set may be another file by now.
+    A set that was revised since has another source; a user's set may be another file today.
     """
     document, name = recording.scene.get("scene"), recording.parameters.get("set")
     if not isinstance(document, dict) or name not in set_names():

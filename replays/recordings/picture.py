@@ -1,4 +1,4 @@
-"""One picture of a hammer recording, in the manner of the paper's figures 12 to 16."""
+"""Picture of a hammer recording, in the style of the paper's figures 12 to 16."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def draw(recording: Recording, path: Path) -> None:
 
     pairs = reactions(forces)
     settled = (end_s - 0.05, end_s)
-    # The houses ring at some kilohertz: of more time a panel would show a block.
+    # The housings vibrate at some kilohertz, which a longer panel would not resolve.
     largest = np.abs(pairs).max(axis=0)
     onset_s = float(forces.times_s[int(np.argmax((largest > 0.1 * largest.max()) & (forces.times_s > hammer_s)))])
     for ax, window, title in (
@@ -87,7 +87,7 @@ def draw(recording: Recording, path: Path) -> None:
 
 
 def _draw_orbit(ax: Any, recording: Recording, hammer_s: float, end_s: float) -> None:
-    """Orbit of the disk within the clearance, as Fig. 12 a."""
+    """Draw the orbit of the disk within the clearance, as in Fig. 12 a."""
     probes = recording.samples("probes")
     circle = 2 * math.pi * np.linspace(0, 1, 361)
     reach = (
@@ -105,7 +105,7 @@ def _draw_orbit(ax: Any, recording: Recording, hammer_s: float, end_s: float) ->
         kept = (probes.times_s >= low) & (probes.times_s < high)
         ax.plot(probes["disk_x"][kept], probes["disk_y"][kept], color=color, lw=1.0, label=label)
     ax.set(title="Orbit at the disk", xlabel="x [mm]", ylabel="y [mm]", aspect="equal")
-    # Above the orbit, where nothing is.
+    # Empty area above the orbit for the legend.
     ax.set_ylim(top=1.75 * ax.get_ylim()[1])
     ax.legend(loc="upper center", ncols=2, handlelength=1.2, columnspacing=1.0)
 
@@ -117,7 +117,7 @@ def _draw_pair(
     window: tuple[float, float],
     names: tuple[str, str],
 ) -> None:
-    """Two signals at right angles to each other, over a part of the time."""
+    """Draw two perpendicular signals over a window."""
     kept = (times_s >= window[0]) & (times_s < window[1])
     draw_signals(ax, times_s[kept], (pair[0][kept], _X, names[0]), (pair[1][kept], _Y, names[1]))
     ax.set(xlabel="time [s]", xlim=window)

@@ -1,4 +1,4 @@
-"""What the probes and transducers say about a whirl: frequency, sense, rolling, reactions, from samples alone."""
+"""Figures of a whirl from probes and transducers: frequency, sense of rotation, slip and reactions."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from rig.channels.orbit import whirl_frequency
 
 @dataclass(frozen=True)
 class WhirlFigures:
-    """Figures of a stretch of a recording in which the shaft whirls.
+    """Figures of an interval of whirl in a recording.
 
     Attributes:
-        from_s: Start of the stretch, simulated [s].
-        to_s: End [s].
+        from_s: Start of the interval, simulated [s].
+        to_s: End of the interval [s].
         frequency_hz: Phase slope of x + j y of the shaft in the ring; negative is backward [Hz].
-        disk_frequency_hz: The same from the probes at the disk [Hz].
+        disk_frequency_hz: Phase slope of the probes at the disk [Hz].
         spin_hz: Mean spin from the keyphasor's edges [Hz].
         radius_m: Mean radius of the orbit in the ring [m].
         law_hz: -spin R_S / radius, rolling without slip [Hz].
-        slip: 1 - frequency / law; 0 rolls.
+        slip: 1 - frequency / law; 0 for rolling.
         reaction_x_n: Amplitude of P_E - P_W, half of peak to peak [N].
-        reaction_y_n: Amplitude of P_N - P_S [N].
+        reaction_y_n: Amplitude of P_N - P_S, half of peak to peak [N].
     """
 
     from_s: float
@@ -42,10 +42,10 @@ class WhirlFigures:
 
 
 def whirl_figures(recording: Recording, from_s: float, to_s: float) -> WhirlFigures:
-    """Work out the figures of a stretch.
+    """Compute the figures of an interval.
 
     Raises:
-        InputError: The stretch holds too few samples or turns.
+        InputError: The interval has too few samples or turns.
     """
     probes, forces = recording.samples("probes"), recording.samples("forces")
     kept = (probes.times_s >= from_s) & (probes.times_s < to_s)
@@ -54,7 +54,7 @@ def whirl_figures(recording: Recording, from_s: float, to_s: float) -> WhirlFigu
     if kept.sum() < 1000 or len(edges) < 3:
         raise InputError(
             "recording",
-            "long enough to judge a whirl (three turns of the shaft)",
+            "long enough for a whirl (three turns of the shaft)",
             Words(f"{from_s:.2f} to {to_s:.2f} s"),
         )
     times = probes.times_s[kept]
@@ -80,12 +80,12 @@ def whirl_figures(recording: Recording, from_s: float, to_s: float) -> WhirlFigu
 
 
 def reactions(forces: Samples) -> tuple[np.ndarray, np.ndarray]:
-    """What opposed transducers differ by: P_E - P_W and P_N - P_S [N], each shape (n,)."""
+    """Return the differences of opposite transducers, P_E - P_W and P_N - P_S [N], each shape (n,)."""
     return forces["P_E"] - forces["P_W"], forces["P_N"] - forces["P_S"]
 
 
 def parameter_si(recording: Recording, key: str) -> float:
-    """A parameter of the recorded rig in SI."""
+    """Return a parameter of the recorded rig in SI units."""
     from rig.physics.parameters import SI
 
     entry = recording.parameters["values"][key]
@@ -93,5 +93,5 @@ def parameter_si(recording: Recording, key: str) -> float:
 
 
 def shaft_radius_m(recording: Recording) -> float:
-    """R_S of the recorded rig [m]."""
+    """Return the shaft radius R_S of the recorded rig [m]."""
     return parameter_si(recording, "shaft.radius")

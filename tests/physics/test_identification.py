@@ -106,7 +106,7 @@ def test_moduli_act_only_together(tmp_path: Path) -> None:
     shaft, ring, friction = found.judgement.findings
     assert shaft.standing == ring.standing == "only together"
     assert friction.standing == "identified"
-    told = re.search(r"a change by \+(\S+) Pa is made up for by ring.young_modulus by (\S+) Pa", shaft.words)
+    told = re.search(r"\+(\S+) Pa is compensated by ring.young_modulus by (\S+) Pa", shaft.words)
     assert told is not None
     parameters = Experiment.of(recording).scene.load_parameters()
     ratio = (parameters["ring.young_modulus"] / parameters["shaft.young_modulus"]) ** 2

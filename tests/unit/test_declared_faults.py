@@ -188,7 +188,7 @@ def test_so_it_is_in_several_files_and_around_triggers(kind: str, tmp_path: Path
 
 def test_a_table_of_rows_has_no_blocks_and_refuses_their_faults(tmp_path: Path) -> None:
     for suffix in ("csv", "wav"):
-        with pytest.raises(InputError, match=r"output must be an \.mcap file where a scene has faults of blocks"):
+        with pytest.raises(InputError, match=r"output must be an \.mcap file for a scene with faults of blocks"):
             write_run(Simulation(scene("dropout")), tmp_path / f"x.{suffix}")
     assert list(tmp_path.iterdir()) == []
 

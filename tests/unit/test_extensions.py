@@ -200,9 +200,9 @@ def test_what_is_wrong_with_another_s_package_is_one_line(package: Path) -> None
         f"nowhere files need my_wrong.missing, {missing}",
         "empty files need my_wrong.exits, which fails: SystemExit: no licence",
         "file must be an intact reader file; instead received a.rd "
-        "(TypeError: my_wrong.reader.look_into returns NoneType, no Source)",
+        "(TypeError: my_wrong.reader.look_into returns NoneType, not Source)",
         "file must be an intact reader file; instead received b.rd (SystemExit: no licence)",
-        "writer files need Writer in my_wrong.reader, which has none",
+        "writer files need Writer in my_wrong.reader, which lacks it",
         f"{must} my_wrong.missing fails: ModuleNotFoundError: No module named 'my_wrong.missing'",
         f"{must} my_wrong.exits fails: SystemExit: no licence",
         f"{must} my_wrong.lame fails: AttributeError: module 'my_wrong.lame' has no attribute 'ORDER'",

@@ -476,7 +476,7 @@ def test_export_that_fails_leaves_nothing(suffix: str, recording: Recording, tmp
         (["-o", "x.xls"], "--output must be a file name that ends in .mf4, .tdms, .uff"),
         (["-o", ""], "--output must be a file name that ends in .mf4, .tdms, .uff"),
         (["-o", "no/x.csv"], "--output must be in a folder that exists"),
-        (["-o", "x.csv", "--channels", "disk_z"], "--channels must be one of the recording's, such as disk_y"),
+        (["-o", "x.csv", "--channels", "disk_z"], "--channels must be a channel of the recording, such as disk_y"),
         (
             ["-o", "x.csv", "--channels", "foo"],
             "--channels must be a channel of the recording, one of its groups (probes",
@@ -544,7 +544,7 @@ def test_polyphase_gives_a_tone_back(rate_hz: float, target_hz: float) -> None:
     axis = clock.Axis(0.0131, rate_hz, round(rate_hz * 0.4))
     values = 3.0 + np.sin(2 * np.pi * tone_hz * axis.instants())
     first_s, rows = 0.0131 + 0.1234567, 3000
-    found = clock.polyphase(values, axis, first_s, target_hz, rows)
+    found = clock.resample_polyphase(values, axis, first_s, target_hz, rows)
     wanted = 3.0 + np.sin(2 * np.pi * tone_hz * (first_s + np.arange(rows) / target_hz))
     assert np.abs(found - wanted).max() < 2 * np.pi * tone_hz / rate_hz / 512 + 1e-4  # its grid of instants is 1/512
 
@@ -552,9 +552,9 @@ def test_polyphase_gives_a_tone_back(rate_hz: float, target_hz: float) -> None:
 def test_polyphase_keeps_out_what_would_fold() -> None:
     axis = clock.Axis(0.0, 20_000.0, 20_000)
     tone = np.sin(2 * np.pi * 2_600.0 * axis.instants())
-    found = clock.polyphase(tone, axis, 0.1, 5_000.0, 4_000)
+    found = clock.resample_polyphase(tone, axis, 0.1, 5_000.0, 4_000)
     assert np.abs(found).max() < 1e-4
-    assert np.abs(clock.linear(tone, axis, 0.1 + np.arange(4_000) / 5_000.0)).max() > 0.9, "as straight lines do not"
+    assert np.abs(clock.interpolate_linear(tone, axis, 0.1 + np.arange(4_000) / 5_000.0)).max() > 0.9
 
 
 def test_parts_of_a_rotation_are_exported_as_one(recording: Recording, tmp_path: Path) -> None:

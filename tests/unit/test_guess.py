@@ -12,11 +12,11 @@ import pytest
 from recorder.reader import Recording
 from replays.recordings.formats import clock
 from replays.recordings.formats.conversion import Conversion, block_starts, convert, write_recording
-from replays.recordings.formats.events.motion import Motion, turning
+from replays.recordings.formats.events.motion import Motion, estimate_speed
 from replays.recordings.formats.guessing import noise, overview
 from replays.recordings.formats.guessing.guess import Guess
 from replays.recordings.formats.guessing.naming import read_name
-from replays.recordings.formats.guessing.template import CHECK, guessed
+from replays.recordings.formats.guessing.template import CHECK, guess_mapping
 from replays.recordings.formats.mapping import parse_mapping
 from rig.base.wire import sensor_key
 from rig.serve.stream_check import Catalogue
@@ -77,7 +77,7 @@ def log(
 ) -> tuple[Path, dict[str, tuple[float, np.ndarray]], str, list[Guess]]:
     path = tmp_path_factory.mktemp("foreign") / request.param
     kept = LOGS[request.param](path)
-    return path, kept, *guessed([path])
+    return path, kept, *guess_mapping([path])
 
 
 def test_each_signal_is_taken_for_what_it_is(
@@ -87,7 +87,7 @@ def test_each_signal_is_taken_for_what_it_is(
     found = {guess.channel: guess for guess in guesses}
     assert set(found) == set(kept)
     for channel, (_, values) in kept.items():
-        np.testing.assert_allclose(found[channel].look.values, values, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(found[channel].features.values, values, rtol=0, atol=1e-9)
     assert text.count(CHECK) == ASKED[path.name]
     named = path.name in ("m.mf4", "g.csv")
     assert all(guess.sure == "sure" for guess in guesses) == named
@@ -124,7 +124,7 @@ def test_what_nothing_speaks_for_stays_a_channel_of_its_own(
     noise_of = np.random.default_rng(0).standard_normal((600, len(names)))
     head = ",".join(["time", *names])
     np.savetxt(path, np.column_stack([t, 5.0 + noise_of]), delimiter=",", header=head, comments="", fmt="%.9f")
-    text, guesses = guessed([path])
+    text, guesses = guess_mapping([path])
     assert tuple(f"{one.channel} {one.sure}" if one.channel else "" for one in guesses) == channels
     conversion, _ = imported(path, text, tmp_path)
     assert len(conversion.channels) == len(names)
@@ -163,7 +163,7 @@ def test_nothing_is_done_to_samples_that_nobody_asked_for(
     for name in recording.table.groups:
         key = sensor_key(name)
         assert {promises[key].broken_by(block) for block in recording.blocks(key)} == {""}
-    untold = [remark for remark in conversion.remarks if remark.startswith("no bandwidth_hz told of")]
+    untold = [remark for remark in conversion.remarks if remark.startswith("no bandwidth_hz for")]
     assert len(untold) == 1
     assert "µs late" in untold[0]
     if path.name == "c.csv":  # a clock that is off stays the clock's affair
@@ -207,7 +207,7 @@ def test_noise_of_any_colour_and_where_it_ends(corner_hz: float | None) -> None:
         white = behind_a_low_pass(white, corner_hz, rate * several)
     heard = white[::several]
     signal = heard + 0.5 * np.sin(2 * np.pi * 6.2 * np.arange(len(heard)) / rate)
-    assert noise.white_or_not(signal) == pytest.approx(float(heard.std()), rel=0.07)
+    assert noise.estimate_noise(signal) == pytest.approx(float(heard.std()), rel=0.07)
     found = noise.corner_hz(signal, float(rate))
     assert found is None if corner_hz is None else found == pytest.approx(corner_hz, rel=0.05)
 
@@ -219,10 +219,10 @@ def test_a_corner_that_is_seen_is_proposed_and_asked(tmp_path: Path) -> None:
     heard = behind_a_low_pass(wide, 4000.0, rate * several)[::several]
     rows = np.column_stack([np.arange(len(heard)) / rate, heard])
     np.savetxt(path, rows, delimiter=",", header="time,inner_x [m/s^2],inner_y [m/s^2]", comments="", fmt="%.9f")
-    text, _ = guessed([path])
+    text, _ = guess_mapping([path])
     asked = [line for line in text.splitlines() if CHECK in line]
     assert len(asked) == 1
-    assert asked[0].endswith(f"# {CHECK}: the noise of 2 of 2 signals ends there, as behind a low-pass of order 4")
+    assert asked[0].endswith(f"# {CHECK}: the noise of 2 of 2 signals ends there, as after a low-pass of order 4")
     mapping = parse_mapping(tomllib.loads(text), name="m.toml")
     assert mapping.channels["inner_y"].bandwidth_hz == pytest.approx(4000.0, rel=0.06)
 
@@ -237,7 +237,7 @@ def test_whether_samples_or_only_their_stamps_are_uneven(taken: str, told: str, 
     values = noise_of + (0.0 if taken == "at rest" else np.sin(60 * (even if taken == "evenly" else stamps)))
     rows = np.column_stack([stamps, values])
     np.savetxt(path, rows, delimiter=",", header="time,P_N [N]", comments="", fmt="%.9f")
-    text, _ = guessed([path])
+    text, _ = guess_mapping([path])
     assert told in text
     conversion, recording = imported(path, text, tmp_path)
     assert ("samples as they were" in conversion.channels[0].time) == (taken != "when stamped")
@@ -269,9 +269,9 @@ def test_resampling_gains_are_those_of_the_filters() -> None:
     values, axis = generator.standard_normal(60_000), clock.Axis(0.0, 1000.0, 60_000)
     for rate in (999.0, 400.0):
         instants = np.arange(round(59.0 * rate)) / rate
-        straight = clock.linear(values, axis, instants)
+        straight = clock.interpolate_linear(values, axis, instants)
         assert float(straight.std()) == pytest.approx(clock.linear_gain(axis, instants), rel=0.02)
-        banded = clock.polyphase(values, axis, 0.0, rate, len(instants))[100:-100]
+        banded = clock.resample_polyphase(values, axis, 0.0, rate, len(instants))[100:-100]
         assert float(banded.std()) == pytest.approx(clock.polyphase_gain(axis, rate), rel=0.02)
 
 
@@ -294,10 +294,10 @@ def test_a_picture_shows_short_blows_of_long_signals(tmp_path: Path) -> None:
     path, t = tmp_path / "x.csv", np.arange(6100) / 3000
     np.savetxt(path, np.column_stack([t, foreign.hammer(t), np.sin(40 * t)]), delimiter=",", comments="", fmt="%.6f",
                header="time,hammer [N],disk_x [mm]")  # fmt: skip
-    _, guesses = guessed([path])
-    times, values = overview.course(guesses[0].look.axis.instants(), guesses[0].look.values)
+    _, guesses = guess_mapping([path])
+    times, values = overview.reduce_samples(guesses[0].features.axis.instants(), guesses[0].features.values)
     assert len(times) == len(values) == 2000
-    assert values.max() == guesses[0].look.extent[1]
+    assert values.max() == guesses[0].features.extent[1]
     assert times[-1] > 0.998 * t[-1]
     overview.draw(guesses, tmp_path / "x.png")
     assert (tmp_path / "x.png").read_bytes().startswith(b"\x89PNG")
@@ -315,7 +315,7 @@ def test_few_pulses_are_those_of_what_a_name_says(
     path, t = tmp_path / "x.csv", np.arange(3000) / 3000
     train = np.sum([(t >= at) & (t < at + 0.01) for at in at_s], axis=0)
     np.savetxt(path, np.column_stack([t, train]), delimiter=",", header=f"time,{name}", comments="", fmt="%.6f")
-    text, (found,) = guessed([path])
+    text, (found,) = guess_mapping([path])
     assert found.channel == channel
     assert ("\n[keyphasor]" in text) == (channel == "keyphasor")
     assert "# commands = []" in text
@@ -333,7 +333,7 @@ def test_few_pulses_are_those_of_what_a_name_says(
         (("--template", "t.toml", "--picture", "p.png"), "FILE must be given"),
         (("x.csv", "-o", "o.wav"), "--output must be a file name that ends in .mcap"),
         (("nowhere.csv",), "file must be a file that can be read"),
-        (("x.csv", "-o", "o.mcap"), "the guess (--template writes it): time.rate_hz must be given"),
+        (("x.csv", "-o", "o.mcap"), "the guess (--template writes it): time.rate_hz must be set"),
     ],
 )
 def test_wrong_input_is_one_line(
@@ -358,7 +358,7 @@ def test_a_channel_without_a_number_does_not_turn(missing: tuple[str, ...]) -> N
     angle = 2.0 * np.pi * 6.2 * axis.instants()
     signals = {"disk_x": np.cos(angle), "disk_y": np.sin(angle)}
     motions = [Motion(name, np.full(axis.rows, np.nan) if name in missing else x, axis) for name, x in signals.items()]
-    found = turning(motions)
+    found = estimate_speed(motions)
     if len(missing) == 2:
         assert found is None
     else:

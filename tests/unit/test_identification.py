@@ -14,8 +14,8 @@ import pytest
 from recorder.reader import Recording
 from replays.recordings.export import write_run
 from replays.recordings.identification import ask, identify
-from replays.recordings.identification.horizon import horizon
-from replays.recordings.identification.judgement import Finding, widened
+from replays.recordings.identification.horizon import find_horizon
+from replays.recordings.identification.judgement import Finding, widen_interval
 from replays.recordings.identification.request import measured_noise
 from replays.recordings.identification.window import Window
 from replays.recordings.resimulation.experiment import Experiment
@@ -96,9 +96,9 @@ def test_an_interval_wider_than_what_was_believed_is_no_result(file: Path) -> No
     recording = Recording.open(file)
     (unknown,) = ask(recording, Experiment.of(recording), ["hammer.1.force_n"]).unknowns
     finding = Finding(unknown, 110.0, 1.0, "identified", "identified")
-    wider = widened(finding, 20.0)
+    wider = widen_interval(finding, 20.0)
     assert (wider.standing, wider.half_width) == ("identified", 21.0)
-    lost = widened(finding, unknown.reach)
+    lost = widen_interval(finding, unknown.reach)
     assert (lost.standing, lost.half_width) == ("not seen", math.inf)
     assert lost.words.endswith("its interval would be wider than the value itself")
 
@@ -129,7 +129,7 @@ def test_the_horizon_is_nearer_where_less_is_known(file: Path) -> None:
     recording = Recording.open(file)
     question = ask(recording, Experiment.of(recording), ["magnet.stiffness", "contact.restitution"])
     window = Window(question, 0.035)
-    vague, sharp = (horizon(window, np.zeros(2), np.diag([size, size]) ** 2) for size in (0.1, 1e-5))
+    vague, sharp = (find_horizon(window, np.zeros(2), np.diag([size, size]) ** 2) for size in (0.1, 1e-5))
     assert not vague.whole
     assert vague.time_s < 0.034
     assert sharp.whole
@@ -140,16 +140,16 @@ def test_the_horizon_is_nearer_where_less_is_known(file: Path) -> None:
     [
         (["--fit", "contact.frictionn"], "a parameter, a number of the scene"),
         (["--fit", "contact.frictionn"], "such as contact.friction"),
-        (["--fit", "engine.step_us"], "none of the simulation"),
-        (["--fit", "sensors.rate_hz"], "none of the simulation"),
+        (["--fit", "engine.step_us"], "not the simulation"),
+        (["--fit", "sensors.rate_hz"], "not the simulation"),
         (["--fit", "contact.friction,contact.friction"], "different keys"),
         (["--fit", "contact.friction", "--bounds", "contact.friction=0.3:0.2"], "ascending"),
         (["--fit", "contact.friction", "--bounds", "contact.friction"], "KEY="),
         (["--fit", "contact.friction", "--prior", "contact.friction=0.25"], "+- between them"),
         (["--fit", "contact.friction", "--start", "magnet.stiffness=1"], "of a key that is fitted"),
         (["--fit", "contact.friction", "--start", "contact.friction=much"], "a number"),
-        (["--fit", "contact.friction", "--channels", "truth_x"], "some that the recording has"),
-        (["--fit", "contact.friction", "--from", "5", "--to", "6"], "a window with samples in it"),
+        (["--fit", "contact.friction", "--channels", "truth_x"], "channels of the recording"),
+        (["--fit", "contact.friction", "--from", "5", "--to", "6"], "a window with samples"),
         (["--fit", "hammer.2.force_n"], "which has 1 of hammer"),
         (["--fit", "contact.friction", "-o", "fitted.json"], "ends in .toml"),
     ],
@@ -266,7 +266,7 @@ def test_nobody_waits_for_what_is_fitted_along(quiet: Path) -> None:
 
     def end_s(along: tuple[str, ...]) -> float:
         keys = ["magnet.stiffness", "contact.friction"]
-        question = ask(recording, Experiment.of(recording), keys, window=(0.0, 0.3), along=along)
+        question = ask(recording, Experiment.of(recording), keys, window=(0.0, 0.3), nuisances=along)
         return identify(question, precision=1e-2).window.end_s
 
     assert end_s(()) == pytest.approx(0.3, abs=1e-3)

@@ -269,7 +269,7 @@ def test_mdf_of_another_system_keeps_its_integers(daq_mdf: Path, tmp_path: Path)
     np.testing.assert_allclose(recording.samples("hammer").times_s, np.arange(8192) / 51_200.0, rtol=0, atol=1e-12)
     assert recording.samples("drive").rate_hz == 2500
     np.testing.assert_allclose(recording.samples("drive")["speed"], np.linspace(370, 380, 400) / 60, rtol=1e-6)
-    assert any("without numbers" in remark for remark in conversion.remarks)
+    assert any("non-numeric" in remark for remark in conversion.remarks)
     # The pulse rises where 40 t + 0.3 is whole, within a sample; half way up between two samples.
     edges = recording.edges()
     exact = (np.arange(1, 1 + len(edges)) - 0.3) / 40.0
@@ -292,7 +292,7 @@ def test_mdf_masters_in_milliseconds_and_of_an_angle(tmp_path: Path) -> None:
     assert by_angle.rate_hz is None
     _, recording = imported(tmp_path, [path], '[channels.P_N]\nsource = "a"\n')
     np.testing.assert_allclose(recording.samples("forces").times_s, t, rtol=0, atol=1e-9)
-    with pytest.raises(InputError, match=r"^time\.rate_hz must be given, as the file tells no rate of b"):
+    with pytest.raises(InputError, match=r"^time\.rate_hz must be set, as the file has no rate for b"):
         imported(tmp_path, [path], '[channels.P_N]\nsource = "b"\n', name="angle")
 
 
@@ -638,7 +638,7 @@ def test_uneven_time_stamps_are_told_and_never_taken_for_even(tmp_path: Path) ->
     t = np.arange(1000) / 1000 + generator.uniform(-2e-4, 2e-4, 1000)
     path = rows_csv(tmp_path / "x.csv", {"time": t, "P_N [N]": np.sin(20 * t)})
     mapping = '[channels.P_N]\nsource = "P_N"\n'
-    with pytest.raises(InputError, match=r'^resample.method must be "linear" .* off even ones of 1000'):
+    with pytest.raises(InputError, match=r'^resample.method must be "linear" .* from an even rate of 1000'):
         imported(tmp_path, [path], mapping)
     conversion, recording = imported(tmp_path, [path], f'[resample]\nmethod = "linear"\nrate_hz = 1000\n{mapping}')
     samples = recording.samples("forces")
@@ -789,9 +789,9 @@ def test_hysteresis_keeps_noise_from_making_edges() -> None:
     t = np.arange(10_000) / 10_000
     signal = np.sin(2 * np.pi * 5 * t - 1.0) + 0.02 * np.sin(2 * np.pi * 3001 * t)
     axis = clock.Axis(0.0, 10_000.0, len(t))
-    found, _ = clock.crossings(signal, axis, threshold=0.0, hysteresis=0.2)
+    found, _ = clock.find_crossings(signal, axis, threshold=0.0, hysteresis=0.2)
     np.testing.assert_allclose(found, (np.arange(5) + 0.5 / np.pi) / 5, atol=2e-3)
-    assert len(clock.crossings(signal, axis, threshold=0.0, hysteresis=0.0)[0]) > len(found)
+    assert len(clock.find_crossings(signal, axis, threshold=0.0, hysteresis=0.0)[0]) > len(found)
 
 
 CSV = "time,x [mm],y [V]\n0,1,2\n0.001,2,3\n0.002,3,4\n0.003,4,5\n"
@@ -825,7 +825,7 @@ X = '[channels.disk_x]\nsource = "x"\n'
             X + "sensitivity = '2 bananas'\n",
             "m.toml: channels.disk_x.sensitivity must be volts per unit, such as",
         ),
-        (X + "group = 'fast'\n", "m.toml: channels.disk_x.group must be left out: there are no groups"),
+        (X + "group = 'fast'\n", "m.toml: channels.disk_x.group must be omitted: the file has no groups"),
         (X + "sensitivity = '7 V/mm'\n", "m.toml: channels.disk_x.unit must be V or mV with a sensitivity"),
         (X + "factor = 0.0\n", "m.toml: channels.disk_x.factor must be another number than 0"),
         (X + "file = 'q.csv'\n", "m.toml: channels.disk_x.file must be one of x.csv"),
@@ -836,9 +836,9 @@ X = '[channels.disk_x]\nsource = "x"\n'
             'm.toml: resample.method must be "polyphase" or "linear" with resample.rate_hz',
         ),
         ("[time]\nrate_hz = 1000.5\n" + X.replace("disk_x", "disk_y"), None),
-        ("[time]\nrate_hz = 2000\n" + X, "m.toml: time.rate_hz must be within 1% of the 1000 Hz that x in x.csv has"),
+        ("[time]\nrate_hz = 2000\n" + X, "m.toml: time.rate_hz must be within 1% of the rate of x in x.csv, 1000 Hz"),
         ("[file]\ntime_column = 'clock'\n" + X, "m.toml: file.time_column must be a column of x.csv"),
-        ("[file]\ntime_column = 'none'\n" + X, "m.toml: time.rate_hz must be given, as the file tells no rate"),
+        ("[file]\ntime_column = 'none'\n" + X, "m.toml: time.rate_hz must be set, as the file has no rate"),
         ("[file]\nencoding = 'klingon'\n" + X, "m.toml: file.encoding must be a text encoding"),
         ("[hammer]\n" + X, "m.toml: hammer must be left out without a channel `hammer`"),
         ("[keyphasor]\nsource = 'y'\nthreshold = 99.0\n" + X, "m.toml: keyphasor.threshold must be between 2 and 5"),
@@ -883,7 +883,7 @@ def test_wrong_mappings_are_one_line(
         ("x.csv", b"\0\1\2\3" * 50, "file must be a text file"),
         ("x.csv", b"just words\nand more\n", "file must be a text file with lines of numbers"),
         ("x.csv", b"a,b\n1,2\n2,3\n3,4\n4,5\n5,6,7\n", "file must be a text file of 2 columns throughout"),
-        ("x.csv", b"", "file must be a file with something in it"),
+        ("x.csv", b"", "file must be a file that is not empty"),
         ("x.xlsx", b"PK", "file must be a file that ends in .mf4"),
         ("x.csv", b"time,x [mm]\n0,1\n1,2\n1,3\n0,4\n", "time stamps must be ascending"),
     ],
@@ -947,7 +947,7 @@ def test_a_file_that_is_cut_off_is_one_line(
     printed = capfd.readouterr()
     assert end.value.code == 2
     assert printed.err.startswith("rig: file must be an intact ")
-    assert "it is cut off" in printed.err or kept < 0.1
+    assert "it is truncated" in printed.err or kept < 0.1
     assert printed.err.count("\n") == 1
     assert "m.toml" not in printed.err.split("instead")[0]
 
@@ -995,7 +995,7 @@ def test_a_template_says_what_else_there_is(daq_mdf: Path, tmp_path: Path, capsy
         main(["import", str(daq_mdf), "--template", str(target)])
     assert "2 lines to check" in capsys.readouterr().out
     text = target.read_text()
-    plain, _, rest = text.partition("# Take away the `# ` of what you need:\n")
+    plain, _, rest = text.partition("# Uncomment the tables that you need:\n")
     taken_up = "\n".join(line.removeprefix("#").removeprefix(" ") for line in rest.splitlines())
     tables = tomllib.loads(plain.replace("[channels.AI0]", "[channels.hammer]") + taken_up)
     mapping = mappings.Mapping(**tables)

@@ -13,9 +13,9 @@ import pytest
 from recorder.reader import Recording
 from replays.recordings.formats.conversion import convert, write_recording
 from replays.recordings.formats.mapping import load_mapping
-from replays.recordings.identification.agreement import by_agreement
+from replays.recordings.identification.agreement import solve_weighted
 from replays.recordings.identification.log import identify_log
-from replays.recordings.identification.nuisance import nuisances_of, tune
+from replays.recordings.identification.nuisance import find_nuisances, tune
 from replays.recordings.resimulation.experiment import Experiment, is_imported
 from replays.recordings.resimulation.sensitivity import ANGLE, value_of, with_values
 from replays.recordings.validation import load_criteria, validate
@@ -146,8 +146,8 @@ def test_a_clock_is_no_number_of_the_experiment(mils: Recording) -> None:
 
 def test_nuisances_are_those_that_an_experiment_has() -> None:
     quiet = Experiment(load_scene("stable-run", {"duration_s": 0.1}))
-    assert not any(key.startswith(("hammer", "state")) for key in nuisances_of(quiet))
-    assert "drive.speed_hz" not in nuisances_of(quiet, besides=["drive.speed_hz"])
+    assert not any(key.startswith(("hammer", "state")) for key in find_nuisances(quiet))
+    assert "drive.speed_hz" not in find_nuisances(quiet, excluded=["drive.speed_hz"])
 
 
 def test_a_channel_that_disagrees_has_no_say() -> None:
@@ -156,8 +156,8 @@ def test_a_channel_that_disagrees_has_no_say() -> None:
     target = [one @ np.array([3.0, -2.0]) + rng.standard_normal(300) for one in columns]
     target[2] = -50.0 * target[2]
     scales = [float(np.std(one)) for one in target]
-    np.testing.assert_allclose(by_agreement(target, columns, scales), [3.0, -2.0], atol=0.2)
-    alone = by_agreement(target, columns, scales, heard=[n == 2 for n in range(6)])
+    np.testing.assert_allclose(solve_weighted(target, columns, scales), [3.0, -2.0], atol=0.2)
+    alone = solve_weighted(target, columns, scales, enabled=[n == 2 for n in range(6)])
     np.testing.assert_allclose(alone, [-150.0, 100.0], rtol=0.1)
 
 

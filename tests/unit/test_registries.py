@@ -14,7 +14,7 @@ import pytest
 import rig
 from drivers.can.signals import LIMITS
 from replays.recordings import export
-from replays.recordings.formats.events.events import told_as
+from replays.recordings.formats.events.events import format_command
 from replays.recordings.formats.events.motion import Impact
 from rig.base.errors import InputError
 from rig.run.commands import table as commands
@@ -95,7 +95,7 @@ def test_a_format_without_a_writer_is_refused_and_not_written_as_csv(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(export, "SUFFIXES", (*export.SUFFIXES, ".xyz"))
-    with pytest.raises(InputError, match=r"output must be of a format that has a writer; .* '.xyz'"):
+    with pytest.raises(InputError, match=r"output must be a format with a writer; .* '.xyz'"):
         export.writer_for(tmp_path / "run.xyz", rig.Simulation("stable-run"))
     assert not list(tmp_path.iterdir())
 
@@ -131,4 +131,4 @@ def test_the_bounds_of_a_hammer_pulse_are_those_of_its_command() -> None:
             with nullcontext() if good else pytest.raises(InputError, match=f"hammer.{field}"):
                 commands.check_command("hammer", {field: value})
     hit = Impact(0.5, ("disk_x",), (0.5, 1e6, 1e-6, 0.0))
-    assert "force_n = 1e+03, duration_ms = 0.5" in told_as(hit)
+    assert "force_n = 1e+03, duration_ms = 0.5" in format_command(hit)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from replays.recordings.resimulation.experiment import Experiment
-from replays.recordings.resimulation.prediction import LeadIns, Measured, bare, predict, sampled
+from replays.recordings.resimulation.prediction import LeadIns, Measured, bare, interpolate_rows, predict
 from replays.recordings.resimulation.sensitivity import Predictor, value_of, with_values
 from rig.base.errors import InputError
 from rig.channels.table import Channel, default_table
@@ -102,10 +102,10 @@ def test_values_between_samples_are_those_of_the_polynomial() -> None:
     times = np.arange(40.0)
     quintic = np.column_stack([(times / 20.0 - 1.0) ** 5, np.sin(2.0 * np.pi * times / 8.0)])
     places = np.linspace(3.3, 35.9, 57)
-    found = sampled(quintic, places)
+    found = interpolate_rows(quintic, places)
     assert found[:, 0] == pytest.approx((places / 20.0 - 1.0) ** 5, abs=1e-12)
     assert np.abs(found[:, 1] - np.sin(2.0 * np.pi * places / 8.0)).max() < 2e-3
-    assert np.array_equal(sampled(quintic, np.array([0.0, 7.0, 39.0])), quintic[[0, 7, 39]])
+    assert np.array_equal(interpolate_rows(quintic, np.array([0.0, 7.0, 39.0])), quintic[[0, 7, 39]])
 
 
 def test_a_clock_that_is_late_and_fast_shows_what_was_before(experiment: Experiment) -> None:

@@ -1,5 +1,6 @@
-"""Other laboratories' file formats: their logs into recordings of this rig, and recordings into theirs.
+"""Import of other systems' logs to recordings of this rig, and export of recordings to other formats.
 
-`conversion` makes a recording out of `source` files by a `mapping`; `selection` gives what the `FormatWriter` of a
-format writes. A module a format (`mdf`, `tdms`, `uff`, `delimited`, `columnar`, `wav`) both reads and writes it.
+`conversion` makes a recording from `source` files and a `mapping`; `exporting.selection` provides what the
+`FormatWriter` of a format writes. Each module of `readers` (`mdf`, `tdms`, `uff`, `delimited`, `columnar`, `wav`) reads
+and writes one format.
 """

@@ -1,4 +1,4 @@
-"""Other systems' logs into a recording of this rig's kind: counts, calibration, edges, events, and what was done."""
+"""Conversion of other systems' logs to recordings: counts, calibration, edges, events and a record of each step."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from replays.recordings.formats import clock
 from replays.recordings.formats.events import events
 from replays.recordings.formats.events.motion import Motion
 from replays.recordings.formats.events.pulses import HammerPulse, find_pulses
-from replays.recordings.formats.group import ImportedChannel, PlacedGroup, nominal_hz, place, quantise, rotate
-from replays.recordings.formats.mapped import Log, MappedSignal, check_rows, engineering
+from replays.recordings.formats.group import ImportedChannel, PlacedGroup, nominal_hz, place_groups, quantise, rotate
+from replays.recordings.formats.mapped import Log, MappedSignal, check_rows, convert_to_engineering
 from replays.recordings.formats.mapping import Mapping
 from rig.base import wire
 from rig.base.errors import InputError
@@ -27,32 +27,32 @@ from rig.channels.table import ChannelTable, default_table
 
 TICK_RATE_HZ = 1_000_000
 _BLOCK_S = 0.05
-_LATE = 2.6131 / (2.0 * math.pi)
-"""Delay of a Butterworth low-pass of order 4 far below its corner, times the corner [1]."""
-_BESIDE = 1.01
-"""So far above half of the rate a corner may be told, as clocks are off."""
-_REST = 0.25
-"""Part of the time between two hammer pulses behind which a log may begin to be judged by the second."""
+_BUTTERWORTH_DELAY = 2.6131 / (2.0 * math.pi)
+"""Delay of a 4th-order Butterworth low-pass far below its corner, times the corner [1]."""
+_MAX_CORNER_RATIO = 1.01
+"""Ratio up to which a corner may exceed half of the rate, as clocks are inaccurate."""
+_SETTLING_FRACTION = 0.25
+"""Fraction of the interval between two hammer pulses after which a log may be cut to validate the second one."""
 NO_SCENE = "none (imported)"
 _EPOCH_S = (946_684_800.0, 4_102_444_800.0)
-"""Times from 2000 to 2100 in seconds since 1970: none that a measurement began at 0 would reach."""
+"""Times from 2000 to 2100 [s since 1970]; a clock that starts at 0 does not reach them."""
 
 
 @dataclass(frozen=True)
 class Conversion:
-    """A recording in the making.
+    """Recording ready to be written.
 
     Attributes:
-        table: Its channel table.
+        table: Channel table.
         counts: int32 counts by group, shape (rows, channels).
-        present: Which rows there are, by group, shape (rows,).
+        present: Mask of the rows that exist, by group, shape (rows,).
         first_s: Time of the first row [s], by group.
-        rates_hz: True rate [Hz], by group; that of the table where it is a whole one.
+        rates_hz: True rate [Hz], by group; equals the rate in the table if that is a whole number.
         edges: Keyphasor edges [ticks], float64, shape (turns,).
-        pulses: Hammer pulses that were found.
-        channels: What was done, channel by channel.
-        remarks: What was done to the whole, and what was assumed.
-        document: All of that, the mapping and the files, as JSON.
+        pulses: Detected hammer pulses.
+        channels: Processing of each channel.
+        remarks: Processing and assumptions that concern the whole recording.
+        document: All of these with the mapping and the files, as JSON.
         start: Wall time of the recording's time zero.
         experiment: Scene, parameters and scene document, or None.
     """
@@ -72,7 +72,7 @@ class Conversion:
 
     @property
     def end_tick(self) -> int:
-        """Tick behind the last row."""
+        """Tick after the last row."""
         return max(
             round(self.first_s[name] * TICK_RATE_HZ) + math.ceil(len(rows) * TICK_RATE_HZ / self.rates_hz[name])
             for name, rows in self.counts.items()
@@ -86,36 +86,36 @@ def convert(
     doubts: Sequence[str] = (),
     say: Callable[[str], None] = lambda text: None,
 ) -> Conversion:
-    """Read files and make of them what a mapping says.
+    """Read files and convert them according to a mapping.
 
     Args:
-        files: The files; the first one's time is the time of all, unless others are aligned.
-        mapping: What becomes what.
-        doubts: What of it is guessed, and stands among the remarks.
-        say: Told what is being done.
+        files: The files; the first one's clock is the reference, to which others are aligned.
+        mapping: Assignment of signals to channels.
+        doubts: Guessed parts of the mapping, added to the remarks.
+        say: Callback for the current step.
 
     Raises:
-        InputError: Something in the files is not as the mapping says, or would be lost silently.
+        InputError: The files contradict the mapping, or data would be lost without notice.
     """
     log = Log(files, mapping)
     remarks = log.remarks
     remarks += doubts
     say("reading")
-    taken = [log.take(name, wanted) for name, wanted in mapping.channels.items()]
+    signals = [log.take(name, wanted) for name, wanted in mapping.channels.items()]
     say("aligning")
     log.align()
-    for entry in taken:
+    for entry in signals:
         axis = log.on_common_clock(entry.axis, entry.source, entry.entry)
-        entry.axis = axis.moved(-entry.mapping.delay_us * 1e-6)
-    check_rows(taken)
-    for entry in taken:
+        entry.axis = axis.shifted(-entry.mapping.delay_us * 1e-6)
+    check_rows(signals)
+    for entry in signals:
         _check_corner(entry, mapping, remarks)
-        engineering(entry, mapping)
-    pulses, low_s, high_s = _range(taken, log)
+        convert_to_engineering(entry, mapping)
+    pulses, low_s, high_s = _range(signals, log)
     say("placing samples")
-    groups, zero_s = place(taken, mapping, low_s, high_s)
+    groups, zero_s = place_groups(signals, mapping, low_s, high_s)
     rotate(groups, mapping, remarks)
-    remarks += [*_of_the_axes(groups), *_of_the_filters(groups)]
+    remarks += [*_describe_axes(groups), *_describe_filters(groups)]
     table, counts, present, channels = quantise(groups)
     lead_s = (mapping.experiment.lead_s or 0.0) if mapping.experiment is not None else 0.0
     rates_hz = {name: group.rate_hz for name, group in groups.items()}
@@ -123,15 +123,15 @@ def convert(
     if any(abs(lead_s * rate - round(lead_s * rate)) > 1e-6 for rate in whole):
         raise InputError("experiment.lead_s", "a whole number of samples", lead_s)
     if not (leading := min(groups.values(), key=lambda group: group.start_s).rate_hz).is_integer():
-        lead_s = math.ceil(lead_s * leading - 1e-6) / leading  # its rows then lie on whole numbers over its rate
+        lead_s = math.ceil(lead_s * leading - 1e-6) / leading  # so that rows are whole multiples of its period
     zero_s -= lead_s
     if lead_s:
-        remarks.append(f"time zero lies {lead_s:g} s before the first sample: there the scene begins")
+        remarks.append(f"time zero, the start of the scene, is {lead_s:g} s before the first sample")
     first_s = {name: group.start_s - zero_s for name, group in groups.items()}
     edges = _edges(log, zero_s, groups)
-    since = tuple(replace(pulse, at_s=pulse.at_s - zero_s) for pulse in pulses)
-    kept = tuple(pulse for pulse in since if pulse.at_s >= 0.0)
-    begin = _began(log, zero_s)
+    shifted = tuple(replace(pulse, at_s=pulse.at_s - zero_s) for pulse in pulses)
+    kept = tuple(pulse for pulse in shifted if pulse.at_s >= 0.0)
+    begin = _start_time(log, zero_s)
     end_s = max(first_s[name] + group.rows / group.rate_hz for name, group in groups.items())
     experiment = None
     if mapping.experiment is not None:
@@ -162,73 +162,73 @@ def convert(
 
 
 def _check_corner(entry: MappedSignal, mapping: Mapping, remarks: list[str]) -> None:
-    """Refuse the default of all as the corner of a channel too slow for it; what a channel says itself is remarked.
+    """Check the low-pass corner of a channel against half of its rate; add a remark if its own corner is too high.
 
     Raises:
-        InputError: The channel has to say its own.
+        InputError: The corner comes from [defaults]; the channel must set its own.
     """
     corner_hz, most_hz = entry.mapping.bandwidth_hz, 0.5 * entry.axis.rate_hz
-    if corner_hz is None or corner_hz <= _BESIDE * most_hz:
+    if corner_hz is None or corner_hz <= _MAX_CORNER_RATIO * most_hz:
         return
     if "bandwidth_hz" not in entry.mapping.model_fields_set:
-        must = f"given, as that of [defaults] is above half of its rate ({most_hz:.6g} Hz)"
+        must = f"set, as the one in [defaults] is above half of its rate ({most_hz:.6g} Hz)"
         raise InputError(f"channels.{entry.name}.bandwidth_hz", must, corner_hz)
     remarks.append(
-        f"{entry.name}: bandwidth_hz {corner_hz:g} is above half of its rate ({most_hz:.6g} Hz), as of a converter "
-        "without a low-pass of its own: what is faster appears as something slower"
+        f"{entry.name}: bandwidth_hz {corner_hz:g} is above half of its rate ({most_hz:.6g} Hz), as for a converter "
+        "without a low-pass filter: faster signals are aliased"
     )
 
 
-def _of_the_axes(groups: dict[str, PlacedGroup]) -> list[str]:
-    """What is to be known of groups that came apart, and of rates that are no whole numbers."""
-    told, alike = list[str](), dict[float, list[str]]()
+def _describe_axes(groups: dict[str, PlacedGroup]) -> list[str]:
+    """Return remarks on groups that were split and on rates that are not a whole number."""
+    remarks, names_by_rate = list[str](), dict[float, list[str]]()
     for name, group in groups.items():
         own = next(iter(group.channels.values())).target.group
         if name != own:
-            told.append(
-                f"{', '.join(group.channels)}: in a group {name} with instants of its own, not those of {own}; nothing "
-                "is resampled (pictures that need both at once: [resample])"
+            remarks.append(
+                f"{', '.join(group.channels)}: in a separate group {name}, sampled at other instants than {own}; "
+                "not resampled (set [resample] for pictures that need both)"
             )
         if not group.rate_hz.is_integer():
-            alike.setdefault(group.rate_hz, []).append(name)
-    for rate_hz, names in alike.items():
+            names_by_rate.setdefault(group.rate_hz, []).append(name)
+    for rate_hz, names in names_by_rate.items():
         set_hz = nominal_hz(rate_hz)
         off = (rate_hz / set_hz - 1.0) * 1e6
         fast = f", {off:+.3g} ppm on {set_hz} Hz" if abs(off) < 1e3 else ""
-        told.append(f"{', '.join(names)}: {rate_hz:.9g} Hz{fast}, as the clock says; samples are as they were")
-    return told
+        remarks.append(f"{', '.join(names)}: {rate_hz:.9g} Hz{fast} by the source's clock; samples are unchanged")
+    return remarks
 
 
-def _of_the_filters(groups: dict[str, PlacedGroup]) -> list[str]:
-    """What follows from filters that nobody tells."""
+def _describe_filters(groups: dict[str, PlacedGroup]) -> list[str]:
+    """Return a remark on the assumed delay of channels without bandwidth_hz."""
     own = default_table().channels
-    untold = {
+    unspecified = {
         name: group.rate_hz
         for group in groups.values()
         for name, entry in group.channels.items()
         if name in own and name != "keyphasor" and entry.mapping.bandwidth_hz is None
     }
-    if not untold:
+    if not unspecified:
         return []
-    late_us = 1e6 * _LATE * (4.0 - 2.0) / max(untold.values())
+    delay_us = 1e6 * _BUTTERWORTH_DELAY * (4.0 - 2.0) / max(unspecified.values())
     return [
-        f"no bandwidth_hz told of {', '.join(untold)}: taken for half of the rate; were it a quarter, they would be "
-        f"{late_us:.0f} µs late, by which models would see impacts shifted, and fits end at the first contact"
+        f"no bandwidth_hz for {', '.join(unspecified)}: assumed half of the rate; if it is a quarter, they are "
+        f"{delay_us:.0f} µs late: impacts appear shifted, and fits end at the first contact"
     ]
 
 
-def _began(log: Log, zero_s: float) -> datetime:
-    """Wall time of the recording's time zero."""
+def _start_time(log: Log, zero_s: float) -> datetime:
+    """Return the wall time of the recording's time zero."""
     start, remarks = log.mapping.time.start or log.sources[0].start, log.remarks
     if start is not None:
         if start.tzinfo is None:
-            remarks.append(f"{start.isoformat()} has no time zone: taken as UTC (time.start says otherwise)")
+            remarks.append(f"{start.isoformat()} has no time zone: read as UTC (set time.start to override)")
             start = start.replace(tzinfo=UTC)
         return datetime.fromtimestamp(start.timestamp() + zero_s, tz=UTC)
     if _EPOCH_S[0] < zero_s < _EPOCH_S[1]:
-        remarks.append("times are so large that they were read as seconds since 1970-01-01, UTC")
+        remarks.append("times are in the range of seconds since 1970-01-01 and were read as UTC")
         return datetime.fromtimestamp(zero_s, tz=UTC)
-    remarks.append("the source does not tell when it was: the wall times in the recording are those of the import")
+    remarks.append("the source has no start time: wall times in the recording are those of the import")
     return datetime.now(tz=UTC)
 
 
@@ -237,32 +237,32 @@ def _digest(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _range(taken: Sequence[MappedSignal], log: Log) -> tuple[tuple[HammerPulse, ...], float, float]:
-    """Hammer pulses (in the time of the source), and from when to when is imported [s]."""
+def _range(signals: Sequence[MappedSignal], log: Log) -> tuple[tuple[HammerPulse, ...], float, float]:
+    """Return the hammer pulses (in source time) and the start and end of the imported range [s]."""
     mapping = log.mapping
     low = -math.inf if mapping.time.from_s is None else mapping.time.from_s
     high = math.inf if mapping.time.to_s is None else mapping.time.to_s
     pulses: tuple[HammerPulse, ...] = ()
     if mapping.hammer is not None:
-        hammer = next(entry for entry in taken if entry.name == "hammer")
+        hammer = next(entry for entry in signals if entry.name == "hammer")
         found, passed_over = find_pulses(hammer.values, hammer.axis, mapping.hammer)
         pulses = tuple(pulse for pulse in found if low <= pulse.at_s <= high)
         if not pulses:
             largest = float(np.nanmax(hammer.values))
             raise InputError("hammer.threshold_n", f"below the largest force, {largest:.3g} N, in what is imported",
                              mapping.hammer.threshold_n)  # fmt: skip
-        told = ", ".join(f"{b.force_n:.4g} N for {b.duration_ms:.3g} ms" for b in pulses[:5])
-        log.remarks.append(f"{len(pulses)} hammer pulses found: {told}")
+        first_pulses = ", ".join(f"{b.force_n:.4g} N for {b.duration_ms:.3g} ms" for b in pulses[:5])
+        log.remarks.append(f"{len(pulses)} hammer pulses found: {first_pulses}")
         if lost := [f"{b.force_n:.4g} N at {b.at_s:.4f} s" for b in passed_over if low <= b.at_s <= high]:
             log.remarks.append(
-                f"{len(lost)} hammer pulses too soon behind another do not count, and nothing foretells what they do "
-                f"(hammer.dead_s, hammer.threshold_n): {', '.join(lost[:5])}"
+                f"{len(lost)} hammer pulses ignored, as too soon after another; predictions do not include "
+                f"them (hammer.dead_s, hammer.threshold_n): {', '.join(lost[:5])}"
             )
         for second in pulses[1:2]:
-            from_s = pulses[0].at_s + _REST * (second.at_s - pulses[0].at_s)
+            from_s = pulses[0].at_s + _SETTLING_FRACTION * (second.at_s - pulses[0].at_s)
             log.remarks.append(
-                f"`rig validate` begins before the first of them and compares samples for as long as motion behind it "
-                f"can be foretold; to begin behind it: [time] from_s = {from_s:.4g}"
+                f"`rig validate` begins before the first of them and compares samples for as long as the "
+                f"following motion can be predicted; to begin after it: [time] from_s = {from_s:.4g}"
             )
         if mapping.hammer.pre_s is not None:
             low = max(low, pulses[0].at_s - mapping.hammer.pre_s)
@@ -270,14 +270,14 @@ def _range(taken: Sequence[MappedSignal], log: Log) -> tuple[tuple[HammerPulse, 
 
 
 def _edges(log: Log, zero_s: float, groups: dict[str, PlacedGroup]) -> np.ndarray:
-    """Keyphasor edges in ticks from time zero."""
+    """Return keyphasor edges in ticks from time zero, shape (turns,)."""
     wanted = log.mapping.keyphasor
     if wanted is None:
         return np.empty(0)
     source, entry = log.find(wanted, "keyphasor")
     signal, axis = log.read(source, entry, "keyphasor")
     values, axis = signal.physical, log.on_common_clock(axis, source, entry)
-    found, level = clock.crossings(
+    found, level = clock.find_crossings(
         values, axis, threshold=wanted.threshold, hysteresis=wanted.hysteresis, falling=wanted.edge == "falling"
     )
     if not len(found):
@@ -295,13 +295,13 @@ def _edges(log: Log, zero_s: float, groups: dict[str, PlacedGroup]) -> np.ndarra
 def write_recording(
     conversion: Conversion, path: Path, *, force: bool = False, progress: Callable[[float], None] = lambda part: None
 ) -> None:
-    """Write a recording; nothing is left behind on an error.
+    """Write a recording; remove the file on an error.
 
     Args:
-        conversion: What to write.
+        conversion: Content of the recording.
         path: File name, ends in .mcap.
         force: Replace an existing file.
-        progress: Told the part done, 0 to 1.
+        progress: Callback for the completed fraction, 0 to 1.
 
     Raises:
         InputError: The destination cannot be used.
@@ -331,7 +331,7 @@ def write_recording(
 
 
 def _catalogue(conversion: Conversion) -> dict[str, Any]:
-    texts = {"Imported": "no samples of this rig; what was done to them stands below and in scene.json under `import`"}
+    texts = {"Imported": "samples of another system; their processing is listed below and in scene.json under `import`"}
     for channel in conversion.channels:
         texts[channel.name] = f"{channel.source}; {channel.formula}; {channel.time}; counts: {channel.counts}"
     texts |= {f"Remark {n + 1}": remark for n, remark in enumerate(conversion.remarks)}
@@ -342,7 +342,7 @@ def _catalogue(conversion: Conversion) -> dict[str, Any]:
 
 
 def _payloads(conversion: Conversion) -> Iterator[tuple[int, str, bytes]]:
-    """Tick, key and bytes of everything, in order of time."""
+    """Yield tick, key and bytes of each message, in order of time."""
     yield 0, wire.EVENTS, _event(0, "import", files=", ".join(file["name"] for file in conversion.document["files"]))
     due: list[tuple[int, str, bytes | wire.Block]] = sorted(
         [
@@ -366,7 +366,7 @@ def _event(tick: int, event: str, **about: Any) -> bytes:
 
 
 def _happenings(conversion: Conversion) -> Iterator[tuple[int, bytes]]:
-    """The commands of the scene, or the hammer pulses that were found where there is none."""
+    """Yield the commands of the scene, or the detected hammer pulses without a scene."""
     experiment = conversion.experiment
     commands = [pulse.command() for pulse in conversion.pulses] if experiment is None else experiment.commands
     for command in commands:
@@ -390,15 +390,15 @@ def _blocks(conversion: Conversion, name: str) -> Iterator[tuple[int, str, wire.
 
 
 def block_starts(rows: int, first: float, rate: float) -> list[int]:
-    """Rows with which blocks begin: a block tells the whole tick of its first row, so those that are nearest to one.
+    """Return the first rows of blocks; a block stores a whole tick, so rows near a whole tick are chosen.
 
     Args:
         rows: Number of rows.
-        first: Time of the first one [ticks].
-        rate: Rows a second [Hz].
+        first: Time of the first row [ticks].
+        rate: Sample rate [Hz].
     """
     if rate.is_integer():
-        # All of them as near as the first one: their times are exact at any rate.
+        # All block starts have the same distance to a whole tick as the first row: their times are exact at any rate.
         unit = int(rate) // math.gcd(int(rate), TICK_RATE_HZ)
         return list(range(0, rows, unit * max(1, round(_BLOCK_S * rate / unit))))
     length = max(1, round(_BLOCK_S * rate))

@@ -1,4 +1,4 @@
-"""Channels of one sensor group: on one time axis, untouched or at other instants, and as counts that lose nothing."""
+"""Channels of one sensor group on a common time axis, unmodified or resampled, and their conversion to counts."""
 
 from __future__ import annotations
 
@@ -20,29 +20,29 @@ from rig.base.checks import check
 from rig.base.errors import InputError, Words
 from rig.channels.table import VERSION, Channel, ChannelTable, Group, default_table
 
-_MOST_TIMES, _MOST_ROWS = 1000, 1_000_000
-"""So many times the values that a file has, and so many rows more, samples may become at another rate."""
-_NEAR = 0.01
-"""Part of a sample by which untouched samples may lie beside the instants that they are given."""
-_LEAST, _MOST = 1e-30, 1e30
-"""Values that a measurement can have, in any unit."""
-_SLOWEST_HZ, _FASTEST_HZ = 0.01, 1e6
-"""Rates that a recording may have, whose clock ticks a million times a second."""
-_DUST = 1e-4
-"""Part of a sample by which a rate of few digits may be off from end to end."""
-_CLOCK = 2e-4
-"""Part by which the clock of a converter may be off, at most."""
+_MAX_ROWS_FACTOR, _MAX_EXTRA_ROWS = 1000, 1_000_000
+"""Limit of resampled rows: this multiple of the values in the file, plus this number of rows."""
+_INSTANT_TOLERANCE = 0.01
+"""Largest distance of unmodified samples from the instants of the group [samples]."""
+_MIN_VALUE, _MAX_VALUE = 1e-30, 1e30
+"""Plausible values of a measurement, in any unit."""
+_MIN_RATE_HZ, _MAX_RATE_HZ = 0.01, 1e6
+"""Rates that a recording can have [Hz]; its clock has 1e6 ticks per second."""
+_ROUNDING = 1e-4
+"""Largest accumulated error of a rate written with few digits [samples]."""
+_MAX_CLOCK_ERROR = 2e-4
+"""Largest relative clock error of a converter."""
 
 
 @dataclass
 class PlacedGroup:
-    """Channels of one sensor group on one axis.
+    """Channels of one sensor group on a common axis.
 
     Attributes:
-        rate_hz: Their rate, as true as it is known, a whole number or not [Hz].
-        start_s: Time of the first row, in the time of the source [s].
+        rate_hz: True rate, not always a whole number [Hz].
+        start_s: Time of the first row, on the clock of the source [s].
         rows: Number of rows.
-        channels: What they show, by name, on this axis.
+        channels: Signals on this axis, by name of the channel.
     """
 
     rate_hz: float
@@ -52,27 +52,34 @@ class PlacedGroup:
 
 
 def nominal_hz(rate_hz: float) -> int:
-    """The whole rate that a converter was set to whose clock made it this one: of the fewest digits [Hz]."""
+    """Return the nominal rate of a converter [Hz]: the whole number of fewest digits within the clock tolerance."""
     if rate_hz >= 1.0 and float(rate_hz).is_integer():
         return int(rate_hz)
-    told = (float(f"{rate_hz:.{digits}g}") for digits in range(1, 8))
-    return max(1, round(next((each for each in told if abs(each / rate_hz - 1.0) < _CLOCK), rate_hz)))
+    candidates = (float(f"{rate_hz:.{digits}g}") for digits in range(1, 8))
+    return max(1, round(next((each for each in candidates if abs(each / rate_hz - 1.0) < _MAX_CLOCK_ERROR), rate_hz)))
 
 
 def true_rate(axis: clock.Axis) -> float:
-    """Rate of even samples [Hz]: a whole one if they have it within a part of a sample from end to end."""
+    """Return the rate of even samples [Hz], rounded to a whole number if the accumulated error is negligible."""
     whole = max(1, round(axis.rate_hz))
-    if abs(whole - axis.rate_hz) / axis.rate_hz * axis.rows <= clock.EVEN:
+    if abs(whole - axis.rate_hz) / axis.rate_hz * axis.rows <= clock.EVENNESS_TOLERANCE:
         return float(whole)
-    told = (float(f"{axis.rate_hz:.{digits}g}") for digits in range(1, 15))  # without dust
-    return next((each for each in told if abs(each / axis.rate_hz - 1.0) * axis.rows < _DUST), axis.rate_hz)
+    candidates = (float(f"{axis.rate_hz:.{digits}g}") for digits in range(1, 15))  # removes rounding errors
+    return next((each for each in candidates if abs(each / axis.rate_hz - 1.0) * axis.rows < _ROUNDING), axis.rate_hz)
 
 
-def place(
-    taken: Sequence[MappedSignal], mapping: Mapping, low_s: float, high_s: float
+def place_groups(
+    signals: Sequence[MappedSignal], mapping: Mapping, low_s: float, high_s: float
 ) -> tuple[dict[str, PlacedGroup], float]:
-    """All channels on the axes of their groups, and the time in the source that becomes zero [s]."""
-    members = _members(taken, mapping)
+    """Place all channels on the axes of their groups.
+
+    Returns:
+        Groups by name, and the source time that becomes time zero [s].
+
+    Raises:
+        InputError: The channels of a group have no common range, or resampling gives too many rows.
+    """
+    members = _group_signals(signals, mapping)
     order = list(members)
     rates = {name: _group_rate(name, entries, mapping) for name, entries in members.items()}
     first = {name: max(low_s, *(entry.axis.first_s for entry in entries)) for name, entries in members.items()}
@@ -82,68 +89,68 @@ def place(
             spans = ", ".join(f"{e.name} {e.axis.first_s:g} to {e.axis.last_s:g} s" for e in members[name])
             raise InputError("range", f"one in which all channels of {name} have samples ({spans})",
                              Words(f"{first[name]:g} to {last[name]:g} s"))  # fmt: skip
-    # Time zero is an instant of the source wherever its samples stay as they are.
+    # Time zero is a sampling instant of the source if its samples are not resampled.
     lead = min(order, key=lambda name: first[name])
-    zero_s = _next_sample(members[lead][0].axis, first[lead]) if _untouched(members[lead], rates[lead]) else first[lead]
+    zero_s = _next_sample(members[lead][0].axis, first[lead]) if _is_placed(members[lead], rates[lead]) else first[lead]
     placed = {}
     for name in order:
         entries, rate = members[name], rates[name]
-        if mapping.resample.method == "none" or _untouched(entries, rate):
-            start, slack = _next_sample(entries[0].axis, first[name]), clock.EVEN
+        if mapping.resample.method == "none" or _is_placed(entries, rate):
+            start, slack = _next_sample(entries[0].axis, first[name]), clock.EVENNESS_TOLERANCE
         else:
             start, slack = zero_s + math.ceil((first[name] - zero_s) * rate - 1e-6) / rate, 1e-6
         rows = math.floor((last[name] - start) * rate + slack) + 1
         held = max(entry.axis.rows for entry in entries)
-        if rows > _MOST_TIMES * held + _MOST_ROWS:
-            must = f"such that {held} values in {name} become at most {_MOST_TIMES * held + _MOST_ROWS} rows"
+        if rows > _MAX_ROWS_FACTOR * held + _MAX_EXTRA_ROWS:
+            must = f"such that {held} values in {name} become at most {_MAX_ROWS_FACTOR * held + _MAX_EXTRA_ROWS} rows"
             raise InputError("resample.rate_hz", must, Words(f"{rate} Hz, {rows} rows"))
         placed[name] = PlacedGroup(rate, start, rows, {entry.name: entry for entry in entries})
         for entry in entries:
-            _put(placed[name], entry, mapping)
+            _place_signal(placed[name], entry, mapping)
     return placed, zero_s
 
 
-def _members(taken: Sequence[MappedSignal], mapping: Mapping) -> dict[str, list[MappedSignal]]:
-    """Signals by sensor group, in the order of the rig's table; without resampling, only those of one axis together.
+def _group_signals(signals: Sequence[MappedSignal], mapping: Mapping) -> dict[str, list[MappedSignal]]:
+    """Return signals by sensor group, in the order of the rig's table; without resampling, one group per time axis.
 
-    The most, and of as many those with the first channel of the rig's, keep the name of its group; others are numbered.
+    If a group is split, its largest part keeps the name (ties: the part with the first channel); others are numbered.
     """
     table, moved = default_table(), mapping.resample.method != "none"
-    places = {name: number for number, name in enumerate((*table.groups, *table.channels))}
-    names = sorted(dict.fromkeys(entry.target.group for entry in taken), key=lambda name: places.get(name, len(places)))
+    places, last = {name: number for number, name in enumerate((*table.groups, *table.channels))}, math.inf
+    names = sorted(dict.fromkeys(entry.target.group for entry in signals), key=lambda name: places.get(name, last))
     found: dict[str, list[MappedSignal]] = {}
     for name in names:
-        alike: list[list[MappedSignal]] = []
-        for entry in (entry for entry in taken if entry.target.group == name):
-            own = next((one for one in alike if moved or _on_one_axis(one[0].axis, entry.axis)), None)
+        parts: list[list[MappedSignal]] = []
+        for entry in (entry for entry in signals if entry.target.group == name):
+            own = next((one for one in parts if moved or _share_axis(one[0].axis, entry.axis)), None)
             if own is None:
-                alike.append([entry])
+                parts.append([entry])
             else:
                 own.append(entry)
-        alike.sort(key=lambda one: (-len(one), min(places.get(entry.name, len(places)) for entry in one)))
+        parts.sort(key=lambda one: (-len(one), min(places.get(entry.name, len(places)) for entry in one)))
         free = (text for number in count(2) if (text := f"{name}_{number}") not in names)
-        found |= dict(zip((name, *islice(free, len(alike) - 1)), alike, strict=True))
+        found |= dict(zip((name, *islice(free, len(parts) - 1)), parts, strict=True))
     return found
 
 
-def _on_one_axis(a: clock.Axis, b: clock.Axis) -> bool:
-    """Whether samples of two axes were taken at the same instants, from end to end within a small part of a sample."""
+def _share_axis(a: clock.Axis, b: clock.Axis) -> bool:
+    """Return whether two axes have the same instants, within a small fraction of a sample from end to end."""
     if (a.times_s is None) != (b.times_s is None):
         return False
     if a.times_s is not None and b.times_s is not None:
         return np.array_equal(a.times_s, b.times_s)
     apart = (b.first_s - a.first_s) * a.rate_hz
     drift = abs(a.rate_hz / b.rate_hz - 1.0) * min(a.rows, b.rows)
-    return abs(apart - round(apart)) < _NEAR and drift < clock.EVEN
+    return abs(apart - round(apart)) < _INSTANT_TOLERANCE and drift < clock.EVENNESS_TOLERANCE
 
 
-def _untouched(entries: Sequence[MappedSignal], rate_hz: float) -> bool:
-    """Whether all samples already lie on one even axis of the wanted rate."""
-    return all(true_rate(entry.axis) == rate_hz and _on_one_axis(entries[0].axis, entry.axis) for entry in entries)
+def _is_placed(entries: Sequence[MappedSignal], rate_hz: float) -> bool:
+    """Return whether all samples already lie on one even axis of the requested rate."""
+    return all(true_rate(entry.axis) == rate_hz and _share_axis(entries[0].axis, entry.axis) for entry in entries)
 
 
 def _next_sample(axis: clock.Axis, time_s: float) -> float:
-    # Of an axis with a whole rate within EVEN of a sample, the sample's own time.
+    # On an axis whose rate is a whole number within `EVEN`, this is the sample's own time.
     number = math.ceil((time_s - axis.first_s) * axis.rate_hz - 1e-6)
     return axis.first_s + number / axis.rate_hz
 
@@ -156,7 +163,7 @@ def _group_rate(name: str, entries: Sequence[MappedSignal], mapping: Mapping) ->
             rms, largest = (f"{1e6 * value:.3g} µs" for value in axis.jitter_s)
             must = (
                 f'"linear" (or time.stamps = "line", or time.rate_hz), as the time stamps of {entry.entry.name} lie '
-                f"up to {largest} (rms {rms}) off even ones of {axis.rate_hz:.6g} Hz"
+                f"up to {largest} (rms {rms}) from an even rate of {axis.rate_hz:.6g} Hz"
             )
             raise InputError("resample.method", must, method)
     if method != "none" and mapping.resample.rate_hz is not None:
@@ -164,48 +171,48 @@ def _group_rate(name: str, entries: Sequence[MappedSignal], mapping: Mapping) ->
     if method == "none" and mapping.resample.rate_hz is not None:
         raise InputError("resample.method", '"polyphase" or "linear" with resample.rate_hz', method)
     rates = {true_rate(entry.axis) for entry in entries}
-    rate, told = true_rate(entries[0].axis), ", ".join(f"{e.name} {e.axis.rate_hz:.9g} Hz" for e in entries[:6])
+    rate, rates_text = true_rate(entries[0].axis), ", ".join(f"{e.name} {e.axis.rate_hz:.9g} Hz" for e in entries[:6])
     if len(rates) > 1 and method != "none":
-        must = f'given with method "{method}", as the rates in {name} are not one (or time.rate_hz'
-        raise InputError("resample.rate_hz", f"{must}, where the file rounds its own)", told)
-    if not _SLOWEST_HZ <= rate <= _FASTEST_HZ:
-        must = f'given, with method "polyphase" or "linear", for rates beyond {_SLOWEST_HZ:g} to {_FASTEST_HZ:g} Hz'
-        raise InputError("resample.rate_hz", must, told)
+        must = f'set with method "{method}", as rates in {name} differ (or set time.rate_hz'
+        raise InputError("resample.rate_hz", f"{must}, if the file has rounded ones)", rates_text)
+    if not _MIN_RATE_HZ <= rate <= _MAX_RATE_HZ:
+        must = f'set with method "polyphase" or "linear", for rates outside {_MIN_RATE_HZ:g} to {_MAX_RATE_HZ:g} Hz'
+        raise InputError("resample.rate_hz", must, rates_text)
     return rate
 
 
-def _put(group: PlacedGroup, entry: MappedSignal, mapping: Mapping) -> None:
-    """Put a signal on the axis of its group."""
+def _place_signal(group: PlacedGroup, entry: MappedSignal, mapping: Mapping) -> None:
+    """Place a signal on the axis of its group."""
     axis, rate, method = entry.axis, group.rate_hz, mapping.resample.method
     shift = (group.start_s - axis.first_s) * axis.rate_hz
-    stays = axis.times_s is None and abs(rate / axis.rate_hz - 1.0) * axis.rows <= clock.EVEN
-    if stays and abs(shift - round(shift)) < _NEAR:
+    stays = axis.times_s is None and abs(rate / axis.rate_hz - 1.0) * axis.rows <= clock.EVENNESS_TOLERANCE
+    if stays and abs(shift - round(shift)) < _INSTANT_TOLERANCE:
         part = slice(round(shift), round(shift) + group.rows)
         entry.values = entry.values[part]
         if entry.signal.values.dtype.kind in "iu" and not entry.missing:
             entry.raw = entry.signal.values[part]
-        entry.noise = noise.white_or_not(entry.values)
+        entry.noise = noise.estimate_noise(entry.values)
         return
     if np.isnan(entry.values).any():
         raise InputError(f"channels.{entry.name}.missing", '"hold" where samples are resampled', entry.mapping.missing)
     wanted = group.start_s + np.arange(group.rows) / rate
-    # What is drawn between samples has less noise than they, and of another colour.
-    entry.noise = noise.white_or_not(entry.values)
+    # Interpolated samples have less noise, and it is not white.
+    entry.noise = noise.estimate_noise(entry.values)
     if method == "linear":
-        entry.values, gain = clock.linear(entry.values, axis, wanted), clock.linear_gain(axis, wanted)
+        entry.values, gain = clock.interpolate_linear(entry.values, axis, wanted), clock.linear_gain(axis, wanted)
         how = "straight lines between samples"
     else:
-        entry.values = clock.polyphase(entry.values, axis, group.start_s, rate, group.rows)
+        entry.values = clock.resample_polyphase(entry.values, axis, group.start_s, rate, group.rows)
         how, gain = clock.FILTER, clock.polyphase_gain(axis, rate)
     entry.noise *= gain
     entry.touched.append(f"{axis.rate_hz:.9g} Hz to {rate:.9g} Hz: {how}; noise {gain:.3f} times that of the samples")
 
 
 def rotate(groups: dict[str, PlacedGroup], mapping: Mapping, remarks: list[str]) -> None:
-    """Make x and y of pairs of probes.
+    """Convert pairs of probes to x and y.
 
     Raises:
-        InputError: Two channels that are no pair, or probes that look nearly the same way.
+        InputError: Two channels are not a pair, or the angles of two probes are nearly equal.
     """
     for number, entry in enumerate(mapping.rotate):
         a, b = entry.channels
@@ -215,21 +222,21 @@ def rotate(groups: dict[str, PlacedGroup], mapping: Mapping, remarks: list[str])
         angles = np.radians(entry.angles_deg)
         seen = np.stack([np.cos(angles), np.sin(angles)], axis=1)
         if abs(np.linalg.det(seen)) < 0.1:
-            raise InputError(f"rotate.{number}.angles_deg", "well apart (the sine of their difference 0.1 or more)",
+            raise InputError(f"rotate.{number}.angles_deg", "different (sine of the difference 0.1 or more)",
                              list(entry.angles_deg))  # fmt: skip
-        told = f"probes at {entry.angles_deg[0]:g} and {entry.angles_deg[1]:g} deg"
+        probes = f"probes at {entry.angles_deg[0]:g} and {entry.angles_deg[1]:g} deg"
         inverse = np.linalg.inv(seen)
         mixed = inverse @ np.stack([group[a].values, group[b].values])
         noises = np.hypot(*(inverse * [group[a].noise, group[b].noise]).T)
         for name, values, level in zip((a, b), mixed, noises.tolist(), strict=True):
             group[name].mix(values, noise=level)
-            group[name].touched.append(f"x and y of {told}")
-        remarks.append(f"{a} and {b} worked out of {told}")
+            group[name].touched.append(f"x and y of {probes}")
+        remarks.append(f"{a} and {b} computed from {probes}")
 
 
 @dataclass(frozen=True)
 class ImportedChannel:
-    """One channel of the recording, and where it is from."""
+    """Description of an imported channel and its origin."""
 
     name: str
     unit: str
@@ -246,35 +253,35 @@ class ImportedChannel:
     high: float
 
     def document(self) -> dict[str, Any]:
-        """As JSON."""
+        """Return the description as JSON."""
         return asdict(self)
 
 
 def quantise(
     groups: dict[str, PlacedGroup],
 ) -> tuple[ChannelTable, dict[str, np.ndarray], dict[str, np.ndarray], list[ImportedChannel]]:
-    """Channel table, int32 counts and present rows by group, and what was done to each channel."""
-    tables, counts, present, told = {}, {}, {}, []
+    """Return channel table, int32 counts and present rows by group, and a description of each channel."""
+    tables, counts, present, imported = {}, {}, {}, []
     for name, group in groups.items():
         columns, channels = [], []
         for entry in group.channels.values():
             channel, column, rule = _counts(entry, name, group.rate_hz)
             channels.append(channel)
             columns.append(column)
-            told.append(_imported(entry, channel, rule, group.rate_hz))
+            imported.append(_imported(entry, channel, rule, group.rate_hz))
         known = default_table().groups.get(next(iter(group.channels.values())).target.group)
         title = known.title if known is not None else name
         tables[name] = Group(name=name, title=title, rate_hz=channels[0].rate_hz, channels=tuple(channels))
         counts[name] = np.stack(columns, axis=1)
         present[name] = np.all([np.isfinite(entry.values) for entry in group.channels.values()], axis=0)
-    return ChannelTable(groups=tables, version=VERSION), counts, present, told
+    return ChannelTable(groups=tables, version=VERSION), counts, present, imported
 
 
 def _counts(entry: MappedSignal, group: str, rate_hz: float) -> tuple[Channel, np.ndarray, str]:
-    """A channel with its scale, and its int32 counts.
+    """Return a channel with its scale, its int32 counts, and the rule of its counts.
 
-    Integers that nobody has touched stay as they are. All else is counted in a power of two that leaves the largest
-    value between a quarter and a half of int32: half a count is at most 2^-30 of the largest value.
+    Unmodified integers are kept. Other values are scaled by a power of two that puts the largest between a quarter and
+    half of the int32 range, so that half a count is at most 2^-30 of it.
     """
     signal, values, raw, mixed = entry.signal, entry.values, entry.raw, entry.mixed
     limits = np.iinfo(np.int32)
@@ -284,16 +291,16 @@ def _counts(entry: MappedSignal, group: str, rate_hz: float) -> tuple[Channel, n
         scale = entry.gain * signal.scale
         offset = entry.gain * (signal.offset - entry.bias)
     else:
-        # Counts of a voltage count from 0 V, as a converter's do.
+        # Counts of a voltage are relative to 0 V, as those of a converter.
         offset = 0.0 if volts_per_unit is None else -entry.gain * entry.bias
         largest = float(np.nanmax(np.abs(values - offset), initial=0.0))
-        if largest and not _LEAST <= largest <= _MOST:
-            raise InputError(f"channels.{entry.name}", f"of values from {_LEAST:g} to {_MOST:g}", largest)
+        if largest and not _MIN_VALUE <= largest <= _MAX_VALUE:
+            raise InputError(f"channels.{entry.name}", f"of values from {_MIN_VALUE:g} to {_MAX_VALUE:g}", largest)
         scale = math.ldexp(1.0, math.frexp(largest)[1] - 30) if largest else math.ldexp(1.0, -30)
         scale = math.copysign(scale, 1.0 if volts_per_unit is None else volts_per_unit)
-    if not (_LEAST * 1e-10 <= abs(scale) <= _MOST and abs(offset) <= _MOST):
-        raise InputError(f"channels.{entry.name}", f"of counts from {_LEAST * 1e-10:g} to {_MOST:g}", scale)
-    # Where nothing is known of volts, a unit is told as one volt.
+    if not (_MIN_VALUE * 1e-10 <= abs(scale) <= _MAX_VALUE and abs(offset) <= _MAX_VALUE):
+        raise InputError(f"channels.{entry.name}", f"of counts from {_MIN_VALUE * 1e-10:g} to {_MAX_VALUE:g}", scale)
+    # If the voltage is unknown, one unit is represented by 1 V.
     sensitivity = volts_per_unit if volts_per_unit is not None else math.copysign(1.0, scale)
     lsb_v = abs(scale * sensitivity)
     sensitivity = lsb_v / scale
@@ -320,10 +327,10 @@ def _counts(entry: MappedSignal, group: str, rate_hz: float) -> tuple[Channel, n
     )  # fmt: skip
     channel = check(Channel, channel.model_dump(), field=f"channels.{entry.name}")
     if keeps and raw is not None:
-        return channel, raw.astype(np.int32), f"the source's own integers, {abs(channel.scale):.6g} {channel.unit} each"
+        return channel, raw.astype(np.int32), f"integers of the source, {abs(channel.scale):.6g} {channel.unit} each"
     found = np.rint((np.nan_to_num(values) - channel.offset) / channel.scale)
     if len(found) and not limits.min <= found.min() <= found.max() <= limits.max:
-        raise InputError(f"channels.{entry.name}", "in reach of its counts", float(np.nanmax(np.abs(values))))
+        raise InputError(f"channels.{entry.name}", "within the range of its counts", float(np.nanmax(np.abs(values))))
     return channel, found.astype(np.int32), f"2^{round(math.log2(abs(scale)))} {channel.unit}"
 
 
@@ -334,7 +341,7 @@ def _imported(entry: MappedSignal, channel: Channel, rule: str, rate_hz: float) 
     gain = f"{entry.gain:.9g}{ratio} * " if ratio or entry.gain != 1.0 else ""
     delay = f", {-entry.mapping.delay_us:+g} µs" if entry.mapping.delay_us else ""
     drift = (entry.axis.rate_hz / channel.rate_hz - 1.0) * 1e6
-    drift = drift if abs(drift) < _CLOCK * 1e6 and not entry.touched else 0.0
+    drift = drift if abs(drift) < _MAX_CLOCK_ERROR * 1e6 and not entry.touched else 0.0
     return ImportedChannel(
         name=entry.name, unit=channel.unit,
         source=" ".join(text for text in (entry.source.path.name, entry.entry.group, entry.entry.name) if text),

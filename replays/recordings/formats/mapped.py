@@ -1,4 +1,4 @@
-"""Mapped signals: found in their files, on their time axes, aligned, and in the channel's unit."""
+"""Mapped signals: located in their files, aligned on a common clock, and converted to the channel's unit."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from rig.base.text import nearest
 from rig.channels.table import Channel, default_table
 
 BITS = 32
-"""Of the counts of an imported channel."""
-_ROUNDING = 0.01
-"""Part by which a file may round its rate; a mapping that says another one is wrong."""
+"""Word length of the counts of an imported channel."""
+_RATE_TOLERANCE = 0.01
+"""Relative error to which a file may round its rate; a larger difference from the mapping is an error."""
 
 
 @dataclass
 class MappedSignal:
-    """A mapped signal on its way."""
+    """Mapped signal during conversion."""
 
     name: str
     mapping: ChannelMapping
@@ -38,33 +38,33 @@ class MappedSignal:
     gain: float
     """Channel unit per source unit, with sign and factor."""
     volts: float | None
-    """Volts per source unit, where it is a voltage."""
+    """Volts per source unit, if the unit is a voltage."""
     bias: float = 0.0
     values: np.ndarray = field(default_factory=lambda: np.empty(0))
-    """Engineering values, nan where missing, on its own axis, then on its group's, shape (rows,)."""
+    """Engineering values, nan if missing, first on their own axis, later on that of the group, shape (rows,)."""
     raw: np.ndarray | None = None
-    """Integers of the source where they are untouched, on the group's axis, shape (rows,)."""
+    """Unmodified integers of the source on the axis of the group, shape (rows,); None if modified."""
     mixed: bool = False
-    """It was worked out of two signals."""
+    """True if computed from two signals."""
     touched: list[str] = field(default_factory=list)
-    """What was done that changes samples."""
+    """Processing steps that changed samples."""
     missing: int = 0
     overrange: int = 0
     noise: float = 0.0
-    """Standard deviation of the noise of `values`, by what was done to them."""
+    """Standard deviation of the noise of `values`, with the processing taken into account."""
 
     def mix(self, values: np.ndarray, *, noise: float) -> None:
-        """Take values that were worked out of two signals, with their noise."""
+        """Replace the values by a combination of two signals, with its noise."""
         self.values, self.raw, self.mixed, self.noise = values, None, True, noise
 
 
 class Log:
-    """The files of one log, and what a mapping says of them.
+    """Files of one log with their mapping.
 
     Attributes:
-        mapping: What becomes what.
-        sources: The files; the first one's time is the time of all.
-        remarks: What was done to the whole, and what was assumed; grows on the way.
+        mapping: Assignment of signals to channels.
+        sources: The files; the first one's clock is the reference.
+        remarks: Processing and assumptions, in order.
     """
 
     def __init__(self, files: Sequence[Path], mapping: Mapping) -> None:
@@ -73,13 +73,17 @@ class Log:
         self.mapping = mapping
         self.sources = [open_source(path, mapping.file) for path in files]
         self.remarks = [f"{source.path.name}: {remark}" for source in self.sources for remark in source.remarks]
-        self._moves: list[tuple[str, str | None, clock.Shift]] = []  # of a file, or of a group in it
+        self._moves: list[tuple[str, str | None, clock.Shift]] = []  # by file, or by group in a file
 
     def find(self, wanted: SignalName, where: str) -> tuple[Source, Entry]:
-        """The one signal that a name means; `where` is the field that names it.
+        """Return the one signal with a name.
+
+        Args:
+            wanted: Name, and optionally group and file.
+            where: Field of the mapping, for errors.
 
         Raises:
-            InputError: There is none, or there are several.
+            InputError: No signal has the name, or several have it.
         """
         sources = self.sources
         if wanted.file is not None and all(source.path.name != wanted.file for source in sources):
@@ -96,35 +100,36 @@ class Log:
             return found[0]
         if found:
             places = ", ".join(f"{source.path.name} {entry.group}".strip() for source, entry in found)
-            raise InputError(f"{where}.group", f"given, as {wanted.source} stands in {places}", wanted.group or None)
+            raise InputError(f"{where}.group", f"set, as {wanted.source} occurs in {places}", wanted.group or None)
         if not inside:
             groups = dict.fromkeys(e.group for s in sources if wanted.file in (None, s.path.name) for e in s.entries)
-            must = f"one of {', '.join(groups)}" if any(groups) else "left out: there are no groups"
+            must = f"one of {', '.join(groups)}" if any(groups) else "omitted: the file has no groups"
             raise InputError(f"{where}.group", must, wanted.group)
         names = [entry.name for _, entry in inside]
         raise UnknownNameError(f"{where}.source", "a signal of the file", wanted.source, names)
 
     def read(self, source: Source, entry: Entry, where: str) -> tuple[FileSignal, clock.Axis]:
-        """A signal and its own time axis; nan where samples are missing from an even one.
+        """Return a signal and its time axis; nan for samples missing from an even one.
 
         Raises:
-            InputError: It is empty, nobody tells its rate, or its time stamps do not ascend.
+            InputError: The signal is empty, its rate is unknown, or its time stamps do not ascend.
         """
         signal = source.read(entry)
         if not len(signal.values):
             raise InputError(where, "a signal with values", Words(f"{entry.name}, which is empty"))
         axis = self._axis(signal, f"{entry.name} in {source.path.name}")
         if axis.numbers is not None:
-            signal = replace(signal, values=axis.placed(signal.values.astype(float)))
+            signal = replace(signal, values=axis.place_samples(signal.values.astype(float)))
         return signal, axis
 
     def _axis(self, signal: FileSignal, what: str) -> clock.Axis:
-        """The time axis of a signal, as the file or the mapping tells it."""
+        """Return the time axis of a signal, from the file or the mapping."""
         rows, time = len(signal.values), self.mapping.time
         if time.rate_hz is not None:
-            told = signal.rate_hz if signal.times_s is None else even_rate_hz(signal.times_s)
-            if told is not None and abs(told / time.rate_hz - 1.0) > _ROUNDING:
-                must = f'within {_ROUNDING:.0%} of the {told:.6g} Hz that {what} has (or file.time_column = "none")'
+            file_rate_hz = signal.rate_hz if signal.times_s is None else even_rate_hz(signal.times_s)
+            if file_rate_hz is not None and abs(file_rate_hz / time.rate_hz - 1.0) > _RATE_TOLERANCE:
+                must = f"within {_RATE_TOLERANCE:.0%} of the rate of {what}, {file_rate_hz:.6g} Hz"
+                must += ' (or set file.time_column = "none")'
                 raise InputError("time.rate_hz", must, time.rate_hz)
             first_s = signal.first_s if signal.times_s is None else float(signal.times_s[0])
             return clock.Axis(first_s, time.rate_hz, rows, note="rate from the mapping")
@@ -132,13 +137,13 @@ class Log:
             return clock.axis_of_stamps(signal.times_s, line=time.stamps == "line", what=what)
         if signal.rate_hz is not None:
             return clock.Axis(signal.first_s, signal.rate_hz, rows, note="rate from the file")
-        raise InputError("time.rate_hz", f"given, as the file tells no rate of {what}", None)
+        raise InputError("time.rate_hz", f"set, as the file has no rate for {what}", None)
 
     def take(self, name: str, wanted: ChannelMapping) -> MappedSignal:
         """Find and read the signal of a channel.
 
         Raises:
-            InputError: There is none, or its unit does not become the channel's.
+            InputError: The signal does not exist, or its unit cannot be converted to the channel's.
         """
         where = f"channels.{name}"
         source, entry = self.find(wanted, where)
@@ -147,19 +152,19 @@ class Log:
             if wanted.to is None or wanted.to_unit is None:
                 close = nearest(name, default_table().channels, most=1)
                 hint = f" (such as {close[0]})" if close else ""
-                must = f"a channel of the rig{hint}, or given with `to` (a group) and `to_unit`"
+                must = f"a channel of the rig{hint}, or one with `to` (a group) and `to_unit`"
                 raise InputError(where, must, name)
             if "/" in wanted.to or "/" in name or not wanted.to:
                 raise InputError(f"{where}.to", "a plain name", wanted.to)
-            target = _foreign(name, wanted.to, units.canonical(wanted.to_unit))
+            target = _foreign_channel(name, wanted.to, units.canonical(wanted.to_unit))
         elif wanted.to is not None or wanted.to_unit is not None:
             raise InputError(
-                f"{where}.to", f"left out, as {name} is one of the rig's channels", wanted.to or wanted.to_unit
+                f"{where}.to", f"omitted, as {name} is one of the rig's channels", wanted.to or wanted.to_unit
             )
         unit = entry.unit if wanted.unit is None else wanted.unit
         volts = units.size_si(unit) if units.kind(unit) == "voltage" else None
         if wanted.bits is not None:
-            raise InputError(f"{where}.bits", "left out: only `rig score` takes it", wanted.bits)
+            raise InputError(f"{where}.bits", "omitted, as only `rig score` uses it", wanted.bits)
         if wanted.sensitivity is not None:
             per_unit_v = units.sensitivity_v(wanted.sensitivity, target.unit, field=f"{where}.sensitivity")
             if volts is None:
@@ -167,8 +172,8 @@ class Log:
             gain = volts / per_unit_v
         else:
             if wanted.unit is None and not entry.unit and target.unit != "1":
-                raise InputError(f"{where}.unit", f"given, as {source.path.name} tells none", None)
-            # A pulse may stay in volts: only when it passes its level matters.
+                raise InputError(f"{where}.unit", f"set, as {source.path.name} has none", None)
+            # A pulse train may stay in volts: only its crossings of a level matter.
             pulse = volts is not None and target.unit == "1"
             gain = volts if pulse and volts is not None else units.factor(unit, target.unit, field=f"{where}.unit")
         signal, axis = self.read(source, entry, where)
@@ -178,12 +183,12 @@ class Log:
         )  # fmt: skip
 
     def align(self) -> None:
-        """Find how the clocks of files and groups move, in the order of the mapping.
+        """Determine the clock shift of each file and group, in the order of the mapping.
 
         Raises:
-            InputError: What they have in common is not to be found.
+            InputError: The common signal of two clocks is not found.
         """
-        self._lay_by_start()
+        self._align_start_times()
         for number, wanted_align in enumerate(self.mapping.align):
             where = f"align.{number}"
             pairs, places = [], []
@@ -210,31 +215,31 @@ class Log:
             )
 
     def on_common_clock(self, axis: clock.Axis, source: Source, entry: Entry) -> clock.Axis:
-        """The time axis of a signal on the clock of the first file."""
+        """Return the time axis of a signal on the clock of the first file."""
         for file, group, shift in self._moves:
             if file == source.path.name and group in (None, entry.group):
-                axis = axis.moved(shift.offset_s, shift.stretch)
+                axis = axis.shifted(shift.offset_s, shift.stretch)
         return axis
 
-    def _lay_by_start(self) -> None:
-        """Lay the files by the wall clocks that started them."""
+    def _align_start_times(self) -> None:
+        """Align the files by their wall-clock start times."""
         sources = self.sources
         base = sources[0].start
         for source in sources[1:]:
             if base is None or source.start is None:
                 self.remarks.append(
-                    f"{source.path.name}: taken to start with {sources[0].path.name}, before any alignment"
+                    f"{source.path.name}: assumed to start with {sources[0].path.name}, before any alignment"
                 )
                 continue
             late_s = (_utc(source.start) - _utc(base)).total_seconds()
             self._moves.append((source.path.name, None, clock.Shift(late_s, 1.0, "")))
             zones = {source.start.tzinfo is None, base.tzinfo is None}
-            unsure = " (one of them without a time zone, taken as UTC)" if len(zones) > 1 else ""
-            self.remarks.append(f"{source.path.name}: {late_s:+.6f} s by the times of day in the files{unsure}")
+            unsure = " (one of them without a time zone, read as UTC)" if len(zones) > 1 else ""
+            self.remarks.append(f"{source.path.name}: {late_s:+.6f} s by the start times in the files{unsure}")
 
 
-def _foreign(name: str, group: str, unit: str) -> Channel:
-    """A channel that is none of the rig's."""
+def _foreign_channel(name: str, group: str, unit: str) -> Channel:
+    """Return a channel that the rig does not have."""
     return Channel(
         name=name, label=name, group=group, signal="", unit=unit, si=units.size_si(unit), sensitivity_v=1.0,
         bias_v=0.0, range_v=(-1.0, 1.0), bandwidth_hz=1.0, highpass_hz=0.0, noise_v=0.0, adc_v=1.0, adc_bits=BITS,
@@ -246,13 +251,13 @@ def _utc(moment: datetime) -> datetime:
     return moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)
 
 
-def check_rows(taken: Sequence[MappedSignal]) -> None:
-    """Refuse signals without a span.
+def check_rows(signals: Sequence[MappedSignal]) -> None:
+    """Check that each signal has two values or more.
 
     Raises:
-        InputError: The first one.
+        InputError: The first one that has not.
     """
-    for entry in taken:
+    for entry in signals:
         if entry.axis.rows < 2:
             raise InputError(f"channels.{entry.name}", "a signal of two or more values", entry.axis.rows)
 
@@ -263,8 +268,8 @@ def _inside(axis: clock.Axis, mapping: Mapping) -> np.ndarray:
     return (times_s >= (-math.inf if low is None else low)) & (times_s <= (math.inf if high is None else high))
 
 
-def engineering(entry: MappedSignal, mapping: Mapping) -> None:
-    """Values in the channel's unit, with what is missing or overrange counted and seen to."""
+def convert_to_engineering(entry: MappedSignal, mapping: Mapping) -> None:
+    """Convert values to the channel's unit; count missing and overrange values and treat missing ones."""
     wanted, where = entry.mapping, f"channels.{entry.name}"
     physical = entry.signal.physical
     bad = ~np.isfinite(physical)
@@ -275,7 +280,7 @@ def engineering(entry: MappedSignal, mapping: Mapping) -> None:
         low, high = entry.signal.rails
         entry.overrange = int(((entry.signal.values <= low) | (entry.signal.values >= high)).sum())
     if bad.all():
-        raise InputError(where, "a signal with numbers in it", entry.entry.name)
+        raise InputError(where, "a signal with finite values", entry.entry.name)
     if entry.missing:
         at = int(np.argmax(bad))
         if wanted.missing == "refuse":

@@ -1,4 +1,4 @@
-"""The mapping file of `rig import`: which signal becomes which channel, and what is done to it. TOML, checked."""
+"""Mapping file of `rig import` (TOML): assignment of signals to channels, and their processing."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from rig.base.checks import check, read_toml
 from rig.base.errors import InputError
 
 _EPOCH = re.compile(r"\b(unix|epoch|posix|since|from|the|1970(-01-01)?|utc)\b", re.IGNORECASE)
-"""Words about the zero of a time, which its unit does not depend on."""
+"""Words for the origin of a time scale, which do not affect its unit."""
 _EPOCH_UNITS = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
-"""Least numbers that are no seconds since 1970 of this millennium, and what they are: 1e11 s is the year 5138, and
-1e11 ms, 1e14 us and 1e17 ns are March 1973."""
+"""Unit of epoch times by their least value. As seconds since 1970, 1e11 is the year 5138; 1e11 ms, 1e14 us and 1e17 ns
+are March 1973."""
 
 
-_ONLY_TEXT = (
+_TEXT_OPTIONS = (
     "delimiter", "decimal", "thousands", "header_line", "units_line", "first_line", "encoding", "time_format",
 )  # fmt: skip
-"""Options that mean nothing for other files."""
+"""Options that apply to text files only."""
 
 
 class _Section(BaseModel):
@@ -32,27 +32,27 @@ class _Section(BaseModel):
 
 
 class FileOptions(_Section):
-    """How a file is read, where it does not say so itself."""
+    """Options for reading a file that does not define them itself."""
 
     delimiter: str | None = None
-    """One character, or tab, comma, semicolon, space."""
+    """Delimiter: one character, or tab, comma, semicolon, space."""
     decimal: Literal[".", ","] | None = None
     thousands: Literal[",", ".", " ", "'"] | None = None
-    """What stands between groups of three digits."""
+    """Separator between groups of three digits."""
     header_line: Annotated[int, Field(ge=0)] | None = None
-    """Line of the names, from 1; 0: there is none, and the columns are called "column 1" and so on."""
+    """Line of the names, from 1; 0: no names, and columns are named "column 1" and so on."""
     units_line: Annotated[int, Field(ge=1)] | None = None
     first_line: Annotated[int, Field(ge=1)] | None = None
     """First line of data, from 1."""
     encoding: str | None = None
     missing: tuple[str, ...] = ()
-    """More texts that stand for no value."""
+    """Additional texts for a missing value."""
     time_column: str | Annotated[int, Field(ge=1)] | None = None
-    """Column of times, by name or number from 1; "none": there is none."""
+    """Time column, by name or number from 1; "none": no time column."""
     time_unit: str | None = None
-    """s, ms, us, ns, min, h, d, or datetime."""
+    """Unit of the time column: s, ms, us, ns, min, h, d, or datetime."""
     time_format: str | None = None
-    """Format of times that are neither numbers, nor ISO 8601, nor h:m:s, as for Python's strptime."""
+    """Format for Python's strptime of times that are not numbers, ISO 8601 or h:m:s."""
 
     @field_validator("delimiter")
     @classmethod
@@ -68,102 +68,102 @@ class FileOptions(_Section):
             raise ValueError("s, ms, us, ns, min, h, d or datetime")
         return unit
 
-    def only_for_text(self, path: Path) -> None:
-        """Refuse options that mean nothing for a file's format.
+    def reject_text_options(self, path: Path) -> None:
+        """Reject text-file options for a file of another format.
 
         Raises:
             InputError: The first such option.
         """
-        for name in _ONLY_TEXT:
+        for name in _TEXT_OPTIONS:
             if getattr(self, name) is not None:
                 raise InputError(f"file.{name}", f"left out with {path.suffix} files", getattr(self, name))
 
-    def time_in_s(self, name: str, told: str, first: float) -> tuple[str, float]:
-        """Return the unit of a column of times that are numbers, and its size [s].
+    def time_in_s(self, name: str, file_unit: str, first: float) -> tuple[str, float]:
+        """Return the unit of a numeric time column and its size [s].
 
-        It is as given here, else as the heading has it ("Time [ms]", "time_ms"), else seconds, but for numbers that
-        can only be a time since 1970 in ms, us or ns.
+        The unit is `time_unit`, or that of the file, or that of the heading ("Time [ms]", "time_ms"), or s. Numbers
+        that can only be times since 1970 in ms, us or ns are recognised.
 
         Args:
             name: Name of the column.
-            told: Its unit by the file; empty where it has none.
-            first: Its first number.
+            file_unit: Unit in the file; empty if it has none.
+            first: First number in the column.
 
         Raises:
-            InputError: The file's unit is none of a time, or ambiguous.
+            InputError: The unit is not a unit of time, or is ambiguous.
         """
         words = re.split(r"[ _]+", name.strip())
         named = words[1] if len(words) == 2 and units.kind(words[1]) == "time" else ""
-        unit = _EPOCH.sub("", (self.time_unit if self.time_unit != "datetime" else None) or told or named).strip()
+        unit = _EPOCH.sub("", (self.time_unit if self.time_unit != "datetime" else None) or file_unit or named).strip()
         unit = unit or next((each for least, each in _EPOCH_UNITS if least <= first), "s")
         if units.kind(unit) != "time":
-            must = "given (s, ms, us, ns, min, h, d), as the unit of the column of times is unknown or ambiguous"
-            raise InputError("file.time_unit", must, told)
+            must = "set to s, ms, us, ns, min, h or d, as the unit of the time column is unknown or ambiguous"
+            raise InputError("file.time_unit", must, file_unit)
         return units.canonical(unit), units.size_si(unit)
 
 
 class TimeOptions(_Section):
-    """The time axis of the source."""
+    """Time axis of the source."""
 
     rate_hz: PositiveFloat | None = None
-    """Sample rate [Hz], where the file tells none or a rounded one; its time stamps are then not used."""
+    """Sample rate [Hz], if the file has none or a rounded one; its time stamps are then ignored."""
     stamps: Literal["as-is", "line"] = "as-is"
-    """As they stand, or the straight line through them: samples came evenly, and only the stamps jitter."""
+    """as-is: use the time stamps; line: use their fitted line, for even sampling with jittering stamps."""
     from_s: FiniteFloat | None = None
-    """Start of what is imported, in the time of the first file [s]."""
+    """Start of the imported range, on the clock of the first file [s]."""
     to_s: FiniteFloat | None = None
-    """End of it [s]."""
+    """End of the imported range [s]."""
     start: datetime | None = None
-    """When the source's time zero was."""
+    """Wall time of the source's time zero."""
 
 
 class Resample(_Section):
-    """Another sample rate, or even samples out of uneven ones."""
+    """Resampling to another rate, or of uneven samples to even ones."""
 
     method: Literal["none", "polyphase", "linear"] = "none"
     rate_hz: Annotated[int, Field(ge=1, le=1_000_000)] | None = None
-    """Rate of the recording [Hz]; left out: that of the source."""
+    """Rate of the recording [Hz]; omitted: that of the source."""
 
 
 class SignalName(_Section):
-    """A signal of the source."""
+    """Signal of the source."""
 
     source: str
-    """Its name in the file."""
+    """Name in the file."""
     group: str | None = None
-    """The file's group that it stands in, where the name is not enough."""
+    """Group in the file, if the name is ambiguous."""
     file: str | None = None
-    """Name of the file, where there are several."""
+    """File name, if there are several files."""
 
 
 class ChannelMapping(SignalName):
-    """How one signal becomes one channel: value = sign * factor * (source - bias), in the channel's unit."""
+    """Conversion of one signal to one channel: value = sign * factor * (source - bias), in the channel's unit."""
 
     unit: str | None = None
-    """Unit of the source; left out: as the file tells. For `rig score` also FS: fractions of the converter's range."""
+    """Unit of the source; omitted: as in the file. `rig score` also accepts FS, fractions of the converter's range."""
     bits: Annotated[int, Field(ge=8, le=32)] | None = None
-    """Of whole numbers that a converter has, in place of a unit; only for `rig score`."""
+    """Word length of a converter's integers, used instead of a unit; only for `rig score`."""
     sensitivity: str | None = None
-    """For a source in volts, such as "7.87 V/mm" or "200 mV/mil"."""
+    """Sensitivity of a source in volts, such as "7.87 V/mm" or "200 mV/mil"."""
     sign: Literal[1, -1] = 1
     factor: FiniteFloat = 1.0
-    """Anything else to multiply by."""
+    """Additional factor."""
     bias: FiniteFloat | Literal["mean"] = 0.0
-    """Source value at zero, in its unit, or the mean of what is imported."""
+    """Source value at zero, in its unit, or the mean of the imported range."""
     delay_us: FiniteFloat = 0.0
-    """How late the source shows what happened [us]: a filter, a multiplexer."""
+    """Delay of the source [us], for example of a filter or a multiplexer."""
     bandwidth_hz: PositiveFloat | None = None
-    """Corner of the low-pass before the converter [Hz]; left out: half of the rate, as nothing is known of it."""
+    """Corner of the anti-aliasing low-pass [Hz]; omitted: half of the rate is assumed."""
     highpass_hz: Annotated[FiniteFloat, Field(ge=0.0)] = 0.0
     """Corner of an AC coupling [Hz]; 0: none."""
     full_scale: PositiveFloat | None = None
-    """Source value (its amount, in its unit) from which on a sample counts as overrange."""
+    """Source value (absolute, in its unit) from which a sample counts as overrange."""
     missing: Literal["gap", "hold", "refuse"] = "gap"
-    """Values that are no numbers: their rows are left out, the last good value stands in, or the import is refused."""
+    """Missing values: gap omits their rows, hold repeats the last valid value, refuse stops the import."""
     to: str | None = None
-    """Sensor group of a channel that is none of the rig's own, ..."""
+    """Sensor group of a channel that the rig does not have."""
     to_unit: str | None = None
-    """... and its unit."""
+    """Unit of a channel that the rig does not have."""
     label: str | None = None
 
     @field_validator("factor")
@@ -175,80 +175,80 @@ class ChannelMapping(SignalName):
 
 
 class Defaults(_Section):
-    """What holds for all channels that do not say it themselves."""
+    """Defaults for channels that do not set the value themselves."""
 
     bandwidth_hz: PositiveFloat | None = None
-    """Corner of the low-pass before the converter [Hz]."""
+    """Corner of the anti-aliasing low-pass [Hz]."""
 
 
 class Rotate(_Section):
-    """Two probes at any two angles as horizontal and vertical."""
+    """Conversion of two probes at any two angles to horizontal and vertical."""
 
     channels: tuple[str, str]
-    """The channels that the two probes are mapped to; they become x and y."""
+    """Channels of the two probes; they become x and y."""
     angles_deg: tuple[FiniteFloat, FiniteFloat]
-    """Where each probe sits: direction of its positive values, from x (EAST) toward y (up) [degrees]."""
+    """Angle of each probe: direction of positive values, from x (EAST) toward y (up) [degrees]."""
 
 
 class Align(_Section):
-    """Brings two clocks together by what both have recorded."""
+    """Alignment of two clocks by a signal that both recorded."""
 
     reference: SignalName
     moved: SignalName
-    """Everything in the file of this signal moves, or everything in its group with scope "group"."""
+    """Signal whose file (or whose group, with scope "group") is moved."""
     scope: Literal["file", "group"] = "file"
     method: Literal["edge", "correlation"] = "edge"
     threshold: FiniteFloat | None = None
-    """Level of the edge, in both signals' own unit; left out: half way between the lowest and the highest value."""
+    """Level of the edge, in the unit of both signals; omitted: midway between the lowest and the highest value."""
     within_s: PositiveFloat = 10.0
-    """Largest shift to look for [s]."""
+    """Largest shift to search [s]."""
 
 
 class KeyphasorMapping(SignalName):
-    """The pulse train that becomes the exact edges."""
+    """Pulse train that gives the keyphasor edges."""
 
     threshold: FiniteFloat | None = None
-    """Level of the edge in the signal's unit; left out: half way between the lowest and the highest value."""
+    """Level of the edge in the signal's unit; omitted: midway between the lowest and the highest value."""
     edge: Literal["rising", "falling"] = "rising"
     hysteresis: Annotated[FiniteFloat, Field(ge=0.0)] | None = None
-    """How far the signal must fall back before the next edge counts; left out: a tenth of its extent."""
+    """Distance by which the signal must fall back before the next edge counts; omitted: a tenth of its range."""
     pulses_per_turn: Annotated[int, Field(ge=1)] = 1
 
 
 class HammerMapping(_Section):
-    """Pulses of the hammer, found in the channel `hammer`."""
+    """Detection of hammer pulses in the channel `hammer`."""
 
     threshold_n: PositiveFloat = 10.0
-    """Force from which on it is a hammer pulse [N]."""
+    """Force from which a hammer pulse counts [N]."""
     dead_s: PositiveFloat | None = None
-    """Time after a hammer pulse in which no other one counts [s]; left out: 0.1, but for a pulse clearly of its own."""
+    """Dead time after a hammer pulse [s]; omitted: 0.1, except for a pulse that is clearly separate."""
     pre_s: Annotated[FiniteFloat, Field(ge=0.0)] | None = None
-    """The recording begins so long before the first hammer pulse [s]."""
+    """Time from the start of the recording to the first hammer pulse [s]."""
     delay_us: FiniteFloat = 0.0
-    """How late the channel shows it [us], as by a filter; only the hammer pulse's time changes, no sample moves."""
+    """Delay of the channel [us], for example of a filter; corrects the time of hammer pulses, not the samples."""
     direction: str | float = "x"
-    """Where it hits, as in a scene."""
+    """Direction of the impact, as in a scene."""
 
 
 class ExperimentMapping(_Section):
-    """What was done, as a scene, so that it can be simulated."""
+    """Experiment as a scene that can be simulated."""
 
     scene: str
-    """Name of a scene, or the path of a file."""
+    """Name of a scene, or path of a file."""
     set: dict[str, Any] = {}
     """Changes of the scene or its parameters, by dotted key."""
     speed_hz: FiniteFloat | Literal["measured"] | None = None
-    """Speed of the drive [Hz]; measured: by the channel `speed`, the edges, or the probes, before the first pulse. Left
-    out: the scene's."""
+    """Drive speed [Hz]; measured: from the channel `speed`, the edges or the probes, before the first pulse; omitted:
+    that of the scene."""
     commands: tuple[dict[str, Any], ...] | Literal["scene", "detected"] = "scene"
-    """Commands with at_s in the recording's time; those of the scene; or the hammer pulses that were found."""
+    """Commands with at_s in the recording's time, those of the scene, or the detected hammer pulses."""
     lead_s: Annotated[FiniteFloat, Field(ge=0.0, le=60.0)] | None = None
-    """The scene began so long before the first sample [s]. Left out: with the first sample; where commands are not the
-    scene's own, the rig was running before, and where its shaft was, the samples tell."""
+    """Time from the start of the scene to the first sample [s]; omitted: 0. With commands other than the scene's, the
+    rig was already running, and the initial state of the shaft is taken from the samples."""
 
 
 class Mapping(_Section):
-    """A mapping file."""
+    """Mapping file."""
 
     file: FileOptions = FileOptions()
     time: TimeOptions = TimeOptions()
@@ -262,7 +262,7 @@ class Mapping(_Section):
     experiment: ExperimentMapping | None = None
 
     def document(self) -> dict[str, Any]:
-        """As JSON, without what is left at its default."""
+        """Return the mapping as JSON, without defaults."""
         return json.loads(self.model_dump_json(exclude_defaults=True))
 
 
@@ -270,20 +270,20 @@ def load_mapping(path: Path) -> Mapping:
     """Read and check a mapping file.
 
     Raises:
-        InputError: The first thing that is wrong, with file and field.
+        InputError: The first error, with file and field.
     """
     return parse_mapping(read_toml(path), name=path.name)
 
 
 def parse_mapping(data: dict[str, Any], *, name: str) -> Mapping:
-    """Check a mapping, and give its channels what holds for all.
+    """Check a mapping, and apply its defaults to the channels.
 
     Args:
-        data: As it stands in TOML.
-        name: What errors call it.
+        data: Content of the TOML file.
+        name: Name of the file, for errors.
 
     Raises:
-        InputError: The first thing that is wrong, with its field.
+        InputError: The first error, with its field.
     """
     try:
         mapping = check(Mapping, data, field="")
@@ -300,15 +300,15 @@ def parse_mapping(data: dict[str, Any], *, name: str) -> Mapping:
         raise InputError(f"{name}: hammer", "left out without a channel `hammer` under [channels]", "[hammer]")
     experiment = mapping.experiment
     if experiment is not None and experiment.commands == "detected" and mapping.hammer is None:
-        raise InputError(f"{name}: experiment.commands", "used with a table [hammer]", "detected")
+        raise InputError(f"{name}: experiment.commands", "used together with a table [hammer]", "detected")
     if mapping.defaults.bandwidth_hz is None:
         return mapping
     corner = {"bandwidth_hz": mapping.defaults.bandwidth_hz}
-    told = {
+    channels = {
         channel: entry if entry.bandwidth_hz is not None else entry.model_copy(update=corner)
         for channel, entry in mapping.channels.items()
     }
-    for channel, entry in told.items():
+    for channel, entry in channels.items():
         if mapping.channels[channel].bandwidth_hz is None:
-            entry.model_fields_set.discard("bandwidth_hz")  # no word of its own: the import holds it against the rate
-    return mapping.model_copy(update={"channels": told})
+            entry.model_fields_set.discard("bandwidth_hz")  # still counts as a default in later checks
+    return mapping.model_copy(update={"channels": channels})

@@ -1,4 +1,4 @@
-"""Files of other measuring systems as signals: what is in them, and the values of each, whatever the format."""
+"""Access to files of other measuring systems: list of signals and their values, independent of the format."""
 
 from __future__ import annotations
 
@@ -30,48 +30,48 @@ def _check_ending(text: str) -> str:
 
 
 class Format(NamedTuple):
-    """A file format that is read, and perhaps written.
+    """File format that can be read, and possibly written.
 
     Another package adds one by an entry point of the group `rig.formats` that refers to a `Format`.
     """
 
     title: str
-    """Name in words."""
+    """Display name."""
     suffixes: Annotated[tuple[Annotated[str, AfterValidator(_check_ending)], ...], Field(min_length=1)]
-    """Endings of its files, in lower case; one that is written ends in the first."""
+    """File suffixes in lower case; written files have the first."""
     module: str
-    """Where `look_into(path, options)` returns a file's `Source`."""
+    """Module whose `look_into(path, options)` returns a file's `Source`."""
     writer: str = ""
-    """Class in that module that writes it (`exporting.export.FormatWriter`); empty: it is read only."""
+    """Class in that module that writes the format (`exporting.export.FormatWriter`); empty: read only."""
 
 
-_OWN = "replays.recordings.formats.readers"
+_READERS_PACKAGE = "replays.recordings.formats.readers"
 FORMATS = {
-    "mdf": Format("MDF", (".mf4", ".mdf", ".dat"), f"{_OWN}.mdf", "MdfWriter"),
-    "tdms": Format("TDMS", (".tdms",), f"{_OWN}.tdms", "TdmsWriter"),
-    "uff": Format("universal (UFF)", (".uff", ".unv"), f"{_OWN}.uff", "UffWriter"),
-    "text": Format("text", (".csv", ".txt", ".asc", ".tsv", ".lvm"), f"{_OWN}.delimited", "CsvWriter"),
-    "parquet": Format("Parquet", (".parquet",), f"{_OWN}.columnar", "ParquetWriter"),
-    "wav": Format("WAV", (".wav",), f"{_OWN}.wav", "WavWriter"),
+    "mdf": Format("MDF", (".mf4", ".mdf", ".dat"), f"{_READERS_PACKAGE}.mdf", "MdfWriter"),
+    "tdms": Format("TDMS", (".tdms",), f"{_READERS_PACKAGE}.tdms", "TdmsWriter"),
+    "uff": Format("universal (UFF)", (".uff", ".unv"), f"{_READERS_PACKAGE}.uff", "UffWriter"),
+    "text": Format("text", (".csv", ".txt", ".asc", ".tsv", ".lvm"), f"{_READERS_PACKAGE}.delimited", "CsvWriter"),
+    "parquet": Format("Parquet", (".parquet",), f"{_READERS_PACKAGE}.columnar", "ParquetWriter"),
+    "wav": Format("WAV", (".wav",), f"{_READERS_PACKAGE}.wav", "WavWriter"),
 }
-"""Our own formats by name."""
+"""Built-in formats by name."""
 
 
 @cache
 def formats() -> dict[str, Format]:
-    """Our formats, then those of other packages, by name."""
+    """Return built-in formats, then those of other packages, by name."""
     return FORMATS | _extensions()[0]
 
 
 @cache
 def _extensions() -> tuple[dict[str, Format], list[str]]:
     found, broken = load_extensions("rig.formats", Format, FORMATS)
-    taken = {suffix for each in FORMATS.values() for suffix in each.suffixes}
+    suffixes_in_use = {suffix for each in FORMATS.values() for suffix in each.suffixes}
     for name, form in list(found.items()):
-        if twice := taken.intersection(form.suffixes):
-            broken.append(f"{name} ({', '.join(sorted(twice))} is the ending of another format)")
+        if renamed := suffixes_in_use.intersection(form.suffixes):
+            broken.append(f"{name} ({', '.join(sorted(renamed))} is the ending of another format)")
             del found[name]
-        taken.update(form.suffixes)
+        suffixes_in_use.update(form.suffixes)
     return found, broken
 
 
@@ -85,36 +85,36 @@ def load_format(form: Format) -> Any:
         module = importlib.import_module(form.module)
     except RefusedError:
         raise
-    except (Exception, SystemExit) as error:  # whatever other people's code raises
+    except (Exception, SystemExit) as error:  # other packages may raise anything
         raise RefusedError(f"{form.title} files need {form.module}, which fails: {describe_error(error)}") from None
     for name in ("look_into", form.writer):
         if name and not callable(getattr(module, name, None)):
-            raise RefusedError(f"{form.title} files need {name} in {form.module}, which has none")
+            raise RefusedError(f"{form.title} files need {name} in {form.module}, which lacks it")
     return module
 
 
-_MOST_ABOUT = 2000
-"""Longest text that is taken over of what a file tells of itself [characters]; longer ones are documents."""
+_MAX_PROPERTY_LENGTH = 2000
+"""Longest file property that is copied [characters]; longer ones are documents."""
 DOCUMENTS = ("catalogue.json", "parameters.json", "scene.json")
-"""What `rig export` attaches."""
+"""Documents that `rig export` attaches."""
 MAX_RATE_HZ = 1e9
-"""Highest sample rate of a file: one by time stamps in ns [Hz]."""
-_MOST_S = 1e12
+"""Highest sample rate [Hz], given by time stamps in ns."""
+_MAX_TIME_S = 1e12
 
 
 @dataclass(frozen=True)
 class Entry:
-    """One signal in a file, before its values are read.
+    """Signal in a file, before its values are read.
 
     Attributes:
-        name: Its name in the file.
-        group: The file's group that it stands in; empty where there are none.
-        unit: Unit as the file spells it; empty where it tells none.
+        name: Name in the file.
+        group: Group in the file; empty if the file has no groups.
+        unit: Unit as spelled in the file; empty if the file has none.
         rows: Number of values.
-        rate_hz: Rate that the file tells, or that its time stamps have [Hz]; None where it tells neither.
-        place: Where the reader finds it.
-        label: What the file says about it.
-        group_number: Number of the group in the file, from 0.
+        rate_hz: Rate in the file or of its time stamps [Hz]; None if it has neither.
+        place: Position of the signal, for the reader.
+        label: Description in the file.
+        group_number: Index of the group in the file, from 0.
     """
 
     name: str
@@ -129,16 +129,16 @@ class Entry:
 
 @dataclass(frozen=True)
 class FileSignal:
-    """The values of one signal.
+    """Values of one signal.
 
     Attributes:
-        values: Numbers as they stand in the file, integer or float64, shape (n,).
-        scale: Physical value of one of them, ...
-        offset: ... and physical value of zero: `physical` applies both.
-        times_s: Time stamp of each from the file's start [s], shape (n,); None for an even rate.
-        rate_hz: The even rate [Hz], if the file tells one.
+        values: Numbers as stored in the file, integer or float64, shape (n,).
+        scale: Physical value per stored unit; `physical` applies scale and offset.
+        offset: Physical value of a stored 0.
+        times_s: Time of each value from the file's start [s], shape (n,); None for an even rate.
+        rate_hz: Even rate [Hz], if the file has one.
         first_s: Time of the first value from the file's start [s].
-        rails: Numbers at which the converter was at its end, where the file tells.
+        rails: Stored numbers at which the converter saturated, if known.
     """
 
     values: np.ndarray
@@ -160,19 +160,19 @@ class FileSignal:
 
 @dataclass(frozen=True)
 class Source:
-    """A file of another measuring system.
+    """File of another measuring system.
 
     Attributes:
         path: The file.
-        format: What it is, in words.
+        format: Name of the format.
         entries: Its signals.
-        read: Reads the values of one of them.
-        pieces: Reads some that have the same stamps, row after row in pieces; None: this format is read whole.
-        start: When its time zero was, if it tells.
-        about: What it tells of itself.
-        documents: The rig's own by name, as text, where `rig export` has made the file.
-        remarks: What had to be assumed to read it.
-        options: What the mapping has to say of the file so that it is read so again.
+        read: Function that reads the values of one signal.
+        pieces: Function that reads signals with common time stamps in pieces; None: the format is read whole.
+        start: Wall time of the file's time zero, if known.
+        about: Properties stored in the file.
+        documents: The rig's own documents as text, by name, if `rig export` wrote the file.
+        remarks: Assumptions made by the reader.
+        options: Options that the mapping needs to read the file the same way.
     """
 
     path: Path
@@ -188,10 +188,10 @@ class Source:
 
 
 def open_source(path: Path, options: FileOptions) -> Source:
-    """Look into a file.
+    """Open a file and list its signals.
 
     Raises:
-        InputError: It cannot be read, is no such file, or the library for it is missing.
+        InputError: The file cannot be read, has another format, or its library is missing.
     """
     suffix = path.suffix.lower()
     form = next((each for each in formats().values() if suffix in each.suffixes), None)
@@ -206,18 +206,18 @@ def open_source(path: Path, options: FileOptions) -> Source:
     except OSError as error:
         raise unreadable(path, error) from None
     if empty:
-        raise InputError("file", "a file with something in it", str(path))
+        raise InputError("file", "a file that is not empty", str(path))
     if form is not FORMATS["text"]:
-        options.only_for_text(path)
+        options.reject_text_options(path)
     what, module = form.title, load_format(form)
     with _parsing(path, what):
         source = module.look_into(path, options)
         if not isinstance(source, Source):
-            raise TypeError(f"{form.module}.look_into returns {type(source).__name__}, no Source")
+            raise TypeError(f"{form.module}.look_into returns {type(source).__name__}, not Source")
     if not source.entries:
-        raise InputError("file", "a file with signals in it", str(path))
+        raise InputError("file", "a file with signals", str(path))
     if not any(entry.rows for entry in source.entries):
-        raise InputError("file", "a file with rows of values", Words(f"{path}, which has columns without a row"))
+        raise InputError("file", "a file with rows of values", Words(f"{path}, which has columns but no rows"))
 
     def read(entry: Entry) -> FileSignal:
         where = f"{what} (signal {entry.name})"
@@ -239,34 +239,34 @@ def open_source(path: Path, options: FileOptions) -> Source:
         for entry in source.entries
     )
     distinct = _distinct(entries)
-    twice = [
-        f"several are named {one.name!r}: this one is {new.name!r}"
+    renamed = [
+        f"several signals are named {one.name!r}; one is renamed to {new.name!r}"
         for one, new in zip(entries, distinct, strict=True)
         if one.name != new.name
     ]
-    about = {key: text for key, text in source.about.items() if len(text) <= _MOST_ABOUT}
+    about = {key: text for key, text in source.about.items() if len(text) <= _MAX_PROPERTY_LENGTH}
     documents = {name: source.about[name] for name in DOCUMENTS if name in source.about} or _beside(path)
     return replace(
         source, entries=distinct, read=read, pieces=source.pieces and pieces, about=about, documents=documents,
-        remarks=(*source.remarks, *twice),
+        remarks=(*source.remarks, *renamed),
     )  # fmt: skip
 
 
 def _beside(path: Path) -> dict[str, str]:
-    """The rig's documents in FILE.json, where `rig export` puts them beside a format without a place for them."""
+    """Return the rig's documents from FILE.json, where `rig export` writes them for formats without metadata."""
     try:
         with open_file(path.with_name(path.name + ".json")) as file:
-            told = read_json(file.read(DOCUMENT_BYTES + 1)).get("documents")
-    except (OSError, InputError):  # there is none, or it is another program's
+            attached = read_json(file.read(DOCUMENT_BYTES + 1)).get("documents")
+    except (OSError, InputError):  # missing, or written by another program
         return {}
-    found = told if isinstance(told, dict) else {}
+    found = attached if isinstance(attached, dict) else {}
     kinds = {name: found.get(name.removesuffix(".json")) for name in DOCUMENTS}
     return {name: json.dumps(document) for name, document in kinds.items() if isinstance(document, dict)}
 
 
 @contextmanager
 def _parsing(path: Path, what: str) -> Iterator[None]:
-    """Whatever a library raises on a file that it cannot read, for want of memory too, becomes the one line."""
+    """Turn any error of a library on an unreadable file, including lack of memory, into one line."""
     try:
         yield
     except InputError:
@@ -276,7 +276,7 @@ def _parsing(path: Path, what: str) -> Iterator[None]:
 
 
 def _check(signal: FileSignal) -> None:
-    """See that the numbers of a signal are such that a measurement can have.
+    """Check that the numbers of a signal are plausible for a measurement.
 
     Raises:
         ValueError: They are not.
@@ -288,14 +288,14 @@ def _check(signal: FileSignal) -> None:
         raise ValueError(f"a rate of {signal.rate_hz} Hz")
     if not (math.isfinite(signal.scale) and signal.scale and math.isfinite(signal.offset)):
         raise ValueError(f"a scale of {signal.scale}, an offset of {signal.offset}")
-    if not abs(signal.first_s) <= _MOST_S:
-        raise ValueError(f"a beginning at {signal.first_s} s")
-    if times_s is not None and not (times_s.shape == values.shape and bool((np.abs(times_s) <= _MOST_S).all())):
-        raise ValueError(f"time stamps that are no numbers up to {_MOST_S:g} s, one a row")
+    if not abs(signal.first_s) <= _MAX_TIME_S:
+        raise ValueError(f"a start time of {signal.first_s} s")
+    if times_s is not None and not (times_s.shape == values.shape and bool((np.abs(times_s) <= _MAX_TIME_S).all())):
+        raise ValueError(f"time stamps that are not finite numbers up to {_MAX_TIME_S:g} s, one per row")
 
 
 def _distinct(entries: tuple[Entry, ...]) -> tuple[Entry, ...]:
-    """The same with a number behind a name that a group has twice."""
+    """Return the entries with a number appended to names that repeat in a group."""
     seen: dict[tuple[str, str], int] = {}
     found = []
     for entry in entries:
@@ -306,19 +306,19 @@ def _distinct(entries: tuple[Entry, ...]) -> tuple[Entry, ...]:
 
 
 def library(what: str, name: str, module: str | None = None) -> Any:
-    """An optional library.
+    """Import an optional library.
 
     Args:
-        what: The format that it is for.
-        name: What pip knows it by.
-        module: What Python knows it by, if that is another name.
+        what: Format that needs it.
+        name: Package name for pip.
+        module: Module name for Python, if different.
 
     Raises:
-        RefusedError: It is not installed, or fails when it is imported.
+        RefusedError: It is not installed, or its import fails.
     """
     try:
         return importlib.import_module(module or name)
-    except Exception as error:  # whatever a broken installation raises
+    except Exception as error:  # a broken installation may raise anything
         need = f"{what} files need the package {name}, which is"
         if isinstance(error, ModuleNotFoundError) and error.name == (module or name):
             line = f"{need} not installed: pip install 'rotor-stator-rig[formats]'"
@@ -329,13 +329,13 @@ def library(what: str, name: str, module: str | None = None) -> Any:
 
 
 def damaged(path: Path, what: str, error: BaseException | str) -> InputError:
-    """The one line for whatever a library raises on a file that it cannot read."""
+    """Return the one-line error for a file that a library cannot read."""
     text = error if isinstance(error, str) else describe_error(error)
     return InputError("file", f"an intact {what} file", Words(f"{path} ({text})"[:300]))
 
 
 def even_rate_hz(times_s: np.ndarray, rows: int | None = None) -> float | None:
-    """Return the mean rate of time stamps [Hz]; None where they do not ascend, or faster than a rate can be.
+    """Return the mean rate of time stamps [Hz]; None if they do not ascend, or the rate exceeds the limit.
 
     Args:
         times_s: The stamps, or the first and last of them [s], shape (n,).

@@ -1,4 +1,4 @@
-"""Numbers of the rig from a recording, with what they are worth."""
+"""Identification of the rig's parameters from a recording, with confidence intervals."""
 
 from __future__ import annotations
 

@@ -14,10 +14,10 @@ from rig.physics.parameters import DEFAULT_SET, Parameter, load_parameters, set_
 
 
 def fitted_set(found: Identification, *, recording: str) -> str:
-    """The parameter set, TOML: what the experiment ran on, with what was identified in its place.
+    """Return the parameter set as TOML: the set of the experiment with the identified values replaced.
 
-    Only identified values are results. What the recording does not tell stays as it was; of values that it tells only
-    together, all are written as the fit left them, which says so.
+    Values that are not seen keep their start. Values that are only seen together are all written as fitted, with a
+    note.
     """
     scene = found.question.experiment.scene
     base = scene.parameters if scene.parameters in set_names() else DEFAULT_SET
@@ -37,32 +37,32 @@ def fitted_set(found: Identification, *, recording: str) -> str:
             continue
         if finding.standing == "not seen":
             if finding.unknown.rule is None and finding.unknown.start != before[key].value:
-                source = f"not seen in {recording}, {span}: as the search began"
+                source = f"not seen in {recording}, {span}: start value"
                 lines += _entry(key, entry, value=finding.unknown.start, kind="assumed", source=source)
             continue
         unit = "" if entry.unit == "1" else f" {entry.unit}"
-        told = f"95 % interval +-{finding.half_width:.3g}{unit}" if math.isfinite(finding.half_width) else ""
-        told = told or f"no interval of its own, {finding.words}"
-        source = f"rig identify, {recording}, {span}: {told}"
+        interval = f"95 % interval +-{finding.half_width:.3g}{unit}" if math.isfinite(finding.half_width) else ""
+        interval = interval or f"no interval of its own, {finding.words}"
+        source = f"rig identify, {recording}, {span}: {interval}"
         lines += _entry(key, entry, value=finding.value, kind="fitted", source=source)
     other = [finding for key, finding in fitted.items() if key not in before]
     if other:
-        lines += ["", "# No parameters, and so not part of the set:"]
+        lines += ["", "# Not parameters, and therefore not part of the set:"]
         lines += [f"# {one.unknown.key} = {one.value:.8g} {one.unknown.unit}: {one.words}" for one in other]
     return "\n".join(lines) + "\n"
 
 
 def check_set(path: Path, *, force: bool) -> None:
-    """Refuse a file that no set can be written to, before anything is computed.
+    """Check that a set can be written to a file, before anything is computed.
 
     Raises:
-        InputError: Another suffix, a folder that is missing, or an existing file.
+        InputError: Another suffix, a missing folder, or an existing file.
     """
     check_new_file(path, field="output", suffixes=(".toml",), force=force)
 
 
 def write_set(text: str, path: Path) -> None:
-    """Write a set to a file that is whole and can be loaded, or not there."""
+    """Write a set to a file atomically, after a test that it can be loaded."""
     with TemporaryDirectory() as folder:  # a draft has not the ending by which a set is known
         named = Path(folder) / path.name
         named.write_text(text, encoding="utf-8")
@@ -72,7 +72,7 @@ def write_set(text: str, path: Path) -> None:
 
 
 def identification_document(found: Identification, *, recording: str) -> dict[str, Any]:
-    """Everything found, as a JSON document; what is no number there is null."""
+    """Return all results as a JSON document; non-finite numbers are null."""
     judgement = found.judgement
     return {
         "recording": recording,

@@ -1,7 +1,7 @@
-"""How far ahead the model can be trusted to be linear in what is not known yet.
+"""Time up to which the model is linear in the remaining uncertainty.
 
-Through impacts a small error grows, and far ahead the distance to the recording has many valleys. Where the response
-to the remaining uncertainty is still nearly a straight line, there is one.
+Impacts amplify small errors, so that over a long window the cost has many minima. While the response to the remaining
+uncertainty is nearly linear, there is only one.
 """
 
 from __future__ import annotations
@@ -13,24 +13,24 @@ import numpy as np
 from replays.recordings.identification.window import Window
 from rig.base.errors import InputError, SimulationError
 
-BENT = 0.1
-"""A response is no longer linear where its bend is above this part of it ..."""
-NOTICEABLE = 3.0
-"""... and above this many times the noise, summed in squares over a bin."""
-SIGMAS = 2.0
-"""The response to an error of so many standard deviations."""
-_PARTS = (1.0, 0.5, 0.25, 0.1)
+MAX_NONLINEARITY = 0.1
+"""A response is nonlinear if its second-order part exceeds this fraction of the linear part."""
+MIN_NONLINEARITY = 3.0
+"""The second-order part must also exceed this multiple of the noise, as root sum of squares over a bin."""
+TEST_SIGMAS = 2.0
+"""Size of the error whose response is tested, in standard deviations."""
+_CHANGE_FRACTIONS = (1.0, 0.5, 0.25, 0.1)
 _BIN_S = 5e-4
 
 
 @dataclass(frozen=True)
 class Horizon:
-    """Up to where the response is linear.
+    """Limit of the linear response.
 
     Attributes:
         time_s: Simulated time [s].
-        whole: Whether it is linear through all of the window.
-        by: The unknown that has most part in the direction that bends first.
+        whole: True if the response is linear in the whole window.
+        by: Unknown with the largest part in the direction that first becomes nonlinear.
     """
 
     time_s: float
@@ -38,13 +38,13 @@ class Horizon:
     by: str = ""
 
 
-def horizon(window: Window, z: np.ndarray, covariance: np.ndarray) -> Horizon:
-    """Up to where the response to errors of the present size is linear.
+def find_horizon(window: Window, z: np.ndarray, covariance: np.ndarray) -> Horizon:
+    """Return the time up to which the response to errors of the present size is linear.
 
     Args:
-        window: As far as it is looked ahead.
-        z: Present values.
-        covariance: Of them, shape (unknowns, unknowns).
+        window: Window that includes the look-ahead.
+        z: Present values, shape (unknowns,).
+        covariance: Covariance of z, shape (unknowns, unknowns).
     """
     question = window.question
     times_s = question.observation.times_s[: window.rows]
@@ -54,24 +54,24 @@ def horizon(window: Window, z: np.ndarray, covariance: np.ndarray) -> Horizon:
     first, by = window.rows, ""
     sizes, directions = np.linalg.eigh(covariance)
     for size, direction in zip(sizes, directions.T, strict=True):
-        change = SIGMAS * np.sqrt(max(size, 0.0)) * direction
+        change = TEST_SIGMAS * np.sqrt(max(size, 0.0)) * direction
         name = question.keys[int(np.argmax(np.abs(direction)))]
-        for part in _PARTS:  # near the edge of what the model takes, a smaller change tells of the whole one
+        for part in _CHANGE_FRACTIONS:  # at the limits of the model a smaller change is scaled up
             try:
                 up, down = window.predicted(z + part * change), window.predicted(z - part * change)
             except (InputError, SimulationError):
                 continue
             break
         else:
-            continue  # at the edge there is only one side
-        slope, bend = (up - down) / (2.0 * part), ((up + down) / 2.0 - base) / part**2
-        slope, bend = (
+            continue  # at a limit there is only one side
+        slope, curvature = (up - down) / (2.0 * part), ((up + down) / 2.0 - base) / part**2
+        slope, curvature = (
             np.sqrt(np.add.reduceat((np.where(window.known, part, 0.0) ** 2).sum(axis=1), starts))
-            for part in (slope, bend)
+            for part in (slope, curvature)
         )
-        bent = np.flatnonzero((bend > BENT * slope) & (bend > NOTICEABLE))
-        if len(bent) and starts[bent[0]] < first:
-            first, by = int(starts[bent[0]]), name
+        nonlinear = np.flatnonzero((curvature > MAX_NONLINEARITY * slope) & (curvature > MIN_NONLINEARITY))
+        if len(nonlinear) and starts[nonlinear[0]] < first:
+            first, by = int(starts[nonlinear[0]]), name
     if first == window.rows:
         return Horizon(window.end_s, whole=True)
     return Horizon(float(times_s[first]), whole=False, by=by)

@@ -1,4 +1,4 @@
-"""What a fit is worth: intervals, what cannot be told apart, and whether the model explains the recording at all."""
+"""Assessment of a fit: intervals, unknowns that cannot be separated, and whether the model explains the recording."""
 
 from __future__ import annotations
 
@@ -14,38 +14,38 @@ from replays.recordings.identification.window import Window
 
 Standing = Literal["identified", "not seen", "only together", "at its bound", "not explained"]
 
-_FITS = 0.03
-"""By so much may the sum of squares a degree of freedom be above 1 beside chance: noise is not known better, ..."""
-_CHANCE = 5.0
-"""... and by so many of its standard deviations is chance."""
-_ALONG = 2.0
-"""What the model lacks may act along the unknowns by so many times what it does across them, which is seen: with a
-correlation of up to 0.9 between the two."""
-_NOTED = 3.0
-"""What is missing is noted from so many standard deviations of the sum of squares on."""
-_LEAST_ROWS = 100
-"""Samples at least over which it is looked for."""
-_NAMED = 0.1
-"""Least part in a direction for an unknown to be named."""
-_ALIKE = 0.99
-"""Correlation from which two unknowns are called hard to tell apart."""
-_STRETCHES = (1.0, 1.5, 2.0, 3.0, 5.0, 8.0, 12.0)
-"""By what an interval is widened, step by step, where the response bends."""
+_CHI2_TOLERANCE = 0.03
+"""Allowed excess of the sum of squares per degree of freedom over 1, as the noise is not known better."""
+_CHI2_SIGMAS = 5.0
+"""Standard deviations of the sum of squares that are allowed as chance."""
+_ERROR_RATIO = 2.0
+"""Ratio of the assumed effect of model errors along the unknowns to the observed one across them; it corresponds to a
+correlation of 0.9 between the two."""
+_ERROR_SIGMAS = 3.0
+"""Standard deviations of the sum of squares from which a model error is counted."""
+_MIN_ROWS = 100
+"""Minimum number of samples in a test for model errors."""
+_MIN_PART = 0.1
+"""Smallest component in a direction for an unknown to be named."""
+_MAX_CORRELATION = 0.99
+"""Correlation from which two unknowns are reported as hard to separate."""
+_WIDENINGS = (1.0, 1.5, 2.0, 3.0, 5.0, 8.0, 12.0)
+"""Factors by which an interval is widened in turn if the response is not linear."""
 _DRAWS = 40_000
 _LAGS = 20
-"""How many samples apart residuals are held against each other."""
+"""Largest lag of the autocorrelation of residuals [samples]."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """What is known of one unknown.
+    """Result for one unknown.
 
     Attributes:
-        unknown: It.
-        value: Where the fit ended, in its unit; a result only where it stands as identified.
-        half_width: Half of the 95 % interval, in its unit; inf where there is none.
-        standing: What the recording tells of it.
-        words: The same in words, with what it acts together with.
+        unknown: The unknown.
+        value: Fitted value in its unit; a result only if it is identified.
+        half_width: Half of the 95 % interval, in its unit; inf without an interval.
+        standing: Status of the result.
+        words: Status in words, with the unknowns that it cannot be separated from.
     """
 
     unknown: Unknown
@@ -57,29 +57,29 @@ class Finding:
 
 @dataclass(frozen=True)
 class ChannelFit:
-    """How well one channel is explained: root mean square of the residuals over the noise, and their correlation."""
+    """Fit of one channel: root mean square of the residuals over the noise, and their autocorrelation."""
 
     name: str
     rms: float
     correlation: float
-    """Of a residual with the next one; 0 for white ones."""
+    """Correlation of consecutive residuals; 0 for white ones."""
     white: bool
-    """Ljung and Box's test over 20 samples does not refuse it at 0.1 %."""
+    """The Ljung-Box test over 20 lags does not reject whiteness at 0.1 %."""
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """What a fit is worth.
+    """Assessment of a fit.
 
     Attributes:
-        findings: One an unknown.
-        correlation: Between the identified ones, nan elsewhere, shape (unknowns, unknowns).
-        singular_values: Of the Jacobian in units of the noise and of each unknown's reach, largest first.
-        chi2: Sum of squares of the residuals over the noise, a degree of freedom.
+        findings: One per unknown.
+        correlation: Correlation of the identified unknowns, nan elsewhere, shape (unknowns, unknowns).
+        singular_values: Singular values of the Jacobian in units of the noise and of each unknown's reach, descending.
+        chi2: Sum of squares of the residuals over the noise, per degree of freedom.
         freedom: Degrees of freedom.
-        together: By what the intervals must be wider so that all hold at once in 95 % of recordings.
-        inflation: By what the intervals are wider than the noise alone would make them, for the largest.
-        channels: How well each channel is explained.
+        together: Factor for simultaneous 95 % intervals.
+        inflation: Largest factor by which an interval exceeds that from noise alone.
+        channels: Fit of each channel.
     """
 
     findings: tuple[Finding, ...]
@@ -93,62 +93,62 @@ class Judgement:
 
     @property
     def fits(self) -> bool:
-        """Whether the residuals are no larger than the noise."""
+        """True if the residuals are no larger than the noise."""
         return _explained(self.chi2, self.freedom)
 
     @property
     def white(self) -> bool:
-        """Whether the residuals are as white as the noise, in all channels but by chance one."""
+        """True if the residuals are white, except for channels that fail by chance."""
         return sum(not channel.white for channel in self.channels) <= len(self.channels) // 10
 
     @property
     def verdict(self) -> str:
-        """In a sentence."""
+        """The verdict in a sentence."""
         if self.fits and self.white:
             return "the model explains the recording within its noise"
         if self.fits:
             coloured = ", ".join(channel.name for channel in self.channels if not channel.white)
-            return f"the residuals are as small as the noise but not white ({coloured}): something small is left out"
+            return f"the residuals are as small as the noise but not white ({coloured}): the model lacks a small effect"
         return f"lack of fit: the residuals are {math.sqrt(self.chi2):.3g} times the noise; no value is a result"
 
 
 def judge(window: Window, z: np.ndarray, slopes: np.ndarray, residuals: np.ndarray, known: np.ndarray) -> Judgement:
-    """Judge a fit by what it rests on.
+    """Judge a fit.
 
     Args:
         window: The samples.
-        z: Where the fit ended, in scales, shape (unknowns,).
+        z: Fitted values in scales, shape (unknowns,).
         slopes: d predicted / d z over the noise, shape (rows, channels, unknowns).
-        residuals: Measured less predicted over the noise, shape (rows, channels).
-        known: Which samples count, shape (rows, channels); slopes and residuals are 0 for the others.
+        residuals: Measured minus predicted over the noise, shape (rows, channels).
+        known: Mask of the samples that count, shape (rows, channels); slopes and residuals are 0 for the others.
     """
     unknowns, observation, values = window.question.unknowns, window.question.observation, window.values(z)
     reach = np.array([unknown.reach / unknown.scale for unknown in unknowns])
     count = int(known.sum())
-    _, singular, directions = np.linalg.svd(triangle_of(slopes * reach))
+    _, singular, directions = np.linalg.svd(triangular_factor(slopes * reach))
     freedom = max(1, count - len(unknowns))
     chi2 = float((residuals**2).sum()) / freedom
     quantile = float(student(freedom))
-    unsure = _FITS if "measured" in observation.noise_from else 0.0
-    spread = 1.0 + _ALONG * _misfit(residuals, known, unsure) / quantile
-    seen = quantile * spread < singular  # a direction's 95 % interval is within the reach
+    unsure = _CHI2_TOLERANCE if "measured" in observation.noise_from else 0.0
+    spread = 1.0 + _ERROR_RATIO * _misfit(residuals, known, unsure) / quantile
+    seen = quantile * spread < singular  # the 95 % interval along the direction is within the reach
     blind = directions[~seen].T
     part = np.linalg.norm(blind, axis=1) if blind.size else np.zeros(len(unknowns))
     alone = quantile * spread > np.linalg.norm(slopes * reach, axis=(0, 1))
 
     kept = directions[seen].T / singular[seen]
-    plain = kept @ kept.T  # of z / reach, from the noise alone
+    plain = kept @ kept.T  # covariance of z / reach from the noise alone
     noise_only = np.sqrt(np.diag(plain))
     covariance = plain * spread**2
     channels = tuple(
         _channel(name, residuals[:, column], known[:, column]) for column, name in enumerate(observation.names)
     )
     if not _explained(chi2, freedom) or sum(not channel.white for channel in channels) > len(channels) // 10:
-        covariance = _wider(covariance, plain @ _scores(slopes * reach, residuals) @ plain)
-    stretch = _bends(window, z, covariance * np.outer(reach, reach), residuals, known, far=quantile, spread=spread)
+        covariance = _max_covariance(covariance, plain @ _scores(slopes * reach, residuals) @ plain)
+    stretch = _widenings(window, z, covariance * np.outer(reach, reach), residuals, known, far=quantile, spread=spread)
     covariance = _with_priors(covariance * np.outer(stretch, stretch), unknowns, reach)
     deviation, inflation = np.sqrt(np.diag(covariance)), 1.0
-    clear = (part < _NAMED) & ~alone & (noise_only > 0.0)
+    clear = (part < _MIN_PART) & ~alone & (noise_only > 0.0)
     if clear.any():
         inflation = float((deviation / np.where(clear, noise_only, np.inf)).max())
 
@@ -158,62 +158,62 @@ def judge(window: Window, z: np.ndarray, slopes: np.ndarray, residuals: np.ndarr
         finding = _finding(place, unknowns, float(values[place]), half, alone=alone, blind=blind, part=part)
         findings.append(finding if _explained(chi2, freedom) else _unexplained(finding))
     correlation = np.full(covariance.shape, np.nan)
-    told = np.array([finding.standing == "identified" for finding in findings])
-    both = np.outer(told, told) & (np.outer(deviation, deviation) > 0.0)
+    identified = np.array([finding.standing == "identified" for finding in findings])
+    both = np.outer(identified, identified) & (np.outer(deviation, deviation) > 0.0)
     correlation[both] = (covariance / np.where(both, np.outer(deviation, deviation), 1.0))[both]
     return Judgement(
-        findings=tuple(_with_likeness(finding, place, findings, correlation) for place, finding in enumerate(findings)),
+        findings=tuple(_with_similar(finding, place, findings, correlation) for place, finding in enumerate(findings)),
         correlation=correlation,
         singular_values=singular,
         chi2=chi2,
         freedom=freedom,
-        together=_together_factor(correlation[np.ix_(told, told)]),
+        together=_together_factor(correlation[np.ix_(identified, identified)]),
         inflation=inflation,
         channels=channels,
     )
 
 
 def _misfit(residuals: np.ndarray, known: np.ndarray, unsure: float) -> float:
-    """Size of what the model lacks, over the noise: root of what the squares have beyond chance from some row on.
+    """Return the size of the model error over the noise: root of the excess sum of squares from the worst row on.
 
-    Added to the intervals as the most that the values may be off by it: bias-aware intervals, after Armstrong and
-    Kolesár (Econometrica 86, 2018). What is missing acts behind an impact, so that all rows together would hide it.
+    It is added to the intervals as the largest possible bias: bias-aware intervals, after Armstrong and Kolesár
+    (Econometrica 86, 2018). Model errors act after an impact, so a sum over all rows could hide them.
 
     Args:
-        residuals: Over the noise, shape (rows, channels).
-        known: Which of them count, shape (rows, channels).
-        unsure: Part by which the square of the noise is not known.
+        residuals: Residuals over the noise, shape (rows, channels).
+        known: Mask of the samples that count, shape (rows, channels).
+        unsure: Relative uncertainty of the noise variance.
     """
     squares, counts = (part.sum(axis=1)[::-1].cumsum() for part in (residuals**2, known))
-    beyond = squares - (1.0 + unsure) * counts - _NOTED * np.sqrt(2.0 * counts)
-    return math.sqrt(max(0.0, float(beyond[counts >= min(_LEAST_ROWS, counts[-1])].max())))
+    beyond = squares - (1.0 + unsure) * counts - _ERROR_SIGMAS * np.sqrt(2.0 * counts)
+    return math.sqrt(max(0.0, float(beyond[counts >= min(_MIN_ROWS, counts[-1])].max())))
 
 
 def _unexplained(finding: Finding) -> Finding:
-    """A finding where the model does not explain the samples: what would be a result is none."""
+    """Return the finding without a result, for a model that does not explain the samples."""
     if finding.standing in ("not seen", "only together"):
         return finding
     half = finding.half_width
-    moved = f", and what is missing may have moved it by {half:.2g}" if half < math.inf else ""
+    moved = f", and the model error may have moved it by {half:.2g}" if half < math.inf else ""
     ended = _with_unit(finding.value, finding.unknown, ".6g")
     words = f"no result, as the model does not explain the samples: the fit ended at {ended}{moved}"
     return Finding(finding.unknown, finding.value, math.inf, "not explained", words)
 
 
 def _explained(chi2: float, freedom: int) -> bool:
-    return chi2 < 1.0 + _FITS + _CHANCE * math.sqrt(2.0 / freedom)
+    return chi2 < 1.0 + _CHI2_TOLERANCE + _CHI2_SIGMAS * math.sqrt(2.0 / freedom)
 
 
 def _together_factor(correlation: np.ndarray) -> float:
-    """Width of simultaneous 95 % intervals over that of single ones, by drawing from the normal distribution."""
+    """Return the width of simultaneous 95 % intervals over that of single ones, by Monte Carlo."""
     if len(correlation) < 2:
         return 1.0
     largest = np.abs(draw_normal(correlation, np.random.default_rng(0), _DRAWS)).max(axis=1)
     return max(1.0, float(np.quantile(largest, 0.95)) / 1.96)
 
 
-def triangle_of(slopes: np.ndarray) -> np.ndarray:
-    """The triangle R of slopes = Q R, which has all that they tell of the unknowns, shape (unknowns, unknowns)."""
+def triangular_factor(slopes: np.ndarray) -> np.ndarray:
+    """Return the triangle R of slopes = Q R, which has all their information, shape (unknowns, unknowns)."""
     from scipy.linalg import qr
 
     flat = slopes.reshape(-1, slopes.shape[-1])
@@ -221,8 +221,8 @@ def triangle_of(slopes: np.ndarray) -> np.ndarray:
 
 
 def blind_directions(slopes: np.ndarray, reach: np.ndarray) -> np.ndarray:
-    """Directions of z / reach that the samples do not tell, shape (unknowns, directions)."""
-    _, singular, directions = np.linalg.svd(triangle_of(slopes * reach))
+    """Return directions of z / reach that the samples do not show, shape (unknowns, directions)."""
+    _, singular, directions = np.linalg.svd(triangular_factor(slopes * reach))
     return directions[singular < 1.96].T
 
 
@@ -239,15 +239,20 @@ def _finding(
     unknown = unknowns[place]
     if alone[place]:
         return Finding(unknown, value, math.inf, "not seen", _not_seen(unknown))
-    if part[place] > _NAMED:
+    if part[place] > _MIN_PART:
         return Finding(unknown, value, math.inf, "only together", _together(place, unknowns, blind))
     if min(value - unknown.low, unknown.high - value) < 1e-6 * unknown.scale:
-        return Finding(unknown, value, math.inf, "at its bound", "at its bound: the interval does not hold there")
-    return widened(Finding(unknown, value, half, "identified", "identified"), 0.0)
+        return Finding(unknown, value, math.inf, "at its bound", "at its bound: no interval")
+    return widen_interval(Finding(unknown, value, half, "identified", "identified"), 0.0)
 
 
-def widened(finding: Finding, by: float) -> Finding:
-    """With an interval wider by so much to either side, in its unit; not seen where it leaves what was believed."""
+def widen_interval(finding: Finding, by: float) -> Finding:
+    """Return the finding with a wider interval; not seen if it exceeds the assumed one.
+
+    Args:
+        finding: The finding.
+        by: Added to half of the interval, in its unit.
+    """
     half = finding.half_width + by
     if finding.standing == "identified" and half > finding.unknown.reach:
         return Finding(finding.unknown, finding.value, math.inf, "not seen", _not_seen(finding.unknown))
@@ -260,40 +265,40 @@ def _not_seen(unknown: Unknown) -> str:
 
 
 def _together(place: int, unknowns: tuple[Unknown, ...], blind: np.ndarray) -> str:
-    """With what an unknown acts together, and how one makes up for the other."""
+    """Return the unknowns that one cannot be separated from, and the changes that compensate each other."""
     direction = blind[:, int(np.argmax(np.abs(blind[place])))]
-    others = [n for n in np.argsort(-np.abs(direction)) if n != place and abs(direction[n]) > _NAMED]
+    others = [n for n in np.argsort(-np.abs(direction)) if n != place and abs(direction[n]) > _MIN_PART]
     if not others:
         return _not_seen(unknowns[place])
     change = 0.01 * unknowns[place].scale
     rates = [change * direction[n] * unknowns[n].reach / (direction[place] * unknowns[place].reach) for n in others]
-    made_up = " and ".join(
+    compensation = " and ".join(
         f"{unknowns[n].key} by {_with_unit(rate, unknowns[n])}" for n, rate in zip(others, rates, strict=True)
     )
     names = ", ".join(unknowns[n].key for n in others)
-    return f"only together with {names}: a change by {_with_unit(change, unknowns[place])} is made up for by {made_up}"
+    return f"only together with {names}: {_with_unit(change, unknowns[place])} is compensated by {compensation}"
 
 
 def _with_unit(change: float, unknown: Unknown, form: str = "+.3g") -> str:
     return f"{change:{form}}" + ("" if unknown.unit in ("", "1") else f" {unknown.unit}")
 
 
-def _with_likeness(finding: Finding, place: int, findings: list[Finding], correlation: np.ndarray) -> Finding:
+def _with_similar(finding: Finding, place: int, findings: list[Finding], correlation: np.ndarray) -> Finding:
     if finding.standing != "identified":
         return finding
     alike = [
         f"{findings[other].unknown.key} ({correlation[place, other]:+.4f})"
         for other in range(len(findings))
-        if other != place and abs(correlation[place, other]) > _ALIKE
+        if other != place and abs(correlation[place, other]) > _MAX_CORRELATION
     ]
     if not alike:
         return finding
-    words = f"identified, but hard to tell apart from {', '.join(alike)}"
+    words = f"identified, but hard to separate from {', '.join(alike)}"
     return Finding(finding.unknown, finding.value, finding.half_width, "identified", words)
 
 
 def _with_priors(covariance: np.ndarray, unknowns: tuple[Unknown, ...], reach: np.ndarray) -> np.ndarray:
-    """The covariance of z / reach with what the priors add."""
+    """Return the covariance of z / reach with the priors added."""
     given = [place for place, unknown in enumerate(unknowns) if unknown.prior is not None]
     for place in given:
         prior = unknowns[place].prior
@@ -304,7 +309,7 @@ def _with_priors(covariance: np.ndarray, unknowns: tuple[Unknown, ...], reach: n
     return covariance
 
 
-def _bends(
+def _widenings(
     window: Window,
     z: np.ndarray,
     covariance: np.ndarray,
@@ -314,29 +319,29 @@ def _bends(
     far: float,
     spread: float,
 ) -> np.ndarray:
-    """By how much each interval has to be wider than a linear response makes it, shape (unknowns,).
+    """Return the factor by which each interval has to be wider than for a linear response, shape (unknowns,).
 
-    From the end of each interval, with the other unknowns moved along, the sum of squares must be larger by as much
-    as the linear response says. Where it is not, as the response bends, the end is moved out until it is.
+    At the end of an interval, with the other unknowns adjusted, the sum of squares must have grown as for a linear
+    response. If it has not, the end is moved outward until it has.
     """
     stretch = np.ones(len(z))
     base = float((residuals**2).sum())
     deviation = np.sqrt(np.diag(covariance))
     for place in np.flatnonzero(deviation > 0.0):
         along = covariance[:, place] / deviation[place]
-        # Only as much as the noise explains: other reasons for a wider interval are in the covariance already.
+        # Only the part from noise: other causes of a wider interval are in the covariance already.
         wanted = 0.5 * (far * spread) ** 2
         for sign in (-1.0, 1.0):
-            for factor in _STRETCHES:
+            for factor in _WIDENINGS:
                 found = window.residuals_or_none(z + sign * factor * far * along)
                 if found is None or float((found[known] ** 2).sum()) - base > wanted:
                     break
-                stretch[place] = max(stretch[place], _STRETCHES[min(_STRETCHES.index(factor) + 1, len(_STRETCHES) - 1)])
+                stretch[place] = max(stretch[place], _WIDENINGS[min(_WIDENINGS.index(factor) + 1, len(_WIDENINGS) - 1)])
     return stretch
 
 
 def _scores(slopes: np.ndarray, residuals: np.ndarray) -> np.ndarray:
-    """Covariance of the sum of slope times residual, with the residuals' own correlation in time.
+    """Return the covariance of the sum of slope times residual, with the autocorrelation of the residuals.
 
     After Newey and West (Econometrica 55, 1987); shape (unknowns, unknowns).
     """
@@ -348,8 +353,8 @@ def _scores(slopes: np.ndarray, residuals: np.ndarray) -> np.ndarray:
     return total
 
 
-def _wider(covariance: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """The first, stretched where the other says more."""
+def _max_covariance(covariance: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Return a covariance, widened where the other one has a larger variance."""
     own = np.sqrt(np.diag(covariance))
     stretch = np.where(own > 0.0, np.sqrt(np.maximum(np.diag(other), 0.0)) / np.where(own > 0.0, own, 1.0), 1.0)
     return covariance * np.outer(np.maximum(stretch, 1.0), np.maximum(stretch, 1.0))

@@ -1,9 +1,9 @@
-"""Numbers of a rig from a log of another system: with all that the log does not tell, and as right models leave them.
+"""Identification from a log of another system, with the unknowns of the log itself fitted along.
 
-The search is that of `nuisance.tune`, with what is asked among its numbers. What it comes to is judged as any fit is.
-Beside the noise, intervals hold what the values moved by as the last samples came, what they do where some are left
-out (a jackknife: what the model lacks is not the same everywhere), and where something is as right as what was assumed:
-a friction that goes through zero, filters with other corners.
+The search is that of `nuisance.tune`, with the requested keys added, and the result is judged as any fit. In addition
+to the noise, the intervals include the last changes of the values as the window grew, a jackknife (model errors are not
+the same everywhere), and equally valid assumptions: a friction law that is continuous at zero speed, and filters with
+other corners.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ import numpy as np
 
 from recorder.reader import Recording
 from replays.estimate.least_squares import solve_normal
-from replays.recordings.identification.agreement import Here, half_without_parts
+from replays.recordings.identification.agreement import ChannelState, jackknife_half_widths
 from replays.recordings.identification.fit import Identification
-from replays.recordings.identification.judgement import Judgement, judge, widened
-from replays.recordings.identification.nuisance import NUISANCES, looks_from, nuisances_of, tune
+from replays.recordings.identification.judgement import Judgement, judge, widen_interval
+from replays.recordings.identification.nuisance import NUISANCES, find_nuisances, tune, window_start_s
 from replays.recordings.identification.request import Question, ask, first_command_s
 from replays.recordings.identification.window import Window
 from replays.recordings.resimulation.experiment import Experiment
@@ -39,89 +39,90 @@ def identify_log(
     bandwidth: float = 1.0,
     progress: Callable[[str], None] = lambda _text: None,
 ) -> Identification:
-    """Fit what is asked of a log.
+    """Fit the requested values to a log.
 
     Args:
         recording: The log.
-        experiment: What was done, as far as it is known.
-        keys: What is asked.
-        start: Where the search begins, by key.
-        bounds: Least and largest value by key.
+        experiment: Experiment, as far as it is known.
+        keys: Requested keys.
+        start: Start values by key.
+        bounds: Lowest and highest value by key.
         priors: Mean and standard deviation by key.
-        channels: By which channels; None for all.
-        to_s: Samples are used up to here [s].
-        variants: Changes that make models as right as ours.
-        bandwidth: Corner of a real anti-alias filter over the one that is told.
-        progress: Told what is being done.
+        channels: Channels to use; None for all.
+        to_s: End of the used samples [s].
+        variants: Changes that make equally valid models.
+        bandwidth: Corner of a real anti-alias filter over the nominal one.
+        progress: Callback for the current step.
 
     Raises:
         InputError: An unknown or doubled key, channel or value, or no samples.
     """
-    # What is wrong with the question is said at once.
+    # Report errors of the request before the long search.
     first = ask(recording, experiment, keys, start=start, bounds=bounds, priors=priors, channels=channels)
     tuned = tune(
         recording, first.experiment, (*keys, *(key for key in NUISANCES if key not in keys)), known=priors or {},
         channels=channels, to_s=to_s, progress=progress,
     )  # fmt: skip
-    along = nuisances_of(tuned.begun, NUISANCES, besides=keys)
-    held = {key: known for key, known in along.items() if known is not None} | dict(priors or {})
+    nuisances = find_nuisances(tuned.begun, NUISANCES, excluded=keys)
+    all_priors = {key: known for key, known in nuisances.items() if known is not None} | dict(priors or {})
     question = ask(
-        recording, tuned.begun, (*keys, *along), start=tuned.values, bounds=bounds, priors=held, along=along,
-        channels=channels, window=(looks_from(tuned.begun), tuned.end_s),
+        recording, tuned.begun, (*keys, *nuisances), start=tuned.values, bounds=bounds, priors=all_priors,
+        nuisances=nuisances, channels=channels, window=(window_start_s(tuned.begun), tuned.end_s),
     )  # fmt: skip
-    progress("what filters with other corners would show")
-    other = {name: part.filtered(bandwidth) for name, part in question.observation.parts.items()}
-    apart = _of(question, other).predicted(z := np.zeros(len(question.keys))) - _of(question).predicted(z)
+    progress("effect of filters with other corners")
+    other = {name: part.with_corner_factor(bandwidth) for name, part in question.observation.parts.items()}
+    z = np.zeros(len(question.keys))
+    apart = _full_window(question, other).predicted(z) - _full_window(question).predicted(z)
     louder = np.hypot(1.0, np.sqrt(np.nanmean(apart**2, axis=0)))
     observation = question.observation
     question = replace(question, observation=replace(observation, noise=observation.noise * louder))
-    window = _of(question)
+    window = _full_window(question)
     progress(f"fitted: {len(question.keys)} values, to {tuned.end_s:.4f} s; their intervals")
     slopes, residuals, known = window.slopes_by_keys(z), window.residuals(z), window.known
     scale = np.array([unknown.scale for unknown in question.unknowns])
     places = [list(tuned.values).index(key) for key in question.keys]
     moves = 1.96 * np.sqrt(np.mean(tuned.moves[:, places] ** 2, axis=0)) / scale
     square, side = _priors(question)
-    here = Here(list(np.nan_to_num(residuals).T), list(np.moveaxis(slopes, 1, 0)))
+    here = ChannelState(list(np.nan_to_num(residuals).T), list(np.moveaxis(slopes, 1, 0)))
     times = [observation.times_s[: len(residuals)]] * len(here.apart)
-    lacking = half_without_parts(here, times, [1.0] * len(times), (square, side), first_command_s(question.experiment))
-    moved = np.hypot(lacking, moves)
+    first_s = first_command_s(question.experiment)
+    jackknife = jackknife_half_widths(here, times, [1.0] * len(times), (square, side), first_s)
+    moved = np.hypot(jackknife, moves)
     shown = [residuals - apart / louder]
     for changes in variants:
-        shown.append(_of(replace(question, experiment=question.experiment.changed(dict(changes)))).residuals(z))
+        experiment = question.experiment.changed(dict(changes))
+        shown.append(_full_window(replace(question, experiment=experiment)).residuals(z))
     flat = slopes.reshape(-1, len(scale))
     for one in shown:
         change = solve_normal(square + flat.T @ flat, flat.T @ np.nan_to_num(one - residuals).ravel())
         moved = np.hypot(moved, np.abs(change))
-    judgement, why = (
-        judge(window, z, slopes, residuals, known),
-        "the model, or a search that follows it, goes no further",
-    )
+    judgement = judge(window, z, slopes, residuals, known)
+    why = "the model, or the search, does not explain later samples"
     if tuned.end_s < tuned.longest_s and any(one.standing == "not seen" for one in judgement.findings[: len(keys)]):
-        why += "; what comes next may show what is not seen: with another --start, or another law of the contact"
+        why += "; later samples may show the missing values, with another --start or contact law"
     return Identification(
-        question=question, judgement=_wider(judgement, moved * scale), window=window,
+        question=question, judgement=_widen_intervals(judgement, moved * scale), window=window,
         z=z, stages=(), why=why, runs=window.runs, narrowed={},
     )  # fmt: skip
 
 
-def _of(question: Question, parts: dict[str, Measured] | None = None) -> Window:
-    """All samples of a question; where other parts are given, behind their filters."""
+def _full_window(question: Question, parts: dict[str, Measured] | None = None) -> Window:
+    """Return the window of all samples of a question, optionally with other filters."""
     if parts is not None:
         question = replace(question, observation=replace(question.observation, parts=parts))
     return Window(question, float(question.observation.times_s[-1]) + 1e-6)
 
 
 def _priors(question: Question) -> tuple[np.ndarray, np.ndarray]:
-    """Return the normal equations of what is known before, in scales, shapes (unknowns, unknowns) and (unknowns,)."""
+    """Return the prior terms of the normal equations in scales, shapes (unknowns, unknowns) and (unknowns,)."""
     known = [(one, *(one.prior or (one.start, one.scale))) for one in question.unknowns]
     square = np.diag([(one.scale / sigma) ** 2 for one, _, sigma in known])
     return square, np.array([(mean - one.start) * one.scale / sigma**2 for one, mean, sigma in known])
 
 
-def _wider(judgement: Judgement, moved: np.ndarray) -> Judgement:
-    """With intervals that hold what the values move by as well."""
-    findings = tuple(widened(finding, float(far)) for finding, far in zip(judgement.findings, moved, strict=True))
-    told = np.array([finding.standing == "identified" for finding in findings])
-    correlation = np.where(np.outer(told, told), judgement.correlation, np.nan)
+def _widen_intervals(judgement: Judgement, moved: np.ndarray) -> Judgement:
+    """Return the judgement with intervals widened by the given changes."""
+    findings = tuple(widen_interval(one, float(by)) for one, by in zip(judgement.findings, moved, strict=True))
+    identified = np.array([finding.standing == "identified" for finding in findings])
+    correlation = np.where(np.outer(identified, identified), judgement.correlation, np.nan)
     return replace(judgement, findings=findings, correlation=correlation)

@@ -1,4 +1,4 @@
-"""What is asked of a recording: which numbers of its experiment, from where, within what, by which channels."""
+"""Request to identify parameters: keys, start values, bounds, priors, channels and window."""
 
 from __future__ import annotations
 
@@ -24,31 +24,31 @@ from rig.run.scenes import Scene
 from rig.run.simulation import TICK_RATE_HZ
 
 NOT_FITTED = ("keyphasor",)
-"""Pulses say where an edge is, which a difference of samples does not."""
-MOST_ROWS = 20_000
-"""A longer window is thinned out."""
+"""Pulses give the time of an edge, which a difference of samples does not."""
+MAX_ROWS = 20_000
+"""Rows to which a longer window is decimated."""
 _SCENE_KEYS = ("drive.speed_hz", "initial.x_mm", "initial.y_mm")
-"""Of a scene, what was done to the rig; the rest is how it is simulated."""
-_QUIET_S = 0.5
-"""The window begins this long before the first command: enough to see where the shaft runs."""
+"""Keys of a scene that describe the rig; the others describe its simulation."""
+_LEAD_S = 0.5
+"""Start of the window before the first command, which shows the steady motion [s]."""
 _COMMAND_UNITS = {"at_s": "s"} | {name: each.quantity.unit for name, each in QUANTITIES.items()}
 
 
 @dataclass(frozen=True)
 class Unknown:
-    """A number that is asked for.
+    """Requested value.
 
     Attributes:
-        key: Its dotted key.
-        unit: Its unit.
-        start: Where the search begins.
-        scale: What counts as a change of size 1.
-        low: Least value.
-        high: Largest value.
-        bounded: Whether these bounds were asked for, and are not only what the model takes.
-        prior: Mean and standard deviation known from elsewhere, or None.
-        rule: The rule that gave the start, if one did.
-        along: Whether it is only fitted along: nobody waits for it to be known finely.
+        key: Dotted key.
+        unit: Unit.
+        start: Start of the search.
+        scale: Size of a unit change.
+        low: Lowest value.
+        high: Highest value.
+        bounded: True if the bounds were requested, False if they are the limits of the model.
+        prior: Mean and standard deviation of the prior, or None.
+        rule: Rule that gave the start, or None.
+        nuisance: True for a nuisance parameter, whose precision does not matter.
     """
 
     key: str
@@ -60,13 +60,13 @@ class Unknown:
     bounded: bool
     prior: tuple[float, float] | None
     rule: str | None
-    along: bool = False
+    nuisance: bool = False
 
     @property
     def reach(self) -> float:
-        """Half of the interval that is believed before the recording is looked at: beyond it a value says nothing.
+        """Half of the interval assumed before the fit; a wider interval has no information.
 
-        Of the prior (95 %), or of the bounds that were asked for, or else as much as the scale.
+        It is that of the prior (95 %), of the requested bounds, or else the scale.
         """
         if self.prior is not None:
             return 1.96 * self.prior[1]
@@ -75,18 +75,18 @@ class Unknown:
 
 @dataclass(frozen=True)
 class Observation:
-    """The samples that are explained.
+    """Samples to be explained.
 
     Attributes:
         names: Channels.
         units: Their units.
-        times_s: Time of the rows of all groups together [s], shape (n,).
-        values: In each channel's unit, nan where there is no sample, shape (n, channels).
-        noise: Standard deviation of each channel's noise, in its unit, shape (channels,).
-        noise_from: Where it is from, by channel: "table", or "measured" where the table tells none.
-        parts: The same by group, with the recording's own calibration and filters.
-        rows: Where in `times_s` the rows of each group are.
-        every: A long window is thinned out to one sample in so many.
+        times_s: Times of the rows of all groups together [s], shape (n,).
+        values: Values in the units of the channels, nan without a sample, shape (n, channels).
+        noise: Standard deviation of the noise in the units of the channels, shape (channels,).
+        noise_from: Source of the noise by channel: "table", or "measured" if the table has none.
+        parts: Samples by group, with the recording's own calibration and filters.
+        rows: Indices in `times_s` of the rows of each group.
+        every: Decimation factor of a long window.
     """
 
     names: tuple[str, ...]
@@ -100,16 +100,16 @@ class Observation:
     every: int = 1
 
     def until(self, end_s: float) -> int:
-        """Number of rows before a time."""
+        """Return the number of rows before a time."""
         return int(np.searchsorted(self.times_s, end_s - 1e-9))
 
     def parts_until(self, rows: int) -> dict[str, Measured]:
-        """The groups in the first rows."""
+        """Return the groups, restricted to the first rows."""
         ends = {name: int(np.searchsorted(self.rows[name], rows)) for name in self.parts}
         return {name: self.parts[name].first(end) for name, end in ends.items() if end}
 
     def placed(self, values: Mapping[str, np.ndarray], rows: int) -> np.ndarray:
-        """Values by group as one table, nan where there is no sample, shape (rows, channels)."""
+        """Return values by group as one table, nan without a sample, shape (rows, channels)."""
         found = np.full((rows, len(self.names)), np.nan)
         for name, held in values.items():
             columns = np.array([self.names.index(channel) for channel in self.parts[name].names])
@@ -119,11 +119,11 @@ class Observation:
 
 @dataclass(frozen=True)
 class Question:
-    """A recording, and what is asked of it.
+    """Request to a recording.
 
     Attributes:
-        experiment: What was done, on the values from which the search begins.
-        unknowns: What is asked for.
+        experiment: Experiment at the start values.
+        unknowns: Requested values.
         observation: The samples.
     """
 
@@ -145,22 +145,22 @@ def ask(
     start: Mapping[str, float] | None = None,
     bounds: Mapping[str, tuple[float, float]] | None = None,
     priors: Mapping[str, tuple[float, float]] | None = None,
-    along: Collection[str] = (),
+    nuisances: Collection[str] = (),
     channels: Sequence[str] | None = None,
     window: tuple[float | None, float | None] = (None, None),
 ) -> Question:
-    """Put a question to a recording.
+    """Build a request to a recording.
 
     Args:
-        recording: Whose samples are explained; its truth is not looked at.
-        experiment: What was done.
-        keys: What is asked for.
-        start: Where the search begins, by key; else the experiment's own values.
-        bounds: Least and largest value by key.
+        recording: Recording with the samples; its truth is not used.
+        experiment: The experiment.
+        keys: Requested keys.
+        start: Start values by key; default: those of the experiment.
+        bounds: Lowest and highest value by key.
         priors: Mean and standard deviation by key.
-        along: Those of the keys that are only fitted along.
-        channels: By which channels; None for all that it has, but for the keyphasor's pulses.
-        window: Simulated times between which samples are used [s]; None: from shortly before the first command, to the
+        nuisances: Keys that are nuisance parameters.
+        channels: Channels to use; None for all except the keyphasor's pulses.
+        window: Start and end of the used samples, simulated [s]; None: from shortly before the first command, to the
             end.
 
     Raises:
@@ -177,7 +177,7 @@ def ask(
     rules = {key: experiment.scene.load_parameters().rule(key) for key in keys if key in load_parameters().entries}
     centres = {key: mean for key, (mean, _) in (priors or {}).items()} | dict(start or {})
     values = {key: centres.get(key, value_of(experiment, key)) for key in keys}
-    # An angle is one on what the experiment has.
+    # An angle is relative to that of the experiment.
     begun = with_values(experiment, {key: value for key, value in values.items() if key != ANGLE})
     unknowns = []
     for key in keys:
@@ -198,7 +198,7 @@ def ask(
                 bounded=key in (bounds or {}),
                 prior=prior,
                 rule=rules.get(key),
-                along=key in along,
+                nuisance=key in nuisances,
             )
         )
     return Question(begun, tuple(unknowns), observe(recording, begun, channels=channels, window=window))
@@ -211,10 +211,10 @@ def observe(
     channels: Sequence[str] | None = None,
     window: tuple[float | None, float | None] = (None, None),
 ) -> Observation:
-    """Samples of a recording.
+    """Return samples of a recording.
 
     Raises:
-        InputError: It has none of these channels, or no samples in the window.
+        InputError: The recording does not have the channels, or has no samples in the window.
     """
     formulas = experiment.scene.formulas()
     groups = {
@@ -227,26 +227,26 @@ def observe(
     wanted = list(channels) if channels else usable
     missing = [name for name in wanted if name not in usable]
     if missing or not wanted:
-        raise InputError("channels", f"some that the recording has: {', '.join(usable)}", ", ".join(missing))
+        raise InputError("channels", f"channels of the recording: {', '.join(usable)}", ", ".join(missing))
     whole = measured(recording, experiment.scene)
     whole = {name: whole[name].only(wanted) for name in dict.fromkeys(groups[name] for name in wanted)}
     first_s = max(float(part.times_s[0]) for part in whole.values())
     last_s = min(float(part.times_s[-1]) for part in whole.values())
     start_s, end_s = window
-    start_s = max(first_s, first_command_s(experiment) - _QUIET_S) if start_s is None else start_s
+    start_s = max(first_s, first_command_s(experiment) - _LEAD_S) if start_s is None else start_s
     end_s = math.inf if end_s is None else end_s
     period_s = max(1.0 / part.channels[0].rate_hz for part in whole.values())
     parts, every = {}, 1
     for name, part in whole.items():
         kept = (part.times_s >= max(start_s, first_s) - 1e-9) & (part.times_s < min(end_s, last_s + period_s) - 1e-9)
-        step = -(-int(kept.sum()) // MOST_ROWS) or 1
-        parts[name] = part.chosen(np.flatnonzero(kept)[::step])
+        step = -(-int(kept.sum()) // MAX_ROWS) or 1
+        parts[name] = part.select_rows(np.flatnonzero(kept)[::step])
         every = max(every, step)
     if min(len(part.times_s) for part in parts.values()) < 10:
-        must = f"a window with samples in it; the recording goes from {first_s:.3f} to {last_s:.3f} s"
+        must = f"a window with samples; the recording is from {first_s:.3f} to {last_s:.3f} s"
         raise InputError("window", must, [start_s, end_s])
     parts = {name: _with_noise(part) for name, part in parts.items()}
-    # Of a thousandth of a microsecond, equal times of two groups are the same row.
+    # Times of two groups are equal if they agree to a nanosecond.
     stamps = {name: np.rint(part.times_s * 1e9).astype(np.int64) for name, part in parts.items()}
     union, first = np.unique(np.concatenate(list(stamps.values())), return_index=True)
     own = {channel.name: (part, c) for part in parts.values() for c, channel in enumerate(part.channels)}
@@ -270,7 +270,7 @@ def _has_noise(part: Measured, column: int) -> bool:
 
 
 def _with_noise(part: Measured) -> Measured:
-    """With the noise of the table and its rounding as white noise; measured where the table tells none."""
+    """Return the part with the noise of the table and of rounding; measured where the table has none."""
     floor = np.array(
         [
             channel_noise(channel) if _has_noise(part, c) else measured_noise(part.values[:, c])
@@ -281,26 +281,26 @@ def _with_noise(part: Measured) -> Measured:
 
 
 def measured_noise(values: np.ndarray) -> float:
-    """Noise of a smooth signal from its third differences, of which impacts spoil only a few."""
+    """Return the noise of a smooth signal from its third differences, few of which are affected by impacts."""
     differences = np.diff(values[np.isfinite(values)], 3)
     spread = float(np.median(np.abs(differences))) / (0.6745 * math.sqrt(20.0)) if len(differences) else 0.0
     return spread or max(1e-9, 1e-6 * float(np.nanmax(np.abs(values), initial=0.0)))
 
 
 def channel_noise(channel: Channel) -> float:
-    """Noise of a channel of the table, with what rounding in the converter adds, in its unit."""
+    """Return the noise of a channel of the table, including rounding in the converter, in its unit."""
     return math.hypot(channel.noise_v, channel.lsb_v / math.sqrt(12.0)) / abs(channel.sensitivity_v)
 
 
 def first_command_s(experiment: Experiment) -> float:
-    """When the first hammer pulse comes [s]; 0 without one."""
+    """Return the time of the first hammer pulse [s]; 0 without one."""
     times = [timed.at_s for timed in experiment.scene.commands if isinstance(timed.request, HammerCommand)]
     times += [command.tick / TICK_RATE_HZ for command in experiment.commands if command.name == "hammer"]
     return min(times, default=0.0)
 
 
 def _check_key(experiment: Experiment, key: str) -> None:
-    """Refuse at once what is no number of the rig or of what was done to it."""
+    """Check that a key is a parameter of the rig or of its experiment."""
     parameters = load_parameters().entries
     own = [name for name, entry in parameters.items() if entry.unit != "count"]
     own += [*_SCENE_KEYS, *CLOCK, ANGLE, *STATE]
@@ -313,7 +313,7 @@ def _check_key(experiment: Experiment, key: str) -> None:
     must = "of a parameter, a number of the scene ("
     must += f"{', '.join(_SCENE_KEYS)}) or of a command (hammer.1.force_n)"
     if key in parameters or key.split(".")[0] in Scene.model_fields:
-        must += ", all properties of the rig or of what was done to it and none of the simulation"
+        must += ", which describe the rig or the experiment, not the simulation"
     elif close:
         must += f", such as {', '.join(close)}"
     raise InputError("fit", must, key)
@@ -328,7 +328,7 @@ def _accepted(key: str) -> tuple[float, float]:
 
 
 def unit_of(key: str) -> str:
-    """Unit of a value that can be fitted; empty where it has none that is told."""
+    """Return the unit of a value that can be fitted; empty if unknown."""
     if key in CLOCK:
         return CLOCK[key][0]
     if key == ANGLE:

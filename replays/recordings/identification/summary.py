@@ -1,4 +1,4 @@
-"""A fit as a report: what was found, what it is worth, and pictures of it."""
+"""Report of a fit: results, their intervals, and pictures."""
 
 from __future__ import annotations
 
@@ -28,22 +28,22 @@ from replays.report.canvas import (
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-HEADINGS = ("key", "start", "result", "95 % interval", "unit", "what the recording tells")
+HEADINGS = ("key", "start", "result", "95 % interval", "unit", "status")
 _MARKS: dict[str, Mark] = {
     "identified": "good", "not seen": "open", "only together": "open", "at its bound": "bad",
     "not explained": "bad",
 }  # fmt: skip
-_MOST_PANELS = 16
-_WRITTEN = 6
-"""Values up to which each correlation is written into its square."""
-_KICK = 0.02
-"""An impact begins where the samples bend by this part of the most they bend, ..."""
-_QUIET = 50.0
-"""... which must be so many times what is usual, or there is none."""
+_MAX_PANELS = 16
+_MAX_LABELLED = 6
+"""Number of values up to which the picture shows each correlation as a number."""
+_ONSET_FRACTION = 0.02
+"""Curvature at the start of an impact, relative to the largest one."""
+_MIN_PEAK = 50.0
+"""Ratio of the largest curvature to the typical one, below which the record has no impact."""
 
 
 def cells(finding: Finding) -> tuple[str, ...]:
-    """One row of the table of values; a number only where it is a result."""
+    """Return one row of the table of values; a number only if it is a result."""
     unknown = finding.unknown
     unit = "" if unknown.unit == "1" else unknown.unit
     start = f"{unknown.start:.6g}" + (f" ({unknown.rule})" if unknown.rule else "")
@@ -56,49 +56,49 @@ def cells(finding: Finding) -> tuple[str, ...]:
 
 
 def window_line(found: Identification) -> str:
-    """Which samples were used, and why no more."""
+    """Return which samples were used, and why the window ends."""
     names = found.question.observation.names
     grown = f", grown in {len(found.stages)} stages" if found.stages else ""
     return (
         f"window {found.from_s:.4f} to {found.window.end_s:.4f} s, {found.window.rows} rows of {len(names)} channels"
-        f"{_thinned(found)}{grown}; it ends there: {found.why}"
+        f"{_decimation(found)}{grown}; end of the window: {found.why}"
     )
 
 
 def spread_line(found: Identification) -> str:
-    """What the search began with where the usual spread was too wide; empty where it was not."""
+    """Return the initial spread of values for which the default was too wide; empty without such values."""
     if not found.narrowed:
         return ""
-    told = ", ".join(f"{key} {part:.2g}" for key, part in found.narrowed.items())
-    return f"spread made smaller, as the first samples already bend with more (parts of each value's scale): {told}"
+    text = ", ".join(f"{key} {part:.2g}" for key, part in found.narrowed.items())
+    return f"initial spread reduced, as the model is not linear over more (relative to each value's scale): {text}"
 
 
-def _thinned(found: Identification) -> str:
+def _decimation(found: Identification) -> str:
     every = found.question.observation.every
-    return f" (thinned out: one sample in {every})" if every > 1 else ""
+    return f" (decimated: one sample in {every})" if every > 1 else ""
 
 
 def fit_line(found: Identification) -> str:
-    """Goodness of the fit."""
+    """Return the goodness of the fit."""
     judgement = found.judgement
-    line = f"chi2 {judgement.chi2:.4g} a degree of freedom ({judgement.freedom}); {judgement.verdict}"
+    line = f"chi2 {judgement.chi2:.4g} per degree of freedom ({judgement.freedom}); {judgement.verdict}"
     if judgement.fits and judgement.inflation > 1.1:
-        line += f"; intervals up to {judgement.inflation:.2g} times as wide as by noise alone"
+        line += f"; intervals up to {judgement.inflation:.2g} times as wide as from noise alone"
     if judgement.together > 1.0:
-        line += f"; each interval holds by itself, all hold at once if {judgement.together:.2f} times as wide"
+        line += f"; for simultaneous intervals multiply by {judgement.together:.2f}"
     return line
 
 
 def report_of(found: Identification, *, recording: str, origin: Mapping[str, str] | None = None) -> Report:
-    """The report of a fit.
+    """Return the report of a fit.
 
     Args:
         found: The fit.
-        recording: Its name.
-        origin: What the report is made by, each by name.
+        recording: Name of the recording.
+        origin: Software that made the report, by name.
     """
     question, judgement = found.question, found.judgement
-    told = "; ".join(
+    results = "; ".join(
         " ".join((finding.unknown.key, *cells(finding)[2:5])).rstrip()
         if finding.standing == "identified"
         else f"{finding.unknown.key}: {finding.words}"
@@ -107,36 +107,36 @@ def report_of(found: Identification, *, recording: str, origin: Mapping[str, str
     good = judgement.fits and all(finding.standing == "identified" for finding in judgement.findings)
     report = Report(
         f"Identification from {recording}",
-        f"{told}. {fit_line(found)}.",
+        f"{results}. {fit_line(found)}.",
         origin=origin,
         mark="good" if good else "open",
     )
-    report.picture(growth(found), "95 % intervals over the end of the window, in parts of each value's scale; right, "
-                   "how the values hang together.")  # fmt: skip
+    report.picture(growth(found), "95 % intervals over the end of the window, relative to each value's scale; right, "
+                   "the correlation of the values.")  # fmt: skip
     report.text(f"W{window_line(found)[1:]}.")
     if found.narrowed:
         report.text(f"The {spread_line(found)}.")
     report.heading("Values")
     rows = [Row(cells(finding), _MARKS[finding.standing]) for finding in judgement.findings]
-    report.table(HEADINGS, rows, caption="Intervals of 95 %, of each value by itself, by the slopes at the optimum.")
+    report.table(HEADINGS, rows, caption="95 % intervals of single values, from the slopes at the optimum.")
     report.text(
         "The intervals hold for this model and engine "
         f"({question.experiment.scene.engine.name}, {question.experiment.scene.engine.step_us} µs) with all other "
-        "parameters as they stand in the set, many of which are assumed, and for sensors as the channel table says: an "
-        "error of those is not in them."
+        "parameters as in the set, many of which are assumed, and for sensors as in the channel table. They do not "
+        "include errors of those."
     )
     if len(judgement.findings) > 1:
         keys = question.keys
         report.heading("Correlation", level=2)
-        told = [[("" if math.isnan(c) else f"{c:+.4f}") for c in row] for row in judgement.correlation]
-        report.table(("", *keys), [(key, *row) for key, row in zip(keys, told, strict=True)])
+        texts = [[("" if math.isnan(c) else f"{c:+.4f}") for c in row] for row in judgement.correlation]
+        report.table(("", *keys), [(key, *row) for key, row in zip(keys, texts, strict=True)])
         report.text(
-            "Singular values of the Jacobian, in units of the noise and of what was believed of each value before "
+            "Singular values of the Jacobian, in units of the noise and of each value's prior interval "
             "(below 2, the direction is not seen): " + ", ".join(f"{s:.3g}" for s in judgement.singular_values)
         )
-    report.heading("How well the samples are explained")
+    report.heading("Fit of the channels")
     report.table(
-        ("channel", "residual over noise", "correlation of neighbours", "noise from", "verdict"),
+        ("channel", "residual over noise", "autocorrelation", "noise from", "verdict"),
         [
             Row(
                 (
@@ -148,11 +148,11 @@ def report_of(found: Identification, *, recording: str, origin: Mapping[str, str
             for channel, source in zip(judgement.channels, question.observation.noise_from, strict=True)
         ],
     )  # fmt: skip
-    report.picture(overlay(found), "Recorded samples (dots) and the fitted model (line); beside each, their difference "
-                   "in units of the sensor's noise, from shortly before the first impact on.")  # fmt: skip
-    report.heading("How the window grew")
+    report.picture(overlay(found), "Recorded samples (dots) and the fitted model (line); right, their difference "
+                   "in units of the sensor's noise, from shortly before the first impact.")  # fmt: skip
+    report.heading("Growth of the window")
     report.table(
-        ("to [s]", "chi2", *question.keys, "because"),
+        ("to [s]", "chi2", *question.keys, "reason"),
         [
             (
                 f"{stage.end_s:.4f}", f"{stage.chi2:.3g}",
@@ -161,18 +161,18 @@ def report_of(found: Identification, *, recording: str, origin: Mapping[str, str
             )
             for stage in found.stages
         ],
-        caption="Values are held loosely to the start here: an interval as wide as the start's own says nothing.",
+        caption="These fits have a weak prior around the start: an interval as wide as the prior has no information.",
     )  # fmt: skip
     return report
 
 
 @house_style()
 def overlay(found: Identification) -> Figure:
-    """Samples, fit and residuals of the channels."""
+    """Draw samples, fit and residuals of the channels."""
     observation, window = found.question.observation, found.window
     predicted = window.predicted(found.z) * observation.noise
     residuals = window.residuals(found.z)
-    moved = np.argsort(-np.ptp(predicted / observation.noise, axis=0), kind="stable")[:_MOST_PANELS]
+    moved = np.argsort(-np.ptp(predicted / observation.noise, axis=0), kind="stable")[:_MAX_PANELS]
     shown = sorted(int(place) for place in moved)
     figure = new_figure(1.35 * len(shown) + 0.8)
     panels = figure.subplots(len(shown), 2, squeeze=False, sharex=True)
@@ -190,17 +190,17 @@ def overlay(found: Identification) -> Figure:
 
 
 def _shown_from_s(times_s: np.ndarray, predicted: np.ndarray) -> float:
-    """A little before the first impact in what is predicted [s]; where there is none, the first sample."""
+    """Return a time shortly before the first impact of the prediction [s], else that of the first sample."""
     bends = np.nan_to_num(np.abs(np.diff(predicted, 2, axis=0))).max(axis=1)
-    if not len(bends) or bends.max() < _QUIET * max(float(np.median(bends[: len(bends) // 4 + 1])), 1e-12):
+    if not len(bends) or bends.max() < _MIN_PEAK * max(float(np.median(bends[: len(bends) // 4 + 1])), 1e-12):
         return float(times_s[0])
-    first_s = float(times_s[int(np.argmax(bends > _KICK * bends.max())) + 1])
+    first_s = float(times_s[int(np.argmax(bends > _ONSET_FRACTION * bends.max())) + 1])
     return max(float(times_s[0]), first_s - 0.15 * (float(times_s[-1]) - first_s))
 
 
 @house_style()
 def growth(found: Identification) -> Figure:
-    """How the intervals shrank as the window grew, and how the values hang together in the end."""
+    """Draw the intervals over the end of the window, and the correlation of the values."""
     keys = found.question.keys
     figure = new_figure(4.6)
     left, right = figure.subplots(1, 2, width_ratios=(3, 2))
@@ -208,16 +208,14 @@ def growth(found: Identification) -> Figure:
     left.set_prop_cycle(color=[BLUE, RED, GREEN, PINK, ORANGE, SKY, BLACK], marker=list("osD^vhP"))
     for place, unknown in enumerate(found.question.unknowns):
         left.semilogy(ends, [stage.half_widths[place] / unknown.scale for stage in found.stages], label=unknown.key)
-    left.set(
-        title="How the intervals shrink", xlabel="end of the window [s]", ylabel="half of the 95 % interval / scale [1]"
-    )
+    left.set(title="Interval widths", xlabel="end of the window [s]", ylabel="half of the 95 % interval / scale [1]")
     image = right.imshow(found.judgement.correlation, cmap="RdBu_r", vmin=-1.0, vmax=1.0)
     # Names once, at the side: below the picture long ones would run off it.
     right.set_xticks(range(len(keys)), [str(place + 1) for place in range(len(keys))])
     right.set_yticks(range(len(keys)), [f"{key}  {place + 1}" for place, key in enumerate(keys)])
     right.grid(visible=False)
-    right.set_title("How they hang together")
-    for row, place in np.argwhere(np.isfinite(found.judgement.correlation)) if len(keys) <= _WRITTEN else ():
+    right.set_title("Correlation")
+    for row, place in np.argwhere(np.isfinite(found.judgement.correlation)) if len(keys) <= _MAX_LABELLED else ():
         value = found.judgement.correlation[row, place]
         right.text(place, row, f"{value:+.2f}", ha="center", va="center", color="white" if abs(value) > 0.6 else BLACK)
     figure.colorbar(image, ax=right, label="correlation [1]", shrink=0.8)

@@ -1,4 +1,4 @@
-"""How far a set of values is from the recording, over a stretch of it, in units of the sensors' noise."""
+"""Distance of a set of values from the recording over a window, in units of the sensors' noise."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from replays.recordings.resimulation.sensitivity import Predictor
 from rig.base.errors import InputError, SimulationError
 
 _STEP_SIGMAS = 0.5
-_LEAST_VARIANCE = 1e-20
-"""Finer steps than the root of this would show rounding."""
+_MIN_VARIANCE = 1e-20
+"""Variance below which difference quotients would be dominated by rounding."""
 
 
 class Window:
-    """The samples from the start of the question to some time, and what the model makes of them.
+    """Samples from the start of the question to some time, and their prediction.
 
-    Values are given as `z`: distances from where the search began, in scales, shape (unknowns,).
+    Values are given as `z`: distances from the start of the search in scales, shape (unknowns,).
 
     Attributes:
-        question: What is asked.
+        question: The request.
         end_s: End of the window, simulated [s].
-        rows: Rows in it.
+        rows: Number of rows.
     """
 
     def __init__(self, question: Question, end_s: float) -> None:
@@ -37,18 +37,18 @@ class Window:
 
     @property
     def runs(self) -> int:
-        """Simulations so far."""
+        """Number of simulations."""
         return self._predictor.runs
 
     def values(self, z: np.ndarray) -> np.ndarray:
-        """The values themselves, each in its unit."""
+        """Return the values in their units, shape (unknowns,)."""
         return self._start + z * self._scale
 
     def predicted(self, z: np.ndarray) -> np.ndarray:
-        """What the channels show without noise, in units of it, shape (rows, channels).
+        """Return the predicted channels without noise, in units of the noise, shape (rows, channels).
 
         Raises:
-            InputError: A value that the model does not take.
+            InputError: The model rejects a value.
             SimulationError: The state became non-finite.
         """
         observation = self.question.observation
@@ -56,31 +56,31 @@ class Window:
         return observation.placed(found.values, self.rows) / observation.noise
 
     def residuals(self, z: np.ndarray) -> np.ndarray:
-        """Measured less predicted, in units of the noise, 0 where a sample was lost, shape (rows, channels)."""
+        """Return measured minus predicted over the noise, 0 for lost samples, shape (rows, channels)."""
         return np.where(self.known, self._measured - self.predicted(z), 0.0)
 
     def residuals_or_none(self, z: np.ndarray) -> np.ndarray | None:
-        """The same; None where the model does not take the values."""
+        """Return the residuals; None if the model rejects the values."""
         try:
             return self.residuals(z)
         except (InputError, SimulationError):
             return None
 
     def slopes(self, z: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-        """D predicted / d z, shape (rows, channels, unknowns).
+        """Return d predicted / d z, shape (rows, channels, unknowns).
 
-        By central differences along the principal directions of what is known, each over half a standard deviation to
-        either side. Where values act almost alike, quotients along the values themselves would be the same but for
-        their errors, and these would pass for information.
+        Central differences are taken along the principal directions of the covariance, half a standard deviation to
+        each side. If two values have nearly equal effects, differences along them would differ only
+        by their errors, which would appear as information.
 
         Args:
-            z: Where.
-            covariance: Of z, shape (unknowns, unknowns).
+            z: Point of the derivative, shape (unknowns,).
+            covariance: Covariance of z, shape (unknowns, unknowns).
         """
         sizes, directions = np.linalg.eigh(covariance)
         whitened = []
         for size, direction in zip(sizes, directions.T, strict=True):
-            change = _STEP_SIGMAS * np.sqrt(max(size, _LEAST_VARIANCE)) * direction
+            change = _STEP_SIGMAS * np.sqrt(max(size, _MIN_VARIANCE)) * direction
             (above, up), (below, down) = (self._side(z, sign * change) for sign in (1.0, -1.0))
             width = float((above - below) @ direction)
             if width == 0.0:
@@ -89,14 +89,14 @@ class Window:
         return np.einsum("nck,pk->ncp", np.stack(whitened, axis=-1), directions)
 
     def slopes_by_keys(self, z: np.ndarray) -> np.ndarray:
-        """The same by each value alone, in the predictor's own steps, shape (rows, channels, unknowns)."""
+        """Return the slopes by each value alone, in the predictor's own steps, shape (rows, channels, unknowns)."""
         observation = self.question.observation
         found = self._predictor.derivatives(self.values(z)).slopes
         columns = [observation.placed(one, self.rows) * s for one, s in zip(found, self._scale, strict=True)]
         return np.nan_to_num(np.stack(columns, axis=-1) / observation.noise[:, None])
 
     def _side(self, z: np.ndarray, change: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """A point beside z and what is predicted there; z itself where the model does not take it."""
+        """Return a point near z and the prediction there; z itself if the model rejects the point."""
         try:
             return z + change, self.predicted(z + change)
         except (InputError, SimulationError):

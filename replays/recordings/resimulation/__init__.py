@@ -1,1 +1,1 @@
-"""The experiment of a recording done again, and how its signals change with any number of it."""
+"""Re-simulation of a recorded experiment, and sensitivity of its signals to any of its numbers."""

@@ -1,4 +1,4 @@
-"""Work on threads of its own, its results taken in order, a few calls behind at most."""
+"""Calls on background threads, with results taken in order and a bounded queue."""
 
 from __future__ import annotations
 
@@ -7,31 +7,31 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
-_AHEAD = 4
+_MAX_PENDING = 4
 
 
 class Background:
-    """Calls that go on while the caller does; an error of one is raised by a later `call`, or by `finish`."""
+    """Background calls; an error of one is raised by a later `call`, or by `finish`."""
 
     def __init__(self, take: Callable[[Any], object] = lambda result: None, *, threads: int = 1) -> None:
-        """Begin.
+        """Start the threads.
 
         Args:
-            take: Given each result, in order, on the caller's thread.
-            threads: How many work at a time.
+            take: Callback for each result, in order, on the caller's thread.
+            threads: Number of threads.
         """
         self._take = take
         self._pool = ThreadPoolExecutor(max_workers=threads)
         self._due: deque[Future[Any]] = deque()
 
     def call(self, function: Callable[..., Any], *arguments: Any) -> None:
-        """Do this next."""
+        """Queue a call; wait while too many are pending."""
         self._due.append(self._pool.submit(function, *arguments))
-        while len(self._due) > _AHEAD:
+        while len(self._due) > _MAX_PENDING:
             self._take(self._due.popleft().result())
 
     def finish(self) -> None:
-        """Wait for everything; what waits behind an error is not done."""
+        """Wait for all calls; those after an error are cancelled."""
         try:
             while self._due:
                 self._take(self._due.popleft().result())

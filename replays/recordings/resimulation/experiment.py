@@ -1,4 +1,4 @@
-"""What was done to the rig in a recording, so that it can be done again: scene, parameters, commands with their times.
+"""Experiment of a recording, for simulation: scene, parameters and commands with their times.
 
 On the same build the same experiment gives the same payloads, bit for bit.
 """
@@ -24,22 +24,23 @@ from rig.run.offline import Run, SentCommand, frames, simulate
 from rig.run.scenes import Scene, change_scene, parse_scene
 from rig.run.simulation import TICK_RATE_HZ, Frame, Simulation
 
-BEFORE_S = 0.5
-"""A log from the middle of a run is taken up so long before the hammer pulse [s]: a few turns tell where it is."""
+PICKUP_S = 0.5
+"""Time before the hammer pulse at which a log from a running rig is picked up [s]: a few turns show the state of the
+shaft."""
 GRID_S = 0.1
-"""A whole number of samples of every rate [s]."""
+"""Time step that is a whole number of samples of every rate [s]."""
 
 
 @dataclass(frozen=True)
 class Experiment:
-    """A scene with the commands that were sent to it.
+    """Scene with the commands that were sent to it.
 
     Attributes:
-        scene: The scene, on the recorded parameters; it ends where the recording does.
-        commands: What was sent to the rig beside the scene's own commands.
+        scene: The scene with the recorded parameters; it ends with the recording.
+        commands: Commands sent in addition to those of the scene.
         first_s: Simulated time at which the recording begins [s].
-        begin: Where it is taken up, of a log from the middle of a run; None: at 0, where its scene begins.
-        unsure: Standard deviation of what a log tells less surely than by a channel of its own, by key, in its unit.
+        begin: Initial state of a log from a running rig; None: the scene's own start at time 0.
+        unsure: Standard deviation of values without their own channel, by key, in their unit.
     """
 
     scene: Scene
@@ -50,11 +51,10 @@ class Experiment:
 
     @classmethod
     def of(cls, recording: Recording) -> Self:
-        """Take the experiment from a recording of this rig.
+        """Return the experiment of a recording of this rig.
 
         Raises:
-            InputError: The recording is none of this rig's, or of a version whose scene or parameters mean nothing
-                here.
+            InputError: The recording is not from this rig, or this version does not know its scene or parameters.
         """
         document = recording.scene.get("scene")
         streams = [stream for stream in recording.streams.values() if stream.rows]
@@ -71,72 +71,72 @@ class Experiment:
             if one["command"] in COMMANDS
         ]
         first_s = min(float(stream.first_time_s) for stream in streams)
-        begin = _taken_up(recording, scene, first_s) if is_from_the_middle(recording) else None
+        begin = _initial_state(recording, scene, first_s) if starts_while_running(recording) else None
         unsure = recording.scene.get("import", {}).get("unsure", {})
         return cls(scene=scene, commands=tuple(sent), first_s=first_s, begin=begin, unsure=unsure)
 
     def changed(self, changes: dict[str, Any]) -> Experiment:
-        """The same with other values of scene or parameters, by dotted key, each in its own unit.
+        """Return the experiment with other values of scene or parameters, by dotted key, each in its own unit.
 
         Raises:
-            InputError: An unknown key, or a value that it must not have.
+            InputError: An unknown key or an invalid value.
         """
         return replace(self, scene=change_scene(self.scene, changes))
 
     def without_faults(self) -> Experiment:
-        """The same with sound sensors: as one who knows nothing of faults has it."""
+        """Return the experiment without sensor faults."""
         kept = tuple(one for one in self.scene.commands if one.request.MECHANICAL)
         sent = tuple(one for one in self.commands if one.name in MECHANICAL)
         return replace(self, scene=self.scene.model_copy(update={"commands": kept}), commands=sent)
 
     @property
     def faulty(self) -> set[str]:
-        """Channels that were told to misbehave, some time."""
+        """Channels that have a fault at some time."""
         timed = [one.request for one in self.scene.commands] + [
             check_command(one.name, dict(one.request)) for one in self.commands if one.name == "fault"
         ]
         table, sensors = self.scene.table, self.scene.sensors
-        told = [one for one in timed if isinstance(one, FaultCommand)]
+        sent = [one for one in timed if isinstance(one, FaultCommand)]
         ideal = sensors.chain == "ideal"
         return {
-            name for one in told for name in channels_of(one.what, one.channel, table, ideal=ideal, noisy=sensors.noise)
+            name for one in sent for name in channels_of(one.what, one.channel, table, ideal=ideal, noisy=sensors.noise)
         }
 
     def simulation(self) -> Simulation:
-        """A simulation of the scene, at its start; `frames` sends it the commands."""
+        """Return a simulation of the scene at its start; `frames` sends it the commands."""
         return Simulation(self.scene, begin=self.begin)
 
     def frames(self, simulation: Simulation, *, chunk_s: float = 0.1) -> Iterator[Frame]:
-        """Do it again on a simulation, chunk by chunk."""
+        """Run the experiment on a simulation, chunk by chunk."""
         return frames(simulation, chunk_s=chunk_s, commands=self.commands)
 
     def run(self, *, duration_s: float | None = None, progress: Callable[[float], None] | None = None) -> Run:
-        """Do it again, and keep everything.
+        """Run the experiment, and keep everything.
 
         Args:
             duration_s: End at another time [s].
-            progress: Called with the part done, 0 to 1.
+            progress: Callback for the completed fraction, 0 to 1.
         """
         return simulate(self.scene, duration_s=duration_s, commands=self.commands, progress=progress)
 
 
 def is_imported(recording: Recording) -> bool:
-    """Whether a recording is a log of another system."""
+    """Return whether a recording is a log of another system."""
     return "import" in recording.scene
 
 
-def is_from_the_middle(recording: Recording) -> bool:
-    """Whether it is one of a rig that ran before: where its shaft was, only its samples tell."""
+def starts_while_running(recording: Recording) -> bool:
+    """Return whether the rig of a log was already running, so that only samples show the shaft's state."""
     mapped = recording.scene.get("import", {}).get("mapping", {}).get("experiment", {})
     return mapped.get("commands", "scene") != "scene" and "lead_s" not in mapped
 
 
-def _taken_up(recording: Recording, scene: Scene, first_s: float) -> Begin:
-    """Where such a log is taken up: shortly before the hammer, with the shaft at the angle that the edges tell."""
+def _initial_state(recording: Recording, scene: Scene, first_s: float) -> Begin:
+    """Return the initial state of such a log: shortly before the hammer pulse, at the angle of the edges."""
     hammer_s = min((timed.at_s for timed in scene.commands), default=first_s)
-    begin_s = math.floor(round(max(first_s, hammer_s - BEFORE_S) / GRID_S, 6)) * GRID_S
+    begin_s = math.floor(round(max(first_s, hammer_s - PICKUP_S) / GRID_S, 6)) * GRID_S
     edges_s = recording.edges()
-    edges_s = edges_s[edges_s < hammer_s] if scene.commands else edges_s  # behind the pulse it slows down
+    edges_s = edges_s[edges_s < hammer_s] if scene.commands else edges_s  # the shaft slows down after the pulse
     if len(edges_s) < 2:
         turns = (begin_s - edges_s.sum()) * scene.drive.speed_hz if len(edges_s) else 0.0
         return Begin(round(begin_s * TICK_RATE_HZ), angle=2.0 * math.pi * (turns % 1.0))
@@ -146,16 +146,16 @@ def _taken_up(recording: Recording, scene: Scene, first_s: float) -> Begin:
 
 
 def _end_s(recording: Recording) -> float:
-    """Simulated time behind the last row of any stream [s].
+    """Return the simulated time after the last row of any stream [s].
 
     Raises:
-        InputError: The times of a stream do not fit its row numbers: no run ends there.
+        InputError: The times of a stream contradict its row numbers.
     """
     rates = {sensor_key(name): group.rate_hz for name, group in recording.table.groups.items()}
     rates |= {truth_key(name): table["rate_hz"] for name, table in recording.catalogue.get("truth", {}).items()}
     ends = [0.0]
     for key, stream in recording.streams.items():
-        if key != EDGES and stream.rows > 1:  # edges come once a turn, not at a rate
+        if key != EDGES and stream.rows > 1:  # edges come once per turn, not at a rate
             steps = stream.rows + stream.lost - 1
             period_s = (stream.last_time_s - stream.first_time_s) / steps
             if key in rates and not 0.5 < period_s * rates[key] < 2.0:
@@ -179,7 +179,7 @@ def recorded_scene(parameters: dict[str, Any], document: dict[str, Any]) -> dict
 
 
 def _recorded_parameters(parameters: dict[str, Any], document: dict[str, Any]) -> dict[str, Any]:
-    """The scene's fields that give the recorded parameters, whatever has become of the files that they were from.
+    """Return the scene's fields that give the recorded parameters, independent of the files they came from.
 
     Raises:
         InputError: This version does not know one of them.

@@ -1,6 +1,6 @@
-"""What the model predicts for the very rows of a recording: every channel without noise, and the truth.
+"""Model prediction for the rows of a recording: every channel without noise, and the truth.
 
-Channels are the recording's own, with its calibration, filters and noise, on its own clock.
+Channels have the recording's own calibration, filters and noise, on its own clock.
 """
 
 from __future__ import annotations
@@ -24,37 +24,37 @@ from rig.run.offline import frames
 from rig.run.scenes import Scene, rig_table
 from rig.run.simulation import TICK_RATE_HZ, Frame, Simulation, Snapshot
 
-_FINE_BITS = 32
-"""Bits of a predicted channel's converter: its steps are none of the recording's."""
-_BEYOND = 16.0
-"""So much more than an imported log shows of a channel may be predicted, where the rig has none of that name."""
-_QUIET = 2.0
-"""Below so many steps of noise a channel's rounding is not random: its floor is a bound, not a deviation."""
+_ADC_BITS = 32
+"""Word length of a predicted channel's converter, whose rounding is then negligible."""
+_RANGE_MARGIN = 16.0
+"""Range of a predicted channel over that of an imported log, if the rig has no channel of that name."""
+_MIN_NOISE_STEPS = 2.0
+"""Noise in converter steps below which rounding is not random, so that the floor is a bound and not a deviation."""
 _CHUNK_S = 0.1
-_BEHIND = 3
-"""Rows behind a sample that a polynomial through six of them may need."""
-_SETTLED_S = 0.02
-"""Low-passes have settled after this [s] ..."""
-_DECAYS = 7.0
-"""... and high-passes after so many of their time constants."""
-_LEAD_INS = 8
-"""So many are kept: those of a central difference in two values, and some more."""
+_POLYNOMIAL_ROWS = 3
+"""Rows after a sample that a polynomial through six of them may need."""
+_LOW_PASS_SETTLING_S = 0.02
+"""Settling time of the low-passes [s]."""
+_HIGH_PASS_SETTLING = 7.0
+"""Settling time of high-passes, in time constants."""
+_MAX_LEAD_INS = 8
+"""Lead-ins kept: those of a central difference in two values, and some more."""
 
 
 @dataclass(frozen=True)
 class Measured:
-    """The channels of one group of a recording that the model knows.
+    """Channels of one group of a recording that the model knows.
 
     Attributes:
-        group: Its name.
-        channels: With the recording's own calibration.
+        group: Name of the group.
+        channels: Channels with the recording's own calibration.
         times_s: Simulated time of each row [s], shape (n,).
         index: Number of each row, shape (n,); a step other than 1 is a gap.
         values: Engineering values, shape (n, channels).
         floor: Standard deviation of noise and rounding of each channel [its unit], shape (channels,).
-        random: Whether that is noise (True) or a bound of the rounding, shape (channels,).
-        ideal: Whether the scene left filters and noise out.
-        version: Of the channel table.
+        random: True if the floor is noise, False if it is a bound of the rounding, shape (channels,).
+        ideal: True if the scene had no filters and no noise.
+        version: Version of the channel table.
     """
 
     group: str
@@ -73,36 +73,42 @@ class Measured:
         return tuple(channel.name for channel in self.channels)
 
     def rows_until(self, end_s: float) -> int:
-        """Number of rows before a time."""
+        """Return the number of rows before a time."""
         return int(np.searchsorted(self.times_s, end_s))
 
     def until(self, end_s: float) -> Measured:
-        """The rows before a time."""
+        """Return the rows before a time."""
         return self.first(self.rows_until(end_s))
 
-    def from_(self, begin_s: float) -> Measured:
-        """The rows from a time on."""
-        return self.chosen(slice(self.rows_until(begin_s), None))
+    def starting_at(self, begin_s: float) -> Measured:
+        """Return the rows from a time on."""
+        return self.select_rows(slice(self.rows_until(begin_s), None))
 
-    def filtered(self, factor: float) -> Measured:
-        """The same behind low-passes of other corners."""
+    def with_corner_factor(self, factor: float) -> Measured:
+        """Return the channels with low-passes of other corners."""
         corners = ((channel, channel.bandwidth_hz * factor) for channel in self.channels)
         return replace(self, channels=tuple(one.model_copy(update={"bandwidth_hz": hz}) for one, hz in corners))
 
     def first(self, n: int) -> Measured:
-        """The first rows."""
-        return self.chosen(slice(n))
+        """Return the first rows."""
+        return self.select_rows(slice(n))
 
-    def chosen(self, rows: slice | np.ndarray) -> Measured:
-        """Some of the rows."""
+    def select_rows(self, rows: slice | np.ndarray) -> Measured:
+        """Return some of the rows."""
         return replace(self, times_s=self.times_s[rows], index=self.index[rows], values=self.values[rows])
 
-    def later(self, shift_s: float, rate: float, *, about_s: float) -> Measured:
-        """The same where the recording's clock is late by a shift [s], and gains at a rate [1] from a time on [s]."""
+    def correct_clock(self, shift_s: float, rate: float, *, about_s: float) -> Measured:
+        """Return the rows with the recording's clock corrected.
+
+        Args:
+            shift_s: Delay of the recording's clock [s].
+            rate: Relative rate error of the clock [1].
+            about_s: Time at which the clocks differ by the delay alone [s].
+        """
         return replace(self, times_s=self.times_s - shift_s - rate * (self.times_s - about_s))
 
-    def earlier(self, late_s: Mapping[str, float]) -> Measured:
-        """The same with some channels as if they were not late [s]."""
+    def remove_delays(self, late_s: Mapping[str, float]) -> Measured:
+        """Return the rows with the delays of some channels removed [s]."""
         from scipy.interpolate import CubicSpline
 
         columns = [c for c, name in enumerate(self.names) if name in late_s]
@@ -114,7 +120,7 @@ class Measured:
         return replace(self, values=values)
 
     def only(self, names: Sequence[str]) -> Measured:
-        """Some of the channels."""
+        """Return some of the channels."""
         kept = [c for c, name in enumerate(self.names) if name in names]
         return replace(
             self, channels=tuple(self.channels[c] for c in kept), values=self.values[:, kept], floor=self.floor[kept],
@@ -123,17 +129,17 @@ class Measured:
 
     @cached_property
     def fine(self) -> tuple[Channel, ...]:
-        """The channels with a converter that hardly rounds, and where no range is known, without one."""
+        """Channels with a converter of negligible rounding, and without range limits if no range is known."""
         return tuple(
-            channel.model_copy(update={"adc_bits": _FINE_BITS} | ({} if channel.has_range else _wide(channel)))
+            channel.model_copy(update={"adc_bits": _ADC_BITS} | ({} if channel.has_range else _range(channel)))
             for channel in self.channels
         )
 
 
-def _wide(channel: Channel) -> dict[str, Any]:
-    """A range that holds what the rig's own channel of that name may show: of the log's, the unit may be wrong."""
+def _range(channel: Channel) -> dict[str, Any]:
+    """Return a range that holds the rig's own channel of that name, as the unit of the log may be wrong."""
     own = default_table().channels.get(channel.name)
-    reach_v = _BEYOND * channel.adc_v
+    reach_v = _RANGE_MARGIN * channel.adc_v
     if own is not None and own.unit == channel.unit:
         ends = ((volts - own.bias_v) / own.sensitivity_v for volts in own.range_v)
         reach_v = max(channel.adc_v, 2.0 * max(abs(channel.bias_v + channel.sensitivity_v * end) for end in ends))
@@ -141,15 +147,15 @@ def _wide(channel: Channel) -> dict[str, Any]:
 
 
 def measured(recording: Recording, scene: Scene, *, longest_s: float = math.inf) -> dict[str, Measured]:
-    """The groups of a recording that the model knows, by name.
+    """Return the groups of a recording that the model knows, by name.
 
     Args:
         recording: The recording.
-        scene: What it is a recording of: what its channels feel, and whether there were filters and noise.
-        longest_s: How much of it, from the first sample on [s].
+        scene: Scene of the recording, for the signals of its channels, filters and noise.
+        longest_s: Length from the first sample on [s].
 
     Raises:
-        InputError: It holds no two samples of a channel that the model knows.
+        InputError: No channel that the model knows has two samples.
     """
     found, formulas, sensors = {}, scene.formulas(), scene.sensors
     ideal = sensors.chain == "ideal"
@@ -162,10 +168,10 @@ def measured(recording: Recording, scene: Scene, *, longest_s: float = math.inf)
         order = np.argsort(samples.index, kind="stable")
         order = order[samples.times_s[order] < samples.times_s[order[0]] + longest_s]
         channels = tuple(group.channels[c] for c in columns)
-        loud = np.array([channel.noise_v if noise else 0.0 for channel in channels])
+        noise_levels = np.array([channel.noise_v if noise else 0.0 for channel in channels])
         step = np.array([channel.lsb_v for channel in channels])
-        random = loud > _QUIET * step
-        floor = np.where(random, np.hypot(loud, step / np.sqrt(12.0)), np.maximum(loud, step))
+        random = noise_levels > _MIN_NOISE_STEPS * step
+        floor = np.where(random, np.hypot(noise_levels, step / np.sqrt(12.0)), np.maximum(noise_levels, step))
         found[name] = Measured(
             group=name,
             channels=channels,
@@ -184,13 +190,13 @@ def measured(recording: Recording, scene: Scene, *, longest_s: float = math.inf)
 
 @dataclass(frozen=True)
 class Prediction:
-    """What is predicted.
+    """Predicted channels and truth.
 
     Attributes:
-        values: Of each group, on the recording's rows, in its channels' units, shape (rows, channels).
-        truth: Of each truth table [SI], from time zero on, shape (n, columns).
-        truth_rate_hz: Rows of it a second.
-        contacts: Contacts begun from the start of the experiment to shortly behind the last row.
+        values: Channels of each group on the recording's rows, in their units, shape (rows, channels).
+        truth: Truth tables [SI] from time zero on, shape (n, columns).
+        truth_rate_hz: Rate of the truth tables [Hz].
+        contacts: Contacts from the start of the experiment to shortly after the last row.
     """
 
     values: dict[str, np.ndarray]
@@ -200,7 +206,7 @@ class Prediction:
 
 
 class _Channels:
-    """Turns rows of the model into what channels of one rate show without noise, on the recorded rows."""
+    """Conversion of model rows to noise-free channels of one rate, on the recorded rows."""
 
     def __init__(
         self, parts: Sequence[Measured], *, rate_hz: int, row_rate_hz: int, formulas: Formulas, digital: bool
@@ -218,7 +224,7 @@ class _Channels:
         self._first = 0
 
     def begin(self, row: int) -> None:
-        """Leave out what is before a row that a sample falls on."""
+        """Skip the samples before a row on which a sample falls."""
         self._first = row * self._in_a_row // self.apart
 
     def take(self, rows: np.ndarray) -> None:
@@ -233,18 +239,19 @@ class _Channels:
         found = {}
         for part in self._parts:
             values = self._groups[part.group].engineering(np.concatenate(self._counts[part.group]))
-            found[part.group] = sampled(values, part.times_s * self._rate_hz - self._first)
+            found[part.group] = interpolate_rows(values, part.times_s * self._rate_hz - self._first)
         return found
 
 
-def sampled(values: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Even samples at places between them, by the polynomial through the six nearest; on a sample, that sample.
+def interpolate_rows(values: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Interpolate even samples by the polynomial through the six nearest ones; sampling points are reproduced.
 
-    Behind a low-pass at an eighth of the rate the error is 1e-3 of the signal where a straight line makes 8e-2.
+    After a low-pass at an eighth of the rate the error is 1e-3 of the signal, compared with 8e-2 of linear
+    interpolation.
 
     Args:
         values: Samples, shape (n, channels).
-        places: In samples from the first, shape (m,).
+        places: Positions in samples from the first, shape (m,).
 
     Returns:
         Shape (m, channels).
@@ -262,7 +269,7 @@ def sampled(values: np.ndarray, places: np.ndarray) -> np.ndarray:
 
 
 def _channels(parts: dict[str, Measured], scene: Scene, *, row_rate_hz: int) -> list[_Channels]:
-    """The channels, those of one rate together."""
+    """Return the channels, grouped by rate."""
     rates: dict[tuple[int, bool], list[Measured]] = {}
     for part in parts.values():
         rate = part.channels[0].rate_hz
@@ -270,7 +277,7 @@ def _channels(parts: dict[str, Measured], scene: Scene, *, row_rate_hz: int) -> 
         digital = part.version < 2
         even = row_rate_hz % rate == 0 if digital else fits(rate, row_rate_hz)
         exact = even and bool(np.abs(places - np.rint(places)).max() < 1e-6)
-        # A clock that does not divide ours is read off every row of the model.
+        # At a rate that does not divide the model's, channels are interpolated between all rows of the model.
         rates.setdefault((rate if exact else row_rate_hz, part.ideal), []).append(part)
     return [
         _Channels(alike, rate_hz=rate, row_rate_hz=row_rate_hz, formulas=scene.formulas(), digital=alike[0].version < 2)
@@ -279,9 +286,9 @@ def _channels(parts: dict[str, Measured], scene: Scene, *, row_rate_hz: int) -> 
 
 
 class LeadIns:
-    """Runs up to shortly before the first samples, or the first command: experiments that differ in commands share one.
+    """Cache of simulations up to the first samples or the first command, for experiments that differ only later.
 
-    What is predicted by them is the same bit for bit.
+    Predictions with and without it are equal bit for bit.
     """
 
     def __init__(self) -> None:
@@ -290,7 +297,7 @@ class LeadIns:
     def take(
         self, experiment: Experiment, simulation: Simulation, *, chunk_s: float, until: int
     ) -> dict[str, list[np.ndarray]]:
-        """Take a simulation at its start to a tick, or as many whole chunks before it as no command comes in.
+        """Advance a simulation from its start to a tick, or by whole chunks to the last one without a command.
 
         Returns:
             The truth up to there, by table.
@@ -302,7 +309,7 @@ class LeadIns:
         alone = experiment.scene.model_copy(update={"commands": ()})
         key = (alone.model_dump_json(), experiment.begin, chunk_s, until)
         if key not in self._kept:
-            if len(self._kept) == _LEAD_INS:
+            if len(self._kept) == _MAX_LEAD_INS:
                 self._kept.pop(next(iter(self._kept)))
             self._kept[key] = _lead_in(Simulation(alone, begin=experiment.begin), chunk_s=chunk_s, until=until)
         snapshot, truth = self._kept[key]
@@ -329,15 +336,16 @@ def predict(
     progress: Callable[[float], None] | None = None,
     lead_ins: LeadIns | None = None,
 ) -> Prediction:
-    """Simulate, and read off what the recorded channels would have shown without noise.
+    """Simulate an experiment, and return the recorded channels without noise.
 
     Args:
-        experiment: What to simulate; `bare` makes it cheaper.
-        parts: The channels, and the rows wanted.
+        experiment: Experiment to simulate; `bare` makes it cheaper.
+        parts: Channels and rows to predict.
         end_s: Only rows before this time [s].
-        follow: Given every frame, to the end of the experiment; without it nothing behind the last row is simulated.
-        progress: Called with the part done, 0 to 1.
-        lead_ins: Those of predictions before this one; without `follow` only.
+        follow: Callback for every frame to the end of the experiment; without it the simulation ends after the last
+            row.
+        progress: Callback for the completed fraction, 0 to 1.
+        lead_ins: Cache of lead-ins; only without `follow`.
     """
     if end_s is not None:
         parts = {name: part.until(end_s) for name, part in parts.items()}
@@ -351,7 +359,7 @@ def predict(
         return Prediction({name: _generated(experiment.scene, part) for name, part in parts.items()}, {}, 1)
     row_rate_hz = TICK_RATE_HZ // simulation.row_ticks
     taking = _channels(parts, experiment.scene, row_rate_hz=row_rate_hz)
-    chunk_s = min(_CHUNK_S, last_s + 2e-3)  # the row of the last sample must be in it, and some behind it
+    chunk_s = min(_CHUNK_S, last_s + 2e-3)  # includes the row of the last sample and some after it
     begin_tick = max(simulation.tick, _begin_tick(parts, taking, chunk_s=chunk_s, row_rate_hz=row_rate_hz))
     for channels in taking:
         channels.begin(begin_tick * row_rate_hz // TICK_RATE_HZ)
@@ -359,8 +367,8 @@ def predict(
     if lead_ins is not None:
         truth = lead_ins.take(experiment, simulation, chunk_s=chunk_s, until=begin_tick)
     for frame in experiment.frames(simulation, chunk_s=chunk_s):
-        if frame.tick <= last_s * TICK_RATE_HZ + _BEHIND * simulation.row_ticks:
-            # A command that was sent ends a frame, and those behind it begin on no grid.
+        if frame.tick <= last_s * TICK_RATE_HZ + _POLYNOMIAL_ROWS * simulation.row_ticks:
+            # A sent command ends a frame; later frames are not aligned to a grid.
             before = max(0, begin_tick - frame.tick) // simulation.row_ticks
             if before < len(frame.rows):
                 for channels in taking:
@@ -382,7 +390,7 @@ def predict(
 
 
 def _generated(scene: Scene, part: Measured) -> np.ndarray:
-    """What a group shows of test signals, in its channels' units, shape (rows, channels)."""
+    """Return a group's test signals in its channels' units, shape (rows, channels)."""
     sources = scene.sources()
     volts = [sources[channel.name].volts(part.times_s).clip(-channel.adc_v, channel.adc_v) for channel in part.channels]
     shown = [(v - channel.bias_v) / channel.sensitivity_v for v, channel in zip(volts, part.channels, strict=True)]
@@ -390,18 +398,18 @@ def _generated(scene: Scene, part: Measured) -> np.ndarray:
 
 
 def _begin_tick(parts: dict[str, Measured], taking: Sequence[_Channels], *, chunk_s: float, row_rate_hz: int) -> int:
-    """From when on the channels are worked out: early enough for their filters to have settled at the first sample."""
+    """Return the tick from which channels are computed, so that filters are settled at the first sample."""
     chunk = round(chunk_s * row_rate_hz)
     if chunk_s < _CHUNK_S or any(chunk % channels.apart for channels in taking):
         return 0
     corners = [c.highpass_hz for part in parts.values() for c in part.channels if c.highpass_hz]
-    settled_s = _SETTLED_S + _DECAYS / (2.0 * math.pi * min(corners, default=math.inf))
+    settled_s = _LOW_PASS_SETTLING_S + _HIGH_PASS_SETTLING / (2.0 * math.pi * min(corners, default=math.inf))
     first_s = min(float(part.times_s[0]) for part in parts.values()) - settled_s
     return max(0, math.floor(first_s / chunk_s)) * chunk * (TICK_RATE_HZ // row_rate_hz)
 
 
 def bare(experiment: Experiment) -> Experiment:
-    """The same motion with one cheap, sound sensor and no companion: rows stay as far apart as they were."""
+    """Return the experiment with one cheap, fault-free sensor group and no companion, at the same row spacing."""
     if experiment.scene.generator is not None:
         return experiment
     groups = (experiment.scene.channels or rig_table()).groups.values()

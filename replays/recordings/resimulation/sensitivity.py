@@ -1,9 +1,9 @@
-"""What the sensors would show without noise, and how that changes with any number of the experiment.
+"""Noise-free channels as a function of the numbers of an experiment, and their derivatives.
 
-A value goes by its dotted key: a parameter (`contact.friction`, in its own unit), a number of the scene
-(`drive.speed_hz`), one of a command (`hammer.1.force_n`: of the first hammer pulse; `at_s`, `duration_ms` and
-`direction` [degrees from x toward y] likewise), or one of the recording (`clock.offset_s` and `clock.rate_ppm` of its
-clock, `shaft.angle_rad` and `state.ring_x` and others where it begins).
+A value has a dotted key: a parameter (`contact.friction`, in its own unit), a number of the scene (`drive.speed_hz`) or
+of a command (`hammer.1.force_n` of the first hammer pulse; likewise `at_s`, `duration_ms` and `direction` [degrees from
+x toward y]), or one of the recording (`clock.offset_s` and `clock.rate_ppm` of its clock, `shaft.angle_rad`,
+`state.ring_x` and others of its initial state).
 """
 
 from __future__ import annotations
@@ -29,40 +29,40 @@ from rig.run.scenes import Scene, change_scene, parse_scene
 from rig.run.simulation import TICK_RATE_HZ
 
 CLOCK = {"clock.offset_s": ("s", 5e-3), "clock.rate_ppm": ("ppm", 1e3)}
-"""How late the recording's clock is where its samples begin, and how much faster it goes: unit, change of size 1."""
+"""Delay of the recording's clock at its first sample, and its relative rate error: unit, size of a unit change."""
 ANGLE = "shaft.angle_rad"
-"""Angle of the shaft where the samples begin, on what the experiment has [rad]: whatever the speed before was."""
+"""Angle of the shaft at the first sample relative to the experiment [rad], independent of the speed before."""
 STATE = {f"state.{name}": (unit, si, scale) for name, unit, si, scale in (
     ("ring_x", "mm", 1e-3, 0.1), ("ring_y", "mm", 1e-3, 0.1), ("vx", "mm/s", 1e-3, 10.0), ("vy", "mm/s", 1e-3, 10.0),
 )}  # fmt: skip
-"""Where the shaft is in the ring, and how fast, where a log from the middle of a run is taken up: unit, that in SI,
-change of size 1."""
+"""Position and velocity of the shaft in the ring at the start of a log from a running rig: unit, that in SI, size of a
+unit change."""
 _STEP = 1e-5
-"""Step of a difference quotient, as a part of the value's scale, ..."""
-_LEAST_STEP = 1e-8
-"""... and this is as far as it is shortened where the contacts are not the same ones on both sides."""
-_KEPT = 8
-"""Predictions that are kept."""
+"""Step of a difference quotient, relative to the value's scale."""
+_MIN_STEP = 1e-8
+"""Smallest step, to which it is shortened while the contacts on the two sides differ."""
+_MAX_CACHED = 8
+"""Predictions kept."""
 _MARGIN_S = 1e-4
-"""The model is followed so far behind the last row, which may lie between two of its own."""
+"""Simulated time after the last row, which may lie between two rows of the model."""
 _ROWS_HZ = TICK_RATE_HZ // ROW_TICKS
 _COMMAND_KEY = re.compile(rf"({'|'.join(MECHANICAL)})\.([1-9][0-9]*)\.(\w+)")
 _TICK_S = 1.0 / TICK_RATE_HZ
 _STEPS = {"at_s": 2.0 * _TICK_S, "duration_ms": 2e3 * _TICK_S}
-"""Steps of difference quotients of what a simulation rounds to ticks, by field of a command, in the field's unit: as
-few ticks as go, as impacts far ahead bend over more."""
+"""Steps of difference quotients in quantities that a simulation rounds to ticks, by field of a command, in its unit.
+They are as small as possible, as later impacts amplify them."""
 _SCALES = {"at_s": 1e-3, "direction": 10.0}
-"""What counts as a change of size 1 where the value itself may be 0 [s], [degrees]."""
+"""Size of a unit change if the value itself may be 0 [s], [degrees]."""
 
 
 @dataclass(frozen=True)
 class Derivatives:
-    """How channels change with values of the experiment.
+    """Derivatives of channels with respect to values of the experiment.
 
     Attributes:
-        base: The channels at the values themselves.
-        slopes: d channel / d value, in their units, by group, each shape (rows, channels); one a key.
-        smooth: Whether the contacts were the same ones on both sides, shape (keys,).
+        base: Channels at the values themselves.
+        slopes: d channel / d value in their units, by group, each shape (rows, channels); one per key.
+        smooth: True if the contacts were the same on both sides, shape (keys,).
     """
 
     base: Prediction
@@ -71,10 +71,10 @@ class Derivatives:
 
 
 def value_of(experiment: Experiment, key: str) -> float:
-    """The number that a key stands for, in its own unit; of a rule, what the rule gives.
+    """Return the number of a key in its own unit; for a rule, its result.
 
     Raises:
-        InputError: No such number.
+        InputError: There is no such number.
     """
     if key in CLOCK or key == ANGLE:
         return 0.0
@@ -105,10 +105,10 @@ def value_of(experiment: Experiment, key: str) -> float:
 
 
 def with_values(experiment: Experiment, values: Mapping[str, float]) -> Experiment:
-    """The experiment with other numbers; a rule gives way to the number. Those of the clock are none of the experiment.
+    """Return the experiment with other numbers; a number replaces a rule. Clock values are ignored.
 
     Raises:
-        InputError: An unknown key, or a value that it must not have.
+        InputError: An unknown key or an invalid value.
     """
     placed: dict[str, Any] = {key.split(".")[1]: value * STATE[key][1] for key, value in values.items() if key in STATE}
     if placed:
@@ -138,7 +138,7 @@ def with_values(experiment: Experiment, values: Mapping[str, float]) -> Experime
         command = commands[place]
         request = command.request.model_dump(exclude={"command"}) | {k: v for k, v in fields.items() if k != "at_s"}
         if "duration_ms" in fields:
-            # As many ticks as a simulation takes, with the same impulse: nothing jumps as it goes on by one.
+            # Whole ticks with the same impulse, so that the motion does not jump as the number of ticks changes by one.
             ticks = max(1, round(fields["duration_ms"] * 1e-3 * TICK_RATE_HZ))
             request["force_n"] *= fields["duration_ms"] * 1e-3 * TICK_RATE_HZ / ticks
             request["duration_ms"] = ticks * _TICK_S * 1e3
@@ -151,12 +151,12 @@ def with_values(experiment: Experiment, values: Mapping[str, float]) -> Experime
 
 def _begin_of(experiment: Experiment, key: str) -> Begin:
     if experiment.begin is None:
-        raise InputError(key, "asked of a log from the middle of a run", key)
+        raise InputError(key, "used with a log of a rig that was already running", key)
     return experiment.begin
 
 
 def scale_of(experiment: Experiment, key: str) -> float:
-    """What counts as a change of size 1 in a value, in its unit: the value itself, or a length or time like it."""
+    """Return the size of a unit change of a value, in its unit: the value itself, or a related length or time."""
     if key in ("ring.offset_x", "ring.offset_y"):
         return value_of(experiment, "ring.clearance")
     if key in ("shaft.unbalance_phase", ANGLE):
@@ -170,14 +170,14 @@ def scale_of(experiment: Experiment, key: str) -> float:
 
 
 class Predictor:
-    """The channels of a recording as a function of some values of its experiment.
+    """Channels of a recording as a function of values of its experiment.
 
     Attributes:
         keys: Keys of the values.
-        start: The values as the experiment has them, shape (keys,).
-        scales: What counts as a change of size 1, shape (keys,).
-        parts: The channels and the rows wanted, by group.
-        runs: How many simulations there have been.
+        start: Values of the experiment, shape (keys,).
+        scales: Sizes of a unit change, shape (keys,).
+        parts: Channels and rows to predict, by group.
+        runs: Number of simulations.
     """
 
     def __init__(
@@ -201,33 +201,33 @@ class Predictor:
         self._lead_ins = LeadIns()
 
     def predict(self, values: Sequence[float] | np.ndarray) -> Prediction:
-        """The channels at some values, shape (keys,).
+        """Return the channels at some values, shape (keys,).
 
-        When a command comes is a whole tick to a simulation: between two ticks it is interpolated.
+        Simulated commands come at whole ticks; between two ticks the channels are interpolated.
 
         Raises:
-            InputError: A value that the model does not take.
+            InputError: The model rejects a value.
             SimulationError: The state became non-finite.
         """
         values = tuple(float(value) for value in values)
         for place, (key, value) in enumerate(zip(self.keys, values, strict=True)):
-            if key.endswith(".at_s") and not self._later(key):
+            if key.endswith(".at_s") and not self._is_later(key):
                 below = math.floor(value / _TICK_S + 1e-3)
                 if value - below * _TICK_S > 1e-3 * _TICK_S:
                     return self._between(values, place, below)
         if values not in self._cache:
-            if len(self._cache) > _KEPT:
+            if len(self._cache) > _MAX_CACHED:
                 self._cache.pop(next(iter(self._cache)))
             self._cache[values] = self._run(dict(zip(self.keys, values, strict=True)))
         return self._cache[values]
 
     def derivatives(self, values: Sequence[float] | np.ndarray) -> Derivatives:
-        """How the channels change with the values, by central differences; one-sided at the edge of what is possible.
+        """Return the derivatives by central differences, one-sided at the limits of the model.
 
         A step over which the number of contacts changes is shortened.
 
         Args:
-            values: Where, shape (keys,).
+            values: Point of the derivative, shape (keys,).
         """
         values = np.asarray(values, dtype=float)
         base = self.predict(values)
@@ -237,23 +237,23 @@ class Predictor:
         for place, (key, direction) in enumerate(zip(self.keys, directions, strict=True)):
             grid, scale = _step_of(key), self.scales[place]
             slope: dict[str, np.ndarray] = {}
-            for step in _shorter(grid or _STEP * scale, grid or _LEAST_STEP * scale):
+            for step in _shorten(grid or _STEP * scale, grid or _MIN_STEP * scale):
                 slope, smooth[place] = self._quotient(values, place, step * direction, base)
                 if smooth[place]:
                     break
             found.append(slope)
         for place, (slope, direction) in enumerate(zip(found, directions, strict=True)):
-            for other in np.flatnonzero(direction):  # what went along is no part of the slope
+            for other in np.flatnonzero(direction):  # subtract the slopes of the values that were changed along
                 if other != place:
                     slope |= {name: one - direction[other] * found[other][name] for name, one in slope.items()}
         return Derivatives(base, tuple(found), smooth)
 
     def _direction(self, values: np.ndarray, place: int) -> np.ndarray:
-        """How values go with one while its difference quotient is taken, shape (keys,).
+        """Return the change of all values in the difference quotient of one, shape (keys,).
 
-        With a pulse's length goes its force, so that the impulse stays. The length goes by whole ticks, and through
-        impacts as much impulse is no small step: its quotient would not cancel against that of the force, and what is
-        left would pass for the shape of the pulse, which hardly shows.
+        The force changes with the length of a pulse, so that the impulse stays constant. The length changes by whole
+        ticks, and after impacts such a change of impulse is not small: it would not cancel against that of the force,
+        and the rest would be mistaken for the shape of the pulse, which has little effect.
         """
         direction = np.zeros(len(self.keys))
         direction[place] = 1.0
@@ -263,14 +263,14 @@ class Predictor:
             direction[other] = -values[other] / values[place]
         return direction
 
-    def _later(self, key: str) -> bool:
-        """Whether a command comes only behind the last row: nothing of it is seen."""
+    def _is_later(self, key: str) -> bool:
+        """Return whether a command comes after the last row, without effect on the samples."""
         kind, number, _ = key.split(".")
         return value_of(self._experiment, f"{kind}.{number}.at_s") > self._last_s + _MARGIN_S
 
     def _between(self, values: tuple[float, ...], place: int, below: int) -> Prediction:
-        """The channels where a command lies between two ticks."""
-        # Rounded, so that what was simulated before is found.
+        """Return the channels for a command between two ticks."""
+        # Rounded, so that the cache is hit.
         ends = [round((below + node) * _TICK_S, 9) for node in (0, 1)]
         first, second = (self.predict((*values[:place], end, *values[place + 1 :])) for end in ends)
         part = values[place] / _TICK_S - below
@@ -280,7 +280,7 @@ class Predictor:
     def _quotient(
         self, values: np.ndarray, place: int, step: np.ndarray, base: Prediction
     ) -> tuple[dict[str, np.ndarray], bool]:
-        """A difference quotient, and whether the contacts were the same ones on both sides."""
+        """Return a difference quotient, and whether the contacts were the same on both sides."""
         sides: list[tuple[float, Prediction]] = []
         for sign in (1.0, -1.0):
             moved = values + sign * step
@@ -296,35 +296,35 @@ class Predictor:
 
     def _run(self, values: dict[str, float]) -> Prediction:
         self.runs += 1
-        parts = on_the_models_clock(self.parts, values, about_s=self._about_s)
+        parts = to_model_clock(self.parts, values, about_s=self._about_s)
         last_s = max(float(part.times_s[-1]) for part in parts.values())
-        # Nothing behind the window: contacts that begin there are none of it.
+        # Contacts after the window do not count.
         end_s = math.ceil(round((last_s + _MARGIN_S) * _ROWS_HZ, 6)) / _ROWS_HZ
         changed = with_values(self._experiment, {**values, "duration_s": end_s})
         return predict(changed, parts, lead_ins=self._lead_ins)
 
 
-def on_the_models_clock(
+def to_model_clock(
     parts: Mapping[str, Measured], values: Mapping[str, float], *, about_s: float
 ) -> dict[str, Measured]:
-    """Channels of a recording whose own clock is off by `clock.offset_s` and `clock.rate_ppm`.
+    """Return channels of a recording whose clock is off by `clock.offset_s` and `clock.rate_ppm`.
 
     Args:
         parts: The channels.
-        values: Values, of which only these two count.
-        about_s: Where both clocks differ by the offset alone [s].
+        values: Values, of which only these two are used.
+        about_s: Time at which the clocks differ by the offset alone [s].
     """
     shift, rate = values.get("clock.offset_s", 0.0), values.get("clock.rate_ppm", 0.0) * 1e-6
     if shift == rate == 0.0:
         return dict(parts)
-    return {name: part.later(shift, rate, about_s=about_s) for name, part in parts.items()}
+    return {name: part.correct_clock(shift, rate, about_s=about_s) for name, part in parts.items()}
 
 
 def _step_of(key: str) -> float | None:
     return _STEPS.get(key.split(".")[-1]) if _COMMAND_KEY.fullmatch(key) else None
 
 
-def _shorter(step: float, least: float) -> Iterator[float]:
+def _shorten(step: float, least: float) -> Iterator[float]:
     yield step
     while step / 4.0 >= least:
         step /= 4.0
@@ -332,7 +332,7 @@ def _shorter(step: float, least: float) -> Iterator[float]:
 
 
 def _commands(experiment: Experiment) -> list[TimedCommand]:
-    """Every command: the scene's own, then those that were sent."""
+    """Return every command: the scene's own, then those that were sent."""
     sent = [
         TimedCommand(at_s=command.tick / TICK_RATE_HZ, request=check_command(command.name, command.request))
         for command in experiment.commands
@@ -341,7 +341,7 @@ def _commands(experiment: Experiment) -> list[TimedCommand]:
 
 
 def _place(experiment: Experiment, key: str) -> int:
-    """Where in `_commands` the command of a key stands: they are numbered by time, each kind from 1."""
+    """Return the index in `_commands` for a key; commands are numbered by time, each kind from 1."""
     kind, number, field = key.split(".")
     commands = _commands(experiment)
     places = [place for place, command in enumerate(commands) if command.request.command == kind]

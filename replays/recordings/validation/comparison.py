@@ -12,7 +12,7 @@ import numpy as np
 
 from recorder.contents.consistency import calibration_off
 from recorder.reader import Recording
-from replays.recordings.identification.nuisance import Tuned, looks_from, tune
+from replays.recordings.identification.nuisance import Tuned, tune, window_start_s
 from replays.recordings.identification.request import first_command_s
 from replays.recordings.parameters import parameter_doubts
 from replays.recordings.resimulation.experiment import Experiment, is_imported
@@ -241,28 +241,28 @@ def _log_done_again(
     rules = criteria.imported
     tuned = tune(recording, experiment, rules.nuisances, late_s=late_s, progress=lambda text: step(f"log: {text}"))
     whole, longest_s = measured(recording, tuned.begun.scene), criteria.window.longest_s
-    begin_s = looks_from(tuned.begun)
-    parts = {name: part.until(float(part.times_s[0]) + longest_s).from_(begin_s) for name, part in whole.items()}
+    begin_s = window_start_s(tuned.begun)
+    parts = {name: part.until(float(part.times_s[0]) + longest_s).starting_at(begin_s) for name, part in whole.items()}
     nominal = tuned.predict(parts)
     step("perturbed, and by models that are as right, to see how far it can be predicted")
     generator = np.random.default_rng(0)  # the same in every validation
-    others = [tuned.before().predict(parts)]
+    others = [tuned.undo_last_growth().predict(parts)]
     models = [tuned, *(tuned.changed(variant.set) for variant in rules.variants)]
     others += [model.predict(parts) for model in models[1:]]
-    others += [tuned.predict({name: part.filtered(rules.bandwidth) for name, part in parts.items()})]
+    others += [tuned.predict({name: part.with_corner_factor(rules.bandwidth) for name, part in parts.items()})]
     gains = {name: v + rules.calibration * (v - v.mean(axis=0)) for name, v in nominal.values.items()}
     others += [replace(nominal, values=gains)]
     until_s = first_command_s(tuned.begun) or math.inf
     if np.count_nonzero(recording.edges() < until_s) < 2:
         # Nothing tells well enough when a pulse is due: it is as likely as not, at any time.
         others.insert(1, _with_pulses(parts, nominal, lambda pulses: 1.0 - pulses))
-    drawn = [models[n % len(models)].drawn(generator) for n in range(criteria.ensemble.members)]
+    drawn = [models[n % len(models)].draw_values(generator) for n in range(criteria.ensemble.members)]
     faults = signal_faults(whole)
     faults += edge_faults(recording.edges(), until_s, tuned.begun.scene.drive.speed_hz)
     return _DoneAgain(
         faults=tuple(faults), members=tuple(one.predict(parts) for one in drawn),
         quick=bare(tuned.experiment), criteria=criteria.of_log(),
-        parts=tuned.on_time(parts),
+        parts=tuned.to_model_clock(parts),
         nominal=nominal, others=tuple(others), bits={}, tuned=tuned,
     )  # fmt: skip
 

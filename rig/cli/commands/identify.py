@@ -75,7 +75,7 @@ class FitRequest:
         from replays.recordings.identification import ask
         from replays.recordings.identification import identify as identify_recording
         from replays.recordings.identification.log import identify_log
-        from replays.recordings.identification.nuisance import asked_along, turned
+        from replays.recordings.identification.nuisance import find_free_nuisances, fit_initial_state
         from replays.recordings.identification.request import first_command_s
         from replays.recordings.resimulation.experiment import is_imported
         from replays.recordings.validation import load_criteria
@@ -97,9 +97,9 @@ class FitRequest:
                     recording, experiment, keys, **given, priors=priors, to_s=self.to_s, bandwidth=rules.bandwidth,
                     variants=[one.set for one in rules.variants], progress=progress,
                 )  # fmt: skip
-                return found, [one.key for one in found.question.unknowns if one.along]
-            experiment = turned(recording, experiment)
-            along = asked_along(experiment, keys)
+                return found, [one.key for one in found.question.unknowns if one.nuisance]
+            experiment = fit_initial_state(recording, experiment)
+            along = find_free_nuisances(experiment, keys)
             priors = {key: told for key, told in along.items() if told is not None} | priors
         question = ask(
             recording, experiment, [*keys, *along], **given, priors=priors, along=along, window=(self.from_s, self.to_s)
@@ -232,7 +232,7 @@ def _show(found: Identification, name: str, console: Console) -> None:
     for finding in found.judgement.findings:
         table.add_row(*cells(finding), style="" if finding.standing == "identified" else "yellow")
     console.print(table)
-    asked = [place for place, unknown in enumerate(found.question.unknowns) if not unknown.along]
+    asked = [place for place, unknown in enumerate(found.question.unknowns) if not unknown.nuisance]
     keys = [found.question.keys[place] for place in asked]
     if len(keys) > 1:
         table = new_table("correlation", "", *(f">{key}" for key in keys))

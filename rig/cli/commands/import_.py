@@ -121,7 +121,7 @@ def _guess(
         if wanted is not None:
             check_new_file(wanted, field=field, suffixes=suffixes, force=force)
             check_not_among(files, wanted, field=field)
-    text, guesses = guessed(files) if files else (example(), [])
+    text, guesses = guess_mapping(files) if files else (example(), [])
     if path is not None:
         with whole_file(path) as draft:
             draft.write_text(text, encoding="utf-8")
@@ -192,8 +192,8 @@ def _document(guess: Guess) -> dict[str, Any]:
     return {
         "file": guess.source.path.name, "group": guess.entry.group, "signal": guess.entry.name,
         "unit": guess.entry.unit, "channel": guess.channel or None, "sure": guess.sure if guess.channel else None,
-        "why": guess.why, "asks": guess.asks, "mean": guess.look.mean, "low": guess.look.extent[0],
-        "high": guess.look.extent[1], "rate_hz": guess.look.axis.rate_hz if guess.look.timed else None,
+        "why": guess.why, "asks": guess.asks, "mean": guess.features.mean, "low": guess.features.extent[0],
+        "high": guess.features.extent[1], "rate_hz": guess.features.axis.rate_hz if guess.features.timed else None,
     }  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""What happened in an imported log: the experiment that a mapping tells of."""
+"""Experiment of an imported log: scene, commands and speed, from the mapping and the log."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from replays.recordings.formats.events.motion import Impact, Motion, impact, turning
+from replays.recordings.formats.events.motion import Impact, Motion, detect_impact, estimate_speed
 from rig.base.errors import InputError, Words
 from rig.channels.table import ChannelTable, default_table
 from rig.run.commands.table import HAMMER_BOUNDS
@@ -18,21 +18,21 @@ if TYPE_CHECKING:
     from replays.recordings.formats.mapping import ExperimentMapping
     from rig.run.scenes import Scene
 
-_BY_HAND, _UNTOLD = 0.01, 0.2
-"""Standard deviation of a speed that is given or that a channel shows, and of one that is the scene's, as a part."""
-_BY_EDGES = 1e-3
-"""Part by which the speed of two edges may be off."""
+_SPEED_DEVIATION, _DEFAULT_SPEED_DEVIATION = 0.01, 0.2
+"""Relative standard deviation of a speed that is given or measured, and of the scene's default."""
+_EDGE_ERROR = 1e-3
+"""Relative error of the speed from two keyphasor edges."""
 _PROBES = "the motion of the probes"
-_ALONG_DEG = 5.0
-"""Hammers hit along x; an angle that is seen with less is no other direction [degrees]."""
-_BY_EYE = {"hammer.1.duration_ms": 0.1, "clock.offset_s": 1e-3}
-"""Of a hammer pulse that no channel shows: of its length, as a part of it, and of its time [s]."""
-_FORETOLD_S = 0.02
-"""So long behind what is sudden in a log the command may stand that explains it [s]."""
+_MIN_ANGLE_DEG = 5.0
+"""Smallest angle of an impact that counts as a separate direction; hammers hit along x [degrees]."""
+_UNRECORDED_PULSE_DEVIATION = {"hammer.1.duration_ms": 0.1, "clock.offset_s": 1e-3}
+"""Standard deviations for a hammer pulse that no channel recorded: of its length (relative) and of its time [s]."""
+_MAX_COMMAND_DELAY_S = 0.02
+"""Largest delay of a command after the sudden motion that it explains [s]."""
 
 
 class Speed(NamedTuple):
-    """A speed that a log tells, its standard deviation [Hz], and what tells it."""
+    """Speed found in a log, with its standard deviation [Hz] and its source."""
 
     hz: float
     deviation_hz: float
@@ -40,36 +40,36 @@ class Speed(NamedTuple):
 
     @property
     def text(self) -> str:
-        """In words."""
+        """The speed in words."""
         within = f" ±{2.0 * self.deviation_hz:.1g}" if self.by == _PROBES else ""
         return f"{self.hz:.4g}{within} Hz by {self.by}"
 
 
 def speeds_before(motions: Sequence[Motion], edges: np.ndarray, until_s: float) -> list[Speed]:
-    """Mean speeds up to some time, else of the whole: of the channel `speed`, of the edges, else of the probes' motion.
+    """Return mean speeds up to some time, or of the whole log: from the channel `speed`, from edges, else from probes.
 
     Args:
         motions: Channels, in the time of the recording.
-        edges: Of the keyphasor [ticks], shape (turns,).
-        until_s: Up to here the drive alone acts [s].
+        edges: Keyphasor edges [ticks], shape (turns,).
+        until_s: Time up to which only the drive acts [s].
     """
     found = []
-    if (own := next((one for one in motions if one.name == "speed"), None)) is not None:
-        rows = max(1, round((min(until_s, 1e6) - own.axis.first_s) * own.axis.rate_hz))
-        hz = float(np.nanmean(own.values[:rows]))
-        found.append(Speed(hz, _BY_HAND * abs(hz), "the channel `speed`"))
+    if (speed_channel := next((one for one in motions if one.name == "speed"), None)) is not None:
+        rows = max(1, round((min(until_s, 1e6) - speed_channel.axis.first_s) * speed_channel.axis.rate_hz))
+        hz = float(np.nanmean(speed_channel.values[:rows]))
+        found.append(Speed(hz, _SPEED_DEVIATION * abs(hz), "the channel `speed`"))
     times = edges[edges < until_s * 1e6]
     times = times if len(times) > 1 else edges
     if len(times) > 1:
         hz = (len(times) - 1) * 1e6 / float(times[-1] - times[0])
         found.append(Speed(hz, 0.0, "the keyphasor"))
-    if not found and (turned := turning(motions, until_s=until_s)) is not None:
+    if not found and (turned := estimate_speed(motions, until_s=until_s)) is not None:
         found.append(Speed(*turned, _PROBES))
     return found
 
 
 class ExperimentDocuments(NamedTuple):
-    """What a recording holds of an experiment."""
+    """Documents of an experiment in a recording."""
 
     name: str
     parameters: dict[str, Any]
@@ -77,7 +77,7 @@ class ExperimentDocuments(NamedTuple):
     commands: list[dict[str, Any]]
     """The scene's commands, each with at_s."""
     unsure: dict[str, float]
-    """Standard deviation of what the log tells less surely than by a channel of its own, by key, in its unit."""
+    """Standard deviation of values without their own channel, by key, in their unit."""
 
 
 def build_experiment(
@@ -90,19 +90,19 @@ def build_experiment(
     table: ChannelTable,
     remarks: list[str],
 ) -> ExperimentDocuments:
-    """The scene that a mapping tells, with what was found in the log, as the documents of a recording.
+    """Build the documents of a recording from the scene in a mapping and the findings in the log.
 
     Args:
-        wanted: What the mapping tells.
-        pulses: Hammer pulses that were found.
-        duration_s: Of the recording [s].
+        wanted: The table [experiment] of the mapping.
+        pulses: Detected hammer pulses.
+        duration_s: Length of the recording [s].
         motions: Channels, in the time of the recording.
-        edges: Of the keyphasor [ticks], shape (turns,).
+        edges: Keyphasor edges [ticks], shape (turns,).
         table: Channel table of the recording.
-        remarks: Grows by what was done, and by what of the log is at odds with what is told.
+        remarks: Extended by processing steps and by contradictions between log and mapping.
 
     Raises:
-        InputError: The scene cannot be so.
+        InputError: The scene is not valid.
     """
     from rig.run.scenes import load_scene, parse_scene
     from rig.run.simulation import Simulation
@@ -128,23 +128,23 @@ def build_experiment(
         if not error.field.startswith("sensors"):
             raise
         scene = parse_scene(data)
-        remarks.append("the scene samples at the rig's own rates, as it cannot at the log's")
-    remarks.append(f"scene {scene.name}: what was done as the mapping tells it, on assumed parameters until identified")
+        remarks.append("the scene uses the rig's own sample rates, as the log's rates are not possible")
+    remarks.append(f"scene {scene.name}: experiment from the mapping, with assumed parameters until identified")
     hits = [timed for timed in scene.commands if timed.request.command == "hammer"]
     first_s = min((timed.at_s for timed in hits), default=math.inf)
     unsure = dict[str, float]()
     if wanted.commands != "scene":
-        hit = impact(motions)
-        if hit is not None and all(timed.at_s > hit.at_s + _FORETOLD_S for timed in scene.commands):
+        hit = detect_impact(motions)
+        if hit is not None and all(timed.at_s > hit.at_s + _MAX_COMMAND_DELAY_S for timed in scene.commands):
             remarks.append(
-                f"from {hit.at_s:.3f} s on {', '.join(hit.names)} move as never before, as behind an impact, and no "
-                f"command comes by then: what follows is predicted wrongly; [experiment] commands = [{told_as(hit)}]"
+                f"from {hit.at_s:.3f} s on {', '.join(hit.names)} move suddenly, as after an impact, without a "
+                f"command: predictions from there are wrong; set [experiment] commands = [{format_command(hit)}]"
             )
             first_s = hit.at_s
         if hits and all(one.name != "hammer" for one in motions):
-            unsure |= _BY_EYE
+            unsure |= _UNRECORDED_PULSE_DEVIATION
             unsure["hammer.1.duration_ms"] *= hits[0].request.model_dump()["duration_ms"]
-    scene, deviation_hz = _driven(scene, wanted, speeds_before(motions, edges, first_s), edges, remarks)
+    scene, deviation_hz = _apply_speed(scene, wanted, speeds_before(motions, edges, first_s), edges, remarks)
     if deviation_hz:
         unsure["drive.speed_hz"] = deviation_hz
     simulation = Simulation(scene)
@@ -154,10 +154,10 @@ def build_experiment(
     )
 
 
-def told_as(hit: Impact) -> str:
-    """An impact as a command in TOML, as far as the probes tell it."""
+def format_command(hit: Impact) -> str:
+    """Return an impact as a command in TOML, from the motion of the probes."""
     at_s, force_n, duration_ms, degrees = hit.pulse or (hit.at_s, 100.0, 5.0, 0.0)
-    way = f", direction = {round(degrees)}" if abs(degrees) > _ALONG_DEG else ""
+    way = f", direction = {round(degrees)}" if abs(degrees) > _MIN_ANGLE_DEG else ""
     force, length = (
         min(max(value, low), high)
         for value, (low, high) in zip((force_n, duration_ms), HAMMER_BOUNDS.values(), strict=True)
@@ -165,40 +165,40 @@ def told_as(hit: Impact) -> str:
     return f'{{ at_s = {at_s:.5f}, command = "hammer", force_n = {force:.3g}, duration_ms = {length:.3g}{way} }}'
 
 
-def _driven(
+def _apply_speed(
     scene: Scene, wanted: ExperimentMapping, speeds: Sequence[Speed], edges: np.ndarray, remarks: list[str]
 ) -> tuple[Scene, float]:
-    """The scene at the speed that is told, and its standard deviation where the log does not show it [Hz], else 0.
+    """Return the scene at the given or measured speed, and the speed's standard deviation [Hz]; 0 if it is known.
 
     Raises:
-        InputError: It is to be measured, and cannot be.
+        InputError: The speed is to be measured, and cannot be.
     """
     from rig.run.scenes import parse_scene
 
     measured = wanted.speed_hz == "measured"
     if measured and not speeds:
-        must = "a number, or measured by a channel `speed`, a keyphasor or probes that turn"
+        must = "a number, or a log with a channel `speed`, a keyphasor or probes that show the rotation"
         raise InputError("experiment.speed_hz", must, Words("measured"))
     number = wanted.set.get("drive.speed_hz") if wanted.speed_hz is None else None if measured else wanted.speed_hz
     if measured:
-        told = speeds[0]
+        chosen = speeds[0]
     elif number is not None:
-        told = Speed(float(number), _BY_HAND * abs(float(number)), "the mapping")
+        chosen = Speed(float(number), _SPEED_DEVIATION * abs(float(number)), "the mapping")
     elif wanted.commands == "scene" or scene.drive.profile:
         return scene, 0.0
     else:
-        told = Speed(scene.drive.speed_hz, 0.0, f"the scene {scene.name}, as experiment.speed_hz is left out")
+        chosen = Speed(scene.drive.speed_hz, 0.0, f"the scene {scene.name}, as experiment.speed_hz is omitted")
     apart = [
         one for one in speeds
-        if abs(one.hz - told.hz) > 2.0 * math.hypot(one.deviation_hz, told.deviation_hz, _BY_EDGES * told.hz)
+        if abs(one.hz - chosen.hz) > 2.0 * math.hypot(one.deviation_hz, chosen.deviation_hz, _EDGE_ERROR * chosen.hz)
     ]  # fmt: skip
     shown = any(one.by != _PROBES for one in speeds)
     if apart or not (shown or number is not None):
         others = f", but {' and '.join(one.text for one in apart)}" * bool(apart)
-        remarks.append(f"speed: {told.text}{others}" + ("" if shown else "; `rig validate` fits it"))
+        remarks.append(f"speed: {chosen.text}{others}" + ("" if shown else "; `rig validate` fits it"))
     if wanted.speed_hz is not None:
         data = scene.model_dump()
-        scene = parse_scene({**data, "drive": {**data["drive"], "speed_hz": max(0.0, told.hz), "profile": ()}})
+        scene = parse_scene({**data, "drive": {**data["drive"], "speed_hz": max(0.0, chosen.hz), "profile": ()}})
     if len(edges) > 2 or (measured and shown):
         return scene, 0.0
-    return scene, told.deviation_hz or _UNTOLD * told.hz
+    return scene, chosen.deviation_hz or _DEFAULT_SPEED_DEVIATION * chosen.hz

@@ -1,4 +1,4 @@
-"""Hammer pulses in a force."""
+"""Detection of hammer pulses in a force signal."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ if TYPE_CHECKING:
     from replays.recordings.formats.clock import Axis
     from replays.recordings.formats.mapping import HammerMapping
 
-_FOOT = 0.05
-"""A pulse is summed out to this part of its peak on either side."""
-_DEAD_S = 0.1
-"""So soon behind a pulse one counts only [s] ..."""
-_RESTED, _LARGE = 2.0, 0.2
-"""... if the hammer has been below the threshold for so many times as long as the one before, and it is this part of
-that in force: ringing does not rest, and rebounds are small."""
+_FOOT_FRACTION = 0.05
+"""Fraction of its peak down to which a pulse is integrated on both sides."""
+_DEFAULT_DEAD_S = 0.1
+"""Dead time after a pulse unless the mapping sets one [s]; within it a pulse counts only if it is clearly separate."""
+_MIN_PAUSE_LENGTHS, _MIN_PEAK_RATIO = 2.0, 0.2
+"""A pulse is separate if the force was below the threshold for this many lengths of the previous pulse, and its peak is
+at least this fraction of the previous one. Ringing has no pause, and rebounds are small."""
 
 
 @dataclass(frozen=True)
 class HammerPulse:
-    """A hammer pulse as the half sine of the same peak and impulse, centred where it is: how a scene tells it.
+    """Hammer pulse as the half sine of equal peak, impulse and centre, as in a scene.
 
     Attributes:
         at_s: Start [s].
         force_n: Peak [N].
         duration_ms: Length, pi/2 times impulse over peak [ms].
-        direction: As in a scene.
+        direction: Direction as in a scene.
     """
 
     at_s: float
@@ -40,7 +40,7 @@ class HammerPulse:
     direction: str | float
 
     def command(self) -> dict[str, Any]:
-        """As a scene's command."""
+        """Return the pulse as a command of a scene."""
         return {
             "at_s": self.at_s, "command": "hammer", "force_n": self.force_n, "duration_ms": self.duration_ms,
             "direction": self.direction,
@@ -48,45 +48,45 @@ class HammerPulse:
 
 
 def find_pulses(force_n: np.ndarray, axis: Axis, wanted: HammerMapping) -> tuple[list[HammerPulse], list[HammerPulse]]:
-    """Hammer pulses in a force: those that count, and those that are of their own but come too soon behind another.
+    """Return the hammer pulses in a force that count, and separate ones that follow another too soon.
 
-    A pulse is a stretch above the threshold. Behind one the dead time has to pass, if it is given; else a pulse counts
-    at once that is clearly one of its own.
+    A pulse is an interval above the threshold. After a pulse, others are ignored for the dead time; without a given
+    dead time, clearly separate pulses count.
 
     Args:
         force_n: Force of the hammer [N], shape (n,).
         axis: Its time axis.
-        wanted: Threshold, dead time, direction.
+        wanted: Threshold, dead time and direction.
     """
     times_s = axis.instants()
     force = np.nan_to_num(force_n)
-    loud_s = times_s[np.abs(force) >= wanted.threshold_n]  # ringing goes to both sides
+    above_s = times_s[np.abs(force) >= wanted.threshold_n]  # both signs, as the hammer rings
     found: list[HammerPulse] = []
-    passed_over: list[HammerPulse] = []
-    free_s = -math.inf
+    ignored: list[HammerPulse] = []
+    next_allowed_s = -math.inf
     for start, end in true_runs(force >= wanted.threshold_n):
         at_s = float(times_s[start])
         last = found[-1] if found else None
-        soon = last is not None and at_s < free_s
+        soon = last is not None and at_s < next_allowed_s
         if last is not None and soon:
-            before = int(np.searchsorted(loud_s, at_s))
-            if at_s - loud_s[before - 1] < _RESTED * 1e-3 * last.duration_ms:
+            before = int(np.searchsorted(above_s, at_s))
+            if at_s - above_s[before - 1] < _MIN_PAUSE_LENGTHS * 1e-3 * last.duration_ms:
                 continue
         pulse = _pulse(force, times_s, (start, end), axis.rate_hz, wanted)
-        if last is not None and soon and (wanted.dead_s is not None or pulse.force_n < _LARGE * last.force_n):
-            passed_over.append(pulse)
+        if last is not None and soon and (wanted.dead_s is not None or pulse.force_n < _MIN_PEAK_RATIO * last.force_n):
+            ignored.append(pulse)
             continue
-        free_s = at_s + (_DEAD_S if wanted.dead_s is None else wanted.dead_s)
+        next_allowed_s = at_s + (_DEFAULT_DEAD_S if wanted.dead_s is None else wanted.dead_s)
         found.append(pulse)
-    return found, passed_over
+    return found, ignored
 
 
 def _pulse(
     force: np.ndarray, times_s: np.ndarray, above: tuple[int, int], rate_hz: float, wanted: HammerMapping
 ) -> HammerPulse:
-    """Return the pulse that is above the threshold in a run of rows."""
+    """Return the pulse that exceeds the threshold in a range of rows."""
     low, high = above
-    foot = _FOOT * float(force[low:high].max())
+    foot = _FOOT_FRACTION * float(force[low:high].max())
     while low > 0 and force[low - 1] > foot:
         low -= 1
     while high < len(force) and force[high] > foot:

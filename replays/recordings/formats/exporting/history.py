@@ -1,4 +1,4 @@
-"""What happened during a recording, as other programs are told: impacts, commands and notes."""
+"""Events of a recording for other programs: impacts, commands and notes."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from recorder.files.schemas import event_text
 from recorder.reader import Recording
 from rig.base.text import printable
 
-_MOST_S = 1e12
-"""Latest time that an event may have [s]."""
+_MAX_TIME_S = 1e12
+"""Latest time of an event [s]."""
 
 
 class ExportEvent(NamedTuple):
-    """What happened during a recording.
+    """Event of a recording.
 
     Attributes:
         time_s: Simulated time [s].
         name: `hammer`, `speed`, `note`, ...
-        text: All of it in a line, for a person.
-        document: The same as the rig told it.
+        text: Description in one line.
+        document: Event as the rig sent it.
     """
 
     time_s: float
@@ -28,15 +28,15 @@ class ExportEvent(NamedTuple):
     document: dict[str, Any]
 
 
-def happenings(recording: Recording, from_s: float, to_s: float) -> tuple[ExportEvent, ...]:
-    """The events of a range [s], in order; a command that took effect at once stands once, with who sent it."""
-    low_s, high_s = max(from_s, 0.0), min(to_s, _MOST_S)
-    told = [each for each in recording.events if each.get("time_s") is not None and low_s <= each["time_s"] <= high_s]
-    effects = {(event.get("tick"), event["event"]) for event in told}
-    sent = [event for event in told if event["event"] == "command"]
+def list_events(recording: Recording, from_s: float, to_s: float) -> tuple[ExportEvent, ...]:
+    """Return the events of a range [s] in order; a command that took effect at once appears once, with its sender."""
+    low_s, high_s = max(from_s, 0.0), min(to_s, _MAX_TIME_S)
+    timed = [each for each in recording.events if each.get("time_s") is not None and low_s <= each["time_s"] <= high_s]
+    effects = {(event.get("tick"), event["event"]) for event in timed}
+    sent = [event for event in timed if event["event"] == "command"]
     senders = {(event["tick"], event["command"]): event.get("from") for event in sent}
     events = []
-    for event in sorted(told, key=lambda event: event["time_s"]):
+    for event in sorted(timed, key=lambda event: event["time_s"]):
         if event["event"] == "command" and (event["tick"], event["command"]) in effects:
             continue
         sender = senders.get((event.get("tick"), event["event"]))

@@ -1,4 +1,4 @@
-"""What of a recording is exported: columns in tables of one rate each, read chunk by chunk."""
+"""Selection of exported channels: columns in tables of one rate each, read chunk by chunk."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import numpy as np
 
 from recorder.contents.inventory import Stream
 from recorder.reader import Recording
-from replays.recordings.formats.exporting.history import ExportEvent, happenings
+from replays.recordings.formats.exporting.history import ExportEvent, list_events
 from replays.recordings.formats.source import DOCUMENTS
 from rig.base.errors import InputError, Words
 from rig.base.text import nearest, printable
@@ -25,19 +25,19 @@ Unit = Literal["engineering", "volts", "counts"]
 ROWS = 1 << 14
 """Rows of a chunk."""
 NO_VOLTS = "imported in its own unit"
-"""Provenance of an imported channel of whose voltage nothing is known."""
+"""Provenance of an imported channel without a known voltage."""
 
 
 @dataclass(frozen=True)
 class Column:
-    """One column of an export.
+    """Column of an export.
 
     Attributes:
         name: Name of the channel; truth is named `truth.TABLE.COLUMN`.
         unit: Unit of the exported values.
-        label: What it is.
+        label: Description.
         source: Channel of the table, or None for truth.
-        linear: Exported value = a * count + b; None for values that are exported as they are (truth, counts).
+        linear: Exported value = a * count + b; None for values exported unchanged (truth, counts).
     """
 
     name: str
@@ -53,7 +53,7 @@ class Column:
 
     @property
     def full_scale(self) -> float:
-        """Exported value's distance from that of count 0 at the end of the converter's range; 1 for truth."""
+        """Exported half range of the converter; 1 for truth."""
         if self.source is None:
             return 1.0
         half = 2.0 ** (self.source.adc_bits - 1)
@@ -61,7 +61,7 @@ class Column:
 
     @property
     def metadata(self) -> dict[str, str | int | float]:
-        """Everything that is known of it."""
+        """Metadata of the column."""
         about: dict[str, str | int | float] = {"name": self.name, "unit": self.unit, "label": self.label}
         about["full_scale"] = self.full_scale
         about["offset_exported"] = 0.0 if self.linear is None else self.linear[1]
@@ -76,10 +76,10 @@ class Column:
         return about
 
     def about(self, sensor: str) -> str:
-        """What it is, by which sensor, and its calibration, in a line for a person.
+        """Return description, sensor and calibration in one line.
 
         Args:
-            sensor: What the group is.
+            sensor: Description of the group.
         """
         texts = [self.label]
         if (channel := self.source) is not None:
@@ -92,13 +92,13 @@ class Column:
 
 @dataclass(frozen=True)
 class ExportStream:
-    """One stream of a recording, as columns of a table."""
+    """Stream of a recording, as columns of a table."""
 
     key: str
     columns: tuple[int, ...]
-    """Its columns that are wanted."""
+    """Selected columns."""
     width: int
-    """Columns that it has."""
+    """Number of columns of the stream."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ class ExportChunk:
     Attributes:
         index: Number of the first row in the table, from 0.
         times_s: Simulated time of each row [s], shape (n,).
-        values: Counts, or values for truth, float64, nan where a stream has no such row, shape (n, columns).
+        values: Counts, or values for truth, float64, nan for rows that a stream lacks, shape (n, columns).
         present: Rows that any of the table's streams has, shape (n,).
     """
 
@@ -124,13 +124,13 @@ class ExportTable:
 
     Attributes:
         name: Name of the sensor group, or of the rate.
-        title: What it is.
-        columns: Its columns.
-        parts: The streams that they come from.
+        title: Description.
+        columns: Columns.
+        parts: Streams of the columns.
         rate_hz: Rows per second [Hz].
-        first_s: Simulated time of its first row [s].
-        rows: Number of rows from the first to the last, missing ones included.
-        shift: Number of the stream's row that is its first.
+        first_s: Simulated time of the first row [s].
+        rows: Number of rows from the first to the last, including missing ones.
+        shift: Row number in the stream of the first row.
     """
 
     name: str
@@ -143,13 +143,13 @@ class ExportTable:
     shift: int
 
     def exported(self, c: int, chunk: ExportChunk) -> np.ndarray:
-        """Values of a column in the unit asked for, float64, shape (n,); nan where it has none."""
+        """Return a column in the exported unit, float64, shape (n,); nan for missing values."""
         linear = self.columns[c].linear
         values = chunk.values[:, c]
         return values.copy() if linear is None else values * linear[0] + linear[1]
 
     def raw(self, c: int, chunk: ExportChunk) -> np.ndarray:
-        """What the recording holds: int32 counts where none is missing, else float64, shape (n,)."""
+        """Return recorded values of a column, shape (n,): int32 counts, or float64 if some are missing."""
         values = chunk.values[:, c]
         present = values[chunk.present]
         if self.columns[c].source is not None and not np.isnan(present).any():
@@ -159,14 +159,14 @@ class ExportTable:
 
 @dataclass(frozen=True)
 class Selection:
-    """What is exported of a recording.
+    """Selected content of a recording.
 
     Attributes:
         recording: The recording.
-        tables: Its tables.
-        unit: What the sensors' values are given in.
-        from_s, to_s: Ends that were asked for, simulated time [s].
-        notes: What was done to the values.
+        tables: Tables.
+        unit: Unit of the sensors' values.
+        from_s, to_s: Requested range, simulated time [s].
+        notes: Processing of the values.
     """
 
     recording: Recording
@@ -179,11 +179,11 @@ class Selection:
     @cached_property
     def events(self) -> tuple[ExportEvent, ...]:
         """Impacts, commands and notes in the range, in order."""
-        return happenings(self.recording, self.from_s, self.to_s)
+        return list_events(self.recording, self.from_s, self.to_s)
 
     @property
     def documents(self) -> dict[str, str]:
-        """The rig's catalogue, parameters and scene, by name; with the scene, all commands that were sent to it."""
+        """The rig's catalogue, parameters and scene by name; the scene includes all commands sent to it."""
         texts = {name: self.recording.attachments[name].decode() for name in DOCUMENTS}
         if commands := self.recording.commands:
             texts["scene.json"] = json.dumps({**self.recording.scene, "taken": commands})
@@ -199,17 +199,17 @@ class Selection:
 
     @cached_property
     def metadata(self) -> dict[str, str]:
-        """What is known of the whole."""
-        told = self.recording.metadata["rig"]
+        """Metadata of the selection."""
+        rig = self.recording.metadata["rig"]
         about = {
             "recording": self.recording.path.name,
-            **{name: told[name] for name in ("scene", "seed", "parameter_set")},
+            **{name: rig[name] for name in ("scene", "seed", "parameter_set")},
         }
         shown = {name: printable(str(text)) for name, text in about.items()}
         return {**shown, "start": self.start.isoformat(), "values": self.unit, **self.notes}
 
     def summary(self) -> str:
-        """The same for a person, line by line."""
+        """Return the metadata as text, line by line."""
         about, scene = self.metadata, self.recording.scene.get("scene") or {}
         title = f" ({printable(str(scene['title']))})" if scene.get("title") else ""
         seed = f", seed {about['seed']}" if about["seed"] else ""
@@ -220,7 +220,7 @@ class Selection:
         ])  # fmt: skip
 
     def sidecar(self) -> dict[str, Any]:
-        """All metadata as a document, for formats that have no place for it."""
+        """Return all metadata as a document, for formats without metadata."""
         tables = [
             {"name": table.name, "rate_hz": table.rate_hz, "first_s": table.first_s, "rows": table.rows,
              "columns": [column.metadata for column in table.columns]}
@@ -232,14 +232,14 @@ class Selection:
 
     @cached_property
     def missing(self) -> dict[str, int]:
-        """Rows that a stream of a table lacks, between the table's first and last, by the table's name."""
+        """Missing rows between the first and the last row of a table, by its name."""
         return {
-            table.name: sum(table.rows - self._held(part.key, table.shift, table.rows) for part in table.parts)
+            table.name: sum(table.rows - self._count_rows(part.key, table.shift, table.rows) for part in table.parts)
             for table in self.tables
         }
 
-    def _held(self, key: str, first: int, rows: int) -> int:
-        """Rows that a stream has out of so many, each counted once: what a table claims to span is not allocated."""
+    def _count_rows(self, key: str, first: int, rows: int) -> int:
+        """Return the number of distinct rows of a stream in a range, without allocating the range."""
         held, reached = 0, first
         for start, length in sorted((block.index, len(block.values)) for block in self.recording.blocks(key)):
             end = min(start + length, first + rows)
@@ -248,16 +248,16 @@ class Selection:
         return held
 
     def whole(self, table: ExportTable) -> bool:
-        """Whether every stream of a table has all its rows."""
+        """Return whether every stream of a table has all its rows."""
         return not self.missing[table.name]
 
     def chunks(self, table: ExportTable, rows: int = ROWS, *, sparse: bool = False) -> Iterator[ExportChunk]:
-        """Rows of a table, in order; blocks that came later than a chunk are in it all the same.
+        """Yield rows of a table in order, including those of late blocks.
 
         Args:
             table: The table.
-            rows: Rows of a chunk.
-            sparse: Pass over chunks of which no stream has a row.
+            rows: Rows per chunk.
+            sparse: Skip chunks for which no stream has a row.
         """
         cursors = [_Cursor(self.recording, part, table) for part in table.parts]
         start = 0
@@ -278,35 +278,35 @@ class Selection:
 
 
 class _Cursor:
-    """Goes once through the blocks of a stream."""
+    """Single pass over the blocks of a stream."""
 
     def __init__(self, recording: Recording, part: ExportStream, table: ExportTable) -> None:
         self.part = part
         self._shift = table.shift
         self._columns = list(part.columns)
         self._blocks = recording.blocks(part.key)
-        self._ahead: list[Block] = []
-        self._over = False
+        self._pending: list[Block] = []
+        self._finished = False
 
     @property
     def next_row(self) -> int:
-        """First row that it may still have; beyond the table's end where there is none."""
-        return min((block.index - self._shift for block in self._ahead), default=1 << 62)
+        """First row that may still come; beyond the table's end if all have come."""
+        return min((block.index - self._shift for block in self._pending), default=1 << 62)
 
     def fill(self, start: int, values: np.ndarray) -> np.ndarray:
-        """Put rows from `start` on into `values`; gives which were there."""
+        """Copy the rows from `start` on into `values`; return which rows were present."""
         end = start + len(values)
         present = np.zeros(len(values), dtype=bool)
-        waiting, self._ahead = self._ahead, []
+        waiting, self._pending = self._pending, []
         for block in waiting:
             self._put(block, start, end, values, present)
-        while not self._over:
+        while not self._finished:
             block = next(self._blocks, None)
             if block is None:
-                self._over = True
+                self._finished = True
                 break
             self._put(block, start, end, values, present)
-            # A recovered block may have been recorded late: look a little further than the chunk.
+            # A recovered block may have been recorded late: read slightly beyond the chunk.
             if block.index - self._shift >= end + ROWS // 4:
                 break
         return present
@@ -318,7 +318,7 @@ class _Cursor:
             values[low - start : high - start] = block.values[low - first : high - first][:, self._columns]
             present[low - start : high - start] = True
         if first + len(block.values) > end:
-            self._ahead.append(block)
+            self._pending.append(block)
 
 
 def select(
@@ -331,23 +331,23 @@ def select(
     to_s: float | None = None,
     merged: bool = False,
 ) -> Selection:
-    """Choose what of a recording is exported.
+    """Select the content of an export.
 
     Args:
         recording: The recording.
-        channels: Names of channels, of groups, of truth (`truth.TABLE` or `truth.TABLE.COLUMN`); none: all sensors.
-        truth: All truth as well.
-        unit: What the sensors' values are given in.
+        channels: Names of channels, of groups, or of truth (`truth.TABLE` or `truth.TABLE.COLUMN`); empty: all sensors.
+        truth: Add all truth.
+        unit: Unit of the sensors' values.
         from_s: Start, simulated time [s].
         to_s: End, simulated time [s].
-        merged: One table a rate instead of one a group.
+        merged: Make one table per rate instead of one per group.
 
     Raises:
-        InputError: No such channel, an empty range, or nothing in it.
+        InputError: An unknown channel, or a range that is empty or has no samples.
     """
     if from_s is not None and to_s is not None and not to_s > from_s:
         raise InputError("--to", f"after --from {from_s:g}", to_s)
-    wanted = _wanted(recording, channels, truth=truth)
+    wanted = _selected_columns(recording, channels, truth=truth)
     streams = recording.streams
     tables: dict[tuple[str, float, int], list[ExportTable]] = {}
     for key, numbers in wanted.items():
@@ -373,8 +373,8 @@ def select(
     )  # fmt: skip
 
 
-def _wanted(recording: Recording, channels: Sequence[str], *, truth: bool) -> dict[str, list[int]]:
-    """Keys and numbers of their columns."""
+def _selected_columns(recording: Recording, channels: Sequence[str], *, truth: bool) -> dict[str, list[int]]:
+    """Return the selected column numbers by key."""
     groups = {name: list(group.names) for name, group in recording.table.groups.items()}
     truths = {
         name: [column["name"] for column in about["columns"]]
@@ -389,7 +389,7 @@ def _wanted(recording: Recording, channels: Sequence[str], *, truth: bool) -> di
     for name, names in groups.items():
         places[name] = [(sensor_key(name), c) for c in range(len(names))]
     for name, names in groups.items():
-        # A channel wins over a group of its name (the group `hammer` has the one channel `hammer`).
+        # A channel takes precedence over a group of the same name (the group `hammer` has one channel `hammer`).
         places |= {channel: [(sensor_key(name), c)] for c, channel in enumerate(names)}
     for name, names in truths.items():
         places[f"truth.{name}"] = [(truth_key(name), c) for c in range(len(names))]
@@ -398,15 +398,15 @@ def _wanted(recording: Recording, channels: Sequence[str], *, truth: bool) -> di
     chosen: dict[str, set[int]] = {}
     for channel in [*channels, *(["truth"] if truth else [])]:
         if channel not in places:
-            raise InputError("channels", _near(channel, groups, truths), channel)
+            raise InputError("channels", _suggest(channel, groups, truths), channel)
         for key, c in places[channel]:
             chosen.setdefault(key, set()).add(c)
     order = [*(sensor_key(name) for name in groups), *(truth_key(name) for name in truths)]
     return {key: sorted(chosen[key]) for key in order if key in chosen}
 
 
-def _near(channel: str, groups: dict[str, list[str]], truths: dict[str, list[str]]) -> str:
-    """What a name that is none could have been."""
+def _suggest(channel: str, groups: dict[str, list[str]], truths: dict[str, list[str]]) -> str:
+    """Return the names that an unknown name may have meant, for an error."""
     prefix, _, rest = channel.partition(".")
     table, _, column = rest.partition(".")
     if prefix == "truth" and table in truths:
@@ -418,7 +418,7 @@ def _near(channel: str, groups: dict[str, list[str]], truths: dict[str, list[str
     sensors = [*(name for group in groups.values() for name in group), *groups]
     near = nearest(channel, sensors)
     if near:
-        return f"one of the recording's, such as {', '.join(near)}"
+        return f"a channel of the recording, such as {', '.join(near)}"
     return f"a channel of the recording, one of its groups ({', '.join(groups)}) or truth.TABLE"
 
 
@@ -433,9 +433,9 @@ def _table(
 ) -> ExportTable | None:
     block = next(block for block in recording.blocks(key) if len(block.values))
     rate = block.rate_hz
-    zero_s = block.start_s - block.index / rate  # of the stream's row 0
+    zero_s = block.start_s - block.index / rate  # time of the stream's row 0
     low, high = stream.first_time_s, stream.last_time_s
-    # A little room for the rounding of times.
+    # Tolerance for the rounding of times.
     first = math.ceil((max(low, -math.inf if from_s is None else from_s) - zero_s) * rate - 1e-6)
     last = math.floor((min(high, math.inf if to_s is None else to_s) - zero_s) * rate + 1e-6)
     if last < first:
@@ -460,10 +460,10 @@ def _table(
 
 
 def sensor_column(channel: Channel, unit: Unit) -> Column:
-    """A channel as an exported column."""
+    """Return a channel as an exported column."""
     name, label = channel.name, channel.label
     if unit == "volts" and channel.kind == NO_VOLTS:
-        raise InputError("unit", f"engineering or counts, as nothing is known of the voltage of {name}", unit)
+        raise InputError("unit", f"engineering or counts, as the voltage of {name} is unknown", unit)
     if unit == "counts":
         return Column(name=name, unit="counts", label=label, source=channel)
     linear = (channel.lsb_v, 0.0) if unit == "volts" else (channel.scale, channel.offset)

@@ -1,1 +1,1 @@
-"""Guesses at the channels of a log's signals, and a mapping to start from."""
+"""Guessing of the rig's channels among the signals of a log, and a mapping to start from."""

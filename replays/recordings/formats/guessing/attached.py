@@ -1,4 +1,4 @@
-"""What a file of `rig export` says of the rig and of what was done, for a mapping to start from."""
+"""The rig's own documents in a file of `rig export`, used for the mapping of a later import."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from rig.run.commands.table import COMMANDS, check_command
 from rig.run.scenes import Scene, load_scene, parse_scene, scene_names
 from rig.run.simulation import TICK_RATE_HZ
 
-_OTHERWISE = "stable-run"
-"""The scene whose differences are told of one that does not come with the rig."""
-_BY_IMPORT = {"duration_s", "fidelity", "pick", "set", "commands", "channels", "sensors.groups", "sensors.rate_hz"}
-"""Fields that an import finds out, and those that are told otherwise."""
+_BASE_SCENE = "stable-run"
+"""Scene that serves as the base if the recorded scene is not one of the rig's."""
+_EXCLUDED = {"duration_s", "fidelity", "pick", "set", "commands", "channels", "sensors.groups", "sensors.rate_hz"}
+"""Fields that an import determines, or that are handled separately."""
 
 
 class Attached(NamedTuple):
-    """What the rig's own documents in a file say for a mapping.
+    """Content for a mapping from the rig's documents in a file.
 
     Attributes:
         channels: The rig's channels by name.
-        experiment: The table [experiment] in TOML, without its heading; empty where it is not told.
-        doubt: Why it is not, where there are documents.
+        experiment: Lines of the TOML table [experiment], without its heading; empty if unknown.
+        doubt: Reason for a missing experiment although there are documents.
     """
 
     channels: Mapping[str, Channel] = {}
@@ -37,7 +37,7 @@ class Attached(NamedTuple):
 
 
 def attached(source: Source) -> Attached:
-    """What `rig export` has attached to a file."""
+    """Return the documents that `rig export` attached to a file."""
     if set(source.documents) != set(DOCUMENTS):
         return Attached()
     try:
@@ -46,26 +46,26 @@ def attached(source: Source) -> Attached:
             for kind, model in documents.ATTACHED.items()
         }
         experiment = _experiment(read["scene"][0], read["parameters"][0], source)
-    except (ValueError, TypeError) as error:  # a time of another kind among them
+    except (ValueError, TypeError) as error:  # including times of another type
         return Attached(doubt=printable(str(error)))
     catalogue = read["catalogue"][1]
     assert isinstance(catalogue, documents.Catalogue)
-    # Of what the rig has imported, filters were assumed.
+    # The filters of imported recordings were only assumed.
     return Attached({} if "import" in read["scene"][0] else catalogue.table.channels, tuple(experiment))
 
 
-def _experiment(told: dict[str, Any], recorded: dict[str, Any], source: Source) -> list[str]:
-    if (document := told.get("scene")) is None:
+def _experiment(scene_document: dict[str, Any], recorded: dict[str, Any], source: Source) -> list[str]:
+    if (document := scene_document.get("scene")) is None:
         return []
     scene = parse_scene(recorded_scene(recorded, document))
-    name = scene.name if scene.name in scene_names() else _OTHERWISE
+    name = scene.name if scene.name in scene_names() else _BASE_SCENE
     base = load_scene(name)
     lines = [f"scene = {_toml(name)}"]
     if changes := _changes(scene, base):
         lines.append(f"set = {_table(changes)}")
     sent = [
         {"at_s": one["tick"] / TICK_RATE_HZ, **check_command(one["command"], one["request"]).model_dump()}
-        for one in told.get("taken", ())
+        for one in scene_document.get("taken", ())
         if one["command"] in COMMANDS
     ]
     if sent or scene.commands != base.commands:
@@ -73,33 +73,33 @@ def _experiment(told: dict[str, Any], recorded: dict[str, Any], source: Source) 
         commands = sorted([*own, *sent], key=lambda command: command["at_s"])
         lines += ["commands = [", *(f"    {_table(command)}," for command in commands), "]"]
     if lead_s := _first_s(source):
-        lines.append(f"lead_s = {lead_s!r}    # its first sample lies so long behind the beginning of the scene")
+        lines.append(f"lead_s = {lead_s!r}    # time from the start of the scene to the first sample")
     return lines
 
 
 def _changes(scene: Scene, base: Scene) -> dict[str, Any]:
-    """What a scene has otherwise than another, by dotted key."""
+    """Return the fields in which a scene differs from another, by dotted key."""
     ours, theirs = scene.model_dump(), base.model_dump()
     found: dict[str, Any] = {}
     for key, value in ours.items():
-        if key in _BY_IMPORT:
+        if key in _EXCLUDED:
             continue
         if isinstance(value, dict):
-            other = {} if key == "engine" and value != theirs[key] else theirs[key]  # an engine brings its own step
+            other = {} if key == "engine" and value != theirs[key] else theirs[key]  # engines differ in step
             found |= {f"{key}.{name}": each for name, each in value.items() if other.get(name) != each}
         elif value != theirs[key]:
             found[key] = value
     before = load_scene(base, {"parameters": scene.parameters}).load_parameters().entries
     now = {key: entry.value for key, entry in scene.load_parameters().entries.items()}
     found |= {key: value for key, value in now.items() if before[key].value != value}
-    return {key: value for key, value in found.items() if key not in _BY_IMPORT}
+    return {key: value for key, value in found.items() if key not in _EXCLUDED}
 
 
 def _first_s(source: Source) -> float:
-    """Simulated time of the first sample [s]."""
+    """Return the simulated time of the first sample [s]."""
     signal = source.read(source.entries[0])
     first_s = signal.first_s if signal.times_s is None else float(signal.times_s[0])
-    if source.start is not None and (zero := source.about.get("start")) is not None:  # TDMS begins at its first sample
+    if source.start is not None and (zero := source.about.get("start")) is not None:  # TDMS starts at its first sample
         first_s += (source.start - datetime.fromisoformat(zero)).total_seconds()
     return round(max(0.0, first_s), 9)
 
@@ -109,5 +109,5 @@ def _table(values: dict[str, Any]) -> str:
 
 
 def _toml(value: Any) -> str:
-    # JSON's texts, numbers, booleans and lists are TOML's too.
+    # JSON texts, numbers, booleans and lists are valid TOML.
     return _table(value) if isinstance(value, dict) else json.dumps(value, ensure_ascii=False)

@@ -1,4 +1,4 @@
-"""What the numbers of a signal look like, alone and beside another: for a guess at what it is."""
+"""Features of a signal, and of signal pairs, used to guess its channel."""
 
 from __future__ import annotations
 
@@ -15,32 +15,32 @@ from replays.recordings.formats.guessing import noise
 from replays.recordings.formats.source import FileSignal, even_rate_hz
 from rig.base.errors import InputError
 
-_MOST = 2_000_000
-"""Longer signals are looked at up to here [samples]."""
-_SLOW = 1 << 16
-"""Samples that two signals are compared on: means of as many as it takes."""
-_NEAR, _TWO_LEVELS = 0.2, 0.85
-"""A pulse train is for such a part of its samples nearer than this part of its extent to one of its ends ..."""
-_EDGES, _REGULAR = 3, 0.3
-"""... and has at least so many edges, whose distances have at most this relative spread, or change slowly."""
-_BLOW, _SELDOM = 20.0, 0.02
-"""A blow is so many times what is usual, in at most so much of the time."""
-_FEW = 20
-"""Values of which nothing is said."""
-_AROUND = 4
-"""Lines of a spectrum on either side of its peak."""
+_MAX_SAMPLES = 2_000_000
+"""Samples evaluated at most, which bounds the time for long signals."""
+_COMPARED_SAMPLES = 1 << 16
+"""Samples on which two signals are compared; longer ones are averaged in blocks."""
+_LEVEL_TOLERANCE, _MIN_LEVEL_FRACTION = 0.2, 0.85
+"""A pulse train stays within this fraction of its range from either end for at least this fraction of its samples."""
+_MIN_EDGES, _MAX_INTERVAL_CHANGE = 3, 0.3
+"""Minimum number of edges of a pulse train, and limit of the relative change of their intervals."""
+_MIN_PEAK, _MAX_TIME = 20.0, 0.02
+"""Peak of a hammer signal over its typical deviation, and the largest fraction of time spent in pulses."""
+_MIN_SAMPLES = 20
+"""Minimum number of samples for a comparison of stamps."""
+_PEAK_HALF_WIDTH = 4
+"""Spectral lines evaluated on each side of a peak."""
 _BLOCKS = " ▁▂▃▄▅▆▇█"
 
 
 @dataclass(frozen=True)
-class Look:
-    """What the numbers of one signal look like.
+class SignalFeatures:
+    """Features of one signal.
 
     Attributes:
-        values: In the file's unit, without what is missing, shape (n,).
-        axis: When they were taken; of a signal without times and rate at 1 Hz, and `timed` is False.
-        timed: Whether the file tells times or a rate.
-        missing: Number of values that are none.
+        values: Values in the file's unit; missing ones are replaced by the mean, shape (n,).
+        axis: Time axis; 1 Hz if the signal has neither times nor rate (`timed` is False).
+        timed: True if the file has times or a rate.
+        missing: Number of missing values.
     """
 
     values: np.ndarray
@@ -50,7 +50,7 @@ class Look:
 
     @cached_property
     def mean(self) -> float:
-        """Mean."""
+        """Mean value."""
         return float(self.values.mean())
 
     @cached_property
@@ -65,55 +65,55 @@ class Look:
 
     @cached_property
     def pulses(self) -> np.ndarray:
-        """Rising edges of a signal that is at one of two levels [s], shape (k,), however few; else none."""
+        """Rising edges of a two-level signal [s], shape (k,); empty for other signals."""
         low, high = self.extent
-        reach = _NEAR * (high - low)
-        if not reach or np.mean((self.values < low + reach) | (self.values > high - reach)) < _TWO_LEVELS:
+        reach = _LEVEL_TOLERANCE * (high - low)
+        if not reach or np.mean((self.values < low + reach) | (self.values > high - reach)) < _MIN_LEVEL_FRACTION:
             return np.empty(0)
-        return clock.crossings(self.values, self.axis, threshold=None, hysteresis=None)[0]
+        return clock.find_crossings(self.values, self.axis, threshold=None, hysteresis=None)[0]
 
     @cached_property
     def edges(self) -> np.ndarray:
-        """Rising edges of a pulse train [s], shape (k,); none where it is no pulse train."""
+        """Rising edges of a regular pulse train [s], shape (k,); empty for other signals."""
         found = self.pulses
-        if len(found) < _EDGES:
+        if len(found) < _MIN_EDGES:
             return np.empty(0)
         apart = np.diff(found)
         uneven = np.abs(np.diff(apart)) / apart[1:] if len(apart) > 1 else np.zeros(1)
-        return found if float(np.median(uneven)) < _REGULAR else np.empty(0)
+        return found if float(np.median(uneven)) < _MAX_INTERVAL_CHANGE else np.empty(0)
 
     @cached_property
     def threshold(self) -> float:
-        """Level half way between lowest and highest."""
+        """Level midway between the lowest and the highest value."""
         return 0.5 * sum(self.extent)
 
     @cached_property
-    def blows(self) -> bool:
-        """Whether it rests, but for short and strong pulses to one side."""
+    def is_hammer(self) -> bool:
+        """True if the signal rests except for short, strong pulses to one side."""
         rest = float(np.median(self.values))
         off = np.abs(self.values - rest)
-        usual = float(np.median(off)) / 0.6745
+        typical = float(np.median(off)) / 0.6745
         peak = float(off.max())
-        return peak > _BLOW * usual and float(np.mean(off > 0.3 * peak)) < _SELDOM and not len(self.edges)
+        return peak > _MIN_PEAK * typical and float(np.mean(off > 0.3 * peak)) < _MAX_TIME and not len(self.edges)
 
     @property
-    def struck_s(self) -> float:
-        """When it first goes a tenth of the way to its largest pulse [s]."""
+    def pulse_start_s(self) -> float:
+        """Time at which the signal first exceeds a tenth of its largest pulse [s]."""
         off = np.abs(self.values - float(np.median(self.values)))
         return float(self.axis.instants()[int(np.argmax(off > 0.1 * off.max()))])
 
     @cached_property
     def corner_hz(self) -> float | None:
-        """Where its noise ends [Hz], if it shows."""
+        """Corner of the signal's noise [Hz]; None if it is not visible."""
         return noise.corner_hz(self.values, self.axis.rate_hz) if self.timed and self.axis.times_s is None else None
 
     @cached_property
     def unevenness(self) -> float:
-        """How far values lie from the line between their neighbours at even times, over the same at their stamps, rms.
+        """Residual of linear interpolation at even times, over that at the time stamps, rms [1].
 
-        Above 1 they were taken when the stamps say, below it evenly; 1 where the stamps are even.
+        Above 1 the samples were taken at their stamps, below 1 at even times; 1 if the stamps are even.
         """
-        if self.axis.times_s is None or len(self.values) < _FEW:
+        if self.axis.times_s is None or len(self.values) < _MIN_SAMPLES:
             return 1.0
 
         def off(times: np.ndarray) -> float:
@@ -127,12 +127,12 @@ class Look:
 
     @cached_property
     def slow(self) -> np.ndarray:
-        """The same as means of several samples, without their mean, shape (m,)."""
-        whole = block_means(self.values, -(-len(self.values) // _SLOW))
+        """Block means of the signal without their mean, shape (m,)."""
+        whole = block_means(self.values, -(-len(self.values) // _COMPARED_SAMPLES))
         return whole - whole.mean()
 
     def sparkline(self, width: int) -> str:
-        """Its course in a line of blocks: in each the value that is farthest from the mean."""
+        """Return the signal as a line of block characters, each the value farthest from the mean in its interval."""
         low, high = self.extent
         parts = np.array_split(self.values, min(width, len(self.values)))
         far = [part[np.argmax(np.abs(part - self.mean))] for part in parts]
@@ -140,9 +140,9 @@ class Look:
         return "".join(_BLOCKS[1 + round((float(value) - low) * scale)] for value in far)
 
 
-def look(signal: FileSignal) -> Look:
-    """Look at the numbers of a signal."""
-    values = signal.physical[:_MOST]
+def compute_features(signal: FileSignal) -> SignalFeatures:
+    """Return the features of a signal."""
+    values = signal.physical[:_MAX_SAMPLES]
     good = np.isfinite(values)
     rows = len(values)
     timed = signal.times_s is not None or signal.rate_hz is not None
@@ -151,22 +151,22 @@ def look(signal: FileSignal) -> Look:
         times_s = signal.times_s[:rows]
         try:
             axis = clock.axis_of_stamps(times_s, line=False, what="")
-        except InputError:  # the import says so
+        except InputError:  # reported by the import
             axis = clock.Axis(0.0, even_rate_hz(times_s) or 1.0, rows)
-        values, good = axis.placed(values), axis.placed(np.where(good, 1.0, np.nan)) == 1.0
+        values, good = axis.place_samples(values), axis.place_samples(np.where(good, 1.0, np.nan)) == 1.0
     mean = float(values[good].mean()) if good.any() else 0.0
-    return Look(np.where(good, values, mean), axis, timed, int(len(good) - good.sum()))
+    return SignalFeatures(np.where(good, values, mean), axis, timed, int(len(good) - good.sum()))
 
 
 @dataclass(frozen=True)
 class Relation:
-    """How a signal goes with another.
+    """Relation of two signals.
 
     Attributes:
-        hz: Frequency at which both move most [Hz].
-        phase_deg: By how much the first leads there [degrees].
-        coherence: How firmly, 0 to 1.
-        likeness: Correlation of all of it, -1 to 1.
+        hz: Frequency of the strongest common line [Hz].
+        phase_deg: Phase lead of the first signal at that frequency [degrees].
+        coherence: Coherence at that frequency, 0 to 1.
+        likeness: Correlation coefficient over all frequencies, -1 to 1.
     """
 
     hz: float
@@ -176,17 +176,17 @@ class Relation:
 
     @property
     def quadrature(self) -> bool:
-        """Whether they are a quarter of a turn apart."""
+        """True if the signals are in quadrature."""
         return self.coherence > 0.8 and abs(abs(self.phase_deg) - 90.0) < 30.0
 
     @property
     def together(self) -> bool:
-        """Whether they go up and down at the same time, or one up and the other down."""
+        """True if the signals are in phase or in opposite phase."""
         return self.coherence > 0.8 and abs(abs(self.phase_deg) - 90.0) > 60.0
 
 
-def relation(a: Look, b: Look) -> Relation | None:
-    """How two signals go together; None where they were not taken at the same instants, or do not move."""
+def compute_relation(a: SignalFeatures, b: SignalFeatures) -> Relation | None:
+    """Return the relation of two signals; None if they were not sampled together, or one is constant."""
     if len(a.values) != len(b.values) or abs(a.axis.rate_hz / b.axis.rate_hz - 1.0) > 1e-3:
         return None
     x, y = a.slow, b.slow
@@ -198,7 +198,7 @@ def relation(a: Look, b: Look) -> Relation | None:
     power = np.abs(ax) * np.abs(by)
     power[:3] = 0.0
     peak = int(np.argmax(power))
-    near = slice(max(1, peak - _AROUND), peak + _AROUND + 1)
+    near = slice(max(1, peak - _PEAK_HALF_WIDTH), peak + _PEAK_HALF_WIDTH + 1)
     cross = complex(np.sum(ax[near] * np.conj(by[near])))
     whole = math.sqrt(float(np.sum(np.abs(ax[near]) ** 2)) * float(np.sum(np.abs(by[near]) ** 2)))
     slow_hz = a.axis.rate_hz * len(x) / len(a.values)

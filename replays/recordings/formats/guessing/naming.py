@@ -1,4 +1,4 @@
-"""What a signal's name says, in the languages and habits of test benches: what is measured, where, and which way."""
+"""Parsing of signal names, in the languages and conventions of test benches: quantity, place and direction."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _KINDS = {
     "length": "weg wegsonde wegaufnehmer sonde probe prox proximity proximiter displacement disp position pos "
     "gap abstand wirbelstrom eddy eddycurrent deplacement desplazamiento spostamento verplaatsing orbit taster d s",
 }  # fmt: skip
-"""What is measured, by words; the first that fits, so that a hammer's force is a hammer's."""
+"""Quantities by words; the first match counts, so that a hammer's force is a hammer."""
 _PLACES = {
     "disk": "disk disc scheibe rotorscheibe disque disco schijf rotor",
     "ring": "ring statorring anneau anillo anello stator fanglager backup",
@@ -36,9 +36,9 @@ _SIDES = {
 }  # fmt: skip
 _LONE_O = ("o", "fo", "po")
 _O = {"E": "W", "W": "E"}
-"""The side that a lone `O` stands for, beside one that is named: Ost beside W, Ouest or Oeste beside E."""
-_LONG = 4
-"""Words of so many letters are found inside others, as German writes them."""
+"""Side meant by a lone `O`, by the other side that is named: Ost with W, Ouest or Oeste with E."""
+_MIN_INNER_LENGTH = 4
+"""Minimum length of a word that is also found inside another, as in German compounds."""
 
 
 def _words(texts: Mapping[str, str]) -> dict[str, str]:
@@ -49,16 +49,16 @@ _KIND_OF, _PLACE_OF, _AXIS_OF, _SIDE_OF = map(_words, (_KINDS, _PLACES, _AXES, _
 
 
 @dataclass(frozen=True)
-class Named:
-    """What a name says; empty where it says nothing.
+class ParsedName:
+    """Content of a signal name; fields are empty if the name does not have them.
 
     Attributes:
-        kind: What is measured: `length`, `force`, `acceleration`, `speed`, `keyphasor` or `hammer`.
-        kind_word: The word that says so.
+        kind: Quantity: `length`, `force`, `acceleration`, `speed`, `keyphasor` or `hammer`.
+        kind_word: Word that gave the quantity.
         place: `disk`, `ring`, `inner` or `outer`.
         axis: `x` or `y`.
         side: `N`, `S`, `E`, `W`, or `O`, which is Ost or Ouest.
-        side_letter: The side is told by one letter, which may be the unit's.
+        side_letter: True if the side is a single letter, which may also be part of a unit.
     """
 
     kind: str = ""
@@ -69,14 +69,14 @@ class Named:
     side_letter: bool = False
 
     def side_among(self, others: set[str]) -> str:
-        """The side, where the sides of all forces tell what `O` is."""
+        """Return the side; the sides of the other forces resolve `O`."""
         if self.side != "O":
             return self.side
         return next((_O[other] for other in ("W", "E") if other in others), "E")
 
 
-def words_of(name: str) -> list[str]:
-    """The words of a name in small letters without accents: `Sonde_X2` is sonde, x, 2; umlauts become ae, oe, ue."""
+def split_words(name: str) -> list[str]:
+    """Return the words of a name in lower case without accents: `Sonde_X2` gives sonde, x, 2; ä gives ae."""
     text = name.replace("ß", "ss")
     for umlaut, plain in zip("äöüÄÖÜ", ("ae", "oe", "ue", "Ae", "Oe", "Ue"), strict=True):
         text = text.replace(umlaut, plain)
@@ -85,29 +85,29 @@ def words_of(name: str) -> list[str]:
     return re.findall(r"[a-z]+|\d+", text.lower())
 
 
-def read_name(name: str) -> Named:
-    """What a name says."""
-    words = words_of(name)
+def read_name(name: str) -> ParsedName:
+    """Return the content of a signal name."""
+    words = split_words(name)
     kind, kind_word = "", ""
     for wanted in _KINDS:
-        kind_word = _found(words, {word: key for word, key in _KIND_OF.items() if key == wanted})[1]
+        kind_word = _find_word(words, {word: key for word, key in _KIND_OF.items() if key == wanted})[1]
         if kind_word:
             kind = wanted
             break
     rest = [word for word in words if word != kind_word or len(kind_word) > 1]
     side_word = next((word for word in reversed(rest) if word in _SIDE_OF or word in _LONE_O), "")
     side = _SIDE_OF.get(side_word, side_word[-1:].upper())
-    axis = _found(words, _AXIS_OF)[0]
-    return Named(kind, kind_word, _found(words, _PLACE_OF)[0], axis, side, len(side_word) == 1)
+    axis = _find_word(words, _AXIS_OF)[0]
+    return ParsedName(kind, kind_word, _find_word(words, _PLACE_OF)[0], axis, side, len(side_word) == 1)
 
 
-def _found(words: list[str], known: dict[str, str]) -> tuple[str, str]:
-    """Key and word: a word of its own first, else a long one inside another."""
+def _find_word(words: list[str], known: dict[str, str]) -> tuple[str, str]:
+    """Return key and word of the first match: a whole word first, else a long one inside another."""
     for word in words:
         if word in known:
             return known[word], word
     for word in words:
         for inside, key in known.items():
-            if len(inside) >= _LONG and inside in word:
+            if len(inside) >= _MIN_INNER_LENGTH and inside in word:
                 return key, inside
     return "", ""

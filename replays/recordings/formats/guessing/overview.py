@@ -1,4 +1,4 @@
-"""A picture of the signals of a log, for who has to say what they are."""
+"""Picture of the signals of a log, for completing the mapping."""
 
 from __future__ import annotations
 
@@ -10,35 +10,35 @@ import numpy as np
 from replays.recordings.formats.guessing.guess import Guess
 from replays.report.canvas import BLACK, BLUE, RED, house_style, label_of, new_figure, save
 
-_HEIGHT = 1.15
-"""Of a row [inch]."""
-_MOST = 40
-"""Signals that one picture shows."""
-_CLOSE_S = 0.3
-"""Length of what is shown close up [s], but at least so many samples:"""
-_FEW = 60
-_STRETCHES = 1000
-"""Of time, into which a long signal is divided."""
+_ROW_HEIGHT = 1.15
+"""Height of a row [inch]."""
+_MAX_SIGNALS = 40
+"""Signals in one picture at most."""
+_DETAIL_S = 0.3
+"""Length of the detail view [s], and its minimum number of samples."""
+_MIN_DETAIL_SAMPLES = 60
+_INTERVALS = 1000
+"""Intervals into which a long signal is divided for drawing."""
 _COLOURS = {"sure": BLUE, "likely": BLUE, "ask": RED}
 
 
 @house_style()
 def draw(guesses: Sequence[Guess], path: Path) -> None:
-    """Draw each signal, whole and close up where it moves most, with what it is taken for; red: to be asked.
+    """Draw each signal, whole and in detail where it moves most, with its guessed channel; red: to be checked.
 
     Raises:
         InputError: The file is neither .png nor .svg.
     """
-    shown = guesses[:_MOST]
-    figure = new_figure(0.6 + _HEIGHT * len(shown), "Signals, whole and close up, and what they are taken for")
+    shown = guesses[:_MAX_SIGNALS]
+    figure = new_figure(0.6 + _ROW_HEIGHT * len(shown), "Signals, whole and in detail, with their guessed channels")
     axes = figure.subplots(len(shown), 2, squeeze=False, width_ratios=(2, 1))
-    zero_s = min(guess.look.axis.first_s for guess in shown)
-    end_s = max(guess.look.axis.last_s for guess in shown) - zero_s
+    zero_s = min(guess.features.axis.first_s for guess in shown)
+    end_s = max(guess.features.axis.last_s for guess in shown) - zero_s
     for (whole, close), guess in zip(axes, shown, strict=True):
-        times, values = guess.look.axis.instants() - zero_s, guess.look.values
+        times, values = guess.features.axis.instants() - zero_s, guess.features.values
         colour = _COLOURS.get(guess.sure, BLACK)
-        whole.plot(*course(times, values), color=colour, lw=0.9)
-        length = min(len(values), max(_FEW, round(_CLOSE_S * guess.look.axis.rate_hz)))
+        whole.plot(*reduce_samples(times, values), color=colour, lw=0.9)
+        length = min(len(values), max(_MIN_DETAIL_SAMPLES, round(_DETAIL_S * guess.features.axis.rate_hz)))
         starts = np.arange(0, len(values) - length + 1, max(1, length // 2))
         start = max(
             starts.tolist(), key=lambda at, values=values, length=length: float(np.ptp(values[at : at + length]))
@@ -54,10 +54,10 @@ def draw(guesses: Sequence[Guess], path: Path) -> None:
     save(figure, path)
 
 
-def course(times: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest and highest of as many stretches as there is room for, in turn: what a line of all samples shows."""
-    if len(values) <= 2 * _STRETCHES:
+def reduce_samples(times: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return minima and maxima of intervals in turn, which draw like all samples."""
+    if len(values) <= 2 * _INTERVALS:
         return times, values
-    starts = np.linspace(0, len(values), _STRETCHES, endpoint=False).astype(int)
+    starts = np.linspace(0, len(values), _INTERVALS, endpoint=False).astype(int)
     extremes = np.stack([np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)], axis=1)
     return np.repeat(times[starts], 2), extremes.ravel()

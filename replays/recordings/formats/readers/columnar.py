@@ -1,4 +1,4 @@
-"""Parquet, by pyarrow."""
+"""Reading and writing of Parquet files, by pyarrow."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ if TYPE_CHECKING:
 
 
 def look_into(path: Path, options: FileOptions) -> Source:
-    """Look into a Parquet file.
+    """Open a Parquet file and list its signals.
 
     Raises:
-        InputError: It is none, or has no column of numbers.
+        InputError: The file is not Parquet, or has no numeric column.
     """
     from pyarrow import parquet
 
@@ -36,12 +36,12 @@ def look_into(path: Path, options: FileOptions) -> Source:
     headings = [parse_heading(field.name) for field in schema]
     names = [name for name, _ in headings]
     stamps = time_column(names, options.time_column, path=path)
-    if stamps is None and options.time_column is None:  # as pandas names an index of instants
+    if stamps is None and options.time_column is None:  # pandas names an index of instants differently
         stamps = next((c for c in range(len(names)) if _is_clock(schema.field(c).type)), None)
 
     def batches(columns: Sequence[int], groups: Iterable[int]) -> Iterator[list[Any]]:
         wanted = [schema.field(c).name for c in columns]
-        for group in groups:  # of several at once, pyarrow keeps those that it has read
+        for group in groups:  # for several groups at once, pyarrow keeps those already read
             for batch in file.iter_batches(_PIECE, row_groups=[group], columns=wanted, use_threads=False):
                 yield [batch.column(batch.schema.names.index(name)) for name in wanted]
 
@@ -60,9 +60,9 @@ def look_into(path: Path, options: FileOptions) -> Source:
     for c, (name, unit) in enumerate(headings):
         field = schema.field(c)
         if c != stamps and _numeric(field.type):
-            told = {key.decode(): text.decode(errors="replace") for key, text in (field.metadata or {}).items()}
+            notes = {key.decode(): text.decode(errors="replace") for key, text in (field.metadata or {}).items()}
             entries.append(
-                Entry(name, "", unit or told.get("unit", ""), file.metadata.num_rows, rate, c, told.get("label", ""))
+                Entry(name, "", unit or notes.get("unit", ""), file.metadata.num_rows, rate, c, notes.get("label", ""))
             )
 
     @cache
@@ -99,11 +99,11 @@ def _is_clock(kind: Any) -> bool:
 
 
 def numbers(column: Any, base: int = 0) -> np.ndarray:
-    """A column of pyarrow as numbers, integers where they are and none is missing; times in seconds, missing: nan.
+    """Return a column of pyarrow as numbers: integers if all are present, else floats with nan; times in seconds.
 
     Args:
         column: The column, or a piece of it.
-        base: From when on instants count [ns], see `base_ns`.
+        base: Origin of instants [ns], see `base_ns`.
     """
     import pyarrow
     import pyarrow.compute as compute
@@ -120,7 +120,7 @@ def numbers(column: Any, base: int = 0) -> np.ndarray:
 
 
 def joined_instants(dates: Any, times_s: Any) -> Any:
-    """Return a column of instants: dates at midnight, each with a time of day [s]."""
+    """Return a column of instants: dates at midnight plus times of day [s]."""
     import pyarrow
 
     ns = np.rint(1e9 * np.asarray(times_s, dtype=float)).astype("timedelta64[ns]")
@@ -128,55 +128,55 @@ def joined_instants(dates: Any, times_s: Any) -> Any:
 
 
 def base_ns(column: Any) -> int:
-    """The second in which a column of instants begins [ns], as `first_instant` tells it; 0 for other columns."""
+    """Return the whole second of a column's first instant [ns], as `first_instant`; 0 for other columns."""
     import pyarrow
     import pyarrow.types as types
 
     if not types.is_timestamp(column.type) or not len(column) or not column[0].is_valid:
-        return 0  # durations count from their own zero
+        return 0  # durations have their own origin
     first = column[0].cast(pyarrow.timestamp("ns", tz=column.type.tz)).value
     return first - first % 1_000_000_000
 
 
 def first_instant(column: Any) -> datetime | None:
-    """The second in which a column of instants begins; None for other columns."""
+    """Return the whole second of a column's first instant; None for other columns."""
     import pyarrow
     import pyarrow.types as types
 
     if not types.is_timestamp(column.type) or not len(column):
         return None
-    told = column[0].cast(pyarrow.timestamp("us", tz=column.type.tz)).as_py()
-    return None if told is None else told.replace(microsecond=0)
+    first = column[0].cast(pyarrow.timestamp("us", tz=column.type.tz)).as_py()
+    return None if first is None else first.replace(microsecond=0)
 
 
 class ParquetRows:
-    """A Parquet file that grows by rows."""
+    """Parquet file written row by row."""
 
     def __init__(self, path: Path, schema: Any) -> None:
         from pyarrow import parquet
 
         self._schema = schema
-        # Dictionaries would be tried in vain on every column of a continuous quantity.
+        # Dictionaries would not compress continuous quantities.
         self._writer = parquet.ParquetWriter(path, schema, compression="lz4", use_dictionary=False)
 
     def write(self, columns: Sequence[np.ndarray]) -> None:
-        """Take rows, column by column, each shape (n,)."""
+        """Write rows, column by column, each shape (n,)."""
         self._writer.write_table(arrow_table(columns, self._schema))
 
     def close(self) -> None:
-        """Write what is left."""
+        """Write pending rows, and close the file."""
         self._writer.close()
 
 
 def float_schema(names: Sequence[str]) -> Any:
-    """Columns of float64."""
+    """Return a schema of float64 columns."""
     import pyarrow
 
     return pyarrow.schema([(name, pyarrow.float64()) for name in names])
 
 
 def arrow_table(columns: Sequence[np.ndarray], schema: Any) -> Any:
-    """Columns as pyarrow has them; nan in a column of integers is null."""
+    """Return columns as a pyarrow table; nan in a column of integers becomes null."""
     import pyarrow
 
     arrays = []
@@ -185,7 +185,7 @@ def arrow_table(columns: Sequence[np.ndarray], schema: Any) -> Any:
             missing = np.isnan(values)
             array = pyarrow.array(np.where(missing, 0.0, values).astype(np.int32), mask=missing)
         else:
-            # Not pyarrow.array: it imports pandas to see what it was given, which takes as long as a second's rows.
+            # pyarrow.array would import pandas to inspect its argument, which takes as long as writing a second's rows.
             whole = np.ascontiguousarray(values, dtype=float)
             array = pyarrow.Array.from_buffers(pyarrow.float64(), len(whole), [None, pyarrow.py_buffer(whole)])
         arrays.append(array)
@@ -193,9 +193,9 @@ def arrow_table(columns: Sequence[np.ndarray], schema: Any) -> Any:
 
 
 class ParquetWriter(export.FormatWriter):
-    """A Parquet file: `time [s]` and a column a channel, their calibration in the columns' metadata.
+    """Writer of Parquet files: `time [s]` and one column per channel, with its calibration as metadata.
 
-    What happened, and the rig's documents, are metadata of the file.
+    Events and the rig's documents are metadata of the file.
     """
 
     merged = True
@@ -208,15 +208,15 @@ class ParquetWriter(export.FormatWriter):
         kind = pyarrow.int32() if selection.unit == "counts" else pyarrow.float64()
         fields = [pyarrow.field("time [s]", pyarrow.float64())]
         for column in table.columns:
-            told = {key: str(value) for key, value in column.metadata.items()}
-            fields.append(pyarrow.field(column.heading, _type(column, kind), metadata=told))
+            metadata = {key: str(value) for key, value in column.metadata.items()}
+            fields.append(pyarrow.field(column.heading, _type(column, kind), metadata=metadata))
         events = json.dumps([event.document for event in selection.events])
         whole = {"rig": json.dumps({**selection.metadata, "rate_hz": table.rate_hz}), "events": events}
         whole |= selection.documents
         self._file = ParquetRows(path, pyarrow.schema(fields, metadata=whole))
 
     def write(self, table: ExportTable, chunk: ExportChunk) -> None:
-        """Take rows; those that no stream has are left out."""
+        """Write rows; those that no stream has are left out."""
         values = [table.exported(c, chunk)[chunk.present] for c in range(len(table.columns))]
         self._file.write([chunk.times_s[chunk.present], *values])
 

@@ -1,4 +1,4 @@
-"""Text with delimiters: CSV in all its dialects, and LabVIEW's measurement files (.lvm). Parsed by pyarrow."""
+"""Delimited text: CSV in all its dialects, and LabVIEW measurement files (.lvm). Parsed by pyarrow."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from replays.recordings.resimulation.background import Background
 from rig.base.errors import InputError, Words
 from rig.base.text import printable
 
-_BLOCK = 1 << 21
-"""Bytes that are parsed at a time."""
+_BLOCK_BYTES = 1 << 21
+"""Bytes parsed at a time."""
 _LAST_BYTES = 1 << 16
-"""Bytes at the end of a file among which its last line is looked for."""
+"""Bytes at the end of a file in which its last line is searched."""
 _BLANKS = [" " * n for n in range(1, 33)]
-"""Fields of blanks only, as fixed columns are padded with them."""
-_KEPT = 1 << 24
-"""Values of a file that are kept once they are parsed; a longer one is parsed anew each time."""
+"""Blank fields, as in fixed-width columns."""
+_MAX_CACHED_VALUES = 1 << 24
+"""Values of a file that are kept in memory; larger files are parsed again each time."""
 
 if TYPE_CHECKING:
     from replays.recordings.formats.exporting.selection import Selection
@@ -33,10 +33,10 @@ if TYPE_CHECKING:
 
 
 def look_into(path: Path, options: FileOptions) -> Source:
-    """Look into a text file and read its columns.
+    """Open a text file and read its columns.
 
     Raises:
-        InputError: It cannot be understood; the message names what is missing or the line.
+        InputError: The layout is not recognised; the message names the missing option or the line.
     """
     layout = find_layout(path, options)
     names = list(layout.names)
@@ -59,10 +59,10 @@ def look_into(path: Path, options: FileOptions) -> Source:
             part_s = columnar.numbers(part[stamps], base) * scale
             if np.isnan(part_s).any():
                 line = layout.first + rows + int(np.argmax(np.isnan(part_s))) + 1
-                raise InputError("file.time_column", "a column without holes", Words(f"{path}, line {line}"))
+                raise InputError("file.time_column", "a column without missing values", Words(f"{path}, line {line}"))
             ends_s = [*(ends_s or part_s)[:1], part_s[-1]]
         rows += len(part[0])
-        kept = None if kept is None or rows * len(names) > _KEPT else [*kept, part]
+        kept = None if kept is None or rows * len(names) > _MAX_CACHED_VALUES else [*kept, part]
     if not rows:
         raise InputError("file", "a text file with lines of numbers", str(path))
     rate = layout.rate_hz if stamps is None else even_rate_hz(np.array(ends_s), rows)
@@ -92,15 +92,15 @@ def look_into(path: Path, options: FileOptions) -> Source:
     dialect, remarks = layout.dialect, layout.remarks
     last = dialect.fields(_last_line(path, layout.encoding))
     if not layout.ragged and len(last) < layout.width:
-        remarks += (f"the last line is cut, and is left out: {len(last)} of {layout.width} columns",)
-    told: dict[str, str | int] = {"delimiter": dialect.delimiter, "decimal": dialect.decimal}
-    told |= {"thousands": dialect.thousands} if dialect.thousands else {}
-    told["first_line"] = layout.first + 1
+        remarks += (f"the last line is incomplete and was ignored: {len(last)} of {layout.width} columns",)
+    dialect_options: dict[str, str | int] = {"delimiter": dialect.delimiter, "decimal": dialect.decimal}
+    dialect_options |= {"thousands": dialect.thousands} if dialect.thousands else {}
+    dialect_options["first_line"] = layout.first + 1
     if stamps is not None:
-        told["time_column"] = names[stamps] or stamps + 1
+        dialect_options["time_column"] = names[stamps] or stamps + 1
     if unit not in ("", "s"):
-        told["time_unit"] = unit
-    return Source(path, "text", entries, read, pieces, start=start, remarks=remarks, options=told)
+        dialect_options["time_unit"] = unit
+    return Source(path, "text", entries, read, pieces, start=start, remarks=remarks, options=dialect_options)
 
 
 def _first_fields(path: Path, layout: Layout) -> list[str]:
@@ -109,7 +109,7 @@ def _first_fields(path: Path, layout: Layout) -> list[str]:
 
 
 def _column_of_instants(path: Path, layout: Layout, options: FileOptions) -> int | None:
-    """The column that has dates and times instead of numbers, whatever its name."""
+    """Return the column that has dates and times instead of numbers, whatever its name."""
     for c, text in enumerate(_first_fields(path, layout)[: len(layout.names)]):
         if not layout.dialect.is_number(text) and instant(text, options.time_format) is not None:
             return c
@@ -117,7 +117,7 @@ def _column_of_instants(path: Path, layout: Layout, options: FileOptions) -> int
 
 
 def _date_and_time(layout: Layout, first: Sequence[str], stamps: int | None) -> tuple[int | None, int | None]:
-    """Return the column of times, and that of the dates (ISO 8601) where it has times of day; else None."""
+    """Return the time column, and the column of its dates (ISO 8601) if it has times of day, else None."""
     texts = list(enumerate(first[: len(layout.names)]))
     times = [c for c, text in texts if isinstance(instant(text, None), float)]
     dates = [c for c, text in texts if isinstance(instant(text, "%Y-%m-%d"), datetime)]
@@ -129,10 +129,10 @@ def _date_and_time(layout: Layout, first: Sequence[str], stamps: int | None) -> 
 def _parsed(
     path: Path, layout: Layout, options: FileOptions, stamps: int | None, date: int | None
 ) -> Iterator[list[Any]]:
-    """The columns in pieces, as pyarrow has them; times of day that have a column of dates as instants.
+    """Yield pieces of the columns from pyarrow; times of day with a column of dates become instants.
 
     Raises:
-        InputError: Lines have more or fewer columns, or something in them cannot be read.
+        InputError: Lines have a wrong number of columns, or unreadable values.
     """
     import pyarrow
     from pyarrow import csv
@@ -155,7 +155,7 @@ def _parsed(
         reader = csv.open_csv(
             source,
             read_options=csv.ReadOptions(
-                column_names=numbered, skip_rows=skipped, use_threads=False, encoding=encoding, block_size=_BLOCK
+                column_names=numbered, skip_rows=skipped, use_threads=False, encoding=encoding, block_size=_BLOCK_BYTES
             ),
             parse_options=csv.ParseOptions(
                 delimiter=layout.dialect.delimiter, invalid_row_handler=note, ignore_empty_lines=True
@@ -182,19 +182,19 @@ def _parsed(
         line = f"line {row.number + layout.first - skipped}: " if row.number else ""
         raise InputError(
             "file", f"a text file of {layout.width} columns throughout",
-            Words(f"{path}, where {len(bad)} lines are not so ({line}{row.actual_columns} columns, {row.text[:40]!r})"),
+            Words(f"{path}, where {len(bad)} lines differ ({line}{row.actual_columns} columns, {row.text[:40]!r})"),
         )  # fmt: skip
 
 
 def _last_line(path: Path, encoding: str) -> str:
-    """Return the last line of a file that has something in it, without spaces at its ends."""
+    """Return the last non-empty line of a file, stripped."""
     with path.open("rb") as file:
         file.seek(max(0, path.stat().st_size - _LAST_BYTES))
         return file.read().decode(encoding, errors="replace").rstrip().rpartition("\n")[2].strip()
 
 
 def _body(path: Path, layout: Layout) -> tuple[Any, int, str]:
-    """What pyarrow parses, how many of its lines to skip, and its encoding: the file, or a copy with lines mended."""
+    """Return the input for pyarrow, lines to skip, and encoding: the file, or a copy with repaired lines."""
     dialect = layout.dialect
     if not (dialect.delimiter == " " or dialect.thousands or layout.encoding == "utf-16" or layout.ragged):
         return str(path), layout.first, layout.encoding.replace("-sig", "")
@@ -208,14 +208,14 @@ def _body(path: Path, layout: Layout) -> tuple[Any, int, str]:
 
 
 def _time_kind(text: str, layout: Layout, options: FileOptions) -> Any:
-    """The type as which pyarrow reads a column of times; what it cannot is read as texts."""
+    """Return the pyarrow type of a time column; formats that pyarrow does not know are read as text."""
     import pyarrow
 
     if options.time_format is None and layout.dialect.is_number(text):
         return pyarrow.float64()
     found = instant(text, options.time_format)
     if found is None:
-        must = "given for times that are no numbers (such as %d.%m.%Y %H:%M:%S)"
+        must = "set for times that are not numbers (such as %d.%m.%Y %H:%M:%S)"
         raise InputError("file.time_format", must if options.time_format is None else "that of the times", text)
     if options.time_format is not None or "," in text or not isinstance(found, datetime):
         return pyarrow.string()
@@ -223,7 +223,7 @@ def _time_kind(text: str, layout: Layout, options: FileOptions) -> Any:
 
 
 def _instants(path: Path, column: Any, options: FileOptions) -> Any:
-    """Texts as instants, or as times of day."""
+    """Convert texts to instants, or to times of day."""
     import pyarrow
 
     found: list[Any] = []
@@ -244,7 +244,7 @@ def _quoted(name: str) -> str:
 
 
 class CsvRows:
-    """A CSV file that grows by rows: numbers in the fewest digits that give them back, on two threads."""
+    """CSV file written row by row, with the shortest decimal form of each number, on two threads."""
 
     def __init__(self, path: Path, names: Sequence[str], *, whole: Collection[str] = ()) -> None:
         """Write the headings.
@@ -252,20 +252,20 @@ class CsvRows:
         Args:
             path: The file.
             names: Headings of the columns.
-            whole: Those of whole numbers, of which a missing one is nan and left empty.
+            whole: Headings of integer columns, in which nan is written as an empty field.
         """
         self._whole = [name in whole for name in names]
         self._file = path.open("wb")
         self._file.write((",".join(f'"{_quoted(name)}"' for name in names) + "\n").encode())
-        # Formatting a number takes ten times as long as simulating it, and needs no lock.
+        # Formatting a number takes ten times as long as simulating it, and does not hold the GIL.
         self._background = Background(self._file.write, threads=2)
 
     def write(self, columns: Sequence[np.ndarray]) -> None:
-        """Take rows, column by column, each shape (n,)."""
+        """Write rows, column by column, each shape (n,)."""
         self._background.call(_lines, columns, self._whole)
 
     def close(self) -> None:
-        """Write what is left."""
+        """Write pending rows, and close the file."""
         try:
             self._background.finish()
         finally:
@@ -273,7 +273,7 @@ class CsvRows:
 
 
 def _lines(columns: Sequence[np.ndarray], whole: Sequence[bool]) -> bytes:
-    """Rows as text; without pyarrow, which a lean install lacks, a fifth as fast."""
+    """Return rows as text; without pyarrow, in a minimal install, this is five times slower."""
     try:
         import pyarrow
         from pyarrow import csv
@@ -291,7 +291,7 @@ def _lines(columns: Sequence[np.ndarray], whole: Sequence[bool]) -> bytes:
 
 
 class CsvWriter(columnar.ParquetWriter):
-    """A CSV file: `time [s]` and a column a channel."""
+    """Writer of CSV files: `time [s]` and one column per channel."""
 
     sidecar = True
 

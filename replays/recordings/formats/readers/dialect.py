@@ -1,4 +1,4 @@
-"""How a text file is laid out: what a mapping does not say of it is found out from its first lines."""
+"""Layout of text files, detected from the first lines as far as the mapping does not define it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 _HEAD_LINES = 200
 _DELIMITERS = {"tab": "\t", "comma": ",", "semicolon": ";", "space": " "}
 MISSING = ["", "nan", "NaN", "NAN", "n/a", "NA", "null", "--", "---", "-", "#N/A", "1.#QNAN", "-1.#IND", "Overload"]
-"""Texts that stand for no value."""
+"""Texts for a missing value."""
 _LVM = "LabVIEW Measurement"
 _LVM_END = "***End_of_Header***"
 _HEADING = re.compile(r"\s*(.*?)\s*[\[(]([^\])]*)[\])]\s*")
@@ -30,15 +30,15 @@ _TIME_OF_DAY = re.compile(r"(\d{1,2}):(\d\d):(\d\d(?:[.,]\d+)?)")
 
 @dataclass(frozen=True)
 class Dialect:
-    """How numbers stand in a line."""
+    """Format of numbers in a line."""
 
     delimiter: str
     decimal: str
     thousands: str = ""
-    """Between groups of three digits; empty: nothing is."""
+    """Separator between groups of three digits; empty: none."""
 
     def fields(self, line: str) -> list[str]:
-        """Texts of a line, without quotes and spaces around them."""
+        """Return the fields of a line, without quotes and surrounding spaces."""
         line = line.rstrip("\r\n")
         if self.delimiter == " ":
             return [text.strip('"') for text in line.split()]
@@ -47,11 +47,11 @@ class Dialect:
         return [text.strip() for text in line.split(self.delimiter)]
 
     def plain(self, text: str) -> str:
-        """A number without what groups its digits."""
+        """Return a number without digit separators."""
         return re.sub(r"\s", "", text) if self.thousands == " " else text.replace(self.thousands or "\0", "")
 
     def is_number(self, text: str) -> bool:
-        """Whether a text is a number, or stands for a missing one."""
+        """Return whether a text is a number or a missing value."""
         if not text or text in MISSING:
             return True
         if self.thousands:
@@ -63,12 +63,12 @@ class Dialect:
             float(text.replace(self.decimal, "."))
         except ValueError:
             return False
-        return "_" not in text  # which Python lets pass
+        return "_" not in text  # Python accepts it
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Where things are in a text file; lines count from 0."""
+    """Layout of a text file; lines count from 0."""
 
     encoding: str
     dialect: Dialect
@@ -77,11 +77,11 @@ class Layout:
     first: int
     """First line of data."""
     width: int
-    """Fields of a line of data; there may be an empty one before or behind those that have names."""
+    """Fields of a line of data, possibly with an empty one at either end."""
     empty_first: bool = False
-    """The first field of every line is empty, as LabVIEW leaves its column of times."""
+    """True if the first field of every line is empty, where LabVIEW omits its time column."""
     ragged: bool = False
-    """Lines may have more fields, empty ones or a comment."""
+    """True if lines may have additional fields, empty ones or a comment."""
     rate_hz: float | None = None
     first_s: float = 0.0
     start: datetime | None = None
@@ -89,7 +89,7 @@ class Layout:
 
 
 def parse_heading(text: str) -> tuple[str, str]:
-    """Name and unit in a heading such as `disk_x [mm]`, `P_N (N)` or `disk_x, mm`."""
+    """Return name and unit of a heading such as `disk_x [mm]`, `P_N (N)` or `disk_x, mm`."""
     match = _HEADING.fullmatch(text)
     if match and match[1]:
         return match[1], match[2]
@@ -98,12 +98,12 @@ def parse_heading(text: str) -> tuple[str, str]:
 
 
 def is_time(name: str) -> bool:
-    """Whether a heading names a column of times."""
+    """Return whether a heading names a time column."""
     return _TIMES.fullmatch(name.strip()) is not None
 
 
 def time_column(names: Sequence[str], wanted: str | int | None, *, path: Path) -> int | None:
-    """Number of the column of times: the one asked for, else the first that is named so.
+    """Return the index of the time column: the requested one, else the first with a name of a time.
 
     Raises:
         InputError: There is no such column.
@@ -121,10 +121,10 @@ def time_column(names: Sequence[str], wanted: str | int | None, *, path: Path) -
 
 
 def find_layout(path: Path, options: FileOptions) -> Layout:
-    """Find out how a text file is laid out.
+    """Detect the layout of a text file.
 
     Raises:
-        InputError: It cannot be understood.
+        InputError: The layout is not recognised.
     """
     text, encoding, remarks = _head(path, options.encoding)
     lines = text.splitlines()
@@ -138,9 +138,9 @@ def find_layout(path: Path, options: FileOptions) -> Layout:
         )] if options.thousands is None else []  # fmt: skip
         found = [layout for dialect in grouped if (layout := _layout(lines, dialect, encoding, options))]
     if not found:
-        must = "a text file with lines of numbers (file.delimiter, decimal, thousands, time_format say how)"
+        must = "a text file with lines of numbers (set file.delimiter, decimal, thousands, time_format)"
         raise InputError("file", must, str(path))
-    # Names above the columns tell most; then the dialect that makes most columns of a line, all of them numbers.
+    # A layout with column names is preferred; then the one with most numeric columns.
     layout = max(found, key=lambda item: (item[0], item[1].width))[1]
     dialect = layout.dialect
     if options.delimiter is None:
@@ -163,18 +163,18 @@ def _dialects(options: FileOptions) -> list[Dialect]:
 
 
 def _layout(lines: list[str], dialect: Dialect, encoding: str, options: FileOptions) -> tuple[bool, Layout] | None:
-    """The layout by a dialect, and whether its columns have names; None where it does not read so."""
+    """Return the layout for a dialect, and whether its columns have names; None if the dialect does not fit."""
     first = _data_start(lines, dialect, options)
     if first is None:
         return None
     width = len(dialect.fields(lines[first]))
     data = [fields for line in lines[first:] if line.strip() and len(fields := dialect.fields(line)) == width]
-    # A delimiter may end every line: that makes no column, unless it has a name.
+    # A delimiter at the end of every line does not make a column, unless that has a name.
     open_end = width > 1 and dialect.delimiter != " " and all(not fields[-1] for fields in data)
     names, names_at = _names(lines, first, dialect, width, options, open_end=open_end)
-    told = _units(lines, first, names_at, dialect, len(names), options)
+    unit_row = _units(lines, first, names_at, dialect, len(names), options)
     headings = [parse_heading(name) for name in names]
-    both = tuple(unit or row for (_, unit), row in zip(headings, told, strict=True))
+    both = tuple(unit or row for (_, unit), row in zip(headings, unit_row, strict=True))
     plain = tuple(name for name, _ in headings)
     return names_at is not None, Layout(encoding, dialect, plain, both, first, width)
 
@@ -184,7 +184,7 @@ def _head(path: Path, encoding: str | None) -> tuple[str, str, tuple[str, ...]]:
         raw = b"".join(file.readline(1 << 16) for _ in range(_HEAD_LINES))
     if encoding is None and raw[:2] in (b"\xff\xfe", b"\xfe\xff"):
         encoding = "utf-16"
-        raw = raw[: len(raw) // 2 * 2]  # a line that was cut behind the first byte of its end
+        raw = raw[: len(raw) // 2 * 2]  # the line was cut within its end
     if b"\0" in raw and encoding is None:
         raise InputError("file", "a text file", Words(f"{path}, which is binary"))
     try:
@@ -194,18 +194,18 @@ def _head(path: Path, encoding: str | None) -> tuple[str, str, tuple[str, ...]]:
     except UnicodeDecodeError as error:
         if encoding is not None:
             raise InputError("file.encoding", "that of the file", Words(f"{encoding} ({error.reason})")) from None
-        return raw.decode("latin-1"), "latin-1", ("read as latin-1, as it is no UTF-8",)
+        return raw.decode("latin-1"), "latin-1", ("read as latin-1, as it is not UTF-8",)
 
 
 def instant(text: str, time_format: str | None) -> datetime | float | None:
-    """A date with a time, or a time of day [s]; None where a text is neither.
+    """Return a date with time, or a time of day [s]; None for other texts.
 
     Args:
         text: The text.
-        time_format: As for strptime; None: ISO 8601, or hours:minutes:seconds.
+        time_format: Format for strptime; None: ISO 8601, or hours:minutes:seconds.
     """
     try:
-        if time_format is not None:  # strptime takes six digits of a second at most
+        if time_format is not None:  # strptime accepts at most six digits of a second
             return datetime.strptime(re.sub(r"([.,]\d{6})\d+", r"\1", text), time_format)
         day = _TIME_OF_DAY.fullmatch(text)
         if day:
@@ -216,7 +216,7 @@ def instant(text: str, time_format: str | None) -> datetime | float | None:
 
 
 def _data_start(lines: list[str], dialect: Dialect, options: FileOptions) -> int | None:
-    """First of the lines that are all numbers, but for a date and time; the next ones must be so, too."""
+    """Return the first line of only numbers and a date or time that is followed by similar lines."""
     if options.first_line is not None:
         return options.first_line - 1 if options.first_line <= len(lines) else None
 
@@ -239,14 +239,14 @@ def _data_start(lines: list[str], dialect: Dialect, options: FileOptions) -> int
 def _names(
     lines: list[str], first: int, dialect: Dialect, width: int, options: FileOptions, *, open_end: bool
 ) -> tuple[list[str], int | None]:
-    """Names of the columns, and their line; a last column that is empty and without a name is none."""
+    """Return the names of the columns, and their line; an empty last column without a name is dropped."""
     columns = width - open_end
     numbered = [f"column {c + 1}" for c in range(columns)]
 
     def named(fields: list[str]) -> list[str] | None:
-        """The line as names, if it is as long as a line of data."""
+        """Return the line as names, if it is as long as a line of data."""
         if columns > 1 and len(fields) > columns and not any(fields[columns:]):
-            fields = fields[:columns]  # lines of names may end in delimiters where those of data do not
+            fields = fields[:columns]  # names may have trailing delimiters that data lines lack
         return fields if len(fields) in (columns, width) else None
 
     if options.header_line == 0:
@@ -257,7 +257,7 @@ def _names(
         if len(fields) < columns:
             raise InputError("file.header_line", f"a line of {columns} names", options.header_line)
         return fields[:columns], at
-    # The line nearest to the data with so many texts, above a line of units.
+    # The nearest line above the data with this many texts that is not a line of units.
     above = [n for n in range(first - 1, -1, -1) if lines[n].strip()]
     if columns == 1:
         above = [n for n in above[:1] if not lines[n].startswith("#")]
@@ -287,7 +287,7 @@ def _units(
 
 
 def _lvm_layout(path: Path, lines: list[str], encoding: str) -> Layout:
-    """A LabVIEW measurement file: its own header tells the dialect (National Instruments' specification of .lvm)."""
+    """Return the layout of a LabVIEW measurement file from its header (National Instruments' specification of .lvm)."""
     head: dict[str, list[str]] = {}
     ends = [n for n, line in enumerate(lines) if line.startswith(_LVM_END)]
     tab = next((line.rstrip("\r").split("Separator")[1][:1] for line in lines if line.startswith("Separator")), "\t")
@@ -299,7 +299,7 @@ def _lvm_layout(path: Path, lines: list[str], encoding: str) -> Layout:
     decimal = (head.get("Decimal_Separator") or ["."])[0] or "."
     mode = (head.get("X_Columns") or ["No"])[0].lower()
     if mode not in ("no", "one"):
-        raise InputError("file", "a .lvm file with no or one column of times", Words(f"{path} (X_Columns {mode})"))
+        raise InputError("file", "a .lvm file with at most one time column", Words(f"{path} (X_Columns {mode})"))
 
     def number(key: str) -> float | None:
         try:
@@ -311,7 +311,7 @@ def _lvm_layout(path: Path, lines: list[str], encoding: str) -> Layout:
     names = [name.strip() for name in lines[first - 1].rstrip("\r").split(tab)]
     width = len(lines[first].rstrip("\r").split(tab))
     names = tuple(names[:width])
-    told = (["", *head.get("Y_Unit_Label", [])] + [""] * width)[:width]
+    unit_row = (["", *head.get("Y_Unit_Label", [])] + [""] * width)[:width]
     step = number("Delta_X")
     empty = mode == "no"
     date, clock = (next(iter(head.get(key, [])), "") for key in ("Date", "Time"))
@@ -321,7 +321,7 @@ def _lvm_layout(path: Path, lines: list[str], encoding: str) -> Layout:
         parts = [int(part) for part in match.groups()[:6]]
         start = datetime(*parts[:6], int((match[7] or "0").ljust(6, "0")))  # type: ignore[misc]
     return Layout(
-        encoding, Dialect(tab, decimal), names[empty:], tuple(told[empty:]), first, width, empty_first=empty,
+        encoding, Dialect(tab, decimal), names[empty:], tuple(unit_row[empty:]), first, width, empty_first=empty,
         ragged=True, rate_hz=1.0 / step if empty and step else None, first_s=number("X0") or 0.0,
-        start=start, remarks=("LabVIEW measurement file: dialect, units and rate from its header",),
+        start=start, remarks=("LabVIEW measurement file: dialect, units and rate are from its header",),
     )  # fmt: skip

@@ -1,4 +1,4 @@
-"""MDF4, as measuring systems in vehicles and test rigs write it, by asammdf."""
+"""Reading and writing of MDF4 files, common in automotive and test-rig data acquisition, by asammdf."""
 
 from __future__ import annotations
 
@@ -25,27 +25,24 @@ if TYPE_CHECKING:
     from replays.recordings.formats.mapping import FileOptions
 
 _TEXT = re.compile(r"<TX>(.*?)</TX>|<TX/>", re.DOTALL)
-"""The text in a comment that is XML."""
+"""Text in an XML comment."""
 _SYNC_NONE, _SYNC_TIME = 0, 1
 """Kinds of master channel in MDF4; 2 is an angle, 3 a length, 4 an index."""
 _PIECE = 1 << 22
-"""Bytes of records that are read at a time."""
+"""Bytes of records read at a time."""
 _HEAD, _FLAGS = 64, 4
-"""Bytes of the first block, and those at its end that say what of a file was not finished, in MDF4."""
+"""Size of the first block, and of the flags at its end that mark an unfinished file, in MDF4."""
 _MASTER, _REMOTE_MASTER = 2, 8
-"""Type of a channel of stamps that are recorded, and the flag of a group whose stamps are another's, in MDF4."""
+"""Channel type of recorded time stamps, and group flag of stamps stored in another group, in MDF4."""
 _MARKER, _BY_TOOL = 6, 2
 """Type and cause of an event in MDF4."""
 _IDENTITY, _LINEAR = 0, 1
-"""Types of the conversion of a channel in MDF4; no conversion is the identity, too."""
+"""Conversion types in MDF4; no conversion is the identity as well."""
 
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Deprecations inside asammdf, and of what it calls in numpy and pandas, are not ours to mend.
-
-    Nor are lines on its speed, which it prints where reading takes long.
-    """
+    """Suppress deprecation warnings inside asammdf, numpy and pandas, and asammdf's prints on slow reading."""
     with warnings.catch_warnings(), redirect_stdout(StringIO()):
         for category in (DeprecationWarning, FutureWarning, PendingDeprecationWarning):
             warnings.simplefilter("ignore", category)
@@ -53,10 +50,10 @@ def _quiet() -> Iterator[None]:
 
 
 def look_into(path: Path, options: FileOptions) -> Source:
-    """Look into an MDF file (version 3 or 4).
+    """Open an MDF file (version 3 or 4) and list its signals.
 
     Raises:
-        InputError: It is none, or asammdf is missing.
+        InputError: The file is not MDF, or asammdf is missing.
     """
     mdf = _open(path)
     with _quiet():
@@ -85,7 +82,7 @@ def look_into(path: Path, options: FileOptions) -> Source:
             times_s = None if second is None else np.asarray(found[0][0], dtype=float) * second
             yield [_of_records(part, kind, times_s) for part, kind in zip(found[1:], kinds, strict=True)]
 
-    remarks = (f"{texts} channels without numbers are passed over",) if texts else ()
+    remarks = (f"{texts} non-numeric channels ignored",) if texts else ()
     about = {"version": str(mdf.version), "comment": str(mdf.header.description or ""), **_documents(mdf)}
     return Source(
         path, f"MDF {mdf.version}", tuple(entries), read, pieces, start=mdf.header.start_time,
@@ -94,7 +91,7 @@ def look_into(path: Path, options: FileOptions) -> Source:
 
 
 def _documents(mdf: Any) -> dict[str, str]:
-    """What `rig export` has attached."""
+    """Return the documents that `rig export` attached."""
     found = {}
     for index, attachment in enumerate(getattr(mdf, "attachments", ())):
         if attachment.file_name in DOCUMENTS:
@@ -109,17 +106,17 @@ def _open(path: Path) -> Any:
     finished = file.read(_HEAD)[-_FLAGS:] == bytes(_FLAGS)
     try:
         with _quiet():
-            # By its path asammdf maps all of a file into memory, and mends a copy of one that was not finished.
+            # Given a path, asammdf maps the whole file into memory, and repairs a copy of an unfinished one.
             mdf = asammdf.MDF(file if finished else path)
             mdf.configure(read_fragment_size=_PIECE)
             finalize(mdf, file.close)
-            # It stands in a cycle, which the collector may take apart at its temporary file first.
+            # The object is part of a reference cycle, and the collector may close its temporary file first.
             finalize(mdf, mdf._mdf._tempfile.close)  # noqa: SLF001 - its own ways to close it wait for the collector
             return mdf
     except Exception as error:
         file.close()
-        # The half-made object of a file that asammdf cannot open closes itself when it goes, and fails aloud: it has
-        # tried once here, and does not try again.
+        # The partly constructed object of an unreadable file closes itself on collection and prints an error. Closing
+        # it here prevents that.
         for frame, _ in walk_tb(error.__traceback__):
             with suppress(Exception):
                 frame.f_locals["self"].close()
@@ -151,9 +148,9 @@ def _entries(mdf: Any) -> tuple[list[Entry], int]:
 
 
 def _second(mdf: Any, group: int) -> float | None:
-    """One unit of a group's master channel [s]; None where it has none, or one of an angle, a length or an index.
+    """Return the unit of a group's master channel [s]; None if it has none, or is an angle, a length or an index.
 
-    The format asks for seconds; some writers have other units all the same.
+    The format requires seconds; some programs write other units.
     """
     index = mdf.masters_db.get(group)
     if index is None:
@@ -168,22 +165,22 @@ def _second(mdf: Any, group: int) -> float | None:
 def _numeric(mdf: Any, group: int, index: int) -> bool:
     try:
         few = mdf.get(group=group, index=index, record_offset=0, record_count=2, ignore_invalidation_bits=True).samples
-    except Exception:  # what cannot be decoded is no number for us
+    except Exception:  # what cannot be decoded is not numeric
         return False
     return few.ndim == 1 and few.dtype.kind in "iufb"
 
 
 def _plain(mdf: Any, group: int) -> bool:
-    """Whether the stamps of a group stand in its own records, which can then be read in pieces."""
-    master, told = mdf.masters_db.get(group), mdf.groups[group]
-    own = not getattr(told.channel_group, "flags", 0) & _REMOTE_MASTER
-    return str(mdf.version) >= "4" and master is not None and own and told.channels[master].channel_type == _MASTER
+    """Return whether the stamps of a group are in its own records, which can then be read in pieces."""
+    master, stored = mdf.masters_db.get(group), mdf.groups[group]
+    own = not getattr(stored.channel_group, "flags", 0) & _REMOTE_MASTER
+    return str(mdf.version) >= "4" and master is not None and own and stored.channels[master].channel_type == _MASTER
 
 
 def _linear(mdf: Any, group: int, index: int) -> tuple[float, float] | None:
-    """What one and none of a channel's integers are; None where they are not integers, or not linear."""
-    told = {"group": group, "index": index, "record_offset": 0, "record_count": 1}
-    raw = mdf.get(raw=True, ignore_invalidation_bits=True, **told)
+    """Return scale and offset of a channel's integers; None if they are not integers, or not linear."""
+    arguments = {"group": group, "index": index, "record_offset": 0, "record_count": 1}
+    raw = mdf.get(raw=True, ignore_invalidation_bits=True, **arguments)
     law = raw.conversion
     kind = _IDENTITY if law is None else law.conversion_type
     if raw.samples.dtype.kind not in "iu" or kind not in (_IDENTITY, _LINEAR):
@@ -210,7 +207,7 @@ def _of_records(record: Sequence[Any], linear: tuple[float, float] | None, times
 
 
 def _event(event: ExportEvent) -> Any:
-    """A marker at a time, to the microsecond of the rig's clock, which holds for all groups."""
+    """Return a marker for an event, to the microsecond of the rig's clock, valid for all groups."""
     from asammdf.blocks.v4_blocks import EventBlock
 
     block = EventBlock(
@@ -222,9 +219,9 @@ def _event(event: ExportEvent) -> Any:
 
 
 class MdfWriter(export.FormatWriter):
-    """An MDF 4.10 file: a channel group a sensor group, integer counts with a linear conversion.
+    """Writer of MDF 4.10 files: one channel group per sensor group, integer counts with a linear conversion.
 
-    What happened is events; the rig's documents are attached.
+    Events are MDF events; the rig's documents are attached.
     """
 
     sparse = True
@@ -245,7 +242,7 @@ class MdfWriter(export.FormatWriter):
             self._file.events.extend(map(_event, selection.events))
 
     def write(self, table: ExportTable, chunk: ExportChunk) -> None:
-        """Take rows; those that no stream has are left out."""
+        """Write rows; those that no stream has are left out."""
         present = chunk.present
         times_s = chunk.times_s[present]
         if not len(times_s):
@@ -269,12 +266,12 @@ class MdfWriter(export.FormatWriter):
 
     def close(self) -> None:
         """Write the file."""
-        # Of a path, asammdf would change the suffix.
+        # Given a path, asammdf would change the suffix.
         with _quiet(), self._path.open("wb+") as file:
             self._file.save(file)
             self._file.close()
 
     def abandon(self) -> None:
-        """Let go of what it holds."""
+        """Release the file."""
         with _quiet():
             self._file.close()

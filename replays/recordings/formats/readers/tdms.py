@@ -1,4 +1,4 @@
-"""TDMS, the format of LabVIEW, by npTDMS."""
+"""Reading and writing of TDMS files, the format of LabVIEW, by npTDMS."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ if TYPE_CHECKING:
     from replays.recordings.formats.exporting.selection import ExportChunk, ExportTable, Selection
     from replays.recordings.formats.mapping import FileOptions
 
-_ABOUT = re.compile("sens|bias|gain|coupling|range", re.IGNORECASE)
-"""Properties of a channel that tell of its sensor or amplifier."""
+_SENSOR_PROPERTIES = re.compile("sens|bias|gain|coupling|range", re.IGNORECASE)
+"""Properties of a channel that describe its sensor or amplifier."""
 _RAW_INPUT = 0xFFFFFFFF
 """Input of the first scale: the raw values."""
 
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Of a file that is cut off, npTDMS prints a line a read; it is said once, as an error."""
+    """Suppress the lines that npTDMS prints for a truncated file, which is reported once as an error."""
     handler = logging.getLogger("nptdms.reader").handlers
     level = [one.level for one in handler]
     for one in handler:
@@ -41,10 +41,10 @@ def _quiet() -> Iterator[None]:
 
 
 def look_into(path: Path, options: FileOptions) -> Source:
-    """Look into a TDMS file.
+    """Open a TDMS file and list its signals.
 
     Raises:
-        InputError: It is none, it is cut off, or npTDMS is missing.
+        InputError: The file is not TDMS or is truncated, or npTDMS is missing.
     """
     nptdms = library("TDMS", "npTDMS", "nptdms")
     with _quiet():
@@ -58,7 +58,7 @@ def look_into(path: Path, options: FileOptions) -> Source:
     ]
     start = min(starts) if starts else None
     if file.file_status.incomplete_final_segment:
-        raise damaged(path, "TDMS", "it is cut off")
+        raise damaged(path, "TDMS", "it is truncated")
     entries, texts = [], 0
     for number, (name, channels) in enumerate(groups):
         for channel in channels:
@@ -75,20 +75,20 @@ def look_into(path: Path, options: FileOptions) -> Source:
         with nptdms.TdmsFile.open(path) as opened:
             return _signal(opened[entry.place[0]], entry.place[1], start)
 
-    remarks = (f"{texts} channels without numbers are passed over",) if texts else ()
+    remarks = (f"{texts} non-numeric channels ignored",) if texts else ()
     about = {key: str(value) for key, value in file.properties.items() if isinstance(value, str | int | float)}
-    told = None if start is None or str(start).startswith("1904") else start.astype("datetime64[us]").item()
+    zero = None if start is None or str(start).startswith("1904") else start.astype("datetime64[us]").item()
     return Source(
         path=path, format="TDMS", entries=tuple(entries), read=read, about=about, remarks=remarks,
-        start=None if told is None else told.replace(tzinfo=UTC),
+        start=None if zero is None else zero.replace(tzinfo=UTC),
     )  # fmt: skip
 
 
 def _label(properties: dict[str, Any]) -> str:
-    """What the properties of a channel say of it: its description, and what its sensor and amplifier do."""
+    """Return the description of a channel, and the properties of its sensor and amplifier."""
     texts = [str(properties.get("description", ""))]
     for key, value in properties.items():
-        if _ABOUT.search(key) and not key.startswith(("rig_", "NI_")) and not key.endswith("_unit"):
+        if _SENSOR_PROPERTIES.search(key) and not key.startswith(("rig_", "NI_")) and not key.endswith("_unit"):
             texts.append(f"{key} {value} {properties.get(f'{key}_unit', '')}".strip())
     return "; ".join(filter(None, texts))
 
@@ -126,9 +126,9 @@ def _signal(group: Any, name: str, start: Any) -> FileSignal:
 
 
 class TdmsWriter(export.FormatWriter):
-    """A TDMS file: a group a sensor group; counts with a linear scale, which LabVIEW applies on reading.
+    """Writer of TDMS files: one group per sensor group; counts with a linear scale, which LabVIEW applies on reading.
 
-    What happened, and the rig's documents, are properties of the file.
+    Events and the rig's documents are properties of the file.
     """
 
     def __init__(self, path: Path, selection: Selection) -> None:
@@ -141,7 +141,7 @@ class TdmsWriter(export.FormatWriter):
         self._start = np.datetime64(selection.start.astimezone(UTC).replace(tzinfo=None), "us")
 
     def write(self, table: ExportTable, chunk: ExportChunk) -> None:
-        """Take rows; a missing one is nan, for the format has a start and a step and no times."""
+        """Write rows; missing ones are nan, as the format has no times."""
         api, new = self._api, table.name not in self._described
         about = {key: value for key, value in self._selection.metadata.items() if value != ""}
         about |= {"description": self._selection.summary(), **self._selection.documents}
@@ -149,7 +149,7 @@ class TdmsWriter(export.FormatWriter):
         objects: list[Any] = [api.RootObject(about if not self._described else {})]
         objects.append(api.GroupObject(table.name, {"description": table.title} if new else {}))
         for c, column in enumerate(table.columns):
-            # Whether a row is missing must be known before the first is written: counts have no nan.
+            # Missing rows must be known before the first write, as counts have no nan.
             counts = column.source is not None and self._selection.whole(table)
             values = table.raw(c, chunk) if counts else table.exported(c, chunk)
             properties = self._properties(table, c, scaled=counts) if new else {}

@@ -1,7 +1,7 @@
-"""Universal files of dataset 58 (a function of time at a degree of freedom), the format of modal analysis.
+"""Reading and writing of universal files, dataset 58 (a function of time at a degree of freedom).
 
-Read by pyuff, binary or text. Written here, binary (58b) in float64, block by block: pyuff packs each value alone. The
-layout is that of the SDRC test data exchange documentation, dataset 58.
+The format is common in modal analysis. pyuff reads binary and text files. Files are written here block by block, binary
+(58b) in float64, as pyuff packs each value separately. The layout follows the SDRC test data exchange documentation.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ _TIME_RESPONSE = (0, 1)
 _REAL = (2, 4)
 """Ordinates in single or double precision; 5 and 6 are complex."""
 _DELIMITER, _BLANK = b"    -1", b"\0\x1a\r\n "
-"""What stands before and behind a dataset, and what may follow it."""
-_TAIL = 4096
-"""Bytes at the end of a file in which that is looked for."""
+"""Line before and after a dataset, and bytes that may follow it."""
+_TAIL_BYTES = 4096
+"""Bytes at the end of a file in which the delimiter is searched."""
 _EXACT = r"\b{}=([0-9.eE+-]+)"
-"""How our files tell what the header has few digits for."""
+"""Pattern of values in our files for which the header has too few digits."""
 _START = ("%d-%b-%y %H:%M:%S", "%d-%b-%Y %H:%M:%S")
 _TIME, _GENERAL, _UNKNOWN = 17, 1, 0
 _ORDINATE = {
@@ -43,25 +43,25 @@ _ORDINATE = {
     "acceleration": (12, 1, 0),
     "speed of rotation": (_GENERAL, 0, 0),
 }
-"""Specific data type, and exponents of length and force, by what a unit measures (9: reaction force)."""
+"""Specific data type, and exponents of length and force, by the kind of unit (9: reaction force)."""
 _DIRECTIONS = {"x": 1, "y": 2, "z": 3, "E": 1, "W": -1, "N": 2, "S": -2}
 _ALONG = {
     0: "none", 1: "x, EAST", -1: "-x, WEST", 2: "y, up", -2: "-y, down", 3: "z, along the shaft", 6: "about z",
 }  # fmt: skip
-_BLOWS = {"x": 1, "-x": -1, "y": 2, "-y": -2}
+_IMPACT_DIRECTIONS = {"x": 1, "-x": -1, "y": 2, "-y": -2}
 _AXIS = re.compile(r"(\w+)_[av]?([xyz])")
 _SIDE = re.compile(r"\w+_([ENWS])")
 
 
 def look_into(path: Path, options: FileOptions) -> Source:
-    """Look into a universal file.
+    """Open a universal file and list its signals.
 
     Raises:
-        InputError: It is none, is cut off, has no time history, or pyuff is missing.
+        InputError: The file is not universal, is truncated or has no time history, or pyuff is missing.
     """
     pyuff = library("UFF", "pyuff")
     if not _ends(path):
-        raise damaged(path, "universal (UFF)", "it is cut off")
+        raise damaged(path, "universal (UFF)", "it is truncated")
     file = pyuff.UFF(str(path))
     kinds = list(np.atleast_1d(file.get_set_types()).astype(int))
     heads = {n: file.read_sets(n, header_only=True) for n, kind in enumerate(kinds) if kind == 58}
@@ -90,15 +90,15 @@ def look_into(path: Path, options: FileOptions) -> Source:
         )
 
     others = len(kinds) - len(entries)
-    remarks = (f"{others} datasets that are no time history are passed over",) if others else ()
+    remarks = (f"{others} datasets without a time history ignored",) if others else ()
     start = _start([str(head["id3"]) for head in heads.values()])
     return Source(path=path, format="UFF58", entries=tuple(entries), read=read, remarks=remarks, start=start)
 
 
 def _ends(path: Path) -> bool:
-    """Whether the file ends with the close of a dataset; pyuff passes over one that does not end."""
+    """Return whether the file ends with a complete dataset; pyuff ignores an incomplete one."""
     with open_file(path) as file:
-        file.seek(max(0, path.stat().st_size - _TAIL))
+        file.seek(max(0, path.stat().st_size - _TAIL_BYTES))
         end = file.read().rstrip(_BLANK)
     # Binary numbers are followed by it without a new line; after one that closes, another opens the next dataset.
     return end.endswith(_DELIMITER) and not end.removesuffix(_DELIMITER).rstrip(_BLANK).endswith(_DELIMITER)
@@ -125,12 +125,12 @@ def _start(texts: list[str]) -> datetime | None:
 
 
 class DegreeOfFreedom(NamedTuple):
-    """Where a channel measures, as universal files tell it.
+    """Place and direction of a channel in a universal file.
 
     Attributes:
         node: Number of the place, from 1, in the order of the channel table.
-        direction: 1, 2, 3: along x (EAST), y (up), z (the shaft); negative: against it; 6: rotation about z; 0: none.
-        place: The place in words.
+        direction: 1, 2, 3: along x (EAST), y (up), z (the shaft); negative: opposite; 6: rotation about z; 0: none.
+        place: Name of the place.
     """
 
     node: int
@@ -139,17 +139,17 @@ class DegreeOfFreedom(NamedTuple):
 
 
 def degrees_of_freedom(recording: Recording) -> dict[str, DegreeOfFreedom]:
-    """Where each channel of a recording measures, by its name: the same, whichever of them are exported.
+    """Return place and direction of each channel of a recording by its name, independent of the export.
 
-    By the names of the channel table: `disk_x` is at the disk along x, `P_W` at a place of its own, against x. The
-    hammer hits the disk, along the direction of its blows if they have one of the axes in common.
+    They follow from the names of the channel table: `disk_x` is at the disk along x, `P_W` at a separate place,
+    against x. The hammer hits the disk, along the direction of its impacts if that is a common axis.
     """
-    blows = {str(event.get("direction")) for event in recording.events if event["event"] == "hammer"}
+    directions = {str(event.get("direction")) for event in recording.events if event["event"] == "hammer"}
     found: dict[str, tuple[str, int]] = {}
     for channel in recording.table.channels.values():
         found[channel.name] = _placed(channel.name, 6 if units.kind(channel.unit) == "speed of rotation" else 0)
     if "hammer" in found:
-        found["hammer"] = ("disk", _BLOWS.get(blows.pop(), 0) if len(blows) == 1 else 0)
+        found["hammer"] = ("disk", _IMPACT_DIRECTIONS.get(directions.pop(), 0) if len(directions) == 1 else 0)
     for table, about in recording.catalogue.get("truth", {}).items():
         for column in about["columns"]:
             found[f"truth.{table}.{column['name']}"] = _placed(column["name"], 0)
@@ -158,7 +158,7 @@ def degrees_of_freedom(recording: Recording) -> dict[str, DegreeOfFreedom]:
 
 
 def _placed(name: str, otherwise: int) -> tuple[str, int]:
-    """Place and direction by a name; one without an axis is a place of its own."""
+    """Return place and direction from a name; one without an axis is a separate place."""
     if (side := _SIDE.fullmatch(name)) is not None:
         return name, _DIRECTIONS[side[1]]
     if (axis := _AXIS.fullmatch(name)) is not None:
@@ -167,7 +167,7 @@ def _placed(name: str, otherwise: int) -> tuple[str, int]:
 
 
 class UffWriter(export.FormatWriter):
-    """A universal file: a binary dataset 58 a channel, in float64, with the node and the direction that it measures."""
+    """Writer of universal files: one binary dataset 58 per channel in float64, with its node and direction."""
 
     documents = "left out, as UFF58 has no place for them"
 
@@ -183,7 +183,7 @@ class UffWriter(export.FormatWriter):
                 self._file.write(b"\n    -1\n")
 
     def write(self, table: ExportTable, chunk: ExportChunk) -> None:
-        """Take rows; a missing one is nan, for the format has a start and a step and no times."""
+        """Write rows; missing ones are nan, as the format has no times."""
         for c, at in enumerate(self._at[table.name]):
             self._file.seek(at + 8 * chunk.index)
             self._file.write(table.exported(c, chunk).astype("<f8").tobytes())
@@ -215,7 +215,7 @@ def _header(table: ExportTable, column: Column, selection: Selection, at: Degree
 
 
 def _real(value: float) -> str:
-    """A number with the most digits that a field of 13 columns holds behind a blank."""
+    """Return a number with the most digits that fit a field of 13 columns after a blank."""
     return next(text for digits in range(12, 0, -1) if len(text := f"{value:#.{digits}G}") < 13)
 
 

@@ -1,4 +1,4 @@
-"""WAV, by soundfile (libsndfile): every channel of one rate, with the full scale that a sample of 1 stands for."""
+"""Reading and writing of WAV files by soundfile (libsndfile): channels of one rate, with their full scales."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 _PCM = {"PCM_U8": 8, "PCM_16": 16, "PCM_24": 24, "PCM_32": 32}
 _FLOAT_BITS = 24
-"""Counts of so many bits are exact in single precision."""
+"""Word length of counts that single precision represents exactly."""
 RULE = (
     "value = sample * full_scale + offset, with sample from -1 to 1; of integer samples, sample = integer / 2^31 "
     "(32 bits), which is the converter's count shifted to the left"
@@ -28,17 +28,17 @@ RULE = (
 
 
 def look_into(path: Path, options: FileOptions) -> Source:
-    """Look into a WAV file; names, units and full scales come from FILE.wav.json if it stands beside it.
+    """Open a WAV file; names, units and full scales come from FILE.wav.json if it exists.
 
     Raises:
-        InputError: It is none, or soundfile is missing.
+        InputError: The file is not WAV, or soundfile is missing.
     """
     soundfile = library("WAV", "soundfile")
     with soundfile.SoundFile(path) as file:
         rate, channels, rows, subtype = file.samplerate, file.channels, file.frames, file.subtype
         comment = file.copy_metadata().get("comment", "")
     bits = _PCM.get(subtype)
-    columns, first_s, start = _beside(path, channels)
+    columns, first_s, start = _read_sidecar(path, channels)
     about = {"samples": subtype, **({"comment": comment} if comment else {})}
     entries = tuple(
         Entry(column.name or f"channel {c + 1}", "", column.unit, rows, float(rate), c, column.label)
@@ -66,7 +66,7 @@ def look_into(path: Path, options: FileOptions) -> Source:
 
 
 class _Column(BaseModel):
-    """What the document beside the file says of a channel."""
+    """Description of a channel in the sidecar document."""
 
     name: str = ""
     unit: str = ""
@@ -75,26 +75,26 @@ class _Column(BaseModel):
     offset_exported: FiniteFloat = 0.0
 
 
-class _BesideTable(BaseModel):
+class _SidecarTable(BaseModel):
     first_s: FiniteFloat
     columns: Annotated[tuple[_Column, ...], Field(min_length=1)]
 
 
-class _Beside(BaseModel):
+class _Sidecar(BaseModel):
     start: datetime
-    tables: Annotated[tuple[_BesideTable, ...], Field(min_length=1, max_length=1)]
+    tables: Annotated[tuple[_SidecarTable, ...], Field(min_length=1, max_length=1)]
 
 
-def _beside(path: Path, channels: int) -> tuple[tuple[_Column, ...], float, datetime | None]:
-    """What a document beside the file says of its channels and its start [s]; nothing if there is none.
+def _read_sidecar(path: Path, channels: int) -> tuple[tuple[_Column, ...], float, datetime | None]:
+    """Return channels, first time [s] and start from the sidecar document; defaults if there is none.
 
     Raises:
-        InputError: There is one, and it is none of ours, or of another file.
+        InputError: The document is not from this rig, or belongs to another file.
     """
     beside = path.with_name(path.name + ".json")
     if not beside.is_file():
         return (_Column(),) * channels, 0.0, None
-    found = check(_Beside, beside.read_bytes(), field=beside.name, most_bytes=DOCUMENT_BYTES)
+    found = check(_Sidecar, beside.read_bytes(), field=beside.name, most_bytes=DOCUMENT_BYTES)
     table = found.tables[0]
     if len(table.columns) != channels:
         raise InputError(beside.name, f"of a file with {channels} channels", len(table.columns))
@@ -102,7 +102,7 @@ def _beside(path: Path, channels: int) -> tuple[tuple[_Column, ...], float, date
 
 
 class WavWriter(export.FormatWriter):
-    """A WAV file. Counts as 32-bit integers, all else as floating point from -1 to 1."""
+    """Writer of WAV files. Counts are 32-bit integers, other values floating point from -1 to 1."""
 
     merged = True
     sidecar = True
@@ -116,7 +116,7 @@ class WavWriter(export.FormatWriter):
             raise InputError("channels", "at most 1024 in a WAV file", len(table.columns))
         if not selection.whole(table):
             raise InputError(
-                "range", "free of missing rows for a WAV file (from_s and to_s choose)", Words("one with gaps")
+                "range", "free of missing rows for a WAV file (set from_s and to_s)", Words("one with gaps")
             )
         truth = any(column.source is None for column in table.columns)
         bits = max((column.source.adc_bits for column in table.columns if column.source is not None), default=64)
@@ -133,12 +133,12 @@ class WavWriter(export.FormatWriter):
         self._file.comment = f"{RULE}. full_scale {scales}"[:2000]
 
     def write(self, table: ExportTable, chunk: ExportChunk) -> None:
-        """Take rows."""
+        """Write rows."""
         if self._integers:
             shifts = [32 - column.source.adc_bits for column in table.columns if column.source is not None]
             samples = np.stack([table.raw(c, chunk) << shift for c, shift in enumerate(shifts)], axis=1)
         else:
-            # The sample is the count over half the converter's counts, whatever unit a sample of 1 is told in.
+            # A sample is the count over half of the converter's range, independent of the unit.
             halves = [1.0 if column.source is None else 2.0 ** (column.source.adc_bits - 1) for column in table.columns]
             samples = chunk.values / np.array(halves)
         self._file.write(samples)

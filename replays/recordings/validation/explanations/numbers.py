@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from replays.estimate.least_squares import solve_normal
-from replays.recordings.identification.agreement import BEYOND
+from replays.recordings.identification.agreement import MAX_PRIOR_DEVIATION
 from replays.recordings.identification.nuisance import Tuned
 from replays.recordings.identification.request import first_command_s, unit_of
 from replays.recordings.resimulation.experiment import Experiment
@@ -83,7 +83,7 @@ def numbers_of_the_model(
         side[place] -= off / deviations
         change = solve_normal(square, side)
         left, back = z - table @ change, off + change[1:] / deviations
-        if abs(change[0]) > one.largest or (np.abs(back) > BEYOND).any() or before == 0.0:
+        if abs(change[0]) > one.largest or (np.abs(back) > MAX_PRIOR_DEVIATION).any() or before == 0.0:
             continue
         unit = "" if relative else one.unit or unit_of(one.keys[0])
         text = f"{100.0 * change[0]:+.3g} %" if relative else f"{change[0]:+.4g} {unit}"

@@ -129,7 +129,7 @@ def _bare(
     part: Measured, channel: Channel, again: Callable[[dict[str, Measured]], Prediction], rows: np.ndarray
 ) -> np.ndarray:
     """What a channel should show in some rows without its low-pass [its unit]."""
-    alone = part.first(int(rows[-1]) + 1).only([channel.name]).filtered(_NO_FILTER)
+    alone = part.first(int(rows[-1]) + 1).only([channel.name]).with_corner_factor(_NO_FILTER)
     return again({part.group: alone}).values[part.group][rows, 0]
 
 
