@@ -280,7 +280,7 @@ def test_a_log_is_imported_in_one_step(tmp_path: Path, capsys: pytest.CaptureFix
     foreign.german_csv(path, rate_hz=2000.0)
     printed = shown(capsys, "import", path)
     assert "Kraft O [N]" in printed
-    assert "Not contained in the logs:\n  [defaults] bandwidth_hz = HZ: the low-pass before" in printed
+    assert "Not contained in the logs:\n  [defaults] bandwidth_hz = HZ: the anti-aliasing low-pass" in printed
     assert list(tmp_path.iterdir()) == [path], "nothing is written unasked"
     found = json.loads(shown(capsys, "import", path, "--json"))
     assert {one["signal"]: one["channel"] for one in found}["Kraft O"] == "P_E"

@@ -101,9 +101,8 @@ class FitRequest:
             experiment = fit_initial_state(recording, experiment)
             along = find_free_nuisances(experiment, keys)
             priors = {key: told for key, told in along.items() if told is not None} | priors
-        question = ask(
-            recording, experiment, [*keys, *along], **given, priors=priors, along=along, window=(self.from_s, self.to_s)
-        )
+        window = (self.from_s, self.to_s)
+        question = ask(recording, experiment, [*keys, *along], **given, priors=priors, nuisances=along, window=window)
         return identify_recording(question, **asdict(search), progress=progress), list(along)
 
     def _experiment(self, recording: Recording) -> Experiment:

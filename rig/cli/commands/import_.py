@@ -115,7 +115,7 @@ def _guess(
     files: list[Path], path: Path | None, output: Path | None, picture: Path | None, *, force: bool, form: Form
 ) -> None:
     """Guess the signals of the logs and print the guess; write it as a mapping or a picture, or import by it."""
-    from replays.recordings.formats.guessing.template import example, guessed
+    from replays.recordings.formats.guessing.template import example, guess_mapping
 
     for wanted, field, suffixes in ((path, "--template", (".toml",)), (picture, "--picture", (".png", ".svg"))):
         if wanted is not None:
@@ -171,7 +171,7 @@ def _tell_guesses(guesses: list[Guess], text: str, console: Console) -> None:
         unit = f" [{guess.entry.unit}]" if guess.entry.unit else ""
         where = f"{guess.entry.group} " if len({each.entry.group for each in guesses}) > 1 else ""
         why = guess.why if guess.channel else "not a channel of the rig; kept as a new channel"
-        course = guess.look.sparkline(_SPARK)
+        course = guess.features.sparkline(_SPARK)
         style = "" if guess.channel and guess.sure != "ask" else "yellow"
         table.add_row(
             f"{where}{guess.entry.name}{unit}",
