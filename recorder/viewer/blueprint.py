@@ -73,7 +73,7 @@ def layout(table: ChannelTable, geometry: Geometry, *, live: bool, only: str | N
 
 def _views_titled(
     text: str, columns: list[tuple[list[tuple[rrb.View | rrb.Container, float]], float]]
-) -> list[rrb.View]:
+) -> list[rrb.View | rrb.Container]:
     """Return the views whose title contains a text."""
     rows = [row for views, _ in columns for row, _ in views]
     views = [view for row in rows for view in (row.contents if isinstance(row, rrb.Container) else [row])]

@@ -47,10 +47,10 @@ class Mutant:
 
 _LATCHED = "np.logical_or.accumulate(on) | (alarm in self.active) if alarm[0] in self._latching else on, value"
 MUTANTS = [
-    Mutant("delay ignored", "an_alarm_comes_after_its_delay", "run > self._rows(delay_s)", "run > 0"),
+    Mutant("delay ignored", "an_alarm_comes_after_its_delay", "above) > self._rows(delay_s)", "above) > 0"),
     Mutant(
         "a row early", "an_alarm_comes_after_its_delay",
-        "run > self._rows(delay_s)", "run >= max(1, self._rows(delay_s))",
+        "above) > self._rows(delay_s)", "above) >= max(1, self._rows(delay_s))",
     ),
     Mutant(
         "delay rounded down", "an_alarm_comes_after_its_delay",
@@ -58,8 +58,8 @@ MUTANTS = [
         "math.floor(duration_s * self._rate_hz + 1e-6)",
     ),
     Mutant(
-        "delay goes on after a break", "a_delay_begins_anew", "run = self._run((kind, name), above)",
-        "run = np.cumsum(above) + 0 * self._run((kind, name), above)",
+        "delay goes on after a break", "a_delay_begins_anew", "= self._run((kind, name), above)",
+        "= np.cumsum(above) + 0 * self._run((kind, name), above)",
     ),
     Mutant("latch lost", "a_danger_stays_and_an_alert_goes", _LATCHED, "on, value"),
     Mutant("all latched", "a_danger_stays_and_an_alert_goes", _LATCHED.partition(" if ")[2], "True else on, value"),

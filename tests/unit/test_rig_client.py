@@ -58,7 +58,7 @@ def test_truth_that_came_is_read_once(client: SettledClient, machine: Rig) -> No
     rows = machine.truth("contact", timeout_s=0.0)
     assert (rows.index, rows.gap, rows.names[0], rows.unit("contact_0")) == (0, 0, "contact_0", "m")
     np.testing.assert_array_equal(rows.values, values_of(0, 1))
-    with pytest.raises(NotSeenError, match="no truth of contact came in 0 s"):
+    with pytest.raises(NotSeenError, match="no rows of the truth table contact came in 0 s"):
         machine.truth("contact", timeout_s=0.0)
 
 
