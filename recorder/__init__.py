@@ -1,4 +1,4 @@
-"""Records the rig's streams to MCAP files and reads them back.
+"""Recorder: writes the rig's streams to MCAP files and reads them back.
 
-Knows the rig through its channel table, its wire format and a transport client; never the model.
+Depends on the channel table, the wire format and a transport client of the rig, never on its model.
 """

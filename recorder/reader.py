@@ -1,4 +1,4 @@
-"""Reads a recording: one file, or several files of one run, such as the parts of a rotation, as one recording."""
+"""Reader of recordings: one file, or several files of one run, such as a series, as one recording."""
 
 from __future__ import annotations
 
@@ -26,19 +26,19 @@ from rig.channels.faults.ledger import Declared, in_order
 
 
 class Recording:
-    """A recording, read topic by topic from the disk; nothing but documents is kept in memory, and no file stays open.
+    """Recording, read from the disk topic by topic. Only documents are kept in memory, and no file stays open.
 
     Attributes:
-        parts: The files that it is read from, in order.
-        complete: All of them were finished.
-        damaged, unchecked, messages: As in `RecordingFile`, of all files.
-        path, catalogue, table, parameters, scene, attachments: The same of the first file.
-        metadata: Metadata records by name: `rig` (start), `end` (closing counts of the last file, only if complete).
+        parts: Its files in order.
+        complete: Whether all files were finished.
+        damaged, unchecked, messages: As in `RecordingFile`, for all files.
+        path, catalogue, table, parameters, scene, attachments: Those of the first file.
+        metadata: Metadata records by name: `rig` (start), `end` (final counts of the last file, only if complete).
 
     Example:
         >>> with Recording.open("replays/sessions/hammer-5.2.mcap") as recording:
         ...     forces = recording.samples("forces")
-        ...     both = recording.samples("disk_x", "speed")  # without names: all there are
+        ...     both = recording.samples("disk_x", "speed")  # without names: all groups
         >>> recording
         Recording(replays/sessions/hammer-5.2.mcap: scene hammer, 0 to 0.5998 s, completed; probes, forces, ...)
         >>> forces
@@ -50,7 +50,7 @@ class Recording:
     """
 
     def __init__(self, parts: tuple[RecordingFile, ...], surveys: tuple[Survey, ...] = ()) -> None:
-        """Join files in the given order, with what was surveyed of them already; see `open` and `join`."""
+        """Combine files in the given order, with existing surveys of them; see `open` and `join`."""
         first, last = parts[0], parts[-1]
         self.parts, self.path = parts, first.path
         self.complete = all(part.complete for part in parts)
@@ -69,20 +69,20 @@ class Recording:
         self.parameters, self.scene = first.parameters, first.scene
         self._surveys, self.in_part = surveys, False
         self.true = False
-        """Blocks are as the rig made them: see `truly`."""
-        self.hears = True
-        """What the rig told of faults of blocks counts: see `untold`."""
+        """Whether the effects of faults on blocks are reversed; see `truly`."""
+        self.applies_faults = True
+        """Whether the fault documents are applied; see `untold`."""
 
     @classmethod
     def open(cls, path: Path | str, *, salvage: bool = False) -> Self:
-        """Open a recording in one file, finished or cut off.
+        """Open a recording in one file, complete or interrupted.
 
         Args:
             path: The file.
-            salvage: Take what can be read of a finished file, too, where it is damaged.
+            salvage: Also read the intact part of a damaged file.
 
         Raises:
-            InputError: The file cannot be read, or is no recording.
+            InputError: The file cannot be read, or is not a recording.
         """
         return cls((RecordingFile(Path(path), salvage=salvage),))
 
@@ -90,7 +90,7 @@ class Recording:
         return self
 
     def __exit__(self, *_: object) -> None:
-        pass  # no file is open between two calls
+        pass  # no file stays open between calls
 
     def __repr__(self) -> str:
         span = "no rows" if self.span_s is None else f"{self.span_s[0]:g} to {self.span_s[1]:g} s"
@@ -102,35 +102,35 @@ class Recording:
 
     @property
     def chunks(self) -> tuple[Chunk, ...]:
-        """Where its messages are, file after file, for who reads from somewhere in the middle; see `read`."""
+        """Chunks with messages, file by file, for random access with `read`."""
         return tuple(replace(chunk, part=number) for number, part in enumerate(self.parts) for chunk in part.chunks)
 
     @property
     def end_reason(self) -> str:
-        """Why the recording ended."""
+        """Reason for the end of the recording."""
         return self.parts[-1].end_reason
 
     @property
     def span_s(self) -> tuple[float, float] | None:
-        """Simulated times of the first and the last row, without a look at the samples [s]; None if there is none."""
+        """Simulated times of the first and the last row, without reading samples [s]; None if there are no rows."""
         spans = [span for part in self.parts if (span := part.span_s) is not None]
         return (min(first for first, _ in spans), max(last for _, last in spans)) if spans else None
 
     @cached_property
     def events(self) -> list[dict[str, Any]]:
-        """The rig's events, in order of arrival."""
+        """Events of the rig in order of arrival."""
         return [event for _, event in self._documents(EVENTS)]
 
     @property
     def commands(self) -> list[dict[str, Any]]:
-        """Commands that came from outside, before the recording began and in it: id, tick, command, request."""
+        """Commands received by the rig, including those before the recording: id, tick, command, request."""
         told = [*self.scene.get("taken", []), *(event for event in self.events if event.get("event") == "command")]
         found = {one["id"]: {name: one[name] for name in ("id", "tick", "command", "request")} for one in told}
         return [found[number] for number in sorted(found)]
 
     @cached_property
     def last_status(self) -> dict[str, Any] | None:
-        """The last of the rig's status documents; None without one."""
+        """Last status document of the rig; None without one."""
         last = None
         for _, document in self._documents(STATUS):
             last = document
@@ -138,24 +138,24 @@ class Recording:
 
     @cached_property
     def gaps(self) -> list[Gap]:
-        """Losses that the recorder noted; index -1 where it is messages that are counted, not rows."""
+        """Gaps noted by the recorder; an index of -1 means that `size` counts messages, not rows."""
         return [gap for _, gap in self.timed_gaps]
 
     @cached_property
     def timed_gaps(self) -> list[tuple[float, Gap]]:
-        """The same with the simulated time at which each was noted [s]."""
+        """Gaps with the simulated time at which each was noted [s]."""
         found = self._documents(schemas.GAPS)
         return [(time_ns / 1e9, Gap(gap["key"], gap["index"], gap["size"])) for time_ns, gap in found]
 
     @cached_property
     def clock(self) -> np.ndarray:
-        """Pairs of simulated time and wall time of arrival [s, unix s], shape (n, 2)."""
+        """Pairs of simulated time and arrival time [s, unix s], shape (n, 2)."""
         pairs = [(pair["time_s"], pair["wall_s"]) for _, pair in self._documents(schemas.CLOCK)]
         return np.array(pairs, dtype=float).reshape(-1, 2)
 
     @cached_property
     def streams(self) -> dict[str, Stream]:
-        """Extent of every block stream by key, counted from the blocks."""
+        """Contents of every block stream by key, counted from the blocks."""
         streams: dict[str, Stream] = {}
         for survey in self._surveyed():
             for key, later in survey.streams.items():
@@ -164,24 +164,27 @@ class Recording:
 
     @property
     def short(self) -> tuple[str, ...]:
-        """Rows that the file says it has, and that are not there though all of it is as it was written."""
+        """Rows that the files state and do not contain, one line per stream."""
         return self._said(lambda survey: survey.short)
 
     @property
     def doubts(self) -> tuple[str, ...]:
-        """What in the file does not fit the rest of it though every checksum holds, in a line each."""
+        """Contradictions in files whose checksums are all valid, one line each."""
         return self._said(lambda survey: survey.doubts)
 
     def look_through(self, on_block: OnBlock | None = None) -> None:
-        """Show all blocks that fit the catalogue, in file order; `streams`, `short` and `doubts` need no further pass.
+        """Scan all files; `streams`, `short` and `doubts` then need no further pass.
+
+        Args:
+            on_block: Callback for each block that fits the catalogue, in file order.
 
         Raises:
             InputError: The file is damaged.
         """
-        self._surveys = tuple(Survey(part, on_block, hears=self.hears) for part in self.parts)
+        self._surveys = tuple(Survey(part, on_block, applies_faults=self.applies_faults) for part in self.parts)
 
     def forget(self) -> None:
-        """Look through the files anew where that is asked for."""
+        """Discard the result of the scan; the next access scans the files again."""
         self._surveys = ()
         self.__dict__.pop("streams", None)
 
@@ -191,7 +194,7 @@ class Recording:
         return self._surveys
 
     def _said(self, what: Callable[[Survey], tuple[str, ...]]) -> tuple[str, ...]:
-        """Lines about each file, with its name where there are several."""
+        """Return lines about each file, prefixed by its name if there are several."""
         if self.in_part:
             return ()
         names = [""] if len(self.parts) == 1 else [f"{part.path.name}: " for part in self.parts]
@@ -199,16 +202,15 @@ class Recording:
         return tuple(name + text for name, survey in found for text in what(survey))
 
     def samples(self, *names: str) -> Samples:
-        """Sensors in engineering units, shape (n, channels).
+        """Return sensor channels in engineering units, shape (n, channels).
 
         Args:
-            names: Channels and groups of the channel table; none: all groups that are in the recording. Those of one
-                group come in order of arrival. Several groups are joined row by row, in order of their numbers, where
-                all of them have one.
+            names: Channels and groups of the channel table; none for all recorded groups. Samples of one group are in
+                order of arrival. Several groups are joined by row number, limited to the rows that all of them have.
 
         Raises:
-            InputError: The recording has no such channel or group, several groups do not have the same instants, or
-                the file is damaged.
+            InputError: The recording has no such channel or group, the groups do not share the same instants, or the
+                file is damaged.
         """
         groups, homes = self.table.groups, {name: each.group for name, each in self.table.channels.items()}
         for name in names:
@@ -229,13 +231,13 @@ class Recording:
             units=tuple(channel.unit for channel in group.channels),
             rate_hz=float(group.rate_hz),
         )
-        values = found.values  # there may be gigabytes of them
+        values = found.values  # convert in place: may be gigabytes
         values *= np.array([channel.scale for channel in group.channels])
         values += np.array([channel.offset for channel in group.channels])
         return found
 
     def truth(self, table: str) -> Samples:
-        """A truth table, in order of arrival.
+        """Return a truth table in order of arrival.
 
         Args:
             table: Name of a truth table of the catalogue.
@@ -256,17 +258,17 @@ class Recording:
         )
 
     def edges(self) -> np.ndarray:
-        """Times of the keyphasor edges, simulated [s], shape (n,)."""
+        """Return the simulated times of the keyphasor edges [s], shape (n,)."""
         times = [row_times_s(EDGES, block) for block in self.blocks(EDGES)]
         return np.concatenate(times) if times else np.empty(0)
 
     def blocks(self, key: str) -> Iterator[Block]:
-        """The blocks of one stream, in order of arrival; payloads that are no blocks are passed over."""
+        """Yield the blocks of a stream in order of arrival; invalid payloads are skipped."""
         for _, block in self.blocks_of({key}):
             yield block
 
     def blocks_of(self, keys: set[str]) -> Iterator[tuple[str, Block]]:
-        """Keys and blocks of several streams in one pass, in file order; without payloads that are none."""
+        """Yield keys and blocks of several streams in one pass, in file order; invalid payloads are skipped."""
         for key in keys:
             if schema_of(key) is None:
                 raise InputError("key", "a key of blocks (sensors or truth)", key)
@@ -283,47 +285,47 @@ class Recording:
                     yield key, block if told is None else told.true(key, block)
 
     def truly(self) -> Self:
-        """The same with blocks as the rig made them, where it told of faults that they met: once, in order, in time."""
+        """Return the recording with reported block faults reversed: each block once, in order, at its own time."""
         found = copy(self)
         found.true = FAULTS in self.messages
         return found
 
     def between(self, from_s: float, to_s: float) -> Self:
-        """Return the recording as a reader of the rows between two times [s] needs it; see `RecordingFile.between`.
+        """Return the recording limited to the rows between two times [s]; see `RecordingFile.between`.
 
-        Its `streams` are those of the rows near these times; `short` and `doubts` are empty, as the rest is not read.
+        Its `streams` cover only the rows near these times; `short` and `doubts` are empty, as the rest is not read.
         """
         if math.isinf(from_s) and math.isinf(to_s):
             return self
         found = type(self)(tuple(part.between(from_s, to_s) for part in self.parts))
-        found.true, found.hears, found.in_part = self.true, self.hears, True
+        found.true, found.applies_faults, found.in_part = self.true, self.applies_faults, True
         return found
 
     def untold(self) -> Self:
-        """The same for one who knows nothing of what the rig told of faults: only `doubts` and `streams` differ."""
+        """Return the recording with its fault documents ignored; only `doubts` and `streams` differ."""
         found = copy(self)
-        found.hears = False
+        found.applies_faults = False
         found.forget()
         return found
 
     def everything(self, topics: Container[str] | None = None) -> Iterator[Message]:
-        """Every message in file order: topic, simulated time [ns], wall time of arrival [unix ns] and payload.
+        """Yield every message in file order: topic, simulated time [ns], arrival time [unix ns] and payload.
 
         Args:
-            topics: Only messages on these.
+            topics: Topics to read; None for all.
         """
         yield from self._stamped(topics)
 
     def read(self, chunk: Chunk) -> Iterator[Message]:
-        """The messages of one of its chunks, as `everything` gives them.
+        """Yield the messages of one chunk in the form of `everything`.
 
         Raises:
-            InputError: The file has changed, or cannot be read any more.
+            InputError: The file has changed, or can no longer be read.
         """
         yield from self.parts[chunk.part].stamped(None, [chunk])
 
     def payloads(self, key: str) -> Iterator[tuple[int, bytes]]:
-        """The payloads of one key, byte for byte as they came: pairs of simulated time [ns] and bytes."""
+        """Yield the payloads of a key as recorded: simulated time [ns] and bytes."""
         for _, time_ns, _, payload in self._stamped({key}):
             yield time_ns, payload
 
@@ -332,7 +334,7 @@ class Recording:
             yield from part.stamped(topics)
 
     def _documents(self, topic: str) -> Iterator[tuple[int, dict[str, Any]]]:
-        """Simulated time [ns] and document of each message that is what its key promises."""
+        """Yield simulated time [ns] and document of each valid message of a topic."""
         kept_bytes = 0
         for time_ns, payload in self.payloads(topic):
             document = documents.document_in(topic, payload)
@@ -343,14 +345,14 @@ class Recording:
 
 
 def join(paths: list[Path], *, in_part: bool = False) -> Recording:
-    """Open one file, or several of one run as one recording, whatever their order.
+    """Open one file, or several files of one run in any order, as one recording.
 
     Args:
         paths: The files.
-        in_part: Hold them against their checksums only where they are read; see `Recording.between`.
+        in_part: Verify checksums only of the parts that are read; see `Recording.between`.
 
     Raises:
-        InputError: A file cannot be read, or they are not of one run or not behind each other.
+        InputError: A file cannot be read, the files belong to different runs, or they overlap in time.
     """
     parts = [RecordingFile(path, in_part=in_part) for path in paths]
     if len(parts) == 1:
@@ -367,8 +369,8 @@ def join(paths: list[Path], *, in_part: bool = False) -> Recording:
     surveys = sorted(map(Survey, parts), key=lambda survey: _extent_s(survey)[0])
     for earlier, later in pairwise(surveys):
         if _extent_s(later)[0] < _extent_s(earlier)[1]:
-            found = Words(f"{earlier.file.path} and {later.file.path}, which overlap")
-            raise InputError("files", "recordings behind each other", found)
+            found = Words(f"{earlier.file.path} and {later.file.path}")
+            raise InputError("files", "recordings that do not overlap in time", found)
     return Recording(tuple(survey.file for survey in surveys), tuple(surveys))
 
 
@@ -384,7 +386,7 @@ def _run_of(part: RecordingFile) -> tuple[Any, ...]:
 
 
 def _extent_s(survey: Survey) -> tuple[float, float]:
-    """Simulated times of the first and the last row of a file [s]."""
+    """Return the simulated times of the first and the last row of a file [s]."""
     filled = {key: stream for key, stream in survey.streams.items() if stream.rows}
     streams = [stream for key, stream in filled.items() if key != EDGES] or list(filled.values())
     return (

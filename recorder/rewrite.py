@@ -1,7 +1,7 @@
-"""Recordings made of recordings: a finished file of what a kill left, and cuts of one or several files.
+"""Recordings derived from recordings: recovery of an interrupted file, and cuts of one or several files.
 
-Payloads are written as they came, through the same writer as in a recording, so that index, counts, gaps and the
-messages for plots are made anew and the file is like any other. Metadata `recovered` or `cut` says what it was made of.
+Payloads are copied unchanged through the writer used for recording. Index, counts, gaps and plot messages are derived
+again, so the result is like any other recording. The metadata `recovered` or `cut` name the source.
 """
 
 from __future__ import annotations
@@ -32,21 +32,21 @@ from rig.base.errors import PART_SUFFIX, InputError, Words, check_not_among
 from rig.base.wire import EDGES, FAULTS, SENSORS, TRUTH, Block, encode_block, schema_of
 from rig.channels.faults.ledger import Declared
 
-_TELL_EVERY = 5000
-"""Messages between two reports of progress."""
-_HEAD = ("README.txt", "catalogue.json", "parameters.json", "scene.json", COPY)
+_PROGRESS_MESSAGES = 5000
+"""Messages between two progress reports."""
+_DERIVED_ATTACHMENTS = ("README.txt", "catalogue.json", "parameters.json", "scene.json", COPY)
 
 
 @dataclass(frozen=True)
 class Rewritten:
-    """What became of it.
+    """Result of a recovery or a cut.
 
     Attributes:
         path: The new file.
-        counts: What stands in it.
-        damaged: Records of the source that are not what was written, and are left out.
-        unchecked: What of the source no checksum covers.
-        short: What the source lacks by its own account.
+        counts: Totals of the new file.
+        damaged: Number of damaged records of the source that were skipped.
+        unchecked: Data of the source without a checksum.
+        short: Rows that the source states and does not contain.
     """
 
     path: Path
@@ -57,17 +57,17 @@ class Rewritten:
 
 
 def recovered_path(source: Path) -> Path:
-    """Where `recover` writes to by default: beside NAME.mcap.part or NAME.mcap, to NAME.recovered.mcap."""
+    """Return the default output of `recover`: NAME.recovered.mcap in the folder of NAME.mcap.part or NAME.mcap."""
     name = source.name.removesuffix(PART_SUFFIX).removesuffix(".mcap")
     return source.with_name(f"{name}.recovered.mcap")
 
 
 def is_whole(source: Path, *, on_progress: Callable[[float], None] | None = None) -> bool:
-    """Whether there is nothing to recover: a finished file under its final name, of which all is there and can be read.
+    """Return whether a file needs no recovery: finished, under its final name, complete and readable.
 
     Args:
         source: The file.
-        on_progress: Called with the part done, 0 to 1.
+        on_progress: Callback for the fraction done, 0 to 1.
 
     Raises:
         InputError: The file is being written, or cannot be read.
@@ -93,18 +93,18 @@ def recover(
     force: bool = False,
     on_progress: Callable[[float], None] | None = None,
 ) -> Rewritten:
-    """Make a finished file of one that was cut off or damaged; the source stays as it is.
+    """Write a finished file from one that was interrupted or damaged; the source is not changed.
 
     Args:
         source: The file.
-        output: The new file; by default beside it, see `recovered_path`.
+        output: The new file; None for `recovered_path`.
         force: Replace an existing file.
-        on_progress: Called with the part done, 0 to 1.
+        on_progress: Callback for the fraction done, 0 to 1.
 
     Raises:
-        InputError: The file is being written, cannot be read, has no whole calibration, or has lost all of its rows;
-            or the new one cannot be written.
-        RecordingError: The disk refused.
+        InputError: The source is being written, cannot be read, has no complete calibration or no readable rows, or the
+            new file cannot be written.
+        RecordingError: The disk reports an error.
     """
     output = output or recovered_path(source)
     check_not_among([source], output)
@@ -117,7 +117,7 @@ def recover(
             "unchecked": "; ".join(recording.unchecked),
             "short": "; ".join(recording.short),
         }
-        lost = InputError("file", "a recording with rows that can be read", Words(f"{source}, of which all are lost"))
+        lost = InputError("file", "a recording with readable rows", Words(f"{source}, which has none"))
         due, ends = _lost_ends(recording)
         counts = _write(
             recording,
@@ -134,7 +134,7 @@ def recover(
 
 
 def _lost_ends(recording: Recording) -> tuple[dict[str, int], dict[str, int]]:
-    """Return where the rows of each stream that lost some at its ends began and ended, by what the file states.
+    """Return the row ranges, as stated by the file, of streams that lost rows at their start or end.
 
     Returns:
         Number of the first row, and number of the row after the last one, by key.
@@ -144,7 +144,7 @@ def _lost_ends(recording: Recording) -> tuple[dict[str, int], dict[str, int]]:
     file = recording.parts[0]
     for key, stream in recording.streams.items():
         noted = [gap.size for gap in recording.gaps if gap.key == key and stream.first < gap.index < stream.due]
-        rows = stream.missing - max(0, stream.lost - sum(noted))  # those between two blocks are counted as gaps
+        rows = stream.missing - max(0, stream.lost - sum(noted))  # losses between blocks count as gaps
         if rows > 0:
             late_s = stream.first_time_s - (file.stated_begin_s or 0.0) if stream.rows else 0.0
             rate_hz = file.promises[key].rate_hz if key in file.promises else 0.0
@@ -165,32 +165,32 @@ def cut(
     force: bool = False,
     on_progress: Callable[[float], None] | None = None,
 ) -> Rewritten:
-    """Write a part of a recording, or several files joined, to a new file.
+    """Write a part of a recording, or several joined files, to a new file.
 
-    Payloads are kept byte for byte, but for the blocks at the edges, which are trimmed to the rows from `from_s` up to
-    but not including `to_s`, and blocks that lose columns.
+    Payloads are copied unchanged, except that the blocks at the ends are trimmed to the interval from `from_s` to
+    before `to_s`, and blocks of which only some channels are kept lose the other columns.
 
     Args:
-        recording: What is cut; `join` opens several files as one.
+        recording: Source; `join` opens several files as one.
         output: The new file.
-        from_s: Begin [s of simulated time].
+        from_s: Start [s of simulated time].
         to_s: End [s of simulated time].
-        only: Sensors or truth alone; events and status stay.
-        channels: Keep only these channels.
+        only: Keep only sensors or only truth; events and status are always kept.
+        channels: Keep only these channels; empty for all.
         force: Replace an existing file.
-        on_progress: Called with the part done, 0 to 1.
+        on_progress: Callback for the fraction done, 0 to 1.
 
     Raises:
-        InputError: Times or channels cannot be used, nothing lies between them, or the file cannot be written.
-        RecordingError: The disk refused.
+        InputError: Times or channels are invalid, the interval has no rows, or the file cannot be written.
+        RecordingError: The disk reports an error.
     """
     if math.isnan(from_s) or math.isnan(to_s) or not from_s < to_s:
-        raise InputError("from and to", "times, one before the other", Words(f"{from_s:g} and {to_s:g}"))
+        raise InputError("from and to", "times in ascending order", Words(f"{from_s:g} and {to_s:g}"))
     if only not in (None, "sensors", "truth"):
         raise InputError("only", "sensors or truth", only)
     check_not_among([part.path for part in recording.parts], output)
     recording = recording.between(from_s, to_s)
-    catalogue, columns = _narrowed(recording, channels, only)
+    catalogue, columns = _select_columns(recording, channels, only)
     tick_rate_hz = recording.catalogue["tick_rate_hz"]
     from_tick, to_tick = (at_s if math.isinf(at_s) else float(round(at_s * tick_rate_hz)) for at_s in (from_s, to_s))
     commands = Commands(recording.scene)
@@ -199,24 +199,24 @@ def cut(
         if tick is not None and tick < from_tick:
             commands.follow(event)
 
-    told = Declared()
+    declared = Declared()
 
     def change(payload: Payload) -> Payload | None:
         key, tick, block = payload.key, payload.tick, payload.block
         if key == FAULTS and payload.document is not None:
-            told.declare(payload.document)
-            return None if only == "sensors" else payload  # it may be about blocks of any time
+            declared.declare(payload.document)
+            return None if only == "sensors" else payload  # may concern blocks of any time
         if schema_of(key) is None:
             return payload if tick is None or from_tick <= tick < to_tick else None
         if key not in columns:
             return None
         if block is None:
             return payload
-        true = told.true(key, block)
-        told.take(key, block)
-        if (true.index, true.tick) != (block.index, block.tick):  # stamped by a fault: as it came, or not at all
-            return payload if from_tick <= true.tick < to_tick else None
-        kept = _trimmed(key, block, from_tick, to_tick, columns[key])
+        original = declared.true(key, block)
+        declared.take(key, block)
+        if (original.index, original.tick) != (block.index, block.tick):  # stamped by a fault: keep unchanged or drop
+            return payload if from_tick <= original.tick < to_tick else None
+        kept = _trim_block(key, block, from_tick, to_tick, columns[key])
         if kept is None or kept is block:
             return payload if kept else None
         return replace(payload, data=encode_block(kept), block=kept)
@@ -230,7 +230,7 @@ def cut(
         "channels": json.dumps(channels),
     }
     first_s, last_s = recording.span_s or (0.0, 0.0)
-    must = f"times that the recording holds rows of, {first_s:g} to {last_s:g} s"
+    must = f"an interval with rows of the recording, {first_s:g} to {last_s:g} s"
     counts = _write(
         recording,
         output,
@@ -261,16 +261,29 @@ def _write(
     empty: InputError | None = None,
     on_progress: Callable[[float], None] | None,
 ) -> Counts:
-    """Copy what was recorded, changed or left out (None), and derive the rest anew; without a row, raise `empty`.
+    """Copy the messages of a recording and derive the rest again.
 
-    `due` and `ends` are the first row and the row after the last one, by key, of streams that lost rows there.
+    Args:
+        recording: Source.
+        output: The new file.
+        metadata: Additional metadata.
+        reason: Reason for the end of the recording.
+        force: Replace an existing file.
+        scene: Scene document; None for the source's.
+        catalogue: Catalogue document; None for the source's.
+        change: Returns the payload to write; None to drop it.
+        due: Number of the first expected row by key, for streams that lost rows at their start.
+        ends: Number of the row after the last one by key, for streams that lost rows at their end.
+        empty: Error to raise if there is no row.
+        on_progress: Callback for the fraction done, 0 to 1.
     """
     check_destination(output, force=force)
     about = recording.metadata["rig"]
-    left_out = {"rig", "end"} if "recovered" in metadata else {"rig", "end", "series"}  # a cut is no part of a series
+    # A cut does not belong to a series.
+    left_out = {"rig", "end"} if "recovered" in metadata else {"rig", "end", "series"}
     kept = {name: entries for name, entries in recording.metadata.items() if name not in left_out}
     metadata = {**kept, "rig": {"created": about["created"]}, **metadata}
-    attachments = {name: data for name, data in recording.attachments.items() if name not in _HEAD}
+    attachments = {name: data for name, data in recording.attachments.items() if name not in _DERIVED_ATTACHMENTS}
     with contextlib.ExitStack() as stack:
         writer = RecordingWriter(
             output,
@@ -282,7 +295,7 @@ def _write(
             beginning=Beginning(metadata=metadata, attachments=attachments, due=due or {}),
             sync_every_s=2.0,
         )
-        stack.callback(writer.abandon)  # nothing half-written stays; does nothing once it is finished
+        stack.callback(writer.abandon)  # remove an incomplete file; no effect after `finish`
         step = _progress(recording, on_progress)
         derived = (schemas.VIEW + "/", schemas.CLOCK)
         topics = {key for key in recording.messages if not key.startswith(derived)}
@@ -305,12 +318,12 @@ def _write(
 
 
 def _progress(recording: Recording, on_progress: Callable[[float], None] | None) -> Callable[[], None]:
-    """Something to call for each message, which reports the part of them that is done now and then."""
+    """Return a function to call for each message; it reports the progress at intervals."""
     total, numbers = max(1, sum(recording.messages.values())), count()
 
     def step() -> None:
         number = next(numbers)
-        if on_progress is not None and number % _TELL_EVERY == 0:
+        if on_progress is not None and number % _PROGRESS_MESSAGES == 0:
             on_progress(number / total)
 
     return step
@@ -318,10 +331,10 @@ def _progress(recording: Recording, on_progress: Callable[[float], None] | None)
 
 @contextlib.contextmanager
 def _unlocked(path: Path) -> Iterator[None]:
-    """Hold a file that nobody is writing to, so that nobody begins to.
+    """Hold a shared lock on a file, so that no recorder can start writing to it.
 
     Raises:
-        InputError: A recorder is writing to it, or it cannot be read.
+        InputError: A recorder is writing to the file, or it cannot be read.
     """
     import fcntl
 
@@ -330,7 +343,7 @@ def _unlocked(path: Path) -> Iterator[None]:
             try:
                 fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
             except BlockingIOError:
-                raise InputError("file", "one that no recorder is writing to", str(path)) from None
+                raise InputError("file", "a file that no recorder is writing to", str(path)) from None
             yield
     except OSError as error:
         if error.filename != str(path):
@@ -338,10 +351,10 @@ def _unlocked(path: Path) -> Iterator[None]:
         raise unreadable(path, error) from None
 
 
-def _narrowed(
+def _select_columns(
     recording: Recording, channels: tuple[str, ...], only: str | None
 ) -> tuple[dict[str, Any], dict[str, list[int] | None]]:
-    """The catalogue of what is kept, and of each key that is kept the columns; None where all are."""
+    """Return the catalogue of a cut, and the columns to keep of each remaining key; None for all columns."""
     known = recording.table.channels
     for name in channels:
         if name not in known:
@@ -366,8 +379,8 @@ def _narrowed(
     return {**recording.catalogue, "table": {**recording.catalogue["table"], "groups": groups}, "truth": truth}, columns
 
 
-def _trimmed(key: str, block: Block, from_tick: float, to_tick: float, columns: list[int] | None) -> Block | None:
-    """The rows of a block between two ticks, with their own tick and number; the same block where it keeps all."""
+def _trim_block(key: str, block: Block, from_tick: float, to_tick: float, columns: list[int] | None) -> Block | None:
+    """Return the rows of a block between two ticks; None without any, and the same block if it is kept completely."""
     rows = len(block.values)
     ticks = block.tick + block.values[:, 0] if key == EDGES else np.round(block.times_s * block.tick_rate_hz, 6)
     kept = np.flatnonzero((ticks >= from_tick) & (ticks < to_tick))

@@ -1,4 +1,4 @@
-"""One recording session: from the rig's streams, through a bounded inbox, to a file."""
+"""Recording session: transfers the streams of a rig through a bounded inbox to files."""
 
 from __future__ import annotations
 
@@ -30,68 +30,69 @@ from rig.serve.waiting import BoundedQueue
 
 Document = dict[str, Any]
 RIG_LOST = "rig lost"
-"""End reason of a session whose rig vanished without an end event."""
+"""End reason of a session whose rig disappeared without an end event."""
 INBOX_BYTES = 256 << 20
-"""About a minute and a half of the default streams: longer than any stall of a disk that still works."""
-_PORTION = 1000
-"""Payloads that are taken out of the inbox at a time: only when all of them are written does their room come free."""
-_ROUND_NS = NS // 5
-"""Streams that begin within this time of each other begin together, each with its first block [ns]."""
+"""Capacity of the inbox [bytes]: about 90 s of the default streams, longer than any stall of a working disk."""
+_BATCH_PAYLOADS = 1000
+"""Payloads taken from the inbox at a time; their space is released after all of them are written."""
+_COMMON_START_NS = NS // 5
+"""Streams that begin within this time of each other start at their own first blocks [ns]."""
 HEARTBEAT_S = 0.5
+"""Interval of the reports to the rig [s]."""
 QUIET_S = 0.3
-"""After the end of the stream, with all streams whole but no last status: silence after which nothing more is expected
-[s]."""
+"""Silence that ends the session after the end event, if all streams are complete but the last status is missing [s]."""
 RECOVERY_S = 2.0
-"""After the end of the stream, or of the time to record, with blocks still missing: silence after which they are given
-up [s]."""
+"""Silence after which missing blocks are given up, after the end event or at the end of the time to record [s]."""
 PATIENCE_S = 30.0
-"""After the end of the stream: longest wait [s]."""
+"""Longest wait after the end event [s]."""
 RETURN_S = 10.0
-"""How long, by default, a rig that is lost may take to be there again with the same run [s]: a recorder that
-was stopped for a minute loses its links, and is linked again in a second or two."""
+"""Default time that a lost rig may take to return with the same run [s].
+
+A recorder that was suspended for a minute loses its links, and has them again in a second or two.
+"""
 _DOCUMENTS_BYTES = 64 << 20
-"""What documents may take of memory when blocks find no more room."""
+"""Additional capacity of the inbox for documents when it is full of blocks [bytes]."""
 
 
 class _Extent:
-    """The simulated time to record, from the first block of each stream on."""
+    """Simulated time to record, counted from the first block of each stream."""
 
-    def __init__(self, duration_s: float | None, promised: Catalogue, monotonic_s: Callable[[], float]) -> None:
+    def __init__(self, duration_s: float | None, streams: Catalogue, monotonic_s: Callable[[], float]) -> None:
         self._duration_ns = math.inf if duration_s is None else duration_s * NS
-        self._tick_rate_hz = round(promised.tick_rate_hz)
-        self._streams = {*map(wire.sensor_key, promised.table.groups), *map(wire.truth_key, promised.truth)}
+        self._tick_rate_hz = round(streams.tick_rate_hz)
+        self._streams = {*map(wire.sensor_key, streams.table.groups), *map(wire.truth_key, streams.truth)}
         self._monotonic_s = monotonic_s
         self._begin_ns: dict[str, int] = {}
         self._within_s = 0.0
-        self._beyond: set[str] = set()
-        """Streams that have come to the end of the time to record."""
+        self._finished: set[str] = set()
+        """Streams that have reached the end of the time to record."""
 
     def takes(self, payload: Payload) -> bool:
-        """Whether a payload is of the time to record; only what is a block can be of a later one."""
+        """Return whether a payload belongs to the time to record; a document always does."""
         key, block = payload.key, payload.block
         if math.isinf(self._duration_ns) or block is None:
             return True
         start_ns = block.tick * NS // self._tick_rate_hz
         begin_ns = self._begin_ns.setdefault(key, start_ns)
         first_ns = min(self._begin_ns.values())
-        if key == wire.EDGES or begin_ns - first_ns > _ROUND_NS:
+        if key == wire.EDGES or begin_ns - first_ns > _COMMON_START_NS:
             begin_ns = first_ns
         if start_ns < begin_ns + self._duration_ns:
             self._within_s = self._monotonic_s()
             return True
-        self._beyond.add(key)
+        self._finished.add(key)
         return False
 
     def over(self, now_s: float) -> bool:
-        """Whether all streams have come to its end, or those that have not are not heard of any more."""
-        return bool(self._beyond) and (self._beyond >= self._streams or now_s - self._within_s > RECOVERY_S)
+        """Return whether all streams have reached the end, or the remaining ones are silent."""
+        return bool(self._finished) and (self._finished >= self._streams or now_s - self._within_s > RECOVERY_S)
 
 
 class RecordingSession:
-    """Records what a rig publishes until the stream ends, somebody stops it, or the rig or the disk is gone.
+    """Recording of a rig's streams until they end, the session is stopped, or the rig or the disk fails.
 
-    Payloads are taken over on the transport's threads and written on one thread of the session; the thread that calls
-    `run` watches.
+    Payloads are received on the transport's threads and written on one thread of the session. The thread that calls
+    `run` monitors both.
     """
 
     def __init__(
@@ -111,24 +112,24 @@ class RecordingSession:
         wall_ns: Callable[[], int] = time.time_ns,
         monotonic_s: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Check the options and the destination; nothing is asked of the rig yet.
+        """Check the options and the destination without contacting the rig.
 
         Args:
-            client: Connection to the rig; remains the caller's to close.
-            path: File to write, ends in .mcap.
+            client: Connection to the rig; closed by the caller.
+            path: Output file, ending in .mcap.
             name: Name in the rig's list of clients.
-            duration_s: Simulated time to record [s], to the block; None until something else ends the session.
-            view_rate_hz: Rate of the plottable messages [Hz]; 0 writes none.
-            history: Also record what the rig's cache still holds from before; rows since the start of the run that it
-                no longer holds count as lost.
-            patience_s: How long a rig that is lost may take to be there again [s]; the same run is then recorded on,
-                with a gap. None: `RETURN_S`.
+            duration_s: Simulated time to record, accurate to one block [s]; None for no limit.
+            view_rate_hz: Rate of the plot messages [Hz]; 0 for none.
+            history: Also record the rig's cache of earlier blocks; rows since the start of the run that are no longer
+                in the cache count as lost.
+            patience_s: Time that a lost rig may take to return [s]; the same run then continues after a gap. None for
+                `RETURN_S`.
             force: Replace an existing file.
-            limits: Size of the files, and what they may take of the disk.
-            capture: Record only around triggers.
-            inbox_bytes: Capacity of the inbox between transport and disk.
+            limits: Limits of file size and disk space; None for no limits.
+            capture: Record only around triggers; None to record everything.
+            inbox_bytes: Capacity of the inbox [bytes].
             wall_ns: Wall clock [unix ns].
-            monotonic_s: Clock of waits and deadlines [s].
+            monotonic_s: Clock for waits and deadlines [s].
 
         Raises:
             InputError: An option or the destination cannot be used.
@@ -146,7 +147,7 @@ class RecordingSession:
         else:
             for field in ("rotate_mb", "rotate_s"):
                 if (given := getattr(self._limits, field)) is not None:
-                    raise InputError(field, "left out where it is recorded around triggers", given)
+                    raise InputError(field, "omitted for a recording around triggers", given)
             check_captures(path, capture, self._limits, force=force)
         self.path = path
         self._client = client
@@ -161,57 +162,57 @@ class RecordingSession:
         self._inbox: BoundedQueue[Payload] = BoundedQueue(
             inbox_bytes, size=lambda payload: len(payload.data), holds=True
         )
-        """Payloads that wait to be written; a full one refuses blocks, for a transport that waits would stall the rig.
-        What it refuses shows as a gap of the row numbers. Documents are small and rare, and have room of their own."""
+        """Payloads to be written. A full inbox drops blocks, because a waiting transport would stall the rig; dropped
+        blocks appear as gaps. Documents are small and rare, and have additional capacity."""
         self._order = threading.Lock()
         self._misses: deque[tuple[str, int, int]] = deque()
         self._wake = threading.Event()
         self._stop_reason = ""
         self._end_reason = ""
         self._end_rows: dict[str, int] | None = None
-        """Number of the row after the last one published, by key, as the end event states it."""
+        """Number of the row after the last one published, by key, as stated in the end event."""
         self._last_status = False
-        """The status that a run publishes behind all else has come."""
-        self._rig: str | None = None
-        """Who the rig is, by its transport."""
+        """Whether the final status of the run has arrived."""
+        self._rig_id: str | None = None
+        """Identity of the rig on the transport."""
         self._rig_lost = False
         self._lost_s = 0.0
         self._replaced = False
         self._remarks: list[str] = []
-        self._heard_s = 0.0
+        self._last_block_s = 0.0
         self._failure: BaseException | None = None
 
     def stop(self, reason: str = "stopped") -> None:
-        """End the session from another thread or a signal handler; what was received is still written."""
-        # Only a flag: a signal handler that took the lock of an event could wait for its own thread.
+        """End the session from another thread or a signal handler; received data are still written."""
+        # Set only a flag: a signal handler that locks an event can deadlock with its own thread.
         self._stop_reason = self._stop_reason or reason
 
     @property
     def waiting(self) -> int:
-        """Payloads that wait to be written."""
+        """Number of payloads in the inbox."""
         return len(self._inbox)
 
     def run(self, on_progress: Callable[[Progress], None] | None = None) -> Summary:
-        """Record until the end.
+        """Record until the session ends.
 
         Args:
-            on_progress: Called about five times a second on the calling thread.
+            on_progress: Callback about five times per second, on the calling thread.
 
         Returns:
-            The outcome; a failure of the disk is in it, not raised.
+            The outcome; a disk error is part of it and is not raised.
 
         Raises:
-            NoReplyError: No rig answers.
+            NoReplyError: No rig replies.
             InputError: The file cannot be created.
         """
         asked = (wire.CATALOGUE, wire.PARAMETERS, wire.SCENE)
         catalogue, parameters, scene = (wire.decode_document(self._client.request(key)) for key in asked)
-        promised = Catalogue.read(catalogue)
-        self._rig = self._client.rig
-        writer = self._open_sink(promised, catalogue, parameters, scene)
-        self._intake = Intake(promised)
-        self._extent = _Extent(self._duration_s, promised, self._monotonic_s)
-        self._table = promised.table
+        streams = Catalogue.read(catalogue)
+        self._rig_id = self._client.rig
+        writer = self._open_sink(streams, catalogue, parameters, scene)
+        self._intake = Intake(streams)
+        self._extent = _Extent(self._duration_s, streams, self._monotonic_s)
+        self._table = streams.table
         thread = threading.Thread(target=self._write_all, args=(writer,), name="recorder-writer", daemon=True)
         thread.start()
         reason = "failed"
@@ -226,19 +227,19 @@ class RecordingSession:
         finally:
             self._inbox.close()
             thread.join()
-            trouble = self._finish(writer, reason)
+            disk_error = self._finish(writer, reason)
         if not self._rig_lost:
-            self._report(writer, done=True)  # lets the rig drop its cache at once
-        return self._summary(writer, reason, trouble)
+            self._report(writer, done=True)  # the rig can then release its cache
+        return self._summary(writer, reason, disk_error)
 
     @property
     def first_files(self) -> list[Path]:
-        """The file that it writes, or the first of several, for each trigger."""
+        """Output file, or the first of several for each trigger."""
         if self._capture is not None:
             return list(dict.fromkeys(capture_path(self.path, each, 1) for each in self._capture.triggers))
         return [part_path(self.path, 0) if self._limits.rotates else self.path]
 
-    def _open_sink(self, promised: Catalogue, catalogue: Document, parameters: Document, scene: Document) -> Sink:
+    def _open_sink(self, streams: Catalogue, catalogue: Document, parameters: Document, scene: Document) -> Sink:
         def open_file(path: Path, scene: Document, beginning: Beginning) -> RecordingWriter:
             return RecordingWriter(
                 path,
@@ -252,13 +253,13 @@ class RecordingSession:
                 monotonic_s=self._monotonic_s,
             )
 
-        tick_rate_hz = round(promised.tick_rate_hz)
-        needs = Needs(promised.table, tick_rate_hz, scene, open_file, self._limits, self._force, self._monotonic_s)
+        tick_rate_hz = round(streams.tick_rate_hz)
+        needs = Needs(streams.table, tick_rate_hz, scene, open_file, self._limits, self._force, self._monotonic_s)
         if self._capture is None:
             return Series(self.path, needs, from_start=self._history)
         return Captures(self.path, self._capture, needs)
 
-    # On the transport's threads.
+    # Called on the transport's threads.
 
     def _on_message(self, key: str, payload: bytes) -> None:
         wall_ns = self._wall_ns()
@@ -277,18 +278,18 @@ class RecordingSession:
             self._inbox.offer(Payload.of(each))
 
     def _take(self, key: str, payload: bytes, wall_ns: int) -> None:
-        """Take a block, on the thread of its stream."""
+        """Process a block on the thread of its stream."""
         due = self._intake.next.get(key, 0)
         try:
             taken = self._intake.take(key, payload, wall_ns)
         except ValueError:
             if self._intake.knows(key):
-                self._inbox.offer(Payload.read(key, payload, wall_ns))  # kept as it came, for the reader to judge
+                self._inbox.offer(Payload.read(key, payload, wall_ns))  # recorded unchanged as malformed
             return
         if taken:
-            # Whoever goes on after the rig was lost and counts from the start again is another one in its place.
+            # A rig whose row numbers restart after a lost link is a different one.
             self._replaced = self._replaced or (self._rig_lost and taken[0].block.index < due)
-            self._heard_s = self._monotonic_s()
+            self._last_block_s = self._monotonic_s()
         self._offer(taken)
 
     def _on_miss(self, key: str, messages: int) -> None:
@@ -299,18 +300,18 @@ class RecordingSession:
             self._lost_s = self._monotonic_s()
             self._rig_lost = True
         elif self._rig_lost:
-            self._replaced = self._replaced or self._client.rig != self._rig
+            self._replaced = self._replaced or self._client.rig != self._rig_id
             self._rig_lost = self._replaced
             if not self._replaced:
-                self._remarks.append("the link to the rig was lost, and is back; what could not be fetched is a gap")
+                self._remarks.append("the link to the rig was lost and restored; data not fetched are recorded as gaps")
         self._wake.set()
 
-    # On the writer thread.
+    # Called on the writer thread.
 
     def _write_all(self, writer: Sink) -> None:
         try:
             while not self._inbox.ended:
-                for payload in self._inbox.take_many(_PORTION, 0.1):
+                for payload in self._inbox.take_many(_BATCH_PAYLOADS, 0.1):
                     if not self._extent.takes(payload):
                         continue
                     writer.take(payload)
@@ -322,7 +323,7 @@ class RecordingSession:
                 while self._misses:
                     writer.write_missed(*self._misses.popleft())
                 writer.sync_if_due()
-        except BaseException as error:  # handed over to the watching thread, which ends the session with it
+        except BaseException as error:  # reported by the monitoring thread, which ends the session
             self._failure = error
             self._inbox.close()
             self._wake.set()
@@ -338,10 +339,10 @@ class RecordingSession:
             self._last_status = True
             self._wake.set()
 
-    # On the calling thread.
+    # Called on the calling thread.
 
     def _wait_for_end(self, writer: Sink, on_progress: Callable[[Progress], None] | None) -> str:
-        """Watch, report and return why the session ends."""
+        """Monitor the session and return the reason for its end."""
         heartbeat_s = -1e9
         ended_s = None
         while True:
@@ -354,22 +355,22 @@ class RecordingSession:
                 return writer.ended
             if self._extent.over(now_s):
                 return "duration reached"
-            gone = self._replaced or (self._rig_lost and now_s - self._lost_s > self._patience_s)
-            if ended_s is None and (self._end_reason or gone):
+            expired = self._replaced or (self._rig_lost and now_s - self._lost_s > self._patience_s)
+            if ended_s is None and (self._end_reason or expired):
                 ended_s = now_s
-            if ended_s is not None and self._nothing_left(writer, now_s, ended_s):
+            if ended_s is not None and self._wait_is_over(writer, now_s, ended_s):
                 return self._end_reason or RIG_LOST
             if now_s - heartbeat_s >= HEARTBEAT_S and not self._rig_lost:
                 heartbeat_s = now_s
                 self._report(writer)
-            self._look_for_strangers()
+            self._report_foreign_messages()
             if on_progress is not None:
                 on_progress(self._progress(writer))
             self._wake.wait(0.2 if ended_s is None else 0.05)
             self._wake.clear()
 
-    def _look_for_strangers(self) -> None:
-        """Say once that somebody else publishes what only the rig should."""
+    def _report_foreign_messages(self) -> None:
+        """Add one remark for each kind of message that does not come from the rig."""
         for count, what in (
             (self._client.foreign, "messages that are not from this rig were left out"),
             (
@@ -380,18 +381,18 @@ class RecordingSession:
             if count and not any(what in remark for remark in self._remarks):
                 self._remarks.append(f"warning: {what}")
 
-    def _nothing_left(self, writer: Sink, now_s: float, ended_s: float) -> bool:
-        """After the end: whatever may still come has had its time."""
+    def _wait_is_over(self, writer: Sink, now_s: float, ended_s: float) -> bool:
+        """Return whether the wait for outstanding data after the end is over."""
         if now_s - ended_s > PATIENCE_S or self._replaced:
             return True
-        # The `end` event can overtake blocks that are being recovered, and what is told of blocks that were refused:
-        # while a stream is short of it, wait longer.
+        # The end event can overtake blocks that are being recovered and documents about refused blocks, so wait
+        # longer while a stream is incomplete.
         due = self.waiting or self._intake.refused or self._end_rows is None
-        whole = not due and not writer.tally.short_of(self._end_rows or {})
-        if whole and self._last_status and writer.tally.next.keys() >= (self._end_rows or {}).keys():
+        complete = not due and not writer.tally.short_of(self._end_rows or {})
+        if complete and self._last_status and writer.tally.next.keys() >= (self._end_rows or {}).keys():
             return True
-        quiet_s = now_s - max(ended_s, self._heard_s)
-        return quiet_s > (QUIET_S if whole or self._rig_lost else RECOVERY_S)
+        quiet_s = now_s - max(ended_s, self._last_block_s)
+        return quiet_s > (QUIET_S if complete or self._rig_lost else RECOVERY_S)
 
     def _report(self, writer: Sink, *, done: bool = False) -> None:
         groups = list(self._table.groups)
@@ -414,7 +415,7 @@ class RecordingSession:
         )
 
     def _finish(self, writer: Sink, reason: str) -> str:
-        """Close the file; return what the disk had against it."""
+        """Close the file and return the disk error, if any."""
         if isinstance(self._failure, RecordingError):
             return str(self._failure)
         try:
@@ -436,12 +437,12 @@ class RecordingSession:
         except RecordingError as error:
             return str(error)
         if self._failure is not None:
-            return f"recording stopped by {type(self._failure).__name__}: {self._failure}; what came before it is kept"
+            return f"recording stopped by {type(self._failure).__name__}: {self._failure}; the earlier data are kept"
         return ""
 
-    def _summary(self, writer: Sink, reason: str, trouble: str) -> Summary:
+    def _summary(self, writer: Sink, reason: str, disk_error: str) -> Summary:
         files = tuple(writer.files)
-        if trouble and writer.part is not None and writer.part.exists():
+        if disk_error and writer.part is not None and writer.part.exists():
             files = (*files, writer.part)
         counts = writer.counts()
         kept = writer.kept()
@@ -449,7 +450,7 @@ class RecordingSession:
         return Summary(
             path=files[-1] if files else writer.path,
             reason=reason,
-            error=trouble or (writer.ended if writer.out_of_room else ""),
+            error=disk_error or (writer.ended if writer.out_of_room else ""),
             first_time_s=(in_files.first_time_ns or 0) / NS,
             duration_s=sum(each.extent_ns for each in kept) / NS,
             rows=in_files.rows,
@@ -467,14 +468,14 @@ class RecordingSession:
             fired=writer.fired if isinstance(writer, Captures) else None,
             remarks=(*writer.remarks, *self._remarks),
             refused=self._intake.refused + self._client.foreign,
-            ended_early=self._ended_early(writer, reason, trouble),
+            ended_early=self._ended_early(writer, reason, disk_error),
         )
 
-    def _ended_early(self, writer: Sink, reason: str, trouble: str) -> str:
-        """Up to which time it is recorded, where that is not all that was asked for; empty else."""
+    def _ended_early(self, writer: Sink, reason: str, disk_error: str) -> str:
+        """Return what is missing at the end of an incomplete recording; empty otherwise."""
         counts = sum(writer.kept(), Counts())
-        if trouble or writer.out_of_room:
-            return f"all that came after {counts.safe_time_ns / NS:.3f} s, where the recording ended before the run"
+        if disk_error or writer.out_of_room:
+            return f"all data after {counts.safe_time_ns / NS:.3f} s, where the recording ended before the run"
         if self._rig_lost and not self._end_reason:
-            return f"what the rig may have sent after {counts.last_time_ns / NS:.3f} s, where it was lost"
+            return f"data that the rig may have sent after {counts.last_time_ns / NS:.3f} s, where it was lost"
         return ""

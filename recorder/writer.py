@@ -1,4 +1,4 @@
-"""Writes one recording: an MCAP file that survives a kill, holds its own calibration and opens in foreign readers."""
+"""Writer of a recording: an MCAP file that survives a kill, includes its calibration and opens in generic viewers."""
 
 from __future__ import annotations
 
@@ -20,39 +20,39 @@ from recorder.files.unfinished_file import Draft
 from rig.base.errors import DiskError, InputError
 from rig.base.wire import EDGES, EVENTS, Gap, encode_document
 
-_SET_BACK_NS = 60 * NS
-"""Step back of the wall clock after which clock pairs begin anew; smaller ones are of streams that came in turn."""
+_CLOCK_STEP_TOLERANCE_NS = 60 * NS
+"""Backward step of the wall clock that restarts the clock pairs [ns]; smaller steps occur between streams."""
 
 
 class RecordingError(DiskError):
-    """The disk ended the recording; everything written before is kept."""
+    """Recording ended by a disk error; all data written before are kept."""
 
 
 def check_view_rate(view_rate_hz: float) -> None:
-    """Refuse a viewing rate [Hz] that means nothing.
+    """Refuse an invalid rate of plot messages [Hz].
 
     Raises:
-        InputError: It is negative, infinite or no number.
+        InputError: The rate is negative, nan or above 1e6.
     """
     if not 0.0 <= view_rate_hz <= 1e6:
         raise InputError("view_rate_hz", "between 0 (none) and 1e6", view_rate_hz)
 
 
 class RecordingWriter:
-    """Writes payloads as they came, the view messages derived from them, gaps and clock pairs.
+    """Writer of payloads as received, with derived plot messages, gaps and clock pairs.
 
-    `log_time` of every message is simulated time [ns], so that plots align with the physics and two recordings with
-    each other; `publish_time` is the wall time of arrival [unix ns]. Each message is thus a clock pair;
-    `recorder/clock` repeats two a second as JSON.
+    `log_time` of every message is simulated time [ns], so that plots align with the physics and recordings with each
+    other; `publish_time` is the wall time of arrival [unix ns]. Each message is thus a clock pair; `recorder/clock`
+    repeats two per second as JSON.
 
-    The file is FILE.mcap.part until `finish`, and is flushed to the disk so often that a kill loses less than 0.5 s.
+    The file is FILE.mcap.part until `finish`. It is flushed often enough that a kill loses less than 0.5 s.
 
     Attributes:
-        path: The file's name in the end.
-        closed: Nothing more can be written: finished, or ended by the disk.
-        tally: What came.
-        head: What the rig says of itself.
-        file: What it takes of the disk.
+        path: Final name of the file.
+        closed: Whether the file was finished, or ended by a disk error.
+        tally: Counts of the written data.
+        head: Documents of the rig.
+        file: MCAP file.
     """
 
     def __init__(
@@ -72,20 +72,20 @@ class RecordingWriter:
         """Create the file and write calibration, parameters and scene to it.
 
         Args:
-            path: File name, ends in .mcap.
-            catalogue: The rig's catalogue document: channel table, truth tables, tick rate.
-            parameters: The rig's parameter document.
-            scene: The rig's scene document.
-            view_rate_hz: Rate of the plottable messages [Hz of simulated time]; 0 writes none.
-            beginning: How it begins, where that is not the whole recording from now on.
+            path: File name, ending in .mcap.
+            catalogue: Catalogue document of the rig: channel table, truth tables, tick rate.
+            parameters: Parameter document of the rig.
+            scene: Scene document of the rig.
+            view_rate_hz: Rate of the plot messages [Hz of simulated time]; 0 for none.
+            beginning: Start of a file that continues or derives from another one.
             force: Replace an existing file.
             sync_every_s: Longest time between two flushes to the disk while messages arrive [s].
             wall_ns: Wall clock [unix ns].
-            monotonic_s: Clock that times the flushes [s].
+            monotonic_s: Clock for the flush interval [s].
 
         Raises:
             InputError: The destination, the view rate or the catalogue cannot be used.
-            RecordingError: The disk refused; there is no file.
+            RecordingError: The disk reports an error; no file remains.
         """
         check_view_rate(view_rate_hz)
         self.head, beginning = Head(catalogue, parameters, scene), beginning or Beginning()
@@ -112,32 +112,32 @@ class RecordingWriter:
 
     @property
     def part(self) -> Path:
-        """Name of the file while it is written."""
+        """Name of the file while it is being written."""
         return self._draft.part
 
     def counts(self) -> Counts:
-        """What was written so far; from any thread."""
+        """Return the totals up to now. Safe to call from any thread."""
         return self.tally.counts(size_bytes=self.file.size_bytes, safe_time_ns=self._safe_time_ns)
 
     def write(self, key: str, data: bytes, wall_ns: int) -> None:
-        """Read what came on a key at a wall time [unix ns], and take it."""
+        """Decode data received on a key at a wall time [unix ns], and write them."""
         self.take(Payload.read(key, data, wall_ns))
 
     def take(self, payload: Payload) -> None:
-        """Write one payload, byte for byte, and what derives from it.
+        """Write a payload unchanged, with the data derived from it.
 
         Raises:
-            RecordingError: The disk refused; the file is closed and what stood in it is kept.
+            RecordingError: The disk reports an error; the file is closed and its contents are kept.
         """
         with self._guard():
             self._topics.add(payload)
         self.sync_if_due()
 
     def write_missed(self, key: str, messages: int, wall_ns: int) -> None:
-        """Record that the transport lost messages for good.
+        """Record messages that the transport dropped.
 
-        Lost rows of block streams show as a step of the row number as well, and are counted there; this is the only
-        trace of lost documents and of blocks that were the last of their stream.
+        Lost rows of a block stream also appear as a step of its row numbers and are counted there. For lost documents,
+        and for lost blocks at the end of a stream, this record is the only trace.
 
         Args:
             key: Key of the stream.
@@ -149,7 +149,7 @@ class RecordingWriter:
             self._topics.add_missed(key, messages, wall_ns)
 
     def note_short(self, rows: dict[str, int], wall_ns: int) -> None:
-        """Record as gaps what is missing at the end of streams.
+        """Record the rows missing at the end of streams as gaps.
 
         Args:
             rows: Number of the row after the last one published, by key.
@@ -160,12 +160,12 @@ class RecordingWriter:
                 self._topics.add_gap(gap, self.tally.last_time_ns, wall_ns)
 
     def sync_if_due(self) -> None:
-        """Flush to the disk if the last flush was long enough ago."""
+        """Flush to the disk if the flush interval has passed."""
         if self._monotonic_s() - self._synced_s >= self._sync_every_s:
             self.sync()
 
     def sync(self) -> None:
-        """Flush to the disk now."""
+        """Flush to the disk."""
         with self._guard():
             self._topics.settle()
             self.file.sync()
@@ -173,20 +173,20 @@ class RecordingWriter:
             self._synced_s = self._monotonic_s()
 
     def abandon(self) -> None:
-        """Close without finishing and remove what was written; a file that was to be replaced stays."""
+        """Close and remove an unfinished file; a file that it would have replaced stays."""
         if not self.closed:
             self.closed = True
             self._draft.discard()
 
     def finish(self, reason: str, *, notes: dict[str, str] | None = None) -> None:
-        """Write the closing counts, close the file and give it its final name; does nothing where it is closed.
+        """Write the final counts, close the file and give it its final name; no effect on a closed file.
 
         Args:
-            reason: Why the recording ended.
-            notes: More entries for the closing metadata.
+            reason: Reason for the end of the recording.
+            notes: Additional entries for the `end` metadata.
 
         Raises:
-            RecordingError: The disk refused; the .part file is kept.
+            RecordingError: The disk reports an error; the .part file is kept.
         """
         if self.closed:
             return
@@ -199,7 +199,7 @@ class RecordingWriter:
 
     @contextlib.contextmanager
     def _guard(self) -> Iterator[None]:
-        """Turn a refusal of the disk into one clear error, with the file closed behind it."""
+        """Close the file on a disk error and raise one RecordingError."""
         if self.closed:
             raise RecordingError(f"recording {self.path} is closed")
         try:
@@ -207,18 +207,18 @@ class RecordingWriter:
         except OSError as error:
             self.closed = True
             self._draft.close()
-            kept = f"what was written before is kept in {self.part}; `rig recover` makes a finished file of it"
+            kept = f"the earlier data are kept in {self.part}; `rig recover` finishes the file"
             if not self._begun:
-                # Without its calibration it is of no use to anybody.
+                # A file without its calibration is useless.
                 self._draft.discard()
-                kept = f"{self.part} could not be begun"
+                kept = f"{self.part} could not be started"
             elif not self.part.exists():
-                kept = f"nothing is left at {self.part}"
+                kept = f"no file is left at {self.part}"
             raise RecordingError(f"recording stopped by the disk: {error.strerror or error}; {kept}") from error
 
 
 class _Topics:
-    """The topics of an open file, and which messages go to which."""
+    """Topics of an open file, and the assignment of messages to them."""
 
     def __init__(
         self, file: McapFile, head: Head, tally: Tally, *, view_rate_hz: float, wall_ns: Callable[[], int]
@@ -232,7 +232,7 @@ class _Topics:
         self._clock_ns = 0
 
     def begin(self, beginning: Beginning) -> None:
-        """Write what stands before the first message."""
+        """Write everything before the first message."""
         now = self._wall_ns()
         metadata = self._head.metadata(beginning.metadata, view_rate_hz=self._view_rate_hz, wall_ns=now)
         for name in dict.fromkeys(["rig", *metadata]):
@@ -250,8 +250,8 @@ class _Topics:
             self._file.register(schemas.VIEW_EVENTS, schemas.LOG, {"source": EVENTS})
 
     def add(self, payload: Payload) -> None:
-        """Write a payload as it came, and what derives from it; a malformed one is left to the reader to judge."""
-        start_ns, _ = self._tally.extent_ns(self._tally.true(payload))
+        """Write a payload unchanged, with the data derived from it; a malformed payload has none."""
+        start_ns, _ = self._tally.extent_ns(self._tally.restore(payload))
         self._register(payload.key)
         if (gap := self._tally.take(payload)) is not None:
             self.add_gap(gap, start_ns, payload.wall_ns)
@@ -259,32 +259,32 @@ class _Topics:
         group = self._head.group(payload.key)
         if payload.block is not None and group is not None:
             self._add_clock(payload, start_ns)
-            if (shown := self._views.add(group, payload.block, start_ns)) is not None:
-                self._add_view(*shown, payload.wall_ns)
+            if (plotted := self._views.add(group, payload.block, start_ns)) is not None:
+                self._add_view(*plotted, payload.wall_ns)
         elif payload.document is not None and payload.key == EVENTS and self._view_rate_hz:
             level, text = schemas.event_text(payload.document)
             line = schemas.encode_log(start_ns, level, payload.key, text)
             self._file.add(schemas.VIEW_EVENTS, line, time_ns=start_ns, wall_ns=payload.wall_ns)
 
     def add_gap(self, gap: Gap, time_ns: int, wall_ns: int) -> None:
-        """Write that rows never arrived, before a simulated time [ns]."""
+        """Write the gap of rows missing before a simulated time [ns]."""
         about = {"kind": "rows", "key": gap.key, "index": gap.index, "size": gap.size}
         self._add_document(schemas.GAPS, about, time_ns, wall_ns)
 
     def add_missed(self, key: str, messages: int, wall_ns: int) -> None:
-        """Write that messages never arrived."""
+        """Write the gap of messages dropped by the transport."""
         about = {"kind": "messages", "key": key, "index": -1, "size": messages}
         self._add_document(schemas.GAPS, about, self._tally.last_time_ns, wall_ns)
 
     def settle(self) -> None:
-        """Write the plottable messages that are complete."""
+        """Write the completed plot messages."""
         for view in self._views.all:
-            self._add_view(view, view.settled(), self._wall_ns())
+            self._add_view(view, view.take_complete(), self._wall_ns())
 
     def end(self, reason: str, notes: dict[str, str]) -> None:
-        """Write the last plottable messages and the closing counts."""
+        """Write the last plot messages and the final counts."""
         for view in self._views.all:
-            self._add_view(view, view.rest(), self._wall_ns())
+            self._add_view(view, view.take_all(), self._wall_ns())
         counts = self._tally.counts(size_bytes=0)
         about = {
             "reason": reason,
@@ -301,14 +301,14 @@ class _Topics:
         self._file.mcap.add_metadata("end", {**about, **notes})
 
     def _register(self, key: str) -> None:
-        """Register the topic of a key, with its calibration, when it is first met."""
+        """Register the topic of a key, with its calibration, at its first payload."""
         if key not in self._file:
             self._file.register(key, definition_of(key), self._head.about(key))
 
     def _add_clock(self, payload: Payload, time_ns: int) -> None:
-        """Write a pair of simulated and wall time, twice a second."""
+        """Write a pair of simulated and wall time, twice per second."""
         since_ns = payload.wall_ns - self._clock_ns
-        if since_ns >= NS // 2 or since_ns < -_SET_BACK_NS:
+        if since_ns >= NS // 2 or since_ns < -_CLOCK_STEP_TOLERANCE_NS:
             self._clock_ns = payload.wall_ns
             self._add_document(schemas.CLOCK, {"tick": payload.tick}, time_ns, payload.wall_ns)
 

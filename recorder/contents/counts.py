@@ -1,4 +1,4 @@
-"""What has come of the streams, and what has not: the numbers that stand at the end of a recording."""
+"""Counts of received, lost and malformed data, as written at the end of a recording."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ NS = 1_000_000_000
 
 @dataclass(frozen=True)
 class Counts:
-    """What was written, to one file or to several in turn.
+    """Totals of one file, or the sum over several files.
 
     Attributes:
-        first_time_ns: Simulated time of the first row [ns]; None before it.
+        first_time_ns: Simulated time of the first row [ns]; None before the first row.
         last_time_ns: Simulated time of the last row [ns].
         rows: Rows received by key.
         lost: Rows lost by key.
-        declared: Of these, those that a fault has taken, as the rig told; by key.
-        gaps: Number of gaps that they are in.
-        missed: Messages that the transport gave up, by key.
-        malformed: Payloads that were not what their key promises.
-        size_bytes: Bytes on the disk.
-        safe_time_ns: Simulated time up to which all is on the disk [ns].
+        declared: Rows among the lost that the rig reported as removed by a fault, by key.
+        gaps: Number of gaps.
+        missed: Messages that the transport dropped, by key.
+        malformed: Number of payloads that do not fit the format of their key.
+        size_bytes: Size on the disk [bytes].
+        safe_time_ns: Simulated time up to which all data are on the disk [ns].
     """
 
     first_time_ns: int | None = None
@@ -41,7 +41,7 @@ class Counts:
 
     @property
     def really_lost(self) -> int:
-        """Rows that were sent, and have not come."""
+        """Number of rows lost without a fault that explains the loss."""
         return sum(max(0, lost - self.declared.get(key, 0)) for key, lost in self.lost.items())
 
     @property
@@ -70,19 +70,19 @@ def _sum(first: dict[str, int], second: dict[str, int]) -> dict[str, int]:
 
 
 class Tally:
-    """Counts payloads as they come, and follows the row numbers and the time.
+    """Counter of arriving payloads, row numbers and times.
 
     Attributes:
         gaps, missed, malformed, first_time_ns, last_time_ns: As in `Counts`.
     """
 
     def __init__(self, tick_rate_hz: int, *, due: dict[str, int] | None = None, from_start: bool = False) -> None:
-        """Begin to count.
+        """Start counting.
 
         Args:
-            tick_rate_hz: Ticks per simulated second.
-            due: Number of the row that is to come first, by key.
-            from_start: It is row 0 for every other stream; else whatever comes first.
+            tick_rate_hz: Ticks per simulated second [Hz].
+            due: Number of the first expected row by key, where a file continues another one.
+            from_start: Expect row 0 first in every other stream; otherwise start with the first row that arrives.
         """
         self.gaps = self.malformed = self.last_time_ns = 0
         self.missed: dict[str, int] = {}
@@ -95,17 +95,17 @@ class Tally:
 
     @property
     def next(self) -> dict[str, int]:
-        """Number of the row that is due next, by key."""
+        """Number of the next expected row by key."""
         return self._continuity.next
 
     def time_ns(self, tick: int) -> int:
-        """Simulated time of a tick as a message can have it: of one that no clock has, the last one there is [ns]."""
+        """Return the simulated time of a tick, clamped to the range of a message time [ns]."""
         return max(0, min(tick * NS // self._tick_rate_hz, 1 << 62))
 
     def extent_ns(self, payload: Payload) -> tuple[int, int]:
-        """Simulated times of the first and the last row of a block [ns]; of a document both are its time.
+        """Return the simulated times of the first and the last row of a block [ns].
 
-        A document without one has that of the latest row.
+        A document counts as one instant: its tick, or the time of the latest row if it has none.
         """
         tick, block = payload.tick, payload.block
         start_ns = self.last_time_ns if tick is None else self.time_ns(tick)
@@ -113,20 +113,20 @@ class Tally:
             return start_ns, start_ns
         return start_ns, start_ns + round((len(block.values) - 1) * NS / block.rate_hz)
 
-    def true(self, payload: Payload) -> Payload:
-        """A block that has not been taken, with its own number and tick where a fault gave it others."""
+    def restore(self, payload: Payload) -> Payload:
+        """Return a payload, its block with the row number and tick that it had before a fault changed them."""
         block = payload.block
         return payload if block is None else replace(payload, block=self._continuity.true(payload.key, block))
 
     def take(self, payload: Payload) -> Gap | None:
-        """Count a payload; give the step of the row numbers before it, if there is one."""
+        """Count a payload and return the step of the row numbers before it, if any."""
         self.malformed += payload.malformed
         block, key = payload.block, payload.key
         if block is None:
             if key == FAULTS and payload.document is not None:
                 self._continuity.declare(payload.document)
             return None
-        start_ns, end_ns = self.extent_ns(self.true(payload))
+        start_ns, end_ns = self.extent_ns(self.restore(payload))
         if self._from_start and key not in self.next:
             self._continuity.follow(key, 0, 0)
         gap = self._continuity.take(key, block)
@@ -137,30 +137,30 @@ class Tally:
         return gap
 
     def miss(self, key: str, messages: int) -> None:
-        """Count messages that the transport gave up."""
+        """Count messages that the transport dropped."""
         self.missed[key] = self.missed.get(key, 0) + messages
 
     def short_of(self, rows: dict[str, int]) -> dict[str, int]:
-        """Streams that have not come to the end of what was published.
+        """Return the streams that received fewer rows than the rig published.
 
         Args:
-            rows: Number of the row after the last one published, by key.
+            rows: Number of the row after the last published one, by key.
 
         Returns:
-            The same for the streams that were met and are short of it.
+            The entries of `rows` for the incomplete streams.
         """
         due = dict(self.next)
         return {key: end for key, end in rows.items() if due.get(key, end) < end}
 
     def end(self, rows: dict[str, int]) -> list[Gap]:
-        """Count what is missing at the end of streams as gaps, and give them; see `short_of`."""
+        """Count the rows missing at the end of each stream as gaps and return the gaps; see `short_of`."""
         found = [self._continuity.follow(key, end, 0) for key, end in self.short_of(rows).items()]
         gaps = [gap for gap in found if gap is not None]
         self.gaps += len(gaps)
         return gaps
 
     def counts(self, *, size_bytes: int, safe_time_ns: int = 0) -> Counts:
-        """What was counted so far; from any thread."""
+        """Return the totals up to now. Safe to call from any thread."""
         return Counts(
             first_time_ns=self.first_time_ns,
             last_time_ns=self.last_time_ns,

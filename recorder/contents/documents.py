@@ -1,4 +1,4 @@
-"""What the documents of a recording must be: checked once, where it is opened, and believed behind that."""
+"""Models of the documents in a recording. Documents are validated once, when the file is opened."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from rig.base.errors import InputError
 from rig.base.wire import EVENTS, FAULTS, STATUS, schema_of
 from rig.channels.table import ChannelTable
 
-_MOST_KEPT = 64 << 20
-"""Documents of one kind that are kept in memory [bytes]."""
+_MAX_KEPT_BYTES = 64 << 20
+"""Size limit of the documents of one kind that are held in memory [bytes]."""
 _Finite = Annotated[float, Field(allow_inf_nan=False)]
 _Rate = Annotated[float, Field(gt=0.0, le=1e12, allow_inf_nan=False)]
 
 
 class _Document(BaseModel):
-    """A document that a rig of any version made: what this one reads of it has its types, the rest is kept."""
+    """JSON document of any rig version: fields used here are type-checked, all others are kept."""
 
     model_config = ConfigDict(strict=True, frozen=True, allow_inf_nan=False)
 
 
 class _Text(BaseModel):
-    """Metadata: numbers stand in them as text."""
+    """Metadata record, in which numbers are stored as text."""
 
     model_config = ConfigDict(frozen=True, allow_inf_nan=False)
 
@@ -38,7 +38,7 @@ def _instant(text: str) -> str:
 
 
 class TruthColumn(_Document):
-    """A column of a truth table."""
+    """Column of a truth table."""
 
     name: str
     unit: str
@@ -46,14 +46,14 @@ class TruthColumn(_Document):
 
 
 class TruthTable(_Document):
-    """A truth table."""
+    """Truth table."""
 
     rate_hz: _Rate
     columns: Annotated[tuple[TruthColumn, ...], Field(min_length=1)]
 
 
 class Catalogue(_Document):
-    """The catalogue: what the rig measures, and how counts become values."""
+    """Catalogue document: channels, truth tables and the conversion from counts to values."""
 
     tick_rate_hz: Annotated[float, Field(ge=1.0, le=1e12)]
     table: ChannelTable
@@ -67,14 +67,14 @@ class _Value(_Document):
 
 
 class Parameters(_Document):
-    """The parameters that the rig ran with."""
+    """Parameter document of the run."""
 
     set: str = ""
     values: dict[str, _Value]
 
 
 class Taken(_Document):
-    """A command that the rig took."""
+    """Command accepted by the rig."""
 
     id: Count
     tick: Count
@@ -103,7 +103,7 @@ class _Sensors(_Document):
 
 
 class _Fields(_Document):
-    """Of a scene's fields those that are read before the scene itself is checked."""
+    """Scene fields that are read before the scene itself is validated."""
 
     name: str = ""
     seed: int | None = None
@@ -126,7 +126,7 @@ class _Import(_Document):
 
 
 class Scene(_Document):
-    """What was run."""
+    """Scene document: what was run."""
 
     name: str = ""
     seed: int | str = ""
@@ -136,7 +136,7 @@ class Scene(_Document):
 
 
 class Event(_Document):
-    """What happened, as the rig or the recorder tells it."""
+    """Event of the rig or of the recorder."""
 
     event: str
     tick: int | None = None
@@ -148,14 +148,14 @@ class Event(_Document):
 
 
 class Command(Taken):
-    """The event of a command that was taken."""
+    """Event of an accepted command."""
 
     event: Literal["command"]
     time_s: _Finite | None = None
 
 
 class Faults(_Document):
-    """What the rig tells of its faults: one that begins or ends, or what has become of blocks."""
+    """Fault document: a fault begins or ends, or reports what it did to blocks."""
 
     event: str
     tick: int | None = None
@@ -173,7 +173,7 @@ class _Lateness(_Document):
 
 
 class Status(_Document):
-    """What the rig said of itself."""
+    """Status document of the rig."""
 
     scene: str | None = None
     engine: _Engine = _Engine()
@@ -183,7 +183,7 @@ class Status(_Document):
 
 
 class Gap(_Document):
-    """What never arrived."""
+    """Gap document: rows or messages that never arrived."""
 
     key: str
     index: Annotated[int, Field(ge=-1, lt=2**62)]
@@ -198,7 +198,7 @@ class ClockPair(_Document):
 
 
 class Rig(_Text):
-    """Metadata `rig`, which opens a file."""
+    """Metadata record `rig` at the start of a file."""
 
     format: Literal["rig-recording"]
     created: Annotated[str, AfterValidator(_instant)]
@@ -209,14 +209,14 @@ class Rig(_Text):
 
 
 def _rows(text: str) -> str:
-    """Rows by key, as JSON."""
+    """Return JSON text of row counts by key; raise ValueError if it is anything else."""
     if not all(type(rows) is int and rows >= 0 for rows in read_json(text.encode(), field="rows").values()):
         raise ValueError("numbers of rows by key")
     return text
 
 
 class End(_Text):
-    """Metadata `end`, which closes it."""
+    """Metadata record `end` that closes a file."""
 
     reason: str = "unknown"
     rows: Annotated[str, AfterValidator(_rows)] = "{}"
@@ -225,7 +225,7 @@ class End(_Text):
 
 
 class SeriesPart(_Text):
-    """Metadata `series`: one of several files in a row."""
+    """Metadata record `series` of one file in a series."""
 
     id: str
     number: Count
@@ -238,7 +238,7 @@ KINDS: dict[str, type[BaseModel]] = {
     schemas.GAPS: Gap,
     schemas.CLOCK: ClockPair,
 }
-"""What is read of the documents of a recording, by topic."""
+"""Document models by topic."""
 METADATA: dict[str, type[BaseModel]] = {"rig": Rig, "end": End, "series": SeriesPart}
 ATTACHED: dict[str, type[BaseModel]] = {"catalogue": Catalogue, "parameters": Parameters, "scene": Scene}
 
@@ -258,10 +258,10 @@ Model = TypeVar("Model", bound=BaseModel)
 
 
 def read(model: type[Model], payload: bytes, *, field: str) -> tuple[dict[str, Any], Model]:
-    """A document as it stands, and as its model.
+    """Return a document both as parsed JSON and as its model.
 
     Raises:
-        InputError: It is none, or out of bounds; the message names the first field that is wrong.
+        InputError: The payload is not a valid document; the message names the first wrong field.
     """
     document = read_json(payload, field=field)
     try:
@@ -271,7 +271,7 @@ def read(model: type[Model], payload: bytes, *, field: str) -> tuple[dict[str, A
 
 
 def document_in(topic: str, payload: bytes) -> dict[str, Any] | None:
-    """The document in a message of one of the topics `KINDS`; None where it is not what the topic promises."""
+    """Return the document in a message of one of the topics in `KINDS`; None if it is invalid."""
     try:
         document, found = read(KINDS[topic], payload, field=topic)
         if isinstance(found, Event) and found.event == "command":
@@ -282,21 +282,21 @@ def document_in(topic: str, payload: bytes) -> dict[str, Any] | None:
 
 
 def check_kept(kept_bytes: int, topic: str, path: Path) -> int:
-    """Refuse a recording with more documents of one kind than memory is to hold; gives their size [bytes].
+    """Return the size of the documents of one kind, or refuse a recording that exceeds the memory limit [bytes].
 
     Raises:
-        InputError: It has.
+        InputError: The size exceeds the limit.
     """
-    if kept_bytes > _MOST_KEPT:
-        raise InputError("file", f"a recording with at most {_MOST_KEPT} bytes of {topic}", str(path))
+    if kept_bytes > _MAX_KEPT_BYTES:
+        raise InputError("file", f"a recording with at most {_MAX_KEPT_BYTES} bytes of {topic}", str(path))
     return kept_bytes
 
 
 def read_metadata(model: type[Model], entries: dict[str, str], *, field: str) -> Model:
-    """Metadata as its model.
+    """Return a metadata record as its model.
 
     Raises:
-        InputError: The first field that is wrong.
+        InputError: The record is invalid; the message names the first wrong field.
     """
     try:
         return model.model_validate(entries)
@@ -305,10 +305,10 @@ def read_metadata(model: type[Model], entries: dict[str, str], *, field: str) ->
 
 
 def check_version(about: dict[str, str]) -> None:
-    """Refuse a version of the format that is not read.
+    """Refuse a format version that cannot be read.
 
     Raises:
-        InputError: It is another one.
+        InputError: The version is not one of `schemas.READ_VERSIONS`.
     """
     if about.get("version") not in schemas.READ_VERSIONS:
         must = f"a recording of format version {' or '.join(schemas.READ_VERSIONS)}"

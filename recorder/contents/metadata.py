@@ -1,4 +1,4 @@
-"""What a recording says before its first message: metadata, attachments, and the calibration of its topics."""
+"""Metadata, attachments and topic calibration written before the first message of a recording."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from rig.base.errors import InputError, Words
 from rig.base.wire import EDGES, SENSORS, TRUTH, sensor_key, truth_key
 from rig.channels.table import ChannelTable, Group
 
-_MOST_COMMANDS = 10_000
-"""Latest commands that a file names as sent before it."""
+_MAX_COMMANDS = 10_000
+"""Largest number of earlier commands that a file repeats; the latest are kept."""
 
 
 @dataclass(frozen=True)
 class Beginning:
-    """How a file begins that is not all that is recorded, or was made of others.
+    """Additional content at the start of a file that continues or derives from another one.
 
     Attributes:
-        from_start: Every stream is meant to be recorded from its row 0: what is missing there is a gap, too.
-        due: Number of the row that is to come first, by key, where this file goes on from another one.
-        metadata: More metadata records for the start of the file, by name; entries under `rig` replace its own.
-        attachments: More attachments, by name.
+        from_start: Whether every stream must begin with row 0, so that rows missing at the start count as a gap.
+        due: Number of the first expected row by key, where the file continues another one.
+        metadata: Additional metadata records by name; entries under `rig` replace the default ones.
+        attachments: Additional attachments by name.
     """
 
     from_start: bool = False
@@ -38,42 +38,42 @@ class Beginning:
 
 
 class Commands:
-    """The scene document, kept up to date: whoever has only a later file needs the commands that came before it."""
+    """Scene document with the commands accepted so far, so that a later file of a series is self-contained."""
 
     def __init__(self, scene: dict[str, Any]) -> None:
         self._scene = scene
         self._taken = {entry.get("id"): entry for entry in scene.get("taken", [])}
 
     def follow(self, event: dict[str, Any] | None) -> None:
-        """Take an event of the stream."""
+        """Add a command event to the scene; ignore all others."""
         if event is not None and event.get("event") == "command":
-            if len(self._taken) >= _MOST_COMMANDS:
+            if len(self._taken) >= _MAX_COMMANDS:
                 self._taken.pop(next(iter(self._taken)))
             fields = ("id", "tick", "command", "request")
             self._taken.setdefault(event.get("id"), {name: event.get(name) for name in fields})
 
     @property
     def scene(self) -> dict[str, Any]:
-        """The scene document with all commands so far."""
+        """Scene document with all commands so far."""
         if not self._taken and "taken" not in self._scene:
             return self._scene
         return {**self._scene, "taken": list(self._taken.values())}
 
 
 class Head:
-    """The rig's own documents, and what of them stands where in a file.
+    """Catalogue, parameter and scene documents, and the metadata and attachments derived from them.
 
     Attributes:
-        table: The channel table of the catalogue.
-        tick_rate_hz: Ticks per simulated second.
-        streams: Keys of the streams that the catalogue promises.
+        table: Channel table of the catalogue.
+        tick_rate_hz: Ticks per simulated second [Hz].
+        streams: Keys of the streams in the catalogue.
     """
 
     def __init__(self, catalogue: dict[str, Any], parameters: dict[str, Any], scene: dict[str, Any]) -> None:
-        """Take the catalogue, parameter and scene documents.
+        """Read the three documents.
 
         Raises:
-            InputError: The catalogue has no channel table, or no tick rate.
+            InputError: The catalogue has no valid channel table or tick rate.
         """
         self._catalogue, self._parameters, self._scene = catalogue, parameters, scene
         try:
@@ -87,13 +87,19 @@ class Head:
         self.streams = [*map(sensor_key, self.table.groups), *map(truth_key, self._truth)]
 
     def group(self, key: str) -> Group | None:
-        """The sensor group of a key."""
+        """Return the sensor channel group of a key; None for any other key."""
         return self.table.groups.get(key.removeprefix(SENSORS + "/")) if key.startswith(SENSORS + "/") else None
 
     def metadata(
         self, more: dict[str, dict[str, str]], *, view_rate_hz: float, wall_ns: int
     ) -> dict[str, dict[str, str]]:
-        """The metadata that open a file: `rig`, then what else there is of them."""
+        """Return the metadata records at the start of a file.
+
+        Args:
+            more: Additional records by name; entries under `rig` replace the default ones.
+            view_rate_hz: Rate of the plot messages [Hz].
+            wall_ns: Creation time [unix ns].
+        """
         about = {
             "format": schemas.FORMAT,
             "version": schemas.VERSION,
@@ -110,7 +116,7 @@ class Head:
         return {**more, "rig": about}
 
     def attachments(self, metadata: dict[str, dict[str, str]]) -> Iterator[tuple[str, str, bytes]]:
-        """Name, media type and bytes of the attachments; one repeats the metadata."""
+        """Yield name, media type and content of each attachment; one of them repeats the metadata."""
         yield "README.txt", "text/plain", self._readme().encode()
         documents = {
             COPY: metadata,
@@ -122,11 +128,11 @@ class Head:
             yield name, "application/json", json.dumps(document, indent=1, allow_nan=False).encode()
 
     def explained_by(self, text: str) -> bool:
-        """Whether a README.txt is that of these documents; one in the words of another version is not judged."""
+        """Return whether README.txt fits these documents; a text of another version always does."""
         return not text.startswith(_README) or text == self._readme()
 
     def about(self, key: str) -> dict[str, str]:
-        """The metadata of a key's topic: one JSON list a property, in column order."""
+        """Return the metadata of a topic: one JSON list per property, in column order."""
         if key == EDGES:
             return {"names": '["edge"]', "units": '["ticks after `tick`"]'}
         group = self.group(key)
@@ -161,7 +167,7 @@ class Head:
 
 
 def about_view(view: View, rate_hz: float) -> dict[str, str]:
-    """The metadata of a topic of plottable messages."""
+    """Return the metadata of a topic of plot messages."""
     return {
         "sources": json.dumps([sensor_key(group) for group in view.groups]),
         "rate_hz": f"{rate_hz:g}",
@@ -172,12 +178,12 @@ def about_view(view: View, rate_hz: float) -> dict[str, str]:
 
 
 def instant(wall_ns: int) -> str:
-    """A wall time [unix ns] in ISO 8601."""
+    """Return a wall time [unix ns] in ISO 8601."""
     return datetime.fromtimestamp(wall_ns / NS, tz=UTC).isoformat()
 
 
 def _calibration(group: Group) -> dict[str, str]:
-    """Channel metadata: one JSON list a property, in column order."""
+    """Return the channel metadata: one JSON list per property, in column order."""
     channels = group.channels
     lists = {
         "names": [channel.name for channel in channels],

@@ -1,4 +1,4 @@
-"""One file of a recording: finished, or what a kill or a full disk left of it."""
+"""One file of a recording, complete or interrupted."""
 
 from __future__ import annotations
 
@@ -22,60 +22,59 @@ from rig.base.errors import InputError, Words
 from rig.base.wire import EVENTS, FAULTS, Block
 from rig.serve import stream_check
 
-_OURS = "a recording made by `rig record`"
-_REACH_S = 0.25
-"""Longest block that is found where blocks are not in order in the file [s]; a rig's have some milliseconds."""
+_MUST_BE_RECORDING = "a recording made by `rig record`"
+_MAX_BLOCK_S = 0.25
+"""Longest block found in a file whose blocks are out of order [s]; the blocks of a rig last a few milliseconds."""
 Message = tuple[str, int, int, bytes]
 """Topic, simulated time [ns], wall time of arrival [unix ns] and payload of a message."""
 
 
 class RecordingFile:
-    """One file, checked when it is opened; its messages are read from the disk.
+    """Recording file, validated when opened; messages are read from the disk on demand.
 
     Attributes:
         path: The file.
-        complete: The file was finished; False for a .part file or one that was cut off, of which everything up to the
-            last whole message is read.
-        damaged: Records that are not what was written, and are passed over by whoever salvages; else 0.
-        unchecked: What of it no checksum covers.
-        catalogue: The rig's catalogue document.
-        table: The channel table in it.
-        parameters: The rig's parameter document.
-        scene: The rig's scene document.
-        metadata: Metadata records by name: `rig` (start), `end` (closing counts, only if complete).
-        attachments: All attachments by name; catalogue, parameters and scene are among them.
-        about: What the file says of each topic: names, units and scales of its columns.
+        complete: Whether the recorder finished the file. An interrupted file is read up to its last whole message.
+        damaged: Number of damaged records that salvage skips; 0 otherwise.
+        unchecked: Parts of the file without a checksum.
+        catalogue: Catalogue document of the rig.
+        table: Channel table of the catalogue.
+        parameters: Parameter document of the rig.
+        scene: Scene document of the rig.
+        metadata: Metadata records by name: `rig` (start), `end` (final counts, only if complete).
+        attachments: All attachments by name, including catalogue, parameters and scene.
+        about: Metadata of each topic: names, units and scales of its columns.
         messages: Number of messages by topic.
-        chunks: Where its messages are, in file order.
-        stated_rows: Rows by key, as the file itself says at its end.
-        near: Offsets of the chunks that are read; None for all; see `between`.
-        stated_begin_s: Simulated time of the first row, likewise [s].
+        chunks: Chunks with messages, in file order.
+        stated_rows: Rows by key, as stated at the end of the file.
+        read_chunks: Offsets of the chunks to read; None for all; see `between`.
+        stated_begin_s: Simulated time of the first row, as stated at the end of the file [s].
     """
 
     def __init__(self, path: Path, *, salvage: bool = False, in_part: bool = False) -> None:
-        """Look through the records of a file.
+        """Read the structure of a file.
 
         Args:
             path: The file.
-            salvage: Take what can be read of a finished file, too, where it is damaged.
-            in_part: Hold it against its checksums only where it is read; see `between`.
+            salvage: Also read the intact part of a damaged file.
+            in_part: Verify checksums only of the parts that are read; see `between`.
 
         Raises:
-            InputError: The file cannot be read, or is no recording.
+            InputError: The file cannot be read, or is not a recording.
         """
         self.path = path
         with self._open() as file:
             if file.read(len(MAGIC)) != MAGIC:
-                raise InputError("file", _OURS, Words(f"{path}, which is no MCAP file"))
+                raise InputError("file", _MUST_BE_RECORDING, Words(f"{path}, which is no MCAP file"))
             found = read_contents(file, path.stat().st_size, salvage=salvage, in_part=in_part)
             self._take_metadata(found.metadata, found.attachments.get(COPY), salvage=salvage)
         self.complete, self.unchecked = found.complete, found.unchecked
         self.damaged += found.damaged
         self.attachments, self.chunks, self._topics = found.attachments, tuple(found.chunks), found.topics
-        self.near: frozenset[int] | None = None
+        self.read_chunks: frozenset[int] | None = None
         self.about, self.stated_rows, self.stated_begin_s = found.about, dict[str, int](), None
         with contextlib.suppress(InputError):
-            stated = found.metadata.get("end", {}) if found.finished else {}  # one that was cut off lacks what it lacks
+            stated = found.metadata.get("end", {}) if found.finished else {}
             end = documents.read_metadata(documents.End, stated, field="end")
             self.stated_rows, self.stated_begin_s = read_json(end.rows.encode()), end.first_time_s
         self.messages = {self._topics[number]: count for number, count in sorted(found.counts.items())}
@@ -84,7 +83,7 @@ class RecordingFile:
         self._check_documents(salvage=salvage)
 
     def _take_metadata(self, found: dict[str, dict[str, str]], copy: bytes | None, *, salvage: bool) -> None:
-        """Believe the copy that has a checksum, where a file has one."""
+        """Use the checksummed copy of the metadata where the file has one."""
         self.damaged, self.metadata = 0, found
         if copy is None:
             return
@@ -94,17 +93,17 @@ class RecordingFile:
         self.metadata = {**({"end": found["end"]} if "end" in found and not salvage else {}), **stated}
 
     def _check_documents(self, *, salvage: bool) -> None:
-        """Hold metadata and attached documents against what they must be."""
+        """Validate metadata and attached documents."""
         about, name = self.metadata.get("rig", {}), self.path.name
         if about.get("format") != schemas.FORMAT:
-            raise InputError("file", _OURS, str(self.path))
+            raise InputError("file", _MUST_BE_RECORDING, str(self.path))
         documents.check_version(about)
         for kind, model in documents.METADATA.items():
             if kind in self.metadata:
                 documents.read_metadata(model, self.metadata[kind], field=f"{name}: {kind}")
         payloads = [self.attachments.get(f"{kind}.json") for kind in documents.ATTACHED]
         if None in payloads:
-            # Where it is damaged it is not there either.
+            # Salvage drops a damaged attachment.
             must = "a recording with its calibration; this one was cut off in it, or damaged"
             raise InputError("file", must, str(self.path))
         self.catalogue, self.parameters, self.scene = (
@@ -119,16 +118,16 @@ class RecordingFile:
 
     @property
     def end_reason(self) -> str:
-        """Why the recording ended."""
+        """Reason for the end of the recording."""
         if self.complete:
             return self.metadata.get("end", {}).get("reason", "unknown")
         return "cut off: the recorder did not finish the file"
 
     @property
     def span_s(self) -> tuple[float, float] | None:
-        """Simulated times of the first and the last row, without a look at the samples [s]; None if there is none.
+        """Simulated times of the first and the last row, without reading samples [s]; None if there are no rows.
 
-        As the recorder counted them; of a file that it did not finish those of its messages, which is to the block.
+        Exact for a complete file. For an interrupted file they are message times, accurate to one block.
         """
         if self.complete:
             end = self.metadata.get("end", {})
@@ -141,35 +140,35 @@ class RecordingFile:
 
     @cached_property
     def promises(self) -> dict[str, stream_check.Promise]:
-        """What the catalogue promises of each stream, by key."""
+        """Declared streams of the catalogue by key."""
         return self._catalogue.promises()
 
     def between(self, from_s: float, to_s: float) -> Self:
-        """Return the file as a reader of the rows between two times [s] needs it: these rows, and all events and gaps.
+        """Return the file limited to the rows between two times [s], with all events and gaps.
 
-        What lies outside is left out chunk by chunk, by the index. A file with faults of blocks is read as a whole, as
-        their times are known from all of their documents.
+        Chunks outside the interval are skipped by the index. A file with block faults is read completely, because the
+        true times of its blocks depend on all of its fault documents.
         """
         found = copy(self)
         if FAULTS in self.messages:
             return found
-        begin_ns, end_ns = (from_s - _REACH_S) * 1e9, to_s * 1e9
-        near = {each for each in self.chunks if each.end_ns >= begin_ns and each.begin_ns <= end_ns}
-        latest: dict[int, Chunk] = {}  # a long block may reach into the time from further back
-        for chunk in sorted(set(self.chunks) - near, key=lambda each: each.begin_ns):
+        begin_ns, end_ns = (from_s - _MAX_BLOCK_S) * 1e9, to_s * 1e9
+        read_chunks = {each for each in self.chunks if each.end_ns >= begin_ns and each.begin_ns <= end_ns}
+        latest: dict[int, Chunk] = {}  # a long earlier block may reach into the interval
+        for chunk in sorted(set(self.chunks) - read_chunks, key=lambda each: each.begin_ns):
             latest |= dict.fromkeys(chunk.channels or () if chunk.begin_ns < from_s * 1e9 else (), chunk)
-        found.near = frozenset(each.offset for each in near | set(latest.values()))
+        found.read_chunks = frozenset(each.offset for each in read_chunks | set(latest.values()))
         return found
 
     def _topics_in(self, chunk: Chunk, wanted: dict[int, str]) -> dict[int, str]:
-        """Return the wanted topics that are read in a chunk."""
-        if self.near is None or chunk.offset in self.near:
+        """Return the requested topics to read in a chunk."""
+        if self.read_chunks is None or chunk.offset in self.read_chunks:
             return wanted
         outside = (EVENTS, schemas.GAPS, schemas.CLOCK)[: 3 if chunk == self.chunks[0] else 2]
         return {number: topic for number, topic in wanted.items() if topic in outside}
 
     def block(self, key: str, payload: bytes) -> Block | None:
-        """The block in a payload; None where it is none, or does not fit the catalogue."""
+        """Return the block in a payload; None if it is invalid or does not fit the catalogue."""
         try:
             block = block_in(key, payload)
         except ValueError:
@@ -179,14 +178,14 @@ class RecordingFile:
         return block if (columns, block.tick_rate_hz) == (promise.columns, promise.tick_rate_hz) else None
 
     def stamped(self, topics: Container[str] | None, chunks: Iterable[Chunk] | None = None) -> Iterator[Message]:
-        """Yield the messages of some topics, in file order; documents without the ROS 2 string message around them.
+        """Yield the messages of some topics in file order, documents without their ROS 2 string wrapper.
 
         Args:
             topics: The topics; None for all.
-            chunks: Read only these of its chunks.
+            chunks: Chunks to read; None for all.
 
         Raises:
-            InputError: The file has changed, is damaged, or cannot be read any more.
+            InputError: The file has changed, is damaged, or can no longer be read.
         """
         wanted = {number: topic for number, topic in self._topics.items() if topics is None or topic in topics}
         if not wanted:
@@ -204,7 +203,7 @@ class RecordingFile:
 
     @contextlib.contextmanager
     def _open(self) -> Iterator[BinaryIO]:
-        """The open file; whatever a damaged one makes the parsers raise becomes one clear error."""
+        """Open the file and convert every parser error on damaged data to an InputError."""
         try:
             with open_file(self.path) as file:
                 yield file

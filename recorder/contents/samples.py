@@ -1,4 +1,4 @@
-"""Rows of a stream as columns of numbers."""
+"""Conversion of stream blocks to arrays of samples."""
 
 from __future__ import annotations
 
@@ -13,7 +13,15 @@ from rig.base.wire import EDGES, Block
 def samples_of(
     blocks: Iterable[Block], *, name: str, names: tuple[str, ...], units: tuple[str, ...], rate_hz: float
 ) -> Samples:
-    """The rows of blocks, in their order, with values as they stand there; the rate is that of the first block."""
+    """Return the rows of blocks in their order, values unconverted.
+
+    Args:
+        blocks: The blocks.
+        name: Name of the stream.
+        names: Column names.
+        units: Column units.
+        rate_hz: Sampling rate if there are no blocks; otherwise that of the first block [Hz].
+    """
     blocks = list(blocks)
     values = np.empty((sum(len(block.values) for block in blocks), len(names)))
     times_s = np.empty(len(values))
@@ -29,7 +37,7 @@ def samples_of(
 
 
 def row_times_s(key: str, block: Block) -> np.ndarray:
-    """Simulated time of each row of a stream's block [s], shape (rows,): of an edge, where it was."""
+    """Return the simulated time of each row of a block [s], shape (rows,); for edges the time of the edge."""
     if key == EDGES:
         return (block.tick + block.values[:, 0]) / block.tick_rate_hz
     return block.times_s

@@ -1,4 +1,4 @@
-"""What a recording session has come to: while it lasts, and in the end."""
+"""Progress and outcome of a recording session."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ class Progress:
     """State of a session, for display.
 
     Attributes:
-        time_s: Simulated time recorded since its first row [s].
-        rows: Rows of sensor blocks received.
-        lost: Rows of all block streams that never arrived.
-        size_bytes: Size of the file.
+        time_s: Simulated time recorded since the first row [s].
+        rows: Number of sensor rows received.
+        lost: Number of rows lost, over all block streams.
+        size_bytes: Size of the file [bytes].
         waiting: Payloads in the inbox.
-        backlog_bytes: Bytes in the inbox.
-        dropped: Payloads that found the inbox full.
-        files: Finished files.
-        remarks: What the user should know at once, a line each; more come behind these.
+        backlog_bytes: Size of the payloads in the inbox [bytes].
+        dropped: Payloads dropped because the inbox was full.
+        files: Number of finished files.
+        remarks: Messages to the user, one line each; later ones are appended.
     """
 
     time_s: float
@@ -39,26 +39,26 @@ class Summary:
 
     Attributes:
         path: The last file; the .part file if it could not be finished.
-        reason: Why the session ended.
-        error: What went wrong at the disk or in the recorder, or that there was no more room; empty if nothing did.
+        reason: Reason for the end of the session.
+        error: Disk or recorder error, or lack of disk space; empty without one.
         first_time_s: Simulated time of the first row in the files [s].
-        duration_s: Simulated time from the first to the last row; of all captures in sum [s].
-        rows: Rows by key in the files that are on the disk.
-        lost: Rows that were lost, by key, only keys that lost some; of captures also those lost between them.
-        declared: Rows that a fault of the rig has taken, which told so, by key: none of the lost.
-        gaps: Gaps that the files contain.
-        missed: Messages that the transport gave up, by key.
-        dropped: Payloads that found the inbox full; they are among the lost.
-        malformed: Payloads that were not what their key promises; they are in the file as they came.
-        size_bytes: Size of the files.
-        files: All files that are there, in order; among them a .part file that could not be finished.
-        removed: Files that were removed for want of room.
-        high_water_bytes: Most that ever waited in the inbox.
-        received_s: Simulated time from the first to the last row received, kept or not [s].
-        fired: Triggers that came; None where it was not recorded around triggers.
-        remarks: What the user should know, a line each.
-        refused: Blocks that cannot be of the rig, and were left out.
-        ended_early: Up to which time it is recorded, where that is not all that was asked for; empty else.
+        duration_s: Simulated time from the first to the last row [s]; summed over captures.
+        rows: Rows by key in the files on the disk.
+        lost: Lost rows by key, only keys with losses; for captures including rows lost between them.
+        declared: Rows that the rig reported as removed by a fault, by key; not among the lost.
+        gaps: Number of gaps in the files.
+        missed: Messages that the transport dropped, by key.
+        dropped: Payloads dropped because the inbox was full; included in the lost rows.
+        malformed: Payloads that do not fit the format of their key; they are recorded unchanged.
+        size_bytes: Size of the files [bytes].
+        files: All files in order, including a .part file that could not be finished.
+        removed: Number of files removed to free disk space.
+        high_water_bytes: Largest size of the inbox [bytes].
+        received_s: Simulated time from the first to the last row received, recorded or not [s].
+        fired: Number of triggers; None for a session without a trigger.
+        remarks: Messages to the user, one line each.
+        refused: Blocks left out because they cannot come from the rig.
+        ended_early: Time up to which the session was recorded, if it is incomplete; otherwise empty.
     """
 
     path: Path
@@ -85,12 +85,12 @@ class Summary:
 
     @property
     def losses(self) -> tuple[str, ...]:
-        """What is missing, a line each."""
+        """Missing data, one line each."""
         lines = [f"{lost} rows of {key}" for key, lost in self.lost.items()]
-        lines += [f"{missed} messages of {key}, says the transport" for key, missed in self.missed.items()]
+        lines += [f"{missed} messages of {key}, reported by the transport" for key, missed in self.missed.items()]
         return (*lines, self.ended_early) if self.ended_early else tuple(lines)
 
     @property
     def good(self) -> bool:
-        """Whether the run did not fail, and all of it was recorded that was to be."""
+        """Whether the session ended without failure and without losses."""
         return not (self.error or self.losses or self.reason.startswith("failed"))

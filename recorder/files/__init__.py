@@ -1,1 +1,1 @@
-"""MCAP files: records, chunks, and the file while it is being written."""
+"""MCAP files: records, chunks, and files being written."""

@@ -1,4 +1,4 @@
-"""Chunks of an MCAP file: their records, unpacked and held against their checksums."""
+"""Chunks of an MCAP file: decompression, checksums and records."""
 
 from __future__ import annotations
 
@@ -15,35 +15,35 @@ from mcap.opcode import Opcode
 
 from rig.base.errors import InputError, Words
 
-MOST_CHUNK_BYTES = 64 << 20
-"""Largest chunk, unpacked: a writer closes one at 1 MiB, and the message that it closes with may be long."""
+MAX_CHUNK_BYTES = 64 << 20
+"""Largest decompressed chunk [bytes]. The writer closes a chunk at 1 MiB, but its last message may be long."""
 RECORD = struct.Struct("<BQ")
 MESSAGE = struct.Struct("<HIQQ")
 CHUNK = struct.Struct("<QQQII")
-PIECE = 1 << 20
-"""Bytes that are read at a time."""
-LONGEST_NAME = 32
-"""Longest name of a compression that is looked at [bytes]."""
-_CUT_PIECE = 4096
+READ_BYTES = 1 << 20
+"""Read size [bytes]."""
+MAX_NAME_BYTES = 32
+"""Longest accepted name of a compression method [bytes]."""
+_CUT_READ_BYTES = 4096
 
 
 class DamagedError(ValueError):
-    """A record is not what was written: its checksum, or its form, says so."""
+    """Record with a wrong checksum or an invalid structure."""
 
 
 @dataclass(frozen=True)
 class Chunk:
-    """Messages in a row that were packed together; see `Recording.chunks`.
+    """Group of consecutive messages that are compressed together; see `Recording.chunks`.
 
     Attributes:
-        offset: Where its record begins in its file [bytes].
+        offset: Position of its record in the file [bytes].
         length: Length of the record's body [bytes].
-        begin_ns: Least simulated time of its messages [ns].
-        end_ns: Greatest simulated time of its messages [ns].
-        channels: Channels with messages in it, where the file says so.
-        cut: The file ends in it.
-        part: Number of the file that it is in, of `Recording.parts`.
-        bare: No chunk but records one after another in the data section, which begin at `offset`.
+        begin_ns: Earliest simulated time of its messages [ns].
+        end_ns: Latest simulated time of its messages [ns].
+        channels: Channels with messages in the chunk, where the file states them.
+        cut: Whether the file ends within the chunk.
+        part: Index of its file in `Recording.parts`.
+        bare: Whether these are records outside a chunk, in sequence from `offset`.
     """
 
     offset: int
@@ -57,26 +57,26 @@ class Chunk:
 
 
 def stamp(data: bytes, start: int, end: int) -> tuple[int, int, int, int]:
-    """Channel, number, simulated time [ns] and wall time of arrival [unix ns] of a message."""
+    """Return channel, sequence number, simulated time [ns] and arrival time [unix ns] of a message."""
     if end - start < MESSAGE.size:
-        raise DamagedError("a message without a head")
+        raise DamagedError("a message shorter than its header")
     return MESSAGE.unpack_from(data, start)
 
 
 def records(data: bytes, *, cut: bool = False) -> Iterator[tuple[int, int, int]]:
-    """Opcode, start and end of the body of each record.
+    """Yield opcode, start and end of the body of each record.
 
     Args:
-        data: Records behind each other.
-        cut: The last one may be cut off.
+        data: Consecutive records.
+        cut: Whether the last record may be incomplete.
 
     Raises:
-        DamagedError: They do not end with the data.
+        DamagedError: The last record does not end at the end of the data.
     """
     position = 0
     while position + RECORD.size <= len(data):
         opcode, length = RECORD.unpack_from(data, position)
-        if opcode == 0:  # no record: zeros
+        if opcode == 0:  # padding
             break
         start = position + RECORD.size
         position = start + length
@@ -87,7 +87,7 @@ def records(data: bytes, *, cut: bool = False) -> Iterator[tuple[int, int, int]]
 
 
 def messages(data: bytes, *, cut: bool = False) -> Iterator[tuple[int, int, int, bytes]]:
-    """Channel, simulated time [ns], wall time of arrival [unix ns] and payload of each message of a chunk."""
+    """Yield channel, simulated time [ns], arrival time [unix ns] and payload of each message of a chunk."""
     for opcode, start, end in records(data, cut=cut):
         if opcode == Opcode.MESSAGE:
             number, _, log_time, publish_time = stamp(data, start, end)
@@ -95,17 +95,17 @@ def messages(data: bytes, *, cut: bool = False) -> Iterator[tuple[int, int, int,
 
 
 def unpack(file: BinaryIO, chunk: Chunk) -> bytes:
-    """Return the records of a chunk, unpacked to the size that it declares and checked against their sum.
+    """Return the decompressed records of a chunk, with size and checksum verified.
 
     Args:
         file: The file.
-        chunk: Where it is; of records outside chunks these themselves.
+        chunk: The chunk; records outside a chunk are returned unchanged.
 
     Raises:
-        DamagedError: It is not what was written, larger than `MOST_CHUNK_BYTES`, or packed by an unknown method.
-        InputError: The library that unpacks it is not installed.
+        DamagedError: The chunk is damaged, larger than `MAX_CHUNK_BYTES`, or uses an unknown compression.
+        InputError: The decompression library is not installed.
     """
-    if chunk.length > MOST_CHUNK_BYTES + PIECE:
+    if chunk.length > MAX_CHUNK_BYTES + READ_BYTES:
         raise DamagedError(f"a chunk of {chunk.length} bytes")
     file.seek(chunk.offset + (0 if chunk.bare else RECORD.size))
     body = file.read(chunk.length)
@@ -114,38 +114,38 @@ def unpack(file: BinaryIO, chunk: Chunk) -> bytes:
     if len(body) < CHUNK.size + 8:
         if chunk.cut:
             return b""
-        raise DamagedError("a chunk without a head")
+        raise DamagedError("a chunk shorter than its header")
     *_, size, checksum, name_length = CHUNK.unpack_from(body)
     name, packed = body[CHUNK.size : CHUNK.size + name_length], body[CHUNK.size + name_length + 8 :]
-    if size > MOST_CHUNK_BYTES or name not in _UNPACKERS:
-        raise DamagedError(f"a chunk of {size} bytes, packed by {name[:LONGEST_NAME]!r}")
+    if size > MAX_CHUNK_BYTES or name not in _UNPACKERS:
+        raise DamagedError(f"a chunk of {size} bytes, compressed by {name[:MAX_NAME_BYTES]!r}")
     if chunk.cut:
         return _UNPACKERS[name](packed, size, True)
     stated = int.from_bytes(body[CHUNK.size + name_length : CHUNK.size + name_length + 8], "little")
     if stated > len(packed):
-        raise DamagedError("a chunk that does not end where it should")
+        raise DamagedError("a chunk shorter than its stated length")
     data = _UNPACKERS[name](packed[:stated], size, False)
-    if len(data) != size or (checksum and zlib.crc32(data) != checksum):  # 0: the writer made none
-        raise DamagedError("a chunk whose checksum does not fit")
+    if len(data) != size or (checksum and zlib.crc32(data) != checksum):  # 0: no checksum
+        raise DamagedError("a chunk with a wrong checksum")
     return data
 
 
 def _unpack_zstd(packed: bytes, size: int, cut: bool) -> bytes:
     if not cut:
         try:
-            # What the packed data say of their size is allocated, so it is asked first.
+            # zstd allocates the size stated in the frame, so check it first.
             if zstandard.frame_content_size(packed) not in (-1, size):
-                raise DamagedError("a chunk of another size than it says")
+                raise DamagedError("a chunk whose size differs from the stated size")
             return zstandard.ZstdDecompressor().decompress(packed, max_output_size=size)
         except zstandard.ZstdError as error:
             raise DamagedError(str(error)) from None
     found, length = [], 0
-    # In small pieces: where it ends in zeros or in nothing, the blocks before that are good.
+    # Small pieces recover all compressed blocks before the point where the file ends.
     with (
         contextlib.suppress(zstandard.ZstdError),
-        zstandard.ZstdDecompressor().stream_reader(BytesIO(packed), read_size=_CUT_PIECE) as reader,
+        zstandard.ZstdDecompressor().stream_reader(BytesIO(packed), read_size=_CUT_READ_BYTES) as reader,
     ):
-        while length < size and (data := reader.read(min(_CUT_PIECE, size - length))):
+        while length < size and (data := reader.read(min(_CUT_READ_BYTES, size - length))):
             found.append(data)
             length += len(data)
     return b"".join(found)
@@ -155,10 +155,10 @@ def _unpack_lz4(packed: bytes, size: int, cut: bool) -> bytes:
     try:
         from lz4.frame import LZ4FrameDecompressor
     except ImportError:
-        must = "packed by zstd or not at all, or read where the library lz4 is (pip install lz4)"
-        raise InputError("file", must, Words("chunks packed by lz4")) from None
+        must = "compressed by zstd or not at all; for lz4, install its library (pip install lz4)"
+        raise InputError("file", must, Words("chunks compressed by lz4")) from None
     decompressor, found, length = LZ4FrameDecompressor(), [], 0
-    step = _CUT_PIECE if cut else max(1, len(packed))
+    step = _CUT_READ_BYTES if cut else max(1, len(packed))
     try:
         for start in range(0, len(packed), step):
             found.append(decompressor.decompress(packed[start : start + step], max_length=size - length + 1))
@@ -176,4 +176,4 @@ _UNPACKERS: dict[bytes, Callable[[bytes, int, bool], bytes]] = {
     b"zstd": _unpack_zstd,
     b"lz4": _unpack_lz4,
 }
-"""Unpacks bytes to a size, by the name of the compression; of a chunk that the file ends in, as far as it goes."""
+"""Decompressors by compression name: (data, size, cut) to bytes; with `cut`, as much as can be decompressed."""

@@ -1,4 +1,4 @@
-"""An MCAP file in the making: topics, messages, metadata and attachments; knows nothing of what they say."""
+"""MCAP file being written: topics, messages, metadata and attachments, independent of their contents."""
 
 from __future__ import annotations
 
@@ -19,56 +19,58 @@ from recorder.files.unfinished_file import Draft
 
 _CHUNK_BYTES = 1 << 20
 _CHUNK_LIST = "_Writer__chunk_indices"
-"""The writer's list of its chunks, which would grow with the file. It is private, and no public way leaves it
-out and still writes the index; the version is bounded for that (mcap<2)."""
+"""Private attribute of the MCAP writer: its chunk list, which would grow with the file.
+
+No public option omits the list and still writes the index. The dependency is limited to mcap<2 for this reason.
+"""
 _CHANNEL = struct.Struct("<H")
 _MESSAGE_BYTES = 47
-"""What a message takes besides its data: its head, and its place in the index of the chunk."""
+"""Overhead of a message: its header and its entry in the chunk's index [bytes]."""
 _END_BYTES = 100_000
-"""What comes to a file when it is finished, its index aside: channels and schemas again, and the last plotted rows."""
+"""Size of the summary without the chunk index [bytes]: repeated channels and schemas, and the last plot messages."""
 
 
 class McapFile:
-    """Writes to a draft, chunk by chunk.
+    """Writer of MCAP records to a draft file, chunk by chunk.
 
     Attributes:
         draft: The file.
-        mcap: Writes metadata and attachments to it.
-        size_bytes: Its size at the last flush.
-        unflushed_bytes: What waits in memory for the next flush, not yet compressed.
+        mcap: MCAP writer, for metadata and attachments.
+        size_bytes: File size at the last flush [bytes].
+        unflushed_bytes: Uncompressed data in memory since the last flush [bytes].
     """
 
     def __init__(self, draft: Draft) -> None:
-        """Begin the file.
+        """Start the file.
 
         Raises:
-            OSError: The disk refused.
+            OSError: The disk reports an error.
         """
         self.draft = draft
         self.size_bytes = self.unflushed_bytes = 0
         self._chunks = self._chunk_bytes = 0
         self._schemas: dict[str, int] = {}
         self._topics: dict[str, tuple[int, Iterator[int], bool]] = {}
-        """Number of the channel of each topic, the numbers of its messages, and whether they are wrapped as text."""
+        """Channel number, sequence counter and whether messages are wrapped as text, by topic."""
         self.mcap = Writer(draft.file, chunk_size=_CHUNK_BYTES, enable_data_crcs=True)
         setattr(self.mcap, _CHUNK_LIST, _ChunkIndexes(draft.file))
         self.mcap.start(profile="ros2", library="rotor-stator-rig recorder")
 
     @property
     def index_bytes(self) -> int:
-        """About what the index at the end of the file will take: it names each chunk, and each topic in it [bytes]."""
+        """Estimated size of the index at the end of the file, which lists each chunk and its topics [bytes]."""
         return (60 + 10 * len(self._topics)) * self._chunks
 
     @property
     def final_bytes(self) -> int:
-        """What the file comes to at most if it is finished now [bytes]."""
+        """Upper bound of the file size if it is finished now [bytes]."""
         return self.size_bytes + self.unflushed_bytes + self.index_bytes + _END_BYTES
 
     def __contains__(self, topic: str) -> bool:
         return topic in self._topics
 
     def register(self, topic: str, definition: Definition, metadata: dict[str, str]) -> None:
-        """Register a topic of messages of some form, with its metadata."""
+        """Register a topic with its message definition and metadata."""
         if definition.name not in self._schemas:
             number = self.mcap.register_schema(definition.name, definition.language, definition.text)
             self._schemas[definition.name] = number
@@ -77,9 +79,9 @@ class McapFile:
         self._topics[topic] = channel, count(), definition == TEXT
 
     def add(self, topic: str, data: bytes, *, time_ns: int, wall_ns: int) -> None:
-        """Write a message of a simulated time [ns], which came at a wall time [unix ns].
+        """Write a message with its simulated time [ns] and arrival time [unix ns].
 
-        On a topic of documents `data` is the text of a ROS 2 string message.
+        On a document topic, `data` is the text of a ROS 2 string message.
         """
         channel, numbers, wrapped = self._topics[topic]
         data = wrap_text(data) if wrapped else data
@@ -91,10 +93,10 @@ class McapFile:
             self._chunk_bytes = 0
 
     def sync(self) -> None:
-        """End the chunk and bring all to the disk.
+        """Close the chunk and flush everything to the disk.
 
         Raises:
-            OSError: The disk refused.
+            OSError: The disk reports an error.
         """
         self.mcap.flush()
         self._chunks += 1
@@ -102,10 +104,10 @@ class McapFile:
         self.unflushed_bytes = self._chunk_bytes = 0
 
     def finish(self) -> None:
-        """Write the index, and give the file its name.
+        """Write the index and rename the file to its final name.
 
         Raises:
-            OSError: The disk refused.
+            OSError: The disk reports an error.
         """
         self.mcap.finish()
         self.size_bytes = self.draft.sync()
@@ -113,13 +115,13 @@ class McapFile:
 
 
 class _ChunkIndexes:
-    """The index of a file's chunks, which it ends with, taken from the disk and not from memory."""
+    """Chunk index of a file, read back from the disk instead of held in memory."""
 
     def __init__(self, file: BinaryIO) -> None:
         self._file = file
 
     def append(self, index: ChunkIndex) -> None:
-        """Keep nothing."""
+        """Discard the entry; the index is read from the file."""
 
     def __iter__(self) -> Iterator[ChunkIndex]:
         self._file.flush()

@@ -1,7 +1,7 @@
-"""Payloads, decoded once, and believed only where a recording can hold what they say.
+"""Decoded payloads, checked for values that a recording can hold.
 
-What comes off a wire or out of a damaged file may be of the right form and still name a time in the far future or a
-rate of zero. Such a payload is malformed like one that does not decode; it must not end a recording.
+Data from a network or a damaged file can be well-formed and still contain a time in the far future or a rate of zero.
+Such a payload counts as malformed, like one that cannot be decoded; it must not end a recording.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ import numpy as np
 from rig.base.wire import EDGES, EVENTS, Block, decode_block, decode_document, schema_of
 from rig.serve.stream_check import Taken, event_in
 
-_MOST = 1 << 53
-"""Ticks up to here are exact in every number that they become: 285 years of microseconds."""
+_MAX_EXACT_TICK = 1 << 53
+"""Largest tick that is exact as int64 and as float64; 285 years at one microsecond per tick."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,9 +26,9 @@ class Payload:
 
     Attributes:
         key: Key of the stream.
-        data: Bytes, as they came.
-        wall_ns: Time of arrival [unix ns].
-        block: Decoded block; None on a key of documents, and where it is malformed.
+        data: Bytes as received.
+        wall_ns: Arrival time [unix ns].
+        block: Decoded block; None on a document key, and for a malformed payload.
     """
 
     key: str
@@ -38,7 +38,7 @@ class Payload:
 
     @classmethod
     def read(cls, key: str, data: bytes, wall_ns: int) -> Self:
-        """Decode a payload; one that is not what its key promises has neither block nor document."""
+        """Decode a payload; a malformed one has neither block nor document."""
         block = None
         with contextlib.suppress(ValueError):
             block = None if schema_of(key) is None else block_in(key, data)
@@ -46,13 +46,13 @@ class Payload:
 
     @classmethod
     def of(cls, taken: Taken) -> Self:
-        """Return the payload of a block that the intake has decoded; an unsound block makes it malformed."""
+        """Return the payload of a block decoded by the intake; an invalid block makes it malformed."""
         block = taken.block if _is_sound(taken.key, taken.block) else None
         return cls(taken.key, taken.payload, taken.wall_ns, block)
 
     @cached_property
     def document(self) -> dict[str, Any] | None:
-        """Document, decoded when it is first asked for; None on a key of blocks, and where it is malformed."""
+        """Document, decoded on first access; None on a block key, and for a malformed payload."""
         if schema_of(self.key) is None:
             with contextlib.suppress(ValueError):
                 return event_in(self.data) if self.key == EVENTS else decode_document(self.data)
@@ -60,28 +60,28 @@ class Payload:
 
     @property
     def malformed(self) -> bool:
-        """Whether it is not what its key promises."""
+        """Whether the payload does not fit the format of its key."""
         return self.block is None and self.document is None
 
     @property
     def tick(self) -> int | None:
-        """The tick that it names; None if it names none."""
+        """Tick in the payload; None if it has none."""
         return tick_in(self.document) if self.block is None else self.block.tick
 
     def event(self, name: str) -> bool:
-        """Whether it is an event of that name."""
+        """Return whether the payload is an event of a name."""
         return self.key == EVENTS and self.document is not None and self.document.get("event") == name
 
 
 def block_in(key: str, payload: bytes) -> Block:
-    """The block in a payload.
+    """Return the block in a payload.
 
     Args:
-        key: Key of blocks that it came on.
+        key: Block key on which the payload was received.
         payload: Its bytes.
 
     Raises:
-        ValueError: It is not what the key promises.
+        ValueError: The payload does not fit the format of the key.
     """
     block = decode_block(payload, schema_of(key) or "")
     if not _is_sound(key, block):
@@ -90,13 +90,13 @@ def block_in(key: str, payload: bytes) -> Block:
 
 
 def _is_sound(key: str, block: Block) -> bool:
-    """Return whether a block has rows at a rate or, on the key of edges, one column of times that a clock can have."""
+    """Return whether a block has a positive rate or, on the edge key, one column of valid times."""
     if key == EDGES:
-        return block.values.shape[1] == 1 and bool((np.abs(block.values) <= _MOST).all())
+        return block.values.shape[1] == 1 and bool((np.abs(block.values) <= _MAX_EXACT_TICK).all())
     return block.rate_hz > 0.0
 
 
 def tick_in(document: dict[str, Any] | None) -> int | None:
-    """The tick that a document names; None if it names none."""
+    """Return the tick in a document; None if it has none."""
     tick = document.get("tick") if document is not None else None
-    return tick if isinstance(tick, int) and not isinstance(tick, bool) and abs(tick) <= _MOST else None
+    return tick if isinstance(tick, int) and not isinstance(tick, bool) and abs(tick) <= _MAX_EXACT_TICK else None

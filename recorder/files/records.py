@@ -1,4 +1,4 @@
-"""An MCAP file as records, each byte that counts held against a checksum; knows nothing of what they say."""
+"""Records of an MCAP file with checksum verification, independent of their contents."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from mcap.records import Attachment, AttachmentIndex, Channel, Metadata, Metadat
 
 from recorder.files.chunks import (
     CHUNK,
-    LONGEST_NAME,
+    MAX_CHUNK_BYTES,
+    MAX_NAME_BYTES,
     MESSAGE,
-    MOST_CHUNK_BYTES,
-    PIECE,
+    READ_BYTES,
     RECORD,
     Chunk,
     DamagedError,
@@ -31,46 +31,46 @@ from recorder.files.chunks import (
 
 MAGIC = b"\x89MCAP0\r\n"
 COPY = "metadata.json"
-"""Attachment that repeats the metadata at the start of a file: a record of metadata has no checksum of its own."""
-_MOST_ATTACHED = 64 << 20
-"""Attachments of a file, together [bytes]."""
-_MOST_METADATA = 16 << 20
-"""Metadata of a file, together [bytes]."""
-_HEAD_BYTES = 1 << 10
-"""What one of them takes at least, as reading it costs time."""
-_MOST_SUMMARY = 256 << 20
-"""Largest summary: that of some 600 GB [bytes]."""
-_MOST_PACKED = 1000
-"""Chunks unpack to at most so many times the file, and to `MOST_CHUNK_BYTES` of a small one."""
-_LEAST_RECORD = 24
-"""A file of records shorter than this, on the whole, is none of a recorder's [bytes]."""
+"""Attachment that repeats the metadata of the file start, because a metadata record has no checksum of its own."""
+_MAX_ATTACHED_BYTES = 64 << 20
+"""Size limit of all attachments of a file [bytes]."""
+_MAX_METADATA_BYTES = 16 << 20
+"""Size limit of all metadata of a file [bytes]."""
+_MIN_RECORD_COST_BYTES = 1 << 10
+"""Smallest size counted for each attachment or metadata record [bytes]; reading one takes time."""
+_MAX_SUMMARY_BYTES = 256 << 20
+"""Largest accepted summary [bytes]; corresponds to a file of about 600 GB."""
+_MAX_COMPRESSION_RATIO = 1000
+"""Largest accepted compression ratio of a file; a small file may always decompress to `MAX_CHUNK_BYTES`."""
+_MIN_RECORD_BYTES = 24
+"""Smallest plausible mean size of a record [bytes]."""
 _CHUNK_INDEX = struct.Struct("<QQQQI")
-_INDEXED = struct.Struct("<HQ")
-_BARE = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
-"""What may stand in chunks, or outside them."""
+_INDEX_ENTRY = struct.Struct("<HQ")
+_CHUNKABLE_OPCODES = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
+"""Records that may be inside or outside chunks."""
 _LAST_OPCODE = 0x0F
-"""Records of a higher number are of a later version of the format, or private (0x80 on); a reader passes over them."""
-_SURE = 0x8F
-"""In a file without an end a number up to this one may be a known one with a flipped bit, which no checksum covers."""
+"""Last opcode of this format version; higher ones are of later versions or private (from 0x80), and are skipped."""
+_LAST_SUSPECT_OPCODE = 0x8F
+"""Largest opcode that counts as damage in an unfinished file: a valid opcode with its highest bit flipped."""
 _FOOTER = struct.Struct("<BQQQI")
 _DATA_END = struct.Struct("<BQI")
 
 
 @dataclass
 class Contents:
-    """What stands in a file outside its chunks, and where these are.
+    """Contents of a file outside its chunks, and the positions of the chunks.
 
     Attributes:
-        complete: The file was finished, and is taken for it.
-        finished: It has an end, whatever is damaged before that.
-        damaged: Records that are not what was written, and are passed over.
-        unchecked: What no checksum covers.
+        complete: Whether the file was finished and verified as such.
+        finished: Whether the file has a valid end, even if damaged elsewhere.
+        damaged: Number of damaged records that were skipped.
+        unchecked: Descriptions of the data without a checksum.
         metadata: Metadata by name.
         attachments: Attachments by name.
         topics: Topic of each channel.
-        about: What a channel says of its topic, by topic.
+        about: Channel metadata by topic.
         counts: Number of messages by channel.
-        chunks: The chunks with messages, in file order.
+        chunks: Chunks with messages, in file order.
     """
 
     complete: bool = False
@@ -86,113 +86,113 @@ class Contents:
 
 
 def read_contents(file: BinaryIO, size: int, *, salvage: bool, in_part: bool = False) -> Contents:
-    """Look through a file; a finished one is held against its checksums from the first byte to the last.
+    """Read the structure of a file and verify the checksums of a finished one.
 
     Args:
-        file: The file, behind its magic bytes.
+        file: The file, positioned after its magic bytes.
         size: Its length [bytes].
-        salvage: Take it for one that was cut off, whether it is or not.
-        in_part: Only some of its chunks will be read, each by its own checksum: leave out the one of the whole.
+        salvage: Treat the file as unfinished.
+        in_part: Skip the checksum of the whole file; each chunk is verified when it is read.
 
     Raises:
-        DamagedError: A finished file is not what was written.
+        DamagedError: A finished file is damaged.
     """
-    footer = _footer(file, size)
+    footer = _read_footer(file, size)
     if footer is None or salvage:
-        found, _ = _walked(file, size)
+        found, _ = _walk_records(file, size)
         if footer is not None:
             found.finished = True
-            with contextlib.suppress(DamagedError):  # a chunk with channels may be among the damaged ones
-                summary = _summary(file, size, footer).found
+            with contextlib.suppress(DamagedError):  # a damaged chunk may have held channel records
+                summary = _read_summary(file, size, footer).found
                 found.topics, found.about = summary.topics | found.topics, summary.about | found.about
-        return _counted(file, found)
-    summary = _summary(file, size, footer)
-    room = _Room(size)
+        return _count_messages(file, found)
+    summary = _read_summary(file, size, footer)
+    limits = _RecordLimits(size)
     found, data_end = summary.found, summary.start - _DATA_END.size
-    if not summary.indexed or not _take_data(file, summary, data_end, room):
-        found, data_end = _walked(file, size, finished=True)
+    if not summary.indexed or not _check_index(file, summary, data_end, limits):
+        found, data_end = _walk_records(file, size, finished=True)
         if data_end is None or found.damaged:
-            raise DamagedError("records of the data section that are not what was written")
-        _check_against(summary, _counted(file, found))
+            raise DamagedError("damaged records in the data section")
+        _check_against(summary, _count_messages(file, found))
     _check_end(file, found, data_end, in_part=in_part)
     found.complete = found.finished = True
     return found
 
 
 def _check_end(file: BinaryIO, found: Contents, data_end: int, *, in_part: bool) -> None:
-    """Hold the data section against its checksum; where none was written, name what nothing covers."""
+    """Verify the checksum of the data section; if there is none, name the unverified data."""
     file.seek(data_end)
     opcode, length, expected = _DATA_END.unpack(file.read(_DATA_END.size))
     if opcode != Opcode.DATA_END or length < 4:
-        raise DamagedError("no end of the data")
+        raise DamagedError("a data section without an end")
     if expected:
-        if not in_part and _sum(file, data_end) != expected:
-            raise DamagedError("the checksum of the whole does not fit")
+        if not in_part and _checksum(file, data_end) != expected:
+            raise DamagedError("a wrong checksum of the data section")
         found.unchecked = ()
     elif COPY not in found.attachments:
-        found.unchecked = ("its metadata (by an earlier version, without a checksum of the whole)",)
+        found.unchecked = ("its metadata (written by an earlier version, without a checksum of the whole file)",)
     else:
-        found.unchecked += ("what has no checksum of its own (its writer made none of the whole)",)
+        found.unchecked += ("records without a checksum of their own (the file has no checksum of the whole)",)
 
 
 def _check_against(summary: _Summary, found: Contents) -> None:
-    """Hold what was found in the data section against what the summary states of it."""
+    """Compare the contents of the data section with the summary."""
     stated, chunks = summary.found, {chunk.offset for chunk in found.chunks}
     if found.damaged or not set(found.counts) <= set(found.topics):
-        raise DamagedError("chunks that are not what was written")
+        raise DamagedError("damaged chunks")
     if not {chunk.offset for chunk in stated.chunks if chunk.channels} <= chunks:
-        raise DamagedError("an index that does not fit what is there")
+        raise DamagedError("an index that does not fit the file")
     if summary.counted and {number: count for number, count in stated.counts.items() if count} != found.counts:
-        raise DamagedError("counts that do not fit the index")
+        raise DamagedError("message counts that do not fit the file")
 
 
-def _take_data(file: BinaryIO, summary: _Summary, data_end: int, room: _Room) -> bool:
-    """Hold the records of the data against their index, and take metadata and attachments.
+def _check_index(file: BinaryIO, summary: _Summary, data_end: int, limits: _RecordLimits) -> bool:
+    """Compare the records of the data section with the index, and read metadata and attachments.
 
     Returns:
-        Whether the index leads to all messages; False where messages stand outside chunks.
+        Whether the index lists all messages; False if there are messages outside chunks.
     """
     found, position, places = summary.found, len(MAGIC), set()
     indexed = summary.places | {(chunk.offset, chunk.length + RECORD.size) for chunk in found.chunks}
-    found.chunks = [chunk for chunk in found.chunks if chunk.channels]  # one without an index has no messages
+    found.chunks = [chunk for chunk in found.chunks if chunk.channels]  # a chunk without an index has no messages
     while position < data_end:
         file.seek(position)
-        opcode, length = _head(file)
+        opcode, length = _read_head(file)
         end = position + RECORD.size + length
         if end > data_end:
-            raise DamagedError("records that do not end with the data")
+            raise DamagedError("records longer than the data section")
         if opcode == Opcode.MESSAGE:
             return False
-        room.take(opcode, file, length)
+        limits.count_record(opcode, file, length)
         if opcode == Opcode.CHUNK or opcode in summary.kinds:
             places.add((position, end - position))
         if opcode in (Opcode.METADATA, Opcode.ATTACHMENT):
-            _take(found, opcode, file.read(length))
+            _read_record(found, opcode, file.read(length))
         position = end
     if places != indexed:
-        raise DamagedError("an index that does not fit what is there")
-    if sum(found.counts.values()) > room.unpacked // (RECORD.size + MESSAGE.size):
-        raise DamagedError("more messages counted than there is room for")
+        raise DamagedError("an index that does not fit the file")
+    if sum(found.counts.values()) > limits.unpacked // (RECORD.size + MESSAGE.size):
+        raise DamagedError("a message count larger than the file can hold")
     counted = {number for number, count in found.counts.items() if count}
     if counted != set().union(*(chunk.channels or () for chunk in found.chunks)):
-        raise DamagedError("counts that do not fit the index")
+        raise DamagedError("message counts that do not fit the index")
     return True
 
 
-class _Room:
-    """What the records of a file may take, so that a small file costs neither memory nor time."""
+class _RecordLimits:
+    """Limits on the records of a file, so that a small malicious file cannot exhaust memory or time."""
 
     def __init__(self, size: int) -> None:
         self.unpacked = 0
-        self._most = _MOST_PACKED * size + MOST_CHUNK_BYTES
-        self._records = size // _LEAST_RECORD + 10_000
-        self._kept: dict[int, int] = {Opcode.ATTACHMENT: _MOST_ATTACHED, Opcode.METADATA: _MOST_METADATA}
+        self._max_unpacked = _MAX_COMPRESSION_RATIO * size + MAX_CHUNK_BYTES
+        self._records = size // _MIN_RECORD_BYTES + 10_000
+        self._kept: dict[int, int] = {Opcode.ATTACHMENT: _MAX_ATTACHED_BYTES, Opcode.METADATA: _MAX_METADATA_BYTES}
 
-    def take(self, opcode: int, file: BinaryIO, length: int) -> None:
-        """Count a record; the file is where its body begins, and stays there.
+    def count_record(self, opcode: int, file: BinaryIO, length: int) -> None:
+        """Count a record. The file is positioned at the record's body and stays there.
 
         Raises:
-            DamagedError: It is too large, or there are too many of them.
+            DamagedError: The record is too large, or there are too many records.
         """
         self._records -= 1
         if opcode == Opcode.CHUNK:
@@ -200,31 +200,31 @@ class _Room:
             head = file.read(CHUNK.size)
             file.seek(start)
             unpacked = CHUNK.unpack(head)[2] if len(head) == CHUNK.size else 0
-            self.unpacked += unpacked if unpacked <= MOST_CHUNK_BYTES else 0  # a larger one is not unpacked
+            self.unpacked += unpacked if unpacked <= MAX_CHUNK_BYTES else 0  # larger chunks are never decompressed
         elif opcode in self._kept:
-            self._kept[opcode] -= length + _HEAD_BYTES
+            self._kept[opcode] -= length + _MIN_RECORD_COST_BYTES
             if self._kept[opcode] < 0:
                 raise DamagedError(f"a record of {length} bytes")
-        if self._records < 0 or self.unpacked > self._most:
-            raise DamagedError("more records, or more packed into them, than a recorder makes of a file of that size")
+        if self._records < 0 or self.unpacked > self._max_unpacked:
+            raise DamagedError("more records, or more data in them, than a recorder writes to a file of this size")
 
 
-def _head(file: BinaryIO) -> tuple[int, int]:
-    """Opcode and length of the record that begins here."""
+def _read_head(file: BinaryIO) -> tuple[int, int]:
+    """Return opcode and length of the record at the current position."""
     return RECORD.unpack(file.read(RECORD.size))
 
 
-def _sum(file: BinaryIO, end: int) -> int:
-    """CRC-32 of a file up to a place."""
+def _checksum(file: BinaryIO, end: int) -> int:
+    """Return the CRC-32 of a file up to a position."""
     file.seek(0)
     checksum = 0
-    while (left := end - file.tell()) > 0 and (data := file.read(min(PIECE, left))):
+    while (left := end - file.tell()) > 0 and (data := file.read(min(READ_BYTES, left))):
         checksum = zlib.crc32(data, checksum)
     return checksum
 
 
-def _footer(file: BinaryIO, size: int) -> tuple[int, int] | None:
-    """Where the summary of a finished file begins, and its checksum."""
+def _read_footer(file: BinaryIO, size: int) -> tuple[int, int] | None:
+    """Return the position and checksum of the summary of a finished file; None for an unfinished one."""
     at = size - len(MAGIC) - _FOOTER.size
     if at < len(MAGIC):
         return None
@@ -236,14 +236,14 @@ def _footer(file: BinaryIO, size: int) -> tuple[int, int] | None:
 
 @dataclass
 class _Summary:
-    """What a file states at its end, each part of which a writer may leave out.
+    """Summary at the end of a file; every part of it is optional in MCAP.
 
     Attributes:
-        start: Where it begins [bytes].
+        start: Position of the summary [bytes].
         found: Channels, counts and chunks.
-        counted: It has statistics.
-        places: Offset and length of indexed metadata and attachments.
-        kinds: Opcodes of those of the two that are indexed.
+        counted: Whether it has statistics.
+        places: Offset and length of each indexed metadata record and attachment.
+        kinds: Opcodes of the indexed kinds of the two.
     """
 
     start: int
@@ -254,32 +254,32 @@ class _Summary:
 
     @property
     def indexed(self) -> bool:
-        """Whether the messages can be found by it: channels, counts, and an index of the chunks with their channels."""
+        """Whether the summary suffices to find all messages: channels, counts, and a chunk index with channels."""
         chunks, counts = self.found.chunks, {number for number, count in self.found.counts.items() if count}
         listed = set().union(*(chunk.channels or () for chunk in chunks))
         return self.counted and bool(listed) and counts | listed <= set(self.found.topics)
 
 
-def _summary(file: BinaryIO, size: int, footer: tuple[int, int]) -> _Summary:
-    """Read what the file states at its end."""
+def _read_summary(file: BinaryIO, size: int, footer: tuple[int, int]) -> _Summary:
+    """Read the summary at the end of a file."""
     start, expected = footer
     if start == 0:
         return _Summary(start)
     end = size - len(MAGIC) - _FOOTER.size
     if start < len(MAGIC) + _DATA_END.size or start > end:
-        raise DamagedError("a footer that points nowhere")
-    if size - start > _MOST_SUMMARY:
+        raise DamagedError("a footer with an invalid position of the summary")
+    if size - start > _MAX_SUMMARY_BYTES:
         raise DamagedError(f"a summary of {size - start} bytes")
     file.seek(start)
     data = file.read(size - len(MAGIC) - 4 - start)
     if expected and zlib.crc32(data) != expected:
-        raise DamagedError("the checksum of the summary does not fit")
+        raise DamagedError("a wrong checksum of the summary")
     summary = _Summary(start)
-    found, room = summary.found, _Room(len(data))
+    found, limits = summary.found, _RecordLimits(len(data))
     for opcode, at, stop in records(data[: end - start]):
-        room.take(opcode, file, 0)
+        limits.count_record(opcode, file, 0)
         if opcode == Opcode.CHUNK_INDEX:
-            found.chunks.append(_chunk_indexed(data[at:stop]))
+            found.chunks.append(_parse_chunk_index(data[at:stop]))
             continue
         body = ReadDataStream(BytesIO(data[at:stop]))
         if opcode == Opcode.CHANNEL:
@@ -295,85 +295,84 @@ def _summary(file: BinaryIO, size: int, footer: tuple[int, int]) -> _Summary:
     found.chunks.sort(key=lambda chunk: chunk.offset)
     for earlier, later in pairwise(found.chunks):
         if later.offset < earlier.offset + earlier.length:
-            raise DamagedError("chunks that lie upon each other")
+            raise DamagedError("overlapping chunks")
     return summary
 
 
-def _chunk_indexed(body: bytes) -> Chunk:
+def _parse_chunk_index(body: bytes) -> Chunk:
     begin_ns, end_ns, offset, length, indexed = _CHUNK_INDEX.unpack_from(body)
     stop = _CHUNK_INDEX.size + indexed
-    if stop > len(body) or indexed % _INDEXED.size or length < RECORD.size:
-        raise DamagedError("an index of a chunk that is none")
-    channels = frozenset(number for number, _ in _INDEXED.iter_unpack(body[_CHUNK_INDEX.size : stop]))
+    if stop > len(body) or indexed % _INDEX_ENTRY.size or length < RECORD.size:
+        raise DamagedError("an invalid chunk index")
+    channels = frozenset(number for number, _ in _INDEX_ENTRY.iter_unpack(body[_CHUNK_INDEX.size : stop]))
     return Chunk(offset, length - RECORD.size, begin_ns, end_ns, channels)
 
 
 def _add_topic(found: Contents, channel: Channel) -> None:
     if found.topics.setdefault(channel.id, channel.topic) != channel.topic:
-        raise DamagedError("one number for two channels")
+        raise DamagedError("two channels with the same number")
     found.about[channel.topic] = channel.metadata
 
 
-def _take(found: Contents, opcode: int, body: bytes) -> None:
-    """Take a record of metadata or an attachment.
+def _read_record(found: Contents, opcode: int, body: bytes) -> None:
+    """Read a metadata record or an attachment.
 
     Raises:
-        DamagedError: It is not what was written, or its name comes twice.
+        DamagedError: The record is damaged, or its name occurs twice.
     """
     stream = ReadDataStream(BytesIO(body))
     try:
         if opcode == Opcode.ATTACHMENT:
             attachment = Attachment.read(stream)
             stated = int.from_bytes(body[stream.count - 4 : stream.count], "little")
-            if stated and zlib.crc32(body[: stream.count - 4]) != stated:  # 0: the writer made none
-                raise DamagedError("an attachment whose checksum does not fit")
+            if stated and zlib.crc32(body[: stream.count - 4]) != stated:  # 0: no checksum
+                raise DamagedError("an attachment with a wrong checksum")
             kept, name, value = found.attachments, attachment.name, attachment.data
         else:
             metadata = Metadata.read(stream)
             kept, name, value = found.metadata, metadata.name, metadata.metadata
     except (McapError, struct.error, UnicodeDecodeError):
-        raise DamagedError("a record that does not end where it should") from None
-    if stream.count > len(body) or name in kept:  # bytes after the last field are for later versions of the format
-        raise DamagedError(f"{name} twice" if name in kept else "a record that does not end where it should")
+        raise DamagedError("a record of the wrong length") from None
+    if stream.count > len(body) or name in kept:  # later format versions may append fields
+        raise DamagedError(f"two records named {name}" if name in kept else "a record of the wrong length")
     kept[name] = value  # type: ignore[assignment]
 
 
-def _walked(file: BinaryIO, size: int, *, finished: bool = False) -> tuple[Contents, int | None]:
-    """Return what the records of a file contain, read from its beginning, and where the data section ends.
+def _walk_records(file: BinaryIO, size: int, *, finished: bool = False) -> tuple[Contents, int | None]:
+    """Return the contents of a file read record by record, and the end of the data section; None if it is not reached.
 
-    A record counts only if all of it lies in the file: a cut at any byte costs at most the chunk it went through. The
-    end is None where the file does not reach it.
+    Only records that lie completely in the file count, so a truncation costs at most one chunk.
     """
     found, bare_from = Contents(), 0
-    position, room = len(MAGIC), _Room(size)
+    position, limits, last = len(MAGIC), _RecordLimits(size), _LAST_OPCODE if finished else _LAST_SUSPECT_OPCODE
     while position + RECORD.size <= size:
         file.seek(position)
-        opcode, length = _head(file)
+        opcode, length = _read_head(file)
         end = position + RECORD.size + length
-        bare = opcode in _BARE and end <= size
-        if bare_from and not (bare and end - bare_from <= PIECE):
+        bare = opcode in _CHUNKABLE_OPCODES and end <= size
+        if bare_from and not (bare and end - bare_from <= READ_BYTES):
             found.chunks.append(Chunk(bare_from, position - bare_from, bare=True))
             bare_from = 0
         if opcode == 0 or end > size:
-            # Cut off, or zeros where a power cut left unwritten pages; else its length is not what was written.
-            if opcode == Opcode.CHUNK and _says(file, length):
+            # Truncated, or zeros from unwritten pages after a power failure; otherwise the length is damaged.
+            if opcode == Opcode.CHUNK and _lengths_agree(file, length):
                 found.chunks.append(Chunk(position, size - position - RECORD.size, cut=True))
-            elif not (length == 0 and _zeros(file) if opcode == 0 else _says_index(file, opcode, length)):
+            elif not (length == 0 and _only_zeros(file) if opcode == 0 else _is_plausible(file, opcode, length)):
                 found.damaged += 1
             break
         if opcode == Opcode.DATA_END and length >= 4:
             return found, position
-        room.take(opcode, file, length)
+        limits.count_record(opcode, file, length)
         if bare:
             bare_from = bare_from or position
         elif opcode == Opcode.CHUNK:
             found.chunks.append(Chunk(position, length))
         elif opcode in (Opcode.METADATA, Opcode.ATTACHMENT):
             try:
-                _take(found, opcode, file.read(length))
+                _read_record(found, opcode, file.read(length))
             except DamagedError:
                 found.damaged += 1
-        elif opcode not in (Opcode.HEADER, Opcode.MESSAGE_INDEX) and opcode <= (_LAST_OPCODE if finished else _SURE):
+        elif opcode not in (Opcode.HEADER, Opcode.MESSAGE_INDEX) and opcode <= last:
             found.damaged += 1
         position = end
     else:
@@ -382,9 +381,9 @@ def _walked(file: BinaryIO, size: int, *, finished: bool = False) -> tuple[Conte
     return found, None
 
 
-def _says(file: BinaryIO, length: int) -> bool:
-    """Whether a chunk that was cut is as long as it says in two places, as far as the file goes."""
-    head = file.read(CHUNK.size + LONGEST_NAME + 8)
+def _lengths_agree(file: BinaryIO, length: int) -> bool:
+    """Return whether the two lengths in the header of a truncated chunk agree, as far as the file contains them."""
+    head = file.read(CHUNK.size + MAX_NAME_BYTES + 8)
     if len(head) < CHUNK.size:
         return True
     name = CHUNK.unpack_from(head)[-1]
@@ -392,23 +391,23 @@ def _says(file: BinaryIO, length: int) -> bool:
     return len(packed) < 8 or CHUNK.size + name + 8 + int.from_bytes(packed, "little") == length
 
 
-def _says_index(file: BinaryIO, opcode: int, length: int) -> bool:
-    """The same of another record that was cut: an index behind a chunk, or the metadata at the end."""
+def _is_plausible(file: BinaryIO, opcode: int, length: int) -> bool:
+    """Return whether another truncated record is plausible: a message index, or a record of the file's end."""
     if opcode == Opcode.MESSAGE_INDEX:
         head = file.read(6)
         return len(head) < 6 or 6 + int.from_bytes(head[2:], "little") == length
-    return opcode in (Opcode.METADATA, Opcode.ATTACHMENT, Opcode.DATA_END, *_BARE)
+    return opcode in (Opcode.METADATA, Opcode.ATTACHMENT, Opcode.DATA_END, *_CHUNKABLE_OPCODES)
 
 
-def _zeros(file: BinaryIO) -> bool:
-    while data := file.read(PIECE):
+def _only_zeros(file: BinaryIO) -> bool:
+    while data := file.read(READ_BYTES):
         if data.count(0) < len(data):
             return False
     return True
 
 
-def _counted(file: BinaryIO, found: Contents) -> Contents:
-    """Find channels, counts and times of a cut file in its chunks; one that does not unpack is passed over."""
+def _count_messages(file: BinaryIO, found: Contents) -> Contents:
+    """Determine channels, counts and times of an unfinished file from its chunks; unreadable chunks are skipped."""
     good, counts, unchecked, bare = [], [], 0, 0
     for chunk in found.chunks:
         times_ns: list[int] = []
@@ -437,9 +436,9 @@ def _counted(file: BinaryIO, found: Contents) -> Contents:
             found.counts[number] = found.counts.get(number, 0) + inside[number]
     found.chunks = good
     if COPY not in found.attachments:
-        found.unchecked += ("its metadata (by an earlier version)",)
+        found.unchecked += ("its metadata (written by an earlier version)",)
     if unchecked:
-        found.unchecked += (f"the last {unchecked} messages (of the chunk in which it was cut off)",)
+        found.unchecked += (f"the last {unchecked} messages (of the chunk in which the file ends)",)
     if bare:
         found.unchecked += (f"{bare} messages outside chunks",)
     return found

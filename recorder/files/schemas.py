@@ -1,6 +1,6 @@
-"""What stands in a recording besides the rig's own payloads: topics, message definitions, and their bytes.
+"""Topics and message definitions of a recording, other than the payloads of the rig, with their encoding.
 
-View messages are standard ROS 2 messages, so that a viewer which knows nothing of this project plots them with labels.
+Plot messages are standard ROS 2 messages, so that a generic viewer plots them with labels.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from rig.base.wire import SCHEMAS
 FORMAT = "rig-recording"
 VERSION = "2"
 READ_VERSIONS = ("1", VERSION)
-"""Versions that are read. In version 1 documents are plain JSON and not in ROS 2 messages."""
+"""Format versions that can be read. In version 1, documents are plain JSON without a ROS 2 message around them."""
 GAPS = "recorder/gaps"
 CLOCK = "recorder/clock"
 VIEW = "view"
@@ -26,13 +26,13 @@ VIEW_EVENTS = f"{VIEW}/events"
 
 @dataclass(frozen=True)
 class Definition:
-    """The form of a topic's messages, as it stands in the file.
+    """Message definition of a topic, as stored in the file.
 
     Attributes:
-        name: Name of the form.
-        encoding: How its messages are encoded.
-        language: What it is written in.
-        text: What it says.
+        name: Name of the message type.
+        encoding: Encoding of its messages.
+        language: Language of the definition.
+        text: The definition.
     """
 
     name: str
@@ -61,14 +61,14 @@ LOG = _ros2(
     + _TIME,
 )
 TEXT = _ros2("std_msgs/msg/String", "string data\n")
-"""Definition of the topics of JSON documents: `data` is the document."""
+"""Definition of document topics; the field `data` is the JSON document."""
 LOG_INFO, LOG_WARN, LOG_ERROR = 20, 30, 40
 
 _ENCAPSULATION = b"\x00\x01\x00\x00"
 
 
 class _Cdr:
-    """Builds one little-endian CDR message; offsets count from behind the encapsulation header."""
+    """Builder of one little-endian CDR message; offsets count from the end of the encapsulation header."""
 
     def __init__(self) -> None:
         self.body = bytearray()
@@ -82,7 +82,7 @@ class _Cdr:
         self.body += struct.pack("<I", value)
 
     def string(self, text: str) -> None:
-        data = text.encode(errors="replace") + b"\0"  # JSON can hold half a character
+        data = text.encode(errors="replace") + b"\0"  # JSON can contain lone surrogates
         self.u32(len(data))
         self.body += data
 
@@ -91,12 +91,12 @@ class _Cdr:
 
 
 def wrap_text(text: bytes) -> bytes:
-    """Return a `std_msgs/msg/String` message with these bytes, whatever they are, as its text."""
+    """Return a `std_msgs/msg/String` message with these bytes as its text."""
     return _ENCAPSULATION + struct.pack("<I", len(text) + 1) + text + b"\0"
 
 
 def unwrap_text(message: bytes) -> bytes:
-    """Return the text of a `std_msgs/msg/String` message; bytes that are none, such as plain JSON, unchanged."""
+    """Return the text of a `std_msgs/msg/String` message; any other bytes, such as plain JSON, unchanged."""
     text = message[len(_ENCAPSULATION) + 4 : -1]
     return text if message == wrap_text(text) else message
 
@@ -105,17 +105,17 @@ SLOTS = ("position", "velocity", "effort")
 
 
 class JointStateRows:
-    """Encodes rows of values as `sensor_msgs/msg/JointState`, one message a row, in one numpy pass.
+    """Encoder of rows as `sensor_msgs/msg/JointState`, one message per row, in one numpy pass.
 
-    All messages of a topic have the same bytes but for the stamp and the values: a template and a few writes.
+    The messages of a topic differ only in stamp and values, so each is a copy of a template.
     """
 
     def __init__(self, names: tuple[str, ...], slots: tuple[str, ...]) -> None:
-        """Lay out the message.
+        """Build the message template.
 
         Args:
-            names: Labels of the columns.
-            slots: Which of the arrays `SLOTS` are filled; each filled one has a value for every name.
+            names: Column labels.
+            slots: Arrays of `SLOTS` to fill; each filled array has a value for every label.
         """
         start = len(_ENCAPSULATION)
         fields: dict[str, tuple[str | tuple[str, tuple[int]], int]] = {
@@ -150,10 +150,10 @@ class JointStateRows:
 
         Args:
             times_ns: Simulated time of each row [ns], int64, shape (n,).
-            values: For each filled slot its values, shape (n, names); nan where a column has none.
+            values: Values by filled array, shape (n, names); nan in columns without a value.
 
         Returns:
-            One CDR message a row, uint8, shape (n, bytes).
+            One CDR message per row, uint8, shape (n, bytes).
         """
         raw = np.empty((len(times_ns), len(self._template)), np.uint8)
         raw[:] = self._template
@@ -166,7 +166,7 @@ class JointStateRows:
 
 
 def encode_log(time_ns: int, level: int, name: str, text: str) -> bytes:
-    """One `rcl_interfaces/msg/Log` message at a simulated time [ns]."""
+    """Return a `rcl_interfaces/msg/Log` message at a simulated time [ns]."""
     cdr = _Cdr()
     seconds, rest = divmod(time_ns, 1_000_000_000)
     cdr.body += struct.pack("<iIB", min(seconds, 2**31 - 1), rest, level)
@@ -177,7 +177,7 @@ def encode_log(time_ns: int, level: int, name: str, text: str) -> bytes:
 
 
 def event_text(event: dict[str, Any]) -> tuple[int, str]:
-    """Log level and one readable line of an event."""
+    """Return the log level and a readable line for an event."""
     kind = str(event.get("event", "event"))
     reason = str(event.get("reason", ""))
     if kind == "note":

@@ -1,6 +1,6 @@
-"""The file of a recording in the making: NAME.mcap.part, locked by who writes it, and NAME.mcap once it is whole.
+"""File of a recording in progress: NAME.mcap.part, locked by its recorder, renamed to NAME.mcap when complete.
 
-Not `rig.base.errors.whole_file`: what a kill or a full disk leaves of a recording stays, for `rig recover`.
+Unlike `rig.base.errors.whole_file`, an interrupted recording keeps its file, for `rig recover`.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from rig.base.errors import PART_SUFFIX, InputError, Words, check_new_file
 
 
 def part_of(path: Path) -> Path:
-    """Name of a recording while it is being written."""
+    """Return the name of a recording in progress."""
     return path.with_name(path.name + PART_SUFFIX)
 
 
 def check_destination(path: Path, *, force: bool = False) -> None:
-    """Refuse a file that cannot become a recording, before anything is subscribed or overwritten.
+    """Refuse a file that cannot become a recording, before subscribing or overwriting anything.
 
     Args:
-        path: File to record to.
-        force: An existing file may be replaced.
+        path: Output file.
+        force: Allow replacing an existing file.
 
     Raises:
         InputError: The name does not end in .mcap, the folder is missing or read-only, or the file exists.
@@ -36,16 +36,21 @@ def check_destination(path: Path, *, force: bool = False) -> None:
 
 
 def files_like(path: Path, what: str) -> list[Path]:
-    """Files beside a recording NAME.mcap that look like NAME.WHAT.mcap, finished or not; WHAT is an expression."""
+    """Return the files named NAME.WHAT.mcap in the folder of NAME.mcap, finished or not.
+
+    Args:
+        path: NAME.mcap.
+        what: Regular expression for WHAT.
+    """
     name = re.compile(rf"{re.escape(path.stem)}\.{what}{re.escape(path.suffix)}({re.escape(PART_SUFFIX)})?")
     return sorted(each for each in path.parent.iterdir() if name.fullmatch(each.name))
 
 
 def remove(files: Iterable[Path]) -> None:
-    """Remove files of an earlier recording, all or none of them.
+    """Remove the files of an earlier recording; if one is in use, remove none.
 
     Raises:
-        InputError: Another recording is writing to one, or one cannot be removed.
+        InputError: Another recorder is writing to one of the files, or one cannot be removed.
     """
     import fcntl
 
@@ -64,11 +69,11 @@ def remove(files: Iterable[Path]) -> None:
 
 
 class Draft:
-    """A recording's file for as long as it is written, locked; it takes its name when it is finished.
+    """Locked file of a recording in progress, renamed when it is finished.
 
     Attributes:
-        path: Its name in the end.
-        part: Its name meanwhile; another one, where somebody removed it and it was saved.
+        path: Final name.
+        part: Current name; differs from the initial one if the file was removed and saved elsewhere.
         file: The open file.
     """
 
@@ -76,11 +81,11 @@ class Draft:
         """Create the file.
 
         Args:
-            path: Its name in the end.
-            force: What another recording left there may go, but not what one is writing to.
+            path: Final name.
+            force: Replace what an earlier recording left there, unless a recorder is writing to it.
 
         Raises:
-            InputError: The destination cannot be used, or another recording is writing to it.
+            InputError: The destination cannot be used, or another recorder is writing to it.
         """
         import fcntl
 
@@ -89,29 +94,29 @@ class Draft:
         self._force = force
         try:
             if force and self.part.exists():
-                # A new file under the name, not the old one emptied: nobody else can have it open.
+                # Create a new file instead of truncating the old one, so that no other process has it open.
                 remove([self.part])
-            self.file = self.part.open("x+b")  # readable, to save it if somebody removes it
+            self.file = self.part.open("x+b")  # readable, so that it can be saved after a removal
             fcntl.flock(self.file, fcntl.LOCK_EX)
         except OSError as error:
             raise InputError("output", "a file that can be written", Words(f"{self.part} ({error.strerror})")) from None
 
     def sync(self) -> int:
-        """Bring what was written to the disk; gives the file's size [bytes].
+        """Flush to the disk and return the file size [bytes].
 
         Raises:
-            OSError: The disk refused, or the file was removed: then it has been copied to the nearest folder that still
-                exists, where that was possible.
+            OSError: The disk reports an error, or the file was removed; then it was copied, if possible, to the nearest
+                existing parent folder.
         """
         self.file.flush()
         os.fsync(self.file.fileno())
-        # A removed file can be written to, and is gone when it is closed.
+        # A removed file can still be written, but is lost when it is closed.
         if not os.fstat(self.file.fileno()).st_nlink:
             self._save()
         return self.file.tell()
 
     def sync_folder(self) -> None:
-        """Bring the names of files to the disk as well; not every file system can."""
+        """Flush the folder entry to the disk, where the file system supports it."""
         with contextlib.suppress(OSError):
             number = os.open(self.part.parent, os.O_RDONLY)
             try:
@@ -120,24 +125,24 @@ class Draft:
                 os.close(number)
 
     def close(self) -> None:
-        """Close the file as it is; what was written stays under its draft's name."""
+        """Close the file and keep it under its current name."""
         with contextlib.suppress(OSError):
             self.file.close()
 
     def discard(self) -> None:
-        """Close the file and remove what was written; a file that was to be replaced stays."""
+        """Close and remove the file; a file that it would have replaced stays."""
         self.close()
         self.part.unlink(missing_ok=True)
 
     def finish(self) -> None:
-        """Close the file, which was synced, and give it its name.
+        """Close the flushed file and rename it to its final name.
 
         Raises:
-            OSError: Somebody else took the name meanwhile, or the disk refused.
+            OSError: The final name was taken by another process, or the disk reports an error.
         """
         self.file.close()
         if self.path.exists() and not self._force:
-            raise FileExistsError(errno.EEXIST, f"{self.path} was created by someone else meanwhile")
+            raise FileExistsError(errno.EEXIST, f"{self.path} was created by another process meanwhile")
         self.part.replace(self.path)
 
     def _save(self) -> None:
@@ -150,4 +155,4 @@ class Draft:
                 while data := os.pread(self.file.fileno(), 1 << 20, position):
                     copy.write(data)
                     position += len(data)
-        raise OSError(errno.ENOENT, f"{gone} was removed while it was written")
+        raise OSError(errno.ENOENT, f"{gone} was removed while it was being written")

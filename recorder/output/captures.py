@@ -1,8 +1,8 @@
-"""Triggered recording: a ring of the latest blocks in memory, and one file for each event around which it is kept.
+"""Triggered recording: a ring buffer of the latest blocks, and one file for each capture.
 
-A capture holds whole blocks, from the one that contains `pre_s` before the trigger to the one that contains `post_s`
-after it; each file is complete in itself. Blocks also stay in the ring while a file is written, so that the next
-capture has its full time before the trigger, even if the same rows then stand in two files.
+A capture consists of whole blocks, from the one that contains `pre_s` before the trigger to the one that contains
+`post_s` after it. Each file is self-contained. Blocks stay in the ring buffer while a file is written, so that the
+next capture has its full time before the trigger, even if two files then contain the same rows.
 """
 
 from __future__ import annotations
@@ -24,64 +24,66 @@ from recorder.writer import RecordingError, RecordingWriter
 from rig.base.errors import InputError
 from rig.base.wire import EDGES, EVENTS, FAULTS
 
-_LATE_NS = NS // 2
-"""For so long after its end a capture waits for streams that are behind the others, and the ring keeps more than it
-need for an event that comes after its blocks [ns of simulated time]."""
-_FAR_NS = 60 * NS
-"""An event that names a later time, or one that the ring no longer holds, counts as one of now [ns]."""
+_WAIT_NS = NS // 2
+"""Time that a capture waits after its end for delayed streams [ns of simulated time].
+
+The ring buffer is longer by this time, for events that arrive after their blocks.
+"""
+_MAX_AHEAD_NS = 60 * NS
+"""Largest time by which an event may be ahead of the streams [ns]; beyond it, the event counts as current."""
 _NUMBERED = r"\w+-\d{3,}"
-_MOST_FIRED = 1000
-"""Triggers that a file lists; more are only counted."""
+_MAX_LISTED_TRIGGERS = 1000
+"""Largest number of triggers listed in a file; further ones are only counted."""
 
 
 def capture_path(path: Path, trigger: Trigger, number: int) -> Path:
-    """Name of the file of a capture."""
+    """Return the name of a capture's file."""
     return path.with_name(f"{path.stem}.{trigger.name}-{number:03d}{path.suffix}")
 
 
 def check_captures(path: Path, capture: Capture, limits: Limits, *, force: bool = False) -> None:
-    """Refuse names that cannot become the files of captures, as `check_files` does."""
+    """Refuse a name that cannot become the files of captures; see `check_files`."""
     names = {trigger.name: capture_path(path, trigger, 1) for trigger in capture.triggers}
     check_files(path, names.values(), _NUMBERED, limits, force=force)
 
 
-class _Held(NamedTuple):
-    """A payload in the ring, with the simulated time that it covers, and at which it came [ns]."""
+class _RingEntry(NamedTuple):
+    """Payload in the ring buffer, with the simulated time that it covers and that of its arrival [ns]."""
 
     payload: Payload
     start_ns: int
     end_ns: int
-    came_ns: int
+    arrival_ns: int
 
 
 @dataclass
-class _Open:
-    """A capture that is being written."""
+class _OpenCapture:
+    """Capture being written."""
 
     writer: RecordingWriter
     end_ns: int
     latest_end_ns: int
-    """Where it ends at the latest, at its longest length."""
+    """End of the capture at its maximum length [ns]."""
     fired: list[dict[str, Any]]
     full: bool = False
-    """It would have gone on otherwise."""
+    """Whether the maximum length cut the capture short."""
     count: int = 1
 
 
 class Captures(Sink):
-    """Writes captures.
+    """Sink that writes captures around triggers.
 
     Attributes:
-        fired: Triggers so far, those during a capture included.
+        fired: Number of triggers, including those during a capture.
     """
 
     def __init__(self, path: Path, capture: Capture, needs: Needs) -> None:
-        """Check names and triggers; a file is opened by the first trigger.
+        """Check names and triggers; the first trigger opens a file.
 
         Args:
             path: NAME.mcap, which becomes NAME.TRIGGER-001.mcap and so on.
-            capture: What is kept.
-            needs: What a sink needs.
+            capture: Triggers and times to keep.
+            needs: Settings of the sink.
 
         Raises:
             InputError: The name or a channel cannot be used.
@@ -94,54 +96,54 @@ class Captures(Sink):
         self.fired = 0
         self._capture = capture
         self._pre_ns, self._post_ns = round(capture.pre_s * NS), round(capture.post_s * NS)
-        self._ring: deque[_Held] = deque()
+        self._ring: deque[_RingEntry] = deque()
         self._reached_ns: dict[str, int] = {}
         self._number = 0
-        self._open: _Open | None = None
+        self._open: _OpenCapture | None = None
 
     @property
     def held(self) -> int:
-        """Payloads in the ring."""
+        """Number of payloads in the ring buffer."""
         return len(self._ring)
 
     def take(self, payload: Payload) -> None:
-        """Take one payload: into the ring, and into the capture that is open."""
-        true = self.tally.true(payload)
+        """Add a payload to the ring buffer, and to the open capture."""
+        original = self.tally.restore(payload)
         self.tally.take(payload)
         if payload.block is None:
             start_ns = end_ns = self._time_of(payload)
         else:
-            start_ns, end_ns = self.tally.extent_ns(true)
+            start_ns, end_ns = self.tally.extent_ns(original)
             if payload.key != EDGES:
                 self._reached_ns[payload.key] = max(self._reached_ns.get(payload.key, 0), end_ns)
         latest_ns = self.tally.last_time_ns
-        self._ring.append(_Held(payload, start_ns, end_ns, latest_ns))
+        self._ring.append(_RingEntry(payload, start_ns, end_ns, latest_ns))
         if self._open is not None and (start_ns <= self._open.end_ns or payload.key == FAULTS):
             self._write(self._open.writer, payload)
-        # The ring's own scene: what was sent before the first thing that it still holds. It is emptied by the time at
-        # which things came, as an event can name a tick that is far off.
-        while self._ring and self._ring[0].came_ns < latest_ns - self._pre_ns - _LATE_NS:
-            gone = self._ring.popleft().payload
-            if gone.key == EVENTS:
-                self._commands.follow(gone.document)
+        # `_commands` has the commands before the oldest payload in the ring. Payloads are removed by arrival time, as
+        # the tick of an event can be far off.
+        while self._ring and self._ring[0].arrival_ns < latest_ns - self._pre_ns - _WAIT_NS:
+            removed = self._ring.popleft().payload
+            if removed.key == EVENTS:
+                self._commands.follow(removed.document)
         for trigger, time_ns, is_new in self._fired_by(payload, start_ns):
             self._fire(trigger, time_ns, is_new=is_new)
         self._close_if_over()
 
     def finish(self, reason: str, *, notes: dict[str, str] | None = None) -> None:
-        """Close the capture that is open, before its time."""
+        """Close the open capture before its end."""
         if self._open is not None:
             self._close_capture(self._open, f"{reason}, before the capture was over", notes)
 
     def _time_of(self, payload: Payload) -> int:
-        """Simulated time that a document names [ns], where that is near what the streams have come to."""
+        """Return the simulated time of a document [ns], or the latest time of the streams if the two are far apart."""
         time_ns, _ = self.tally.extent_ns(payload)
         latest_ns = self.tally.last_time_ns
-        near = -self._pre_ns - _LATE_NS <= time_ns - latest_ns <= _FAR_NS
-        return time_ns if near or self.tally.first_time_ns is None else latest_ns
+        plausible = -self._pre_ns - _WAIT_NS <= time_ns - latest_ns <= _MAX_AHEAD_NS
+        return time_ns if plausible or self.tally.first_time_ns is None else latest_ns
 
     def _write(self, writer: RecordingWriter, payload: Payload) -> None:
-        """To the capture that is open, as long as there is room for it."""
+        """Write to the open capture while there is disk space."""
         if self.ended:
             return
         writer.take(payload)
@@ -149,7 +151,7 @@ class Captures(Sink):
             self._end(why)
 
     def _fired_by(self, payload: Payload, start_ns: int) -> list[tuple[Trigger, int, bool]]:
-        """Triggers that a payload sets off, with their simulated times [ns], and whether each may start a capture."""
+        """Return the triggers of a payload, their simulated times [ns], and whether each may start a capture."""
         found = []
         for trigger in self._capture.triggers:
             crossings = self._crossings.get(trigger)
@@ -171,7 +173,7 @@ class Captures(Sink):
             self._begin(trigger, time_ns, about)
             return
         writing.count += 1
-        if len(writing.fired) < _MOST_FIRED:
+        if len(writing.fired) < _MAX_LISTED_TRIGGERS:
             writing.fired.append(about)
         if self._capture.extends(trigger):
             end_ns = max(writing.end_ns, time_ns + self._post_ns)
@@ -179,7 +181,7 @@ class Captures(Sink):
             writing.end_ns = min(end_ns, writing.latest_end_ns)
 
     def _begin(self, trigger: Trigger, time_ns: int, about: dict[str, Any]) -> None:
-        """Begin a capture, and write to it what the ring holds of it."""
+        """Start a capture and write the contents of the ring buffer that belong to it."""
         if self._open is not None:
             self._close_capture(self._open)
         if self.ended:
@@ -205,14 +207,14 @@ class Captures(Sink):
             raise RecordingError(f"recording stopped: {error}; the captures before it are kept") from None
         latest_end_ns = time_ns - self._pre_ns + round(self._capture.most_s * NS)
         self._writer = writer
-        self._open = _Open(writer, time_ns + self._post_ns, latest_end_ns, [about])
+        self._open = _OpenCapture(writer, time_ns + self._post_ns, latest_end_ns, [about])
         for held in self._ring:
             inside = held.end_ns >= start_ns and held.start_ns <= self._open.end_ns
-            if inside or held.payload.key == FAULTS:  # which may be about blocks that lie inside
+            if inside or held.payload.key == FAULTS:  # may concern blocks of the capture
                 self._write(writer, held.payload)
 
     def _scene_before(self, start_ns: int) -> dict[str, Any]:
-        """The scene with the commands that came before what the file will hold."""
+        """Return the scene with the commands sent before the start of a file."""
         commands = Commands(self._commands.scene)
         for held in self._ring:
             if held.payload.key == EVENTS and held.end_ns < start_ns:
@@ -220,15 +222,15 @@ class Captures(Sink):
         return commands.scene
 
     def _close_if_over(self) -> None:
-        """Close the capture when all streams have come to its end, or have had their time."""
+        """Close the capture when all streams have reached its end, or the wait for them is over."""
         if self._open is None or self.tally.last_time_ns < self._open.end_ns:
             return
-        late = self.tally.last_time_ns >= self._open.end_ns + _LATE_NS
-        if late or min(self._reached_ns.values(), default=0) >= self._open.end_ns:
+        waited = self.tally.last_time_ns >= self._open.end_ns + _WAIT_NS
+        if waited or min(self._reached_ns.values(), default=0) >= self._open.end_ns:
             self._close_capture(self._open)
 
-    def _close_capture(self, writing: _Open, reason: str = "", notes: dict[str, str] | None = None) -> None:
-        """Close a capture; without a reason because it has come to its end."""
+    def _close_capture(self, writing: _OpenCapture, reason: str = "", notes: dict[str, str] | None = None) -> None:
+        """Close a capture; without a reason, because it is complete."""
         full = f", up to its longest length of {self._capture.most_s:g} s" if writing.full else ""
         self._open = None
         fired = {"triggers": json.dumps(writing.fired), "trigger_count": str(writing.count)}

@@ -1,4 +1,4 @@
-"""What the files of a recording may take of the disk."""
+"""Limits of the disk space used by a recording."""
 
 from __future__ import annotations
 
@@ -15,25 +15,24 @@ from rig.base.errors import InputError, Words
 
 MB = 1_000_000
 _PENDING_BYTES = 2 * MB
-"""What may still come to a file at its end, but for its index: a chunk that is not yet on the disk."""
+"""Space reserved for the end of a file, without its index [bytes]: a chunk not yet on the disk."""
 _NEW_BYTES = 300_000
-"""What a file takes that was only just begun, with its end."""
+"""Size of a new file with its end [bytes]."""
 _FLUSH_BYTES = MB // 4
-"""At the budget, more than that in memory is flushed, for it is less once it is compressed; less is let go."""
+"""Smallest amount in memory that is flushed when the budget is reached [bytes]; compression then reduces it."""
 _CHECK_S = 0.25
 
 
 @dataclass(frozen=True)
 class Limits:
-    """How large files become, and what they may take of the disk; None or 0 where there is no limit.
+    """Limits of file size and disk space; None or 0 for no limit.
 
     Attributes:
-        rotate_mb: About this size of a part [MB].
-        rotate_s: Length of a part [s of simulated time].
-        budget_mb: All parts together [MB].
-        keep_free_mb: Room that is left to others on the disk [MB].
-        when_full: What happens at the budget, or when there is no more room: the recording stops, or its oldest part
-            is removed.
+        rotate_mb: Approximate size of a file in a series [MB].
+        rotate_s: Length of a file in a series [s of simulated time].
+        budget_mb: Total size of all files [MB].
+        keep_free_mb: Space to leave free on the disk [MB].
+        when_full: Action at the budget or without disk space: stop the recording, or remove its oldest file.
     """
 
     rotate_mb: float | None = None
@@ -59,22 +58,22 @@ class Limits:
 
     @property
     def rotates(self) -> bool:
-        """Whether there are several files."""
+        """Whether the recording is split into several files."""
         return self.rotate_mb is not None or self.rotate_s is not None
 
 
 def check_files(path: Path, first: Iterable[Path], others: str, limits: Limits, *, force: bool) -> None:
-    """Refuse names that cannot become the files of a recording; remove nothing.
+    """Refuse names that cannot become the files of a recording, without removing anything.
 
     Args:
         path: Name of the recording.
-        first: Names of the first file, or of what may become it.
-        others: Expression that its numbered files look like (`files_like`); empty if there are none.
-        limits: What they may take of the disk.
-        force: Existing files may be replaced.
+        first: Possible names of the first file.
+        others: Regular expression for the numbered files (`files_like`); empty if there are none.
+        limits: Limits of the disk space.
+        force: Allow replacing existing files.
 
     Raises:
-        InputError: As `check_destination`; there are such files; or the disk has too little room to begin with.
+        InputError: A name is refused by `check_destination`, numbered files exist, or the disk is full.
     """
     for name in first:
         check_destination(name, force=force)
@@ -85,33 +84,33 @@ def check_files(path: Path, first: Iterable[Path], others: str, limits: Limits, 
 
 
 def _lack_of_room(folder: Path, keep_free_mb: float, *, index_bytes: int = 0) -> str:
-    """What is wrong if a disk has less room than is to be left on it [MB]; empty if nothing is.
+    """Return why the disk has too little space; empty if it has enough.
 
-    With nothing to be left there must still be room to end the file well.
+    The end of the file needs space even with `keep_free_mb` of 0.
     """
     try:
         disk = os.statvfs(folder)
     except OSError:
-        return ""  # the next write says what is wrong
+        return ""  # the next write reports the error
     if disk.f_bavail * disk.f_frsize >= keep_free_mb * MB + _PENDING_BYTES + index_bytes:
         return ""
     return f"less than {keep_free_mb:g} MB are free on the disk" if keep_free_mb else "the disk is full"
 
 
 class Room:
-    """What the files of a recording may still take of the disk.
+    """Disk space left for the files of a recording.
 
     Attributes:
-        finished_bytes: Size of the finished files that are there [bytes].
+        finished_bytes: Size of the finished files [bytes].
     """
 
     def __init__(self, folder: Path, limits: Limits, *, monotonic_s: Callable[[], float] = time.monotonic) -> None:
-        """Take the folder and its limits.
+        """Store the folder and its limits.
 
         Args:
-            folder: Where the files are.
-            limits: What they may take.
-            monotonic_s: Clock that times the looks at the disk [s].
+            folder: Folder of the files.
+            limits: Limits of the disk space.
+            monotonic_s: Clock for the interval between two checks of the disk [s].
         """
         self.finished_bytes = 0
         self._folder = folder
@@ -121,16 +120,16 @@ class Room:
         self._unchecked_bytes = 0
 
     def lack_after(self, payload_bytes: int, writer: RecordingWriter) -> str:
-        """The same as `lack`, after a payload of that size; looks only now and then, and costs next to nothing."""
+        """Return the result of `lack` after a payload of a size; checks the disk only at intervals."""
         self._unchecked_bytes += payload_bytes
         due = self._unchecked_bytes >= MB // 2 or self._monotonic_s() - self._checked_s >= _CHECK_S
         return self.lack(writer) if self._over_budget(writer) or due else ""
 
     def lack(self, writer: RecordingWriter | None = None) -> str:
-        """What there is no more room for; empty if there is room for all.
+        """Return why there is no more space; empty if there is enough.
 
         Args:
-            writer: The file that is being written; None for one that is to be begun.
+            writer: File being written; None before a new file.
         """
         self._checked_s = self._monotonic_s()
         self._unchecked_bytes = 0

@@ -1,9 +1,9 @@
-"""A recording in one file, or in several that follow each other, within what the disk may take.
+"""Sink for a recording in one file, or in a series of files, within the disk limits.
 
-NAME.mcap becomes NAME.0000.mcap, NAME.0001.mcap, ...: four digits, so that they sort. Each is complete in itself:
-calibration, parameters, and the scene with the commands sent up to its beginning. A part ends between two blocks of
-simulated time, for all streams at once, and the next one knows which row is due, so that a row lost at a seam is
-recorded like any other. History, which comes stream by stream, stands in the first part, however long it is.
+NAME.mcap becomes NAME.0000.mcap, NAME.0001.mcap, ...: four digits, so that the names sort. Each file is self-contained,
+with calibration, parameters, and the scene including earlier commands. A file ends between two blocks of simulated
+time, for all streams at once, and the next one states its first expected rows, so that a row lost in between is
+recorded as a gap. History arrives stream by stream and is written to the first file, whatever its length.
 """
 
 from __future__ import annotations
@@ -25,35 +25,35 @@ from rig.base.wire import EDGES, EVENTS, FAULTS
 
 MOST_PARTS = 1_000_000
 _NUMBER = r"\d{4,}"
-_BEHIND_NS = NS
-"""Simulated time by which streams may be apart at a seam: more, and one of them is still catching up [ns]."""
-_TOLD = 8
-"""Documents on faults that each file begins with."""
+_MAX_DELAY_NS = NS
+"""Largest delay between streams at a file change [ns of simulated time]; beyond it, a stream is still catching up."""
+_MAX_REPEATED_FAULTS = 8
+"""Number of earlier fault documents repeated at the start of each file."""
 _CATCH_UP_S = 5.0
-"""Longest wait with a full file for a stream that may never come [s]."""
+"""Longest wait with a full file for a delayed stream, which may never arrive [s]."""
 
 
 def part_path(path: Path, number: int) -> Path:
-    """Name of a part of a recording."""
+    """Return the name of a file in the series."""
     return path.with_name(f"{path.stem}.{number:04d}{path.suffix}")
 
 
 def check_series(path: Path, limits: Limits, *, force: bool = False) -> None:
-    """Refuse names that cannot become the files of a recording, as `check_files` does."""
+    """Refuse names that cannot become the files of a recording; see `check_files`."""
     rotates = limits.rotates
     check_files(path, [part_path(path, 0) if rotates else path], _NUMBER if rotates else "", limits, force=force)
 
 
 class Series(Sink):
-    """Writes a recording to one file or to several in turn."""
+    """Sink that writes a recording to one file or to a series of files."""
 
     def __init__(self, path: Path, needs: Needs, *, from_start: bool = False) -> None:
         """Open the first file.
 
         Args:
-            path: Name of the recording, ends in .mcap.
-            needs: What a sink needs.
-            from_start: Every stream is meant to be recorded from its row 0.
+            path: Name of the recording, ending in .mcap.
+            needs: Settings of the sink.
+            from_start: Expect row 0 first in every stream.
 
         Raises:
             InputError: The file cannot be created.
@@ -65,8 +65,8 @@ class Series(Sink):
         self._number = 0
         self._reached_ns: dict[str, int] = {}
         self._full_s: float | None = None
-        self._told: deque[Payload] = deque(maxlen=_TOLD)
-        """The latest that was told of faults."""
+        self._faults: deque[Payload] = deque(maxlen=_MAX_REPEATED_FAULTS)
+        """Latest fault documents."""
         self._series = f"{path.stem} {time.time_ns():x}"
         if needs.force and rotates:
             remove(files_like(path, _NUMBER))
@@ -74,7 +74,7 @@ class Series(Sink):
         self._expected = set(self._file.head.streams)
 
     def take(self, payload: Payload) -> None:
-        """Write one payload, to the next file where that is due."""
+        """Write a payload, after a change to the next file if that is due."""
         if self._limits.rotates and self._is_seam(payload):
             self._rotate()
         self.tally.take(payload)
@@ -82,11 +82,11 @@ class Series(Sink):
         if payload.key == EVENTS:
             self._commands.follow(payload.document)
         if payload.key == FAULTS:
-            self._told.append(payload)
+            self._faults.append(payload)
         self._make_room(len(payload.data))
 
     def kept(self) -> list[Counts]:
-        """What stands in the files: it is all of one stretch."""
+        """Return the total of all files as one interval."""
         return [sum(super().kept(), Counts())]
 
     def _open(
@@ -104,7 +104,7 @@ class Series(Sink):
         return self._needs.open_file(path, self._commands.scene, beginning)
 
     def _is_seam(self, payload: Payload) -> bool:
-        """Whether the file is full and this is the first block of a later time than all that it holds."""
+        """Return whether the file is full and a payload is the first block later than all rows in it."""
         if payload.block is None or payload.key == EDGES:
             return False
         limits, tally = self._limits, self._file.tally
@@ -118,15 +118,15 @@ class Series(Sink):
         return full and not self._await_others(block_ns)
 
     def _await_others(self, block_ns: int) -> bool:
-        """Whether streams are still catching up with a block that would begin the next file."""
-        behind = {key for key in self._expected if self._reached_ns.get(key, -_BEHIND_NS) < block_ns - _BEHIND_NS}
+        """Return whether other streams are still catching up with a block that would start the next file."""
+        slow = {key for key in self._expected if self._reached_ns.get(key, -_MAX_DELAY_NS) < block_ns - _MAX_DELAY_NS}
         now_s = self._needs.monotonic_s()
-        if not behind:
+        if not slow:
             self._full_s = None
         elif self._full_s is None:
             self._full_s = now_s
         elif now_s - self._full_s > _CATCH_UP_S:
-            self._expected -= behind
+            self._expected -= slow
             self._full_s = None
         return self._full_s is not None
 
@@ -144,23 +144,23 @@ class Series(Sink):
         try:
             self._file = self._writer = self._open(new, previous=old.path.name, due=dict(old.tally.next))
         except (InputError, RecordingError) as error:
-            raise RecordingError(f"{error}; what was written before is kept, finished, in {old.path}") from None
-        for told in self._told:  # they may be about blocks that come behind the seam
-            self._file.take(told)
+            raise RecordingError(f"{error}; the earlier data are complete in {old.path}") from None
+        for fault in self._faults:  # may concern blocks of the new file
+            self._file.take(fault)
 
     def _make_room(self, payload_bytes: int) -> None:
-        why = self._room.lack_after(payload_bytes, self._file)
-        while why:
+        reason = self._room.lack_after(payload_bytes, self._file)
+        while reason:
             if self._limits.when_full == "stop" or not self.files:
-                self._end(why)
+                self._end(reason)
                 return
             try:
                 self.files[0].unlink(missing_ok=True)
             except OSError as error:
-                self._end(f"{why}, and {self.files[0]} stays ({error.strerror})")
+                self._end(f"{reason}, and {self.files[0]} stays ({error.strerror})")
                 return
             self.files.pop(0)
             self._room.finished_bytes -= self._sizes.pop(0)
             self._kept.pop(0)
             self.removed += 1
-            why = self._room.lack(self._file)
+            reason = self._room.lack(self._file)

@@ -1,4 +1,4 @@
-"""Where a session's payloads go: one or several files, and the room that these may take."""
+"""Sink of a recording session: destination of its payloads, in one or several files within the disk limits."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ from recorder.writer import RecordingWriter
 from rig.channels.table import ChannelTable
 
 OpenFile = Callable[[Path, dict[str, Any], Beginning], RecordingWriter]
-"""Opens one file, given its path, the rig's scene document and how the file begins."""
+"""Factory of a file from its path, the scene document and the beginning of the file."""
 
 
 @dataclass(frozen=True)
 class Needs:
-    """What both kinds of sink need.
+    """Settings of a sink.
 
     Attributes:
-        table: The rig's channel table.
-        tick_rate_hz: Ticks per simulated second.
-        scene: The rig's scene document.
-        open_file: Opens one file.
-        limits: Limits of the files.
-        force: Replace what is there of that name.
-        monotonic_s: Clock that times the looks at the disk [s].
+        table: Channel table of the rig.
+        tick_rate_hz: Ticks per simulated second [Hz].
+        scene: Scene document of the rig.
+        open_file: Factory of one file.
+        limits: Limits of file size and disk space.
+        force: Whether to replace existing files.
+        monotonic_s: Clock for the interval between two checks of the disk [s].
     """
 
     table: ChannelTable
@@ -44,20 +44,20 @@ class Needs:
 
 
 class Sink(ABC):
-    """Takes all that is received: a `Series` keeps all of it, `Captures` what is around triggers.
+    """Destination of received payloads: `Series` keeps all of them, `Captures` those around triggers.
 
     Attributes:
-        path: Name of the recording, ends in .mcap.
-        tally: What was received, whether kept or not.
-        files: The finished files that are there, in order.
-        removed: Number of finished files that were removed for want of room.
-        ended: Why nothing more is recorded, where a limit ended it; empty before.
-        out_of_room: It is for want of room.
-        remarks: What the user should know at once, a line each.
+        path: Name of the recording, ending in .mcap.
+        tally: Counts of received data, recorded or not.
+        files: Finished files in order.
+        removed: Number of finished files removed to free disk space.
+        ended: Limit that ended the recording; empty before.
+        out_of_room: Whether that limit was disk space.
+        remarks: Messages to the user, one line each.
     """
 
     def __init__(self, path: Path, needs: Needs, *, from_start: bool = False) -> None:
-        """Take what both kinds need, and whether row 0 is due of each stream; opens nothing."""
+        """Store the settings, and whether row 0 is expected first in every stream; open no file."""
         self.path = path
         self.tally = Tally(needs.tick_rate_hz, from_start=from_start)
         self.files: list[Path] = []
@@ -69,46 +69,46 @@ class Sink(ABC):
         self._room = Room(path.parent, needs.limits, monotonic_s=needs.monotonic_s)
         self._commands = Commands(needs.scene)
         self._writer: RecordingWriter | None = None
-        """The file that is being written, or that the disk ended."""
+        """File being written, or ended by a disk error."""
         self._kept: list[Counts] = []
-        """What stands in the finished files."""
+        """Totals of the finished files."""
 
     @property
     def part(self) -> Path | None:
-        """Name of the file that is being written, if there is one."""
+        """Name of the file being written; None if there is none."""
         return None if self._writer is None else self._writer.part
 
     def counts(self) -> Counts:
-        """What was received so far, and the size of the files; from any thread."""
+        """Return the totals of received data and the size of the files. Safe to call from any thread."""
         return self.tally.counts(size_bytes=sum(each.size_bytes for each in self.kept()))
 
     def kept(self) -> list[Counts]:
-        """What stands in the files, for each stretch of time that is recorded without a pause."""
+        """Return the totals of the files for each interval recorded without interruption."""
         writer = self._writer
         return [*self._kept] if writer is None else [*self._kept, writer.counts()]
 
     @abstractmethod
     def take(self, payload: Payload) -> None:
-        """Take one payload.
+        """Take a payload.
 
         Raises:
-            RecordingError: The disk refused.
+            RecordingError: The disk reports an error.
         """
 
     def write_missed(self, key: str, messages: int, wall_ns: int) -> None:
-        """Record that the transport lost messages for good; see `RecordingWriter.write_missed`."""
+        """Record messages that the transport dropped; see `RecordingWriter.write_missed`."""
         self.tally.miss(key, messages)
         if self._writer is not None:
             self._writer.write_missed(key, messages, wall_ns)
 
     def note_short(self, rows: dict[str, int], wall_ns: int) -> None:
-        """Record as gaps what is missing at the end of streams; see `RecordingWriter.note_short`."""
+        """Record the rows missing at the end of streams as gaps; see `RecordingWriter.note_short`."""
         self.tally.end(rows)
         if self._writer is not None:
             self._writer.note_short(rows, wall_ns)
 
     def sync_if_due(self) -> None:
-        """Flush to the disk if the last flush was long enough ago."""
+        """Flush to the disk if the flush interval has passed."""
         if self._writer is not None:
             self._writer.sync_if_due()
 
@@ -118,7 +118,7 @@ class Sink(ABC):
             self._close(self._writer, reason, notes)
 
     def _close(self, writer: RecordingWriter, reason: str, notes: dict[str, str] | None = None) -> None:
-        """Finish the file that is being written."""
+        """Finish the file being written."""
         if writer.closed:
             return
         writer.finish(reason, notes=notes)
@@ -129,5 +129,5 @@ class Sink(ABC):
         self._writer = None
 
     def _end(self, why: str) -> None:
-        """There is no more room."""
+        """End the recording because the disk space is used up."""
         self.ended, self.out_of_room = why, True

@@ -1,4 +1,4 @@
-"""What a recording around triggers waits for: events of the stream, and channels that cross a level."""
+"""Triggers of a capture: events of the run, and channels that cross a level."""
 
 from __future__ import annotations
 
@@ -16,27 +16,29 @@ from rig.channels.table import ChannelTable
 from rig.run.commands.table import TRIGGERS
 
 EVENT_NAMES = (*TRIGGERS, "note", "warning")
-"""Events of the stream that can be waited for."""
+"""Events that can be triggers."""
 _LEVEL = re.compile(r"\s*(\|?)([A-Za-z_]\w*)(\|?)\s*([<>])\s*([-+.\deE]+)\s*")
 MOST_CAPTURES = 1000
-_MOST_PRE_S = 120.0
+_MAX_PRE_S = 120.0
 LONGEST_S = 60.0
-"""Longest length of a capture by default [s of simulated time]."""
+"""Default maximum length of a capture [s of simulated time]."""
 REARM_S = 0.25
-"""A level starts a new capture only if nothing was beyond it for so long: whirl crosses one twice a turn, and would
-otherwise start captures for as long as it lasts [s of simulated time]."""
+"""Time without a value beyond the level after which it triggers again [s of simulated time].
+
+Whirl crosses a level twice per revolution and would otherwise start captures for as long as it lasts.
+"""
 
 
 @dataclass(frozen=True)
 class Trigger:
-    """What starts a capture: an event, or a channel that crosses a level.
+    """Condition that starts a capture: an event, or a channel that crosses a level.
 
     Attributes:
-        text: As the user wrote it.
-        name: Event or channel; goes into the name of the file.
+        text: Trigger as typed by the user.
+        name: Event or channel; part of the file name.
         level: Level [unit of the channel]; None for an event.
-        above: The value rises above the level; False: it falls below.
-        magnitude: It is the absolute value that counts.
+        above: Whether the value must rise above the level; otherwise it must fall below.
+        magnitude: Whether the absolute value is compared.
     """
 
     text: str
@@ -47,10 +49,10 @@ class Trigger:
 
     @classmethod
     def parse(cls, text: str) -> Trigger:
-        """Read a trigger: an event such as `hammer`, or a level such as `P_E>3200`, `speed<5` or `|disk_x|>0.5`.
+        """Parse a trigger: an event such as `hammer`, or a level such as `P_E>3200`, `speed<5` or `|disk_x|>0.5`.
 
         Raises:
-            InputError: It is neither.
+            InputError: The text is neither.
         """
         if text in EVENT_NAMES:
             return cls(text=text, name=text)
@@ -67,12 +69,12 @@ class Trigger:
         return cls(text=text, name=match[2], level=level, above=match[4] == ">", magnitude=bool(match[1]))
 
     def crossed(self, values: np.ndarray) -> np.ndarray:
-        """Where values are beyond the level, shape (n,)."""
+        """Return which values are beyond the level, shape (n,)."""
         values = np.abs(values) if self.magnitude else values
         return values > self.level if self.above else values < self.level
 
     def already(self, unit: str) -> str:
-        """What to say where the first value is beyond the level, in this unit."""
+        """Return the message for a first value beyond the level, in a unit."""
         name = f"|{self.name}|" if self.magnitude else self.name
         side, other = ("above", "below") if self.above else ("below", "above")
         return f"{name} is {side} {self.level:g} {unit} already; waiting until it has been {other}"
@@ -80,18 +82,18 @@ class Trigger:
 
 @dataclass(frozen=True)
 class Capture:
-    """Which triggers, and how much around them is kept.
+    """Triggers of a recording and the time to keep around each.
 
     Attributes:
-        triggers: Any of them starts a capture.
-        pre_s: Time kept before the trigger [s of simulated time].
-        post_s: Time kept after it [s of simulated time].
-        count: The recording ends after so many captures; None if it does not.
-        again: A trigger during a capture makes it longer, to `post_s` after the last one; or is ignored. Either way
-            it is counted, and noted in the file. None: an event makes it longer, a level is ignored, for it can be
-            crossed again for as long as the rig whirls.
-        longest_s: Longest length of a capture, with the time before the trigger [s of simulated time]; None for
-            `LONGEST_S`, or `pre_s` and `post_s` where they are more.
+        triggers: Triggers, each of which starts a capture.
+        pre_s: Time before the trigger [s of simulated time].
+        post_s: Time after the trigger [s of simulated time].
+        count: Number of captures after which the recording ends; None for no limit.
+        again: Effect of a trigger during a capture: extend it to `post_s` after the trigger, or ignore the trigger.
+            Both count it and list it in the file. None: events extend; levels are ignored, because whirl can cross a
+            level again and again.
+        longest_s: Maximum length of a capture, including `pre_s` [s of simulated time]; None for `LONGEST_S`, or
+            `pre_s` + `post_s` if that is longer.
     """
 
     triggers: tuple[Trigger, ...]
@@ -102,8 +104,8 @@ class Capture:
     longest_s: float | None = None
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.pre_s <= _MOST_PRE_S:
-            raise InputError("pre_s", f"from 0 to {_MOST_PRE_S:g}, as it is kept in memory", self.pre_s)
+        if not 0.0 <= self.pre_s <= _MAX_PRE_S:
+            raise InputError("pre_s", f"from 0 to {_MAX_PRE_S:g}, as it is kept in memory", self.pre_s)
         if not 0.0 < self.post_s <= 1e6:
             raise InputError("post_s", "above 0, at most 1e6", self.post_s)
         if self.count is not None and not 1 <= self.count <= MOST_CAPTURES:
@@ -116,27 +118,27 @@ class Capture:
 
     @property
     def most_s(self) -> float:
-        """Longest length of a capture, whether it was given or not [s of simulated time]."""
+        """Effective maximum length of a capture [s of simulated time]."""
         return max(LONGEST_S, self.pre_s + self.post_s) if self.longest_s is None else self.longest_s
 
     def extends(self, trigger: Trigger) -> bool:
-        """Whether this trigger makes a capture longer that is being made."""
+        """Return whether a trigger extends a capture in progress."""
         return trigger.level is None if self.again is None else self.again == "extend"
 
 
 class Crossings:
-    """Where a channel crosses the level of a trigger, block after block.
+    """Detector of level crossings of a channel, block by block.
 
     Attributes:
         key: Key of the channel's blocks.
-        remark: What the user should know at once; empty if nothing.
+        remark: Message to the user; empty without one.
     """
 
     def __init__(self, trigger: Trigger, table: ChannelTable) -> None:
-        """Find the channel.
+        """Find the channel in the table.
 
         Raises:
-            InputError: The table does not have it.
+            InputError: The table does not have the channel.
         """
         if trigger.name not in table.channels:
             raise InputError("trigger", f"on one of {', '.join(table.channels)}", trigger.text)
@@ -147,35 +149,39 @@ class Crossings:
         self.key = sensor_key(self._channel.group)
         self.remark = ""
         self._beyond: bool | None = None
-        """Whether the latest value was beyond the level; None before the first one."""
+        """Whether the latest value was beyond the level; None before the first value."""
         self._beyond_ns = -math.inf
-        """Simulated time of the latest value beyond it [ns]."""
+        """Simulated time of the latest value beyond the level [ns]."""
 
     def take(self, block: Block, begin_ns: int) -> list[tuple[int, bool]]:
-        """Take the next block, which begins at a simulated time [ns].
+        """Process the next block.
+
+        Args:
+            block: The block.
+            begin_ns: Simulated time of its first row [ns].
 
         Returns:
-            Simulated time of those crossings that count [ns], and whether each may start a capture.
+            Simulated time of each relevant crossing [ns], and whether it may start a capture.
         """
         if not len(block.values) or block.values.shape[1] != self._columns:
             return []
         channel = self._channel
         beyond = self._trigger.crossed(block.values[:, self._column] * channel.scale + channel.offset)
-        # What is beyond its level from the first row on has not crossed it.
+        # A signal that is beyond the level from the first row on has not crossed it.
         if self._beyond is None and beyond[0]:
             self.remark = self._trigger.already(channel.unit)
         before = np.concatenate(([self._beyond is not False], beyond[:-1]))
         self._beyond = bool(beyond[-1])
-        there = np.flatnonzero(beyond)
-        if not len(there):
+        beyond_rows = np.flatnonzero(beyond)
+        if not len(beyond_rows):
             return []
         row_ns = NS / block.rate_hz
         crossings = np.flatnonzero(beyond & ~before)
-        # Time for which nothing was beyond the level, at each crossing.
-        places = np.searchsorted(there, crossings)
-        before_ns = np.where(places > 0, there[places - 1] * row_ns, self._beyond_ns - begin_ns)
+        # Time without a value beyond the level, before each crossing.
+        positions = np.searchsorted(beyond_rows, crossings)
+        before_ns = np.where(positions > 0, beyond_rows[positions - 1] * row_ns, self._beyond_ns - begin_ns)
         is_new = crossings * row_ns - before_ns >= REARM_S * NS
-        self._beyond_ns = begin_ns + round(int(there[-1]) * row_ns)
-        # One that may start a capture, or else the first, counts, and the last, which may make it longer.
-        picked = dict.fromkeys((int(np.argmax(is_new)), len(crossings) - 1)) if len(crossings) else ()
-        return [(begin_ns + round(int(crossings[which]) * row_ns), bool(is_new[which])) for which in picked]
+        self._beyond_ns = begin_ns + round(int(beyond_rows[-1]) * row_ns)
+        # Report the crossing that may start a capture, or else the first, and the last, which may extend it.
+        reported = dict.fromkeys((int(np.argmax(is_new)), len(crossings) - 1)) if len(crossings) else ()
+        return [(begin_ns + round(int(crossings[which]) * row_ns), bool(is_new[which])) for which in reported]

@@ -122,7 +122,7 @@ CONTRADICTIONS: dict[str, tuple[Spoil, str]] = {
     "seed, start": (event("start", seed=2), "seed: 1 in its metadata but 2 in rig/events"),
     "set, metadata": (metadata("rig", parameter_set="dtu-2019"), "parameter set: dtu-2019 in its metadata but correc"),
     "set, scene": (scene(lambda s: s.update(parameters="as-printed")), "parameter set: corrected in its metadata but"),
-    "ticks": (metadata("rig", tick_rate_hz="1000"), "ticks a second: 1000 in its metadata but 1000000 in catalogue"),
+    "ticks": (metadata("rig", tick_rate_hz="1000"), "tick rate: 1000 in its metadata but 1000000 in catalogue"),
     "parameter, scene": (
         scene(lambda s: s["set"].update({"contact.friction": 0.2})),
         "contact.friction: 0.2 in scene.json but 0.25 in parameters.json",
@@ -153,7 +153,7 @@ CONTRADICTIONS: dict[str, tuple[Spoil, str]] = {
     "truth rate": (scene(lambda s: s["sensors"].update(truth_rate_hz=200)), f"rate of {STATE}: 100 in catalogue.json"),
     "text": (
         lambda layout: layout.attachments.update({"README.txt": readme(layout) + b"x"}),
-        "README.txt says something else than catalogue.json",
+        "README.txt differs from catalogue.json",
     ),
     "hammer, scene": (
         scene(lambda s: s["commands"][0]["request"].update(force_n=120.0)),
@@ -161,10 +161,10 @@ CONTRADICTIONS: dict[str, tuple[Spoil, str]] = {
     ),
     "hammer, time": (
         scene(lambda s: s["commands"][0].update(at_s=0.03)),
-        "hammer at 0.02 s in rig/events that neither the scene nor a command asks for",
+        "hammer at 0.02 s in rig/events without a scene entry or a command",
     ),
-    "hammer, did not happen": (event("hammer"), "hammer at 0.02 s is asked for, and did not happen in rig/events"),
-    "command, did not happen": (more(EVENTS, SPEED, 10**8), "speed at 0.1 s is asked for, and did not happen"),
+    "hammer, did not happen": (event("hammer"), "hammer at 0.02 s is requested, but did not happen in rig/events"),
+    "command, did not happen": (more(EVENTS, SPEED, 10**8), "speed at 0.1 s is requested, but did not happen"),
     "command, twice": (
         together(
             more(EVENTS, COMMAND, 20_000_000),
@@ -172,15 +172,15 @@ CONTRADICTIONS: dict[str, tuple[Spoil, str]] = {
         ),
         "command 1: request: {'force_n': 60.0} in scene.json, taken but {'force_n': 50.0} in rig/events",
     ),
-    "time of an event": (event("hammer", time_s=0.03), f"messages of {EVENTS} at another time than they say: 1"),
+    "time of an event": (event("hammer", time_s=0.03), f"messages of {EVENTS} whose time differs from the time in them: 1"),
     "two starts": (more(EVENTS, {"event": "start", "tick": 0}), "more than one start of the run among the events"),
     "end, metadata": (event("end", reason="stopped"), "end: completed in metadata end but stopped in rig/events"),
     "end, none": (event("end"), "end: completed in metadata end but no end of the run in rig/events"),
     "end, early": (event("end", tick=500_000, time_s=0.5), "end: completed at 0.5 s in rig/events but 0.6 s long"),
-    "end, behind": (event("end", tick=500_000, time_s=0.5), f"{PROBES} goes on to 0.599800 s, behind the end"),
+    "end, behind": (event("end", tick=500_000, time_s=0.5), f"{PROBES} continues to 0.599800 s, after the end"),
     "duration": (scene(lambda s: s.update(duration_s=0.1)), "rows up to 0.599800 s of a scene that ends at 0.1 s"),
-    "published": (event("end", rows={PROBES: 2999}), f"{PROBES} goes on to row 3000, of 2999 that the rig says"),
-    "one group longer": (longer, f"{PROBES} goes on to row 3500, of 3000 that the rig says it published"),
+    "published": (event("end", rows={PROBES: 2999}), f"{PROBES} continues to row 3000, but the rig published 2999"),
+    "one group longer": (longer, f"{PROBES} continues to row 3500, but the rig published 3000"),
     "first row": (metadata("end", first_time_s="0.1"), "first row: at 0.100000 s in metadata end but at 0.000000 s"),
     "last row": (metadata("end", last_time_s="9.9"), "last row: at 9.900000 s in metadata end but at 0.599800 s"),
     "begun and ended": (metadata("end", ended="2020-01-01T00:00:00+00:00"), "ended 2020-01-01T00:00:00+00:00, before"),
@@ -190,23 +190,23 @@ CONTRADICTIONS: dict[str, tuple[Spoil, str]] = {
     "gap that is none": (more("recorder/gaps", GAP), f"7 rows of {PROBES} from 1000 on: noted as missing, and they"),
     "gap not noted": (
         blocks(PROBES, lambda block, _: ({"values": block.values[:-7]}, 0), number=2),
-        f"7 rows of {PROBES} from 1493 on: no gap is noted where they are missing",
+        f"7 rows of {PROBES} from 1493 on: missing, and no gap is noted",
     ),
     "time of a block": (
         blocks(FORCES, lambda block, _: ({"tick": block.tick + 5000}, 0), number=2),
-        f"messages of {FORCES} at another time than they say: 1",
+        f"messages of {FORCES} whose time differs from the time in them: 1",
     ),
     "time and row number": (
         blocks(FORCES, lambda block, _: ({"tick": block.tick + 5000}, 5_000_000), number=2),
         f"1 blocks of {FORCES} have a time that does not fit their row number",
     ),
-    "cut, from": (metadata("cut", from_s="0.2", to_s="inf"), f"{PROBES} begins at 0.000000 s, before the cut from 0.2"),
-    "cut, to": (metadata("cut", from_s="-inf", to_s="0.3"), f"{PROBES} ends at 0.599800 s, behind the cut up to 0.3"),
-    "cut, channels": (metadata("cut", channels='["disk_x"]'), "disk_y is there, though the cut is of disk_x only"),
-    "cut, only": (metadata("cut", only="truth"), f"{PROBES} is there, though the cut is of truth only"),
+    "cut, from": (metadata("cut", from_s="0.2", to_s="inf"), f"{PROBES} begins at 0.000000 s, before the start of the cut at 0.2"),
+    "cut, to": (metadata("cut", from_s="-inf", to_s="0.3"), f"{PROBES} ends at 0.599800 s, after the end of the cut at 0.3"),
+    "cut, channels": (metadata("cut", channels='["disk_x"]'), "disk_y is present, although the cut keeps only disk_x"),
+    "cut, only": (metadata("cut", only="truth"), f"{PROBES} is present, although the cut keeps only truth"),
     "series": (
         metadata("series", id="a", number="1", due=json.dumps({PROBES: 100})),
-        f"{PROBES} begins with row 0, before row 100 that its series says is due",
+        f"{PROBES} begins with row 0, before row 100 stated by its series",
     ),
 }  # fmt: skip
 

@@ -242,19 +242,19 @@ _LIES: dict[str, tuple[Callable[[Layout], object], str]] = {
     "undecodable": (lambda layout: _odd(layout, _of(layout)[0]), "are no blocks, or do not fit the catalogue: 1"),
     "twice": (
         lambda layout: layout.messages.insert(0, layout.messages[_of(layout)[0]]),
-        f"blocks of {PROBES} that repeat row numbers, or go back: 1",
+        f"blocks of {PROBES} with repeated or decreasing row numbers: 1",
     ),
     "channel": (
         _catalogue(lambda document: document["table"]["groups"]["probes"]["channels"].pop()),
-        f"payloads of {PROBES} that are no blocks, or do not fit the catalogue: 3",
+        f"payloads of {PROBES} that are not blocks or do not fit the catalogue: 3",
     ),
     "ticks": (
         _catalogue(lambda document: document.update(tick_rate_hz=1000.0)),
-        f"payloads of {PROBES} that are no blocks, or do not fit the catalogue: 3",
+        f"payloads of {PROBES} that are not blocks or do not fit the catalogue: 3",
     ),
     "rate": (
         _catalogue(_slower),
-        f"blocks of {PROBES} at another rate than the catalogue says: 3",
+        f"blocks of {PROBES} whose rate differs from the catalogue: 3",
     ),
     "group": (
         _catalogue(lambda document: document["table"]["groups"].pop("probes")),
@@ -323,7 +323,7 @@ def test_a_chunk_that_the_index_leaves_out_is_told_and_statistics_may_be_missing
         end = summary + data[len(data) - 37 : checksum_at]
         spoilt.write_bytes(data[:start] + end + struct.pack("<I", zlib.crc32(end)) + MAGIC)
         if opcode == 8:
-            with pytest.raises(InputError, match="does not fit what is there"):
+            with pytest.raises(InputError, match="does not fit the file"):
                 Recording.open(spoilt)
     assert contents(Recording.open(spoilt)) == contents(Recording.open(path))
 

@@ -367,7 +367,7 @@ def test_a_full_disk_ends_the_command_with_what_was_kept_and_recover_finishes_it
         output, errors = process.communicate(timeout=PATIENCE_S)
         assert process.returncode == 1
         assert "ended: disk error" in output
-        assert "lost: all that came after " in output
+        assert "lost: all data after " in output
         assert "lost: nothing" not in output
         assert "is kept in" in " ".join(errors.split())
         part = path.with_name("run.mcap.part")

@@ -118,7 +118,7 @@ def test_help_is_told_once_and_fits_80_columns(capsys: pytest.CaptureFixture[str
         ("import a.csv --template -o b", "--template must be followed by a value; instead received '-o'"),
         (
             f"cut {ROOT}/replays/sessions/hammer-6.2.mcap -o b.mcap --from 2 --to 1",
-            "--from and --to must be times, one before the other; instead received 2 and 1",
+            "--from and --to must be times in ascending order; instead received 2 and 1",
         ),
         (
             "run hammer --engine rk5",

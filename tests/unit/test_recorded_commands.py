@@ -24,8 +24,8 @@ DOUBTS = {
     "an unknown command": ({**COMMAND, "command": "sped", "request": {}}, "command must be one of"),
     "a number as text": ({**COMMAND, "command": "speed", "request": {"speed_hz": "5"}}, "speed_hz must be"),
     "a force below 0": ({**COMMAND, "command": "hammer", "request": {"force_n": -5.0}}, "force_n must be"),
-    "a negative tick": ({**COMMAND, "tick": -5}, "that are not what it promises: 1"),
-    "an id as text": ({**COMMAND, "id": "all"}, "that are not what it promises: 1"),
+    "a negative tick": ({**COMMAND, "tick": -5}, "malformed messages of rig/events: 1"),
+    "an id as text": ({**COMMAND, "id": "all"}, "malformed messages of rig/events: 1"),
 }
 
 

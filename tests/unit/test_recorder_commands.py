@@ -160,7 +160,7 @@ def test_nothing_is_recovered_where_one_file_is_missing(path, tmp_path, capsys):
         (["--trigger", "hit"], "--trigger must be one of"),
         (
             ["--trigger", "hammer", "--rotate-s", "5"],
-            "--rotate-s must be left out where it is recorded around triggers; instead received 5.0",
+            "--rotate-s must be omitted for a recording around triggers; instead received 5.0",
         ),
         (["--trigger-count", "3"], "--trigger-count must be used with --trigger"),
         (["--pre-s", "0.5"], "--pre-s must be used with --trigger; instead received 0.5"),
@@ -231,7 +231,7 @@ def test_a_disk_that_refuses_is_told_in_a_line(path, tmp_path, capsys, monkeypat
     with pytest.raises(SystemExit) as exit_info:
         main(["cut", str(path), "-o", str(tmp_path / "new.mcap")])
     assert exit_info.value.code == 1
-    assert capsys.readouterr().err.strip().endswith("new.mcap.part could not be begun")
+    assert capsys.readouterr().err.strip().endswith("new.mcap.part could not be started")
     assert not list(tmp_path.glob("new*"))
 
 
@@ -285,7 +285,7 @@ def test_recover_makes_no_file_where_every_chunk_is_unreadable(
 ) -> None:
     source = _damaged(in_chunks, tmp_path / "x.mcap", Recording.open(in_chunks).chunks)
     assert run("recover", source) == 2
-    assert "must be a recording with rows that can be read" in capsys.readouterr().err
+    assert "must be a recording with readable rows" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == [source]
 
 

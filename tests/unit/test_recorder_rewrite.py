@@ -149,7 +149,7 @@ def test_a_file_in_the_making_is_not_recovered(tmp_path, items):
     with writer(tmp_path / "run.mcap", sync_every_s=0.0) as file:
         for key, payload in items[:30]:
             file.write(key, payload, 0)
-        with pytest.raises(InputError, match="one that no recorder is writing to"):
+        with pytest.raises(InputError, match="a file that no recorder is writing to"):
             recover(file.part)
         file.finish("completed")
     assert list(tmp_path.iterdir()) == [tmp_path / "run.mcap"]
@@ -324,7 +324,7 @@ def test_a_cut_knows_the_commands_before_it(tmp_path, items):
 @pytest.mark.parametrize(
     ("options", "must"),
     [
-        ({"from_s": 2.0, "to_s": 1.0}, "from and to must be times, one before the other"),
+        ({"from_s": 2.0, "to_s": 1.0}, "from and to must be times in ascending order"),
         ({"from_s": float("nan")}, "from and to must be times"),
         ({"from_s": 50.0}, "from and to must be times that the recording holds"),
         ({"channels": ("disk_z",)}, "channels must be among disk_x"),

@@ -330,7 +330,7 @@ def test_a_removed_folder_leaves_a_copy_in_the_nearest_one(tmp_path, items):
     for each in folder.iterdir():
         each.unlink()
     folder.rmdir()
-    with pytest.raises(RecordingError, match=r"was removed while it was written.*is kept in .*run\.mcap\.part"):
+    with pytest.raises(RecordingError, match=r"was removed while it was being written.*is kept in .*run\.mcap\.part"):
         write(file, items[200:])
     copy = tmp_path / "run.mcap.part"
     assert file.part == copy
@@ -370,5 +370,5 @@ def test_files_of_different_runs_are_not_joined(tmp_path, items):
 def test_the_same_rows_twice_are_not_joined(tmp_path, items):
     for name in ("a", "b"):
         write(series(tmp_path / f"{name}.mcap"), items[:100])
-    with pytest.raises(InputError, match="recordings behind each other"):
+    with pytest.raises(InputError, match="recordings that do not overlap in time"):
         join([tmp_path / "a.mcap", tmp_path / "b.mcap"])

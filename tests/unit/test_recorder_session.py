@@ -399,7 +399,7 @@ def test_a_lost_rig_closes_the_file_well(path):
 
     summary = record(RecordingSession(client, path), client, act)
     assert summary.reason == RIG_LOST
-    assert summary.losses == ("what the rig may have sent after 0.100 s, where it was lost",)
+    assert summary.losses == ("data that the rig may have sent after 0.100 s, where it was lost",)
     recording = Recording.open(path)
     assert recording.complete
     assert recording.end_reason == RIG_LOST
@@ -492,7 +492,7 @@ def test_a_disk_error_ends_the_session_with_what_was_written(path, monkeypatch):
         thread.join()
     assert summary.reason == "disk error"
     assert len(summary.losses) == 1
-    assert summary.losses[0].startswith("all that came after")
+    assert summary.losses[0].startswith("all data after")
     assert "No space left on device" in summary.error
     assert summary.path == path.with_name("run.mcap.part")
     assert not path.exists()

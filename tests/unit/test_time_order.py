@@ -133,8 +133,8 @@ def test_stamps_that_make_no_rate_are_refused_as_a_line_too(name: str) -> None:
 
 
 Change = Callable[[Block, int], dict[str, object]]
-REPEATED, MISPLACED = "that repeat row numbers, or go back", "have a time that does not fit their row number"
-NOT_BLOCKS, TURNED = "that are no blocks, or do not fit the catalogue", "have edges no later than the ones before"
+REPEATED, MISPLACED = "with repeated or decreasing row numbers", "have a time that does not fit their row number"
+NOT_BLOCKS, TURNED = "that are not blocks or do not fit the catalogue", "have edges that are not in ascending order"
 STATE = "rig/truth/state"
 TICKS: dict[str, tuple[str, Change, str]] = {
     "one back": (PROBES, lambda block, n: {"tick": block.tick - 150_000 * (n == 3)}, MISPLACED),
