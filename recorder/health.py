@@ -1,6 +1,6 @@
 """Health check of a recording: calibration of each channel, timing, and the status reported by the rig.
 
-The check needs only the recording and works window by window, so long recordings fit into memory. A finding is a
+The check needs only the recording and works window by window, to fit long recordings into memory. A finding is a
 reason to look, not a proof: a rig whose housings ring at 50 Hz looks like one with mains hum.
 """
 

@@ -69,9 +69,9 @@ class Recording:
         self.parameters, self.scene = first.parameters, first.scene
         self._surveys, self.in_part = surveys, False
         self.true = False
-        """Whether the effects of faults on blocks are reversed; see `truly`."""
+        """True if the effects of faults on blocks are reversed; see `truly`."""
         self.applies_faults = True
-        """Whether the fault documents are applied; see `untold`."""
+        """True if the fault documents are applied; see `untold`."""
 
     @classmethod
     def open(cls, path: Path | str, *, salvage: bool = False) -> Self:

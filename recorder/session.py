@@ -172,7 +172,7 @@ class RecordingSession:
         self._end_rows: dict[str, int] | None = None
         """Number of the row after the last one published, by key, as stated in the end event."""
         self._last_status = False
-        """Whether the final status of the run has arrived."""
+        """True if the final status of the run has arrived."""
         self._rig_id: str | None = None
         """Identity of the rig on the transport."""
         self._rig_lost = False
@@ -342,7 +342,7 @@ class RecordingSession:
     # Called on the calling thread.
 
     def _wait_for_end(self, writer: Sink, on_progress: Callable[[Progress], None] | None) -> str:
-        """Monitor the session and return the reason for its end."""
+        """Wait for the end of the session and return its reason."""
         heartbeat_s = -1e9
         ended_s = None
         while True:

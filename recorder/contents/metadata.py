@@ -38,7 +38,7 @@ class Beginning:
 
 
 class Commands:
-    """Scene document with the commands accepted so far, so that a later file of a series is self-contained."""
+    """Scene document with the commands accepted up to now, which makes a later file of a series self-contained."""
 
     def __init__(self, scene: dict[str, Any]) -> None:
         self._scene = scene
@@ -54,7 +54,7 @@ class Commands:
 
     @property
     def scene(self) -> dict[str, Any]:
-        """Scene document with all commands so far."""
+        """Scene document with all commands up to now."""
         if not self._taken and "taken" not in self._scene:
             return self._scene
         return {**self._scene, "taken": list(self._taken.values())}

@@ -92,5 +92,5 @@ class Summary:
 
     @property
     def good(self) -> bool:
-        """Whether the session ended without failure and without losses."""
+        """True if the session ended without failure and without losses."""
         return not (self.error or self.losses or self.reason.startswith("failed"))

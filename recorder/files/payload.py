@@ -60,7 +60,7 @@ class Payload:
 
     @property
     def malformed(self) -> bool:
-        """Whether the payload does not fit the format of its key."""
+        """True if the payload does not fit the format of its key."""
         return self.block is None and self.document is None
 
     @property

@@ -150,7 +150,7 @@ def _check_index(file: BinaryIO, summary: _Summary, data_end: int, limits: _Reco
     """Compare the records of the data section with the index, and read metadata and attachments.
 
     Returns:
-        Whether the index lists all messages; False if there are messages outside chunks.
+        True if the index lists all messages; False if there are messages outside chunks.
     """
     found, position, places = summary.found, len(MAGIC), set()
     indexed = summary.places | {(chunk.offset, chunk.length + RECORD.size) for chunk in found.chunks}
@@ -254,7 +254,7 @@ class _Summary:
 
     @property
     def indexed(self) -> bool:
-        """Whether the summary suffices to find all messages: channels, counts, and a chunk index with channels."""
+        """True if the summary suffices to find all messages: channels, counts, and a chunk index with channels."""
         chunks, counts = self.found.chunks, {number for number, count in self.found.counts.items() if count}
         listed = set().union(*(chunk.channels or () for chunk in chunks))
         return self.counted and bool(listed) and counts | listed <= set(self.found.topics)

@@ -66,7 +66,7 @@ class _OpenCapture:
     """End of the capture at its maximum length [ns]."""
     fired: list[dict[str, Any]]
     full: bool = False
-    """Whether the maximum length cut the capture short."""
+    """True if the maximum length cut the capture short."""
     count: int = 1
 
 

@@ -58,7 +58,7 @@ class Limits:
 
     @property
     def rotates(self) -> bool:
-        """Whether the recording is split into several files."""
+        """True if the recording is split into several files."""
         return self.rotate_mb is not None or self.rotate_s is not None
 
 

@@ -149,7 +149,7 @@ class Crossings:
         self.key = sensor_key(self._channel.group)
         self.remark = ""
         self._beyond: bool | None = None
-        """Whether the latest value was beyond the level; None before the first value."""
+        """True if the latest value was beyond the level; None before the first value."""
         self._beyond_ns = -math.inf
         """Simulated time of the latest value beyond the level [ns]."""
 

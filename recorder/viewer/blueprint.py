@@ -1,4 +1,4 @@
-"""The layout of the viewer."""
+"""Layout of the viewer."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from rig.base.errors import InputError
 from rig.channels.table import ChannelTable
 
 LIVE_S = 10.0
-"""Time series of a live view show this much of the past [s]."""
+"""Time span of the time series in a live view [s]."""
 _BACKGROUND = (16, 18, 23)
-_SMALL = ("Spin speed [Hz]", "Hammer [N]")
-"""Plots that need little height."""
+_LOW_PLOTS = ("Spin speed [Hz]", "Hammer [N]")
+"""Plots of reduced height."""
 
 
 def layout(table: ChannelTable, geometry: Geometry, *, live: bool, only: str | None = None) -> rrb.Blueprint:
@@ -33,9 +33,9 @@ def layout(table: ChannelTable, geometry: Geometry, *, live: bool, only: str | N
         InputError: No title contains `only`.
     """
     curves = _curve_views(table, geometry, live=live)
-    small = [curves.pop(name) for name in _SMALL if name in curves]
+    small = [curves.pop(name) for name in _LOW_PLOTS if name in curves]
     planes = [plane for plane in orbit.PLANES if plane in painter.planes_in(table)]
-    # Views with their heights; of channels that are not a rig's, as of an imported log, only what they can fill.
+    # Views with their heights. An imported log with other channels gets only the views that it has data for.
     motion: list[tuple[rrb.View | rrb.Container, float]] = []
     frequency: list[tuple[rrb.View | rrb.Container, float]] = []
     if planes:
@@ -110,11 +110,11 @@ def _events_view() -> rrb.TextLogView:
 
 
 def _orbit_view(plane: str, geometry: Geometry) -> rrb.Spatial2DView:
-    reach = 1.9 * geometry.clearance_mm(plane)
+    limit = 1.9 * geometry.clearance_mm(plane)
     return rrb.Spatial2DView(
         origin=f"{orbit.ROOT}/{plane}",
         name=f"Orbit at the {plane} [mm]",
-        visual_bounds=rrb.VisualBounds2D(x_range=[-reach, reach], y_range=[-reach, reach]),
+        visual_bounds=rrb.VisualBounds2D(x_range=[-limit, limit], y_range=[-limit, limit]),
         background=_BACKGROUND,
     )
 
@@ -132,36 +132,36 @@ def _scene_view() -> rrb.Spatial3DView:
 
 
 def _curve_views(table: ChannelTable, geometry: Geometry, *, live: bool) -> dict[str, rrb.TimeSeriesView]:
-    """One plot a quantity by its title, those that the table has."""
-    # Titles name the colours: a legend would hide the first impacts.
+    """Return the time series plots by title, limited to the channels of the table."""
+    # Titles name the colours, because a legend would hide the first impacts.
     plots = {
         "Ring [mm]: x blue, y amber": [f"{series.ROOT}/probes/ring"],
         "Disk [mm]: x blue, y amber": [f"{series.ROOT}/probes/disk"],
         "Reaction [N]: x = E - W blue, y = N - S amber": [series.REACTION],
         "Forces [N]: N blue, S dark blue, E amber, W brown": [f"{series.ROOT}/forces/P"],
-        "Accelerations [m/s²]: x blue, y amber, outer house darker": [
+        "Accelerations [m/s²]: x blue, y amber, outer housing darker": [
             f"{series.ROOT}/accelerations/inner",
             f"{series.ROOT}/accelerations/outer",
         ],
         "Spin speed [Hz]": [f"{series.ROOT}/drive/speed"],
         "Hammer [N]": [f"{series.ROOT}/hammer/hammer"],
     }
-    reaches = {f"{series.ROOT}/probes/{plane}": 1.15 * geometry.clearance_mm(plane) for plane in orbit.PLANES}
-    there = series.paths_of(table)
+    limits = {f"{series.ROOT}/probes/{plane}": 1.15 * geometry.clearance_mm(plane) for plane in orbit.PLANES}
+    known = series.paths_of(table)
     planned = {path for paths in plots.values() for path in paths}
     views = {
-        title: _curve_view(title, [path for path in paths if path in there], reach=reaches.get(paths[0]), live=live)
+        title: _curve_view(title, [path for path in paths if path in known], limit=limits.get(paths[0]), live=live)
         for title, paths in plots.items()
-        if set(paths) & set(there)
+        if set(paths) & set(known)
     }
-    others = {path.removeprefix(f"{series.ROOT}/"): path for path in there if path not in planned}
+    others = {path.removeprefix(f"{series.ROOT}/"): path for path in known if path not in planned}
     return views | {
-        title: _curve_view(title, [path], reach=None, live=live, legend=True) for title, path in others.items()
+        title: _curve_view(title, [path], limit=None, live=live, legend=True) for title, path in others.items()
     }
 
 
 def _curve_view(
-    title: str, paths: Sequence[str], *, reach: float | None, live: bool, legend: bool = False
+    title: str, paths: Sequence[str], *, limit: float | None, live: bool, legend: bool = False
 ) -> rrb.TimeSeriesView:
     return rrb.TimeSeriesView(
         origin="/",
@@ -169,7 +169,7 @@ def _curve_view(
         name=title,
         plot_legend=rrb.PlotLegend(corner="LeftTop", visible=legend),
         axis_x=_time_axis(live=live),
-        axis_y=None if reach is None else rrb.ScalarAxis(range=(-reach, reach)),
+        axis_y=None if limit is None else rrb.ScalarAxis(range=(-limit, limit)),
     )
 
 
@@ -177,7 +177,7 @@ def _contact_view(*, live: bool) -> rrb.StateTimelineView:
     return rrb.StateTimelineView(
         origin="/contact",
         contents=[f"+ {contact.SENSED}", f"+ {contact.TRUTH}"],
-        name="Contact at the ring: by the probes, and by the model if it tells",
+        name="Contact at the ring: from probes, and from the model if available",
         time_view=_time_axis(live=live),
     )
 

@@ -1,4 +1,4 @@
-"""One rerun recording, with simulated and wall time under everything that is drawn."""
+"""Canvas: a rerun recording stream with simulated and wall time for everything drawn."""
 
 from __future__ import annotations
 
@@ -14,44 +14,46 @@ APPLICATION = "rig"
 SIMULATED = "simulated_time"
 WALL = "wall_time"
 PICTURE = "picture"
-"""Counts what was drawn live, for a viewer to tell how far it is: simulated time may jump, as in a replay."""
+"""Timeline that counts live pictures, to measure the viewer's progress; simulated time may jump, as in a replay."""
 Place = tuple[float, float]
 RGB = tuple[int, int, int]
 
 
 def new_stream(name: str, *, batch_s: float = 0.1) -> rr.RecordingStream:
-    """A recording stream named `name` that is connected to nothing yet.
+    """Return an unconnected recording stream.
 
-    What is drawn of one thing within `batch_s` [s] leaves together: a viewer takes long for many pieces, not for large
-    ones.
+    Args:
+        name: Name of the recording.
+        batch_s: Time over which the data of an entity are sent together [s]; a viewer processes a few large pieces
+            faster than many small ones.
     """
     stream = rr.RecordingStream(APPLICATION, batcher_config=rr.ChunkBatcherConfig(flush_tick=batch_s))
-    # rerun's own time of logging would stand as a third time line that means nothing to the reader.
+    # rerun's log time would appear as a third timeline without a meaning to the user.
     stream.set_log_time_enabled(False)
     stream.send_recording_name(name)
     return stream
 
 
 def pixels(size: float) -> list[float]:
-    """A radius in points of the screen, whatever the zoom: rerun takes negative radii for that."""
+    """Return a radius in screen points, independent of zoom; rerun encodes these as negative radii."""
     return [-size]
 
 
 class Canvas:
-    """Logs to a stream; every time is simulated time [s]."""
+    """Drawing functions on a stream; all times are simulated [s]."""
 
     def __init__(self, stream: rr.RecordingStream, clock: WallClock | None = None) -> None:
         self.stream = stream
         self.clock = WallClock() if clock is None else clock
         self.picture = 0
-        """Number of the picture that is being drawn; 0 where pictures are not counted."""
+        """Number of the current picture; 0 if pictures are not counted."""
 
     def fix(self, path: str, *what: Any) -> None:
-        """Draw something that holds for all times."""
+        """Draw an entity valid at all times."""
         self.stream.log(path, what[0], *what[1:], static=True)
 
     def draw(self, path: str, time_s: float, *what: Any) -> None:
-        """Draw something that holds from an instant on."""
+        """Draw an entity valid from an instant on [s]."""
         self.stream.set_time(SIMULATED, duration=time_s)
         if self.picture:
             self.stream.set_time(PICTURE, sequence=self.picture)
@@ -61,7 +63,7 @@ class Canvas:
         self.stream.log(path, what[0], *what[1:])
 
     def write(self, path: str, words: dict[Place, str], colors: Sequence[RGB], *, time_s: float | None = None) -> None:
-        """Write words at places of a 2-D view; without a time [s] they hold for all times."""
+        """Write labels at positions of a 2-D view, valid from an instant on [s], or at all times without one."""
         text = rr.Points2D(list(words), radii=pixels(0.0), colors=colors, labels=list(words.values()), show_labels=True)
         if time_s is None:
             self.fix(path, text)
@@ -69,7 +71,7 @@ class Canvas:
             self.draw(path, time_s, text)
 
     def keeps_up(self, *, timeout_s: float) -> bool:
-        """Whether all that was drawn so far leaves for the viewer within that time; what does not, piles up here."""
+        """Return whether everything drawn is sent to the viewer within a timeout [s]."""
         try:
             self.stream.flush(timeout_sec=timeout_s)
         except (RuntimeError, ValueError):
@@ -77,7 +79,13 @@ class Canvas:
         return True
 
     def plot(self, path: str, times_s: np.ndarray, columns: Iterable[Any]) -> None:
-        """Draw many instants at once; `columns` comes from an archetype's `columns`."""
+        """Draw many instants at once.
+
+        Args:
+            path: Entity path.
+            times_s: Simulated times [s], shape (n,).
+            columns: Result of an archetype's `columns`.
+        """
         indexes = [rr.TimeColumn(SIMULATED, duration=np.round(times_s * 1e9).astype("timedelta64[ns]"))]
         wall = self.clock.at(times_s)
         if wall is not None:

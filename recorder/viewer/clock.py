@@ -1,14 +1,14 @@
-"""Wall time of simulated instants, from pairs of both that somebody saw."""
+"""Wall time of simulated instants, interpolated from observed pairs."""
 
 from __future__ import annotations
 
 import numpy as np
 
-_KEPT = 4096
+_MAX_PAIRS = 4096
 
 
 class WallClock:
-    """Piecewise linear between the marks, one second a second outside of them."""
+    """Piecewise linear clock through the observed pairs, extrapolated at one second per second."""
 
     def __init__(self) -> None:
         self._simulated: list[float] = []
@@ -18,16 +18,16 @@ class WallClock:
         return len(self._wall)
 
     def mark(self, simulated_s: float, wall_s: float) -> None:
-        """Say that a simulated instant [s] was seen at a wall time [s since 1970]; marks that go back are ignored."""
+        """Add a pair of simulated time [s] and wall time [unix s]; ignore pairs that go backward."""
         if self._simulated and (simulated_s <= self._simulated[-1] or wall_s < self._wall[-1]):
             return
         self._simulated.append(simulated_s)
         self._wall.append(wall_s)
-        if len(self._simulated) > _KEPT:
-            del self._simulated[: _KEPT // 2], self._wall[: _KEPT // 2]
+        if len(self._simulated) > _MAX_PAIRS:
+            del self._simulated[: _MAX_PAIRS // 2], self._wall[: _MAX_PAIRS // 2]
 
     def at(self, simulated_s: np.ndarray) -> np.ndarray | None:
-        """Wall times [s since 1970] of simulated times [s], same shape; None as long as nothing was marked."""
+        """Return the wall times [unix s] of simulated times [s], same shape; None before the first pair."""
         if not self._simulated:
             return None
         first, last = self._simulated[0], self._simulated[-1]

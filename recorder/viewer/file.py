@@ -1,4 +1,4 @@
-"""A recorded file on a canvas."""
+"""Drawing of a recording on a canvas."""
 
 from __future__ import annotations
 
@@ -14,23 +14,24 @@ from recorder.viewer.canvas import Canvas
 from recorder.viewer.drawings.geometry import Geometry
 from recorder.viewer.painter import FRAME_S, Painter
 
-MOST_ROWS_PER_S = 2000.0
-MOST_ROWS = 60_000
-"""Points of one curve, whatever the length of the file; full rate around hammer pulses comes on top."""
-MOST_FRAMES = 6_000
-"""Orbits and places of the rotor; 25 Hz up to four minutes, fewer in longer files."""
-_FLUSH_EVERY = 100
+MAX_ROWS_PER_S = 2000.0
+"""Largest number of points per second of one curve."""
+MAX_ROWS = 60_000
+"""Largest number of points of one curve, for any length of file; full rate around hammer pulses is additional."""
+MAX_FRAMES = 6_000
+"""Largest number of orbit and rotor frames: 25 Hz up to four minutes, fewer per second in longer files."""
+_FRAMES_PER_FLUSH = 100
 
 
 @dataclass(frozen=True, slots=True)
 class Painted:
-    """What was drawn.
+    """Result of drawing a file.
 
     Attributes:
         start_s: Time of the first row [s].
         end_s: Time of the last row [s].
-        last_contact_s: Last instant of sensed contact [s], or None.
-        points: Values of curves drawn.
+        last_contact_s: Last instant of sensed contact [s]; None without contact.
+        points: Number of curve values drawn.
     """
 
     start_s: float
@@ -40,20 +41,20 @@ class Painted:
 
 
 def rows_per_s(duration_s: float) -> float:
-    """Points of a curve per second [Hz] for a file of that length."""
-    return min(MOST_ROWS_PER_S, MOST_ROWS / max(duration_s, 1e-3))
+    """Return the points of a curve per second [Hz] for a file of a length [s]."""
+    return min(MAX_ROWS_PER_S, MAX_ROWS / max(duration_s, 1e-3))
 
 
 def frame_s(duration_s: float) -> float:
-    """Time between two frames [s] for a file of that length."""
-    return max(FRAME_S, duration_s / MOST_FRAMES)
+    """Return the time between two frames [s] for a file of a length [s]."""
+    return max(FRAME_S, duration_s / MAX_FRAMES)
 
 
 def paint(recording: Recording, canvas: Canvas) -> Painted:
     """Draw a whole recording."""
     for simulated_s, wall_s in recording.clock:
         canvas.clock.mark(float(simulated_s), float(wall_s))
-    # The hammer comes first: its pulses decide where the other curves keep their full rate.
+    # Hammer pulses determine where the other curves keep their full rate, so draw the hammer first.
     names = sorted(recording.table.groups, key=lambda name: name != "hammer")
     painter: Painter | None = None
     start_s, end_s = np.inf, -np.inf
@@ -69,7 +70,7 @@ def paint(recording: Recording, canvas: Canvas) -> Painted:
         for count, part in enumerate(_frames(times_s, samples.rate_hz, rows=rows)):
             painter.add(name, times_s[part], values[part])
             painter.frame(name)
-            if count % _FLUSH_EVERY == 0:
+            if count % _FRAMES_PER_FLUSH == 0:
                 painter.flush()
     if painter is None:
         painter = _new_painter(recording, canvas, 0.0)
@@ -87,7 +88,7 @@ def _new_painter(recording: Recording, canvas: Canvas, duration_s: float) -> Pai
         geometry,
         rows_per_s=rows_per_s(duration_s),
         whole=True,
-        held_s=0.0,
+        hold_s=0.0,
         frame_s=frame_s(duration_s),
     )
     for event in recording.events:
@@ -96,7 +97,7 @@ def _new_painter(recording: Recording, canvas: Canvas, duration_s: float) -> Pai
 
 
 def _in_order(samples: Samples) -> tuple[np.ndarray, np.ndarray]:
-    """Times and values in order and once each: a recorder may have taken a recovered block late."""
+    """Return times and values sorted by row number without duplicates; recovered blocks may be recorded late."""
     if np.all(np.diff(samples.index) > 0):
         return samples.times_s, samples.values
     _, order = np.unique(samples.index, return_index=True)
@@ -104,7 +105,7 @@ def _in_order(samples: Samples) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _frames(times_s: np.ndarray, rate_hz: float, *, rows: int) -> Iterator[slice]:
-    """Slices of one frame each, broken where rows are missing."""
+    """Yield slices of one frame each, split where rows are missing."""
     holes = np.flatnonzero(np.abs(np.diff(times_s) * rate_hz - 1.0) > 0.5) + 1
     edges = [0, *holes.tolist(), len(times_s)]
     for start, end in pairwise(edges):

@@ -1,4 +1,4 @@
-"""A running rig on a canvas, as a guest that the rig never waits for."""
+"""Live drawing of a running rig. The viewer is a client that the rig never waits for."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 
 from recorder.viewer.canvas import Canvas
 from recorder.viewer.drawings.geometry import Geometry
-from recorder.viewer.pace import CURVES_S, FASTEST_S, POINTS, Pace
+from recorder.viewer.pace import CURVE_INTERVAL_S, MAX_POINTS, MIN_INTERVAL_S, Pace
 from recorder.viewer.painter import Painter
 from rig.base import wire
 from rig.base.text import printable
@@ -24,29 +24,34 @@ from rig.serve.transport.clients import Reporter
 
 NAME = "viewer"
 ROWS_PER_S = 500.0
-"""Points of each curve per simulated second [Hz]; full rate around hammer pulses."""
-_TICK_S = FASTEST_S
-_HEARTBEAT_S = 0.5
-_INBOX = 4000
-_OLDEST_S = 1.5
-"""How many payloads wait at most, and for how long [s]; then the oldest go."""
-_QUIET_S = 0.3
-_GONE_S = 3.0
-"""How long a rig that is gone may take to be there again [s]: a viewer that was stopped is linked again in a second."""
-_CHECK_S = 1.0
-_PATIENCE_S = 0.3
-_NOTED_S = 10.0
+"""Points of each curve per simulated second [Hz], except for full rate around hammer pulses."""
+_TICK_S = MIN_INTERVAL_S
+_HEARTBEAT_INTERVAL_S = 0.5
+_MAX_WAITING = 4000
+"""Largest number of waiting payloads; beyond it, the oldest are dropped."""
+_MAX_AGE_S = 1.5
+"""Longest time that a payload waits before it is dropped [s]."""
+_END_SILENCE_S = 0.3
+"""Silence after which the end of a run is final [s]."""
+_RETURN_S = 3.0
+"""Time that a lost rig may take to return [s]; a suspended viewer has its link again within a second."""
+_CHECK_INTERVAL_S = 1.0
+"""Interval of the checks whether the viewer receives data [s]."""
+_CHECK_TIMEOUT_S = 0.3
+"""Longest wait for the viewer in such a check [s]."""
+_NOTE_INTERVAL_S = 10.0
+"""Shortest interval between two notes about the pace [s]."""
 _CONTACT = wire.truth_key("contact")
 
 
 @dataclass(frozen=True, slots=True)
 class Described:
-    """What a rig says of itself, as far as it is drawn.
+    """Description of a rig, as needed for drawing.
 
     Attributes:
-        catalogue: Its streams.
-        geometry: Its lengths.
-        contact_columns: Column names of its truth table of the contact; empty if it has none.
+        catalogue: Declared streams.
+        geometry: Lengths.
+        contact_columns: Column names of the truth table `contact`; empty if the rig has none.
     """
 
     catalogue: Catalogue
@@ -55,19 +60,19 @@ class Described:
 
     @property
     def table(self) -> ChannelTable:
-        """Its channels."""
+        """Channel table."""
         return self.catalogue.table
 
 
 def ask(client: Client) -> Described:
-    """Ask the rig that a client is connected to.
+    """Request the description of a rig.
 
     Args:
-        client: The rig.
+        client: Connection to the rig.
 
     Raises:
-        NoReplyError: No rig answers.
-        InputError: What answers is no rig of this version.
+        NoReplyError: No rig replies.
+        InputError: The reply does not come from a rig of this version.
     """
     catalogue = Catalogue.read(wire.decode_document(client.request(wire.CATALOGUE)))
     parameters = wire.decode_document(client.request(wire.PARAMETERS))
@@ -80,7 +85,7 @@ def ask(client: Client) -> Described:
 
 
 class LiveView:
-    """Draws a rig's streams from now on until they end."""
+    """View of a rig's streams from now until they end."""
 
     def __init__(
         self,
@@ -91,15 +96,15 @@ class LiveView:
         wall: Callable[[], float] = time.time,
         taken: Callable[[], int | None] | None = None,
     ) -> None:
-        """Prepare the canvas; nothing is received before `run`.
+        """Prepare the canvas without receiving anything yet.
 
         Args:
-            client: The rig.
-            canvas: Where to draw.
-            described: What the rig says of itself.
-            wall: The wall clock [s since 1970].
-            taken: Number of the latest picture that the viewer has taken in, or None if nobody looks; without it
-                pictures are not counted and nothing is thinned for a viewer.
+            client: Connection to the rig.
+            canvas: Canvas to draw on.
+            described: Description of the rig.
+            wall: Wall clock [unix s].
+            taken: Returns the number of the latest picture that the viewer has processed, or None if no viewer is open.
+                Without this function, pictures are not counted and curves are not thinned for the viewer.
         """
         self._client = client
         self._reporter = Reporter(client, NAME)
@@ -114,127 +119,127 @@ class LiveView:
         self._taken = taken
         self._pace = None if taken is None else Pace()
         self._curves_s = self._folded_s = self._noted_s = -math.inf
-        self._noted_every_s = FASTEST_S
+        self._noted_every_s = MIN_INTERVAL_S
         self._fresh = False
         self._missing: dict[str, int] = {}
-        self._inbox: deque[tuple[float, str, bytes]] = deque(maxlen=_INBOX)
+        self._inbox: deque[tuple[float, str, bytes]] = deque(maxlen=_MAX_WAITING)
         self._intake = Intake(described.catalogue)
         self._continuity = wire.Continuity()
         self._received_index = 0
-        self._there: bool | None = None
-        self._gone_at_s = 0.0
+        self._alive: bool | None = None
+        self._lost_at_s = 0.0
         self.ended: str | None = None
-        """Why the run ended, as the rig states it; None before."""
+        """Reason for the end of the run, as stated by the rig; None before."""
         self._stalled = False
         self.failed = False
-        """Whether the run failed, or the rig went without an end."""
+        """True if the run failed, or the rig disappeared without an end event."""
         self._malformed = 0
         self.skipped = 0
-        """Sensor rows that arrived and were not drawn, because the viewer's window did not take them."""
+        """Sensor rows received but not drawn, because the viewer's window did not accept them."""
         self._oldest_s = 0.0
         self.waits_s = 0.0
-        """How long what came waits on our side [s]: for us to take it, and for the viewer's server to have it."""
+        """Delay of the data in this process [s]: in the inbox, and until the viewer's server has them."""
 
     @property
     def malformed(self) -> int:
-        """Payloads that were not what their key and the rig's catalogue promise."""
+        """Number of payloads that do not fit the format of their key or the catalogue."""
         return self._malformed + self._intake.refused
 
     @property
     def received(self) -> int:
-        """Sensor rows that arrived."""
+        """Number of sensor rows received."""
         return sum(rows for key, rows in self._continuity.received.items() if key in self._groups)
 
     @property
     def lost(self) -> int:
-        """Sensor rows that did not arrive: the viewer takes what it gets."""
+        """Number of sensor rows lost; the viewer does not request lost data again."""
         return sum(rows for key, rows in self._continuity.lost.items() if key in self._groups)
 
     def run(self, *, stop: Callable[[], bool] = lambda: False, tell: Callable[[str], None] = lambda text: None) -> str:
-        """Draw until the rig ends, is gone, or `stop` says so.
+        """Draw until the rig ends or disappears, or until `stop` returns True.
 
         Args:
-            stop: Asked again and again.
-            tell: Is told every second how it goes.
+            stop: Polled in each cycle.
+            tell: Receives a progress message every second.
 
         Returns:
-            Why it ended, in one line.
+            The reason for the end, in one line.
         """
         self._client.subscribe(f"{wire.SENSORS}/*", self.take, lossless=False)
         if self._force_column is not None:
             self._client.subscribe(_CONTACT, self.take, lossless=False)
-        # Events are few: those from before we came are fetched.
+        # Events are few, so earlier ones are fetched as well.
         self._client.subscribe(wire.EVENTS, self.take, history=True)
         self._client.watch(wire.ALIVE, self._watch)
         try:
-            return self._draw_on(stop, tell)
+            return self._draw_until_end(stop, tell)
         finally:
             self._report(done=True)
 
-    def _draw_on(self, stop: Callable[[], bool], tell: Callable[[str], None]) -> str:
-        heard_s, beat_s, check_s = time.monotonic(), 0.0, 0.0
+    def _draw_until_end(self, stop: Callable[[], bool], tell: Callable[[str], None]) -> str:
+        received_s, heartbeat_s, check_s = time.monotonic(), 0.0, 0.0
         while True:
             now_s = time.monotonic()
             if self.take_in():
-                heard_s = now_s
+                received_s = now_s
             if self._pace is not None and self._taken is not None:
                 self._pace.taken_in(self._taken(), now_s=now_s)
             if self._pace is None or self._pace.due(now_s):
                 self._draw(now_s)
-            elif now_s - self._folded_s >= CURVES_S:
-                self._painter.fold(most=POINTS)
+            elif now_s - self._folded_s >= CURVE_INTERVAL_S:
+                self._painter.fold(most=MAX_POINTS)
                 self._folded_s = now_s
-            if now_s - check_s >= _CHECK_S:
+            if now_s - check_s >= _CHECK_INTERVAL_S:
                 self._check_canvas()
                 if self._pace is not None:
                     self._tell_pace(self._pace, now_s, tell)
                 check_s = now_s
-            if now_s - beat_s >= _HEARTBEAT_S:
+            if now_s - heartbeat_s >= _HEARTBEAT_INTERVAL_S:
                 self._report()
-                beat_s = now_s
-            reason = self._reason(now_s, heard_s) or ("the viewer was closed" if stop() else None)
+                heartbeat_s = now_s
+            reason = self._reason(now_s, received_s) or ("the viewer was closed" if stop() else None)
             if reason is not None:
                 if self.ended is None:
                     self._painter.note(self._painter.now_s, reason, level="WARN")
                 self._painter.close()
                 return reason
-            # An absolute grid is not needed here: a late picture is only late.
+            # A late picture does no harm, so no absolute schedule is needed.
             time.sleep(max(0.0, _TICK_S - (time.monotonic() - now_s)))
 
-    def _reason(self, now_s: float, heard_s: float) -> str | None:
-        if now_s - heard_s < _QUIET_S:
+    def _reason(self, now_s: float, received_s: float) -> str | None:
+        if now_s - received_s < _END_SILENCE_S:
             return None
         if self.ended is not None:
             self.failed = self.ended.startswith("failed")
             return f"the rig ended: {self.ended}"
-        if self._there is False and now_s - self._gone_at_s > _GONE_S:
+        if self._alive is False and now_s - self._lost_at_s > _RETURN_S:
             self.failed = True
-            return "the rig is gone without ending its stream (killed, or the connection broke)"
+            return "the rig disappeared without ending its stream (killed, or connection lost)"
         return None
 
     def take(self, key: str, payload: bytes) -> None:
-        """Take a payload, from any thread."""
+        """Queue a payload. Safe to call from any thread."""
         self._inbox.append((time.monotonic(), key, payload))
 
-    def _watch(self, there: bool) -> None:
-        self._gone_at_s = time.monotonic()
-        self._there = there
+    def _watch(self, alive: bool) -> None:
+        self._lost_at_s = time.monotonic()
+        self._alive = alive
 
     def _report(self, *, done: bool = False) -> None:
         self._reporter.tell(self._received_index, lost=self.lost, done=done)
 
     def _check_canvas(self) -> None:
-        """Stop drawing for a viewer that takes nothing, or memory would fill with what it still has to get."""
+        """Stop drawing for a viewer that accepts no data, so that memory does not fill up."""
         begin_s = time.monotonic()
-        stalled = not self._canvas.keeps_up(timeout_s=_PATIENCE_S)
+        stalled = not self._canvas.keeps_up(timeout_s=_CHECK_TIMEOUT_S)
         self.waits_s, self._oldest_s = self._oldest_s + time.monotonic() - begin_s, 0.0
         if self._stalled and not stalled:
-            text = f"the viewer took nothing for a while: {self.skipped} rows in all were not drawn"
+            text = f"the viewer did not accept data for a while: {self.skipped} rows in total were not drawn"
             self._painter.note(self._painter.now_s, text, level="WARN")
         self._stalled = stalled
 
     def _draw(self, now_s: float) -> None:
-        """Draw a picture of the latest instant, and the curves until then."""
+        """Draw a picture of the latest instant, and the curves up to it."""
         if self._stalled or not self._fresh:
             return
         if self._pace is not None:
@@ -242,8 +247,8 @@ class LiveView:
             self._pace.drew(self._canvas.picture, now_s=now_s)
         for name in self._groups.values():
             self._painter.frame(name)
-        if now_s - self._curves_s >= CURVES_S - 1e-6:
-            self._painter.flush(most=None if self._pace is None else POINTS)
+        if now_s - self._curves_s >= CURVE_INTERVAL_S - 1e-6:
+            self._painter.flush(most=None if self._pace is None else MAX_POINTS)
             self._curves_s = now_s
         self._fresh = False
         if self._missing:
@@ -253,30 +258,30 @@ class LiveView:
             self._missing = {}
 
     def _tell_pace(self, pace: Pace, now_s: float, tell: Callable[[str], None]) -> None:
-        """Say how far the viewer is behind and what is left out; in the log of events, too, if that has changed."""
+        """Report the viewer's delay and the thinning; if they changed, also in the event log."""
         every_s, behind_s = max(pace.every_s, pace.interval_s), pace.behind_s(now_s)
-        who = "viewer loading" if pace.looked_at else "no viewer looks"
+        state = "viewer loading" if pace.looked_at else "no viewer open"
         if behind_s is not None:
-            who = f"viewer {behind_s:.1f} s behind"
-        points = min(ROWS_PER_S, POINTS / max(every_s, CURVES_S))
-        thinned = f"{1.0 / every_s:.1f} of {1.0 / FASTEST_S:.0f} pictures/s, {points:.0f} of {ROWS_PER_S:.0f} points/s"
-        tell(f"{who}, {thinned}; {self.waits_s:.2f} s here")
+            state = f"viewer {behind_s:.1f} s behind"
+        points = min(ROWS_PER_S, MAX_POINTS / max(every_s, CURVE_INTERVAL_S))
+        rates = f"{1 / every_s:.1f} of {1 / MIN_INTERVAL_S:.0f} pictures/s, {points:.0f} of {ROWS_PER_S:.0f} points/s"
+        tell(f"{state}, {rates}; {self.waits_s:.2f} s here")
         changed = not 0.4 < every_s / self._noted_every_s < 2.5
-        if changed and behind_s is not None and now_s - self._noted_s >= _NOTED_S:
+        if changed and behind_s is not None and now_s - self._noted_s >= _NOTE_INTERVAL_S:
             self._noted_s, self._noted_every_s = now_s, every_s
             level = "INFO" if points == ROWS_PER_S else "WARN"
-            self._painter.note(self._painter.now_s, f"{who}, so it gets {thinned} a curve; peaks stay", level=level)
+            self._painter.note(self._painter.now_s, f"{state}, reduced to {rates} a curve; peaks are kept", level=level)
 
     def take_in(self) -> bool:
-        """Take all that has arrived; whether anything had."""
+        """Process all queued payloads and return whether there were any."""
         arrived: list[tuple[str, bytes]] = []
         now_s = time.monotonic()
         while self._inbox:
-            came_s, key, payload = self._inbox.popleft()
-            if key == wire.EVENTS or now_s - came_s < _OLDEST_S:
-                self._oldest_s = max(self._oldest_s, now_s - came_s)
+            arrival_s, key, payload = self._inbox.popleft()
+            if key == wire.EVENTS or now_s - arrival_s < _MAX_AGE_S:
+                self._oldest_s = max(self._oldest_s, now_s - arrival_s)
                 arrived.append((key, payload))
-        # Stable: each key stays in order, and its blocks come together. Events first: they announce hammer pulses.
+        # Events first, as they announce hammer pulses. The sort is stable, so each key stays in order.
         arrived.sort(key=lambda item: (item[0] != wire.EVENTS, item[0]))
         for key, items in groupby(arrived, key=lambda item: item[0]):
             payloads = [payload for _, payload in items]
@@ -317,7 +322,7 @@ class LiveView:
         self._take_run(key, run)
 
     def _take_run(self, key: str, run: list[wire.Block]) -> None:
-        """Take consecutive blocks."""
+        """Process consecutive blocks."""
         if not run:
             return
         if key == self._beat_key:

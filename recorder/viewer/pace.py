@@ -1,8 +1,8 @@
-"""How often a live view draws: as often as its viewer takes in what is drawn, and never far ahead of it.
+"""Pace of a live view: as many pictures as its viewer can process, and never far ahead of it.
 
-A rerun viewer takes in what arrived for 10 ms of each frame that it paints, however much waits. A slow one that gets
-more than that keeps it all and falls behind without end. So the viewer is asked how far it has come; a new picture
-leaves only while those on their way are young, and pictures get rarer as soon as they take long to be taken in.
+A rerun viewer processes received data for 10 ms of each frame, regardless of how much is waiting. A slow viewer that
+receives more than that falls further and further behind. Its progress is therefore polled: a new picture is sent only
+while the pending ones are recent, and the interval grows as soon as pictures take long to be processed.
 """
 
 from __future__ import annotations
@@ -10,79 +10,81 @@ from __future__ import annotations
 import math
 from collections import deque
 
-FASTEST_S = 0.04
+MIN_INTERVAL_S = 0.04
 """Time between two pictures for a viewer that keeps up [s]."""
-SLOWEST_S = 2.0
-"""Longest time between two pictures that is chosen [s]; waiting for a viewer may add to it, up to `DEAF_S`."""
-FIRST_S = 0.2
-"""Time between two pictures for a viewer of which nothing is known yet [s]."""
-LATE_S, PROMPT_S = 0.6, 0.3
-"""A picture that took longer than the first to be taken in makes the next ones rarer; below the second, denser [s]."""
-DEAF_S = 10.0
-"""A picture leaves at least that often, even if nobody looks or takes it in [s]: a viewer that comes takes all in."""
-CURVES_S = 0.16
-"""Curves are drawn at most that often [s]: a piece of a curve costs the viewer as much as a whole picture."""
-POINTS = 120
-"""Points of each curve between two pictures at most, full rate around hammer pulses apart: a slow viewer gets an
-envelope that is coarser, with the same peaks."""
+MAX_INTERVAL_S = 2.0
+"""Longest chosen time between two pictures [s]; waiting for the viewer can extend it up to `MAX_WAIT_S`."""
+FIRST_INTERVAL_S = 0.2
+"""Time between two pictures for a viewer of unknown speed [s]."""
+SLOW_PROCESSING_S, FAST_PROCESSING_S = 0.6, 0.3
+"""Processing times of a picture above which the pace slows down, and below which it speeds up [s]."""
+MAX_WAIT_S = 10.0
+"""Longest time between two pictures, even without a responding viewer [s]; a new viewer receives all of them."""
+CURVE_INTERVAL_S = 0.16
+"""Shortest time between two updates of the curves [s]; a piece of a curve costs the viewer as much as a picture."""
+MAX_POINTS = 120
+"""Largest number of points of each curve between two pictures, outside hammer pulses.
+
+A slow viewer receives a coarser envelope with the same peaks.
+"""
 
 
 class Pace:
-    """When to draw, by what was drawn and what the viewer has taken in; every time is passed in."""
+    """Schedule of the pictures from those drawn and those processed by the viewer; all times are arguments."""
 
     def __init__(self) -> None:
-        self.every_s = DEAF_S
-        """Time between two pictures that is aimed at [s]."""
-        self.interval_s = DEAF_S
-        """Time between the last two [s], with all waiting for the viewer."""
-        self._on_the_way: deque[tuple[int, float]] = deque()  # pictures' numbers, and when they were drawn
+        self.every_s = MAX_WAIT_S
+        """Target time between two pictures [s]."""
+        self.interval_s = MAX_WAIT_S
+        """Time between the last two pictures, including waits for the viewer [s]."""
+        self._pending: deque[tuple[int, float]] = deque()  # numbers and times of pending pictures
         self._drawn_s = -math.inf
         self._changed_s = -math.inf
         self._delay_s = 0.0
-        self._shown_s: float | None = None  # when the latest that the viewer has was drawn
+        self._shown_s: float | None = None  # time of the latest picture that the viewer has
         self.looked_at = False
-        """Whether there is a viewer, be it one that is still loading."""
+        """True if a viewer is open, including one that is still loading."""
 
     def due(self, now_s: float) -> bool:
-        """Whether to draw now."""
+        """Return whether a picture is due."""
         since_s = now_s - self._drawn_s
         if since_s < self.every_s - 1e-6:
             return False
-        if not self._on_the_way or since_s >= DEAF_S:
+        if not self._pending or since_s >= MAX_WAIT_S:
             return True
-        return self._shown_s is not None and now_s - self._on_the_way[0][1] < LATE_S
+        return self._shown_s is not None and now_s - self._pending[0][1] < SLOW_PROCESSING_S
 
     def drew(self, picture: int, *, now_s: float) -> None:
-        """The picture of that number was drawn."""
-        self.interval_s, self._drawn_s = min(now_s - self._drawn_s, DEAF_S), now_s
-        self._on_the_way.append((picture, now_s))
+        """Register a drawn picture."""
+        self.interval_s, self._drawn_s = min(now_s - self._drawn_s, MAX_WAIT_S), now_s
+        self._pending.append((picture, now_s))
 
     def taken_in(self, picture: int | None, *, now_s: float) -> None:
-        """The slowest viewer has all pictures up to that number, or nobody looks (None)."""
+        """Register that the slowest viewer has all pictures up to a number; None if no viewer is open."""
         if picture is None:
-            self._on_the_way.clear()
-            self.looked_at, self.every_s, self._shown_s = False, DEAF_S, None
+            self._pending.clear()
+            self.looked_at, self.every_s, self._shown_s = False, MAX_WAIT_S, None
             return
         if not self.looked_at:
-            self.looked_at, self.every_s = True, FIRST_S
+            self.looked_at, self.every_s = True, FIRST_INTERVAL_S
         drawn_s = None
-        while self._on_the_way and self._on_the_way[0][0] <= picture:
-            drawn_s = self._on_the_way.popleft()[1]
+        while self._pending and self._pending[0][0] <= picture:
+            drawn_s = self._pending.popleft()[1]
         if drawn_s is None:
             return
         self._shown_s, self._delay_s = drawn_s, now_s - drawn_s
         if drawn_s < self._changed_s:
-            return  # drawn at the pace before
-        if self._delay_s > max(LATE_S, 1.5 * self.every_s):
-            self.every_s = min(SLOWEST_S, max(2.0 * self.every_s, 0.5 * self._delay_s))
+            return  # drawn before the last change of pace
+        if self._delay_s > max(SLOW_PROCESSING_S, 1.5 * self.every_s):
+            self.every_s = min(MAX_INTERVAL_S, max(2.0 * self.every_s, 0.5 * self._delay_s))
             self._changed_s = now_s
-        elif self._delay_s < max(PROMPT_S, 0.5 * self.every_s):
-            # In large steps only as long as the viewer is idle between two pictures.
+        elif self._delay_s < max(FAST_PROCESSING_S, 0.5 * self.every_s):
+            # Use large steps only while the viewer is idle between pictures.
             step = 0.7 if self._delay_s < 0.5 * self.every_s else 0.93
-            self.every_s = max(FASTEST_S, step * self.every_s)
+            self.every_s = max(MIN_INTERVAL_S, step * self.every_s)
 
     def behind_s(self, now_s: float) -> float | None:
-        """How old what the viewer shows is [s]; None as long as it shows nothing."""
+        """Return the age of the displayed picture [s]; None if nothing is displayed."""
         if self._shown_s is None:
             return None
-        return now_s - self._shown_s if self._on_the_way else self._delay_s
+        return now_s - self._shown_s if self._pending else self._delay_s

@@ -1,7 +1,7 @@
-"""rerun's web viewer at an address of our own: short, without requests to other sites, and it tells how far it is.
+"""Web page with rerun's viewer: a short address, no requests to other sites, and progress reports.
 
-The page is rerun's, fetched from its server, with a script that sends the viewer's own description of its state. What
-comes in so is checked here: bounded in size, number and time, and read as far as one number.
+The page is fetched from rerun's server and extended by a script that posts the viewer's state. Posted data are limited
+in size, number and time, and only one number is read from them.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
 _FILE = re.compile(r"/[A-Za-z0-9_]*(\.(js|wasm|ico|png|svg))?")
-_FOREIGN = re.compile(rb"<link[^>]*https://fonts[^>]*>")
+_EXTERNAL_LINK = re.compile(rb"<link[^>]*https://fonts[^>]*>")
 _PAGE = re.compile(r"[a-z0-9]{1,16}")
 _SIZE = re.compile(r"[0-9]{1,9}")
-_HERE = re.compile(r"(127\.0\.0\.1|localhost)(:[0-9]+)?")
-"""What a page of ours is asked for by; another site may give a name of its own our address."""
-_MOST_BYTES = 1 << 20
-_MOST_PAGES = 32
-_FORGOTTEN_S = 30.0
-"""A page that tells nothing for so long is lost, not only busy loading or painting [s]."""
-_REST_S = 15.0
-"""A page that nobody sees paints nothing and takes nothing in: after so long it leaves, to come back when seen [s]."""
+_OWN_HOST = re.compile(r"(127\.0\.0\.1|localhost)(:[0-9]+)?")
+"""Accepted `Host` headers; another site may resolve its own name to this address (DNS rebinding)."""
+_MAX_BODY_BYTES = 1 << 20
+_MAX_PAGES = 32
+_SILENCE_S = 30.0
+"""Silence after which a page counts as closed [s]; a busy page may be silent while it loads or draws."""
+_HIDDEN_LIMIT_S = 15.0
+"""Time after which a hidden page is unloaded [s], as it processes no data; it reloads when visible."""
 _SCRIPT = """<script>
 const page = Math.random().toString(36).slice(2);
 let seen = Date.now();
@@ -46,7 +46,7 @@ async function tell() {
 addEventListener("pagehide", () => navigator.sendBeacon("closed?" + page));
 tell();
 </script></body>"""
-_RESTING = b"""<!doctype html><title>rig: resting</title><script>
+_RESTING_PAGE = b"""<!doctype html><title>rig: resting</title><script>
 document.addEventListener("visibilitychange", () => document.hidden || location.replace("/"));
 document.hidden || location.replace("/");
 </script>"""
@@ -54,35 +54,35 @@ document.hidden || location.replace("/");
 
 class _Server(ThreadingHTTPServer):
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Nothing for a browser that goes in the middle of a file or a word: the terminal is ours."""
+        """Suppress errors of browsers that disconnect, which would clutter the terminal."""
         if not isinstance(sys.exception(), OSError):
             super().handle_error(request, client_address)
 
 
 class Page:
-    """Serves the page on a thread of its own, and knows how far each browser has come.
+    """Server of the page on its own thread, with the progress of each browser.
 
     Attributes:
-        title: What the browsers show as the page's title.
+        title: Title of the page in the browsers.
     """
 
     def __init__(self, host: str, port: int, *, viewer: str, query: str, timeline: str, rests: bool = False) -> None:
-        """Listen.
+        """Start listening.
 
         Args:
-            host: Where.
-            port: Where.
-            viewer: URL of rerun's own page.
-            query: What that page is asked for.
-            timeline: Whose end tells how far a browser has come.
-            rests: A page that is not seen leaves and begins anew when it is, instead of falling behind.
+            host: Host to listen on.
+            port: Port to listen on.
+            viewer: URL of rerun's page.
+            query: Query string for that page.
+            timeline: Timeline whose end measures the progress of a browser.
+            rests: Unload hidden pages and reload them when visible, instead of letting them fall behind.
         """
         self.title = "rig"
         self._viewer = viewer
         self._query = query
         self._timeline = timeline
-        self._script = _SCRIPT % (round(1000.0 * _REST_S) if rests else "Infinity")
-        self._told: dict[str, tuple[int, float]] = {}
+        self._script = _SCRIPT % (round(1000.0 * _HIDDEN_LIMIT_S) if rests else "Infinity")
+        self._progress: dict[str, tuple[int, float]] = {}
         self._lock = threading.Lock()
         page = self
 
@@ -96,29 +96,29 @@ class Page:
                 page._post(self)
 
             def log_message(self, format: str, *args: object) -> None:
-                """Nothing: the terminal is ours."""
+                """Suppress the request log, which would clutter the terminal."""
 
         self._server = _Server((host, port), Handler)
         threading.Thread(target=self._server.serve_forever, args=(0.1,), name="page", daemon=True).start()
 
     def taken(self) -> int | None:
-        """Number of the latest picture that the slowest browser has, 0 where it has none; None without any browser."""
+        """Return the number of the latest picture that the slowest browser has, 0 for none; None without a browser."""
         now_s = time.monotonic()
         with self._lock:
-            self._told = {page: told for page, told in self._told.items() if now_s - told[1] < _FORGOTTEN_S}
-            return min((number for number, _ in self._told.values()), default=None)
+            self._progress = {page: entry for page, entry in self._progress.items() if now_s - entry[1] < _SILENCE_S}
+            return min((number for number, _ in self._progress.values()), default=None)
 
     def close(self) -> None:
-        """Serve no more."""
+        """Stop serving."""
         self._server.shutdown()
         self._server.server_close()
 
     def _get(self, request: BaseHTTPRequestHandler) -> None:
         path, _, query = request.path.partition("?")
-        if not _HERE.fullmatch(request.headers.get("Host", "")):
+        if not _OWN_HOST.fullmatch(request.headers.get("Host", "")):
             return request.send_error(HTTPStatus.BAD_REQUEST)
         if path == "/resting":
-            return _reply(request, _RESTING)
+            return _reply(request, _RESTING_PAGE)
         if path == "/" and query != self._query:
             request.send_response(HTTPStatus.FOUND)
             request.send_header("Location", f"/?{self._query}")
@@ -132,25 +132,25 @@ class Page:
         except OSError:
             return request.send_error(HTTPStatus.NOT_FOUND)
         if path == "/":
-            body = _FOREIGN.sub(b"", body).replace(b"</body>", self._script.encode())
+            body = _EXTERNAL_LINK.sub(b"", body).replace(b"</body>", self._script.encode())
         return _reply(request, body, kind=kind)
 
     def _post(self, request: BaseHTTPRequestHandler) -> None:
         path, _, page = request.path.partition("?")
         size = request.headers.get("Content-Length", "")
-        # A browser says from which site a page speaks, or null where it hides that; programs say nothing.
+        # Browsers send the origin of a page, or null to hide it; other programs send none.
         host = request.headers.get("Host", "")
-        ours = _HERE.fullmatch(host) and request.headers.get("Origin") in (None, f"http://{host}")
-        if not ours or path not in ("/state", "/closed") or not _PAGE.fullmatch(page) or not _SIZE.fullmatch(size):
+        own = _OWN_HOST.fullmatch(host) and request.headers.get("Origin") in (None, f"http://{host}")
+        if not own or path not in ("/state", "/closed") or not _PAGE.fullmatch(page) or not _SIZE.fullmatch(size):
             return request.send_error(HTTPStatus.BAD_REQUEST)
-        if int(size) > _MOST_BYTES:
+        if int(size) > _MAX_BODY_BYTES:
             return request.send_error(HTTPStatus.REQUEST_ENTITY_TOO_LARGE)
         number = end_of(self._timeline, request.rfile.read(int(size)))
         with self._lock:
             if path == "/closed":
-                self._told.pop(page, None)
-            elif page in self._told or len(self._told) < _MOST_PAGES:
-                self._told[page] = (number, time.monotonic())
+                self._progress.pop(page, None)
+            elif page in self._progress or len(self._progress) < _MAX_PAGES:
+                self._progress[page] = (number, time.monotonic())
         return _reply(request, self.title.encode(), kind="text/plain; charset=utf-8")
 
 
@@ -163,14 +163,14 @@ def _reply(request: BaseHTTPRequestHandler, body: bytes, *, kind: str = "text/ht
 
 
 def end_of(timeline: str, state: bytes) -> int:
-    """The end of a timeline in a viewer's state; 0 where there is no such line, or it is no such state.
+    """Return the end of a timeline in a viewer's state; 0 if it is absent or the state is invalid.
 
     Args:
-        timeline: Its name.
-        state: A `GetStateResponse` of rerun's viewer control. In it a timeline's name is followed by its type (field 2)
-            and its range (field 3): a start, which may be missing, and an end.
+        timeline: Name of the timeline.
+        state: `GetStateResponse` of rerun's viewer control. In it a timeline's name is followed by its type (field 2)
+            and its range (field 3): an optional start, and an end.
     """
     number = rb"[\x80-\xff]{0,9}[\x00-\x7f]"
     ends = re.findall(timeline.encode() + rb"\x10.\x1a.(?:\x08%b)?\x10(%b)" % (number, number), state, re.DOTALL)
-    # A protobuf number has seven bits in each byte, the lowest first.
+    # Protobuf varint: seven bits per byte, lowest first.
     return max((sum((byte & 0x7F) << 7 * at for at, byte in enumerate(end)) for end in ends), default=0)

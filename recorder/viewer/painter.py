@@ -1,4 +1,4 @@
-"""Turns samples and events into everything that the viewer shows; the same for a file and for a running rig."""
+"""Painter: draws samples and events as orbits, spectra, curves, contact and 3-D rig, for files and live views."""
 
 from __future__ import annotations
 
@@ -23,20 +23,22 @@ from rig.channels.table import ChannelTable, Group
 
 EVENTS = "/events"
 FRAME_S = 0.04
-"""Orbits and the 3-D rig are drawn at 25 Hz."""
+"""Time between two frames of orbits and 3-D rig [s]."""
 SPECTRUM_EVERY = 5
-"""Least number of frames for a spectrum: 5 Hz."""
-AROUND_HAMMER_S = 0.05
-HELD_S = AROUND_HAMMER_S + 0.02
-"""Live curves lag by this much, so that a hammer pulse still finds the rows before it at full rate."""
+"""Frames per spectrum; gives 5 Hz."""
+HAMMER_MARGIN_S = 0.05
+"""Time before and after a hammer pulse with curves at full rate [s]."""
+HOLD_S = HAMMER_MARGIN_S + 0.02
+"""Delay of live curves [s], so that the rows before a hammer pulse are still available at full rate."""
 
 _LEVELS = {schemas.LOG_INFO: "INFO", schemas.LOG_WARN: "WARN", schemas.LOG_ERROR: "ERROR"}
 _SLOW_ROWS_PER_S = 200.0
+"""Points per second of curves without fast detail [Hz]."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Plane:
-    """The two probes of a measuring plane within their group."""
+    """Column pair of the two probes of a measuring plane."""
 
     name: str
     x: int
@@ -44,12 +46,12 @@ class _Plane:
     millimetres: float
 
     def z(self, values: np.ndarray) -> np.ndarray:
-        """X + j y [mm], shape (n,)."""
+        """Return x + j y [mm], shape (n,)."""
         return (values[:, self.x] + 1j * values[:, self.y]) * self.millimetres
 
 
 def planes_of(group: Group) -> list[_Plane]:
-    """The measuring planes that a group holds, in the order of `orbit.PLANES`."""
+    """Return the measuring planes of a group, in the order of `orbit.PLANES`."""
     return [
         _Plane(
             name=plane,
@@ -63,28 +65,28 @@ def planes_of(group: Group) -> list[_Plane]:
 
 
 def planes_in(table: ChannelTable) -> set[str]:
-    """Names of the measuring planes that some channels have."""
+    """Return the names of the measuring planes in a channel table."""
     return {plane.name for group in table.groups.values() for plane in planes_of(group)}
 
 
 def not_drawn(table: ChannelTable) -> list[str]:
-    """What of a rig cannot be drawn of other channels, such as those of an imported log, and why."""
-    lacking = []
+    """Return the drawings that a channel table, such as that of an imported log, does not support, with reasons."""
+    missing = []
     if not planes_in(table):
         pairs = " or ".join(f"{plane}_x and {plane}_y" for plane in orbit.PLANES)
-        lacking.append(f"orbit, spectrum, contact (no channels {pairs})")
+        missing.append(f"orbit, spectrum, contact (no channels {pairs})")
     if not any(set(group.names) >= REACTIONS for group in table.groups.values()):
-        lacking.append("reaction (no channels P_N, P_S, P_E and P_W in one group)")
+        missing.append("reaction (no channels P_N, P_S, P_E and P_W in one group)")
     if "speed" not in table.channels:
-        lacking.append("turning of the rotor (no channel speed)")
-    return lacking
+        missing.append("turning of the rotor (no channel speed)")
+    return missing
 
 
 class Painter:
-    """Draws on a canvas what it is fed, each group in order of time.
+    """Painter of samples, each group in order of time.
 
-    `add` takes samples, `frame` draws what belongs to one instant (orbits, spectrum, 3-D rig), `flush` draws the
-    curves, `close` draws what is left.
+    `add` adds samples, `frame` draws one instant (orbits, spectrum, 3-D rig), `flush` draws the curves, `close` draws
+    the rest.
     """
 
     def __init__(
@@ -95,22 +97,22 @@ class Painter:
         *,
         rows_per_s: float,
         whole: bool,
-        held_s: float = HELD_S,
+        hold_s: float = HOLD_S,
         frame_s: float = FRAME_S,
     ) -> None:
         """Prepare the canvas.
 
         Args:
-            canvas: Where to draw.
-            table: The channels that will be fed.
+            canvas: Canvas to draw on.
+            table: Channel table of the samples.
             geometry: Lengths of the rig.
-            rows_per_s: Points of each curve per simulated second [Hz]; full rate around hammer pulses.
-            whole: A file, drawn from its start to its end, in contrast to a stream.
-            held_s: How long curves wait for a hammer pulse that is not known yet [s].
-            frame_s: Least time between two frames [s].
+            rows_per_s: Points of each curve per simulated second [Hz], except for full rate around hammer pulses.
+            whole: Whether a complete file is drawn, not a live stream.
+            hold_s: Time that curves wait for a hammer pulse still to come [s].
+            frame_s: Shortest time between two frames [s].
         """
         self._canvas = canvas
-        self._held_s = held_s
+        self._held_s = hold_s
         self._whole = whole
         self._last_s: dict[str, float] = {}
         self._windows: list[Span] = []
@@ -130,11 +132,11 @@ class Painter:
         self._truth = ContactPlot(canvas, path=contact.TRUTH, touch=Touch(enter=1e-9, leave=1e-9))
         if geometry.assumed and planes_in(table):
             names = ", ".join(geometry.assumed)
-            self.note(0.0, f"the stream does not give {names}: usual values are drawn", level="WARN")
+            self.note(0.0, f"the stream does not state {names}: drawn with default values", level="WARN")
 
     @property
     def points(self) -> int:
-        """Values of curves drawn so far."""
+        """Number of curve values drawn."""
         return sum(curves.points for curves in self._curves.values())
 
     @property
@@ -144,12 +146,12 @@ class Painter:
 
     @property
     def last_contact_s(self) -> float | None:
-        """The last instant at which the probes saw contact [s]."""
+        """Last instant of contact sensed by the probes [s]; None without contact."""
         seen = [part.last_contact_s for parts in self._parts.values() for part in parts if isinstance(part, _Probes)]
         return max((time for time in seen if time is not None), default=None)
 
     def add(self, name: str, times_s: np.ndarray, values: np.ndarray) -> None:
-        """Take consecutive rows of a group.
+        """Add consecutive rows of a group.
 
         Args:
             name: The group.
@@ -171,32 +173,32 @@ class Painter:
             self._watch_hammer(self._groups[name], times_s, values)
 
     def add_truth(self, times_s: np.ndarray, normal_force_n: np.ndarray) -> None:
-        """Take the contact's true normal force [N], shape (n,): drawn on a marked path, apart from what is sensed."""
+        """Add the contact's true normal force [N], shape (n,), drawn on a separate path from the sensed contact."""
         if len(times_s):
             self._truth.add(times_s, normal_force_n)
 
     def add_event(self, event: Mapping[str, Any]) -> None:
-        """Take an event of the stream."""
+        """Draw an event."""
         name = str(event.get("event", "event"))
         time_s = float(event.get("time_s") or 0.0)
         if name == "hammer":
-            self._windows.append((time_s - AROUND_HAMMER_S, time_s + AROUND_HAMMER_S))
+            self._windows.append((time_s - HAMMER_MARGIN_S, time_s + HAMMER_MARGIN_S))
         self._marks.take(event, time_s)
         level, text = schemas.event_text(dict(event))
         self.note(time_s, text, level=_LEVELS[level])
 
     def note(self, time_s: float, text: str, *, level: str = "INFO") -> None:
-        """Write a line into the log of events."""
+        """Write a line to the event log."""
         self._canvas.draw(EVENTS, time_s, rr.TextLog(text, level=level))
 
     def frame(self, name: str) -> None:
-        """Draw what a group's latest rows show at their instant."""
+        """Draw the latest instant of a group."""
         if name in self._last_s:
             for part in self._parts[name]:
                 part.draw(self._last_s[name])
 
     def flush(self, *, most: int | None = None) -> None:
-        """Draw all curves as far as they are settled, with `most` points each outside of hammer pulses."""
+        """Draw all final curve points, at most `most` per curve outside hammer pulses."""
         for name, curves in self._curves.items():
             if name in self._last_s:
                 curves.flush(until_s=self._last_s[name] - self._held_s, windows=self._windows, most=most)
@@ -206,13 +208,13 @@ class Painter:
             self._windows = [window for window in self._windows if window[1] > oldest]
 
     def fold(self, *, most: int) -> None:
-        """Thin what waits for `flush` to `most` points of each curve outside of hammer pulses."""
+        """Reduce the pending points to `most` per curve outside hammer pulses."""
         for name, curves in self._curves.items():
             if name in self._last_s:
                 curves.fold(until_s=self._last_s[name] - self._held_s, windows=self._windows, most=most)
 
     def close(self) -> None:
-        """Draw what is still held."""
+        """Draw all remaining data."""
         for name, curves in self._curves.items():
             curves.flush(until_s=np.inf, windows=self._windows, rest=True)
             for part in self._parts[name]:
@@ -228,39 +230,39 @@ class Painter:
     def _watch_hammer(self, group: Group, times_s: np.ndarray, values: np.ndarray) -> None:
         channel = group.channels[0]
         threshold = max(1.0, 20.0 * channel.noise_v / abs(channel.sensitivity_v))
-        struck = times_s[np.abs(values[:, 0]) > threshold]
-        if len(struck):
-            self._windows.append((float(struck[0]) - AROUND_HAMMER_S, float(struck[-1]) + AROUND_HAMMER_S))
+        pulse_s = times_s[np.abs(values[:, 0]) > threshold]
+        if len(pulse_s):
+            self._windows.append((float(pulse_s[0]) - HAMMER_MARGIN_S, float(pulse_s[-1]) + HAMMER_MARGIN_S))
 
 
 def _is_fast(group: Group) -> bool:
-    """Whether curves have detail at all times: speed has none, and the hammer is drawn at full rate when it strikes."""
+    """Return whether a group's curves need detail at all times; hammer pulses are drawn at full rate anyway."""
     return group.name not in {"drive", "hammer"}
 
 
 class _Part:
-    """Something that is drawn from one group besides its curves."""
+    """Drawing of one group other than its curves."""
 
     last_contact_s: float | None = None
 
     def add(self, times_s: np.ndarray, values: np.ndarray) -> None:
-        """Take rows."""
+        """Add rows."""
 
     def draw(self, time_s: float) -> None:
         """Draw the latest instant."""
 
     def flush(self) -> None:
-        """Draw what was collected."""
+        """Draw the collected data."""
 
     def interrupt(self) -> None:
-        """Rows are missing before the next ones."""
+        """Handle missing rows before the next ones."""
 
     def close(self) -> None:
-        """Draw what is known at the end only."""
+        """Draw what requires the complete data."""
 
 
 class _Probes(_Part):
-    """Orbits, spectrum, contact and the rotor's tilt."""
+    """Orbits, spectrum, contact and tilt of the rotor."""
 
     def __init__(
         self,
@@ -281,7 +283,7 @@ class _Probes(_Part):
             )
             for plane in planes
         }
-        # The ring's plane shows most; a rig with probes at the disk only shows the same whirl there.
+        # The ring plane is preferred; with probes only at the disk, the same whirl is visible there.
         self._main = planes[0]
         self._spectrum = SpectrumPlot(canvas, rate_hz=group.rate_hz, interval_s=frame_s * SPECTRUM_EVERY, whole=whole)
         self._contact = None
@@ -330,7 +332,7 @@ class _Probes(_Part):
 
 
 class _Reaction(_Part):
-    """The arrow of the reaction."""
+    """Arrow of the reaction force."""
 
     def __init__(self, scene: Scene3D, reaction: Callable[[np.ndarray], np.ndarray]) -> None:
         self._scene = scene
@@ -346,7 +348,7 @@ class _Reaction(_Part):
 
 
 class _Spin(_Part):
-    """The turning of the rotor."""
+    """Rotation of the rotor."""
 
     def __init__(self, scene: Scene3D, group: Group) -> None:
         self._scene = scene

@@ -1,7 +1,7 @@
-"""A rerun process of our own: on the screen, in the browser, or without either for a picture.
+"""Process of a rerun viewer: in a window, in the browser, or headless for a picture.
 
-It listens on 127.0.0.1 only (rerun's own calls listen on every interface), reports its use to nobody, and runs in a
-process group that ends with us: ending the starting script alone would leave the viewer behind.
+It listens only on 127.0.0.1 (rerun's default is every interface), sends no usage reports, and runs in its own process
+group, which is terminated with this process; terminating only the start script would leave the viewer running.
 """
 
 from __future__ import annotations
@@ -28,37 +28,43 @@ from rig.base.errors import InputError, Words
 from rig.serve.waiting import Deadline
 
 Kind = Literal["native", "web", "headless"]
-_Answer = TypeVar("_Answer")
-_NO_ANSWER = (ConnectionError, TimeoutError, RuntimeError)
-"""What rerun raises of a viewer that is not there, is not there yet, or has too much to do."""
+_Reply = TypeVar("_Answer")
+_NO_REPLY = (ConnectionError, TimeoutError, RuntimeError)
+"""Exceptions of rerun for a viewer that is absent, not ready or busy."""
 
 _HOST = "127.0.0.1"
 _PORT, _WEB_PORT = 9876, 9090
-_PAGE = "notebook=1&theme=dark"
-"""As in a notebook: the page then sends no usage reports and looks for no updates, which no environment can tell it."""
-_ASKED_S = 0.2
-_READY_S = 60.0
-_LOADED_S = 240.0
-"""On a busy machine without a graphics card one answer may take the 15 s that rerun itself waits for a picture."""
-_TOLD_S = 15.0
-_SETTLED_S = 0.5
-_PICTURES = 8
-_ENDED_S = 5.0
+_PAGE_OPTIONS = "notebook=1&theme=dark"
+"""Notebook mode, in which the page sends no usage reports and does not check for updates."""
+_POLL_INTERVAL_S = 0.2
+"""Interval of the requests for the viewer's progress [s]."""
+_START_TIMEOUT_S = 60.0
+"""Longest wait until the viewer listens [s]."""
+_REPLY_TIMEOUT_S = 240.0
+"""Longest wait for a reply of the viewer [s]; without a graphics card, one screenshot may take 15 s."""
+_MESSAGE_INTERVAL_S = 15.0
+"""Interval of the messages during a wait [s]."""
+_SCREENSHOT_INTERVAL_S = 0.5
+"""Time between two screenshots that are compared [s]."""
+_MAX_SCREENSHOTS = 8
+"""Largest number of screenshots until two are equal."""
+_EXIT_TIMEOUT_S = 5.0
+"""Longest wait for the end of the process [s]."""
 
 
 def screen_is_there() -> bool:
-    """Whether a window can be opened."""
+    """Return whether a window can be opened."""
     return sys.platform in ("darwin", "win32") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
 def environment() -> dict[str, str]:
-    """Our environment without rerun's usage reports: it sends none where `CI` is set and nothing forces it to."""
+    """Return the environment for rerun, without usage reports: none are sent with `CI` set and no override."""
     quiet = {key: value for key, value in os.environ.items() if key != "FORCE_RERUN_ANALYTICS"}
     return {**quiet, "CI": "true", "TELEMETRY_ENABLED": "false", "RUST_LOG": "warn"}
 
 
 def free_port(wanted: int) -> int:
-    """The wanted port of 127.0.0.1 if it is free, else another that is."""
+    """Return the wanted port of 127.0.0.1 if it is free, otherwise another free one."""
     for port in (wanted, 0):
         with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -69,16 +75,16 @@ def free_port(wanted: int) -> int:
 
 
 class WindowError(RuntimeError):
-    """The viewer could not be started, or it went away."""
+    """Viewer that could not be started or has ended unexpectedly."""
 
 
 class Window(Closing):
-    """A running rerun viewer, or the server of one.
+    """Running rerun viewer, or the server of a web viewer.
 
     Attributes:
-        url: Where a recording stream connects to.
-        address: What to open in a browser; empty if it is not that kind.
-        page: What browsers are served; None if it is not that kind.
+        url: Address for the recording stream.
+        address: Address for the browser; empty for other kinds.
+        page: Page server; None for other kinds.
     """
 
     def __init__(
@@ -89,19 +95,19 @@ class Window(Closing):
         live: bool = False,
         tell: Callable[[str], None] = lambda text: None,
     ) -> None:
-        """Start it and wait until it listens.
+        """Start the viewer and wait until it listens.
 
         Args:
-            kind: What it is.
-            size: Of the picture [pixels].
-            live: For a stream without end: little is kept.
-            tell: Is told in words if something takes long.
+            kind: Window, browser page or headless.
+            size: Size of the picture [pixels].
+            live: Whether the stream has no end, so that only little history is kept.
+            tell: Receives a message if something takes long.
 
         Raises:
-            WindowError: It ended at once, or does not listen in time.
+            WindowError: The viewer ended at once, or does not listen in time.
         """
         memory = "512MiB" if live else "2GiB"
-        # A browser that comes later takes in all that the server kept before anything new.
+        # A browser opened later first processes everything that the server has kept.
         history = "1MiB" if live else memory
         self._tell = tell
         self._taken: int | None = None
@@ -131,128 +137,128 @@ class Window(Closing):
         try:
             for each in ports:
                 self._wait_for(each)
-            # A viewer listens before it looks for a screen, and without one for a graphics driver at its first picture.
+            # A viewer listens before it opens a screen, or a graphics driver for its first picture.
             if kind == "native":
-                self._ask(lambda viewer: viewer.get_state().viewer_version)
+                self._request(lambda viewer: viewer.get_state().viewer_version)
                 threading.Thread(target=self._watch, name="viewer watch", daemon=True).start()
             elif kind == "headless":
-                self._ask(lambda viewer: viewer.take_screenshot(max_size=64))
+                self._request(lambda viewer: viewer.take_screenshot(max_size=64))
             else:
-                asked = f"url=rerun%2Bhttp%3A%2F%2F{_HOST}%3A{port}%2Fproxy&{_PAGE}"
+                request = f"url=rerun%2Bhttp%3A%2F%2F{_HOST}%3A{port}%2Fproxy&{_PAGE_OPTIONS}"
                 viewer = f"http://{_HOST}:{own_port}"
-                self.page = Page(_HOST, web_port, viewer=viewer, query=asked, timeline=PICTURE, rests=live)
+                self.page = Page(_HOST, web_port, viewer=viewer, query=request, timeline=PICTURE, rests=live)
         except BaseException:
             self.close()
             raise
 
     @property
     def pid(self) -> int:
-        """Process (and process group) id."""
+        """Process id, equal to the process group id."""
         return self._process.pid
 
     @property
     def open(self) -> bool:
-        """Whether it still runs: the user may close the window."""
+        """True if the viewer is running; the user may have closed the window."""
         return self._process.poll() is None
 
     @property
     def failure(self) -> str:
-        """What went wrong with a viewer that is not open any more; empty if it was closed in good order."""
-        return "" if self._process.poll() in (None, 0) else self.last_words()
+        """Error of a viewer that has ended; empty if it was closed normally."""
+        return "" if self._process.poll() in (None, 0) else self.last_output()
 
     def wait(self, timeout_s: float) -> bool:
-        """Wait for it to be closed; whether it was."""
+        """Wait for the viewer to be closed and return whether it was, within a timeout [s]."""
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(timeout_s)
         return not self.open
 
     def taken(self) -> int | None:
-        """Number of the latest picture that the viewer, or the slowest browser, has taken in; None if nobody looks."""
+        """Return the number of the latest picture processed by the viewer or the slowest browser; None without one."""
         return self._taken if self.page is None else self.page.taken()
 
     def _watch(self) -> None:
-        """Ask a viewer on the screen again and again how far it is: it answers with its next frame."""
+        """Poll the progress of a viewer on the screen; it replies with its next frame."""
         viewer = ViewerClient.connect(self.url)
         while self.open:
-            with contextlib.suppress(*_NO_ANSWER):
+            with contextlib.suppress(*_NO_REPLY):
                 self._taken = _end_of(PICTURE, viewer.get_state())
-            time.sleep(_ASKED_S)
+            time.sleep(_POLL_INTERVAL_S)
 
     def picture(self, path: Path, *, at_s: float, end_s: float) -> None:
-        """Save what it shows at an instant.
+        """Save a screenshot of an instant.
 
         Args:
             path: PNG file to write.
             at_s: Simulated time to show [s].
-            end_s: Last instant that was drawn [s]: as long as it is not there, it is waited for.
+            end_s: Last instant drawn [s]; the viewer must have received it first.
 
         Raises:
-            WindowError: It does not show the recording in time.
+            WindowError: The viewer does not show the recording in time.
         """
-        self._ask(lambda viewer: _end_of(SIMULATED, viewer.get_state()) >= round(end_s * 1e9) - 1000)
-        self._ask(lambda viewer: viewer.set_time(SIMULATED, duration=at_s, play_state="paused") or True)
-        # Nothing tells that the last of it is on the screen: it is when two pictures are equal.
+        self._request(lambda viewer: _end_of(SIMULATED, viewer.get_state()) >= round(end_s * 1e9) - 1000)
+        self._request(lambda viewer: viewer.set_time(SIMULATED, duration=at_s, play_state="paused") or True)
+        # rerun does not report a finished frame, so wait until two screenshots are equal.
         picture = b""
-        for _ in range(_PICTURES):
-            time.sleep(_SETTLED_S)
-            before, picture = picture, self._ask(lambda viewer: viewer.take_screenshot())
+        for _ in range(_MAX_SCREENSHOTS):
+            time.sleep(_SCREENSHOT_INTERVAL_S)
+            before, picture = picture, self._request(lambda viewer: viewer.take_screenshot())
             if picture == before:
                 break
         path.write_bytes(picture)
 
-    def _ask(self, asked: Callable[[ViewerClient], _Answer]) -> _Answer:
-        """Ask the viewer until it gives an answer that is one."""
-        for _ in self._while_it_runs(_LOADED_S, 0.1):
-            with contextlib.suppress(*_NO_ANSWER):
-                answer = asked(ViewerClient.connect(self.url))
-                if answer:
-                    return answer
+    def _request(self, request: Callable[[ViewerClient], _Reply]) -> _Reply:
+        """Repeat a request to the viewer until the reply is not empty."""
+        for _ in self._while_it_runs(_REPLY_TIMEOUT_S, 0.1):
+            with contextlib.suppress(*_NO_REPLY):
+                reply = request(ViewerClient.connect(self.url))
+                if reply:
+                    return reply
         raise WindowError(
-            f"the viewer did not load the recording and answer within {_LOADED_S:g} s (a busy machine?): "
-            f"{self.last_words()}"
+            f"the viewer did not load the recording within {_REPLY_TIMEOUT_S:g} s (is the machine busy?): "
+            f"{self.last_output()}"
         )
 
-    def last_words(self) -> str:
-        """The end of what it printed."""
-        # Read in place: the process writes through the same position in the file.
+    def last_output(self) -> str:
+        """Return the last line of output, or the last error in it."""
+        # The process shares the file position, so read with an explicit one.
         size = os.fstat(self._output.fileno()).st_size
         lines = os.pread(self._output.fileno(), size, 0).decode(errors="replace").strip().splitlines()
-        telling = [line for line in lines if "rror" in line or "panicked" in line] or lines
-        return telling[-1].strip() if telling else "it said nothing"
+        error_lines = [line for line in lines if "rror" in line or "panicked" in line] or lines
+        return error_lines[-1].strip() if error_lines else "it printed nothing"
 
     def close(self) -> None:
-        """End it and all that it started."""
+        """Terminate the viewer and its child processes."""
         if self.page is not None:
             self.page.close()
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.killpg(self._process.pid, signal.SIGTERM)
-        self.wait(_ENDED_S)
+        self.wait(_EXIT_TIMEOUT_S)
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.killpg(self._process.pid, signal.SIGKILL)
-        self._process.wait(_ENDED_S)
+        self._process.wait(_EXIT_TIMEOUT_S)
         self._output.close()
 
     def _wait_for(self, port: int) -> None:
-        for _ in self._while_it_runs(_READY_S, 0.05):
+        for _ in self._while_it_runs(_START_TIMEOUT_S, 0.05):
             with contextlib.suppress(OSError), socket.create_connection((_HOST, port), timeout=1.0):
                 return
-        raise WindowError(f"the viewer does not listen on port {port} after {_READY_S:g} s: {self.last_words()}")
+        raise WindowError(f"no viewer on port {port} within {_START_TIMEOUT_S:g} s: {self.last_output()}")
 
     def _while_it_runs(self, timeout_s: float, pause_s: float) -> Iterator[None]:
-        """Again and again for a time, with a pause after each turn."""
-        deadline, report = Deadline(timeout_s), Deadline(_TOLD_S)
+        """Yield at intervals until the timeout, while the viewer is running."""
+        deadline, report = Deadline(timeout_s), Deadline(_MESSAGE_INTERVAL_S)
         for _ in deadline.polls(pause_s):
             if not self.open:
-                raise WindowError(f"the viewer could not start: {self.last_words()}")
+                raise WindowError(f"the viewer could not start: {self.last_output()}")
             if report.passed:
-                report = Deadline(_TOLD_S)
+                report = Deadline(_MESSAGE_INTERVAL_S)
                 waited_s = timeout_s - deadline.left_s
-                self._tell(f"waiting for the viewer since {waited_s:.0f} s, at most {timeout_s:.0f} s")
+                self._tell(f"waiting for the viewer for {waited_s:.0f} s, at most {timeout_s:.0f} s")
             yield
 
 
 def _end_of(timeline: str, state: ViewerState) -> int:
-    """The end of a time line in a viewer; 0 where nothing is there yet."""
+    """Return the end of a timeline in a viewer; 0 if it has no data yet."""
     lines = (line for recording in state.recordings for line in recording.timelines if line.name == timeline)
     return max((line.end or 0 for line in lines), default=0)
 

@@ -144,7 +144,7 @@ def test_live_view_notices_that_the_rig_was_killed(tmp_path: Path) -> None:
         server.send_signal(signal.SIGKILL)
         out, _ = viewer.communicate(timeout=60)
     assert viewer.returncode == 1
-    assert out.startswith("the rig is gone without ending its stream")
+    assert out.startswith("the rig disappeared without ending its stream")
     assert Saved(target)["/events", "TextLog:level"].values[-1] == ["WARN"]
 
 

@@ -196,9 +196,9 @@ def test_the_file_is_small(painted: Any, recording: Synthetic) -> None:
     stored = sum(values.size for values in recording.values.values()) * 4
     assert size < 1.02 * stored  # what there is of lanes and labels is the same for any length
     for duration_s in (1.0, 60.0, 3600.0):
-        assert file.rows_per_s(duration_s) * duration_s <= file.MOST_ROWS * (1.0 + 1e-9)
+        assert file.rows_per_s(duration_s) * duration_s <= file.MAX_ROWS * (1.0 + 1e-9)
         assert file.rows_per_s(duration_s) <= 2000.0
-        assert duration_s / file.frame_s(duration_s) <= file.MOST_FRAMES * (1.0 + 1e-9)
+        assert duration_s / file.frame_s(duration_s) <= file.MAX_FRAMES * (1.0 + 1e-9)
 
 
 def test_missing_rows_interrupt_the_curves(tmp_path: Path) -> None:

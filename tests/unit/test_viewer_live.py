@@ -125,7 +125,7 @@ def test_a_killed_rig_is_noticed(recording: Synthetic, tmp_path: Path) -> None:
     half = payloads_of(recording)[:300]
     reason, view, saved = run(ScriptedClient(recording, half, killed=True), tmp_path / "killed.rrd")
     assert view.failed
-    assert reason.startswith("the rig is gone without ending its stream")
+    assert reason.startswith("the rig disappeared without ending its stream")
     assert saved["/events", "TextLog:text"].values[-1] == [reason]
     assert saved["/events", "TextLog:level"].values[-1] == ["WARN"]
 

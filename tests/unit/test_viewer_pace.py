@@ -7,7 +7,7 @@ from collections import deque
 
 import pytest
 
-from recorder.viewer.pace import DEAF_S, FASTEST_S, Pace
+from recorder.viewer.pace import MAX_WAIT_S, MIN_INTERVAL_S, Pace
 
 TICK_S = 0.04
 
@@ -50,20 +50,20 @@ def test_a_viewer_of_any_speed_is_held(cost_s: float) -> None:
     viewer.run(300.0)
     assert max(viewer.behind_s) < 2.0 + 2.5 * cost_s
     # And it is not left idle: it gets a good part of what it could take.
-    could = min(1.0 / FASTEST_S, 1.0 / cost_s)
+    could = min(1.0 / MIN_INTERVAL_S, 1.0 / cost_s)
     assert 0.6 * could < len(viewer.drawn) / 300.0 < 1.1 * could
 
 
 def test_a_viewer_that_becomes_slow_and_fast_again() -> None:
     viewer = Viewer(0.01)
     viewer.run(20.0)
-    assert viewer.pace.every_s == pytest.approx(FASTEST_S)
+    assert viewer.pace.every_s == pytest.approx(MIN_INTERVAL_S)
     viewer.cost_s = 1.0
     viewer.run(60.0)
     assert len(viewer.waiting) <= 2
     viewer.cost_s = 0.01
     viewer.run(30.0)
-    assert viewer.pace.every_s == pytest.approx(FASTEST_S)
+    assert viewer.pace.every_s == pytest.approx(MIN_INTERVAL_S)
     assert viewer.behind_s[-1] < 0.2
 
 
@@ -71,7 +71,7 @@ def test_a_viewer_that_takes_nothing_gets_a_picture_now_and_then() -> None:
     viewer = Viewer(math.inf)
     viewer.run(100.0)
     late = [time for time in viewer.drawn if time > 2.0]
-    assert len(late) == pytest.approx(100.0 / DEAF_S, abs=1)
+    assert len(late) == pytest.approx(100.0 / MAX_WAIT_S, abs=1)
     assert viewer.pace.behind_s(viewer.now_s) is None
 
 
@@ -84,5 +84,5 @@ def test_nobody_looks() -> None:
         if pace.due(now_s):
             drawn += 1
             pace.drew(drawn, now_s=now_s)
-    assert drawn == pytest.approx(1000 * TICK_S / DEAF_S, abs=1)
+    assert drawn == pytest.approx(1000 * TICK_S / MAX_WAIT_S, abs=1)
     assert not pace.looked_at

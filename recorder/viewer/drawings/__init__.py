@@ -1,1 +1,1 @@
-"""Drawings of the viewer, one module each, with common geometry and history."""
+"""Drawings of the viewer, one per module, with shared geometry and history."""

@@ -1,4 +1,4 @@
-"""Is the shaft in touch with the ring? As the probes see it, and, on a path of its own, as the model knows it."""
+"""Contact of shaft and ring: as sensed by the probes and, on a separate path, as computed by the model."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ TOUCH, FREE = "contact", "free"
 
 
 def resolution_mm(channel: Channel) -> float:
-    """Resolution of a probe [mm]: three standard deviations of its noise and converter step."""
+    """Return the resolution of a probe [mm]: three standard deviations of noise and converter step."""
     step = channel.lsb_v / math.sqrt(12.0)
     return 3.0 * math.hypot(channel.noise_v, step) / abs(channel.sensitivity_v) * channel.si * 1e3
 
 
 class Touch:
-    """Contact from a quantity that reaches `enter`, until it falls below `leave`."""
+    """Contact state with hysteresis: on when a quantity reaches `enter`, off when it falls below `leave`."""
 
     def __init__(self, *, enter: float, leave: float) -> None:
         self._enter = enter
@@ -30,7 +30,7 @@ class Touch:
         self.state: bool | None = None
 
     def changes(self, times_s: np.ndarray, quantity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Instants of change [s] and the states from there on (bool); the first state known is a change."""
+        """Return the instants of change [s] and the new states (bool); the first known state counts as a change."""
         decided = np.where(quantity >= self._enter, 1, np.where(quantity < self._leave, 0, -1))
         known = np.flatnonzero(decided >= 0)
         before = self.state
@@ -44,7 +44,7 @@ class Touch:
 
 
 class ContactPlot:
-    """One lane of the contact view."""
+    """Lane of the contact view."""
 
     def __init__(self, canvas: Canvas, *, path: str, touch: Touch) -> None:
         self._canvas = canvas
@@ -62,11 +62,11 @@ class ContactPlot:
 
     @property
     def touching(self) -> bool:
-        """Whether the last row was in contact."""
+        """True if the last row was in contact."""
         return bool(self._touch.state)
 
     def add(self, times_s: np.ndarray, quantity: np.ndarray) -> None:
-        """Take the rows of the deciding quantity, shape (n,)."""
+        """Add rows of the quantity that determines contact, shape (n,)."""
         times, states = self._touch.changes(times_s, quantity)
         if len(times_s) and self.touching:
             self.last_contact_s = float(times_s[-1])
@@ -76,11 +76,11 @@ class ContactPlot:
         self._words += [TOUCH if state else FREE for state in states]
 
     def flush(self) -> None:
-        """Draw the changes."""
+        """Draw the changes of state."""
         if self._times:
             self._canvas.plot(self._path, np.array(self._times), rr.StateChange.columns(state=self._words))
             self._times, self._words = [], []
 
     def interrupt(self) -> None:
-        """Rows are missing: the state is not known."""
+        """Reset the state to unknown, because rows are missing."""
         self._touch.state = None

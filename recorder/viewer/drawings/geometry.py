@@ -1,4 +1,4 @@
-"""The few lengths that the drawings need."""
+"""Lengths of the rig used by the drawings."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Geometry:
         ring_arm_m: Pivot to ring, l0A [m].
         disk_arm_m: Pivot to disk, l0I [m].
         magnet_arm_m: Pivot to magnet, l0B [m].
-        assumed: Parameter keys that no document gave, so that the default stands for them.
+        assumed: Parameter keys without a value in the document, for which the defaults are used.
     """
 
     ring_clearance_m: float = 0.926e-3
@@ -38,7 +38,11 @@ class Geometry:
 
     @classmethod
     def from_parameters(cls, document: Mapping[str, Any] | None) -> Geometry:
-        """Lengths from a parameters document, `{"values": {key: {"value", "unit"}}}`; defaults for the rest."""
+        """Return the lengths of a parameter document, with defaults for missing ones.
+
+        Args:
+            document: `{"values": {key: {"value", "unit"}}}`, or None.
+        """
         values = (document or {}).get("values", {})
         found: dict[str, float] = {}
         for name, key in _KEYS.items():
@@ -56,5 +60,5 @@ class Geometry:
         return self.ring_clearance_m * self.disk_arm_m / self.ring_arm_m
 
     def clearance_mm(self, plane: str) -> float:
-        """Radius of the clearance circle in a measuring plane, `ring` or `disk` [mm]."""
+        """Return the radius of the clearance circle in a measuring plane, `ring` or `disk` [mm]."""
         return 1e3 * (self.ring_clearance_m if plane == "ring" else self.disk_clearance_m)

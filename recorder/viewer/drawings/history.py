@@ -1,4 +1,4 @@
-"""The last stretch of a signal, at full rate."""
+"""Latest values of a signal at full rate."""
 
 from __future__ import annotations
 
@@ -6,22 +6,22 @@ import numpy as np
 
 
 class History:
-    """Keeps the last `capacity` values of a signal."""
+    """Buffer of the last `capacity` values of a signal."""
 
     def __init__(self, *, capacity: int, dtype: type = float) -> None:
         self._capacity = capacity
         self._rows = np.empty(0, dtype=dtype)
 
     def add(self, rows: np.ndarray) -> None:
-        """Append values, shape (n,), and forget the oldest beyond the capacity."""
+        """Append values, shape (n,), and drop the oldest beyond the capacity."""
         self._rows = np.concatenate((self._rows, rows))[-self._capacity :]
 
     def clear(self) -> None:
-        """Forget everything: what follows does not join what went before."""
+        """Drop all values, because the next ones are not contiguous with them."""
         self._rows = self._rows[:0]
 
     def last(self, count: int) -> np.ndarray:
-        """The last `count` values, or as many as there are."""
+        """Return the last `count` values, or fewer if there are not as many."""
         return self._rows[max(0, len(self._rows) - count) :]
 
     def __len__(self) -> int:

@@ -1,6 +1,6 @@
-"""Orbits: the last few revolutions in a plane, inside its clearance circle.
+"""Orbits: the last few revolutions in a measuring plane, within its clearance circle.
 
-The 2-D view counts y downwards, so everything is drawn with -y: EAST is right, NORTH (up) is up, forward whirl turns
+The 2-D view counts y downward, so everything is drawn with -y: EAST is right, NORTH (up) is up, forward whirl turns
 counter-clockwise on screen.
 """
 
@@ -20,42 +20,42 @@ ROOT = "/orbit"
 PLANES = ("ring", "disk")
 
 _REVOLUTIONS = 3.0
-_SHORTEST_S = 0.02
-_LONGEST_S = 0.4
-_JUDGED_S = 0.33
-"""Stretch over which sense and frequency are judged [s]: two revolutions at the usual spin speed."""
+_MIN_SPAN_S = 0.02
+_MAX_SPAN_S = 0.4
+_WHIRL_SPAN_S = 0.33
+"""Time over which sense and frequency are determined [s]: two revolutions at the usual spin speed."""
 _POINTS = 144
 _TAIL = 6
 _CLEARANCE_RGB = (140, 146, 158)
 _FAINT_RGB = (70, 74, 82)
-_WORDS_RGB = (190, 195, 205)
-_TURN = 0.48
-"""Radius of the round arrow over the clearance."""
+_TEXT_RGB = (190, 195, 205)
+_ARROW_RADIUS = 0.48
+"""Radius of the round arrow, relative to the clearance."""
 
 
 def screen(z: np.ndarray) -> np.ndarray:
-    """Points of the 2-D view for x + j y: shape (n, 2), y turned over."""
+    """Return the points of the 2-D view for x + j y, shape (n, 2), with y inverted."""
     return np.stack((np.real(z), -np.imag(z)), axis=-1)
 
 
-def _placed(words: dict[complex, str]) -> dict[Place, str]:
+def _to_places(words: dict[complex, str]) -> dict[Place, str]:
     return {(float(np.real(z)), float(-np.imag(z))): text for z, text in words.items()}
 
 
 def shown_s(whirl: Whirl) -> float:
-    """How much of the past an orbit shows [s]: a few revolutions of the whirl."""
+    """Return the time span of an orbit [s]: a few revolutions of the whirl."""
     if whirl.sense == "none":
-        return _LONGEST_S
-    return min(_LONGEST_S, max(_SHORTEST_S, _REVOLUTIONS / abs(whirl.frequency_hz)))
+        return _MAX_SPAN_S
+    return min(_MAX_SPAN_S, max(_MIN_SPAN_S, _REVOLUTIONS / abs(whirl.frequency_hz)))
 
 
 class OrbitPlot:
-    """One plane's orbit on a canvas."""
+    """Orbit of one measuring plane."""
 
     def __init__(self, canvas: Canvas, *, plane: str, clearance_mm: float, rate_hz: int) -> None:
         self._canvas = canvas
         self._rate_hz = rate_hz
-        self._history = History(capacity=math.ceil(_LONGEST_S * rate_hz), dtype=complex)
+        self._history = History(capacity=math.ceil(_MAX_SPAN_S * rate_hz), dtype=complex)
         self._path = f"{ROOT}/{plane}"
         self._clearance_mm = clearance_mm
         self._draw_frame(plane)
@@ -78,25 +78,25 @@ class OrbitPlot:
             1.42j * radius: "UP +y",
             1.80j * radius: f"clearance {radius:.3f} mm{at_ring}",
         }
-        self._canvas.write(f"{self._path}/words", _placed(words), [_WORDS_RGB, _WORDS_RGB, _CLEARANCE_RGB])
+        self._canvas.write(f"{self._path}/words", _to_places(words), [_TEXT_RGB, _TEXT_RGB, _CLEARANCE_RGB])
 
     def add(self, z: np.ndarray) -> None:
-        """Take rows of x + j y [mm], shape (n,)."""
+        """Add rows of x + j y [mm], shape (n,)."""
         self._history.add(z)
 
     def interrupt(self) -> None:
-        """Rows are missing: start the orbit anew."""
+        """Restart the orbit, because rows are missing."""
         self._history.clear()
 
     def draw(self, time_s: float) -> None:
-        """Draw the orbit that ends at `time_s`, with an arrow in its direction and a line that names its sense."""
-        whirl = whirl_of(self._history.last(math.ceil(_JUDGED_S * self._rate_hz)), self._rate_hz)
+        """Draw the orbit that ends at a time [s], with an arrow in its direction and a text for its sense."""
+        whirl = whirl_of(self._history.last(math.ceil(_WHIRL_SPAN_S * self._rate_hz)), self._rate_hz)
         z = self._history.last(math.ceil(shown_s(whirl) * self._rate_hz))
         if len(z) < 2:
             return
         points = z[np.linspace(0, len(z) - 1, min(len(z), _POINTS)).round().astype(int)]
         color = np.array(whirl.color, dtype=float)
-        # Older parts are darker, so that the direction shows in a still picture.
+        # Older parts are darker, so that a still picture shows the direction.
         edges = np.linspace(0, len(points) - 1, _TAIL + 1).round().astype(int)
         strips = [screen(points[start : end + 1]) for start, end in itertools.pairwise(edges)]
         shades = [(color * (0.3 + 0.7 * (part + 1) / _TAIL)).astype(np.uint8) for part in range(_TAIL)]
@@ -111,17 +111,17 @@ class OrbitPlot:
         self._draw_turn(time_s, complex(points[-1] - z.mean()), whirl)
         first, second = reading_of(whirl)
         at = -1.16j * self._clearance_mm
-        words = _placed({at: first, 1.31 * at: second})
+        words = _to_places({at: first, 1.31 * at: second})
         self._canvas.write(f"{self._path}/reading", words, [whirl.color], time_s=time_s)
 
     def _draw_turn(self, time_s: float, position: complex, whirl: Whirl) -> None:
-        """Draw a round arrow in the middle that turns as the shaft whirls; it leads up to the shaft's direction."""
+        """Draw a round arrow in the centre that rotates with the whirl and ends at the shaft's direction."""
         path = f"{self._path}/turn"
         if whirl.sense == "none" or position == 0.0:
             self._canvas.draw(path, time_s, rr.LineStrips2D([]))
             return
         turn = 1.0 if whirl.sense == "forward" else -1.0
-        radius = _TURN * self._clearance_mm
+        radius = _ARROW_RADIUS * self._clearance_mm
         head = math.atan2(position.imag, position.real)
         arc = radius * np.exp(1j * (head - turn * np.linspace(1.4 * math.pi, 0.0, 40)))
         along = turn * 1j * np.exp(1j * head)
@@ -136,7 +136,7 @@ class OrbitPlot:
 
 
 def reading_of(whirl: Whirl) -> tuple[str, str]:
-    """Two lines that say what the orbit does."""
+    """Return two lines that describe the orbit."""
     if whirl.sense == "none":
         return "no whirl", f"radius {whirl.radius_mm:.3f} mm"
     turn = "clockwise" if whirl.sense == "backward" else "counter-clockwise"

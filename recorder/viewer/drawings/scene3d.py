@@ -1,7 +1,7 @@
-"""The rig in space: pivoted shaft with disk and magnet, ring, houses, and the reaction, with displacements exaggerated.
+"""3-D view of the rig: pivoted shaft with disk and magnet, ring, housings, and the reaction, displacements exaggerated.
 
-The shaft is a rigid line from the pivot through the displacement that the disk's probes see. Both displacement and
-clearance are multiplied by `EXAGGERATION`, so that shaft and ring touch in the picture when they touch in the rig.
+The shaft is a rigid line from the pivot through the displacement measured at the disk. Displacement and clearance are
+both multiplied by `EXAGGERATION`, so that shaft and ring touch in the picture when they touch in the rig.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from recorder.viewer.drawings.whirl import BACKWARD_RGB
 ROOT = "/rig3d"
 EXAGGERATION = 25.0
 FORCE_M_PER_N = 1.2e-4
-"""Length of the reaction's arrow: 500 N are 60 mm."""
+"""Scale of the reaction's arrow [m/N]: 500 N are 60 mm."""
 
 _STEEL = (168, 176, 190)
 _DARK = (110, 118, 132)
@@ -31,7 +31,7 @@ _HUB_RADIUS_M = 0.008
 
 
 class Scene3D:
-    """The rig on a canvas."""
+    """3-D rig on a canvas."""
 
     def __init__(self, canvas: Canvas, geometry: Geometry) -> None:
         self._canvas = canvas
@@ -57,7 +57,7 @@ class Scene3D:
                 half_sizes=[(inner, inner, 0.012), (outer, outer, 0.014)],
                 colors=[_HOUSE, _DARK],
                 radii=[0.0008],
-                labels=["inner house", "outer house"],
+                labels=["inner housing", "outer housing"],
                 show_labels=False,
                 fill_mode="MajorWireframe",
             ),
@@ -78,7 +78,7 @@ class Scene3D:
         )  # fmt: skip
         places = {
             "pivot": (0.0, 0.06, 0.0),
-            "ring in its houses": (0.0, -outer - 0.035, g.ring_arm_m),
+            "ring in its housings": (0.0, -outer - 0.035, g.ring_arm_m),
             "disk": (0.0, _DISK_RADIUS_M + 0.03, g.disk_arm_m),
             "magnets": (0.0, -0.085, g.magnet_arm_m),
         }
@@ -136,24 +136,24 @@ class Scene3D:
         )
 
     def draw_tilt(self, time_s: float, disk_m: complex) -> None:
-        """Tilt the rotor so that its disk is at x + j y [m]."""
+        """Draw the rotor tilted so that its disk is at x + j y [m]."""
         tilt = EXAGGERATION * abs(disk_m) / self._geometry.disk_arm_m
         half = 0.5 * math.atan(tilt)
         direction = disk_m / abs(disk_m) if abs(disk_m) > 0.0 else 1.0 + 0.0j
-        # Turns +z towards the displacement: about the axis (-y, x, 0).
+        # Rotate +z towards the displacement, about the axis (-y, x, 0).
         axis = (-direction.imag * math.sin(half), direction.real * math.sin(half), 0.0)
         self._canvas.draw(
             f"{ROOT}/rotor", time_s, rr.Transform3D(quaternion=rr.Quaternion(xyzw=(*axis, math.cos(half))))
         )
 
     def draw_spin(self, time_s: float, turned_rad: float) -> None:
-        """Show the rotor turned by an angle [rad] since the start, where its angle is not known."""
+        """Rotate the rotor by the angle accumulated since the start [rad]; its absolute angle is unknown."""
         half = 0.5 * math.remainder(turned_rad, 4.0 * math.pi)
         turned = rr.Quaternion(xyzw=(0.0, 0.0, math.sin(half), math.cos(half)))
         self._canvas.draw(f"{ROOT}/rotor/spin", time_s, rr.Transform3D(quaternion=turned))
 
     def draw_contact(self, time_s: float, ring_m: complex, *, touching: bool) -> None:
-        """Mark the point of the ring nearest to the shaft at x + j y [m], or nothing."""
+        """Mark the point of the ring nearest to the shaft at x + j y [m], or remove the mark."""
         g = self._geometry
         path = f"{ROOT}/contact"
         if not touching or ring_m == 0.0:
@@ -167,7 +167,7 @@ class Scene3D:
         )
 
     def draw_reaction(self, time_s: float, reaction_n: complex) -> None:
-        """Draw the force of the shaft on the houses, x + j y [N], at the ring."""
+        """Draw the force of the shaft on the housings, x + j y [N], at the ring."""
         g = self._geometry
         bore = g.shaft_radius_m + EXAGGERATION * g.ring_clearance_m
         size = abs(reaction_n)

@@ -1,4 +1,4 @@
-"""Time series: which curves there are, and how many points of them are drawn."""
+"""Time series: selection of the curves, and thinning of their points."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from rig.channels.table import ChannelTable, Group
 ROOT = "/sensors"
 REACTION = "/derived/reaction"
 REACTIONS = {"P_N", "P_S", "P_E", "P_W"}
-"""Channels that together give the reaction."""
-_NOT_DRAWN = {"keyphasor"}
-"""A pulse of a fraction of a millisecond, once per turn, is a row of meaningless spikes at a viewing rate."""
+"""Channels required for the reaction."""
+_HIDDEN_CHANNELS = {"keyphasor"}
+"""Channels without a curve: a pulse of a fraction of a millisecond per revolution is meaningless at a viewing rate."""
 
 _COLORS = {
     "N": (86, 180, 233),
@@ -26,9 +26,9 @@ _COLORS = {
     "x": (86, 180, 233),
     "y": (240, 190, 70),
 }
-_PLAIN = (200, 205, 215)
+_DEFAULT_RGB = (200, 205, 215)
 _SHADES = {"outer": 0.6}
-"""Curves of the outer house stand in the plot of the inner one."""
+"""Brightness of the outer housing's curves, which share the plot of the inner housing."""
 
 Span = tuple[float, float]
 Points = tuple[np.ndarray, np.ndarray]
@@ -37,13 +37,13 @@ Points = tuple[np.ndarray, np.ndarray]
 
 @dataclass(frozen=True, slots=True)
 class Curves:
-    """Curves that share a plot: one entity with a value per curve.
+    """Curves that share a plot: one entity with one value per curve.
 
     Attributes:
         path: Entity path in the viewer.
         labels: Legend of each curve, with its unit.
         colors: RGB of each curve.
-        select: Takes engineering values of the whole group, shape (n, channels), to shape (n, curves).
+        select: Maps engineering values of the group, shape (n, channels), to curves, shape (n, curves).
     """
 
     path: str
@@ -53,10 +53,10 @@ class Curves:
 
 
 def series_of(group: Group) -> list[Curves]:
-    """The curves of one sensor group: channels with a common first part of the name stand together."""
+    """Return the curves of a sensor group; channels with the same first part of the name share a plot."""
     planes: dict[str, list[int]] = {}
     for column, channel in enumerate(group.channels):
-        if channel.name not in _NOT_DRAWN:
+        if channel.name not in _HIDDEN_CHANNELS:
             planes.setdefault(channel.name.split("_")[0], []).append(column)
     found = [
         Curves(
@@ -80,28 +80,31 @@ def series_of(group: Group) -> list[Curves]:
 
 
 def _color_of(name: str) -> tuple[int, int, int]:
-    """The same colour for the same direction in all plots."""
-    red, green, blue = _COLORS.get(name.split("_")[-1], _PLAIN)
+    """Return the colour of a channel's direction, the same in all plots."""
+    red, green, blue = _COLORS.get(name.split("_")[-1], _DEFAULT_RGB)
     shade = _SHADES.get(name.split("_")[0], 1.0)
     return round(shade * red), round(shade * green), round(shade * blue)
 
 
 def paths_of(table: ChannelTable) -> list[str]:
-    """Entity paths of all curves, in table order."""
+    """Return the entity paths of all curves, in table order."""
     return [series.path for group in table.groups.values() for series in series_of(group)]
 
 
 def reaction_of(group: Group) -> Callable[[np.ndarray], np.ndarray]:
-    """From rows of the force group to the reaction of each direction [N], shape (n, 2): the pairs' differences."""
+    """Return a function that maps rows of the force group to the reaction [N], shape (n, 2).
+
+    Each component is the difference of opposite transducers.
+    """
     east, west, north, south = (group.names.index(name) for name in ("P_E", "P_W", "P_N", "P_S"))
     return lambda values: np.stack((values[:, east] - values[:, west], values[:, north] - values[:, south]), axis=1)
 
 
 class Envelope:
-    """Keeps the extremes of each bucket of rows, and every row inside the given windows.
+    """Min-max envelope of buckets of rows, with all rows in given windows.
 
-    A bucket of `bucket` rows becomes two: the extreme that came first at the bucket's start, the other at its middle,
-    each curve by itself; so peaks survive at their height and within half a bucket of their time.
+    A bucket of `bucket` rows becomes two points: its first extreme at the start of the bucket and the other one at its
+    middle, separately for each curve. Peaks keep their height, and their time within half a bucket.
     """
 
     def __init__(self, *, bucket: int) -> None:
@@ -112,54 +115,54 @@ class Envelope:
         self._points: list[Points] = []
 
     def add(self, times_s: np.ndarray, values: np.ndarray) -> None:
-        """Take rows, shapes (n,) and (n, curves)."""
+        """Add rows, shapes (n,) and (n, curves)."""
         self._times.append(times_s)
         self._values.append(values)
 
     def fold(self, *, until_s: float, windows: list[Span], rest: bool = False, most: int | None = None) -> None:
-        """Turn rows into points, so that what waits to be given is bounded.
+        """Reduce rows to points, to limit the pending data.
 
         Args:
-            until_s: Of the buckets that end before this time [s].
-            windows: Where every row is kept.
-            rest: Those of the unfinished bucket, too.
-            most: So many points wait outside of the windows; where they would be more, the buckets become larger.
+            until_s: Reduce the buckets that end before this time [s].
+            windows: Time spans in which all rows are kept.
+            rest: Also reduce the incomplete last bucket.
+            most: Largest number of pending points outside the windows; beyond it, buckets grow.
         """
         if self._times:
             times_s, values = np.concatenate(self._times), np.concatenate(self._values)
             bucket = self._bucket * self._coarse
             rows = int(np.searchsorted(times_s, until_s)) // bucket * bucket
-            self._points.append(_reduced(times_s[:rows], values[:rows], bucket, windows))
+            self._points.append(_reduce(times_s[:rows], values[:rows], bucket, windows))
             if rest and rows < len(times_s):
-                self._points.append(_reduced(times_s[rows:], values[rows:], len(times_s) - rows, windows))
+                self._points.append(_reduce(times_s[rows:], values[rows:], len(times_s) - rows, windows))
                 rows = len(times_s)
             self._times, self._values = [times_s[rows:]], [values[rows:]]
-        outside = sum(_outside(at, windows) for at, _ in self._points)
+        outside = sum(_count_outside(at, windows) for at, _ in self._points)
         while most is not None and outside > most:
-            self._points = [_reduced(*_joined(self._points), 4, windows)]
-            before, outside = outside, _outside(self._points[0][0], windows)
-            if outside > 0.75 * before:  # between windows that are close together little is left to be thinned
+            self._points = [_reduce(*_merge(self._points), 4, windows)]
+            before, outside = outside, _count_outside(self._points[0][0], windows)
+            if outside > 0.75 * before:  # little can be thinned between close windows
                 break
             self._coarse *= 2
 
     def take(self, *, until_s: float, windows: list[Span], rest: bool = False, most: int | None = None) -> Points:
-        """Give the points of the buckets that end before `until_s`; as `fold`, whose points are given first."""
+        """Return and remove the points of the buckets that end before `until_s`; arguments as in `fold`."""
         self.fold(until_s=until_s, windows=windows, rest=rest, most=most)
         points, self._points, self._coarse = self._points, [], 1
-        return _joined(points) if points else (np.empty(0), np.empty((0, 0)))
+        return _merge(points) if points else (np.empty(0), np.empty((0, 0)))
 
 
-def _joined(points: list[Points]) -> Points:
+def _merge(points: list[Points]) -> Points:
     return np.concatenate([at for at, _ in points]), np.concatenate([values for _, values in points])
 
 
-def _outside(times_s: np.ndarray, windows: list[Span]) -> int:
-    """How many of the times are in no window."""
+def _count_outside(times_s: np.ndarray, windows: list[Span]) -> int:
+    """Return the number of times outside all windows."""
     return len(times_s) - int(np.any([(times_s >= start) & (times_s <= end) for start, end in windows], axis=0).sum())
 
 
-def _reduced(times_s: np.ndarray, values: np.ndarray, bucket: int, windows: list[Span]) -> Points:
-    """The extremes of each bucket, every row of the buckets that touch a window, and what is left of the last one."""
+def _reduce(times_s: np.ndarray, values: np.ndarray, bucket: int, windows: list[Span]) -> Points:
+    """Return the extremes of each bucket, all rows of buckets that overlap a window, and the remaining rows."""
     whole = len(times_s) // bucket
     rows = whole * bucket
     points = [(times_s[rows:], values[rows:])]
@@ -173,7 +176,7 @@ def _reduced(times_s: np.ndarray, values: np.ndarray, bucket: int, windows: list
         reduces = [_flat if full[part[0]] or bucket <= 2 else _extremes for part in parts]
         points = [reduce(bucket_times[part], bucket_values[part]) for part, reduce in zip(parts, reduces, strict=True)]
         points.append((times_s[rows:], values[rows:]))
-    return _joined(points)
+    return _merge(points)
 
 
 def _flat(times: np.ndarray, values: np.ndarray) -> Points:
@@ -189,7 +192,7 @@ def _extremes(times: np.ndarray, values: np.ndarray) -> Points:
 
 
 class SeriesPlot:
-    """The curves of one sensor group on a canvas."""
+    """Curves of one sensor group."""
 
     def __init__(self, canvas: Canvas, group: Group, *, rows_per_s: float) -> None:
         self._canvas = canvas
@@ -210,12 +213,12 @@ class SeriesPlot:
             )
 
     def add(self, times_s: np.ndarray, values: np.ndarray) -> None:
-        """Take consecutive engineering values of the whole group, shape (n, channels)."""
+        """Add consecutive engineering values of the whole group, shape (n, channels)."""
         for series, envelope in zip(self._series, self._envelopes, strict=True):
             envelope.add(times_s, series.select(values))
 
     def flush(self, *, until_s: float, windows: list[Span], rest: bool = False, most: int | None = None) -> None:
-        """Draw what is complete before `until_s`: `most` points of each curve, and what is in the windows."""
+        """Draw the points before `until_s`: at most `most` per curve, and all in the windows."""
         for series, envelope in zip(self._series, self._envelopes, strict=True):
             times, values = envelope.take(until_s=until_s, windows=windows, rest=rest, most=most)
             if len(times):
@@ -223,12 +226,12 @@ class SeriesPlot:
                 self.points += values.size
 
     def fold(self, *, until_s: float, windows: list[Span], most: int) -> None:
-        """Thin what is complete before `until_s` and waits to be drawn."""
+        """Reduce the pending points before `until_s`."""
         for envelope in self._envelopes:
             envelope.fold(until_s=until_s, windows=windows, most=most)
 
     def lift(self, *, at_s: float, windows: list[Span]) -> None:
-        """Draw what is held, then interrupt the curves at `at_s`: rows are missing from here on."""
+        """Draw all pending points and break the curves at a time [s], because rows are missing."""
         self.flush(until_s=np.inf, windows=windows, rest=True)
         for series in self._series:
             hole = np.full((1, len(series.labels)), np.nan)

@@ -21,7 +21,7 @@ WATERFALL = f"{ROOT}/waterfall"
 LIMIT_HZ = round(SPECTRUM_HZ)
 WINDOW_S = 0.5
 COLUMN_HZ = 2
-"""Width of a waterfall column [Hz]: the window of half a second resolves no more."""
+"""Width of a waterfall column [Hz]: the resolution of the window."""
 HEIGHT = 120
 """Rows of the waterfall's image."""
 FLOOR_DB, CEILING_DB = 0.0, 62.0
@@ -30,7 +30,9 @@ _MARKS_RGB = (150, 155, 165)
 
 
 def shown_spectrum(z: np.ndarray, rate_hz: int) -> tuple[np.ndarray, np.ndarray]:
-    """Amplitude of each circular component of z about its centre, at whole hertz (`rig.channels.orbit.full_spectrum`).
+    """Return the amplitude of each circular component of z about its centre, at whole hertz.
+
+    See `rig.channels.orbit.full_spectrum`.
 
     Args:
         z: x + j y, shape (n,), n at most `rate_hz`.
@@ -47,7 +49,7 @@ def shown_spectrum(z: np.ndarray, rate_hz: int) -> tuple[np.ndarray, np.ndarray]
 
 
 class SpectrumPlot:
-    """The spectrum of the last half second as bars, backward and forward in their own colours, and the waterfall."""
+    """Spectrum of the last half second as bars, with separate colours for backward and forward, and its waterfall."""
 
     def __init__(self, canvas: Canvas, *, rate_hz: int, interval_s: float, whole: bool) -> None:
         self._canvas = canvas
@@ -59,27 +61,27 @@ class SpectrumPlot:
         for path, start, color in ((BACKWARD, -LIMIT_HZ, BACKWARD_RGB), (FORWARD, 1, FORWARD_RGB)):
             abscissa = np.arange(start, start + LIMIT_HZ, dtype=np.float32)
             chart = rr.BarChart(np.zeros(LIMIT_HZ, dtype=np.float32), abscissa=abscissa, color=color)
-            # Abscissa and colour are drawn once, for all times; the bars must not, for that would hide all later ones.
-            lasting = [
+            # Abscissa and colour are static. Static bars would hide all later ones.
+            static = [
                 part
                 for part in chart.as_component_batches()
                 if part.component_descriptor() != chart.descriptor_values()
             ]
-            canvas.fix(path, lasting)
+            canvas.fix(path, static)
 
     def add(self, z: np.ndarray) -> None:
-        """Take rows of x + j y [mm], shape (n,)."""
+        """Add rows of x + j y [mm], shape (n,)."""
         self._history.add(z)
 
     def interrupt(self) -> None:
-        """Rows are missing: a spectrum across the gap would show what never was."""
+        """Restart, because rows are missing; a spectrum across the gap would be wrong."""
         self._history.clear()
         self._drawn_s = -math.inf
 
     def draw(self, time_s: float) -> None:
-        """Draw the spectrum of the half second that ends at `time_s`.
+        """Draw the spectrum of the half second that ends at a time [s].
 
-        Nothing before there is that much, nor as long as the last one is younger than the interval.
+        Draws nothing before half a second of data, or within the interval after the last spectrum.
         """
         z = self._history.last(math.ceil(WINDOW_S * self._rate_hz))
         if len(z) < math.ceil(WINDOW_S * self._rate_hz) or time_s - self._drawn_s < 0.9 * self._interval_s:
@@ -92,14 +94,15 @@ class SpectrumPlot:
         self._waterfall.add(time_s, amplitude)
 
     def close(self) -> None:
-        """Draw what is known at the end only."""
+        """Draw what requires the complete data."""
         self._waterfall.finish()
 
 
 class Waterfall:
     """Spectra over time as one image of fixed height, newest at the top.
 
-    For a file the image holds all of it and a line marks the present (`whole`); live it holds the last spectra.
+    For a file (`whole`) the image covers all of it and a line marks the current time; a live image covers the latest
+    spectra.
     """
 
     def __init__(self, canvas: Canvas, *, whole: bool, interval_s: float) -> None:
@@ -122,11 +125,11 @@ class Waterfall:
         self._canvas.write(f"{WATERFALL}/senses", senses, [BACKWARD_RGB, FORWARD_RGB])
 
     def x_of(self, frequency_hz: float) -> float:
-        """Place of a frequency in the image [pixels]."""
+        """Return the position of a frequency in the image [pixels]."""
         return (frequency_hz + LIMIT_HZ) / COLUMN_HZ + 0.5
 
     def add(self, time_s: float, amplitude_mm: np.ndarray) -> None:
-        """Take a spectrum, shape (401,)."""
+        """Add a spectrum, shape (401,)."""
         around = np.pad(amplitude_mm, 1)
         widest = np.maximum(np.maximum(around[:-2], around[2:]), amplitude_mm)[::COLUMN_HZ]
         decibel = 20.0 * np.log10(np.maximum(widest * 1e3, 1e-6))
@@ -140,7 +143,7 @@ class Waterfall:
         self._draw_image(time_s, self.image())
 
     def image(self) -> np.ndarray:
-        """Levels [dB re 1 um], uint8, shape (HEIGHT, columns): newest row first; rows that never were are 0."""
+        """Return levels [dB re 1 um], uint8, shape (HEIGHT, columns), newest row first; unused rows are 0."""
         rows = np.array(self._rows, dtype=np.uint8).reshape(-1, self.columns)
         if self._whole and len(rows):
             edges = np.linspace(0, len(rows), HEIGHT + 1)
@@ -152,7 +155,7 @@ class Waterfall:
         return full
 
     def finish(self) -> None:
-        """For a whole file: draw the image, its times, and the line that marks the present."""
+        """Draw the complete image of a file, its times, and the line at the current time; no effect on a live view."""
         if not self._whole or not self._times:
             return
         self._draw_image(None, self.image())

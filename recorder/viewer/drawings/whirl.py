@@ -12,13 +12,13 @@ BACKWARD_RGB = (240, 100, 75)
 FORWARD_RGB = (95, 205, 150)
 STILL_RGB = (150, 155, 165)
 
-_LEAST_RADIUS_MM = 5e-3
-_LEAST_FREQUENCY_HZ = 0.5
+_MIN_RADIUS_MM = 5e-3
+_MIN_FREQUENCY_HZ = 0.5
 
 
 @dataclass(frozen=True, slots=True)
 class Whirl:
-    """How z turned over a stretch of time.
+    """Rotation of z over a time span.
 
     Attributes:
         frequency_hz: Mean rotation [Hz]: forward (counter-clockwise, with the spin) positive, backward negative.
@@ -30,19 +30,19 @@ class Whirl:
 
     @property
     def sense(self) -> str:
-        """`forward`, `backward`, or `none` where hardly anything turns."""
-        if self.radius_mm < _LEAST_RADIUS_MM or abs(self.frequency_hz) < _LEAST_FREQUENCY_HZ:
+        """`forward`, `backward`, or `none` for negligible rotation."""
+        if self.radius_mm < _MIN_RADIUS_MM or abs(self.frequency_hz) < _MIN_FREQUENCY_HZ:
             return "none"
         return "forward" if self.frequency_hz > 0.0 else "backward"
 
     @property
     def color(self) -> tuple[int, int, int]:
-        """RGB of that sense, the same in every view."""
+        """RGB colour of the sense, the same in every view."""
         return {"forward": FORWARD_RGB, "backward": BACKWARD_RGB, "none": STILL_RGB}[self.sense]
 
 
 def whirl_of(z: np.ndarray, rate_hz: float) -> Whirl:
-    """How z turns about its mean.
+    """Return the rotation of z about its mean.
 
     Args:
         z: x + j y [mm], shape (n,).
