@@ -1,1 +1,1 @@
-"""Channels: their table, formulas, generators, faults and sensors."""
+"""Channels: table, formulas, generators, faults and sensors."""

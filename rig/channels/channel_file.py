@@ -1,17 +1,17 @@
-"""A user's own channels: `channels = "mine.toml"` in a scene, `--channels mine.toml` on a command line.
+"""User-defined channels: `channels = "mine.toml"` in a scene, `--channels mine.toml` on a command line.
 
-The file says what is different from the built-in table (`channels.toml` beside this), or, with `base = "none"`, all
-there is:
+The file states the differences from the built-in table (`channels.toml` in this folder) or, with `base = "none"`, the
+whole table:
 
-    drop = ["accelerations", "hammer"]          # groups or channels that are left out
+    drop = ["accelerations", "hammer"]          # groups or channels to leave out
 
-    [channels.disk_x]                           # other numbers of a channel that there is
+    [channels.disk_x]                           # changes to an existing channel
     sensitivity_v = 4.5
 
-    [groups.probes]                             # of a group that there is; `channels` are added to it
+    [groups.probes]                             # changes to an existing group; `channels` are added to it
     rate_hz = 51200
 
-    [groups.bearing]                            # a new one
+    [groups.bearing]                            # a new group
     rate_hz = 51200
     defaults = { unit = "mm", si = 1e-3, sensitivity_v = 3.94, bias_v = -10, range_v = [-18, -2], adc_v = 20 }
     channels = [
@@ -21,7 +21,7 @@ there is:
     [curves]
     runout = "runout.csv"                       # degrees, value in SI; or the points themselves
 
-What a new channel does not say is in `_PLAIN`; a bandwidth that nobody gave is at most a quarter of the rate.
+A new channel takes omitted fields from `_DEFAULTS`; an omitted bandwidth is at most a quarter of the rate.
 """
 
 from __future__ import annotations
@@ -41,20 +41,20 @@ from rig.channels.sampling import TICKS_HZ
 from rig.channels.table import TABLE, Channel, ChannelTable, raw_groups, table_of
 
 KIND = "user"
-"""Provenance of what stands in such a file."""
-_PLAIN: dict[str, Any] = {
+"""Provenance of values from such a file."""
+_DEFAULTS: dict[str, Any] = {
     "bias_v": 0.0, "range_v": [-10.0, 10.0], "highpass_hz": 0.0, "noise_v": 0.0, "adc_v": 10.0, "adc_bits": 24,
 }  # fmt: skip
 _RATE_HZ = 20_000
 MOST_HZ = 130_000.0
-"""Largest bandwidth: what rows of 1 us can show [Hz]."""
-_MOST, _MOST_POINTS = 512, 10_000
-"""Most channels of a table, and points of a curve."""
+"""Largest bandwidth [Hz] that rows at an interval of 1 us can represent."""
+_MAX_CHANNELS, _MAX_CURVE_POINTS = 512, 10_000
+"""Largest number of channels in a table, and of points in a curve."""
 
 
 def _identifier(name: str) -> str:
     if not (name.isascii() and name.isidentifier() and len(name) <= 28):
-        raise ValueError("a name of letters, digits and _, 28 at most, as buses and files have them")
+        raise ValueError("a name of at most 28 letters, digits and _, as required by buses and files")
     return name
 
 
@@ -62,7 +62,7 @@ _Name = Annotated[str, AfterValidator(_identifier)]
 
 
 class _Row(Written):
-    """A new channel; numbers are checked where the whole table is."""
+    """New channel; its values are validated with the whole table."""
 
     model_config = ConfigDict(extra="allow")
 
@@ -70,7 +70,7 @@ class _Row(Written):
 
 
 class _Group(Written):
-    """A group, or what is different of one."""
+    """New group, or changes to an existing one."""
 
     title: str | None = None
     rate_hz: Annotated[int, Field(ge=1, le=1_000_000)] | None = None
@@ -87,19 +87,19 @@ class _File(Written):
 
 
 def read_channels(path: Path, check_more: Callable[[ChannelTable], None] = lambda _: None) -> ChannelTable:
-    """The channel table that a user's file makes.
+    """Return the channel table of a user's file.
 
     Args:
         path: The file.
-        check_more: Refuses what is wrong by rules that are not known here.
+        check_more: Additional check of the table by the caller.
 
     Raises:
-        InputError: The first thing that is wrong in it: its channel and field, behind the file's name.
+        InputError: The file is invalid; the message names the file, channel and field.
     """
     try:
         file = check(_File, read_toml(path), field="")
-        curves = {name: _curve(name, given, path.parent) for name, given in file.curves.items()}
-        table = table_of(_merged(file), curves)
+        curves = {name: _curve(name, stated, path.parent) for name, stated in file.curves.items()}
+        table = table_of(_merge_groups(file), curves)
         check_table(table)
         check_more(table)
         return table
@@ -109,13 +109,13 @@ def read_channels(path: Path, check_more: Callable[[ChannelTable], None] = lambd
 
 
 def check_table(table: ChannelTable) -> None:
-    """Refuse what streams, buses and files could not carry.
+    """Refuse a table that streams, buses and files cannot represent.
 
     Raises:
-        InputError: The first such thing.
+        InputError: The table is invalid; the message names the first wrong field.
     """
-    if not table.groups or len(table.channels) > _MOST:
-        raise InputError("groups", f"of 1 to {_MOST} channels together", len(table.channels))
+    if not table.groups or len(table.channels) > _MAX_CHANNELS:
+        raise InputError("groups", f"of 1 to {_MAX_CHANNELS} channels together", len(table.channels))
     for group in table.groups.values():
         if not 1 <= group.rate_hz <= TICKS_HZ:
             raise InputError(f"groups.{group.name}.rate_hz", f"from 1 to {TICKS_HZ}", group.rate_hz)
@@ -141,14 +141,14 @@ def check_table(table: ChannelTable) -> None:
         _check_curve(name, points)
 
 
-def _merged(file: _File) -> dict[str, Any]:
-    """The groups of the table, with whole rows."""
+def _merge_groups(file: _File) -> dict[str, Any]:
+    """Return the groups of the table with complete rows."""
     groups = raw_groups(TABLE.read_text()) if file.base == "rig" else {}
-    given: dict[str, set[str]] = {}
-    """What the file says of each channel."""
-    said = [(f"groups.{name}.defaults", group.defaults) for name, group in file.groups.items()]
-    said += [(f"channel {row.name}", row.model_dump()) for group in file.groups.values() for row in group.channels]
-    for where, fields in [*said, *((f"channels.{name}", changes) for name, changes in file.channels.items())]:
+    stated: dict[str, set[str]] = {}
+    """Fields that the file states for each channel."""
+    sources = [(f"groups.{name}.defaults", group.defaults) for name, group in file.groups.items()]
+    sources += [(f"channel {row.name}", row.model_dump()) for group in file.groups.values() for row in group.channels]
+    for where, fields in [*sources, *((f"channels.{name}", changes) for name, changes in file.channels.items())]:
         for name in {"rate_hz", "group", "kind"} & set(fields):
             raise InputError(f"{where}.{name}", "left out: it is the group's", fields[name])
     for name, group in file.groups.items():
@@ -157,16 +157,16 @@ def _merged(file: _File) -> dict[str, Any]:
         whole = groups.setdefault(name, {"title": name, "rate_hz": _RATE_HZ, "kind": KIND, "channels": []})
         whole |= group.model_dump(include={"title", "rate_hz"}, exclude_none=True)
         old = whole["channels"]
-        alike = (
-            {key: value for key, value in old[0].items() if all(row[key] == value for row in old)} if old else _PLAIN
+        shared = (
+            {key: value for key, value in old[0].items() if all(row[key] == value for row in old)} if old else _DEFAULTS
         )
         for row in old:
             row |= group.defaults
-            given.setdefault(row["name"], set()).update(group.defaults, {"rate_hz"} if group.rate_hz else ())
+            stated.setdefault(row["name"], set()).update(group.defaults, {"rate_hz"} if group.rate_hz else ())
         for row in group.channels:
             own = {**group.defaults, **row.model_dump()}
-            whole["channels"].append({"label": row.name, **alike, **own})
-            given.setdefault(row.name, set()).update(own)
+            whole["channels"].append({"label": row.name, **shared, **own})
+            stated.setdefault(row.name, set()).update(own)
     rows = {row["name"]: row for group in groups.values() for row in group["channels"]}
     for name, changes in file.channels.items():
         if name not in rows:
@@ -174,7 +174,7 @@ def _merged(file: _File) -> dict[str, Any]:
         if "name" in changes:
             raise InputError(f"channels.{name}.name", "left out: drop the channel and add another", changes["name"])
         rows[name] |= changes
-        given.setdefault(name, set()).update(changes)
+        stated.setdefault(name, set()).update(changes)
     for name in file.drop:
         if name not in groups and name not in rows:
             raise UnknownNameError("drop", "names of groups or channels", name, [*groups, *rows])
@@ -184,35 +184,35 @@ def _merged(file: _File) -> dict[str, Any]:
             del groups[name]
         for row in group["channels"]:
             _check_kinds(row)
-            if "bandwidth_hz" not in given.get(row["name"], ()):
+            if "bandwidth_hz" not in stated.get(row["name"], ()):
                 row["bandwidth_hz"] = min(row.get("bandwidth_hz", math.inf), group["rate_hz"] / 4.0)
-            row |= {"kind": KIND} if given.get(row["name"]) else {}
+            row |= {"kind": KIND} if stated.get(row["name"]) else {}
     if not groups:
         raise InputError("drop", "such that a channel is left", list(file.drop))
     return groups
 
 
 def _check_kinds(row: dict[str, Any]) -> None:
-    """Numbers are no texts, and neither true nor false."""
+    """Refuse text and Boolean values in number fields."""
     for name, field in Channel.model_fields.items():
         value = row.get(name)
         if field.annotation is not str and isinstance(value, bool | str):
             raise InputError(f"channel {row['name']}.{name}", "a number", value)
 
 
-def _curve(name: str, given: str | tuple[tuple[float, float], ...], folder: Path) -> tuple[tuple[float, float], ...]:
-    """The points of a curve, from its file or as they are given."""
+def _curve(name: str, stated: str | tuple[tuple[float, float], ...], folder: Path) -> tuple[tuple[float, float], ...]:
+    """Return the points of a curve, from its file or from the table."""
     field = f"curves.{name}"
-    if not isinstance(given, str):
-        points = given
+    if not isinstance(stated, str):
+        points = stated
     else:
         try:
-            with open_file(folder / given) as file:
+            with open_file(folder / stated) as file:
                 lines = file.read(TOML_BYTES).decode("utf-8-sig").splitlines()
             rows = [row.split(",") for line in lines if (row := line.partition("#")[0].strip())]
             points = tuple((float(degrees), float(value)) for degrees, value in rows)
         except OSError as error:
-            received = Words(f"{given} ({error.strerror})")
+            received = Words(f"{stated} ({error.strerror})")
             raise InputError(field, "a file that can be read, degrees and values", received) from None
         except ValueError as error:
             raise InputError(field, "a file of lines `degrees, value`", Words(printable(str(error), 100))) from None
@@ -221,7 +221,7 @@ def _curve(name: str, given: str | tuple[tuple[float, float], ...], folder: Path
 
 def _check_curve(name: str, points: tuple[tuple[float, float], ...]) -> None:
     field, degrees = f"curves.{name}", [a for a, _ in points]
-    if not 2 <= len(points) <= _MOST_POINTS or any(b <= a for a, b in pairwise(degrees)):
-        raise InputError(field, f"2 to {_MOST_POINTS} points of ascending angle", Words(f"{len(points)} points"))
+    if not 2 <= len(points) <= _MAX_CURVE_POINTS or any(b <= a for a, b in pairwise(degrees)):
+        raise InputError(field, f"2 to {_MAX_CURVE_POINTS} points of ascending angle", Words(f"{len(points)} points"))
     if not (degrees[0] >= 0.0 and degrees[-1] < 360.0 and all(math.isfinite(value) for _, value in points)):
         raise InputError(field, "points from 0 to below 360 degrees with finite values", [points[0], points[-1]])

@@ -1,18 +1,18 @@
-"""Test signals: what a scene's `[generator]` puts on the channels in place of the physics.
+"""Test signals: the `[generator]` of a scene replaces the physics on the channels.
 
-A generator is a calibrator at the converter's input: its volts are worked out at the very instants of the samples,
-without rows of the model, sensor, range, anti-alias filter or AC coupling. The channel's noise (where the scene has
-noise on) is added, and its converter rounds and limits. Volts of a channel are
+A generator acts as a calibrator at the converter's input. Its voltage is computed at the exact sampling instants,
+without model, sensor, range, anti-alias filter or AC coupling. The channel's noise is added if the scene has noise on,
+and its converter rounds and limits. The voltage of a channel is
 
     v(t) = bias_v + offset + amplitude w(t - delay)
 
-with `w` of one of the `KINDS` below, at most 1 in size; amplitude and offset in volts (`amplitude_v`, `offset_v`) or
-in the channel's own unit. Channels differ by `[generator.channels.NAME]`. Time is split into whole seconds and the
-rest, and frequencies are taken as the decimal fractions that they are written as: phases are as exact after hours as
-at the start, and depend on the instant alone. What jumps has jumped at an instant that is within 1e-9 of its period.
+with the wave `w` of one of the `KINDS` below, |w| <= 1. Amplitude and offset are in volts (`amplitude_v`, `offset_v`)
+or in the channel's unit. `[generator.channels.NAME]` overrides single channels. Time is split into whole seconds and
+remainder, and frequencies are taken as exact decimal fractions: phases are as exact after hours as at the start, and
+depend only on the instant. A jump is located to within 1e-9 of its period.
 
-Where the scene has a `drive.speed_hz`, the shaft's nominal turns are told by the exact edges and by the channels that
-feel `keyphasor` (a pulse over the first 10 degrees) and `spin_rate`; without, these channels are as all others.
+If the scene has a `drive.speed_hz`, the exact edges and the channels of the signals `keyphasor` (a pulse over the first
+10 degrees) and `spin_rate` follow this nominal speed; otherwise these channels are like all others.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ from rig.base.errors import InputError, UnknownNameError, Words
 from rig.channels.table import Channel, ChannelTable
 from rig.channels.waveform import Waveform, exact, read_waveform
 
-_WRAP = 1e-11
-"""Parts of a period that a phase may lack of the whole by rounding."""
-_EDGE = 1e-9
-"""Parts of a step or chip by which an instant may lie before an edge and still be behind it."""
-_TURNED = Fraction(10, 360)
-"""Part of a period that a pulse lasts: as the mark of the keyphasor."""
-_MOST_TONES, _FINEST = 256, 4096
-"""Most tones, and how far the highest may be above what all are multiples of."""
+_WRAP_TOLERANCE = 1e-11
+"""Rounding tolerance of a phase below a whole period [periods]."""
+_EDGE_TOLERANCE = 1e-9
+"""Tolerance by which an instant before an edge counts as after it [steps or chips]."""
+_PULSE_LENGTH = Fraction(10, 360)
+"""Length of a pulse [periods]: that of the keyphasor mark."""
+_MAX_TONES, _MAX_LINE = 256, 4096
+"""Largest number of tones, and largest multiple of their common base frequency."""
 
 _Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 _Hz = Annotated[_Number, Field(ge=1e-6, le=1e6)]
@@ -48,35 +48,35 @@ _Kind = Literal["sine", "two-tone", "chirp", "step", "pulse", "prbs", "multisine
 
 
 class Instants(NamedTuple):
-    """Instants as whole seconds, int64, and the rest, from 0 to 1 s, both shape (n,)."""
+    """Instants as whole seconds, int64, and remainder, 0 to 1 s, both shape (n,)."""
 
     whole: np.ndarray
     rest: np.ndarray
 
     @classmethod
     def of_samples(cls, index: np.ndarray, rate_hz: int) -> Instants:
-        """Those of the samples of a rate, by their number."""
+        """Return the instants of samples from their numbers and rate [Hz]."""
         whole, rest = np.divmod(index, rate_hz)
         return cls(whole, rest / rate_hz)
 
     @classmethod
     def of_times(cls, times_s: np.ndarray) -> Instants:
-        """Any [s]."""
+        """Return the instants of arbitrary times [s]."""
         whole = np.floor(times_s)
         return cls(whole.astype(np.int64), times_s - whole)
 
     def later(self, delay_s: float | np.ndarray) -> Instants:
-        """The same of a clock that is behind by so much, each by its own where it is an array, shape (n,)."""
+        """Return the instants reduced by a delay [s], a number or one per instant, shape (n,)."""
         rest = self.rest - delay_s
         carry = np.floor(rest)
         return Instants(self.whole + carry.astype(np.int64), rest - carry)
 
     def cycles(self, frequency: Fraction, ahead: float = 0.0) -> np.ndarray:
-        """Parts of a period since the last whole one, from 0 to 1, shape (n,).
+        """Return the phase in periods, 0 to 1, shape (n,).
 
         Args:
-            frequency: Periods a second [Hz].
-            ahead: At time zero.
+            frequency: Periods per second [Hz].
+            ahead: Phase at time zero [periods].
         """
         if not len(self.whole):
             return np.empty(0)
@@ -84,47 +84,47 @@ class Instants(NamedTuple):
         begun = np.array([float(frequency * second % 1) for second in range(first, int(self.whole.max()) + 1)])
         turns = begun[self.whole - first] + float(frequency) * self.rest + ahead
         turns -= np.floor(turns)
-        turns[turns > 1.0 - _WRAP] = 0.0
+        turns[turns > 1.0 - _WRAP_TOLERANCE] = 0.0
         return turns
 
 
 class Signal(Written):
-    """What a generator makes; of a channel, what is different there. What is left out is the kind's own, or 0."""
+    """Signal of a generator, or the overrides for one channel; omitted fields have the kind's default, or 0."""
 
     kind: _Kind | None = None
     amplitude: Annotated[_Number, Field(ge=-1e9, le=1e9)] | None = None
-    """Peak, in the channel's unit."""
+    """Peak [unit of the channel]."""
     amplitude_v: Annotated[_Number, Field(ge=-1e3, le=1e3)] | None = None
-    """Peak [V]; of a ramp, left out, up to the ends of the converter."""
+    """Peak [V]; a ramp without one spans the range of the converter."""
     offset: Annotated[_Number, Field(ge=-1e9, le=1e9)] | None = None
-    """Middle, in the channel's unit, from the value that the channel has at its bias: zero."""
+    """Mean level, relative to the value at the bias voltage [unit of the channel]."""
     offset_v: Annotated[_Number, Field(ge=-1e3, le=1e3)] | None = None
-    """The same [V], from the bias."""
+    """Mean level, relative to the bias voltage [V]."""
     phase_deg: Annotated[_Number, Field(ge=-360.0, le=360.0)] | None = None
-    """Ahead by so much of a period, a sweep or a sequence (of a PRBS, to the next whole chip) [degrees]."""
+    """Phase lead, in periods, sweeps or sequences of 360 degrees; for a PRBS rounded to whole chips [degrees]."""
     delay_us: Annotated[_Number, Field(ge=-1e6, le=1e6)] | None = None
-    """Later by so much [us]."""
+    """Delay [us]."""
     frequency_hz: _Hz | None = None
-    """Of a sine or pulses; chips a second of a PRBS [Hz]."""
-    frequencies: Annotated[tuple[_Hz, ...], Field(min_length=2, max_length=_MOST_TONES)] | None = None
-    """Of the tones; from where to where a chirp goes [Hz]."""
+    """Frequency of a sine or of pulses; chip rate of a PRBS [Hz]."""
+    frequencies: Annotated[tuple[_Hz, ...], Field(min_length=2, max_length=_MAX_TONES)] | None = None
+    """Frequencies of the tones; start and end of a chirp [Hz]."""
     period_s: Annotated[_Number, Field(ge=1e-5, le=1000.0)] | None = None
-    """Of steps up and down, of a ramp, of a sweep [s]."""
+    """Period of steps, ramp or sweep [s]."""
     order: Annotated[int, Field(ge=3, le=20)] | None = None
-    """Length of the shift register: a PRBS has 2^order - 1 chips."""
+    """Length of the shift register; a PRBS has 2^order - 1 chips."""
     seed: Annotated[int, Field(ge=1, lt=2**20)] | None = None
-    """What the shift register starts from."""
+    """Initial state of the shift register."""
     crest: Annotated[_Number, Field(ge=1.0, le=30.0)] | None = None
-    """Peak over RMS; left out, that of Schroeder's phases."""
+    """Ratio of peak to RMS; omitted, that of Schroeder's phases."""
 
 
 class Generator(Signal):
-    """The signal of all channels, and what is different of some."""
+    """Signal of all channels, with overrides for single channels."""
 
     apart: bool = False
-    """Channels begin evenly spread over a period, so that each is told from the others."""
+    """Whether the phases of the channels are spread evenly over a period, so that each channel can be identified."""
     file: Waveform | None = None
-    """CSV file as `rig export` writes it, of kind recorded."""
+    """CSV file in the format of `rig export`, for kind recorded."""
     channels: dict[str, Signal] = Field(default={})
 
     @field_validator("file", mode="before")
@@ -135,15 +135,15 @@ class Generator(Signal):
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """What stands at the converter of one channel.
+    """Voltage source at the converter of one channel.
 
     Attributes:
         channel: The channel.
-        signal: With all that its kind takes.
+        signal: Signal with all fields of its kind.
         amplitude_v: Peak [V].
-        middle_v: Bias and offset [V].
-        ahead: At time zero, in periods.
-        waveform: What is played, in the channel's unit; None but for kind recorded.
+        middle_v: Bias plus offset [V].
+        ahead: Phase at time zero [periods].
+        waveform: Period and spline of a recorded waveform [unit of the channel]; None for other kinds.
     """
 
     channel: Channel
@@ -155,25 +155,25 @@ class Source:
 
     @property
     def largest_v(self) -> float:
-        """How far it goes from 0 V [V]."""
+        """Largest magnitude of the voltage [V]."""
         top = 1.0 if self.waveform is None else max(map(abs, self.waveform[1][3].tolist()))
         return abs(self.middle_v) + abs(self.amplitude_v) * (top if self.signal.kind != "quiet" else 0.0)
 
     @property
     def wave(self) -> tuple[Any, ...]:
-        """What is alike where the wave is."""
+        """Key that is equal for channels with equal waves."""
         signal = self.signal
         differing = {"amplitude", "amplitude_v", "offset", "offset_v", "phase_deg", "delay_us"}
         shape = () if self.waveform is None else (self.channel.name,)
         return (signal.model_dump_json(exclude=differing), signal.delay_us, self.ahead, *shape)
 
     def shape(self, instants: Instants) -> np.ndarray:
-        """The wave w, shape (n,)."""
+        """Return the wave w, shape (n,)."""
         signal = self.signal
         return KINDS[signal.kind or "quiet"].wave(self, instants.later((signal.delay_us or 0.0) * 1e-6))
 
     def volts(self, times_s: np.ndarray) -> np.ndarray:
-        """At the converter, before noise, and beyond its limits too [V], shape (n,).
+        """Return the voltage at the converter, before noise and limits [V], shape (n,).
 
         Args:
             times_s: Instants [s], shape (n,).
@@ -181,7 +181,7 @@ class Source:
         return self.at(self.shape(Instants.of_times(np.asarray(times_s, float))))
 
     def at(self, shape: np.ndarray) -> np.ndarray:
-        """Volts of a wave [V]."""
+        """Return the voltage for a wave [V]."""
         return self.middle_v + self.amplitude_v * shape
 
 
@@ -206,12 +206,16 @@ def _chirp(source: Source, instants: Instants) -> np.ndarray:
 
 def _step(source: Source, instants: Instants) -> np.ndarray:
     """Steps: w = -1 in the first half of each period, 1 in the second."""
-    return np.where(np.floor(2.0 * instants.cycles(1 / _period(source), source.ahead) + _EDGE) == 1.0, 1.0, -1.0)
+    return np.where(
+        np.floor(2.0 * instants.cycles(1 / _period(source), source.ahead) + _EDGE_TOLERANCE) == 1.0, 1.0, -1.0
+    )
 
 
 def _pulse(source: Source, instants: Instants) -> np.ndarray:
     """Pulses: w = 1 in the first 10/360 of each period, else 0."""
-    return np.where(instants.cycles(_frequency(source), source.ahead) + _EDGE < float(_TURNED), 1.0, 0.0)
+    return np.where(
+        instants.cycles(_frequency(source), source.ahead) + _EDGE_TOLERANCE < float(_PULSE_LENGTH), 1.0, 0.0
+    )
 
 
 def _prbs(source: Source, instants: Instants) -> np.ndarray:
@@ -219,7 +223,7 @@ def _prbs(source: Source, instants: Instants) -> np.ndarray:
     sequence = chips(source.signal.order or 0, source.signal.seed or 1)
     length = len(sequence)
     turns = instants.cycles(_frequency(source) / length, round(source.ahead * length) / length)
-    return sequence[np.floor(turns * length + _EDGE).astype(np.int64) % length]
+    return sequence[np.floor(turns * length + _EDGE_TOLERANCE).astype(np.int64) % length]
 
 
 def _multisine(source: Source, instants: Instants) -> np.ndarray:
@@ -254,13 +258,13 @@ def _recorded(source: Source, instants: Instants) -> np.ndarray:
 
 
 class Kind(NamedTuple):
-    """One kind of signal: its wave, what it needs, and what it takes beside phase, delay and offset."""
+    """Kind of signal: wave, required fields, and optional fields other than phase, delay and offset."""
 
     wave: Callable[[Source, Instants], np.ndarray]
     needs: tuple[str, ...] = ()
     takes: tuple[str, ...] = ()
     amplitude: bool | None = True
-    """Has to be given; None: may be; False: must not be."""
+    """Whether an amplitude is required (True), optional (None) or not allowed (False)."""
 
 
 KINDS: dict[str, Kind] = {
@@ -275,20 +279,20 @@ KINDS: dict[str, Kind] = {
     "quiet": Kind(_quiet, amplitude=False),
     "recorded": Kind(_recorded, amplitude=False),
 }
-"""All kinds by name: the equation of each is that of its wave."""
+"""All kinds by name; the docstring of each wave states its equation."""
 _OFFSETS, _AMPLITUDES, _SHIFTS = ("offset", "offset_v"), ("amplitude", "amplitude_v"), ("phase_deg", "delay_us")
 
 
 def sources(generator: Generator, table: ChannelTable, speed_hz: float = 0.0) -> dict[str, Source]:
-    """What stands at the converter of every channel.
+    """Return the source of every channel.
 
     Args:
-        generator: Of the scene.
-        table: All its channels.
-        speed_hz: Nominal speed [Hz]; 0: none is told.
+        generator: Generator of the scene.
+        table: Channel table.
+        speed_hz: Nominal speed [Hz]; 0 for none.
 
     Raises:
-        InputError: The first thing that is wrong in the generator.
+        InputError: The generator is invalid; the message names the first wrong field.
     """
     for name in generator.channels:
         if name not in table.channels:
@@ -310,9 +314,9 @@ def _source(generator: Generator, channel: Channel, place: float, speed_hz: floa
             generator = Generator(kind="pulse", frequency_hz=speed_hz, amplitude=1.0 / channel.si)
         elif channel.signal == "spin_rate":
             generator = Generator(kind="quiet", offset=2.0 * math.pi * speed_hz / channel.si)
-    signal = _checked(generator, {}, generator.kind, "generator")
+    signal = _merge_fields(generator, {}, generator.kind, "generator")
     if own is not None:
-        signal = _checked(own, signal, own.kind or generator.kind, f"generator.channels.{channel.name}")
+        signal = _merge_fields(own, signal, own.kind or generator.kind, f"generator.channels.{channel.name}")
     made = Signal(**signal)
     field = "generator" if own is None else f"generator.channels.{channel.name}"
     _check_rate(made, channel, field)
@@ -331,11 +335,11 @@ def _source(generator: Generator, channel: Channel, place: float, speed_hz: floa
     return found
 
 
-def _checked(given: Signal, base: dict[str, Any], kind: str | None, field: str) -> dict[str, Any]:
-    """The fields of a signal over those of another: of this, what the kind takes.
+def _merge_fields(given: Signal, base: dict[str, Any], kind: str | None, field: str) -> dict[str, Any]:
+    """Return the fields of a signal merged over those of another, limited to those of its kind.
 
     Raises:
-        InputError: A field that the kind does not take, or lacks, or one told twice.
+        InputError: A field is not used by the kind, is missing, or is stated twice.
     """
     if kind is None:
         raise InputError(f"{field}.kind", f"one of {', '.join(KINDS)}", None)
@@ -349,8 +353,8 @@ def _checked(given: Signal, base: dict[str, Any], kind: str | None, field: str) 
     for pair in (_OFFSETS, _AMPLITUDES):
         if {*pair} <= {*own}:
             raise InputError(f"{field}.{pair[0]}", f"left out where {pair[1]} is given", own[pair[0]])
-    told_anew = {name for pair in (_OFFSETS, _AMPLITUDES) if {*pair} & {*own} for name in pair}
-    found = {name: value for name, value in base.items() if name in takes - told_anew} | own | {"kind": kind}
+    restated = {name for pair in (_OFFSETS, _AMPLITUDES) if {*pair} & {*own} for name in pair}
+    found = {name: value for name, value in base.items() if name in takes - restated} | own | {"kind": kind}
     for name in (*rule.needs, *(("amplitude_v",) if rule.amplitude and not {*_AMPLITUDES} & {*found} else ())):
         if name not in found:
             raise InputError(f"{field}.{name}", f"given with kind {kind}", None)
@@ -365,13 +369,13 @@ def _checked(given: Signal, base: dict[str, Any], kind: str | None, field: str) 
 
 
 def _check_rate(signal: Signal, channel: Channel, field: str) -> None:
-    """Refuse what the channel's rate cannot show: no filter stands before the converter."""
+    """Refuse frequencies above the limit of the channel's rate; there is no filter before the converter."""
     for name in ("frequency_hz", "frequencies", "period_s"):
         value = getattr(signal, name)
         if value is None:
             continue
         highest = 1.0 / value if name == "period_s" else max(value if isinstance(value, tuple) else (value,))
-        # Chips are as long as a sample at the least.
+        # A chip lasts at least one sample.
         most = channel.rate_hz / (1.0 if signal.kind == "prbs" else 2.0)
         if highest > most or (highest == most and signal.kind != "prbs"):
             must = f"at most {most:g} Hz" if signal.kind == "prbs" else f"below {most:g} Hz, half of the rate"
@@ -390,23 +394,23 @@ _TAPS = {
     3: 2, 4: 3, 5: 3, 6: 5, 7: 6, 8: (6, 5, 4), 9: 5, 10: 7, 11: 9, 12: (11, 10, 4), 13: (12, 11, 8),
     14: (13, 12, 2), 15: 14, 16: (15, 13, 4), 17: 14, 18: 11, 19: (18, 17, 14), 20: 17,
 }  # fmt: skip
-"""Taps beside the last one: primitive polynomials (P. Alfke, Xilinx XAPP052, 1996, and older tables)."""
+"""Taps in addition to the last one: primitive polynomials (P. Alfke, Xilinx XAPP052, 1996, and older tables)."""
 
 
 @cache
 def chips(order: int, seed: int) -> np.ndarray:
-    """One period of the sequence of a shift register: 1 and -1, shape (2^order - 1,).
+    """Return one period of a shift register's sequence: 1 and -1, shape (2^order - 1,).
 
-    The register starts as the seed's lowest bits (1 where these are all zero); each chip is its last bit, and what is
-    shifted in is the sum modulo 2 of its taps.
+    The register starts with the lowest bits of the seed (1 if these are all zero). Each chip is the last bit; the sum
+    modulo 2 of the taps is shifted in.
     """
     length, taps = 2**order - 1, _TAPS[order]
-    taken = [order, *(taps if isinstance(taps, tuple) else (taps,))]
+    positions = [order, *(taps if isinstance(taps, tuple) else (taps,))]
     register, found = seed & length or 1, np.empty(length)
     for n in range(length):
         found[n] = 2 * (register >> (order - 1)) - 1
         bit = 0
-        for tap in taken:
+        for tap in positions:
             bit ^= register >> (tap - 1)
         register = (register << 1 | bit & 1) & length
     found.flags.writeable = False
@@ -415,24 +419,24 @@ def chips(order: int, seed: int) -> np.ndarray:
 
 @cache
 def multisine_phases(frequencies: tuple[float, ...], crest: float | None) -> tuple[np.ndarray, float]:
-    """Phases of cosines of one size that together have a crest factor, and the peak of their sum.
+    """Return the phases of equal cosines with a given crest factor, and the peak of their sum.
 
-    Schroeder's phases (IEEE Trans. Inf. Theory 16(1), 1970) times s: from s = 1 to s = 0, where all cosines are 1
-    together, the crest factor goes from about 1.7 to sqrt(2 N); by halving, s is found.
+    Schroeder's phases (IEEE Trans. Inf. Theory 16(1), 1970) are scaled by s. From s = 1 to s = 0, where all cosines are
+    in phase, the crest factor rises from about 1.7 to sqrt(2 N). The value of s is found by bisection.
 
     Args:
-        frequencies: [Hz]
-        crest: Asked for; None: that of Schroeder's phases.
+        frequencies: Frequencies [Hz].
+        crest: Required crest factor; None for that of Schroeder's phases.
 
     Raises:
-        InputError: No s has that crest factor, or the frequencies have no common measure that is near them.
+        InputError: No s gives the crest factor, or the frequencies have no common base frequency.
     """
-    exactly = [exact(hz) for hz in frequencies]
-    scale = math.lcm(*(hz.denominator for hz in exactly))
-    base = Fraction(math.gcd(*(int(hz * scale) for hz in exactly)), scale)
-    lines = [int(hz / base) for hz in exactly]
-    if len(set(lines)) < len(lines) or max(lines) > _FINEST:
-        must = f"different multiples of one that the highest has at most {_FINEST} of"
+    ratios = [exact(hz) for hz in frequencies]
+    scale = math.lcm(*(hz.denominator for hz in ratios))
+    base = Fraction(math.gcd(*(int(hz * scale) for hz in ratios)), scale)
+    lines = [int(hz / base) for hz in ratios]
+    if len(set(lines)) < len(lines) or max(lines) > _MAX_LINE:
+        must = f"different multiples of one that the highest has at most {_MAX_LINE} of"
         raise InputError("frequencies", must, list(frequencies))
     n = len(lines)
     schroeder = -math.pi * np.arange(n) ** 2 / n

@@ -1,8 +1,8 @@
-"""Figures of an orbit, read off samples of it: how often it goes round, in which sense, and its two-sided spectrum.
+"""Orbit analysis: rotation frequency and sense, radius, two-sided spectrum, and 1X vector.
 
-One definition of each, for recordings and simulations, predictions and live views. An orbit is z = x + j y; forward is
-with the spin, from x to y, and positive; backward is negative. Lengths keep the unit of x and y. Samples come first,
-then when they were: `rate_hz`, `times_s`, `edges_s`, in this order.
+One definition of each serves recordings, simulations, predictions and live views. An orbit is z = x + j y; forward is
+with the spin, from x to y, and positive; backward is negative. Lengths keep the unit of x and y. Functions take samples
+first, then their timing: `rate_hz`, `times_s`, `edges_s`, in this order.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ from numpy.typing import ArrayLike
 from rig.base.errors import InputError, Words
 
 SPECTRUM_HZ = 200.0
-"""Spectra are shown up to this frequency, to both sides: the rig whirls below 130 Hz."""
+"""Frequency limit of displayed spectra, both sides [Hz]; the rig whirls below 130 Hz."""
 _LAG_S = 1e-3
-_TURN_SAMPLES = 8
-_TURN_HOLE = 0.25
-"""Part of a turn without samples from which on nothing is fitted to it."""
+_MIN_TURN_SAMPLES = 8
+_MAX_TURN_GAP = 0.25
+"""Largest fraction of a revolution without samples for which a fit is accepted."""
 _INSTANTS = ("times_s", "edges_s")
 
 
 def phase(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Angle of x + j y about the origin, without jumps [rad], shape (n,)."""
+    """Return the unwrapped angle of x + j y about the origin [rad], shape (n,)."""
     return np.unwrap(np.arctan2(y, x))
 
 
@@ -48,7 +48,7 @@ def whirl_frequency(x: ArrayLike, y: ArrayLike, times_s: ArrayLike, *, about: co
         >>> round(whirl_frequency(np.cos(angle), np.sin(angle), times_s), 1)  # backward
         -81.7
     """
-    x, y, times_s = _rows(x=x, y=y, times_s=times_s, at_least=2)
+    x, y, times_s = _check_rows(x=x, y=y, times_s=times_s, at_least=2)
     centre = complex(x.mean(), y.mean()) if about is None else about
     angle = phase(x - centre.real, y - centre.imag)
     return float(np.polyfit(times_s - times_s[0], angle, 1)[0] / (2.0 * math.pi))
@@ -69,14 +69,14 @@ def mean_rotation(x: np.ndarray, y: np.ndarray, rate_hz: float) -> float:
     lag = max(1, round(_LAG_S * rate_hz))
     if len(x) < 2 * lag:
         return 0.0
-    turning = _centred(x, y)
+    turning = _subtract_mean(x, y)
     advance = np.vdot(turning[:-lag], turning[lag:])
     return math.atan2(advance.imag, advance.real) * rate_hz / (2.0 * math.pi * lag)
 
 
 def rms_radius(x: np.ndarray, y: np.ndarray) -> float:
-    """Root mean square distance of the orbit from its own mean, in the unit of x."""
-    return float(np.sqrt(np.mean(np.abs(_centred(x, y)) ** 2)))
+    """Return the root mean square distance of the orbit from its mean, in the unit of x."""
+    return float(np.sqrt(np.mean(np.abs(_subtract_mean(x, y)) ** 2)))
 
 
 def full_spectrum(
@@ -104,16 +104,16 @@ def full_spectrum(
         >>> f"{amplitude.max():.2f} at {frequency[amplitude.argmax()]:.0f} Hz"
         '0.90 at -80 Hz'
     """
-    x, y = _rows(x=x, y=y)
+    x, y = _check_rows(x=x, y=y)
     _check_positive(rate_hz=rate_hz)
     count = len(x) if lines is None else lines
     if not isinstance(count, int | np.integer) or count < len(x):
         raise InputError("lines", f"a whole number of at least the {len(x)} samples", lines)
     orbit = x + 1j * y
-    # Without its zeros at both ends, which would leave two samples out.
+    # Omit the zeros at both ends of the window, which would discard two samples.
     window = np.hanning(len(orbit) + 2)[1:-1]
     total = window.sum()
-    # The plain mean of an unfinished revolution is not zero: taking it off would put a line at 0 Hz.
+    # The unweighted mean of an incomplete revolution is not its centre; subtracting it would add a line at 0 Hz.
     centre = np.dot(window, orbit) / total
     amplitude = np.abs(np.fft.fftshift(np.fft.fft((orbit - centre) * window, n=count))) / total
     return np.fft.fftshift(np.fft.fftfreq(count, 1.0 / rate_hz)), amplitude
@@ -146,15 +146,15 @@ def waterfall(
         >>> [f"{at:.2f} s: {frequency[row.argmax()]:.0f} Hz" for at, row in zip(at_s, amplitude)][::7]
         ['0.25 s: 4 Hz', '0.95 s: 18 Hz', '1.65 s: 32 Hz']
     """
-    x, y, times_s = _rows(x=x, y=y, times_s=times_s)
+    x, y, times_s = _check_rows(x=x, y=y, times_s=times_s)
     _check_positive(rate_hz=rate_hz, window_s=window_s, hop_s=hop_s)
     size, hop = (max(1, round(each * rate_hz)) for each in (window_s, hop_s))
     starts = range(0, max(1, len(x) - size + 1), hop)
     spectra = [full_spectrum(x[s : s + size], y[s : s + size], rate_hz) for s in starts]
     frequency = spectra[0][0]
-    near = np.abs(frequency) <= SPECTRUM_HZ
+    shown = np.abs(frequency) <= SPECTRUM_HZ
     centres = np.array([times_s[min(s + size // 2, len(x) - 1)] for s in starts])
-    return centres, frequency[near], np.array([amplitude[near] for _, amplitude in spectra])
+    return centres, frequency[shown], np.array([amplitude[shown] for _, amplitude in spectra])
 
 
 def synchronous(values: ArrayLike, times_s: ArrayLike, edges_s: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
@@ -182,13 +182,13 @@ def synchronous(values: ArrayLike, times_s: ArrayLike, edges_s: ArrayLike) -> tu
         >>> f"{speed_hz[0]:.1f} Hz: {abs(vector[0]):.3f} at {np.angle(vector[0]):.3f} rad"
         '8.0 Hz: 0.300 at -0.500 rad'
     """
-    values, times_s = _rows(values=values, times_s=times_s)
-    (edges_s,) = _rows(edges_s=edges_s, at_least=0)
+    values, times_s = _check_rows(values=values, times_s=times_s)
+    (edges_s,) = _check_rows(edges_s=edges_s, at_least=0)
     places = np.searchsorted(times_s, edges_s)
     speeds, vectors = [], []
     for first, last, begin_s, end_s in zip(places, places[1:], edges_s, edges_s[1:], strict=False):
         turns = (times_s[first:last] - begin_s) / (end_s - begin_s)
-        if len(turns) >= _TURN_SAMPLES and np.diff(turns, append=turns[0] + 1.0).max() < _TURN_HOLE:
+        if len(turns) >= _MIN_TURN_SAMPLES and np.diff(turns, append=turns[0] + 1.0).max() < _MAX_TURN_GAP:
             angle = 2.0 * math.pi * turns
             parts = np.stack([np.cos(angle), np.sin(angle), np.ones_like(angle)], axis=1)
             (cosine, sine, _), *_ = np.linalg.lstsq(parts, values[first:last])
@@ -197,18 +197,18 @@ def synchronous(values: ArrayLike, times_s: ArrayLike, edges_s: ArrayLike) -> tu
     return np.array(speeds), np.array(vectors, dtype=complex)
 
 
-def _rows(*, at_least: int = 1, **given: ArrayLike) -> list[np.ndarray]:
-    """Rows of finite numbers of one length as float64, each shape (n,), instants ascending.
+def _check_rows(*, at_least: int = 1, **given: ArrayLike) -> list[np.ndarray]:
+    """Return finite rows of equal length as float64, each shape (n,); instants must ascend.
 
     Raises:
-        InputError: They are not.
+        InputError: The rows are invalid.
     """
     rows: list[np.ndarray] = []
     for name, values in given.items():
         try:
             row = np.asarray(values)
-        except ValueError:  # lists of unlike lengths
-            raise InputError(name, "one row of numbers", Words("rows of unlike lengths")) from None
+        except ValueError:  # lists of different lengths
+            raise InputError(name, "one row of numbers", Words("rows of different lengths")) from None
         if row.ndim != 1 or row.dtype.kind not in "iuf":
             raise InputError(name, "one row of numbers", Words(f"{row.dtype} of shape {row.shape}"))
         if len(row) < at_least:
@@ -224,17 +224,17 @@ def _rows(*, at_least: int = 1, **given: ArrayLike) -> list[np.ndarray]:
 
 
 def _check_positive(**given: float) -> None:
-    """See that each is a number greater than 0.
+    """Raise an error unless each value is a number greater than 0.
 
     Raises:
-        InputError: It is not.
+        InputError: A value is not.
     """
     for name, value in given.items():
         if not isinstance(value, int | float | np.integer | np.floating) or not 0.0 < value < math.inf:
             raise InputError(name, "a number greater than 0", value)
 
 
-def _centred(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """X + j y about its mean, complex, shape (n,)."""
+def _subtract_mean(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Return x + j y minus its mean, complex, shape (n,)."""
     orbit = x + 1j * y
     return orbit - orbit.mean()

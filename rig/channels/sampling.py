@@ -1,4 +1,4 @@
-"""What a scene measures; how far apart rows of the model are for it, and where the samples of a rate fall between."""
+"""Sensor settings of a scene, the interval of the model's rows, and the positions of samples between rows."""
 
 from __future__ import annotations
 
@@ -15,32 +15,32 @@ from rig.channels.table import ChannelTable
 
 TICKS_HZ = 1_000_000
 ROW_TICKS = 25
-"""How far apart rows are [ticks], ..."""
-_ELSE = (25, 20, 10, 5, 4, 2)
-"""... or where that does not divide the periods of samples and truth, ..."""
-_A_WAVE = 7.5
-"""... and how many there are at least in a period of the highest bandwidth."""
-_MOST = 4096
-"""Most places between rows that the samples of one rate may have: what each is made of is worked out beforehand."""
+"""Default interval of the rows [ticks]."""
+_OTHER_ROW_TICKS = (25, 20, 10, 5, 4, 2)
+"""Alternative intervals [ticks], if the default does not divide the periods of samples and truth."""
+_MIN_ROWS_PER_PERIOD = 7.5
+"""Smallest number of rows per period of the highest bandwidth."""
+_MAX_POSITIONS = 4096
+"""Largest number of positions between rows for the samples of one rate; coefficients are precomputed for each."""
 
 
 class SensorChoice(Written):
-    """What is measured, and how often."""
+    """Channel groups and rates of a scene."""
 
     groups: tuple[str, ...] = ()
-    """Groups of channels that are on; none named: all."""
+    """Channel groups that are on; empty for all."""
     rate_hz: Annotated[int, Field(ge=0, le=1_000_000)] = 0
-    """Sample rate of every channel [Hz]; 0: that of each group in the channel table."""
+    """Sample rate of every channel [Hz]; 0 for the rates of the channel table."""
     truth_rate_hz: Annotated[int, Field(ge=10, le=1_000_000)] = 2_000
-    """Rate of the truth that is published beside the sensors [Hz]."""
+    """Rate of the published truth tables [Hz]."""
     noise: bool = True
-    """False leaves the sensors' noise out."""
+    """Whether the sensors have noise."""
     chain: Literal["ideal", "full"] = "full"
-    """The full chain of filter, noise, offset and converter, or what the sensor measures and nothing else."""
+    """`full` for filter, noise, offset and converter; `ideal` for the measured quantity only."""
 
     @field_validator("rate_hz")
     @classmethod
-    def _a_rate(cls, rate_hz: int) -> int:
+    def _check_rate(cls, rate_hz: int) -> int:
         if 0 < rate_hz < 100:
             raise ValueError("at least 100, or 0 for the channel table's own")
         return rate_hz
@@ -54,65 +54,65 @@ class SensorChoice(Written):
 
 
 def row_ticks(table: ChannelTable, *, truth_rate_hz: int, ideal: bool) -> int:
-    """Ticks between the rows that sensors and truth see: of the channels' making, whatever the engine's step.
+    """Return the interval of the rows for sensors and truth [ticks]; it is independent of the engine's step.
 
     Args:
-        table: What is measured.
+        table: Channel table.
         truth_rate_hz: Rate of the truth [Hz].
-        ideal: Whether there are no filters.
+        ideal: Whether the channels have no filters.
     """
     rates = [group.rate_hz for group in table.groups.values()]
-    # Samples and truth fall on rows where their periods are whole ticks.
+    # Samples and truth with periods of whole ticks coincide with rows.
     periods = [TICKS_HZ // rate for rate in (truth_rate_hz, *rates) if TICKS_HZ % rate == 0]
     if ideal and len(periods) > len(rates):
         return math.gcd(*periods)
-    longest = TICKS_HZ / _A_WAVE / max(channel.bandwidth_hz for channel in table.channels.values())
-    fit = [ticks for ticks in (*_ELSE, 1) if ticks <= longest and all(period % ticks == 0 for period in periods)]
-    few = [ticks for ticks in fit if all(fits(rate, TICKS_HZ // ticks) for rate in rates)]
-    return [*few, *fit, 1][0]
+    longest = TICKS_HZ / _MIN_ROWS_PER_PERIOD / max(channel.bandwidth_hz for channel in table.channels.values())
+    fit = [
+        ticks for ticks in (*_OTHER_ROW_TICKS, 1) if ticks <= longest and all(period % ticks == 0 for period in periods)
+    ]
+    fitting = [ticks for ticks in fit if all(fits(rate, TICKS_HZ // ticks) for rate in rates)]
+    return [*fitting, *fit, 1][0]
 
 
 def check_rates(table: ChannelTable, row_rate_hz: int, *, field: str) -> None:
-    """Refuse rates whose samples fall on too many places between rows.
+    """Refuse rates whose samples have too many different positions between rows.
 
     Args:
-        table: What is measured.
-        row_rate_hz: Rows a second [Hz].
-        field: What errors call a rate; empty: that of its group.
+        table: Channel table.
+        row_rate_hz: Rows per second [Hz].
+        field: Name of the rate in errors; empty for that of its group.
 
     Raises:
-        InputError: The first of them, and the nearest that would do.
+        InputError: A rate is invalid; the message suggests the nearest valid ones.
     """
     for group in table.groups.values():
         rate = group.rate_hz
         if not fits(rate, row_rate_hz):
-            near = [other for away in range(5000) for other in (rate - away, rate + away) if other > 0]
-            such = sorted([other for other in near if fits(other, row_rate_hz)][:2])
-            must = (
-                f"one whose samples fall on at most {_MOST} places between the rows of {row_rate_hz} Hz that they are"
-            )
-            must += f" made of, such as {' or '.join(map(str, such))}" if such else " made of"
+            near = [other for offset in range(5000) for other in (rate - offset, rate + offset) if other > 0]
+            valid = sorted([other for other in near if fits(other, row_rate_hz)][:2])
+            must = f"one whose samples fall on at most {_MAX_POSITIONS} places between the rows of {row_rate_hz} Hz that they are"
+            must += f" made of, such as {' or '.join(map(str, valid))}" if valid else " made of"
             raise InputError(field or f"groups.{group.name}.rate_hz", must, rate)
 
 
 def between(rate_hz: int, row_rate_hz: int) -> tuple[int, int]:
-    """From sample to sample in parts of a row, and how many parts a row has."""
+    """Return the sample interval in parts of a row interval, and the number of parts per row interval."""
     common = math.gcd(rate_hz, row_rate_hz)
     return row_rate_hz // common, rate_hz // common
 
 
 def fits(rate_hz: int, row_rate_hz: int) -> bool:
-    """Whether samples of a rate fall on few enough places between rows."""
-    return between(rate_hz, row_rate_hz)[1] <= _MOST
+    """Return whether the samples of a rate have few enough different positions between rows."""
+    return between(rate_hz, row_rate_hz)[1] <= _MAX_POSITIONS
 
 
 def first_row(tick: int, rate_hz: int) -> int:
-    """Number of the first of even rows at or behind a tick."""
+    """Return the number of the first row at or after a tick."""
     return -(-tick * rate_hz // TICKS_HZ)
 
 
 def lagrange(places: np.ndarray, nodes: Sequence[int] | np.ndarray) -> np.ndarray:
-    """Weights of the polynomial through nodes, at places, shape (nodes, places)."""
+    """Return the weights of the polynomial through nodes, evaluated at places, shape (nodes, places)."""
     apart = [places - node for node in nodes]
     found = np.ones((len(apart), *np.shape(places)))
     for weight, node in zip(found, nodes, strict=True):

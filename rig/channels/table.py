@@ -1,6 +1,6 @@
-"""The channel table: what the rig measures, and how counts become volts and engineering values.
+"""Channel table: measured channels and the conversion from counts to volts and engineering values.
 
-Everything outside the physics (wire, drivers, recorder, viewer, exports) knows the rig through this table alone.
+All code outside the physics (wire, drivers, recorder, viewer, exports) knows the rig only through this table.
 """
 
 from __future__ import annotations
@@ -19,23 +19,23 @@ from rig.base.checks import check, parse_toml
 from rig.base.errors import InputError, UnknownNameError, Words
 
 VERSION = 2
-"""Of tables that are made now: another one whenever the rig's own changes, as recordings are held against it."""
+"""Version of new tables; increased when the rig's own table changes, because recordings are compared with it."""
 TABLE = Path(__file__).with_name("channels.toml")
 
 
 class Channel(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
-    """One measured channel with its complete calibration; half a scale is refused on load."""
+    """Measured channel with its complete calibration; an incomplete one is refused on load."""
 
     name: Annotated[str, Field(min_length=1)]
     label: str
     group: str
     signal: str
-    """Ideal signal of the model that the sensor feels (see `rig.physics.kernels.signals`)."""
+    """Signal of the model measured by the sensor (see `rig.physics.kernels.signals`)."""
     unit: str
     si: PositiveFloat
     """One engineering unit in SI."""
     sensitivity_v: float
-    """[V per engineering unit]"""
+    """Sensitivity [V per engineering unit]."""
     bias_v: float
     """Output at value zero [V]."""
     range_v: tuple[float, float]
@@ -70,7 +70,7 @@ class Channel(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
 
     @property
     def has_range(self) -> bool:
-        """Whether its range is one; of an imported channel of which none is told, it is the ends of its counts."""
+        """True if the range is known; an imported channel without one has the limits of its counts."""
         return not self.kind.startswith("imported") or self.range_v != (-self.adc_v, self.adc_v)
 
     @property
@@ -90,7 +90,7 @@ class Channel(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
 
 
 class Group(BaseModel, frozen=True, extra="forbid"):
-    """Channels that share a connector: one key, one block, one rate."""
+    """Channels of one connector: they share key, block and rate."""
 
     name: str
     title: str
@@ -119,13 +119,13 @@ class Group(BaseModel, frozen=True, extra="forbid"):
 
 
 class ChannelTable(BaseModel, frozen=True, extra="forbid"):
-    """All groups, by name."""
+    """All channel groups by name."""
 
     groups: dict[str, Group]
     version: Annotated[int, Field(ge=1, le=2)] = 1
-    """How to read the table: 1 is of recordings before 0.2, whose filters were digital ones on rows of 25 us."""
+    """Version of the filters: 1 for recordings before 0.2, with digital filters on rows at an interval of 25 us."""
     curves: dict[str, tuple[tuple[FiniteFloat, FiniteFloat], ...]] = {}
-    """What formulas may use of an angle: points (degrees, value), periodic in a turn."""
+    """Periodic functions of an angle for formulas, as points (degrees, value)."""
 
     def __repr__(self) -> str:
         groups = [f"{name}: {', '.join(group.names)}" for name, group in self.groups.items()]
@@ -149,7 +149,7 @@ class ChannelTable(BaseModel, frozen=True, extra="forbid"):
         return {channel.name: channel for group in self.groups.values() for channel in group.channels}
 
     def only(self, names: tuple[str, ...], rate_hz: int | None = None) -> ChannelTable:
-        """The table with only the named groups, all where none is named, and another sample rate where one is given."""
+        """Return the table limited to the named groups (none for all), with another sample rate if given [Hz]."""
         kept = {}
         for name in names or self.groups:
             group = self.groups[name]
@@ -167,10 +167,10 @@ class ChannelTable(BaseModel, frozen=True, extra="forbid"):
 
 
 def parse_table(text: str) -> ChannelTable:
-    """Parse a channel table from TOML text (group defaults merged into each row).
+    """Return the channel table of a TOML text, group defaults merged into each row.
 
     Raises:
-        InputError: It is no TOML, or the first thing that is missing or wrong in it.
+        InputError: The text is not TOML, or a value is missing or invalid.
     """
     try:
         return table_of(raw_groups(text))
@@ -183,7 +183,7 @@ def parse_table(text: str) -> ChannelTable:
 
 
 def raw_groups(text: str) -> dict[str, Any]:
-    """The groups of a TOML text as they stand there, with the group's own kind and defaults merged into each row."""
+    """Return the groups of a TOML text as parsed, with kind and defaults of the group merged into each row."""
     groups = parse_toml(text, field="channel table")["groups"]
     for body in groups.values():
         shared = {**body.pop("defaults", {}), "kind": body["kind"]}
@@ -192,10 +192,10 @@ def raw_groups(text: str) -> dict[str, Any]:
 
 
 def table_of(groups: dict[str, Any], curves: dict[str, Any] | None = None) -> ChannelTable:
-    """The table of groups with whole rows, and of curves.
+    """Return the channel table of groups with complete rows, and of curves.
 
     Raises:
-        InputError: The first thing that is missing or wrong.
+        InputError: A value is missing or invalid.
     """
     made = {}
     for name, body in groups.items():
@@ -210,14 +210,14 @@ def table_of(groups: dict[str, Any], curves: dict[str, Any] | None = None) -> Ch
 
 
 def check_signals(channels: Iterable[Channel], known: Collection[str]) -> None:
-    """Refuse channels that feel a signal that the model does not have.
+    """Refuse channels of a signal that the model does not have.
 
     Args:
         channels: The channels.
         known: Names of the model's signals.
 
     Raises:
-        InputError: The first of them.
+        InputError: The message names the first such channel.
     """
     for channel in channels:
         if channel.signal not in known:
@@ -226,5 +226,5 @@ def check_signals(channels: Iterable[Channel], known: Collection[str]) -> None:
 
 @cache
 def default_table() -> ChannelTable:
-    """The rig's own channel table."""
+    """Return the rig's own channel table."""
     return parse_table(TABLE.read_text())

@@ -1,4 +1,4 @@
-"""A recording that is played again: read from a CSV file as `rig export` writes it, and the spline through it."""
+"""Waveform played by a generator: read from a CSV file in the format of `rig export`, interpolated by a spline."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from pydantic import Field, FiniteFloat, model_validator
 from rig.base.checks import Written, open_file
 from rig.base.errors import InputError, Words
 
-_MOST, _BYTES = 200_000, 8 << 20
-"""Most numbers of a waveform, and most bytes of its file: every recording of it holds it."""
+_MAX_VALUES, _MAX_FILE_BYTES = 200_000, 8 << 20
+"""Limits of a waveform's values and of its file size [bytes]; each recording contains the waveform."""
 _FIELD = "generator.file"
 
 
 def exact(number: float) -> Fraction:
-    """A number as the decimal fraction that it is written as."""
+    """Return a number as the exact fraction of its shortest decimal form."""
     return Fraction(repr(float(number)))
 
 
 class Waveform(Written):
-    """Values in each channel's own unit, at one rate, which are played again and again."""
+    """Values of channels in their own units at one rate, played repeatedly."""
 
     rate_hz: Annotated[FiniteFloat, Field(ge=1e-6, le=1e6)]
     units: dict[str, str]
@@ -39,11 +39,11 @@ class Waveform(Written):
 
     @property
     def period(self) -> Fraction:
-        """How long it is [s]."""
+        """Length [s]."""
         return len(next(iter(self.values.values()))) / exact(self.rate_hz)
 
     def spline(self, name: str) -> np.ndarray:
-        """Coefficients of the periodic cubic spline of a channel, highest power first, a piece a row, shape (4, n)."""
+        """Return the coefficients of a channel's periodic cubic spline, highest power first, shape (4, n)."""
         from scipy.interpolate import CubicSpline
 
         closed = np.array([*self.values[name], self.values[name][0]])
@@ -51,18 +51,18 @@ class Waveform(Written):
 
 
 def read_waveform(path: Path) -> Waveform:
-    """A waveform from a CSV file: headings `time [s]` and `NAME [unit]`, then rows at one rate, in the channels' units.
+    """Return the waveform of a CSV file with the headings `time [s]` and `NAME [unit]`, and rows at one rate.
 
     Raises:
-        InputError: The file cannot be read, or is none.
+        InputError: The file cannot be read or is not such a file.
     """
     try:
         with open_file(path) as file:
-            data = file.read(_BYTES + 1)
+            data = file.read(_MAX_FILE_BYTES + 1)
     except OSError as error:
         raise InputError(_FIELD, "a file that can be read", Words(f"{path} ({error.strerror})")) from None
-    if len(data) > _BYTES:
-        raise InputError(_FIELD, f"at most {_BYTES >> 20} MB", Words(f"{path}, which is larger"))
+    if len(data) > _MAX_FILE_BYTES:
+        raise InputError(_FIELD, f"at most {_MAX_FILE_BYTES >> 20} MB", Words(f"{path}, which is larger"))
     try:
         headings, *rows = [row for row in csv.reader(data.decode("utf-8-sig").splitlines()) if row]
         numbers = np.array(rows, dtype=float)
@@ -70,16 +70,16 @@ def read_waveform(path: Path) -> Waveform:
         raise InputError(_FIELD, "a CSV file of headings and rows of numbers", Words(f"{path} ({error})")) from None
     if numbers.ndim != 2 or not headings[0].startswith("time") or not np.isfinite(numbers).all():
         raise InputError(_FIELD, "with a first column `time [s]` and a number in every field", str(path))
-    if len(numbers) < 4 or numbers[:, 1:].size > _MOST:
+    if len(numbers) < 4 or numbers[:, 1:].size > _MAX_VALUES:
         received = Words(f"{len(numbers)} rows of {numbers.shape[1] - 1}")
-        raise InputError(_FIELD, f"of 4 rows at least, and {_MOST} numbers at most", received)
+        raise InputError(_FIELD, f"of 4 rows at least, and {_MAX_VALUES} numbers at most", received)
     times_s = numbers[:, 0]
     rate_hz = round((len(times_s) - 1) / float(times_s[-1] - times_s[0] or 1.0), 6)
     if not 1e-6 <= rate_hz <= 1e6 or np.ptp(times_s - np.arange(len(times_s)) / rate_hz) > 0.01 / rate_hz:
         raise InputError(_FIELD, "of rows at one rate", str(path))
-    told = [heading.partition(" [") for heading in headings[1:]]
+    columns = [heading.partition(" [") for heading in headings[1:]]
     return Waveform(
         rate_hz=rate_hz,
-        units={name: unit.removesuffix("]") for name, _, unit in told},
-        values={name: tuple(numbers[:, c + 1].tolist()) for c, (name, _, _) in enumerate(told)},
+        units={name: unit.removesuffix("]") for name, _, unit in columns},
+        values={name: tuple(numbers[:, c + 1].tolist()) for c, (name, _, _) in enumerate(columns)},
     )
