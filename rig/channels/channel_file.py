@@ -157,7 +157,7 @@ def _merge_groups(file: _File) -> dict[str, Any]:
         whole = groups.setdefault(name, {"title": name, "rate_hz": _RATE_HZ, "kind": KIND, "channels": []})
         whole |= group.model_dump(include={"title", "rate_hz"}, exclude_none=True)
         old = whole["channels"]
-        shared = (
+        same = (
             {key: value for key, value in old[0].items() if all(row[key] == value for row in old)} if old else _DEFAULTS
         )
         for row in old:
@@ -165,7 +165,7 @@ def _merge_groups(file: _File) -> dict[str, Any]:
             stated.setdefault(row["name"], set()).update(group.defaults, {"rate_hz"} if group.rate_hz else ())
         for row in group.channels:
             own = {**group.defaults, **row.model_dump()}
-            whole["channels"].append({"label": row.name, **shared, **own})
+            whole["channels"].append({"label": row.name, **same, **own})
             stated.setdefault(row.name, set()).update(own)
     rows = {row["name"]: row for group in groups.values() for row in group["channels"]}
     for name, changes in file.channels.items():

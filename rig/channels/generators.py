@@ -35,7 +35,7 @@ from rig.channels.waveform import Waveform, exact, read_waveform
 
 _WRAP_TOLERANCE = 1e-11
 """Rounding tolerance of a phase below a whole period [periods]."""
-_EDGE_TOLERANCE = 1e-9
+_EDGE_TOL = 1e-9
 """Tolerance by which an instant before an edge counts as after it [steps or chips]."""
 _PULSE_LENGTH = Fraction(10, 360)
 """Length of a pulse [periods]: that of the keyphasor mark."""
@@ -206,16 +206,12 @@ def _chirp(source: Source, instants: Instants) -> np.ndarray:
 
 def _step(source: Source, instants: Instants) -> np.ndarray:
     """Steps: w = -1 in the first half of each period, 1 in the second."""
-    return np.where(
-        np.floor(2.0 * instants.cycles(1 / _period(source), source.ahead) + _EDGE_TOLERANCE) == 1.0, 1.0, -1.0
-    )
+    return np.where(np.floor(2.0 * instants.cycles(1 / _period(source), source.ahead) + _EDGE_TOL) == 1.0, 1.0, -1.0)
 
 
 def _pulse(source: Source, instants: Instants) -> np.ndarray:
     """Pulses: w = 1 in the first 10/360 of each period, else 0."""
-    return np.where(
-        instants.cycles(_frequency(source), source.ahead) + _EDGE_TOLERANCE < float(_PULSE_LENGTH), 1.0, 0.0
-    )
+    return np.where(instants.cycles(_frequency(source), source.ahead) + _EDGE_TOL < float(_PULSE_LENGTH), 1.0, 0.0)
 
 
 def _prbs(source: Source, instants: Instants) -> np.ndarray:
@@ -223,7 +219,7 @@ def _prbs(source: Source, instants: Instants) -> np.ndarray:
     sequence = chips(source.signal.order or 0, source.signal.seed or 1)
     length = len(sequence)
     turns = instants.cycles(_frequency(source) / length, round(source.ahead * length) / length)
-    return sequence[np.floor(turns * length + _EDGE_TOLERANCE).astype(np.int64) % length]
+    return sequence[np.floor(turns * length + _EDGE_TOL).astype(np.int64) % length]
 
 
 def _multisine(source: Source, instants: Instants) -> np.ndarray:

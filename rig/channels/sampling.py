@@ -90,8 +90,8 @@ def check_rates(table: ChannelTable, row_rate_hz: int, *, field: str) -> None:
         if not fits(rate, row_rate_hz):
             near = [other for offset in range(5000) for other in (rate - offset, rate + offset) if other > 0]
             valid = sorted([other for other in near if fits(other, row_rate_hz)][:2])
-            must = f"one whose samples fall on at most {_MAX_POSITIONS} places between the rows of {row_rate_hz} Hz that they are"
-            must += f" made of, such as {' or '.join(map(str, valid))}" if valid else " made of"
+            must = f"a rate with at most {_MAX_POSITIONS} sample positions between the rows of {row_rate_hz} Hz"
+            must += f", such as {' or '.join(map(str, valid))}" if valid else ""
             raise InputError(field or f"groups.{group.name}.rate_hz", must, rate)
 
 
