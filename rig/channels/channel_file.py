@@ -46,7 +46,7 @@ _DEFAULTS: dict[str, Any] = {
     "bias_v": 0.0, "range_v": [-10.0, 10.0], "highpass_hz": 0.0, "noise_v": 0.0, "adc_v": 10.0, "adc_bits": 24,
 }  # fmt: skip
 _RATE_HZ = 20_000
-MOST_HZ = 130_000.0
+MAX_BANDWIDTH_HZ = 130_000.0
 """Largest bandwidth [Hz] that rows at an interval of 1 us can represent."""
 _MAX_CHANNELS, _MAX_CURVE_POINTS = 512, 10_000
 """Largest number of channels in a table, and of points in a curve."""
@@ -122,8 +122,8 @@ def check_table(table: ChannelTable) -> None:
         for channel in group.channels:
             field = f"channel {channel.name}"
             for name in ("bandwidth_hz", "highpass_hz"):
-                if getattr(channel, name) > MOST_HZ:
-                    raise InputError(f"{field}.{name}", f"at most {MOST_HZ:g}", getattr(channel, name))
+                if getattr(channel, name) > MAX_BANDWIDTH_HZ:
+                    raise InputError(f"{field}.{name}", f"at most {MAX_BANDWIDTH_HZ:g}", getattr(channel, name))
             if (channel.rate_hz, channel.group) != (group.rate_hz, group.name):
                 raise InputError(f"{field}.rate_hz", f"that of its group, {group.rate_hz}", channel.rate_hz)
             gain = channel.sensitivity_v / channel.si

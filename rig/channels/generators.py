@@ -122,7 +122,7 @@ class Generator(Signal):
     """Signal of all channels, with overrides for single channels."""
 
     apart: bool = False
-    """Whether the phases of the channels are spread evenly over a period, so that each channel can be identified."""
+    """Spread the phases of the channels evenly over a period, so that each channel can be identified."""
     file: Waveform | None = None
     """CSV file in the format of `rig export`, for kind recorded."""
     channels: dict[str, Signal] = Field(default={})
@@ -186,18 +186,18 @@ class Source:
 
 
 def _sine(source: Source, instants: Instants) -> np.ndarray:
-    """Sine: w = sin(2 pi (f t + phase/360))."""
+    """Return a sine: w = sin(2 pi (f t + phase/360))."""
     return np.sin(2.0 * np.pi * instants.cycles(_frequency(source), source.ahead))
 
 
 def _two_tone(source: Source, instants: Instants) -> np.ndarray:
-    """Two tones: w = (sin(2 pi (f1 t + phase/360)) + sin(2 pi (f2 t + phase/360))) / 2, 1 at most."""
+    """Return two tones: w = (sin(2 pi (f1 t + phase/360)) + sin(2 pi (f2 t + phase/360))) / 2, at most 1."""
     tones = [instants.cycles(exact(hz), source.ahead) for hz in source.signal.frequencies or ()]
     return np.sum([0.5 * np.sin(2.0 * np.pi * turns) for turns in tones], axis=0)
 
 
 def _chirp(source: Source, instants: Instants) -> np.ndarray:
-    """Chirp: w = sin(2 pi (f1 s + (f2 - f1) s^2 / (2 T))), s = t mod T: linear from f1 to f2, again and again."""
+    """Return repeated linear sweeps from f1 to f2: w = sin(2 pi (f1 s + (f2 - f1) s^2 / (2 T))), s = t mod T."""
     low, high = source.signal.frequencies or (0.0, 0.0)
     part, period_s = instants.cycles(1 / _period(source), source.ahead), float(_period(source))
     turns = period_s * part * (low + 0.5 * (high - low) * part)
@@ -205,17 +205,17 @@ def _chirp(source: Source, instants: Instants) -> np.ndarray:
 
 
 def _step(source: Source, instants: Instants) -> np.ndarray:
-    """Steps: w = -1 in the first half of each period, 1 in the second."""
+    """Return steps: w = -1 in the first half of each period, 1 in the second."""
     return np.where(np.floor(2.0 * instants.cycles(1 / _period(source), source.ahead) + _EDGE_TOL) == 1.0, 1.0, -1.0)
 
 
 def _pulse(source: Source, instants: Instants) -> np.ndarray:
-    """Pulses: w = 1 in the first 10/360 of each period, else 0."""
+    """Return pulses: w = 1 in the first 10/360 of each period, else 0."""
     return np.where(instants.cycles(_frequency(source), source.ahead) + _EDGE_TOL < float(_PULSE_LENGTH), 1.0, 0.0)
 
 
 def _prbs(source: Source, instants: Instants) -> np.ndarray:
-    """Pseudo-random binary sequence: w = 1 or -1, chip floor(f t) of 2^order - 1, again and again (see `chips`)."""
+    """Return a pseudo-random binary sequence: w = 1 or -1, chip floor(f t) modulo 2^order - 1 (see `chips`)."""
     sequence = chips(source.signal.order or 0, source.signal.seed or 1)
     length = len(sequence)
     turns = instants.cycles(_frequency(source) / length, round(source.ahead * length) / length)
@@ -223,7 +223,7 @@ def _prbs(source: Source, instants: Instants) -> np.ndarray:
 
 
 def _multisine(source: Source, instants: Instants) -> np.ndarray:
-    """Multisine: w = sum cos(2 pi (f_k t + phase/360) - s pi k^2 / N) / peak, k = 0..N-1, s by the crest factor."""
+    """Return a multisine: w = sum cos(2 pi (f_k t + phase/360) - s pi k^2 / N) / peak, k = 0..N-1, s by the crest."""
     frequencies = source.signal.frequencies or ()
     phases, peak = multisine_phases(frequencies, source.signal.crest)
     total = np.zeros(len(instants.whole))
@@ -233,17 +233,17 @@ def _multisine(source: Source, instants: Instants) -> np.ndarray:
 
 
 def _ramp(source: Source, instants: Instants) -> np.ndarray:
-    """Ramp: w = 2 ((t/T) mod 1) - 1: every code of the converter in turn, where no amplitude is given."""
+    """Return a ramp: w = 2 ((t/T) mod 1) - 1; without an amplitude, it passes every code of the converter."""
     return 2.0 * instants.cycles(1 / _period(source), source.ahead) - 1.0
 
 
 def _quiet(source: Source, instants: Instants) -> np.ndarray:
-    """Nothing: w = 0: bias, offset and noise alone."""
+    """Return w = 0, which leaves bias, offset and noise."""
     return np.zeros(len(instants.whole))
 
 
 def _recorded(source: Source, instants: Instants) -> np.ndarray:
-    """Recording: w = periodic cubic spline through the waveform's values, in the channel's unit, again and again."""
+    """Return a repeated recording: w = periodic cubic spline through the waveform's values, in the channel's unit."""
     assert source.waveform is not None
     period, pieces = source.waveform
     rows = pieces.shape[1]
@@ -260,7 +260,7 @@ class Kind(NamedTuple):
     needs: tuple[str, ...] = ()
     takes: tuple[str, ...] = ()
     amplitude: bool | None = True
-    """Whether an amplitude is required (True), optional (None) or not allowed (False)."""
+    """Amplitude: required (True), optional (None) or not allowed (False)."""
 
 
 KINDS: dict[str, Kind] = {

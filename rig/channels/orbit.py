@@ -29,18 +29,18 @@ def phase(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def whirl_frequency(x: ArrayLike, y: ArrayLike, times_s: ArrayLike, *, about: complex | None = None) -> float:
-    """Slope of the phase of x + j y about a centre [Hz]; forward is positive.
+    """Return the mean rotation frequency of x + j y about a centre, from the slope of its phase [Hz]; forward positive.
 
-    Unlike the bin of a spectrum this has no resolution limit; the orbit must go round the centre.
+    Unlike a line of a spectrum it has no resolution limit; the orbit must enclose the centre.
 
     Args:
         x: Horizontal, shape (n,).
         y: Vertical, shape (n,).
         times_s: Times [s], ascending, shape (n,).
-        about: The centre, in the unit of x; None: the orbit's own mean.
+        about: Centre, in the unit of x; None for the orbit's mean.
 
     Raises:
-        InputError: These are no rows of numbers of one length, with two samples at least.
+        InputError: The arguments are not rows of numbers of equal length with at least two samples.
 
     Example:
         >>> times_s = np.arange(2000) / 20_000.0
@@ -55,11 +55,11 @@ def whirl_frequency(x: ArrayLike, y: ArrayLike, times_s: ArrayLike, *, about: co
 
 
 def mean_rotation(x: np.ndarray, y: np.ndarray, rate_hz: float) -> float:
-    """Mean rotation of x + j y about its mean [Hz], weighted by the square of the radius; 0 of less than 2 ms.
+    """Return the mean rotation of x + j y about its mean [Hz], weighted by the squared radius; 0 for less than 2 ms.
 
-    For an orbit that may be as small as the probes' noise, where a phase would jump. The phase is advanced over 1 ms:
-    short against any whirl of the rig (unambiguous to +-500 Hz), long against the correlation time of that noise, which
-    would otherwise pull the slope of a small orbit towards zero.
+    Suitable for an orbit as small as the probes' noise, where an unwrapped phase would jump. The phase advance is taken
+    over 1 ms: short against any whirl of the rig (unambiguous to +-500 Hz), long against the correlation time of that
+    noise, which would otherwise bias the result of a small orbit towards zero.
 
     Args:
         x: Horizontal, shape (n,).
@@ -82,7 +82,7 @@ def rms_radius(x: np.ndarray, y: np.ndarray) -> float:
 def full_spectrum(
     x: ArrayLike, y: ArrayLike, rate_hz: float, *, lines: int | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Two-sided spectrum: the amplitude of each circular component of x + j y about its centre.
+    """Return the two-sided spectrum: the amplitude of each circular component of x + j y about its centre.
 
     Hann window over all samples, scaled so that a steady whirl of radius r has its peak at r.
 
@@ -90,13 +90,13 @@ def full_spectrum(
         x: Horizontal, shape (n,).
         y: Vertical, shape (n,).
         rate_hz: Sample rate [Hz].
-        lines: Number of lines, at least n: the samples are padded with zeros, so that lines stand closer. None: n.
+        lines: Number of lines, at least n; zero padding makes the lines denser. None for n.
 
     Returns:
         Frequencies [Hz], ascending, and amplitudes in the unit of x, each shape (lines,).
 
     Raises:
-        InputError: These are no rows of numbers of one length, or the rate or the lines are none.
+        InputError: The samples are not rows of numbers of equal length, or the rate or the lines are invalid.
 
     Example:
         >>> angle = -2.0 * np.pi * 80.0 * np.arange(2000) / 20_000.0
@@ -122,7 +122,7 @@ def full_spectrum(
 def waterfall(
     x: ArrayLike, y: ArrayLike, rate_hz: float, times_s: ArrayLike, *, window_s: float = 0.5, hop_s: float = 0.1
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Full spectra over time, up to `SPECTRUM_HZ`.
+    """Return full spectra over time, up to `SPECTRUM_HZ`.
 
     Args:
         x: Horizontal, shape (n,).
@@ -130,14 +130,14 @@ def waterfall(
         rate_hz: Sample rate [Hz].
         times_s: Times [s], ascending, shape (n,).
         window_s: Length of a window [s].
-        hop_s: From one window to the next [s].
+        hop_s: Time between two windows [s].
 
     Returns:
         Times of the windows' centres [s], shape (t,); frequencies [Hz], shape (f,); amplitudes in the unit of x, shape
         (t, f).
 
     Raises:
-        InputError: As of `full_spectrum`.
+        InputError: As in `full_spectrum`.
 
     Example:
         >>> times_s = np.arange(4000) / 2000.0
@@ -158,9 +158,9 @@ def waterfall(
 
 
 def synchronous(values: ArrayLike, times_s: ArrayLike, edges_s: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-    """What of a signal goes once around with the shaft, turn by turn: what a Bode plot of a run-up shows.
+    """Return the 1X component of a signal for each revolution, as shown in a Bode plot of a run-up.
 
-    Fitted to each turn with its mean, so that a turn of no whole number of samples does as well.
+    Fitted to each revolution together with its mean, so that the number of samples need not be whole.
 
     Args:
         values: A signal, such as one probe, shape (n,).
@@ -168,12 +168,12 @@ def synchronous(values: ArrayLike, times_s: ArrayLike, edges_s: ArrayLike) -> tu
         edges_s: Keyphasor edges [s], ascending, shape (edges,).
 
     Returns:
-        Speed of each turn between two edges [Hz], and as one complex number the signal's amplitude in it (`np.abs`, in
-        the unit of the values) with its phase from the edge on (`np.angle` [rad]; negative lags), each shape (turns,);
-        turns with fewer than 8 samples, or with none in a quarter of it, are left out.
+        Speed of each revolution between two edges [Hz], and its complex 1X amplitude: magnitude (`np.abs`, in the unit
+        of the values) and phase from the edge (`np.angle` [rad]; negative lags), each shape (turns,). Revolutions
+        with fewer than 8 samples, or with a gap of a quarter revolution, are omitted.
 
     Raises:
-        InputError: These are no rows of numbers, or values and times of different lengths.
+        InputError: The arguments are not rows of numbers, or values and times differ in length.
 
     Example:
         >>> times_s = np.arange(4000) / 2000.0

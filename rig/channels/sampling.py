@@ -34,7 +34,7 @@ class SensorChoice(Written):
     truth_rate_hz: Annotated[int, Field(ge=10, le=1_000_000)] = 2_000
     """Rate of the published truth tables [Hz]."""
     noise: bool = True
-    """Whether the sensors have noise."""
+    """True if the sensors have noise."""
     chain: Literal["ideal", "full"] = "full"
     """`full` for filter, noise, offset and converter; `ideal` for the measured quantity only."""
 

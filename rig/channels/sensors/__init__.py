@@ -1,1 +1,1 @@
-"""Virtual sensors: from the model's observed rows to ADC counts, a pure function of the rows and the seed."""
+"""Virtual sensors: conversion of the model's observed rows to ADC counts, a pure function of rows and seed."""

@@ -1,7 +1,7 @@
-"""Signal conditioning of all sensors: sensitivity, range, anti-alias filter and AC coupling, noise, converter.
+"""Signal conditioning of all sensors: sensitivity, range, anti-alias filter, AC coupling, noise and converter.
 
-A channel is a chain in continuous time (`rig.channels.sensors.filters`), and so its samples lie where its rate puts
-them.
+A channel is a chain in continuous time (`rig.channels.sensors.filters`), so samples lie exactly at the times of its
+rate.
 """
 
 from __future__ import annotations
@@ -22,44 +22,43 @@ from rig.physics.kernels.signals import COLUMN
 from rig.physics.kernels.stage import kernel
 
 _LANES = 16
-"""Channels that one pass takes, side by side."""
-_SOMETHING = 1e-25
-"""Added to all volts: filters of silent channels else decay to where a processor takes a hundred times as long."""
+"""Channels processed in one pass, in SIMD lanes."""
+_SUBNORMAL_GUARD_V = 1e-25
+"""Offset of all voltages [V]: without it, filters of silent channels decay to subnormal numbers, 100 times slower."""
 _CHUNK = 64
-"""Rows that are filtered at a time."""
+"""Rows filtered at a time."""
 
 _GAIN, _BIAS, _LOW, _HIGH, _NOISE, _LSB, _LIMIT = range(7)
-"""Rows of the table of channels: volts per SI unit; volts at zero; output limits [V]; noise [V]; converter step [V];
+"""Rows of the channel table: gain [V per SI unit], bias [V], output limits [V], noise [V rms], converter step [V],
 largest count."""
 
 
 @kernel
 def _filter(step, wave, phases, volts, rows, late, apart, parts, out):
-    """Step the filters from row to row, and read off every sample on the way, for `_LANES` channels.
+    """Step the filters from row to row and compute every sample on the way, for `_LANES` channels.
 
-    Every number of a channel stands at a fixed distance from the next one: only so can the compiler see that the
-    channels may go side by side.
+    All numbers of a channel have the same stride, so that the compiler can vectorise over the channels.
 
     Args:
-        step: Of the poles, shape (poles * POLE * _LANES,).
-        wave: Their states, in and out, shape (poles * 2 * _LANES,).
-        phases: What a sample is made of, by its place, shape (parts * (4 + 2 * poles) * _LANES,).
+        step: Pole coefficients, shape (poles * POLE * _LANES,).
+        wave: Pole states, in and out, shape (poles * 2 * _LANES,).
+        phases: Sample weights by position, shape (parts * (4 + 2 * poles) * _LANES,).
         volts: Two rows before the first, the first, and `rows` more, shape ((rows + 3) * _LANES,).
-        rows: How many to step on.
-        late: Place of the next sample behind the first row, in parts of a row.
-        apart: From sample to sample, in such parts.
-        parts: Of a row.
-        out: Out, shape (samples * _LANES,).
+        rows: Number of row intervals to step.
+        late: Position of the next sample after the first row, in parts of a row interval.
+        apart: Sample interval, in such parts.
+        parts: Parts per row interval.
+        out: Samples, out, shape (samples * _LANES,).
 
     Returns:
-        Place of the next sample behind the last row.
+        Position of the next sample after the last row.
     """
     poles = len(step) // (POLE * _LANES)
     sample = 0
     for n in range(rows):
         at = n * _LANES
         if late == 0:
-            # On the row itself, a sample is what goes straight through, and the poles' states.
+            # A sample on the row itself is the direct gain times the voltage, plus the pole states.
             for c in range(_LANES):
                 out[sample + c] = phases[_LANES + c] * volts[at + 2 * _LANES + c]
             for pole in range(poles):
@@ -103,27 +102,27 @@ def _filter(step, wave, phases, volts, rows, late, apart, parts, out):
 
 
 @kernel
-def _limited(scale, volts):
-    """From signals to volts within the conditioner's range, in place, shape (rows * _LANES,)."""
+def _clip_volts(scale, volts):
+    """Convert signals to volts within the conditioner's range, in place, shape (rows * _LANES,)."""
     for n in range(0, len(volts), _LANES):
         for c in range(_LANES):
-            v = scale[c + _BIAS * _LANES] + scale[c + _GAIN * _LANES] * volts[n + c] + _SOMETHING
+            v = scale[c + _BIAS * _LANES] + scale[c + _GAIN * _LANES] * volts[n + c] + _SUBNORMAL_GUARD_V
             volts[n + c] = min(max(v, scale[c + _LOW * _LANES]), scale[c + _HIGH * _LANES])
 
 
 @kernel
 def _convert(scale, volts, noise):
-    """From volts to counts, still as floats, in place.
+    """Convert volts to counts, still as floats, in place.
 
     Args:
-        scale: As above.
-        volts: In and out, shape (samples * _LANES,).
-        noise: Of each sample, shape (samples, _LANES).
+        scale: Channel table, shape (7 * _LANES,).
+        volts: Volts in, counts out, shape (samples * _LANES,).
+        noise: Noise of each sample, shape (samples, _LANES).
     """
     for n in range(len(noise)):
         row = volts[n * _LANES : (n + 1) * _LANES]
         loud = noise[n]
-        # A length that the compiler knew would be unrolled, one channel after the other.
+        # With a length known at compile time, the loop would be unrolled instead of vectorised.
         for c in range(len(row)):
             count = np.rint((row[c] + loud[c] * scale[c + _NOISE * _LANES]) / scale[c + _LSB * _LANES])
             limit = scale[c + _LIMIT * _LANES]
@@ -132,24 +131,24 @@ def _convert(scale, volts, noise):
 
 @njit(cache=True, error_model="numpy", fastmath=False, nogil=True)
 def _condition(rows, made, late, apart, parts, columns, places, scales, past, waves, steps, phases, streams, counts):
-    """Filter from the first row to the last, and convert the samples that lie before that.
+    """Filter from the first row to the last, and convert the samples before the last row.
 
     Args:
         rows: Observed rows, shape (n, N_ROW).
         made: Signals by formulas at the same instants, shape (n, formulas).
-        late: Place of the first sample behind the first row, in parts of a row.
-        apart: From sample to sample, in such parts.
-        parts: Of a row.
-        columns: Column of each channel, those of `made` behind those of `rows`, shape (c,).
-        places: Where its counts go: channels in the groups before its own, channels in its group, place in it,
-            shape (c, 3).
-        scales: Of the channels by sixteen, shape (sets, 7, _LANES).
-        past: Their volts at the two rows before the first, in and out, shape (sets, 2 * _LANES).
-        waves: States of their poles, in and out, shape (sets, poles * 2 * _LANES).
-        steps: Steps of their poles, shape (sets, poles * POLE * _LANES).
-        phases: Samples, shape (sets, parts * (4 + 2 * poles) * _LANES).
-        streams: Of their noise, in and out, shape (c, 4); (0, 4): no noise.
-        counts: Out, one group behind the other, each (samples, channels).
+        late: Position of the first sample after the first row, in parts of a row interval.
+        apart: Sample interval, in such parts.
+        parts: Parts per row interval.
+        columns: Column of each channel, those of `made` after those of `rows`, shape (c,).
+        places: Position of each channel's counts: channels in the groups before its own, channels in its group, column
+            in its group, shape (c, 3).
+        scales: Channel tables by set of `_LANES`, shape (sets, 7, _LANES).
+        past: Volts at the two rows before the first, in and out, shape (sets, 2 * _LANES).
+        waves: Pole states, in and out, shape (sets, poles * 2 * _LANES).
+        steps: Pole coefficients, shape (sets, poles * POLE * _LANES).
+        phases: Sample weights, shape (sets, parts * (4 + 2 * poles) * _LANES).
+        streams: Noise streams, in and out, shape (c, 4); (0, 4) for no noise.
+        counts: Counts, out, group after group, each (samples, channels).
     """
     samples = len(counts) // len(columns)
     volts = np.zeros((_CHUNK + 3) * _LANES)
@@ -173,40 +172,40 @@ def _condition(rows, made, late, apart, parts, columns, places, scales, past, wa
                 else:
                     for n in range(length + 1):
                         volts[(n + 2) * _LANES + c] = made[begin + n, column - rows.shape[1]]
-            _limited(scale, volts[2 * _LANES : (length + 3) * _LANES])
-            here = max(0, -((due - length * parts) // apart))
+            _clip_volts(scale, volts[2 * _LANES : (length + 3) * _LANES])
+            ready = max(0, -((due - length * parts) // apart))
             if len(streams) > 0:
-                draw(streams[at : at + lanes], noise[:here])
+                draw(streams[at : at + lanes], noise[:ready])
             due = _filter(steps[part], waves[part], phases[part], volts, length, due, apart, parts, out)
             for n in range(2 * _LANES):
                 volts[n] = volts[length * _LANES + n]
-            _convert(scale, out, noise[:here])
+            _convert(scale, out, noise[:ready])
             for c in range(lanes):
                 before, width, place = places[at + c]
                 to = before * samples + sample * width + place
-                for n in range(here):
+                for n in range(ready):
                     counts[to + n * width] = np.int32(out[n * _LANES + c])
-            sample += here
+            sample += ready
         for n in range(2 * _LANES):
             past[part, n] = volts[n]
 
 
 class Conditioner:
-    """Turns rows into counts, block by block; cutting a run into blocks in another way changes no bit.
+    """Conversion of rows to counts, block by block; the result does not depend on the division of a run into blocks.
 
-    An ideal one has range and converter only: no filter, no coupling, no noise.
+    An ideal conditioner has only range and converter: no filter, no coupling, no noise.
 
-    Each channel draws its noise from a stream of its own, keyed by seed and name: leaving a channel out does not
+    Each channel draws its noise from a separate stream, keyed by seed and name, so that omitting a channel does not
     change the others.
 
     Args:
         groups: Groups of one rate.
-        row_rate_hz: Rows a second.
-        seed: Of the noise.
-        noise: Whether there is any.
-        ideal: Leave everything out but range and converter.
-        digital: Filters as tables of version 1 have them: by the bilinear transform, at the rate of the rows.
-        columns: Of each channel's signal in the rows, or behind them; the model's own unless given.
+        row_rate_hz: Rows per second [Hz].
+        seed: Seed of the noise.
+        noise: Whether the channels have noise.
+        ideal: Omit everything except range and converter.
+        digital: Filters of tables of version 1: by the bilinear transform, at the rate of the rows.
+        columns: Column of each channel's signal, in the rows or after them; None for the model's own.
     """
 
     def __init__(
@@ -239,7 +238,7 @@ class Conditioner:
         ]
         most = max(len(poles) for poles, _, _ in filters)
         sets = -(-len(channels) // _LANES)
-        # Lanes without a channel make zeros.
+        # Unused lanes produce zeros.
         self._scales = np.zeros((sets, 7, _LANES))
         self._scales[:, _LSB] = 1.0
         steps, self._settling = np.zeros((sets, most, POLE, _LANES)), np.zeros((sets, most, 2, _LANES))
@@ -267,25 +266,25 @@ class Conditioner:
         self._row_rate_hz, self._noise, self._ideal = row_rate_hz, noise, ideal
         self._lanes = {channel.name: divmod(c, _LANES) for c, channel in enumerate(channels)}
         self._inherited: list[tuple[str, np.ndarray, np.ndarray]] = []
-        """Of a twin that has not begun: channels, with the states of their poles and their volts before."""
+        """Channels of a twin before its first rows, with their pole states and earlier volts."""
         self._streams = noise_streams([channel.name for channel in channels] if noise and not ideal else [], seed)
 
     @property
     def columns(self) -> np.ndarray:
-        """Column of each channel's signal in the rows, or behind them, shape (channels,)."""
+        """Column of each channel's signal, in the rows or after them, shape (channels,)."""
         return self._columns
 
     def twin(self, channels: Mapping[str, Channel], *, rate_hz: int, first: int, row: int, columns: int) -> Conditioner:
-        """Another chain of some of the channels, which goes on from where this one is.
+        """Return another chain of some of the channels, which continues from the state of this one.
 
         Args:
-            channels: The channels by name; one with another filter begins in the steady state of its first row.
-            rate_hz: Samples a second.
+            channels: Channels by name; one with another filter starts in the steady state of its first row.
+            rate_hz: Samples per second [Hz].
             first: Number of its first sample.
             row: Number of its first row.
-            columns: From which on its signals are, one behind the other.
+            columns: First column of its signals; the others follow.
         """
-        # Not checked: no table has channels without a range, or without a filter.
+        # Skip validation, which refuses channels without a range or a filter.
         group = Group.model_construct(name="twin", title="", rate_hz=rate_hz, channels=tuple(channels.values()))
         other = Conditioner(
             [group], row_rate_hz=self._row_rate_hz, seed=0, noise=self._noise, ideal=self._ideal,
@@ -296,7 +295,7 @@ class Conditioner:
         return other
 
     def take_over(self, other: Conditioner, names: Sequence[str]) -> None:
-        """Go on from another's noise, and where they have the same filters, from their states."""
+        """Copy another chain's noise streams and, for channels with equal filters, its states."""
         mine = {channel.name: channel for group in self.groups for channel in group.channels}
         theirs = {channel.name: channel for group in other.groups for channel in group.channels}
         for name in names:
@@ -309,8 +308,8 @@ class Conditioner:
                 waves = other._waves[part].reshape(-1, _LANES)[:, lane].copy()
                 self._inherited.append((name, waves, other._past[part].reshape(2, _LANES)[:, lane].copy()))
 
-    def _go_on(self) -> None:
-        """Begin with what was taken over, once the rest is settled."""
+    def _restore_inherited(self) -> None:
+        """Apply the inherited states after the other channels are settled."""
         assert self._past is not None
         for name, waves, past in self._inherited:
             part, lane = self._lanes[name]
@@ -320,18 +319,18 @@ class Conditioner:
         self._inherited = []
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Conditioner:
-        """With states of its own; what does not change is shared."""
+        """Return a copy with its own states; constant arrays are shared."""
         other = copy.copy(self)
         for name in ("_waves", "_past", "_streams", "_inherited"):
             setattr(other, name, copy.copy(getattr(self, name)))
         return other
 
     def counts(self, rows: np.ndarray, made: np.ndarray | None = None) -> dict[str, np.ndarray]:
-        """Samples from the first of these rows on that lie before the last one.
+        """Return the samples from the first of these rows to before the last one.
 
         Args:
-            rows: Observed rows from the last one of the call before on, shape (n, N_ROW).
-            made: More signals at the same instants, whose columns are behind those of the rows, shape (n, m).
+            rows: Observed rows, starting with the last one of the previous call, shape (n, N_ROW).
+            made: Additional signals at the same instants, whose columns follow those of the rows, shape (n, m).
 
         Returns:
             ADC counts by group, int32, shape (samples, channels).
@@ -341,11 +340,11 @@ class Conditioner:
         if self._past is None:
             self._past = self._settle(rows, made)
         if self._inherited:
-            self._go_on()
+            self._restore_inherited()
         span = (len(rows) - 1) * self._parts
         samples = max(0, -((self._late - span) // self._apart))
         counts = np.empty(samples * len(self._columns), dtype=np.int32)
-        # Sums of unsigned integers wrap, of which numpy would warn where nothing is compiled.
+        # Sums of unsigned integers wrap; without compilation, numpy would warn about it.
         with np.errstate(over="ignore"):
             _condition(
                 rows, made, self._late, self._apart, self._parts, self._columns, self._places, self._scales, self._past,
@@ -358,7 +357,7 @@ class Conditioner:
         }
 
     def _settle(self, rows: np.ndarray, made: np.ndarray) -> np.ndarray:
-        """Filters in the steady state of the first row, as the instruments have been on for long; its volts, twice."""
+        """Set the filters to the steady state of the first row, and return its volts, twice."""
         first = np.zeros(len(self._scales) * _LANES)
         first[: len(self._columns)] = np.concatenate([rows[0], made[0]])[self._columns]
         volts = self._scales[:, _BIAS] + self._scales[:, _GAIN] * first.reshape(-1, _LANES)

@@ -1,4 +1,4 @@
-"""Keyphasor: the exact instants at which the shaft's mark passes."""
+"""Keyphasor: exact instants at which the mark on the shaft passes the probe."""
 
 from __future__ import annotations
 
@@ -12,28 +12,28 @@ from rig.physics.kernels.stage import kernel
 
 TURN = 2.0 * math.pi
 FRACTIONS = 2**20
-"""Parts of a tick (1 ps) that an edge is told in: added to whole ticks they are exact, whatever the block."""
+"""Resolution of an edge: parts per tick (1 ps). Added to whole ticks, such fractions are exact for any block."""
 _ANGLE, _RATE = COLUMN["theta"], COLUMN["theta_rate"]
 
 
 class Keyphasor:
-    """Finds the once-per-turn edges between observed rows, on the cubic Hermite interpolant of the spin angle."""
+    """Detector of once-per-turn edges, on the cubic Hermite interpolant of the spin angle between observed rows."""
 
     def __init__(self) -> None:
         self.edges_seen = 0
         self._last = np.full(2, np.nan)
-        """Angle and rate at the last row of the call before."""
+        """Angle and rate at the last row of the previous call."""
 
     def edges(self, rows: np.ndarray, row_ticks: int) -> np.ndarray:
-        """Edges (mark arriving, forward spin) up to the last of these rows.
+        """Return the edges (mark arriving, forward spin) up to the last of these rows.
 
         Args:
             rows: Observed rows that follow those of the last call, shape (n, N_ROW).
-            row_ticks: Ticks a row.
+            row_ticks: Ticks per row interval.
 
         Returns:
-            Instants in ticks from the first of these rows, with their fraction; negative ones lie between the last
-            row of the call before and the first of this one. Shape (edges,).
+            Instants in ticks from the first of these rows, with fraction, shape (edges,). Negative ones lie between the
+            last row of the previous call and the first of this one.
         """
         found = np.empty(len(rows))
         count = _edges(rows, row_ticks, self._last, found)
@@ -43,7 +43,14 @@ class Keyphasor:
 
 @njit(cache=True, error_model="numpy", fastmath=False, nogil=True)
 def _edges(rows, row_ticks, last, found):
-    """How many edges there are, at most one a row; `last` in and out, shape (2,), `found` out, shape (n,)."""
+    """Return the number of edges, at most one per row interval.
+
+    Args:
+        rows: Observed rows, shape (n, N_ROW).
+        row_ticks: Ticks per row interval.
+        last: Angle and rate of the previous row, in and out, shape (2,).
+        found: Instants [ticks], out, shape (n,).
+    """
     count = 0
     angle, rate = last[0], last[1]
     turns = math.floor(angle / TURN) if angle == angle else np.inf
@@ -63,9 +70,9 @@ def _edges(rows, row_ticks, last, found):
 
 @kernel
 def _crossing(y0, y1, m0, m1):
-    """Part of an interval at which the interpolant of values y and slopes m is 0, by Newton's method.
+    """Return the fraction of an interval at which the Hermite interpolant of values y and slopes m is 0.
 
-    Four rounds are enough: the angle is nearly straight over one row.
+    Four Newton iterations suffice, because the angle is nearly linear over one row interval.
     """
     s = -y0 / (y1 - y0)
     for _ in range(4):

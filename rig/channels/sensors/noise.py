@@ -1,8 +1,8 @@
-"""White noise: standard normal numbers drawn inside a kernel, from a stream of its own for every channel.
+"""White noise: standard normal numbers drawn within a kernel, from a separate stream for every channel.
 
-Numbers are those of numpy's `Generator(SFC64(...)).standard_normal()`: Doty-Humphrey's generator SFC64 and the ziggurat
-of Marsaglia and Tsang (J. Stat. Softw. 5(8), 2000) with 256 layers. Drawn where they are used, no sample has to pay
-for a store that is filled now and then.
+The numbers equal those of numpy's `Generator(SFC64(...)).standard_normal()`: Doty-Humphrey's generator SFC64 and the
+ziggurat of Marsaglia and Tsang (J. Stat. Softw. 5(8), 2000) with 256 layers. They are drawn where they are used, which
+avoids the latency of refilling a buffer.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ from rig.physics.kernels.stage import kernel
 
 _LAYERS = 256
 EDGE = 3.6541528853610088
-"""Where the lowest layer ends and the tail begins, ..."""
+"""Abscissa at which the lowest layer ends and the tail begins."""
 _AREA = EDGE * math.exp(-0.5 * EDGE * EDGE) + math.sqrt(0.5 * math.pi) * math.erfc(EDGE / math.sqrt(2.0))
-"""... and the area of every layer."""
+"""Area of every layer."""
 
 
 def _tables() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Per layer: integers below which a point is inside at once; width per integer; density at its edge."""
+    """Return, per layer: limit of integers accepted at once, width per integer, and density at its edge."""
     edges = np.empty(_LAYERS)
     density = np.empty(_LAYERS)
     inside = np.zeros(_LAYERS, dtype=np.uint64)
     x = edges[-1] = EDGE
     density[-1] = math.exp(-0.5 * x * x)
-    edges[0] = _AREA / density[-1]  # the lowest layer's width, were it a rectangle
+    edges[0] = _AREA / density[-1]  # width of a rectangle with the lowest layer's area
     density[0] = 1.0
     inside[0] = int(EDGE / edges[0] * 2.0**52)
     for layer in range(_LAYERS - 2, 0, -1):
@@ -48,7 +48,7 @@ _ELEVEN, _TURN, _BACK = np.uint64(11), np.uint64(24), np.uint64(40)
 
 
 def noise_streams(names: Sequence[str], seed: int) -> np.ndarray:
-    """Starts of the streams of these channels, keyed by seed and name, shape (channels, 4), uint64."""
+    """Return the initial streams of channels, keyed by seed and name, shape (channels, 4), uint64."""
     streams = np.empty((len(names), 4), dtype=np.uint64)
     for stream, name in zip(streams, names, strict=True):
         generator = np.random.SFC64(np.random.SeedSequence([seed, zlib.crc32(name.encode())]))
@@ -58,7 +58,7 @@ def noise_streams(names: Sequence[str], seed: int) -> np.ndarray:
 
 @kernel
 def _uniform(stream):
-    """A number in [0, 1); sums of unsigned integers wrap."""
+    """Return a number in [0, 1); sums of unsigned integers wrap."""
     a, b, c, count = stream[0], stream[1], stream[2], stream[3]
     bits = a + b + count
     stream[0], stream[1], stream[3] = b ^ (b >> _ELEVEN), c + (c << _THREE), count + _ONE
@@ -68,7 +68,7 @@ def _uniform(stream):
 
 @kernel
 def _near_edge(stream, layer, whole, x):
-    """Whether a point that may lie beyond the edge of its layer counts, and its place: 1 of 80 comes here."""
+    """Return whether a point near the edge of its layer is accepted, and its value; needed for 1 of 80 points."""
     if layer == 0:
         while True:
             beyond = -math.log1p(-_uniform(stream)) / EDGE
@@ -81,7 +81,7 @@ def _near_edge(stream, layer, whole, x):
 
 @kernel
 def draw(streams, out):
-    """The next numbers of every stream: normal, mean 0, variance 1.
+    """Draw the next numbers of every stream: normal, mean 0, variance 1.
 
     Args:
         streams: In and out, shape (channels, 4), uint64.
