@@ -66,7 +66,7 @@ class Stream:
         """Return this stream extended by its continuation in a later file."""
         sums = {
             name: getattr(self, name) + getattr(later, name)
-            for name in ("messages", "rows", "lost", "odd", "back", "off", "misplaced", "missing", "declared")
+            for name in ("messages", "rows", "lost", "invalid", "back", "off", "misplaced", "missing", "declared")
         }
         if not (self.rows and later.rows):
             return replace(self if self.rows else later, **sums, around=[*self.around, *later.around])

@@ -223,7 +223,7 @@ def test_the_counts_are_those_of_the_files_that_are_there(tmp_path, more):
     assert counted.rows == {key: stream.rows for key, stream in found.streams.items() if stream.rows}
     assert counted.first_time_ns == pytest.approx(1e9 * found.streams[PROBES].first_time_s)
     assert counted.gaps == len(found.gaps) > 0
-    assert counted.malformed == sum(stream.odd for stream in found.streams.values()) == (1 if more else 2)
+    assert counted.malformed == sum(stream.invalid for stream in found.streams.values()) == (1 if more else 2)
 
 
 def test_the_oldest_files_make_room_on_a_disk_of_which_nothing_is_to_be_left(tmp_path, monkeypatch):
