@@ -187,7 +187,7 @@ CONTRADICTIONS: dict[str, tuple[Spoil, str]] = {
     "gaps": (metadata("end", gaps="3"), "gaps: 3 in metadata end but 0 in recorder/gaps"),
     "lost rows": (metadata("end", lost_rows=json.dumps({PROBES: 7})), f"lost rows: {{'{PROBES}': 7}} in metadata end"),
     "missed": (more("recorder/gaps", MISSED), "missed messages: {} in metadata end but {'rig/sensors/probes': 7}"),
-    "gap that is none": (more("recorder/gaps", GAP), f"7 rows of {PROBES} from 1000 on: noted as missing, and they"),
+    "gap that is none": (more("recorder/gaps", GAP), f"7 rows of {PROBES} from 1000 on: noted as missing, but"),
     "gap not noted": (
         blocks(PROBES, lambda block, _: ({"values": block.values[:-7]}, 0), number=2),
         f"7 rows of {PROBES} from 1493 on: missing, and no gap is noted",

@@ -239,7 +239,7 @@ _LIES: dict[str, tuple[Callable[[Layout], object], str]] = {
     "middle": (lambda layout: _without(layout, {_of(layout)[1]}), f"20 rows of {PROBES} are missing"),
     "last": (lambda layout: _without(layout, {_of(layout)[-1]}), f"20 rows of {PROBES} are missing"),
     "all": (lambda layout: _without(layout, set(_of(layout))), f"60 rows of {PROBES} are missing"),
-    "undecodable": (lambda layout: _odd(layout, _of(layout)[0]), "are no blocks, or do not fit the catalogue: 1"),
+    "undecodable": (lambda layout: _odd(layout, _of(layout)[0]), "are not blocks or do not fit the catalogue: 1"),
     "twice": (
         lambda layout: layout.messages.insert(0, layout.messages[_of(layout)[0]]),
         f"blocks of {PROBES} with repeated or decreasing row numbers: 1",

@@ -239,9 +239,9 @@ def test_a_busy_viewer_is_asked_again_and_given_up_in_one_line(tmp_path: Path, m
     with Window("web", tell=said.append) as shown:
         shown.picture(tmp_path / "busy.png", at_s=1.0, end_s=2.0)
         assert (tmp_path / "busy.png").read_bytes() == BusyViewer.picture
-        assert said[-1].startswith("waiting for the viewer since ")
-        monkeypatch.setattr(window, "_LOADED_S", 0.3)
-        with pytest.raises(WindowError, match="did not load the recording and answer within"):
+        assert said[-1].startswith("waiting for the viewer for ")
+        monkeypatch.setattr(window, "_REPLY_TIMEOUT_S", 0.3)
+        with pytest.raises(WindowError, match="did not load the recording within"):
             shown.picture(tmp_path / "never.png", at_s=1.0, end_s=3.0)
     assert not (tmp_path / "never.png").exists()
 

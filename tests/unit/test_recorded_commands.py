@@ -20,7 +20,7 @@ COMMAND = {"event": "command", "tick": 20_000, "time_s": 0.02, "id": 1, "command
 DOUBTS = {
     "a huge duration": ({**COMMAND, "request": {**FAULT, "for_s": 1e308}}, "for_s must be"),
     "a negative duration": ({**COMMAND, "request": {**FAULT, "for_s": -1.0}}, "for_s must be"),
-    "an effect of a huge duration": ({**COMMAND, **FAULT, "event": "fault", "for_s": 1e308}, "neither the scene nor"),
+    "an effect of a huge duration": ({**COMMAND, **FAULT, "event": "fault", "for_s": 1e308}, "without a scene entry"),
     "an unknown command": ({**COMMAND, "command": "sped", "request": {}}, "command must be one of"),
     "a number as text": ({**COMMAND, "command": "speed", "request": {"speed_hz": "5"}}, "speed_hz must be"),
     "a force below 0": ({**COMMAND, "command": "hammer", "request": {"force_n": -5.0}}, "force_n must be"),

@@ -326,7 +326,7 @@ def test_a_cut_knows_the_commands_before_it(tmp_path, items):
     [
         ({"from_s": 2.0, "to_s": 1.0}, "from and to must be times in ascending order"),
         ({"from_s": float("nan")}, "from and to must be times"),
-        ({"from_s": 50.0}, "from and to must be times that the recording holds"),
+        ({"from_s": 50.0}, "from and to must be an interval with rows of the recording"),
         ({"channels": ("disk_z",)}, "channels must be among disk_x"),
     ],
 )
