@@ -235,7 +235,7 @@ class BusyViewer:
 def test_a_busy_viewer_is_asked_again_and_given_up_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(window, "ViewerClient", BusyViewer)
     said: list[str] = []
-    monkeypatch.setattr(window, "_TOLD_S", 0.0)
+    monkeypatch.setattr(window, "_MESSAGE_INTERVAL_S", 0.0)
     with Window("web", tell=said.append) as shown:
         shown.picture(tmp_path / "busy.png", at_s=1.0, end_s=2.0)
         assert (tmp_path / "busy.png").read_bytes() == BusyViewer.picture

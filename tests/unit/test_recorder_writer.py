@@ -182,8 +182,8 @@ def test_history_that_comes_key_by_key_is_joined(tmp_path, path, items):
 
 
 def test_groups_that_never_come_do_not_hold_up_the_others_for_ever(monkeypatch):
-    monkeypatch.setattr("recorder.contents.views._PATIENCE", 3)
-    monkeypatch.setattr("recorder.contents.views._BATCH", 1)
+    monkeypatch.setattr("recorder.contents.views._MAX_WAITING_INSTANTS", 3)
+    monkeypatch.setattr("recorder.contents.views._BATCH_INSTANTS", 1)
     table = default_table()
     views = Views(table, rate_hz=500.0)
     counts = []

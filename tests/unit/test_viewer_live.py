@@ -219,7 +219,7 @@ def test_a_window_that_takes_nothing_is_not_drawn_for(
     recording: Synthetic, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(Canvas, "keeps_up", lambda self, *, timeout_s: False)
-    monkeypatch.setattr(live, "_CHECK_S", 0.0)
+    monkeypatch.setattr(live, "_CHECK_INTERVAL_S", 0.0)
     blocks = list(stream_of(recording))
     early = [message for block in blocks[:10] for message in block]
     late = [message for block in blocks[10:] for message in block]
