@@ -28,7 +28,7 @@ from rig.base.errors import InputError, Words
 from rig.serve.waiting import Deadline
 
 Kind = Literal["native", "web", "headless"]
-_Reply = TypeVar("_Answer")
+_Reply = TypeVar("_Reply")
 _NO_REPLY = (ConnectionError, TimeoutError, RuntimeError)
 """Exceptions of rerun for a viewer that is absent, not ready or busy."""
 
