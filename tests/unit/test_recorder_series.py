@@ -330,7 +330,7 @@ def test_a_removed_folder_leaves_a_copy_in_the_nearest_one(tmp_path, items):
     for each in folder.iterdir():
         each.unlink()
     folder.rmdir()
-    with pytest.raises(RecordingError, match=r"was removed while it was being written.*is kept in .*run\.mcap\.part"):
+    with pytest.raises(RecordingError, match=r"was removed while it was being written.*are kept in .*run\.mcap\.part"):
         write(file, items[200:])
     copy = tmp_path / "run.mcap.part"
     assert file.part == copy

@@ -386,7 +386,7 @@ def test_a_rig_that_is_back_with_the_same_run_is_recorded_on_and_the_gap_is_told
     assert recording.streams[PROBES].rows + summary.lost[PROBES] == 8000
     assert summary.lost[PROBES] > 0
     assert recording.streams[PROBES].lost == summary.lost[PROBES]
-    assert any("is back" in remark for remark in summary.remarks)
+    assert any("restored" in remark for remark in summary.remarks)
 
 
 def test_a_lost_rig_closes_the_file_well(path):
@@ -572,7 +572,7 @@ def test_without_a_trigger_nothing_is_counted_as_recorded(path):
 
 
 def test_rotation_and_triggers_together_are_refused_by_name(path):
-    with pytest.raises(InputError, match=r"^rotate_mb must be left out .* around triggers; instead received 5\.0$"):
+    with pytest.raises(InputError, match=r"^rotate_mb must be omitted .* around triggers; instead received 5\.0$"):
         RecordingSession(
             ScriptedClient(), path, capture=Capture((Trigger.parse("hammer"),)), limits=Limits(rotate_mb=5.0)
         )
