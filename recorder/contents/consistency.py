@@ -115,7 +115,7 @@ class ConsistencyCheck:
             if len(_distinct_values(places)) > 1
         ]
         found += [
-            f"messages of {key} whose time differs from the time in them: {n}" for key, n in self._mistimed.items() if n
+            f"messages of {key} whose time differs from their content: {n}" for key, n in self._mistimed.items() if n
         ]
         return [*found, *self._findings]
 

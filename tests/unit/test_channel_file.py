@@ -279,7 +279,7 @@ def test_a_wrong_table_is_one_line_that_names_channel_and_field(what: str, tmp_p
 
 
 INLINE = {
-    "group.name": ({"groups": {"g/../*": {"name": "g/../*"}}}, "a name of letters"),
+    "group.name": ({"groups": {"g/../*": {"name": "g/../*"}}}, "a name of at most 28 letters"),
     "rate": ({"groups": {"g": {"rate_hz": 10**9}}}, "groups.g.rate_hz must be from 1 to 1000000"),
     "channel rate": ({"groups": {"g": {"channels": {"rate_hz": 2000}}}}, "channel a.rate_hz must be that of its group"),
     "bandwidth": ({"groups": {"g": {"channels": {"bandwidth_hz": 1e9}}}}, "channel a.bandwidth_hz must be at most"),
