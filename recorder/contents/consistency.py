@@ -114,9 +114,7 @@ class ConsistencyCheck:
             for what, places in self._values.items()
             if len(_distinct_values(places)) > 1
         ]
-        found += [
-            f"messages of {key} whose time differs from their content: {n}" for key, n in self._mistimed.items() if n
-        ]
+        found += [f"messages of {key} with contradictory times: {n}" for key, n in self._mistimed.items() if n]
         return [*found, *self._findings]
 
     def _state(self, what: str, **places: Any) -> None:

@@ -172,7 +172,7 @@ CONTRADICTIONS: dict[str, tuple[Spoil, str]] = {
         ),
         "command 1: request: {'force_n': 60.0} in scene.json, taken but {'force_n': 50.0} in rig/events",
     ),
-    "time of an event": (event("hammer", time_s=0.03), f"{EVENTS} whose time differs from their content: 1"),
+    "time of an event": (event("hammer", time_s=0.03), f"{EVENTS} with contradictory times: 1"),
     "two starts": (more(EVENTS, {"event": "start", "tick": 0}), "more than one start of the run among the events"),
     "end, metadata": (event("end", reason="stopped"), "end: completed in metadata end but stopped in rig/events"),
     "end, none": (event("end"), "end: completed in metadata end but no end of the run in rig/events"),
@@ -194,7 +194,7 @@ CONTRADICTIONS: dict[str, tuple[Spoil, str]] = {
     ),
     "time of a block": (
         blocks(FORCES, lambda block, _: ({"tick": block.tick + 5000}, 0), number=2),
-        f"messages of {FORCES} whose time differs from their content: 1",
+        f"messages of {FORCES} with contradictory times: 1",
     ),
     "time and row number": (
         blocks(FORCES, lambda block, _: ({"tick": block.tick + 5000}, 5_000_000), number=2),
