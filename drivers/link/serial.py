@@ -71,7 +71,7 @@ class SerialLink:
                 with self._errors(), contextlib.suppress(BlockingIOError):
                     data = os.read(self._descriptor, _READ_BYTES)
                     if not data:
-                        raise LinkClosedError("the other end of the line has gone")
+                        raise LinkClosedError("the other end of the line was closed")
                     self._messages = self._deframer.feed(data)
             return self._messages.pop(0)
 
@@ -86,7 +86,7 @@ class SerialLink:
             raise LinkClosedError("the line is closed")
         state = ready.get(self._descriptor, 0)
         if state & (select.POLLERR | select.POLLNVAL) or (state & select.POLLHUP and not state & event):
-            raise LinkClosedError("the other end of the line has gone")
+            raise LinkClosedError("the other end of the line was closed")
         if not state:
             raise LinkTimeoutError(text)
 
@@ -97,7 +97,7 @@ class SerialLink:
         except LinkClosedError:
             raise
         except OSError as error:
-            raise LinkClosedError(f"the line has gone: {error.strerror}") from None
+            raise LinkClosedError(f"the line failed: {error.strerror}") from None
 
     def close(self) -> None:
         """Close the line, after waking the threads that send or receive."""

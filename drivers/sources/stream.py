@@ -21,7 +21,7 @@ from rig.serve.transport import Client, NoReplyError
 
 GRACE_S = 2.0
 """Silence that ends a stream after an end event without row counts, and longest absence of the rig [s]."""
-RIG_GONE = "the rig has gone"
+RIG_GONE = "the link to the rig is lost"
 
 
 def decimation_factor(native_hz: float, rate_hz: float) -> int:

@@ -65,7 +65,7 @@ class RecordingFile:
         self.path = path
         with self._open() as file:
             if file.read(len(MAGIC)) != MAGIC:
-                raise InputError("file", _MUST_BE_RECORDING, Words(f"{path}, which is no MCAP file"))
+                raise InputError("file", _MUST_BE_RECORDING, Words(f"{path}, which is not an MCAP file"))
             found = read_contents(file, path.stat().st_size, salvage=salvage, in_part=in_part)
             self._take_metadata(found.metadata, found.attachments.get(COPY), salvage=salvage)
         self.complete, self.unchecked = found.complete, found.unchecked

@@ -262,7 +262,7 @@ class LiveView:
         every_s, behind_s = max(pace.every_s, pace.interval_s), pace.behind_s(now_s)
         state = "viewer loading" if pace.looked_at else "no viewer open"
         if behind_s is not None:
-            state = f"viewer {behind_s:.1f} s behind"
+            state = f"viewer late by {behind_s:.1f} s"
         points = min(ROWS_PER_S, MAX_POINTS / max(every_s, CURVE_INTERVAL_S))
         rates = f"{1 / every_s:.1f} of {1 / MIN_INTERVAL_S:.0f} pictures/s, {points:.0f} of {ROWS_PER_S:.0f} points/s"
         tell(f"{state}, {rates}; {self.waits_s:.2f} s here")

@@ -121,7 +121,7 @@ class Trial:
         late = 0 if self.bench is None else self.bench.late_blocks()
         if not late:
             return MeasurementError(line)
-        return LateRigError(f"not judged because the rig fell behind real time in {late} blocks (use lockstep): {line}")
+        return LateRigError(f"not judged because the rig was late in {late} blocks (use lockstep): {line}")
 
     def mask_addresses(self, text: str) -> str:
         """Replace the folders, ports and names of this run in a text, so that every run gives the same text."""

@@ -197,7 +197,7 @@ class Player(ServedRun):
         warnings += [f"recorded: {text}" for text in self._outlet.recorded_status.get("warnings", [])]
         if behind_s := self._playhead.behind_s:
             warnings.append(
-                f"x{self._playhead.rate:g} is faster than this machine and its clients: {behind_s:.1f} s behind"
+                f"x{self._playhead.rate:g} is faster than this machine and its clients: late by {behind_s:.1f} s"
             )
         if self._held is not None and (held_s := time.monotonic() - self._held[1]) > _MIN_WAIT_REPORTED_S:
             warnings.append(f"has waited {held_s:.0f} s for client {self._held[0]} to receive the data")

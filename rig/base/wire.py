@@ -157,7 +157,7 @@ def decode_block(payload: bytes, schema: str) -> Block:
     dtype = _DTYPES[schema]
     start = len(_ENCAPSULATION) + _HEAD.size
     if len(payload) < start or payload[:4] != _ENCAPSULATION:
-        raise ValueError(f"payload must be a {schema} message; instead received {len(payload)} bytes that are none")
+        raise ValueError(f"payload must be a {schema} message; instead received {len(payload)} other bytes")
     tick, index, rate_hz, tick_rate_hz, columns, size = _HEAD.unpack_from(payload, len(_ENCAPSULATION))
     if columns == 0 or size % columns or len(payload) != start + size * dtype.itemsize:
         raise ValueError(

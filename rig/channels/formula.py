@@ -129,7 +129,7 @@ class Formulas(Grammar):
     def name(self, name: str, field: str) -> Part:
         """Return a signal of the model."""
         if name not in COLUMN:
-            raise UnknownNameError(field, "made of the model's signals", name, [*COLUMN, *self.functions()])
+            raise UnknownNameError(field, "a formula with signals of the model", name, [*COLUMN, *self.functions()])
         column = COLUMN[name]
         return lambda rows: rows[:, column]
 
@@ -137,7 +137,7 @@ class Formulas(Grammar):
         """Return the value of a parameter."""
         name = f"{table}.{key}"
         if name not in self._parameters:
-            raise UnknownNameError(field, "made of the parameters that are numbers", name, self._parameters)
+            raise UnknownNameError(field, "a formula with numeric parameters", name, self._parameters)
         return np.float64(self._parameters[name])
 
     def functions(self) -> Mapping[str, int]:

@@ -375,7 +375,7 @@ def _check_rate(signal: Signal, channel: Channel, field: str) -> None:
         most = channel.rate_hz / (1.0 if signal.kind == "prbs" else 2.0)
         if highest > most or (highest == most and signal.kind != "prbs"):
             must = f"at most {most:g} Hz" if signal.kind == "prbs" else f"below {most:g} Hz, half of the rate"
-            raise InputError(f"{field}.{name}", f"{must} of {channel.name}, before whose converter is no filter", value)
+            raise InputError(f"{field}.{name}", f"{must} of {channel.name}, whose converter has no filter", value)
 
 
 def _frequency(source: Source) -> Fraction:

@@ -140,7 +140,7 @@ class ChannelTable(BaseModel, frozen=True, extra="forbid"):
             name = next(name for name in names if names.count(name) > 1)
             raise InputError(f"channel {name}", "in the table once", names.count(name))
         if any(name != group.name or not name for name, group in self.groups.items()):
-            raise ValueError("each group must stand under its own name")
+            raise ValueError("the key of each group must be its name")
         return self
 
     @property

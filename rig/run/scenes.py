@@ -165,7 +165,7 @@ class Scene(Written):
             fields = {"commands": commands, "drive.profile": self.drive.profile, "engine.limits": limits}
             for name, given in fields.items():
                 if given:
-                    raise InputError(name, "left out with a [generator], which stands for the physics", Words("some"))
+                    raise InputError(name, "left out with a [generator], which replaces the physics", Words("some"))
             if self.fidelity == "auto":
                 raise InputError("fidelity", '"given" with a [generator], which has no model', "auto")
             self.sources()

@@ -263,7 +263,7 @@ class Simulation:
         """
         command, self.told = check_command(name, request), {}
         if command.MECHANICAL and self.scene.generator is not None:
-            raise InputError(name, "left out: signals of a [generator] stand for the physics", Words("a command to it"))
+            raise InputError(name, "left out: signals of a [generator] replace the physics", Words("a command to it"))
         if not command.is_carried_out():
             raise command.refusal()
         self.told = command.check(self, [other for tick, other in self.pending if tick <= self.tick])
@@ -304,7 +304,7 @@ class Simulation:
         # If little is dissipated, the ledger must account for the stored energy.
         turned_over = max(dissipated, abs(float(balance["stored"][0])), 1e-6)
         if abs(residual) > self._method.energy * turned_over:
-            text = f"energy residual {residual:.2e} J is above {self._method.energy:g} of what was turned over"
+            text = f"energy residual {residual:.2e} J is above {self._method.energy:g} of the converted energy"
             if abs(residual) > BRANCH_ALARM * turned_over and memory[CONTACTS] > 1:
                 text += "; after contacts, a wrong branch is suspected"
             warnings.append(text)

@@ -158,7 +158,7 @@ class Devices:
     def _joined(self, command: str, name: str) -> _Device:
         device = self._devices.get(name)
         if device is None or device.lost is not None:
-            why = "" if device is None else f" (it was put out: {device.lost})"
+            why = "" if device is None else f" (it was removed: {device.lost})"
             raise InputError(f"{command}.device", f"one that has joined{why}", name)
         return device
 

@@ -314,7 +314,7 @@ class Intake:
 
     def _refuse_step(self, waiting: Taken) -> None:
         due = self.next[waiting.key]
-        why = f"row {waiting.block.index} came where row {due} was due, and nothing went on from it"
+        why = f"row {waiting.block.index} came where row {due} was due, and no block continued from it"
         self._refuse(waiting.key, why, waiting)
 
     def _refuse(self, key: str, why: str, block: Taken | None = None) -> list[Taken]:

@@ -518,7 +518,7 @@ def test_a_hub_that_ends_is_told_to_those_who_send(rig: Rig) -> None:
     if rig.server is not None:
         rig.server.close()
     until(lambda: bus.state is BusState.ERROR)
-    with pytest.raises(can.CanOperationError, match=r"the hub of CAN channel can0 .* has gone: nothing can be sent"):
+    with pytest.raises(can.CanOperationError, match=r"the hub of CAN channel can0 .* is lost: nothing can be sent"):
         bus.send(message())
     assert waiting.recv(0.01) is None
 

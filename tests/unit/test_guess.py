@@ -286,7 +286,7 @@ def test_a_log_is_imported_in_one_step(tmp_path: Path, capsys: pytest.CaptureFix
     assert {one["signal"]: one["channel"] for one in found}["Kraft O"] == "P_E"
     printed = shown(capsys, "import", path, "-o", tmp_path / "g.mcap")
     assert "imported by the guess" in printed
-    assert "guessed and not told: [defaults] bandwidth_hz" in printed
+    assert "assumed, not in the mapping: [defaults] bandwidth_hz" in printed
     assert len(Recording.open(tmp_path / "g.mcap").table.channels) == 13
 
 

@@ -105,7 +105,7 @@ def test_a_device_that_hangs_is_put_out_and_the_rig_goes_on_with_the_others() ->
             "well": ("joined", None),
             "ill": ("lost", reason),
         }
-        with pytest.raises(RefusedError, match=rf"one that has joined \(it was put out: {reason}\)"):
+        with pytest.raises(RefusedError, match=rf"one that has joined \(it was removed: {reason}\)"):
             ill.done(BLOCK)
         assert ill.join().tick == 2 * BLOCK, "it may come again"
         ill.leave()

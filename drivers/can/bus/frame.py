@@ -78,7 +78,7 @@ def _find_faults(word: Any, length: Any, flags: Any, room: Any, *, fd: bool) -> 
     if not fd:
         yield is_fd, "a CAN FD frame, on a bus for classic CAN"
     yield is_fd & (word & REMOTE != 0), "a remote frame, which CAN FD does not have"
-    yield is_fd & _IS_NO_FD_LENGTH[length], "{length} bytes, which is no CAN FD length"
+    yield is_fd & _IS_NO_FD_LENGTH[length], "{length} bytes, which is not a CAN FD length"
     yield (
         classic & (flags & (BRS | ESI) != 0),
         "a bit rate switch or error state indicator, which classic CAN does not have",

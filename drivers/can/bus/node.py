@@ -299,7 +299,7 @@ class NodeBus(can.BusABC):
             while True:
                 self._check_open()
                 if not self._there:
-                    raise can.CanOperationError(f"{self._where()} has gone: nothing can be sent")
+                    raise can.CanOperationError(f"the link to {self._where()} is lost: nothing can be sent")
                 if self._listen_only:
                     raise can.CanOperationError(f"this node of {self.channel} only listens: nothing can be sent")
                 if self._report.state == 2:

@@ -149,13 +149,13 @@ class ExpectSignal(_Signal, _Within):
         """
         unit = self.unit(units, where=where)
         if (self.take in _TIMES) != bool(self.beyond):
-            must = "given for" if self.take in _TIMES else "left out, but for the times"
+            must = "given for" if self.take in _TIMES else "left out, except for the times"
             raise InputError(f"{where}.beyond", f"{must} {', '.join(_TIMES)}", self.beyond or None)
         if self.beyond:
             quantity(self.beyond, unit, field=f"{where}.beyond", of=_name(self.names))
             unit = "s"
         if (self.take == "value") != (self.at_s is not None):
-            must = "given where take is value" if self.at_s is None else "left out, but where take is value"
+            must = "given where take is value" if self.at_s is None else "left out, unless take is value"
             raise InputError(f"{where}.at_s", must, self.at_s)
         if self.take == "whirl frequency":
             if len(self.names) != 2:
@@ -163,7 +163,7 @@ class ExpectSignal(_Signal, _Within):
             unit = "Hz"
         if self.since is not None:
             if self.take not in ("first beyond", "last beyond"):
-                raise InputError(f"{where}.since", "left out, but where take is first beyond or last beyond", self.take)
+                raise InputError(f"{where}.since", "left out, unless take is first beyond or last beyond", self.take)
             self.since.check(units, where=f"{where}.since")
         return parse_limit(self.must, unit, where=where, of=self.label)
 

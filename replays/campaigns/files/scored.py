@@ -60,7 +60,7 @@ class ExpectScore(Expected):
         load_limits(self.limits)
         for name, usual in (("begins_s", 0.0), ("ends_s", 0.0), ("every", 1)):
             if self.score != "all" and getattr(self, name) != usual:
-                raise InputError(f"{where}.{name}", "left out, but where score is all", getattr(self, name))
+                raise InputError(f"{where}.{name}", "left out, unless score is all", getattr(self, name))
         for name in self.channels or ():
             if name not in units[""]:
                 raise UnknownNameError(f"{where}.channels", "channels that the rig sends", name, units[""])

@@ -42,7 +42,7 @@ def fitted_set(found: Identification, *, recording: str) -> str:
             continue
         unit = "" if entry.unit == "1" else f" {entry.unit}"
         interval = f"95 % interval +-{finding.half_width:.3g}{unit}" if math.isfinite(finding.half_width) else ""
-        interval = interval or f"no interval of its own, {finding.words}"
+        interval = interval or f"no separate interval, {finding.words}"
         source = f"rig identify, {recording}, {span}: {interval}"
         lines += _entry(key, entry, value=finding.value, kind="fitted", source=source)
     other = [finding for key, finding in fitted.items() if key not in before]

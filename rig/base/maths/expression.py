@@ -99,7 +99,7 @@ class Grammar:
             UnknownNameError: The name is unknown.
         """
         if name not in self._variables:
-            raise UnknownNameError(field, f"made of {self.made_of}", name, [*self._variables, *FUNCTIONS])
+            raise UnknownNameError(field, f"a formula with {self.made_of}", name, [*self._variables, *FUNCTIONS])
         return lambda given: given[name]
 
     def member(self, table: str, key: str, field: str) -> Part:
@@ -108,7 +108,7 @@ class Grammar:
         Raises:
             InputError: The name is unknown.
         """
-        raise InputError(field, f"made of {self.made_of}", f"{table}.{key}")
+        raise InputError(field, f"a formula with {self.made_of}", f"{table}.{key}")
 
     def functions(self) -> Mapping[str, int]:
         """Return the number of arguments of each function."""
@@ -133,7 +133,7 @@ class Grammar:
                 pass
             case ast.Constant(value=int() | float() as value):
                 if abs(value) >= _MAX_NUMBER:
-                    raise InputError(field, f"made of numbers below {_MAX_NUMBER:g}", text[:60])
+                    raise InputError(field, f"a formula with numbers below {_MAX_NUMBER:g}", text[:60])
                 return np.float64(value)
             case ast.Name(id="pi"):
                 return math.pi
@@ -148,11 +148,11 @@ class Grammar:
             case ast.Call(func=ast.Name(id=name), args=args, keywords=[]):
                 known = self.functions()
                 if name not in known:
-                    raise UnknownNameError(field, "made of the functions", name, known)
+                    raise UnknownNameError(field, "a formula with the functions", name, known)
                 if len(args) != known[name]:
                     raise InputError(field, f"{name} of {known[name]} argument{'s' * (known[name] > 1)}", len(args))
                 return self.call(name, [inner(each) for each in args], field)
-        raise InputError(field, f"made of {self.made_of}", text[:60])
+        raise InputError(field, f"a formula with {self.made_of}", text[:60])
 
 
 def value_of(part: Part, **variables: float) -> float:

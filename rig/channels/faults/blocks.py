@@ -142,7 +142,7 @@ class StaleStamps(OfBlocks, number=35):
 
     @classmethod
     def needs_at(cls, door: str, group: str, groups: tuple[str, ...]) -> str:
-        away = f"{groups[0]}, whose time Sync tells, for {cls.name()} on CAN (dropout is for all)"
+        away = f"{groups[0]}, whose time is in Sync, for {cls.name()} on CAN (dropout supports all)"
         return away if door == "can" and group != groups[0] else ""
 
     def sent(self, message: Message, u: float, first: tuple[int, int]) -> list[Message]:

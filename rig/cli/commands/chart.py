@@ -48,7 +48,7 @@ def chart(
     if quick and full:
         raise InputError("--quick, --full", "one of the two", Words("both"))
     if sum((bool(add), problem is not None, any((quick, full, only, panel, no_peers, fresh, draw)))) > 1:
-        raise InputError("--add or --problem", "the only option besides --output", Words("more options"))
+        raise InputError("--add or --problem", "the only option except --output", Words("more options"))
     if problem is not None:
         echo(str(write_problem(problem, output)))
         return

@@ -69,7 +69,7 @@ def demo(
     if verdict.remark:
         console.print(Text(verdict.remark, "yellow"))
     say(f"verdict: {'pass' if verdict.good else 'fail'}")
-    echo(f"\nrecording   {file}\npicture     {picture}\nlook at it  rig view {file}   (or: rerun {file})")
+    echo(f"\nrecording   {file}\npicture     {picture}\nview        rig view {file}   (or: rerun {file})")
     if not verdict.good:
         raise typer.Exit(1)
 

@@ -88,7 +88,7 @@ def _import(files: list[Path], mapping: Path | str, output: Path, *, force: bool
     with reporting() as reporter:
         try:
             doubts = (
-                [f"guessed and not told: {question}" for question in _asked(mapping)]
+                [f"assumed, not in the mapping: {question}" for question in _asked(mapping)]
                 if isinstance(mapping, str)
                 else []
             )

@@ -43,7 +43,7 @@ def params(name: SetName = "corrected", *, changes: Changes = None, form: Form) 
     )
     if derived["contact_fit_error"]:
         console.print(
-            f"K and n stand for the contact's stiffness law within {derived['contact_fit_error']:.1%} of its force "
+            f"K and n fit the contact's stiffness law within {derived['contact_fit_error']:.1%} of its force "
             "(see `rig laws`)",
         )
     console.print(f"sets: {', '.join(set_names())}")

@@ -173,7 +173,7 @@ def _words(status: dict[str, Any]) -> list[str]:
     else:
         pace = "paused" if play["paused"] else f"x{play['achieved_rate']:.4f}"
     if play["behind_s"]:
-        pace += f" of x{play['rate']:g}, behind by {play['behind_s']:.1f} s"
+        pace += f" of x{play['rate']:g}, late by {play['behind_s']:.1f} s"
     words = [f"{status['time_s']:7.2f} of {status['end_s']:.2f} s", pace, lateness_text(status)]
     if play["passes"] != 1:
         words.append(f"pass {play['pass']}" + (f" of {play['passes']}" if play["passes"] else ""))
@@ -194,6 +194,6 @@ def _tell(summary: dict[str, Any]) -> None:
         echo(f"{lateness_summary(summary)}, overruns {summary['overruns']}")
         if play["behind_s"]:
             echo(
-                f"warning: the replay ended {play['behind_s']:.1f} s behind; for full speed use --burst",
+                f"warning: the replay ended {play['behind_s']:.1f} s late; for full speed use --burst",
                 err=True,
             )

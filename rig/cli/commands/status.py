@@ -147,7 +147,7 @@ def status_table(document: dict[str, Any]) -> Table:
         rows.append(("CAN", ", ".join(shares)))
     for device in document.get("devices", ()):
         reason = f": {device['reason']}" if device["reason"] else f", finished tick {device['tick']}"
-        reason += f", behind for {behind:.1f} s" if (behind := device["behind_s"]) else ""
+        reason += f", late for {behind:.1f} s" if (behind := device["behind_s"]) else ""
         rows.append((f"device {device['name']}", f"{device['state']}{reason}"))
     for name, client in document["clients"].items():
         text = f"lag {client['lag_s']:.3f} s, last message {client['last_heard_s']:.1f} s ago, lost {client['lost']}"

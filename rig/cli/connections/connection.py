@@ -115,7 +115,7 @@ class Serving:
         None
     )
     plaintext: Annotated[
-        bool, _exposure("Instead of --tls: no encryption, full access for everybody", "--plaintext")
+        bool, _exposure("Instead of --tls: no encryption, full access for every client", "--plaintext")
     ] = False
 
     def check(self) -> None:
@@ -216,7 +216,7 @@ def print_addresses(server: ZenohServer, exposed: Exposure | None, name: str | N
         echo(f"rig: certificate of the rig: {own}", err=True)
     elif exposed is not None:
         doors = ", ".join(door.what for door in (*ROLES["operator"], TRUTH))
-        echo(f"rig: WARNING: {exposed.endpoint} is open to everybody, unencrypted:", err=True)
+        echo(f"rig: WARNING: {exposed.endpoint} is open to every client, unencrypted:", err=True)
         echo(f"rig: WARNING: {doors}", err=True)
     called = "" if name is None else f" as {name}"
     echo(f"rig: listening on {server.endpoint}{called}; Ctrl-C or `rig stop` ends it", err=True)

@@ -182,7 +182,9 @@ class ZenohServer(Closing):
         """Receive the clients' reports on matching keys."""
         subscriber = self._session.session.declare_subscriber(key, fifo())
         self._declared.append(subscriber)
-        self._session.drain(subscriber, lambda x: callback(str(x.key_expr), x.payload.to_bytes()), f"hears {key}")
+        self._session.drain(
+            subscriber, lambda x: callback(str(x.key_expr), x.payload.to_bytes()), f"subscriber of {key}"
+        )
 
     def announce(self, key: str = wire.ALIVE) -> None:
         """Publish the rig's token, or another; it disappears when this process ends for any reason."""
@@ -448,7 +450,7 @@ class ZenohClient(Closing):
                 if (text := payload_back.decode(errors="replace")) != "Timeout":
                     raise NoReplyError(f"the rig at {self.endpoint} could not answer {key}: {text}")
             if asked and not asked & self._linked():
-                raise NoReplyError(f"the rig at {self.endpoint} has gone, and has not answered {key}")
+                raise NoReplyError(f"the link to the rig at {self.endpoint} was lost before the reply to {key}")
             # Without a rig the reply is empty at once; the rig may be about to start. A denied request looks the same.
             late = (deadline if self._linked() else sooner).left_s <= _RETRY_S
             role = None if self._holder is None else self._holder.name

@@ -212,7 +212,9 @@ class Outlet:
     def _enter(self, bus: can.BusABC) -> None:
         """Receive from a bus from now on; it is shut down with the client."""
         self.bus = bus
-        self._receiver = threading.Thread(target=self._receive, args=(bus,), name=f"{self._name} hears", daemon=True)
+        self._receiver = threading.Thread(
+            target=self._receive, args=(bus,), name=f"receiver of {self._name}", daemon=True
+        )
         self._receiver.start()
 
     def _leave(self) -> None:
