@@ -40,7 +40,7 @@ WITHOUT_ENGINE = (
     "tests/house/test_contracts.py",
 )
 """Modules that compile no engine, 28 s of processor time. Rigs started during this time would also compile theirs."""
-LONGEST = (
+LONG_MODULES = (
     "tests/unit/test_score_track.py",
     "tests/unit/test_nuisance.py",
     "tests/unit/test_score.py",
@@ -107,20 +107,18 @@ def _place(nodeid: str) -> tuple[int, int]:
         return 3, WITHOUT_ENGINE.index(module)
     if _queue(module) == "rigs":
         return 4, 0
-    if module in LONGEST:
-        return 5, LONGEST.index(module)
+    if module in LONG_MODULES:
+        return 5, LONG_MODULES.index(module)
     return 6, 0
 
 
 def pytest_configure(config: pytest.Config) -> None:
     # Tests start hundreds of programs. Without stored bytecode each compiles 300 files again: 0.6 s of processor time.
-    # Only
-    # with workers, that is for the whole suite: the programs of `tests/mutants.py` need it off.
+    # Only with workers, that is for the whole suite: the programs of `tests/mutants.py` need it off.
     if getattr(config.option, "numprocesses", None):
         os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
     # One cache for all processes that tests start. Without it, a program that uses the bus only would keep its machine
-    # code
-    # elsewhere and compile for another 25 s.
+    # code elsewhere and compile for another 25 s.
     os.environ.setdefault("NUMBA_CACHE_DIR", str(numba.config.CACHE_DIR))
     # A shell that starts the tests in the background may have signals ignored, and child processes would inherit that.
     for number, usual in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL)):

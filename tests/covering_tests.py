@@ -34,7 +34,7 @@ _TURN_S = 2.0
 """Processor time of the tests of one file before the next file has its turn [s]."""
 
 Record = dict[str, dict[str, Any]]
-"""By test id: `cpu_s`, processor time [s], and `lines`, the lines that the test executes, by file."""
+"""`cpu_s`, processor time [s], and `lines`, the lines that the test executes, by file; for each test id."""
 
 
 class _Loader(SourceFileLoader):

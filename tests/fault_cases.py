@@ -17,7 +17,7 @@ NUMBERED = (
     "spikes", "bits", "stuck-bit", "clip", "freeze", "miss-pulses", "extra-pulses", "edge-jitter", "dropout",
     "lose-blocks", "duplicate-blocks", "reorder-blocks", "late-blocks", "stale-stamps", "restart",
 )  # fmt: skip
-"""Kinds with the numbers from 1 on CAN, which never change: other people's DBC files hold them. New kinds follow."""
+"""Kinds numbered from 1 on CAN; the numbers never change, because users' DBC files contain them. New kinds follow."""
 EXAMPLES: dict[str, dict[str, Any]] = {
     "gain": {"factor": 1.1}, "offset": {"value": 0.05}, "drift": {"rate": 5.0}, "polarity": {}, "stuck": {},
     "nonlinear": {"end": 0.01}, "open": {"level_v": 1.0}, "short": {}, "intermittent": {"part": 0.5, "slot_s": 0.002},

@@ -23,7 +23,7 @@ def missing_in_generated_files() -> Iterator[str]:
         ("rig/KEYS.md", keys, ("keys", "--markdown"), "rig keys --markdown > rig/KEYS.md"),
         ("drivers/can/rig.dbc", dbc.COPY, ("can", "dbc"), "rig can dbc -o drivers/can/rig.dbc"),
     ):
-        # Another process has the rig's own channel table, and not that of the tests.
+        # Another process uses the rig's own channel table, not that of the tests.
         made = subprocess.run([sys.executable, "-m", "rig", *arguments], capture_output=True, check=True)
         text, committed = made.stdout.decode(), path.read_text(encoding="utf-8")
         if committed == text:

@@ -67,7 +67,7 @@ _TURNED = {
     ast.Lt: ">=", ast.LtE: ">", ast.Gt: "<=", ast.GtE: "<", ast.Eq: "!=", ast.NotEq: "==", ast.In: "not in",
     ast.NotIn: "in", ast.Is: "is not", ast.IsNot: "is",
 }  # fmt: skip
-_SHOWN = ("__repr__", "__str__", "picture", "verdict_line", "describe")
+_DISPLAY_FUNCTIONS = ("__repr__", "__str__", "picture", "verdict_line", "describe")
 """Functions whose places are skipped: their results are only displayed."""
 PICKED = (
     ("replays/score/card/scorecard.py", "shown=PASS in verdicts and not self.doubts", "shown=not self.doubts"),
@@ -150,7 +150,7 @@ class _Places(ast.NodeVisitor):
             self.found.append(Mutant(self.file, begin, end, f"{closed.rstrip()} {new} {opened.lstrip()}", kind))
 
     def visit_FunctionDef(self, node: ast.FunctionDef) -> None:
-        if node.name not in _SHOWN:
+        if node.name not in _DISPLAY_FUNCTIONS:
             for each in (*node.args.defaults, *[d for d in node.args.kw_defaults if d], *node.body):
                 self.visit(each)
 

@@ -34,7 +34,7 @@ class Case:
         file: The DAQ's file.
         sent: The session to compare it with.
         path: The requested path; None: detected from the file.
-        right: Quantities of which one must fail; empty if none is required.
+        right: Quantities; at least one must fail, unless this is empty.
         allowed: Further quantities that the defect changes.
         judged: Further arguments of `replays.score.judgement.judge`.
     """

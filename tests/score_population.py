@@ -2,9 +2,8 @@
 
 Judges records that differ from the session (`foreign`), DAQs without a defect (`perfect`) and DAQs with one defect
 (`defects`) by the function of `rig score`, and with `--command EVERY` some of them by the command itself. Each case is
-a
-line of a journal, from which an interrupted population continues; `--only NUMBER` judges one case and prints its line.
-Status 1 if the goal is missed:
+a line of a journal, from which an interrupted population continues; `--only NUMBER` judges one case and prints its
+line. Status 1 if the goal is missed:
 
 - foreign: none of 200 passes
 - perfect: none of 200 fails, and at most 5 % are inconclusive

@@ -99,7 +99,7 @@ class Sent:
 
     @property
     def generated(self) -> bool:
-        """Whether a test signal replaces the model."""
+        """True if a test signal replaces the model."""
         return scene_of(self.kind).generator is not None
 
     @property
@@ -135,7 +135,7 @@ class Sent:
     def volts(self, name: str, times_s: np.ndarray) -> np.ndarray:
         """Return one channel's noise-free volts at any times of the run [s], shape (n,).
 
-        By the formula of a test signal without jumps, otherwise by a windowed sinc between the samples.
+        Uses the formula of a test signal without jumps, otherwise a windowed sinc between the samples.
         """
         channel = self.table.channels[name]
         if self.kind in FORMULAS:

@@ -1,7 +1,7 @@
-"""The wall clock of the tests, in one place: a test waits for what must come, and asserts no time.
+"""The wall clock of the tests, in one place: a test waits for a condition, and asserts no time.
 
-A machine that is busy with other work may hold any thread or process up for seconds. So a test names the condition that
-it waits for, and what is waited for in vain is a failure only after a time that no machine needs.
+A busy machine may delay any thread or process by seconds. So a test names the condition that it waits for, and fails
+only after a time that no machine needs.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 PATIENCE_S = 60.0
-"""Nothing that comes at all takes this long; a test that passes never waits so long."""
+"""Longer than any wait that succeeds; only a failing test waits this long."""
 
 
 def until(
@@ -25,13 +25,13 @@ def until(
     """Wait until a condition holds.
 
     Args:
-        condition: What to wait for.
-        of: The process that has to run for the condition to come true; fail as soon as it has ended.
+        condition: The condition to wait for.
+        of: The process that must run for the condition to become true; fail as soon as it has ended.
         timeout_s: Longest wait [s].
-        every_s: Time between two looks at the condition [s].
+        every_s: Period of the checks [s].
 
     Raises:
-        AssertionError: The time is over, or the process has ended; the message has its output.
+        AssertionError: Timeout, or the process has ended; the message has its output.
     """
     deadline = time.monotonic() + timeout_s
     while not condition():
@@ -43,7 +43,7 @@ def until(
 
 
 def _output_of(ended: subprocess.Popen[str]) -> str:
-    """Return what an ended process printed and nobody has read."""
+    """Return the unread output of an ended process."""
     try:
         return "".join(part or "" for part in ended.communicate(timeout=5.0))
     except subprocess.TimeoutExpired:
@@ -52,7 +52,7 @@ def _output_of(ended: subprocess.Popen[str]) -> str:
 
 @contextmanager
 def sooner_than(limit_s: float) -> Iterator[None]:
-    """Fails where what is done inside lasted so long: a limit that was not to be waited for, never a speed."""
+    """Fail if the body takes longer: a limit on a wait that must not occur, never a speed."""
     begin = time.monotonic()
     yield
     assert time.monotonic() - begin < limit_s

@@ -12,7 +12,7 @@ from typing import Any
 
 from rig.base.errors import DiskError, InputError
 
-LONGEST_S = 20.0
+MAX_INPUT_S = 20.0
 
 
 def inputs(default: int) -> int:
@@ -43,7 +43,7 @@ class Door:
             frames = traceback.extract_tb(error.__traceback__)
             place = " < ".join(f"{frame.filename.rsplit('/', 1)[-1]}:{frame.lineno}" for frame in frames[:-4:-1])
             self.faults.setdefault(f"{type(error).__name__} at {place}", (str(error)[:200], what))
-        if time.monotonic() - begin > LONGEST_S:
+        if time.monotonic() - begin > MAX_INPUT_S:
             self.faults["too long"] = what
 
 

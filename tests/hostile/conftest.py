@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-MOST_MB = 1000
+MAX_GROWTH_MB = 1000
 
 
 def _memory_mb(name: str) -> float:
@@ -35,4 +35,4 @@ def bounded() -> Iterator[None]:
         threading.excepthook = before
     assert not died
     if tells:
-        assert _memory_mb("VmHWM") - start_mb < MOST_MB
+        assert _memory_mb("VmHWM") - start_mb < MAX_GROWTH_MB

@@ -1,8 +1,7 @@
 """Generated inputs for the interfaces of the CAN bus and of the instruments: frames, messages, requests, text.
 
 Not allowed: an exception that escapes, a thread that ends, a value that is accepted though it is not exactly valid
-(each
-interface has an independent check here, written from the protocol), delayed frames of the rig, growing memory.
+(each interface has an independent check here, written from the protocol), delayed frames of the rig, growing memory.
 """
 
 from __future__ import annotations

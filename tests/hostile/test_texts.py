@@ -231,7 +231,7 @@ def test_logs_of_other_systems_are_taken_or_refused_in_one_line(tmp_path: Path) 
                 write_recording(conversion, tmp_path / "out.mcap", force=True)
                 Recording.open(tmp_path / "out.mcap")
     logging.disable(logging.NOTSET)
-    gc.collect()  # here, where unclosed files are no error
+    gc.collect()  # unclosed files are allowed here
     tell(doors)
 
 

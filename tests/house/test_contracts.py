@@ -1,8 +1,7 @@
 """Import contracts (pyproject.toml): each detects a breach; and the imports of `rig --help`.
 
 A breach is an import added to the graph of all imports, so that the files are read once only. One breach is written to
-a
-copy of the files, to show that a line of code has the same effect.
+a copy of the files, to show that a line of code has the same effect.
 """
 
 from __future__ import annotations
@@ -91,7 +90,7 @@ BREACHES = [
     ("replays.studies.bench", "recorder.reader", "Studies of methods never"),
     ("replays.studies.ladder.quantity", "replays.studies.ladder.chart", "No ring"),
     ("rig.channels.sensors.noise", "rig.channels.sensors.conditioning", "No ring"),
-    # Pairs of modules of which one must not import the other.
+    # Pairs of modules; the first must not import the second.
     ("recorder.contents.views", "rig.physics.kernels.signals", "cannot see the model"),
     ("drivers.console", "rig.physics.model", "cannot see the model"),
     ("drivers.instruments.hammer.driver", "drivers.instruments.hammer.twin", "does not know its twin"),

@@ -2,8 +2,7 @@
 
 Blank lines, comments and docstrings are not counted. A budget is the size when it was set: a commit that needs more
 explains why it raises the budget, and one that needs less lowers it. The docstring of a generated file contains "Made
-by
-`command`" and names the test that compares it with the command's output; such files are not counted.
+by `command`" and names the test that compares it with the command's output; such files are not counted.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ from rig.physics.engines.split.condensed import set_step
 from rig.physics.engines.taylor.series import sliding
 from rig.run.simulation import Simulation
 
-LATE = """
+PROGRAM = """
 import gc
 from numba.core.dispatcher import Dispatcher
 from rig.run.simulation import Simulation
@@ -44,7 +44,7 @@ def test_a_run_compiles_nothing_of_it_again() -> None:
 
 def test_nothing_is_compiled_late() -> None:
     """A live rig would stop for it."""
-    done = subprocess.run([sys.executable, "-c", LATE], capture_output=True, text=True, check=False)
+    done = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout.strip()) == (0, ""), done.stderr
 
 

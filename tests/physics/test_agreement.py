@@ -1,4 +1,4 @@
-"""What must agree with what, and why: the physics of the rig against things that are not its own code.
+"""Agreement of the rig's physics with results that are not its own code.
 
 | the rig's                       | must agree with                         | because                                  |
 |---------------------------------|-----------------------------------------|------------------------------------------|

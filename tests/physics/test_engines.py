@@ -165,8 +165,7 @@ def test_split_is_right_where_it_is_hard_and_its_estimate_says_how_far(name: str
 
 def test_a_minute_of_whirl_is_right_for_as_long_as_its_growth_allows() -> None:
     # In whirl small differences grow by 0.3 per second: a factor of 400 in 20 s. The ledger still closes to far less
-    # than
-    # the tolerance of the motion (3e-4), which sets the steps of rolling.
+    # than the tolerance of the motion (3e-4), which sets the steps of rolling.
     bare = {"sensors.chain": "ideal", "sensors.rate_hz": 100, "sensors.truth_rate_hz": 100}
     run = simulate("hammer", bare, duration_s=20.0)
     health = run.simulation.health()

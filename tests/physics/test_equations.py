@@ -31,7 +31,7 @@ from rig.run.motion import STORED
 
 SPIN = 2 * math.pi * 6.2
 FREE = {"gravity": 0.0, "unbalance": 0.0}
-FAR = {"clearance": 10.0, "offset_x": 0.0, "offset_y": 0.0}
+REMOTE_RING = {"clearance": 10.0, "offset_x": 0.0, "offset_y": 0.0}
 """A ring beyond the shaft's reach."""
 UNDAMPED = {"damping_x": 0.0, "damping_y": 0.0}
 
@@ -192,7 +192,7 @@ def test_the_shaft_turns_with_its_scene(angle: float) -> None:
 
 def test_level_top_precesses_steadily_at_large_angles() -> None:
     # An axis that stays level precesses about the vertical at M g l / (Izz w), whatever the angle.
-    constants = rig_of(shaft={"unbalance": 0.0}, magnet=UNDAMPED, contact=FAR)
+    constants = rig_of(shaft={"unbalance": 0.0}, magnet=UNDAMPED, contact=REMOTE_RING)
     shaft, w = constants.shaft, 2000.0
     rate = shaft.mass * shaft.gravity * shaft.arm_centre / (shaft.polar_inertia * w)
     motion = run(constants, quiet_inputs(), state(beta_rate=rate, theta_rate=w), ticks=1_000_000, every=200_000)
@@ -210,7 +210,7 @@ def lateral(motion: Motion) -> np.ndarray:
 @pytest.mark.parametrize("spin", [SPIN, 400.0, -400.0, 5000.0])
 @pytest.mark.parametrize("which", [0, 1])
 def test_small_whirl_has_the_gyroscopic_frequencies(spin: float, which: int) -> None:
-    constants = rig_of({"magnet": "linear"}, shaft=FREE, magnet=UNDAMPED, contact=FAR)
+    constants = rig_of({"magnet": "linear"}, shaft=FREE, magnet=UNDAMPED, contact=REMOTE_RING)
     shaft, size = constants.shaft, 1e-6
     spring = constants.magnet.stiffness * shaft.arm_magnet**2
     roots = np.roots([shaft.transverse_inertia, -shaft.polar_inertia * spin, -spring])
@@ -223,7 +223,7 @@ def test_small_whirl_has_the_gyroscopic_frequencies(spin: float, which: int) -> 
 
 
 def test_unbalance_drives_the_linear_rotors_forced_whirl() -> None:
-    constants = rig_of({"magnet": "linear"}, shaft={**FREE, "unbalance": 1.28e-7}, magnet=UNDAMPED, contact=FAR)
+    constants = rig_of({"magnet": "linear"}, shaft={**FREE, "unbalance": 1.28e-7}, magnet=UNDAMPED, contact=REMOTE_RING)
     shaft, spin = constants.shaft, 30.0
     spring = constants.magnet.stiffness * shaft.arm_magnet**2
     stiffness = spring - (shaft.transverse_inertia - shaft.polar_inertia) * spin**2
@@ -235,12 +235,12 @@ def test_unbalance_drives_the_linear_rotors_forced_whirl() -> None:
 
 
 def test_drive_and_hammer_alone() -> None:
-    constants = rig_of(shaft=FREE, magnet=UNDAMPED, contact=FAR, gain=0.02)
+    constants = rig_of(shaft=FREE, magnet=UNDAMPED, contact=REMOTE_RING, gain=0.02)
     motion = run(constants, quiet_inputs(spin=SPIN), state(), ticks=25_000, every=5000)
     grown = 1 - np.exp(-0.02 / constants.shaft.polar_inertia * motion.times)
     assert motion.column("theta_rate") == pytest.approx(SPIN * grown, rel=1e-9)
 
-    constants = rig_of(shaft=FREE, magnet=UNDAMPED, contact=FAR)
+    constants = rig_of(shaft=FREE, magnet=UNDAMPED, contact=REMOTE_RING)
     inputs = quiet_inputs(pulse=(100.0, 2000, 7000))
     wanted = constants.shaft.arm_disk * 100.0 * 5e-3 * 2 / math.pi / constants.shaft.transverse_inertia
     for (x, y), rate in (((1.0, 0.0), "beta_rate"), ((0.0, -1.0), "Gamma_rate")):
@@ -270,7 +270,7 @@ def test_sliding_impact_has_coulombs_impulse(sense: float) -> None:
 
 
 def test_house_under_a_steady_load_is_springs() -> None:
-    constants = rig_of(contact=FAR)
+    constants = rig_of(contact=REMOTE_RING)
     house, Fx, Fy = constants.house, 300.0, -200.0
     x_oh, y_oh = Fx / house.pair_stiffness_horizontal, Fy / house.outer_beam_stiffness
     x_ih, y_ih = x_oh + Fx / house.inner_beam_stiffness, y_oh + Fy / house.pair_stiffness_vertical
@@ -285,7 +285,7 @@ def test_house_under_a_steady_load_is_springs() -> None:
 
 def test_lost_preload_halves_the_stiffness() -> None:
     P0, undamped = 100.0, {"inner_beam_damping": 0.0, "outer_beam_damping": 0.0}
-    constants = rig_of(shaft=FREE, magnet=UNDAMPED, contact=FAR, house={"preload": P0, **undamped})
+    constants = rig_of(shaft=FREE, magnet=UNDAMPED, contact=REMOTE_RING, house={"preload": P0, **undamped})
     house = constants.house
     k, u0 = house.pair_stiffness_vertical, 2 * P0 / house.pair_stiffness_vertical
     for u, force in ((0.5 * u0, P0), (3 * u0, 2 * P0 + k / 2 * 2 * u0)):

@@ -64,7 +64,7 @@ def held(speed_hz: float, stator: str = "two-houses") -> Outcome:
 
 
 def rolling(speed_hz: float) -> tuple[float, float]:
-    """Whirl frequency [rad/s] and penetration [m], by a root."""
+    """Return whirl frequency [rad/s] and penetration [m], found as a root."""
 
     def residual(depth: float) -> float:
         whirl = 2 * math.pi * speed_hz * RS / (R0 + depth)

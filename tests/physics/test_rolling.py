@@ -140,7 +140,7 @@ def test_linear_bodies_are_the_kernels(changes: dict[str, Any]) -> None:
             evaluate(constants, INPUTS, 0, 0.0, 1.0, FLIGHT, False, y, dy, out)
             sides.append(dy[ROWS_OF_STATE] * SIGN_OF_STATE)
         found[:, column] = (sides[0] - sides[1]) / (2.0 * small)
-    # The unbalance rotates with the spin; it is no part of a linear body.
+    # The unbalance rotates with the spin; it does not belong to a linear body.
     found[:4, 4:6] = 0.0
     assert np.abs(found - matrix).max() < 1e-6 * np.abs(matrix).max()
     assert found == pytest.approx(matrix, rel=1e-6, abs=1e-3)

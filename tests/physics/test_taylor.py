@@ -300,7 +300,7 @@ def test_a_stiff_linear_contact_rolls() -> None:
         simulation = ready("drop", name, **law)
         simulation.advance(310_000)  # to rest, 20 pm deep
         parts = []
-        for force in (2.0, 100.0):  # along the ring: friction holds the shaft against one of them
+        for force in (2.0, 100.0):  # along the ring: friction stops the shaft under one of them
             simulation.submit("hammer", {"force_n": force, "duration_ms": 2.0, "direction": "x"})
             parts.append(simulation.advance(10_000).rows.copy())
         rows.append(np.concatenate(parts))

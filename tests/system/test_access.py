@@ -49,7 +49,7 @@ def everything(session: zenoh.Session, selector: str) -> Iterator[zenoh.Reply]:
 
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """One authority's certificates for every role, for a name that is no role, and an expired one."""
+    """One authority's certificates for every role, for an unknown role, and an expired one."""
     folder = tmp_path_factory.mktemp("keys")
     signing = ec.generate_private_key(ec.SECP256R1())
     issue, late = Issue(signing, timedelta(days=1)), Issue(signing, timedelta(minutes=-1))

@@ -145,7 +145,7 @@ def test_a_device_in_lockstep_is_judged_alike_each_time(folder: Path) -> None:
     assert json.dumps(again).replace("how=again", "how=well") == json.dumps(well)
 
 
-LONG = """
+SLOW_CAMPAIGN = """
 title = "It takes long"
 scene = "stable-run"
 pace = "real-time"
@@ -170,7 +170,7 @@ def descendants(pid: int) -> list[Any]:
 
 
 def test_ctrl_c_leaves_nothing_running_and_tells_what_was_done(tmp_path: Path) -> None:
-    (tmp_path / "long.campaign.toml").write_text(LONG, encoding="utf-8")
+    (tmp_path / "long.campaign.toml").write_text(SLOW_CAMPAIGN, encoding="utf-8")
     (tmp_path / "test_a.py").write_text("def test_a(measure):\n    measure('a', 1, 'mm', '<=', 2)\n", encoding="utf-8")
     arguments = ("campaign", "test_a.py", "long.campaign.toml", "-j", "2", "-o", "out")
     with processes.rig(*arguments, cwd=tmp_path, start_new_session=True) as child:

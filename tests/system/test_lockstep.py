@@ -41,7 +41,7 @@ with rig.connect(sys.argv[1], channels=["P_E"], name="a") as machine:
     for _ in machine.blocks(patience_s=float(sys.argv[2])):
         pass
 """
-PLAIN = str(processes.ROOT / "docs/plain_device.py")
+SOCKET_DEVICE = str(processes.ROOT / "docs/plain_device.py")
 
 
 @contextmanager
@@ -61,7 +61,7 @@ def reactions(slow_s: float) -> tuple[list[str], list[dict[str, Any]]]:
     with (
         bench(*can) as (machine, endpoint),
         processes.python("-c", DEVICE, f"zenoh:{endpoint}", str(slow_s)) as guard,
-        processes.python("-I", PLAIN, str(port)) as plain,
+        processes.python("-I", SOCKET_DEVICE, str(port)) as plain,
     ):
         joined = [machine.event("device", timeout_s=60.0) for _ in range(2)]
         assert {event["device"]: (event["state"], event["tick"]) for event in joined} == {

@@ -33,7 +33,7 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 TEXTS = [*PAGES, ROOT / "CONTRIBUTING.md"]
 PORTS = (7460, 7461, 7462, 7463)
 """Ports of the pages' rig, bus and instruments."""
-_LONG = bool(os.environ.get("RIG_LONG_PAGES"))
+_RUNS_LONG_BLOCKS = bool(os.environ.get("RIG_LONG_PAGES"))
 _BLOCK = re.compile(r"(?:^<!-- ([^\n]*) -->\n)?^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 _READY = {
     "run": "listening on",
@@ -58,11 +58,11 @@ class Running:
 
     @property
     def ends_with_the_rig(self) -> bool:
-        """Whether it serves or records a rig, and therefore ends with it."""
+        """True if it serves or records a rig."""
         return self.line.split()[1] in ("run", "replay", "record")
 
     def said(self) -> str:
-        """Return its output so far."""
+        """Return its present output."""
         return Path(self.log.name).read_text(encoding="utf-8", errors="replace")
 
     def end(self, *, by_itself: bool) -> None:
@@ -81,12 +81,12 @@ class Reader:
     folder: Path
     terminals: dict[str, Running] = field(default_factory=dict)
     settings: list[str] = field(default_factory=list)
-    """Shell variables set by the page so far."""
+    """Shell variables set by the preceding lines."""
 
     def do(self, directive: str, language: str, text: str) -> None:
         """Execute one block."""
         what, _, rest = directive.partition(": ")
-        if what == "elsewhere" or (what == "long" and not _LONG):
+        if what == "elsewhere" or (what == "long" and not _RUNS_LONG_BLOCKS):
             return
         if what == "file":
             (self.folder / rest).write_text(text, encoding="utf-8")
@@ -131,7 +131,7 @@ class Reader:
             input=stdin,
             text=True,
             capture_output=True,
-            timeout=COMPILE_S if not _LONG else None,
+            timeout=COMPILE_S if not _RUNS_LONG_BLOCKS else None,
         )
         said = f"{command}\n{stdin or ''}{done.stdout}{done.stderr}"
         assert done.returncode == status, said

@@ -1,8 +1,8 @@
 """Acceptance tables of the protection monitor: alarms, channel values, corners, OK limits, faults and votes.
 
 Signals are test scenes, fed to the converters' inputs, with the rig's own faults on the probe disk_x; expected results
-are in each table. `python -m tests.unit.protection_acceptance [HOURS]` feeds an hour just below an alert:
-there is none.
+are in each table. `python -m tests.unit.protection_acceptance [HOURS]` feeds an hour just below an alert, and no alarm
+must occur.
 """
 
 from __future__ import annotations

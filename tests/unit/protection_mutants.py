@@ -37,7 +37,7 @@ class Mutant:
         return SimpleNamespace(**{**vars(sound()), **made})
 
     def fails(self, scenario: str) -> bool:
-        """Return whether a scenario detects it: its result is wrong; an exception of its own does not count."""
+        """Return whether a scenario detects it: its result is wrong; an exception in the mutant does not count."""
         try:
             SCENARIOS[scenario](self.device())
         except AssertionError:

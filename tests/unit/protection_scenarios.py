@@ -18,7 +18,7 @@ from drivers.sources.samples import Samples
 
 RATE = 1000.0
 SCENARIOS: dict[str, Callable[[Any], None]] = {}
-"""By name: each takes a device (`Protection`, `act`, `protect`), and raises AssertionError if it is wrong."""
+"""Scenario by name: takes a device (`Protection`, `act`, `protect`), raises AssertionError if it is wrong."""
 
 
 def scenario(function: Callable[[Any], None]) -> Callable[[Any], None]:

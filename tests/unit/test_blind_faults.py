@@ -150,7 +150,7 @@ def some_fault(rng: random.Random) -> dict[str, Any]:
 
 @pytest.mark.skipif("RIG_BLIND_FAULTS" not in os.environ, reason="RIG_BLIND_FAULTS=250: four minutes")
 def test_random_faults_have_their_names(tmp_path: Path) -> None:
-    """Of those that change a count, 95 of 100 by name, and at most one by a wrong name."""
+    """95 of 100 faults that change a count have the right name, and at most one a wrong one."""
     rng = random.Random(int(os.environ.get("RIG_BLIND_SEED", "2030")))
     seen, wrong, unnamed = 0, list[str](), list[str]()
     for n in range(int(os.environ["RIG_BLIND_FAULTS"])):

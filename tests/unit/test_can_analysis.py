@@ -36,9 +36,8 @@ def test_three_messages_that_the_old_analysis_gets_wrong():
 
 
 # The SAE benchmark as Tindell and Burns (1994), Guaranteeing message latencies on Control Area Network (CAN), have it
-# at
-# 125 kbit/s, quoted from memory and not compared with the print: bytes, jitter [ms], period [ms], response time without
-# the jitter [ms], for the first nine messages.
+# at 125 kbit/s, quoted from memory and not compared with the print: bytes, jitter [ms], period [ms], response time
+# without the jitter [ms], for the first nine messages.
 SAE = (
     (1, 0.1, 50.0, 1.544),
     (2, 0.1, 5.0, 2.128),
@@ -157,8 +156,7 @@ def test_no_simulation_is_worse_than_the_analysis(
         rows: list[tuple[int, int]] = []
         while event < span:
             # The analysis assumes that instances of one message do not overtake each other, even with a jitter longer
-            # than the
-            # period.
+            # than the period.
             queued = event + late[len(rows) % len(late)]
             rows.append((event, max(queued, rows[-1][1]) if rows else queued))
             event += period

@@ -18,7 +18,7 @@ from rig.base.errors import InputError
 
 US = 1_000
 MS = 1_000_000
-FAR = 10_000 * MS
+HORIZON = 10_000 * MS
 EMPTY = Frame(0x555)
 """47 bits and no stuff bit before the CRC: 0 10101010101 000 0000 has one after the fifth dominant bit."""
 
@@ -72,7 +72,7 @@ def test_arbitration_follows_the_bits_on_the_wire():
         Frame(0x100, b"1"),
         Frame(0x7FF, b"1"),
     ]
-    # As on the bus: bit by bit without stuffing, the first difference decides.
+    # Compare bit by bit without stuffing: the first difference decides.
     words = []
     for frame in order:
         encoded = encode(frame)
@@ -144,12 +144,12 @@ class Slow:
         free = number = 0
         on_wire: tuple[int, int, tuple[str, int, int, Frame]] | None = None
         while self.waiting or on_wire or any(queues.values()):
-            arrival = self.waiting[0][1][0] if self.waiting else FAR
+            arrival = self.waiting[0][1][0] if self.waiting else HORIZON
             if on_wire and on_wire[0] <= arrival:
                 queues[on_wire[1]].remove(on_wire[2])
                 on_wire = None
                 continue
-            start = free if any(queues.values()) else FAR
+            start = free if any(queues.values()) else HORIZON
             if on_wire or arrival <= max(start, free):
                 _, (at, node, frame) = self.waiting.pop(0)
                 number += 1
@@ -193,7 +193,7 @@ def test_schedule_is_that_of_a_slow_model(offers: list[tuple[int, int, int, bool
         bus.attach(queue=capacity)
     for at, node, frame in rows:
         bus.offer(node, frame, at)
-    got = sent(bus.advance(FAR))
+    got = sent(bus.advance(HORIZON))
     expected, dropped = Slow(rows, capacity).run()
     assert [(row.start_ns, row.end_ns, row.frame) for row in got] == expected
     assert sum(bus.node(node).dropped for node in range(4)) == dropped
@@ -414,7 +414,7 @@ def test_random_errors_come_at_their_rate_and_by_the_seed():
         array["node"] = a
         array["time_ns"] = np.arange(20_000) * 400 * US
         bus.take(array)
-        rows = bus.advance_records(FAR)
+        rows = bus.advance_records(HORIZON)
         faults = rows["outcome"] == OUTCOMES.index("bit error")
         assert bus.node(a).sent == 20_000
         return int(faults.sum()), len(rows), rows["start_ns"][faults].tolist()
@@ -484,12 +484,12 @@ def test_records_and_single_frames_give_the_same():
     one.take(array)
     for k, frame in enumerate(some):
         two.offer(k % 3, frame, int(times[k]))
-    rows = one.advance_records(FAR)
+    rows = one.advance_records(HORIZON)
     assert len(rows) > 3000 // 2
     assert [
         (row["start_ns"], row["end_ns"], OUTCOMES[row["outcome"]], row["node"], frame)
         for row, frame in zip(rows, frames.frames(rows["frame"]), strict=True)
-    ] == [(row.start_ns, row.end_ns, row.error, row.node, row.frame) for row in two.advance(FAR)]
+    ] == [(row.start_ns, row.end_ns, row.error, row.node, row.frame) for row in two.advance(HORIZON)]
     assert one.next_ns() is None
     assert (rows["frame"]["time_ns"] == rows["end_ns"]).all()
 

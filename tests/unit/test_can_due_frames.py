@@ -71,7 +71,7 @@ def test_a_frame_that_is_offered_now_does_not_wait_for_those_that_are_not_due() 
         message = listener.recv(30.0)
         assert message is not None
         assert message.arbitration_id == 8
-        # Frames that are not due when their sender leaves are not sent, and delay nobody else.
+        # Frames that are not due when their sender leaves are not sent, and do not delay others.
         until(lambda: listener.done == 1)
         sender.flush_tx_buffer()
         assert hub.status()["counts"]["unsent"] == 0

@@ -330,7 +330,7 @@ def test_a_full_transmit_queue_is_waited_for_or_told_and_can_be_flushed(way: str
         while not found or found[-1].arbitration_id != 0x300:
             found += read(receiver, 1)
         until(lambda: sender.done == sender.offered)
-        # How many had left before depends on how long this process was held up; but each has left or was dropped.
+        # The number sent before depends on the delay of this process; but each was sent or dropped.
         offered = sender.offered
         until(lambda: rig.hub.status()["nodes"][0]["done"] == offered)
         dropped = rig.hub.status()["nodes"][0]["dropped"]
@@ -467,7 +467,7 @@ def test_a_passive_node_only_listens(rig: Rig) -> None:
         listener.state = BusState.ERROR
 
 
-# Opening, closing, hubs that come and go.
+# Opening, closing, restarting hubs.
 
 
 def test_opening_without_a_hub_says_how_to_start_one() -> None:
@@ -563,7 +563,7 @@ def test_channels_are_detected(monkeypatch: pytest.MonkeyPatch) -> None:
         assert can.detect_available_configs(["zenoh"]) == [{"interface": "zenoh", "channel": "can5"}]
 
 
-# What python-can does with a bus.
+# Functions that python-can calls on a bus.
 
 
 def test_notifier_listeners_and_periodic_tasks_work(rig: Rig) -> None:
@@ -590,11 +590,11 @@ def test_asyncio_readers_work(rig: Rig) -> None:
     assert asyncio.run(run()) == list(range(50))
 
 
-# The hub among others.
+# The hub as one node of several.
 
 
 def fuzz(rng: random.Random) -> bytes:
-    """Random bytes, or a message of frames with some of its bytes changed."""
+    """Return random bytes, or a message of frames with some of its bytes changed."""
     if rng.random() < 0.3:
         return rng.randbytes(rng.choice([0, 1, 7, 8, 32, 88, 500]))
     payload = bytearray(codec.encode(codec.make_records(rng.choices(KINDS, k=rng.randint(1, 12)))))
@@ -623,7 +623,7 @@ def test_random_payloads_leave_the_hub_as_it_was() -> None:
         assert any(thread.name == "can hub can0" for thread in threading.enumerate())
         villain.shutdown()
         until(lambda: rig.hub.endpoints.waiting == 0)
-        # A frame made so that all malformed ones differ from it.
+        # A frame that differs from all malformed ones.
         sender.send(message(0x7A5, b"unique"))
         while (found := read(receiver, 1)[0]).data != b"unique":
             assert found.is_error_frame or frames.find_fault(codec.make_record(found)) is None
@@ -650,7 +650,7 @@ def test_random_payloads_over_zenoh_leave_the_hub_as_it_was() -> None:
 
 
 def join(hub: Hub, name: str, *, token: bool = False, **more: Any) -> dict[str, Any]:
-    """What an endpoint of another process gets."""
+    """Return the reply to an endpoint of another process that joins."""
     if token:
         hub.watch(codec.node_key("can0", name), True)
     return hub.answer("join", {"endpoint": name, **more})
@@ -679,14 +679,14 @@ def test_endpoints_without_a_token_make_room_for_each_other_and_for_those_that_h
         for number in range(endpoints.MAX_ENDPOINTS):
             join(rig.hub, f"e{number}", token=True)
         assert [row["name"] for row in rig.hub.status()["nodes"]] == [f"e{n}" for n in range(endpoints.MAX_ENDPOINTS)]
-        # However many tokens somebody shows, the newest count.
+        # However many tokens a node declares, the newest counts.
         for number in range(5000):
             rig.hub.watch(codec.node_key("can0", f"t{number}"), True)
         assert rig.hub.endpoints.tokens.keys() >= {"t4999"}
         assert len(rig.hub.endpoints.tokens) <= 16 * endpoints.MAX_ENDPOINTS
 
 
-# Whose name it is.
+# The owner of a name.
 
 
 def test_nobody_sets_flushes_joins_or_offers_under_the_name_of_another(rig: Rig) -> None:
@@ -707,7 +707,7 @@ def test_nobody_sets_flushes_joins_or_offers_under_the_name_of_another(rig: Rig)
         client.announce(codec.node_key("can0", sender.name))
         client.report(codec.offer_key("can0", sender.name), bytes.fromhex(villain.secret) + forged)
         until(lambda: rig.hub.status()["counts"]["forged"] >= 10)
-        # A second token of the same name, and its end, take nothing away.
+        # A second token of the same name, and its end, change nothing.
         villain.shutdown()
         time.sleep(0.3)
     else:

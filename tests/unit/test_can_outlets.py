@@ -1,4 +1,4 @@
-"""A bus for programs that do not speak zenoh: socketcand and SLCAN, with python-can's own interfaces as clients."""
+"""A bus for programs without zenoh: socketcand and SLCAN, with python-can's own interfaces as clients."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ pytestmark = pytest.mark.wallclock
 
 
 class Bench:
-    """A bus, and all that is opened on it."""
+    """A bus, and everything that is opened on it."""
 
     def __init__(self, way: str, rate: str = "1M/8M") -> None:
         self.stack = ExitStack()
@@ -69,7 +69,7 @@ class Bench:
         return self.stack.enter_context(SocketCanDaemonBus("can0", server.host, server.port, tcp_tune=True))
 
     def slcan(self, port: SlcanPort, **settings: Any) -> Any:
-        """To be closed before the port."""
+        """Open a python-can SLCAN bus, which must be closed before the port."""
         bus = slcanBus(port.path, sleep_after_open=0, **settings)
         until(lambda: port.figures()["open"] == 1)
         return bus
@@ -79,11 +79,11 @@ class Bench:
 
 
 class Text:
-    """A client that sends text and looks at what comes."""
+    """A client that sends text and checks the replies."""
 
     def __init__(self, server: SocketcandServer) -> None:
         self.socket = socket.socket()
-        # What it does not read is to be noticed soon.
+        # A small buffer, so that unread data is noticed soon.
         self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         self.socket.settimeout(5.0)
         self.socket.connect((server.host, server.port))
@@ -113,7 +113,7 @@ class Text:
 
 
 class Terminal:
-    """A program that writes lines to a port and looks at what comes."""
+    """A program that writes lines to a port and checks the replies."""
 
     def __init__(self, port: SlcanPort) -> None:
         self.descriptor = os.open(port.path, os.O_RDWR | os.O_NOCTTY)
@@ -126,7 +126,7 @@ class Terminal:
         os.close(self.descriptor)
 
     def next(self, *, timeout_s: float = 5.0) -> bytes:
-        """The next line or bell; empty where none comes."""
+        """Return the next line or bell; empty after the timeout."""
         while not (match := re.match(rb"[^\r\a]*[\r\a]", self.seen)):
             if not select.select([self.descriptor], [], [], timeout_s)[0]:
                 return b""
@@ -206,7 +206,7 @@ def test_python_cans_socketcand_client_sends_and_receives(bench: Bench) -> None:
         assert alike([each], read(other, 1))
     before = time.time()
     for each in CLASSIC:
-        # One by one: on the hub's bus those that wait together go by identifier.
+        # One by one: on the hub's bus, waiting frames are sent in the order of their identifiers.
         other.send(each)
         (found,) = read(client, 1)
         assert same(each, found)
@@ -328,7 +328,7 @@ def test_fd_frames_are_left_out_and_counted(bench: Bench) -> None:
     other.send(CLASSIC[0])
     assert alike([CLASSIC[0]], read(client, 1))
     assert server.counts()["fd_left_out"] == 1
-    # One that the client sends makes an error that its reader takes for an error frame, and goes on.
+    # A bad frame from the client causes an error, which its reader handles as an error frame before it continues.
     client.send(FD[0])
     assert read(client, 1)[0].is_error_frame
     other.send(CLASSIC[0])
@@ -570,7 +570,7 @@ def test_time_stamps_are_milliseconds_of_the_minute(bench: Bench) -> None:
         assert [terminal.ask("C"), terminal.ask("Z0"), terminal.ask("O")] == [b"\r"] * 3
         other.send(CLASSIC[0])
         assert terminal.next() == b"t1233616263\r"
-    # The client of python-can has no use for them, and reads what is before.
+    # python-can's client has no use for them, and reads only what precedes.
     port.close()
 
 
@@ -613,7 +613,7 @@ def test_a_program_that_stops_reading_loses_frames_and_its_channel(hub_bench: Be
         figures = port.figures()
         assert (figures["given_up"], figures["open"]) == (1, 0)
         assert figures["dropped"] > 0
-        # It can begin again, without what was left.
+        # It can start again, without the remaining frames.
         assert terminal.ask("C") == b"\r"
         assert terminal.ask("O") == b"\r"
         other.send(CLASSIC[0])
@@ -673,12 +673,12 @@ def test_lines_and_frames_are_each_others_inverse() -> None:
         assert same(slcan.parse(line.decode().rstrip("\r")), each)
 
 
-# What they share.
+# Common to both.
 
 
 def test_a_bus_that_does_not_take_a_frame_is_told() -> None:
     class Full(can.BusABC):
-        """Takes nothing."""
+        """A port that accepts nothing."""
 
         def __init__(self) -> None:
             super().__init__("x")
@@ -726,7 +726,7 @@ def test_a_bus_that_fails_ends_the_connection_and_can_be_opened_anew() -> None:
 
 
 class Echo(Outlet):
-    """Answers what comes, and knows no bus."""
+    """A port that returns its input, without a bus."""
 
     def _take(self, data: bytes) -> None:
         self._answer(data)
@@ -761,7 +761,7 @@ def test_messages_are_bounded_and_never_torn_however_little_is_taken_at_once() -
 
 
 def test_each_write_holds_whole_messages() -> None:
-    # Here what is read is what was written at once.
+    # Here all that was written is read at once.
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     with ours, theirs:
         ours.setblocking(False)

@@ -1,4 +1,4 @@
-"""The table of CAN messages: layout, load, packing, commands that noise cannot imitate."""
+"""The table of CAN messages: layout, load, packing, and commands that noise cannot imitate."""
 
 from __future__ import annotations
 
@@ -69,13 +69,13 @@ def test_classic_frames_take_at_most_their_share_of_1_mbit() -> None:
     by_hand = math.fsum(135e-6 / period for period in rows.values())
     assert Schedule().load(speed("1M")) == pytest.approx(by_hand, rel=1e-9)
     assert 0.675 < by_hand <= CLASSIC_SHARE
-    # The frame that is that long exists.
+    # A frame of this length exists.
     assert analysis.worst_bits(analysis.PeriodicMessage(0x201, 1e-3)) == (135, 0)
 
 
 def test_all_channels_at_10_khz_need_more_than_5_mbit_and_8_carry_them() -> None:
     schedule = Schedule(None, 10_000)
-    # 7500 frames a second of 64 bytes: even without one stuff bit by content 29 us and 549 bits of 0.2 us each.
+    # 7500 frames per second of 64 bytes: even without a stuff bit in the data 29 us and 549 bits of 0.2 us each.
     assert 7500 * (29e-6 + 549 * 0.2e-6) > 1.0
     with pytest.raises(InputError, match=r"CAN load must be .* at most 100 %.* received 1\d\d\.\d % of 1M/5M"):
         schedule.check(speed("1M/5M"))
@@ -113,7 +113,7 @@ def test_packing_agrees_with_the_positions_of_the_signals(message: CanMessage) -
     assert data.shape == (frames, message.length)
     expected = counts if message.fd else np.maximum(counts >> 8, ABSENT + 1)
     for frame in range(frames):
-        # Bit by bit, by the table of signals: what a receiver with the DBC does.
+        # Bit by bit, by the table of signals, as a receiver with the DBC decodes.
         raw = message.decode(data[frame].tobytes())
         assert raw["index"] == numbers[frame]
         rows = expected[frame * samples.rows : (frame + 1) * samples.rows]

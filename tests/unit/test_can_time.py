@@ -29,18 +29,18 @@ ROWS = 200
 _numbers = itertools.count()
 
 INSTANTS_S = [0.0, 20 * 60, 40 * 60, 80 * 60, 60 * 3600, 300 * 3600]
-"""Each wrap is passed: of half of 2^32 us (35.8 min), of 2^32 us (71.6 min), of 2^32 samples (59.7 h at 20 kHz)."""
+"""Beyond each wrap: of half of 2^32 us (35.8 min), of 2^32 us (71.6 min), of 2^32 samples (59.7 h at 20 kHz)."""
 
 
 class LateRig(FakeRig):
-    """A rig that is at a simulated time, and accepts commands then."""
+    """A rig that starts at a simulated time, and then accepts commands."""
 
     def __init__(self, server: MemoryServer, time_s: float) -> None:
         super().__init__(server)
         self.index = dict.fromkeys(GROUPS, round(time_s * RATE_HZ))
 
     def step(self) -> None:
-        """Publish a block that is over 10 ms later, with its end, in every group."""
+        """Publish a block that ends 10 ms later, in every group."""
         for group, index in self.index.items():
             values = np.zeros((ROWS, len(default_table().groups[group].names)), np.int32)
             block = wire.Block(index * 1_000_000 // RATE_HZ, index, float(RATE_HZ), 1e6, values)
@@ -68,7 +68,7 @@ def late_rig(time_s: float, *, lockstep: bool = False) -> Iterator[tuple[LateRig
             if lockstep:
                 server.publish(wire.STATUS, wire.encode_document({"pace": "lockstep"}))
                 rig.step()
-                until(lambda: gateway.outbox.sent > 50)  # the block, not the status alone
+                until(lambda: gateway.outbox.sent > 50)  # the block, not only the status
                 yield rig, channel
                 return
             ends = threading.Event()

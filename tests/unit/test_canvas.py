@@ -1,4 +1,4 @@
-"""Pictures on disk: whole or not there, the same bytes each time."""
+"""Pictures on disk: complete or absent, with the same bytes each time."""
 
 from __future__ import annotations
 

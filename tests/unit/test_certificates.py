@@ -1,4 +1,6 @@
-"""`rig keys init`: folders that are whole, private, never lost and never half made; and what --expose asks for."""
+"""`rig keys init`: complete, private folders, never overwritten and never half written; and the requirements of
+--expose.
+"""
 
 from __future__ import annotations
 
@@ -48,7 +50,7 @@ def test_every_holder_gets_a_folder_that_is_whole_and_private(tmp_path: Path) ->
 def test_what_is_there_is_replaced_only_on_purpose_and_only_if_it_is_ours(tmp_path: Path) -> None:
     folder = tmp_path / "keys"
     folder.mkdir()
-    make(folder)  # an empty folder holds nothing to lose
+    make(folder)  # an empty folder is not refused
     before = files(folder)
     with pytest.raises(InputError, match=r"^DIR must be a new folder"):
         make(folder)

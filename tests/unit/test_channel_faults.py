@@ -1,4 +1,4 @@
-"""Channels that misbehave on command: each kind by its equation, on its rows, and nothing else anywhere."""
+"""Faults of channels on command: each kind by its equation, on its rows, and no effect elsewhere."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ CHANNELS = tuple(SCENE.table.channels)
 
 
 def run(*faults: dict[str, Any], cut: int = 50_000, scene: Any = SCENE) -> tuple[dict[str, np.ndarray], list[Any]]:
-    """Counts of every channel by name, edges under "edges" [ticks], and events."""
+    """Return the counts of every channel by name, edges under "edges" [ticks], and events."""
     simulation, found, edges, events = Simulation(scene), dict[str, list[np.ndarray]](), [np.empty(0)], []
     for fault in faults:
         while simulation.tick < round(1e6 * fault.get("at_s", FROM)):
@@ -50,7 +50,7 @@ def step(simulation: Simulation, cut: int, found: Any, edges: Any, events: Any) 
 
 
 def differs(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> dict[str, tuple[int, int]]:
-    """First and last rows that differ, by channel."""
+    """Return the first and last rows that differ, by channel."""
     rows = {name: np.flatnonzero(one[name] != other[name]) for name in one if name != "edges"}
     return {name: (int(each[0]), int(each[-1])) for name, each in rows.items() if len(each)}
 
@@ -74,7 +74,7 @@ def test_every_number_of_a_kind_is_an_option() -> None:
 def test_a_number_that_a_kind_does_not_take_is_refused_with_those_that_it_takes(
     kind: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """By a rig, and by the command without a rig; the line names the number, or option, and the kind."""
+    """The rig, and the command without a rig, refuse it; the line names the number, or option, and the kind."""
     takes = [name for name in KINDS[kind].model_fields if name != "kind"]
     words = f"must be left out: {kind} takes {', '.join(takes) or 'no numbers'}; instead received "
     others = {field for each in KINDS.values() for field in each.model_fields} - {*takes, "kind"}
@@ -89,7 +89,7 @@ def test_a_number_that_a_kind_does_not_take_is_refused_with_those_that_it_takes(
 
 @pytest.mark.parametrize("kind", EXAMPLES)
 def test_a_fault_is_on_its_channels_and_rows_alone(kind: str, sound: dict[str, np.ndarray]) -> None:
-    """However the run is cut; once it is over, every count is what it would have been."""
+    """Independent of the cuts; after its end, every count is the original."""
     channel = "keyphasor" if KINDS[kind].channel_only else "disk_x"
     there, events = run(example(kind, channel))
     found = differs(there, sound)
@@ -99,7 +99,7 @@ def test_a_fault_is_on_its_channels_and_rows_alone(kind: str, sound: dict[str, n
     for first, last in found.values():
         assert begun["first_row"][SCENE.table.channels[channel].group] == FROM * rate_hz
         assert FROM * rate_hz <= first <= last < TO * rate_hz
-        # What comes at random, or once a turn, may come later; the rest is seen within the filter's first samples.
+        # Random faults, or those once per turn, may come later; the others appear within the filter's first samples.
         assert first <= FROM * rate_hz + 4 or kind in (
             "intermittent",
             "spikes",
@@ -126,11 +126,11 @@ def test_every_kind_does_something_on_every_channel_or_is_refused(kind: str, sou
         else:
             faults.append(fault)
     assert len(faults) == 1 if KINDS[kind].channel_only else len(faults) >= len(CHANNELS) - 2
-    # On all channels at once, but for what makes one show another.
+    # On all channels at once, except for kinds that make one channel show another.
     for together in [[fault] for fault in faults] if other else [faults]:
         found = differs(run(*together)[0], sound)
         for channel in (fault["channel"] for fault in together):
-            # A hammer that rests, and a spin that is all but even, show nothing of what acts on their motion.
+            # A hammer at rest and a nearly constant spin show no fault that acts on their motion.
             still = channel in ("hammer", "speed") and kind in (
                 "gain", "polarity", "stuck", "nonlinear", "no-filter", "bandwidth", "saturation", "short", "clip",
                 "intermittent", "resonance",
@@ -152,7 +152,7 @@ def engineering(counts: dict[str, np.ndarray], name: str) -> np.ndarray:
 def test_its_size_comes_out_of_the_counts(
     channel: str, kind: str, number: str, value: float, sound: dict[str, np.ndarray]
 ) -> None:
-    """Within 1 %, or three standard deviations of what noise makes of it."""
+    """Within 1 %, or three standard deviations of the estimate's noise."""
     there, _ = run({"channel": channel, "kind": kind, "for_s": TO - FROM, number: value})
     y, x = engineering(there, channel), engineering(sound, channel)
     about = SCENE.table.channels[channel]
@@ -166,7 +166,7 @@ def test_its_size_comes_out_of_the_counts(
         found, slack = float(t @ (y - x) / (t @ t)), 0.0
     elif kind == "hum":
         turn = np.exp(-2j * math.pi * 50.0 * t)
-        # What the channel's filter lets through of 50 Hz is all of it.
+        # The channel's filter passes 50 Hz unchanged.
         found, slack = abs(2.0 * np.mean((y - x) * turn)) * abs(about.sensitivity_v), 0.0
     elif kind == "noise":
         found = math.sqrt(float(np.var(y - x)) / noise**2 + 1.0)
@@ -194,12 +194,12 @@ def test_what_pulses_lack_or_have_too_many_edges_have_too(sound: dict[str, np.nd
 @pytest.mark.parametrize("cut", [1_000, 7_000, 400_000])
 @pytest.mark.parametrize(("from_s", "for_s"), [(0.081, 0.2), (0.115, 0.21), (0.15, 0.001), (0.09, 0.011)])
 def test_edges_are_those_that_the_signal_has(from_s: float, for_s: float, cut: int) -> None:
-    """A fault may begin and end in the midst of a turn, whose other pulses are there in both, or in none."""
+    """A fault may begin and end within a turn, whose other pulses are in both runs, or in none."""
     fault = {"channel": "keyphasor", "kind": "extra-pulses", "part": 1.0, "at_s": from_s, "for_s": for_s}
     found, channel = run(fault, cut=cut)[0], SCENE.table.channels["keyphasor"]
     high = found["keyphasor"] * channel.scale > 0.5
     rising_s = (np.flatnonzero(high[1:] & ~high[:-1]) + 1) / channel.rate_hz
-    # The run begins in a pulse; half a turn on is told by the speed of the last one.
+    # The run begins in a pulse; the pulse half a turn later follows from the speed of the last one.
     np.testing.assert_allclose(rising_s[1:], found["edges"] * 1e-6, atol=5e-4)
 
 
@@ -212,7 +212,7 @@ def test_several_at_once_on_a_group_and_one_of_them_cleared(sound: dict[str, np.
     assert 3000 <= first <= last < 4000
     scales = {name: abs(SCENE.table.channels[name].lsb_v) for name in ("disk_x", "ring_y")}
     one, other = (scales[name] * (alone[name] - sound[name]) for name in scales)
-    np.testing.assert_allclose(one, other, atol=5e-6)  # one hum in all of them
+    np.testing.assert_allclose(one, other, atol=5e-6)  # the same hum in all of them
 
 
 def test_a_snapshot_holds_the_faults(sound: dict[str, np.ndarray]) -> None:
@@ -241,7 +241,7 @@ def test_faults_of_a_scene_are_recorded_and_done_again_bit_by_bit(tmp_path: Any)
     blind = validate(recording, blind=True)
     assert not blind.good
     assert blind.explained is not None
-    # Of a preload that rests, much looks alike.
+    # On a constant preload, several kinds have the same effect.
     found = {one.name: one.change for one in blind.explained.ranked}
     assert found["P_E offset or gain or open or saturation"] == "+150 N"
     assert found["ring_x hum"] == "50 Hz, 0.01271 mm"
@@ -284,23 +284,23 @@ def test_only_a_fault_that_there_is_can_be_cleared() -> None:
 
 @pytest.mark.parametrize("kind", ["late", "jitter", "wander", "clock"])
 def test_a_clock_fault_of_a_group_leaves_each_channel_its_own_noise(kind: str) -> None:
-    """Third differences leave little but the converters' noise: it is as independent as in sound channels."""
+    """Third differences leave mainly the converters' noise: it is as independent as in channels without a fault."""
     still = load_scene("stable-run", {"duration_s": 0.3, "sensors.groups": ["forces", "probes"]})
     late = {"channel": "forces", "kind": kind, "at_s": 0.1, **EXAMPLES[kind]}
     alone = {"channel": "disk_x", "kind": kind, "at_s": 0.1, **EXAMPLES[kind]}
     there, _ = run(late, alone, scene=still)
     names = ("P_N", "P_S", "P_E", "P_W", "disk_x")
     rough = np.array([np.diff(there[name][2400:].astype(float), 3) for name in names])
-    if kind != "jitter":  # which makes noise of its own, of motion, the same in all channels of the group
+    if kind != "jitter":  # jitter makes noise from motion, the same in all channels of the group
         off = np.corrcoef(rough) - np.eye(len(names))
         assert np.abs(off).max() < 0.1
-    # White noise of one standard deviation has third differences of sqrt(20) of it.
+    # White noise of one standard deviation has third differences of sqrt(20).
     loud = np.array([still.table.channels[name].noise_v / still.table.channels[name].lsb_v for name in names])
     assert (rough[:4].std(axis=1) / loud[:4] / math.sqrt(20.0) < 1.2).all()
 
 
 def plugged_volts(scene: Any, *faults: dict[str, Any]) -> dict[str, float]:
-    """What the forces show on average after 0.2 s [V], of 1.1, 2.2, 3.3, 4.4 V at P_N, P_S, P_E, P_W."""
+    """Return the mean force signals after 0.2 s [V], of inputs of 1.1, 2.2, 3.3, 4.4 V at P_N, P_S, P_E, P_W."""
     found, _ = run(*faults, scene=scene)
     table = scene.table.channels
     return {
@@ -319,7 +319,7 @@ def plugged_volts(scene: Any, *faults: dict[str, Any]) -> dict[str, float]:
 def test_swaps_that_share_a_channel_are_done_in_their_order(
     swaps: list[tuple[str, str]], shown: tuple[float, ...], physics: bool
 ) -> None:
-    """Whatever is swapped, each signal is shown by one channel; offsets of transducers go with the cables."""
+    """With any swaps, each signal appears on one channel; offsets of transducers follow the cables."""
     names, volts = ("P_N", "P_S", "P_E", "P_W"), (1.1, 2.2, 3.3, 4.4)
     if physics:
         scene = load_scene("stable-run", {"duration_s": 0.22, "sensors.groups": ["forces"]})
@@ -346,13 +346,13 @@ def test_a_swap_that_ends_leaves_the_others_as_if_it_had_never_been() -> None:
     ended, _ = run(swaps[0], {**swaps[1], "for_s": 0.05}, swaps[2], scene=scene)
     never, _ = run(swaps[0], swaps[2], scene=scene)
     all_, _ = run(*swaps, scene=scene)
-    # The filters of those that stay swapped remember it for some samples.
+    # The filters of channels that remain swapped retain it for some samples.
     assert all(first >= 2000 and last < 3100 for first, last in differs(ended, never).values())
     assert all(first >= 3000 for first, _ in differs(ended, all_).values())
 
 
 def test_the_numbers_of_a_random_fault_are_functions_of_its_place() -> None:
-    """A recording's faults are repeated from its seed by later versions, so the numbers themselves are pinned."""
+    """Later versions repeat a recording's faults from its seed, so the numbers themselves are fixed."""
     places = np.arange(20_000)
     uniform, normal = Draws(7, 1, 0).uniform(places), Draws(7, 1, 0).normal(places)
     assert uniform[:2].ravel() == pytest.approx(
@@ -373,7 +373,7 @@ def test_the_numbers_of_a_random_fault_are_functions_of_its_place() -> None:
 
 @pytest.mark.parametrize("quiet", [{"sensors.noise": False}, {"sensors.chain": "ideal"}], ids=["no noise", "ideal"])
 def test_channels_that_are_late_by_one_sample_have_the_counts_of_the_row_before(quiet: dict[str, Any]) -> None:
-    """Probes lie around -10 V of 20 V, and their volts reach to both sides of half of the converter's range."""
+    """Probes are around -10 V of 20 V, and their volts extend to both sides of half of the converter's range."""
     still = load_scene("stable-run", {"duration_s": 0.05, "sensors.groups": ["probes"], **quiet})
     sound, _ = run(scene=still)
     there, _ = run({"channel": "probes", "kind": "late", "late_us": 50.0, "at_s": 0.0}, scene=still)

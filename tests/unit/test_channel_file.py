@@ -1,4 +1,4 @@
-"""A user's own channels: what the file makes, what formulas say, and one line for every wrong table."""
+"""A user's own channels: result of the file, formulas, and one line for every wrong table."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def test_the_file_says_what_is_different(tmp_path: Path) -> None:
         update={"sensitivity_v": 7.87, "rate_hz": 51_200, "kind": "user"}
     )
     assert found["P_N"] == own["P_N"]
-    # What a new channel does not say is its group's where all there agree, and plain otherwise.
+    # Settings that a new channel omits are its group's if all channels there agree, otherwise the defaults.
     assert (found["beam"].unit, found["beam"].sensitivity_v, found["beam"].range_v) == ("N", 1e-3, (-5.0, 5.0))
     assert (found["strain"].bandwidth_hz, found["strain"].adc_bits, found["strain"].noise_v) == (250.0, 24, 0.0)
     assert (found["bearing_u"].kind, found["bearing_u"].label) == ("user", "bearing_u")
@@ -275,7 +275,7 @@ def test_a_wrong_table_is_one_line_that_names_channel_and_field(what: str, tmp_p
     assert "\n" not in said
     assert len(said) < 400
     assert line in said, said
-    assert "mine.toml" in said or what == "rate of too many places"  # which is the whole scene's to know
+    assert "mine.toml" in said or what == "rate of too many places"  # that limit belongs to the whole scene
 
 
 INLINE = {
@@ -290,7 +290,7 @@ INLINE = {
 
 @pytest.mark.parametrize("what", INLINE)
 def test_a_table_that_stands_in_the_scene_is_held_to_the_same(what: str, tmp_path: Path) -> None:
-    # As recordings have it: nothing comes in by that door that does not by the other.
+    # Equal to recordings: a value is accepted by this path exactly if it is accepted by the other.
     text = 'base = "none"\n' + channel('signal = "P_N"')
     document = read_channels(written(tmp_path, text)).model_dump(mode="json")
     changes, line = INLINE[what]

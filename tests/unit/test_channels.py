@@ -1,4 +1,4 @@
-"""The channel table: whole calibrations only, counts to values and back, and what the model must offer it."""
+"""The channel table: complete calibrations only, conversion of counts, and the signals that the model must provide."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from rig.run.scenes import rig_table
 
 TABLE_TEXT = TABLE.read_text()
 CHANNELS = list(default_table().channels.values())
-GOOD = CHANNELS[0].model_dump()
+VALID_CHANNEL = CHANNELS[0].model_dump()
 
 
 def one_channel(row: str = "") -> str:
@@ -67,7 +67,7 @@ def test_names_are_unique_and_groups_whole() -> None:
     for group in table.groups.values():
         assert {channel.group for channel in group.channels} == {group.name}
         assert {channel.rate_hz for channel in group.channels} == {group.rate_hz}
-        # What the channel feels must not fold back: the corner lies below half the sample rate.
+        # The sensor's signal must not fold back: the corner is below half the sample rate.
         assert all(channel.bandwidth_hz < channel.rate_hz / 2 for channel in group.channels)
 
 
@@ -104,10 +104,10 @@ def test_range_and_converter_of_the_small_table() -> None:
     assert channel.offset == 0.5
 
 
-@pytest.mark.parametrize("missing", sorted(set(GOOD) - {"filter_order"}))
+@pytest.mark.parametrize("missing", sorted(set(VALID_CHANNEL) - {"filter_order"}))
 def test_a_row_without_one_of_its_fields_is_refused(missing: str) -> None:
     with pytest.raises(ValidationError, match=missing):
-        Channel(**{key: value for key, value in GOOD.items() if key != missing})
+        Channel(**{key: value for key, value in VALID_CHANNEL.items() if key != missing})
 
 
 @pytest.mark.parametrize(
@@ -130,7 +130,7 @@ def test_a_row_without_one_of_its_fields_is_refused(missing: str) -> None:
 )
 def test_half_or_wrong_scale_is_refused(field: str, value: object) -> None:
     with pytest.raises(ValidationError, match=field):
-        Channel(**{**GOOD, field: value})
+        Channel(**{**VALID_CHANNEL, field: value})
 
 
 def test_rows_take_the_defaults_of_their_group_and_may_differ() -> None:

@@ -48,7 +48,7 @@ def test_a_recording_holds_the_table_and_is_done_again_bit_for_bit(recording: Re
     again = validate(recording)
     assert again.bit_exact
     samples = recording.samples("pivot")
-    # Rows lie on whole numbers over the rate, though no tick does.
+    # Rows are on whole numbers over the rate, though no tick is.
     np.testing.assert_array_equal(samples.times_s, np.arange(len(samples)) / 51_200)
     run = rig.simulate(Scene.model_validate(recording.scene["scene"]), {"sensors.groups": ["pivot"]})
     np.testing.assert_array_equal(samples["pivot_v"], run.samples["pivot_v"])
@@ -62,7 +62,7 @@ def test_an_export_has_the_channels_and_their_instants(recording: Recording, cap
 
 
 class Played:
-    """A rig in this process, whose blocks are published as they are made."""
+    """A rig in this process, whose blocks are published as they are produced."""
 
     def __init__(self, server: MemoryServer) -> None:
         self.simulation = Simulation(load_scene("hammer", {"channels": str(TABLE), "sensors.noise": False}))
@@ -134,12 +134,12 @@ def test_a_recording_of_before_is_read_and_found_good() -> None:
     judged = validate(recording)
     assert judged.good, judged
     for residual in judged.residuals:
-        # Behind today's filters, which are 4 us later, the force transducers would be off by 100 times their noise.
-        if residual.channel not in ("keyphasor", "hammer"):  # one had steps for edges
+        # With today's filters, which are 4 us later, the force transducers would be off by 100 times their noise.
+        if residual.channel not in ("keyphasor", "hammer"):  # one had steps instead of edges
             assert residual.rms < 1.15, residual
 
 
-NEAR = {
+SIMILAR_RUNS = {
     "taylor": {"engine.tolerance": 1e-9},
     "split": {"engine.tolerance": 1e-6},
     "split in other steps": {"engine.tolerance": 1e-6, "engine.step_us": 100},
@@ -149,7 +149,7 @@ NEAR = {
 }
 
 
-@pytest.mark.parametrize("how", NEAR)
+@pytest.mark.parametrize("how", SIMILAR_RUNS)
 @pytest.mark.parametrize("rate_hz", [20_000, 51_200])
 def test_the_engine_and_its_step_are_not_in_what_the_sensors_show(how: str, rate_hz: int) -> None:
     def volts(changes: dict[str, object]) -> tuple[np.ndarray, np.ndarray]:
@@ -162,5 +162,5 @@ def test_the_engine_and_its_step_are_not_in_what_the_sensors_show(how: str, rate
     name = how.split()[0]
     assert name in ENGINES
     fine, _ = volts({"engine.name": "taylor", "engine.tolerance": 1e-12})
-    shown_, _ = volts({"engine.name": name, **NEAR[how]})
+    shown_, _ = volts({"engine.name": name, **SIMILAR_RUNS[how]})
     assert np.abs(shown_ - fine).max() < 0.1, "a tenth of the noise, in every channel"

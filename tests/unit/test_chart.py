@@ -1,4 +1,4 @@
-"""`rig chart`: what is kept and resumed, what counts as failed, what is drawn, what is refused. No timing asserted."""
+"""`rig chart`: resuming, criteria of failure, drawing, refusals. No timing asserted."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from rig.base.errors import InputError
 from rig.cli.main import main
 from rig.physics.kernels.signals import N_STATE
 
-ONCE = Budget(30.0, 1)
+ONE_RUN = Budget(30.0, 1)
 
 
 def row(**columns: Any) -> dict[str, Any]:
@@ -40,7 +40,7 @@ def test_store_resumes_what_the_same_code_measured(tmp_path: Path) -> None:
     store = Store(tmp_path)
     store.add(row(error=1e-3, speed=math.nan))
     with (tmp_path / "chart.journal.jsonl").open("a") as file:
-        file.write('{"mode": "qui')  # a run that was killed
+        file.write('{"mode": "qui')  # a killed run
     again = Store(tmp_path)
     assert again.has(row())
     assert not again.has(row(mode="full"))
@@ -76,7 +76,7 @@ def test_store_writes_one_table_in_two_formats(tmp_path: Path) -> None:
 
 
 def hand_made(shift: float) -> tuple[Problem, Reference, Run]:
-    """A reference that stands still, and a run that is off by `shift` scales in one of seven states, half the time."""
+    """Return a reference at rest, and a run that is off by `shift` scales in one of seven states, half the time."""
     problem = problem_of("exact", "first-impacts", "", end_s=4e-3)
     problem = Problem(**{**problem.__dict__, "times": problem.times[:4]})
     solution = Solution(problem.times, 1.0).close()
@@ -99,7 +99,7 @@ def test_error_and_verdict_of_a_hand_made_run(
     done.solution.onsets = [(0.0, 0.1)] * contacts
     done.solution.failure = "the state is not finite" if failure == "nan" else None
     monkeypatch.setattr(measure, "run", lambda *_: done)
-    found = point(competitors(peers=False)["rk4"], Setting("5 us", 0.0, step_us=5), problem, reference, ONCE)
+    found = point(competitors(peers=False)["rk4"], Setting("5 us", 0.0, step_us=5), problem, reference, ONE_RUN)
     assert found["failure"] == failure
     assert (found["cpu_s"], found["cpu_min_s"], found["cpu_max_s"]) == (0.2, 0.1, 0.5)
     assert found["speed"] == pytest.approx(problem.duration_s / 0.2)
@@ -112,7 +112,7 @@ def test_error_and_verdict_of_a_hand_made_run(
 
 def test_engine_called_directly_agrees_with_another_code_and_closes_its_ledger() -> None:
     problem = problem_of("exact", "first-impacts", "", end_s=0.03)
-    done = run_engine("rk4", Setting("10 us", 0.0, step_us=10), problem, ONCE)
+    done = run_engine("rk4", Setting("10 us", 0.0, step_us=10), problem, ONE_RUN)
     truth = PEERS["scipy-dop853"].solve(problem, Setting("1e-9", 1e-9))
     assert done.failure == ""
     assert measure.scaled_error(done.solution.states, truth.states) < 1e-3
@@ -135,12 +135,12 @@ def test_engine_without_time_is_a_failure_and_no_error() -> None:
 def test_frames_must_be_whole_steps() -> None:
     problem = problem_of("exact", "first-impacts", "", end_s=0.01)
     with pytest.raises(ValueError, match="no whole number of steps"):
-        run_engine("rk4", Setting("30 us", 0.0, step_us=30), problem, ONCE)
+        run_engine("rk4", Setting("30 us", 0.0, step_us=30), problem, ONE_RUN)
 
 
 def test_block_statistics_of_a_square_wave() -> None:
     times = np.arange(0.0, 5.0, 1e-3)
-    force = np.where((times * 10.0) % 1.0 < 0.25, 8.0, 0.0)  # ten impacts a second, in contact a quarter of the time
+    force = np.where((times * 10.0) % 1.0 < 0.25, 8.0, 0.0)  # ten impacts per second, in contact a quarter of the time
     found = block_statistics(times, force, np.arange(0.05, 5.0, 0.1), settle_s=1.0)
     assert found["contact_fraction"] == pytest.approx((0.25, 0.25, 0.25), abs=2e-3)
     assert found["rms_force"] == pytest.approx((4.0, 4.0, 4.0), abs=2e-2)
@@ -155,7 +155,7 @@ def test_bootstrap_bars_hold_the_mean_of_what_scatters() -> None:
     mean, low, high = block_statistics(
         times, rng.exponential(10.0, len(times)), rng.uniform(0.0, 40.0, 800), settle_s=0.0
     )["impacts_per_s"]
-    # 20 a second by chance: the standard error of the mean is sqrt(20/40).
+    # 20 per second by chance: the standard error of the mean is sqrt(20/40).
     assert low < mean < high
     assert 0.5 * 1.96 * math.sqrt(0.5) < 0.5 * (high - low) < 2.0 * 1.96 * math.sqrt(0.5)
 
@@ -166,7 +166,7 @@ def test_elastic_force_is_hertz() -> None:
     states = np.tile(problem.y0, (2, 1))
     beta = math.asin((contact.clearance + 1e-5 + contact.offset_x) / shaft.arm_ring)
     states[1, 1] = beta
-    # The ring is centred on the shaft at rest, so a swing to the side alone closes the gap.
+    # The ring is centred on the shaft at rest, so that a lateral swing alone closes the gap.
     assert elastic_forces(problem, states) == pytest.approx([0.0, contact.stiffness * 1e-5**1.5], rel=1e-3)
 
 
@@ -211,7 +211,7 @@ def test_plan_gives_a_method_only_what_it_takes() -> None:
 
 @pytest.fixture
 def no_png(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Write an empty file for each PNG: what is drawn is read off the SVG beside it."""
+    """Write an empty file for each PNG: the test reads the SVG of the same picture."""
     monkeypatch.setattr("replays.report.canvas.png", lambda _figure, **_about: b"")
 
 

@@ -1,4 +1,4 @@
-"""Solvers of others on the chart: the problem that is written, the results that are read, and what is refused."""
+"""Foreign solvers on the chart: the problem file, the file of results, and refusals."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ KEYS = {"solver": "mine", "phase": PHASE, "setting": "1e-4", "cpu_s": "0.25", "c
 
 
 def text_of(times: np.ndarray, states: np.ndarray, **keys: str) -> str:
-    """A file of results."""
+    """Return the text of a file of results."""
     rows = [",".join(map(repr, row)) for row in np.column_stack([times, states]).tolist()]
     return "\n".join([*(f"# {key}: {value}" for key, value in (KEYS | keys).items()), ",".join(HEADINGS), *rows, ""])
 
 
 def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
-    """The line that a refused command ends in."""
+    """Run a command that must be refused, and return its last line."""
     with pytest.raises(SystemExit) as end:
         main(["chart", *arguments])
     assert end.value.code == 2
@@ -49,7 +49,7 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
 
 @pytest.fixture
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Draw nothing, and take a cheap reference without floors of smoothed laws."""
+    """Draw nothing, and use a cheap reference without floors of smoothed laws."""
 
     def reference(problem: Problem, *, quick: bool) -> Reference:
         assert quick
@@ -89,7 +89,7 @@ def test_results_of_an_engine_land_where_the_engine_does(tmp_path: Path) -> None
     row = rows["right"]
     assert (row["cpu_s"], row["speed"], row["tolerance"], row["rung"]) == (0.25, pytest.approx(0.2), 1e-4, "1e-4")
     assert {rows[name]["family"] for name in versions} == {ADDED_FAMILY}
-    # The same solver, setting and phase again: the later file counts, beside what there was.
+    # The same solver, setting and phase again: the later file replaces the earlier one only.
     (tmp_path / "right.csv").write_text(text_of(problem.times, states, solver="right", cpu_s="0.5"), encoding="utf-8")
     session.add_solvers(folder, [tmp_path / "right.csv"])
     again = {row["method"]: row for row in read_table(folder)}
@@ -102,7 +102,7 @@ def at_rest(**keys: str) -> str:
 
 
 def change_line(number: int, change: Callable[[str], str]) -> Callable[[str], str]:
-    """Change one line of a text, counted from its end where the number is negative."""
+    """Change one line of a text, counted from its end if the number is negative."""
 
     def changed(text: str) -> str:
         lines = text.splitlines()
@@ -211,7 +211,7 @@ def test_a_problem_holds_what_the_page_states_and_no_more(phase: str, tmp_path: 
         values = document[group]
         assert values == getattr(problem.constants, group)._asdict()
         assert {*document["units"][group]} >= {*values} - {"terms", "number", "gap_counts_outer"}
-    # What the equations of docs/charts.md leave out is not there.
+    # Terms that the equations of docs/charts.md omit are zero.
     levels = problem.constants.levels
     assert (levels.euler, levels.inner_house, levels.outer_house, levels.compliant) == (True, True, True, True)
     assert levels.friction == FRICTION_LAWS["exact"]

@@ -1,4 +1,4 @@
-"""What clients report: nothing of it is believed unchecked, and nothing of it holds up a run for long."""
+"""Reports of clients: all are checked, and none delays a run for long."""
 
 from __future__ import annotations
 
@@ -140,7 +140,7 @@ def test_whoever_goes_back_and_forth_does_not_get_on(clients: Clients, time_: Ti
 
 
 class Links:
-    """A server of which only the links are looked at."""
+    """A server of which only the links are used."""
 
     def __init__(self, clients: Clients, time_: Time, **counts: float) -> None:
         self.clients, self.time_, self.counts = clients, time_, counts
@@ -152,7 +152,7 @@ class Links:
 def settle_s(
     monkeypatch: pytest.MonkeyPatch, clients: Clients, time_: Time, beat: Any = None, **counts: float
 ) -> float:
-    """How long the end of a run is held up, in simulated wall time."""
+    """Return the delay of a run's end in simulated wall time [s]."""
 
     def sleep(seconds: float) -> None:
         time_.now_s += seconds

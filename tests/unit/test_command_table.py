@@ -1,4 +1,6 @@
-"""The table of scene commands: what an entry lacks is named here, and every list of commands follows from the table."""
+"""The table of scene commands: missing parts of an entry are reported here, and every list of commands follows
+from it.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +38,7 @@ _VALUE_BITS = 32
 
 
 def missing_in(name: str, entry: type[SceneCommand]) -> Iterator[str]:
-    """What an entry lacks, each in one line that says where to put it."""
+    """Yield the missing parts of an entry, each in one line that names its place."""
     where = f"{entry.__module__.replace('.', '/')}.py"
     if entry.model_fields["command"].default != name:
         yield f'{where}: the field `command` must be Literal["{name}"] = "{name}"'
@@ -129,7 +131,7 @@ def test_every_class_has_a_line_of_help_and_every_line_a_class() -> None:
 
 
 class TiltCommand(SceneCommand):
-    """A half entry, of which each case below leaves out something."""
+    """An incomplete entry; each case below omits a part."""
 
 
 FORCE = Quantity("N", "Force, in N.", CanField("tilt", 15, 16, 0.1, "Force"))
@@ -190,11 +192,11 @@ def sized(**quantity: Any) -> Any:
 def test_half_an_entry_is_told_what_it_lacks(entry: Any, words: str) -> None:
     found = [line for line in missing_in("tilt", entry) if ("SUMMARIES" in line) == ("SUMMARIES" in words)]
     assert words in " ".join(found)
-    assert len(found) == 1 or all("CAN kind" in line for line in found)  # of two commands at once
+    assert len(found) == 1 or all("CAN kind" in line for line in found)  # two commands share the number
 
 
 def request_of(entry: type[SceneCommand]) -> dict[str, Any]:
-    """Fields of a command that a rig takes."""
+    """Return fields of a command that a rig accepts."""
     needed = {field: max(each.low, 1.0) for field, each in entry.quantities().items() if each.required}
     return {"channel": "disk_x", "kind": "gain", "factor": 2.0} if "channel" in entry.model_fields else needed
 

@@ -1,4 +1,4 @@
-"""The DAQ client: rows of several streams made one, gaps told, memory bounded, over the rig's keys and over CAN."""
+"""The DAQ client: merged streams, reported gaps, bounded memory, over the rig's keys and over CAN."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ _numbers = itertools.count()
 
 
 def part(index: int, rows: int, *, name: str = "a", columns: int = 1, rate_hz: float = 1000.0) -> Samples:
-    """Rows whose values tell their number."""
+    """Return rows whose values encode their number."""
     values = np.arange(index, index + rows, dtype=float)[:, None] + np.arange(columns) * 1e6
     names = tuple(f"{name}{n}" for n in range(columns))
     return Samples(index, round(index * 1e6 / rate_hz), rate_hz, 1e6, names, ("V",) * columns, values)
@@ -149,7 +149,7 @@ def test_rows_of_different_runs_are_never_joined() -> None:
     made = aligner()
     assert made.feed("a", part(1000, 50, columns=2)) == []
     assert len(made.feed("b", part(1000, 20, name="b", columns=2))) == 1
-    # The rig was started again; `a` is the first to notice.
+    # The rig was restarted; `a` is the first to notice.
     assert made.feed("a", part(0, 10, columns=2)) == []
     assert made.feed("b", part(1020, 20, name="b", columns=2)) == []
     (out,) = made.feed("b", part(0, 10, name="b", columns=2))
@@ -192,7 +192,7 @@ def test_chosen_channels_come_aligned_in_engineering_units() -> None:
         shown = f"Samples(P_W [N], disk_x [mm], hammer [N]; {len(samples)} rows at 20000 Hz, 0 to"
         assert repr(samples).startswith(shown)
         assert repr(replace(samples, gap=7)).endswith(" s; 7 missing before)")
-        # Nothing of this was lost or made up on the way.
+        # None of these rows was lost or invented in transit.
         assert (daq.lost, daq.dropped, daq.unmatched) == (dict.fromkeys(GROUPS, 0), 0, 0)
 
 
@@ -237,7 +237,7 @@ def test_an_end_that_overtakes_blocks_waits_for_them() -> None:
 
 
 def test_an_end_does_not_overtake_rows_that_are_being_handed_on() -> None:
-    """Blocks and events come on threads of their own: the end, while the last block is on its way to its listeners."""
+    """Blocks and events arrive on separate threads: the end, while the last block is still being delivered."""
     heard, held, on_the_way = [], threading.Event(), threading.Event()
 
     class Threads(MemoryClient):
@@ -282,7 +282,7 @@ def test_an_end_that_does_not_tell_its_rows_gives_the_last_blocks_time(monkeypat
 
 @pytest.mark.wallclock
 def test_an_end_that_does_not_tell_its_rows_waits_for_silence(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where a machine is held up, the last blocks come later than the grace after the end, but not apart."""
+    """On a delayed machine the last blocks come later than the grace after the end, but close together."""
     monkeypatch.setattr(stream, "GRACE_S", 1.0)
     with on_memory(channels=["P_N"]) as (rig, daq):
         rig.server.publish(wire.EVENTS, b'{"event": "end", "reason": "completed"}')
@@ -477,13 +477,14 @@ def test_a_run_that_ends_is_told_on_the_bus() -> None:
         gateway.close()
 
 
-# The examples, on a rig of known counts.
+# The examples, on a rig with known counts.
 
 
 @pytest.fixture
 def live() -> Iterator[tuple[str, str]]:
-    """A rig and its instruments over zenoh, five times slower than real time: two that ask one after the other still
-    get the same rows where the machine is held up between them."""
+    """A rig and its instruments over zenoh, five times slower than real time: two consecutive requests receive the same
+    rows even if the machine is delayed between them.
+    """
     rig_at, instruments_at = free_endpoint(), free_endpoint()
     done = threading.Event()
     with ZenohServer(rig_at) as server:
@@ -543,7 +544,7 @@ def test_example_callback(live: tuple[str, str]) -> None:
 
 @pytest.mark.parametrize(("late", "name"), [(None, ""), (AsyncForce, "read"), (Daq, "aread")])
 def test_example_asynchronous(live: tuple[str, str], late: Any, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """However much later one of the two begins: the first read passes over rows."""
+    """However much later one of the two begins: the first read skips rows."""
     from drivers.examples.asynchronous import main
 
     async def held_up(reader: Any, rows: int) -> Samples:

@@ -44,7 +44,7 @@ def test_a_wait_on_a_condition_after_the_deadline_returns_at_once() -> None:
     changed = threading.Condition()
     with changed:
         assert not Deadline(0.0).wait(changed)
-        assert Deadline(0.001).wait(changed)  # once more: something may have come in this time
+        assert Deadline(0.001).wait(changed)  # one last check: the condition may have changed meanwhile
 
 
 @pytest.mark.parametrize("timeout_s", [0.0, -5.0])

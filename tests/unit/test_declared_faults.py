@@ -1,4 +1,4 @@
-"""What a fault of blocks has taken is told apart from what is lost, live and in the file."""
+"""Rows removed by a fault of blocks are distinguished from lost rows, live and in the file."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def scene(kind: str) -> Any:
 
 @cache
 def published(kind: str) -> list[tuple[str, bytes]]:
-    """What a rig says, in its order."""
+    """Return the messages that a rig publishes, in order."""
     simulation, rows = Simulation(scene(kind)), wire.Continuity()
     found = [(wire.EVENTS, {"event": "start", "tick": 0, "time_s": 0.0})]
     items = [(key, wire.encode_document(each)) for key, each in found]
@@ -119,7 +119,7 @@ def test_who_records_all_that_is_sent_ends_well_and_has_it_as_it_came(kind: str,
     [("duplicate-blocks", 5), ("reorder-blocks", 5), ("stale-stamps", 5), ("restart", 0), ("restart", 5)],
 )
 def test_what_is_told_late_counts_nevertheless(kind: str, behind: int, tmp_path: Path) -> None:
-    """Blocks and what is told of them come on threads of their own; `behind` so many blocks."""
+    """Blocks and fault events come on separate threads; the events are late by a number of blocks."""
     items = published(kind)
     told, held = [item for item in items if item[0] == wire.FAULTS], list[tuple[str, bytes]]()
     blocks = 0
@@ -137,7 +137,7 @@ def test_what_is_told_late_counts_nevertheless(kind: str, behind: int, tmp_path:
 
 @pytest.mark.parametrize("seed", [25, 34, 40, 57])
 def test_what_is_told_comes_in_bursts(seed: int, tmp_path: Path) -> None:
-    """Blocks that are numbered anew, and what is told of that, each in order, one ahead of the other by chance."""
+    """Renumbered blocks and the events that report it, each in order, one randomly ahead of the other."""
     rng, items = random.Random(seed), list(published("restart"))
     end, held = items.pop(), list[tuple[str, bytes]]()
     streams = [[item for item in items if (item[0] == wire.FAULTS) == told] for told in (True, False)]
@@ -221,7 +221,7 @@ def test_nothing_that_is_told_can_end_or_swell_who_hears_it() -> None:
 
 @pytest.mark.parametrize("kind", BLOCKS)
 def test_a_validation_knows_blocks_by_what_was_told_of_them(kind: str, tmp_path: Path) -> None:
-    """Bit by bit where it was told; one who was not told sees what does not fit together, but for what only waits."""
+    """Bit by bit with the events; without them the contradictions are reported, except for delayed blocks."""
     write_run(Simulation(scene(kind)), tmp_path / "a.mcap")
     recording = Recording.open(tmp_path / "a.mcap")
     known = validate(recording)
@@ -239,12 +239,12 @@ def test_a_validation_knows_blocks_by_what_was_told_of_them(kind: str, tmp_path:
 
 @pytest.mark.parametrize(("from_s", "rows"), [(0.0, 8000), (0.1, 6000), (0.38, 400)])
 def test_rows_that_are_missing_at_the_end_count_too(from_s: float, rows: int, tmp_path: Path) -> None:
-    """A stream that never begins, or ends before the others: blind, nothing else tells it."""
+    """A stream that never begins, or ends before the others: a blind validation has no other evidence."""
     fault = {"at_s": from_s, "channel": "probes", "kind": "dropout"}
     whole = parse_scene({"duration_s": 0.4, "sensors": {"groups": ["probes", "drive"]}, "faults": [fault]})
     write_run(Simulation(whole), tmp_path / "a.mcap")
     found = validate(Recording.open(tmp_path / "a.mcap"), blind=True)
-    if rows < _EDGE_ROWS:  # no more than a recorder lacks that ends within a block
+    if rows < _EDGE_ROWS:  # within the loss of a recorder that ends inside a block
         assert found.good
     else:
         assert (found.good, found.skipped) == (False, rows)
@@ -256,7 +256,7 @@ _EDGE_ROWS = 1000
 
 @pytest.mark.parametrize("kind", ["stale-stamps", "duplicate-blocks"])
 def test_instants_out_of_order_end_in_a_verdict(kind: str, tmp_path: Path) -> None:
-    """Spectra need ascending instants: of a whirl without them nothing is judged but what does not fit together."""
+    """Spectra need ascending instants: without whirl, only the contradictions are judged."""
     pulse = {"at_s": 0.02, "command": "hammer", "force_n": 120.0}
     fault = {"at_s": 0.5, "command": "fault", "channel": "probes", "for_s": 0.05, "kind": kind, **BLOCKS[kind]}
     whirl = load_scene("hammer", {"duration_s": 0.8, "sensors.groups": ["probes", "drive"], "commands": [pulse, fault]})

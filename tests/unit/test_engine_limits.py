@@ -1,4 +1,4 @@
-"""Limits of a run's error in a scene: what they choose, what is refused, and that a scene without them is as before."""
+"""Limits of a run's error in a scene: the chosen tolerance, refusals, and no change for scenes without them."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from rig.run.simulation import Simulation
 from tests.commands import said, shown
 
 LIMITS = {"engine.limits.radius_um": 0.03, "engine.limits.angle_deg": 0.5}
-SHORT = {"duration_s": 0.2, "sensors.rate_hz": 2000, "sensors.truth_rate_hz": 1000}
+RUN_CHANGES = {"duration_s": 0.2, "sensors.rate_hz": 2000, "sensors.truth_rate_hz": 1000}
 
 
 def tolerance(changes: dict[str, Any], scene: str | Scene = "hammer") -> float:
@@ -155,7 +155,7 @@ def test_a_recording_keeps_its_limits_and_is_validated(capsys: pytest.CaptureFix
     path, table, mapping = tmp_path / "run.mcap", tmp_path / "run.csv", tmp_path / "run.toml"
     write_run(
         Simulation(
-            load_scene("hammer", {**SHORT, **LIMITS, "engine.limits.angle_deg": 1e-9, "engine.tolerance": 3e-3})
+            load_scene("hammer", {**RUN_CHANGES, **LIMITS, "engine.limits.angle_deg": 1e-9, "engine.tolerance": 3e-3})
         ),
         path,
     )

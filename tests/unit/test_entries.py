@@ -1,7 +1,7 @@
-"""Completeness of entries: half an entry fails here, and the message names the entry and the part that is missing.
+"""Completeness of entries: an incomplete entry fails here, and the message names the entry and the missing part.
 
 Contact laws, engines, channels, kinds of faults, file formats, quantities of a scorecard, commands of `rig` and
-instruments. Commands of a run have test_command_table.py; test_registries.py tests how a half entry is refused.
+instruments. Commands of a run have test_command_table.py; test_registries.py tests the refusal of incomplete entries.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from tests.generated import missing_in_generated_files
 ROOT = Path(__file__).parents[2]
 DEFECT_TABLE = "rig/channels/faults/defects.toml"
 SHARED = {"common", "tape", "split", "taylor"}
-"""Folders in rig/physics/engines; the last two are engines and are looked at by their names."""
+"""Folders in rig/physics/engines; the last two are engines and are checked by their names."""
 
 
 def page(name: str) -> str:
@@ -88,7 +88,7 @@ def test_an_engine_has_a_module_a_row_and_a_contract() -> None:
 
 
 def test_an_observed_signal_is_computed() -> None:
-    """Compare texts: to import and run the kernels would compile them anew after such a change."""
+    """Compare texts: importing and running the kernels would compile them again after such a change."""
     kernels = "rig/physics/kernels"
     table = (ROOT / kernels / "signals.py").read_text()
     stages = "".join(path.read_text() for path in (ROOT / kernels).rglob("*.py") if path.name != "signals.py")
@@ -103,7 +103,7 @@ def test_a_channel_stands_in_the_generated_files() -> None:
 
 
 def test_a_kind_of_fault_is_in_the_union_and_on_the_page() -> None:
-    """A class outside the union has tests of its own and can be given nowhere."""
+    """A class outside the union would have tests but could not be used."""
 
     def concrete(cls: type[faults.Kind]) -> Iterator[type[faults.Kind]]:
         for each in cls.__subclasses__():
@@ -269,7 +269,7 @@ def test_a_command_has_a_line_a_function_and_is_on_the_page() -> None:
     missing = []
     for name, text in named.items():
         if hasattr(requests, name) or (name in SUMMARIES and name != "fault"):
-            continue  # a request, or made of the command's own class
+            continue  # a request, or built from the command's own class
         module = name.replace("import", "import_")
         place = f"rig/cli/commands/{module}.py"
         if not re.search(rf"\brig {name}\b", page("commands.md")):

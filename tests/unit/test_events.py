@@ -30,7 +30,7 @@ SENSORS = {"groups": ["probes", "forces"]}
 
 
 def named_in_the_code() -> set[str]:
-    """Kinds of events that the code spells out, in `_event("...")` and in `{"event": "..."}`."""
+    """Return the kinds of events in the code, in `_event("...")` and in `{"event": "..."}`."""
     found = set[str]()
     folder = Path(rig.__file__).parent
     for path in (*folder.rglob("*.py"), folder.parent / "replays/recordings/export.py"):
@@ -52,8 +52,8 @@ def test_the_table_of_events_is_complete() -> None:
 
 
 def test_every_kind_of_event_is_recorded_and_validated(tmp_path: Path) -> None:
-    """In one run: a kind that is added to the table and has no case here fails."""
-    # A hammer pulse of the scene meets one that was commanded: a warning.
+    """In one run: a new kind in the table without a case here fails."""
+    # A hammer pulse of the scene overlaps a commanded one: a warning.
     timed = [{"at_s": 0.042, "command": "hammer", "duration_ms": 1.0}]
     scene = parse_scene({"duration_s": 0.1, "commands": timed, "sensors": SENSORS})
     server = MemoryServer()
@@ -71,7 +71,7 @@ def test_every_kind_of_event_is_recorded_and_validated(tmp_path: Path) -> None:
     console.leave("dut")
     for name in MECHANICAL:
         needed = {field: 5.0 for field, each in COMMANDS[name].quantities().items() if each.required}
-        if name != "hammer":  # below, as it meets another
+        if name != "hammer":  # below, as it overlaps another
             console.send(name, **needed)
     for number in (1.1, 1.2, 1.3):
         console.fault("P_E", "gain", factor=number)

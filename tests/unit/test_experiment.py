@@ -1,4 +1,4 @@
-"""What a recording says was done to the rig is enough to do it again, bit for bit."""
+"""The record of a run in its recording is sufficient to repeat it, bit for bit."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ from rig.serve.pacing import Lockstep
 from rig.serve.service import Service
 from rig.serve.transport.memory import MemoryClient, MemoryServer
 
-_SMALL = {"sensors.truth_rate_hz": 500, "sensors.rate_hz": 5000}
+_LOW_RATES = {"sensors.truth_rate_hz": 500, "sensors.rate_hz": 5000}
 
 
 def _record(path: Path, scene: str, changes: dict[str, Any]) -> Recording:
-    simulation = Simulation(load_scene(scene, {**_SMALL, **changes}))
+    simulation = Simulation(load_scene(scene, {**_LOW_RATES, **changes}))
     write_run(simulation, path)
     return Recording.open(path)
 
 
 def _assert_same(recording: Recording, experiment: Experiment) -> None:
-    """Every block of sensors, truth and edges comes out again, from the recording's first row to its last."""
+    """Assert that every block of sensors, truth and edges is reproduced, from the recording's first row to its last."""
     simulation = experiment.simulation()
     made: dict[str, list[wire.Block]] = {}
     for frame in experiment.frames(simulation, chunk_s=0.05):
@@ -99,8 +99,8 @@ def test_changes_are_of_the_scene_or_its_parameters(tmp_path: Path) -> None:
 
 
 def test_commands_from_before_and_during_a_live_recording(tmp_path: Path) -> None:
-    """The recorder comes after a blow, and a change of speed and another blow come after it."""
-    simulation = Simulation(load_scene("stable-run", {**_SMALL, "duration_s": 0.6}))
+    """The recorder starts after an impact; a change of speed and another impact follow."""
+    simulation = Simulation(load_scene("stable-run", {**_LOW_RATES, "duration_s": 0.6}))
     server = MemoryServer()
     clock = Lockstep()
     service = Service(simulation, server, clock, block_ticks=10_000)
@@ -150,7 +150,7 @@ def _until(true: Callable[[], bool]) -> None:
 
 
 def test_commands_are_sent_at_their_ticks_however_long_the_chunks_are() -> None:
-    scene = load_scene("stable-run", {**_SMALL, "duration_s": 0.3})
+    scene = load_scene("stable-run", {**_LOW_RATES, "duration_s": 0.3})
     commands = [SentCommand(120_000, "speed", {"speed_hz": 5.0}), SentCommand(40_000, "hammer", {"force_n": 50.0})]
     ends = []
     for chunk_s in (0.01, 1.0):

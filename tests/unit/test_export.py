@@ -1,4 +1,4 @@
-"""Files of a run: what `rig simulate` writes is what `simulate()` returns, and nothing half-made is left behind."""
+"""Files of a run: `rig simulate` writes what `simulate()` returns, and leaves no partial file."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def run() -> Run:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """One file of each kind, made by the command."""
+    """One file of each kind, written by the command."""
     folder = tmp_path_factory.mktemp("export")
     changes = [text for key, value in CHANGES.items() for text in ("--set", f"{key}={value}")]
     for suffix in SUFFIXES:
@@ -167,7 +167,7 @@ def test_folders_are_not_made_and_not_replaced(tmp_path: Path) -> None:
 
 
 class Stop(Exception):
-    """Something went wrong on the way."""
+    """An error during writing."""
 
 
 @pytest.mark.parametrize("error", [Stop, KeyboardInterrupt])
@@ -178,7 +178,7 @@ def test_interrupted_writer_leaves_nothing(suffix: str, error: type[BaseExceptio
     with pytest.raises(error), writer_for(path, simulation) as writer:  # noqa: PT012
         for n, frame in enumerate(frames(simulation)):
             writer.write(frame)
-            (made,) = tmp_path.iterdir()  # in the making, under another name
+            (made,) = tmp_path.iterdir()  # being written, under another name
             assert made.name.startswith(f"{path.name}.")
             assert made.suffix == ".part"
             if n == 2:

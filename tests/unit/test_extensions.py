@@ -1,4 +1,4 @@
-"""Engines and file formats of another package: found by entry points, used, and refused in one line where wrong."""
+"""Engines and file formats of another package: found by entry points, used, and refused in one line if wrong."""
 
 from __future__ import annotations
 
@@ -130,7 +130,7 @@ print(coarse / fine)
 
 @pytest.fixture
 def package(tmp_path: Path) -> Path:
-    """A folder with the packages of the page, as an installer would leave them, and with wrong entry points."""
+    """A folder with the packages of the page, as an installer would create them, and with wrong entry points."""
     for name, text in re.findall(r"```python\n# (my_\w+/\w+\.py)\n(.*?)```", PAGE, re.DOTALL):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text(text)

@@ -1,4 +1,4 @@
-"""Each kind of fault against the equation of its docstring, by its methods alone; no run of the rig."""
+"""Each kind of fault compared with the equation of its docstring, by its methods alone; no run of the rig."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ RATE_HZ, ROWS = 20_000, 6000
 T, N = np.arange(ROWS) / RATE_HZ, np.arange(ROWS)
 X = 0.8 * np.sin(2.0 * np.pi * 37.0 * T + 0.4) + 0.1
 V = -10.0 + 3.94 * X
-OTHER = np.cos(2.0 * np.pi * 91.0 * T)
+SOURCE_V = np.cos(2.0 * np.pi * 91.0 * T)
 COUNTS = np.rint(V / CHANNEL.lsb_v)
 U = Draws(3, 1, 0).uniform(N)
 TURNS_HZ = 25.0
@@ -31,18 +31,18 @@ def kind(name: str, **numbers: Any) -> Kind:
 
 
 def at(rows: slice = slice(None), kept: dict[str, float] | None = None) -> At:
-    """Rows of the channel, with the numbers of one fault."""
+    """Return rows of the channel, with the state of one fault."""
     none = np.empty(0)
     return At(
-        T[rows], N[rows], CHANNEL, Draws(3, 1, 0), {} if kept is None else kept, lambda _: OTHER[rows], none, none,
+        T[rows], N[rows], CHANNEL, Draws(3, 1, 0), {} if kept is None else kept, lambda _: SOURCE_V[rows], none, none,
         lambda x: x,
     )  # fmt: skip
 
 
 def at_edges() -> At:
-    """Edges of a shaft that turns evenly, once a turn."""
+    """Return the edges of a shaft that turns evenly, one per turn."""
     angle, rate = 2.0 * np.pi * np.arange(1, 400), np.full(399, 2.0 * np.pi * TURNS_HZ)
-    return At(1e-6 * TICKS, np.arange(399), CHANNEL, Draws(3, 1, 0), {}, lambda _: OTHER, angle, rate, lambda x: x)
+    return At(1e-6 * TICKS, np.arange(399), CHANNEL, Draws(3, 1, 0), {}, lambda _: SOURCE_V, angle, rate, lambda x: x)
 
 
 @pytest.mark.parametrize(("name", "numbers", "expected"), [
@@ -75,8 +75,8 @@ def test_a_resonance_settles_to_the_response_of_an_oscillator() -> None:
      np.where(np.repeat(U[:300, 0] < 0.15, 20), 2.0, V)),
     ("hum", {"amplitude_v": 0.2, "frequency_hz": 60.0, "third": 0.4, "offset_v": -0.1},
      V + 0.2 * (np.sin(120.0 * np.pi * T) + 0.4 * np.sin(360.0 * np.pi * T)) - 0.1),
-    ("crosstalk", {"source": "disk_y", "db": -20.0}, V + 0.1 * OTHER),
-    ("crosstalk", {"source": "disk_y", "db": -6.0}, V + 0.501187233627272 * OTHER),
+    ("crosstalk", {"source": "disk_y", "db": -20.0}, V + 0.1 * SOURCE_V),
+    ("crosstalk", {"source": "disk_y", "db": -6.0}, V + 0.501187233627272 * SOURCE_V),
     ("saturation", {"part": 0.2}, np.clip(V, -11.6, -8.4)),
 ])  # fmt: skip
 def test_cables_and_conditioners(name: str, numbers: dict[str, Any], expected: np.ndarray) -> None:

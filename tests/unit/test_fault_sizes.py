@@ -1,4 +1,4 @@
-"""Faults that could change no count are refused, and the message has the smallest size that would."""
+"""Faults that could change no count are refused, and the message contains the smallest effective size."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tests.fault_cases import EXAMPLES
 from tests.unit.test_channel_faults import differs, run
 
 SCENE = load_scene("stable-run", {"duration_s": 0.2, "sensors.groups": ["probes", "forces", "drive"]})
-TINY: dict[str, tuple[str, dict[str, Any], str]] = {
+TOO_SMALL_FAULTS: dict[str, tuple[str, dict[str, Any], str]] = {
     "gain": ("disk_x", {"factor": 1.0 + 1e-12}, "factor"), "offset": ("disk_x", {"value": -1e-12}, "value"),
     "drift": ("P_E", {"rate": 1e-9, "for_s": 0.05}, "rate"), "nonlinear": ("disk_x", {"end": 1e9}, "end"),
     "hum": ("P_E", {"amplitude_v": 1e-9}, "amplitude_v"), "saturation": ("P_E", {"part": 1.0 - 1e-12}, "part"),
@@ -32,7 +32,7 @@ TINY: dict[str, tuple[str, dict[str, Any], str]] = {
     "spikes": ("P_E", {"size_v": 1e-9}, "size_v"), "clip": ("disk_x", {"part": 0.999}, "part"),
     "edge-jitter": ("keyphasor", {"rms_us": 1e-9}, "rms_us"),
 }  # fmt: skip
-RARE: dict[str, tuple[str, str]] = {
+TOO_RARE_FAULTS: dict[str, tuple[str, str]] = {
     "intermittent": ("P_E", "part"), "spikes": ("P_E", "rate_hz"), "lose-blocks": ("forces", "part"),
     "duplicate-blocks": ("forces", "part"), "reorder-blocks": ("forces", "part"), "miss-pulses": ("keyphasor", "part"),
     "extra-pulses": ("keyphasor", "part"),
@@ -40,7 +40,7 @@ RARE: dict[str, tuple[str, str]] = {
 
 
 def refused(request: dict[str, Any], scene: Any = SCENE) -> str:
-    """What a live command is refused with; a fault of the scene is refused with the same."""
+    """Return the message with which a live command is refused; a fault of the scene must be refused with the same."""
     with pytest.raises(InputError) as caught:
         Simulation(scene).submit("fault", request)
     timed = {"at_s": 0.0, "command": "fault", **request}
@@ -51,20 +51,22 @@ def refused(request: dict[str, Any], scene: Any = SCENE) -> str:
 
 
 def test_every_kind_with_a_size_has_a_case() -> None:
-    """A kind whose effect can be too small, or too rare, says so by a `reach_v` or a `chance` of its own."""
+    """A kind whose effect can be too small, or too rare, has its own `reach_v` or `chance`."""
     sized = {name for name, kind in KINDS.items() if (kind.reach_v, kind.chance) != (Kind.reach_v, Kind.chance)}
-    assert not sized - {*TINY, *RARE, "crosstalk", "late-blocks"}, "TINY or RARE must have a case of each"
+    assert not sized - {*TOO_SMALL_FAULTS, *TOO_RARE_FAULTS, "crosstalk", "late-blocks"}, (
+        "each of these kinds must have a case"
+    )
 
 
-@pytest.mark.parametrize("kind", TINY)
+@pytest.mark.parametrize("kind", TOO_SMALL_FAULTS)
 def test_a_fault_below_a_step_is_refused_with_the_smallest_size(kind: str) -> None:
-    channel, numbers, field = TINY[kind]
+    channel, numbers, field = TOO_SMALL_FAULTS[kind]
     text = refused({"channel": channel, "kind": kind, **numbers})
     found = re.match(rf"{field} must be at (least|most) (\S+) to change a count of {channel}, whose", text)
     assert found is not None, text
     enough = {"channel": channel, "kind": kind, **numbers, field: float(found[2])}
     Simulation(SCENE).submit("fault", enough)
-    # A fifth less is refused again: the message has the smallest, and no safe one.
+    # A fifth less is refused again: the message contains the smallest size, not a safe one.
     neutral = {"gain": 1.0, "noise": 1.0, "saturation": 1.0, "bandwidth": 5000.0}.get(kind, 0.0)
     less = neutral + 0.8 * (float(found[2]) - neutral)
     if kind == "nonlinear":
@@ -78,7 +80,7 @@ def test_a_fault_below_a_step_is_refused_with_the_smallest_size(kind: str) -> No
     ("offset", {}), ("hum", {"frequency_hz": 150.0}), ("spikes", {"rate_hz": 5000.0}), ("late", {}), ("jitter", {}),
 ])  # fmt: skip
 def test_the_smallest_size_changes_counts(kind: str, numbers: dict[str, Any]) -> None:
-    channel, tiny, field = TINY[kind]
+    channel, tiny, field = TOO_SMALL_FAULTS[kind]
     given = {"channel": channel, "kind": kind, **tiny, **numbers}
     size = float(refused(given).split()[5])
     sound, _ = run(scene=SCENE)
@@ -86,9 +88,9 @@ def test_the_smallest_size_changes_counts(kind: str, numbers: dict[str, Any]) ->
     assert set(differs(there, sound)) == {channel}
 
 
-@pytest.mark.parametrize("kind", RARE)
+@pytest.mark.parametrize("kind", TOO_RARE_FAULTS)
 def test_a_random_fault_that_never_happens_is_refused(kind: str) -> None:
-    channel, field = RARE[kind]
+    channel, field = TOO_RARE_FAULTS[kind]
     tiny = {"channel": channel, "kind": kind, "for_s": 0.1, field: 1e-9}
     found = re.match(rf"{field} must be above (\S+) to happen once", refused(tiny))
     assert found is not None
@@ -101,7 +103,7 @@ def test_a_random_fault_that_never_happens_is_refused(kind: str) -> None:
 
 
 def coarse(bits: int, noise_v: float) -> Any:
-    """The scene with a converter of few bits at P_E."""
+    """Return the scene with a converter of few bits at P_E."""
     table = SCENE.table
     change = {"adc_bits": bits, "noise_v": noise_v}
     groups = {
@@ -117,7 +119,7 @@ def coarse(bits: int, noise_v: float) -> Any:
 
 
 def noise_of(scene: Any, *faults: dict[str, Any]) -> float:
-    """Standard deviation of P_E's counts after 0.05 s."""
+    """Return the standard deviation of P_E's counts after 0.05 s."""
     found, _ = run(*faults, scene=scene)
     return float(np.std(found["P_E"][1000:]))
 
@@ -168,11 +170,11 @@ def test_blocks_held_back_by_nothing_are_refused() -> None:
     assert "delay_s must be" in refused({"channel": "probes", "kind": "late-blocks", "delay_s": 1e-9})
 
 
-@pytest.mark.parametrize("kind", sorted({*TINY} - {"edge-jitter"}))
+@pytest.mark.parametrize("kind", sorted({*TOO_SMALL_FAULTS} - {"edge-jitter"}))
 def test_the_reach_of_a_fault_has_no_sign(kind: str) -> None:
-    """A sensor that inverts, and a size below zero, are no smaller than others."""
+    """An inverting sensor and a negative size are not smaller than others."""
     table = SCENE.table.channels
-    name, _, field = TINY[kind]
+    name, _, field = TOO_SMALL_FAULTS[kind]
     inverting = {n: one.model_copy(update={"sensitivity_v": -one.sensitivity_v}) for n, one in table.items()}
     fault = KINDS[kind].model_validate({"kind": kind, **EXAMPLES[kind]})
     reach_v = fault.reach_v(table[name], 0.1, table[name])
@@ -198,7 +200,7 @@ def test_the_reach_of_a_fault_has_no_sign(kind: str) -> None:
     ("wander", {"amplitude_us": 1.0, "period_s": 0.05}, 0.16 * math.pi), ("spikes", {"size_v": 0.3}, 0.3),
 ])  # fmt: skip
 def test_the_reach_of_a_fault_is_that_of_its_equation(kind: str, numbers: dict[str, float], expected_v: float) -> None:
-    """After 0.1 s, of a probe of 3.94 V/mm and 5 kHz that reaches 8 V to each side."""
+    """After 0.1 s, of a probe of 3.94 V/mm and 5 kHz with a range of 8 V to each side."""
     channel = SCENE.table.channels["disk_x"]
     fault = KINDS[kind].model_validate({"kind": kind, **numbers})
     assert fault.reach_v(channel, 0.1, channel) == pytest.approx(expected_v, rel=1e-12)
@@ -209,5 +211,5 @@ def test_a_clock_takes_samples_at_its_own_rate_until_it_is_ten_milliseconds_off(
     t = np.linspace(0.0, 2.0, 401)
     at = cast(At, SimpleNamespace(t=t))
     late_s = cast(Clock, KINDS["clock"].model_validate({"kind": "clock", "ppm": ppm})).late_s(at)
-    taken_s = (0.0 if ppm > 0.0 else -0.01) + t / (1.0 + 1e-6 * ppm)  # one that is slow begins late
+    taken_s = (0.0 if ppm > 0.0 else -0.01) + t / (1.0 + 1e-6 * ppm)  # a slow one begins late
     assert t - late_s == pytest.approx(np.clip(taken_s, t - 0.01, t), abs=1e-12)

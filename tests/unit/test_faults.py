@@ -1,4 +1,4 @@
-"""Faults of channels by themselves: each on made-up signals, with its name and size."""
+"""Faults of channels alone: each on artificial signals, with its name and size."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ TIMES = np.arange(ROWS) / RATE_HZ
 
 
 def signals(group: str, seed: int = 3) -> tuple[Measured, np.ndarray]:
-    """A group with smooth signals of its own in each channel, and what was to be seen."""
+    """Return a group with independent smooth signals in each channel, and the expected signals."""
     channels, rng = default_table().groups[group].channels, np.random.default_rng(seed)
     floor = np.array([channel.noise_v / channel.sensitivity_v for channel in channels])
-    # One steady turning, and knocks that ring.
+    # A steady rotation, and decaying impacts.
     clean = np.stack([
         floor[c] * (900.0 * np.sin(2.0 * math.pi * (7.0 * TIMES + rng.random()))
                     + 300.0 * np.exp(-40.0 * np.maximum(TIMES - 0.15, 0.0)) * (TIMES > 0.15)
@@ -37,7 +37,9 @@ def signals(group: str, seed: int = 3) -> tuple[Measured, np.ndarray]:
 
 
 def told(change: Callable[[np.ndarray, np.ndarray], None], group: str = "probes") -> list[tuple[str, float]]:
-    """Names and sizes of what is found where some columns are changed, given values and what was to be seen."""
+    """Return names and sizes of the faults found after a change of columns; `change` receives values and
+    expectation.
+    """
     part, clean = signals(group)
     values = part.values.copy()
     change(values, clean)
@@ -78,7 +80,7 @@ def test_delays_that_are_the_same_are_told_together(rows: int) -> None:
 
 
 def test_one_that_has_more_beside_the_same_delay_is_told_with_the_other() -> None:
-    """A ten-thousandth of gain and a little offset are what a fit leaves, and no faults beside a delay."""
+    """A ten-thousandth of gain and a small offset are residues of a fit, and no faults next to a delay."""
 
     def change(values: np.ndarray, clean: np.ndarray) -> None:
         values[8:, :2] += clean[:-8, :2] - clean[8:, :2]
@@ -156,7 +158,7 @@ def test_pulses() -> None:
     (-0.05, "is +8.065 ms long beside the others: its time jumps"),
 ])  # fmt: skip
 def test_a_pulse_at_the_wrong_time_has_one_name(change_s: float, line: str) -> None:
-    """A pulse half a turn after another, and all pulses from the 20th on that come some part of a turn too early."""
+    """A pulse half a turn after another, and all pulses from the 20th on a fraction of a turn too early."""
     edges_s = np.arange(40) / 6.2
     if change_s == 0.5:
         edges_s = np.insert(edges_s, 20, edges_s[19] + 0.5 / 6.2)

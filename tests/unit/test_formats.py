@@ -1,4 +1,4 @@
-"""Exports, read back by other people's readers: they are the recording, to the last bit where the format can."""
+"""Exports, read by third-party readers: they equal the recording, to the last bit if the format allows."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
 
 @pytest.fixture(scope="module")
 def gappy(recording: Recording, tmp_path_factory: pytest.TempPathFactory) -> Recording:
-    """The same without a block of the probes, and with two others the wrong way round."""
+    """The same without a block of the probes, and with two others exchanged."""
     path = tmp_path_factory.mktemp("gaps") / "gaps.mcap"
     with RecordingWriter(
         path, catalogue=recording.catalogue, parameters=recording.parameters, scene=recording.scene
@@ -75,7 +75,7 @@ def gappy(recording: Recording, tmp_path_factory: pytest.TempPathFactory) -> Rec
 
 @pytest.fixture(scope="module")
 def noted(recording: Recording, tmp_path_factory: pytest.TempPathFactory) -> Recording:
-    """The probes of the same, with a command by hand and a note, as a rig tells them that runs."""
+    """The probes of the same, with a manual command and a note, as a running rig reports them."""
     path = tmp_path_factory.mktemp("noted") / "noted.mcap"
     told = [
         *recording.events[:-1],
@@ -229,7 +229,7 @@ def test_an_mdf_file_that_is_let_go_leaves_nothing_open(
     written(recording, path)
     made, make = [], mdf_v4.NamedTemporaryFile
     monkeypatch.setattr(mdf_v4, "NamedTemporaryFile", lambda **options: made.append(make(**options)) or made[-1])
-    for owner in (MDF, mdf_v4.MDF4):  # the collector may come to the temporary file before it comes to them
+    for owner in (MDF, mdf_v4.MDF4):  # the garbage collector may reach the temporary file before them
         monkeypatch.delattr(owner, "__del__")
     source = open_source(path, FileOptions())
     assert [file.closed for file in made] == [False]
@@ -365,7 +365,7 @@ def test_parquet_by_pyarrow(recording: Recording, tmp_path: Path) -> None:
     assert json.loads(table.schema.metadata[b"rig"])["scene"] == "hammer"
 
 
-# libsndfile adds a chunk of peaks to floating point, which scipy reads past with a warning.
+# libsndfile adds a chunk of peaks to floating point, which scipy skips with a warning.
 @pytest.mark.filterwarnings("ignore:Chunk .non-data. not understood")
 def test_wav_by_scipy_and_the_wave_module(recording: Recording, tmp_path: Path) -> None:
     from scipy.io import wavfile
@@ -539,7 +539,7 @@ def test_a_package_that_a_format_needs_is_named(
 
 @pytest.mark.parametrize(("rate_hz", "target_hz"), [(51_200.0, 20_000.0), (10_000.0, 20_000.0), (19_998.7, 20_000.0)])
 def test_polyphase_gives_a_tone_back(rate_hz: float, target_hz: float) -> None:
-    """Against the closed form: a tone in the pass band, at instants between samples, within 90 dB."""
+    """Compared with the closed form: a tone in the pass band, at instants between samples, within 90 dB."""
     tone_hz = 0.8 * clock.PASS_BAND * min(rate_hz, target_hz) / 2
     axis = clock.Axis(0.0131, rate_hz, round(rate_hz * 0.4))
     values = 3.0 + np.sin(2 * np.pi * tone_hz * axis.instants())
@@ -578,7 +578,7 @@ def test_parts_of_a_rotation_are_exported_as_one(recording: Recording, tmp_path:
 
 @pytest.mark.wallclock
 def test_tables_are_made_without_pandas() -> None:
-    """Its import takes longer than a table of a second does; in a process of its own, as others import it here."""
+    """Its import takes longer than a table of one second; in a separate process, because others import it here."""
     code = (
         "import sys, numpy as np; from replays.recordings.formats.readers.columnar import arrow_table, float_schema; "
         "t = arrow_table([np.arange(3.0), np.arange(6.0)[::2]], float_schema(['a', 'b'])); "

@@ -1,4 +1,4 @@
-"""Faults of channels that carry test signals: by their equations, on their rows, and nothing else anywhere."""
+"""Faults of channels that carry test signals: by their equations, on their rows, and no effect elsewhere."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_a_fault_is_on_its_channels_and_rows_alone_or_refused(kind: str, sound: 
 
 
 def tone(counts: np.ndarray) -> complex:
-    """Amplitude of the signal's frequency in whole periods of the faulty rows [counts]."""
+    """Return the amplitude at the signal's frequency in whole periods of the faulty rows [counts]."""
     part = counts[round(0.2 * RATE_HZ) : round(0.3 * RATE_HZ)]
     hz = SCENE.sources()["disk_x"].signal.frequency_hz
     assert hz is not None
@@ -68,7 +68,7 @@ def test_their_sizes_come_out_of_the_counts(sound: dict[str, np.ndarray]) -> Non
 
 @pytest.mark.parametrize("ppm", [-2e4, 5e3])
 def test_a_clock_that_is_off_shows_another_frequency(ppm: float, sound: dict[str, np.ndarray]) -> None:
-    """From the phase: a slow clock begins 10 ms late and makes that up, a fast one falls behind."""
+    """From the phase: a slow clock begins 10 ms late and catches up, a fast one lags increasingly."""
     there, _ = run(fault("clock", ppm=ppm), scene=SCENE)
     hz, steps = SCENE.sources()["disk_x"].signal.frequency_hz or 0.0, 10
     begin, length = round(0.15 * RATE_HZ), round(0.1 * RATE_HZ)

@@ -38,7 +38,7 @@ def scene_of(generator: dict[str, Any], **more: Any) -> Scene:
 
 
 def closed_form(kind: str, given: dict[str, Any], t: list[Fraction], ahead: Fraction) -> np.ndarray:
-    """Wave by its equation, in rational time; phases are reduced before they become floating point."""
+    """Compute the wave by its equation, in rational time; phases are reduced before they become floating point."""
 
     def cycles(hz: Fraction, start: Fraction = ahead) -> np.ndarray:
         return np.array([float((hz * each + start) % 1) for each in t])

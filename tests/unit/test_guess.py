@@ -1,4 +1,4 @@
-"""What signals of foreign logs are taken for, and that nothing is done to samples that nobody asked for."""
+"""Guesses for the signals of foreign logs, and no change of samples without a request."""
 
 from __future__ import annotations
 
@@ -67,8 +67,8 @@ LOGS = {
     "m.mf4": foreign.mdf_of_three_rates, "t.tdms": foreign.tdms_in_volts, "g.csv": foreign.german_csv,
     "c.csv": foreign.csv_without_names,
 }  # fmt: skip
-ASKED = {"m.mf4": 1, "t.tdms": 4, "g.csv": 1, "c.csv": 5}
-"""Lines to check: filters of all; which probe is x, and pulses a turn; of nameless forces which side."""
+LINES_TO_CHECK = {"m.mf4": 1, "t.tdms": 4, "g.csv": 1, "c.csv": 5}
+"""Lines to check: filters of all; which probe is x, and pulses per turn; the side of nameless forces."""
 
 
 @pytest.fixture(scope="module", params=LOGS)
@@ -88,7 +88,7 @@ def test_each_signal_is_taken_for_what_it_is(
     assert set(found) == set(kept)
     for channel, (_, values) in kept.items():
         np.testing.assert_allclose(found[channel].features.values, values, rtol=0, atol=1e-9)
-    assert text.count(CHECK) == ASKED[path.name]
+    assert text.count(CHECK) == LINES_TO_CHECK[path.name]
     named = path.name in ("m.mf4", "g.csv")
     assert all(guess.sure == "sure" for guess in guesses) == named
     if not named:
@@ -119,7 +119,7 @@ def test_each_signal_is_taken_for_what_it_is(
 def test_what_nothing_speaks_for_stays_a_channel_of_its_own(
     names: tuple[str, ...], channels: tuple[str, ...], tmp_path: Path
 ) -> None:
-    """Noise alone: nothing but names and units speaks; each template imports as it is."""
+    """Noise alone: only names and units give evidence; each template imports unchanged."""
     path, t = tmp_path / "x.csv", np.arange(600) / 1000
     noise_of = np.random.default_rng(0).standard_normal((600, len(names)))
     head = ",".join(["time", *names])
@@ -166,7 +166,7 @@ def test_nothing_is_done_to_samples_that_nobody_asked_for(
     untold = [remark for remark in conversion.remarks if remark.startswith("no bandwidth_hz for")]
     assert len(untold) == 1
     assert "µs late" in untold[0]
-    if path.name == "c.csv":  # a clock that is off stays the clock's affair
+    if path.name == "c.csv":  # the error of a clock is not corrected
         assert recording.table.groups["probes"].rate_hz == 10_000
         assert all(channel.drift_ppm == pytest.approx(80.0, abs=1e-3) for channel in conversion.channels)
         ring = recording.table.channels["ring_x"]
@@ -199,7 +199,7 @@ def behind_a_low_pass(white: np.ndarray, corner_hz: float, rate_hz: float) -> np
 
 @pytest.mark.parametrize("corner_hz", [3000.0, 5000.0, 7000.0, None])
 def test_noise_of_any_colour_and_where_it_ends(corner_hz: float | None) -> None:
-    """Noise older than a low-pass ends at its corner; a converter's own tells nothing of it."""
+    """Noise older than a low-pass ends at its corner; a converter's own gives no evidence."""
     rate, several = 20_000, 8
     generator = np.random.default_rng(2)
     white = 1e-3 * generator.standard_normal(40_000 * several)
@@ -311,7 +311,7 @@ def test_a_picture_shows_short_blows_of_long_signals(tmp_path: Path) -> None:
 def test_few_pulses_are_those_of_what_a_name_says(
     name: str, at_s: tuple[float, ...], channel: str, tmp_path: Path
 ) -> None:
-    """Of a short log, or a slow shaft; and where no hammer hit, the template says how that is told."""
+    """A short log, or a slow shaft. If there was no impact, the template explains how to specify that."""
     path, t = tmp_path / "x.csv", np.arange(3000) / 3000
     train = np.sum([(t >= at) & (t < at + 0.01) for at in at_s], axis=0)
     np.savetxt(path, np.column_stack([t, train]), delimiter=",", header=f"time,{name}", comments="", fmt="%.6f")

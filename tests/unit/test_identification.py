@@ -1,4 +1,4 @@
-"""`rig identify`: what it reads, writes and refuses; judging a fit; how far ahead is looked."""
+"""`rig identify`: input, output and refusals; judgement of a fit; length of the window."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_writes_a_set_that_a_run_takes_and_a_report(
     assert "not seen" in told
     document = tomllib.loads(fitted.read_text(encoding="utf-8"))
     assert document["base"] == "corrected"
-    assert set(document["contact"]) == {"friction", "stiffness"}  # what is not seen stays as it was
+    assert set(document["contact"]) == {"friction", "stiffness"}  # an unidentified value stays unchanged
     parameters = load_parameters(str(fitted))
     friction = parameters.entries["contact.friction"]
     assert friction.kind == "fitted"
@@ -186,7 +186,7 @@ def test_single_samples_that_are_far_off_count_less(file: Path) -> None:
 
 
 def test_a_wrong_model_gives_no_value(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Recorded with a restitution of 0.88 and fitted with 0.9: friction and magnets would make up for it."""
+    """Recorded with a restitution of 0.88 and fitted with 0.9: friction and magnets would compensate for it."""
     wrong, fitted = tmp_path / "w.mcap", tmp_path / "w.toml"
     write_run(Simulation(load_scene("hammer", {"duration_s": 0.035, "contact.restitution": 0.88})), wrong)
     arguments = ("--fit", "contact.friction,magnet.stiffness", "--parameters", "corrected", "-o", fitted)
@@ -250,7 +250,7 @@ def quiet(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_late_begin_without_contact_needs_no_spread(quiet: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """From 0.37 s on, 10 % of the stiffness turn the transient about: the search begins with less by itself."""
+    """From 0.37 s on, 10 % of the stiffness reverse the transient: the search reduces its step."""
     begun = ("--from", "0.37", "--start", "magnet.stiffness=1.65", "--json")
     assert run(quiet, "--fit", "contact.friction,magnet.stiffness", *begun) == 0
     document = json.loads(capsys.readouterr().out)
@@ -261,7 +261,7 @@ def test_a_late_begin_without_contact_needs_no_spread(quiet: Path, capsys: pytes
 
 
 def test_nobody_waits_for_what_is_fitted_along(quiet: Path) -> None:
-    """Friction is never seen without contact: asked for, the window grows to the end of the samples."""
+    """Friction cannot be identified without contact: if requested, the window grows to the end of the samples."""
     recording = Recording.open(quiet)
 
     def end_s(along: tuple[str, ...]) -> float:

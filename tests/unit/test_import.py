@@ -1,4 +1,4 @@
-"""Imports of logs that this project did not write: text byte by byte, MDF4 as a measuring system writes it, others."""
+"""Imports of foreign logs: text byte by byte, MDF4 as a measuring system writes it, others."""
 
 from __future__ import annotations
 
@@ -102,7 +102,9 @@ def test_text_with_semicolons_and_decimal_commas(daq_text: tuple[Path, np.ndarra
     assert recording.table.channels["ring_x"].sensitivity_v == pytest.approx(-7.874, abs=1e-3)
     ring = recording.table.channels["ring_x"]
     volts = np.concatenate([b.values[:, 0] for b in recording.blocks("rig/sensors/probes")]) * ring.lsb_v
-    np.testing.assert_allclose(volts, columns[:, 1], rtol=0, atol=1e-7)  # counts are those of the voltage, bias and all
+    np.testing.assert_allclose(
+        volts, columns[:, 1], rtol=0, atol=1e-7
+    )  # counts are those of the voltage, bias included
     assert any("latin-1" in remark for remark in conversion.remarks)
     assert recording.scene["import"]["channels"]["P_N"]["source"] == "messung.txt Kraft N"
     assert recording.scene["import"]["mapping"]["channels"]["ring_x"]["sign"] == -1
@@ -265,12 +267,12 @@ def test_mdf_of_another_system_keeps_its_integers(daq_mdf: Path, tmp_path: Path)
     blocks = list(recording.blocks("rig/sensors/hammer"))
     np.testing.assert_array_equal(np.concatenate([block.values[:, 0] for block in blocks]), codes)
     np.testing.assert_allclose(recording.samples("hammer")["hammer"], codes * (10 / 32_768) / 2.25e-3, rtol=1e-12)
-    # At 51.2 kHz a sample is no whole number of microseconds: the times are exact all the same.
+    # At 51.2 kHz the sample period is a fraction of a microsecond: the times are exact nevertheless.
     np.testing.assert_allclose(recording.samples("hammer").times_s, np.arange(8192) / 51_200.0, rtol=0, atol=1e-12)
     assert recording.samples("drive").rate_hz == 2500
     np.testing.assert_allclose(recording.samples("drive")["speed"], np.linspace(370, 380, 400) / 60, rtol=1e-6)
     assert any("non-numeric" in remark for remark in conversion.remarks)
-    # The pulse rises where 40 t + 0.3 is whole, within a sample; half way up between two samples.
+    # The pulse rises where 40 t + 0.3 is whole, within a sample; half height between two samples.
     edges = recording.edges()
     exact = (np.arange(1, 1 + len(edges)) - 0.3) / 40.0
     assert len(edges) == 6
@@ -309,7 +311,7 @@ def test_a_mean_is_taken_off_within_the_range(tmp_path: Path) -> None:
 
 
 def test_the_noise_of_a_channel_is_told(tmp_path: Path) -> None:
-    """White noise of known size under a slow motion that comes and goes."""
+    """White noise of known size under a slow intermittent motion."""
     t = np.arange(20_000) / 10_000
     noise = 0.003 * np.random.default_rng(4).standard_normal(len(t))
     path = rows_csv(tmp_path / "x.csv", {"time": t, "d [mm]": np.where(t > 0.5, np.sin(400 * t), 0.0) + noise})
@@ -444,7 +446,7 @@ def test_probes_at_any_angles_become_x_and_y(angles: tuple[float, float], tmp_pa
 
 
 def trigger(t: np.ndarray, at: tuple[float, ...]) -> np.ndarray:
-    """Ramps of 2 ms from 0 to 5 V, half way at the given times."""
+    """Return ramps of 2 ms from 0 to 5 V, half way at the given times."""
     up = [np.clip((t - when) / 2e-3 + 0.5, 0, 1) for when in at]
     down = [np.clip((t - when - 0.05) / 2e-3 + 0.5, 0, 1) for when in at]
     return 5.0 * (np.sum(up, axis=0) - np.sum(down, axis=0))
@@ -481,7 +483,7 @@ source = "d"
     ("method", "ppm", "within"), [("edge", 150.0, 2e-4), ("edge", 0.0, 2e-4), ("correlation", 0.0, 2e-3)]
 )
 def test_two_clocks_are_aligned(method: str, ppm: float, within: float, tmp_path: Path) -> None:
-    """The same motion, seen by two systems: after alignment it is the same at the same time."""
+    """The same motion, recorded by two systems: after alignment it is the same at the same time."""
     files = two_clocks(tmp_path, offset_s=0.123456, ppm=ppm)
     conversion, recording = imported(tmp_path, files, CLOCK_MAPPING.replace("METHOD", f'method = "{method}"'))
     force, way = recording.samples("hammer"), recording.samples("probes")
@@ -509,7 +511,7 @@ def test_files_lie_as_their_times_of_day_say(tmp_path: Path) -> None:
 
 
 def test_one_group_of_a_file_is_aligned_and_the_others_stay(tmp_path: Path) -> None:
-    """A TDMS file of two devices: the second one's clock is 0.0123 s late, and only its group moves."""
+    """A TDMS file of two devices: the second one's clock is 0.0123 s late, and only its group is shifted."""
     from nptdms import ChannelObject, TdmsWriter
 
     late_s = 0.0123
@@ -536,7 +538,7 @@ source = "south"
 """
     conversion, recording = imported(tmp_path, [path], mapping)
     samples = recording.samples("forces")
-    # Edges are found to a sample: 0.0123 s is 12.3 of them, and both triggers rise half way between two.
+    # Edges are found to a sample: 0.0123 s is 12.3 samples, and both triggers cross half height between two.
     np.testing.assert_allclose(samples["P_N"], np.sin(20 * (samples.times_s + 0.012)), rtol=0, atol=1e-6)
     np.testing.assert_allclose(samples["P_S"], samples["P_N"], rtol=0, atol=20 * 1.01e-3)
     assert "x.tdms, group B: moved by +12.0000 ms" in " ".join(conversion.remarks)
@@ -545,7 +547,7 @@ source = "south"
 
 
 def test_a_clock_that_is_some_ppm_off_is_put_right(tmp_path: Path) -> None:
-    """Stamps that run 12 ppm fast make a rate of 999.988 Hz: at 1000 Hz nothing may drift."""
+    """Stamps 12 ppm fast give a rate of 999.988 Hz: at 1000 Hz nothing may drift."""
     n = np.arange(40_000)
     t = n / 1000 * (1 + 12e-6)
     path = rows_csv(tmp_path / "x.csv", {"time": t, "P_N [N]": np.sin(300 * t)})
@@ -559,7 +561,7 @@ def test_a_clock_that_is_some_ppm_off_is_put_right(tmp_path: Path) -> None:
 
 
 def test_the_example_has_every_option_and_imports(tmp_path: Path) -> None:
-    """Logs of a usual rig, made here in volts; what comes out is the motion that they were made of."""
+    """Logs of a typical rig, generated here in volts; the import recovers the motion from which they were computed."""
     text = example()
     for model in (each for each in vars(mappings).values() if hasattr(each, "model_fields")):
         for name in model.model_fields:
@@ -588,10 +590,10 @@ def test_the_example_has_every_option_and_imports(tmp_path: Path) -> None:
     inside = slice(100, -100)
     for name, motion in (("ring_x", x), ("ring_y", y)):
         found, expected = probes[name], motion[at]
-        # The mean of what was imported is taken for zero.
+        # The mean of an imported signal is assumed to be zero.
         assert np.ptp((found - expected)[inside]) < 1e-6
     house = recording.samples("accelerations")
-    # Samples that nobody had to move stay as they are, at times in whole microseconds.
+    # Samples that need no shift stay unchanged, at times in whole microseconds.
     acceleration = 30.0 * np.sin(400 * (house.times_s + zero_s))  # m/s^2
     np.testing.assert_allclose(house["inner_x"], acceleration, rtol=0, atol=30 * 400 * 0.6e-6)
     force = recording.samples("forces")
@@ -600,7 +602,7 @@ def test_the_example_has_every_option_and_imports(tmp_path: Path) -> None:
     )
     (timed,) = Experiment.of(recording).scene.commands
     assert timed.at_s == pytest.approx(0.2, abs=1e-4)
-    assert timed.at_s + zero_s == pytest.approx(0.5 - 2.5e-3, abs=1e-4)  # time zero lies in the log
+    assert timed.at_s + zero_s == pytest.approx(0.5 - 2.5e-3, abs=1e-4)  # time zero is inside the log
     assert Experiment.of(recording).scene.drive.speed_hz == pytest.approx(6.2, rel=1e-3)
     assert recording.samples("bearing").names == ("oil_temperature",)
 
@@ -686,7 +688,7 @@ def test_a_hammer_pulse_is_found_and_becomes_a_scene(tmp_path: Path) -> None:
     conversion, recording = imported(tmp_path, [path], HAMMER_MAPPING)
     assert len(conversion.pulses) == 1
     experiment = Experiment.of(recording)
-    # The rig ran before: it is taken up with the first sample, wherever its shaft was.
+    # The rig ran before: the simulation starts at the first sample, with any angle of the shaft.
     assert experiment.begin is not None
     assert (experiment.first_s, experiment.begin.tick) == (0.0, 0)
     (timed,) = experiment.scene.commands
@@ -711,8 +713,8 @@ def test_a_delay_moves_a_channel_back(tmp_path: Path) -> None:
     conversion, recording = imported(tmp_path, [path], mapping, name="apart")
     north, south = recording.samples("P_N"), recording.samples("P_S")
     assert [len(north), len(south)] == [2000, 2000]
-    np.testing.assert_allclose(south["P_S"], np.sin(200 * (t - late_s)), rtol=0, atol=2e-9)  # the samples as they were
-    np.testing.assert_allclose(north.times_s - south.times_s, late_s, rtol=0, atol=1e-9)  # at instants of their own
+    np.testing.assert_allclose(south["P_S"], np.sin(200 * (t - late_s)), rtol=0, atol=2e-9)  # the original samples
+    np.testing.assert_allclose(north.times_s - south.times_s, late_s, rtol=0, atol=1e-9)  # at separate instants
     assert any("P_S" in remark and "forces_2" in remark for remark in conversion.remarks)
     _, recording = imported(tmp_path, [path], f'[resample]\nmethod = "polyphase"\n{mapping}')
     samples = recording.samples("forces")
@@ -738,7 +740,7 @@ def test_there_and_back_again(suffix: str, tmp_path: Path, capsys: pytest.Captur
         assert end.value.code == 0, capsys.readouterr().err
     a, b = Recording.open(source), Recording.open(back)
     assert list(b.table.groups) == list(a.table.groups)
-    if suffix != ".uff":  # which has no place for the scene
+    if suffix != ".uff":  # that format cannot hold the scene
         assert Experiment.of(b).scene == Experiment.of(a).scene
         assert b.table.channels["inner_x"].bandwidth_hz == a.table.channels["inner_x"].bandwidth_hz
     for name in a.table.groups:
@@ -863,7 +865,7 @@ def test_wrong_mappings_are_one_line(
     with pytest.raises(SystemExit) as end:
         main(["import", "x.csv", "-m", "m.toml", "-o", "o.mcap"])
     printed = capsys.readouterr()
-    if message is None:  # a rate that is whole over so few samples
+    if message is None:  # over so few samples the rate is whole
         assert end.value.code == 0
         return
     assert end.value.code == 2

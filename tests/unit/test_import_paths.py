@@ -1,4 +1,4 @@
-"""Import paths of earlier versions, and folders of a user's own with the names of ours."""
+"""Import paths of earlier versions, and a user's own folders with the same names."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_a_wrong_path_is_no_module(name: str) -> None:
 
 
 def imported(folder: Path, code: str, script: str = "script.py") -> str:
-    """What a script in a folder prints, or the last line of its error."""
+    """Return the output of a script in a folder, or the last line of its error."""
     (folder / script).write_text(code)
     command = [sys.executable, str(folder / script)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)

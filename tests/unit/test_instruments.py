@@ -1,4 +1,4 @@
-"""One contract for all instruments on all links: who opens a driver need not know what carries its bytes."""
+"""One contract for all instruments on all links: the user of a driver need not know the link."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ from tests.waiting import PATIENCE_S, sooner_than, until
 pytestmark = pytest.mark.wallclock
 
 LINKS = ("memory", "pty", "zenoh", "can", "can-zenoh")
-"""`can` is classic CAN of python-can's own virtual bus, one bus an instrument; `can-zenoh` is CAN FD on a hub."""
+"""`can` is classic CAN of python-can's own virtual bus, one bus per instrument; `can-zenoh` is CAN FD on a hub."""
 KINDS = {twin.CODEC.address.name: twin for twin in TWINS}
 DRIVERS: dict[str, tuple[type[Instrument], type[AsyncInstrument[Any]]]] = {
     "proximity": (Proximity, AsyncProximity),
@@ -71,7 +71,7 @@ _channels = itertools.count()
 
 @dataclass
 class Bench:
-    """A fake rig, and what is needed to open its instruments on one kind of link."""
+    """A fake rig, and the means to open its instruments on one kind of link."""
 
     link: str
     server: MemoryServer
@@ -83,7 +83,7 @@ class Bench:
     url: str = ""
 
     def open_link(self, name: str) -> Link:
-        """The host's end of the way to an instrument, which is switched on for it."""
+        """Open the host's end of a link to an instrument, which is started on it."""
         kind = KINDS[name]
         if self.link == "memory":
             near, far = memory.pair()
@@ -110,7 +110,7 @@ class Bench:
         return open_link(self.url, kind.CODEC.address)
 
     def open(self, name: str, *, timeout_s: float = 5.0) -> Any:
-        """A driver of an instrument."""
+        """Open the driver of an instrument."""
         driver = DRIVERS[name][0](self.open_link(name), timeout_s=timeout_s)
         self.closing.callback(driver.close)
         return driver
@@ -138,7 +138,7 @@ def _bench(link: str) -> Iterator[Bench]:
 
 
 def drain(driver: Sampler) -> tuple[int, int]:
-    """Read until nothing comes; rows that came, and that are missing in between."""
+    """Read until the stream is silent; return the numbers of received rows and of missing rows between them."""
     rows = missing = 0
     while True:
         try:
@@ -303,7 +303,7 @@ def read_on(force: Force) -> None:
 
 @contextmanager
 def publishing(rig: FakeRig) -> Iterator[None]:
-    """Blocks again and again: a subscription may take its time to arrive."""
+    """Publish blocks repeatedly: a subscription may take some time to arrive."""
     done = threading.Event()
 
     def work() -> None:
@@ -384,7 +384,7 @@ def test_an_instrument_can_be_opened_again(bench: Bench) -> None:
             bench.rig.publish("hammer")
             assert hammer.read(BLOCK).index == (number - 1) * BLOCK
             if number == 2:
-                # As where its process is killed.
+                # Equivalent to a killed process.
                 hammer.link.close()
 
 
@@ -402,7 +402,7 @@ def test_closing_a_driver_stops_its_stream_and_no_other(memory_bench: Bench) -> 
 
 def test_the_other_kind_of_instrument_is_not_taken_for_the_right_one(memory_bench: Bench) -> None:
     driver = Hammer(memory_bench.open_link("force"), timeout_s=0.2)
-    # Its reply carries its own number, which is no message of a hammer.
+    # Its reply has the instrument's own number, which a hammer does not send.
     with pytest.raises(LinkTimeoutError, match="did not reply to Identify"):
         driver.identify()
     assert driver.malformed == 1
@@ -436,7 +436,7 @@ def test_an_instrument_that_is_switched_off_is_told(bench: Bench) -> None:
     bench.rig.publish("probes")
     bench.twins.close()
     if bench.link in ("memory", "pty"):
-        # The other end is gone, which may be seen before what it said last.
+        # The other end has closed, which may be detected before its last message.
         with pytest.raises((StreamEndedError, LinkClosedError)):
             drain(driver)
     else:
@@ -477,7 +477,7 @@ def test_random_bytes_crash_nothing(bench: Bench) -> None:
         if bench.link.startswith("can") and not message:
             continue
         link.send(message, timeout_s=2.0)
-        # What is asked for is answered, even where the question is nonsense.
+        # Every request gets a reply, even an invalid one.
         assert link.receive(timeout_s=2.0) is not None
     assert bench.twin("hammer").refused == 30 or bench.link.startswith("can")
     assert driver.identify().virtual
@@ -580,7 +580,7 @@ def test_nonsense_is_one_clear_line(url: str) -> None:
 @pytest.mark.parametrize(
     ("data", "stuffed"),
     [
-        # Worked by hand from the paper's rules.
+        # Computed by hand from the paper's rules.
         ("", "01"),
         ("00", "0101"),
         ("0000", "010101"),
@@ -624,7 +624,7 @@ def test_frames_are_found_in_portions_of_any_size_and_between_rubbish() -> None:
         ]
         assert found == sent
         assert deframer.spoilt == 1
-    # One bit anywhere spoils one frame, or, where it makes or breaks a zero, its neighbour as well.
+    # One bit anywhere corrupts one frame, or, if it adds or removes a zero, its neighbour as well.
     for _ in range(200):
         spoilt = bytearray(stream)
         spoilt[noise.randrange(8, len(stream) - 4)] ^= 1 << noise.randrange(8)
@@ -660,7 +660,7 @@ def test_a_line_that_nobody_reads_holds_nobody_up() -> None:
     host = open_serial(path)
     with sooner_than(PATIENCE_S), pytest.raises(LinkTimeoutError, match="accepted no data"):
         line.send(b"x" * 60_000, timeout_s=0.2)
-    # Whoever reads now is in step after the frame that was cut.
+    # A new reader is synchronised after the truncated frame.
     reader = threading.Thread(target=lambda: line.send(b"last", timeout_s=5.0))
     reader.start()
     found = []
@@ -675,7 +675,7 @@ def test_a_line_that_nobody_reads_holds_nobody_up() -> None:
         line.receive(timeout_s=0.1)
 
 
-# What is each instrument's own.
+# Specific to each instrument.
 
 
 def samples(driver: Sampler, values: np.ndarray) -> Samples:

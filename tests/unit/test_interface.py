@@ -1,4 +1,4 @@
-"""The page on keys, messages and units: made from the tables, committed, and complete."""
+"""The page on keys, messages and units: generated from the tables, committed, and complete."""
 
 from __future__ import annotations
 

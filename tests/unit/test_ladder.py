@@ -1,4 +1,4 @@
-"""`rig ladder`: what it reads, what it picks, how a pick is stored and comes into force, what it refuses."""
+"""`rig ladder`: input, chosen model, storage and use of a choice, refusals."""
 
 from __future__ import annotations
 
@@ -167,7 +167,7 @@ def test_a_first_run_in_short_blocks_is_no_cost(monkeypatch: pytest.MonkeyPatch)
 
 def test_a_run_is_given_up_by_its_processor_time(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = iter(range(0, 10**9, 1000))
-    monkeypatch.setattr("replays.studies.common.run.time.perf_counter", lambda: next(clock))  # a machine that is busy
+    monkeypatch.setattr("replays.studies.common.run.time.perf_counter", lambda: next(clock))  # a busy machine
     scene = load_scene("hammer", {"duration_s": 0.1})
     candidate = Candidate(ModelLevels(), "torque", "split", 25, 3e-4)
     failures = [measure(scene, candidate, ["spin"], runs=1, limit_s=limit_s).failure for limit_s in (60.0, 0.0)]
@@ -193,20 +193,20 @@ def test_what_saves_less_than_a_tenth_is_not_left_out(monkeypatch: pytest.Monkey
     monkeypatch.setattr("replays.studies.ladder.search.saving", saved)
     found = search(load_scene("hammer"), {"spin": 0.1})
     assert found.picked.candidate.model == {
-        "magnet": "map",  # the linear one saves 3 % of it
+        "magnet": "map",  # the linear one saves 3 %
         "shaft": "euler",
         "stator": "rigid",
         "contact": "compliant",  # costs the same
-        "friction": "exact",  # without it, it slides
+        "friction": "exact",  # without it, the contact slides
         "drive": "torque",
     }
     assert found.savings == pytest.approx({"magnet": 1 - 1.6 / 2.05, "stator": 1 - 1.6 / 2.0})
-    # Where that is all that it saves, the scene stays as it was given.
+    # If it saves nothing else, the scene stays unchanged.
     extra.update({"two-houses": 0.0, "inner-house": 0.0})
     given = load_scene("hammer", {"engine.name": "tsit5", "engine.step_us": 50})
     again = search(given, {"spin": 0.1})
     assert (again.picked.candidate.engine, again.savings) == ("tsit5", {})
-    # What the scene leaves out already is told where it is what the search picks, too.
+    # A level that the scene omits already is reported if the search chooses it, too.
     given = load_scene("hammer", {"engine.tolerance": 3e-2, "engine.companion": False})
     again = search(given, {"spin": 0.1})
     assert (again.picked.candidate, list(again.savings)) == (again.given.candidate, ["magnet"])
@@ -237,7 +237,7 @@ def test_a_pick_meets_its_tolerance_as_it_will_run(found: Ladder) -> None:
         assert errors.total[name] + found.reference_errors[name] <= tolerance
         assert errors.model[name] <= tolerance
         assert errors.numerical[name] <= tolerance
-    # A rigid impact has no force: infinite, and never picked with a peak asked for.
+    # A rigid impact has no force: infinite, and never chosen if a peak is required.
     impact = next(step for step in found.steps if step.label == "contact impact")
     assert impact.errors.model["peak_normal_force"] == math.inf
     assert not impact.passes
@@ -246,7 +246,7 @@ def test_a_pick_meets_its_tolerance_as_it_will_run(found: Ladder) -> None:
 
 
 def test_errors_are_the_same_each_time(found: Ladder) -> None:
-    again = search(found.scene, found.tolerances, runs=1)  # how often it is timed changes no error
+    again = search(found.scene, found.tolerances, runs=1)  # repeated timing changes no error
     single = [[(s.label, s.errors.model, s.passes) for s in ladder.steps if s.stage == "single"]
               for ladder in (found, again)]  # fmt: skip
     assert single[0] == single[1]
@@ -279,7 +279,7 @@ def test_a_pick_comes_into_force_and_says_so(found: Ladder, path: Path) -> None:
     assert document["fidelity"] == "auto"
     assert document["pick"]["quantities"][0]["total_error"] >= 0.0
     assert Scene(**document) == scene  # a recording's document runs again
-    # As given, the same file is what it was.
+    # With the original numbers the file is the original.
     given = load_scene(path, {"fidelity": "given"})
     assert given.model.magnet == "map"
     assert given.fidelity_line is None
@@ -292,7 +292,7 @@ def test_only_the_table_is_replaced(found: Ladder, end: str) -> None:
     assert with_pick(once, pick) == once
     assert once.count("[pick]") == 1
     assert ("\r" in once) == (end == "\r\n")
-    # With more behind it, comments and all.
+    # With more after it, comments included.
     later = once + end + "# mine" + end + "[sensors]" + end + "noise = false  # quiet" + end
     changed = with_pick(later, pick.model_copy(update={"seed": 5}))
     assert "# mine" in changed

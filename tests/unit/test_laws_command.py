@@ -1,4 +1,4 @@
-"""`rig laws`: the comparison as a table, as JSON and as a picture; what it refuses."""
+"""`rig laws`: the comparison as a table, as JSON and as a picture; refusals."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def test_table_names_every_law_and_marks_those_in_use(capsys: pytest.CaptureFixt
         assert any(line.startswith(f"{name} ") for line in lines), name
     marked = [line.split()[0] for line in lines if "  yes  " in line]
     assert marked == ["lankarani-nikravesh", "internal-sphere"]
-    # A unit in brackets is no markup.
+    # A unit in brackets is not markup.
     assert "contact [ms]" in lines[1]
     assert "returns 0.913 where 0.9 is asked" in lines[-1]
 
@@ -118,7 +118,7 @@ def test_picture_labels_every_axis_and_law(monkeypatch: pytest.MonkeyPatch, tmp_
     assert set(DAMPING) in legends
     assert any(set(STIFFNESS) < legend for legend in legends)
     styles = [
-        (line.get_color(), line.get_linestyle(), line._unscaled_dash_pattern)  # noqa: SLF001 (dashes are told apart by nothing public)
+        (line.get_color(), line.get_linestyle(), line._unscaled_dash_pattern)  # noqa: SLF001 (no public function distinguishes the dashes)
         for line in panels[0].lines[: len(DAMPING)]
     ]
     assert len(set(map(str, styles))) == len(DAMPING)

@@ -1,4 +1,4 @@
-"""What talks to a rig does without what the extra `full` brings, and what does not says so."""
+"""Clients of a rig work without the extra `full`, and other commands report that they need it."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ CLIENTS = (
 
 
 def lean(code: str) -> subprocess.CompletedProcess[str]:
-    """A program on a machine without the extra."""
+    """Run a program as on a machine without the extra."""
     program = LEAN.format(full=set(FULL)) + code
     return subprocess.run([sys.executable, "-c", program], cwd=ROOT, text=True, capture_output=True, timeout=120)
 
@@ -61,7 +61,7 @@ NEEDING = {
     "simulate": "hammer -o {folder}/x.mcap",
     "can": "hub c0", "ladder": "hammer -q whirl_frequency -t 0.1", "paper": "-o {folder}/x.html",
 }  # fmt: skip
-"""What commands are given that do not go without."""
+"""Arguments of commands that need the extra."""
 
 
 def test_the_help_names_the_commands_that_need_the_whole_rig(tmp_path: Path) -> None:
@@ -105,7 +105,7 @@ PROMISED = {
     "fault": "-h", "stop": "-h", "step": "-h", "status": "-h", "note": "-h", "twins": "-h", "record": "-h",
     "replay": "-h", "pause": "-h", "resume": "-h", "seek": "-h", "rate": "-h",
 }  # fmt: skip
-"""What docs/install.md promises without extras; commands of a running rig are only asked for their help."""
+"""Commands that docs/install.md promises without extras; for those of a running rig only the help is called."""
 
 
 def test_each_promised_command_runs_without_any_extra(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Fits where a residual costs a simulation: few residuals, bounded steps, and values that the model does not take."""
+"""Fits with a simulation per residual: few residuals, bounded steps, and values that the model refuses."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ TIMES = np.linspace(0.0, 1.0, 50)
 
 
 class Decay:
-    """a exp(-b t) against a = 2, b = 3; it takes no b below `least`."""
+    """a exp(-b t) against a = 2, b = 3; it refuses b below `least`."""
 
     def __init__(self, least: float = -np.inf) -> None:
         self.least, self.runs = least, 0

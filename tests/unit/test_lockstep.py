@@ -1,4 +1,4 @@
-"""Devices under test in lockstep: what each command does, and that no device holds up a rig for ever."""
+"""Devices under test in lockstep: effect of each command, and no device blocks a rig for ever."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def running(duration_s: float | None = None) -> Iterator[Running]:
 
 
 class Steps:
-    """Steps that a tester takes on a thread of its own."""
+    """Steps that a tester requests on a separate thread."""
 
     def __init__(self, rig: Running, *ticks: int) -> None:
         self.replies: list[AcceptedStep] = []
@@ -41,7 +41,7 @@ class Steps:
 
 
 class Device(Console):
-    """One that deals with each block as it is told to."""
+    """A device that handles each block as instructed."""
 
     def __init__(self, rig: Running, name: str) -> None:
         super().__init__(MemoryClient(rig.server), name=name)
@@ -65,7 +65,7 @@ def test_no_block_is_run_before_all_devices_are_done_and_what_they_sent_before_i
         assert one.wait(1) == BLOCK
         assert one.hammer().tick == BLOCK
         one.done(BLOCK)
-        one.done(BLOCK)  # told twice is told once
+        one.done(BLOCK)  # the second report changes nothing
         assert rig.service.status()["tick"] == BLOCK
         assert two.speed(3.0).tick == BLOCK
         two.done(BLOCK)
@@ -245,7 +245,7 @@ def test_what_two_devices_command_at_one_tick_is_taken_in_the_order_of_their_nam
 
         thread = threading.Thread(target=command)
         thread.start()
-        time.sleep(0.4)  # who waits for others is not late
+        time.sleep(0.4)  # a device that waits for others is not late
         assert first.speed(1.0).id == 4
         assert rig.console.note("of nobody that has joined").id == 5
         assert numbers == []

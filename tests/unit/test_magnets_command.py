@@ -1,4 +1,4 @@
-"""`rig magnets`: the comparison as tables, JSON and a picture; what it refuses; what `rig params` says of it."""
+"""`rig magnets`: the comparison as tables, JSON and a picture; refusals; the entry in `rig params`."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def document(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict[str, A
 
 
 def numbers(lines: list[str], title: str) -> dict[str, list[float]]:
-    """Rows of the table of forces under a title: the columns of numbers by model."""
+    """Return the rows of the table of forces under a title: the columns of numbers by model."""
     start = next(n for n, line in enumerate(lines) if line.startswith(title)) + 2
     rows = {name: lines[start + n] for n, name in enumerate(FAMILY)}
     assert all(line.strip().startswith(name) for name, line in rows.items())
@@ -60,7 +60,7 @@ def test_tables_show_what_the_document_holds(capsys: pytest.CaptureFixture[str])
         )
         assert same_stiffness[name] == pytest.approx([1.7, *model["force_at_stiffness_used_n"]], abs=5.1e-4)
     text = " ".join(lines)
-    # A unit in brackets is no markup.
+    # A unit in brackets is not markup.
     assert "K [kN/m]" in text
     assert "8 magnets of 16.9 mm: number and length are assumed" in text
     assert "no measured force is available" in text

@@ -1,6 +1,6 @@
-"""What a user can get wrong: each gives one line on stderr that names the field and what it must be, and status 2.
+"""User errors: each gives one line on stderr that names the field and its valid values, and status 2.
 
-Nothing is printed on stdout, no traceback is shown, and no file is made or changed.
+Nothing is printed on stdout, no traceback is shown, and no file is created or changed.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ DROP = ("simulate", "drop", "-o", "out.csv")
 
 @dataclass(frozen=True)
 class Case:
-    """Files to put in place, what to type, and what the line must hold: the field, then what it must be."""
+    """Files to create, the command line, and the text that the line must contain: the field, then the requirement."""
 
     what: str
     arguments: tuple[str, ...]
@@ -353,7 +353,7 @@ def test_is_refused_in_one_line(
     printed = capsys.readouterr()
     assert end.value.code == 2
     assert printed.out == ""
-    # A range stands in the set below the file's, and the ring in the set of the scene.
+    # A range is in the set below the file's, and the ring in the set of the scene.
     read = [name for name in case.files if name in case.arguments and case.what not in OF_TWO_FILES]
     assert not read or any(name in printed.err for name in read), "the file is not named"
     check_line(printed.err, case)
@@ -402,7 +402,7 @@ def test_is_refused_by_the_command_itself(what: str, tmp_path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def simulation() -> Simulation:
-    """Spinning, the magnets on; nothing in this module moves it on."""
+    """Spinning, the magnets on; no test of this module advances it."""
     return Simulation(load_scene("stable-run"))
 
 

@@ -1,4 +1,4 @@
-"""Rigs by name: found while they run, whoever asks, and forgotten with their process, however it ended."""
+"""Rigs by name: found by any client while they run, and removed with their process, however it ended."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Notes: through the rig into its events, and so into every recording."""
+"""Notes: sent through the rig into its events, and thus into every recording."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ pytestmark = pytest.mark.wallclock
 
 
 class Simulation(FakeSimulation):
-    """The fake one, with a catalogue that a recorder can use."""
+    """The fake simulation with a catalogue that a recorder can use."""
 
     def catalogue(self) -> dict:
         return documents()[wire.CATALOGUE]
@@ -60,6 +60,6 @@ def test_a_note_is_recorded_with_its_time_and_is_no_command(tmp_path: Path) -> N
     assert (note["text"], note["tags"], note["from"]) == ("bearing is warm", ["bearing", "look"], "a test")
     assert note["wall_s"] > 1e9
     assert event_text(note)[1] == "note: bearing is warm #bearing #look"
-    # It does nothing to the rig: it is not among the commands that have to be sent again.
+    # It has no effect on the rig: it is not among the commands that must be repeated.
     scene = wire.decode_document(MemoryClient(server).request(wire.SCENE))
     assert all(entry["command"] != "note" for entry in scene["taken"])

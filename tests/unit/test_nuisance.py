@@ -1,4 +1,4 @@
-"""Logs of another rig: what they do not tell exactly comes out of them, and what is wrong in them is named."""
+"""Logs of another rig: values that they do not contain exactly are estimated, and faults in them are named."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ source = "keyphasor"
 
 
 def imported(folder: Path, columns: dict[str, np.ndarray], mapping: str, head: str = HEAD) -> Recording:
-    """A recording of columns of another recorder."""
+    """Import columns of another recorder; return the recording."""
     import pyarrow as pa
     from pyarrow import parquet
 
@@ -91,7 +91,7 @@ def mils(motion: second_rig.Motion, tmp_path_factory: pytest.TempPathFactory) ->
 
 
 def whole(folder: Path, motion: second_rig.Motion, *, seed: int, case: faulty_logs.Case | None = None) -> Recording:
-    """All channels, with something wrong."""
+    """Return a recording of all channels with a fault."""
     fault = faulty_logs.Case("", "") if case is None else case
     own_s, values = second_rig.log(motion, seed=seed, ppm=fault.ppm, edit=lambda values: fault.signals(values, motion))
     own_s, values = fault.samples(own_s, values)
@@ -99,7 +99,7 @@ def whole(folder: Path, motion: second_rig.Motion, *, seed: int, case: faulty_lo
 
 
 def test_the_second_rig_is_one_of_this_kind(motion: second_rig.Motion) -> None:
-    """It shares no line with the model; before its friction matters they are one, to the first impacts and beyond."""
+    """It shares no code with the model; until its friction matters they agree, to the first impacts and beyond."""
     pulse = {"at_s": 2.8, "command": "hammer", "force_n": 100.0, "duration_ms": 5.0, "direction": "x"}
     changes = {"duration_s": 2.86, "commands": [pulse], "sensors.chain": "ideal", "sensors.rate_hz": 40_000}
     run = simulate(load_scene("hammer", {**changes, "shaft.unbalance_phase": 0.21 + TURNED}))
@@ -128,7 +128,7 @@ def test_what_a_log_does_not_tell_comes_out_of_it(mils: Recording, motion: secon
     assert fitted["hammer.1.duration_ms"] == pytest.approx(5.0, rel=1e-3)
     (clock,) = (one for one in found.fitted if one.key == "clock.rate_ppm")
     assert abs(clock.value - PPM) < clock.half_width < 130.0
-    # Where the shaft was, on the log's clock.
+    # The shaft's angle, on the log's clock.
     row = 0.3 * (1.0 - PPM * 1e-6) * motion.rate_hz
     for axis in "xy":
         values = motion.values[f"ring_{axis}"]
@@ -170,7 +170,7 @@ def test_an_aligned_log_is_good(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("number", ["mu = 0.24", pytest.param("e = 0.885", marks=MATRIX)])
 def test_a_log_of_another_contact_is_not_good(number: str, tmp_path: Path) -> None:
-    """Its phases are within their limits, but no fit goes on through the first contact."""
+    """Its phases are within their limits; no fit continues through the first contact."""
     name, _, value = number.partition(" = ")
     other = {"c": damping_factor(float(value))} if name == "e" else {name: float(value)}
     motion = second_rig.run(second_rig.Rig(**other), turned=1.0, before_s=0.2, after_s=0.1)
@@ -189,7 +189,7 @@ commands = []
 
 
 def test_the_hum_of_the_mains_has_a_name(motion: second_rig.Motion, tmp_path: Path) -> None:
-    """The lines' hum on one probe is no fault of the model."""
+    """Mains hum on one probe is not a fault of the model."""
     own_s, values = second_rig.log(motion, seed=7, rate_hz=10_000.0, bandwidth_hz=4000.0, ppm=PPM)
     few = ("disk_x", "disk_y", "ring_x", "ring_y", "speed")
     mapping = "".join(f"[channels.{one}" for one in WHOLE.split("[channels.") if one.partition("]")[0] in few)
@@ -204,7 +204,7 @@ def test_the_hum_of_the_mains_has_a_name(motion: second_rig.Motion, tmp_path: Pa
 
 @pytest.mark.parametrize("name", ["quiet", pytest.param("contact", marks=MATRIX)])
 def test_a_log_without_a_pulse_is_taken_up_as_well(name: str, motion: second_rig.Motion, tmp_path: Path) -> None:
-    """It is of a shaft that turned before; of one that was in contact already, nobody knows from where it came."""
+    """Its shaft turned before. If it was in contact already, the origin of its motion is unknown."""
     own_s, values = second_rig.log(motion, seed=7, rate_hz=10_000.0, bandwidth_hz=4000.0, ppm=PPM)
     rows = own_s < 0.4 if name == "quiet" else own_s > 1.0
     part = {channel: one[rows] for channel, one in values.items()}
@@ -224,7 +224,9 @@ def test_contact_without_a_pulse_is_no_fault_of_sensors(motion: second_rig.Motio
 
 
 def test_pulses_that_nothing_foretells_are_no_fault(motion: second_rig.Motion, tmp_path: Path) -> None:
-    """One before the hammer tells the angle by the speed, as contact slows the shaft behind; none tells nothing."""
+    """One pulse before the hammer gives the angle by the speed, as contact slows the shaft afterwards; no pulse gives
+    nothing.
+    """
     own_s, values = second_rig.log(motion, seed=7, rate_hz=10_000.0, bandwidth_hz=4000.0, ppm=PPM)
     few = ("ring_x", "ring_y", "speed", "hammer", "keyphasor")
     columns = {"time": own_s[: (own_s > 0.63).sum()], **{name: values[name][own_s > 0.63] for name in few}}
@@ -246,28 +248,28 @@ def test_a_log_has_to_begin_before_the_pulse(motion: second_rig.Motion, tmp_path
         validate(recording)
 
 
-ASKED = {"contact.friction": 0.25, "contact.restitution": 0.9, "magnet.stiffness": 1.7}
+TRUTH = {"contact.friction": 0.25, "contact.restitution": 0.9, "magnet.stiffness": 1.7}
 PULSE = ("hammer.1.force_n", "hammer.1.duration_ms")
-"""Through impacts the two differ by little more than their product."""
+"""Through impacts, force and duration differ by little more than their product."""
 
 
 def test_contact_parameters_come_out_of_a_log_from_the_middle_of_a_run(tmp_path: Path) -> None:
-    """From a restitution, too, that is too far off for a slope to lead on."""
+    """Also from a restitution that is too far off for a descent along the slope."""
     motion = second_rig.run(second_rig.Rig(mu=0.235), turned=1.0, before_s=0.2, after_s=0.06, settled_s=1.5)
     recording, rules = whole(tmp_path, motion, seed=5), load_criteria().imported
     found = identify_log(
-        recording, Experiment.of(recording), tuple(ASKED), variants=[one.set for one in rules.variants],
+        recording, Experiment.of(recording), tuple(TRUTH), variants=[one.set for one in rules.variants],
         bandwidth=rules.bandwidth, start={"contact.restitution": 0.8},
     )  # fmt: skip
     assert found.judgement.fits
     told = {finding.unknown.key: finding for finding in found.judgement.findings}
-    for key, truth in zip((*ASKED, *PULSE), (0.235, 0.9, 1.7, 100.0, 5.0), strict=True):
+    for key, truth in zip((*TRUTH, *PULSE), (0.235, 0.9, 1.7, 100.0, 5.0), strict=True):
         assert told[key].standing == "identified"
         assert abs(told[key].value - truth) < told[key].half_width < 0.02 * truth
 
 
 def damping_factor(restitution: float) -> float:
-    """c (1 + e) = ln[(1 + c) / (1 - c e)]: what returns the restitution that is asked for."""
+    """Solve c (1 + e) = ln[(1 + c) / (1 - c e)] for the damping factor of a restitution e."""
     from scipy.optimize import brentq
 
     e = restitution
@@ -279,10 +281,10 @@ FIVE = (
     "contact.friction", "contact.restitution", "magnet.stiffness", "shaft.unbalance_eccentricity",
     "house.inner_beam_damping",
 )  # fmt: skip
-LONG = pytest.mark.skipif("RIG_COVERAGE_SEEDS" not in os.environ, reason="RIG_COVERAGE_SEEDS=40: ten minutes")
+slow_test = pytest.mark.skipif("RIG_COVERAGE_SEEDS" not in os.environ, reason="RIG_COVERAGE_SEEDS=40: ten minutes")
 
 
-@LONG
+@slow_test
 @pytest.mark.timeout(0)
 def test_intervals_hold_the_truth_as_often_as_they_say(tmp_path: Path) -> None:
     """Five unknowns of a log from the middle of a run, and its pulse; other speeds, clocks, angles and noises."""
@@ -317,11 +319,11 @@ def test_intervals_hold_the_truth_as_often_as_they_say(tmp_path: Path) -> None:
         held += np.abs(off) < 1.0
         print(seed, f"to {found.window.end_s:.3f} s:", " ".join(f"{one:+.2f}" for one in off), held, flush=True)
     assert held.min() >= 0.85 * seeds
-    for those in (held[: len(FIVE)], held):  # the pulse's make up for none of the five
+    for those in (held[: len(FIVE)], held):  # the pulse's values compensate for none of the five
         assert those.sum() >= 0.91 * len(those) * seeds
 
 
-@LONG
+@slow_test
 @pytest.mark.parametrize("number", ["e = 0.85", "e = 0.89", "k_ns = 1.42e8", "K_bv = 1.29e7", "M_ih = 1.75"])
 def test_a_wrong_model_gives_no_wrong_number(number: str, tmp_path: Path) -> None:
     name, _, value = number.partition(" = ")
@@ -339,7 +341,7 @@ def test_a_wrong_model_gives_no_wrong_number(number: str, tmp_path: Path) -> Non
 @MATRIX
 @pytest.mark.parametrize("seed", range(20))
 def test_aligned_logs_are_good(seed: int, tmp_path: Path) -> None:
-    """Four speeds, hard and soft pulses: whirl, or impacts that die out; angles and noise of their own."""
+    """Four speeds, hard and soft pulses: whirl, or impacts that decay; independent angles and noise."""
     speed_hz, force_n = (3.2, 4.2, 5.2, 6.2)[seed % 4], (100.0, 60.0)[seed // 4 % 2]
     aligned = second_rig.run(speed_hz=speed_hz, force_n=force_n, turned=0.9 * seed, settled_s=1.5)
     found = validate(whole(tmp_path, aligned, seed=200 + seed))

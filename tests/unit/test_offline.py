@@ -1,4 +1,4 @@
-"""The Python interface: as the package's own first lines show it, and what a run holds."""
+"""The Python interface: as in the package's docstring, and the contents of a run."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from rig.run.simulation import Simulation
 
 @pytest.fixture(scope="module")
 def shown() -> dict[str, Any]:
-    """What the lines in the docstring of the package leave behind, run as they stand there."""
+    """Variables after the example in the docstring of the package, run unchanged."""
     lines = textwrap.dedent((rig.__doc__ or "").split("\n\n")[1])
     assert len(lines.strip().splitlines()) == 5
     space: dict[str, Any] = {}
@@ -100,7 +100,7 @@ def test_every_signal_has_a_column_and_a_unit(run: Run) -> None:
         assert run.samples.unit(name) == channel.unit
         np.testing.assert_allclose(run.samples.to_si()[name], run.samples[name] * channel.si, rtol=1e-15)
         assert run.samples.to_si().unit(name) == run.unit(channel.signal)
-    # The same name on both sides: the model's in SI, the probe's in its own unit.
+    # The same name in both: the model's in SI, the probe's in its own unit.
     assert (run.unit("disk_x"), run.samples.unit("disk_x")) == ("m", "mm")
     assert run.samples.to_si().to_si().units == run.samples.to_si().units
 
@@ -180,7 +180,7 @@ def test_a_run_keeps_the_columns_that_are_named_where_they_are_to_go(tmp_path: P
     assert isinstance(some.signals, np.memmap)
     assert sorted(file.name for file in folder.iterdir()) == ["counts.npy", "samples.npy", "signals.npy"]
     assert some.unit("normal_force") == "N"
-    # Another run into the same folder leaves what the first one has in its hands.
+    # Another run into the same folder leaves the first one's data unchanged.
     mine = np.array(some.signals)
     few = simulate("hammer", duration_s=0.05, signals=["disk_x"], folder=str(folder))
     np.testing.assert_array_equal(some.signals, mine)
@@ -206,7 +206,7 @@ def test_a_run_keeps_the_columns_that_are_named_where_they_are_to_go(tmp_path: P
 def test_times_are_those_of_the_samples(run: Run) -> None:
     np.testing.assert_allclose(run.samples.times_s, np.arange(40_000) / 20_000, rtol=0, atol=1e-12)
     np.testing.assert_array_equal(run.times_s, run.samples.times_s)
-    # The probes see what the model says, at the same instants.
+    # The probes show the model's values, at the same instants.
     before = run.times_s < 0.02
     np.testing.assert_allclose(run.samples["ring_x"][before], run["ring_x"][before] * 1e3, rtol=0, atol=2e-3)
 

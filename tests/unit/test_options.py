@@ -1,4 +1,4 @@
-"""The command line: its help, its options, what it completes, and what it says of a line that is wrong."""
+"""The command line: its help, its options, completion, and errors."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ SHARED = ("--from", "--to", "--force", "--report", "--connect")
 
 
 def commands() -> dict[str, Any]:
-    """Every command and subcommand, by its name behind `rig`."""
+    """Return every command and subcommand, by its name after `rig`."""
     root = rig()
     found = {name: root.get_command(None, name) for name in root.list_commands(None)}
     return found | {f"{name} {part}": found[name].get_command(None, part) for name in GROUPS for part in GROUPS[name]}
@@ -40,7 +40,7 @@ IN_ALL = sum(map(len, COMMANDS.values()))
 
 
 def options() -> list[tuple[str, str, Any]]:
-    """Command, flag and parameter of every option there is."""
+    """Return command, flag and parameter of every option."""
     return [
         (name, flag, parameter)
         for name, command in COMMAND.items()
@@ -203,7 +203,7 @@ def test_a_new_shell_completes_once_that_is_installed(shell: str, tmp_path: Path
     program.chmod(0o755)
     home = {"HOME": str(tmp_path), "PATH": f"{tmp_path}:{os.environ['PATH']}", "SHELL": shell, "TERM": "dumb"}
     settings: Any = {"env": home, "cwd": tmp_path}
-    for _ in range(2):  # which changes nothing more
+    for _ in range(2):  # which changes nothing else
         subprocess.run([program, "completion", "--install"], check=True, **settings)
     for path in (path for path in tmp_path.iterdir() if path.name.endswith("shrc")):
         assert path.read_text().count("completion --install") == 1

@@ -46,7 +46,7 @@ def test_whirl_frequency_knows_sense_and_needs_no_centre(
     sign = 1.0 if forward else -1.0
     times, ox, oy = orbit(sign * hz, centre=complex(x, y))
     found = whirl_frequency(ox, oy, times + start_s)
-    # A part of a turn left over moves the mean, and with it the centre, by up to 1 part in 2 pi turns.
+    # A fraction of a turn at the end moves the mean, and with it the centre, by up to 1 part in 2 pi turns.
     assert found == pytest.approx(sign * hz, abs=0.2 / hz + 1e-6)
     assert whirl_frequency(ox, -oy, times + start_s) == pytest.approx(-found, rel=1e-9)
     assert whirl_frequency(oy, ox, times + start_s) == pytest.approx(-found, rel=1e-6)

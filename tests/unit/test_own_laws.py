@@ -1,4 +1,4 @@
-"""A contact law of a user's own: as a formula in a parameter, and as a file for the commands."""
+"""A user's own contact law: as a formula in a parameter, and as a file for the commands."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ BLOCK = 10_000
 
 
 class FakeTime:
-    """A time source that only moves when it is slept on, and by `cost_ns` at each look."""
+    """A time source that only advances by sleeping, and by `cost_ns` at each reading."""
 
     def __init__(self, *, oversleep_ns: int = 0, cost_ns: int = 0) -> None:
         self.ns = 123_456_789
@@ -221,7 +221,7 @@ def test_a_tick_and_its_utc_are_told_with_how_well_they_are_known() -> None:
     clock.start(250_000, 1_000_000)
     told = clock.statistics()["utc"]
     assert isinstance(told, dict)
-    # 2.123457789 s after the start lies between two ticks; the tick before was due 0.789 us earlier.
+    # 2.123457789 s after the start is between two ticks; the tick before was due 0.789 us earlier.
     assert told["tick"] == 250_000 + 2_123_457
     assert told["utc_s"] == pytest.approx(1_700_000_000.0 - 0.789e-6, abs=3e-7)  # a double holds 0.24 us
     assert told["uncertainty_s"] == pytest.approx(1e-6, rel=1e-3)

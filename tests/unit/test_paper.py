@@ -1,4 +1,4 @@
-"""`rig paper`: its data files, its verdicts, its quick variant, and what the command refuses."""
+"""`rig paper`: its data files, its verdicts, its quick variant, and refusals."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ from rig.cli.main import main
 from rig.physics.parameters import load_parameters
 from tests.commands import shown
 
-BESIDE = {"hammer.duration", "hammer.at", "transducer.bandwidth"}
-"""What the report assumes beside the parameters."""
+ASSUMPTIONS = {"hammer.duration", "hammer.at", "transducer.bandwidth"}
+"""Assumptions of the report in addition to the parameters."""
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +59,7 @@ def test_every_assumed_value_has_a_range():
     for name in SETS:
         entries = load_parameters(name).entries
         assumed = {key for key, entry in entries.items() if entry.kind == "assumed"}
-        assert {entry.key for entry in assumed_values()} == assumed | BESIDE
+        assert {entry.key for entry in assumed_values()} == assumed | ASSUMPTIONS
 
 
 def test_ranges_hold_what_is_taken_and_what_the_model_accepts():
@@ -135,7 +135,7 @@ def test_printed_values_against_the_sets():
     printed = {entry.key: entry for entry in printed_values()}
     verdicts = {key: entry.verdict(load_parameters("as-printed")) for key, entry in printed.items()}
     differs = {key for key, verdict in verdicts.items() if verdict == "differs"}
-    # M_oh stands for the sum in eqs. 24 and 25, K_ft for one transducer of a pair.
+    # M_oh denotes the sum in eqs. 24 and 25, K_ft one transducer of a pair.
     assert differs == {"house.outer_mass", "house.pair_stiffness_vertical"}
 
 
@@ -204,7 +204,7 @@ def test_quick_variant_has_a_number_on_every_line(findings: Findings, told: list
 
 @pytest.fixture(scope="module")
 def report(findings: Findings) -> Iterator[Report]:
-    """Return the report of the quick variant, its pictures small and without automatic layout, which takes long."""
+    """The report of the quick variant, its pictures small and without automatic layout, which takes long."""
     picture = Report.picture
 
     def small(report: Report, figure: Any, caption: str, *, dpi: int = 25) -> None:

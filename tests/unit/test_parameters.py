@@ -1,4 +1,4 @@
-"""Parameter sets: what is in them, units that come off at loading, overrides, users' own files."""
+"""Parameter sets: their contents, units removed at loading, overrides, users' own files."""
 
 from __future__ import annotations
 
@@ -89,7 +89,9 @@ ARITHMETIC = (
 
 
 def is_formula(text: str, variables: tuple[str, ...]) -> bool:
-    """Whether a short text is one and no wrong name: numbers and variables, with a digit, an operator or a space."""
+    """Return whether a short text is a formula and not a wrong name: numbers and variables, with a digit, an operator
+    or a space.
+    """
     try:
         nodes = list(ast.walk(ast.parse(text.strip(), mode="eval")))
     except (SyntaxError, ValueError):

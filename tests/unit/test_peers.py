@@ -1,4 +1,4 @@
-"""Other people's solvers on the rig's equations: that they solve the same problem, and say so where they do not."""
+"""Third-party solvers on the rig's equations: they solve the same problem, or report that they do not."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def solve(name: str, given: Problem, tolerance: float, **options):
 
 
 def states_in_contact(given: Problem, *, count: int) -> np.ndarray:
-    """States about the ring, shape (count, 14); the houses move less than a transducer's preload."""
+    """Return states around the ring, shape (count, 14); the houses move less than a transducer's preload."""
     rng = np.random.default_rng(1)
     spread = STATE_SCALE * [0.05, 0.0, 1.0, 0.3, 0.3, 0.3, 0.3, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0]
     y = given.y0 + rng.normal(size=(count, 14)) * spread
@@ -65,7 +65,7 @@ def test_a_window_ends_where_the_inputs_change() -> None:
 @pytest.mark.parametrize("changes", [{}, {"drive.mode": "ideal"}, {"parameters": "as-printed"}])
 @pytest.mark.parametrize("phase", [FLIGHT, TOUCHING])
 def test_compiled_and_plain_python_are_the_same_equations(changes: dict, phase: int) -> None:
-    # Euler's equations in the turning frame against Lagrange's in the angles.
+    # Euler's equations in the rotating frame against Lagrange's in the angles.
     given = replace(problem(0.03, changes=changes), phase=phase, onset_speed=0.1)
     parameters, plain = pack(given), PlainPython(given)
     for y in states_in_contact(given, count=8):
@@ -149,7 +149,7 @@ def test_tight_solvers_agree(name: str, tolerance: float, within: float, frictio
 
 
 def test_a_contact_without_sliding_rolls_from_the_start() -> None:
-    # A drop from the top is symmetric: friction has nothing to do, and must not invent a direction.
+    # A drop from the top is symmetric: friction does no work, and must not create a direction.
     given = problem(0.055, scene="drop", friction="exact")
     for name, tolerance in (("scipy-dop853", 1e-9), ("cvode-adams", 1e-10), ("heyoka", 1e-12)):
         if not PEERS[name].installed:
@@ -162,7 +162,7 @@ def test_a_contact_without_sliding_rolls_from_the_start() -> None:
 
 
 def test_a_drop_without_sliding_does_not_stall_where_the_law_would_pull() -> None:
-    # Friction and normal force reach 0 at one instant: a loose series must not slide on under a force that pulls.
+    # Friction and normal force reach 0 at one instant: a loose series must not keep sliding under a tensile force.
     given = problem(0.5, scene="drop", friction="exact")
     solution = solve("heyoka", given, 1e-4)
     assert solution.failure is None
@@ -189,7 +189,7 @@ def test_a_drop_meets_the_ring_after_the_time_of_a_pendulum() -> None:
     lean = np.sqrt(1.0 - (bottom / shaft.arm_ring) ** 2)
     assert speed == pytest.approx(shaft.arm_ring * lean * rate, rel=1e-6)
     fall = shaft.mass * shaft.gravity * shaft.arm_centre / shaft.transverse_inertia
-    assert time_s == pytest.approx(rate / fall, rel=1e-4)  # but for the lean of a hundredth
+    assert time_s == pytest.approx(rate / fall, rel=1e-4)  # except for the inclination of a hundredth
 
 
 @pytest.mark.parametrize("name", PEERS)

@@ -1,4 +1,4 @@
-"""What a stored pick depends on: the code of the equations and engines, each file of it, and no other."""
+"""Dependencies of a stored choice: the code of the equations and engines, each file of it, and no other."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The player: payload for payload, on time, from any position, and changed only as asked for."""
+"""The player: payload by payload, on time, from any position, and changed only on request."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def track(path: Path) -> Track:
 
 
 class Heard:
-    """Everything that was published, with the time at which it was."""
+    """Everything that was published, with its time."""
 
     def __init__(self, server: MemoryServer, time: FakeTime | None = None) -> None:
         self.all: list[tuple[str, bytes]] = []
@@ -81,7 +81,7 @@ class Heard:
 
 
 def play(track: Track, **options: Any) -> tuple[Heard, dict[str, Any]]:
-    """Play to the end with a clock of our own; returns what was heard and the summary."""
+    """Play to the end with a simulated clock; return the published messages and the summary."""
     time = FakeTime(oversleep_ns=700_000)
     server = MemoryServer()
     heard = Heard(server, time)
@@ -550,7 +550,7 @@ def test_the_scene_tells_latecomers_the_commands_so_far(folder: Path) -> None:
             assert scene.get("taken", []) == taken
 
 
-# What it stands on.
+# Dependencies.
 
 
 def test_an_end_that_was_none_stays_where_it_was(folder: Path) -> None:

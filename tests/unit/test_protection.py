@@ -1,4 +1,4 @@
-"""The protection monitor: rows worked out by hand, its settings, and its broken mutants."""
+"""The protection monitor: hand-computed rows, its settings, and its broken mutants."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The protection monitor does what it is accepted by: tables of `protection_acceptance`, with the rig's own faults."""
+"""Acceptance of the protection monitor: tables of `protection_acceptance`, with the rig's own faults."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tests.unit import protection_acceptance as table
 from tests.unit.protection_acceptance import monitor, outcome, sine
 
 SETTLED = {"startup_s": 2.0}
-"""The high-pass of 0.5 Hz has forgotten where it began."""
+"""The high-pass of 0.5 Hz has settled."""
 
 
 def kinds(settings: Any, rows: list[Any]) -> set[str]:
@@ -59,7 +59,7 @@ def test_a_fault_comes_to_what_the_vote_says(kind: str) -> None:
 
 def test_the_edge_of_a_cable_that_breaks_is_a_danger_without_a_delay_alone() -> None:
     changes = {"duration_s": 0.4, "commands": [table.fault("open")]}
-    rows = list(table.stream("probes", changes, "stable-run"))  # behind the low-pass, which test signals have not
+    rows = list(table.stream("probes", changes, "stable-run"))  # after the low-pass, which test signals bypass
     for delay_s, expected in ((0.0, True), (1e-4, False)):
         actions = outcome(monitor(danger_delay_s=delay_s), rows)
         assert any(action.kind == "trip" for action in actions) == expected
@@ -77,7 +77,7 @@ def test_a_fault_of_the_keyphasor_comes_to_what_is_told(kind: str) -> None:
 def test_a_trip_stops_whirl_where_drive_and_delay_are_fast(ramp_hz_s: float, delay_s: float, established: bool) -> None:
     trip_s, found = table.whirls(ramp_hz_s, delay_s)
     assert found == established
-    # The level is above its set point 6.3 ms after the blow begins; the trip is at the end of a block.
+    # The level exceeds its set point 6.3 ms after the start of the pulse; the trip is at the end of a block.
     assert math.isclose(trip_s, 0.01 * math.ceil(100.0 * (0.0063 + delay_s)))
 
 

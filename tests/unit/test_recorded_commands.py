@@ -1,4 +1,4 @@
-"""Command events in a file are checked by the models of live commands: what no rig takes is a doubt, no traceback."""
+"""Command events in a file are checked by the models of live commands: an invalid one is a doubt, no traceback."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Readers of a part of a recording read its chunks by the index, and find there what a reader of the whole finds."""
+"""Readers of a part of a recording read its chunks by the index, and find the same there as a reader of the whole."""
 
 from __future__ import annotations
 
@@ -75,13 +75,13 @@ def in_order(rows: list[tuple[str, bytes]]) -> list[tuple[str, bytes]]:
 
 
 def late(rows: list[tuple[str, bytes]]) -> list[tuple[str, bytes]]:
-    """A block of the middle arrives at the end, as after a lost link."""
+    """Move a block of the middle to the end, as after a lost link."""
     place = next(n for n, (key, _) in enumerate(rows) if key == PROBES and n > len(rows) // 2)
     return [*rows[:place], *rows[place + 1 :], rows[place]]
 
 
 def long(rows: list[tuple[str, bytes]]) -> list[tuple[str, bytes]]:
-    """All blocks of a stream as one, as an import may have it."""
+    """Merge all blocks of a stream into one, as an import may have it."""
     blocks = [decode_block(data, schema_of(key) or "") for key, data in rows if key == PROBES]
     first, values = blocks[0], [row for block in blocks for row in block.values.tolist()]
     data = encode_block(Block(first.tick, first.index, first.rate_hz, first.tick_rate_hz, _as(first, values)))
@@ -95,7 +95,7 @@ def _as(block: Block, values: list[list[int]]) -> Any:
 
 
 def faulty(rows: list[tuple[str, bytes]]) -> list[tuple[str, bytes]]:
-    """A file with documents on faults is read as a whole."""
+    """Append a document on faults; such a file is read as a whole."""
     return [*rows, (FAULTS, encode_document({"event": "begin", "tick": 5, "id": 1, "time_s": 5e-6}))]
 
 

@@ -1,4 +1,4 @@
-"""The commands on recordings: `rig info`, `rig cut`, `rig recover`, and what `rig record` refuses."""
+"""The commands on recordings: `rig info`, `rig cut`, `rig recover`, and refusals of `rig record`."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ def test_a_finished_file_with_a_damaged_chunk_is_not_whole(path, tmp_path, capsy
     source.write_bytes(data)
     assert run("recover", source) == 1
     assert "1 damaged record skipped" in capsys.readouterr().out
-    # A .part that was finished but not yet renamed is still to become a recording.
+    # A finished .part that was not yet renamed still becomes a recording.
     part = tmp_path / "other.mcap.part"
     part.write_bytes(path.read_bytes())
     assert run("recover", part) == 1

@@ -1,4 +1,4 @@
-"""What a recording tells of its own soundness, against signals whose faults are known."""
+"""Health of the channels in a recording, compared with signals of known faults."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def _channel(name: str) -> Channel:
 
 
 def volts_of(name: str) -> np.ndarray:
-    """A sound channel: its noise on a whirl of 84 Hz with a few impacts [V]."""
+    """Return a normal channel: its noise on a whirl of 84 Hz with a few impacts [V]."""
     channel = _channel(name)
     rng = np.random.default_rng(len(name) + ord(name[-1]))
     signal = 0.1 * np.sin(2 * np.pi * 84.3 * TIME_S)
@@ -40,7 +40,7 @@ def volts_of(name: str) -> np.ndarray:
 
 
 def record(path: Path, changed: dict[str, np.ndarray] | None = None, **options: Any) -> Health:
-    """Write the channels, some of them changed, and examine what was written."""
+    """Write the channels, some of them changed, and examine the recording."""
     about = documents()
     scene = {**about[SCENE], "scene": {"sensors": options.get("sensors", {})}, **dict(options.get("about", {}))}
     with RecordingWriter(

@@ -32,7 +32,7 @@ def write(path: Path, *, blocks: int = BLOCKS) -> None:
         monotonic_s=lambda: now_s[0],
     ) as file:
         for number, (key, payload) in enumerate(stream(blocks)):
-            now_s[0] = number * 0.00125  # eight payloads a block: a flush each five blocks
+            now_s[0] = number * 0.00125  # eight payloads per block: a flush every five blocks
             file.write(key, payload, number)
         file.finish("completed")
 
@@ -137,7 +137,7 @@ def test_groups_are_joined_where_all_have_a_row(recording):
     shorter = replace(probes, index=probes.index[7:], times_s=probes.times_s[7:], values=probes.values[7:])
     np.testing.assert_array_equal(joined([opened.samples("forces"), shorter]).index, shorter.index)
     late = replace(probes, times_s=probes.times_s + 20e-6)
-    # A stretch of two rates, from far behind the start, has no row number in common.
+    # A stretch of two rates, far from the start, has no row number in common.
     slow = replace(probes, rate_hz=probes.rate_hz / 4, index=probes.index + 10**9)
     for parts in ([], [opened.samples("forces"), late], [probes, slow]):
         with pytest.raises(InputError, match=r"^groups must be sampled at the same instants"):
@@ -196,7 +196,7 @@ def test_a_file_cut_anywhere_gives_all_whole_chunks_before_the_cut(path, tmp_pat
         try:
             recording = Recording.open(cut_file)
         except InputError:
-            # Nothing but the head was there, or not all of that.
+            # Only the header was there, or a part of it.
             assert not [end for end, _ in chunks if end <= cut], cut
             continue
         readable += 1
@@ -236,7 +236,7 @@ def test_a_damaged_byte_is_an_input_error_or_harmless(path, tmp_path):
 
 
 def test_zeros_behind_the_last_flush_are_no_data(path, tmp_path):
-    """What a power cut can leave: the length of the file is right, the last pages are not."""
+    """A possible result of a power cut: the length of the file is right, the last pages are not."""
     chunks = _chunks(path)
     data = path.read_bytes()[: chunks[4][0]]
     torn = tmp_path / "torn.mcap.part"

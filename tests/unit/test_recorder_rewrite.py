@@ -1,4 +1,4 @@
-"""Recordings made of recordings: recovered and cut."""
+"""Recordings derived from recordings: recovered and cut."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def writer(path: Path, **options: Any) -> RecordingWriter:
 
 
 def write(path: Path, items: list[tuple[str, bytes]]) -> Path:
-    """A recording whose chunks are as large as they become."""
+    """Write a recording with chunks of the largest size."""
     with writer(path, sync_every_s=1e9) as file:
         for number, (key, payload) in enumerate(items):
             file.write(key, payload, 1_700_000_000_000_000_000 + number * 1_250_000)
@@ -111,7 +111,7 @@ def test_a_recovered_file_is_finished_and_holds_what_the_source_did(path, chunks
     for topic in (topic for topic in source.messages if topic.startswith("rig/")):
         made_of, had = ([one for one in each.everything() if one[0] == topic] for each in (recording, source))
         assert made_of == had, topic
-    # Derived anew: the messages for plots of the last rows too.
+    # Recomputed: the messages for plots of the last rows included.
     views = [topic for topic in recording.messages if topic.startswith("view/")]
     for topic in views:
         again = [payload for _, payload in recording.payloads(topic)]
@@ -221,7 +221,7 @@ def test_a_cut_keeps_the_rows_between_two_times_and_whole_payloads(path, items, 
         np.testing.assert_array_equal(new.values, old.values[rows])
         np.testing.assert_array_equal(new.index, old.index[rows])
         np.testing.assert_allclose(new.times_s, old.times_s[rows], atol=1e-12)
-    # Rows lie at each 0.5 ms: the first one not before 0.2034 s is number 407.
+    # Rows are at every 0.5 ms: the first one not before 0.2034 s is number 407.
     np.testing.assert_array_equal(recording.truth("state").index, np.arange(407, 1500))
     edges = whole.edges()
     np.testing.assert_array_equal(recording.edges(), edges[(edges >= 0.2034) & (edges < 0.75)])
@@ -254,7 +254,7 @@ def short(tmp_path_factory) -> Recording:
 
 
 def rows(recording: Recording, key: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Ticks, numbers and values of all rows."""
+    """Return ticks, numbers and values of all rows."""
     blocks = list(recording.blocks(key))
     ticks = [
         block.tick + (block.values[:, 0] if key == EDGES else block.times_s * 1e6 - block.tick) for block in blocks
@@ -280,7 +280,7 @@ def test_pieces_of_any_cuts_hold_each_row_once_and_join_to_the_whole(short, tmp_
     edges_s = [-np.inf, *sorted(times_s), np.inf]
     pieces = []
     for from_s, to_s in pairwise(edges_s):
-        # A piece between two rows of all streams holds nothing and is refused.
+        # A piece between two rows of all streams contains nothing and is refused.
         with contextlib.suppress(InputError):
             pieces.append(cut(short, folder / f"{len(pieces)}.mcap", from_s=from_s, to_s=to_s).path)
     joined = Recording.open(cut(join(pieces), folder / "joined.mcap").path)

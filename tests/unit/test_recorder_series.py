@@ -1,4 +1,4 @@
-"""Recordings in several files, and what they may take of the disk."""
+"""Recordings in several files, and their limit of disk space."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def series(
             scene=scene,
             beginning=beginning,
             force=force,
-            monotonic_s=lambda: 0.01 * next(calls),  # a flush each 25 payloads
+            monotonic_s=lambda: 0.01 * next(calls),  # a flush every 25 payloads
         )
 
     needs = Needs(default_table(), TICK_RATE_HZ, about[SCENE], open_file, Limits(**limits), force, monotonic_s)
@@ -214,7 +214,7 @@ def test_the_oldest_files_make_room_where_that_was_asked_for(tmp_path):
 
 @pytest.mark.parametrize("more", [{"budget_mb": 5.0, "when_full": "remove-oldest"}, {}])
 def test_the_counts_are_those_of_the_files_that_are_there(tmp_path, more):
-    """Rows, gaps, payloads that were no blocks, and times: of files that made room nothing is counted."""
+    """Rows, gaps, invalid payloads, and times: deleted files do not count."""
     file, items = series(tmp_path / "run.mcap", rotate_mb=1.0, **more), list(stream(500))
     lost = [item for number, item in enumerate(items) if item[0] != PROBES or number % 100]
     write(file, [*lost[:50], (PROBES, b"no block"), *lost[50:-9], (PROBES, b"no block"), *lost[-9:]])

@@ -60,7 +60,7 @@ def path(tmp_path) -> Path:
 
 
 def play(client: ScriptedClient, items: list[tuple[str, bytes]]) -> Callable[[], None]:
-    """What the rig does: publish all that."""
+    """Return an action that publishes all items."""
 
     def act() -> None:
         for item in items:
@@ -72,7 +72,7 @@ def play(client: ScriptedClient, items: list[tuple[str, bytes]]) -> Callable[[],
 def record(
     session: RecordingSession, client: ScriptedClient, act: Callable[[], None], progress: list[Progress] | None = None
 ) -> Summary:
-    """Run a session while another thread acts as the rig, from the moment on which the session has subscribed."""
+    """Run a session while another thread acts as the rig, as soon as the session has subscribed."""
 
     def wait_and_act() -> None:
         deadline = time.monotonic() + 10.0
@@ -143,7 +143,7 @@ def test_the_last_status_ends_it_where_all_rows_are_there_and_only_there(path, s
     items.append((EVENTS, encode_document(end)))
     if status:
         items.append((STATUS, encode_document({"tick": 30_000, "time_s": 0.03, "state": "ended"})))
-    session = RecordingSession(client, path, monotonic_s=lambda: 0.0)  # no silence lasts where time stands still
+    session = RecordingSession(client, path, monotonic_s=lambda: 0.0)  # without a clock no silence lasts
     late = threading.Timer(0.3 if reason == "late" else 10.0, session.stop, ["late"])
     late.start()
     summary = record(session, client, play(client, items))
@@ -174,7 +174,7 @@ def test_over_the_memory_transport(path):
     for key in {key for key, _ in items}:
         assert [p for _, p in recording.payloads(key)] == [p for k, p in items if k == key]
     assert {beat["name"] for beat in beats} == {"recorder-7"}
-    # The last one tells the rig that everything is here, so that it need not keep its cache.
+    # The last one reports to the rig that everything has arrived, so that it need not keep its cache.
     assert (beats[-1]["received_index"], beats[-1]["lost"]) == (4000, 0)
 
 
@@ -448,7 +448,7 @@ def test_a_full_inbox_refuses_blocks_counts_them_and_leaves_a_gap(path, monkeypa
         gate.set()
         deadline = time.monotonic() + 10.0
         quiet = 0
-        while quiet < 100 and time.monotonic() < deadline:  # what is being written takes room, too
+        while quiet < 100 and time.monotonic() < deadline:  # data being written also takes space
             before = len(done)
             time.sleep(0.002)
             quiet = quiet + 1 if len(done) == before and not session.waiting else 0

@@ -51,7 +51,7 @@ def event(name: str, time_s: float, **fields: Any) -> tuple[str, bytes]:
 
 
 def feed(file: Captures, blocks: range, events: dict[int, list[tuple[str, bytes]]] | None = None) -> None:
-    """Blocks of 10 ms of probes and forces; events behind the block that they are in, as the rig sends them."""
+    """Feed blocks of 10 ms of probes and forces; events follow the block that contains them, as the rig sends them."""
     for number in blocks:
         for key in (PROBES, FORCES):
             file.take(Payload.read(key, encode_block(block_of(key, number)), number))
@@ -92,7 +92,7 @@ def test_without_a_trigger_there_is_no_file(tmp_path):
 
 
 def _level_block(number: int, values: np.ndarray) -> tuple[str, bytes]:
-    """Forces with P_E [N] as given and the others at zero."""
+    """Return a block of forces with the given P_E [N] and zero for the others."""
     group = default_table().groups["forces"]
     counts = np.zeros((200, 4), dtype=np.int32)
     counts[:, group.names.index("P_E")] = np.rint(values / group.channels[2].scale)
@@ -138,7 +138,7 @@ def test_the_time_before_a_trigger_is_whole_even_if_it_was_captured_before(tmp_p
 
 
 def pulses(file: Captures, rows: list[int], blocks: range) -> None:
-    """Probes of 10 ms blocks, at rest but for single rows of 0.3 mm."""
+    """Feed blocks of 10 ms of probes, at rest except for single rows of 0.3 mm."""
     group = default_table().groups["probes"]
     channel = group.channels[0]
     for number in blocks:
@@ -177,7 +177,7 @@ def test_a_level_that_is_passed_already_is_told_once(tmp_path):
 
 
 def _whirl(time_s: np.ndarray) -> np.ndarray:
-    """Beyond 500 N twice a turn at 40 Hz, from 1 s to 6 s and from 7 s on."""
+    """Return a signal above 500 N twice per turn at 40 Hz, from 1 s to 6 s and from 7 s on."""
     whirling = ((time_s >= 1.0) & (time_s < 6.0)) | (time_s >= 7.0)
     return np.where(whirling, 1000.0 * np.sin(2 * np.pi * 40.0 * (time_s - 1.0)), 0.0)
 

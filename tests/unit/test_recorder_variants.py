@@ -1,4 +1,4 @@
-"""Each legal form of an MCAP file is read by every command as our own form of it."""
+"""Each legal form of an MCAP file is read by every command like the rig's own form."""
 
 from __future__ import annotations
 

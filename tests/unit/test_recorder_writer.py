@@ -64,7 +64,7 @@ def path(tmp_path_factory, items) -> Path:
 
 
 def foreign(path: Path, topic: str) -> list:
-    """Topic, read by the decoder of another project that knows nothing of this one."""
+    """Read a topic by the decoder of an independent project."""
     from mcap.reader import make_reader
     from mcap_ros2.decoder import DecoderFactory
 
@@ -413,7 +413,7 @@ def test_what_is_flushed_survives_without_finish(tmp_path, items):
     copy = tmp_path / "copy.mcap.part"
     copy.write_bytes(file.part.read_bytes())
     found = sum(count for topic, count in Recording.open(copy).messages.items() if topic.startswith("rig/"))
-    assert len(items) - 26 <= found < len(items)  # a flush each 0.25 s of that clock, 0.01 s a payload
+    assert len(items) - 26 <= found < len(items)  # a flush each 0.25 s of that clock, 0.01 s per payload
     file.finish("completed")
 
 

@@ -1,4 +1,4 @@
-"""Closed sets: a member that only one of its tables has is refused; it neither acts nor shows a number."""
+"""Closed sets: a member that is missing in one of its tables is refused; it neither acts nor shows a number."""
 
 import ast
 import os
@@ -75,7 +75,7 @@ def test_a_signal_that_no_stage_computes_is_refused_by_name() -> None:
 
 
 class Siren(SceneCommand):
-    """A command that nothing carries out."""
+    """A command without an implementation."""
 
     command: Literal["siren"] = "siren"
 
@@ -101,7 +101,7 @@ def test_a_format_without_a_writer_is_refused_and_not_written_as_csv(
 
 
 def test_no_choice_between_commands_ends_in_an_else_that_acts() -> None:
-    """Every if-chain over two or more commands' classes has no else, or one that raises."""
+    """Every if-chain over two or more classes of commands has no else, or one that raises."""
     classes = {each.__name__ for each in commands.COMMANDS.values()}
     chains, acting = 0, []
     for path in (path for folder in ("rig", "recorder", "replays", "drivers") for path in Path(folder).rglob("*.py")):
@@ -119,7 +119,7 @@ def test_no_choice_between_commands_ends_in_an_else_that_acts() -> None:
                 chains += 1
                 if last.orelse and not isinstance(last.orelse[-1], ast.Raise):
                     acting.append(f"{path}:{last.orelse[-1].lineno}")
-    assert chains >= 1  # of faults; what a command does stands in its own class
+    assert chains >= 1  # for faults; a command's effect is in its own class
     assert not acting
 
 

@@ -1,4 +1,4 @@
-"""Reports: whole, the same bytes for the same numbers, and safe against what stands in a name."""
+"""Reports: complete, the same bytes for the same numbers, and safe against names with markup."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ def test_pdf_is_one(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("suffix", [".html", ".pdf"])
 def test_a_name_that_is_no_text_is_shown_escaped(suffix: str, tmp_path: Path) -> None:
-    name = "a\udcff\x01\u202e.mcap"  # as the system gives a file's name that is not UTF-8
+    name = "a\udcff\x01\u202e.mcap"  # as the system represents a file name that is not UTF-8
     report = Report(name, name, origin={"file": name})
     report.heading(name)
     report.text(name)
@@ -152,7 +152,7 @@ def test_an_existing_report_is_replaced_when_asked(tmp_path: Path) -> None:
 
 
 def test_tables_of_any_width_go_into_a_pdf(tmp_path: Path) -> None:
-    """Columns that just fill a page must not be wider than it by a rounding error."""
+    """Columns that just fill a page must not exceed it by a rounding error."""
     report = Report("Tables", "")
     for columns in range(1, 12):
         for length in range(1, 60, 7):

@@ -1,4 +1,4 @@
-"""The client of a rig whose streams a test scripts: rows of the truth are checked as those of sensors are."""
+"""The client of a rig whose streams a test defines: rows of the truth are checked like those of sensors."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ ROWS = 20
 
 
 class SettledClient(ScriptedClient):
-    """A client whose subscriptions are in effect at once."""
+    """A client whose subscriptions are active at once."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -28,10 +28,10 @@ class SettledClient(ScriptedClient):
         self.replies[STATUS] = encode_document(status)
 
     def settle(self) -> None:
-        """Nothing is on its way."""
+        """Return at once: nothing is in transit."""
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Do nothing: there are no resources."""
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""Brent's method against closed forms and another code of it."""
+"""Brent's method compared with closed forms and another implementation."""
 
 from __future__ import annotations
 

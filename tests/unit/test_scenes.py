@@ -1,4 +1,4 @@
-"""Scenes: shipped ones, what a field accepts, overrides by dotted key, and the document that runs again."""
+"""Scenes: shipped ones, valid fields, overrides by dotted key, and the document that runs again."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from rig.run.commands.table import COMMANDS, HammerCommand, ReleaseCommand, Spee
 from rig.run.scenes import Scene, load_scene, parse_scene, read_value, scene_document, scene_names
 
 PERIODS = [n for n in range(1, 10_001) if 1_000_000 % n == 0]
-"""Whole numbers of ticks whose rates are whole as well [us]."""
+"""Periods of whole ticks whose rates are whole as well [us]."""
 
 
 def numbers(low: float, high: float) -> st.SearchStrategy[float]:
@@ -34,7 +34,7 @@ hammers = st.fixed_dictionaries(
 )
 speeds = st.fixed_dictionaries({"command": st.just("speed"), "speed_hz": numbers(0.0, 15.0)})
 requests = hammers | speeds | st.just({"command": "release"})
-# A blow each half second at most, and the magnets let go once.
+# At most one impact per half second, and one release of the magnets.
 timed = st.lists(requests, max_size=4, unique_by=lambda request: request["command"] == "release" or id(request)).map(
     lambda found: [{"at_s": 0.5 * n, **request} for n, request in enumerate(found)]
 )
@@ -45,7 +45,7 @@ profiles = st.lists(st.tuples(numbers(0.01, 10.0), numbers(0.0, 15.0)), min_size
 
 @st.composite
 def scenes(draw: st.DrawFn) -> dict[str, Any]:
-    """The data of a good scene, as TOML would give it."""
+    """Draw a valid scene, as TOML would give it."""
     step = draw(st.sampled_from([1, 5, 10, 25, 50]))
     rates = [1_000_000 // period for period in PERIODS if period % step == 0]
     drive = {"mode": draw(st.sampled_from(["torque", "ideal"]))}

@@ -1,4 +1,4 @@
-"""Scorecards of synthetic DAQs whose defects are known: what they declare turns red, and nothing else."""
+"""Scorecards of synthetic DAQs with known defects: the declared quantities fail, and no others."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def red(card: Scorecard) -> set[str]:
     return {row.quantity for row in card.rows if row.verdict == FAIL}
 
 
-# Digital: what was sent is the counts of the probes.
+# Digital: the counts of the probes were sent.
 
 
 @pytest.fixture(scope="module")
@@ -208,7 +208,7 @@ def recorded(
     offset: float = 0.0, wires: tuple[int, ...] = (0, 1, 2, 3),
     turned: int = -1, corner_hz: float = 0.0, seconds: float = SECONDS,
 ) -> dict[str, np.ndarray]:  # fmt: skip
-    """What a DAQ with these defects makes of the tones, in volts; skew is that of the second channel."""
+    """Return the tones as a DAQ with these defects records them, in volts; skew is that of the second channel."""
     rows = round(seconds * RATE_HZ)
     true_s = START_S + np.arange(rows) / RATE_HZ / (1.0 + 1e-6 * ppm)
     columns = {"time [s]": np.arange(rows) / RATE_HZ}
@@ -245,7 +245,7 @@ def test_each_defect_turns_red_what_it_declares_and_nothing_else(
     true = {"gain": 2000.0, "offset": 0.01, "clock": 260.0, "skew": 1500.0, "jitter": 120.0, "corner": 2000.0}
     for row in card.rows:
         if row.verdict == FAIL and row.quantity in true and row.channel not in NAMES[2:]:
-            wide = row.high - row.low  # one interval in twenty does not hold: none may be off by its whole width
+            wide = row.high - row.low  # one interval in twenty misses the truth: none may miss by its whole width
             assert row.low - wide < true[row.quantity] < row.high + wide, row
 
 
@@ -341,7 +341,7 @@ def test_what_lies_between_samples_is_off_by_a_millionth() -> None:
     assert samples.span_s[0] == EDGE / RATE_HZ
 
 
-# What is asked, and how it is told.
+# Options, and output of the result.
 
 
 def test_an_interval_that_reaches_over_its_limit_shows_nothing() -> None:
@@ -458,7 +458,7 @@ def test_wrong_inputs_are_one_line(
     ("name", "ppm"), [("test-two-tone", 30.0), ("test-two-tone", 60.0), ("test-chirp", 30.0), ("test-multisine", 30.0)]
 )
 def test_a_test_signal_is_known_by_its_formula(name: str, ppm: float, tmp_path: Path) -> None:
-    """The session's own noise is then not in what the DAQ is held against."""
+    """The session's own noise is then not in the DAQ's reference."""
     scene = load_scene(name, {"duration_s": 0.8})
     write_run(Simulation(scene), tmp_path / "sent.mcap")
     generator, true_s = np.random.default_rng(8), 0.05 + np.arange(12_000) / RATE_HZ / (1.0 + 1e-6 * ppm)
@@ -533,7 +533,7 @@ def test_a_file_in_pieces_is_the_whole_file(suffix: str, tmp_path: Path, monkeyp
 
 @pytest.mark.parametrize(("bits", "noise"), [(24, 1e-3), (12, 1e-4), (24, 2e-2)])
 def test_effective_bits_are_those_of_a_windowed_spectrum(bits: int, noise: float) -> None:
-    """The textbook's other way: no fit, but lines of a Blackman-Harris window, which spreads a line over nine."""
+    """The textbook's alternative: no fit, but lines of a Blackman-Harris window, which spreads a line over nine."""
     rows = 1 << 16
     phase = 2.0 * np.pi * 0.0498765 * np.arange(rows) + 0.3
     values = 4.0 * np.sin(phase) + 1e-3 * np.sin(3.0 * phase) + 0.2
@@ -550,6 +550,6 @@ def test_effective_bits_are_those_of_a_windowed_spectrum(bits: int, noise: float
     assert found.enob[0] == pytest.approx((sinad - 1.76) / 6.02, abs=0.05)
     third = round(3.0 * 0.0498765 * rows)
     thd = 10.0 * math.log10(power[third - 5 : third + 6].sum() / signal)
-    # The fit takes the noise at the harmonics off, which a spectrum does not: beside much noise the interval decides.
+    # The fit subtracts the noise at the harmonics, a spectrum does not: at high noise the interval decides.
     assert noise > 1e-2 or found.thd_db[0] == pytest.approx(thd, abs=1.0)
     assert found.thd_db[1] <= 20.0 * math.log10(1e-3 / 4.0) <= found.thd_db[2]

@@ -1,4 +1,4 @@
-"""DAQs whose converters have other bits than the rig's: their counts are exact; bits that one channel loses are not."""
+"""DAQs with converters of other bits than the rig's: their counts are exact; bits lost by one channel are not."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def test_a_daq_of_other_bits_has_every_count(form: str, session: Path, counts: n
     assert any("lower bits" in line for line in card.remarks) == (form not in ("24 bits in 32", list(FORMS)[-1]))
     name = next(iter(columns))
     values = np.unique(columns[name])
-    columns[name][4000] = values[np.searchsorted(values, columns[name][4000]) - 3]  # some counts less
+    columns[name][4000] = values[np.searchsorted(values, columns[name][4000]) - 3]  # some counts lower
     columns = {each: np.delete(column, 1500) for each, column in columns.items()}
     card = judge(write_parquet(tmp_path / "daq.parquet", columns), [session])
     assert red(card) == {("altered values", "disk_x"), ("missing rows", "probes")}

@@ -1,4 +1,4 @@
-"""Every fault of a channel turns red the rows that it is declared to, of its own channels, and no other."""
+"""Every fault of a channel makes its declared rows fail, on its own channels, and no others."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ DUE = [channel.name for channel in CHANNELS]
 
 
 SIZED = ("gain", "offset", "late", "clock", "jitter", "crosstalk")
-"""Kinds whose size is that of a quantity of the scorecard."""
+"""Kinds with the size of a quantity of the scorecard."""
 Sessions = dict[bool, tuple[Path, dict[str, np.ndarray]]]
 
 
 class Rig:
-    """Tones in place of the physics, behind the sensors' chains."""
+    """Tones in place of the physics, fed through the sensors' chains."""
 
     def __init__(self) -> None:
         t = np.arange(round(SECONDS * ROWS_HZ) + 1) / ROWS_HZ
@@ -54,7 +54,7 @@ class Rig:
         self.columns = [places[name] for group in GROUPS for name in group.names]
 
     def counts(self, faults: tuple[str, ...], *, noisy: bool) -> dict[str, np.ndarray]:
-        """Counts by group with faults from the beginning on."""
+        """Return counts by group with faults from the beginning."""
         chain = Conditioner(GROUPS, row_rate_hz=ROWS_HZ, seed=2, noise=noisy, columns=self.columns)
         faulty = Faulty(default_table(), [chain], seed=2, row_ticks=10, setting=Setting())
         for kind in faults:
@@ -86,7 +86,7 @@ def declared(kinds: tuple[str, ...], what: set[str] | None = None) -> set[tuple[
 def daq(
     path: Path, counts: dict[str, np.ndarray], change: Callable[[dict[str, np.ndarray]], Any] = lambda _: None
 ) -> Path:
-    """A file of volts."""
+    """Write a file of volts."""
     columns = {"time [s]": np.arange(round(SECONDS * RATE_HZ)) / RATE_HZ}
     for group in GROUPS:
         for n, channel in enumerate(group.channels):
@@ -101,7 +101,7 @@ def names_of(kind: str) -> set[str]:
 
 
 def together(most: int) -> list[tuple[str, ...]]:
-    """Kinds of which no two are on one channel, so many at a time."""
+    """Return sets of at most `most` kinds, no two of which are on one channel."""
     sets: list[tuple[str, ...]] = []
     for kind in SCORED:
         taken = [
@@ -144,7 +144,7 @@ def test_a_daq_that_takes_counts(kinds: tuple[str, ...], rig: Rig, sessions: Ses
 
 
 ROWS = np.arange(round(SECONDS * RATE_HZ))
-LATE = np.r_[ROWS[:4000], ROWS[4200:4400], ROWS[4000:4200], ROWS[4400:5000], 5001, 5000, ROWS[5002:]]
+LATE_BLOCK_ROWS = np.r_[ROWS[:4000], ROWS[4200:4400], ROWS[4000:4200], ROWS[4400:5000], 5001, 5000, ROWS[5002:]]
 
 
 def swapped(columns: dict[str, np.ndarray]) -> None:
@@ -167,11 +167,11 @@ def picked(rows: np.ndarray) -> Callable[[dict[str, np.ndarray]], None]:
 
 WRONG = (changed("disk_x [V]", 1.0005), changed("P_N [V]", plus=0.25), changed("P_S [V]", -1.0), swapped)
 BACK, ALL = ("all groups", "stamps that go back"), "all groups"
-OWN: dict[str, tuple[Callable[[dict[str, np.ndarray]], Any], set[tuple[str, str]]]] = {
+FILE_DEFECTS: dict[str, tuple[Callable[[dict[str, np.ndarray]], Any], set[tuple[str, str]]]] = {
     "sound": (lambda _: None, set()),
     "a row and a block lost": (picked(np.delete(ROWS, np.r_[4321, 6000:6200])), {(ALL, "missing rows")}),
     "a block twice": (picked(np.insert(ROWS, 4200, ROWS[4000:4200])), {(ALL, "doubled rows"), BACK}),
-    "a block late, and two rows swapped": (picked(LATE), {(ALL, "swapped rows"), BACK}),
+    "a block late, and two rows swapped": (picked(LATE_BLOCK_ROWS), {(ALL, "swapped rows"), BACK}),
     "wrong sensitivity, zero, sign and wires": (
         lambda columns: [change(columns) for change in WRONG],
         {("disk_x", "scale"), ("P_N", "offset"), ("P_S", "polarity"), ("disk_y", "mapping"), ("P_E", "mapping")},
@@ -183,7 +183,9 @@ OWN: dict[str, tuple[Callable[[dict[str, np.ndarray]], Any], set[tuple[str, str]
 
 @pytest.mark.parametrize(("suffix", "fd"), [(".log", True), (".asc", False), (".blf", True)])
 def test_a_logger_of_a_can_bus(suffix: str, fd: bool, sessions: Sessions, tmp_path: Path) -> None:
-    """Of every n-th row, in classic frames of the upper 16 bits: what came is exact, and a lost frame is named."""
+    """Every n-th row, in classic frames of the upper 16 bits: the received rows are exact, and a lost frame is
+    named.
+    """
     import can
 
     session, counts = sessions[True]
@@ -211,9 +213,9 @@ def test_a_logger_of_a_can_bus(suffix: str, fd: bool, sessions: Sessions, tmp_pa
     assert card.runs == {"missing rows probes": [(lost, lost + (form.rows - 1) * step)]}
 
 
-@pytest.mark.parametrize("defect", OWN)
+@pytest.mark.parametrize("defect", FILE_DEFECTS)
 def test_a_daqs_own_defects(defect: str, sessions: Sessions, tmp_path: Path) -> None:
-    (session, counts), (change, declares) = sessions[True], OWN[defect]
+    (session, counts), (change, declares) = sessions[True], FILE_DEFECTS[defect]
     assert red(judge(daq(tmp_path / "daq.parquet", counts, change), [session], channels=DUE)) == declares
 
 

@@ -1,4 +1,4 @@
-"""Inputs of `rig score`: which channels were to be recorded, limits, and files that are not whole."""
+"""Inputs of `rig score`: requested channels, limits, and incomplete files."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def test_a_clock_that_was_set_gives_no_traceback(at: int, gap_s: float, session:
     stamps[at:] += gap_s
     columns = {"time [s]": stamps, "disk_x [mm]": np.sin(0.04 * np.arange(400))}
     daq = write_parquet(tmp_path / "daq.parquet", columns)
-    with suppress(InputError):  # a rate that no record can have is refused in a line
+    with suppress(InputError):  # a rate that no record can have is refused in one line
         assert judge(daq, [session]).outcome != Outcome.PASS
 
 
@@ -105,7 +105,7 @@ def test_a_stretch_without_values_gives_no_warning(session: Path, counts: np.nda
 def test_no_channel_at_all_is_refused(
     channels: str, session: Path, counts: np.ndarray, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Of an empty variable of a shell: no channel would be judged, and each record would pass."""
+    """From an empty variable of a shell: no channel would be judged, and each record would pass."""
     daq = write_parquet(tmp_path / "daq.parquet", columns_of(counts))
     status, _, err = said(capsys, "score", daq, "--against", str(session), "--channels", channels)
     assert (status, err.count("\n")) == (2, 1), err

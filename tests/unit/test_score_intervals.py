@@ -1,4 +1,4 @@
-"""Widths of a scorecard's intervals, and limits made of the channel table, against closed forms."""
+"""Widths of a scorecard's intervals, and limits derived from the channel table, against closed forms."""
 
 from __future__ import annotations
 
@@ -129,7 +129,9 @@ def test_the_interval_of_stamp_jitter_is_that_of_chi_squared() -> None:
 
 @pytest.mark.parametrize("noise", ["white", "ar10", "ar100", "sine"])
 def test_intervals_hold_for_coloured_and_drifting_noise(noise: str) -> None:
-    """Of 40, at least 33 hold, which is 3.6 standard deviations below 38; the long run is `tests.score_coverage`."""
+    """Of 40, at least 33 contain the truth, which is 3.6 standard deviations below 38; the long run is
+    `tests.score_coverage`.
+    """
     found: dict[str, list[Estimate]] = {"offset": [], "noise": [], "SINAD": []}
     t = np.arange(ROWS) / 20e3
     for seed in range(40):
@@ -190,13 +192,13 @@ def test_limits_made_of_the_table_are_closed_forms() -> None:
     sine_db = 20.0 * math.log10(1.0 / math.sqrt(2.0) / noise_mm)
     assert ends("SINAD", amplitude=1.0) == pytest.approx((sine_db - 0.83, math.inf))
     assert ends("ENOB", amplitude=1.0) == pytest.approx(((sine_db - 1.76) / 6.02 - 0.14, math.inf))
-    # Without an amplitude nothing is asked.
+    # Without an amplitude there is no requirement.
     assert ends("SINAD") is None
 
 
 @pytest.mark.parametrize(("alike", "expected"), [(False, 1.0), (True, 2.0)])
 def test_errors_of_rounding_do_not_average_out_over_channels(alike: bool, expected: float) -> None:
-    """Channels of one rotor are rounded alike: a 14-bit stable run had its clock drift red by a mean of four."""
+    """Channels of one rotor are rounded equally: a 14-bit stable run failed its clock drift by a mean of four."""
     value, half = pool_estimates(np.array([-3.0, -1.0, -3.0, -1.0]), np.full(4, 0.25), equal_errors=alike)
     assert value == pytest.approx(-2.0)
     assert half == pytest.approx(expected)

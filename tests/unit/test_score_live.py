@@ -1,4 +1,4 @@
-"""A DAQ that delivers while the rig runs: what came is a file as any other, and when it came is told."""
+"""A DAQ that delivers while the rig runs: its data are judged as any file, and their latency is reported."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_latency_is_arrival_less_that_of_the_rigs_block(counts: np.ndarray, tmp_
     daq = tmp_path / "daq.csv"
     daq.write_text(HEADING + lines(counts))
     blocks = np.arange(len(counts) // BLOCK)
-    # A block comes to the session at its first row; half of each comes from the DAQ after 20 ms, the rest after 30.
+    # A block reaches the session at its first row; half of each comes from the DAQ after 20 ms, the rest after 30.
     rows = 1 + np.column_stack([blocks * BLOCK + BLOCK // 2, (blocks + 1) * BLOCK]).ravel()
     unix_s = 1.7e9 + np.column_stack([blocks * 0.01 + 0.02, blocks * 0.01 + 0.03]).ravel()
     card = judge(daq, [session], arrivals=Arrivals(rows, unix_s, 1e-4))
@@ -74,7 +74,7 @@ def test_rows_from_before_the_session_are_not_judged(counts: np.ndarray, tmp_pat
 
 
 class Deliverer:
-    """A rig that sends blocks, and a DAQ that writes them into a pipe, without some rows, from a moment on."""
+    """A rig that sends blocks, and a DAQ that writes them into a pipe, from a moment on and without some rows."""
 
     def __init__(self, *, without: tuple[int, ...] = (), blocks: int = 150) -> None:
         self.client, (self.source, self._sink) = ScriptedClient(), os.pipe()
@@ -96,7 +96,7 @@ class Deliverer:
                 kept = [n for n in range(len(block.values)) if block.index + n not in self._without]
                 pipe.write(lines(block.values[kept]))
                 pipe.flush()
-            pipe.write("0.1,0.2")  # cut off
+            pipe.write("0.1,0.2")  # truncated
 
     def collect(self, folder: Path) -> Delivered:
         def tell(part: float, text: str) -> None:

@@ -1,4 +1,4 @@
-"""`rig score -m`: names, units, fractions of full scale, bits and signs by a mapping, and units that it must give."""
+"""`rig score -m`: names, units, fractions of full scale, bits and signs by a mapping, and units that it must have."""
 
 from __future__ import annotations
 

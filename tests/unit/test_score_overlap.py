@@ -1,4 +1,6 @@
-"""The digital path by counts alone: where a recording lies in the session, small gains, and time stamps of any kind."""
+"""The digital path by counts alone: position of a recording in the session, small gains, and time stamps of any
+kind.
+"""
 
 from __future__ import annotations
 
@@ -109,7 +111,7 @@ QUIET = {
     "five of eight, reversed": (["probes", "forces"], 3, True),
     "two of four": (["probes"], 2, True),
 }
-"""Groups, channels that whirl, and whether the others stand in reverse order; these have noise and a level alone."""
+"""Groups, channels that whirl, and whether the others are in reverse order; these have only noise and a level."""
 
 
 @pytest.mark.parametrize("which", QUIET)
@@ -137,14 +139,14 @@ PERIOD = 1500
 
 
 def repeating(rows: int, channels: int, generator: np.random.Generator) -> np.ndarray:
-    """Return counts of a signal that repeats, with noise below one count: a few in 10,000 are off by one."""
+    """Return counts of a repeating signal, with noise below one count: a few in 10,000 are off by one."""
     counts = generator.integers(-50, 50, (PERIOD, channels))[np.arange(rows) % PERIOD]
     return counts + (generator.random(counts.shape) < 3e-4)
 
 
 @pytest.mark.parametrize(("first", "last"), [(7200, 11_000), (0, 3800)], ids=["after", "before"])
 def test_rows_beyond_a_session_are_not_those_of_another_period(first: int, last: int, tmp_path: Path) -> None:
-    """Nearly all of them are equal a period away, and more rows of the record are in the session there."""
+    """Nearly all of them are equal one period away, where more rows of the record would be in the session."""
     whole = repeating(11_000, 4, np.random.default_rng(0))
     session = write_session(tmp_path / "session.mcap", {"probes": whole[2700:8700]})
     card = judge(write_parquet(tmp_path / "daq.parquet", columns_of(whole[first:last])), [session])
@@ -166,7 +168,7 @@ STALE = {
     "the end first, a row lost after it": [(15_000, 20_000), (3000, 5000), (5001, 8600)],
     "the begin last": [(3000, 14_000), (0, 7000)],
 }
-"""Rows of the session that a record has, in its order."""
+"""Rows of the session in a record, in its order."""
 
 
 @pytest.mark.parametrize(("which", "repeats"), [*((which, False) for which in STALE), ("the end first", True)])

@@ -11,7 +11,7 @@ from tests.score_population import Population, bounds, figures
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder of the sessions, which several cases are held against."""
+    """Folder of the sessions, which several cases share."""
     return tmp_path_factory.mktemp("population")
 
 
@@ -46,4 +46,4 @@ def test_a_goal_is_missed_by_one_wrong_verdict() -> None:
     assert figures("defects", [line] * 19 + [line | {"other": ["clock"]}])[1]
     assert not figures("defects", [line] * 18 + [line | {"right": False}] * 2)[1]
     assert not figures("defects", [line] * 19 + [line | {"outcome": "crashed"}])[1]
-    assert bounds(0, 200)[1] == pytest.approx(1.0 - 0.025 ** (1.0 / 200.0))  # the closed form of none of n
+    assert bounds(0, 200)[1] == pytest.approx(1.0 - 0.025 ** (1.0 / 200.0))  # the closed form of 0 of n

@@ -24,16 +24,16 @@ from tests.score_sessions import Sent, table_with, write_counts
 
 RATE_HZ, NOISE = 20e3, 1e-3
 SEEDS = 20
-LEAST = 17
-"""Intervals of 95 % that hold of 20, in 99 of 100 cases."""
+MIN_HITS = 17
+"""Number of 20 intervals of 95 % that contain the truth, in 99 of 100 cases."""
 
 
 def held(true: float, judged: Callable[[np.random.Generator], Interval | None], width: float) -> None:
-    """Check how many intervals hold a value, and that they are at most so wide."""
+    """Check how many intervals contain a value, and their largest width."""
     found = [judged(np.random.default_rng(seed)) for seed in range(SEEDS)]
     whole = [each for each in found if each is not None]
     assert len(whole) == SEEDS
-    assert sum(low <= true <= high for _, low, high in whole) >= LEAST, (true, whole)
+    assert sum(low <= true <= high for _, low, high in whole) >= MIN_HITS, (true, whole)
     assert np.median([high - low for _, low, high in whole]) < width
 
 
@@ -46,7 +46,7 @@ def test_intermodulation_is_that_of_a_polynomial(square: float, cube: float) -> 
     true = 10.0 * math.log10(((square * a**2) ** 2 + (0.75 * cube * a**3) ** 2) / a**2)
 
     def judged(generator: np.random.Generator) -> Interval | None:
-        known = x + NOISE * generator.standard_normal(len(x))  # a session has noise of its own
+        known = x + NOISE * generator.standard_normal(len(x))  # a session has independent noise
         y = x + bent + NOISE * generator.standard_normal(len(x))
         matrix = np.column_stack([known, np.ones(len(x))])
         parts = np.linalg.lstsq(matrix, y, rcond=None)[0]
@@ -72,7 +72,7 @@ def test_products_that_fold_or_coincide_are_no_intermodulation(
         assert found[2] < -80.0
     bent = intermodulation(t, known, 1e-3 * (known**2 - np.mean(known**2)) + noise, 1.0)
     assert bent is not None
-    assert -61.0 < bent[0] < -53.0  # two lines of a2 A^2 over two tones are -54 dB; one may lie at another one
+    assert -61.0 < bent[0] < -53.0  # two lines of a2 A^2 over two tones are -54 dB; one may coincide with another
 
 
 def test_tones_whose_products_are_all_beyond_half_of_the_rate_show_no_intermodulation() -> None:
@@ -101,8 +101,7 @@ def ramp(rows: int, period: int) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize(("square", "cube"), [(1e-4, 0.0), (0.0, 4e-5)])
 def test_inl_is_that_of_a_polynomial(square: float, cube: float) -> None:
-    # Off the best line, a2 x^2 on +-h is at most 2/3 a2 h^2, and a3 x^3 is 2/5 a3 h^3, both at the ends.
-    # 80 rows beside the jump, and 4 noises, are left out.
+    # From the best line, a2 x^2 on +-h deviates by at most 2/3 a2 h^2, and a3 x^3 by 2/5 a3 h^3, both at the ends.
     t, x = ramp(12_000, 12_000)
     h = 10.0 - 80 * 20.0 / 12_000 - 4.0 * NOISE
     true = max(2.0 / 3.0 * square * h**2, 0.4 * cube * h**3) / 20.0 * 1e6
@@ -118,7 +117,7 @@ def test_inl_is_that_of_a_polynomial(square: float, cube: float) -> None:
 
 @pytest.mark.parametrize("wider", [0.0, 0.7])
 def test_dnl_is_that_of_one_wide_code(wider: float) -> None:
-    # 8 bits: code 100 takes a part of the next one.
+    # 8 bits: code 100 includes a part of the next one.
     t, x = ramp(20_000, 20_000)
     step = 20.0 / 256
 
@@ -169,7 +168,7 @@ def test_crosstalk_of_equal_signals_is_inconclusive(same: str) -> None:
 def test_errors_of_a_slow_known_signal_are_no_crosstalk(hz: float, amplitude: float) -> None:
     from scipy.signal import detrend
 
-    # Without mean and slope of each of 64 blocks, less is left of slow signals than a session's rounding may repeat.
+    # Without mean and slope of each of 64 blocks, less remains of slow signals than a session's rounding may repeat.
     t, size = np.arange(24_000) / 48e3, 1.2e-3
     angle = 2.0 * np.pi * hz * t
     own = amplitude * np.sin(angle)
@@ -183,7 +182,7 @@ def test_errors_of_a_slow_known_signal_are_no_crosstalk(hz: float, amplitude: fl
 
 
 def steps(respond: Callable[[np.ndarray], np.ndarray], generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Return a square wave and what a DAQ makes of it, whose rows lie 0.37 rows after the steps and less each time."""
+    """Return a square wave and a DAQ's record of it, whose rows are 0.37 rows after the steps and decreasing."""
     n = np.arange(9700)
     known, values = np.where(n // 600 % 2, 2.0, -2.0), np.full(len(n), -2.0)
     for number, edge in enumerate(range(600, len(n), 600)):

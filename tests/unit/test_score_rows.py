@@ -1,4 +1,4 @@
-"""Rows of the digital path: which row of those sent each recorded one is, at any offset and after any loss."""
+"""Rows of the digital path: which sent row each recorded one is, at any offset and after any loss."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def followed(sent: np.ndarray, recorded: np.ndarray, start: int = 0, pieces: int
 
 
 def wrong(found: Followed) -> list[int]:
-    """Return the numbers of missing, foreign, doubled, swapped and altered rows."""
+    """Return the numbers of missing, foreign, repeated, swapped and altered rows."""
     events = found.foreign, found.doubled, found.swapped
     missing = int(np.sum(found.lost[:, 1] - found.lost[:, 0] + 1))
     return [missing, *map(len, events), sum(each.rows for each in found.altered)]

@@ -1,4 +1,4 @@
-"""Time stamps of a record of counts: whatever they are, rows are judged by counts, and bad stamps are red."""
+"""Time stamps of a record of counts: rows are always judged by counts, and bad stamps fail."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Time track of an analogue record: lost and doubled samples, drift of the clock, begins, and what is judged."""
+"""Time track of an analogue record: lost and repeated samples, drift of the clock, start of the record, judged
+parts.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +37,7 @@ def two_tones(t: np.ndarray) -> np.ndarray:
 def track(
     signal: object, kept: np.ndarray, *, ppm_s: float = 0.0, ppm: float = 30.0, span_s: tuple[float, float] = (0.0, 0.8)
 ) -> Track:
-    """Follow a record at 30 ppm or another rate, of which some rows are kept, from rows 1000 to 4000."""
+    """Follow a record at 30 ppm or another rate, with some rows removed, from rows 1000 to 4000."""
     since_s = ROWS / RATE_HZ
     bend_s = 0.5e-6 * ppm_s * (since_s - since_s[2500]) ** 2
     true_s = 0.05 + since_s * (1.0 - 1e-6 * ppm) - bend_s
@@ -91,7 +93,7 @@ def test_a_step_within_eight_rows_of_an_end_is_not_told_from_a_late_begin(row: i
 
 
 def test_a_disturbed_end_is_no_step() -> None:
-    """The last rows are explained by no other part of the session."""
+    """No other part of the session explains the last rows."""
     values = np.concatenate([ROWS[:-100], np.random.default_rng(3).permutation(ROWS[-100:])])
     found = track(TONES, values)
     assert found.steps() == []
@@ -124,7 +126,9 @@ def test_rows_that_nothing_explains_are_not_judged() -> None:
 
 @pytest.mark.parametrize("doubled", [None, 9900])
 def test_a_record_is_not_followed_round_and_round_at_an_end_of_a_session(doubled: int | None) -> None:
-    """The last rows of a session are less well known than those a period earlier, which explain what comes after."""
+    """The last rows of a session are less well known than those a period earlier, which explain the rows that
+    follow.
+    """
 
     def whirl(t: np.ndarray) -> np.ndarray:
         return np.sin(2.0 * np.pi * RATE_HZ / 245.1 * t)
@@ -168,7 +172,7 @@ def test_the_begin_that_explains_all_signals_is_taken_where_one_signal_repeats()
         sources.append(Source(name, table[name], wire, values, 0.0, RATE_HZ, Exact(signal, (0.0, 2.0), RATE_HZ), 0.0))
     found = align(sources)
     assert found is not None
-    assert not found.ambiguous  # the pulse comes at another part of the whirl at each of the other begins
+    assert not found.ambiguous  # at each of the other begins the pulse is at another part of the whirl
     assert found.begin_s == pytest.approx(repeat_s, abs=1e-6)
     assert found.own_s["keyphasor"] == pytest.approx(found.own_s["disk_x"], abs=1e-6)
 
@@ -195,7 +199,7 @@ def slow_sources(
 
 
 def test_a_begin_that_needs_steps_where_another_one_does_not_is_not_taken() -> None:
-    """Turns of a rotor differ by some samples: early begins explain rows after the session, by steps; a loss is one."""
+    """Turns of a rotor differ by some samples: early begins explain rows after the session by steps; a loss is one."""
 
     def angle(t: np.ndarray) -> np.ndarray:
         return 2.0 * np.pi * 5.0 * (t + 7e-4 * np.sin(2.0 * np.pi * (t + 0.6 * t**2)))
@@ -272,7 +276,7 @@ def test_a_lost_sample_of_a_signal_that_repeats_fails(session: Path, tmp_path: P
 
 
 def test_a_doubled_sample_of_a_whirl_leaves_every_channel_at_one_begin(tmp_path: Path) -> None:
-    """One channel is explained as well half a turn off; the channels a quarter turn behind it are not."""
+    """One channel is explained equally well half a turn off; the channels a quarter turn later are not."""
     sent, rate_hz = Sessions(tmp_path).get("test-whirl", seed=54, first_s=61.0), 25.6e3
     box = Converter(61.3 + 1e-5, round(0.8 * rate_hz), rate_hz, ppm=40.0)
     volts = box.volts(sent, np.random.default_rng(3))
@@ -283,7 +287,7 @@ def test_a_doubled_sample_of_a_whirl_leaves_every_channel_at_one_begin(tmp_path:
 
 
 def test_rows_before_a_channel_freezes_do_not_stand_outside_the_session(tmp_path: Path) -> None:
-    """A fault of 10 ms of one channel spoils no fit of the rest of a sine, and hides no rows."""
+    """A fault of 10 ms on one channel spoils no fit of the rest of a sine, and hides no rows."""
     sent = Sessions(tmp_path / "sessions").get("test-sine")
     volts = Converter(2.05, 24_000).volts(sent, np.random.default_rng(9))
     volts[9000:9200, 1] = volts[9000, 1]
@@ -298,7 +302,7 @@ def test_rows_before_a_channel_freezes_do_not_stand_outside_the_session(tmp_path
 def test_a_block_in_place_of_another_does_not_move_the_record_out_of_the_session(
     at: int, names: int, tmp_path: Path
 ) -> None:
-    """A begin from which rows are judged up to the fault only leaves less than the right one."""
+    """Judged up to the fault only, a wrong begin leaves a smaller residual than the right one."""
     sent = Sessions(tmp_path / "sessions").get("test-two-tone", first_s=61.0)
     volts = Converter(61.2, 20_000).volts(sent, np.random.default_rng(3))
     volts[at : at + 200] = volts[at - 200 : at]
@@ -330,7 +334,7 @@ def test_rows_without_a_value_are_lost(
         assert card.row("lost samples", PROBES[n].name).value == count
 
 
-OWN_S = np.arange(len(TRUE_S)) / RATE_HZ
+DAQ_TIMES_S = np.arange(len(TRUE_S)) / RATE_HZ
 UNEVEN = np.arange(len(TRUE_S)) % 7 == 5
 
 
@@ -338,10 +342,10 @@ UNEVEN = np.arange(len(TRUE_S)) % 7 == 5
 def test_a_channel_of_a_lower_rate_in_one_table_is_judged_by_its_own_rows(
     held: int, phase: int, session: Path, tmp_path: Path
 ) -> None:
-    """Of two rates that no rows have in common, as programs merge files, the time stamps are uneven."""
+    """Two rates with no row in common, as programs merge files: the time stamps are uneven."""
     rows = np.arange(len(TRUE_S))
     if held:
-        blank, true_s, stamps_s = {1: rows % held != phase}, TRUE_S, OWN_S
+        blank, true_s, stamps_s = {1: rows % held != phase}, TRUE_S, DAQ_TIMES_S
     else:
         blank, shift = {0: UNEVEN, 1: ~UNEVEN, 2: UNEVEN}, np.where(UNEVEN, 0.5, 0.0)
         own = np.cumsum(np.where(UNEVEN, 0, 1)) - 1 + shift
@@ -355,11 +359,11 @@ def test_a_channel_of_a_lower_rate_in_one_table_is_judged_by_its_own_rows(
 @pytest.mark.parametrize(
     ("stamps_s", "quantity"),
     [
-        (np.where(np.arange(len(TRUE_S)) == 4000, OWN_S - 1e-4, OWN_S), "stamps that go back"),
-        (np.where(np.arange(len(TRUE_S)) < 4000, OWN_S, OWN_S - 2e-3), "stamps that go back"),
-        (np.where(np.arange(len(TRUE_S)) < 4000, OWN_S, OWN_S + 2e-3), "stamp rate"),
+        (np.where(np.arange(len(TRUE_S)) == 4000, DAQ_TIMES_S - 1e-4, DAQ_TIMES_S), "stamps that go back"),
+        (np.where(np.arange(len(TRUE_S)) < 4000, DAQ_TIMES_S, DAQ_TIMES_S - 2e-3), "stamps that go back"),
+        (np.where(np.arange(len(TRUE_S)) < 4000, DAQ_TIMES_S, DAQ_TIMES_S + 2e-3), "stamp rate"),
         (np.zeros(len(TRUE_S)), "stamp rate"),
-        (OWN_S[::-1].copy(), "stamps that go back"),
+        (DAQ_TIMES_S[::-1].copy(), "stamps that go back"),
     ],
     ids=["one back", "back from a row on", "ahead from a row on", "constant", "reversed"],
 )
@@ -390,7 +394,7 @@ def test_a_few_rows_in_place_of_others_fail_although_the_judged_part_is_within_i
 def test_a_record_that_is_inverted_as_a_whole_fails_where_that_shows(
     kind: str, unit: str, outcome: str, tmp_path: Path
 ) -> None:
-    """A sine is inverted half a period later, which leaves its polarity open; a bias is not."""
+    """A sine is inverted half a period later, which leaves its polarity open; a bias does not."""
     sent = Sessions(tmp_path / "sessions").get(kind, first_s=61.0)
     volts = Converter(61.2, 8000).volts(sent, np.random.default_rng(9))
     columns = {name: (told, -values) for name, (told, values) in as_columns(sent, volts, unit).items()}
@@ -414,7 +418,7 @@ def test_clock_is_the_mean_and_its_drift_fails(session: Path, tmp_path: Path) ->
 
 
 def test_a_daq_that_waits_for_a_signal_that_repeats_begins_with_the_session(session: Path, tmp_path: Path) -> None:
-    """Later begins explain the same rows; from them the idle rows would lie in the session."""
+    """Later begins explain the same rows; with them the idle rows would be in the session."""
     idle = np.full(2000, 0.0125)  # where the signal is zero
     card = card_of(session, tmp_path / "daq.parquet", np.concatenate([idle, 0.004 + np.arange(8001) / RATE_HZ]))
     assert red(card) == set()
@@ -425,7 +429,7 @@ def test_a_daq_that_waits_for_a_signal_that_repeats_begins_with_the_session(sess
 def test_quiet_rows_of_seconds_beside_a_session_that_repeats_are_not_judged(
     before_s: float, taken_s: float, after_s: float, tmp_path: Path
 ) -> None:
-    """Hundreds of begins by whole periods explain the same rows; of these, few leave the quiet rows outside."""
+    """Hundreds of begins by whole periods explain the same rows; few of these leave the quiet rows outside."""
     sent = Sessions(tmp_path / "sessions").get("test-sine", seed=80, first_s=61.0)
     begin_s = 61.0 - before_s if before_s else 63.0 - taken_s
     rows = round((before_s + taken_s + after_s) * RATE_HZ)
@@ -472,5 +476,5 @@ def test_times_at_which_a_signal_nearly_repeats_come_behind_those_at_which_it_do
     fit = fit_stretch(values, rows / RATE_HZ, known, begin_s, (5000, 10_000))
     assert fit is not None
     found = np.array(find_repeats(values, 0.0, fit, known)[:3])
-    # Half a second later both tones have gone through an odd number of half periods.
+    # Half a second later both tones have passed an odd number of half periods.
     assert np.sort(found) == pytest.approx([0.2, 0.7, 1.2], abs=1e-5)

@@ -1,4 +1,4 @@
-"""Channels without noise and their derivatives: a recording's own channels, keys of every kind, quotients that hold."""
+"""Noise-free channels and their derivatives: a recording's own channels, keys of every kind, accurate quotients."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ CHANNELS = ("disk_x", "ring_y", "P_E", "inner_x", "speed", "hammer")
 
 
 def rows(names: tuple[str, ...], times_s: np.ndarray, **own: Any) -> dict[str, Measured]:
-    """Rows wanted of some channels, each group on its own; `own` changes their calibration."""
+    """Return rows of some channels, each a group; `own` changes their calibration."""
     found = {}
     for name in names:
         channel = Channel.model_validate(default_table().channels[name].model_dump() | own)
@@ -51,13 +51,13 @@ def test_channels_are_the_recorded_ones_but_for_noise_and_rounding(experiment: E
 
 
 def test_a_recordings_own_calibration_counts_and_not_the_rigs(experiment: Experiment) -> None:
-    """Volts clip where its conditioner does, and its low-pass delays: by tau = 2.613 / (2 pi f), Butterworth's."""
+    """Volts clip where its conditioner does, and its low-pass delays by tau = 2.613 / (2 pi f), Butterworth's."""
     usual = shown(experiment, "P_E")
     assert usual.max() > 3000.0
     clipped = shown(experiment, "P_E", bandwidth_hz=18_500.0, range_v=(-3.0, 3.0))
     assert clipped.max() == pytest.approx(3000.0, rel=1e-6)
     slow = shown(experiment, "hammer", end_s=0.06, bandwidth_hz=200.0)[:, 0]
-    quick = shown(experiment, "hammer", end_s=0.06, bandwidth_hz=18_500.0)[:, 0]  # none: half of the rows' rate
+    quick = shown(experiment, "hammer", end_s=0.06, bandwidth_hz=18_500.0)[:, 0]  # no delay: half of the rows' rate
     times_s = np.arange(len(slow)) / 20_000
     delay_s = slow @ times_s / slow.sum() - quick @ times_s / quick.sum()
     assert delay_s == pytest.approx(2.6131 / (2.0 * np.pi * 200.0), rel=0.03)
@@ -65,7 +65,7 @@ def test_a_recordings_own_calibration_counts_and_not_the_rigs(experiment: Experi
 
 @pytest.mark.parametrize("sent", [(), (SentCommand(30_500, "speed", {"speed_hz": 5.0}),)])
 def test_a_late_start_is_the_same_as_from_the_start(sent: tuple[SentCommand, ...]) -> None:
-    """Far behind the start the channels are worked out from shortly before the rows wanted on."""
+    """Far from the start the channels are computed from shortly before the requested rows."""
     experiment = Experiment(scene=load_scene("hammer", {"duration_s": 4.0}), commands=sent)
     whole, late = (shown(experiment, "ring_x", "inner_x", start_s=start, end_s=3.6)[-100:] for start in (0.0, 3.5))
     assert np.abs(whole[:, 0] - late[:, 0]).max() < 1e-8
@@ -137,7 +137,7 @@ def test_derivatives_are_secants_of_small_steps(experiment: Experiment) -> None:
 
 
 def test_the_length_of_a_pulse_acts_through_impacts_by_its_impulse_above_all(experiment: Experiment) -> None:
-    """What its slope has beside that of the force is a secant at the same impulse: ticks of length bend the rest."""
+    """Apart from the force's slope, its slope is a secant at constant impulse: ticks of length bend the rest."""
     parts = rows(("ring_x", "P_E"), np.arange(1200) / 20_000)
     predictor = Predictor(experiment, ("hammer.1.duration_ms", "hammer.1.force_n"), parts)
     length_ms, force_n = predictor.start
@@ -153,7 +153,9 @@ def test_the_length_of_a_pulse_acts_through_impacts_by_its_impulse_above_all(exp
 
 
 def test_a_value_that_acts_on_nothing_has_no_derivative(experiment: Experiment) -> None:
-    predictor = Predictor(experiment, ["contact.friction"], rows(CHANNELS, np.arange(400) / 20_000))  # before the blow
+    predictor = Predictor(
+        experiment, ["contact.friction"], rows(CHANNELS, np.arange(400) / 20_000)
+    )  # before the impact
     assert not any(slope.any() for slope in predictor.derivatives(predictor.start).slopes[0].values())
 
 

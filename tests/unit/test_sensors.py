@@ -19,7 +19,7 @@ from rig.run.scenes import load_scene
 from rig.run.simulation import Simulation
 
 ROW_RATE = 40_000
-"""Rows a second of a run at 25 us."""
+"""Row rate of a run at 25 us [Hz]."""
 DC = [channel for channel in default_table().channels.values() if channel.highpass_hz == 0.0]
 
 
@@ -34,13 +34,13 @@ def group_of(name: str) -> Group:
 
 
 def counts_of(group: Group, rows: np.ndarray, *, seed: int = 1, noise: bool = True) -> np.ndarray:
-    """What a group's converters give, shape (samples, channels); it stays as it is at the end for another row."""
+    """Return the counts of a group's converters, shape (samples, channels), with the last row repeated."""
     rows = np.concatenate([rows, rows[-1:]])
     return Conditioner([group], row_rate_hz=ROW_RATE, seed=seed, noise=noise).counts(rows)[group.name]
 
 
 def shown(name: str, signal_si: np.ndarray, *, seed: int = 1, noise: bool = False) -> np.ndarray:
-    """What one channel shows of its ideal signal, in its own unit, at its sample rate."""
+    """Return one channel's samples of its ideal signal, in its own unit, at its sample rate."""
     channel = default_table().channels[name]
     group = group_of(channel.group)
     counts = counts_of(group, rows_of(channel.signal, signal_si), seed=seed, noise=noise)
@@ -69,7 +69,7 @@ def test_output_is_limited_to_the_range_of_the_conditioner(channel) -> None:
 
 def test_counts_end_at_the_converter() -> None:
     hammer = default_table().channels["hammer"]
-    # A conditioner that reaches the converter's limits, with noise that goes beyond them.
+    # A conditioner that reaches the converter's limits, with noise beyond them.
     loud = hammer.model_copy(update={"range_v": (-5.0, 5.0), "noise_v": 1.0, "adc_bits": 16})
     group = group_of("hammer").model_copy(update={"channels": (loud,)})
     for sign, end in ((1.0, 2**15 - 1), (-1.0, -(2**15))):
@@ -88,7 +88,7 @@ def test_noise_is_as_loud_as_the_table_says(group: str) -> None:
     for c, channel in enumerate(group_of(group).channels):
         volts = counts[:, c] * channel.lsb_v
         assert volts.std() == pytest.approx(channel.noise_v, rel=0.05)
-        # White: neighbours know nothing of each other (standard error 0.7 %), and centred on the quiet value.
+        # White: neighbours are independent (standard error 0.7 %), and centred on the noise-free value.
         assert abs(np.corrcoef(volts[1:], volts[:-1])[0, 1]) < 0.035
         assert volts.mean() == pytest.approx(
             channel.bias_v if channel.highpass_hz == 0.0 else 0.0, abs=0.035 * channel.noise_v
@@ -140,7 +140,7 @@ def test_cutting_the_rows_anywhere_changes_no_count(cuts: list[int], rate_hz: in
 
 
 def test_more_channels_than_lanes_are_taken_in_several_passes() -> None:
-    # The same twenty-two channels one group at a time, and in one pass; a group lies across the border.
+    # The same twenty-two channels one group at a time, and in one pass; a group crosses the border.
     groups = [group_of(name) for name in ("probes", "forces", "accelerations", "drive")]
     twice = [group.model_copy(update={"name": f"{group.name}-again"}) for group in (*groups[:2],)]
     rows = 1e-3 * np.random.default_rng(2).normal(size=(600, N_ROW))
@@ -154,7 +154,7 @@ def test_more_channels_than_lanes_are_taken_in_several_passes() -> None:
 
 @pytest.mark.parametrize("seed", [1, 2**31])
 def test_noise_is_numpys(seed: int) -> None:
-    # An independent code of the same published generator and ziggurat, to the rounding of its tables.
+    # An independent implementation of the same published generator and ziggurat, to the rounding of its tables.
     count, names = 200_000, ["disk_x", "P_N", "hammer"]
     drawn, streams = np.full((count, len(names)), np.nan), noise_streams(names, seed)
     for start, end in pairwise((0, 1, 1, 777, 50_000, count)):
@@ -181,7 +181,7 @@ def test_without_noise_there_is_none() -> None:
 
 
 def analogue(channel: Channel, frequency_hz: float) -> complex:
-    """Transfer function of a channel's filters in continuous time, from scipy's analogue designs."""
+    """Return the transfer function of a channel's filters in continuous time, from scipy's analogue designs."""
     from scipy.signal import butter, freqs
 
     at = [2.0 * math.pi * frequency_hz]
@@ -193,7 +193,7 @@ def analogue(channel: Channel, frequency_hz: float) -> complex:
 
 
 def response(channel: Channel, frequency_hz: float, *, seconds: float) -> complex:
-    """Gain and phase of a channel for a sine, fitted to the second half of its samples."""
+    """Return gain and phase of a channel for a sine, fitted to the second half of its samples."""
     group = group_of(channel.group).model_copy(update={"channels": (channel,), "rate_hz": channel.rate_hz})
     times = np.arange(round(seconds * ROW_RATE)) / ROW_RATE
     amplitude = 0.4 * min(channel.range_v[1] - channel.bias_v, channel.bias_v - channel.range_v[0])
@@ -217,7 +217,7 @@ def test_the_chain_is_the_closed_form_of_its_filters_at_any_rate(rate_hz: int, o
         channel = default_table().channels[name].model_copy(update={"rate_hz": rate_hz, "filter_order": order})
         for frequency_hz in (150.0, 1_000.0, 2_500.0, 5_000.0):
             measured = response(channel, frequency_hz, seconds=0.08)
-            # What a cubic through four rows of 25 us leaves of a sine: (2 pi f T)^4 / 24 at most.
+            # Error of a cubic through four rows of 25 us for a sine: (2 pi f T)^4 / 24 at most.
             cubic = (2.0 * math.pi * frequency_hz / ROW_RATE) ** 4 / 24.0
             settled = 2e-4 if channel.highpass_hz else 2e-6
             assert abs(measured - analogue(channel, frequency_hz)) < cubic + settled, (name, frequency_hz)
@@ -225,7 +225,7 @@ def test_the_chain_is_the_closed_form_of_its_filters_at_any_rate(rate_hz: int, o
 
 @pytest.mark.parametrize("rate_hz", RATES)
 def test_a_ramp_is_behind_by_the_filters_own_delay(rate_hz: int) -> None:
-    # A cubic has a ramp exactly; behind a Butterworth low-pass it is late by the sum of 1 / -pole.
+    # A cubic reproduces a ramp exactly; a Butterworth low-pass delays it by the sum of 1 / -pole.
     channel = default_table().channels["disk_x"].model_copy(update={"rate_hz": rate_hz})
     group = group_of("probes").model_copy(update={"channels": (channel,), "rate_hz": rate_hz})
     times = np.arange(800) / ROW_RATE
@@ -239,7 +239,7 @@ def test_a_ramp_is_behind_by_the_filters_own_delay(rate_hz: int) -> None:
 def test_a_step_is_answered_in_closed_form() -> None:
     from scipy.signal import butter, lsim
 
-    # A step that lasts a row: what a cubic through the rows makes of it, through scipy's simulation of the filter.
+    # A step of one row: the cubic through the rows, fed to scipy's simulation of the filter.
     channel = default_table().channels["P_E"].model_copy(update={"rate_hz": 51_200})
     group = group_of("forces").model_copy(update={"channels": (channel,), "rate_hz": 51_200})
     rows = rows_of("P_E", np.where(np.arange(200) < 100, 0.0, 5_000.0))
@@ -269,7 +269,7 @@ def test_a_slower_rate_has_a_lower_corner() -> None:
     rows = rows_of("P_E", 5_000.0 * np.sin(2 * math.pi * 5_000.0 * times))
     seen = group.engineering(counts_of(group, rows, noise=False))
     assert len(seen) == 400
-    # 5 kHz would fold back to 1 kHz; the corner of 500 Hz holds it down by ten to the fourth.
+    # 5 kHz would fold back to 1 kHz; the corner of 500 Hz attenuates it by ten to the fourth.
     assert np.abs(seen[200:]).max() < 5_000.0 * abs(analogue(group.channels[0], 5_000.0)) * 1.1
 
 
@@ -309,9 +309,10 @@ def keyphasor_rows(times_s: np.ndarray, angle: float, spin: float, acceleration:
 
 
 TOLERANCE_S = 5e-13
-"""The interpolant is exact for constant acceleration, so only rounding is left: that of the angle (1.1e-13 rad at
-660 rad, there at 630 rad/s), and of row numbers up to 8e4 with their fraction (1.5e-11 rows of 25 us): below 1e-15 s.
-Edges are told in parts of 2^-20 us: half of that is 4.8e-13 s. An instrument would be asked for 1 ns."""
+"""The interpolant is exact for constant acceleration, so only rounding remains: that of the angle (1.1e-13 rad at 660
+rad, there at 630 rad/s), and of row numbers up to 8e4 with their fraction (1.5e-11 rows of 25 us): below 1e-15 s. Edges
+have a resolution of 2^-20 us: half of that is 4.8e-13 s. A laboratory instrument resolves about 1 ns.
+"""
 
 
 @pytest.mark.parametrize(
@@ -332,7 +333,7 @@ def test_keyphasor_edges_are_the_closed_form(angle: float, spin: float, accelera
         * np.arange(math.floor(angle / (2 * math.pi)) + 1, math.floor(rows[-1, COLUMN["theta"]] / (2 * math.pi)) + 1)
     )
     way = marks - angle
-    # The root of spin t + acceleration t^2 / 2 = way in the form that does not cancel.
+    # The root of spin t + acceleration t^2 / 2 = angle in the form without cancellation.
     expected = 2 * way / (spin + np.sqrt(spin**2 + 2 * acceleration * way))
     assert len(edges) == len(expected) == sensor.edges_seen
     assert len(edges) >= (1 if cut == 1 else 10)
@@ -345,7 +346,7 @@ def test_edges_of_a_run_lie_where_the_mark_passes() -> None:
     blocks = [frame.edges for frame in frames if frame.edges is not None]
     edges = np.concatenate([block.tick + block.values[:, 0] for block in blocks]) * 1e-6
     assert [block.index for block in blocks] == list(range(len(blocks))), "one turn takes many blocks"
-    # A prescribed spin of 6 Hz that grows by 2 Hz a second turns 6 t + t^2 times.
+    # A prescribed spin of 6 Hz that grows by 2 Hz per second turns 6 t + t^2 times.
     turns = np.arange(1, len(edges) + 1)
     assert len(edges) == 6
     np.testing.assert_allclose(edges, np.sqrt(9.0 + turns) - 3.0, rtol=0, atol=1e-9)
@@ -365,7 +366,7 @@ def test_pulse_rises_where_the_edge_is() -> None:
     assert frame.edges is not None
     edges = frame.edges.values[:, 0] * 1e-6
     assert len(rises) == len(edges) == 6
-    # The filter of 5 kHz holds the pulse back by some 80 us; samples are 50 us apart.
+    # The filter of 5 kHz delays the pulse by some 80 us; samples are 50 us apart.
     late = rises / 20_000 - edges
     assert late.min() > 0.0
     assert late.max() < 2e-4
@@ -377,7 +378,7 @@ def test_poles_are_butterworths(order: int) -> None:
     poles, residues, direct = channel_poles(channel)
     for frequency_hz in (0.1, 0.5, 40.0, 5_000.0, 20_000.0):
         s = 2j * math.pi * frequency_hz
-        # One of each pair: the other is its conjugate, and the residue's factor 2 stands for it.
+        # One pole of each pair: the other is its conjugate, included by the residue's factor 2.
         sums = sum(
             0.5 * (r / (s - p) + r.conjugate() / (s - p.conjugate())) if abs(p.imag) > 1e-6 else r / (s - p)
             for p, r in zip(poles, residues, strict=True)

@@ -51,7 +51,7 @@ class Listener:
 
 
 class Running:
-    """A service on a thread of its own, joined at the end."""
+    """A service on a separate thread, joined at the end."""
 
     def __init__(self, simulation: FakeSimulation, clock: Clock, **options: Any) -> None:
         self.server = MemoryServer()
@@ -373,7 +373,7 @@ def test_each_kind_of_warning_becomes_one_event() -> None:
 
 
 class Gate(MemoryServer):
-    """Holds up every publication until it is opened."""
+    """Delays every publication until it is opened."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -404,7 +404,7 @@ def test_a_paced_run_drops_whole_blocks_and_counts_them_while_it_keeps_every_eve
     service = Service(Noted(duration_s=1.0), server, clock, block_ticks=BLOCK, queue_seconds=0.2)
     summary = service.run()
     assert summary["queue"]["high_water"] == summary["queue"]["capacity"] == 20
-    # 100 blocks; at most one was in the publisher's hands, and 20 in the queue.
+    # 100 blocks; at most one was being published, and 20 were in the queue.
     dropped = summary["queue"]["dropped"]
     assert dropped in (79, 80)
     blocks = listener.blocks[wire.sensor_key("probes")]
@@ -469,7 +469,7 @@ def test_the_number_of_clients_is_bounded() -> None:
 
 
 class Slow(MemoryServer):
-    """Claims a link that is stalled until the clock of the test says otherwise."""
+    """Reports a stalled link until the clock of the test indicates otherwise."""
 
     def __init__(self, stalled_calls: int) -> None:
         super().__init__()

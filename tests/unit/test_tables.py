@@ -1,4 +1,4 @@
-"""Tables and lines: whole on a terminal of 80 columns, and one line a row into a pipe."""
+"""Tables and lines: complete on a terminal of 80 columns, and one line per row in a pipe."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def test_a_real_terminal_shows_whole_values() -> None:
     try:
         while block := os.read(ours, 65536):
             text += block
-    except OSError:  # how Linux ends a terminal that nobody writes to any more
+    except OSError:  # Linux ends a terminal without a writer in this way
         pass
     os.close(ours)
     plain = [line.rstrip() for line in text.decode().replace("\x1b[1m", "").replace("\x1b[0m", "").splitlines()]
@@ -269,7 +269,7 @@ def test_compiling_is_told_as_long_as_it_lasts(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_every_command_with_tables_has_the_same_options(capsys: pytest.CaptureFixture[str]) -> None:
-    """What prints a table takes --wide and --json, but for what is made of two processes."""
+    """Commands with a table have --wide and --json, except those that consist of two processes."""
     found = set()
     for path in sorted(Path(next(iter(rig.cli.__path__)), "commands").glob("*.py")):
         calls = {ast.unparse(node.func) for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call)}

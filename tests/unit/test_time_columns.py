@@ -1,4 +1,4 @@
-"""Columns of times in every unit and form, and fields and units that are refused instead of assumed."""
+"""Columns of times in every unit and form, and fields and units that are refused rather than assumed."""
 
 from datetime import datetime
 from pathlib import Path
@@ -42,7 +42,7 @@ def test_a_column_of_times_has_the_unit_of_its_heading(tmp_path: Path, heading: 
     source = open_source(log(tmp_path, heading, [f"{n * STEP_S / each_s:.12g}" for n in range(20)]), FileOptions())
     assert [entry.name for entry in source.entries] == ["P_E"]
     np.testing.assert_allclose(stamps(source), STEP_S * np.arange(20), rtol=1e-9, atol=1e-12)
-    if each_s != 1.0:  # a mapping that is made of the file says so
+    if each_s != 1.0:  # a generated mapping declares it
         assert units.size_si(str(source.options["time_unit"])) == each_s
 
 

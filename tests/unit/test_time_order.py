@@ -1,4 +1,6 @@
-"""Logs and recordings whose times go backwards, repeat or hardly move: read rightly, or one line, and no traceback."""
+"""Logs and recordings whose times go backwards, repeat or hardly change: read correctly, or one line and no
+traceback.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,7 @@ TIMES_S = ROWS / RATE_HZ
 
 
 def changed(row: int, time_s: float) -> np.ndarray:
-    """The stamps with one of them changed."""
+    """Return the stamps with one of them changed."""
     return np.where(row == ROWS, time_s, TIMES_S)
 
 
@@ -116,7 +118,7 @@ def test_stamps_that_make_no_rate_do_not_change_how_values_are_judged(
         judge(log(tmp_path, times_s, counts), [session], path="analogue")
         for times_s in (TIMES_S, *(STAMPS[name][0] for name in NO_RATE))
     ]
-    # Stamps are judged by quantities of their own.
+    # Separate quantities judge the stamps.
     right, *others = [
         [(row.quantity, row.channel, row.verdict) for row in card.rows if not row.quantity.startswith("stamp")]
         for card in cards

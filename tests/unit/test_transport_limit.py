@@ -1,4 +1,4 @@
-"""Commands a second, on a clock of the test's own."""
+"""Commands per second, on a simulated clock."""
 
 from __future__ import annotations
 

@@ -209,7 +209,7 @@ def test_the_token_appears_when_announced_and_vanishes_on_close() -> None:
 
 
 def test_a_subscriber_with_history_misses_nothing_whenever_it_comes(server: ZenohServer) -> None:
-    """Several keys at a time, heartbeats between: where zenoh's own history lost messages."""
+    """Several keys at a time, with heartbeats: zenoh's own history lost messages here."""
     keys = [f"rig/sensors/g{n}" for n in range(6)]
     stop = threading.Event()
     published = 0
@@ -243,7 +243,7 @@ def test_a_subscriber_with_history_misses_nothing_whenever_it_comes(server: Zeno
 
 
 class Publisher:
-    """One key with its cache, as a subscription sees it."""
+    """One key with its cache, as a subscription uses it."""
 
     def __init__(self, cache: int = 3000) -> None:
         self.cache = cache
@@ -274,13 +274,13 @@ class Publisher:
             return [self.sample(self.kept[-1])]
         first, last = map(int, selection.removeprefix("_sn=").split(".."))
         replies = [self.sample(number) for number in self.kept if first <= number <= last]
-        if self.cut is not None:  # the link is lost in the middle of the reply
+        if self.cut is not None:  # the link is lost within the reply
             replies, self.cut = replies[: self.cut], None
         return replies
 
 
 class Subscription:
-    """A stream under test, and what it gave."""
+    """A stream under test, and its output."""
 
     def __init__(self, publisher: Publisher, *, history: bool) -> None:
         self.got: list[int] = []
@@ -310,7 +310,7 @@ class Subscription:
 
 @pytest.mark.parametrize("seed", range(60))
 def test_whatever_is_dropped_everything_is_delivered_once_in_order_or_reported(seed: int) -> None:
-    """Random drops, silences and heartbeats; caches that hold all, or too little."""
+    """Random drops, silences and heartbeats; caches that contain all, or too little."""
     draw = random.Random(seed)
     publisher = Publisher(cache=draw.choice((3000, 3000, 40)))
     rows = Subscription(publisher, history=seed % 2 == 0)
@@ -344,7 +344,7 @@ def test_whatever_is_dropped_everything_is_delivered_once_in_order_or_reported(s
     assert rows.got[-1] == publisher.sent - 1, "heartbeats tell of the last one"
     assert rows.missed == publisher.sent - rows.got[0] - len(rows.got), "what is not delivered is reported, exactly"
     if publisher.cache == 3000:
-        # Never further behind than the cache reaches: whatever was lost, and however often the cache was silent.
+        # Never further back than the cache reaches, despite losses and silences of the cache.
         assert rows.missed == 0
         if rows.history:
             assert rows.got == list(range(publisher.sent))
@@ -365,7 +365,7 @@ def test_a_gap_is_always_asked_for_though_a_heartbeat_came_just_before_it() -> N
 
 
 def test_what_waited_while_the_process_was_stopped_is_not_taken_for_a_duplicate() -> None:
-    """The messages in the channel are older than all that the cache still has."""
+    """The messages in the channel are older than all that the cache still contains."""
     publisher = Publisher(cache=30)
     rows = Subscription(publisher, history=True)
     waiting = [publisher.send() for _ in range(20)]
@@ -439,7 +439,7 @@ def test_the_history_of_a_restarted_rig_is_fetched_too() -> None:
         until(lambda: got == [b"first 0"])
         first.close()
         with ZenohServer(endpoint) as second:
-            # Before the client can have come back.
+            # Before the client can be back.
             second.publish("rig/events", b"second 0")
             second.publish("rig/sensors/a", b"second 1")
             until(lambda: second.congestion()["links"] == 2)
@@ -493,7 +493,7 @@ def test_closing_does_not_fail_though_a_callback_never_returns(monkeypatch: pyte
     try:
         with ZenohServer(free_endpoint()) as server, ZenohClient(server.endpoint) as client:
             client.subscribe("rig/**", block)
-            # The server may hear of the subscription later than the client's call returns.
+            # The server may receive the subscription later than the client's call returns.
             until(lambda: server.publish("rig/status", bytes(1000)) or entered)
             for _ in range(500):
                 server.publish("rig/status", bytes(1000))

@@ -1,4 +1,4 @@
-"""The twelve scenes: what each shows in its window, and their panel of `rig chart`. No timing asserted."""
+"""The twelve scenes: the contents of each window, and their panel of `rig chart`. No timing asserted."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from rig.physics.engines.common.memory import CONTACTS
 from rig.physics.kernels.signals import COLUMN, N_ROW
 
 _WHIRL_S = 0.1
-"""At the end of a window with whirl, contact lasts for at least this long [s]."""
+"""Minimum contact time at the end of a window with whirl [s]."""
 _IMPACTS = {"drop", "run-up", "partial-rub"}
 _FREE = {"stable-run"}
 

@@ -1,4 +1,4 @@
-"""The table of units: every quantity, the spellings that files use, and what is refused instead of assumed."""
+"""The table of units: every quantity, the spellings in files, and names that are refused rather than assumed."""
 
 import math
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Parts of a validation: criteria, phases, spectra, bits, and what explains a difference."""
+"""Parts of a validation: criteria, phases, spectra, bits, and causes of a difference."""
 
 from __future__ import annotations
 
@@ -28,14 +28,16 @@ from rig.run.offline import frames
 from rig.run.scenes import load_scene
 from rig.run.simulation import Simulation
 
-SMALL = {"sensors.rate_hz": 2000, "sensors.truth_rate_hz": 100, "duration_s": 0.06}
+RUN_CHANGES = {"sensors.rate_hz": 2000, "sensors.truth_rate_hz": 100, "duration_s": 0.06}
 
 
 def record(
     path: Path, scene: str = "hammer", *, truth: bool = True, leave_out: tuple[int, ...] = (), **changes: object
 ) -> Recording:
-    """A recording of a scene; of some frames of 0.01 s nothing arrives."""
-    simulation = Simulation(load_scene(scene, {**SMALL, **{key.replace("__", "."): v for key, v in changes.items()}}))
+    """Record a scene; the frames of 0.01 s in `leave_out` are missing."""
+    simulation = Simulation(
+        load_scene(scene, {**RUN_CHANGES, **{key.replace("__", "."): v for key, v in changes.items()}})
+    )
     with RecordingWriter(
         path, catalogue=simulation.catalogue(), parameters=simulation.parameters_document(),
         scene=simulation.scene_document(), view_rate_hz=0.0, force=True,
@@ -60,7 +62,7 @@ def hammer(tmp_path_factory: pytest.TempPathFactory) -> Recording:
 
 
 def with_candidates(*names: str) -> Criteria:
-    """Return the usual criteria that look for a cause among these parameters alone."""
+    """Return the default criteria with these parameters as the only candidates for a cause."""
     criteria = load_criteria()
     few = tuple(one for one in criteria.attribution.candidates if one.name in names)
     return criteria.model_copy(update={"attribution": criteria.attribution.model_copy(update={"candidates": few})})
@@ -116,7 +118,7 @@ def test_distance_of_spectra() -> None:
     turn = np.exp(2j * np.pi * 50.0 * np.arange(4096) / 4096.0)
     assert spectrum_distance(turn, turn) == 0.0
     assert spectrum_distance(turn, turn * np.exp(0.7j)) == pytest.approx(0.0, abs=1e-12)  # phase does not count
-    assert spectrum_distance(turn, turn.conj()) == pytest.approx(1.0, abs=1e-6)  # the other way round
+    assert spectrum_distance(turn, turn.conj()) == pytest.approx(1.0, abs=1e-6)  # the opposite sense
     assert spectrum_distance(turn, 1.1 * turn) == pytest.approx(0.1 / math.sqrt(1.0 + 1.1**2))
 
 
@@ -171,9 +173,9 @@ def test_a_pass_needs_rows_or_criteria_that_were_judged(hammer: Recording) -> No
 
 
 def test_a_recording_that_was_cut_off_is_inconclusive(hammer: Recording, tmp_path: Path) -> None:
-    """Every count that is there holds, and nobody knows how many are not."""
+    """Every count present is right, and the number of missing ones is unknown."""
     cut = tmp_path / "cut.mcap"
-    cut.write_bytes(hammer.path.read_bytes()[:-100])  # all samples are there, as it is short
+    cut.write_bytes(hammer.path.read_bytes()[:-100])  # all samples are there, because it is short
     found = validate(Recording.open(cut))
     assert found.bit_exact
     assert found.outcome is Outcome.INCONCLUSIVE
@@ -210,7 +212,7 @@ def test_of_some_channels_the_bits_are_compared_by_name(
     assert found.bit_exact
     assert sum(one.rows for one in found.bits.values()) == 2 * 60
     assert "probes 2 of 4" in found.bits_line
-    # ... and not by place: another channel's counts under a name are another's.
+    # ... and not by place: another channel's counts under a name are that channel's.
     recording = Recording.open(small)
     group = recording.table.groups["probes"]
     turned = group.model_copy(update={"channels": group.channels[::-1]})
@@ -283,7 +285,7 @@ def test_few_channels_and_no_truth_are_enough(tmp_path: Path) -> None:
 def test_rows_of_another_clock_lie_between_the_models_own(
     hammer: Recording, heard: tuple[dict[str, Measured], Prediction]
 ) -> None:
-    """A recorder at 1/3 of a millisecond past every row: nothing of the model falls there."""
+    """A recorder at 1/3 of a millisecond past every row: no row of the model coincides."""
     from scipy.interpolate import CubicSpline
 
     parts, nominal = heard
@@ -293,7 +295,7 @@ def test_rows_of_another_clock_lie_between_the_models_own(
     assert between == pytest.approx(CubicSpline(part.times_s, nominal.values["probes"])(late.times_s), abs=2e-5)
 
 
-# What explains a difference: faults put into the channels themselves.
+# Causes of a difference: faults applied to the channels themselves.
 
 
 def explained(recording: Recording, parts: dict[str, Measured], nominal: Prediction) -> Explained:
@@ -355,7 +357,7 @@ def test_a_late_clock_is_called_time(hammer: Recording, heard: tuple[dict[str, M
 
 
 def test_two_that_explain_it_alike_are_both_named(tmp_path: Path) -> None:
-    """Transducers at rest show the preload alone: so does an offset of theirs."""
+    """Transducers at rest show the preload alone, or an offset of the same size."""
     recording = record(tmp_path / "rest.mcap", "stable-run", sensors__groups=["forces"])
     found = validate(recording, changes={"house.preload": 2990.0})
     assert not found.good
@@ -365,7 +367,7 @@ def test_two_that_explain_it_alike_are_both_named(tmp_path: Path) -> None:
 
 
 def test_a_second_cause_behind_the_first_is_named_with_it(tmp_path: Path) -> None:
-    """Damping is seen before the impacts, friction only in them."""
+    """Damping is identified before the impacts, friction only in them."""
     both = {"shaft__damping_ratio_x": 0.03, "contact__friction": 0.24}
     recording = record(tmp_path / "two.mcap", sensors__rate_hz=20_000, duration_s=0.045, **both)
     criteria = with_candidates("contact.friction", "shaft.damping_ratio_x")

@@ -1,4 +1,6 @@
-"""The verdict on hammer recordings: good on a good one, not on one that was turned, cut or thinned; and the picture."""
+"""The verdict on hammer recordings: good on a good one, not on one that was rotated, cut or thinned; and the
+picture.
+"""
 
 from __future__ import annotations
 
@@ -50,7 +52,7 @@ def rewritten(
     catalogue: dict[str, Any] | None = None,
     status: bytes | None = None,
 ) -> Recording:
-    """The same recording with some payloads changed, with another channel table, or with a status at its end."""
+    """Write the same recording with some payloads changed, with another channel table, or with a status at its end."""
     writer = RecordingWriter(
         path, catalogue=catalogue or good.catalogue, parameters=good.parameters, scene=good.scene, view_rate_hz=0.0
     )
@@ -184,16 +186,16 @@ def status(**changes: Any) -> bytes:
     return wire.encode_document(document | changes)
 
 
-LATE = {"p50": 0.1, "p99": 10.5, "max": 30.0}
+LATENESS_MS = {"p50": 0.1, "p99": 10.5, "max": 30.0}
 
 
 @pytest.mark.parametrize(
     ("changes", "expected"),
     [
         ({}, set()),
-        ({"lateness_ms": LATE}, set()),
-        ({"lateness_ms": LATE, "real_time_factor": 0.9}, set()),
-        ({"lateness_ms": LATE, "real_time_factor": 1.1}, {"real-time factor"}),
+        ({"lateness_ms": LATENESS_MS}, set()),
+        ({"lateness_ms": LATENESS_MS, "real_time_factor": 0.9}, set()),
+        ({"lateness_ms": LATENESS_MS, "real_time_factor": 1.1}, {"real-time factor"}),
         ({"real_time_factor": 0.99}, {"real-time factor"}),
         ({"energy": {"residual_j": 1e-3, "dissipated_j": 0.5}}, {"energy residual"}),
     ],
@@ -203,9 +205,9 @@ def test_what_the_rig_said_of_itself_counts(
 ) -> None:
     verdict = judge(rewritten(good, tmp_path / "status.mcap", status=status(**changes)))
     assert bad(verdict) == expected
-    # A run without a clock has its energy, and no pace.
+    # A run without a clock has an energy figure, and no pace.
     assert len(verdict.rows) == len(judge(good).rows) + 2
-    # A machine that is busy says nothing of the rig, but is told of.
+    # A busy machine does not affect the verdict, but is reported.
     assert ("busy" in verdict.remark) == ("lateness_ms" in changes)
     check_legible(verdict_table(verdict))
 

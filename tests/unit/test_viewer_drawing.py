@@ -1,4 +1,4 @@
-"""Orbits, spectra, contact and curves: what is drawn, without a viewer."""
+"""Orbits, spectra, contact and curves: the drawn data, without a viewer."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def whirling(frequency_hz: float, radius_mm: float, *, seconds: float = 0.5) -> 
 def test_whirl_has_the_sign_of_its_rotation(frequency_hz: float, sense: str) -> None:
     whirl = whirl_of(whirling(frequency_hz, 0.926), RATE_HZ)
     assert whirl.sense == sense
-    # Half a second holds no whole number of turns at 6.2 Hz: its mean is not quite its centre.
+    # Half a second is not a multiple of the period at 6.2 Hz: its mean is not exactly its centre.
     assert whirl.frequency_hz == pytest.approx(frequency_hz, rel=5e-2 if abs(frequency_hz) < 10 else 2e-3)
 
 
@@ -178,7 +178,7 @@ def test_wall_clock_joins_marks_and_goes_on_at_the_wall_s_pace() -> None:
     assert clock.at(np.array([1.0])) is None
     clock.mark(0.0, 100.0)
     clock.mark(10.0, 105.0)
-    clock.mark(5.0, 300.0)  # goes back: ignored
+    clock.mark(5.0, 300.0)  # backwards: ignored
     np.testing.assert_allclose(clock.at(np.array([-1.0, 4.0, 12.0])), [99.0, 102.0, 107.0])
     for n in range(10_000):
         clock.mark(20.0 + n, 200.0 + n)

@@ -194,7 +194,7 @@ def test_rotor_tilts_towards_the_displacement(painted: Any, recording: Synthetic
 def test_the_file_is_small(painted: Any, recording: Synthetic) -> None:
     _, _, size = painted
     stored = sum(values.size for values in recording.values.values()) * 4
-    assert size < 1.02 * stored  # what there is of lanes and labels is the same for any length
+    assert size < 1.02 * stored  # lanes and labels have the same size for any length
     for duration_s in (1.0, 60.0, 3600.0):
         assert file.rows_per_s(duration_s) * duration_s <= file.MAX_ROWS * (1.0 + 1e-9)
         assert file.rows_per_s(duration_s) <= 2000.0

@@ -1,4 +1,4 @@
-"""The live view against a rig that is a list of payloads; the view reads the wall clock to know when it is quiet."""
+"""The live view of a rig that is a list of payloads; the view reads the wall clock to detect silence."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ pytestmark = pytest.mark.wallclock
 
 
 class ScriptedClient:
-    """Hands over a list of payloads as soon as the viewer watches for the rig, then may take the rig away."""
+    """Delivers a list of payloads as soon as the viewer watches for the rig; may remove the rig afterwards."""
 
     foreign = 0
     rig = "a rig"
@@ -166,7 +166,7 @@ def test_a_viewer_that_is_behind_forgets_the_oldest_and_says_so(recording: Synth
 
 
 def test_the_picture_is_drawn_at_the_pace_of_the_viewer_not_of_the_rig(recording: Synthetic, tmp_path: Path) -> None:
-    # All of it arrives at once: one frame, not one for each block.
+    # All of it arrives at once: one frame, not one per block.
     _, _, saved = run(ScriptedClient(recording, payloads_of(recording)), tmp_path / "frames.rrd")
     assert len(saved["/orbit/ring/trace", "LineStrips2D:strips"].values) <= 3
 
@@ -197,7 +197,7 @@ def test_a_slow_viewer_gets_fewer_pictures_with_all_peaks(recording: Synthetic, 
     assert view.received == 5 * len(recording.times_s)
     assert max(row[0] for row in ring.values) == pytest.approx(RADIUS_MM, abs=3e-3)
     assert ring.times_s[-1] == pytest.approx(recording.times_s[-1], abs=0.01 if prompt else 0.1)
-    # Around the hammer pulse every row is there, for slow viewers too.
+    # Around the hammer pulse all rows are present, for slow viewers too.
     near = np.abs(ring.times_s - recording.hit_s) < 0.049
     assert near.sum() == pytest.approx(0.098 * RATE_HZ, rel=0.01)
     far = np.abs(ring.times_s - recording.hit_s) > 0.06

@@ -1,4 +1,4 @@
-"""How often a live view draws, against viewers that are a few lines and a clock that is a number."""
+"""Frame rate of a live view, with viewers of a few lines and a simulated clock."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ TICK_S = 0.04
 
 
 class Viewer:
-    """Takes in one picture after the other, each for so long; draws and takes simulated time for wall time."""
+    """Receives pictures one after the other, each in a fixed time; draws and uses simulated time as wall time."""
 
     def __init__(self, cost_s: float) -> None:
         self.cost_s = cost_s
@@ -49,7 +49,7 @@ def test_a_viewer_of_any_speed_is_held(cost_s: float) -> None:
     viewer = Viewer(cost_s)
     viewer.run(300.0)
     assert max(viewer.behind_s) < 2.0 + 2.5 * cost_s
-    # And it is not left idle: it gets a good part of what it could take.
+    # And it is not idle: it receives a good part of its capacity.
     could = min(1.0 / MIN_INTERVAL_S, 1.0 / cost_s)
     assert 0.6 * could < len(viewer.drawn) / 300.0 < 1.1 * could
 

@@ -1,4 +1,4 @@
-"""The page of the web viewer: what it adds to rerun's own, and what it makes of what browsers say."""
+"""The page of the web viewer: additions to rerun's own, and handling of the browsers' reports."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from recorder.viewer.window import free_port
 
 pytestmark = pytest.mark.wallclock
 
-# What a browser with rerun 0.41 said, as it came, its views cut off.
+# Report of a browser with rerun 0.41, as received, with its views cut off.
 STATE = (
     b"\nHabout:recording?app_id=rig&recording_id=25718b766d4b4e7f9b698300588bf302\x12.Recording:rig:"
     b"25718b766d4b4e7f9b698300588bf302\x1a\xe7\x01\n.Recording:rig:25718b766d4b4e7f9b698300588bf302"
@@ -73,7 +73,7 @@ def test_the_slowest_browser_counts(served: tuple[page.Page, str]) -> None:
     shown.title = "rig: 0.1 s behind"
     assert post(f"{address}/state?a", STATE) == "rig: 0.1 s behind"
     assert shown.taken() == 5_699_950_000
-    post(f"{address}/state?b", b"")  # one that is still loading
+    post(f"{address}/state?b", b"")  # a page that is still loading
     assert shown.taken() == 0
     post(f"{address}/closed?b", b"")
     assert shown.taken() == 5_699_950_000
@@ -83,8 +83,8 @@ def test_the_slowest_browser_counts(served: tuple[page.Page, str]) -> None:
     "headers",
     [
         {"Origin": "http://example.com"},
-        {"Origin": "null"},  # a frame of another site that hides whose it is
-        {"Origin": "http://example.com", "Host": "example.com"},  # a site that gives its own name our address
+        {"Origin": "null"},  # a frame of another site that hides its origin
+        {"Origin": "http://example.com", "Host": "example.com"},  # a site that resolves its own name to our address
         {"Host": "example.com"},
     ],
 )

@@ -1,4 +1,4 @@
-"""Waits of the tests: one for a process ends when the process does, and its message has what the process printed."""
+"""Waits of the tests: a wait for a process ends with it, and its message contains the process's output."""
 
 from __future__ import annotations
 

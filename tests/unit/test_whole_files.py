@@ -1,4 +1,6 @@
-"""Files that commands make are whole or not there, whatever a library says of the disk; what is read is never lost."""
+"""Files written by commands are complete or absent, whatever a library reports about the disk; inputs are never
+lost.
+"""
 
 from __future__ import annotations
 

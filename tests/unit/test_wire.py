@@ -1,4 +1,4 @@
-"""The codec: blocks and documents there and back, anything else refused with ValueError only, and the count of gaps."""
+"""The codec: blocks and documents in both directions, ValueError only for anything else, and the count of gaps."""
 
 from __future__ import annotations
 

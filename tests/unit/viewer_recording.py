@@ -1,4 +1,4 @@
-"""A synthetic recording with a known whirl, and what a saved .rrd file holds, for the viewer's tests."""
+"""A synthetic recording with a known whirl, and the contents of a saved .rrd file, for the viewer's tests."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ WALL = "wall_time"
 
 
 class Synthetic:
-    """Free for the first third, then a hammer blow and a whirl at `whirl_hz`; answers as a `Recording` does."""
+    """Free for the first third, then a hammer impact and a whirl at `whirl_hz`; has the interface of a `Recording`."""
 
     def __init__(self, *, duration_s: float = 1.8, whirl_hz: float = -83.0, pace: float = 1.0, seed: int = 3) -> None:
         self.table = default_table()
@@ -106,7 +106,7 @@ class Synthetic:
 
 @dataclass(frozen=True)
 class Column:
-    """What one component of one entity became: instants [s] (nan: for all times) and values, one a row."""
+    """One component of one entity: instants [s] (nan: for all times) and values, one per row."""
 
     times_s: np.ndarray
     walls_s: np.ndarray
@@ -151,7 +151,7 @@ class Saved:
 
     @property
     def paths(self) -> set[str]:
-        """Entities that hold anything."""
+        """Entities with data."""
         return {path for path, _ in self.columns}
 
     def __getitem__(self, key: tuple[str, str]) -> Column:
@@ -159,7 +159,7 @@ class Saved:
 
 
 def stream_of(recording: Synthetic, *, block_s: float = 0.01) -> Iterator[list[tuple[str, bytes]]]:
-    """What a rig would have published of a recording: keys and payloads, a list for each block time."""
+    """Yield the messages of a rig for a recording: keys and payloads, a list for each block time."""
     rows = round(block_s * RATE_HZ)
     counts = {name: _counts(group, recording.values[name]) for name, group in recording.table.groups.items()}
     events = sorted(recording.events, key=lambda event: event["time_s"])
@@ -186,7 +186,7 @@ def _counts(group: Group, values: np.ndarray) -> np.ndarray:
 
 
 def documents_of(recording: Synthetic) -> dict[str, bytes]:
-    """Replies of the rig's queries."""
+    """Return the replies to the rig's queries."""
     table = recording.table.model_dump(mode="json")
     catalogue = {"root": "rig", "tick_rate_hz": 1e6, "table": table, **recording.catalogue}
     return {
