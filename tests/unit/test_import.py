@@ -838,7 +838,7 @@ X = '[channels.disk_x]\nsource = "x"\n'
             'm.toml: resample.method must be "polyphase" or "linear" with resample.rate_hz',
         ),
         ("[time]\nrate_hz = 1000.5\n" + X.replace("disk_x", "disk_y"), None),
-        ("[time]\nrate_hz = 2000\n" + X, "m.toml: time.rate_hz must be within 1% of the rate of x in x.csv, 1000 Hz"),
+        ("[time]\nrate_hz = 2000\n" + X, "m.toml: time.rate_hz must be within 1% of the 1000 Hz of x in x.csv"),
         ("[file]\ntime_column = 'clock'\n" + X, "m.toml: file.time_column must be a column of x.csv"),
         ("[file]\ntime_column = 'none'\n" + X, "m.toml: time.rate_hz must be set, as the file has no rate"),
         ("[file]\nencoding = 'klingon'\n" + X, "m.toml: file.encoding must be a text encoding"),

@@ -126,10 +126,9 @@ class Log:
         """Return the time axis of a signal, from the file or the mapping."""
         rows, time = len(signal.values), self.mapping.time
         if time.rate_hz is not None:
-            file_rate_hz = signal.rate_hz if signal.times_s is None else even_rate_hz(signal.times_s)
-            if file_rate_hz is not None and abs(file_rate_hz / time.rate_hz - 1.0) > _RATE_TOLERANCE:
-                must = f"within {_RATE_TOLERANCE:.0%} of the rate of {what}, {file_rate_hz:.6g} Hz"
-                must += ' (or set file.time_column = "none")'
+            rate_hz = signal.rate_hz if signal.times_s is None else even_rate_hz(signal.times_s)
+            if rate_hz is not None and abs(rate_hz / time.rate_hz - 1.0) > _RATE_TOLERANCE:
+                must = f'within {_RATE_TOLERANCE:.0%} of the {rate_hz:.6g} Hz of {what} (or file.time_column = "none")'
                 raise InputError("time.rate_hz", must, time.rate_hz)
             first_s = signal.first_s if signal.times_s is None else float(signal.times_s[0])
             return clock.Axis(first_s, time.rate_hz, rows, note="rate from the mapping")

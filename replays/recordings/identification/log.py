@@ -71,12 +71,11 @@ def identify_log(
     )  # fmt: skip
     progress("effect of filters with other corners")
     other = {name: part.with_corner_factor(bandwidth) for name, part in question.observation.parts.items()}
-    z = np.zeros(len(question.keys))
-    apart = _full_window(question, other).predicted(z) - _full_window(question).predicted(z)
+    apart = _window(question, other).predicted(z := np.zeros(len(question.keys))) - _window(question).predicted(z)
     louder = np.hypot(1.0, np.sqrt(np.nanmean(apart**2, axis=0)))
     observation = question.observation
     question = replace(question, observation=replace(observation, noise=observation.noise * louder))
-    window = _full_window(question)
+    window = _window(question)
     progress(f"fitted: {len(question.keys)} values, to {tuned.end_s:.4f} s; their intervals")
     slopes, residuals, known = window.slopes_by_keys(z), window.residuals(z), window.known
     scale = np.array([unknown.scale for unknown in question.unknowns])
@@ -90,8 +89,7 @@ def identify_log(
     moved = np.hypot(jackknife, moves)
     shown = [residuals - apart / louder]
     for changes in variants:
-        experiment = question.experiment.changed(dict(changes))
-        shown.append(_full_window(replace(question, experiment=experiment)).residuals(z))
+        shown.append(_window(replace(question, experiment=question.experiment.changed(dict(changes)))).residuals(z))
     flat = slopes.reshape(-1, len(scale))
     for one in shown:
         change = solve_normal(square + flat.T @ flat, flat.T @ np.nan_to_num(one - residuals).ravel())
@@ -106,7 +104,7 @@ def identify_log(
     )  # fmt: skip
 
 
-def _full_window(question: Question, parts: dict[str, Measured] | None = None) -> Window:
+def _window(question: Question, parts: dict[str, Measured] | None = None) -> Window:
     """Return the window of all samples of a question, optionally with other filters."""
     if parts is not None:
         question = replace(question, observation=replace(question.observation, parts=parts))
