@@ -18,6 +18,8 @@ LIVE_S = 10.0
 _BACKGROUND = (16, 18, 23)
 _LOW_PLOTS = ("Spin speed [Hz]", "Hammer [N]")
 """Plots of reduced height."""
+_Column = tuple[list[tuple[rrb.View | rrb.Container, float]], float]
+"""Views with their heights, and the width of the column."""
 
 
 def layout(table: ChannelTable, geometry: Geometry, *, live: bool, only: str | None = None) -> rrb.Blueprint:
@@ -46,7 +48,7 @@ def layout(table: ChannelTable, geometry: Geometry, *, live: bool, only: str | N
     if small:
         motion.append((rrb.Horizontal(*small), 2.6))
     frequency += [(_marks_view(live=live), 1.8), (_events_view(), 2.6)]
-    columns = [(motion, 5.2), ([(view, 1.0) for view in curves.values()], 5.0), (frequency, 4.6)]
+    columns: list[_Column] = [(motion, 5.2), ([(view, 1.0) for view in curves.values()], 5.0), (frequency, 4.6)]
     if only is not None:
         columns = [([(view, 1.0) for view in _views_titled(only, columns)], 1.0)]
     columns = [(views, share) for views, share in columns if views]
@@ -71,9 +73,7 @@ def layout(table: ChannelTable, geometry: Geometry, *, live: bool, only: str | N
     )
 
 
-def _views_titled(
-    text: str, columns: list[tuple[list[tuple[rrb.View | rrb.Container, float]], float]]
-) -> list[rrb.View | rrb.Container]:
+def _views_titled(text: str, columns: list[_Column]) -> list[rrb.View | rrb.Container]:
     """Return the views whose title contains a text."""
     rows = [row for views, _ in columns for row, _ in views]
     views = [view for row in rows for view in (row.contents if isinstance(row, rrb.Container) else [row])]
