@@ -122,7 +122,7 @@ def test_what_came_is_judged_as_a_file(tmp_path: Path) -> None:
     assert found.arrivals.floor_s > 0.0
     card = judge(found.file, [found.session], arrivals=found.arrivals)
     assert (red(card), card.row("missing rows", "probes").note) == ({"missing rows"}, "rows 7000 to 7001")
-    assert "the last line is cut, and is left out: 2 of 4 columns" in card.remarks
+    assert "the last line is cut and was ignored: 2 of 4 columns" in card.remarks
 
 
 def test_an_interruption_keeps_the_whole_lines_that_there_were(tmp_path: Path) -> None:

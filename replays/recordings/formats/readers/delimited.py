@@ -92,7 +92,7 @@ def look_into(path: Path, options: FileOptions) -> Source:
     dialect, remarks = layout.dialect, layout.remarks
     last = dialect.fields(_last_line(path, layout.encoding))
     if not layout.ragged and len(last) < layout.width:
-        remarks += (f"the last line is incomplete and was ignored: {len(last)} of {layout.width} columns",)
+        remarks += (f"the last line is cut and was ignored: {len(last)} of {layout.width} columns",)
     dialect_options: dict[str, str | int] = {"delimiter": dialect.delimiter, "decimal": dialect.decimal}
     dialect_options |= {"thousands": dialect.thousands} if dialect.thousands else {}
     dialect_options["first_line"] = layout.first + 1
