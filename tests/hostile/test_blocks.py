@@ -203,7 +203,7 @@ def _short_waits(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("limits", [Limits(), Limits(rotate_s=1.0)], ids=["one file", "several files"])
-def test_a_recording_holds_the_true_rows_and_no_others(tmp_path: Path, limits: Limits) -> None:
+def test_a_recording_contains_only_valid_rows(tmp_path: Path, limits: Limits) -> None:
     client = ScriptedClient()
     session = RecordingSession(client, tmp_path / "run.mcap", limits=limits)
     summary, true = fed(session, client, inputs(3000), seed=1)
@@ -227,7 +227,7 @@ def is_block(key: str, payload: bytes) -> bool:
     return True
 
 
-def test_captures_end_and_hold_only_true_rows(tmp_path: Path) -> None:
+def test_captures_end_and_contain_only_valid_rows(tmp_path: Path) -> None:
     client = ScriptedClient()
     triggers = tuple(map(Trigger.parse, ("note", "hammer", "P_N>1e9", "speed<-1e9")))
     capture = Capture(triggers, pre_s=0.2, post_s=0.2, longest_s=2.0, again="ignore")
@@ -330,7 +330,7 @@ def test_the_live_view_draws_the_true_rows(monkeypatch: pytest.MonkeyPatch) -> N
     assert view.malformed > inputs(3000) / 3
 
 
-def test_a_step_is_believed_once_something_follows_it_and_a_lone_block_is_not() -> None:
+def test_a_jump_is_accepted_only_with_a_following_block() -> None:
     truth = Truth()
     for numbers, taken, refused in (
         ([0, 1, 5, 6], [0, 1, 5, 6], 0),  # a gap
@@ -365,7 +365,7 @@ def test_a_step_is_believed_once_something_follows_it_and_a_lone_block_is_not() 
     [{"table": 1}, {"table": {"groups": 3}}, {"tick_rate_hz": 0}, {"tick_rate_hz": "x"}, {"truth": []}, {"table": None},
      {"truth": {"state": {"rate_hz": -1, "columns": []}}}],
 )  # fmt: skip
-def test_a_catalogue_that_is_none_is_one_line_for_recorder_and_daq(tmp_path: Path, change: dict[str, Any]) -> None:
+def test_recorder_and_daq_refuse_an_invalid_catalogue_in_one_line(tmp_path: Path, change: dict[str, Any]) -> None:
     client = ScriptedClient()
     client.replies[wire.CATALOGUE] = wire.encode_document({**documents()[wire.CATALOGUE], **change})
     with pytest.raises(InputError, match="catalogue"):
@@ -377,7 +377,7 @@ def test_a_catalogue_that_is_none_is_one_line_for_recorder_and_daq(tmp_path: Pat
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_another_session_publishes_is_left_out_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_messages_of_another_session_are_skipped_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     import zenoh
 
     # With access control, the default, the block is refused and none has to be skipped.

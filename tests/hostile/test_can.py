@@ -196,7 +196,7 @@ def test_a_command_is_carried_out_only_where_its_frame_is_exactly_valid() -> Non
 # Return the rig's publications as a gateway in another process would receive them.
 
 
-def test_blocks_events_and_states_that_lie_do_not_stop_a_gateway() -> None:
+def test_false_blocks_events_and_states_do_not_stop_a_gateway() -> None:
     random = np.random.default_rng(2)
     rig = Rig(lambda: REPLIES[0])
     channel = f"hostile-{next(_channels)}"
@@ -250,7 +250,7 @@ def an_offer(random: np.random.Generator, secret: bytes) -> tuple[bytes, list[co
     return secret + message, rows
 
 
-def test_messages_and_requests_to_the_hub_stop_nobody_and_forge_nothing() -> None:
+def test_hostile_messages_to_the_hub_have_no_effect_on_others() -> None:
     random = np.random.default_rng(3)
     examples: list[dict[str, Any]] = [
         {"endpoint": "a", "listen_only": True, "secret": "0" * 32},
@@ -369,7 +369,7 @@ def a_command(random: np.random.Generator) -> bytes:
     return text.encode() if random.random() < 0.5 else mutated(random, text.encode())
 
 
-def test_text_to_socketcand_makes_a_frame_only_where_it_stands_for_one() -> None:
+def test_socketcand_text_gives_a_frame_only_if_valid() -> None:
     random = np.random.default_rng(4)
     made = 0
     splitter = socketcand.Splitter()
@@ -429,7 +429,7 @@ class Flood:
         return last
 
 
-def test_text_to_a_socketcand_server_stops_nobody() -> None:
+def test_hostile_text_does_not_stop_a_socketcand_server() -> None:
     random = np.random.default_rng(5)
     with Hub(BusModel("1M"), "can0") as hub, HubBus(hub) as other:  # noqa: SIM117
         with SocketcandServer({"can0": lambda: HubBus(hub)}, port=0) as server:
@@ -478,7 +478,7 @@ def a_line(random: np.random.Generator) -> bytes:
     return line if random.random() < 0.5 else mutated(random, line)
 
 
-def test_lines_to_an_slcan_port_make_a_frame_only_where_they_stand_for_one() -> None:
+def test_slcan_lines_give_a_frame_only_if_valid() -> None:
     random = np.random.default_rng(6)
     lines = slcan.Lines()
     made = 0
@@ -537,7 +537,7 @@ def a_request(random: np.random.Generator, codec: Codec) -> bytes:
     return head + body if random.random() < 0.6 else mutated(random, head + body)
 
 
-def test_requests_to_instruments_are_answered_and_only_exact_ones_carried_out() -> None:
+def test_instruments_reply_to_all_requests_and_execute_valid_ones_only() -> None:
     random = np.random.default_rng(7)
     rig = FakeRig(MemoryServer())
     with Twins(MemoryClient(rig.server)) as twins:
@@ -593,7 +593,7 @@ def _crc(data: bytes) -> int:
     return value
 
 
-def test_transport_frames_of_instruments_on_a_bus_leave_them_answering() -> None:
+def test_instruments_on_a_bus_survive_hostile_transport_frames() -> None:
     random = np.random.default_rng(9)
     channel = f"hostile-{next(_channels)}"
     rig = FakeRig(MemoryServer())
@@ -638,7 +638,7 @@ def test_transport_frames_of_instruments_on_a_bus_leave_them_answering() -> None
 # A DAQ on the bus.
 
 
-def test_frames_that_lie_to_a_daq_stop_nothing_and_are_counted() -> None:
+def test_false_frames_do_not_stop_a_daq_and_are_counted() -> None:
     random = np.random.default_rng(10)
     channel = f"hostile-{next(_channels)}"
     table = default_messages()

@@ -217,7 +217,7 @@ def doubts_of(path: Path) -> tuple[str, ...]:
 
 
 @pytest.mark.parametrize("name", CONTRADICTIONS)
-def test_a_contradiction_inside_a_file_is_told_in_a_line(name: str, layout: Layout, tmp_path: Path) -> None:
+def test_a_contradiction_in_a_file_is_reported_in_one_line(name: str, layout: Layout, tmp_path: Path) -> None:
     changed = copy.deepcopy(layout)
     spoil, told = CONTRADICTIONS[name]
     spoil(changed)
@@ -225,7 +225,7 @@ def test_a_contradiction_inside_a_file_is_told_in_a_line(name: str, layout: Layo
     assert any(line.startswith(told) or told in line for line in found), found
 
 
-def test_what_a_topic_says_of_itself_is_held_against_the_catalogue(layout: Layout, tmp_path: Path) -> None:
+def test_topic_metadata_is_compared_with_the_catalogue(layout: Layout, tmp_path: Path) -> None:
     changed = copy.deepcopy(layout)
     changed.about[PROBES] = {"scales": "[1.0]", "names": '["disk_x", "disk_y", "ring_x", "ring_y"]'}
     found = doubts_of(changed.write(tmp_path / "x.mcap"))
@@ -234,7 +234,7 @@ def test_what_a_topic_says_of_itself_is_held_against_the_catalogue(layout: Layou
 
 
 @pytest.mark.parametrize("name", ["calibration", "parameter, scene", "parameter, set"])
-def test_info_and_validate_tell_it_and_validate_ends_with_1(
+def test_info_and_validate_report_a_contradiction_and_validate_exits_with_1(
     name: str, layout: Layout, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     changed = copy.deepcopy(layout)
@@ -250,11 +250,11 @@ def test_info_and_validate_tell_it_and_validate_ends_with_1(
 
 
 @pytest.mark.parametrize("path", [*sorted(SESSIONS.glob("*.mcap")), *sorted(Path("tests/recordings").glob("*.mcap"))])
-def test_what_the_rig_made_does_not_contradict_itself(path: Path) -> None:
+def test_recordings_of_the_rig_have_no_contradiction(path: Path) -> None:
     assert doubts_of(path) == ()
 
 
-def test_nor_does_what_is_made_of_it(layout: Layout, tmp_path: Path) -> None:
+def test_derived_recordings_have_no_contradiction(layout: Layout, tmp_path: Path) -> None:
     whole = layout.write(tmp_path / "whole.mcap")
     assert doubts_of(whole) == ()
     recording = Recording.open(whole)

@@ -70,7 +70,7 @@ def asked(client: MemoryClient, name: str, payload: bytes) -> dict[str, Any]:
     return wire.decode_document(client.request(wire.command_key(name), payload))
 
 
-def test_whatever_is_sent_as_a_command_is_answered_and_only_what_is_right_is_taken(served: Any) -> None:
+def test_every_command_gets_a_reply_and_only_valid_ones_are_accepted(served: Any) -> None:
     simulation, _, client = served
     random = np.random.default_rng(11)
     accepted = 0
@@ -92,7 +92,7 @@ def test_whatever_is_sent_as_a_command_is_answered_and_only_what_is_right_is_tak
     assert len(client.request(wire.SCENE)) < 1_000_000
 
 
-def test_whatever_is_reported_the_status_goes_on(served: Any) -> None:
+def test_hostile_reports_do_not_stop_the_status(served: Any) -> None:
     _, _, client = served
     statuses: list[bytes] = []
     client.subscribe(wire.STATUS, lambda _, payload: statuses.append(payload))

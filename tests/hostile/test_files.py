@@ -52,7 +52,7 @@ def flipped(data: bytes, at: int, bit: int) -> bytes:
 
 
 @pytest.mark.parametrize("finished", [True, False])
-def test_each_of_600_flipped_bits_in_attachments_is_told(
+def test_each_of_600_flipped_bits_in_attachments_is_reported(
     path: Path, part: Path, finished: bool, tmp_path: Path
 ) -> None:
     data = (path if finished else part).read_bytes()
@@ -69,7 +69,7 @@ def test_each_of_600_flipped_bits_in_attachments_is_told(
     assert told == 600
 
 
-def test_a_changed_calibration_is_never_recovered_as_if_it_were_whole(path: Path, tmp_path: Path) -> None:
+def test_a_changed_calibration_is_never_recovered_as_complete(path: Path, tmp_path: Path) -> None:
     data = path.read_bytes()
     at = data.index(b'"sensitivity_v": ')
     spoilt = tmp_path / "x.mcap"
@@ -83,7 +83,7 @@ def test_a_changed_calibration_is_never_recovered_as_if_it_were_whole(path: Path
 
 
 @pytest.mark.parametrize("command", ["info", "validate", "identify", "recover", "cut", "export", "replay", "view"])
-def test_a_sensitivity_that_was_turned_is_told_by_every_command(
+def test_every_command_reports_an_inverted_sensitivity(
     command: str, path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     data = path.read_bytes()
@@ -103,7 +103,9 @@ def test_a_sensitivity_that_was_turned_is_told_by_every_command(
 
 
 @pytest.mark.parametrize("finished", [True, False])
-def test_no_changed_byte_gives_other_contents_untold(path: Path, part: Path, finished: bool, tmp_path: Path) -> None:
+def test_every_changed_byte_that_alters_contents_is_reported(
+    path: Path, part: Path, finished: bool, tmp_path: Path
+) -> None:
     source = path if finished else part
     data, before = source.read_bytes(), contents(Recording.open(source))
     messages = before[0]
@@ -134,7 +136,7 @@ def _unsure(recording: Recording) -> int:
     return int(told.split()[2])
 
 
-def test_what_is_put_together_wrongly_is_refused_or_read_and_never_a_traceback(layout: Layout, tmp_path: Path) -> None:
+def test_a_malformed_file_is_read_or_refused_without_a_traceback(layout: Layout, tmp_path: Path) -> None:
     rng = np.random.default_rng([4, inputs(160)])
     doors = {name: Door() for name in uses()}
     for number in range(inputs(160)):
@@ -271,7 +273,7 @@ def _rig(*arguments: str) -> int:
 
 
 @pytest.mark.parametrize("lie", _LIES)
-def test_rows_that_are_gone_or_do_not_fit_are_told_though_every_checksum_holds(
+def test_missing_or_inconsistent_rows_are_reported_despite_valid_checksums(
     lie: str, layout: Layout, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     changed = copy.deepcopy(layout)
@@ -296,7 +298,7 @@ def test_rows_that_are_gone_or_do_not_fit_are_told_though_every_checksum_holds(
         assert next(one for one in channels if one["name"] == "disk_x")["findings"]
 
 
-def test_a_validation_of_what_is_not_all_there_is_not_good(tmp_path: Path) -> None:
+def test_a_validation_of_an_incomplete_file_does_not_pass(tmp_path: Path) -> None:
     from replays.recordings.validation import validate
 
     changed = Layout(Recording.open(SESSIONS / "hammer-5.2.mcap"))
@@ -308,7 +310,7 @@ def test_a_validation_of_what_is_not_all_there_is_not_good(tmp_path: Path) -> No
     assert re.search(r"fail, .* rows of rig/sensors/probes are missing", found.verdict_line)
 
 
-def test_a_chunk_that_the_index_leaves_out_is_told_and_statistics_may_be_missing(path: Path, tmp_path: Path) -> None:
+def test_a_chunk_missing_in_the_index_is_reported_and_statistics_are_optional(path: Path, tmp_path: Path) -> None:
     data = path.read_bytes()
     start, checksum_at = struct.unpack_from("<Q", data, len(data) - 28)[0], len(data) - 12
     spoilt = tmp_path / "x.mcap"

@@ -71,7 +71,7 @@ def spoil_toml(text: str, rng: Rng) -> bytes:
     return text.encode()
 
 
-def test_toml_of_every_kind_is_taken_or_refused_in_one_line(tmp_path: Path) -> None:
+def test_any_toml_is_accepted_or_refused_in_one_line(tmp_path: Path) -> None:
     rng = np.random.default_rng([5, inputs(120)])
 
     def text(path: Path) -> str:
@@ -99,7 +99,7 @@ def test_toml_of_every_kind_is_taken_or_refused_in_one_line(tmp_path: Path) -> N
     tell(doors)
 
 
-def test_documents_of_another_form_are_taken_or_refused_in_one_line(tmp_path: Path) -> None:
+def test_any_document_is_accepted_or_refused_in_one_line(tmp_path: Path) -> None:
     """The same TOML files as documents, with values of another type and values in place of tables."""
     (tmp_path / "m.toml").write_text(example())
     kinds: dict[str, tuple[list[Any], Callable[[Any], object]]] = {
@@ -127,7 +127,7 @@ def test_documents_of_another_form_are_taken_or_refused_in_one_line(tmp_path: Pa
     "text",
     ["9" * 5000, "-" + "9" * 30, "0x" + "f" * 5000, "[" * 5000, "[" * 40 + "]" * 40, "{a." + "a." * 200 + "a = 1}"],
 )
-def test_numbers_and_nesting_beyond_all_bounds_are_one_line(
+def test_extreme_numbers_and_nesting_are_refused_in_one_line(
     text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "x.toml").write_text(f"seed = {text}\n")
@@ -199,7 +199,7 @@ def logs(folder: Path) -> dict[str, bytes]:
 # pyuff leaves its file to the garbage collector, and asammdf files that it could not open.
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning", "ignore::ResourceWarning")
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
-def test_logs_of_other_systems_are_taken_or_refused_in_one_line(tmp_path: Path) -> None:
+def test_foreign_logs_are_accepted_or_refused_in_one_line(tmp_path: Path) -> None:
     (tmp_path / "whole").mkdir()
     whole = logs(tmp_path / "whole")
     (tmp_path / "m.toml").write_text(X)
@@ -262,9 +262,7 @@ def printed_safely(text: str) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_info_prints_names_that_a_terminal_would_act_on(
-    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_info_escapes_control_sequences_in_names(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     layout = Layout(Recording.open(write(tmp_path / "run.mcap")))
     text = json.dumps(name)[1:-1]
     for old in ('"disk_x"', '"hammer"', '"forces"'):
@@ -293,7 +291,7 @@ def test_info_prints_names_that_a_terminal_would_act_on(
 
 @pytest.mark.parametrize("name", [*NAMES[:7], 'a","b', "\n    -1\n    -1\n    58"])
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-def test_names_do_not_change_the_form_of_what_is_exported(name: str, tmp_path: Path) -> None:
+def test_names_do_not_change_the_format_of_exports(name: str, tmp_path: Path) -> None:
     layout = Layout(Recording.open(write(tmp_path / "run.mcap")))
     catalogue = json.loads(layout.attachments["catalogue.json"])
     for channel in catalogue["table"]["groups"]["probes"]["channels"][:1]:
@@ -309,7 +307,7 @@ def test_names_do_not_change_the_form_of_what_is_exported(name: str, tmp_path: P
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_status_and_a_validation_print_them_too(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_status_and_validation_escape_control_sequences_in_names(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     from rig.cli.commands.status import status_table
 
     document = {
@@ -362,7 +360,7 @@ def test_paths_with_such_names_end_no_command(
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_recording_to_such_a_path_is_made(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_path_with_control_sequences_can_be_recorded_to(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     from rig.cli.commands.record import run_session
 
     progress = SimpleNamespace(
@@ -379,7 +377,7 @@ def test_a_recording_to_such_a_path_is_made(name: str, capsys: pytest.CaptureFix
     printed_safely(capsys.readouterr().err)
 
 
-def test_nothing_is_printed_but_through_the_one_door() -> None:
+def test_all_output_uses_the_common_module() -> None:
     """No command creates a console, a progress bar or a live display, or prints past the common module."""
     found = []
     for path in sorted(Path(next(iter(rig.cli.__path__))).glob("*.py")):

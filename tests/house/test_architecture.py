@@ -9,5 +9,5 @@ def test_picture_is_up_to_date() -> None:
     assert PICTURE.read_text(encoding="utf-8") == picture(), "make it anew: python -m tests.house.architecture"
 
 
-def test_readme_shows_it() -> None:
+def test_readme_shows_the_picture() -> None:
     assert f"({PICTURE.relative_to(ROOT)})" in (ROOT / "README.md").read_text(encoding="utf-8")

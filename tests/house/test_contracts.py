@@ -132,7 +132,7 @@ def test_contracts_hold() -> None:
 
 
 @pytest.mark.parametrize(("importer", "imported", "words"), BREACHES)
-def test_contracts_see_what_is_forbidden(graph: grimp.ImportGraph, importer: str, imported: str, words: str) -> None:
+def test_contracts_detect_forbidden_imports(graph: grimp.ImportGraph, importer: str, imported: str, words: str) -> None:
     contract = contract_named(words)
     broken = copy.deepcopy(graph)
     assert importer in broken.modules, f"{importer} has moved: name another"
@@ -145,7 +145,7 @@ def test_contracts_see_what_is_forbidden(graph: grimp.ImportGraph, importer: str
     assert not contract.check(broken, verbose=False).kept
 
 
-def test_each_contract_is_seen_to_break() -> None:
+def test_each_contract_detects_a_breach() -> None:
     for each in CONFIGURATION["contracts_options"]:
         assert [words for *_, words in BREACHES if words in each["name"]], f"no breach of: {each['name']}"
 

@@ -54,7 +54,7 @@ def test_examples_of_a_module(name: str, monkeypatch: pytest.MonkeyPatch) -> Non
 
 # Warnings of matplotlib about its own layout.
 @pytest.mark.filterwarnings("ignore::PendingDeprecationWarning")
-def test_the_notebook_plots_what_it_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_notebook_plots_as_documented(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import matplotlib
 
     matplotlib.use("agg")
@@ -75,6 +75,6 @@ def test_the_notebook_plots_what_it_says(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 @pytest.mark.parametrize("called", CALLED, ids=lambda called: called.__name__)
-def test_what_a_notebook_calls_has_an_example(called: object) -> None:
+def test_functions_for_notebooks_have_an_example(called: object) -> None:
     assert ">>> " in (called.__doc__ or "")
     assert getattr(called, "__module__", "") in MODULES

@@ -34,7 +34,7 @@ def step(y):
         ("import advance", "import retreat as advance", False),
     ],
 )  # fmt: skip
-def test_a_digest_is_of_what_code_does(old: str, new: str, same: bool, tmp_path: Path) -> None:
+def test_a_digest_depends_only_on_behaviour(old: str, new: str, same: bool, tmp_path: Path) -> None:
     (tmp_path / "folder").mkdir()
     paths = [tmp_path / "a.py", tmp_path / "folder/b.py"]
     assert old in MODULE

@@ -24,7 +24,7 @@ def test_packages_have_few_rooms_on_few_floors(graph: grimp.ImportGraph) -> None
     assert not wrong, "\n".join(wrong)
 
 
-def test_like_entries_do_not_import_each_other(graph: grimp.ImportGraph) -> None:
+def test_entries_of_one_kind_do_not_import_each_other(graph: grimp.ImportGraph) -> None:
     for package in LIKE_ENTRIES:
         wrong = {name: beside for name, beside in rooms(graph, package).items() if beside}
         assert not wrong, "what two entries need stands in neither of them"

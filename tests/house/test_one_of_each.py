@@ -136,7 +136,7 @@ def test_each_mechanism_of_estimation_has_one_home() -> None:
     assert not wrong, "\n".join(wrong)
 
 
-def test_the_homes_have_what_they_are_named_for() -> None:
+def test_homes_contain_their_mechanism() -> None:
     for mechanism, home in HOMES.items():
         tree = ast.parse((ROOT / home).read_text(encoding="utf-8"))
         assert any(found == mechanism for _, found, _ in mechanisms(tree)), f"{home} has no {mechanism}"
@@ -164,7 +164,7 @@ def test_the_homes_have_what_they_are_named_for() -> None:
         ("from scipy import fft\nfft.dct(x)", SPECTRUM),
     ],
 )
-def test_a_second_one_is_found_however_it_is_imported(text: str, mechanism: str) -> None:
+def test_a_second_implementation_is_found_with_any_form_of_import(text: str, mechanism: str) -> None:
     assert {found for _, found, _ in mechanisms(ast.parse(text))} == {mechanism}
 
 
@@ -179,5 +179,5 @@ def test_a_second_one_is_found_however_it_is_imported(text: str, mechanism: str)
         "from scipy.signal import correlate\ncorrelate(a, b)",
     ],
 )
-def test_what_only_looks_like_one_is_not(text: str) -> None:
+def test_similar_code_is_not_reported(text: str) -> None:
     assert not list(mechanisms(ast.parse(text)))

@@ -33,7 +33,7 @@ print(*(each.py_func.__qualname__ for each, count in known().items() if count > 
 """
 
 
-def test_a_run_compiles_nothing_of_it_again() -> None:
+def test_a_run_compiles_no_kernel_again() -> None:
     background_compiling.compile_last()
     compiled: dict[Dispatcher, list[object]] = {each: list(each.signatures) for each in (sliding, set_step)}
     assert all(len(signatures) == 1 for signatures in compiled.values())
@@ -42,13 +42,13 @@ def test_a_run_compiles_nothing_of_it_again() -> None:
     assert {kernel: list(kernel.signatures) for kernel in compiled} == compiled
 
 
-def test_nothing_is_compiled_late() -> None:
+def test_nothing_is_compiled_during_a_run() -> None:
     """A live rig would stop for it."""
     done = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout.strip()) == (0, ""), done.stderr
 
 
-def test_the_second_process_takes_no_code_of_the_working_directory(
+def test_the_second_process_ignores_modules_in_the_working_directory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The cache is indexed by the files' paths: code compiled from other files would never be used."""

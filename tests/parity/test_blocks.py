@@ -94,7 +94,7 @@ def whole() -> Whole:
     return run(END)
 
 
-def test_there_is_something_to_compare(whole: Whole) -> None:
+def test_the_run_has_rows_to_compare(whole: Whole) -> None:
     assert [event["event"] for event in whole.events] == ["hammer", "speed", "hammer", "release"]
     assert [event["tick"] for event in whole.events] == [20_000, 150_000, 205_000, 400_000]
     assert whole.health["contacts"] > 10
@@ -159,7 +159,7 @@ def test_a_release_of_the_scene_finds_the_magnets_released() -> None:
     assert abs(health["energy"]["residual_j"]) < 1e-5 * health["energy"]["dissipated_j"], "booked once"
 
 
-def test_a_blow_of_the_scene_finds_the_hammer_in_a_blow() -> None:
+def test_an_impact_of_the_scene_may_meet_a_running_impact() -> None:
     simulation = Simulation(load_scene("hammer"))
     simulation.advance(18_000)
     simulation.submit("hammer", {"force_n": 50.0, "duration_ms": 10.0})
@@ -177,7 +177,7 @@ def test_same_seed_same_bits_and_another_seed_only_another_noise(whole: Whole) -
         assert np.mean(other.samples[name] != counts) > 0.9
 
 
-def test_a_command_of_the_scene_is_one_sent_at_that_tick() -> None:
+def test_a_scene_command_equals_a_command_sent_at_its_tick() -> None:
     scene = load_scene("hammer")
     simulation = Simulation(scene.model_copy(update={"commands": ()}))
     request = scene.commands[0].request.model_dump(exclude={"command"})

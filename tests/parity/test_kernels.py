@@ -177,7 +177,7 @@ def test_conditioner_writes_every_count(monkeypatch: pytest.MonkeyPatch) -> None
         np.testing.assert_array_equal(counts, made[1][name])
 
 
-def test_rows_of_a_simulation_are_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_simulations_do_not_share_rows(monkeypatch: pytest.MonkeyPatch) -> None:
     clean, poisoned = Simulation(load_scene("hammer")), Simulation(load_scene("hammer"))
     poisoned._rows = np.full((4_000, S.N_ROW), np.nan)
     assert clean.advance(50_000).rows.tobytes() == poisoned.advance(50_000).rows.tobytes()

@@ -95,7 +95,7 @@ def test_a_limit_of_the_spin_angle_is_in_degrees() -> None:
         assert (f"spin angle off by 0.3 deg (limit {limit})" in accuracy.warning()) == warned
 
 
-def test_impacts_that_differ_are_not_explained_by_an_angle() -> None:
+def test_different_impacts_are_not_explained_by_an_angle() -> None:
     rng = np.random.default_rng(5)
     rows, other = whirl(128), whirl(128)
     rows[:, COLUMN["normal_force"]] = np.where(rng.random(128) < 0.2, 400.0, 0.0)
@@ -154,7 +154,7 @@ WRONG: dict[str, tuple[str, dict[str, Any], float]] = {
 
 
 @pytest.mark.parametrize("name", WRONG)
-def test_what_is_off_in_radius_or_force_warns(name: str) -> None:
+def test_an_error_of_radius_or_force_warns(name: str) -> None:
     radius, force, simulation = held_against_taylor(*WRONG[name])
     found = simulation.health()["accuracy"]["quantities"]
     assert radius * 1e6 > found["radius"]["tolerance"] or force > found["force"]["tolerance"]
@@ -162,7 +162,7 @@ def test_what_is_off_in_radius_or_force_warns(name: str) -> None:
     assert any(text.startswith("accuracy: ") for text in simulation.health()["warnings"])
 
 
-def test_a_run_beyond_its_angle_limit_warns_and_the_same_without_it_does_not() -> None:
+def test_only_a_run_with_an_angle_limit_warns_of_the_angle() -> None:
     changes = {**BARE, "engine.tolerance": 3e-3}
     plain = simulate("hammer", changes, duration_s=0.3)
     limited = simulate("hammer", {**changes, "engine.limits.angle_deg": 1e-5}, duration_s=0.3)
@@ -223,7 +223,7 @@ def test_text_of_an_estimate_of_any_version(accuracy: dict[str, Any], text: str)
     assert accuracy_text(accuracy) == text
 
 
-def test_info_of_an_older_recording_has_its_warning_once() -> None:
+def test_info_of_an_older_recording_shows_its_warning_once() -> None:
     recording = join([Path(__file__).parents[2] / "replays" / "sessions" / "partial-rub.mcap"])
     event = next(event for event in recording.events if event["event"] == "warning")
     later = event["text"].replace("1.1e-02", "2.2e-01")

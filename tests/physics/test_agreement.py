@@ -151,7 +151,7 @@ def test_ledger_of_the_default_engine_closes_to_its_own_error(scene: str) -> Non
         assert not [text for text in simulation.health()["warnings"] if "energy" in text]
 
 
-def test_as_printed_gap_makes_energy_and_the_ledger_says_so() -> None:
+def test_the_printed_gap_creates_energy_and_the_ledger_shows_it() -> None:
     run = simulate(load_scene("hammer", {"parameters": "as-printed", "engine.name": "rk8"}), duration_s=0.3)
     assert abs(run["gap_work"][-1]) > 1e-5
     energy = run.energy()
@@ -209,7 +209,7 @@ def test_whirl_rolls_backward_and_its_force_grows_as_spin_squared() -> None:
     np.testing.assert_allclose(forces, [130, 230, 361, 523], rtol=0.08)
 
 
-def test_short_blow_dies_out() -> None:
+def test_whirl_after_a_short_impact_decays() -> None:
     scene = load_scene("hammer")
     short = scene.commands[0].request.model_copy(update={"duration_ms": 2.0})
     scene = scene.model_copy(update={"commands": (scene.commands[0].model_copy(update={"request": short}),)})

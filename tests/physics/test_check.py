@@ -21,7 +21,7 @@ def states(changes: dict[str, Any]) -> Any:
     return run.signals[:, :N_STATE]
 
 
-def test_error_is_as_large_as_against_another_method() -> None:
+def test_error_agrees_with_that_of_another_method() -> None:
     changes = {"duration_s": 0.3, "sensors.rate_hz": 1000, "sensors.truth_rate_hz": 1000}
     found = check(load_scene("hammer", changes))
     true = scaled_error(states(changes), states(changes | {"engine.name": "rk8", "engine.step_us": 25}))

@@ -38,7 +38,7 @@ def effect(rate_hz: int, command: dict[str, Any]) -> tuple[np.ndarray, float]:
 
 @pytest.mark.parametrize("command", [HAMMER, SPEED, RELEASE], ids=lambda command: command["command"])
 @pytest.mark.parametrize("rate_hz", [500, 100])
-def test_rows_far_apart_leave_a_command_as_it_is(rate_hz: int, command: dict[str, Any]) -> None:
+def test_a_low_row_rate_does_not_change_a_command(rate_hz: int, command: dict[str, Any]) -> None:
     change, work = effect(rate_hz, command)
     true_change, true_work = effect(20_000, command)
     assert np.abs(true_change).max() > 1e-6, "it has an effect"

@@ -84,7 +84,7 @@ def two_bodies(law: NormalLaw, masses: tuple[float, float], speed: float) -> flo
 
 @pytest.mark.parametrize("restitution", [0.05, 0.3, 0.5, 0.9, 0.99])
 @pytest.mark.parametrize("name", DAMPING)
-def test_returned_restitution_is_that_of_two_free_bodies(name: str, restitution: float) -> None:
+def test_returned_restitution_agrees_with_two_free_bodies(name: str, restitution: float) -> None:
     law = chosen(name, restitution)
     collided = two_bodies(law, (IMPACT.shaft_mass, IMPACT.house_mass), IMPACT.speed)
     assert free_impact(law, mass=IMPACT.mass, speed=IMPACT.speed).restitution == pytest.approx(collided, abs=2e-5)
@@ -102,7 +102,7 @@ def test_memory_of_v0_returns_the_same_for_any_mass_speed_and_exponent(stiffness
     assert two_bodies(law, (0.3, 7.0), 0.02) == pytest.approx(returned_restitution(law.damping_factor), abs=2e-5)
 
 
-def test_lankarani_nikravesh_returns_what_is_known_of_it() -> None:
+def test_lankarani_nikravesh_returns_its_published_restitution() -> None:
     assert returned_restitution(chosen("lankarani-nikravesh", 0.9).damping_factor) == pytest.approx(0.913, abs=5e-4)
     assert returned_restitution(chosen("lankarani-nikravesh", 0.5).damping_factor) == pytest.approx(0.725, abs=5e-4)
 
@@ -119,7 +119,7 @@ def test_factors_at_half_worked_out_by_hand(name: str, factor: float) -> None:
     assert chosen(name, 0.5).damping_factor == pytest.approx(factor, abs=5e-5)
 
 
-def test_which_laws_are_right_near_elastic_impacts() -> None:
+def test_accuracy_of_the_laws_near_elastic_impacts() -> None:
     # Losses to first order: 1 - e = 2 c / 3 for any exponent.
     slope = {name: chosen(name, 1.0 - 1e-6).damping_factor / 1e-6 for name in DAMPING}
     right = {name for name, value in slope.items() if value == pytest.approx(1.5, rel=1e-4)}
@@ -132,13 +132,13 @@ def test_which_laws_are_right_near_elastic_impacts() -> None:
 
 
 @pytest.mark.parametrize("restitution", [0.1, 0.5, 0.9])
-def test_exact_rule_is_the_implicit_one_of_gonthier(restitution: float) -> None:
+def test_exact_rule_solves_the_implicit_equation_of_gonthier(restitution: float) -> None:
     e = restitution
     d = restitution_factor(e) * e
     assert (1 + d / e) / (1 - d) == pytest.approx(math.exp(d * (1 + 1 / e)), rel=1e-9)
 
 
-def test_factor_and_returned_restitution_undo_each_other() -> None:
+def test_factor_and_returned_restitution_are_inverse() -> None:
     wanted = np.linspace(0.05, 1.0, 96)
     returned = [returned_restitution(restitution_factor(float(e))) for e in wanted]
     np.testing.assert_allclose(returned, wanted, atol=1e-9)
@@ -194,7 +194,7 @@ def test_floor_of_v0_makes_slow_impacts_more_elastic() -> None:
     assert slow.restitution > 0.8
 
 
-def test_kelvin_voigt_goes_as_deep_as_the_law_it_stands_for() -> None:
+def test_kelvin_voigt_has_the_depth_of_the_law_it_replaces() -> None:
     for name in STIFFNESS:
         linear, own = chosen(KELVIN_VOIGT, 0.9, stiffness=name), chosen("none", 0.9, stiffness=name)
         assert linear.exponent == 1.0
@@ -245,7 +245,7 @@ def test_palmgren_for_steel_is_the_published_number() -> None:
     assert depth * 1e3 == pytest.approx(3.84e-5 * 1000.0**0.9 / 10.0**0.8, rel=5e-3)
 
 
-def test_pereira_stands_in_for_johnson() -> None:
+def test_pereira_approximates_johnson() -> None:
     depths = np.geomspace(0.5e-6, 12e-6, 12)
     for clearance in (0.3e-3, 0.926e-3, 2e-3):
         pair = PAIR._replace(clearance=clearance)
@@ -269,7 +269,7 @@ def test_liu_is_a_power_of_three_halves_in_a_wide_ring() -> None:
 
 
 @pytest.mark.parametrize("name", STIFFNESS)
-def test_fit_is_as_far_off_as_it_says(name: str) -> None:
+def test_fit_has_the_reported_error(name: str) -> None:
     fit, law = fit_power(name, PAIR), STIFFNESS[name]
     depths = np.geomspace(fit.low, fit.high, 777)
     ratio = fit.stiffness * depths**fit.exponent / np.array([law.force(float(depth), PAIR) for depth in depths])
@@ -318,7 +318,7 @@ def test_wider_ring_is_stiffer_for_cylinders_only() -> None:
             assert 1.5 < ratio < 2.0
 
 
-def test_numbers_stand_as_they_are_given() -> None:
+def test_given_numbers_are_used_unchanged() -> None:
     given = {
         "contact.stiffness": 3e10,
         "contact.exponent": 1.4,
@@ -332,7 +332,7 @@ def test_numbers_stand_as_they_are_given() -> None:
     assert two_bodies(linear, (IMPACT.shaft_mass, IMPACT.house_mass), 0.03) == pytest.approx(0.9, abs=2e-5)
 
 
-def test_another_exponent_keeps_the_depth_and_says_that_the_fit_is_gone() -> None:
+def test_another_exponent_keeps_the_depth_and_reports_the_lost_fit() -> None:
     resolved = normal_law(DEFAULT.override({"contact.exponent": 1.2}))
     assert resolved.fit_error is None
     own = chosen("none", 0.9)
@@ -362,6 +362,6 @@ def test_reference_masses_are_the_shafts_and_the_inner_houses() -> None:
         ),
     ],
 )  # fmt: skip
-def test_laws_that_do_not_go_together_are_refused_by_name(changes: dict[str, float | str], message: str) -> None:
+def test_incompatible_laws_are_refused_by_name(changes: dict[str, float | str], message: str) -> None:
     with pytest.raises(InputError, match=message):
         build_model(DEFAULT.override(changes))

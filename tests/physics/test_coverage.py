@@ -52,7 +52,7 @@ def held(recording: Recording, keys: tuple[str, ...]) -> tuple[dict[str, bool], 
 
 @pytest.mark.skipif(not SEEDS, reason="RIG_COVERAGE_SEEDS says how many seeds; half a minute each")
 @pytest.mark.timeout(0)
-def test_intervals_hold_the_truth_as_often_as_they_say(tmp_path: Path) -> None:
+def test_intervals_have_their_nominal_coverage(tmp_path: Path) -> None:
     from scipy.stats import binomtest
 
     counts: dict[str, list[bool | None]] = {}

@@ -153,7 +153,7 @@ HARD: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.parametrize("name", HARD)
-def test_split_is_right_where_it_is_hard_and_its_estimate_says_how_far(name: str) -> None:
+def test_split_is_accurate_in_hard_cases_and_estimates_its_error(name: str) -> None:
     bare = {"sensors.chain": "ideal", "sensors.rate_hz": 1000, "sensors.truth_rate_hz": 1000, **HARD[name]}
     exact = simulate("hammer", {**bare, "engine.name": "taylor", "engine.tolerance": 1e-12}, duration_s=0.15)
     run = simulate("hammer", bare, duration_s=0.15)
@@ -163,7 +163,7 @@ def test_split_is_right_where_it_is_hard_and_its_estimate_says_how_far(name: str
     assert 0.2 * estimate < error < 5.0 * estimate + 3e-5
 
 
-def test_a_minute_of_whirl_is_right_for_as_long_as_its_growth_allows() -> None:
+def test_whirl_is_accurate_as_long_as_its_error_growth_allows() -> None:
     # In whirl small differences grow by 0.3 per second: a factor of 400 in 20 s. The ledger still closes to far less
     # than the tolerance of the motion (3e-4), which sets the steps of rolling.
     bare = {"sensors.chain": "ideal", "sensors.rate_hz": 100, "sensors.truth_rate_hz": 100}
@@ -223,13 +223,13 @@ def test_without_a_drive_only_contact_brakes_the_shaft(engine: str) -> None:
 
 
 @pytest.mark.parametrize("engine", [name for name in ENGINES if name not in EXACT])
-def test_engines_without_exact_friction_say_so(engine: str) -> None:
+def test_engines_without_exact_friction_refuse_it(engine: str) -> None:
     with pytest.raises(InputError, match="friction"):
         ready("hammer", engine, model__friction="exact")
 
 
 @pytest.mark.parametrize("smoothing_speed", [1e-4, 1e-6])
-def test_linearly_implicit_engine_holds_at_any_smoothing_speed(smoothing_speed: float) -> None:
+def test_linearly_implicit_engine_is_stable_at_any_smoothing_speed(smoothing_speed: float) -> None:
     exact = motion(ready("hammer", "rk8"), 0.15)
     implicit = ready("hammer", "rosenbrock", smoothing_speed, model__friction="smoothed", engine__tolerance=1e-6)
     assert distance(motion(implicit, 0.15), exact) < 4e-3

@@ -52,7 +52,7 @@ def truth() -> dict[str, float]:
 
 
 @pytest.mark.parametrize("engine", ["split", "taylor"])
-def test_truth_comes_back_from_a_hammer_recording(tmp_path: Path, truth: dict[str, float], engine: str) -> None:
+def test_truth_is_recovered_from_a_hammer_recording(tmp_path: Path, truth: dict[str, float], engine: str) -> None:
     changes = {key.replace(".", "__"): value for key, value in truth.items()}
     recording = recorded(tmp_path / "h.mcap", "hammer", duration_s=0.1, engine__name=engine, seed=11, **changes)
     experiment = Experiment.of(recording).changed({"parameters": "corrected", "set": {}, "engine.name": "split"})
@@ -68,7 +68,7 @@ def test_truth_comes_back_from_a_hammer_recording(tmp_path: Path, truth: dict[st
         assert found.judgement.white
 
 
-def test_start_ten_per_cent_off_gets_there(tmp_path: Path) -> None:
+def test_a_start_ten_per_cent_off_converges(tmp_path: Path) -> None:
     recording = recorded(tmp_path / "h.mcap", "hammer", duration_s=0.06, seed=5)
     experiment = Experiment.of(recording)
     right = {key: value_of(experiment, key) for key in ("contact.friction", "contact.restitution", "contact.stiffness")}
@@ -83,7 +83,7 @@ def test_start_ten_per_cent_off_gets_there(tmp_path: Path) -> None:
     assert max(map(abs, errors.values())) < 2.0
 
 
-def test_intervals_are_the_scatter_of_fits_to_other_noise(tmp_path: Path) -> None:
+def test_intervals_agree_with_the_scatter_of_repeated_fits(tmp_path: Path) -> None:
     keys = ("magnet.stiffness", "shaft.unbalance_eccentricity", "shaft.unbalance_phase")
     values, widths = [], []
     for seed in range(8):
@@ -113,7 +113,7 @@ def test_moduli_act_only_together(tmp_path: Path) -> None:
     assert float(told[2]) / float(told[1]) == pytest.approx(-ratio, rel=0.02)
 
 
-def test_a_drop_tells_neither_friction_nor_magnets(tmp_path: Path) -> None:
+def test_a_drop_identifies_neither_friction_nor_magnets(tmp_path: Path) -> None:
     """A released shaft has neither their stiffness nor their damping; the ring's place is given, not by the sag."""
     recording = recorded(tmp_path / "d.mcap", "drop", duration_s=0.06, seed=3, ring__offset_y=-1.56)
     keys = ("contact.friction", "magnet.stiffness", "contact.restitution")

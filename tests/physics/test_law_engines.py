@@ -93,7 +93,7 @@ def test_law_is_the_same_in_every_engine(engine: str, field: str, law: str) -> N
 
 
 @pytest.mark.parametrize(("field", "law"), LAWS)
-def test_reference_takes_every_law_and_limits_see_one_that_is_a_tenth_stronger(field: str, law: str) -> None:
+def test_limits_detect_a_law_that_is_ten_per_cent_stronger(field: str, law: str) -> None:
     simulation = falling("rk8", field, law, "exact")
     constants = simulation.model.constants
     stronger = {

@@ -72,7 +72,7 @@ def test_planar_differs_from_euler_by_the_square_of_the_tilt() -> None:
 
 
 @pytest.mark.parametrize("friction", ["none", "exact"])
-def test_planar_model_is_one_model_on_two_engines(friction: str) -> None:
+def test_planar_model_agrees_on_two_engines(friction: str) -> None:
     planar = {"model.shaft": "planar", "model.friction": friction}
     split = Run("hammer", 0.031, **planar, **{"engine.step_us": 5})
     rk8 = Run("hammer", 0.031, **planar, **{"engine.name": "rk8"})
@@ -156,7 +156,7 @@ def whirl(run: Run) -> float:
     return float(np.polyfit(run.times[-200:], phase, 1)[0]) / (2.0 * math.pi)
 
 
-def test_rigid_impacts_whirl_as_the_kinematics_say() -> None:
+def test_rigid_impacts_whirl_by_the_kinematics() -> None:
     run = Run("hammer", 1.0, **IMPACT)
     # In lasting contact, the compliant law penetrates as far as the force requires.
     shaft, clearance = run.constants.shaft, run.constants.contact.clearance
@@ -221,7 +221,7 @@ def test_ideal_drive_keeps_the_spin() -> None:
     "lowered",
     [{"model.magnet": "linear"}, {"model.shaft": "planar"}, {"model.stator": "rigid"}],
 )
-def test_a_lowered_level_takes_no_more_steps(lowered: dict[str, str]) -> None:
+def test_a_lower_level_needs_no_more_steps(lowered: dict[str, str]) -> None:
     # With one method: split's steps are of several kinds.
     changes = {"engine.name": "taylor"}
     full, less = (Run("hammer", 0.5, **changes, **more).simulation.health()["steps"] for more in ({}, lowered))

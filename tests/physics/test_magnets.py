@@ -87,7 +87,7 @@ def test_field_is_magpylibs() -> None:
 
 @pytest.mark.parametrize("geometry", [TABLE_1, FLAT])
 @pytest.mark.parametrize("distance", [15e-3, 20e-3, 35e-3])
-def test_force_is_that_of_surface_currents_in_magpylibs_field(geometry: MagnetGeometry, distance: float) -> None:
+def test_force_agrees_with_surface_currents_in_magpylibs_field(geometry: MagnetGeometry, distance: float) -> None:
     import magpylib as magpy
 
     bearing = magpy.magnet.Cylinder(
@@ -159,7 +159,7 @@ def test_quadrature_converges_geometrically() -> None:
 
 
 @pytest.mark.parametrize("gap", [1e-3, 0.2e-3])
-def test_quadrature_is_refined_where_magnets_all_but_touch(gap: float) -> None:
+def test_quadrature_is_refined_at_small_gaps(gap: float) -> None:
     tight = TABLE_1._replace(bearing_radius=14e-3 + gap)
     assert tight.reach < gap
     nearest = tight.bearing_radius - tight.reach
@@ -271,7 +271,7 @@ def test_ripple_is_worth_its_term() -> None:
     assert missed(fitted._replace(growth=0.0)) > 2 * missed(fitted)
 
 
-def test_ripple_that_is_rounding_noise_is_left_out() -> None:
+def test_ripple_at_rounding_level_is_omitted() -> None:
     geometry = TABLE_1._replace(number=64, bearing_radius=0.5)
     assert fit_cylinder_map(geometry).terms == RADIAL
     assert fit_cylinder_map(geometry).error < 1e-8
@@ -319,7 +319,7 @@ def test_force_turns_with_the_magnets(magnet_map: MagnetMap) -> None:
     assert alike == (magnet_map.terms != RIPPLED)
 
 
-def test_levels_take_their_maps() -> None:
+def test_levels_use_their_maps() -> None:
     made = {level: model_of(level).constants.magnet for level in LEVELS}
     assert {level: magnet.terms for level, magnet in made.items()} == {
         "linear": LINEAR,
@@ -382,7 +382,7 @@ def test_ledger_closes_on_every_level_and_through_a_release(level: str) -> None:
     assert last[0, S_MAGNET] == 0.0
 
 
-def test_run_on_cylinders_differs_from_the_map_as_its_force_does() -> None:
+def test_runs_on_cylinders_and_map_differ_like_their_forces() -> None:
     scene = {"sensors.noise": False}
     held = {
         level: simulate(load_scene("stable-run", {**scene, "model.magnet": level}), duration_s=0.05) for level in LEVELS

@@ -88,7 +88,7 @@ def test_drop_reaches_the_ring_as_a_body_falls(parameters):
 
 
 @pytest.mark.parametrize("parameters", ["as-printed", "corrected"])
-def test_ring_gives_back_the_momentum_of_the_weight(parameters):
+def test_ring_returns_the_momentum_of_the_weight(parameters):
     run = drop(parameters)
     weight = P["shaft.mass"] * 9.81 * P["shaft.arm_centre"] / P["shaft.arm_ring"]
     assert run["contact_impulse"][-1] == pytest.approx(weight * run.times_s[-1], rel=1e-3)
@@ -103,7 +103,7 @@ def test_first_contact_of_the_drop_is_between_a_free_and_a_fixed_house(parameter
 
 
 @pytest.mark.parametrize("speed_hz", [3.2, 6.2, 9.0])
-def test_whirl_frequency_is_that_of_rolling(speed_hz):
+def test_whirl_frequency_agrees_with_rolling(speed_hz):
     whirl, depth = rolling(speed_hz)
     assert held(speed_hz).outcome == "backward whirl"
     assert held(speed_hz).whirl_hz == pytest.approx(-whirl / (2 * math.pi), rel=1e-3)
@@ -120,7 +120,7 @@ def test_force_in_whirl_bends_the_path(speed_hz):
 
 
 @pytest.mark.parametrize("mu", [0.08, 0.3])
-def test_slowest_whirl_that_friction_speeds_up(mu):
+def test_slowest_whirl_accelerated_by_friction(mu):
     natural = math.sqrt(STIFFNESS / MASS)
     ratio = DAMPING / (2 * MASS * natural)
     closed = natural * (ratio / mu + math.sqrt(1 + (ratio / mu) ** 2))
@@ -130,7 +130,7 @@ def test_slowest_whirl_that_friction_speeds_up(mu):
 
 
 @pytest.mark.parametrize("spin_hz", [6.2, 9.0])
-def test_least_friction_that_keeps_up_whirl(spin_hz):
+def test_minimum_friction_for_whirl(spin_hz):
     whirl, depth = rolling(spin_hz)
     normal, drag = (R0 + depth) * (MASS * whirl**2 - STIFFNESS), DAMPING * (R0 + depth) * whirl
     (found,) = condition.sustain_thresholds((spin_hz,))
@@ -143,14 +143,14 @@ def test_least_friction_that_keeps_up_whirl(spin_hz):
     assert found.used[1] > 2.0 * found.full
 
 
-def test_start_and_sustain_are_one_condition():
+def test_start_and_sustain_have_the_same_condition():
     own = condition.oscillator(base_model(ModelLevels()).constants)
     for mu in (0.01, 0.1, 0.4):
         assert condition.least_friction(own, condition.critical_whirl(own, mu)) == pytest.approx(mu, rel=1e-12)
     assert math.isinf(condition.least_friction(own, 0.99 * own.natural))
 
 
-def test_houses_take_what_forced_vibration_takes():
+def test_house_loss_agrees_with_forced_vibration():
     constants, spin = base_model(ModelLevels()).constants, 2 * math.pi * 6.2
     whirl, depth = condition.rolling_whirl(constants, spin)
     begun = condition.settle_rolling(constants, spin)
@@ -167,7 +167,7 @@ def test_houses_take_what_forced_vibration_takes():
 
 
 @pytest.mark.parametrize(("stator", "share"), [("two-houses", 1.0), ("rigid", 0.0)])
-def test_friction_swings_as_the_ring_goes_on_an_ellipse(stator, share):
+def test_friction_varies_with_the_ellipse_of_the_ring(stator, share):
     """Equal damping in x and y, no weight, no unbalance: the houses alone cause the swing at twice the whirl
     frequency.
     """
@@ -208,7 +208,7 @@ def test_slip_to_rolling():
     assert kept == pytest.approx(polar / (polar + MASS * RS**2), rel=1e-12)
 
 
-def test_free_decay_is_faster_than_the_ratio_that_damping_is_made_of():
+def test_free_decay_is_faster_than_the_nominal_damping_ratio():
     constants = condition.bare_rig(0.25)._replace(magnet=base_model(ModelLevels(magnet="linear")).constants.magnet)
     begun = state(beta=0.5 * R0 / P["shaft.arm_ring"])
     run = move("split", constants, quiet_inputs(magnets=True, ideal=True), begun, ticks=1_000_000, every=100)

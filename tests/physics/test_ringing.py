@@ -92,7 +92,7 @@ def test_ringing_is_the_matrix_exponential(changes: dict[str, Any]) -> None:
         assert runs[-1, S.HOUSE_IMPULSE_Y] == pytest.approx(simpson(force_y, x=times), rel=1e-4)
 
 
-def test_two_modes_that_are_one_are_left_out() -> None:
+def test_coincident_modes_are_excluded() -> None:
     constants, memory = constants_of({}), np.zeros(MEMORY)
     matrices = matrices_of(constants)
     matrices[1] = -np.eye(4) + np.eye(4, k=1)
@@ -130,7 +130,7 @@ def test_impacts_are_those_of_the_series(scene: str, ticks: int, changes: dict[s
     assert np.abs(rows - exact)[:, losses].max(axis=0) == pytest.approx(0.0, abs=1e-3 * scale.max())
 
 
-def test_flight_takes_fewer_steps_and_the_same_bits_in_any_calls() -> None:
+def test_flight_takes_fewer_steps_and_does_not_depend_on_calls() -> None:
     whole, memory = run("partial-rub", 300_000)
     _, series = run("partial-rub", 300_000, engine__rolling="series")
     assert memory[STEPS] < 0.5 * series[STEPS]
@@ -140,7 +140,7 @@ def test_flight_takes_fewer_steps_and_the_same_bits_in_any_calls() -> None:
 
 
 @pytest.mark.parametrize("preload", [1e-9, 1e-3, 0.1])
-def test_a_small_preload_is_nearly_none(preload: float) -> None:
+def test_a_small_preload_approaches_no_preload(preload: float) -> None:
     def states(newtons: float) -> np.ndarray:
         engine = {"engine.name": "taylor", "engine.tolerance": 1e-9, "engine.companion": False}
         simulation = Simulation(load_scene("hammer", {**QUIET, **engine, "duration_s": 0.05, "house.preload": newtons}))

@@ -108,7 +108,7 @@ def test_linear_bodies_respond_as_in_closed_form(parameters: str, monkeypatch: p
 INPUTS = Inputs(1e-6, 0.0, 1.0, 0.0, 0, 0, 0.0, 0.0, 0, ideal_drive=False, magnet_engaged=True)
 
 
-def test_it_is_the_default_of_split_alone() -> None:
+def test_collocation_is_the_default_of_split_only() -> None:
     assert load_scene("hammer").engine.rolling == "collocation"
     with pytest.raises(
         InputError, match=r"engine.rolling must be series with engine rk8; instead received 'collocation'"
@@ -147,7 +147,7 @@ def test_linear_bodies_are_the_kernels(changes: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize(("tolerance", "error"), [(1e-2, 2e-3), (1e-4, 1e-4), (1e-6, 2e-6)])
-def test_settled_whirl_is_that_of_the_series(tolerance: float, error: float) -> None:
+def test_settled_whirl_agrees_with_the_series(tolerance: float, error: float) -> None:
     reference = ready("taylor", 1e-11).advance(300_000).rows
     run = ready("split", tolerance)
     first = run.first_row.copy()
@@ -181,7 +181,7 @@ def test_smoothed_friction_creeps_by_collocation(smoothing_speed: float) -> None
 
 
 @pytest.mark.parametrize("tolerance", [1e-2, 3e-4])
-def test_the_companion_rolls_too_and_tells_the_error(tolerance: float) -> None:
+def test_the_companion_also_rolls_and_estimates_the_error(tolerance: float) -> None:
     """Its steps are shorter. At equal steps it would share the error, because it uses the same constraint."""
     exact = ready("taylor", 1e-11).advance(600_000).rows
     run = ready("split", tolerance, engine__companion=True)
@@ -194,7 +194,7 @@ def test_the_companion_rolls_too_and_tells_the_error(tolerance: float) -> None:
     assert 0.3 * error < run.health()["accuracy"]["estimate"] < 3.0 * error
 
 
-def test_bits_do_not_depend_on_calls() -> None:
+def test_results_do_not_depend_on_the_division_into_calls() -> None:
     whole = ready("split", 1e-3).advance(200_000).rows.copy()
     run = ready("split", 1e-3)
     parts = np.concatenate([run.advance(1000 * n).rows.copy() for n in (61, 1, 1, 7, 30, 100)])
@@ -214,7 +214,7 @@ def test_a_command_ends_rolling_at_once() -> None:
     assert np.abs(rows[:3, S.COLUMN["sliding_speed"]]).max() < 1e-9
 
 
-def test_contact_that_slips_goes_back_to_a_series() -> None:
+def test_slipping_contact_returns_to_a_series() -> None:
     # A drive that brakes hard: the normal force falls with the whirl, until friction can no longer hold.
     changes = {"drive__ramp_rate": 20.0, "drive__torque_gain": 1.0}
     reference, run = ready("taylor", 1e-11, **changes), ready("split", 1e-4, **changes)

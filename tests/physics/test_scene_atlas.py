@@ -46,21 +46,21 @@ def kinds(found: list[Outcome], method: str) -> dict[str, str]:
     return {one.setting: one.kind for one in found if one.method == method}
 
 
-def test_the_default_engine_is_right_at_each_setting(found: list[Outcome]) -> None:
+def test_the_default_engine_is_accurate_at_each_setting(found: list[Outcome]) -> None:
     assert set(kinds(found, "split").values()) == {"right"}
     assert not any(is_silent(one) for one in found if one.method == "split")
 
 
-def test_verlet_is_wrong_with_a_warning_and_without(found: list[Outcome]) -> None:
+def test_verlet_is_wrong_with_or_without_a_warning(found: list[Outcome]) -> None:
     verlet = kinds(found, "verlet")
     assert (verlet["50 us"], verlet["10 us"]) == ("told", "silent")
 
 
-def test_a_law_that_an_engine_cannot_take_is_refused(found: list[Outcome]) -> None:
+def test_an_unsupported_law_is_refused(found: list[Outcome]) -> None:
     assert set(kinds(found, "semi-implicit-euler").values()) == {"refused"}
 
 
-def test_a_peer_at_a_loose_tolerance_is_wrong_and_silent(found: list[Outcome]) -> None:
+def test_a_peer_at_a_loose_tolerance_is_wrong_without_warning(found: list[Outcome]) -> None:
     assert kinds(found, "scipy-lsoda")["1e-3"] == "silent"
     assert kinds(found, "scipy-lsoda")["1e-8"] == "right"
 
@@ -72,7 +72,7 @@ def test_each_outcome_is_drawn(found: list[Outcome], tmp_path: Path) -> None:
     assert all(title.split(",")[0] in vector.read_text() for _, title in OUTCOMES.values())
 
 
-def test_a_scene_that_is_not_there_is_refused() -> None:
+def test_an_unknown_scene_is_refused() -> None:
     assert chosen_scenes(None) == list(TWELVE_SCENES)
     assert chosen_scenes("run-up, Drop,drop,") == ["drop", "run-up"]
     with pytest.raises(InputError, match=r"--only must be one or more of hammer-3.2, .*; instead received 'hamer'"):
@@ -88,7 +88,7 @@ def test_an_option_of_another_study_is_refused(more: list[str], capsys: pytest.C
     assert "--scenes must be given without --full and --random; instead received" in error
 
 
-def test_a_stopped_atlas_shows_what_was_measured(
+def test_a_stopped_atlas_shows_its_measurements(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def stopped(*_: object, **__: object) -> Iterator[Outcome]:

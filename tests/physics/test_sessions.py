@@ -20,7 +20,7 @@ from replays.sessions import FOLDER, SESSIONS, make
 AGAIN = "make them anew by `rig sessions -o replays/sessions --force` if physics has changed on purpose, and review it"
 
 
-def test_every_session_is_there_and_small() -> None:
+def test_every_session_exists_and_is_small() -> None:
     assert (
         {path.stem for path in FOLDER.glob("*.mcap")} == set(SESSIONS) == {path.stem for path in FOLDER.glob("*.toml")}
     )
@@ -29,7 +29,7 @@ def test_every_session_is_there_and_small() -> None:
     assert sum(sizes) < 2_000_000
 
 
-def test_the_same_build_makes_the_same_bytes(tmp_path: Path) -> None:
+def test_the_same_build_writes_the_same_bytes(tmp_path: Path) -> None:
     """The end event contains the number of rows, so that a reader can detect a loss at the very end."""
     twice = [make(SESSIONS["drop"], tmp_path)[0].read_bytes() for _ in range(2)]
     assert twice[0] == twice[1]
@@ -40,7 +40,7 @@ def test_the_same_build_makes_the_same_bytes(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", SESSIONS)
-def test_a_session_is_done_again(name: str) -> None:
+def test_a_session_is_reproduced(name: str) -> None:
     found = validate(Recording.open(FOLDER / f"{name}.mcap"), declared=True)
     assert found.good, f"{found.verdict_line}; {AGAIN}"
     # The text file next to it describes the same recording.

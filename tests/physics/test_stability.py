@@ -50,7 +50,7 @@ def test_known_failures_are_expected_to_fail():
     assert not any(holds for _, holds in found)
 
 
-def test_a_cell_tells_when_it_disagrees():
+def test_a_cell_reports_disagreement():
     cell = Cell("case", 2.0, 1.0, "")
     assert not cell.holds
     assert not cell.agrees

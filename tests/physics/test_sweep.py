@@ -38,7 +38,7 @@ DOUBT = "energy residual 1 J is above 0.001 of what was dissipated"
 
 
 @pytest.mark.parametrize("number", [2, 6, 7, 12, 22, 23, 24, 27, 41, 44, 48, 69])
-def test_default_engine_is_right_in_fixed_scenes(number: int) -> None:
+def test_default_engine_is_accurate_in_fixed_scenes(number: int) -> None:
     scene = change_scene(draw_scene(7, number), {"duration_s": 0.08})
     row = measure(scene, [DEFAULT], run_task)
     assert row["contacts"] > 1
@@ -51,7 +51,7 @@ def test_default_engine_is_right_in_fixed_scenes(number: int) -> None:
     assert one["contacts"] == row["contacts"]
 
 
-def test_a_law_that_is_another_is_seen() -> None:
+def test_another_law_is_detected() -> None:
     # The same engines at another restitution: a difference that the fixed scenes treat as small is large.
     scene = change_scene(draw_scene(7, 7), {"duration_s": 0.08})
 
@@ -121,7 +121,7 @@ def test_faults_of_a_run(shift: float, own: dict[str, Any], faults: list[str]) -
     assert all(found[kind] == [4] for kind in faults)
 
 
-def test_where_the_model_has_no_end_no_fault_counts() -> None:
+def test_an_ill_posed_scene_counts_no_fault() -> None:
     wild = {"peak_normal_force_n": 1e15}
     run = stub({}, {"taylor": wild, "rk8": wild, DEFAULT: {"failure": "crash", "health": {}}})
     row = {"number": 4} | measure(SCENE, [DEFAULT], run)
@@ -129,17 +129,17 @@ def test_where_the_model_has_no_end_no_fault_counts() -> None:
     assert summary([row], [DEFAULT])["engines"][DEFAULT]["crashes"] == []
 
 
-def test_an_accurate_run_that_doubts_itself_stands_back() -> None:
+def test_an_accurate_run_with_a_warning_is_excluded() -> None:
     row = measure(SCENE, [DEFAULT], stub({"rk8": 0.5}, {"rk8": {"warnings": [DOUBT]}}))
     assert (row["status"], row["distance"], len(row["accurate"])) == ("decided", 0.0, 3)
 
 
-def test_an_engine_is_not_held_against_itself() -> None:
+def test_an_engine_is_not_compared_with_itself() -> None:
     row = measure(SCENE, ["taylor"], stub({"rk8": 1e-3}))
     assert row["tested"][0]["error"] == pytest.approx(1e-3)
 
 
-def test_what_an_engine_refuses_is_counted_with_its_reason() -> None:
+def test_refused_scenes_are_counted_with_the_reason() -> None:
     scene = change_scene(SCENE, {"engine.name": "rk4", "model.friction": "switch", "duration_s": 0.002})
     row = measure(scene, ["taylor"], run_task)
     found = summary([{"number": 0} | row], ["taylor"])["engines"]["taylor"]
@@ -159,7 +159,7 @@ def test_a_scene_is_its_numbers_alone_and_scenes_are_wide() -> None:
     assert sum(at != round(at) for at in blows) > 0.9 * len(blows)
 
 
-def test_the_kept_scene_is_the_scene() -> None:
+def test_the_stored_scene_equals_the_scene() -> None:
     for number in range(20):
         scene = draw_scene(5, number)
         kept = measure(scene, [], stub({}))["scene"]
@@ -175,7 +175,7 @@ def test_a_nudge_is_small_and_inside_the_ring(position: str) -> None:
     assert 0.99e-3 * clearance < apart.max() < 3.01e-3 * clearance
 
 
-def test_a_stopped_sweep_goes_on(tmp_path) -> None:
+def test_a_stopped_sweep_continues(tmp_path) -> None:
     calls: list[Task] = []
 
     def run(task: Task) -> Run:
@@ -221,7 +221,7 @@ class _Dies:
         os._exit(7)
 
 
-def test_a_process_that_hangs_or_dies_is_a_result() -> None:
+def test_a_process_that_hangs_or_ends_gives_a_result() -> None:
     lost: list[Any] = [_Hangs(), _Dies()]
     with Worker() as worker:
         hung, died = (worker.run(Task(scene, "rk4")) for scene in lost)
@@ -231,13 +231,13 @@ def test_a_process_that_hangs_or_dies_is_a_result() -> None:
     assert (good.failure, good.states.shape) == ("", (3, N_STATE))
 
 
-def test_a_run_is_given_its_limit_where_it_begins() -> None:
+def test_the_time_limit_starts_with_the_run() -> None:
     begun: list[bool] = []
     run_task(Task(change_scene(SCENE, {"duration_s": 0.001}), "rk4"), lambda: begun.append(True))
     assert begun == [True]
 
 
-def test_command_tells_keeps_and_draws(tmp_path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_command_prints_stores_and_draws(tmp_path, capsys: pytest.CaptureFixture[str]) -> None:
     command = ["stability", "--random", "1", "--seed", "7", "--only", "2", "--engines", DEFAULT, "-o", str(tmp_path)]
     with pytest.raises(SystemExit, match="0"):
         main([*command, "--json"])

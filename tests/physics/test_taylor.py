@@ -258,7 +258,7 @@ def test_a_long_flight_takes_few_steps() -> None:
 
 
 @pytest.mark.parametrize("stiffness", ["johnson-cylinder", "palmgren-cylinder", "liu-cylinder"])
-def test_the_peak_is_the_laws_own_for_every_exponent(stiffness: str) -> None:
+def test_the_peak_agrees_with_the_law_for_every_exponent(stiffness: str) -> None:
     # Close to an onset the series of delta^n is useless, and a series' own force there was 562 kN.
     changes = {"contact.stiffness": stiffness, "sensors.chain": "ideal"}
     peaks = [
@@ -272,7 +272,7 @@ def test_the_peak_is_the_laws_own_for_every_exponent(stiffness: str) -> None:
 
 @pytest.mark.parametrize("friction", [0.0, 0.22])
 @pytest.mark.parametrize("force", [300.0, 320.0, 330.0])
-def test_a_motion_along_a_line_goes_on(friction: float, force: float) -> None:
+def test_motion_along_a_line_continues_after_contact(friction: float, force: float) -> None:
     # At a sliding speed of exactly 0, phases that change at one depth change back at once.
     blow = {"at_s": 0.018, "command": "hammer", "force_n": force, "duration_ms": 1.0, "direction": "y"}
     changes = {**QUIET, "model.stator": "rigid", "drive.speed_hz": 0.0, "ring.clearance": 0.2685, "commands": [blow]}
@@ -286,7 +286,7 @@ def test_a_motion_along_a_line_goes_on(friction: float, force: float) -> None:
     assert not one.health()["warnings"]
 
 
-def test_a_contact_that_begins_with_hardly_any_speed_goes_on() -> None:
+def test_a_contact_with_a_small_onset_speed_continues() -> None:
     # It begins deeper than it may without friction: rolling began before the ring, where there is no force.
     run = {name: run_task(Task(draw_scene(21, 385), name, 1e-9)) for name in ("taylor", "rk8")}
     assert [done.failure for done in run.values()] == ["", ""]

@@ -189,7 +189,7 @@ SUBJECTS = [
 
 
 @pytest.mark.parametrize(("name", "mode"), SUBJECTS)
-def test_everybody_may_do_what_the_table_says_and_nothing_else(name: str | None, mode: str, folders: Path) -> None:
+def test_each_role_has_exactly_the_rights_of_the_table(name: str | None, mode: str, folders: Path) -> None:
     plain, exposed = free_endpoint(), free_endpoint()
     doors = doors_of(name)
     seen: list[tuple[str, bytes]] = []
@@ -251,7 +251,7 @@ def test_everybody_may_do_what_the_table_says_and_nothing_else(name: str | None,
     ],
     ids=["wrong authority", "expired", "the rig's", "no certificate"],
 )
-def test_without_a_valid_certificate_nobody_is_let_in(who: str | None, why: str, folders: Path) -> None:
+def test_a_client_without_a_valid_certificate_is_refused(who: str | None, why: str, folders: Path) -> None:
     plain, exposed = free_endpoint(), free_endpoint()
     holder = holder_in(folders / "server", server=True)
     with ZenohServer(plain, exposed=Exposure(exposed, holder)) as server:
@@ -264,7 +264,7 @@ def test_without_a_valid_certificate_nobody_is_let_in(who: str | None, why: str,
             until(lambda: server.congestion().get("links_viewer") == 1)
 
 
-def test_a_link_ends_when_its_certificate_does(folders: Path, tmp_path: Path) -> None:
+def test_a_link_ends_when_its_certificate_expires(folders: Path, tmp_path: Path) -> None:
     plain, exposed = free_endpoint(), free_endpoint()
     signing = ec.generate_private_key(ec.SECP256R1())
     issue = Issue(signing, timedelta(days=1))
@@ -285,7 +285,7 @@ def test_a_link_ends_when_its_certificate_does(folders: Path, tmp_path: Path) ->
         pytest.fail("not connected while the certificate was valid")
 
 
-def test_clients_say_why_they_are_not_let_in_and_what_is_denied(folders: Path) -> None:
+def test_clients_report_the_reason_of_a_refusal(folders: Path) -> None:
     plain, exposed = free_endpoint(), free_endpoint()
     with ZenohServer(plain, exposed=Exposure(exposed, holder_in(folders / "server", server=True))) as server:
         server.answer("rig/command/hammer", lambda _: b"hit")
@@ -318,7 +318,7 @@ def test_clients_say_why_they_are_not_let_in_and_what_is_denied(folders: Path) -
             ZenohClient(exposed, tls=folders / folder)
 
 
-def test_an_exposed_rig_takes_so_many_links_and_messages_of_so_many_bytes(folders: Path) -> None:
+def test_an_exposed_rig_limits_links_and_message_size(folders: Path) -> None:
     plain, exposed = free_endpoint(), free_endpoint()
     heard: list[int] = []
     with ExitStack() as stack:
@@ -349,7 +349,7 @@ def test_without_its_ports_no_rig_opens(busy: str, folders: Path) -> None:
         pytest.fail("opened without a port")
 
 
-def test_the_table_names_every_key_once_a_verb_and_no_two_roles_alike() -> None:
+def test_the_table_has_each_key_once_per_verb_and_distinct_roles() -> None:
     pairs = [(door.verb, key) for door in DOORS for key in door.keys]
     assert len(set(pairs)) == len(pairs)
     assert len({doors_of(name) for name in (None, STRANGER, *NAMES)}) == len(NAMES) + 2

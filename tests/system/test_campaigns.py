@@ -117,7 +117,7 @@ def campaign(folder: Path, *arguments: str, status: int) -> tuple[str, dict[str,
     return out, document
 
 
-def test_a_device_in_lockstep_is_judged_alike_each_time(folder: Path) -> None:
+def test_a_device_in_lockstep_gets_the_same_verdict_each_time(folder: Path) -> None:
     out, both = campaign(folder, "x.campaign.toml", "test_x.py", status=1)
     well, dies, again, fixtures, behind = both["cases"]
     assert [case["outcome"] for case in both["cases"]] == ["passed", "failed", "passed", "failed", "inconclusive"]
@@ -169,7 +169,7 @@ def descendants(pid: int) -> list[Any]:
     return list(psutil.Process(pid).children(recursive=True))
 
 
-def test_ctrl_c_leaves_nothing_running_and_tells_what_was_done(tmp_path: Path) -> None:
+def test_ctrl_c_ends_all_processes_and_reports_finished_cases(tmp_path: Path) -> None:
     (tmp_path / "long.campaign.toml").write_text(SLOW_CAMPAIGN, encoding="utf-8")
     (tmp_path / "test_a.py").write_text("def test_a(measure):\n    measure('a', 1, 'mm', '<=', 2)\n", encoding="utf-8")
     arguments = ("campaign", "test_a.py", "long.campaign.toml", "-j", "2", "-o", "out")
@@ -266,7 +266,7 @@ must = "<= 2 s"
 """
 
 
-def test_a_campaign_runs_on_a_recording_and_on_a_rig_that_is_there(folder: Path) -> None:
+def test_a_campaign_runs_on_a_recording_and_on_a_running_rig(folder: Path) -> None:
     session = processes.ROOT / "replays/sessions/hammer-6.2.mcap"
     _, played = campaign(folder, "hammer", "--replay", str(session), status=0)
     assert [(case["outcome"], case["reason"]) for case in played["cases"]] == [

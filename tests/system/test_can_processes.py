@@ -195,7 +195,7 @@ def test_a_signal_ends_the_hub_and_it_sums_up(own_hub: Bench) -> None:
     assert "frames 1" in output
 
 
-def test_a_hub_that_is_killed_is_told_to_its_nodes(own_hub: Bench) -> None:
+def test_nodes_are_informed_of_a_killed_hub(own_hub: Bench) -> None:
     bus = own_hub.bus()
     own_hub.child.kill()
     until(lambda: bus.state is can.BusState.ERROR)
@@ -213,7 +213,7 @@ print("sent", flush=True)
 """
 
 
-def test_a_script_that_closes_nothing_ends(hub: Bench) -> None:
+def test_a_script_without_close_ends(hub: Bench) -> None:
     with process("-c", CARELESS, hub.endpoint) as child:
         output, _ = child.communicate(timeout=PATIENCE_S)
     assert child.returncode == 0, output
@@ -231,7 +231,7 @@ time.sleep(600)
 
 
 @pytest.mark.parametrize("how", [signal.SIGSTOP, signal.SIGKILL], ids=["stopped", "killed"])
-def test_an_endpoint_that_stalls_or_dies_slows_nobody(hub: Bench, how: signal.Signals) -> None:
+def test_a_stalled_or_killed_endpoint_does_not_delay_others(hub: Bench, how: signal.Signals) -> None:
     count = 20_000
     sender, receiver = hub.bus(), hub.bus()
     with process("-c", IDLE, hub.endpoint) as child:
@@ -260,7 +260,7 @@ def test_an_endpoint_that_stalls_or_dies_slows_nobody(hub: Bench, how: signal.Si
             hub.nodes(2)
 
 
-def test_two_processes_answer_each_other_without_loss(hub: Bench) -> None:
+def test_two_processes_exchange_frames_without_loss(hub: Bench) -> None:
     echo = """
 import sys, can
 with can.Bus("can0", interface="zenoh", endpoint=sys.argv[1]) as bus:
@@ -292,7 +292,7 @@ with can.Bus("can0", interface="zenoh", endpoint=sys.argv[1]) as bus:
         (("can0", "--listen", "0.0.0.0:7999"), "ssh -L 7999:127.0.0.1:7999"),
     ],
 )
-def test_wrong_options_of_the_hub_are_one_line(
+def test_wrong_options_of_the_hub_are_refused_in_one_line(
     arguments: tuple[str, ...], line: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit) as ended:

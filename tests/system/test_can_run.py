@@ -134,7 +134,7 @@ class InProcess:
         return self.decoded("Acknowledge")[-1]
 
 
-def test_a_hammer_pulse_from_the_bus_causes_the_whirl_and_wrong_ones_do_nothing(tmp_path: Path) -> None:
+def test_a_valid_hammer_frame_causes_whirl_and_invalid_ones_nothing(tmp_path: Path) -> None:
     with InProcess(tmp_path / "run.mcap", Schedule(1000, 10_000), "stable-run") as rig:
         rig.console.step(200_000)
         identifier, good = command_frame(CommandKind.HAMMER, 1, force_n=100.0, duration_ms=5.0)
@@ -243,7 +243,7 @@ def test_rig_run_on_a_virtual_bus_between_processes(tmp_path: Path, options: lis
     assert compared > 0.9 * 15 * 2 * sum(rates.values())
 
 
-def test_a_schedule_that_the_bus_cannot_carry_is_refused_before_anything_runs() -> None:
+def test_an_infeasible_schedule_is_refused_before_the_run() -> None:
     from rig.cli.commands.run import run as command
     from rig.cli.groups import expand_groups
 

@@ -42,7 +42,7 @@ def unstepped() -> Iterator[str]:
         yield url
 
 
-def test_a_program_reads_the_same_rows_as_the_model_makes() -> None:
+def test_a_program_reads_the_rows_of_the_model() -> None:
     with connected(channels=CHANNELS, truth=["contact"]) as machine:
         before = machine.advance(0.3)
         assert (before.index, len(before), before.gap) == (0, 6000, 0)
@@ -93,7 +93,7 @@ def test_turns_are_those_of_the_shaft() -> None:
         assert abs(turn.once["disk_x"] - once) < 0.02 * abs(once) + 1e-4
 
 
-def test_rows_that_are_read_between_turns_are_of_none() -> None:
+def test_rows_read_between_turns_belong_to_no_turn() -> None:
     with connected(channels=CHANNELS, buffer_s=0.5) as machine:
         speeds = []
         for turn in machine.turns():
@@ -106,7 +106,7 @@ def test_rows_that_are_read_between_turns_are_of_none() -> None:
             machine.until(lambda rows: rows["disk_x"], within_s=0.1)
 
 
-def test_rows_that_a_fault_takes_end_a_piece_and_the_next_tells_of_the_gap() -> None:
+def test_rows_removed_by_a_fault_end_a_piece_and_the_next_reports_the_gap() -> None:
     with connected(channels=["disk_x"]) as machine:
         machine.advance(0.1)
         machine.fault("probes", "dropout", for_s=0.2)
@@ -123,7 +123,7 @@ def test_rows_that_a_fault_takes_end_a_piece_and_the_next_tells_of_the_gap() -> 
     ({"channels": ["disk_x"], "truth": ["contacts"]}, "truth must be one of the rig's tables, such as contact"),
     ({"channels": ["disk_x"], "rate_hz": 3000.0}, "rate_hz must be 20000 divided by a whole number"),
 ])  # fmt: skip
-def test_what_the_rig_does_not_have_is_told(settings: dict[str, Any], says: str, unstepped: str) -> None:
+def test_unknown_channels_of_a_client_are_reported(settings: dict[str, Any], says: str, unstepped: str) -> None:
     with (
         pytest.raises((InputError, UnknownNameError)) as caught,
         rig.connect(unstepped, wait_s=PATIENCE_S, **settings),
@@ -132,7 +132,7 @@ def test_what_the_rig_does_not_have_is_told(settings: dict[str, Any], says: str,
     assert says in str(caught.value)
 
 
-def test_a_client_without_channels_says_so(unstepped: str) -> None:
+def test_reading_without_channels_is_refused(unstepped: str) -> None:
     with rig.connect(unstepped, wait_s=PATIENCE_S) as machine:
         with pytest.raises(InputError, match=r"channels must be given to rig\.connect"):
             machine.advance(0.1)
@@ -140,7 +140,7 @@ def test_a_client_without_channels_says_so(unstepped: str) -> None:
             machine.truth("contact")
 
 
-def test_blocks_of_a_rig_that_runs_by_itself_are_read_alike_and_end_with_it() -> None:
+def test_blocks_of_a_rig_in_real_time_are_read_until_it_ends() -> None:
     with connected("real-time", channels=["disk_x", "P_E"]) as machine:
         rows, first = 0, None
         for samples in machine.blocks():

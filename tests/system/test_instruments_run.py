@@ -121,7 +121,7 @@ def test_drivers_and_daq_show_the_same_rig() -> None:
         (("--zenoh", "--connect", "nowhere"), "rig: --connect must be HOST:PORT"),
     ],
 )
-def test_what_is_wrong_is_one_line(arguments: tuple[str, ...], message: str) -> None:
+def test_errors_are_one_line(arguments: tuple[str, ...], message: str) -> None:
     with twins(*arguments) as (child, _):
         _, errors = child.communicate(timeout=60.0)
     assert child.returncode == 2

@@ -80,7 +80,7 @@ def reactions(slow_s: float) -> tuple[list[str], list[dict[str, Any]]]:
     return said, [{name: value for name, value in event.items() if name != "wall_s"} for event in events]
 
 
-def test_devices_over_zenoh_and_over_can_react_at_the_same_ticks_however_slow_they_are() -> None:
+def test_devices_over_zenoh_and_can_react_at_the_same_ticks_at_any_speed() -> None:
     one, two = reactions(0.0), reactions(0.02)
     assert one == two
     (guard, plain), (slower, guard_left, halt, plain_left) = one
@@ -96,7 +96,7 @@ def test_devices_over_zenoh_and_over_can_react_at_the_same_ticks_however_slow_th
     ]
 
 
-def test_a_device_that_is_killed_is_told_and_the_rig_goes_on() -> None:
+def test_a_killed_device_is_reported_and_the_rig_continues() -> None:
     with bench() as (machine, endpoint), processes.python("-c", WAITS, f"zenoh:{endpoint}", "0.5") as device:
         machine.event("device", timeout_s=60.0)
         machine.step(10_000)
@@ -108,7 +108,7 @@ def test_a_device_that_is_killed_is_told_and_the_rig_goes_on() -> None:
         assert (lost["state"], lost["tick"], lost["reason"]) == ("lost", 20_000, reason)
 
 
-def test_whoever_waits_for_a_rig_that_waits_for_a_device_is_told_so() -> None:
+def test_a_client_is_informed_that_the_rig_waits_for_a_device() -> None:
     with bench() as (machine, endpoint), processes.python("-c", WAITS, f"zenoh:{endpoint}", "60") as device:
         machine.event("device", timeout_s=60.0)
         device.send_signal(signal.SIGSTOP)

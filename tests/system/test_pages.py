@@ -186,7 +186,7 @@ def reader(tmp_path: Path) -> Iterator[Reader]:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_a_page_says_what_works(page: Path, reader: Reader) -> None:
+def test_commands_and_code_of_a_page_run(page: Path, reader: Reader) -> None:
     shutil.copytree(ROOT / "docs", reader.folder, dirs_exist_ok=True)  # files next to the page
     blocks = [block for block in blocks_of(page) if not block[0].endswith(" command")]
     assert blocks or page.stem in ("install", "development")
@@ -195,7 +195,7 @@ def test_a_page_says_what_works(page: Path, reader: Reader) -> None:
     reader.leave()
 
 
-def test_the_two_commands_of_the_readme_differ_in_what_they_install_alone() -> None:
+def test_the_readmes_two_install_commands_differ_only_in_extras() -> None:
     commands = {
         directive: text for directive, _, text in blocks_of(ROOT / "README.md") if directive.endswith(" command")
     }
@@ -211,7 +211,7 @@ def spans_of(text: str) -> Iterator[list[str]]:
 
 
 @pytest.mark.parametrize("page", TEXTS, ids=lambda page: page.stem)
-def test_every_command_that_is_named_is_there_with_its_options(page: Path) -> None:
+def test_every_command_in_the_docs_exists_with_its_options(page: Path) -> None:
     from rig.cli.app import rig
     from rig.cli.command import Group
 

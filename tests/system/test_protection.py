@@ -40,7 +40,7 @@ def trip() -> tuple[list[str], list[dict[str, Any]], list[Samples]]:
     return lines, [{**event, "wall_s": 0.0} for event in events], rows
 
 
-def test_a_blow_trips_the_rig_at_the_end_of_the_block_with_its_row_twice_alike() -> None:
+def test_an_impact_trips_the_rig_at_the_end_of_its_block_reproducibly() -> None:
     lines, events, rows = trip()
     again = trip()
     assert (again[0], again[1]) == (lines, events)

@@ -197,7 +197,7 @@ threading.Event().wait()
 """
 
 
-def test_a_killed_rig_leaves_a_file_that_is_closed_well(tmp_path):
+def test_a_killed_rig_leaves_a_finished_file(tmp_path):
     port = free_port()
     path = tmp_path / "run.mcap"
     with python("-c", RIG, str(port), stderr=subprocess.STDOUT) as rig:
@@ -239,7 +239,7 @@ def test_a_duration_ends_the_recording(tmp_path):
     assert recording.streams[PROBES].rows == 10_000
 
 
-def test_without_a_rig_one_line_and_no_file(tmp_path):
+def test_without_a_rig_the_recorder_prints_one_line_and_writes_no_file(tmp_path):
     with recorder(tmp_path / "run.mcap", free_port()) as process:
         output, errors = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 1
@@ -248,7 +248,7 @@ def test_without_a_rig_one_line_and_no_file(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_rotating_recorder_loses_nothing_at_its_seams(tmp_path):
+def test_a_rotating_recorder_loses_nothing_between_files(tmp_path):
     port = free_port()
     path = tmp_path / "run.mcap"
     with publisher(port) as rig, recorder(path, port, "rotate_s=0.4") as process:
@@ -269,7 +269,7 @@ def test_a_rotating_recorder_loses_nothing_at_its_seams(tmp_path):
             assert len(payloads) >= 200 or schema_of(key) is None, key
 
 
-def test_a_recorder_waits_for_a_rig_that_comes_later(tmp_path):
+def test_a_recorder_waits_for_a_rig_that_starts_later(tmp_path):
     port = free_port()
     with recorder(tmp_path / "run.mcap", port, "wait_s=30.0, duration_s=0.3, keep_free_mb=0.0") as process:
         time.sleep(3.0)  # longer than a recorder waits without that option
@@ -280,7 +280,7 @@ def test_a_recorder_waits_for_a_rig_that_comes_later(tmp_path):
     assert "ended: duration reached" in output
 
 
-def test_a_trigger_makes_a_file_of_its_own(tmp_path):
+def test_a_trigger_writes_a_separate_file(tmp_path):
     port = free_port()
     options = "trigger=['hammer'], pre_s=0.2, post_s=0.3, trigger_count=1"
     with publisher(port) as rig, recorder(tmp_path / "run.mcap", port, options) as process:
@@ -299,7 +299,7 @@ def test_a_trigger_makes_a_file_of_its_own(tmp_path):
     assert stream_.lost == 0
 
 
-def test_a_recorder_that_was_stopped_for_longer_than_its_link_lives_goes_on(tmp_path):
+def test_a_recorder_continues_after_a_stop_longer_than_its_link_lease(tmp_path):
     port = free_port()
     path = tmp_path / "run.mcap"
     code = "import rig.serve.transport.session; rig.serve.transport.session._LEASE_S = 1.0; "
@@ -326,7 +326,7 @@ def test_a_recorder_that_was_stopped_for_longer_than_its_link_lives_goes_on(tmp_
     assert stream_.last_time_s == pytest.approx(rig.blocks() * 0.01, abs=0.001)
 
 
-def test_a_run_that_failed_is_an_exit_status(tmp_path):
+def test_a_failed_run_sets_the_exit_status(tmp_path):
     port = free_port()
     with publisher(port) as rig, recorder(tmp_path / "run.mcap", port) as process:
         until(lambda: received(rig) > 0, of=process)
@@ -337,7 +337,7 @@ def test_a_run_that_failed_is_an_exit_status(tmp_path):
     assert "lost: nothing" in output
 
 
-def test_a_second_recorder_to_the_same_file_is_refused_and_the_first_one_goes_on(tmp_path):
+def test_a_second_recorder_to_the_same_file_is_refused(tmp_path):
     port = free_port()
     path = tmp_path / "run.mcap"
     with publisher(port) as rig, recorder(path, port) as first:
@@ -356,7 +356,7 @@ def test_a_second_recorder_to_the_same_file_is_refused_and_the_first_one_goes_on
     assert Recording.open(tmp_path / "other.mcap").complete
 
 
-def test_a_full_disk_ends_the_command_with_what_was_kept_and_recover_finishes_it(tmp_path):
+def test_after_a_full_disk_recover_completes_the_recording(tmp_path):
     from rig.cli.commands.recover import recover
 
     port = free_port()

@@ -74,7 +74,7 @@ def playing(path: Path, clock: RealTime | FreeRun, **options: Any) -> Iterator[t
 
 
 @pytest.mark.parametrize("clock", [RealTime, FreeRun])
-def test_recorded_again_it_is_the_same_byte_for_byte(path: Path, tmp_path: Path, clock: type[FreeRun]) -> None:
+def test_a_recording_of_a_replay_is_identical_byte_for_byte(path: Path, tmp_path: Path, clock: type[FreeRun]) -> None:
     again = tmp_path / "again.mcap"
     with playing(path, clock()) as (_, endpoint), ZenohClient(endpoint, wait_s=10.0) as client:
         RecordingSession(client, again, name="recorder").run()
@@ -114,7 +114,7 @@ def test_passes_without_end_have_consecutive_rows_for_a_daq(path: Path) -> None:
         assert (daq.dropped, daq.unmatched, sum(daq.lost.values())) == (0, 0, 0)
 
 
-def test_two_replays_at_one_place_are_refused(path: Path) -> None:
+def test_two_replays_at_one_endpoint_are_refused(path: Path) -> None:
     with playing(path, RealTime()) as (_, endpoint), command("replay", str(path), "--listen", endpoint) as child:
         _, errors = child.communicate(timeout=30.0)
     assert child.returncode == 2
@@ -171,7 +171,7 @@ def test_the_command_is_led_from_elsewhere_and_stopped(path: Path) -> None:
     assert output.startswith("replay: stopped at 0.5")
 
 
-def test_ctrl_c_ends_the_stream_and_says_so(path: Path) -> None:
+def test_ctrl_c_ends_the_stream_with_a_message(path: Path) -> None:
     events: list[dict] = []
     with (
         replaying(path, "--rate", "0.01") as (child, endpoint),
@@ -189,7 +189,7 @@ def test_ctrl_c_ends_the_stream_and_says_so(path: Path) -> None:
     assert (events[-1]["event"], events[-1]["reason"]) == ("end", "stopped")
 
 
-def test_clients_that_do_not_come_end_the_command(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_ends_if_clients_do_not_connect(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     from rig.cli.main import main
 
     with pytest.raises(SystemExit) as end:
@@ -210,7 +210,7 @@ def test_clients_that_do_not_come_end_the_command(path: Path, capsys: pytest.Cap
         (("FILE", "--can-rate", "1000"), "--can must be given with the other --can options"),
     ],
 )
-def test_wrong_input_is_one_line(
+def test_wrong_input_is_refused_in_one_line(
     path: Path, arguments: tuple[str, ...], message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from rig.cli.main import main

@@ -164,7 +164,7 @@ def stalled_subscriber(messages: int) -> tuple[str, dict[str, float]]:
         return report, congestion
 
 
-def test_a_stopped_subscriber_gets_everything_afterwards_and_is_seen_meanwhile() -> None:
+def test_a_stopped_subscriber_is_reported_and_then_receives_everything() -> None:
     # 50 MB, ten times the sockets' buffers; within the cache.
     report, congestion = stalled_subscriber(2500)
     assert report.split() == ["2500", "True", "0"]
@@ -174,7 +174,7 @@ def test_a_stopped_subscriber_gets_everything_afterwards_and_is_seen_meanwhile()
     assert congestion["slow_puts"] < 2500 / 4
 
 
-def test_what_the_cache_no_longer_holds_is_reported_as_missed() -> None:
+def test_messages_dropped_from_the_cache_are_reported_as_missed() -> None:
     report, _ = stalled_subscriber(8000)
     received, in_order, missed = report.split()
     assert in_order == "True"
@@ -182,7 +182,7 @@ def test_what_the_cache_no_longer_holds_is_reported_as_missed() -> None:
     assert int(received) + int(missed) == 8000
 
 
-def test_a_script_that_never_closes_its_client_still_ends() -> None:
+def test_a_script_without_close_still_ends() -> None:
     script = (
         "import sys; from rig.serve.transport.zenoh import ZenohClient; client = ZenohClient(sys.argv[1], wait_s=10.0);"
         "client.subscribe('rig/**', print); client.subscribe('rig/**', print, lossless=False);"
@@ -248,7 +248,7 @@ def test_the_commands_reach_a_rig_in_lockstep() -> None:
 
 
 @pytest.mark.parametrize("arguments", [("hammer",), ("status", "--json"), ("status", "--watch"), ("step", "1000")])
-def test_without_a_rig_every_command_says_so_in_one_line(arguments: tuple[str, ...]) -> None:
+def test_without_a_rig_every_command_prints_one_line(arguments: tuple[str, ...]) -> None:
     endpoint = free_endpoint()
     with pytest.raises(RefusedError) as caught:
         invoke(endpoint, *arguments)
@@ -261,7 +261,7 @@ def test_a_malformed_endpoint_is_refused() -> None:
         invoke("nowhere", "stop")
 
 
-def test_watching_a_rig_ends_with_it() -> None:
+def test_watch_ends_with_the_rig() -> None:
     with rig("real-time") as (child, endpoint):
         lines = invoke(endpoint, "status", "--watch", "--json", at_first_line=child.terminate).splitlines()
         ticks = [json.loads(line)["tick"] for line in lines]

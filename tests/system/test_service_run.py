@@ -82,7 +82,7 @@ def test_ctrl_c_ends_the_run_in_good_order(number: signal.Signals) -> None:
         (("nowhere",), "scene must be one of"),
     ],
 )
-def test_malformed_options_are_one_line(
+def test_malformed_options_are_refused_in_one_line(
     arguments: tuple[str, ...], message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     status, output, errors = said(capsys, "run", *arguments)

@@ -74,7 +74,7 @@ def test_wrong_input_ends_in_2(
     assert out == ""
 
 
-def test_several_files_are_taken_as_one(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_several_files_are_read_as_one(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     first, second = tmp_path / "a.mcap", tmp_path / "b.mcap"
     assert said(capsys, "cut", str(recording), "-o", str(first), "--to", "0.04")[0] == 0
     assert said(capsys, "cut", str(recording), "-o", str(second), "--from", "0.04")[0] == 0
@@ -90,7 +90,7 @@ def test_a_new_folder_is_made_for_sessions(tmp_path: Path, capsys: pytest.Captur
     assert said(capsys, "sessions", "drop", "-o", str(tmp_path / "no" / "new"))[0] == 2
 
 
-def test_sessions_are_written_only_where_they_may(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_sessions_are_written_only_to_allowed_folders(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert said(capsys, "sessions", "drop", "-o", str(tmp_path))[0] == 0
     assert {path.name for path in tmp_path.iterdir()} == {"drop.mcap", "drop.toml"}
     code, _, error = said(capsys, "sessions", "drop", "-o", str(tmp_path))

@@ -102,7 +102,7 @@ def test_a_recording_becomes_an_rrd(recorded: Path, tmp_path: Path) -> None:
         (["--live", "--connect", "127.0.0.1:1", "--wait-s", "0.1"], "no rig answers"),
     ],
 )
-def test_what_cannot_be_viewed_is_one_line(
+def test_invalid_files_are_refused_in_one_line(
     arguments: list[str], expected: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from rig.cli.main import main
@@ -148,7 +148,7 @@ def test_live_view_notices_that_the_rig_was_killed(tmp_path: Path) -> None:
     assert Saved(target)["/events", "TextLog:level"].values[-1] == ["WARN"]
 
 
-def test_the_web_viewer_is_on_loopback_only_and_goes_with_the_command(recorded: Path) -> None:
+def test_the_web_viewer_uses_loopback_only_and_ends_with_the_command(recorded: Path) -> None:
     import psutil
 
     with started([*VIEW, str(recorded)]) as viewer:
@@ -197,7 +197,7 @@ def test_rerun_keeps_no_usage_reports(tmp_path: Path, monkeypatch: pytest.Monkey
     assert list(tmp_path.rglob("*rerun*")) == []
 
 
-def test_a_viewer_that_cannot_start_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_viewer_that_cannot_start_reports_the_reason(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DISPLAY", ":987")
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     with pytest.raises(WindowError, match="could not start"):
@@ -232,7 +232,7 @@ class BusyViewer:
         return self.picture
 
 
-def test_a_busy_viewer_is_asked_again_and_given_up_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_busy_viewer_is_retried_and_then_refused_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(window, "ViewerClient", BusyViewer)
     said: list[str] = []
     monkeypatch.setattr(window, "_MESSAGE_INTERVAL_S", 0.0)

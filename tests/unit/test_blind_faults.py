@@ -87,7 +87,7 @@ def test_a_fault_of_blocks_is_a_doubt(kind: str, tmp_path: Path) -> None:
     assert DEFECTS[DEFECT_OF[kind]].doubts in doubts
 
 
-def test_a_validation_tells_it(tmp_path: Path) -> None:
+def test_a_blind_validation_names_the_fault(tmp_path: Path) -> None:
     commands = [
         {"at_s": 0.05, "command": "fault", "channel": "ring_x", "kind": "hum", "amplitude_v": 0.01},
         {"at_s": 0.1, "command": "fault", "channel": "P_W", "kind": "drift", "rate": 50.0, "for_s": 0.2},
@@ -101,7 +101,7 @@ def test_a_validation_tells_it(tmp_path: Path) -> None:
     assert found.explained.best == ("ring_x hum", "P_W drift")
 
 
-def test_a_recording_from_inside_a_run_is_good(tmp_path: Path) -> None:
+def test_a_recording_of_a_part_of_a_run_passes(tmp_path: Path) -> None:
     """The missing history before its start is not a fault."""
     whole = recorded(tmp_path / "a.mcap", "stable-run", duration_s=0.6, drive__speed_hz=12.0)
     cut(whole, tmp_path / "part.mcap", from_s=0.25, to_s=0.5)
@@ -172,7 +172,7 @@ def test_random_faults_have_their_names(tmp_path: Path) -> None:
     assert len(unnamed) <= 0.05 * seen
 
 
-def test_what_several_have_alike_and_what_lacks_truth_is_told(tmp_path: Path) -> None:
+def test_a_common_fault_and_one_without_truth_are_reported(tmp_path: Path) -> None:
     """If all channels of a kind are late, they are reported as late and the others not as early; a single channel is
     reported without the truth as well.
     """
@@ -189,7 +189,7 @@ def test_what_several_have_alike_and_what_lacks_truth_is_told(tmp_path: Path) ->
     assert "disk_x gain" in (found.explained.conclusion if found.explained else "")
 
 
-def test_what_changes_on_the_way_is_not_named_by_its_beginning(tmp_path: Path) -> None:
+def test_a_fault_that_changes_is_not_named_by_its_start(tmp_path: Path) -> None:
     faults = [
         {"at_s": 0.05, "command": "fault", "channel": "P_N", "kind": "gain", "factor": 1.05, "for_s": 2.0},
         {"at_s": 2.05, "command": "fault", "channel": "P_N", "kind": "polarity"},

@@ -52,7 +52,7 @@ def sound() -> dict[str, Sent]:
 
 
 @pytest.mark.parametrize("kind", BLOCKS)
-def test_a_fault_is_on_its_stream_and_rows_alone_and_told(kind: str, sound: dict[str, Sent]) -> None:
+def test_a_fault_affects_only_its_stream_and_rows_and_is_reported(kind: str, sound: dict[str, Sent]) -> None:
     there, told = run({"kind": kind, **BLOCKS[kind]})
     assert {
         key for key in sound if rows(there[key]) != rows(sound[key]) or kind in ("stale-stamps", "late-blocks")
@@ -82,7 +82,7 @@ def test_a_fault_is_on_its_stream_and_rows_alone_and_told(kind: str, sound: dict
 
 
 @pytest.mark.parametrize("kind", BLOCKS)
-def test_how_the_run_is_cut_changes_nothing_of_it(kind: str) -> None:
+def test_the_division_of_a_run_does_not_change_a_fault(kind: str) -> None:
     fault = {"kind": kind, **BLOCKS[kind], "for_s": 0.1234}
     several = ({"kind": "duplicate-blocks", "part": 0.3, "block_s": 0.007}, {"kind": "lose-blocks", "part": 0.3})
 
@@ -116,7 +116,7 @@ def test_each_by_its_definition(sound: dict[str, Sent]) -> None:
     assert came == [*[1] * 10, 0, 0, 0, 0, *[1] * 16, 5, *[1] * 9]  # 33 ms have passed in the block that ends at 40 ms
 
 
-def test_at_one_door_the_other_has_all(sound: dict[str, Sent]) -> None:
+def test_a_fault_on_one_transport_does_not_affect_the_other(sound: dict[str, Sent]) -> None:
     fault = {"kind": "dropout", "door": "can"}
     assert rows(run(fault)[0][PROBES]) == rows(sound[PROBES])
     assert len(run(fault, door="can")[0][PROBES]) == len(sound[PROBES]) - 20
@@ -135,7 +135,7 @@ def through(what: Any, blocks: int, seed: int = 5) -> list[int]:
 
 
 @pytest.mark.parametrize("part", [0.1, 0.6])
-def test_random_ones_are_as_often_as_they_say_and_independent(part: float) -> None:
+def test_random_faults_have_their_rate_and_are_independent(part: float) -> None:
     n = 2000
     came = np.isin(np.arange(n), through(LoseBlocks(part=part), n))
     sigma = math.sqrt(part * (1.0 - part) / n)
@@ -161,13 +161,13 @@ def test_random_ones_are_as_often_as_they_say_and_independent(part: float) -> No
     ({"channel": "probes", "kind": "restart"}, "one that shows from the first row on, such as dropout"),
     ({"channel": "probes", "kind": "late-blocks", "delay_s": 11.0}, "delay_s must be"),
 ])  # fmt: skip
-def test_what_cannot_be_is_refused_and_what_can_is_named(request_: dict[str, Any], says: str) -> None:
+def test_impossible_faults_are_refused_with_the_possible_ones(request_: dict[str, Any], says: str) -> None:
     with pytest.raises(InputError) as caught:
         Simulation(SCENE).submit("fault", request_)
     assert says in str(caught.value)
 
 
-def test_a_door_that_is_not_there_is_refused() -> None:
+def test_an_unknown_transport_is_refused() -> None:
     simulation = Simulation(SCENE)
     simulation.serve(("zenoh",))
     with pytest.raises(InputError, match=r"door must be one that this rig has: zenoh \(a CAN bus: rig run --can\)"):
@@ -175,7 +175,7 @@ def test_a_door_that_is_not_there_is_refused() -> None:
 
 
 @pytest.mark.parametrize("scene", ["hammer", "test-sine"])
-def test_what_is_listed_is_what_is_taken(scene: str) -> None:
+def test_listed_combinations_are_accepted_and_others_refused(scene: str) -> None:
     """Every kind on every channel and group is accepted if listed, otherwise refused."""
     simulation = Simulation(load_scene(scene))
     simulation.advance(10_000)

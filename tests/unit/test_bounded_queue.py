@@ -21,7 +21,7 @@ def test_a_full_queue_refuses_drops_the_oldest_or_waits() -> None:
     assert queue.take(0.0) is None
 
 
-def test_whoever_waits_for_room_or_for_an_item_goes_on() -> None:
+def test_a_wait_for_room_or_an_item_ends() -> None:
     queue = BoundedQueue[int](1)
     taken: list[int | None] = []
     reader = threading.Thread(target=lambda: taken.extend(queue.take(10.0) for _ in range(3)))
@@ -34,7 +34,7 @@ def test_whoever_waits_for_room_or_for_an_item_goes_on() -> None:
     assert taken == [1, 2, None]
 
 
-def test_what_was_taken_counts_until_something_else_is_taken_where_it_is_held() -> None:
+def test_a_taken_item_counts_until_the_next_is_taken() -> None:
     inbox = BoundedQueue[bytes](100, size=len, holds=True)
     for _ in range(3):
         inbox.offer(bytes(40))
@@ -47,7 +47,7 @@ def test_what_was_taken_counts_until_something_else_is_taken_where_it_is_held() 
     assert (inbox.dropped, inbox.used, inbox.high_water) == (2, 40, 80)
 
 
-def test_the_next_item_inherits_from_one_that_is_dropped_and_what_takes_no_room_does_not_count() -> None:
+def test_the_next_item_inherits_from_a_dropped_one() -> None:
     queue = BoundedQueue[list[str]](
         1, size=lambda item: "block" in item, inherit=lambda dropped, following: following.extend(dropped)
     )
@@ -61,7 +61,7 @@ def test_the_next_item_inherits_from_one_that_is_dropped_and_what_takes_no_room_
     assert queue.ended
 
 
-def test_without_an_heir_what_takes_no_room_is_never_dropped() -> None:
+def test_items_without_size_are_not_dropped_without_an_heir() -> None:
     queue = BoundedQueue[str](2, size=lambda item: item.isdigit())
     for item in ("start", "1", "fault", "2", "3", "stop", "4"):
         queue.push(item)
@@ -69,7 +69,7 @@ def test_without_an_heir_what_takes_no_room_is_never_dropped() -> None:
     assert queue.take_many(9) == ["start", "fault", "3", "stop", "4"]
 
 
-def test_a_closed_queue_gives_what_waits_and_takes_no_more() -> None:
+def test_a_closed_queue_returns_its_items_and_accepts_no_more() -> None:
     queue = BoundedQueue[int](5)
     queue.offer(1)
     queue.close()
@@ -83,7 +83,7 @@ def test_a_closed_queue_gives_what_waits_and_takes_no_more() -> None:
     assert not queue.wait_for_item(10.0)
 
 
-def test_of_two_queues_the_first_goes_before_the_other() -> None:
+def test_the_first_of_two_queues_has_priority() -> None:
     changed = threading.Condition()
     replies, data = BoundedQueue[str](5, changed=changed), BoundedQueue[str](5, changed=changed)
     data.offer("data")

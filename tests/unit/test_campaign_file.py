@@ -193,7 +193,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("name", WRONG)
-def test_what_is_wrong_is_told_in_a_line_with_file_and_line(name: str, tmp_path: Path) -> None:
+def test_errors_are_one_line_with_file_and_line_number(name: str, tmp_path: Path) -> None:
     text, line, says = WRONG[name]
     with pytest.raises(InputError) as caught:
         load(tmp_path, text)
@@ -203,7 +203,7 @@ def test_what_is_wrong_is_told_in_a_line_with_file_and_line(name: str, tmp_path:
     assert "\n" not in message
 
 
-def test_the_command_tells_it_and_ends_with_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_prints_the_error_and_exits_with_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "x.campaign.toml"
     file.write_text(HEAD + PEAK.replace("mm", "N"), encoding="utf-8")
     status, out, err = said(capsys, "campaign", file)
@@ -229,7 +229,7 @@ SHIPPED = {
 """Campaigns of the rig, and the number of their cases."""
 
 
-def test_what_ships_is_listed_by_name_and_loads(capsys: pytest.CaptureFixture[str]) -> None:
+def test_shipped_campaigns_are_listed_by_name_and_load(capsys: pytest.CaptureFixture[str]) -> None:
     assert list(shipped()) == list(SHIPPED)
     status, out, err = said(capsys, "campaign")
     assert (status, err) == (0, "")
@@ -295,7 +295,7 @@ def test_a_matrix_is_the_product_of_its_axes(tmp_path: Path) -> None:
     assert (case.bench.scene, case.duration_s) == ("stable-run", 0.5)
 
 
-def test_lines_of_what_stands_in_tables_lists_and_inline_tables() -> None:
+def test_line_numbers_inside_tables_lists_and_inline_tables() -> None:
     text = 'a.b = """\n x = 1\n"""\n[[c]]\nd = [1, # [\n  { "e.f" = "}" },\n]\n[c.g]\nh = 2\n[[c]]\ni = \'[\'\n'
     found = lines_of(text)
     assert found == {

@@ -83,7 +83,7 @@ def test_values_of_signals_are_those_of_their_rows(seen: CaseRecording) -> None:
     assert "nothing" in never.line
 
 
-def test_events_come_or_not_in_time_and_in_order(seen: CaseRecording) -> None:
+def test_expected_events_are_checked_for_time_and_order(seen: CaseRecording) -> None:
     assert one(seen, event="hammer").value == 1.0
     assert not one(seen, event="hammer", appears=False).good
     assert one(seen, event="note", appears=False).good
@@ -110,7 +110,7 @@ def test_a_scorecard_is_an_expectation(seen: CaseRecording) -> None:
     assert "nothing.csv" in absent.note
 
 
-def test_rows_that_have_to_be_missing_are_an_expectation(tmp_path: Path) -> None:
+def test_missing_rows_can_be_expected(tmp_path: Path) -> None:
     counts = counts_of("probes", np.cumsum(np.random.default_rng(1).normal(size=(4000, 4)), axis=0) * 1e-3, None)
     session = CaseRecording(Recording.open(write_session(tmp_path / "sent.mcap", {"probes": counts})), tmp_path)
     names = default_table().groups["probes"].names
@@ -127,7 +127,7 @@ def test_rows_that_have_to_be_missing_are_an_expectation(tmp_path: Path) -> None
     assert (absent.outcome, absent.open_reason) == (Outcome.INCONCLUSIVE, "the scorecard has no such quantity")
 
 
-def test_all_asks_for_every_channel_and_row_that_was_sent_but_for_what_is_granted(tmp_path: Path) -> None:
+def test_all_requires_every_sent_channel_and_row_except_allowed_losses(tmp_path: Path) -> None:
     counts = counts_of("probes", np.cumsum(np.random.default_rng(1).normal(size=(4000, 4)), axis=0) * 1e-3, None)
     session = CaseRecording(Recording.open(write_session(tmp_path / "sent.mcap", {"probes": counts})), tmp_path)
     names, times_s = default_table().groups["probes"].names, np.arange(4000) / 20_000
@@ -157,7 +157,7 @@ def test_all_asks_for_every_channel_and_row_that_was_sent_but_for_what_is_grante
     assert told(part, list(names), begins_s=0.05, ends_s=0.02)[0]
 
 
-def test_a_run_that_is_stopped_before_the_case_is_over_fails_unless_that_is_expected(tmp_path: Path) -> None:
+def test_a_run_stopped_early_fails_unless_expected(tmp_path: Path) -> None:
     stop = {"event": "command", "command": "stop", "from": "guard", "tick": 10_000, "time_s": 0.01}
     end = {"event": "end", "reason": "stopped", "tick": 10_000, "time_s": 0.01}
     counts = counts_of("probes", np.zeros((200, 4)), None)
@@ -181,7 +181,7 @@ def test_a_run_that_is_stopped_before_the_case_is_over_fails_unless_that_is_expe
     assert told({**end, "reason": "completed"}) == told({**end, "time_s": 0.5}) == told() == []
 
 
-def test_a_device_that_has_to_be_killed_fails_and_one_that_ends_when_it_is_told_to_does_not(tmp_path: Path) -> None:
+def test_only_a_device_that_must_be_killed_fails(tmp_path: Path) -> None:
     for status, notes in ((137, ["it had to be killed: it did not end within 5 s of a SIGTERM"]), (143, []), (0, [])):
         program = SimpleNamespace(status=None, last_line="", end=lambda: None)
         program.end = lambda program=program, status=status: setattr(program, "status", status)
@@ -273,7 +273,7 @@ def check_junit(path: Path) -> list[ElementTree.Element]:
     return list(root)
 
 
-def test_junit_is_as_its_schema_has_it(tmp_path: Path) -> None:
+def test_junit_follows_its_schema(tmp_path: Path) -> None:
     write_junit(results(good=0.4, bad=-0.25), tmp_path / "junit.xml")
     good, bad, skipped, broken = check_junit(tmp_path / "junit.xml")
     properties = {each.get("name"): each.get("value") for each in bad.iter("property")}
@@ -290,7 +290,7 @@ def test_junit_is_as_its_schema_has_it(tmp_path: Path) -> None:
     check_junit(tmp_path / "empty.xml")
 
 
-def test_the_page_says_first_what_failed_then_what_changed(tmp_path: Path) -> None:
+def test_the_page_lists_failures_first_then_changes(tmp_path: Path) -> None:
     then, now = results(good=0.4, bad=0.1, gone=0.2), results(good=0.5, bad=-0.25, fresh=0.1)
     rows = {row.cells[:2]: row.cells[2:] for row in changes(then, now)}
     assert rows == {
@@ -318,7 +318,7 @@ def test_the_page_says_first_what_failed_then_what_changed(tmp_path: Path) -> No
     assert places == sorted(places)
 
 
-def test_a_recording_that_was_cut_off_is_no_bench(tmp_path: Path) -> None:
+def test_a_truncated_recording_cannot_be_a_bench(tmp_path: Path) -> None:
     data, half = (ROOT / "replays/sessions/hammer-6.2.mcap").read_bytes(), tmp_path / "half.mcap"
     half.write_bytes(data[: len(data) // 2])
     validate_replay(ROOT / "replays/sessions/hammer-6.2.mcap")
@@ -326,7 +326,7 @@ def test_a_recording_that_was_cut_off_is_no_bench(tmp_path: Path) -> None:
         validate_replay(half)
 
 
-def test_two_campaigns_do_not_write_into_one_folder(tmp_path: Path) -> None:
+def test_two_campaigns_cannot_write_into_one_folder(tmp_path: Path) -> None:
     config = cast("Any", SimpleNamespace())
     first = Results(tmp_path / "out", None, config)
     with pytest.raises(InputError, match=r"^--output must be a folder that no other running campaign writes to"):
@@ -335,7 +335,7 @@ def test_two_campaigns_do_not_write_into_one_folder(tmp_path: Path) -> None:
     Results(tmp_path / "out", None, config).pytest_sessionfinish(cast("Any", None))
 
 
-def test_results_that_are_none_are_told(tmp_path: Path) -> None:
+def test_invalid_results_are_reported(tmp_path: Path) -> None:
     file = tmp_path / "results.json"
     file.write_text(json.dumps(results(good=0.4)), encoding="utf-8")
     assert load_results(tmp_path) == load_results(file)

@@ -17,7 +17,7 @@ from rig.base.errors import InputError
 MS = 1_000_000
 
 
-def test_three_messages_that_the_old_analysis_gets_wrong():
+def test_the_old_analysis_underestimates_three_messages():
     """Davis et al. 2007, section 3.1 and table 3: 7 bytes at 125 kbit/s are 1 ms; the second C takes 3.5 ms.
 
     The old analysis considers the first only, finds 3 ms, and calls the set schedulable.
@@ -233,7 +233,7 @@ def test_measured_load_is_the_predicted_one():
     assert bus.state().load == pytest.approx(predicted, rel=1e-6)
 
 
-def test_schedule_beyond_what_the_bus_carries_has_messages_that_never_come():
+def test_an_overloaded_schedule_has_messages_without_a_bound():
     messages = [PeriodicMessage(0x100 + k, 1e-3) for k in range(8)]
     assert load(messages, "1M") == pytest.approx(8 * 0.135)
     assert all(not math.isfinite(row.worst_s) for row in worst_case(messages, "1M")[7:])

@@ -185,7 +185,7 @@ offer_lists = st.lists(
 
 @settings(deadline=None, max_examples=150)
 @given(offer_lists, st.integers(1, 6))
-def test_schedule_is_that_of_a_slow_model(offers: list[tuple[int, int, int, bool, bytes]], capacity: int):
+def test_schedule_agrees_with_a_slow_model(offers: list[tuple[int, int, int, bool, bytes]], capacity: int):
     """Order, times and drops; the nodes' identifiers differ, so no two send the same."""
     rows = [(at, node, Frame(number << 2 | node, data, extended)) for at, node, number, extended, data in offers]
     bus = BusModel("1M")
@@ -221,7 +221,7 @@ def test_steps_of_any_length_give_the_same(offers: list[tuple[int, int, int, boo
     assert run([*sorted({*every, *(cut * US for cut in cuts)}), end]) == run([2 * MS, end])
 
 
-def test_alone_on_the_bus_nobody_acknowledges():
+def test_a_lone_node_gets_no_acknowledge():
     """The lone node turns passive after 16 attempts and stays: ISO 11898-1:2015, 12.1.4.2, exception 1 of rule c."""
     bus = BusModel("1M")
     a = bus.attach()
@@ -274,7 +274,7 @@ def test_error_frame_has_the_length_of_the_superposed_flags():
         assert (two.start_ns - one.end_ns, two.error, two.attempt) == (3 * US, "", 2)
 
 
-def test_error_in_the_end_of_frame_is_seen_by_all_at_once():
+def test_all_nodes_detect_an_error_in_the_end_of_frame_at_once():
     length = duration_us(EMPTY) - 3
     for bit, flag in ((length - 1, 6), (length - 9, 7), (10_000, 6)):
         bus, a, _ = pair()
@@ -450,7 +450,7 @@ def test_load_is_the_time_taken_by_windows():
     assert bus.node(a).dropped > 0
 
 
-def test_detached_nodes_are_gone_and_their_numbers_used_again():
+def test_numbers_of_detached_nodes_are_reused():
     bus, a, b = pair()
     for k in range(3):
         bus.offer(b, Frame(0x100 + k, bytes(8)), 0)

@@ -34,7 +34,7 @@ DATABASE = dbc.database()
 SAMPLED = (*TABLE.classic, *TABLE.fd)
 
 
-def test_the_command_shows_and_writes_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_shows_and_writes_the_dbc(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert shown(capsys, "can", "dbc") == dbc.text()
     shown(capsys, "can", "dbc", "-o", tmp_path / "rig.dbc")
     assert (tmp_path / "rig.dbc").read_text(encoding="utf-8") == dbc.text()
@@ -48,7 +48,7 @@ def test_the_load_command_shows_every_message(capsys: pytest.CaptureFixture[str]
     assert "load: at most 126.1 % of the bus" in shown(capsys, "can", "load", "--can-fd", "--can-bitrate", "1M/5M")
 
 
-def test_a_bus_that_gets_too_full_is_told_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_overloaded_bus_is_refused_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "fuller.toml"
     more = ", ".join(f'{{ name = "P_N_{side}", signal = "P_N" }}' for side in "ab")
     path.write_text(f"[groups.forces]\nchannels = [{more}]")
@@ -69,7 +69,7 @@ def test_a_bus_that_gets_too_full_is_told_in_one_line(tmp_path: Path, capsys: py
         CanOutput("virtual:full", CanOptions(messages=CanMessages(can_bitrate="500k")), table)
 
 
-def test_the_usual_bus_is_not_too_full(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_default_bus_is_not_overloaded(capsys: pytest.CaptureFixture[str]) -> None:
     for command in (["can", "load"], ["can", "dbc"], ["can", "load", "--can-fd"]):
         assert said(capsys, *command)[2] == ""
 
@@ -84,7 +84,7 @@ def test_cantools_sees_the_messages_of_the_table() -> None:
         assert {signal.name for signal in found.signals} == {signal.name for signal in row.signals}
 
 
-def test_every_channel_says_unit_and_provenance_and_every_layout_how_it_was_thinned() -> None:
+def test_signals_have_unit_and_provenance_and_layouts_their_decimation() -> None:
     for row in SAMPLED:
         found = DATABASE.get_message_by_name(row.name)
         assert row.samples is not None
@@ -117,7 +117,7 @@ def test_cantools_decodes_to_the_values_of_the_channel_table(row) -> None:  # ty
         assert np.all(np.abs(got - exact) <= (1e-6 if row.fd else 1.0) * step)
 
 
-def test_a_command_made_by_cantools_alone_is_taken() -> None:
+def test_a_command_encoded_by_cantools_is_accepted() -> None:
     from drivers.can.signals import checksum
 
     values = {"kind": "hammer", "counter": 3, "force": 80, "duration": 5, "direction": 0, "key": 0x9D, "checksum": 0}

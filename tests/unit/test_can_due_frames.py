@@ -47,7 +47,7 @@ def identifiers(bus: can.BusABC) -> list[int]:
     return found
 
 
-def test_a_frame_begins_when_it_is_due_however_early_it_was_handed_over() -> None:
+def test_a_frame_begins_when_due_however_early_it_was_queued() -> None:
     with ExitStack() as stack:
         hub = stack.enter_context(Hub(BusModel("1M"), "can0"))
         sender, listener = (stack.enter_context(HubBus(hub)) for _ in range(2))
@@ -61,7 +61,7 @@ def test_a_frame_begins_when_it_is_due_however_early_it_was_handed_over() -> Non
         assert 100e-6 < np.diff(times_s)[1] < 150e-6
 
 
-def test_a_frame_that_is_offered_now_does_not_wait_for_those_that_are_not_due() -> None:
+def test_an_immediate_frame_does_not_wait_for_future_ones() -> None:
     with ExitStack() as stack:
         hub = stack.enter_context(Hub(BusModel("1M"), "can0"))
         sender, listener = (stack.enter_context(HubBus(hub)) for _ in range(2))
@@ -97,7 +97,7 @@ def test_a_hub_hands_out_frames_of_a_lone_endpoint_in_few_messages_and_those_wit
 
 
 @pytest.mark.parametrize("ahead_ms", [50, 0, -50])
-def test_frames_of_a_slot_keep_their_order_in_however_many_portions_they_come(ahead_ms: int) -> None:
+def test_frames_of_a_slot_keep_their_order_in_any_portions(ahead_ms: int) -> None:
     with ExitStack() as stack:
         hub = stack.enter_context(Hub(BusModel("1M"), "can0"))
         sender, listener = (stack.enter_context(HubBus(hub)) for _ in range(2))
@@ -173,7 +173,7 @@ def test_frames_of_a_block_go_to_the_bus_at_once_in_the_order_of_their_slots() -
     assert (outbox.sent, outbox.dropped) == (11, 0)
 
 
-def test_of_long_blocks_the_bus_gets_a_part_at_a_time_and_never_late() -> None:
+def test_long_blocks_are_sent_in_parts_and_never_late() -> None:
     bus = Holding()
     outbox, clock = outbox_at_5_s(bus, 1000)
     outbox.put(SYNC, np.zeros((100, SYNC.length), np.uint8), np.arange(1, 101) * 1e-3)
@@ -203,7 +203,7 @@ def test_a_bus_that_gets_many_frames_a_slot_holds_few_of_them(many: int) -> None
     assert outbox.sent == len(times_s)
 
 
-def test_a_full_bus_loses_the_oldest_frames_and_no_more_than_find_no_room() -> None:
+def test_a_full_bus_drops_only_the_oldest_frames_in_excess() -> None:
     bus = Holding()
     bus.full = True
     outbox, clock = outbox_at_5_s(bus, 4)

@@ -43,7 +43,7 @@ SIMULATION.tick = 10_000  # at the first row there is nothing to restart
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_every_kind_comes_back_with_its_main_number(kind: str) -> None:
+def test_every_kind_is_acknowledged_with_its_main_parameter(kind: str) -> None:
     main, numbers = KINDS[kind].main(), (EXAMPLES | BLOCKS)[kind]
     channel = "probes" if kind in BLOCKS else "keyphasor" if KINDS[kind].channel_only else "disk_x"
     found = parse_command(*fault_frame(channel, kind, 7, number=numbers.get(main)), 6)
@@ -55,7 +55,7 @@ def test_every_kind_comes_back_with_its_main_number(kind: str) -> None:
     SIMULATION.submit("clear", {})
 
 
-def test_clear_and_what_is_none() -> None:
+def test_clear_and_invalid_frames() -> None:
     assert parse_command(*clear_frame(1), 0) == Command(FaultKind.CLEAR, 1, {"id": "all"})
     assert parse_command(*clear_frame(1, number=300), 0) == Command(FaultKind.CLEAR, 1, {"id": 300})
     identifier, data = fault_frame("P_E", "freeze", 1)
@@ -80,7 +80,7 @@ def test_clear_and_what_is_none() -> None:
         fault_frame("P_E", "freeze", 1, number=3.0)
 
 
-def test_a_channel_table_of_ones_own_has_its_own_targets() -> None:
+def test_a_users_channel_table_has_its_own_targets() -> None:
     table = messages_for(load_scene("stable-run", {"channels": str(ROOT / "docs/daq24.toml")}).table)
     frame = fault_frame("end_u", "freeze", 1, table=table)
     assert parse_command(*frame, 0, table) == Command(FaultKind.FAULT, 1, {"channel": "end_u", "kind": "freeze"})
@@ -140,7 +140,7 @@ def test_faults_of_blocks_show_on_the_bus_and_on_their_stream_alone(kind: str, s
     assert len(there["Probes"]) <= whole * len(sound["Probes"])
 
 
-def test_at_one_door_only() -> None:
+def test_a_fault_on_can_does_not_affect_zenoh() -> None:
     """The effect of a fault on CAN is not visible on zenoh, and vice versa."""
     faults = [
         {"at_s": at_s, "channel": "probes", "kind": "dropout", "for_s": 0.1, "door": door}

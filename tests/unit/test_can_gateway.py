@@ -171,7 +171,7 @@ def samples_of(tap: Tap, name: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("paced", [False, True])
-def test_every_sample_is_there_in_both_layouts(paced: bool) -> None:
+def test_every_sample_is_sent_in_both_layouts(paced: bool) -> None:
     with rig(Fake(duration_s=0.4), paced=paced) as setup:
         setup.start()
         setup.join()
@@ -200,7 +200,7 @@ def test_every_sample_is_there_in_both_layouts(paced: bool) -> None:
     assert last_sample < last_beat
 
 
-def test_slow_messages_say_how_it_goes_and_how_samples_were_picked() -> None:
+def test_slow_messages_contain_the_status_and_the_decimation() -> None:
     with rig(Fake(duration_s=None), paced=True) as setup:
         setup.start()
         until(lambda: len(setup.tap.of("Status")) >= 3)
@@ -229,7 +229,7 @@ def test_edges_keep_the_fraction_of_their_microsecond() -> None:
     assert [row["time"] + row["fraction"] / 65536 for row in found] == [1012.25, 2_001_000.5]
 
 
-def test_channels_that_a_run_does_not_have_are_marked() -> None:
+def test_absent_channels_are_marked() -> None:
     class Part(Fake):
         groups = ("forces", "hammer")
 
@@ -312,7 +312,7 @@ def test_blocks_that_find_no_room_never_take_the_place_of_an_event(monkeypatch: 
         until(lambda: set(documents) <= set(unpacked))
 
 
-def test_what_the_bus_refuses_is_counted() -> None:
+def test_frames_refused_by_the_bus_are_counted() -> None:
     with rig(Fake(duration_s=0.6), paced=True, bus=Stubborn(refuse=True)) as setup:
         setup.start()
         setup.join()
@@ -322,7 +322,7 @@ def test_what_the_bus_refuses_is_counted() -> None:
 
 
 @pytest.mark.parametrize("refuse", [False, True])
-def test_frames_of_a_time_that_never_comes_do_not_keep_a_gateway_busy_that_was_closed(refuse: bool) -> None:
+def test_future_frames_do_not_keep_a_closed_gateway_busy(refuse: bool) -> None:
     before = set(threading.enumerate())
     with rig(Fake(duration_s=None), paced=True, bus=Stubborn(refuse=refuse)) as setup:
         for index in (0, 10**9):
@@ -335,7 +335,7 @@ def test_frames_of_a_time_that_never_comes_do_not_keep_a_gateway_busy_that_was_c
         assert setup.gateway.outbox.dropped >= (40 if refuse else 20)
 
 
-def test_what_finds_no_room_for_a_moment_is_sent_afterwards_in_its_order() -> None:
+def test_frames_without_room_are_sent_later_in_order() -> None:
     bus = Stubborn(refuse=True)
     with rig(Fake(duration_s=0.5), paced=True, bus=bus, schedule=Schedule(None, 10_000)) as setup:
         setup.start()
@@ -406,7 +406,7 @@ def test_a_hammer_pulse_is_acknowledged_with_its_time() -> None:
         until(lambda: any(row["counter"] == 1 for row in setup.tap.decoded("Heartbeat")))
 
 
-def test_the_acknowledge_does_not_wait_for_the_end_of_a_block() -> None:
+def test_an_acknowledge_does_not_wait_for_the_end_of_a_block() -> None:
     with rig(Fake(duration_s=None), paced=True, block_ticks=500_000) as setup:
         setup.start()
         until(lambda: bool(setup.tap.of("Probes")))
@@ -449,7 +449,7 @@ def test_refusals_name_their_reason_and_are_counted() -> None:
         (CommandKind.SPEED, {"speed_hz": 5000.0}, Field.SPEED, 61.5),
     ],
 )
-def test_a_refusal_says_which_limit_was_passed(kind: CommandKind, values: Any, field: Field, limit: float) -> None:
+def test_a_refusal_names_the_exceeded_limit(kind: CommandKind, values: Any, field: Field, limit: float) -> None:
     class Checked(Fake):
         """Refuses as the rig's own simulation does."""
 
@@ -513,7 +513,7 @@ class Silent(MemoryClient):
         return super().request(key, payload, timeout_s=timeout_s)
 
 
-def test_a_command_that_the_rig_does_not_answer_times_out_and_too_many_are_refused() -> None:
+def test_commands_without_a_reply_time_out_and_too_many_are_refused() -> None:
     channel = f"gateway-{next(_channels)}"
     tap, own = Tap(channel), can.Bus(channel, interface="virtual", ignore_config=True)
     server = MemoryServer(cache=0)
@@ -535,7 +535,7 @@ def test_a_command_that_the_rig_does_not_answer_times_out_and_too_many_are_refus
         own.shutdown()
 
 
-def test_threads_of_a_gateway_outlive_what_fails_in_them_and_a_command_is_asked_once(
+def test_gateway_threads_survive_errors_and_send_a_command_once(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     with rig(Fake(duration_s=None), paced=True) as setup:
@@ -603,7 +603,7 @@ def test_a_rig_that_does_not_fit_the_messages_is_refused(change: Any, message: s
         (b'{"tick_rate_hz":1000000,"table":{"groups":{"x":1}}}', "catalogue.table.groups.x"),
     ],
 )
-def test_what_is_no_catalogue_is_refused_in_one_line(payload: bytes, field: str) -> None:
+def test_an_invalid_catalogue_is_refused_in_one_line(payload: bytes, field: str) -> None:
     server = MemoryServer()
     server.answer(wire.CATALOGUE, lambda _: payload)
     with pytest.raises(InputError) as caught:

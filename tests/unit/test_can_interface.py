@@ -110,7 +110,7 @@ def read(bus: can.BusABC, count: int, *, timeout_s: float = PATIENCE_S) -> list[
 # The codec.
 
 
-def test_a_record_has_the_layout_that_its_documentation_tells() -> None:
+def test_a_record_has_its_documented_layout() -> None:
     payload = codec.encode(frames.pack_records([codec.Record(7, 0x123 | codec.EXTENDED, 2, 0, 5, b"hi")]))
     assert payload == b"RCB1" + bytes((0, 8, 1, 0)) + struct.pack("<QIBBH", 7, 0x80000123, 2, 0, 5) + b"hi\0\0\0\0\0\0"
     assert (codec.EXTENDED, codec.REMOTE, codec.ERROR) == (
@@ -158,7 +158,7 @@ def test_both_judges_of_frames_agree() -> None:
 
 
 @pytest.mark.parametrize("identifier", [-1, 1 << 29, 1 << 31])
-def test_an_identifier_of_more_bits_is_none(identifier: int) -> None:
+def test_an_identifier_with_too_many_bits_is_refused(identifier: int) -> None:
     with pytest.raises(codec.CodecError, match="29 bits"):
         codec.make_record(can.Message(arbitration_id=identifier))
 
@@ -175,7 +175,7 @@ def test_an_identifier_of_more_bits_is_none(identifier: int) -> None:
         lambda payload: payload[:6] + b"\xff\xff" + payload[8:],
     ],
 )
-def test_malformed_payloads_are_told(spoil: Callable[[bytes], bytes]) -> None:
+def test_malformed_payloads_are_reported(spoil: Callable[[bytes], bytes]) -> None:
     with pytest.raises(codec.CodecError):
         codec.decode(spoil(codec.encode(codec.make_records(KINDS[:1]))))
 
@@ -219,7 +219,7 @@ def test_every_kind_of_frame_arrives_as_it_was_sent(kind: can.Message) -> None:
         assert sender.recv(0.05) is None
 
 
-def test_others_get_all_frames_in_order_and_senders_theirs_if_asked(rig: Rig) -> None:
+def test_receivers_get_all_frames_in_order_and_senders_theirs_on_request(rig: Rig) -> None:
     sender, own, other = rig.bus(), rig.bus(receive_own_messages=True), rig.bus()
     for number in range(100):
         sender.send(message(0x100, bytes((number,))))
@@ -317,7 +317,7 @@ def fill(bus: can.BusABC) -> None:
         bus.send(message(0x100), timeout=0)
 
 
-def test_a_full_transmit_queue_is_waited_for_or_told_and_can_be_flushed(way: str) -> None:
+def test_a_full_transmit_queue_blocks_or_raises_and_can_be_flushed(way: str) -> None:
     with Rig(way, "10k") as rig:
         sender, receiver = rig.bus(), rig.bus()
         with pytest.raises(can.CanOperationError, match=r"transmit queue of can0 is full: 51[0-2] frames wait"):
@@ -355,7 +355,7 @@ def test_many_flushes_during_one_frame_use_up_no_controllers() -> None:
         assert rig.hub.endpoints.waiting == 0
 
 
-def test_what_was_sent_before_a_shutdown_is_on_the_bus(rig: Rig) -> None:
+def test_frames_sent_before_a_shutdown_reach_the_bus(rig: Rig) -> None:
     sender, receiver = rig.bus(), rig.bus()
     for number in range(300):
         sender.send(message(0x100, number.to_bytes(2, "big")))
@@ -375,7 +375,7 @@ def test_many_small_steps_lose_nothing(rig: Rig) -> None:
     assert [int.from_bytes(item.data, "big") for item in taken] == list(range(20_000))
 
 
-def test_a_reader_that_is_late_loses_the_oldest_and_is_told(rig: Rig) -> None:
+def test_a_late_reader_loses_the_oldest_frames_with_a_report(rig: Rig) -> None:
     sender, receiver = rig.bus(), rig.bus(rx_queue_size=100)
     for first in range(0, 400, 40):
         rows = [message(0x100, number.to_bytes(2, "big")) for number in range(first, first + 40)]
@@ -393,7 +393,7 @@ def test_a_reader_that_is_late_loses_the_oldest_and_is_told(rig: Rig) -> None:
 # Errors and states.
 
 
-def test_a_spoiled_frame_is_an_error_frame_and_comes_again(rig: Rig) -> None:
+def test_a_corrupt_frame_is_an_error_frame_and_is_repeated(rig: Rig) -> None:
     sender, receiver = rig.bus(), rig.bus()
     rig.model.disturb(rig.node(sender), count=1)
     sender.send(message(0x100))
@@ -408,7 +408,7 @@ def test_a_spoiled_frame_is_an_error_frame_and_comes_again(rig: Rig) -> None:
     assert sender.state is BusState.ACTIVE
 
 
-def test_without_anybody_to_acknowledge_a_node_becomes_passive_and_never_bus_off(way: str) -> None:
+def test_a_node_without_acknowledge_becomes_passive_but_not_bus_off(way: str) -> None:
     with Rig(way, "1M", acknowledge=False) as rig:
         sender = rig.bus()
         sender.send(message(0x100))
@@ -427,7 +427,7 @@ def test_without_anybody_to_acknowledge_a_node_becomes_passive_and_never_bus_off
         until(lambda: sender.done == 1)
 
 
-def test_bus_off_is_told_to_its_own_node_refuses_and_ends(rig: Rig) -> None:
+def test_bus_off_is_reported_to_its_node_and_ends(rig: Rig) -> None:
     sender, other = rig.bus(), rig.bus()
     rig.model.disturb(rig.node(sender), count=40)
     sender.send(message(0x100))
@@ -470,7 +470,7 @@ def test_a_passive_node_only_listens(rig: Rig) -> None:
 # Opening, closing, restarting hubs.
 
 
-def test_opening_without_a_hub_says_how_to_start_one() -> None:
+def test_opening_without_a_hub_explains_how_to_start_one() -> None:
     endpoint = free_endpoint()
     with pytest.raises(can.CanInitializationError) as caught:
         ZenohBus("can7", endpoint=endpoint, connect_s=0.1)
@@ -478,7 +478,7 @@ def test_opening_without_a_hub_says_how_to_start_one() -> None:
         assert part in str(caught.value)
 
 
-def test_opening_another_channel_names_those_that_are_there() -> None:
+def test_opening_an_unknown_channel_names_the_known_ones() -> None:
     with Rig("zenoh", "1M") as rig:
         with pytest.raises(can.CanInitializationError, match=r"channel can1 .*\(channels there: can0\)"):
             ZenohBus("can1", endpoint=rig.endpoint)
@@ -501,7 +501,7 @@ def test_wrong_channels_are_refused(channel: str) -> None:
         Hub(BusModel("1M"), channel)
 
 
-def test_a_bus_that_was_shut_down_says_so_and_is_forgotten(rig: Rig) -> None:
+def test_a_closed_bus_raises_and_is_removed(rig: Rig) -> None:
     bus = rig.bus()
     until(lambda: len(rig.hub.status()["nodes"]) == 1)
     bus.shutdown()
@@ -512,7 +512,7 @@ def test_a_bus_that_was_shut_down_says_so_and_is_forgotten(rig: Rig) -> None:
     until(lambda: rig.hub.status()["nodes"] == [])
 
 
-def test_a_hub_that_ends_is_told_to_those_who_send(rig: Rig) -> None:
+def test_senders_are_informed_when_a_hub_ends(rig: Rig) -> None:
     bus, waiting = rig.bus(), rig.bus()
     rig.hub.close()
     if rig.server is not None:
@@ -523,7 +523,7 @@ def test_a_hub_that_ends_is_told_to_those_who_send(rig: Rig) -> None:
     assert waiting.recv(0.01) is None
 
 
-def test_a_hub_that_is_started_again_is_joined_again() -> None:
+def test_clients_rejoin_a_restarted_hub() -> None:
     endpoint = free_endpoint()
     with ExitStack() as stack:
         with ZenohServer(endpoint) as server, Hub(BusModel("1M"), "can0", server):
@@ -552,7 +552,7 @@ def test_two_channels_at_one_address_do_not_mix() -> None:
         assert one.recv(0.1) is None
 
 
-def test_the_command_listens_where_clients_look() -> None:
+def test_the_command_listens_at_the_clients_default_endpoint() -> None:
     assert can_command.LISTEN == codec.DEFAULT_ENDPOINT
 
 
@@ -603,7 +603,7 @@ def fuzz(rng: random.Random) -> bytes:
     return bytes(payload)
 
 
-def test_random_payloads_leave_the_hub_as_it_was() -> None:
+def test_random_payloads_do_not_change_the_hub() -> None:
     rng = random.Random(1)
     with Rig("process", "1M/8M") as rig:
         villain, sender, receiver = rig.bus(), rig.bus(), rig.bus()
@@ -631,7 +631,7 @@ def test_random_payloads_leave_the_hub_as_it_was() -> None:
         assert nodes[receiver.name]["state"] == 0
 
 
-def test_random_payloads_over_zenoh_leave_the_hub_as_it_was() -> None:
+def test_random_payloads_over_zenoh_do_not_change_the_hub() -> None:
     rng = random.Random(2)
     with Rig("zenoh", "1M/8M") as rig:
         villain, sender, receiver = rig.bus(), rig.bus(), rig.bus()
@@ -670,7 +670,7 @@ def test_the_number_of_endpoints_is_bounded_and_those_of_this_process_always_get
         assert "node" in join(rig.hub, "e0", secret=first["secret"])
 
 
-def test_endpoints_without_a_token_make_room_for_each_other_and_for_those_that_have_one() -> None:
+def test_endpoints_without_a_token_are_replaced_first() -> None:
     with Rig("process", "1M") as rig:
         for number in range(1000):
             join(rig.hub, f"ghost{number}")
@@ -689,7 +689,7 @@ def test_endpoints_without_a_token_make_room_for_each_other_and_for_those_that_h
 # The owner of a name.
 
 
-def test_nobody_sets_flushes_joins_or_offers_under_the_name_of_another(rig: Rig) -> None:
+def test_requests_under_the_name_of_another_node_are_refused(rig: Rig) -> None:
     sender, receiver = rig.bus(), rig.bus()
     villain = rig.bus()
     before = rig.hub.status()
@@ -722,7 +722,7 @@ def test_nobody_sets_flushes_joins_or_offers_under_the_name_of_another(rig: Rig)
     assert any("used the name of another endpoint" in text for text in after["warnings"])
 
 
-def test_an_endpoint_that_has_gone_can_come_again_under_its_name() -> None:
+def test_an_endpoint_can_rejoin_under_its_name() -> None:
     with Rig("process", "1M") as rig:
         first = join(rig.hub, "mine", token=True)
         with pytest.raises(InputError, match="endpoint must be unused"):
@@ -759,7 +759,7 @@ def test_requests_are_strict(name: str, document: dict[str, Any], field: str) ->
         assert rig.hub.status()["counts"]["refused"] == 1
 
 
-def test_a_hub_that_fails_inside_goes_on_and_says_so(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_hub_continues_after_an_internal_error_and_reports_it(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     sender, receiver = rig.bus(), rig.bus()
     for owner, name in ((rig.model, "next_ns"), (rig.hub.endpoints, "offer")):
 
@@ -782,7 +782,7 @@ def test_a_hub_that_fails_inside_goes_on_and_says_so(rig: Rig, monkeypatch: pyte
     assert any("failed" in text and "\x1b" not in text for text in rig.hub.warnings())
 
 
-def test_an_endpoint_that_never_shows_its_token_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_endpoint_without_a_token_is_removed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(endpoints, "_TOKEN_TIMEOUT_S", 0.2)
     with Rig("process", "1M") as rig:
         rig.hub.answer("join", {"endpoint": "ghost"})
@@ -790,7 +790,7 @@ def test_an_endpoint_that_never_shows_its_token_is_forgotten(monkeypatch: pytest
         until(lambda: [row["name"] for row in rig.hub.status()["nodes"]] == [bus.name])
 
 
-def test_numbers_of_nodes_are_not_used_again_at_once() -> None:
+def test_numbers_of_nodes_are_not_reused_at_once() -> None:
     with Rig("process", "1M") as rig:
         seen = set()
         for _ in range(10):

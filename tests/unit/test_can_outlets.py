@@ -215,7 +215,7 @@ def test_python_cans_socketcand_client_sends_and_receives(bench: Bench) -> None:
     assert server.counts() == dict.fromkeys(server.counts(), 0) | {"clients": 1}
 
 
-def test_clients_of_one_server_hear_each_other(bench: Bench) -> None:
+def test_clients_of_one_server_receive_each_others_frames(bench: Bench) -> None:
     server = bench.serve()
     clients = [bench.socketcand(server) for _ in range(3)]
     clients[0].send(CLASSIC[0])
@@ -298,7 +298,7 @@ def test_subscriptions(bench: Bench) -> None:
         "\xff\xfe",
     ],
 )
-def test_what_is_no_command_is_answered_with_an_error(command: str) -> None:
+def test_an_invalid_command_gets_an_error_reply(command: str) -> None:
     bench = Bench("virtual")
     with bench.stack:
         other, server = bench.bus(), bench.serve()
@@ -321,7 +321,7 @@ def test_before_a_bus_is_open(bench: Bench) -> None:
     until(lambda: server.counts()["clients"] == 0)
 
 
-def test_fd_frames_are_left_out_and_counted(bench: Bench) -> None:
+def test_fd_frames_are_skipped_and_counted(bench: Bench) -> None:
     other, server = bench.bus(), bench.serve()
     client = bench.socketcand(server)
     other.send(FD[0])
@@ -348,7 +348,7 @@ def test_error_frames_reach_the_client(hub_bench: Bench) -> None:
     assert same(second, CLASSIC[0])
 
 
-def test_a_stalled_client_loses_frames_and_is_given_up_while_others_hear_all() -> None:
+def test_a_stalled_client_is_dropped_while_others_receive_all_frames() -> None:
     bench = Bench("virtual")
     with bench.stack:
         other, server = bench.bus(), bench.serve(room=100, patience_s=0.3)
@@ -372,7 +372,7 @@ def test_a_stalled_client_loses_frames_and_is_given_up_while_others_hear_all() -
         until(lambda: server.counts()["clients"] == 1)
 
 
-def test_a_client_that_takes_no_answers_is_asked_no_more() -> None:
+def test_a_client_that_reads_no_replies_is_no_longer_served() -> None:
     bench = Bench("virtual")
     with bench.stack:
         server = bench.serve(room=100, patience_s=0.3)
@@ -384,7 +384,7 @@ def test_a_client_that_takes_no_answers_is_asked_no_more() -> None:
         assert server.counts()["given_up"] == 1
 
 
-def test_a_killed_client_leaves_the_bus_and_no_more_than_a_few_are_let_in() -> None:
+def test_a_killed_client_leaves_the_bus_and_clients_are_limited() -> None:
     bench = Bench("hub")
     with bench.stack:
         server = bench.serve()
@@ -401,7 +401,7 @@ def test_a_killed_client_leaves_the_bus_and_no_more_than_a_few_are_let_in() -> N
         assert bench.socketcand(server)
 
 
-def test_random_bytes_do_no_harm() -> None:
+def test_random_bytes_have_no_effect() -> None:
     random_ = random.Random(4)
     bench = Bench("virtual")
     with bench.stack:
@@ -421,7 +421,7 @@ def test_random_bytes_do_no_harm() -> None:
         assert server.counts()["clients"] >= 1
 
 
-def test_a_server_keeps_to_this_machine() -> None:
+def test_a_server_listens_on_this_machine_only() -> None:
     with pytest.raises(InputError, match=r"socketcand must be on 127\.0\.0\.1, .*ssh -L 29536:127.*'0\.0\.0\.0:29536'"):
         SocketcandServer({}, host="0.0.0.0", port=0)
     with SocketcandServer({}, port=0) as server:
@@ -431,7 +431,7 @@ def test_a_server_keeps_to_this_machine() -> None:
 
 
 @pytest.mark.parametrize("place", ["0.0.0.0:29536", "192.0.2.1:29536", "[::]:29536", "example.org:29536"])
-def test_no_door_of_the_bus_is_open_to_other_machines_whatever_is_asked(place: str) -> None:
+def test_no_port_of_the_bus_is_open_to_other_machines(place: str) -> None:
     from rig.cli.commands.can import hub
 
     loopback = (
@@ -451,7 +451,7 @@ def test_no_door_of_the_bus_is_open_to_other_machines_whatever_is_asked(place: s
 
 
 @pytest.mark.parametrize("size", [1, 2, 7, 1000])
-def test_commands_come_in_any_portions(size: int) -> None:
+def test_commands_may_arrive_in_any_portions(size: int) -> None:
     text = b"x< hi ><echo>\n < send 1 0 > y z < " + b"a" * 600 + b"> < end >"
     splitter = Splitter()
     found = [each for k in range(0, len(text), size) for each in splitter.feed(text[k : k + size])]
@@ -460,7 +460,7 @@ def test_commands_come_in_any_portions(size: int) -> None:
     assert None in found[4:-1]
 
 
-def test_what_a_frame_is_in_text() -> None:
+def test_text_form_of_a_frame() -> None:
     for each in CLASSIC:
         digits = 8 if each.is_extended_id else 3
         words = [f"{each.arbitration_id:0{digits}X}", f"{len(each.data)}", *(f"{byte:x}" for byte in each.data)]
@@ -487,7 +487,7 @@ def test_python_cans_slcan_client_sends_and_receives(bench: Bench) -> None:
     until(lambda: port.figures()["open"] == 0)
 
 
-def test_a_port_takes_one_program_after_another(bench: Bench) -> None:
+def test_a_port_serves_one_program_after_another(bench: Bench) -> None:
     other, port = bench.bus(), bench.port()
     for _ in range(2):
         with bench.slcan(port) as client:
@@ -586,7 +586,7 @@ def test_listening_only_sends_nothing(bench: Bench) -> None:
         assert other.recv(0.05) is None
 
 
-def test_status_flags_tell_what_error_frames_say(bench: Bench) -> None:
+def test_status_flags_agree_with_error_frames(bench: Bench) -> None:
     port = bench.port()
     with Terminal(port) as terminal:
         terminal.ask("O")
@@ -638,7 +638,7 @@ def test_dropped_frames_set_flags_when_there_is_room_again() -> None:
             assert terminal.ask("F") == b"F09\r"
 
 
-def test_random_lines_do_no_harm() -> None:
+def test_random_lines_have_no_effect() -> None:
     random_ = random.Random(5)
     bench = Bench("virtual")
     with bench.stack:
@@ -658,7 +658,7 @@ def test_random_lines_do_no_harm() -> None:
             assert port.figures()["given_up"] == 0
 
 
-def test_lines_come_in_any_portions() -> None:
+def test_lines_may_arrive_in_any_portions() -> None:
     text = b"O\r" + b"t" * 500 + b"\rt1230\r\n\rC\r"
     for size in (1, 3, 1000):
         lines = Lines()
@@ -666,7 +666,7 @@ def test_lines_come_in_any_portions() -> None:
         assert found == ["O", None, "t1230", "", "C"]
 
 
-def test_lines_and_frames_are_each_others_inverse() -> None:
+def test_lines_and_frames_convert_in_both_directions() -> None:
     for each in CLASSIC + REMOTE + FD:
         line = slcan.show(each)
         assert line is not None
@@ -676,7 +676,7 @@ def test_lines_and_frames_are_each_others_inverse() -> None:
 # Common to both.
 
 
-def test_a_bus_that_does_not_take_a_frame_is_told() -> None:
+def test_a_frame_refused_by_the_bus_is_reported() -> None:
     class Full(can.BusABC):
         """A port that accepts nothing."""
 
@@ -699,7 +699,7 @@ def test_a_bus_that_does_not_take_a_frame_is_told() -> None:
         assert [terminal.ask("O"), terminal.ask("t1230"), terminal.ask("F")] == [b"\r", b"\a", b"F02\r"]
 
 
-def test_a_bus_that_fails_ends_the_connection_and_can_be_opened_anew() -> None:
+def test_a_failed_bus_ends_the_connection_and_can_be_reopened() -> None:
     class Broken(can.BusABC):
         """Fails when something is sent."""
 
@@ -732,7 +732,7 @@ class Echo(Outlet):
         self._answer(data)
 
 
-def test_messages_are_bounded_and_never_torn_however_little_is_taken_at_once() -> None:
+def test_messages_are_bounded_and_never_split_by_short_reads() -> None:
     ours, theirs = socket.socketpair()
     with ours, theirs:
         ours.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)
@@ -760,7 +760,7 @@ def test_messages_are_bounded_and_never_torn_however_little_is_taken_at_once() -
         assert not thread.is_alive()
 
 
-def test_each_write_holds_whole_messages() -> None:
+def test_each_write_contains_complete_messages() -> None:
     # Here all that was written is read at once.
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     with ours, theirs:
@@ -780,7 +780,7 @@ def test_each_write_holds_whole_messages() -> None:
         thread.join(5.0)
 
 
-def test_what_fails_inside_a_door_is_told_and_ends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_internal_error_of_a_port_is_reported_and_ends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     bench = Bench("virtual")
     with bench.stack:
         other, server = bench.bus(), bench.serve()

@@ -127,7 +127,7 @@ def test_packing_agrees_with_the_positions_of_the_signals(message: CanMessage) -
     np.testing.assert_array_equal(values, expected)
 
 
-def test_numbers_beyond_their_width_begin_anew() -> None:
+def test_numbers_wrap_at_their_width() -> None:
     message = TABLE.by_name["Samples_1"]
     assert message.samples is not None
     data = message.samples.pack(np.array([65536 + 7]), np.zeros((1, 3), np.int32), 8)
@@ -164,14 +164,14 @@ def test_a_value_beyond_its_bits_is_refused() -> None:
         TABLE.by_name["Heartbeat"].encode(beat=256)
 
 
-def test_a_table_that_does_not_fit_is_refused() -> None:
+def test_a_table_that_exceeds_the_bus_is_refused() -> None:
     group = default_table().groups["hammer"]
     wide = group.channels[0].model_copy(update={"adc_bits": 32})
     with pytest.raises(ValueError, match=r"channel hammer.adc_bits must be at most 24 on a CAN bus"):
         make_table(ChannelTable(groups={"hammer": group.model_copy(update={"channels": (wide,)})}))
 
 
-def test_crc8_is_that_of_sae_j1850() -> None:
+def test_crc8_agrees_with_sae_j1850() -> None:
     # The check value of the catalogue of CRC algorithms (G. Cook), CRC-8/SAE-J1850.
     assert crc8(b"123456789") == 0x4B
 
@@ -179,7 +179,7 @@ def test_crc8_is_that_of_sae_j1850() -> None:
 HAMMER = command_frame(CommandKind.HAMMER, 8, force_n=123.4, duration_ms=5.25, direction=90.0)
 
 
-def test_commands_come_back_as_they_were() -> None:
+def test_commands_are_decoded_unchanged() -> None:
     assert parse_command(*HAMMER, 7) == Command(
         CommandKind.HAMMER, 8, {"force_n": 123.4, "duration_ms": 5.25, "direction": 90.0}
     )
@@ -196,7 +196,7 @@ def _signed(identifier: int, data: bytes) -> tuple[int, bytes]:
     return identifier, data[:7] + bytes([checksum(identifier, data)])
 
 
-def test_each_way_of_being_wrong_has_its_result() -> None:
+def test_each_kind_of_invalid_command_has_its_result() -> None:
     identifier, data = HAMMER
 
     def change(place: int, value: int) -> tuple[int, bytes]:
@@ -244,7 +244,7 @@ def test_a_frame_has_the_values_of_its_kind(kind: CommandKind, values: dict[str,
         command_frame(kind, 1, **values)
 
 
-def test_only_a_counter_that_goes_on_is_taken() -> None:
+def test_only_an_advancing_counter_is_accepted() -> None:
     taken = [last for last in range(256) if isinstance(parse_command(*HAMMER, last), Command)]
     assert sorted((8 - last) % 256 for last in taken) == list(range(1, MAX_LEAD + 1))
     assert parse_command(*HAMMER, 8) is Result.STALE_COUNTER
@@ -272,7 +272,7 @@ def test_the_odds_of_noise_are_as_stated() -> None:
     assert 100_000 / ODDS < 1e-4
 
 
-def test_random_frames_are_no_commands_and_their_checksum_is_what_it_seems() -> None:
+def test_random_frames_are_not_commands_at_the_rate_of_the_checksum() -> None:
     random = np.random.default_rng(20_240)
     data = random.integers(0, 256, (100_000, 8), dtype=np.uint8).tobytes()
     results = [parse_command(0x020, data[at : at + 8], 0) for at in range(0, len(data), 8)]
@@ -281,7 +281,7 @@ def test_random_frames_are_no_commands_and_their_checksum_is_what_it_seems() -> 
     assert passed == pytest.approx(100_000 / 256, abs=5 * math.sqrt(100_000 / 256))
 
 
-def test_what_a_device_says_is_read_as_it_was_said_and_nothing_else_is() -> None:
+def test_device_frames_are_decoded_and_all_others_refused() -> None:
     message = TABLE.by_name["Device"]
     said = {kind: parse_command(*device_frame(message, kind, 7, block=300, patience_s=2.5), 0) for kind in DeviceKind}
     assert said == {

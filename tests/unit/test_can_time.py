@@ -87,7 +87,7 @@ def late_rig(time_s: float, *, lockstep: bool = False) -> Iterator[tuple[LateRig
 
 
 @pytest.mark.parametrize("time_s", INSTANTS_S)
-def test_a_client_that_joins_late_has_the_time_of_the_rig(time_s: float) -> None:
+def test_a_late_client_has_the_time_of_the_rig(time_s: float) -> None:
     with late_rig(time_s) as (rig, channel), CanClient(f"virtual:{channel}") as client:
         status = wire.decode_document(client.request(wire.STATUS))
         assert time_s - 0.3 <= status["time_s"] <= rig.tick * 1e-6
@@ -97,7 +97,7 @@ def test_a_client_that_joins_late_has_the_time_of_the_rig(time_s: float) -> None
 
 
 @pytest.mark.parametrize("time_s", [80 * 60, 60 * 3600])
-def test_samples_that_are_read_late_have_the_time_of_the_rig(time_s: float) -> None:
+def test_samples_read_late_have_the_time_of_the_rig(time_s: float) -> None:
     with late_rig(time_s) as (rig, channel), Daq(CanSource(f"virtual:{channel}"), channels=["P_E"]) as daq:
         block = daq.read(10)
         assert time_s <= block.tick * 1e-6 <= rig.tick * 1e-6
@@ -111,7 +111,7 @@ def test_a_client_that_joins_between_two_steps_has_the_time_of_the_rig(time_s: f
         assert status["time_s"] == pytest.approx(rig.tick * 1e-6)
 
 
-def test_an_index_is_the_nearest_that_ends_in_its_32_bits() -> None:
+def test_an_index_is_the_nearest_with_its_low_32_bits() -> None:
     wrap = 1 << 32
     for index, near in ((7, 0), (wrap + 5, wrap - 5), (wrap - 5, wrap + 5), (3 * wrap, 3 * wrap + wrap // 4)):
         assert full_index(index % wrap, near) == index

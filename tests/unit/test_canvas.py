@@ -69,7 +69,7 @@ def test_a_palette_keeps_tints_and_steps_of_a_scale() -> None:
     assert not apart[tint].any()
 
 
-def test_the_style_is_left_behind() -> None:
+def test_a_picture_does_not_change_the_global_style() -> None:
     import matplotlib
 
     before = matplotlib.rcParams["axes.grid"]
@@ -95,7 +95,7 @@ def test_a_signal_of_many_periods_is_its_mean_in_a_band() -> None:
     assert list(axes.get_legend_handles_labels()[1]) == ["few", "many"]
 
 
-def test_disk_that_fills_up_leaves_the_former_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_keeps_the_former_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "picture.png"
     path.write_bytes(b"former")
     write = Path.write_bytes

@@ -22,7 +22,7 @@ def files(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
 
 
-def test_every_holder_gets_a_folder_that_is_whole_and_private(tmp_path: Path) -> None:
+def test_every_holder_gets_a_complete_private_folder(tmp_path: Path) -> None:
     folder = tmp_path / "keys"
     assert make(folder, hosts=["lab.example", "192.0.2.7", "::1"], days=2, truth=["viewer"]) == [
         "lab.example",
@@ -47,7 +47,7 @@ def test_every_holder_gets_a_folder_that_is_whole_and_private(tmp_path: Path) ->
     assert [path.name for path in tmp_path.iterdir()] == ["keys"], "nothing else is left"
 
 
-def test_what_is_there_is_replaced_only_on_purpose_and_only_if_it_is_ours(tmp_path: Path) -> None:
+def test_existing_keys_are_replaced_only_on_request_and_if_ours(tmp_path: Path) -> None:
     folder = tmp_path / "keys"
     folder.mkdir()
     make(folder)  # an empty folder is not refused
@@ -67,7 +67,7 @@ def test_what_is_there_is_replaced_only_on_purpose_and_only_if_it_is_ours(tmp_pa
     assert (folder / "viewer" / "notes.txt").read_text() == "mine"
 
 
-def test_a_failure_half_way_leaves_what_was_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failure_keeps_the_existing_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = tmp_path / "keys"
     make(folder)
     before = files(folder)
@@ -88,7 +88,7 @@ def test_a_failure_half_way_leaves_what_was_there(tmp_path: Path, monkeypatch: p
 
 
 @pytest.mark.parametrize("host", ["", "bad host", "a_b", "-a", "a..b", "x" * 65, "*", "lab.example:7463", "ä.example"])
-def test_names_that_are_none_are_refused(host: str, tmp_path: Path) -> None:
+def test_invalid_names_are_refused(host: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"^--host must be the name or address"):
         make(tmp_path / "keys", hosts=[host])
     assert list(tmp_path.iterdir()) == []
@@ -110,7 +110,7 @@ def test_folders_without_keys_are_refused(tmp_path: Path) -> None:
             holder_in(folder / "viewer", server=False)
 
 
-def test_the_command_says_what_goes_where(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_explains_where_each_folder_belongs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = tmp_path / "keys"
     with pytest.raises(SystemExit) as end:
         main(["keys", "init", str(folder), "--host", "lab.example", "--truth", "recorder"])
@@ -130,7 +130,7 @@ def test_the_command_says_what_goes_where(tmp_path: Path, capsys: pytest.Capture
         assert capsys.readouterr().err.startswith(f"rig: {message}")
 
 
-def test_exposure_says_who_may_come_in(tmp_path: Path) -> None:
+def test_exposure_reports_the_admitted_roles(tmp_path: Path) -> None:
     make(tmp_path / "keys")
     assert Serving().exposure() is None
     exposed = Serving(expose="192.0.2.1", tls=tmp_path / "keys").exposure()
@@ -149,7 +149,7 @@ def test_exposure_says_who_may_come_in(tmp_path: Path) -> None:
             Serving(tls=keys, plaintext=plaintext).exposure()
 
 
-def test_plain_exposure_says_what_is_open(capsys: pytest.CaptureFixture[str]) -> None:
+def test_exposure_without_tls_reports_what_is_open(capsys: pytest.CaptureFixture[str]) -> None:
     server = SimpleNamespace(endpoint="127.0.0.1:7460")
     print_addresses(server, Serving(expose="192.0.2.1", plaintext=True).exposure())  # type: ignore[arg-type]
     errors = capsys.readouterr().err

@@ -71,9 +71,7 @@ def test_every_number_of_a_kind_is_an_option() -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_number_that_a_kind_does_not_take_is_refused_with_those_that_it_takes(
-    kind: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_unknown_parameter_is_refused_with_the_known_ones(kind: str, capsys: pytest.CaptureFixture[str]) -> None:
     """The rig, and the command without a rig, refuse it; the line names the number, or option, and the kind."""
     takes = [name for name in KINDS[kind].model_fields if name != "kind"]
     words = f"must be left out: {kind} takes {', '.join(takes) or 'no numbers'}; instead received "
@@ -113,7 +111,7 @@ def test_a_fault_is_on_its_channels_and_rows_alone(kind: str, sound: dict[str, n
 
 
 @pytest.mark.parametrize("kind", EXAMPLES)
-def test_every_kind_does_something_on_every_channel_or_is_refused(kind: str, sound: dict[str, np.ndarray]) -> None:
+def test_every_kind_has_an_effect_on_every_channel_or_is_refused(kind: str, sound: dict[str, np.ndarray]) -> None:
     other = {"swap": "other", "crosstalk": "source"}.get(kind)
     faults, refusing = list[dict[str, Any]](), Simulation(SCENE)
     for channel in CHANNELS:
@@ -149,7 +147,7 @@ def engineering(counts: dict[str, np.ndarray], name: str) -> np.ndarray:
     ("P_S", "noise", "factor", 5.0), ("inner_x", "noise", "factor", 2.5), ("disk_x", "late", "late_us", 730.0),
     ("P_E", "late", "late_us", 90.0),
 ])  # fmt: skip
-def test_its_size_comes_out_of_the_counts(
+def test_the_size_of_a_fault_is_recovered_from_the_counts(
     channel: str, kind: str, number: str, value: float, sound: dict[str, np.ndarray]
 ) -> None:
     """Within 1 %, or three standard deviations of the estimate's noise."""
@@ -179,7 +177,7 @@ def test_its_size_comes_out_of_the_counts(
     assert abs(found - value) < max(0.01 * value, slack)
 
 
-def test_what_pulses_lack_or_have_too_many_edges_have_too(sound: dict[str, np.ndarray]) -> None:
+def test_edges_follow_missing_and_extra_pulses(sound: dict[str, np.ndarray]) -> None:
     inside = [edge for edge in sound["edges"] if FROM <= edge * 1e-6 < TO]
     missing, extra, late = (
         run(example(kind, "keyphasor"))[0]["edges"] for kind in ("miss-pulses", "extra-pulses", "edge-jitter")
@@ -193,7 +191,7 @@ def test_what_pulses_lack_or_have_too_many_edges_have_too(sound: dict[str, np.nd
 
 @pytest.mark.parametrize("cut", [1_000, 7_000, 400_000])
 @pytest.mark.parametrize(("from_s", "for_s"), [(0.081, 0.2), (0.115, 0.21), (0.15, 0.001), (0.09, 0.011)])
-def test_edges_are_those_that_the_signal_has(from_s: float, for_s: float, cut: int) -> None:
+def test_edges_agree_with_the_signal(from_s: float, for_s: float, cut: int) -> None:
     """A fault may begin and end within a turn, whose other pulses are in both runs, or in none."""
     fault = {"channel": "keyphasor", "kind": "extra-pulses", "part": 1.0, "at_s": from_s, "for_s": for_s}
     found, channel = run(fault, cut=cut)[0], SCENE.table.channels["keyphasor"]
@@ -203,7 +201,7 @@ def test_edges_are_those_that_the_signal_has(from_s: float, for_s: float, cut: i
     np.testing.assert_allclose(rising_s[1:], found["edges"] * 1e-6, atol=5e-4)
 
 
-def test_several_at_once_on_a_group_and_one_of_them_cleared(sound: dict[str, np.ndarray]) -> None:
+def test_one_of_several_faults_on_a_group_can_be_cleared(sound: dict[str, np.ndarray]) -> None:
     hum = {"channel": "probes", "kind": "hum", "amplitude_v": 0.2}
     there, _ = run(hum, {"channel": "disk_x", "kind": "noise", "factor": 4.0, "at_s": 0.15, "for_s": 0.05})
     alone, _ = run(hum)
@@ -215,7 +213,7 @@ def test_several_at_once_on_a_group_and_one_of_them_cleared(sound: dict[str, np.
     np.testing.assert_allclose(one, other, atol=5e-6)  # the same hum in all of them
 
 
-def test_a_snapshot_holds_the_faults(sound: dict[str, np.ndarray]) -> None:
+def test_a_snapshot_contains_the_faults(sound: dict[str, np.ndarray]) -> None:
     simulation = Simulation(SCENE)
     simulation.submit("fault", {"channel": "P_E", "kind": "late", "late_us": 500.0})
     simulation.advance(50_000)
@@ -225,7 +223,7 @@ def test_a_snapshot_holds_the_faults(sound: dict[str, np.ndarray]) -> None:
     np.testing.assert_array_equal(simulation.advance(50_000).samples["forces"].values, first)
 
 
-def test_faults_of_a_scene_are_recorded_and_done_again_bit_by_bit(tmp_path: Any) -> None:
+def test_faults_of_a_scene_are_recorded_and_repeated_bit_by_bit(tmp_path: Any) -> None:
     text = {
         "duration_s": 0.3, "drive": {"speed_hz": 6.2},
         "faults": [{"at_s": 0.1, "channel": "P_E", "kind": "gain", "factor": 1.05},
@@ -264,14 +262,14 @@ def test_faults_of_a_scene_are_recorded_and_done_again_bit_by_bit(tmp_path: Any)
     ({"channel": "disk_x", "kind": "late", "late_us": -3.0}, "late_us must be greater than 0"),
     ({"channel": "disk_x", "kind": "open", "for_s": 0.0}, "for_s must be greater than 0"),
 ])  # fmt: skip
-def test_what_cannot_be_done_is_refused_in_one_line(request_: dict[str, Any], says: str) -> None:
+def test_impossible_faults_are_refused_in_one_line(request_: dict[str, Any], says: str) -> None:
     with pytest.raises(InputError) as caught:
         Simulation(SCENE).submit("fault", request_)
     assert says in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
-def test_only_a_fault_that_there_is_can_be_cleared() -> None:
+def test_only_an_active_fault_can_be_cleared() -> None:
     simulation = Simulation(SCENE)
     simulation.submit("fault", {"channel": "P_E", "kind": "open"})
     assert simulation.told == {"fault": 1, "channels": ["P_E"], "first_row": {"forces": 0}}
@@ -316,7 +314,7 @@ def plugged_volts(scene: Any, *faults: dict[str, Any]) -> dict[str, float]:
     ([("P_N", "P_S"), ("P_E", "P_W"), ("P_S", "P_E")], (2.0, 4.0, 1.0, 3.0)),
 ])  # fmt: skip
 @pytest.mark.parametrize("physics", [True, False])
-def test_swaps_that_share_a_channel_are_done_in_their_order(
+def test_swaps_with_a_common_channel_are_applied_in_order(
     swaps: list[tuple[str, str]], shown: tuple[float, ...], physics: bool
 ) -> None:
     """With any swaps, each signal appears on one channel; offsets of transducers follow the cables."""
@@ -339,7 +337,7 @@ def test_swaps_that_share_a_channel_are_done_in_their_order(
     assert tuple(found.values()) == pytest.approx([1.1 * volts for volts in shown], abs=0.02)
 
 
-def test_a_swap_that_ends_leaves_the_others_as_if_it_had_never_been() -> None:
+def test_the_end_of_a_swap_restores_the_other_swaps() -> None:
     scene = load_scene("stable-run", {"duration_s": 0.25, "sensors.groups": ["forces", "probes"]})
     pairs = [("P_N", "P_S"), ("P_S", "disk_x"), ("disk_x", "P_E")]
     swaps = [{"channel": a, "kind": "swap", "other": b, "at_s": 0.1} for a, b in pairs]
@@ -372,7 +370,7 @@ def test_the_numbers_of_a_random_fault_are_functions_of_its_place() -> None:
 
 
 @pytest.mark.parametrize("quiet", [{"sensors.noise": False}, {"sensors.chain": "ideal"}], ids=["no noise", "ideal"])
-def test_channels_that_are_late_by_one_sample_have_the_counts_of_the_row_before(quiet: dict[str, Any]) -> None:
+def test_a_delay_of_one_sample_shows_the_previous_row(quiet: dict[str, Any]) -> None:
     """Probes are around -10 V of 20 V, and their volts extend to both sides of half of the converter's range."""
     still = load_scene("stable-run", {"duration_s": 0.05, "sensors.groups": ["probes"], **quiet})
     sound, _ = run(scene=still)

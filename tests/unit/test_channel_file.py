@@ -62,7 +62,7 @@ def written(folder: Path, text: str = MINE) -> Path:
     return path
 
 
-def test_the_file_says_what_is_different(tmp_path: Path) -> None:
+def test_the_file_contains_only_differences(tmp_path: Path) -> None:
     table, own = read_channels(written(tmp_path)), default_table().channels
     assert {name: group.names for name, group in table.groups.items()} == {
         "probes": ("disk_x", "disk_y", "ring_x", "ring_y"),
@@ -83,20 +83,20 @@ def test_the_file_says_what_is_different(tmp_path: Path) -> None:
     assert (found["bearing_u"].kind, found["bearing_u"].label) == ("user", "bearing_u")
 
 
-def test_a_slower_group_lowers_the_corner_that_nobody_gave(tmp_path: Path) -> None:
+def test_a_slower_group_lowers_the_default_corner(tmp_path: Path) -> None:
     slow = "[groups.probes]\nrate_hz = 1000\n[channels.disk_y]\nbandwidth_hz = 900.0"
     table = read_channels(written(tmp_path, slow))
     assert (table.channels["disk_x"].bandwidth_hz, table.channels["disk_y"].bandwidth_hz) == (250.0, 900.0)
 
 
-def test_a_table_can_be_made_of_nothing(tmp_path: Path) -> None:
+def test_a_table_can_start_empty(tmp_path: Path) -> None:
     table = read_channels(written(tmp_path, 'base = "none"\n' + channel('signal = "pivot_x"')))
     assert list(table.channels) == ["a"]
     frame = Simulation(load_scene("stable-run", {"channels": str(tmp_path / "mine.toml")})).advance(10_000)
     assert (frame.samples["g"].values.shape, frame.edges) == ((200, 1), None)
 
 
-def test_channels_show_what_their_formulas_say(tmp_path: Path) -> None:
+def test_channels_follow_their_formulas(tmp_path: Path) -> None:
     changes = {"channels": str(written(tmp_path)), "sensors.chain": "ideal", "sensors.rate_hz": 20_000}
     run = rig.simulate("hammer", changes, duration_s=0.1)
     model = run.simulation.model.constants
@@ -117,7 +117,7 @@ def test_channels_show_what_their_formulas_say(tmp_path: Path) -> None:
         )
 
 
-def test_formulas_are_what_they_read() -> None:
+def test_formulas_are_evaluated_as_written() -> None:
     rows = np.random.default_rng(1).normal(size=(50, N_ROW))
     x, y, angle = (rows[:, COLUMN[name]] for name in ("disk_x", "disk_y", "theta"))
     formulas = Formulas({"ring.clearance": 0.5}, {"cam": ((0.0, 0.0), (90.0, 1.0), (270.0, -1.0))})
@@ -183,7 +183,7 @@ def test_messages_follow_the_table(tmp_path: Path) -> None:
     database(wide)
 
 
-def test_a_scene_names_the_file_beside_it_and_holds_what_it_said(tmp_path: Path) -> None:
+def test_a_scene_names_its_channel_file_and_stores_the_contents(tmp_path: Path) -> None:
     written(tmp_path)
     (tmp_path / "scene.toml").write_text('channels = "mine.toml"\n')
     scene = load_scene(tmp_path / "scene.toml")
@@ -266,7 +266,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("what", WRONG)
-def test_a_wrong_table_is_one_line_that_names_channel_and_field(what: str, tmp_path: Path) -> None:
+def test_a_wrong_table_is_refused_with_channel_and_field(what: str, tmp_path: Path) -> None:
     text, line = WRONG[what]
     path = written(tmp_path, text)
     with pytest.raises(InputError) as caught:
@@ -289,7 +289,7 @@ INLINE = {
 
 
 @pytest.mark.parametrize("what", INLINE)
-def test_a_table_that_stands_in_the_scene_is_held_to_the_same(what: str, tmp_path: Path) -> None:
+def test_a_table_inside_a_scene_has_the_same_checks(what: str, tmp_path: Path) -> None:
     # Equal to recordings: a value is accepted by this path exactly if it is accepted by the other.
     text = 'base = "none"\n' + channel('signal = "P_N"')
     document = read_channels(written(tmp_path, text)).model_dump(mode="json")
@@ -328,7 +328,7 @@ def test_a_high_pass_at_the_corner_of_the_low_pass_is_no_double_pole() -> None:
                 assert abs(direct + sum(parts) - low * high) < 1e-3, (order, near, frequency_hz)
 
 
-def test_a_slow_group_leaves_blocks_and_lengths_alone(tmp_path: Path) -> None:
+def test_a_slow_group_does_not_change_blocks_and_durations(tmp_path: Path) -> None:
     text = 'base = "none"\n[groups.s]\nrate_hz = 64\n' + channel('signal = "P_N"').partition("\n")[2]
     scene = load_scene("stable-run", {"channels": str(written(tmp_path, text)), "duration_s": 0.1})
     simulation = Simulation(scene)
@@ -341,7 +341,7 @@ def test_a_slow_group_leaves_blocks_and_lengths_alone(tmp_path: Path) -> None:
     np.testing.assert_array_equal(run.times_s, run.groups["s"].times_s)
 
 
-def test_rates_of_a_sound_card_get_rows_that_they_fit(tmp_path: Path) -> None:
+def test_rates_of_a_sound_card_get_suitable_rows(tmp_path: Path) -> None:
     for rate in (44_100, 131_072, 262_144):
         text = 'base = "none"\n' + channel('signal = "P_N"').replace("[groups.g]", f"[groups.g]\nrate_hz = {rate}")
         assert load_scene("hammer", {"channels": str(written(tmp_path, text))}).table.groups["g"].rate_hz == rate
@@ -356,7 +356,7 @@ def test_a_dbc_holds_any_unit_and_label(tmp_path: Path) -> None:
     assert inches.layout != messages.layout, "another unit is another layout"
 
 
-def test_a_channel_of_another_unit_has_messages_of_its_own() -> None:
+def test_a_channel_of_another_unit_has_separate_messages() -> None:
     group = default_table().groups["forces"]
     other = group.channels[0].model_copy(update={"unit": "lbf", "si": 4.448})
     table = default_table().model_copy(update={"groups": {"forces": group.model_copy(update={"channels": (other,)})}})

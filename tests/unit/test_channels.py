@@ -52,7 +52,7 @@ def one_channel(row: str = "") -> str:
     """
 
 
-def test_every_channel_feels_a_signal_of_the_model_in_a_unit_that_fits() -> None:
+def test_every_channel_has_a_model_signal_with_a_compatible_unit() -> None:
     si = {"mm": ("m", 1e-3), "N": ("N", 1.0), "m/s^2": ("m/s^2", 1.0), "Hz": ("rad/s", 2 * math.pi), "1": ("1", 1.0)}
     units = {signal.name: signal.unit for signal in ROW}
     for channel in CHANNELS:
@@ -71,7 +71,7 @@ def test_names_are_unique_and_groups_whole() -> None:
         assert all(channel.bandwidth_hz < channel.rate_hz / 2 for channel in group.channels)
 
 
-def test_the_hardest_blow_that_is_accepted_can_be_measured() -> None:
+def test_the_largest_accepted_impact_can_be_measured() -> None:
     hammer = default_table().channels["hammer"]
     (limit,) = [item.le for item in HammerCommand.model_fields["force_n"].metadata if hasattr(item, "le")]
     assert hammer.bias_v + hammer.sensitivity_v * limit < hammer.range_v[1]
@@ -105,7 +105,7 @@ def test_range_and_converter_of_the_small_table() -> None:
 
 
 @pytest.mark.parametrize("missing", sorted(set(VALID_CHANNEL) - {"filter_order"}))
-def test_a_row_without_one_of_its_fields_is_refused(missing: str) -> None:
+def test_a_row_with_a_missing_field_is_refused(missing: str) -> None:
     with pytest.raises(ValidationError, match=missing):
         Channel(**{key: value for key, value in VALID_CHANNEL.items() if key != missing})
 
@@ -140,7 +140,7 @@ def test_rows_take_the_defaults_of_their_group_and_may_differ() -> None:
     assert channel.scale < 0.0
 
 
-def test_a_name_stands_once() -> None:
+def test_names_are_unique() -> None:
     twice = TABLE_TEXT.replace('name = "P_N"', 'name = "disk_x"')
     assert twice != TABLE_TEXT
     with pytest.raises(ValueError, match="disk_x must be in the table once"):
@@ -178,7 +178,7 @@ def test_unknown_field_in_a_row_is_refused() -> None:
     ],
     ids=["a missing field", "a wrong signal"],
 )
-def test_every_command_that_uses_the_table_says_in_a_line_what_is_wrong_with_it(
+def test_every_command_reports_a_wrong_table_in_one_line(
     command: tuple[str, ...],
     was: str,
     becomes: str,
@@ -206,7 +206,7 @@ def test_every_command_that_uses_the_table_says_in_a_line_what_is_wrong_with_it(
     assert ended.value.code == 2
 
 
-def test_a_channel_without_a_sensitivity_and_one_of_no_signal_are_one_line() -> None:
+def test_a_channel_without_sensitivity_or_signal_is_refused_in_one_line() -> None:
     with pytest.raises(InputError, match=r"channel c\.sensitivity_v must be given; instead received nothing"):
         parse_table(one_channel().replace("sensitivity_v", "# "))
     table = parse_table(one_channel().replace('"disk_x"', '"endx"'))

@@ -42,7 +42,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     return record(path, channels=str(TABLE), sensors__rate_hz=0)
 
 
-def test_a_recording_holds_the_table_and_is_done_again_bit_for_bit(recording: Recording) -> None:
+def test_a_recording_contains_the_table_and_is_reproduced_bit_for_bit(recording: Recording) -> None:
     assert set(recording.table.channels) == {*default_table().channels, *ADDED}
     assert {recording.table.groups[name].rate_hz for name in GROUPS} == {51_200}
     again = validate(recording)
@@ -96,7 +96,7 @@ def test_a_daq_reads_every_channel_of_the_table() -> None:
     np.testing.assert_array_equal(got.times_s, np.arange(4_000) / 51_200)
 
 
-def test_a_bus_carries_the_table_and_a_client_that_has_another_is_told() -> None:
+def test_a_bus_carries_the_table_and_a_client_with_another_is_refused() -> None:
     import can
 
     channel = f"channels{next(_names)}"
@@ -128,7 +128,7 @@ def test_a_bus_carries_the_table_and_a_client_that_has_another_is_told() -> None
         np.testing.assert_allclose(got[name], played.shown(name)[got.index * 8 :: 8][:800], rtol=0, atol=1e-9)
 
 
-def test_a_recording_of_before_is_read_and_found_good() -> None:
+def test_a_recording_of_an_earlier_version_passes() -> None:
     recording = Recording.open(ROOT / "tests/recordings/hammer-table-1.mcap")
     assert (recording.table.version, recording.samples("probes").rate_hz) == (1, 20_000)
     judged = validate(recording)
@@ -151,7 +151,7 @@ SIMILAR_RUNS = {
 
 @pytest.mark.parametrize("how", SIMILAR_RUNS)
 @pytest.mark.parametrize("rate_hz", [20_000, 51_200])
-def test_the_engine_and_its_step_are_not_in_what_the_sensors_show(how: str, rate_hz: int) -> None:
+def test_sensor_signals_do_not_depend_on_engine_and_step(how: str, rate_hz: int) -> None:
     def volts(changes: dict[str, object]) -> tuple[np.ndarray, np.ndarray]:
         common = {"sensors.noise": False, "sensors.rate_hz": rate_hz, "engine.companion": False}
         run = rig.simulate("hammer", {**changes, **common}, duration_s=0.06)

@@ -36,7 +36,7 @@ def row(**columns: Any) -> dict[str, Any]:
     return base | columns
 
 
-def test_store_resumes_what_the_same_code_measured(tmp_path: Path) -> None:
+def test_store_reuses_results_of_the_same_code(tmp_path: Path) -> None:
     store = Store(tmp_path)
     store.add(row(error=1e-3, speed=math.nan))
     with (tmp_path / "chart.journal.jsonl").open("a") as file:
@@ -53,7 +53,7 @@ def test_store_resumes_what_the_same_code_measured(tmp_path: Path) -> None:
     assert not Store(tmp_path, fresh=True).rows("quick")
 
 
-def test_store_measures_anew_what_other_code_measured(tmp_path: Path) -> None:
+def test_store_repeats_results_of_other_code(tmp_path: Path) -> None:
     store = Store(tmp_path)
     store.stamp = {**store.stamp, "code": "another"}
     store.add(row(error=1e-3))
@@ -149,7 +149,7 @@ def test_block_statistics_of_a_square_wave() -> None:
         block_statistics(times[:800], force[:800], np.empty(0), settle_s=0.1)
 
 
-def test_bootstrap_bars_hold_the_mean_of_what_scatters() -> None:
+def test_bootstrap_bars_contain_the_mean() -> None:
     rng = np.random.default_rng(5)
     times = np.arange(0.0, 40.0, 1e-2)
     mean, low, high = block_statistics(
@@ -185,7 +185,7 @@ def test_profile_shares_by_hand() -> None:
     assert len(curves["never"][0]) == 0
 
 
-def test_profile_of_a_bound_is_held_against_the_best_of_all() -> None:
+def test_profile_of_a_bound_is_compared_with_the_best_method() -> None:
     points = [
         {"phase": "a", "method": "led", "cpu_s": 4.0, "own_cpu_s": 1.0, "failure": ""},
         {"phase": "a", "method": "other", "cpu_s": 2.0, "own_cpu_s": None, "failure": ""},
@@ -202,7 +202,7 @@ def test_draws_are_the_same_again_and_differ() -> None:
     assert draw_scene(3).commands != draw_scene(4).commands
 
 
-def test_plan_gives_a_method_only_what_it_takes() -> None:
+def test_plan_gives_a_method_only_supported_settings() -> None:
     tasks = plan(competitors(), mode="full", panels=list(PANELS))
     assert {task.case for task in tasks if task.panel == "memory"} == {"memory", "no memory"}
     assert not [task for task in tasks if task.panel == "exact" and task.method == "scipy-bdf-no-events"]
@@ -241,7 +241,7 @@ def test_failures_are_drawn_not_dropped(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("no_png")
-def test_a_bound_is_drawn_and_named_beside_the_method_it_bounds(tmp_path: Path) -> None:
+def test_a_bound_is_drawn_and_named_with_its_method(tmp_path: Path) -> None:
     stamp = {"commit": "abc", "date": "2026-01-01", "machine": "m", "versions": "v"}
     blank = {name: None for name in COLUMNS if name not in KEY and name not in ("title", "family")}
     measured = {"error": 1e-4, "speed": 100.0, "speed_min": 90.0, "speed_max": 110.0, "tolerance": 1e-6,
@@ -260,9 +260,7 @@ def test_a_table_of_an_earlier_version_is_read() -> None:
     assert all("own_cpu_s" in one for one in rows)
 
 
-def test_a_small_chart_end_to_end_resumes_and_says_what_is_missing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_small_chart_resumes_and_lists_missing_points(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def chart(**changes: Any) -> session.Outcome:
         return make_chart(
             tmp_path / "out",
@@ -330,7 +328,7 @@ def test_without_peers_there_is_still_a_reference() -> None:
         (["--draw"], "output must be a folder with chart.csv of an earlier chart"),
     ],
 )
-def test_wrong_input_ends_in_one_line(
+def test_wrong_input_is_refused_in_one_line(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, arguments: list[str], words: str
 ) -> None:
     with pytest.raises(SystemExit) as end:

@@ -62,7 +62,7 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_results_of_an_engine_land_where_the_engine_does(tmp_path: Path) -> None:
+def test_submitted_results_of_an_engine_equal_its_own_point(tmp_path: Path) -> None:
     problem, setting = problem_of("exact", PHASE, ""), Setting("25 us", 0.0, step_us=25)
     done = run_engine("rk4", setting, problem, Budget(30.0, 1))
     states, contacts = done.solution.states[:, ERROR_COLUMNS], done.solution.contacts
@@ -140,7 +140,7 @@ def change_line(number: int, change: Callable[[str], str]) -> Callable[[str], st
         ({}, change_line(-2, lambda line: line.rpartition(",")[0]), "theta_rate [rad/s] in row 50 must be a number"),
     ],
 )  # fmt: skip
-def test_a_wrong_file_ends_in_one_line(
+def test_a_wrong_file_is_refused_in_one_line(
     keys: dict[str, str],
     change: Callable[[str], str],
     words: str,
@@ -155,7 +155,7 @@ def test_a_wrong_file_ends_in_one_line(
     assert not (tmp_path / "out").exists()
 
 
-def test_wrong_options_end_in_one_line(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_wrong_options_are_refused_in_one_line(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     path, folder = tmp_path / "mine.csv", tmp_path / "out"
     path.write_text(at_rest(), encoding="utf-8")
     assert "file must be a file that can be read" in refused(capsys, "--add", f"{path}x", "-o", str(folder))
@@ -167,7 +167,7 @@ def test_wrong_options_end_in_one_line(capsys: pytest.CaptureFixture[str], tmp_p
     assert "must be a folder" in refused(capsys, "--problem", "drop", "-o", str(path))
 
 
-def test_a_chart_of_other_code_is_not_added_to(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_a_chart_of_other_code_is_not_extended(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     path = tmp_path / "mine.csv"
     path.write_text(at_rest(), encoding="utf-8")
     store = Store(tmp_path / "out")
@@ -197,7 +197,7 @@ def test_an_added_solver_is_drawn_and_named(tmp_path: Path, monkeypatch: pytest.
 
 
 @pytest.mark.parametrize("phase", ["first-impacts", "drop"])
-def test_a_problem_holds_what_the_page_states_and_no_more(phase: str, tmp_path: Path) -> None:
+def test_a_problem_file_contains_exactly_the_documented_fields(phase: str, tmp_path: Path) -> None:
     with pytest.raises(SystemExit) as end:
         main(["chart", "--problem", phase, "-o", str(tmp_path)])
     assert end.value.code == 0

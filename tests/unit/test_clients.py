@@ -68,13 +68,13 @@ def test_a_report_out_of_bounds_is_counted_and_not_believed(clients: Clients, pa
 
 
 @pytest.mark.parametrize("name", ["", "x" * 101, "a\x1b[2Jb", "a\nb", "\u202eexe"])
-def test_a_name_that_a_terminal_would_act_on_is_no_name(clients: Clients, name: str) -> None:
+def test_a_name_with_control_characters_is_refused(clients: Clients, name: str) -> None:
     report(clients, name, received_index=1)
     assert clients.malformed == 1
     assert clients.present == 0
 
 
-def test_made_up_names_hide_none_that_gets_on(clients: Clients, time_: Time) -> None:
+def test_false_names_do_not_hide_an_active_client(clients: Clients, time_: Time) -> None:
     made_up = 0
     for second in range(60):
         time_.now_s = float(second)
@@ -89,7 +89,7 @@ def test_made_up_names_hide_none_that_gets_on(clients: Clients, time_: Time) -> 
     assert clients.hidden > 0
 
 
-def test_a_recorder_that_comes_after_thousands_of_made_up_names_is_shown(clients: Clients, time_: Time) -> None:
+def test_a_recorder_is_shown_after_thousands_of_false_names(clients: Clients, time_: Time) -> None:
     for number in range(3 * MOST):
         report(clients, f"made up {number}", received_index=5)
     for half_second in range(4):
@@ -98,7 +98,7 @@ def test_a_recorder_that_comes_after_thousands_of_made_up_names_is_shown(clients
     assert "recorder" in clients.rows(30_000, 20_000.0)
 
 
-def test_who_reports_but_gets_nothing_is_not_waited_for_for_ever(clients: Clients, time_: Time) -> None:
+def test_the_wait_for_a_client_without_progress_is_limited(clients: Clients, time_: Time) -> None:
     for second in range(70):
         time_.now_s = float(second)
         report(clients, "stuck", received_index=0, room=0)
@@ -111,7 +111,7 @@ def test_who_reports_but_gets_nothing_is_not_waited_for_for_ever(clients: Client
     assert clients.behind(1000) == 990, "it goes on"
 
 
-def test_nobody_reports_under_the_name_of_another(clients: Clients, time_: Time) -> None:
+def test_a_report_under_the_name_of_another_client_is_ignored(clients: Clients, time_: Time) -> None:
     class Rig:
         def report(self, key: str, payload: bytes) -> None:
             clients.take(key, payload)
@@ -129,7 +129,7 @@ def test_nobody_reports_under_the_name_of_another(clients: Clients, time_: Time)
     assert clients.behind(1000, silent=True) == 0
 
 
-def test_whoever_goes_back_and_forth_does_not_get_on(clients: Clients, time_: Time) -> None:
+def test_a_client_whose_count_oscillates_makes_no_progress(clients: Clients, time_: Time) -> None:
     for tick in range(100):
         time_.now_s = 0.1 * tick
         for number in range(80):
@@ -166,7 +166,7 @@ def settle_s(
     return time_.now_s - begin
 
 
-def test_the_end_waits_for_a_recorder_that_gets_on_and_not_for_one_that_is_stuck(
+def test_the_end_waits_only_for_a_recorder_with_progress(
     monkeypatch: pytest.MonkeyPatch, clients: Clients, time_: Time
 ) -> None:
     has = iter(range(0, 10_000, 20))
@@ -177,7 +177,7 @@ def test_the_end_waits_for_a_recorder_that_gets_on_and_not_for_one_that_is_stuck
     assert 3.0 < held < 5.0
 
 
-def test_the_end_waits_for_a_recorder_that_is_stopped_but_hardly_for_a_slow_stranger(
+def test_the_end_waits_longer_for_a_recorder_than_for_other_clients(
     monkeypatch: pytest.MonkeyPatch, clients: Clients, time_: Time
 ) -> None:
     assert settle_s(monkeypatch, clients, time_, links=1, stalled_links=1) < 1.5

@@ -105,7 +105,7 @@ def missing_in(name: str, entry: type[SceneCommand]) -> Iterator[str]:
         yield f"{where}: the CAN signals have {bits} bits, and a frame has room for {_VALUE_BITS}"
 
 
-def test_no_entry_lacks_anything() -> None:
+def test_all_entries_are_complete() -> None:
     missing = [line for name, entry in COMMANDS.items() for line in missing_in(name, entry)]
     if missing:
         pytest.fail("\n".join(missing), pytrace=False)
@@ -189,7 +189,7 @@ def sized(**quantity: Any) -> Any:
         (half(), "SUMMARIES has no line of help"),
     ],
 )
-def test_half_an_entry_is_told_what_it_lacks(entry: Any, words: str) -> None:
+def test_an_incomplete_entry_is_reported_with_the_missing_part(entry: Any, words: str) -> None:
     found = [line for line in missing_in("tilt", entry) if ("SUMMARIES" in line) == ("SUMMARIES" in words)]
     assert words in " ".join(found)
     assert len(found) == 1 or all("CAN kind" in line for line in found)  # two commands share the number
@@ -250,7 +250,7 @@ def test_the_console_has_each_command_with_the_fields_of_the_table(name: str) ->
 
 
 @pytest.mark.parametrize("name", MECHANICAL)
-def test_a_command_is_the_same_behind_its_can_frame(name: str) -> None:
+def test_a_command_survives_its_can_frame(name: str) -> None:
     quantities = COMMANDS[name].quantities()
     values = {field: max(1.0, each.low) for field, each in quantities.items() if not each.takes_text}
     words = {field: "y" for field, each in quantities.items() if each.takes_text}
@@ -273,7 +273,7 @@ def test_all_bits_of_a_can_frame_belong_to_one_signal_of_each_kind() -> None:
         assert min((one ^ other).bit_count() for one, other in combinations(kinds, 2)) >= 4
 
 
-def test_what_an_instrument_is_told_has_the_fields_of_a_command() -> None:
+def test_requests_to_instruments_have_the_fields_of_commands() -> None:
     acts = {act for twin in TWINS for act in twin.CODEC.acts}
     assert {"hammer", "speed", "release"} <= {act.COMMAND for act in acts} <= set(MECHANICAL)
     for act in acts:

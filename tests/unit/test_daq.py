@@ -65,7 +65,7 @@ def test_rows_that_are_missing_late_or_twice_are_counted() -> None:
     assert (again.gap, rows.runs) == (0, {"": 1})
 
 
-def test_a_pile_gives_what_was_asked_for_and_never_over_a_gap() -> None:
+def test_a_buffer_returns_the_requested_rows_and_never_across_a_gap() -> None:
     pile = RowBuffer()
     for samples in (part(0, 10), part(10, 10)):
         pile.add(samples)
@@ -84,7 +84,7 @@ def test_a_pile_gives_what_was_asked_for_and_never_over_a_gap() -> None:
     assert (last.gap, len(last), pile.rows) == (20, 5, 0)
 
 
-def test_a_pile_that_nobody_takes_from_stays_small_and_tells_what_went() -> None:
+def test_an_unread_buffer_stays_small_and_reports_lost_rows() -> None:
     pile = RowBuffer(50)
     for n in range(100):
         pile.add(part(10 * n, 10))
@@ -101,7 +101,7 @@ def aligner(room: int = 1000) -> Aligner:
     return Aligner({"a": [0, 1], "b": [1]}, [2, 0, 1], room)
 
 
-def test_rows_are_joined_by_number_and_columns_come_in_the_order_asked_for() -> None:
+def test_rows_are_merged_by_number_with_columns_in_the_requested_order() -> None:
     made = aligner()
     assert made.feed("a", part(0, 10, columns=2)) == []
     (first,) = made.feed("b", part(4, 4, name="b", columns=2))
@@ -113,7 +113,7 @@ def test_rows_are_joined_by_number_and_columns_come_in_the_order_asked_for() -> 
     assert (second.index, len(second), second.gap) == (8, 2, 0)
 
 
-def test_a_gap_of_one_stream_is_a_gap_of_all_and_names_the_stream() -> None:
+def test_a_gap_in_one_stream_is_a_gap_in_all_with_its_name() -> None:
     made = aligner()
     out = made.feed("a", part(0, 30, columns=2)) + made.feed("b", part(0, 10, name="b", columns=2))
     out += made.feed("b", part(17, 13, name="b", columns=2))
@@ -136,7 +136,7 @@ def test_portions_of_any_size_in_any_order_give_the_same_rows() -> None:
     assert all(each.gap == 0 for each in out)
 
 
-def test_a_stream_that_waits_for_another_in_vain_is_bounded() -> None:
+def test_a_stream_without_its_partner_is_bounded() -> None:
     made = aligner(room=100)
     for n in range(100):
         assert made.feed("a", part(10 * n, 10, columns=2)) == []
@@ -236,7 +236,7 @@ def test_an_end_that_overtakes_blocks_waits_for_them() -> None:
         assert sum(map(len, daq)) == 3 * BLOCK
 
 
-def test_an_end_does_not_overtake_rows_that_are_being_handed_on() -> None:
+def test_an_end_does_not_overtake_rows_being_delivered() -> None:
     """Blocks and events arrive on separate threads: the end, while the last block is still being delivered."""
     heard, held, on_the_way = [], threading.Event(), threading.Event()
 
@@ -269,7 +269,7 @@ def test_an_end_does_not_overtake_rows_that_are_being_handed_on() -> None:
     assert heard == [BLOCK, "the rig's run has ended: completed"]
 
 
-def test_an_end_that_does_not_tell_its_rows_gives_the_last_blocks_time(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_end_without_row_numbers_allows_time_for_the_last_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stream, "GRACE_S", 0.2)
     with on_memory(channels=["P_N"]) as (rig, daq):
         rig.publish("forces")
@@ -281,7 +281,7 @@ def test_an_end_that_does_not_tell_its_rows_gives_the_last_blocks_time(monkeypat
 
 
 @pytest.mark.wallclock
-def test_an_end_that_does_not_tell_its_rows_waits_for_silence(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_end_without_row_numbers_waits_for_silence(monkeypatch: pytest.MonkeyPatch) -> None:
     """On a delayed machine the last blocks come later than the grace after the end, but close together."""
     monkeypatch.setattr(stream, "GRACE_S", 1.0)
     with on_memory(channels=["P_N"]) as (rig, daq):
@@ -311,7 +311,7 @@ def test_a_function_is_called_with_each_block() -> None:
     np.testing.assert_allclose(np.concatenate([each.values for each in taken]), expected(0, 5 * BLOCK), atol=1e-9)
 
 
-def test_what_the_function_raises_is_raised_again() -> None:
+def test_an_exception_of_the_function_is_raised_again() -> None:
     with on_memory(channels=CHANNELS) as (rig, daq):
         daq.call(lambda samples: 1 / 0)
         rig.publish(*GROUPS)
@@ -337,7 +337,7 @@ def test_asyncio_waits_without_holding_the_loop() -> None:
         asyncio.run(use(rig, daq))
 
 
-def test_a_user_who_is_slow_loses_rows_that_are_counted_and_memory_stays() -> None:
+def test_a_slow_reader_loses_counted_rows_with_constant_memory() -> None:
     with on_memory(channels=["P_N"], buffer_s=0.1) as (rig, daq):
         rig.publish("forces", blocks=100)
         assert daq.dropped == 90 * BLOCK
@@ -346,7 +346,7 @@ def test_a_user_who_is_slow_loses_rows_that_are_counted_and_memory_stays() -> No
         assert daq.lost == {"forces": 0}
 
 
-def test_what_is_malformed_is_one_line() -> None:
+def test_malformed_arguments_are_refused_in_one_line() -> None:
     for options, message in [
         (
             {"channels": ["P_N", "disk_z"]},
@@ -375,7 +375,7 @@ def test_reading_after_closing_and_closing_twice() -> None:
 
 
 @pytest.mark.parametrize(("layout", "step"), [("fd", 2), ("classic", 20)])
-def test_frames_give_back_the_counts_of_the_recording(layout: str, step: int) -> None:
+def test_frames_reproduce_the_counts_of_the_recording(layout: str, step: int) -> None:
     table = default_messages()
     # The running number wraps in the classic layout: 65,536 instants of 20 samples.
     start = 2 * step * 32_760
@@ -454,7 +454,7 @@ def test_the_same_channels_come_over_can(layout: Schedule, step: int, steps: flo
         assert np.all(np.abs(got.values - wanted) <= tolerance + 1e-9)
 
 
-def test_a_bus_without_a_rig_is_one_line() -> None:
+def test_a_bus_without_a_rig_is_reported_in_one_line() -> None:
     with pytest.raises(InputError, match="can must be a bus with a rig on it"):
         Daq.open("can:virtual:empty", wait_s=0.1)
 
@@ -468,7 +468,7 @@ def test_a_bus_that_falls_silent_ends_the_blocks(monkeypatch: pytest.MonkeyPatch
             daq.read()
 
 
-def test_a_run_that_ends_is_told_on_the_bus() -> None:
+def test_the_end_of_a_run_is_sent_on_the_bus() -> None:
     with on_can(Schedule(classic_hz=1000), channels=["P_N"]) as (rig, daq, gateway):
         rig.end()
         assert sum(map(len, daq.blocks(timeout_s=5.0))) == 200
@@ -518,7 +518,7 @@ def test_the_examples_are_short_and_all_run_here() -> None:
 
 
 @pytest.mark.wallclock
-def test_an_example_without_a_rig_says_so_in_one_line() -> None:
+def test_an_example_without_a_rig_prints_one_line() -> None:
     file = Path(drivers.examples.__file__).with_name("callback.py")
     with python(str(file), f"zenoh:{free_endpoint()}") as child:
         output, complaints = child.communicate(timeout=60.0)

@@ -10,7 +10,7 @@ import pytest
 from rig.serve.waiting import Deadline, wait_until
 
 
-def test_a_deadline_has_the_rest_of_its_time_and_then_none() -> None:
+def test_a_deadline_returns_the_remaining_time() -> None:
     assert 0.0 < Deadline(60.0).left_s <= 60.0
     assert not Deadline(60.0).passed
     for past in (Deadline(0.0), Deadline(-1.0)):
@@ -48,13 +48,13 @@ def test_a_wait_on_a_condition_after_the_deadline_returns_at_once() -> None:
 
 
 @pytest.mark.parametrize("timeout_s", [0.0, -5.0])
-def test_a_condition_is_looked_at_once_even_without_time(timeout_s: float) -> None:
+def test_a_condition_is_checked_once_even_without_time(timeout_s: float) -> None:
     assert wait_until(lambda: True, timeout_s)
     assert not wait_until(lambda: False, timeout_s)
     assert len(list(Deadline(timeout_s).polls())) == 1
 
 
-def test_the_last_look_is_behind_the_deadline() -> None:
+def test_the_last_check_is_after_the_deadline() -> None:
     deadline = Deadline(0.01)
     looks = [deadline.passed for _ in deadline.polls(0.004)]
     assert looks[-1]

@@ -97,7 +97,7 @@ def rows(payloads: list[bytes]) -> list[int]:
 
 
 @pytest.mark.parametrize("kind", BLOCKS)
-def test_who_records_all_that_is_sent_ends_well_and_has_it_as_it_came(kind: str, tmp_path: Path) -> None:
+def test_a_recorder_of_a_faulty_stream_ends_normally_with_all_blocks(kind: str, tmp_path: Path) -> None:
     items = published(kind)
     summary = recorded(tmp_path / "live.mcap", kind, items)
     assert (summary.good, summary.losses, summary.refused) == (True, (), 0)
@@ -118,7 +118,7 @@ def test_who_records_all_that_is_sent_ends_well_and_has_it_as_it_came(kind: str,
     ("kind", "behind"),
     [("duplicate-blocks", 5), ("reorder-blocks", 5), ("stale-stamps", 5), ("restart", 0), ("restart", 5)],
 )
-def test_what_is_told_late_counts_nevertheless(kind: str, behind: int, tmp_path: Path) -> None:
+def test_late_fault_events_are_used(kind: str, behind: int, tmp_path: Path) -> None:
     """Blocks and fault events come on separate threads; the events are late by a number of blocks."""
     items = published(kind)
     told, held = [item for item in items if item[0] == wire.FAULTS], list[tuple[str, bytes]]()
@@ -136,7 +136,7 @@ def test_what_is_told_late_counts_nevertheless(kind: str, behind: int, tmp_path:
 
 
 @pytest.mark.parametrize("seed", [25, 34, 40, 57])
-def test_what_is_told_comes_in_bursts(seed: int, tmp_path: Path) -> None:
+def test_fault_events_may_arrive_in_bursts(seed: int, tmp_path: Path) -> None:
     """Renumbered blocks and the events that report it, each in order, one randomly ahead of the other."""
     rng, items = random.Random(seed), list(published("restart"))
     end, held = items.pop(), list[tuple[str, bytes]]()
@@ -149,7 +149,7 @@ def test_what_is_told_comes_in_bursts(seed: int, tmp_path: Path) -> None:
     assert recorded(tmp_path / "bursts.mcap", "restart", [*held, end]).good
 
 
-def test_what_is_told_of_a_block_may_come_behind_the_end(tmp_path: Path) -> None:
+def test_fault_events_may_arrive_after_the_end(tmp_path: Path) -> None:
     items = published("restart")
     last = max(n for n, (key, payload) in enumerate(items) if key == wire.FAULTS and json.loads(payload).get("blocks"))
     summary = recorded(tmp_path / "late.mcap", "restart", items[:last] + items[last + 1 :], late=(items[last],))
@@ -157,7 +157,7 @@ def test_what_is_told_of_a_block_may_come_behind_the_end(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("kind", ["lose-blocks", "reorder-blocks"])
-def test_what_is_really_lost_beside_is_told_to_the_row(kind: str, tmp_path: Path) -> None:
+def test_lost_rows_are_counted_exactly_in_addition_to_faults(kind: str, tmp_path: Path) -> None:
     items = published(kind)
     places = [n for n, (key, _) in enumerate(items) if key == PROBES]
     gone = {places[n] for n in (3, 14, 17)}
@@ -166,14 +166,14 @@ def test_what_is_really_lost_beside_is_told_to_the_row(kind: str, tmp_path: Path
     assert not summary.good
 
 
-def test_who_is_told_nothing_of_faults_believes_none_of_it(tmp_path: Path) -> None:
+def test_a_client_without_fault_events_reports_losses(tmp_path: Path) -> None:
     items = [item for item in published("dropout") if item[0] != wire.FAULTS]
     summary = recorded(tmp_path / "untold.mcap", "dropout", items)
     assert summary.lost == {PROBES: 4000}
 
 
 @pytest.mark.parametrize("kind", ["dropout", "reorder-blocks", "stale-stamps", "restart"])
-def test_so_it_is_in_several_files_and_around_triggers(kind: str, tmp_path: Path) -> None:
+def test_fault_events_work_across_files_and_triggers(kind: str, tmp_path: Path) -> None:
     items = published(kind)
     summary = recorded(tmp_path / "parts.mcap", kind, items, limits=Limits(rotate_s=0.13))
     assert summary.good
@@ -194,7 +194,7 @@ def test_a_table_of_rows_has_no_blocks_and_refuses_their_faults(tmp_path: Path) 
 
 
 @pytest.mark.parametrize("kind", BLOCKS)
-def test_a_cut_keeps_what_was_told_and_goes_by_true_times(kind: str, tmp_path: Path) -> None:
+def test_a_cut_keeps_fault_events_and_uses_true_times(kind: str, tmp_path: Path) -> None:
     write_run(Simulation(scene(kind)), tmp_path / "whole.mcap")
     cut(Recording.open(tmp_path / "whole.mcap"), tmp_path / "part.mcap", from_s=0.15, to_s=0.35)
     part = Recording.open(tmp_path / "part.mcap")
@@ -204,7 +204,7 @@ def test_a_cut_keeps_what_was_told_and_goes_by_true_times(kind: str, tmp_path: P
         assert (stream.rows, stream.first_time_s) == (4000, 0.15)
 
 
-def test_nothing_that_is_told_can_end_or_swell_who_hears_it() -> None:
+def test_forged_fault_events_neither_stop_nor_grow_a_receiver() -> None:
     rng, rows = np.random.default_rng(7), Declared()
     odd: list[Any] = [None, True, -1, 1.5, 1e300, 2**62, "", "x", [], {}, [[]], {"a": []}, "9" * 400]
     for n in range(3000):
@@ -220,7 +220,7 @@ def test_nothing_that_is_told_can_end_or_swell_who_hears_it() -> None:
 
 
 @pytest.mark.parametrize("kind", BLOCKS)
-def test_a_validation_knows_blocks_by_what_was_told_of_them(kind: str, tmp_path: Path) -> None:
+def test_a_validation_uses_the_fault_events_of_blocks(kind: str, tmp_path: Path) -> None:
     """Bit by bit with the events; without them the contradictions are reported, except for delayed blocks."""
     write_run(Simulation(scene(kind)), tmp_path / "a.mcap")
     recording = Recording.open(tmp_path / "a.mcap")
@@ -238,7 +238,7 @@ def test_a_validation_knows_blocks_by_what_was_told_of_them(kind: str, tmp_path:
 
 
 @pytest.mark.parametrize(("from_s", "rows"), [(0.0, 8000), (0.1, 6000), (0.38, 400)])
-def test_rows_that_are_missing_at_the_end_count_too(from_s: float, rows: int, tmp_path: Path) -> None:
+def test_missing_rows_at_the_end_are_counted(from_s: float, rows: int, tmp_path: Path) -> None:
     """A stream that never begins, or ends before the others: a blind validation has no other evidence."""
     fault = {"at_s": from_s, "channel": "probes", "kind": "dropout"}
     whole = parse_scene({"duration_s": 0.4, "sensors": {"groups": ["probes", "drive"]}, "faults": [fault]})

@@ -48,9 +48,7 @@ def test_each_limit_is_of_a_quantity_of_the_estimate_in_its_unit() -> None:
         ({"force_n": 1e-320}, FINEST_TOLERANCE),
     ],
 )
-def test_a_tolerance_that_is_left_out_is_the_smallest_limit_over_its_scale(
-    changes: dict[str, float], chosen: float
-) -> None:
+def test_a_default_tolerance_is_the_smallest_limit_over_its_scale(changes: dict[str, float], chosen: float) -> None:
     limits = {f"engine.limits.{name}": limit for name, limit in changes.items()}
     assert tolerance(limits) == pytest.approx(chosen)
     assert tolerance({**limits, "engine.tolerance": 0.0}) == pytest.approx(chosen)
@@ -62,7 +60,7 @@ def test_an_engine_finer_than_the_finest_choice_keeps_its_own_tolerance() -> Non
     assert tolerance(taylor) == EngineChoice(name="taylor").tolerance < FINEST_TOLERANCE
 
 
-def test_other_limits_of_a_loaded_scene_choose_again_unless_the_tolerance_was_given() -> None:
+def test_changed_limits_choose_a_new_tolerance_unless_it_was_given() -> None:
     scene = load_scene("hammer", LIMITS)
     assert tolerance({"engine.limits.radius_um": 0.01}, scene) == pytest.approx(0.01 / 900.0)
     assert tolerance({"engine.limits": {}}, scene) == 3e-4
@@ -71,7 +69,7 @@ def test_other_limits_of_a_loaded_scene_choose_again_unless_the_tolerance_was_gi
     assert change_scene(scene, {"engine.name": "rk8"}).engine == EngineChoice(name="rk8")
 
 
-def test_a_scene_without_limits_has_the_document_it_had() -> None:
+def test_a_scene_without_limits_keeps_its_document() -> None:
     before = {"name": "split", "step_us": 25, "tolerance": 3e-4, "companion": True, "rolling": "collocation"}
     for scene in (load_scene("hammer"), load_scene("hammer", {"engine.limits": {}})):
         assert json.dumps(scene_document(scene)["engine"]) == json.dumps(before)
@@ -141,7 +139,7 @@ def test_limits_without_an_estimate_are_refused(scene: str, changes: dict[str, A
     assert str(refused.value).startswith(field)
 
 
-def test_a_pick_without_a_companion_leaves_the_limits_out() -> None:
+def test_a_stored_choice_without_a_companion_omits_the_limits() -> None:
     data = scene_document(load_scene("hammer", LIMITS))
     levels = {"magnet": "map", "shaft": "euler", "stator": "two-houses", "contact": "compliant", "friction": "exact"}
     made = {**levels, "drive": "torque", "sensors": "full", "engine": "split", "step_us": 25, "engine_tolerance": 1e-3}

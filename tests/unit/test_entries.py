@@ -98,7 +98,7 @@ def test_an_observed_signal_is_computed() -> None:
              for constant, name in places if not constant or not re.search(rf"\b{constant}\b", stages)])  # fmt: skip
 
 
-def test_a_channel_stands_in_the_generated_files() -> None:
+def test_a_channel_is_in_the_generated_files() -> None:
     require([*missing_in_generated_files()])
 
 
@@ -150,7 +150,7 @@ def test_a_kind_of_fault_is_in_the_union_and_on_the_page() -> None:
     require(missing)
 
 
-def test_a_defect_is_injected_sized_and_recognised_or_says_why_not() -> None:
+def test_a_defect_is_injected_sized_and_recognised_or_has_a_reason() -> None:
     calls = [
         node for path in (ROOT / "replays/recordings/validation/explanations").glob("*.py")
         for node in ast.walk(ast.parse(path.read_text()))

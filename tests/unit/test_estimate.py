@@ -52,7 +52,7 @@ def test_columns_may_have_any_size(sizes: tuple[float, float]) -> None:
     assert own == pytest.approx(np.linalg.inv((matrix / sizes).T @ (matrix / sizes)), rel=1e-10)
 
 
-def test_normal_equations_of_unlike_unknowns_are_solved_and_a_blind_one_stays() -> None:
+def test_normal_equations_are_scaled_and_an_unidentifiable_value_is_kept() -> None:
     wanted, sizes = np.array([3.0, -2.0]), np.array([1e-6, 1e6])
     square, side = np.zeros((3, 3)), np.zeros(3)
     plain = np.array([[2.0, 1.0], [1.0, 3.0]])

@@ -53,7 +53,7 @@ def _assert_same(recording: Recording, experiment: Experiment) -> None:
         np.testing.assert_array_equal(old, new[first:], err_msg=key)
 
 
-def test_a_scene_on_a_users_parameters_whose_file_is_gone(tmp_path: Path) -> None:
+def test_a_scene_with_a_deleted_parameter_file_is_repeated(tmp_path: Path) -> None:
     own = tmp_path / "own.toml"
     own.write_text('title = "Mine"\nbase = "as-printed"\n[contact]\nfriction = 0.3\n[magnet]\nstiffness = 1.9\n')
     recording = _record(
@@ -68,7 +68,7 @@ def test_a_scene_on_a_users_parameters_whose_file_is_gone(tmp_path: Path) -> Non
     _assert_same(recording, experiment)
 
 
-def test_a_set_of_the_rigs_own_is_named_as_it_was(tmp_path: Path) -> None:
+def test_a_parameter_set_of_the_rig_keeps_its_name(tmp_path: Path) -> None:
     recording = _record(tmp_path / "a.mcap", "drop", {"parameters": "as-printed", "duration_s": 0.05})
     scene = Experiment.of(recording).scene
     assert (scene.parameters, scene.set) == ("as-printed", {})

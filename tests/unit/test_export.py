@@ -126,7 +126,7 @@ def test_scene_of_a_recording_runs_again_to_the_same_bits(folder: Path, run: Run
     np.testing.assert_array_equal(again.counts.values, run.counts.values)
 
 
-def test_command_tells_what_it_made(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_command_names_the_written_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "run.parquet"
     with pytest.raises(SystemExit) as end:
         main(["simulate", "drop", "-o", str(path), "--duration-s", "0.05"])
@@ -187,7 +187,7 @@ def test_interrupted_writer_leaves_nothing(suffix: str, error: type[BaseExceptio
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
-def test_interrupted_writer_keeps_the_file_that_was_to_be_replaced(suffix: str, tmp_path: Path) -> None:
+def test_interrupted_writer_keeps_the_existing_file(suffix: str, tmp_path: Path) -> None:
     path = tmp_path / f"run{suffix}"
     path.write_text("precious")
     simulation = Simulation(load_scene("drop"))
@@ -199,7 +199,7 @@ def test_interrupted_writer_keeps_the_file_that_was_to_be_replaced(suffix: str, 
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
-def test_a_disk_that_refuses_is_told_and_leaves_nothing(
+def test_a_disk_error_is_reported_and_leaves_no_file(
     suffix: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / f"run{suffix}"

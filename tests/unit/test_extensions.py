@@ -157,7 +157,7 @@ def python(code: str, package: Path) -> list[str]:
     return done.stdout.splitlines()
 
 
-def test_it_is_an_engine_as_any_other(package: Path) -> None:
+def test_an_external_engine_is_used_like_a_built_in_one(package: Path) -> None:
     names, takes, wrong, gone, digest = python(ASK, package)
     assert names == "heun ours", "the rig's own engines keep their names"
     assert takes == "True"
@@ -169,18 +169,18 @@ def test_it_is_an_engine_as_any_other(package: Path) -> None:
     assert python(ASK, package)[-1] not in (digest, source_digest())
 
 
-def test_it_runs_and_converges_at_its_order(package: Path) -> None:
+def test_an_external_engine_converges_at_its_order(package: Path) -> None:
     assert float(python(RUN, package)[0]) == pytest.approx(25.0, rel=0.1)
 
 
-def test_a_format_is_read_as_any_other(package: Path) -> None:
+def test_an_external_format_is_read_like_a_built_in_one(package: Path) -> None:
     values, damaged, unknown = python(IMPORT, package)
     assert values == "raw 0.0 1.0 2.0 3.0 4.0"
     assert "file must be an intact raw file" in damaged
     assert "; not usable: bad (my_engine:ROW must be a replays.recordings.formats.source.Format)" in unknown
 
 
-def test_what_is_wrong_with_another_s_package_is_one_line(package: Path) -> None:
+def test_errors_in_an_external_package_are_one_line(package: Path) -> None:
     unknown, *lines = python(LINES, package)
     for words in (
         "exits (my_wrong.exits:ROW cannot be loaded: SystemExit: no licence)",

@@ -121,7 +121,7 @@ def test_pulses(name: str, numbers: dict[str, float], expected: np.ndarray) -> N
 
 
 @pytest.mark.parametrize("name", sorted(name for name, each in KINDS.items() if not each.of_blocks))
-def test_what_a_fault_does_not_change_stays(name: str) -> None:
+def test_a_fault_changes_only_its_stage(name: str) -> None:
     """A fault of one stage leaves the values of all others."""
     fault = kind(name, **EXAMPLES[name])
     methods: dict[str, tuple[Callable[[np.ndarray, At], np.ndarray], np.ndarray]] = {

@@ -166,7 +166,7 @@ def test_a_fault_that_ends_before_the_next_sample_is_refused(
             scene(least_s - 1e-6)
 
 
-def test_blocks_held_back_by_nothing_are_refused() -> None:
+def test_a_block_delay_of_zero_is_refused() -> None:
     assert "delay_s must be" in refused({"channel": "probes", "kind": "late-blocks", "delay_s": 1e-9})
 
 
@@ -199,7 +199,9 @@ def test_the_reach_of_a_fault_has_no_sign(kind: str) -> None:
     ("wander", {"amplitude_us": 1.0}, 0.08 * math.pi * (1.0 - math.cos(0.2 * math.pi))),
     ("wander", {"amplitude_us": 1.0, "period_s": 0.05}, 0.16 * math.pi), ("spikes", {"size_v": 0.3}, 0.3),
 ])  # fmt: skip
-def test_the_reach_of_a_fault_is_that_of_its_equation(kind: str, numbers: dict[str, float], expected_v: float) -> None:
+def test_the_reach_of_a_fault_follows_from_its_equation(
+    kind: str, numbers: dict[str, float], expected_v: float
+) -> None:
     """After 0.1 s, of a probe of 3.94 V/mm and 5 kHz with a range of 8 V to each side."""
     channel = SCENE.table.channels["disk_x"]
     fault = KINDS[kind].model_validate({"kind": kind, **numbers})

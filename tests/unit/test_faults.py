@@ -47,7 +47,7 @@ def told(change: Callable[[np.ndarray, np.ndarray], None], group: str = "probes"
     return [(one.name, one.value) for one in found]
 
 
-def test_nothing_is_found_where_nothing_is_wrong() -> None:
+def test_signals_without_a_fault_have_no_finding() -> None:
     assert told(lambda values, clean: None) == []
 
 
@@ -61,7 +61,7 @@ def test_gain(factor: float) -> None:
     assert value == pytest.approx(factor - 1.0, abs=1e-3)
 
 
-def test_polarity_of_a_preloaded_one_and_offset() -> None:
+def test_polarity_and_offset_of_a_preloaded_transducer() -> None:
     def change(values: np.ndarray, clean: np.ndarray) -> None:
         values[:, 0] = 6000.0 - values[:, 0]
         values[:, 2] += 4.0
@@ -70,7 +70,7 @@ def test_polarity_of_a_preloaded_one_and_offset() -> None:
 
 
 @pytest.mark.parametrize("rows", [1, 7, 30])
-def test_delays_that_are_the_same_are_told_together(rows: int) -> None:
+def test_equal_delays_are_reported_together(rows: int) -> None:
     def change(values: np.ndarray, clean: np.ndarray) -> None:
         values[rows:, :2] += clean[:-rows, :2] - clean[rows:, :2]
 
@@ -79,7 +79,7 @@ def test_delays_that_are_the_same_are_told_together(rows: int) -> None:
     assert value == pytest.approx(rows / RATE_HZ, rel=0.01)
 
 
-def test_one_that_has_more_beside_the_same_delay_is_told_with_the_other() -> None:
+def test_a_channel_with_an_equal_delay_and_small_residues_is_grouped() -> None:
     """A ten-thousandth of gain and a small offset are residues of a fit, and no faults next to a delay."""
 
     def change(values: np.ndarray, clean: np.ndarray) -> None:
@@ -125,7 +125,7 @@ def test_swapped_and_turned() -> None:
     assert (name, value) == ("ring_x and ring_y angle", pytest.approx(-0.2, abs=1e-3))
 
 
-def test_what_signals_show_by_themselves() -> None:
+def test_faults_visible_without_a_prediction() -> None:
     part, _ = signals("forces")
     assert signal_faults({"forces": part}) == []
     values = part.values.copy()

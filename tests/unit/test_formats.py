@@ -104,7 +104,7 @@ HAPPENED = [
 ]
 
 
-def test_mdf_has_events_attachments_and_comments_that_a_person_reads(noted: Recording, tmp_path: Path) -> None:
+def test_mdf_has_events_attachments_and_readable_comments(noted: Recording, tmp_path: Path) -> None:
     from asammdf import MDF
 
     path = tmp_path / "x.mf4"
@@ -127,7 +127,7 @@ def test_mdf_has_events_attachments_and_comments_that_a_person_reads(noted: Reco
         assert told.endswith("24 bits over +-20 V, to 5000 Hz; 3.94 V per mm, -10 V at 0; calibration assumed")
 
 
-def test_events_and_documents_go_where_a_format_has_a_place(noted: Recording, tmp_path: Path) -> None:
+def test_events_and_documents_are_exported_if_the_format_allows(noted: Recording, tmp_path: Path) -> None:
     from nptdms import TdmsFile
     from pyarrow import parquet
 
@@ -183,7 +183,7 @@ def counts_of(recording: Recording, group: str) -> np.ndarray:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="file names are text")
 @pytest.mark.parametrize("suffix", written_suffixes())
-def test_a_recording_whose_name_is_no_text_is_exported(suffix: str, recording: Recording, tmp_path: Path) -> None:
+def test_a_recording_with_an_undecodable_name_is_exported(suffix: str, recording: Recording, tmp_path: Path) -> None:
     path = tmp_path / os.fsdecode(b"a\xff\x01.mcap")
     path.write_bytes(recording.path.read_bytes())
     opened = Recording.open(path)
@@ -219,9 +219,7 @@ def test_mdf_by_asammdf(recording: Recording, tmp_path: Path) -> None:
         assert (force.unit, len(force.timestamps)) == ("N", round(DURATION_S * 2000))
 
 
-def test_an_mdf_file_that_is_let_go_leaves_nothing_open(
-    recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_released_mdf_file_is_closed(recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from asammdf import MDF
     from asammdf.blocks import mdf_v4
 
@@ -294,7 +292,7 @@ FREEDOMS = {
 """Node and direction: x is 1, y is 2, against them is negative, turning about the shaft is 6."""
 
 
-def test_uff_nodes_do_not_depend_on_what_is_exported(recording: Recording, tmp_path: Path) -> None:
+def test_uff_nodes_do_not_depend_on_the_selection(recording: Recording, tmp_path: Path) -> None:
     import pyuff
 
     path = tmp_path / "x.uff"
@@ -325,7 +323,7 @@ def test_uff_by_pyuff(recording: Recording, tmp_path: Path) -> None:
         np.testing.assert_array_equal(found["data"], recording.samples(channel.group)[channel.name])
 
 
-def test_uff_begins_when_it_does_to_all_digits(recording: Recording, tmp_path: Path) -> None:
+def test_uff_has_the_exact_start_time(recording: Recording, tmp_path: Path) -> None:
     import pyuff
 
     selection = select(recording, channels=["disk_x"])
@@ -388,7 +386,7 @@ def test_wav_by_scipy_and_the_wave_module(recording: Recording, tmp_path: Path) 
     np.testing.assert_array_equal(integers, counts_of(recording, "forces") << 8)
 
 
-def test_volts_are_what_the_converter_saw(recording: Recording, tmp_path: Path) -> None:
+def test_volts_equal_the_converter_input(recording: Recording, tmp_path: Path) -> None:
     selection, _ = written(recording, tmp_path / "x.parquet", "disk_x", unit="volts")
     table = selection.tables[0]
     volts = np.concatenate([table.exported(0, chunk) for chunk in selection.chunks(table)])
@@ -414,7 +412,7 @@ def test_one_rate_by_a_declared_method(recording: Recording, tmp_path: Path) -> 
         export(select(recording, unit="counts"), tmp_path / "y.tdms", rate_hz=1000)
 
 
-def test_rows_that_are_missing_are_left_out_or_nan_never_made_up(gappy: Recording, tmp_path: Path) -> None:
+def test_missing_rows_are_omitted_or_nan(gappy: Recording, tmp_path: Path) -> None:
     from nptdms import TdmsFile
 
     assert gappy.streams["rig/sensors/probes"].rows == round(DURATION_S * 20_000) - 200
@@ -436,7 +434,7 @@ def test_rows_that_are_missing_are_left_out_or_nan_never_made_up(gappy: Recordin
 
 
 @pytest.mark.parametrize("suffix", written_suffixes())
-def test_one_row_is_exported_and_none_is_told(suffix: str, recording: Recording, tmp_path: Path) -> None:
+def test_one_row_is_exported_and_zero_rows_are_refused(suffix: str, recording: Recording, tmp_path: Path) -> None:
     key = sensor_key("probes")
     for rows in (0, 1):
         path = tmp_path / f"{rows}.mcap"
@@ -456,7 +454,7 @@ def test_one_row_is_exported_and_none_is_told(suffix: str, recording: Recording,
 
 
 @pytest.mark.parametrize("suffix", written_suffixes())
-def test_export_that_fails_leaves_nothing(suffix: str, recording: Recording, tmp_path: Path) -> None:
+def test_a_failed_export_leaves_no_file(suffix: str, recording: Recording, tmp_path: Path) -> None:
     path = tmp_path / f"x{suffix}"
     path.write_text("precious")
     selection = select(recording, merged=True)
@@ -491,7 +489,7 @@ def test_export_that_fails_leaves_nothing(suffix: str, recording: Recording, tmp
         (["-o", "x.tdms", "--rate-hz", "1000", "--unit", "counts"], "--unit must be engineering or volts"),
     ],
 )
-def test_wrong_exports_are_one_line(
+def test_wrong_exports_are_refused_in_one_line(
     arguments: list[str],
     message: str,
     recording: Recording,
@@ -538,7 +536,7 @@ def test_a_package_that_a_format_needs_is_named(
 
 
 @pytest.mark.parametrize(("rate_hz", "target_hz"), [(51_200.0, 20_000.0), (10_000.0, 20_000.0), (19_998.7, 20_000.0)])
-def test_polyphase_gives_a_tone_back(rate_hz: float, target_hz: float) -> None:
+def test_polyphase_reproduces_a_tone(rate_hz: float, target_hz: float) -> None:
     """Compared with the closed form: a tone in the pass band, at instants between samples, within 90 dB."""
     tone_hz = 0.8 * clock.PASS_BAND * min(rate_hz, target_hz) / 2
     axis = clock.Axis(0.0131, rate_hz, round(rate_hz * 0.4))
@@ -549,7 +547,7 @@ def test_polyphase_gives_a_tone_back(rate_hz: float, target_hz: float) -> None:
     assert np.abs(found - wanted).max() < 2 * np.pi * tone_hz / rate_hz / 512 + 1e-4  # its grid of instants is 1/512
 
 
-def test_polyphase_keeps_out_what_would_fold() -> None:
+def test_polyphase_suppresses_aliases() -> None:
     axis = clock.Axis(0.0, 20_000.0, 20_000)
     tone = np.sin(2 * np.pi * 2_600.0 * axis.instants())
     found = clock.resample_polyphase(tone, axis, 0.1, 5_000.0, 4_000)

@@ -55,7 +55,7 @@ def tone(counts: np.ndarray) -> complex:
     return complex(2.0 * np.mean(part * np.exp(-2j * math.pi * hz * np.arange(len(part)) / RATE_HZ)))
 
 
-def test_their_sizes_come_out_of_the_counts(sound: dict[str, np.ndarray]) -> None:
+def test_fault_sizes_are_recovered_from_the_counts(sound: dict[str, np.ndarray]) -> None:
     plain, hz = tone(sound["disk_x"]), SCENE.sources()["disk_x"].signal.frequency_hz or 0.0
     gain = tone(run(fault("gain", factor=0.7), scene=SCENE)[0]["disk_x"]) / plain
     assert gain == pytest.approx(0.7, abs=1e-4)
@@ -67,7 +67,7 @@ def test_their_sizes_come_out_of_the_counts(sound: dict[str, np.ndarray]) -> Non
 
 
 @pytest.mark.parametrize("ppm", [-2e4, 5e3])
-def test_a_clock_that_is_off_shows_another_frequency(ppm: float, sound: dict[str, np.ndarray]) -> None:
+def test_a_clock_error_shifts_the_frequency(ppm: float, sound: dict[str, np.ndarray]) -> None:
     """From the phase: a slow clock begins 10 ms late and catches up, a fast one lags increasingly."""
     there, _ = run(fault("clock", ppm=ppm), scene=SCENE)
     hz, steps = SCENE.sources()["disk_x"].signal.frequency_hz or 0.0, 10

@@ -98,7 +98,7 @@ def test_counts_are_the_closed_form_to_half_a_step_of_the_converter(kind: str, r
 
 
 @pytest.mark.parametrize("kind", SIGNALS)
-def test_it_is_as_exact_after_a_day_as_at_the_start(kind: str) -> None:
+def test_a_wave_is_as_exact_after_a_day_as_at_the_start(kind: str) -> None:
     source = scene_of({"kind": kind, **SIGNALS[kind]}).sources()["disk_x"]
     index = 86_399 * 51_200 + 777 + np.arange(500)
     found = source.shape(Instants.of_samples(index, 51_200))
@@ -120,7 +120,7 @@ def test_how_a_run_is_cut_changes_no_bit(name: str) -> None:
         assert run(1, rates) == run(10, rates) == run(300, rates)
 
 
-def test_a_snapshot_is_taken_up_bit_by_bit() -> None:
+def test_a_snapshot_continues_bit_by_bit() -> None:
     simulation = Simulation("test-sine")
     simulation.advance(10_000)
     kept = simulation.snapshot()
@@ -138,7 +138,7 @@ def test_a_prbs_correlates_with_itself_at_no_other_shift(order: int) -> None:
     assert np.abs(correlation[1:] + 1.0).max() < 1e-6
 
 
-def test_channels_of_a_prbs_are_told_apart_by_their_place() -> None:
+def test_channels_of_a_prbs_differ_by_their_shift() -> None:
     sources = load_scene("test-prbs").sources()
     index = np.arange(0, 4095 * 5)
     waves = {name: source.shape(Instants.of_samples(index, 20_000)) for name, source in sources.items()}
@@ -152,7 +152,7 @@ def test_channels_of_a_prbs_are_told_apart_by_their_place() -> None:
 
 
 @pytest.mark.parametrize("crest", [None, 2.0, 3.5, 7.0])
-def test_a_multisine_has_the_crest_factor_that_was_told(crest: float | None) -> None:
+def test_a_multisine_has_the_documented_crest_factor(crest: float | None) -> None:
     told = {} if crest is None else {"crest": crest}
     frequencies = [257.0 * k for k in range(1, 32)]
     source = scene_of({"kind": "multisine", "amplitude_v": 3.0, "frequencies": frequencies, **told}).sources()["P_N"]
@@ -174,7 +174,7 @@ def test_a_ramp_takes_every_code_of_a_converter_of_12_bits(tmp_path: Path) -> No
     assert set(times[1:-1]) <= {4, 5}
 
 
-def test_noise_is_what_is_left_and_is_that_of_the_sensor() -> None:
+def test_the_residual_is_the_noise_of_the_sensor() -> None:
     scene = load_scene("test-sine", {"duration_s": 1.0})
     quiet = load_scene("test-sine", {"duration_s": 1.0, "sensors.noise": False})
     loud, still = (Simulation(each).advance(1_000_000).samples["probes"].values for each in (scene, quiet))
@@ -187,7 +187,7 @@ def test_noise_is_what_is_left_and_is_that_of_the_sensor() -> None:
         assert np.abs(left[:, c] - drawn).max() <= 1.001 * channel.lsb_v
 
 
-def test_amplitude_in_units_is_that_of_the_channel() -> None:
+def test_amplitude_in_units_uses_the_channels_calibration() -> None:
     told = {"amplitude": 1.5, "offset": 0.25, "frequency_hz": 50.0, "channels": {"P_N": {"amplitude_v": 1.0}}}
     run = simulate(scene_of({"kind": "sine", **told}, sensors={"noise": False}))
     disk, force = run.samples["disk_x"], run.samples["P_N"]
@@ -205,7 +205,7 @@ def test_edges_and_drive_channels_follow_the_nominal_speed_and_are_quiet_without
     assert simulate(scene_of(told)).edges_s.size == 0
 
 
-def test_a_waveform_goes_through_its_points_again_and_again() -> None:
+def test_a_waveform_repeats_its_points() -> None:
     scene = load_scene("test-whirl", {"sensors.noise": False})
     waveform = scene.generator.file if scene.generator is not None else None
     assert waveform is not None
@@ -246,7 +246,7 @@ WRONG = [
 
 
 @pytest.mark.parametrize(("generator", "line"), WRONG, ids=[line for _, line in WRONG])
-def test_what_is_wrong_is_told_in_one_line_with_its_field(generator: dict[str, Any], line: str) -> None:
+def test_errors_are_one_line_with_the_field(generator: dict[str, Any], line: str) -> None:
     with pytest.raises(InputError) as error:
         scene_of(generator)
     assert str(error.value).startswith(line)
@@ -263,14 +263,14 @@ def test_what_is_wrong_is_told_in_one_line_with_its_field(generator: dict[str, A
         ("time [s],disk_x [V]\n0,1\n1,2\n2,1\n3,1\n", "with a column `disk_x [mm]`"),
     ],
 )
-def test_a_waveform_that_is_none_is_refused(text: str, must: str, tmp_path: Path) -> None:
+def test_an_invalid_waveform_is_refused(text: str, must: str, tmp_path: Path) -> None:
     (tmp_path / "wave.csv").write_text(text)
     with pytest.raises(InputError, match=r"^generator\.file must be") as error:
         scene_of({"kind": "recorded", "file": str(tmp_path / "wave.csv")})
     assert error.value.must.startswith(must)
 
 
-def test_the_physics_is_left_out_and_what_asks_for_it_is_refused() -> None:
+def test_physics_is_not_run_and_commands_for_it_are_refused() -> None:
     simulation = Simulation("test-sine")
     for name, request in {"hammer": {}, "speed": {"speed_hz": 5.0}, "release": {}}.items():
         with pytest.raises(InputError, match=rf"^{name} must be left out: signals of a \[generator\]"):
@@ -294,7 +294,7 @@ def test_the_physics_is_left_out_and_what_asks_for_it_is_refused() -> None:
     assert simulation.parameters_document()
 
 
-def test_a_signal_beyond_the_converter_is_limited_and_told() -> None:
+def test_a_signal_beyond_the_converter_is_clipped_and_reported() -> None:
     simulation = Simulation(load_scene("test-sine", {"generator.amplitude_v": 7.0}))
     channel = simulation.table.channels["hammer"]
     counts = simulation.advance(100_000).samples["hammer"].values
@@ -305,7 +305,7 @@ def test_a_signal_beyond_the_converter_is_limited_and_told() -> None:
 
 
 @pytest.mark.parametrize("name", [name for name in scene_names() if name.startswith("test-")])
-def test_a_recording_of_test_signals_is_made_again_bit_by_bit(name: str, tmp_path: Path) -> None:
+def test_a_recording_of_test_signals_is_reproduced_bit_by_bit(name: str, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     write_run(Simulation(load_scene(name, {"duration_s": 0.1})), path)
     found = validate(Recording.open(path))
@@ -313,7 +313,7 @@ def test_a_recording_of_test_signals_is_made_again_bit_by_bit(name: str, tmp_pat
     assert found.good
 
 
-def test_a_recording_of_other_signals_is_told_by_its_channels(tmp_path: Path) -> None:
+def test_a_recording_of_other_signals_is_detected_by_channel(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     write_run(Simulation(load_scene("test-sine", {"duration_s": 0.2})), path)
     assert validate(Recording.open(path), declared=True).good

@@ -58,7 +58,7 @@ def test_names_in_many_languages(name: str, kind: str, place: str, axis: str, si
     assert (found.kind, found.place, found.axis, found.side) == (kind, place, axis, side)
 
 
-def test_the_o_of_compass_points_is_told_by_the_others() -> None:
+def test_the_o_of_compass_points_is_recognised_from_the_others() -> None:
     assert read_name("Kraft O").side_among({"N", "S", "W", "O"}) == "E"
     assert read_name("Effort O").side_among({"N", "S", "E", "O"}) == "W"
 
@@ -80,7 +80,7 @@ def log(
     return path, kept, *guess_mapping([path])
 
 
-def test_each_signal_is_taken_for_what_it_is(
+def test_each_signal_is_guessed_correctly(
     log: tuple[Path, dict[str, tuple[float, np.ndarray]], str, list[Guess]],
 ) -> None:
     path, kept, text, guesses = log
@@ -116,7 +116,7 @@ def test_each_signal_is_taken_for_what_it_is(
         (("ai0 ring x [V]", "ai1 ring y [V]"), ("ring_x sure", "ring_y sure")),
     ],
 )
-def test_what_nothing_speaks_for_stays_a_channel_of_its_own(
+def test_a_signal_without_evidence_remains_an_unknown_channel(
     names: tuple[str, ...], channels: tuple[str, ...], tmp_path: Path
 ) -> None:
     """Noise alone: only names and units give evidence; each template imports unchanged."""
@@ -136,7 +136,7 @@ def imported(path: Path, text: str, folder: Path) -> tuple[Conversion, Recording
     return conversion, Recording.open(folder / "out.mcap")
 
 
-def test_nothing_is_done_to_samples_that_nobody_asked_for(
+def test_samples_are_not_changed_without_a_request(
     log: tuple[Path, dict[str, tuple[float, np.ndarray]], str, list[Guess]], tmp_path: Path
 ) -> None:
     """Imported as guessed, without an edit: values, rates and edges are those of the log, and it can be played."""
@@ -174,7 +174,7 @@ def test_nothing_is_done_to_samples_that_nobody_asked_for(
 
 
 @pytest.mark.parametrize(("method", "gain"), [("linear", 0.8165), ("polyphase", 0.9694)])
-def test_noise_that_resampling_takes_away_is_not_told(method: str, gain: float, tmp_path: Path) -> None:
+def test_noise_reduced_by_resampling_is_not_reported(method: str, gain: float, tmp_path: Path) -> None:
     """Straight lines between samples at all phases leave 2/3 of the variance of white noise."""
     path, rate = tmp_path / "x.csv", 10_000.8
     t, generator = np.arange(30_000) / rate, np.random.default_rng(4)
@@ -212,7 +212,7 @@ def test_noise_of_any_colour_and_where_it_ends(corner_hz: float | None) -> None:
     assert found is None if corner_hz is None else found == pytest.approx(corner_hz, rel=0.05)
 
 
-def test_a_corner_that_is_seen_is_proposed_and_asked(tmp_path: Path) -> None:
+def test_a_detected_corner_is_proposed_for_confirmation(tmp_path: Path) -> None:
     rate, several, path = 20_000, 8, tmp_path / "x.csv"
     generator = np.random.default_rng(2)
     wide = generator.standard_normal((20_000 * several, 2))
@@ -246,7 +246,7 @@ def test_whether_samples_or_only_their_stamps_are_uneven(taken: str, told: str, 
         np.testing.assert_allclose(found["P_N"], np.sin(60 * (found.times_s + at_s)), rtol=0, atol=6e-3)
 
 
-def test_a_default_gives_way_to_what_a_channel_says() -> None:
+def test_a_channels_setting_overrides_the_default() -> None:
     data = {"defaults": {"bandwidth_hz": 4000.0}, "channels": {
         "disk_x": {"source": "a"}, "speed": {"source": "b", "bandwidth_hz": 200.0},
     }}  # fmt: skip
@@ -290,7 +290,7 @@ def test_a_log_is_imported_in_one_step(tmp_path: Path, capsys: pytest.CaptureFix
     assert len(Recording.open(tmp_path / "g.mcap").table.channels) == 13
 
 
-def test_a_picture_shows_short_blows_of_long_signals(tmp_path: Path) -> None:
+def test_a_picture_shows_short_impacts_in_long_signals(tmp_path: Path) -> None:
     path, t = tmp_path / "x.csv", np.arange(6100) / 3000
     np.savetxt(path, np.column_stack([t, foreign.hammer(t), np.sin(40 * t)]), delimiter=",", comments="", fmt="%.6f",
                header="time,hammer [N],disk_x [mm]")  # fmt: skip
@@ -308,7 +308,7 @@ def test_a_picture_shows_short_blows_of_long_signals(tmp_path: Path) -> None:
     [("tach [V]", (0.1, 0.5), "keyphasor"), ("keyphasor", (0.3,), "keyphasor"), ("tach [V]", (0.3,), "speed"),
      ("gate [V]", (0.1, 0.5), "")],
 )  # fmt: skip
-def test_few_pulses_are_those_of_what_a_name_says(
+def test_few_pulses_are_interpreted_by_the_name(
     name: str, at_s: tuple[float, ...], channel: str, tmp_path: Path
 ) -> None:
     """A short log, or a slow shaft. If there was no impact, the template explains how to specify that."""
@@ -336,7 +336,7 @@ def test_few_pulses_are_those_of_what_a_name_says(
         (("x.csv", "-o", "o.mcap"), "the guess (--template writes it): time.rate_hz must be set"),
     ],
 )
-def test_wrong_input_is_one_line(
+def test_wrong_input_is_refused_in_one_line(
     arguments: tuple[str, ...],
     complaint: str,
     tmp_path: Path,

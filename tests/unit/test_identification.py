@@ -39,7 +39,7 @@ def run(*arguments: str | Path) -> int:
     return command("identify", *arguments)
 
 
-def test_writes_a_set_that_a_run_takes_and_a_report(
+def test_identification_writes_a_usable_parameter_set_and_a_report(
     file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     fitted, page = tmp_path / "fitted.toml", tmp_path / "page.html"
@@ -68,7 +68,7 @@ def test_writes_a_set_that_a_run_takes_and_a_report(
     assert sorted(entry.name for entry in tmp_path.iterdir()) == ["fitted.toml", "page.html"]
 
 
-def test_json_has_a_number_only_where_there_is_one(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_json_omits_missing_numbers(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(file, "--fit", "contact.friction,magnet.stiffness", "--from", "0", "--to", "0.018", "--json") == 0
     document = json.loads(capsys.readouterr().out)
     friction, magnet = document["values"]["contact.friction"], document["values"]["magnet.stiffness"]
@@ -79,7 +79,7 @@ def test_json_has_a_number_only_where_there_is_one(file: Path, capsys: pytest.Ca
     assert magnet["half_width_95"] > 0.0
 
 
-def test_bounds_decide_what_counts_as_seen(file: Path) -> None:
+def test_bounds_decide_which_values_are_identified(file: Path) -> None:
     recording = Recording.open(file)
 
     def half_width(given: dict[str, tuple[float, float]]) -> tuple[str, float]:
@@ -92,7 +92,7 @@ def test_bounds_decide_what_counts_as_seen(file: Path) -> None:
     assert half_width({"magnet.stiffness": (1.7 - wide / 2, 1.7 + wide / 2)})[0] == "not seen"
 
 
-def test_an_interval_wider_than_what_was_believed_is_no_result(file: Path) -> None:
+def test_an_interval_wider_than_the_prior_is_no_result(file: Path) -> None:
     recording = Recording.open(file)
     (unknown,) = ask(recording, Experiment.of(recording), ["hammer.1.force_n"]).unknowns
     finding = Finding(unknown, 110.0, 1.0, "identified", "identified")
@@ -125,7 +125,7 @@ def test_lost_samples_are_left_out(file: Path) -> None:
     assert whole.rows == window.rows
 
 
-def test_the_horizon_is_nearer_where_less_is_known(file: Path) -> None:
+def test_the_window_is_shorter_for_less_certain_starts(file: Path) -> None:
     recording = Recording.open(file)
     question = ask(recording, Experiment.of(recording), ["magnet.stiffness", "contact.restitution"])
     window = Window(question, 0.035)
@@ -154,7 +154,7 @@ def test_the_horizon_is_nearer_where_less_is_known(file: Path) -> None:
         (["--fit", "contact.friction", "-o", "fitted.json"], "ends in .toml"),
     ],
 )
-def test_wrong_input_is_one_line(
+def test_wrong_input_is_refused_in_one_line(
     file: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
 ) -> None:
     assert run(file, *arguments) == 2
@@ -174,7 +174,7 @@ def test_no_truth_is_read(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         ask(recording, Experiment.of(recording), [])
 
 
-def test_single_samples_that_are_far_off_count_less(file: Path) -> None:
+def test_outliers_have_less_weight(file: Path) -> None:
     recording = Recording.open(file)
     errors = []
     for robust in (False, True):
@@ -185,7 +185,7 @@ def test_single_samples_that_are_far_off_count_less(file: Path) -> None:
     assert errors[1] < 0.2 * errors[0]
 
 
-def test_a_wrong_model_gives_no_value(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_wrong_model_yields_no_value(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Recorded with a restitution of 0.88 and fitted with 0.9: friction and magnets would compensate for it."""
     wrong, fitted = tmp_path / "w.mcap", tmp_path / "w.toml"
     write_run(Simulation(load_scene("hammer", {"duration_s": 0.035, "contact.restitution": 0.88})), wrong)
@@ -215,7 +215,7 @@ def test_a_small_misfit_widens_the_intervals_by_its_size(lacking: float, widened
     assert (judged.inflation > 3.0) is widened
 
 
-def test_a_log_without_a_scene_takes_one_from_elsewhere(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_log_without_a_scene_uses_a_given_scene(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ("--fit", "magnet.stiffness", "--from", "0", "--to", "0.02", "--channels", "ring_x,ring_y", "--json")
     assert run(file, *arguments) == 0
     own = json.loads(capsys.readouterr().out)
@@ -225,13 +225,13 @@ def test_a_log_without_a_scene_takes_one_from_elsewhere(file: Path, capsys: pyte
     assert [channel["name"] for channel in given["channels"]] == ["ring_x", "ring_y"]
 
 
-def test_noise_is_measured_where_the_table_tells_none() -> None:
+def test_noise_is_measured_if_the_table_has_none() -> None:
     noise = np.random.default_rng(1).normal(0.0, 0.02, 4000)
     smooth = np.sin(np.linspace(0.0, 30.0, 4000))
     assert measured_noise(smooth + noise) == pytest.approx(0.02, rel=0.1)
 
 
-def test_samples_that_begin_after_the_impacts_are_refused(tmp_path: Path) -> None:
+def test_samples_starting_after_the_impacts_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "late.mcap"
     simulation = Simulation(load_scene("hammer", {"duration_s": 0.3}))
     write_run(simulation, path)
@@ -260,7 +260,7 @@ def test_a_late_begin_without_contact_needs_no_spread(quiet: Path, capsys: pytes
     assert abs(stiffness["value"] - 1.7) < 2.0 * stiffness["half_width_95"] < 1e-2
 
 
-def test_nobody_waits_for_what_is_fitted_along(quiet: Path) -> None:
+def test_nuisance_values_do_not_lengthen_the_window(quiet: Path) -> None:
     """Friction cannot be identified without contact: if requested, the window grows to the end of the samples."""
     recording = Recording.open(quiet)
 

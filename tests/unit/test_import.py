@@ -193,7 +193,7 @@ def test_wall_time_of_text(time: str, hour_utc: int, tmp_path: Path) -> None:
     assert any("no time zone" in remark for remark in conversion.remarks) == (len(time) == 19)
 
 
-def test_seconds_since_1970_tell_when_it_was(tmp_path: Path) -> None:
+def test_seconds_since_1970_give_the_date(tmp_path: Path) -> None:
     path = rows_csv(tmp_path / "x.csv", {"time": 1_800_000_000.0 + np.arange(100) / 100, "P_N [N]": np.arange(100.0)})
     conversion, _ = imported(tmp_path, [path], '[channels.P_N]\nsource = "P_N"\n')
     assert conversion.start.timestamp() == pytest.approx(1_800_000_000.0, abs=1e-3)
@@ -260,7 +260,7 @@ threshold = 2.5
 """
 
 
-def test_mdf_of_another_system_keeps_its_integers(daq_mdf: Path, tmp_path: Path) -> None:
+def test_a_foreign_mdf_keeps_its_integers(daq_mdf: Path, tmp_path: Path) -> None:
     conversion, recording = imported(tmp_path, [daq_mdf], MDF_MAPPING)
     codes = np.round(20_000 * np.sin(700 * np.arange(8192) / 51_200.0)).astype(int)
     codes[100:103] = 32_767
@@ -298,7 +298,7 @@ def test_mdf_masters_in_milliseconds_and_of_an_angle(tmp_path: Path) -> None:
         imported(tmp_path, [path], '[channels.P_N]\nsource = "b"\n', name="angle")
 
 
-def test_a_mean_is_taken_off_within_the_range(tmp_path: Path) -> None:
+def test_a_mean_is_subtracted_within_the_range(tmp_path: Path) -> None:
     t = np.arange(1000) / 1000
     path = rows_csv(
         tmp_path / "x.csv", {"time": t, "d [um]": np.where(t < 0.5, 7000.0, 30.0 + 10.0 * np.sign(t - 0.7495))}
@@ -310,7 +310,7 @@ def test_a_mean_is_taken_off_within_the_range(tmp_path: Path) -> None:
     np.testing.assert_allclose(samples["disk_x"], 0.01 * np.sign(samples.times_s - 0.2495), rtol=0, atol=1e-9)
 
 
-def test_the_noise_of_a_channel_is_told(tmp_path: Path) -> None:
+def test_the_noise_of_a_channel_is_reported(tmp_path: Path) -> None:
     """White noise of known size under a slow intermittent motion."""
     t = np.arange(20_000) / 10_000
     noise = 0.003 * np.random.default_rng(4).standard_normal(len(t))
@@ -325,7 +325,7 @@ def test_full_scale_counts_overrange(daq_mdf: Path, tmp_path: Path) -> None:
     assert {c.name: c.overrange for c in conversion.channels} == {"hammer": 3, "speed": 0}
 
 
-def test_wav_of_another_writer_shows_its_rails(tmp_path: Path) -> None:
+def test_a_foreign_wav_shows_clipped_samples(tmp_path: Path) -> None:
     path = tmp_path / "x.wav"
     codes = np.array([0, 1000, -32_768, 32_767, 5, -7], dtype="<i2")
     with wave.open(str(path), "wb") as file:
@@ -339,7 +339,7 @@ def test_wav_of_another_writer_shows_its_rails(tmp_path: Path) -> None:
     assert conversion.channels[0].overrange == 2
 
 
-def test_tdms_groups_start_when_they_say(tmp_path: Path) -> None:
+def test_tdms_groups_start_at_their_declared_times(tmp_path: Path) -> None:
     """Two groups of another writer, the second started 0.25 s later; integers with LabVIEW's linear scale."""
     from nptdms import ChannelObject, TdmsWriter
 
@@ -409,7 +409,7 @@ def test_parquet_with_instants_and_integers(tmp_path: Path) -> None:
     assert conversion.start.timestamp() == pytest.approx(1_800_000_000.5)
 
 
-def test_an_import_that_is_interrupted_leaves_nothing(daq_mdf: Path, tmp_path: Path) -> None:
+def test_an_interrupted_import_leaves_no_file(daq_mdf: Path, tmp_path: Path) -> None:
     path = tmp_path / "m.toml"
     path.write_text(MDF_MAPPING)
     conversion = convert([daq_mdf], mappings.load_mapping(path))
@@ -497,7 +497,7 @@ def test_two_clocks_are_aligned(method: str, ppm: float, within: float, tmp_path
         assert f"{ppm:+.0f}" in remark
 
 
-def test_files_lie_as_their_times_of_day_say(tmp_path: Path) -> None:
+def test_files_are_placed_by_their_times_of_day(tmp_path: Path) -> None:
     for name, late_ms in (("a.csv", 0), ("b.csv", 250)):
         rows = [
             f"2026-11-21 10:00:0{(n + late_ms) // 1000}.{(n + late_ms) % 1000:03d},{n + late_ms}" for n in range(900)
@@ -510,7 +510,7 @@ def test_files_lie_as_their_times_of_day_say(tmp_path: Path) -> None:
     np.testing.assert_allclose(samples["P_S"], samples["P_N"], atol=1e-6)
 
 
-def test_one_group_of_a_file_is_aligned_and_the_others_stay(tmp_path: Path) -> None:
+def test_one_group_of_a_file_is_aligned_without_the_others(tmp_path: Path) -> None:
     """A TDMS file of two devices: the second one's clock is 0.0123 s late, and only its group is shifted."""
     from nptdms import ChannelObject, TdmsWriter
 
@@ -546,7 +546,7 @@ source = "south"
         imported(tmp_path, [path], mapping.replace('scope = "group"\n', ""), name="file")
 
 
-def test_a_clock_that_is_some_ppm_off_is_put_right(tmp_path: Path) -> None:
+def test_a_clock_error_of_some_ppm_is_corrected(tmp_path: Path) -> None:
     """Stamps 12 ppm fast give a rate of 999.988 Hz: at 1000 Hz nothing may drift."""
     n = np.arange(40_000)
     t = n / 1000 * (1 + 12e-6)
@@ -607,7 +607,7 @@ def test_the_example_has_every_option_and_imports(tmp_path: Path) -> None:
     assert recording.samples("bearing").names == ("oil_temperature",)
 
 
-def test_missing_values_are_gaps_or_held_or_refused(tmp_path: Path) -> None:
+def test_missing_values_are_gaps_or_filled_or_refused(tmp_path: Path) -> None:
     path = tmp_path / "x.csv"
     lines = ["time,P_N [N]", *(f"{n / 1000},{'NaN' if n in (3, 4, 9) else n}" for n in range(20))]
     path.write_text("\n".join(lines) + "\n")
@@ -625,7 +625,7 @@ def test_missing_values_are_gaps_or_held_or_refused(tmp_path: Path) -> None:
         imported(tmp_path, [path], mapping + 'missing = "refuse"\n', name="refused")
 
 
-def test_samples_that_a_network_lost_are_gaps(tmp_path: Path) -> None:
+def test_samples_lost_in_a_network_are_gaps(tmp_path: Path) -> None:
     n = np.array([k for k in range(500) if k not in (50, 51, 300)])
     path = rows_csv(tmp_path / "x.csv", {"time": 7.0 + n / 1000, "P_N [N]": n * 1.0})
     _, recording = imported(tmp_path, [path], '[channels.P_N]\nsource = "P_N"\n')
@@ -635,7 +635,7 @@ def test_samples_that_a_network_lost_are_gaps(tmp_path: Path) -> None:
     assert recording.streams["rig/sensors/forces"].lost == 3
 
 
-def test_uneven_time_stamps_are_told_and_never_taken_for_even(tmp_path: Path) -> None:
+def test_uneven_time_stamps_are_reported_and_not_assumed_even(tmp_path: Path) -> None:
     generator = np.random.default_rng(3)
     t = np.arange(1000) / 1000 + generator.uniform(-2e-4, 2e-4, 1000)
     path = rows_csv(tmp_path / "x.csv", {"time": t, "P_N [N]": np.sin(20 * t)})
@@ -722,7 +722,9 @@ def test_a_delay_moves_a_channel_back(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".mf4", ".tdms", ".uff", ".csv", ".parquet", ".wav"])
-def test_there_and_back_again(suffix: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_export_and_import_reproduce_the_values(
+    suffix: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """rig simulate, export, import --template, import: the same values within half a count, by the commands alone."""
     source, other, back = tmp_path / "a.mcap", tmp_path / f"b{suffix}", tmp_path / "c.mcap"
     mapping = tmp_path / "m.toml"
@@ -758,7 +760,7 @@ def _counts(recording: Recording, group: str) -> np.ndarray:
     return np.concatenate([block.values for block in recording.blocks(f"rig/sensors/{group}")])
 
 
-def test_a_template_of_an_unknown_file_imports_as_it_is(daq_mdf: Path, tmp_path: Path) -> None:
+def test_a_template_of_an_unknown_file_imports_unchanged(daq_mdf: Path, tmp_path: Path) -> None:
     text = template([daq_mdf])
     assert text.count("PLEASE CHECK") == 2
     assert re.search(r"# bandwidth_hz = HZ +# PLEASE CHECK", text), "filters are what it cannot know"
@@ -852,7 +854,7 @@ X = '[channels.disk_x]\nsource = "x"\n'
         ("[experiment]\nscene = 'drop'\nset = { 'contact.frictoin' = 1 }\n" + X, "contact.frictoin must be"),
     ],
 )
-def test_wrong_mappings_are_one_line(
+def test_wrong_mappings_are_refused_in_one_line(
     mapping: str,
     message: str | None,
     tmp_path: Path,
@@ -890,7 +892,7 @@ def test_wrong_mappings_are_one_line(
         ("x.csv", b"time,x [mm]\n0,1\n1,2\n1,3\n0,4\n", "time stamps must be ascending"),
     ],
 )
-def test_damaged_files_are_one_line(
+def test_damaged_files_are_refused_in_one_line(
     name: str, content: bytes, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
@@ -918,7 +920,7 @@ def test_a_pipe_is_no_log_and_is_not_waited_for(name: str, tmp_path: Path) -> No
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.parametrize("suffix", [".tdms", ".uff"])
 @pytest.mark.parametrize("kept", [0.02, 0.6, 0.97])
-def test_a_file_that_is_cut_off_is_one_line(
+def test_a_truncated_file_is_refused_in_one_line(
     suffix: str, kept: float, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     whole, cut = tmp_path / f"whole{suffix}", tmp_path / f"cut{suffix}"
@@ -954,13 +956,13 @@ def test_a_file_that_is_cut_off_is_one_line(
     assert "m.toml" not in printed.err.split("instead")[0]
 
 
-def test_a_group_that_is_none_is_told(daq_mdf: Path, tmp_path: Path) -> None:
+def test_an_unknown_group_is_reported(daq_mdf: Path, tmp_path: Path) -> None:
     (tmp_path / "m.toml").write_text("[channels.disk_y]\nsource = 'Speed'\ngroup = 'sluggish'\n")
     with pytest.raises(InputError, match=r"disk_y\.group must be one of Fast, Slow; instead received 'sluggish'"):
         convert([daq_mdf], mappings.load_mapping(tmp_path / "m.toml"))
 
 
-def test_the_import_is_told_in_a_line_a_channel(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_import_is_reported_in_one_line_per_channel(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "log.csv"
     t = np.arange(500) / 1000.0
     rows_csv(path, {"time": t, "a": np.sin(t), "b": np.cos(t), "c": np.sin(t)})
@@ -979,7 +981,7 @@ def test_the_import_is_told_in_a_line_a_channel(tmp_path: Path, capsys: pytest.C
     assert "jitter" not in text
 
 
-def test_what_is_not_known_of_an_imported_channel_is_not_told(
+def test_unknown_properties_of_an_imported_channel_are_omitted(
     daq_mdf: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     imported(tmp_path, [daq_mdf], template([daq_mdf]))
@@ -991,7 +993,7 @@ def test_what_is_not_known_of_an_imported_channel_is_not_told(
     assert "parameters" not in printed
 
 
-def test_a_template_says_what_else_there_is(daq_mdf: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_template_lists_the_other_signals(daq_mdf: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     target = tmp_path / "t.toml"
     with pytest.raises(SystemExit):
         main(["import", str(daq_mdf), "--template", str(target)])
@@ -1007,7 +1009,7 @@ def test_a_template_says_what_else_there_is(daq_mdf: Path, tmp_path: Path, capsy
     assert mapping.experiment
 
 
-def test_a_comment_that_is_json_is_told_by_its_label(tmp_path: Path) -> None:
+def test_a_json_comment_is_recognised_by_its_label(tmp_path: Path) -> None:
     from replays.recordings.formats.guessing.template import label_of
     from replays.recordings.formats.source import Entry
 

@@ -49,7 +49,7 @@ def imported(folder: Path, code: str, script: str = "script.py") -> str:
 
 
 @pytest.mark.parametrize("package", ["drivers", "recorder", "replays"])
-def test_a_folder_of_a_user_s_own_hides_no_module_of_ours(package: str, tmp_path: Path) -> None:
+def test_a_users_folder_hides_no_module_of_the_rig(package: str, tmp_path: Path) -> None:
     (tmp_path / package).mkdir()
     (tmp_path / package / "__init__.py").write_text("MINE = True")
     (tmp_path / package / "mine.py").write_text("VALUE = 7")
@@ -61,7 +61,7 @@ def test_a_folder_of_a_user_s_own_hides_no_module_of_ours(package: str, tmp_path
 
 @pytest.mark.parametrize("first", ["", "import {package}\n"])
 @pytest.mark.parametrize("package", ["drivers", "recorder", "replays"])
-def test_a_file_of_a_user_s_own_hides_no_module_of_ours(package: str, first: str, tmp_path: Path) -> None:
+def test_a_users_file_hides_no_module_of_the_rig(package: str, first: str, tmp_path: Path) -> None:
     (tmp_path / f"{package}.py").write_text("MINE = True")
     module = {"drivers": "drivers.link", "recorder": "recorder.viewer", "replays": "replays.report"}[package]
     code = f"{first}import rig, {package}, {module}\n".format(package=package)
@@ -69,12 +69,12 @@ def test_a_file_of_a_user_s_own_hides_no_module_of_ours(package: str, first: str
 
 
 @pytest.mark.parametrize("package", ["drivers", "recorder", "replays"])
-def test_a_script_with_a_name_of_ours_runs_once(package: str, tmp_path: Path) -> None:
+def test_a_script_named_like_a_module_runs_once(package: str, tmp_path: Path) -> None:
     code = f"print('once')\nimport rig, {package}\nprint({package}.__path__[0].endswith('{package}'))"
     assert imported(tmp_path, code, script=f"{package}.py") == "once\nTrue"
 
 
-def test_our_client_is_known_by_its_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_client_is_recognised_by_its_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "link").symlink_to(import_paths.PLACE)
     monkeypatch.setattr(import_paths, "PLACE", str(tmp_path / "link"))
     assert rig.connect.__module__ == "drivers.client"
@@ -85,7 +85,7 @@ def test_our_client_is_known_by_its_folder(tmp_path: Path, monkeypatch: pytest.M
         _ = rig.connect
 
 
-def test_a_module_of_a_user_s_own_in_the_place_of_ours_is_named(tmp_path: Path) -> None:
+def test_a_users_module_that_replaces_one_of_the_rig_is_named(tmp_path: Path) -> None:
     (tmp_path / "drivers").mkdir()
     (tmp_path / "drivers/__init__.py").touch()
     (tmp_path / "drivers/client.py").touch()

@@ -155,7 +155,7 @@ def group_of(name: str) -> str:
     return group
 
 
-def test_every_instrument_tells_who_it_is_and_how_it_is_calibrated(bench: Bench) -> None:
+def test_every_instrument_reports_identity_and_calibration(bench: Bench) -> None:
     for name in DRIVERS:
         sheet = bench.open(name).identify()
         assert sheet.virtual
@@ -197,7 +197,7 @@ def test_channels_and_a_slower_rate_can_be_chosen(bench: Bench) -> None:
     np.testing.assert_allclose(samples.times_s, np.arange(rows) * 7 / 20_000.0, atol=1e-12)
 
 
-def test_what_cannot_be_configured_is_refused(bench: Bench) -> None:
+def test_an_invalid_configuration_is_refused(bench: Bench) -> None:
     driver = bench.open("force")
     with pytest.raises(RefusedError, match="rate_hz must be 20000 divided by a whole number; instead received 3000"):
         driver.configure(rate_hz=3000.0)
@@ -239,7 +239,7 @@ def test_commands_are_acknowledged_with_their_time_or_refused_with_the_rigs_text
     assert len(bench.rig.commands) == 2
 
 
-def test_numbers_that_are_none_never_reach_the_rig(bench: Bench) -> None:
+def test_invalid_numbers_never_reach_the_rig(bench: Bench) -> None:
     with pytest.raises(RefusedError, match="finite"):
         bench.open("hammer").trigger(force_n=float("nan"))
     with pytest.raises(RefusedError, match="finite"):
@@ -247,7 +247,7 @@ def test_numbers_that_are_none_never_reach_the_rig(bench: Bench) -> None:
     assert bench.rig.commands == []
 
 
-def test_a_command_goes_through_while_data_stream(bench: Bench) -> None:
+def test_a_command_is_executed_while_data_stream(bench: Bench) -> None:
     hammer = bench.open("hammer")
     hammer.start()
     bench.rig.publish("hammer", blocks=5)
@@ -256,7 +256,7 @@ def test_a_command_goes_through_while_data_stream(bench: Bench) -> None:
     np.testing.assert_allclose(hammer.read(10 * BLOCK).values, values_of("hammer", 0, 10 * BLOCK), rtol=0, atol=1e-9)
 
 
-def test_twins_and_daq_read_nothing_but_sensors_and_the_runs_events(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_twins_and_daq_read_only_sensors_and_events(monkeypatch: pytest.MonkeyPatch) -> None:
     read, good = set(), MemoryClient.subscribe
 
     def subscribe(client: MemoryClient, key: str, *arguments: Any, **settings: Any) -> None:
@@ -272,7 +272,7 @@ def test_twins_and_daq_read_nothing_but_sensors_and_the_runs_events(monkeypatch:
     assert read == {f"rig/sensors/{group_of(name)}" for name in SAMPLERS} | {"rig/events"}
 
 
-def test_instruments_find_a_rig_that_is_started_again() -> None:
+def test_instruments_reconnect_to_a_restarted_rig() -> None:
     endpoint = free_endpoint()
     with ExitStack() as closing:
         first = ZenohServer(endpoint)
@@ -332,7 +332,7 @@ def test_the_magnet_measures_nothing(bench: Bench) -> None:
         magnet.ask(protocol.Start(), protocol.Started)
 
 
-def test_time_outs_are_errors_and_lose_nothing(bench: Bench) -> None:
+def test_timeouts_raise_and_lose_nothing(bench: Bench) -> None:
     driver = bench.open("force")
     driver.start()
     with pytest.raises(LinkTimeoutError, match=r"force: 0 of 10 rows came in 0\.05 s"):
@@ -361,7 +361,7 @@ def test_a_stream_ends_when_it_is_stopped_and_when_the_run_ends(bench: Bench) ->
         driver.read(1)
 
 
-def test_closing_twice_is_closing_once_and_a_closed_instrument_says_so(bench: Bench) -> None:
+def test_an_instrument_can_be_closed_twice_and_then_refuses_requests(bench: Bench) -> None:
     for name in DRIVERS:
         driver = bench.open(name)
         driver.identify()
@@ -400,7 +400,7 @@ def test_closing_a_driver_stops_its_stream_and_no_other(memory_bench: Bench) -> 
         assert twin.running is runs
 
 
-def test_the_other_kind_of_instrument_is_not_taken_for_the_right_one(memory_bench: Bench) -> None:
+def test_another_kind_of_instrument_is_refused(memory_bench: Bench) -> None:
     driver = Hammer(memory_bench.open_link("force"), timeout_s=0.2)
     # Its reply has the instrument's own number, which a hammer does not send.
     with pytest.raises(LinkTimeoutError, match="did not reply to Identify"):
@@ -409,7 +409,7 @@ def test_the_other_kind_of_instrument_is_not_taken_for_the_right_one(memory_benc
     assert memory_bench.twin("force").refused == 1
 
 
-def test_nobody_at_the_other_end_is_an_error() -> None:
+def test_a_link_without_an_instrument_raises() -> None:
     line, path = open_pty()
     with pytest.raises(LinkTimeoutError, match=r"force did not reply to Identify in 0\.1 s"):
         Force.open(f"pty:{path}", timeout_s=0.1)
@@ -420,7 +420,7 @@ def test_nobody_at_the_other_end_is_an_error() -> None:
         Force.open("can:virtual:nobody", timeout_s=0.2)
 
 
-def test_a_rig_that_has_gone_is_told(bench: Bench) -> None:
+def test_a_missing_rig_is_reported(bench: Bench) -> None:
     driver = bench.open("proximity")
     driver.start()
     bench.rig.server.close()
@@ -430,7 +430,7 @@ def test_a_rig_that_has_gone_is_told(bench: Bench) -> None:
         driver.identify()
 
 
-def test_an_instrument_that_is_switched_off_is_told(bench: Bench) -> None:
+def test_a_stopped_instrument_is_reported(bench: Bench) -> None:
     driver = bench.open("proximity")
     driver.start()
     bench.rig.publish("probes")
@@ -446,7 +446,7 @@ def test_an_instrument_that_is_switched_off_is_told(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize("name", DRIVERS)
-def test_the_asyncio_forms_do_the_same(memory_bench: Bench, name: str) -> None:
+def test_the_asyncio_drivers_agree(memory_bench: Bench, name: str) -> None:
     async def use() -> None:
         kind: Any = DRIVERS[name][1]
         async with kind.from_link(memory_bench.open_link(name)) as instrument:
@@ -531,7 +531,7 @@ def test_a_wrong_version_and_a_wrong_length_are_named() -> None:
         codec.decode(good[:6])
 
 
-def test_a_host_that_does_not_read_loses_rows_and_is_told_how_many(memory_bench: Bench) -> None:
+def test_a_host_that_does_not_read_loses_a_reported_number_of_rows(memory_bench: Bench) -> None:
     near, far = memory.pair(room=5)
     twin = memory_bench.twins.serve(KINDS["force"], MessagePort(near, "memory:", room=16_000))
     driver = Force(far)
@@ -568,7 +568,7 @@ def test_a_second_host_ends_the_stream_of_the_first() -> None:
         "can:nothing:can0", "can:virtual:x?fd", "usb:3", "http://127.0.0.1",
     ],
 )  # fmt: skip
-def test_nonsense_is_one_clear_line(url: str) -> None:
+def test_invalid_input_is_refused_in_one_line(url: str) -> None:
     with pytest.raises(InputError, match=r"must be .*; instead received") as caught:
         open_link(url, Address("hammer", 4))
     assert "\n" not in str(caught.value)
@@ -597,7 +597,7 @@ def test_stuffing(data: str, stuffed: str) -> None:
     assert frames.unstuff(bytes.fromhex(stuffed)).hex() == data
 
 
-def test_stuffing_goes_both_ways_for_all_sorts_of_bytes() -> None:
+def test_stuffing_is_reversible_for_any_bytes() -> None:
     noise = random.Random(3)
     for length in [*range(600), 5000]:
         for zeros in (0.0, 0.01, 0.5):
@@ -608,7 +608,7 @@ def test_stuffing_goes_both_ways_for_all_sorts_of_bytes() -> None:
             assert frames.unstuff(stuffed) == data
 
 
-def test_the_check_is_that_of_the_catalogues() -> None:
+def test_the_checksum_agrees_with_the_catalogue() -> None:
     # CRC-16/XMODEM of "123456789" is 0x31C3.
     assert frames.encode_frame(b"123456789") == b"\x00\x0c123456789\x31\xc3\x00"
 
@@ -655,7 +655,7 @@ def test_a_spoilt_line_is_counted_and_used_again(memory_bench: Bench) -> None:
     assert line.lost > 0
 
 
-def test_a_line_that_nobody_reads_holds_nobody_up() -> None:
+def test_an_unread_line_does_not_block_the_writer() -> None:
     line, path = open_pty()
     host = open_serial(path)
     with sooner_than(PATIENCE_S), pytest.raises(LinkTimeoutError, match="accepted no data"):

@@ -22,7 +22,7 @@ def test_command_prints_the_page(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.parametrize("channel", default_table().channels.values(), ids=lambda channel: channel.name)
-def test_every_channel_is_on_it_with_its_calibration(channel) -> None:
+def test_every_channel_is_on_the_page_with_its_calibration(channel) -> None:
     (row,) = [
         row
         for row in ROWS
@@ -37,7 +37,7 @@ def test_every_channel_is_on_it_with_its_calibration(channel) -> None:
 
 
 @pytest.mark.parametrize("table", TRUTH)
-def test_every_column_of_the_truth_is_on_it_in_order(table: str) -> None:
+def test_every_column_of_the_truth_is_on_the_page_in_order(table: str) -> None:
     units = {signal.name: signal.unit for signal in ROW}
     start = ROWS.index(f"### `{wire.truth_key(table)}`")
     rows = [row for row in ROWS[start : start + 6 + len(TRUTH[table])] if row.startswith("| ") and "`" in row]
@@ -48,12 +48,12 @@ def test_every_column_of_the_truth_is_on_it_in_order(table: str) -> None:
 @pytest.mark.parametrize(
     "key", [wire.EVENTS, wire.STATUS, wire.CATALOGUE, wire.PARAMETERS, wire.SCENE, wire.EDGES, wire.ALIVE]
 )
-def test_every_key_is_on_it(key: str) -> None:
+def test_every_key_is_on_the_page(key: str) -> None:
     assert f"`{key}`" in page()
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_every_command_is_on_it_with_its_fields_and_ranges(name: str) -> None:
+def test_every_command_is_on_the_page_with_its_fields_and_ranges(name: str) -> None:
     (row,) = [row for row in ROWS if row.startswith(f"| `{wire.command_key(name)}`")]
     for field, about in COMMANDS[name].model_fields.items():
         if field == "command":

@@ -100,7 +100,7 @@ def test_quantities_read_closed_forms() -> None:
     assert math.isnan(QUANTITIES["whirl_frequency"].read(apart))
 
 
-def test_errors_are_parts_of_the_value_and_a_wrong_outcome_is_infinite() -> None:
+def test_errors_are_relative_and_infinite_for_a_wrong_outcome() -> None:
     for name in ("spin", "force_ripple", "contact_fraction"):
         assert QUANTITIES[name].error(6.3, 6.0) == pytest.approx(0.05)
         assert QUANTITIES[name].error(math.nan, 6.0) == QUANTITIES[name].error(1e-9, 0.0) == math.inf
@@ -124,12 +124,12 @@ WHIRL = Ending(touches=True, contact_share=1.0, turns=-40.0, rolling_share=1.0)
         ({"contact_share": 0.0, "touches": False}, "flight", False),
     ],
 )
-def test_outcomes_have_a_word_and_limits_that_are_soft(change: dict[str, float], word: str, alike: bool) -> None:
+def test_outcomes_have_a_name_and_soft_limits(change: dict[str, float], word: str, alike: bool) -> None:
     other = WHIRL._replace(**change)
     assert (other.word, WHIRL.alike(other), other.alike(WHIRL)) == (word, alike, alike)
 
 
-def test_time_to_roll_sees_every_slip() -> None:
+def test_time_to_roll_detects_every_slip() -> None:
     scene = load_scene("hammer", {"duration_s": 0.06})
     run = simulate(scene)  # with rows every 50 us
     radius = run.simulation.model.constants.shaft.radius
@@ -139,7 +139,7 @@ def test_time_to_roll_sees_every_slip() -> None:
     assert found.values["time_to_roll"] == pytest.approx(last + 25e-6, abs=26e-6)
 
 
-def test_a_model_without_friction_has_another_outcome_whatever_is_asked_for() -> None:
+def test_a_model_without_friction_has_another_outcome_for_any_quantity() -> None:
     scene = load_scene("hammer")
     full = Candidate(ModelLevels(), "torque", "split", scene.engine.step_us, scene.engine.tolerance)
     whirl, flight = (
@@ -165,7 +165,7 @@ def test_a_first_run_in_short_blocks_is_no_cost(monkeypatch: pytest.MonkeyPatch)
         assert (measured.cpu_s * 0.1, measured.runs) == pytest.approx((cost, 1))
 
 
-def test_a_run_is_given_up_by_its_processor_time(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_is_stopped_at_its_limit_of_processor_time(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = iter(range(0, 10**9, 1000))
     monkeypatch.setattr("replays.studies.common.run.time.perf_counter", lambda: next(clock))  # a busy machine
     scene = load_scene("hammer", {"duration_s": 0.1})
@@ -175,7 +175,7 @@ def test_a_run_is_given_up_by_its_processor_time(monkeypatch: pytest.MonkeyPatch
     assert failures[1].startswith("given up after 0 s")
 
 
-def test_what_saves_less_than_a_tenth_is_not_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_level_that_saves_less_than_a_tenth_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     extra = {"cylinders": 0.5, "map": 0.05, "euler": 0.05, "two-houses": 0.4, "inner-house": 0.2, "exact": 0.5}
 
     def cost(candidate: Candidate) -> float:
@@ -212,7 +212,7 @@ def test_what_saves_less_than_a_tenth_is_not_left_out(monkeypatch: pytest.Monkey
     assert (again.picked.candidate, list(again.savings)) == (again.given.candidate, ["magnet"])
 
 
-def test_a_pick_has_no_companion_and_an_old_one_what_the_scene_has(found: Ladder) -> None:
+def test_a_stored_choice_has_no_companion_and_an_old_one_the_scenes(found: Ladder) -> None:
     assert (found.given.candidate.companion, found.picked.candidate.companion) == (True, False)
     pick = pick_of(found).model_copy(update={"engine": "split", "step_us": 25, "engine_tolerance": 3e-4})
     for companion, has in ((pick.companion, False), (None, True)):
@@ -220,7 +220,7 @@ def test_a_pick_has_no_companion_and_an_old_one_what_the_scene_has(found: Ladder
         assert parse_scene(applied).engine.companion == has
 
 
-def test_rungs_are_the_models_own_and_are_tried_one_at_a_time(found: Ladder) -> None:
+def test_levels_are_those_of_the_model_and_are_tried_one_at_a_time(found: Ladder) -> None:
     assert LEVELS["stator"] == ("rigid", "inner-house", "two-houses")
     singles = [step.label for step in found.steps if step.stage == "single"]
     assert singles == [f"{level} {rung}" for level, rungs in LEVELS.items() for rung in rungs[:-1]]
@@ -229,7 +229,7 @@ def test_rungs_are_the_models_own_and_are_tried_one_at_a_time(found: Ladder) -> 
     assert all(part > MIN_SAVING for part in found.savings.values())
 
 
-def test_a_pick_meets_its_tolerance_as_it_will_run(found: Ladder) -> None:
+def test_a_choice_meets_its_tolerance_in_its_final_form(found: Ladder) -> None:
     picked, errors = found.picked, found.picked_errors
     assert picked is not None
     assert errors is not None
@@ -252,7 +252,7 @@ def test_errors_are_the_same_each_time(found: Ladder) -> None:
     assert single[0] == single[1]
 
 
-def test_document_and_pictures_hold_the_evidence(found: Ladder, tmp_path: Path) -> None:
+def test_document_and_pictures_contain_the_evidence(found: Ladder, tmp_path: Path) -> None:
     document = json.loads(json.dumps(ladder_document(found), allow_nan=False))
     assert {entry["name"] for entry in document["quantities"]} == set(found.tolerances)
     assert all(entry["reference_error"] < entry["tolerance"] for entry in document["quantities"])
@@ -262,7 +262,7 @@ def test_document_and_pictures_hold_the_evidence(found: Ladder, tmp_path: Path) 
         assert file.stat().st_size > 20_000
 
 
-def test_a_pick_comes_into_force_and_says_so(found: Ladder, path: Path) -> None:
+def test_a_stored_choice_is_applied_with_a_message(found: Ladder, path: Path) -> None:
     pick = pick_of(found)
     write_pick(path, str(path), pick)
     text = path.read_text(encoding="utf-8")
@@ -303,7 +303,7 @@ def test_only_the_table_is_replaced(found: Ladder, end: str) -> None:
     assert data["sensors"] == {"noise": False}
 
 
-def test_text_that_hides_a_pick_is_left_alone(found: Ladder) -> None:
+def test_text_that_hides_a_choice_is_not_changed(found: Ladder) -> None:
     with pytest.raises(InputError, match="--write"):
         with_pick('title = """\n[pick]\n"""\n', pick_of(found))
 
@@ -341,7 +341,9 @@ def test_tables_are_legible(found: Ladder) -> None:
         check_legible(table)
 
 
-def test_no_pick_is_one_line(capsys: pytest.CaptureFixture[str], path: Path, tmp_path: Path) -> None:
+def test_a_search_without_a_choice_prints_one_line(
+    capsys: pytest.CaptureFixture[str], path: Path, tmp_path: Path
+) -> None:
     line = refused(capsys, "simulate", str(path), "-o", str(tmp_path / "x.csv"))
     assert 'fidelity must be "given" until' in line
 
@@ -359,11 +361,13 @@ def test_no_pick_is_one_line(capsys: pytest.CaptureFixture[str], path: Path, tmp
         (("-q", "spin", "-t", "1e-14", "--set", "duration_s=0.1"), "--tolerance must be at least"),
     ],
 )
-def test_wrong_input_is_one_line(capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], says: str) -> None:
+def test_wrong_input_is_refused_in_one_line(
+    capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], says: str
+) -> None:
     assert says in refused(capsys, "ladder", "hammer", *arguments)
 
 
-def test_a_quantity_that_is_rounding_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_quantity_at_rounding_level_is_named(capsys: pytest.CaptureFixture[str]) -> None:
     line = refused(capsys, "ladder", "drop", "-q", "spin", "-t", "1", "--set", "duration_s=0.1")
     assert "--quantity must be one that two accurate engines agree on in scene drop; instead received 'spin'" in line
 

@@ -36,7 +36,7 @@ def test_table_names_every_law_and_marks_those_in_use(capsys: pytest.CaptureFixt
     assert "returns 0.913 where 0.9 is asked" in lines[-1]
 
 
-def test_document_holds_both_families(capsys: pytest.CaptureFixture[str]) -> None:
+def test_document_contains_both_families(capsys: pytest.CaptureFixture[str]) -> None:
     found = document(capsys)
     assert [law["name"] for law in found["damping"]] == list(DAMPING)
     assert [law["name"] for law in found["stiffness"]] == list(STIFFNESS)
@@ -52,7 +52,7 @@ def test_document_holds_both_families(capsys: pytest.CaptureFixture[str]) -> Non
     ]
 
 
-def test_restitution_can_be_asked_for(capsys: pytest.CaptureFixture[str]) -> None:
+def test_restitution_can_be_selected(capsys: pytest.CaptureFixture[str]) -> None:
     found = document(capsys, "--restitution", "0.5")
     assert found["restitution"] == 0.5
     returned = {law["name"]: law["returned"] for law in found["damping"]}
@@ -69,7 +69,7 @@ def test_parameters_can_be_changed(capsys: pytest.CaptureFixture[str]) -> None:
     assert found["in_use"]["fit_error"] == entry["fit_error"] > 0.0
 
 
-def test_given_numbers_are_compared_as_deep(capsys: pytest.CaptureFixture[str]) -> None:
+def test_given_numbers_are_compared_at_equal_depth(capsys: pytest.CaptureFixture[str]) -> None:
     found = document(capsys, "--set", "contact.stiffness=2e10", "--set", "contact.damping_factor=0.3")
     assert found["in_use"]["stiffness_law"] is None
     assert not any(law["in_use"] for law in found["damping"] + found["stiffness"])
@@ -79,7 +79,7 @@ def test_given_numbers_are_compared_as_deep(capsys: pytest.CaptureFixture[str]) 
     assert linear["depth_um"] == pytest.approx(hertz["depth_um"], rel=0.1)
 
 
-def test_law_that_does_not_hold_is_shown_as_such(capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_inapplicable_law_is_marked(capsys: pytest.CaptureFixture[str]) -> None:
     found = document(capsys, "--set", "ring.clearance=15")
     refused = {law["name"]: law["refused"] for law in found["stiffness"] if law["refused"]}
     assert list(refused) == ["pereira-cylinder"]
@@ -134,7 +134,9 @@ def test_picture_labels_every_axis_and_law(monkeypatch: pytest.MonkeyPatch, tmp_
         (["nonsense"], "parameters must be one of"),
     ],
 )
-def test_wrong_input_ends_in_one_line(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_wrong_input_is_refused_in_one_line(
+    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     with pytest.raises(SystemExit) as end:
         main(["laws", *arguments])
     assert end.value.code == 2
@@ -144,7 +146,7 @@ def test_wrong_input_ends_in_one_line(arguments: list[str], message: str, capsys
     assert captured.out == ""
 
 
-def test_params_tells_how_far_the_fit_is_off(capsys: pytest.CaptureFixture[str]) -> None:
+def test_params_shows_the_error_of_the_fit(capsys: pytest.CaptureFixture[str]) -> None:
     told = shown(capsys, "params", "--set", "contact.stiffness=johnson-cylinder")
     rows = {line.split()[0]: line.split() for line in told.splitlines() if line.startswith("contact.")}
     assert rows["contact.stiffness"][1].startswith("8.91")

@@ -35,7 +35,7 @@ def lean(code: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([sys.executable, "-c", program], cwd=ROOT, text=True, capture_output=True, timeout=120)
 
 
-def test_the_extra_is_what_the_message_takes_it_for() -> None:
+def test_the_message_names_the_extra() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     extra = {re.split(r"[>=<\[]", line)[0] for line in project["optional-dependencies"]["full"]}
     assert {name.lower() for module in FULL for name in packages_distributions()[module]} == extra
@@ -46,7 +46,7 @@ def test_clients_need_no_more_than_the_lean_install() -> None:
     assert (done.returncode, done.stderr) == (0, "")
 
 
-def test_what_needs_the_whole_rig_says_how_to_get_it() -> None:
+def test_commands_of_the_full_install_explain_how_to_get_it() -> None:
     done = lean("from rig.cli.main import main; main(['simulate', 'hammer', '-o', 'never.csv'])")
     need = r"numba, which comes with the whole rig: pip install 'rotor-stator-rig\[full\]'"
     assert done.returncode == 2
@@ -80,7 +80,7 @@ def test_the_help_names_the_commands_that_need_the_whole_rig(tmp_path: Path) -> 
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_csv_of_the_lean_install_is_that_of_the_whole_rig(tmp_path: Path) -> None:
+def test_the_lean_install_writes_the_same_csv(tmp_path: Path) -> None:
     from rig.cli.main import main
 
     for unit in ("engineering", "counts"):

@@ -27,7 +27,7 @@ class Decay:
         return np.column_stack([decay, -values[0] * TIMES * decay])
 
 
-def test_values_come_back_in_few_runs_and_the_slopes_of_the_last_step_with_them() -> None:
+def test_a_fit_needs_few_runs_and_returns_the_last_slopes() -> None:
     model = Decay()
     found = fit(model.residuals, model.slopes, np.array([1.0, 1.0]), rounds=10)
     assert found is not None
@@ -38,7 +38,7 @@ def test_values_come_back_in_few_runs_and_the_slopes_of_the_last_step_with_them(
     assert model.runs <= 8
 
 
-def test_a_start_that_the_model_does_not_take_is_no_fit_and_a_step_there_is_shortened() -> None:
+def test_an_invalid_start_is_no_fit_and_an_invalid_step_is_shortened() -> None:
     model = Decay(least=2.9)
     assert fit(model.residuals, model.slopes, np.array([2.0, 1.0]), rounds=3) is None
     found = fit(model.residuals, model.slopes, np.array([2.0, 6.0]), rounds=10)
@@ -48,7 +48,7 @@ def test_a_start_that_the_model_does_not_take_is_no_fit_and_a_step_there_is_shor
 
 
 @pytest.mark.parametrize(("limit", "expected"), [({"farthest": 2.5}, 2.5), ({"longest": 0.25}, 1.25)])
-def test_no_value_goes_further_and_no_step_is_longer_than_it_may(limit: dict[str, float], expected: float) -> None:
+def test_values_and_steps_stay_within_their_bounds(limit: dict[str, float], expected: float) -> None:
     model = Decay()
     rounds = 1 if "longest" in limit else 10
     found = fit(model.residuals, model.slopes, np.array([1.0, 1.0]), rounds=rounds, **limit)
@@ -56,7 +56,7 @@ def test_no_value_goes_further_and_no_step_is_longer_than_it_may(limit: dict[str
     assert np.abs(found.values).max() == pytest.approx(expected, abs=1e-6)
 
 
-def test_what_acts_on_nothing_stays() -> None:
+def test_a_value_without_effect_is_kept() -> None:
     start = np.array([1.0])
     found = fit(lambda _: np.ones(5), lambda *_: np.zeros((5, 1)), start, rounds=5)
     assert found is not None

@@ -57,7 +57,7 @@ def events_of(rig: Running) -> list[tuple[int, str, str]]:
     return [(event["tick"], event["device"], event["state"]) for event in rig.listener.named("device")]
 
 
-def test_no_block_is_run_before_all_devices_are_done_and_what_they_sent_before_is_exact() -> None:
+def test_a_block_waits_for_all_devices_and_their_commands_are_exact() -> None:
     with running() as rig:
         one, two = Device(rig, "one"), Device(rig, "two")
         assert (one.join().tick, two.join().tick) == (0, 0)
@@ -90,7 +90,7 @@ def test_no_block_is_run_before_all_devices_are_done_and_what_they_sent_before_i
     assert rig.summary["commands"] == 8, "what is done once a block is not counted"
 
 
-def test_a_device_that_hangs_is_put_out_and_the_rig_goes_on_with_the_others() -> None:
+def test_a_device_that_hangs_is_removed_and_the_rig_continues() -> None:
     with running() as rig:
         well, ill = Device(rig, "well"), Device(rig, "ill")
         well.join()
@@ -117,7 +117,7 @@ def test_a_device_that_hangs_is_put_out_and_the_rig_goes_on_with_the_others() ->
 
 
 @pytest.mark.parametrize("said", [BLOCK - 1, 2 * BLOCK, 2**62])
-def test_a_device_that_is_done_with_what_is_not_there_is_put_out(said: int) -> None:
+def test_a_device_that_reports_a_future_block_is_removed(said: int) -> None:
     with running() as rig:
         device = Device(rig, "a")
         device.join()
@@ -134,7 +134,7 @@ def test_a_device_that_is_done_with_what_is_not_there_is_put_out(said: int) -> N
         assert rig.console.step(BLOCK).lost == {}
 
 
-def test_a_device_that_leaves_in_the_middle_of_a_step_holds_up_nobody() -> None:
+def test_a_device_that_leaves_within_a_step_does_not_block_others() -> None:
     with running() as rig:
         device = Device(rig, "a")
         device.join()
@@ -145,7 +145,7 @@ def test_a_device_that_leaves_in_the_middle_of_a_step_holds_up_nobody() -> None:
         assert len(device.ends) == 1, "nobody is told where nobody has joined"
 
 
-def test_the_step_to_the_end_of_a_scene_is_answered_when_all_are_done_with_it() -> None:
+def test_the_last_step_is_answered_when_all_devices_are_done() -> None:
     with running(duration_s=0.02) as rig:
         device = Device(rig, "a")
         device.join()
@@ -198,7 +198,7 @@ def test_a_stop_does_not_wait_for_devices() -> None:
         ("leave", {"device": "b"}, "leave.device must be one that has joined"),
     ],
 )
-def test_what_is_malformed_or_of_nobody_is_refused_and_changes_nothing(
+def test_malformed_or_unknown_reports_are_refused_without_effect(
     command: str, fields: dict[str, Any], says: str
 ) -> None:
     with running() as rig:
@@ -208,7 +208,7 @@ def test_what_is_malformed_or_of_nobody_is_refused_and_changes_nothing(
         assert [row["state"] for row in rig.console.status()["devices"]] == ["joined"]
 
 
-def test_nobody_is_waited_for_but_in_lockstep() -> None:
+def test_devices_are_waited_for_only_in_lockstep() -> None:
     with (
         Running(FakeSimulation(duration_s=None), FreeRun()) as rig,
         pytest.raises(RefusedError, match="join must be sent to a rig that runs with --pace lockstep; instead"),
@@ -216,7 +216,7 @@ def test_nobody_is_waited_for_but_in_lockstep() -> None:
         rig.console.join()
 
 
-def test_of_too_many_devices_those_that_are_lost_are_forgotten_first() -> None:
+def test_lost_devices_are_removed_first_when_there_are_too_many() -> None:
     with running() as rig:
         for n in range(64):
             rig.console.join(f"device {n}")
@@ -230,7 +230,7 @@ def test_of_too_many_devices_those_that_are_lost_are_forgotten_first() -> None:
         assert "device 5" not in names
 
 
-def test_what_two_devices_command_at_one_tick_is_taken_in_the_order_of_their_names() -> None:
+def test_commands_of_two_devices_at_one_tick_are_ordered_by_name() -> None:
     with running() as rig:
         first, second = Device(rig, "a"), Device(rig, "b")
         first.join()
@@ -256,7 +256,7 @@ def test_what_two_devices_command_at_one_tick_is_taken_in_the_order_of_their_nam
     assert [event["request"] for event in rig.listener.named("command")[-2:]] == [{"speed_hz": 1.0}, {"speed_hz": 2.0}]
 
 
-def test_a_stop_refuses_what_waits_for_others() -> None:
+def test_a_stop_refuses_waiting_requests() -> None:
     with running() as rig:
         first, second = Device(rig, "a"), Device(rig, "b")
         first.join()

@@ -29,7 +29,7 @@ def numbers(lines: list[str], title: str) -> dict[str, list[float]]:
     return {name: [float(text) for text in line.split()[-7:]] for name, line in rows.items()}
 
 
-def test_document_holds_the_family_and_its_errors(capsys: pytest.CaptureFixture[str]) -> None:
+def test_document_contains_the_family_and_its_errors(capsys: pytest.CaptureFixture[str]) -> None:
     found = document(capsys)
     assert [model["name"] for model in found["models"]] == FAMILY
     assert found["displacement_mm"] == pytest.approx([1, 2, 4, 6, 8, 10])
@@ -49,7 +49,7 @@ def test_document_holds_the_family_and_its_errors(capsys: pytest.CaptureFixture[
     assert all(0.0 < error["over_travel"] <= error["over_reach"] for error in found["errors"])
 
 
-def test_tables_show_what_the_document_holds(capsys: pytest.CaptureFixture[str]) -> None:
+def test_tables_agree_with_the_document(capsys: pytest.CaptureFixture[str]) -> None:
     found, lines = document(capsys), run(capsys, "magnets").splitlines()
     same_magnets = numbers(lines, "force toward the centre, same magnets (corrected)")
     same_stiffness = numbers(lines, "force at 1.7 kN/m")
@@ -76,7 +76,7 @@ def test_parameters_can_be_changed(capsys: pytest.CaptureFixture[str]) -> None:
     assert exact["force_at_stiffness_used_n"] == pytest.approx(exact["force_toward_a_magnet_n"])
 
 
-def test_tight_magnets_are_compared_over_the_room_they_leave(capsys: pytest.CaptureFixture[str]) -> None:
+def test_tight_magnets_are_compared_over_their_clearance(capsys: pytest.CaptureFixture[str]) -> None:
     found = document(capsys, "--set", "magnet.bearing_radius=19")
     assert found["reach_mm"] == pytest.approx(0.92 * 5)
     assert found["displacement_mm"][-1] == pytest.approx(found["reach_mm"])
@@ -102,7 +102,7 @@ def test_picture_is_drawn_the_same_each_time(capsys: pytest.CaptureFixture[str],
         (["nowhere"], "parameters must be one of corrected"),
     ],
 )
-def test_wrong_input_is_told_in_a_line(
+def test_wrong_input_is_refused_in_one_line(
     capsys: pytest.CaptureFixture[str],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -120,7 +120,7 @@ def test_wrong_input_is_told_in_a_line(
     assert not list(tmp_path.iterdir())
 
 
-def test_params_tells_the_errors(capsys: pytest.CaptureFixture[str]) -> None:
+def test_params_shows_the_errors(capsys: pytest.CaptureFixture[str]) -> None:
     found = " ".join(run(capsys, "params").split())
     assert "eq. 35 gives 1.659 kN/m at the centre, exact cylinders 0.735 kN/m" in found
     assert "follows the field sum within 6.5% over 10 mm and 0.2% where the ring lets the shaft go" in found

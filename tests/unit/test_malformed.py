@@ -337,7 +337,7 @@ OF_TWO_FILES = ("outside the ring", *(f"set: {each}" for each in ("bad rule", "r
                                                                   "nan", "inf")))  # fmt: skip
 
 
-def test_there_are_enough_of_them() -> None:
+def test_the_number_of_cases_is_sufficient() -> None:
     assert len(CASES) >= 36
     assert len({case.what for case in CASES}) == len(CASES)
 
@@ -458,7 +458,7 @@ def test_commands_that_are_not_possible_now_are_refused() -> None:
 
 
 @pytest.mark.parametrize("command", ["hammer", "release"])
-def test_a_command_that_waits_refuses_its_like(command: str) -> None:
+def test_a_waiting_command_refuses_another_of_its_kind(command: str) -> None:
     simulation = Simulation(load_scene("stable-run"))
     simulation.submit(command, {})
     with pytest.raises(InputError, match=f"^{command} must be"):

@@ -24,7 +24,7 @@ def runtime(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "rig"
 
 
-def test_a_name_is_there_while_it_is_held_and_of_one_only(runtime: Path) -> None:
+def test_a_name_exists_while_it_is_held_by_one_process(runtime: Path) -> None:
     with names.registered("one", "127.0.0.1:7777"):
         assert names.running() == [names.Named(name="one", endpoint="127.0.0.1:7777", pid=os.getpid())]
         assert names.endpoint_of("one", field="connect") == ("127.0.0.1", 7777)
@@ -38,7 +38,7 @@ def test_a_name_is_there_while_it_is_held_and_of_one_only(runtime: Path) -> None
     assert names.running() == []
 
 
-def test_what_a_process_that_was_killed_has_left_is_forgotten(runtime: Path) -> None:
+def test_the_name_of_a_killed_process_is_removed(runtime: Path) -> None:
     hold = "with registered('gone', '127.0.0.1:1'): print(1, flush=True); time.sleep(60)"
     code = f"import time; from rig.serve.transport.names import registered\n{hold}"
     with processes.python("-c", code) as child:
@@ -54,12 +54,12 @@ def test_what_a_process_that_was_killed_has_left_is_forgotten(runtime: Path) -> 
 
 
 @pytest.mark.parametrize("name", ["", ".lock", "../x", "a b", "a:1", "é", "x" * 65])
-def test_what_can_be_no_name_is_refused(name: str) -> None:
+def test_invalid_names_are_refused(name: str) -> None:
     with pytest.raises(InputError, match="--name must be 1 to 64 letters, digits"):
         names.check_name(name)
 
 
-def test_who_asks_for_a_name_that_is_not_there_is_told_those_that_are() -> None:
+def test_an_unknown_name_is_refused_with_the_known_ones() -> None:
     with pytest.raises(
         InputError, match=r"HOST:PORT such as 127.0.0.1:7460, or the name of a running rig \(none runs\)"
     ):
@@ -71,14 +71,14 @@ def test_who_asks_for_a_name_that_is_not_there_is_told_those_that_are() -> None:
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="folders have no modes there")
-def test_a_folder_that_others_may_write_to_is_not_believed(runtime: Path) -> None:
+def test_a_folder_writable_by_others_is_not_trusted(runtime: Path) -> None:
     runtime.mkdir(mode=0o700)
     runtime.chmod(0o777)
     with pytest.raises(InputError, match=r"a folder private to its owner \(chmod 700"):
         names.running()
 
 
-def test_a_free_port_is_taken_where_none_is_asked_for_and_only_on_the_loopback() -> None:
+def test_a_free_port_is_chosen_by_default_on_loopback_only() -> None:
     with ZenohServer("127.0.0.1:0") as one, ZenohServer("127.0.0.1:0") as two:
         assert one.endpoint != two.endpoint
         assert parse_loopback(one.endpoint, field="listen")[1] > 0

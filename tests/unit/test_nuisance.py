@@ -111,7 +111,7 @@ def test_the_second_rig_is_one_of_this_kind(motion: second_rig.Motion) -> None:
             assert np.abs(1e3 * run[name][rows] - there).max() < most_mm
 
 
-def test_a_log_from_the_middle_of_a_run_is_taken_up_before_the_pulse(mils: Recording) -> None:
+def test_a_log_of_a_part_of_a_run_is_resumed_before_the_pulse(mils: Recording) -> None:
     experiment = Experiment.of(mils)
     assert is_imported(mils)
     assert experiment.begin is not None
@@ -119,7 +119,7 @@ def test_a_log_from_the_middle_of_a_run_is_taken_up_before_the_pulse(mils: Recor
     assert value_of(experiment, "hammer.1.at_s") == pytest.approx(0.8, abs=2e-4)
 
 
-def test_what_a_log_does_not_tell_comes_out_of_it(mils: Recording, motion: second_rig.Motion) -> None:
+def test_values_missing_in_a_log_are_estimated(mils: Recording, motion: second_rig.Motion) -> None:
     found = tune(mils, Experiment.of(mils))
     fitted = {one.key: one.value for one in found.fitted}
     assert max(found.scales.values()) < 1.2
@@ -144,13 +144,13 @@ def test_a_clock_is_no_number_of_the_experiment(mils: Recording) -> None:
     assert ahead == pytest.approx(0.5)
 
 
-def test_nuisances_are_those_that_an_experiment_has() -> None:
+def test_nuisances_are_those_of_the_experiment() -> None:
     quiet = Experiment(load_scene("stable-run", {"duration_s": 0.1}))
     assert not any(key.startswith(("hammer", "state")) for key in find_nuisances(quiet))
     assert "drive.speed_hz" not in find_nuisances(quiet, excluded=["drive.speed_hz"])
 
 
-def test_a_channel_that_disagrees_has_no_say() -> None:
+def test_a_contradicting_channel_is_ignored() -> None:
     rng = np.random.default_rng(1)
     columns = [rng.standard_normal((300, 2)) for _ in range(6)]
     target = [one @ np.array([3.0, -2.0]) + rng.standard_normal(300) for one in columns]
@@ -161,7 +161,7 @@ def test_a_channel_that_disagrees_has_no_say() -> None:
     np.testing.assert_allclose(alone, [-150.0, 100.0], rtol=0.1)
 
 
-def test_an_aligned_log_is_good(tmp_path: Path) -> None:
+def test_an_aligned_log_passes(tmp_path: Path) -> None:
     motion = second_rig.run(turned=TURNED, before_s=0.2, after_s=0.1, settled_s=2.0)
     found = validate(whole(tmp_path, motion, seed=8))
     assert found.good, found.verdict_line
@@ -169,7 +169,7 @@ def test_an_aligned_log_is_good(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("number", ["mu = 0.24", pytest.param("e = 0.885", marks=MATRIX)])
-def test_a_log_of_another_contact_is_not_good(number: str, tmp_path: Path) -> None:
+def test_a_log_of_another_contact_law_does_not_pass(number: str, tmp_path: Path) -> None:
     """Its phases are within their limits; no fit continues through the first contact."""
     name, _, value = number.partition(" = ")
     other = {"c": damping_factor(float(value))} if name == "e" else {name: float(value)}
@@ -203,7 +203,7 @@ def test_the_hum_of_the_mains_has_a_name(motion: second_rig.Motion, tmp_path: Pa
 
 
 @pytest.mark.parametrize("name", ["quiet", pytest.param("contact", marks=MATRIX)])
-def test_a_log_without_a_pulse_is_taken_up_as_well(name: str, motion: second_rig.Motion, tmp_path: Path) -> None:
+def test_a_log_without_a_pulse_is_resumed(name: str, motion: second_rig.Motion, tmp_path: Path) -> None:
     """Its shaft turned before. If it was in contact already, the origin of its motion is unknown."""
     own_s, values = second_rig.log(motion, seed=7, rate_hz=10_000.0, bandwidth_hz=4000.0, ppm=PPM)
     rows = own_s < 0.4 if name == "quiet" else own_s > 1.0
@@ -223,7 +223,7 @@ def test_contact_without_a_pulse_is_no_fault_of_sensors(motion: second_rig.Motio
     assert "a hammer pulse that the mapping does not tell" in found.conclusion
 
 
-def test_pulses_that_nothing_foretells_are_no_fault(motion: second_rig.Motion, tmp_path: Path) -> None:
+def test_unpredicted_pulses_are_no_fault(motion: second_rig.Motion, tmp_path: Path) -> None:
     """One pulse before the hammer gives the angle by the speed, as contact slows the shaft afterwards; no pulse gives
     nothing.
     """
@@ -253,7 +253,7 @@ PULSE = ("hammer.1.force_n", "hammer.1.duration_ms")
 """Through impacts, force and duration differ by little more than their product."""
 
 
-def test_contact_parameters_come_out_of_a_log_from_the_middle_of_a_run(tmp_path: Path) -> None:
+def test_contact_parameters_are_identified_from_a_part_of_a_run(tmp_path: Path) -> None:
     """Also from a restitution that is too far off for a descent along the slope."""
     motion = second_rig.run(second_rig.Rig(mu=0.235), turned=1.0, before_s=0.2, after_s=0.06, settled_s=1.5)
     recording, rules = whole(tmp_path, motion, seed=5), load_criteria().imported
@@ -286,7 +286,7 @@ slow_test = pytest.mark.skipif("RIG_COVERAGE_SEEDS" not in os.environ, reason="R
 
 @slow_test
 @pytest.mark.timeout(0)
-def test_intervals_hold_the_truth_as_often_as_they_say(tmp_path: Path) -> None:
+def test_intervals_have_their_nominal_coverage(tmp_path: Path) -> None:
     """Five unknowns of a log from the middle of a run, and its pulse; other speeds, clocks, angles and noises."""
     seeds, rules = int(os.environ["RIG_COVERAGE_SEEDS"]), load_criteria().imported
     keys = (*FIVE, *PULSE)
@@ -340,7 +340,7 @@ def test_a_wrong_model_gives_no_wrong_number(number: str, tmp_path: Path) -> Non
 
 @MATRIX
 @pytest.mark.parametrize("seed", range(20))
-def test_aligned_logs_are_good(seed: int, tmp_path: Path) -> None:
+def test_aligned_logs_pass(seed: int, tmp_path: Path) -> None:
     """Four speeds, hard and soft pulses: whirl, or impacts that decay; independent angles and noise."""
     speed_hz, force_n = (3.2, 4.2, 5.2, 6.2)[seed % 4], (100.0, 60.0)[seed // 4 % 2]
     aligned = second_rig.run(speed_hz=speed_hz, force_n=force_n, turned=0.9 * seed, settled_s=1.5)
@@ -361,7 +361,7 @@ def test_every_fault_has_its_name(case: faulty_logs.Case, motion: second_rig.Mot
     ("eps = 0.11e-3", "model: shaft.unbalance_eccentricity"), ("K_mag = 1751.0", "model: magnet.stiffness"),
     ("Ixx = 0.0848", "shaft.transverse_inertia|nearest|neither|no "),
 ])  # fmt: skip
-def test_another_number_of_the_model_passes_for_no_sensor(number: str, told: str, tmp_path: Path) -> None:
+def test_a_changed_model_parameter_is_not_reported_as_a_sensor_fault(number: str, told: str, tmp_path: Path) -> None:
     name, _, value = number.partition(" = ")
     other = second_rig.run(second_rig.Rig(**{name: float(value)}), turned=1.0, settled_s=1.5, after_s=0.1)
     found = validate(whole(tmp_path, other, seed=4))
@@ -369,7 +369,7 @@ def test_another_number_of_the_model_passes_for_no_sensor(number: str, told: str
     assert re.search(told, found.explained.conclusion)
 
 
-def test_a_pulse_that_is_missing_is_told_wherever_it_is() -> None:
+def test_a_missing_pulse_is_reported_anywhere() -> None:
     """Before the hammer pulse with few turns there, and while whirl slows the shaft down."""
     turns = np.r_[np.full(3, 0.16), 0.16 * np.linspace(1.0, 2.0, 20)]
     edges = np.concatenate([[0.0], np.cumsum(turns)])

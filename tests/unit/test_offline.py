@@ -48,7 +48,7 @@ def test_the_lines_of_the_docstring_work(shown: dict[str, Any]) -> None:
     assert run.simulation.model.parameters["contact.friction"] == 0.3
 
 
-def test_everything_is_the_public_interface() -> None:
+def test_all_lists_the_public_interface() -> None:
     for name in rig.__all__:
         assert getattr(rig, name).__name__ == name
     assert set(rig.__all__) <= set(dir(rig))
@@ -57,7 +57,7 @@ def test_everything_is_the_public_interface() -> None:
         rig.nothing  # type: ignore[attr-defined]  # noqa: B018
 
 
-def test_the_page_of_help_opens_with_what_to_do() -> None:
+def test_help_starts_with_an_example() -> None:
     page = pydoc.plain(pydoc.render_doc(rig))
     assert page.index('run = rig.simulate("hammer"') < page.index("CLASSES")
     for name in rig.__all__:
@@ -105,7 +105,7 @@ def test_every_signal_has_a_column_and_a_unit(run: Run) -> None:
     assert run.samples.to_si().to_si().units == run.samples.to_si().units
 
 
-def test_a_name_that_is_none_tells_the_nearest(run: Run) -> None:
+def test_an_unknown_name_suggests_the_nearest(run: Run) -> None:
     parameters = run.simulation.model.parameters
     for look_up, wrong, near in (
         (run.__getitem__, "inner_x", "inner_ax"),
@@ -126,7 +126,7 @@ def test_a_name_that_is_none_tells_the_nearest(run: Run) -> None:
         assert len(str(caught.value)) < 2_000
 
 
-def test_what_is_shown_of_each_object_is_a_line(run: Run) -> None:
+def test_each_object_has_a_one_line_representation(run: Run) -> None:
     frame = Simulation(run.simulation.scene).advance(50_000)
     assert len(repr(frame)) < 2_000
     for each in (run, run.simulation, run.simulation.scene, run.simulation.model.parameters, run.table):
@@ -138,7 +138,7 @@ def test_what_is_shown_of_each_object_is_a_line(run: Run) -> None:
     assert "\n" not in repr(run.samples)
 
 
-def test_a_run_is_gone_through_by_its_signals(run: Run) -> None:
+def test_a_run_iterates_over_its_signals(run: Run) -> None:
     assert tuple(run) == run.names
     assert "disk_x" in run
     assert "disk_z" not in run
@@ -152,7 +152,7 @@ def test_samples_are_columns_like_those_of_a_table(run: Run) -> None:
     assert run.names == tuple(signal.name for signal in ROW)
 
 
-def test_a_scene_is_given_by_name_by_path_or_as_it_is(tmp_path: Path) -> None:
+def test_a_scene_is_given_by_name_path_or_object(tmp_path: Path) -> None:
     changes = {"drive.speed_hz": 5.2, "duration_s": 0.01, "sensors.rate_hz": 1_000}
     path = tmp_path / "mine.toml"
     path.write_text('duration_s = 0.5\n[[commands]]\nat_s = 0.02\ncommand = "hammer"\n')
@@ -167,7 +167,7 @@ def test_a_scene_is_given_by_name_by_path_or_as_it_is(tmp_path: Path) -> None:
         simulate("hammer", {"drive.sped_hz": 5.2})
 
 
-def test_a_run_keeps_the_columns_that_are_named_where_they_are_to_go(tmp_path: Path) -> None:
+def test_a_run_keeps_the_selected_columns(tmp_path: Path) -> None:
     whole, folder = simulate("hammer", duration_s=0.25), tmp_path / "run"
     ledger = [name for name in whole.names if name.endswith(("energy", "work", "loss"))]
     some = simulate("hammer", duration_s=0.25, signals=("normal_force", *ledger), folder=folder)
@@ -245,13 +245,13 @@ def test_another_duration_and_its_progress() -> None:
     assert run.edges_s.shape == (0,)
 
 
-def test_a_duration_that_cannot_be_is_the_users_error() -> None:
+def test_an_impossible_duration_is_an_input_error() -> None:
     with pytest.raises(InputError, match=r"^duration_s must be"):
         simulate(load_scene("drop"), duration_s=-1.0)
 
 
 @pytest.mark.parametrize("changes", [5.2, ["drive.speed_hz"], {1: 2}])
-def test_changes_that_are_no_values_by_key_are_the_users_error(changes: Any) -> None:
+def test_invalid_changes_are_an_input_error(changes: Any) -> None:
     for scene in ("hammer", load_scene("hammer")):
         with pytest.raises(InputError, match="changes must be a dictionary of values by dotted key"):
             simulate(scene, changes)
@@ -265,7 +265,7 @@ def test_duration_is_rounded_up_to_a_whole_block() -> None:
     assert len(simulate(load_scene("drop"), duration_s=0.0012).times_s) == 30, "1.5 ms: three rows of truth"
 
 
-def test_only_the_sensors_that_are_on() -> None:
+def test_only_enabled_sensors_are_returned() -> None:
     run = simulate(load_scene("drop", {"sensors.groups": ["hammer"], "sensors.rate_hz": 1_000}), duration_s=0.1)
     assert list(run.samples) == ["hammer"]
     assert run.samples.unit("hammer") == "N"
@@ -273,7 +273,7 @@ def test_only_the_sensors_that_are_on() -> None:
     assert len(run.samples["hammer"]) == 100
 
 
-def test_commands_behind_the_end_are_told() -> None:
+def test_commands_after_the_end_are_reported() -> None:
     run = simulate(load_scene("hammer"), duration_s=0.01)
     assert run.events == []
     assert run.simulation.health()["warnings"] == ["1 commands of the scene lie after its end and will not be given"]

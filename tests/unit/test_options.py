@@ -57,7 +57,7 @@ def test_a_shared_option_is_worded_once(shared: str) -> None:
     assert len({(one.help, one.metavar, *one.opts, *one.secondary_opts) for one in found}) == 1
 
 
-def test_the_same_thing_has_one_name() -> None:
+def test_one_option_has_one_name_in_all_commands() -> None:
     others = {"--from-s", "--to-s", "--window", "--channel", "--overwrite", "--out", "--html"}
     assert [(name, flag) for name, flag, _ in options() if flag in others] == []
 
@@ -74,7 +74,7 @@ def test_names_and_pairs() -> None:
         parse_pairs("--set", ["a=1", "a=2"], "KEY=VALUE")
 
 
-def test_the_help_says_what_each_command_says_of_itself() -> None:
+def test_the_help_lists_the_summary_of_each_command() -> None:
     listed = {name: line for lines in COMMANDS.values() for name, line in lines.items()}
     listed |= {f"{name} {part}": line for name, lines in GROUPS.items() for part, line in lines.items()}
     assert listed.keys() == COMMAND.keys()
@@ -157,7 +157,7 @@ def test_help_is_told_once_and_fits_80_columns(capsys: pytest.CaptureFixture[str
         ("chart --quick --full", "--quick, --full must be one of the two; instead received both"),
     ],
 )
-def test_a_wrong_line_is_told_in_one(capsys: pytest.CaptureFixture[str], line: str, says: str) -> None:
+def test_a_wrong_command_line_is_refused_in_one_line(capsys: pytest.CaptureFixture[str], line: str, says: str) -> None:
     assert said(capsys, *line.split()) == (2, "", f"rig: {says}\n")
 
 
@@ -165,7 +165,7 @@ def completed(line: str, shell: str = "zsh") -> list[str]:
     return [each.partition("\t")[0] for each in complete(rig(), shell, line)]
 
 
-def test_what_may_follow_on_a_line() -> None:
+def test_completion_of_a_command_line() -> None:
     assert set(completed("rig ")) == set(COMMAND) - {name for name in COMMAND if " " in name}
     assert completed("rig can ") == list(GROUPS["can"])
     assert completed("rig run ham") == ["hammer"]
@@ -184,7 +184,7 @@ def test_what_may_follow_on_a_line() -> None:
     assert complete(rig(), "fish", "rig run x --tls ") == ["\t/"]
 
 
-def test_keys_of_a_scene_that_are_completed_are_those_that_it_has() -> None:
+def test_completed_keys_are_those_of_the_scene() -> None:
     tables = {name: field.annotation for name, field in Scene.model_fields.items()} | {"generator": Generator}
     inner = {name: getattr(table, "model_fields", None) for name, table in tables.items()}
     keys = {f"{name}.{part}" for name, parts in inner.items() for part in parts or ()} | set(inner)
@@ -195,7 +195,7 @@ def test_keys_of_a_scene_that_are_completed_are_those_that_it_has() -> None:
 
 @pytest.mark.wallclock
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
-def test_a_new_shell_completes_once_that_is_installed(shell: str, tmp_path: Path) -> None:
+def test_a_new_shell_completes_after_installation(shell: str, tmp_path: Path) -> None:
     if shutil.which(shell) is None:
         pytest.skip(f"there is no {shell} on this machine")
     program = tmp_path / "rig"

@@ -40,7 +40,7 @@ def orbit(
     y=st.floats(-3.0, 3.0),
     start_s=st.floats(0.0, 1e5),
 )
-def test_whirl_frequency_knows_sense_and_needs_no_centre(
+def test_whirl_frequency_has_a_sense_and_needs_no_centre(
     hz: float, forward: bool, x: float, y: float, start_s: float
 ) -> None:
     sign = 1.0 if forward else -1.0
@@ -76,7 +76,7 @@ def test_full_spectrum_shows_sense_and_amplitude(hz: float) -> None:
 
 
 @pytest.mark.parametrize("hz", [-80.0, 6.0])
-def test_lines_of_a_padded_spectrum_stand_closer_and_a_shift_shows_none_at_zero(hz: float) -> None:
+def test_a_padded_spectrum_has_closer_lines_and_none_at_zero(hz: float) -> None:
     times, x, y = orbit(hz, n=2_000, centre=3 + 2j)
     frequency, amplitude = full_spectrum(x, y, 4_000.0, lines=4_000)
     assert len(times) == 2_000
@@ -93,12 +93,12 @@ def test_mean_rotation_is_not_pulled_to_zero_by_noise(hz: float) -> None:
     assert mean_rotation(x[:5], y[:5], 4_000.0) == 0.0
 
 
-def test_radius_is_that_about_the_own_centre() -> None:
+def test_radius_is_about_the_orbits_centre() -> None:
     _, x, y = orbit(10.0, centre=5 - 1j)
     assert rms_radius(0.3 * x, 0.3 * y) == pytest.approx(0.3)
 
 
-def test_phase_and_frequency_about_a_given_centre_tell_a_small_orbit_beside_it_from_one_around_it() -> None:
+def test_a_small_orbit_next_to_the_centre_is_not_taken_as_one_around_it() -> None:
     times, x, y = orbit(10.0, centre=5 + 0j)
     assert abs(phase(x, y)[-1] - phase(x, y)[0]) < 1.0, "it never goes round the origin"
     assert whirl_frequency(x, y, times, about=0.0) == pytest.approx(0.0, abs=0.1)
@@ -123,7 +123,7 @@ def test_waterfall_shows_when_the_whirl_turns_over() -> None:
 
 
 @pytest.mark.parametrize("hz", [8.0, 153.0, 230.0])
-def test_a_turn_of_no_whole_number_of_samples_on_a_large_mean_gives_the_closed_form(hz: float) -> None:
+def test_a_fractional_turn_on_a_large_mean_gives_the_closed_form(hz: float) -> None:
     times = np.arange(2_000) / 2_000.0
     edges = np.arange(0.0123, 0.99, 1.0 / hz)
     speed, vector = synchronous(50.0 + 0.3 * np.cos(2.0 * math.pi * hz * (times - edges[0]) - 0.5), times, edges)
@@ -132,7 +132,7 @@ def test_a_turn_of_no_whole_number_of_samples_on_a_large_mean_gives_the_closed_f
     assert vector == pytest.approx(0.3 * np.exp(-0.5j), rel=1e-9)
 
 
-def test_a_turn_with_a_quarter_missing_is_left_out() -> None:
+def test_a_turn_with_a_missing_quarter_is_omitted() -> None:
     times, x, _ = orbit(10.0)
     held = (times < 0.31) | (times > 0.34)
     assert len(synchronous(x, times, np.arange(0.0, 1.0, 0.1))[0]) == 9
@@ -167,13 +167,13 @@ T, X, Y = (part.tolist() for part in orbit(200.0, n=40))
         (lambda: synchronous(X, T, [0.2, 0.1]), "edges_s must be ascending"),
     ],
 )
-def test_what_is_no_orbit_is_one_line(call: Callable[[], Any], message: str) -> None:
+def test_invalid_orbits_are_refused_in_one_line(call: Callable[[], Any], message: str) -> None:
     with pytest.raises(InputError) as error:
         call()
     assert str(error.value).startswith(message)
 
 
-def test_lists_do_as_well_as_arrays() -> None:
+def test_lists_are_accepted_like_arrays() -> None:
     times, x, y = (np.array(part) for part in (T, X, Y))
     assert whirl_frequency(X, Y, T) == whirl_frequency(x, y, times)
     assert np.array_equal(waterfall(X, Y, 4000, T)[2], waterfall(x, y, 4e3, times)[2])

@@ -77,7 +77,7 @@ def test_a_power_of_the_penetration_is_resolved_to_its_numbers() -> None:
         ("friction", "0.1 + 0.1", "contact.friction must be a number from 0 to"),
     ],
 )
-def test_a_formula_that_is_no_law_is_refused_in_one_line(key: str, value: str, words: str) -> None:
+def test_an_invalid_law_formula_is_refused_in_one_line(key: str, value: str, words: str) -> None:
     with pytest.raises(InputError, match=words):
         build_model(load_parameters().override({f"contact.{key}": value}))
 
@@ -90,7 +90,7 @@ def test_a_formula_may_be_a_variable_alone(formula: str) -> None:
 @pytest.mark.parametrize(
     ("formula", "exponent"), [("1e9 * delta", 1.0), ("2e12 * delta**2.5", 2.5), ("E*L*delta", 1.0)]
 )
-def test_a_power_at_the_limits_of_the_exponent_is_taken_exactly(formula: str, exponent: float) -> None:
+def test_a_power_at_the_limits_of_the_exponent_is_exact(formula: str, exponent: float) -> None:
     fit = fit_power(formula, PAIR)
     assert (fit.exponent, fit.error) == (exponent, 0.0)
 
@@ -138,7 +138,7 @@ def test_laws_are_compared_with_the_file_s(tmp_path: Path, capsys: pytest.Captur
         assert own[column] == pytest.approx(known[column])
 
 
-def test_a_law_is_a_scene_beside_the_twelve(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_users_law_is_an_additional_scene_of_the_chart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(law_scene, "TWELVE_SCENES", scenes := dict(TWELVE_SCENES))
     path = tmp_path / "x.toml"
     path.write_text(LAW)
@@ -151,7 +151,7 @@ def test_a_law_is_a_scene_beside_the_twelve(tmp_path: Path, monkeypatch: pytest.
 
 
 @pytest.mark.parametrize("command", ["chart", "stability"])
-def test_charts_refuse_a_wrong_law_before_anything_is_measured(
+def test_charts_refuse_a_wrong_law_before_measuring(
     command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)

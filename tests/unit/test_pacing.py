@@ -114,7 +114,7 @@ def lockstep(fake: FakeTime, *, timeout_s: float = 5.0) -> Lockstep:
     return clock
 
 
-def test_lockstep_hands_out_exactly_what_was_allowed() -> None:
+def test_lockstep_grants_exactly_the_allowed_steps() -> None:
     clock = lockstep(FakeTime())
     clock.allow(25_000)
     clock.allow(3_000)
@@ -190,7 +190,7 @@ def test_histogram_memory_does_not_grow() -> None:
     assert sum(histogram.counts) == histogram.count == 100_000
 
 
-def test_a_wake_ends_the_wait_for_a_deadline_once() -> None:
+def test_a_wake_ends_one_wait_for_a_deadline() -> None:
     clock = RealTime()
     clock.start(0, 1)
     clock.wake()
@@ -204,7 +204,7 @@ def test_a_wake_ends_the_wait_for_a_deadline_once() -> None:
     assert clock.statistics()["overruns"] == 1
 
 
-def test_a_result_that_was_ready_is_no_overrun_because_a_command_came() -> None:
+def test_a_command_does_not_make_a_ready_result_an_overrun() -> None:
     now = [0]
     clock = RealTime(now_ns=lambda: now[0], sleep=lambda seconds: None)
     clock.start(0, 1)
@@ -215,7 +215,7 @@ def test_a_result_that_was_ready_is_no_overrun_because_a_command_came() -> None:
     assert clock.statistics()["overruns"] == 0
 
 
-def test_a_tick_and_its_utc_are_told_with_how_well_they_are_known() -> None:
+def test_a_tick_is_reported_with_its_utc_and_uncertainty() -> None:
     times = iter([0, 5_000_000_000, 7_123_456_789, 7_123_458_789])
     clock = RealTime(now_ns=lambda: next(times), utc_ns=lambda: 1_700_000_000_000_000_000)
     clock.start(250_000, 1_000_000)

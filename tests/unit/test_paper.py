@@ -62,7 +62,7 @@ def test_every_assumed_value_has_a_range():
         assert {entry.key for entry in assumed_values()} == assumed | ASSUMPTIONS
 
 
-def test_ranges_hold_what_is_taken_and_what_the_model_accepts():
+def test_ranges_contain_the_default_and_are_valid_in_the_model():
     entries = load_parameters().entries
     for entry in free_values():
         assert entry.low < entry.high
@@ -80,7 +80,7 @@ def test_tied_value_follows():
     assert changes({"shaft.radius": 27.0}) == {"shaft.radius": 27.0, "ring.clearance": 2.0}
 
 
-def test_hypercube_is_one_in_each_layer_and_the_same_again():
+def test_hypercube_has_one_point_per_layer_and_is_reproducible():
     parts, pulses = hypercube(8)
     assert np.array_equal(parts, hypercube(8)[0])
     assert len(pulses) == 8
@@ -88,7 +88,7 @@ def test_hypercube_is_one_in_each_layer_and_the_same_again():
         assert sorted(np.floor(column * 8).astype(int)) == list(range(8))
 
 
-def test_statements_say_where_and_what_agrees():
+def test_statements_name_their_source_and_agreement():
     names = [entry.quantity for entry in (*statements(), *claims())]
     assert len(set(names)) == len(names)
     for entry in (*statements(), *claims()):
@@ -105,7 +105,7 @@ def test_statements_say_where_and_what_agrees():
 @pytest.mark.parametrize(
     ("value", "verdict"), [(1.0, "agrees"), (2.0, "agrees"), (2.1, "differs"), (0.9, "differs"), (math.nan, "differs")]
 )
-def test_verdict_comes_of_the_number(value, verdict):
+def test_verdict_of_a_number(value, verdict):
     assert statement(low=1.0, high=2.0).verdict(np.array([value])) == verdict
 
 
@@ -113,12 +113,12 @@ def test_verdict_comes_of_the_number(value, verdict):
     ("inside", "verdict"),
     [(0, "differs"), (1, "differs"), (2, "cannot be judged"), (18, "cannot be judged"), (19, "agrees"), (20, "agrees")],
 )
-def test_verdict_comes_of_how_many_are_inside(inside, verdict):
+def test_verdict_of_a_share_inside(inside, verdict):
     values = np.repeat([1.5, math.nan], [inside, 20 - inside])
     assert statement(low=1.0, high=2.0).verdict(values) == verdict
 
 
-def test_nothing_to_judge_by():
+def test_verdict_without_data():
     assert statement(why="no axis").verdict(np.array([1.0])) == "cannot be judged"
 
 
@@ -127,7 +127,7 @@ def test_nothing_to_judge_by():
     [([1.0, 1.0], "1"), ([1.1111, 1.1112], "1.111"), ([538.6], "538.6"), ([1000.0, 2084.0, 3000.0], "2080 (1110–2910)"),
      ([1.049, 1.6, 2.38], "1.60 (1.10–2.30)"), ([13.19, 13.4, 13.47], "13.40 (13.21–13.46)"), ([math.nan], "none")],
 )  # fmt: skip
-def test_distribution_is_told_to_as_many_figures_as_it_has(values, shown):
+def test_distribution_is_printed_with_its_significant_figures(values, shown):
     assert distribution(np.array(values)) == shown
 
 
@@ -139,7 +139,7 @@ def test_printed_values_against_the_sets():
     assert differs == {"house.outer_mass", "house.pair_stiffness_vertical"}
 
 
-def test_a_pulse_that_dies_out_and_one_that_cannot_be_built():
+def test_a_decaying_pulse_and_an_invalid_model():
     weak = outcome(Pulse(force_n=5.0, duration_s=0.3))
     assert not weak.whirls
     assert math.isnan(weak.whirl_hz)
@@ -159,7 +159,7 @@ def test_corrections_are_where_the_sets_differ():
     assert set(correction_keys()) == set(CORRECTIONS)
 
 
-def test_tornado_is_widest_first_and_tells_what_reaches_the_measured():
+def test_tornado_is_sorted_by_width_and_marks_the_measured_value():
     blank = Outcome("backward whirl", reaction_x_n=540.0)
     results = {name: [blank] for name in claim_groups(ensemble=1)}
     results["low shaft.radius"] = [Outcome("backward whirl", reaction_x_n=350.0)]
@@ -252,7 +252,7 @@ def test_report_backs_every_section_with_a_table(report: Report, tmp_path: Path)
 
 
 @pytest.mark.wallclock
-def test_two_processes_give_what_one_gives():
+def test_two_processes_give_the_result_of_one():
     pulses = [Pulse(label=str(force), force_n=force, duration_s=0.3) for force in (20.0, 80.0, 100.0, 120.0)]
     told: list[str] = []
     assert str(list(outcomes(pulses, processes=2, progress=told.append))) == str(list(outcomes(pulses, processes=1)))
@@ -311,7 +311,7 @@ def test_symbols_powers_and_signs_are_set_as_in_print():
     assert [in_print(words) for words in ("6 to 12 count", "eqs. 24 and 25 count")] == ["6 to 12", "eqs. 24 and 25"]
 
 
-def test_terminal_tells_every_statement_and_the_rule(findings: Findings, capsys, monkeypatch):
+def test_terminal_shows_every_statement_and_the_rule(findings: Findings, capsys, monkeypatch):
     monkeypatch.setattr("replays.studies.paper.findings.find", lambda **_: findings)
     printed = shown(capsys, "paper", "--quick")
     said = " ".join(printed.split())
@@ -322,7 +322,7 @@ def test_terminal_tells_every_statement_and_the_rule(findings: Findings, capsys,
     assert "no file written" in said
 
 
-def test_a_folder_for_pictures_is_made_beside_others(findings: Findings, tmp_path, capsys, monkeypatch):
+def test_a_folder_for_pictures_is_created(findings: Findings, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("replays.studies.paper.findings.find", lambda **_: findings)
     drawn: list[Path] = []
     monkeypatch.setattr("replays.studies.paper.document.draw_pictures", lambda _, folder: drawn.append(folder) or [])
@@ -335,7 +335,7 @@ def test_a_folder_for_pictures_is_made_beside_others(findings: Findings, tmp_pat
     assert (tmp_path / "new").is_dir()
 
 
-def test_what_is_corrected_on_purpose_does_not_differ(report: Report):
+def test_deliberate_corrections_are_not_reported_as_differences(report: Report):
     table = next(part for part in report.parts if isinstance(part, Table) and part.headings[0] == "symbol")
     kept = load_parameters("corrected")
     for printed, row in zip(printed_values(), table.rows, strict=True):

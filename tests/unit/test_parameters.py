@@ -32,7 +32,7 @@ def test_names_put_the_default_first() -> None:
 
 
 @pytest.mark.parametrize("name", set_names())
-def test_every_value_says_where_it_comes_from(name: str) -> None:
+def test_every_value_has_a_source(name: str) -> None:
     parameters = load_parameters(name)
     assert set(parameters.entries) == set(DEFAULT.entries)
     for key, entry in parameters.entries.items():
@@ -43,7 +43,7 @@ def test_every_value_says_where_it_comes_from(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", [name for name in set_names() if name != DEFAULT_SET])
-def test_another_set_differs_just_where_its_file_says(name: str) -> None:
+def test_another_set_differs_only_in_the_values_of_its_file(name: str) -> None:
     data = tomllib.loads((SETS / f"{name}.toml").read_text())
     listed = {f"{section}.{key}" for section, members in data.items() if isinstance(members, dict) for key in members}
     parameters = load_parameters(name)
@@ -64,12 +64,12 @@ def test_another_set_differs_just_where_its_file_says(name: str) -> None:
         ("shaft.young_modulus", 70e9),
     ],
 )
-def test_units_come_off(key: str, si: float) -> None:
+def test_units_are_converted_at_loading(key: str, si: float) -> None:
     assert DEFAULT[key] == pytest.approx(si, rel=1e-15)
 
 
 @given(key=st.sampled_from(NUMBERS), part=st.floats(0.0, 1.0))
-def test_override_is_in_the_parameters_own_unit(key: str, part: float) -> None:
+def test_override_uses_the_parameters_unit(key: str, part: float) -> None:
     entry = DEFAULT.entries[key]
     low, high = entry.range
     value = min(high, low + part * (high - low))
@@ -106,7 +106,7 @@ def is_formula(text: str, variables: tuple[str, ...]) -> bool:
 
 
 @given(key=st.sampled_from(list(DEFAULT.entries)), value=st.floats() | st.text(max_size=5))
-def test_override_accepts_just_what_the_entry_says(key: str, value: float | str) -> None:
+def test_override_accepts_only_the_range_of_the_entry(key: str, value: float | str) -> None:
     entry = DEFAULT.entries[key]
     if isinstance(value, str):
         good = value in entry.rules or (bool(entry.formula) and is_formula(value, entry.formula))
@@ -120,14 +120,14 @@ def test_override_accepts_just_what_the_entry_says(key: str, value: float | str)
             DEFAULT.override({key: value})
 
 
-def test_override_leaves_the_loaded_set_alone() -> None:
+def test_override_does_not_change_the_loaded_set() -> None:
     before = DEFAULT["contact.friction"]
     DEFAULT.override({"contact.friction": 0.9})
     assert load_parameters()["contact.friction"] == before
 
 
 @pytest.mark.parametrize("value", [True, None, [0.1], {"value": 0.1}, 1j])
-def test_override_refuses_what_is_neither_number_nor_rule(value: object) -> None:
+def test_override_refuses_values_that_are_neither_number_nor_rule(value: object) -> None:
     with pytest.raises(InputError, match=r"^contact\.friction must be a number from 0 to 2"):
         DEFAULT.override({"contact.friction": value})
 
@@ -161,7 +161,7 @@ def test_document_is_json_with_unit_and_provenance_of_every_value() -> None:
         }
 
 
-def test_users_file_gives_a_bare_number_or_a_table(tmp_path: Path) -> None:
+def test_users_file_contains_numbers_or_tables(tmp_path: Path) -> None:
     parameters = user_file(
         tmp_path,
         """
@@ -187,14 +187,14 @@ def test_users_file_gives_a_bare_number_or_a_table(tmp_path: Path) -> None:
     assert parameters.entries["house.inner_mass"] == load_parameters("dtu-2019").entries["house.inner_mass"]
 
 
-def test_users_file_may_stand_on_another_file(tmp_path: Path) -> None:
+def test_users_file_may_be_based_on_another_file(tmp_path: Path) -> None:
     below = tmp_path / "below.toml"
     below.write_text('base = "corrected"\n[contact]\nfriction = 0.11\n')
     parameters = user_file(tmp_path, f'base = "{below.as_posix()}"\n[shaft]\nmass = 1.5\n')
     assert (parameters["contact.friction"], parameters["shaft.mass"]) == (0.11, 1.5)
 
 
-def test_users_file_is_read_again_when_it_has_changed(tmp_path: Path) -> None:
+def test_a_changed_users_file_is_reloaded(tmp_path: Path) -> None:
     assert user_file(tmp_path, 'base = "corrected"\n[contact]\nfriction = 0.11\n')["contact.friction"] == 0.11
     assert user_file(tmp_path, 'base = "corrected"\n[contact]\nfriction = 0.22\n')["contact.friction"] == 0.22
 
@@ -209,12 +209,12 @@ def test_users_file_is_read_again_when_it_has_changed(tmp_path: Path) -> None:
         pytest.param('base = "corrected"\n[contact.friction]\nvalue = "x"\nrules = ["x"]\n', id="own-rule"),
     ],
 )
-def test_users_file_cannot_change_what_the_model_accepts(tmp_path: Path, text: str) -> None:
+def test_users_file_cannot_extend_the_models_limits(tmp_path: Path, text: str) -> None:
     with pytest.raises(InputError, match="must be"):
         user_file(tmp_path, text)
 
 
-def test_files_that_stand_on_each_other_are_refused(tmp_path: Path) -> None:
+def test_circular_parameter_files_are_refused(tmp_path: Path) -> None:
     one, other = tmp_path / "one.toml", tmp_path / "other.toml"
     one.write_text(f'base = "{other.as_posix()}"\n')
     other.write_text(f'base = "{one.as_posix()}"\n')
@@ -231,7 +231,7 @@ def _corners() -> list[object]:
 
 
 @pytest.mark.parametrize(("key", "value"), _corners())
-def test_every_accepted_value_makes_a_model_or_is_refused_in_words(key: str, value: float | str) -> None:
+def test_every_accepted_value_gives_a_model_or_an_error_message(key: str, value: float | str) -> None:
     parameters = DEFAULT.override({key: value})
     try:
         model = build_model(parameters)

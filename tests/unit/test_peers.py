@@ -43,7 +43,7 @@ def states_in_contact(given: Problem, *, count: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("scene", ["hammer", "drop", "run-up", "stable-run"])
-def test_a_problem_starts_where_the_simulation_does(scene: str) -> None:
+def test_a_problem_has_the_initial_state_of_the_simulation(scene: str) -> None:
     simulation = Simulation(load_scene(scene))
     given = cut_window(load_scene(scene), end_s=0.01)
     np.testing.assert_array_equal(given.y0, simulation.first_row[:14])
@@ -161,7 +161,7 @@ def test_a_contact_without_sliding_rolls_from_the_start() -> None:
         assert np.max(np.abs(solution.states[:, [1, 2, 3, 5, 9]])) < 1e-12
 
 
-def test_a_drop_without_sliding_does_not_stall_where_the_law_would_pull() -> None:
+def test_a_drop_without_sliding_does_not_stall_at_tensile_force() -> None:
     # Friction and normal force reach 0 at one instant: a loose series must not keep sliding under a tensile force.
     given = problem(0.5, scene="drop", friction="exact")
     solution = solve("heyoka", given, 1e-4)
@@ -169,7 +169,7 @@ def test_a_drop_without_sliding_does_not_stall_where_the_law_would_pull() -> Non
     assert solution.switches < 200
 
 
-def test_the_own_time_of_a_library_is_told_where_python_leads_it() -> None:
+def test_the_time_of_a_library_without_python_is_reported() -> None:
     given = problem(0.03)
     led = solve("heyoka", given, 1e-8)
     assert led.own_s is not None
@@ -221,7 +221,7 @@ def test_cvode_is_the_same_compiled_and_as_installed() -> None:
     assert max(errors) < 5.0 * min(errors)
 
 
-def test_samples_do_not_move_the_steps_of_cvode() -> None:
+def test_sampling_does_not_change_the_steps_of_cvode() -> None:
     coarse, fine = (solve("cvode-adams", problem(0.03, sample_s=every), 1e-6) for every in (1e-3, 1e-4))
     assert coarse.evaluations == fine.evaluations
     np.testing.assert_array_equal(coarse.states, fine.states[::10])
@@ -267,7 +267,7 @@ def test_a_spent_budget_is_a_failure_and_no_exception(name: str) -> None:
     assert np.isnan(solution.states[-1]).all()
 
 
-def test_what_a_peer_cannot_express_is_a_failure() -> None:
+def test_an_unsupported_problem_of_a_peer_is_a_failure() -> None:
     exact = problem(0.01, friction="exact")
     for name in ("scipy-bdf-python", "scipy-bdf-no-events"):
         failure = solve(name, exact, 1e-6).failure

@@ -18,7 +18,7 @@ def copy(tmp_path: Path) -> Path:
     return Path(shutil.copytree(RIG, tmp_path / "rig", ignore=shutil.ignore_patterns("__pycache__")))
 
 
-def test_the_digest_is_that_of_the_files_wherever_they_lie(copy: Path) -> None:
+def test_the_digest_does_not_depend_on_the_folder(copy: Path) -> None:
     assert equations_digest(copy) == equations_digest()
     kernel = next(iter(sorted((copy / "physics/kernels").glob("*.py"))))
     kernel.write_bytes(kernel.read_bytes().replace(b"\n", b"\r\n"))
@@ -29,13 +29,13 @@ def test_the_digest_is_that_of_the_files_wherever_they_lie(copy: Path) -> None:
     "changed",
     ["model.py", "contacts.py", "magnets.py", "levels.py", "kernels/laws/contact.py", "../base/maths/roots.py"],
 )
-def test_a_changed_file_of_the_equations_is_seen(copy: Path, changed: str) -> None:
+def test_a_changed_file_of_the_equations_changes_the_digest(copy: Path, changed: str) -> None:
     with (copy / "physics" / changed).open("a") as file:
         file.write("# changed\n")
     assert equations_digest(copy) != equations_digest()
 
 
-def test_a_new_file_and_one_with_another_name_are_seen(copy: Path) -> None:
+def test_new_and_renamed_files_change_the_digest(copy: Path) -> None:
     (copy / "physics/engines/deep").mkdir()
     (copy / "physics/engines/deep/another.py").write_text("")
     deeper = equations_digest(copy)
@@ -52,7 +52,7 @@ def test_a_new_file_and_one_with_another_name_are_seen(copy: Path) -> None:
 @pytest.mark.parametrize(
     "other", ["serve/service.py", "run/scenes.py", "base/errors.py", "cli/commands/run.py", "base/wire.py"]
 )
-def test_what_computes_no_motion_does_not_count(copy: Path, other: str) -> None:
+def test_files_without_equations_are_not_in_the_digest(copy: Path, other: str) -> None:
     with (copy / other).open("a") as file:
         file.write("# changed\n")
     assert equations_digest(copy) == equations_digest()

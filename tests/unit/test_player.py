@@ -95,7 +95,7 @@ def play(track: Track, **options: Any) -> tuple[Heard, dict[str, Any]]:
 
 
 @pytest.mark.parametrize("by", By)
-def test_every_payload_comes_once_and_in_the_order_of_its_key(track: Track, by: By) -> None:
+def test_every_payload_is_played_once_in_the_order_of_its_key(track: Track, by: By) -> None:
     played = [(item.key, item.payload) for batch in Timeline(track, by).play(0) for item in batch]
     assert by_key(played) == by_key(stream(BLOCKS))
 
@@ -114,7 +114,7 @@ def test_deadlines_by_arrival_are_those_of_the_recorder(track: Track) -> None:
     assert np.all(np.diff(due) == 1_000_000)
 
 
-def test_what_was_recorded_key_by_key_is_played_by_its_time(folder: Path) -> None:
+def test_payloads_recorded_key_by_key_are_played_by_time(folder: Path) -> None:
     history = Track([write_recording(folder / "history.mcap", key_by_key())])
     due: list[int] = []
     played: list[tuple[str, bytes]] = []
@@ -126,7 +126,7 @@ def test_what_was_recorded_key_by_key_is_played_by_its_time(folder: Path) -> Non
 
 
 @pytest.mark.parametrize("from_ms", [0, 5, 10, 333])
-def test_a_range_has_the_whole_blocks_inside_it(track: Track, from_ms: int) -> None:
+def test_a_range_contains_its_complete_blocks(track: Track, from_ms: int) -> None:
     to_ms = from_ms + 100
     played = [item for batch in Timeline(track).play(from_ms * 1_000_000, to_ms * 1_000_000) for item in batch]
     ticks = [item.block.tick for item in played if item.key == PROBES and item.block is not None]
@@ -135,7 +135,7 @@ def test_a_range_has_the_whole_blocks_inside_it(track: Track, from_ms: int) -> N
 
 
 @pytest.mark.parametrize("kind", ["whole", "cut off", "parts"])
-def test_chunks_hold_every_message_once_and_tell_their_times(folder: Path, path: Path, kind: str) -> None:
+def test_chunks_contain_every_message_once_with_its_time(folder: Path, path: Path, kind: str) -> None:
     files = [path]
     if kind == "cut off":
         files = [folder / "chunks.mcap.part"]
@@ -168,7 +168,7 @@ def test_a_replay_is_the_recording_byte_for_byte(track: Track) -> None:
 
 
 @pytest.mark.parametrize("rate", [0.01, 1.0, 1000.0])
-def test_nothing_adds_up_though_every_sleep_is_late(track: Track, rate: float) -> None:
+def test_late_sleeps_do_not_accumulate(track: Track, rate: float) -> None:
     heard, summary = play(track, rate=rate)
     begin_ns = heard.begin_ns  # type: ignore[attr-defined]
     for (key, payload), at_ns in zip(heard.all, heard.at_ns, strict=True):
@@ -180,7 +180,7 @@ def test_nothing_adds_up_though_every_sleep_is_late(track: Track, rate: float) -
     assert summary["lateness_ms"]["max"] <= 0.701
 
 
-def test_one_that_cannot_keep_up_says_how_far_it_is_behind(track: Track) -> None:
+def test_a_player_that_cannot_keep_up_reports_its_lag(track: Track) -> None:
     for slow_ns, behind in ((0, False), (20_000_000, True)):
         time = FakeTime(oversleep_ns=0)
         server = MemoryServer()
@@ -196,7 +196,7 @@ def test_one_that_cannot_keep_up_says_how_far_it_is_behind(track: Track) -> None
         assert any("behind" in text for text in player.status()["warnings"]) == behind
 
 
-def test_documents_are_answered_from_the_file_and_the_status_says_what_it_is(track: Track) -> None:
+def test_documents_come_from_the_file_and_the_status_names_the_replay(track: Track) -> None:
     server = MemoryServer()
     player = Player(track, server, FreeRun(), paused=True)
     player.prepare()
@@ -213,7 +213,7 @@ def test_documents_are_answered_from_the_file_and_the_status_says_what_it_is(tra
 
 
 @pytest.mark.parametrize("cut", [0.35, 0.7, 0.97])
-def test_a_cut_off_file_is_played_as_far_as_it_goes_and_then_ended(folder: Path, path: Path, cut: float) -> None:
+def test_a_truncated_file_is_played_to_its_last_message(folder: Path, path: Path, cut: float) -> None:
     short = folder / f"cut-{cut}.mcap"
     data = path.read_bytes()
     short.write_bytes(data[: int(cut * len(data))])
@@ -270,7 +270,7 @@ def test_passes_with_original_numbers_step_back(track: Track) -> None:
     assert summary["played_s"] == pytest.approx(0.6)
 
 
-def test_whole_passes_keep_every_payload_but_the_ends_between(track: Track) -> None:
+def test_complete_passes_keep_every_payload_except_intermediate_ends(track: Track) -> None:
     heard, summary = play(track, part=Part(loops=2))
     once = by_key(stream(BLOCKS))
     for key, payloads in once.items():
@@ -313,13 +313,13 @@ def test_new_numbers_run_on_through_passes_and_belong_together(track: Track) -> 
         (Part(loops=0), "loop must be at least 1"),
     ],
 )
-def test_parts_that_there_are_not_are_refused(track: Track, part: Part, message: str) -> None:
+def test_unknown_parts_are_refused(track: Track, part: Part, message: str) -> None:
     with pytest.raises(InputError, match=message):
         Player(track, MemoryServer(), FreeRun(), part=part)
 
 
 @pytest.mark.parametrize("rate", [0.0, 0.009, 1001.0, float("nan"), True, "1"])
-def test_rates_that_there_are_not_are_refused(track: Track, rate: Any) -> None:
+def test_unsupported_rates_are_refused(track: Track, rate: Any) -> None:
     with pytest.raises(InputError, match=r"rate must be a number of 0\.01 to 1000"):
         Player(track, MemoryServer(), FreeRun(), rate=rate)
 
@@ -331,7 +331,7 @@ def edit(track: Track, **options: Any) -> Edit:
     return Edit(track.documents[wire.CATALOGUE], **options)
 
 
-def test_a_key_goes_elsewhere_with_the_same_payloads(track: Track) -> None:
+def test_a_renamed_key_keeps_its_payloads(track: Track) -> None:
     new = wire.sensor_key("probes2")
     heard, _ = play(track, edit=edit(track, keys={PROBES: new}))
     assert PROBES not in heard.payloads
@@ -438,7 +438,7 @@ def test_steps_while_paused(track: Track) -> None:
             assert b'"accepted":false' in heard.client.request(wire.command_key("step"), request)
 
 
-def test_a_seek_goes_on_from_there(track: Track) -> None:
+def test_playback_continues_after_a_seek(track: Track) -> None:
     with running(track, paused=True) as (_, heard, console):
         console.step_blocks(1)
         assert console.seek(0.4).time_s == pytest.approx(0.4)
@@ -489,7 +489,7 @@ def test_a_stop_ends_the_stream_well(track: Track) -> None:
     assert heard.events[-1]["rows"][PROBES] == 600
 
 
-def test_a_burst_waits_for_what_clients_report(track: Track, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_burst_waits_for_the_clients_reports(track: Track, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(player_module, "_MAX_AHEAD_BLOCKS", 10)
     with running(track, clock=FreeRun(), paused=True) as (_, heard, console):
         client = heard.client
@@ -504,7 +504,7 @@ def test_a_burst_waits_for_what_clients_report(track: Track, monkeypatch: pytest
         until(lambda: len(heard.blocks()) == BLOCKS)
 
 
-def test_a_play_begins_when_all_are_there_that_it_waits_for(track: Track) -> None:
+def test_playback_starts_when_all_expected_clients_are_connected(track: Track) -> None:
     with running(track, clock=FreeRun(), wait_for=2) as (player, heard, console):
         play = player.status()["replay"]
         assert (play["waiting_for"], play["paused"]) == (2, True)
@@ -530,7 +530,7 @@ def test_waiting_is_ended_by_commands(track: Track, ends: str) -> None:
     assert heard.blocks() == []
 
 
-def test_who_does_not_come_is_not_waited_for_for_ever(track: Track) -> None:
+def test_the_wait_for_clients_is_limited(track: Track) -> None:
     server = MemoryServer()
     heard = Heard(server)
     with pytest.raises(RefusedError, match=r"0 of 1 clients were present after 0\.05 s"):
@@ -538,7 +538,7 @@ def test_who_does_not_come_is_not_waited_for_for_ever(track: Track) -> None:
     assert [event["reason"] for event in heard.events] == ["failed: 0 of 1 clients were present after 0.05 s"]
 
 
-def test_the_scene_tells_latecomers_the_commands_so_far(folder: Path) -> None:
+def test_the_scene_contains_earlier_commands_for_late_clients(folder: Path) -> None:
     command = {"event": "command", "id": 1, "tick": 200_000, "time_s": 0.2, "command": "hammer", "request": {}}
     payloads = list(stream(BLOCKS))
     payloads.insert(len(payloads) // 2, (wire.EVENTS, wire.encode_document(command)))
@@ -553,7 +553,7 @@ def test_the_scene_tells_latecomers_the_commands_so_far(folder: Path) -> None:
 # Dependencies.
 
 
-def test_an_end_that_was_none_stays_where_it_was(folder: Path) -> None:
+def test_a_premature_end_event_keeps_its_position(folder: Path) -> None:
     late = {"event": "warning", "tick": 600_000, "time_s": 0.6, "text": "went on"}
     payloads = [*stream(BLOCKS), (wire.EVENTS, wire.encode_document(late))]
     heard, _ = play(Track([write_recording(folder / "on.mcap", payloads)]))
@@ -561,7 +561,7 @@ def test_an_end_that_was_none_stays_where_it_was(folder: Path) -> None:
     assert heard.payloads[wire.EVENTS][:3] == by_key(payloads)[wire.EVENTS]
 
 
-def test_what_is_told_late_of_an_earlier_time_keeps_its_place(folder: Path) -> None:
+def test_late_documents_keep_their_position(folder: Path) -> None:
     told = [{"event": "command", "id": 1, "tick": tick, "time_s": tick / 1e6} for tick in (300_000, 295_000, 301_000)]
     payloads = list(stream(BLOCKS))
     for number, event in enumerate(told):
@@ -598,7 +598,7 @@ def test_a_file_that_is_damaged_while_it_is_played_ends_the_stream_and_says_so(f
     assert heard.blocks(), "what came before went out"
 
 
-def test_a_clock_tells_where_it_is() -> None:
+def test_a_clock_reports_its_position() -> None:
     time = FakeTime()
     clock = RealTime(now_ns=time.now_ns, sleep=time.sleep)
     clock.start(500, 2_000_000_000)

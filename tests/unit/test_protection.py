@@ -21,11 +21,11 @@ def test_the_monitor(name: str) -> None:
 
 
 @pytest.mark.parametrize("mutant", MUTANTS, ids=lambda mutant: mutant.name)
-def test_a_broken_monitor_is_told_by_the_scenario_that_is_meant(mutant: Mutant) -> None:
+def test_each_mutant_is_detected_by_its_scenario(mutant: Mutant) -> None:
     assert mutant.fails(mutant.told_by)
 
 
-def test_each_scenario_tells_a_mutant() -> None:
+def test_each_scenario_detects_a_mutant() -> None:
     assert {mutant.told_by for mutant in MUTANTS} == set(SCENARIOS)
 
 
@@ -45,7 +45,7 @@ def test_each_scenario_tells_a_mutant() -> None:
         ("colour", {"colour": "red"}),
     ],
 )
-def test_settings_that_cannot_be_are_refused(field: str, changes: dict[str, Any]) -> None:
+def test_impossible_settings_are_refused(field: str, changes: dict[str, Any]) -> None:
     with pytest.raises(InputError, match=f"^{field} must be"):
         Settings(**{"alert_um": 500.0, "danger_um": 1000.0, **changes})
 
@@ -61,7 +61,7 @@ def test_each_setting_is_an_option() -> None:
         parse([*line.split(), "--overspeed-hz", "-1"])
 
 
-def test_a_stream_that_is_another_one_is_refused() -> None:
+def test_another_stream_is_refused() -> None:
     monitor = sound().Protection(protection_scenarios.settings())
     rows = protection_scenarios.samples(disk_x=0.0, disk_y=0.0)
     monitor.feed(rows)

@@ -20,7 +20,7 @@ def kinds(settings: Any, rows: list[Any]) -> set[str]:
 
 
 @pytest.mark.parametrize(("peak_to_peak_um", "expected"), table.ALARMS.items())
-def test_alarms_come_within_1_percent_of_their_set_points(peak_to_peak_um: float, expected: set[str]) -> None:
+def test_alarms_are_within_1_percent_of_their_set_points(peak_to_peak_um: float, expected: set[str]) -> None:
     actions = outcome(monitor(**SETTLED), sine(peak_to_peak_um, duration_s=2.5))
     assert {(action.kind, action.name) for action in actions if action.kind != "trip"} == {
         (kind, name) for kind in expected - {"trip"} for name in ("disk_x", "disk_y")
@@ -29,14 +29,14 @@ def test_alarms_come_within_1_percent_of_their_set_points(peak_to_peak_um: float
 
 
 @pytest.mark.parametrize(("frequency_hz", "measure", "level_um"), table.VALUES)
-def test_channel_values_are_right_to_1_percent(frequency_hz: float, measure: Any, level_um: float) -> None:
+def test_channel_values_are_accurate_to_1_percent(frequency_hz: float, measure: Any, level_um: float) -> None:
     rows = sine(800.0, frequency_hz, duration_s=2.5)
     assert kinds(monitor(**SETTLED, measure=measure, alert_um=0.99 * level_um), rows) == {"alert"}
     assert kinds(monitor(**SETTLED, measure=measure, alert_um=1.01 * level_um, danger_um=2000.0), rows) == set()
 
 
 @pytest.mark.parametrize(("times", "gain"), table.CORNER)
-def test_the_corner_is_where_it_is_told(times: float, gain: float) -> None:
+def test_the_corner_is_at_its_declared_frequency(times: float, gain: float) -> None:
     rows = sine(800.0, 4.0 * times, duration_s=1.5)
     for part, expected in ((0.99, {"alert"}), (1.01, set())):
         given = monitor(corner_hz=4.0, window_s=0.3, startup_s=1.0, alert_um=part * gain * 800.0)
@@ -44,20 +44,20 @@ def test_the_corner_is_where_it_is_told(times: float, gain: float) -> None:
 
 
 @pytest.mark.parametrize(("volts", "okay"), table.LIMITS)
-def test_ok_limits_are_where_they_are_told(volts: float, okay: bool) -> None:
+def test_ok_limits_are_at_their_declared_voltage(volts: float, okay: bool) -> None:
     rows = sine(0.0, duration_s=0.6, commands=[table.fault("open", level_v=volts)])
     found = [(action.name, action.row) for action in outcome(monitor(alert_um=1e5, danger_um=1e5), rows)]
     assert found == ([] if okay else [("disk_x", 5000)]), "the fault begins at 0.25 s"
 
 
 @pytest.mark.parametrize("kind", MONITORED)
-def test_a_fault_comes_to_what_the_vote_says(kind: str) -> None:
+def test_a_fault_has_the_effect_of_the_vote(kind: str) -> None:
     numbers, expected = MONITORED[kind]
     rows = sine(200.0, duration_s=0.8, commands=[table.fault(kind, **numbers)])
     assert tuple(table.judged(rows, *vote) for vote in table.VOTES) == expected
 
 
-def test_the_edge_of_a_cable_that_breaks_is_a_danger_without_a_delay_alone() -> None:
+def test_the_edge_of_a_broken_cable_is_a_danger_only_without_a_delay() -> None:
     changes = {"duration_s": 0.4, "commands": [table.fault("open")]}
     rows = list(table.stream("probes", changes, "stable-run"))  # after the low-pass, which test signals bypass
     for delay_s, expected in ((0.0, True), (1e-4, False)):
@@ -67,7 +67,7 @@ def test_the_edge_of_a_cable_that_breaks_is_a_danger_without_a_delay_alone() -> 
 
 
 @pytest.mark.parametrize("kind", MONITORED_PULSES)
-def test_a_fault_of_the_keyphasor_comes_to_what_is_told(kind: str) -> None:
+def test_a_fault_of_the_keyphasor_has_its_declared_effect(kind: str) -> None:
     numbers, expected = MONITORED_PULSES[kind]
     given = monitor(overspeed_hz=7.0, speed_lost_s=0.3)
     assert kinds(given, table.keyphasor(kind, **numbers)) - {"clear"} == expected

@@ -30,7 +30,7 @@ DOUBTS = {
 
 
 @pytest.mark.parametrize("name", DOUBTS)
-def test_a_command_that_no_rig_takes_is_a_doubt(tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str) -> None:
+def test_an_invalid_recorded_command_is_a_doubt(tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str) -> None:
     event, text = DOUBTS[name]
     found = {}
     for file, events in (("sound", []), ("odd", [event])):

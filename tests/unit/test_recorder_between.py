@@ -100,7 +100,7 @@ def faulty(rows: list[tuple[str, bytes]]) -> list[tuple[str, bytes]]:
 
 
 @pytest.mark.parametrize("form", [in_order, late, long, faulty])
-def test_a_cut_of_a_part_is_that_of_a_reader_of_the_whole(
+def test_a_cut_of_a_part_equals_the_cut_of_the_whole(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, form: Any
 ) -> None:
     source = write(tmp_path / "run.mcap", form(items()))
@@ -127,7 +127,7 @@ def test_a_part_reads_few_chunks(
     capsys.readouterr()
 
 
-def test_an_export_of_a_part_is_that_of_a_reader_of_the_whole(
+def test_an_export_of_a_part_equals_the_export_of_the_whole(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     source = write(tmp_path / "run.mcap", late(items()))
@@ -148,9 +148,7 @@ def test_a_part_of_a_file_without_an_index_is_the_same(source: Path, tmp_path: P
     assert payloads(tmp_path / "a.mcap") == payloads(tmp_path / "b.mcap")
 
 
-def test_a_damaged_chunk_is_found_where_it_is_read_and_a_damaged_file_where_all_is(
-    source: Path, tmp_path: Path
-) -> None:
+def test_damage_is_found_only_in_the_chunks_read(source: Path, tmp_path: Path) -> None:
     data = bytearray(source.read_bytes())
     hit = next(chunk for chunk in Recording.open(source).chunks if chunk.begin_ns > 7e8)
     data[hit.offset + hit.length // 2] ^= 0xFF

@@ -106,7 +106,7 @@ def test_recover_takes_several_files(path, tmp_path, capsys):
         assert Recording.open(tmp_path / f"{number}.recovered.mcap").end_reason == "recovered"
 
 
-def test_of_a_whole_file_nothing_is_made(path, tmp_path, capsys):
+def test_a_complete_file_is_not_recovered(path, tmp_path, capsys):
     source = tmp_path / "run.mcap"
     source.write_bytes(path.read_bytes())
     assert run("recover", source) == 0
@@ -131,7 +131,7 @@ def test_a_finished_file_with_a_damaged_chunk_is_not_whole(path, tmp_path, capsy
     assert (tmp_path / "other.recovered.mcap").exists()
 
 
-def test_quick_info_tells_the_times_of_cuts_and_of_files_that_were_cut_off(path, tmp_path, capsys):
+def test_quick_info_shows_the_times_of_cuts_and_of_truncated_files(path, tmp_path, capsys):
     cut, broken = tmp_path / "cut.mcap", tmp_path / "broken.mcap"
     assert run("cut", path, "-o", cut, "--from", 0.2, "--to", 0.4) == 0
     broken.write_bytes(path.read_bytes()[:-300])
@@ -144,7 +144,7 @@ def test_quick_info_tells_the_times_of_cuts_and_of_files_that_were_cut_off(path,
     assert json.loads(capsys.readouterr().out)["span_s"] == [0.2, 0.39995]
 
 
-def test_nothing_is_recovered_where_one_file_is_missing(path, tmp_path, capsys):
+def test_nothing_is_recovered_if_a_file_is_missing(path, tmp_path, capsys):
     part = tmp_path / "0.mcap.part"
     part.write_bytes(path.read_bytes()[:-200])
     assert run("recover", part, tmp_path / "1.mcap.part") == 2
@@ -199,7 +199,7 @@ def _summary(**values: Any) -> Summary:
     return Summary(**{**about, **values})
 
 
-def test_a_triggered_recording_counts_what_it_kept(capsys):
+def test_a_triggered_recording_counts_its_own_rows(capsys):
     tell(_summary(fired=0, received_s=6.4))
     assert capsys.readouterr().out.splitlines()[0] == ("no trigger in 6.400 s; nothing written; ended: completed")
     files = (Path("run.hammer-001.mcap"),)
@@ -223,7 +223,7 @@ def test_remarks_are_printed_once(capsys):
     assert lines == ["first", "second", "third"]
 
 
-def test_a_disk_that_refuses_is_told_in_a_line(path, tmp_path, capsys, monkeypatch):
+def test_a_disk_error_is_reported_in_one_line(path, tmp_path, capsys, monkeypatch):
     def full(_: int) -> None:
         raise OSError(28, "No space left on device")
 
@@ -280,7 +280,7 @@ def test_recover_ends_with_1_and_info_counts_each_row_that_is_lost(
     assert set(Recording.open(made).doubts) <= set(recording.doubts)
 
 
-def test_recover_makes_no_file_where_every_chunk_is_unreadable(
+def test_recover_writes_no_file_if_all_chunks_are_unreadable(
     in_chunks: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     source = _damaged(in_chunks, tmp_path / "x.mcap", Recording.open(in_chunks).chunks)

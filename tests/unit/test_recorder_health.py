@@ -71,7 +71,7 @@ def channel(health: Health, name: str) -> ChannelHealth:
     return next(each for each in health.channels if each.name == name)
 
 
-def test_a_sound_recording_raises_no_doubt_and_its_noise_is_that_which_was_put_in(tmp_path):
+def test_a_normal_recording_has_no_doubt_and_the_true_noise(tmp_path):
     health = record(tmp_path / "a.mcap")
     assert [each.findings for each in health.channels] == [[]] * 8
     for each in health.channels:
@@ -113,7 +113,7 @@ def test_a_fault_is_found_on_its_channel_alone(tmp_path, fault):
             assert each.findings == []
 
 
-def test_the_size_of_the_hum_is_told(tmp_path):
+def test_the_amplitude_of_the_hum_is_reported(tmp_path):
     hum = 0.02 / abs(_channel("outer_x").sensitivity_v)
     health = record(tmp_path / "a.mcap", {"outer_x": volts_of("outer_x") + 0.02 * np.sin(100.0 * np.pi * TIME_S)})
     (finding,) = channel(health, "outer_x").findings
@@ -136,7 +136,7 @@ def test_the_clock_is_measured(tmp_path, ppm):
     assert health.jitter_max_ms < 0.1
 
 
-def test_history_that_arrived_at_once_does_not_bend_the_clock():
+def test_fetched_history_does_not_affect_the_clock_estimate():
     wall_s = np.arange(20) * 0.5
     simulated_s = np.where(wall_s < 2.0, wall_s * 10.0, 16.5 + wall_s * (1.0 + 50e-6))
     slope, jitter_ms, _, strays = pace_of(np.column_stack((simulated_s, wall_s)))
@@ -146,18 +146,18 @@ def test_history_that_arrived_at_once_does_not_bend_the_clock():
 
 
 @pytest.mark.parametrize("event", [{"event": "start", "pace": "none"}, {"event": "import", "files": "a.csv"}])
-def test_wall_times_that_no_clock_told_are_no_clock(tmp_path, event):
+def test_artificial_wall_times_give_no_clock_estimate(tmp_path, event):
     assert math.isnan(record(tmp_path / "a.mcap", event=event).pace)
 
 
-def test_an_import_is_not_judged_by_a_calibration_that_it_does_not_have(tmp_path):
+def test_an_import_without_calibration_is_not_judged_by_one(tmp_path):
     still = {name: np.full(ROWS, _channel(name).bias_v) for name in default_table().groups["probes"].names}
     health = record(tmp_path / "a.mcap", still, about={"import": {}})
     assert all(math.isnan(each.noise_calibrated) for each in health.channels)
     assert not any(channel(health, name).findings for name in still)
 
 
-def test_a_block_at_another_time_than_its_rows_and_what_the_rig_said(tmp_path):
+def test_blocks_with_wrong_times_and_warnings_of_the_rig_are_reported(tmp_path):
     health = record(tmp_path / "a.mcap", late=2000)
     assert health.misplaced == {sensor_key("probes"): 1}
     assert health.warnings == ["the shaft has gone", "doubtful"]

@@ -66,7 +66,7 @@ def test_samples_are_the_published_counts_in_engineering_units(recording, group)
 
 
 @pytest.mark.parametrize("table", list(TRUTH_COLUMNS))
-def test_truth_is_what_was_published(recording, table):
+def test_truth_equals_the_published_truth(recording, table):
     samples = recording.truth(table)
     values = np.concatenate([block_of(truth_key(table), number).values for number in range(BLOCKS)])
     np.testing.assert_array_equal(samples.values, values)
@@ -79,7 +79,7 @@ def test_edges_lie_between_ticks(recording):
     np.testing.assert_allclose(recording.edges(), np.arange(BLOCKS) * 0.01 + 0.25e-6, atol=1e-12)
 
 
-def test_documents_come_back(recording):
+def test_documents_are_read_unchanged(recording):
     assert [event["event"] for event in recording.events] == ["start", "end"]
     assert recording.last_status["time_s"] == 0.5
     assert recording.gaps == []
@@ -112,7 +112,7 @@ def test_streams_tell_their_extent(recording):
         (lambda recording: list(recording.blocks(STATUS)), "key must be a key of blocks"),
     ],
 )
-def test_what_is_not_there_is_refused(recording, ask, must):
+def test_unknown_streams_are_refused(recording, ask, must):
     with pytest.raises(InputError, match=must):
         ask(recording)
 
@@ -182,7 +182,7 @@ def _chunks(path: Path) -> list[tuple[int, dict[str, list[bytes]]]]:
     return chunks
 
 
-def test_a_file_cut_anywhere_gives_all_whole_chunks_before_the_cut(path, tmp_path):
+def test_a_truncated_file_gives_all_complete_chunks(path, tmp_path):
     data = path.read_bytes()
     chunks = _chunks(path)
     assert len(chunks) > 8
@@ -235,7 +235,7 @@ def test_a_damaged_byte_is_an_input_error_or_harmless(path, tmp_path):
     assert refused > 30
 
 
-def test_zeros_behind_the_last_flush_are_no_data(path, tmp_path):
+def test_zeros_after_the_last_flush_are_no_data(path, tmp_path):
     """A possible result of a power cut: the length of the file is right, the last pages are not."""
     chunks = _chunks(path)
     data = path.read_bytes()[: chunks[4][0]]
@@ -249,14 +249,14 @@ def test_zeros_behind_the_last_flush_are_no_data(path, tmp_path):
 
 
 @pytest.mark.parametrize("content", [b"", b"\x89MCAP0\r\n", b"PK\x03\x04", b"tick,disk_x\n0,1\n", bytes(10_000)])
-def test_a_file_that_is_no_recording_is_refused(tmp_path, content):
+def test_other_files_are_refused(tmp_path, content):
     path = tmp_path / "x.mcap"
     path.write_bytes(content)
     with pytest.raises(InputError, match="file must be a recording made by `rig record`"):
         Recording.open(path)
 
 
-def test_an_mcap_of_somebody_else_is_refused(tmp_path):
+def test_a_foreign_mcap_is_refused(tmp_path):
     from mcap.writer import Writer
 
     path = tmp_path / "x.mcap"
@@ -271,12 +271,12 @@ def test_an_mcap_of_somebody_else_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["missing.mcap", "."])
-def test_what_cannot_be_read_is_refused(tmp_path, name):
+def test_unreadable_files_are_refused(tmp_path, name):
     with pytest.raises(InputError, match="file must be a file that can be read"):
         Recording.open(tmp_path / name)
 
 
-def test_what_was_not_finished_is_named_where_it_is_asked_for_by_its_name_in_the_end(tmp_path):
+def test_opening_an_unfinished_recording_names_its_part_file(tmp_path):
     for name in ("a.mcap.part", "run.0000.mcap", "run.mcap.part", "run.toml"):
         (tmp_path / name).touch()
     for asked, named in (("a.mcap", "a.mcap.part"), ("run.mcap", f"run.0000.mcap, {tmp_path}/run.mcap.part")):

@@ -71,7 +71,7 @@ def chunks(path) -> list[tuple[int, int]]:
     return [(row.chunk_start_offset, row.chunk_start_offset + row.chunk_length) for row in summary.chunk_indexes]
 
 
-def test_a_file_cut_in_a_chunk_gives_whole_messages_of_that_chunk_too(path, chunks, items, tmp_path):
+def test_a_file_truncated_in_a_chunk_gives_its_complete_messages(path, chunks, items, tmp_path):
     data = path.read_bytes()
     sent = of(items)
     part = tmp_path / "run.mcap.part"
@@ -95,7 +95,7 @@ def _part(path: Path, data: bytes) -> Path:
     return path
 
 
-def test_a_recovered_file_is_finished_and_holds_what_the_source_did(path, chunks, tmp_path):
+def test_a_recovered_file_is_finished_with_the_sources_messages(path, chunks, tmp_path):
     part = _part(tmp_path / "run.mcap.part", path.read_bytes()[: chunks[-1][1] - 1000])
     source = Recording.open(part)
     raw = part.read_bytes()
@@ -135,7 +135,7 @@ def test_a_damaged_chunk_is_passed_over_and_its_rows_are_a_gap(path, chunks, ite
     assert rows + gap.size == 20_000
 
 
-def test_what_the_transport_gave_up_stays_on_record(tmp_path, items):
+def test_losses_of_the_transport_remain_recorded(tmp_path, items):
     with writer(tmp_path / "run.mcap") as file:
         for key, payload in items[:30]:
             file.write(key, payload, 0)
@@ -156,7 +156,7 @@ def test_a_file_in_the_making_is_not_recovered(tmp_path, items):
 
 
 @pytest.mark.parametrize("output", ["run.mcap", "run.mcap.part"])
-def test_the_source_is_never_the_place_to_write_to(path, tmp_path, output):
+def test_the_source_is_never_overwritten(path, tmp_path, output):
     part = _part(tmp_path / "run.mcap.part", path.read_bytes()[:-100])
     raw = part.read_bytes()
     with pytest.raises(InputError, match="output must be"):
@@ -164,7 +164,7 @@ def test_the_source_is_never_the_place_to_write_to(path, tmp_path, output):
     assert part.read_bytes() == raw
 
 
-def test_a_file_cut_in_its_calibration_is_refused_and_nothing_is_left(path, tmp_path):
+def test_a_file_truncated_in_its_calibration_is_refused_without_output(path, tmp_path):
     part = _part(tmp_path / "run.mcap.part", path.read_bytes()[:5000])
     with pytest.raises(InputError, match="cut off in it"):
         recover(part)
@@ -189,7 +189,7 @@ def test_a_file_cut_at_any_byte_loses_nothing_that_was_flushed(tmp_path):
         assert len(kept) >= max(count for end, count in flushed if end <= size)
 
 
-def test_damage_behind_the_calibration_is_never_a_reason_to_refuse(path, chunks, items, tmp_path):
+def test_damage_after_the_calibration_is_always_recovered(path, chunks, items, tmp_path):
     raw, sent = path.read_bytes(), of(items)
     first = chunks[0][0]
     rng = np.random.default_rng(4)
@@ -210,7 +210,7 @@ def test_the_name_of_a_recovered_file():
     assert recovered_path(Path("a/x.mcap.part")) == recovered_path(Path("a/x.mcap")) == Path("a/x.recovered.mcap")
 
 
-def test_a_cut_keeps_the_rows_between_two_times_and_whole_payloads(path, items, tmp_path):
+def test_a_cut_keeps_the_rows_between_two_times_and_complete_payloads(path, items, tmp_path):
     made = cut(Recording.open(path), tmp_path / "cut.mcap", from_s=0.2034, to_s=0.75)
     recording = Recording.open(made.path)
     assert recording.complete
@@ -233,7 +233,7 @@ def test_a_cut_keeps_the_rows_between_two_times_and_whole_payloads(path, items, 
     assert recording.gaps == []
 
 
-def test_cuts_behind_each_other_join_to_the_whole(path, tmp_path):
+def test_consecutive_cuts_join_to_the_whole(path, tmp_path):
     whole = Recording.open(path)
     pieces = []
     for number, (start, end) in enumerate([(0.0, 0.31234), (0.31234, 0.6), (0.6, 9.0)]):
@@ -275,7 +275,7 @@ def rows(recording: Recording, key: str) -> tuple[np.ndarray, np.ndarray, np.nda
     )
 )
 @example([5.1e-05, 5.2e-05])  # no row between them
-def test_pieces_of_any_cuts_hold_each_row_once_and_join_to_the_whole(short, tmp_path_factory, times_s):
+def test_pieces_contain_each_row_once_and_join_to_the_whole(short, tmp_path_factory, times_s):
     folder = tmp_path_factory.mktemp("cuts")
     edges_s = [-np.inf, *sorted(times_s), np.inf]
     pieces = []
@@ -295,7 +295,7 @@ def test_pieces_of_any_cuts_hold_each_row_once_and_join_to_the_whole(short, tmp_
             assert ticks[-1] < to_s * 1e6 - 1e-6
 
 
-def test_channels_and_kinds_are_left_out_with_their_calibration(path, tmp_path):
+def test_excluded_channels_are_removed_with_their_calibration(path, tmp_path):
     whole = Recording.open(path)
     recording = Recording.open(cut(whole, tmp_path / "a.mcap", only="sensors", channels=("P_W", "disk_y")).path)
     assert {key for key in recording.messages if key.startswith("rig/s")} == {PROBES, sensor_key("forces"), STATUS}
@@ -310,7 +310,7 @@ def test_channels_and_kinds_are_left_out_with_their_calibration(path, tmp_path):
     assert truth_key("contact") in truth.messages
 
 
-def test_a_cut_knows_the_commands_before_it(tmp_path, items):
+def test_a_cut_contains_earlier_commands(tmp_path, items):
     def command(number: int, tick: int) -> tuple[str, bytes]:
         about = {"event": "command", "tick": tick, "id": number, "command": "speed", "request": {"speed_hz": 2.0}}
         return EVENTS, encode_document(about)
@@ -330,7 +330,7 @@ def test_a_cut_knows_the_commands_before_it(tmp_path, items):
         ({"channels": ("disk_z",)}, "channels must be among disk_x"),
     ],
 )
-def test_impossible_cuts_are_refused_and_leave_nothing(path, tmp_path, options, must):
+def test_impossible_cuts_are_refused_without_output(path, tmp_path, options, must):
     with pytest.raises(InputError, match=must):
         cut(Recording.open(path), tmp_path / "cut.mcap", **options)
     assert list(tmp_path.iterdir()) == []

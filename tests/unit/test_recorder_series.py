@@ -84,7 +84,7 @@ def parts(tmp_path_factory, items) -> list[Path]:
     return file.files
 
 
-def test_every_payload_stands_in_one_part_and_the_parts_in_order_are_the_stream(parts, items):
+def test_every_payload_is_in_one_part_and_the_parts_join_to_the_stream(parts, items):
     assert [part.name for part in parts] == [f"run.{number:04d}.mcap" for number in range(4)]
     assert sorted(parts) == parts
     sent = defaultdict(list)
@@ -104,7 +104,7 @@ def _streams_of(items: list[tuple[str, bytes]], folder: Path) -> dict[str, Any]:
     return Recording.open(folder / "whole.mcap").streams
 
 
-def test_a_seam_lies_at_one_instant_for_all_streams(parts):
+def test_files_are_split_at_one_instant_for_all_streams(parts):
     for number, part in enumerate(parts):
         streams = Recording.open(part).streams
         firsts = [stream.first_time_s for key, stream in streams.items() if "edges" not in key]
@@ -133,7 +133,7 @@ def test_each_part_is_complete_and_names_its_neighbours(parts):
         assert summary.statistics.message_count == sum(recording.messages.values())
 
 
-def test_a_part_knows_the_commands_before_it(tmp_path, items):
+def test_a_part_contains_earlier_commands(tmp_path, items):
     command = {
         "event": "command",
         "tick": 100_000,
@@ -160,7 +160,7 @@ def test_rows_lost_at_a_seam_are_a_gap(tmp_path):
     assert join(file.files).streams[PROBES].lost == 600
 
 
-def test_history_that_comes_stream_by_stream_stands_in_the_first_part(tmp_path, items):
+def test_history_received_stream_by_stream_is_in_the_first_part(tmp_path, items):
     then, now = (
         [item for item in items if schema_of(item[0])][:700],
         [item for item in items if schema_of(item[0])][700:],
@@ -177,7 +177,7 @@ def test_history_that_comes_stream_by_stream_stands_in_the_first_part(tmp_path, 
     assert all(stream.lost == 0 for stream in join(file.files).streams.values())
 
 
-def test_a_stream_that_never_comes_holds_up_no_rotation_for_long(tmp_path, monkeypatch):
+def test_a_missing_stream_does_not_delay_rotation_for_long(tmp_path, monkeypatch):
     monkeypatch.setattr(recorder.output.series, "_CATCH_UP_S", 0.0)
     file = series(tmp_path / "run.mcap", rotate_s=0.1)
     write(file, [(PROBES, encode_block(block_of(PROBES, number))) for number in range(100)])
@@ -192,7 +192,7 @@ def test_rotation_by_size(tmp_path):
     assert all(1_000_000 < size < 1_300_000 for size in sizes[:-1])
 
 
-def test_the_budget_ends_a_recording_that_is_closed_well(tmp_path):
+def test_the_budget_ends_a_recording_with_a_finished_file(tmp_path):
     file = series(tmp_path / "run.mcap", budget_mb=5.0)
     write(file, list(stream(400)))
     assert file.ended == "the budget of 5 MB is used up"
@@ -201,7 +201,7 @@ def test_the_budget_ends_a_recording_that_is_closed_well(tmp_path):
     assert Recording.open(tmp_path / "run.mcap").complete
 
 
-def test_the_oldest_files_make_room_where_that_was_asked_for(tmp_path):
+def test_the_oldest_files_are_deleted_on_request(tmp_path):
     file = series(tmp_path / "run.mcap", rotate_mb=1.0, budget_mb=5.0, when_full="remove-oldest")
     write(file, list(stream(500)))
     assert file.ended == ""
@@ -213,7 +213,7 @@ def test_the_oldest_files_make_room_where_that_was_asked_for(tmp_path):
 
 
 @pytest.mark.parametrize("more", [{"budget_mb": 5.0, "when_full": "remove-oldest"}, {}])
-def test_the_counts_are_those_of_the_files_that_are_there(tmp_path, more):
+def test_the_counts_are_those_of_the_existing_files(tmp_path, more):
     """Rows, gaps, invalid payloads, and times: deleted files do not count."""
     file, items = series(tmp_path / "run.mcap", rotate_mb=1.0, **more), list(stream(500))
     lost = [item for number, item in enumerate(items) if item[0] != PROBES or number % 100]
@@ -226,7 +226,7 @@ def test_the_counts_are_those_of_the_files_that_are_there(tmp_path, more):
     assert counted.malformed == sum(stream.invalid for stream in found.streams.values()) == (1 if more else 2)
 
 
-def test_the_oldest_files_make_room_on_a_disk_of_which_nothing_is_to_be_left(tmp_path, monkeypatch):
+def test_the_oldest_files_are_deleted_on_a_full_disk(tmp_path, monkeypatch):
     disk_bytes = 8_000_000
 
     def statvfs(_: object) -> SimpleNamespace:
@@ -242,7 +242,7 @@ def test_the_oldest_files_make_room_on_a_disk_of_which_nothing_is_to_be_left(tmp
     assert join(file.files).streams[PROBES].last_time_s == pytest.approx(7.0 - 50e-6)
 
 
-def test_room_is_left_on_the_disk(tmp_path, monkeypatch):
+def test_free_space_is_kept_on_the_disk(tmp_path, monkeypatch):
     free = [100]
     monkeypatch.setattr(os, "statvfs", lambda _: SimpleNamespace(f_bavail=free[0], f_frsize=1_000_000))
     now_s = [0.0]
@@ -309,7 +309,7 @@ def test_force_removes_no_file_of_a_recording_in_the_making(tmp_path, items):
     assert [file.name for file in tmp_path.iterdir()] == ["run.0000.mcap"]
 
 
-def test_an_oldest_file_that_cannot_be_removed_ends_the_recording_well(tmp_path, items, monkeypatch):
+def test_a_file_that_cannot_be_deleted_ends_the_recording_normally(tmp_path, items, monkeypatch):
     def refused(self: Path, **_: object) -> None:
         raise OSError(30, "Read-only file system", str(self))
 
@@ -339,7 +339,7 @@ def test_a_removed_folder_leaves_a_copy_in_the_nearest_one(tmp_path, items):
     assert len(payloads) >= 24
 
 
-def test_a_recovered_part_joins_the_others_and_cuts_of_them_join_too(parts, tmp_path):
+def test_a_recovered_part_and_cuts_of_parts_join(parts, tmp_path):
     torn = tmp_path / "run.0003.mcap.part"
     torn.write_bytes(parts[3].read_bytes()[:-300])
     whole = join([*parts[:3], recover(torn).path])
@@ -367,7 +367,7 @@ def test_files_of_different_runs_are_not_joined(tmp_path, items):
         join([tmp_path / "a.mcap", tmp_path / "b.mcap"])
 
 
-def test_the_same_rows_twice_are_not_joined(tmp_path, items):
+def test_overlapping_parts_are_not_joined(tmp_path, items):
     for name in ("a", "b"):
         write(series(tmp_path / f"{name}.mcap"), items[:100])
     with pytest.raises(InputError, match="recordings that do not overlap in time"):

@@ -136,7 +136,7 @@ def test_each_block_and_each_document_is_decoded_once(path, monkeypatch):
 
 
 @pytest.mark.parametrize(("status", "short", "reason"), [(True, 0, "completed"), (False, 0, "late"), (True, 1, "late")])
-def test_the_last_status_ends_it_where_all_rows_are_there_and_only_there(path, status, short, reason):
+def test_the_last_status_ends_a_session_only_with_all_rows(path, status, short, reason):
     client = ScriptedClient()
     *items, _ = stream(3)
     end = {"event": "end", "tick": 30_000, "time_s": 0.03, "reason": "completed", "rows": {PROBES: 600 + short}}
@@ -178,7 +178,7 @@ def test_over_the_memory_transport(path):
     assert (beats[-1]["received_index"], beats[-1]["lost"]) == (4000, 0)
 
 
-def test_blocks_that_the_end_event_overtook_are_waited_for(path):
+def test_blocks_overtaken_by_the_end_event_are_awaited(path):
     client = ScriptedClient()
     items = list(stream(10))
     end = decode_document(items[-1][1]) | {"rows": {PROBES: 2000, truth_key("state"): 200}}
@@ -199,7 +199,7 @@ def test_blocks_that_the_end_event_overtook_are_waited_for(path):
     assert summary.lost == {}
 
 
-def test_blocks_that_never_come_are_a_gap_at_the_end(path):
+def test_missing_last_blocks_are_a_gap_at_the_end(path):
     client = ScriptedClient()
     items = [item for item in stream(10) if item[0] in (PROBES, EVENTS)]
     end = decode_document(items[-1][1]) | {"rows": {PROBES: 2000}}
@@ -214,7 +214,7 @@ def test_blocks_that_never_come_are_a_gap_at_the_end(path):
     assert Recording.open(path).gaps == [Gap(PROBES, 1600, 400)]
 
 
-def test_a_gap_and_what_the_transport_gave_up_are_in_the_summary_and_the_file(path):
+def test_gaps_and_transport_losses_are_in_summary_and_file(path):
     client = ScriptedClient()
     items = [item for number, item in enumerate(stream(10)) if number not in (10, 11, 12)]
 
@@ -256,7 +256,7 @@ def test_a_time_to_record_ends_for_all_streams_at_the_same_block(path):
     assert summary.lost == {}
 
 
-def test_streams_that_begin_a_block_apart_are_all_recorded_for_the_time(path):
+def test_streams_starting_a_block_apart_have_the_full_duration(path):
     client = ScriptedClient()
     items = [item for item in stream(60) if schema_of(item[0])]
     place = items.index((sensor_key("hammer"), encode_block(block_of(sensor_key("hammer"), 3))))
@@ -266,7 +266,7 @@ def test_streams_that_begin_a_block_apart_are_all_recorded_for_the_time(path):
     assert summary.duration_s == pytest.approx(0.21, abs=1e-3)
 
 
-def test_a_rig_that_is_started_again_is_not_mixed_into_the_recording(path):
+def test_a_restarted_rig_is_not_mixed_into_the_recording(path):
     client = ScriptedClient()
     items = list(stream(20))[1:-1]
 
@@ -289,7 +289,7 @@ def test_a_rig_that_is_started_again_is_not_mixed_into_the_recording(path):
         assert [p for _, p in recording.payloads(key)] == [p for k, p in items if k == key]
 
 
-def test_a_fault_of_the_recorder_itself_is_told_and_the_file_is_finished(path, monkeypatch):
+def test_an_internal_error_is_reported_and_the_file_finished(path, monkeypatch):
     client = ScriptedClient()
     blocks = [(PROBES, encode_block(block_of(PROBES, number))) for number in range(20)]
     real = RecordingWriter.take
@@ -308,7 +308,7 @@ def test_a_fault_of_the_recorder_itself_is_told_and_the_file_is_finished(path, m
     assert Recording.open(path).complete
 
 
-def test_blocks_with_impossible_times_are_left_out_and_odd_documents_are_kept_and_neither_ends_anything(path):
+def test_blocks_with_impossible_times_are_skipped_and_odd_documents_kept(path):
     client = ScriptedClient()
     head = struct.Struct("<qqddII")
     good = encode_block(block_of(PROBES, 0))
@@ -366,7 +366,7 @@ def test_stop_keeps_everything_received(path):
     assert (summary.reason, summary.rows[PROBES]) == ("interrupted by SIGINT", 40_000)
 
 
-def test_a_rig_that_is_back_with_the_same_run_is_recorded_on_and_the_gap_is_told(path):
+def test_a_rig_that_returns_with_the_same_run_continues_with_a_gap(path):
     client = ScriptedClient()
     items = list(stream(40))
     third = len(items) // 3
@@ -406,7 +406,7 @@ def test_a_lost_rig_closes_the_file_well(path):
     assert recording.streams[PROBES].rows == 2000
 
 
-def test_the_end_event_counts_even_if_the_rig_is_gone_before_it_is_read(path):
+def test_the_end_event_counts_even_if_the_rig_has_ended(path):
     client = ScriptedClient()
 
     def act() -> None:
@@ -417,7 +417,7 @@ def test_the_end_event_counts_even_if_the_rig_is_gone_before_it_is_read(path):
     assert record(RecordingSession(client, path), client, act).reason == "completed"
 
 
-def test_a_run_that_is_over_is_recognised_by_its_status(path):
+def test_a_finished_run_is_recognised_by_its_status(path):
     client = ScriptedClient()
     summary = record(
         RecordingSession(client, path),
@@ -462,7 +462,7 @@ def test_a_full_inbox_refuses_blocks_counts_them_and_leaves_a_gap(path, monkeypa
     assert Recording.open(path).metadata["end"]["dropped_payloads"] == str(summary.dropped)
 
 
-def test_a_disk_error_ends_the_session_with_what_was_written(path, monkeypatch):
+def test_a_disk_error_ends_the_session_with_the_written_part(path, monkeypatch):
     client = ScriptedClient()
     calls = [0]
     real = os.fsync
@@ -499,7 +499,7 @@ def test_a_disk_error_ends_the_session_with_what_was_written(path, monkeypatch):
     assert Recording.open(summary.path).streams[PROBES].rows > 0
 
 
-def test_heartbeats_tell_the_rig_how_far_the_recorder_is(path):
+def test_heartbeats_report_the_recorders_progress(path):
     client = ScriptedClient()
     summary = record(
         RecordingSession(client, path, name="recorder-1"),
@@ -518,7 +518,7 @@ def test_impossible_durations_are_refused(path, duration_s):
         RecordingSession(ScriptedClient(), path, duration_s=duration_s)
 
 
-def test_nothing_is_subscribed_before_the_destination_is_known_to_work(path):
+def test_the_destination_is_checked_before_subscribing(path):
     path.write_text("precious")
     client = ScriptedClient()
     with pytest.raises(InputError, match="a new file"):
@@ -535,7 +535,7 @@ def test_without_a_rig_there_is_no_file(path):
     assert list(path.parent.iterdir()) == []
 
 
-def test_what_will_be_written_is_named(path):
+def test_the_output_file_is_named(path):
     client, triggers = ScriptedClient(), tuple(map(Trigger.parse, ("hammer", "disk_x>1", "disk_x<0")))
     assert RecordingSession(client, path).first_files == [path]
     parts = RecordingSession(client, path, limits=Limits(rotate_s=1.0)).first_files
@@ -545,7 +545,7 @@ def test_what_will_be_written_is_named(path):
     ]
 
 
-def test_around_triggers_the_summary_tells_what_is_in_the_files(path):
+def test_the_summary_of_triggers_describes_the_files(path):
     client = ScriptedClient()
     capture = Capture((Trigger.parse("note"), Trigger.parse("P_N>-1e9")), pre_s=0.1, post_s=0.2)
     items = list(stream(100))
@@ -578,7 +578,7 @@ def test_rotation_and_triggers_together_are_refused_by_name(path):
         )
 
 
-def test_an_error_of_the_transport_still_closes_the_file_well(path, monkeypatch):
+def test_a_transport_error_leaves_a_finished_file(path, monkeypatch):
     client = ScriptedClient()
 
     def fail(key: str, callback) -> None:

@@ -64,7 +64,7 @@ def extent(path: Path, key: str = PROBES) -> tuple[float, float]:
     return stream.first_time_s, stream.last_time_s
 
 
-def test_a_blow_is_captured_with_the_time_before_and_after_it(tmp_path):
+def test_an_impact_is_captured_with_the_time_before_and_after(tmp_path):
     file = captures(tmp_path / "run.mcap", "hammer", pre_s=0.2, post_s=0.5)
     feed(file, range(300), {100: [event("hammer", 1.0)]})
     file.finish("completed")
@@ -102,7 +102,7 @@ def _level_block(number: int, values: np.ndarray) -> tuple[str, bytes]:
 @pytest.mark.parametrize(
     ("trigger", "sign"), [("P_E>500", 1.0), ("P_E<-500", -1.0), ("|P_E| > 500", 1.0), ("|P_E|>5e2", -1.0)]
 )
-def test_a_level_fires_where_it_is_crossed_and_once(tmp_path, trigger, sign):
+def test_a_level_trigger_fires_once_per_crossing(tmp_path, trigger, sign):
     file = captures(tmp_path / "run.mcap", trigger, pre_s=0.1, post_s=0.1)
     for number in range(200):
         time_s = (np.arange(200) + 200 * number) / 20_000
@@ -129,7 +129,7 @@ def test_a_trigger_during_a_capture(tmp_path, again, files, end_s):
     ]
 
 
-def test_the_time_before_a_trigger_is_whole_even_if_it_was_captured_before(tmp_path):
+def test_the_time_before_a_trigger_is_complete_even_after_a_capture(tmp_path):
     file = captures(tmp_path / "run.mcap", "hammer", pre_s=0.5, post_s=0.2)
     feed(file, range(300), {100: [event("hammer", 1.0)], 150: [event("hammer", 1.5)]})
     file.finish("completed")
@@ -166,7 +166,7 @@ def _forces(file: Captures, values_of: Callable[[np.ndarray], np.ndarray], block
             file.take(Payload.read(*_level_block(number, values_of((np.arange(200) + 200 * number) / 20_000)), number))
 
 
-def test_a_level_that_is_passed_already_is_told_once(tmp_path):
+def test_an_exceeded_level_is_reported_once(tmp_path):
     file = captures(tmp_path / "run.mcap", "P_E>500", "|P_E|<100")
     _forces(file, lambda time_s: np.where(time_s < 0.5, 3000.0, 3100.0), range(100))
     assert file.remarks == ("P_E is above 500 N already; waiting until it has been below",)
@@ -182,7 +182,7 @@ def _whirl(time_s: np.ndarray) -> np.ndarray:
     return np.where(whirling, 1000.0 * np.sin(2 * np.pi * 40.0 * (time_s - 1.0)), 0.0)
 
 
-def test_whirl_is_captured_where_it_begins_and_not_for_as_long_as_it_lasts(tmp_path):
+def test_whirl_is_captured_at_its_start_only(tmp_path):
     file = captures(tmp_path / "run.mcap", "|P_E|>500", pre_s=0.1, post_s=0.5)
     _forces(file, _whirl, range(900))
     recordings = [Recording.open(path) for path in file.files]
@@ -194,7 +194,7 @@ def test_whirl_is_captured_where_it_begins_and_not_for_as_long_as_it_lasts(tmp_p
     assert [each.metadata["end"]["reason"] for each in recordings] == ["captured", "captured"]
 
 
-def test_a_capture_that_is_made_longer_has_a_longest_length(tmp_path):
+def test_an_extended_capture_has_a_maximum_length(tmp_path):
     file = captures(tmp_path / "run.mcap", "|P_E|>500", pre_s=0.1, post_s=0.5, again="extend", longest_s=2.0)
     _forces(file, _whirl, range(950))
     first, second = (Recording.open(path) for path in file.files)
@@ -204,7 +204,7 @@ def test_a_capture_that_is_made_longer_has_a_longest_length(tmp_path):
     assert float(second.metadata["trigger"]["time_s"]) == pytest.approx(7.002, abs=1e-3)
 
 
-def test_a_blow_during_a_capture_makes_it_longer_and_a_level_does_not(tmp_path):
+def test_an_impact_extends_a_capture_and_a_level_does_not(tmp_path):
     file = captures(tmp_path / "run.mcap", "|P_E|>500", "hammer", pre_s=0.0, post_s=0.5)
     _forces(file, _whirl, range(130))
     file.take(Payload.read(*event("hammer", 1.3), 0))
@@ -213,7 +213,7 @@ def test_a_blow_during_a_capture_makes_it_longer_and_a_level_does_not(tmp_path):
     assert extent(path, FORCES)[1] == pytest.approx(1.8, abs=0.011)
 
 
-def test_what_is_kept_is_counted_apart_from_what_came(tmp_path):
+def test_stored_and_received_rows_are_counted_separately(tmp_path):
     file = captures(tmp_path / "run.mcap", "hammer", pre_s=0.2, post_s=0.5)
     feed(file, range(300), {100: [event("hammer", 1.0)]})
     (kept,) = file.kept()
@@ -238,7 +238,7 @@ def test_the_budget_holds_for_captures(tmp_path):
     assert end in ("captured", "the budget of 5 MB is used up, before the capture was over")
 
 
-def test_triggers_without_end_take_no_memory_without_end(tmp_path):
+def test_endless_triggers_use_bounded_memory(tmp_path):
     file = captures(tmp_path / "run.mcap", "note", pre_s=0.0, post_s=1.0)
     feed(file, range(5))
     for number in range(3000):
@@ -249,14 +249,14 @@ def test_triggers_without_end_take_no_memory_without_end(tmp_path):
     assert (end["trigger_count"], len(json.loads(end["triggers"]))) == ("3000", 1000)
 
 
-def test_an_event_of_a_far_time_does_not_hold_up_the_ring(tmp_path):
+def test_an_event_far_ahead_does_not_block_the_buffer(tmp_path):
     file = captures(tmp_path / "run.mcap", "hammer", pre_s=0.1, post_s=0.1)
     file.take(Payload.read(*event("command", 1e6, id=1, command="speed", request={}), 0))
     feed(file, range(500))
     assert file.held < 200
 
 
-def test_streams_that_are_behind_are_waited_for(tmp_path):
+def test_delayed_streams_are_awaited(tmp_path):
     file = captures(tmp_path / "run.mcap", "hammer", pre_s=0.1, post_s=0.2)
     file.take(Payload.read(FORCES, encode_block(block_of(FORCES, 0)), 0))
     for number in range(100, 140):
@@ -277,14 +277,14 @@ def test_the_number_of_captures_is_limited(tmp_path):
     assert len(file.files) == 2
 
 
-def test_a_capture_that_the_end_cuts_short_says_so(tmp_path):
+def test_a_capture_truncated_by_the_end_is_marked(tmp_path):
     file = captures(tmp_path / "run.mcap", "note", pre_s=0.1, post_s=5.0)
     feed(file, range(100), {50: [event("note", 0.5, text="now")]})
     file.finish("completed")
     assert Recording.open(file.files[0]).end_reason == "completed, before the capture was over"
 
 
-def test_a_capture_knows_the_commands_before_it_and_no_others(tmp_path):
+def test_a_capture_contains_only_earlier_commands(tmp_path):
     file = captures(tmp_path / "run.mcap", "hammer", pre_s=0.2, post_s=0.2)
     commands = {
         at: [event("command", at / 100, id=at, command="speed", request={"speed_hz": 1.0})] for at in (10, 70, 95)
@@ -297,7 +297,7 @@ def test_a_capture_knows_the_commands_before_it_and_no_others(tmp_path):
 
 
 @pytest.mark.parametrize("text", ["", "hit", "P_E", "P_E=5", "P_E>x", "|P_E>5", "P_E>nan", ">5", "P_E>1e999"])
-def test_what_is_no_trigger_is_refused(text):
+def test_invalid_triggers_are_refused(text):
     with pytest.raises(InputError, match="trigger must be one of hammer, speed"):
         Trigger.parse(text)
 

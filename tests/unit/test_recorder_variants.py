@@ -21,7 +21,7 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_variant_is_read_as_our_own_file(source: Path, tmp_path: Path, name: str) -> None:
+def test_a_variant_is_read_like_the_rigs_own_file(source: Path, tmp_path: Path, name: str) -> None:
     ours, path = Recording.open(source), mcap_variants.write(source, tmp_path / "x.mcap", name)
     theirs = Recording.open(path)
     assert theirs.complete

@@ -73,7 +73,7 @@ def foreign(path: Path, topic: str) -> list:
         return [(row.message, row.decoded_message) for row in reader.iter_decoded_messages(topics=[topic])]
 
 
-def test_every_payload_comes_back_byte_for_byte(path, items):
+def test_every_payload_is_read_byte_for_byte(path, items):
     recording = Recording.open(path)
     sent = defaultdict(list)
     for key, payload in items:
@@ -144,7 +144,7 @@ def test_plots_are_labelled_and_show_the_samples(path):
     assert seen == set(table.channels)
 
 
-def test_few_enough_plots_for_a_viewer_that_makes_eight():
+def test_the_number_of_plots_fits_a_viewer_with_eight():
     views = Views(default_table(), rate_hz=500.0).all
     assert 3 * len(views) <= 8
     for view in views:
@@ -171,7 +171,7 @@ def test_view_does_not_depend_on_the_size_of_the_blocks(tmp_path):
     assert views[0] == views[1] == views[2]
 
 
-def test_history_that_comes_key_by_key_is_joined(tmp_path, path, items):
+def test_history_received_key_by_key_is_merged(tmp_path, path, items):
     by_key = sorted(items, key=lambda item: item[0])
     write(tmp_path / "sorted.mcap", by_key)
     joined, straight = Recording.open(tmp_path / "sorted.mcap"), Recording.open(path)
@@ -181,7 +181,7 @@ def test_history_that_comes_key_by_key_is_joined(tmp_path, path, items):
         assert list(joined.payloads(topic)) == list(straight.payloads(topic))
 
 
-def test_groups_that_never_come_do_not_hold_up_the_others_for_ever(monkeypatch):
+def test_missing_groups_do_not_block_the_others_for_ever(monkeypatch):
     monkeypatch.setattr("recorder.contents.views._MAX_WAITING_INSTANTS", 3)
     monkeypatch.setattr("recorder.contents.views._BATCH_INSTANTS", 1)
     table = default_table()
@@ -194,7 +194,7 @@ def test_groups_that_never_come_do_not_hold_up_the_others_for_ever(monkeypatch):
     assert counts == [0, 0, 0, 5, 5, 5]
 
 
-def test_a_view_row_without_one_of_its_groups_is_nan_there(tmp_path):
+def test_a_view_row_with_a_missing_group_is_nan_there(tmp_path):
     path = tmp_path / "run.mcap"
     forces = sensor_key("forces")
     items = [(key, encode_block(block_of(key, number))) for number in range(3) for key in (PROBES, forces)]
@@ -230,7 +230,7 @@ def test_impossible_viewing_rate_is_refused(tmp_path, rate):
     assert not list(tmp_path.iterdir())
 
 
-def test_calibration_parameters_and_scene_stand_in_the_file(path):
+def test_calibration_parameters_and_scene_are_in_the_file(path):
     recording = Recording.open(path)
     about = documents()
     assert recording.catalogue == about[CATALOGUE]
@@ -247,7 +247,7 @@ def test_calibration_parameters_and_scene_stand_in_the_file(path):
     assert f"rig/truth/state: {about[CATALOGUE]['truth']['state']['rate_hz']} Hz" in readme
 
 
-def test_gaps_are_recorded_where_they_are(tmp_path, items):
+def test_gaps_are_recorded_at_their_place(tmp_path, items):
     path = tmp_path / "run.mcap"
     kept = [
         (key, payload)
@@ -266,7 +266,7 @@ def test_gaps_are_recorded_where_they_are(tmp_path, items):
 
 
 @pytest.mark.parametrize(("from_start", "gaps"), [(True, [Gap(PROBES, 0, 600)]), (False, [])])
-def test_a_late_start_is_a_gap_only_where_the_whole_run_was_asked_for(tmp_path, from_start, gaps):
+def test_a_late_start_is_a_gap_only_if_the_whole_run_was_requested(tmp_path, from_start, gaps):
     path = tmp_path / "run.mcap"
     late = [(PROBES, encode_block(block_of(PROBES, number))) for number in (3, 4)]
     write(path, late, beginning=Beginning(from_start=from_start))
@@ -282,7 +282,7 @@ def test_a_catalogue_without_a_table_is_refused(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_messages_that_the_transport_gave_up_are_recorded(tmp_path, items):
+def test_losses_of_the_transport_are_recorded(tmp_path, items):
     path = tmp_path / "run.mcap"
     with writer(path) as file:
         file.write(EVENTS, items[0][1], 0)
@@ -304,7 +304,7 @@ def test_rows_missing_at_the_end_are_a_gap(tmp_path):
     assert Recording.open(path).gaps == [Gap(PROBES, 200, 100)]
 
 
-def test_payloads_that_are_not_what_their_key_promises_are_kept(tmp_path, items):
+def test_payloads_that_contradict_their_key_are_kept(tmp_path, items):
     path = tmp_path / "run.mcap"
     odd = [(PROBES, b"\x00\x01\x00\x00short"), (EVENTS, b"not json"), ("rig/sensors/unknown", b""), (EVENTS, b"[1]")]
     file = write(path, [items[0], *odd, *items[1:]])
@@ -316,7 +316,7 @@ def test_payloads_that_are_not_what_their_key_promises_are_kept(tmp_path, items)
     assert [event["event"] for event in recording.events] == ["start", "end"]
 
 
-def test_streams_that_the_catalogue_does_not_know_are_recorded_too(tmp_path):
+def test_unknown_streams_are_recorded(tmp_path):
     path = tmp_path / "run.mcap"
     block = encode_block(block_of(PROBES, 0))
     write(path, [("rig/sensors/later", block), ("rig/truth/later", encode_block(block_of(truth_key("state"), 0)))])
@@ -364,7 +364,7 @@ def test_a_read_only_folder_is_refused_before_anything_is_written():
         writer(Path("/proc/self/run.mcap"))
 
 
-def test_a_full_disk_ends_the_recording_and_keeps_what_is_there(tmp_path):
+def test_a_full_disk_ends_the_recording_and_keeps_its_data(tmp_path):
     path = tmp_path / "run.mcap"
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     written = []
@@ -391,7 +391,7 @@ def test_a_full_disk_ends_the_recording_and_keeps_what_is_there(tmp_path):
     assert recording.streams[PROBES].rows == 200 * len(written)
 
 
-def test_an_error_in_the_body_still_closes_the_file_well(tmp_path, items):
+def test_an_error_in_the_body_leaves_a_finished_file(tmp_path, items):
     path = tmp_path / "run.mcap"
 
     def fail() -> None:
@@ -404,7 +404,7 @@ def test_an_error_in_the_body_still_closes_the_file_well(tmp_path, items):
     assert Recording.open(path).end_reason == "failed: of the caller"
 
 
-def test_what_is_flushed_survives_without_finish(tmp_path, items):
+def test_flushed_data_survive_without_finish(tmp_path, items):
     now_s = [0.0]
     file = writer(tmp_path / "run.mcap", monotonic_s=lambda: now_s[0])
     for number, (key, payload) in enumerate(items):
@@ -443,7 +443,7 @@ def test_the_size_of_the_index_is_known_beforehand(tmp_path, items):
     assert promised < 6 * index
 
 
-def test_a_wall_clock_that_is_set_back_goes_on_being_recorded(tmp_path):
+def test_recording_continues_after_the_wall_clock_is_set_back(tmp_path):
     with writer(tmp_path / "run.mcap") as file:
         for number in range(400):
             wall_ns = 10**18 + number * 10_000_000 - (3600 * 10**9 if number >= 200 else 0)
@@ -474,7 +474,7 @@ def test_a_recording_in_the_making_is_not_replaced(tmp_path, items):
     assert sum(Recording.open(path).messages[key] for key in {key for key, _ in items}) == len(items)
 
 
-def test_what_a_killed_recording_left_is_replaced_by_a_new_file(tmp_path, items):
+def test_the_remainder_of_a_killed_recording_is_replaced(tmp_path, items):
     path = tmp_path / "run.mcap"
     left = path.with_name(path.name + ".part")
     left.write_bytes(b"what a kill left")

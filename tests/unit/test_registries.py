@@ -100,7 +100,7 @@ def test_a_format_without_a_writer_is_refused_and_not_written_as_csv(
     assert not list(tmp_path.iterdir())
 
 
-def test_no_choice_between_commands_ends_in_an_else_that_acts() -> None:
+def test_choices_between_commands_have_no_default_action() -> None:
     """Every if-chain over two or more classes of commands has no else, or one that raises."""
     classes = {each.__name__ for each in commands.COMMANDS.values()}
     chains, acting = 0, []

@@ -51,7 +51,7 @@ class _Page(HTMLParser):
         self.text.append(data.strip())
 
 
-def test_html_is_one_file_that_needs_nothing_beside_it(tmp_path: Path) -> None:
+def test_html_is_self_contained(tmp_path: Path) -> None:
     path = tmp_path / "report.html"
     write_report(_report(), path)
     page = _Page()
@@ -65,7 +65,7 @@ def test_html_is_one_file_that_needs_nothing_beside_it(tmp_path: Path) -> None:
     assert page.tags.count("img") == 1
 
 
-def test_numbers_stand_right_code_as_code_and_the_origin_in_the_head(tmp_path: Path) -> None:
+def test_numbers_are_right_aligned_and_the_header_has_the_origin(tmp_path: Path) -> None:
     path = tmp_path / "report.html"
     report = Report("Fit", "NOT GOOD.", origin={"command": "`rig identify <a>.mcap`", "made": "2026-01-01"}, mark="bad")
     rows = [("a", "1.5", "within ±2", "-", "1"), ("b", "-2e-05 m/s^2", "3", "≤ 0.2 N", "see `rest`")]
@@ -82,7 +82,7 @@ def test_numbers_stand_right_code_as_code_and_the_origin_in_the_head(tmp_path: P
     assert "`" not in page
 
 
-def test_symbols_are_set_and_points_stand_in_line(tmp_path: Path) -> None:
+def test_symbols_are_typeset_and_decimal_points_aligned(tmp_path: Path) -> None:
     report = Report("Fit")
     rows = [("R_{S}", "1.5", "1"), ("shaft.arm_ring", "12", "a word"), ("K", "7·10^{5}", "2.50"), ("e", "−", "3")]
     report.table(("name", "value [N^{2}]", "mixed"), rows)
@@ -107,7 +107,7 @@ def test_the_same_report_gives_the_same_bytes(tmp_path: Path, name: str) -> None
     assert [path.name for path in tmp_path.iterdir()] == [name]
 
 
-def test_pdf_is_one(tmp_path: Path) -> None:
+def test_pdf_is_a_valid_file(tmp_path: Path) -> None:
     path = tmp_path / "report.pdf"
     write_report(_report(), path)
     data = path.read_bytes()
@@ -117,7 +117,7 @@ def test_pdf_is_one(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".html", ".pdf"])
-def test_a_name_that_is_no_text_is_shown_escaped(suffix: str, tmp_path: Path) -> None:
+def test_an_undecodable_name_is_shown_escaped(suffix: str, tmp_path: Path) -> None:
     name = "a\udcff\x01\u202e.mcap"  # as the system represents a file name that is not UTF-8
     report = Report(name, name, origin={"file": name})
     report.heading(name)
@@ -137,7 +137,7 @@ def test_a_row_of_another_length_is_refused() -> None:
     ("name", "complaint"),
     [("r.txt", "ends in .html or .pdf"), ("none/r.html", "in a folder that exists"), ("old.pdf", "a new file")],
 )
-def test_places_that_no_report_can_go_to(tmp_path: Path, name: str, complaint: str) -> None:
+def test_invalid_report_paths_are_refused(tmp_path: Path, name: str, complaint: str) -> None:
     (tmp_path / "old.pdf").write_bytes(b"")
     with pytest.raises(InputError, match=complaint):
         check_report(tmp_path / name, force=False)

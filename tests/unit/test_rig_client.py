@@ -53,7 +53,7 @@ def values_of(*numbers: int) -> np.ndarray:
     return np.concatenate([block_of(CONTACT, number).values for number in numbers])
 
 
-def test_truth_that_came_is_read_once(client: SettledClient, machine: Rig) -> None:
+def test_received_truth_is_read_once(client: SettledClient, machine: Rig) -> None:
     send(client, 0, 1)
     rows = machine.truth("contact", timeout_s=0.0)
     assert (rows.index, rows.gap, rows.names[0], rows.unit("contact_0")) == (0, 0, "contact_0", "m")
@@ -62,7 +62,7 @@ def test_truth_that_came_is_read_once(client: SettledClient, machine: Rig) -> No
         machine.truth("contact", timeout_s=0.0)
 
 
-def test_forged_truth_is_left_out(client: SettledClient, machine: Rig) -> None:
+def test_forged_truth_is_skipped(client: SettledClient, machine: Rig) -> None:
     forged = block_of(CONTACT, 1)
     send(client, 0)
     for payload in (
@@ -78,7 +78,7 @@ def test_forged_truth_is_left_out(client: SettledClient, machine: Rig) -> None:
     np.testing.assert_array_equal(machine.truth("contact", timeout_s=0.0).values, values_of(0, 1))
 
 
-def test_truth_that_came_twice_is_read_once(client: SettledClient, machine: Rig) -> None:
+def test_repeated_truth_is_read_once(client: SettledClient, machine: Rig) -> None:
     send(client, 0, 1, 1, 2)
     np.testing.assert_array_equal(machine.truth("contact", timeout_s=0.0).values, values_of(0, 1, 2))
 
@@ -100,7 +100,7 @@ def part(index: int, rows: int, *, gap: int = 0) -> Samples:
     return Samples(index, 1000 * index, 1000.0, 1e6, ("a",), ("V",), values, gap=gap)
 
 
-def test_rows_that_are_put_back_are_read_next() -> None:
+def test_returned_rows_are_read_next() -> None:
     reader = RowReader("a reader")
     for samples in (part(0, 10), part(10, 10)):
         reader.add(samples)
@@ -109,7 +109,7 @@ def test_rows_that_are_put_back_are_read_next() -> None:
     assert [(each.index, len(each)) for each in (reader.read(10), reader.read())] == [(5, 10), (15, 5)]
 
 
-def test_what_has_come_is_read_in_pieces_without_a_gap() -> None:
+def test_received_rows_are_read_in_pieces_without_a_gap() -> None:
     reader = RowReader("a reader")
     for samples in (part(0, 10), part(10, 10), part(30, 10, gap=10), part(40, 5)):
         reader.add(samples)

@@ -30,11 +30,11 @@ def test_root_is_the_closed_form_and_scipys_to_the_bit(function, low: float, hig
     assert found == brentq(function, low, high, xtol=within, maxiter=1000)
 
 
-def test_without_a_change_of_sign_it_says_so() -> None:
+def test_a_missing_change_of_sign_raises() -> None:
     with pytest.raises(ValueError, match="change its sign from 1 to 2"):
         find_root(lambda x: x, 1.0, 2.0, within=1e-9)
 
 
-def test_what_is_not_finite_is_not_searched_for_ever() -> None:
+def test_a_search_ends_at_non_finite_values() -> None:
     with pytest.raises(ValueError, match="no root found"):
         find_root(lambda x: math.nan if 0.0 < x < 1.0 else x - 0.5, 0.0, 1.0, within=1e-9)

@@ -81,7 +81,7 @@ def test_document_of_a_scene_is_the_scene(data: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize("name", scene_names())
-def test_shipped_scenes_load_and_say_what_happens(name: str) -> None:
+def test_shipped_scenes_load_and_have_a_description(name: str) -> None:
     scene = load_scene(name)
     assert scene.name == name
     assert scene.title
@@ -97,7 +97,7 @@ def test_hammer_scene_is_the_papers() -> None:
     assert blow.request == HammerCommand(force_n=100.0, duration_ms=5.0, direction="x")
 
 
-def test_file_gives_its_own_name_and_commands_stand_flat_in_it(tmp_path: Path) -> None:
+def test_a_scene_file_has_a_name_and_flat_commands(tmp_path: Path) -> None:
     path = tmp_path / "mine.toml"
     path.write_text('[[commands]]\nat_s = 0.5\ncommand = "speed"\nspeed_hz = 3\n[set]\n"contact.friction" = 0.3\n')
     scene = load_scene(path)
@@ -108,7 +108,7 @@ def test_file_gives_its_own_name_and_commands_stand_flat_in_it(tmp_path: Path) -
 
 
 @given(rate=st.integers(100, 1_000_000), step=st.integers(1, 1000), truth=st.sampled_from([10, 1000, 2000, 40_000]))
-def test_any_rate_whose_samples_fall_on_few_places_between_rows_will_do(rate: int, step: int, truth: int) -> None:
+def test_rates_with_few_sample_positions_between_rows_are_accepted(rate: int, step: int, truth: int) -> None:
     data = {"engine": {"step_us": step}, "sensors": {"rate_hz": rate, "truth_rate_hz": truth}}
     try:
         scene = parse_scene(data)
@@ -129,7 +129,7 @@ def test_any_rate_whose_samples_fall_on_few_places_between_rows_will_do(rate: in
     assert rows >= 7.5 * max(channel.bandwidth_hz for channel in scene.table.channels.values())
 
 
-def test_rates_that_laboratories_have_will_do_with_any_step() -> None:
+def test_common_laboratory_rates_are_accepted_with_any_step() -> None:
     for rate in (1_000, 1_024, 8_192, 25_600, 44_100, 48_000, 51_200, 65_536, 96_000, 102_400, 131_072, 204_800):
         for step in (1, 7, 25, 50, 1000):
             parse_scene({"engine": {"step_us": step}, "sensors": {"rate_hz": rate}})
@@ -194,7 +194,7 @@ def test_overrides_reach_scene_and_parameters() -> None:
     assert load_scene("hammer").set == {}, "the shipped scene stays as it is"
 
 
-def test_points_of_a_profile_may_be_just_as_near_as_is_said() -> None:
+def test_points_of_a_profile_may_have_the_minimum_distance() -> None:
     profile = [[0.01 * n, 1.0] for n in range(100)]
     assert len(parse_scene({"drive": {"profile": profile}}).drive.profile) == 100
 
@@ -211,7 +211,7 @@ RELEASE = {"command": "release"}
         ([{"at_s": 0.1, **RELEASE}, {"at_s": 0.2, **RELEASE}], "release"),
     ],
 )
-def test_commands_that_cannot_both_be_are_refused(commands: list[dict[str, Any]], field: str) -> None:
+def test_contradicting_commands_are_refused(commands: list[dict[str, Any]], field: str) -> None:
     with pytest.raises(InputError, match=f"^{field} must be "):
         parse_scene({"commands": commands})
     apart = [{**command, "at_s": 0.3 * n} for n, command in enumerate(commands)]
@@ -219,7 +219,7 @@ def test_commands_that_cannot_both_be_are_refused(commands: list[dict[str, Any]]
         assert len(parse_scene({"commands": apart}).commands) == 2
 
 
-def test_magnets_that_have_let_go_are_not_released() -> None:
+def test_released_magnets_cannot_be_released_again() -> None:
     with pytest.raises(InputError, match=r"^release must be given once, while the magnets hold"):
         parse_scene({"initial": {"magnets": False}, "commands": [{"at_s": 0.1, **RELEASE}]})
 
@@ -229,7 +229,7 @@ def test_a_speed_from_outside_replaces_the_profile() -> None:
     assert (scene.drive.profile, scene.drive.speed_hz) == ((), 4.0)
 
 
-def test_overrides_do_not_touch_a_file(tmp_path: Path) -> None:
+def test_overrides_do_not_change_a_file(tmp_path: Path) -> None:
     path = tmp_path / "mine.toml"
     path.write_text("[drive]\nspeed_hz = 3.0\n")
     assert load_scene(path, {"drive.speed_hz": 4.0}).drive.speed_hz == 4.0
@@ -250,14 +250,14 @@ def test_unknown_key_names_its_neighbours() -> None:
 
 
 @pytest.mark.parametrize("text", ["drive = 3\n", 'drive = "fast"\n'])
-def test_override_inside_what_is_no_table_is_refused(tmp_path: Path, text: str) -> None:
+def test_override_inside_a_value_is_refused(tmp_path: Path, text: str) -> None:
     path = tmp_path / "mine.toml"
     path.write_text(text)
     with pytest.raises(InputError, match="drive must be"):
         load_scene(path, {"drive.speed_hz": 1.0})
 
 
-def test_override_of_a_parameter_beside_a_wrong_set_is_refused(tmp_path: Path) -> None:
+def test_override_with_a_wrong_set_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "mine.toml"
     path.write_text("set = 4\n")
     with pytest.raises(InputError, match="set must be"):
@@ -278,12 +278,12 @@ def test_no_speed_of_a_scene_is_above_the_drives(overrides: dict[str, Any]) -> N
         load_scene("stable-run", overrides)
 
 
-def test_the_drives_limit_itself_is_a_good_speed() -> None:
+def test_the_drives_limit_is_a_valid_speed() -> None:
     assert load_scene("stable-run", {"drive.speed_hz": 15.0}).drive.speed_hz == 15.0
 
 
 @given(direction=st.sampled_from(["x", "y", "-x", "-y"]) | numbers(-360.0, 360.0))
-def test_direction_of_a_blow_is_a_unit_vector(direction: str | float) -> None:
+def test_direction_of_an_impact_is_a_unit_vector(direction: str | float) -> None:
     assert math.hypot(*HammerCommand(direction=direction).cosines) == pytest.approx(1.0, abs=1e-15)
 
 
@@ -316,7 +316,7 @@ def test_direction_turns_from_x_toward_y(direction: Any, cosines: tuple[float, f
         ("release", {}, ReleaseCommand()),
     ],
 )
-def test_good_commands(name: str, request_: dict[str, Any], command: object) -> None:
+def test_valid_commands(name: str, request_: dict[str, Any], command: object) -> None:
     assert check_command(name, request_) == command
 
 

@@ -98,9 +98,7 @@ def test_the_session_itself_is_perfect_and_its_stamps_are_the_ticks(sent: tuple[
     assert card.row("stamp offset", "probes").value == pytest.approx(0.0, abs=1e-12)
 
 
-def test_rows_that_are_lost_doubled_swapped_and_altered_are_named(
-    sent: tuple[Path, np.ndarray], tmp_path: Path
-) -> None:
+def test_lost_repeated_swapped_and_altered_rows_are_named(sent: tuple[Path, np.ndarray], tmp_path: Path) -> None:
     session, counts = sent
     rows = np.delete(np.arange(len(counts)), [5000, 5001, 12000])
     rows = np.insert(rows, 7001, rows[7000])
@@ -119,7 +117,7 @@ def test_rows_that_are_lost_doubled_swapped_and_altered_are_named(
     assert [card.row("altered values", name).value for name in NAMES] == [0, 0, 1, 0]
 
 
-def test_a_scale_that_is_none_of_the_tables_is_found_and_told(sent: tuple[Path, np.ndarray], tmp_path: Path) -> None:
+def test_a_scale_outside_the_table_is_found_and_reported(sent: tuple[Path, np.ndarray], tmp_path: Path) -> None:
     session, counts = sent
     columns = in_units(counts)
     columns["disk_y [mm]"] = 1.001 * columns["disk_y [mm]"]
@@ -171,7 +169,7 @@ def test_every_event_in_many_rows_is_found(levels: int) -> None:
     assert not len(found.foreign)
 
 
-def test_a_block_that_comes_late_and_rows_that_are_none_are_told() -> None:
+def test_late_blocks_and_foreign_rows_are_reported() -> None:
     counts = np.random.default_rng(5).integers(-9000, 9000, (6000, 2))
     order = np.concatenate([np.arange(1000), np.arange(2000, 3000), np.arange(1000, 2000), np.arange(3000, 6000)])
     daq = counts[order]
@@ -184,7 +182,7 @@ def test_a_block_that_comes_late_and_rows_that_are_none_are_told() -> None:
     assert not len(found.lost)
 
 
-def test_a_channel_that_is_broken_has_no_say_in_which_row_is_which() -> None:
+def test_a_broken_channel_does_not_affect_the_row_assignment() -> None:
     counts = np.random.default_rng(6).integers(-9000, 9000, (200_000, 3))
     daq = counts.copy()
     daq[70_000:, 1] += 1
@@ -235,7 +233,7 @@ def recorded(
     ],
     ids=["perfect", "gain-offset", "swapped-polarity", "clock-skew", "jitter", "low-pass"],
 )
-def test_each_defect_turns_red_what_it_declares_and_nothing_else(
+def test_each_defect_fails_exactly_its_declared_quantities(
     sent: tuple[Path, np.ndarray], tmp_path: Path, defects: dict[str, float], declared: set[str]
 ) -> None:
     columns = recorded(np.random.default_rng(3), **defects)  # type: ignore[arg-type]
@@ -249,7 +247,7 @@ def test_each_defect_turns_red_what_it_declares_and_nothing_else(
             assert row.low - wide < true[row.quantity] < row.high + wide, row
 
 
-def test_without_a_formula_the_sessions_own_noise_leaves_open_what_it_hides(
+def test_without_a_formula_the_sessions_noise_makes_small_defects_inconclusive(
     sent: tuple[Path, np.ndarray], tmp_path: Path
 ) -> None:
     columns = recorded(np.random.default_rng(3))
@@ -280,7 +278,7 @@ def test_fifteen_channels_are_mapped_by_two_seconds_of_chips() -> None:
     assert wires["ai0"].late_s == pytest.approx(0.1)
 
 
-def test_intervals_are_as_wide_as_cramer_and_rao_have_it() -> None:
+def test_intervals_have_the_cramer_rao_width() -> None:
     # A sine of 5 V in 1 mV of noise, 80 Hz, for 10 s at 20 kHz.
     amplitude, noise, hz, seconds = 5.0, 1e-3, 80.0, 10.0
     t = np.arange(int(seconds * RATE_HZ)) / RATE_HZ
@@ -299,7 +297,7 @@ def test_intervals_are_as_wide_as_cramer_and_rao_have_it() -> None:
     assert (widths < [10e-6, 20e-6, 20e-9 / math.sqrt(2.0), 0.01e-6]).all()
 
 
-def test_jitter_of_five_nanoseconds_is_told_apart_from_noise() -> None:
+def test_jitter_of_five_nanoseconds_is_separated_from_noise() -> None:
     t = np.arange(10 * RATE_HZ) / RATE_HZ
     generator = np.random.default_rng(5)
     signal = Exact(lambda at: 5.0 * np.sin(2.0 * np.pi * 1000.3 * at), (-1.0, 11.0), RATE_HZ)
@@ -313,7 +311,7 @@ def test_jitter_of_five_nanoseconds_is_told_apart_from_noise() -> None:
     assert split.noise[1] < 1e-3 < split.noise[2]
 
 
-def test_a_sine_record_tells_bits_and_distortion_as_closed_forms_have_them() -> None:
+def test_bits_and_distortion_of_a_sine_agree_with_closed_forms() -> None:
     rows, amplitude, noise = 40_000, 4.0, 1e-3
     phase = 2.0 * np.pi * 0.048713 * np.arange(rows) + 0.4
     clean = amplitude * np.cos(phase) + 2e-3 * np.cos(2.0 * phase) + 1e-3 * np.cos(3.0 * phase + 1.0) + 0.2
@@ -330,7 +328,7 @@ def test_a_sine_record_tells_bits_and_distortion_as_closed_forms_have_them() -> 
     assert not is_sine(chips(1, 1.0), 0.1)
 
 
-def test_what_lies_between_samples_is_off_by_a_millionth() -> None:
+def test_interpolation_has_an_error_of_a_millionth() -> None:
     signal = Tones(9, 1.0, high_hz=0.4 * RATE_HZ)
     samples = Sampled(signal(np.arange(4000) / RATE_HZ), 0.0, RATE_HZ)
     t = np.sort(np.random.default_rng(9).uniform(*samples.span_s, 3000))
@@ -344,7 +342,7 @@ def test_what_lies_between_samples_is_off_by_a_millionth() -> None:
 # Options, and output of the result.
 
 
-def test_an_interval_that_reaches_over_its_limit_shows_nothing() -> None:
+def test_an_interval_across_its_limit_is_inconclusive() -> None:
     limit = load_limits().bounds("analogue", "gain")
     assert [judge_row("analogue", "gain", "", each, limit=limit).verdict for each in (
         (0.0, -5.0, 5.0), (200.0, 150.0, 250.0), (95.0, 80.0, 110.0), None,
@@ -385,13 +383,13 @@ def test_an_outcome_is_a_pass_only_without_a_failing_quantity_and_without_a_doub
     assert errors == (["inconclusive"] if outcome is Outcome.INCONCLUSIVE else [])
 
 
-def test_every_quantity_stands_in_the_documentation() -> None:
+def test_every_quantity_is_in_the_documentation() -> None:
     text = " ".join((ROOT / "docs/score-reference.md").read_text("utf-8").split())
     for path, known in QUANTITIES.items():
         assert f"- {path}: {', '.join(known)} " in text
 
 
-def test_limits_say_where_they_are_from() -> None:
+def test_limits_have_a_source() -> None:
     table = load_limits().bounds("analogue", "noise", PROBES[0])
     assert table is not None
     assert table.high == pytest.approx(1.1 * 1e-3 / 3.94, rel=1e-3)
@@ -431,7 +429,7 @@ def test_the_report_draws_the_channels_of_the_analogue_path(sent: tuple[Path, np
     assert (tmp_path / "r.html").read_text(encoding="utf-8").count("<img") == 1
 
 
-def test_wrong_inputs_are_one_line(
+def test_wrong_inputs_are_refused_in_one_line(
     sent: tuple[Path, np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     session, counts = sent
@@ -457,7 +455,7 @@ def test_wrong_inputs_are_one_line(
 @pytest.mark.parametrize(
     ("name", "ppm"), [("test-two-tone", 30.0), ("test-two-tone", 60.0), ("test-chirp", 30.0), ("test-multisine", 30.0)]
 )
-def test_a_test_signal_is_known_by_its_formula(name: str, ppm: float, tmp_path: Path) -> None:
+def test_a_test_signal_is_compared_with_its_formula(name: str, ppm: float, tmp_path: Path) -> None:
     """The session's own noise is then not in the DAQ's reference."""
     scene = load_scene(name, {"duration_s": 0.8})
     write_run(Simulation(scene), tmp_path / "sent.mcap")
@@ -477,9 +475,7 @@ def test_a_test_signal_is_known_by_its_formula(name: str, ppm: float, tmp_path: 
 
 
 @pytest.mark.parametrize(("rejection_db", "verdict"), [(40.0, FAIL), (75.0, PASS)])
-def test_a_tone_above_half_of_the_rate_shows_how_much_of_it_folds_back(
-    rejection_db: float, verdict: str, tmp_path: Path
-) -> None:
+def test_a_tone_above_half_of_the_rate_measures_aliasing(rejection_db: float, verdict: str, tmp_path: Path) -> None:
     scene = load_scene("test-two-tone", {"duration_s": 0.8, "generator.frequencies": [79.0, 7001.0]})
     write_run(Simulation(scene), tmp_path / "sent.mcap")
     source, rate_hz = scene.sources()["disk_x"], RATE_HZ // 2

@@ -105,7 +105,7 @@ def test_whole_numbers_in_a_wav_are_counts(session: Path, counts: np.ndarray, tm
 
 @pytest.mark.parametrize("lost", [1, 8])
 @pytest.mark.parametrize("form", ["mm", "counts", "16 bits"])
-def test_bits_that_one_channel_leaves_out_are_altered_values(
+def test_bits_lost_by_one_channel_are_altered_values(
     form: str, lost: int, session: Path, counts: np.ndarray, tmp_path: Path
 ) -> None:
     counts = counts if form != "16 bits" else counts >> 8

@@ -117,7 +117,7 @@ def together(most: int) -> list[tuple[str, ...]]:
 
 
 @pytest.mark.parametrize("kinds", together(13), ids=len)
-def test_a_daq_that_samples_by_itself(kinds: tuple[str, ...], rig: Rig, sessions: Sessions, tmp_path: Path) -> None:
+def test_a_daq_with_its_own_clock(kinds: tuple[str, ...], rig: Rig, sessions: Sessions, tmp_path: Path) -> None:
     card = judge(
         daq(tmp_path / "daq.parquet", rig.counts(kinds, noisy=True)),
         [sessions[False][0]],
@@ -137,7 +137,7 @@ def test_a_daq_that_samples_by_itself(kinds: tuple[str, ...], rig: Rig, sessions
 
 
 @pytest.mark.parametrize("kinds", together(5), ids=len)
-def test_a_daq_that_takes_counts(kinds: tuple[str, ...], rig: Rig, sessions: Sessions, tmp_path: Path) -> None:
+def test_a_daq_that_records_counts(kinds: tuple[str, ...], rig: Rig, sessions: Sessions, tmp_path: Path) -> None:
     card = judge(daq(tmp_path / "daq.parquet", rig.counts(kinds, noisy=True)), [sessions[True][0]], channels=DUE)
     assert card.path == "digital"
     assert red(card) == declared(kinds, {"altered values"})
@@ -214,7 +214,7 @@ def test_a_logger_of_a_can_bus(suffix: str, fd: bool, sessions: Sessions, tmp_pa
 
 
 @pytest.mark.parametrize("defect", FILE_DEFECTS)
-def test_a_daqs_own_defects(defect: str, sessions: Sessions, tmp_path: Path) -> None:
+def test_defects_of_the_daqs_file(defect: str, sessions: Sessions, tmp_path: Path) -> None:
     (session, counts), (change, declares) = sessions[True], FILE_DEFECTS[defect]
     assert red(judge(daq(tmp_path / "daq.parquet", counts, change), [session], channels=DUE)) == declares
 
@@ -228,7 +228,7 @@ def test_stamps_of_the_computers_clock_show_latency(sessions: Sessions, tmp_path
     assert row.low < late_s.mean() < row.high < row.low + 2e-5
 
 
-def test_a_recording_that_a_command_triggered_shows_its_row(tmp_path: Path) -> None:
+def test_a_recording_triggered_by_a_command_has_the_commands_row(tmp_path: Path) -> None:
     session = FOLDER / "hammer-3.2.mcap"
     with Recording.open(session) as recording:
         samples, (tick,) = recording.samples("forces"), [e["tick"] for e in recording.events if e["event"] == "hammer"]

@@ -41,7 +41,7 @@ def session(counts: np.ndarray, tmp_path_factory: pytest.TempPathFactory) -> Pat
 
 
 @pytest.mark.parametrize("path", [None, "analogue"])
-def test_a_channel_that_is_absent_fails_unless_fewer_were_to_be_recorded(
+def test_an_absent_channel_fails_unless_it_was_not_requested(
     path: None, session: Path, counts: np.ndarray, tmp_path: Path
 ) -> None:
     daq = write_parquet(tmp_path / "daq.parquet", columns_of(counts, "disk_x", "ring_y"))
@@ -56,7 +56,7 @@ def test_a_channel_that_is_absent_fails_unless_fewer_were_to_be_recorded(
 
 
 @pytest.mark.parametrize(("at", "gap_s"), [(1, 3600.0), (100, 3600.0), (399, 86400.0)])
-def test_a_clock_that_was_set_gives_no_traceback(at: int, gap_s: float, session: Path, tmp_path: Path) -> None:
+def test_a_clock_adjustment_gives_no_traceback(at: int, gap_s: float, session: Path, tmp_path: Path) -> None:
     stamps = np.arange(400) * 1e-3
     stamps[at:] += gap_s
     columns = {"time [s]": stamps, "disk_x [mm]": np.sin(0.04 * np.arange(400))}
@@ -70,7 +70,7 @@ def test_a_column_without_a_value_is_absent(session: Path, counts: np.ndarray, t
     assert ("recorded", "ring_x") in red(judge(write_parquet(tmp_path / "daq.parquet", columns), [session]))
 
 
-def test_a_channel_that_the_session_lacks_is_one_line(
+def test_a_channel_missing_in_the_session_is_refused_in_one_line(
     session: Path, counts: np.ndarray, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     daq = write_parquet(tmp_path / "daq.parquet", columns_of(counts))
@@ -82,7 +82,7 @@ def test_a_channel_that_the_session_lacks_is_one_line(
 
 @pytest.mark.parametrize("value", [0.0, 1.5, np.nan])
 @pytest.mark.parametrize("unit", ["mm", "V"])
-def test_channels_that_are_all_dead_fail_and_have_a_junit_file(
+def test_dead_channels_fail_with_a_junit_file(
     value: float, unit: str, session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     columns = {f"{name} [{unit}]": np.full(4000, value) for name in PROBES.names}
@@ -112,7 +112,7 @@ def test_no_channel_at_all_is_refused(
     assert "--channels must be names of channels or groups" in err
 
 
-def test_a_channel_of_a_mapping_that_the_session_lacks_is_named_where_it_is(
+def test_an_unknown_channel_of_a_mapping_is_named_with_its_line(
     session: Path, counts: np.ndarray, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     daq, mapping = write_parquet(tmp_path / "daq.parquet", columns_of(counts)), tmp_path / "m.toml"
@@ -132,7 +132,7 @@ def test_a_channel_of_a_mapping_that_the_session_lacks_is_named_where_it_is(
         ('high = 1.0, measures = "lenght"', "lenght"),
     ],
 )
-def test_a_limit_that_nothing_or_anything_keeps_is_refused(ends: str, told: str, tmp_path: Path) -> None:
+def test_a_limit_that_always_or_never_passes_is_refused(ends: str, told: str, tmp_path: Path) -> None:
     file = tmp_path / "ours.toml"
     file.write_text(f'title = "x"\n[analogue]\ngain = {{ {ends}, kind = "assumed", source = "me" }}\n')
     with pytest.raises(InputError) as error:
@@ -140,7 +140,7 @@ def test_a_limit_that_nothing_or_anything_keeps_is_refused(ends: str, told: str,
     assert told in str(error.value)
 
 
-def test_ends_of_a_limit_that_the_channel_table_turns_round_are_refused(tmp_path: Path) -> None:
+def test_a_limit_reversed_by_the_channel_table_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "ours.toml"
     file.write_text(
         'title = "x"\n[analogue]\nnoise = { low = 1e9, high = { of = "noise" }, kind = "assumed", source = "me" }\n'
@@ -150,7 +150,7 @@ def test_ends_of_a_limit_that_the_channel_table_turns_round_are_refused(tmp_path
 
 
 @pytest.mark.parametrize("kept", [1, 20, 75])
-def test_a_text_whose_last_line_is_cut_is_judged_as_far_as_it_is_whole(
+def test_a_text_with_a_truncated_last_line_is_judged_without_it(
     kept: int, session: Path, counts: np.ndarray, tmp_path: Path
 ) -> None:
     lines = [",".join(map(repr, row)) for row in PROBES.engineering(counts[:2000]).tolist()]

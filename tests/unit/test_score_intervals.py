@@ -24,7 +24,7 @@ PROBE = default_table().channels["disk_x"]
 NOISE_V = math.hypot(1e-3, PROBE.lsb_v / math.sqrt(12.0))
 
 
-def test_students_t_is_that_of_two_sides() -> None:
+def test_students_t_is_two_sided() -> None:
     # Tables of the 97.5 % quantile.
     assert student([1.0, 5.0, 30.0, 1e9]) == pytest.approx([12.7062, 2.5706, 2.0423, 1.95996], rel=1e-4)
 
@@ -58,7 +58,7 @@ def _two_levels(gain: float, noise: float) -> Waveform:
     )  # fmt: skip
 
 
-def test_two_levels_that_a_session_rounded_leave_the_gain_open() -> None:
+def test_two_levels_rounded_by_the_session_leave_the_gain_inconclusive() -> None:
     # 204.8 counts, rounded to 205 with noise of a tenth of a step: off by 976 ppm, and by up to 0.4 / 205 from others.
     fit = _two_levels(204.8 / 205.0, 0.1)
     session = Converter(1.0, 0.1, values=fit.known)
@@ -66,7 +66,7 @@ def test_two_levels_that_a_session_rounded_leave_the_gain_open() -> None:
     assert 976e-6 < half < 0.5 / 205.0
 
 
-def test_noise_of_a_step_leaves_no_rounding() -> None:
+def test_noise_of_one_step_removes_the_rounding_error() -> None:
     fit = _two_levels(1.0, 1.0)
     assert undithered(fit, 1.0, Converter(1.0, 1.0, values=fit.known)) == ()
     assert widen(fit, ()) is fit
@@ -86,7 +86,7 @@ def test_intervals_of_noise_and_jitter_are_two_standard_deviations_to_each_side(
     assert np.mean([low < 2e-7 < high for _, low, high in jitters]) >= 0.88
 
 
-def test_a_floor_is_taken_off_the_low_end_of_the_noise_alone() -> None:
+def test_a_floor_is_subtracted_from_the_low_end_of_the_noise_only() -> None:
     found, generator = [], np.random.default_rng(3)
     fit = _fit(1e-3, 0.0, generator)
     for floor in (0.0, 0.6e-3):
@@ -96,7 +96,7 @@ def test_a_floor_is_taken_off_the_low_end_of_the_noise_alone() -> None:
     assert lower == pytest.approx(math.sqrt(low**2 - 0.36e-6))
 
 
-def test_the_interval_of_sinad_is_that_of_chi_squared() -> None:
+def test_the_interval_of_sinad_follows_chi_squared() -> None:
     from scipy.stats import chi2
 
     n, t = 500, np.arange(500)
@@ -107,7 +107,7 @@ def test_the_interval_of_sinad_is_that_of_chi_squared() -> None:
     assert (low - value, high - value) == pytest.approx(ends, rel=0.15)
 
 
-def test_the_interval_of_stamp_jitter_is_that_of_chi_squared() -> None:
+def test_the_interval_of_stamp_jitter_follows_chi_squared() -> None:
     from scipy.stats import chi2
 
     n = 4096
@@ -128,7 +128,7 @@ def test_the_interval_of_stamp_jitter_is_that_of_chi_squared() -> None:
 
 
 @pytest.mark.parametrize("noise", ["white", "ar10", "ar100", "sine"])
-def test_intervals_hold_for_coloured_and_drifting_noise(noise: str) -> None:
+def test_intervals_have_coverage_for_coloured_and_drifting_noise(noise: str) -> None:
     """Of 40, at least 33 contain the truth, which is 3.6 standard deviations below 38; the long run is
     `tests.score_coverage`.
     """
@@ -174,7 +174,7 @@ def test_a_pass_needs_a_quantity_that_passes_and_no_doubt(
     assert card.outcome == outcome
 
 
-def test_limits_made_of_the_table_are_closed_forms() -> None:
+def test_limits_from_the_table_agree_with_closed_forms() -> None:
     limits = load_limits()
 
     def ends(quantity: str, **told: float) -> tuple[float, float] | None:

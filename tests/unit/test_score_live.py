@@ -47,7 +47,7 @@ def counts() -> np.ndarray:
     return counts_of("probes", volts, None)
 
 
-def test_latency_is_arrival_less_that_of_the_rigs_block(counts: np.ndarray, tmp_path: Path) -> None:
+def test_latency_is_relative_to_the_arrival_of_the_rigs_block(counts: np.ndarray, tmp_path: Path) -> None:
     session = write_session(tmp_path / "session.mcap", {"probes": counts})
     daq = tmp_path / "daq.csv"
     daq.write_text(HEADING + lines(counts))
@@ -114,7 +114,7 @@ def _short_waits(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(live, "_FLOOR_LINES", 10)
 
 
-def test_what_came_is_judged_as_a_file(tmp_path: Path) -> None:
+def test_received_data_are_judged_like_a_file(tmp_path: Path) -> None:
     daq = Deliverer(without=(7000, 7001))
     found = daq.collect(tmp_path)
     assert found.remarks[0].startswith("live: 30000 lines in ")
@@ -125,7 +125,7 @@ def test_what_came_is_judged_as_a_file(tmp_path: Path) -> None:
     assert "the last line is cut and was ignored: 2 of 4 columns" in card.remarks
 
 
-def test_an_interruption_keeps_the_whole_lines_that_there_were(tmp_path: Path) -> None:
+def test_an_interruption_keeps_the_complete_lines(tmp_path: Path) -> None:
     daq = Deliverer(blocks=20)
     read, write = os.pipe()
     daq.source = read
@@ -154,7 +154,7 @@ def full(_: Deliverer, monkeypatch: pytest.MonkeyPatch) -> None:
     ("how", "kind", "told"),
     [(nobody, ConnectionError, "no reply"), (silent, InputError, "in 0.1 s"), (full, RefusedError, "No space left")],
 )
-def test_what_goes_wrong_meanwhile_is_told(
+def test_errors_during_a_live_run_are_reported(
     how: Callable[[Deliverer, pytest.MonkeyPatch], None], kind: type[Exception], told: str, tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
@@ -164,7 +164,9 @@ def test_what_goes_wrong_meanwhile_is_told(
         daq.collect(tmp_path)
 
 
-def test_wrong_options_are_one_line(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_wrong_options_are_refused_in_one_line(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     for arguments, told in (
         (["-", "--against", "sent.mcap"], "--against must be left out"),
         (["daq.csv"], "--against must be given"),

@@ -69,7 +69,7 @@ def test_values_are_those_of_the_mapping_on_the_analogue_path(
     assert gains[1] == pytest.approx(gains[0], abs=20.0)
 
 
-def test_a_channel_that_is_mapped_to_anothers_signal_fails(session: Path, counts: np.ndarray, tmp_path: Path) -> None:
+def test_a_channel_mapped_to_another_signal_fails(session: Path, counts: np.ndarray, tmp_path: Path) -> None:
     daq = write(tmp_path / "daq.parquet", counts[:, [1, 0, 2, 3]] * CHANNEL.lsb_v)
     card = judge(daq, [session], mapping=mapped({"unit": "V"}))
     assert {(row.quantity, row.channel) for row in card.rows if row.verdict == FAIL} == {
@@ -78,7 +78,7 @@ def test_a_channel_that_is_mapped_to_anothers_signal_fails(session: Path, counts
 
 
 @pytest.mark.parametrize("unit", ["milimetre", "MN", "um pk-pk"])
-def test_a_unit_that_is_unknown_is_asked_for(
+def test_an_unknown_unit_must_be_given(
     unit: str, session: Path, counts: np.ndarray, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     columns = {f"{name} [{unit}]": PROBES.engineering(counts)[:, n] for n, name in enumerate(PROBES.names)}
@@ -107,7 +107,7 @@ def test_a_misspelt_name_of_counts_is_proposed(
 
 
 @pytest.mark.parametrize("unit", ["counts", "raw", "LSB"])
-def test_a_mapping_takes_counts(unit: str, session: Path, counts: np.ndarray, tmp_path: Path) -> None:
+def test_a_mapping_accepts_counts(unit: str, session: Path, counts: np.ndarray, tmp_path: Path) -> None:
     card = judge(write(tmp_path / "daq.parquet", counts[1000:]), [session], mapping=mapped({"unit": unit}))
     assert (card.path, card.outcome) == ("digital", "pass"), card.verdict_line
 
@@ -123,7 +123,7 @@ def test_a_mapping_takes_counts(unit: str, session: Path, counts: np.ndarray, tm
         ({"disk_x": {"source": "ai0", "unit": "mm", "sensitivity": "7.87 V/mm"}}, "channels.disk_x.unit"),
     ],
 )
-def test_what_is_wrong_with_a_mapping_is_named(
+def test_errors_in_a_mapping_are_named(
     table: dict[str, Any], field: str, session: Path, counts: np.ndarray, tmp_path: Path
 ) -> None:
     daq = write(tmp_path / "daq.parquet", counts[:100])

@@ -96,7 +96,7 @@ def test_an_offset_fails_where_it_changes_counts(off: float, session: Path, coun
     assert red(card) == ({("offset", "disk_y")} if off >= 0.5 else set())
 
 
-def test_digits_that_the_file_leaves_out_are_no_gain(session: Path, counts: np.ndarray, tmp_path: Path) -> None:
+def test_missing_digits_of_a_file_are_not_a_gain(session: Path, counts: np.ndarray, tmp_path: Path) -> None:
     small = counts // 40  # 6 digits are exact to less than half a count
     session = write_session(tmp_path / "session.mcap", {"probes": small})
     values = PROBES.engineering(small) - np.array([c.offset for c in PROBES.channels])
@@ -115,7 +115,7 @@ QUIET = {
 
 
 @pytest.mark.parametrize("which", QUIET)
-def test_channels_of_noise_are_found_by_the_begin_that_others_show(which: str, tmp_path: Path) -> None:
+def test_channels_of_noise_use_the_start_found_by_others(which: str, tmp_path: Path) -> None:
     groups, moving, reverse = QUIET[which]
     g, channels = np.random.default_rng(3), [c for group in groups for c in default_table().groups[group].channels]
     counts = np.rint(g.standard_normal((9000, len(channels))) * [c.noise_v / c.lsb_v for c in channels]).astype(
@@ -145,7 +145,7 @@ def repeating(rows: int, channels: int, generator: np.random.Generator) -> np.nd
 
 
 @pytest.mark.parametrize(("first", "last"), [(7200, 11_000), (0, 3800)], ids=["after", "before"])
-def test_rows_beyond_a_session_are_not_those_of_another_period(first: int, last: int, tmp_path: Path) -> None:
+def test_rows_outside_a_session_are_not_assigned_one_period_away(first: int, last: int, tmp_path: Path) -> None:
     """Nearly all of them are equal one period away, where more rows of the record would be in the session."""
     whole = repeating(11_000, 4, np.random.default_rng(0))
     session = write_session(tmp_path / "session.mcap", {"probes": whole[2700:8700]})
@@ -155,7 +155,7 @@ def test_rows_beyond_a_session_are_not_those_of_another_period(first: int, last:
     assert f"{max(2700 - first, last - 8700)} rows are not judged" in card.remarks[0]
 
 
-def test_the_sessions_last_rows_in_place_of_others_are_no_begin(tmp_path: Path) -> None:
+def test_repeated_last_rows_of_a_session_are_not_a_start(tmp_path: Path) -> None:
     whole = repeating(6000, 4, np.random.default_rng(0))
     session = write_session(tmp_path / "session.mcap", {"probes": whole})
     daq = np.concatenate([whole[5700:], whole[1300:5300]])
@@ -172,7 +172,7 @@ STALE = {
 
 
 @pytest.mark.parametrize(("which", "repeats"), [*((which, False) for which in STALE), ("the end first", True)])
-def test_rows_of_the_session_are_not_those_beyond_it(which: str, repeats: bool, tmp_path: Path) -> None:
+def test_rows_of_the_session_are_not_assigned_outside_it(which: str, repeats: bool, tmp_path: Path) -> None:
     g = np.random.default_rng(0)
     whole = repeating(20_000, 4, g) if repeats else g.integers(-50, 50, (20_000, 4))
     session = write_session(tmp_path / "session.mcap", {"probes": whole})
@@ -194,7 +194,7 @@ def test_stale_rows_in_one_table_of_several_do_not_pass(tmp_path: Path) -> None:
     assert "probes: unjudged rows after the session equal a run of rows in it" in card.doubts
 
 
-def test_a_begin_without_unequal_rows_is_found_though_others_have_more_rows() -> None:
+def test_a_start_without_unequal_rows_wins_over_longer_overlaps() -> None:
     whole = repeating(40_000, 1, np.random.default_rng(1))[:, 0]
     places = find_begins([whole[29_500:]], [whole[:30_000]], 1, 500)
     assert 29_500 in places

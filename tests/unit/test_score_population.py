@@ -29,12 +29,12 @@ def test_a_perfect_daq_passes(number: int, folder: Path) -> None:
 @pytest.mark.parametrize(
     ("seed", "number"), [(1, 0), (1, 4), (1, 6), pytest.param(11, 47, id="a doubled sample in a signal that repeats")]
 )
-def test_one_defect_turns_its_own_quantity_red(seed: int, number: int, folder: Path) -> None:
+def test_one_defect_fails_its_own_quantity(seed: int, number: int, folder: Path) -> None:
     line = Population("defects", seed, folder).judged(number)
     assert (line["outcome"], line["right"], line["other"]) == ("fail", True, [])
 
 
-def test_a_goal_is_missed_by_one_wrong_verdict() -> None:
+def test_one_wrong_verdict_misses_the_goal() -> None:
     line = {"outcome": "fail", "right": True, "other": [], "cpu_s": 0.0, "by": "function"}
     refused, passed = line | {"outcome": "refused"}, line | {"outcome": "pass"}
     assert figures("foreign", [refused] * 20)[1]

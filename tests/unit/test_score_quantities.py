@@ -38,7 +38,7 @@ def held(true: float, judged: Callable[[np.random.Generator], Interval | None], 
 
 
 @pytest.mark.parametrize(("square", "cube"), [(2e-3, 0.0), (1e-3, 2e-3)])
-def test_intermodulation_is_that_of_a_polynomial(square: float, cube: float) -> None:
+def test_intermodulation_agrees_with_a_polynomial(square: float, cube: float) -> None:
     # y = x + a2 x^2 + a3 x^3 of two tones of amplitude A: products of a2 A^2, twice, and of 3/4 a3 A^3, twice.
     a, t = 2.0, np.arange(3000) / RATE_HZ
     x = a * (np.sin(2.0 * np.pi * 79.0 * t) + np.sin(2.0 * np.pi * 1999.0 * t + 0.3))
@@ -60,9 +60,7 @@ def test_intermodulation_is_that_of_a_polynomial(square: float, cube: float) -> 
     ("rate_hz", "low_hz", "high_hz", "rows"),
     [(4e3, 80.0, 1000.02, 2400), (4e3, 500.0, 1500.02, 4000), (20e3, 300.0, 900.03, 9000)],
 )
-def test_products_that_fold_or_coincide_are_no_intermodulation(
-    rate_hz: float, low_hz: float, high_hz: float, rows: int
-) -> None:
+def test_folded_or_coincident_products_are_excluded(rate_hz: float, low_hz: float, high_hz: float, rows: int) -> None:
     t = np.arange(rows) / rate_hz
     known = 2.0 * (np.sin(2.0 * np.pi * low_hz * t) + np.sin(2.0 * np.pi * high_hz * t + 0.3))
     for seed in range(4):
@@ -75,14 +73,14 @@ def test_products_that_fold_or_coincide_are_no_intermodulation(
     assert -61.0 < bent[0] < -53.0  # two lines of a2 A^2 over two tones are -54 dB; one may coincide with another
 
 
-def test_tones_whose_products_are_all_beyond_half_of_the_rate_show_no_intermodulation() -> None:
+def test_products_above_half_of_the_rate_give_no_intermodulation() -> None:
     t = np.arange(4000) / 5e3
     known = np.sin(2.0 * np.pi * 1000.0 * t) + np.sin(2.0 * np.pi * 2000.0 * t + 0.3)
     assert intermodulation(t, known, NOISE * np.random.default_rng(1).standard_normal(4000), 1.0) is None
 
 
 @pytest.mark.parametrize("kind", ["sine", "noise", "quiet", "chips"])
-def test_what_is_not_two_tones_has_no_intermodulation(kind: str) -> None:
+def test_intermodulation_needs_two_tones(kind: str) -> None:
     t, generator = np.arange(4000) / RATE_HZ, np.random.default_rng(1)
     known = {
         "sine": np.sin(2.0 * np.pi * 997.0 * t), "noise": generator.standard_normal(4000), "quiet": np.zeros(4000),
@@ -100,7 +98,7 @@ def ramp(rows: int, period: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize(("square", "cube"), [(1e-4, 0.0), (0.0, 4e-5)])
-def test_inl_is_that_of_a_polynomial(square: float, cube: float) -> None:
+def test_inl_agrees_with_a_polynomial(square: float, cube: float) -> None:
     # From the best line, a2 x^2 on +-h deviates by at most 2/3 a2 h^2, and a3 x^3 by 2/5 a3 h^3, both at the ends.
     t, x = ramp(12_000, 12_000)
     h = 10.0 - 80 * 20.0 / 12_000 - 4.0 * NOISE
@@ -116,7 +114,7 @@ def test_inl_is_that_of_a_polynomial(square: float, cube: float) -> None:
 
 
 @pytest.mark.parametrize("wider", [0.0, 0.7])
-def test_dnl_is_that_of_one_wide_code(wider: float) -> None:
+def test_dnl_agrees_with_one_wide_code(wider: float) -> None:
     # 8 bits: code 100 includes a part of the next one.
     t, x = ramp(20_000, 20_000)
     step = 20.0 / 256
@@ -134,7 +132,7 @@ def test_dnl_is_that_of_one_wide_code(wider: float) -> None:
     held(wider, judged, 1.4)
 
 
-def test_too_few_samples_a_code_and_half_a_ramp_show_nothing() -> None:
+def test_too_few_samples_per_code_and_half_a_ramp_are_inconclusive() -> None:
     t, x = ramp(20_000, 50_000)
     y = np.rint(x / 20.0 * 2**16) * 20.0 / 2**16
     found = transfer_curve(t, x, y, 20.0)
@@ -165,7 +163,7 @@ def test_crosstalk_of_equal_signals_is_inconclusive(same: str) -> None:
 
 
 @pytest.mark.parametrize(("hz", "amplitude"), [(5.0, 0.3), (8.0, 0.2), (12.0, 0.1)])
-def test_errors_of_a_slow_known_signal_are_no_crosstalk(hz: float, amplitude: float) -> None:
+def test_errors_of_a_slow_reference_are_not_crosstalk(hz: float, amplitude: float) -> None:
     from scipy.signal import detrend
 
     # Without mean and slope of each of 64 blocks, less remains of slow signals than a session's rounding may repeat.
@@ -204,7 +202,7 @@ def test_a_low_pass_of_first_order_rises_in_2_2_time_constants(quantity: str) ->
 
 
 @pytest.mark.parametrize("zeta", [0.3, 0.6])
-def test_overshoot_of_a_second_order_low_pass_is_that_of_its_damping(zeta: float) -> None:
+def test_overshoot_of_a_second_order_low_pass_follows_its_damping(zeta: float) -> None:
     w, root = 0.1, math.sqrt(1.0 - zeta**2)
     true = 100.0 * math.exp(-math.pi * zeta / root)
 
@@ -242,7 +240,7 @@ def test_a_matrix_has_the_worst_verdict_of_each_quantity_and_channel() -> None:
     assert make_matrix(card)[1] == []
 
 
-def test_a_sensor_that_inverts_has_the_scorecard_of_any_other(tmp_path: Path) -> None:
+def test_an_inverting_sensor_has_the_same_scorecard(tmp_path: Path) -> None:
     document = table_with(16, ["probes"]).model_dump(mode="json")
     for channel in document["groups"]["probes"]["channels"]:
         channel["sensitivity_v"] *= -1.0
@@ -279,7 +277,7 @@ def test_values_of_any_unit_are_those_of_the_channels_unit(unit: str, expected: 
 
 
 @pytest.mark.parametrize("unit", ["", "N", "bananas", "m/s", "counts"])
-def test_values_of_a_unit_that_does_not_fit_stay_and_are_not_known(unit: str) -> None:
+def test_values_of_an_incompatible_unit_are_kept_and_not_judged(unit: str) -> None:
     values = np.array([1.0, 5.0])
     signal = cast(Recorded, SimpleNamespace(name="a", unit=unit, values=values))
     assert in_unit(signal, default_table().channels["disk_x"]) == (values, False)

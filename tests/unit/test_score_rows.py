@@ -27,7 +27,7 @@ def wrong(found: Followed) -> list[int]:
 
 @pytest.mark.parametrize("pieces", [1, 9])
 @pytest.mark.parametrize("offset", OFFSETS)
-def test_a_perfect_record_has_every_row_wherever_it_begins(offset: int, pieces: int) -> None:
+def test_a_perfect_record_has_every_row_at_any_start(offset: int, pieces: int) -> None:
     found = followed(_RANDOM, _RANDOM[offset : offset + 14_000], 0, pieces)
     assert (wrong(found), found.first, found.last) == ([0] * 5, offset, offset + 13_999)
 

@@ -52,12 +52,12 @@ STAMPS: dict[str, tuple[Callable[[np.ndarray], np.ndarray], set[str]]] = {
 
 @pytest.mark.parametrize("resolution_s", [1e-3, 1e-4, 4e-5, 3e-5])
 @pytest.mark.parametrize("rate_hz", [20_000.0, 20_006.0])
-def test_stamps_of_a_coarse_resolution_tell_the_rate(resolution_s: float, rate_hz: float) -> None:
+def test_coarse_stamps_give_the_rate(resolution_s: float, rate_hz: float) -> None:
     stamps = np.floor(np.arange(20_000) / rate_hz / resolution_s + 1e-6) * resolution_s
     assert Table(len(stamps), 0, lambda _: [stamps[:, None]]).rate_hz == pytest.approx(rate_hz, rel=20e-6)
 
 
-def test_lost_rows_do_not_change_the_rate_that_stamps_tell() -> None:
+def test_lost_rows_do_not_change_the_rate_of_stamps() -> None:
     stamps = np.delete(np.arange(20_000) / RATE_HZ, [3000, 3001, 9000])
     assert Table(len(stamps), 0, lambda _: [stamps[:, None]]).rate_hz == pytest.approx(RATE_HZ, rel=1e-9)
 
@@ -73,7 +73,7 @@ JITTER: dict[str, Callable[[np.ndarray, np.random.Generator], np.ndarray]] = {
 
 
 @pytest.mark.parametrize("kind", JITTER)
-def test_jitter_does_not_change_the_rate_that_stamps_tell(kind: str) -> None:
+def test_jitter_does_not_change_the_rate_of_stamps(kind: str) -> None:
     for seed in range(4):
         stamps = JITTER[kind](np.arange(12_000) / RATE_HZ, np.random.default_rng(seed))
         table = Table(len(stamps), 0, lambda _, stamps=stamps: [stamps[:, None]])

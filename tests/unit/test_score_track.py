@@ -88,7 +88,7 @@ def test_a_step_near_an_end_is_found_at_its_row(signal: object, row: int, size: 
 
 
 @pytest.mark.parametrize("row", [3, -4])
-def test_a_step_within_eight_rows_of_an_end_is_not_told_from_a_late_begin(row: int) -> None:
+def test_a_jump_within_eight_rows_of_an_end_equals_a_late_start(row: int) -> None:
     assert track(TONES, np.delete(ROWS, row)).steps() == []
 
 
@@ -100,7 +100,7 @@ def test_a_disturbed_end_is_no_step() -> None:
     assert 100 <= len(ROWS) - found.explained < 600
 
 
-def test_a_step_is_found_at_its_row_by_a_clock_that_is_far_off() -> None:
+def test_a_jump_is_found_at_its_row_despite_a_large_clock_error() -> None:
     """From the stretch to the ends of the record its time is off by up to 30 samples."""
     for row in (300, 12_000):
         found = track(TONES, np.delete(ROWS, row), ppm=3000.0)
@@ -119,13 +119,13 @@ def test_a_missing_half_and_exchanged_parts_are_followed() -> None:
     assert [size for *_, size in exchanged.steps()] == [4900, -9800]
 
 
-def test_rows_that_nothing_explains_are_not_judged() -> None:
+def test_unexplained_rows_are_not_judged() -> None:
     order = np.concatenate([ROWS[:5000], np.random.default_rng(3).permutation(ROWS[5000:10_000])])
     assert track(TONES, order).explained == pytest.approx(5000, abs=300)
 
 
 @pytest.mark.parametrize("doubled", [None, 9900])
-def test_a_record_is_not_followed_round_and_round_at_an_end_of_a_session(doubled: int | None) -> None:
+def test_a_record_does_not_cycle_at_an_end_of_a_session(doubled: int | None) -> None:
     """The last rows of a session are less well known than those a period earlier, which explain the rows that
     follow.
     """
@@ -150,13 +150,13 @@ def test_rows_outside_the_session_are_outside() -> None:
     assert found.explained == 8000
 
 
-def test_a_clock_that_drifts_is_followed() -> None:
+def test_a_drifting_clock_is_followed() -> None:
     found = track(TONES, ROWS, ppm_s=60.0)
     assert found.steps() == []
     assert 2.0 * RATE_HZ * found.line(2500.0)[2] == pytest.approx(-60e-6, rel=0.01)
 
 
-def test_the_begin_that_explains_all_signals_is_taken_where_one_signal_repeats() -> None:
+def test_a_repeating_signal_uses_the_start_that_explains_all_signals() -> None:
     """A keyphasor's pulse is a millisecond off at the begin at which the probes show the same whirl."""
 
     def pulse(t: np.ndarray) -> np.ndarray:
@@ -198,7 +198,7 @@ def slow_sources(
     ]  # fmt: skip
 
 
-def test_a_begin_that_needs_steps_where_another_one_does_not_is_not_taken() -> None:
+def test_a_start_without_jumps_is_preferred() -> None:
     """Turns of a rotor differ by some samples: early begins explain rows after the session by steps; a loss is one."""
 
     def angle(t: np.ndarray) -> np.ndarray:
@@ -216,7 +216,7 @@ def test_a_begin_that_needs_steps_where_another_one_does_not_is_not_taken() -> N
 
 
 @pytest.mark.parametrize("begin_s", [0.4, -0.5])
-def test_more_rows_in_the_session_are_no_reason_for_an_inverted_begin(begin_s: float) -> None:
+def test_a_longer_overlap_does_not_favour_an_inverted_start(begin_s: float) -> None:
     """Two tones of odd frequencies are inverted half a second later, where all of the session is in the record."""
 
     def tones_of(phase: float) -> Callable[[np.ndarray], np.ndarray]:
@@ -267,7 +267,7 @@ def red(card: Scorecard) -> set[tuple[str, str]]:
     return {(row.quantity, row.channel) for row in card.rows if row.verdict == FAIL}
 
 
-def test_a_lost_sample_of_a_signal_that_repeats_fails(session: Path, tmp_path: Path) -> None:
+def test_a_lost_sample_of_a_repeating_signal_fails(session: Path, tmp_path: Path) -> None:
     card = card_of(session, tmp_path / "daq.parquet", np.delete(TRUE_S, 5000))
     assert red(card) == {("lost samples", "")}
     assert card.runs["lost samples"] == [(5000, 5000)]
@@ -275,7 +275,7 @@ def test_a_lost_sample_of_a_signal_that_repeats_fails(session: Path, tmp_path: P
     assert card.row("gain", "disk_x").verdict == PASS
 
 
-def test_a_doubled_sample_of_a_whirl_leaves_every_channel_at_one_begin(tmp_path: Path) -> None:
+def test_a_repeated_sample_of_a_whirl_keeps_one_start_for_all_channels(tmp_path: Path) -> None:
     """One channel is explained equally well half a turn off; the channels a quarter turn later are not."""
     sent, rate_hz = Sessions(tmp_path).get("test-whirl", seed=54, first_s=61.0), 25.6e3
     box = Converter(61.3 + 1e-5, round(0.8 * rate_hz), rate_hz, ppm=40.0)
@@ -286,7 +286,7 @@ def test_a_doubled_sample_of_a_whirl_leaves_every_channel_at_one_begin(tmp_path:
     assert red(judge(file, [sent.path], path="analogue")) == {("doubled samples", "")}
 
 
-def test_rows_before_a_channel_freezes_do_not_stand_outside_the_session(tmp_path: Path) -> None:
+def test_rows_before_a_frozen_channel_stay_inside_the_session(tmp_path: Path) -> None:
     """A fault of 10 ms on one channel spoils no fit of the rest of a sine, and hides no rows."""
     sent = Sessions(tmp_path / "sessions").get("test-sine")
     volts = Converter(2.05, 24_000).volts(sent, np.random.default_rng(9))
@@ -299,9 +299,7 @@ def test_rows_before_a_channel_freezes_do_not_stand_outside_the_session(tmp_path
 
 
 @pytest.mark.parametrize(("at", "names"), [(8000, 4), (10_000, 2)])
-def test_a_block_in_place_of_another_does_not_move_the_record_out_of_the_session(
-    at: int, names: int, tmp_path: Path
-) -> None:
+def test_a_replaced_block_does_not_move_the_record_out_of_the_session(at: int, names: int, tmp_path: Path) -> None:
     """Judged up to the fault only, a wrong begin leaves a smaller residual than the right one."""
     sent = Sessions(tmp_path / "sessions").get("test-two-tone", first_s=61.0)
     volts = Converter(61.2, 20_000).volts(sent, np.random.default_rng(3))
@@ -376,7 +374,7 @@ def test_bad_time_stamps_fail_on_the_analogue_path(
 
 
 @pytest.mark.parametrize(("begin", "rows"), [(4000, 100), (2000, 200), (6000, 100)])
-def test_a_few_rows_in_place_of_others_fail_although_the_judged_part_is_within_its_limit(
+def test_a_few_replaced_rows_fail_even_within_the_limit_of_unjudged_rows(
     begin: int, rows: int, session: Path, tmp_path: Path
 ) -> None:
     zeros = slice(begin, begin + rows)
@@ -391,7 +389,7 @@ def test_a_few_rows_in_place_of_others_fail_although_the_judged_part_is_within_i
     ("kind", "unit", "outcome"),
     [("test-sine", "unit", "pass"), ("test-sine", "V", "fail")],
 )
-def test_a_record_that_is_inverted_as_a_whole_fails_where_that_shows(
+def test_an_inverted_record_fails_if_its_polarity_is_determined(
     kind: str, unit: str, outcome: str, tmp_path: Path
 ) -> None:
     """A sine is inverted half a period later, which leaves its polarity open; a bias does not."""
@@ -404,7 +402,7 @@ def test_a_record_that_is_inverted_as_a_whole_fails_where_that_shows(
     assert any("polarity" in each for each in card.remarks) == (outcome == "pass")
 
 
-def test_one_turned_channel_of_a_signal_that_repeats_fails(session: Path, tmp_path: Path) -> None:
+def test_one_inverted_channel_of_a_repeating_signal_fails(session: Path, tmp_path: Path) -> None:
     card = card_of(session, tmp_path / "daq.parquet", TRUE_S, turned=2)
     assert red(card) == {("polarity", PROBES[2].name)}
 
@@ -417,7 +415,7 @@ def test_clock_is_the_mean_and_its_drift_fails(session: Path, tmp_path: Path) ->
     assert card.row("clock drift").value == pytest.approx(120.0, rel=0.01)
 
 
-def test_a_daq_that_waits_for_a_signal_that_repeats_begins_with_the_session(session: Path, tmp_path: Path) -> None:
+def test_an_idle_start_of_a_repeating_signal_begins_with_the_session(session: Path, tmp_path: Path) -> None:
     """Later begins explain the same rows; with them the idle rows would be in the session."""
     idle = np.full(2000, 0.0125)  # where the signal is zero
     card = card_of(session, tmp_path / "daq.parquet", np.concatenate([idle, 0.004 + np.arange(8001) / RATE_HZ]))
@@ -426,7 +424,7 @@ def test_a_daq_that_waits_for_a_signal_that_repeats_begins_with_the_session(sess
 
 
 @pytest.mark.parametrize(("before_s", "taken_s", "after_s"), [(5.0, 0.55, 0.0), (0.0, 0.8, 7.0)])
-def test_quiet_rows_of_seconds_beside_a_session_that_repeats_are_not_judged(
+def test_quiet_rows_outside_a_repeating_session_are_not_judged(
     before_s: float, taken_s: float, after_s: float, tmp_path: Path
 ) -> None:
     """Hundreds of begins by whole periods explain the same rows; few of these leave the quiet rows outside."""
@@ -443,7 +441,7 @@ def test_quiet_rows_of_seconds_beside_a_session_that_repeats_are_not_judged(
     assert card.row("judged part").value == pytest.approx(1.0, abs=0.002)
 
 
-def test_exchanged_signals_a_quarter_turn_apart_are_seen() -> None:
+def test_exchanged_signals_a_quarter_turn_apart_are_detected() -> None:
     """A later begin and another polarity explain one of the two pairs, not both."""
     t = np.arange(20_000) / RATE_HZ
     signals = {"disk_x": np.cos, "disk_y": np.sin, "ring_x": np.cos, "ring_y": np.sin}
@@ -456,7 +454,7 @@ def test_exchanged_signals_a_quarter_turn_apart_are_seen() -> None:
     assert "ring_x" not in wires["ring_x"].rivals
 
 
-def test_what_rings_on_behind_a_hit_is_told_from_a_channel_that_is_nearly_like_it() -> None:
+def test_ringing_after_an_impact_is_distinguished_from_a_similar_channel() -> None:
     time_s = np.arange(20_000) / RATE_HZ
     ringing = TONES(time_s)
     hit = np.where((time_s > 0.05) & (time_s < 0.06), 30.0 * np.ptp(ringing), 0.0)
@@ -466,7 +464,7 @@ def test_what_rings_on_behind_a_hit_is_told_from_a_channel_that_is_nearly_like_i
     assert (wire.channel, wire.rivals) == ("struck", ("near",))
 
 
-def test_times_at_which_a_signal_nearly_repeats_come_behind_those_at_which_it_does() -> None:
+def test_exact_repetitions_precede_near_repetitions() -> None:
     def tones(t: np.ndarray) -> np.ndarray:
         return np.sin(2.0 * np.pi * 79.0 * t) + np.sin(2.0 * np.pi * 1999.0 * t)
 

@@ -42,7 +42,7 @@ def experiment() -> Experiment:
     return Experiment(scene=load_scene("hammer", {"duration_s": 0.06}))
 
 
-def test_channels_are_the_recorded_ones_but_for_noise_and_rounding(experiment: Experiment) -> None:
+def test_channels_equal_the_recorded_ones_except_noise_and_rounding(experiment: Experiment) -> None:
     found = shown(experiment, *CHANNELS, start_s=0.01, end_s=0.05)
     run = simulate(experiment.changed({"sensors.noise": False}).scene)
     for column, name in enumerate(CHANNELS):
@@ -50,7 +50,7 @@ def test_channels_are_the_recorded_ones_but_for_noise_and_rounding(experiment: E
         assert np.abs(found[:, column] - run.samples[name][200:1000]).max() <= 0.51 * rounding
 
 
-def test_a_recordings_own_calibration_counts_and_not_the_rigs(experiment: Experiment) -> None:
+def test_a_recordings_own_calibration_is_used(experiment: Experiment) -> None:
     """Volts clip where its conditioner does, and its low-pass delays by tau = 2.613 / (2 pi f), Butterworth's."""
     usual = shown(experiment, "P_E")
     assert usual.max() > 3000.0
@@ -72,7 +72,7 @@ def test_a_late_start_is_the_same_as_from_the_start(sent: tuple[SentCommand, ...
     assert np.abs(whole[:, 1] - late[:, 1]).max() < 1e-3 * np.abs(whole[:, 1]).max()
 
 
-def test_experiments_that_differ_in_a_command_share_the_run_before_it_bit_for_bit() -> None:
+def test_experiments_share_the_run_before_their_first_difference() -> None:
     pulse = {"at_s": 0.46, "command": "hammer", "force_n": 60.0, "duration_ms": 5.0, "direction": "x"}
     experiment = bare(Experiment(scene=load_scene("hammer", {"duration_s": 0.5, "commands": [pulse]})))
     parts = rows(("ring_x", "hammer"), np.arange(9000, 10_000) / 20_000)
@@ -87,7 +87,7 @@ def test_experiments_that_differ_in_a_command_share_the_run_before_it_bit_for_bi
             }
 
 
-def test_a_snapshot_of_a_scene_without_commands_is_of_no_use_behind_the_first() -> None:
+def test_a_snapshot_without_commands_is_not_used_after_the_first_command() -> None:
     scene = load_scene("hammer", {"commands": []})
     lead = Simulation(scene)
     lead.advance(200_000)
@@ -108,7 +108,7 @@ def test_values_between_samples_are_those_of_the_polynomial() -> None:
     assert np.array_equal(interpolate_rows(quintic, np.array([0.0, 7.0, 39.0])), quintic[[0, 7, 39]])
 
 
-def test_a_clock_that_is_late_and_fast_shows_what_was_before(experiment: Experiment) -> None:
+def test_a_late_fast_clock_shows_earlier_values(experiment: Experiment) -> None:
     from scipy.interpolate import CubicSpline
 
     times_s = np.arange(200, 600) / 20_000
@@ -152,14 +152,14 @@ def test_the_length_of_a_pulse_acts_through_impacts_by_its_impulse_above_all(exp
         assert np.abs(shape).max() < 0.1 * np.abs(by_length[name]).max()
 
 
-def test_a_value_that_acts_on_nothing_has_no_derivative(experiment: Experiment) -> None:
+def test_a_value_without_effect_has_no_derivative(experiment: Experiment) -> None:
     predictor = Predictor(
         experiment, ["contact.friction"], rows(CHANNELS, np.arange(400) / 20_000)
     )  # before the impact
     assert not any(slope.any() for slope in predictor.derivatives(predictor.start).slopes[0].values())
 
 
-def test_rules_give_way_to_numbers(experiment: Experiment) -> None:
+def test_numbers_override_rules(experiment: Experiment) -> None:
     sag_mm = value_of(experiment, "ring.offset_y")
     assert sag_mm == pytest.approx(-1.5606, abs=1e-3)
     moved = with_values(experiment, {"ring.offset_y": sag_mm + 0.01})
@@ -167,7 +167,7 @@ def test_rules_give_way_to_numbers(experiment: Experiment) -> None:
     assert shown(moved, "ring_y", end_s=0.001)[0, 0] == pytest.approx(-0.01, abs=1e-6)
 
 
-def test_commands_are_numbered_by_time_wherever_they_are_from() -> None:
+def test_commands_of_all_sources_are_numbered_by_time() -> None:
     scene = load_scene("hammer", {"duration_s": 0.2})
     sent = SentCommand(100_000, "hammer", {"force_n": 50.0, "duration_ms": 4.0, "direction": "y"})
     both = Experiment(scene=scene, commands=(sent,))
@@ -182,7 +182,7 @@ def test_commands_are_numbered_by_time_wherever_they_are_from() -> None:
             value_of(both, key)
 
 
-def test_times_of_blows_are_interpolated_between_rows(experiment: Experiment) -> None:
+def test_times_of_impacts_are_interpolated_between_rows(experiment: Experiment) -> None:
     """A half sine that begins between two rows: its impulse about any time is that of the formula."""
     parts = rows(("hammer",), np.arange(600) / 20_000)
     parts = {"hammer": replace(parts["hammer"], ideal=True)}
@@ -192,7 +192,7 @@ def test_times_of_blows_are_interpolated_between_rows(experiment: Experiment) ->
     assert not np.allclose(low, high)
 
 
-def test_a_blow_behind_the_window_is_not_simulated(experiment: Experiment) -> None:
+def test_an_impact_after_the_window_is_not_simulated(experiment: Experiment) -> None:
     predictor = Predictor(experiment, ["hammer.1.duration_ms"], rows(("ring_x",), np.arange(200) / 20_000))
     predictor.predict([5.01])
     assert predictor.runs == 1

@@ -49,7 +49,7 @@ def shown(name: str, signal_si: np.ndarray, *, seed: int = 1, noise: bool = Fals
 
 @pytest.mark.parametrize("channel", DC, ids=lambda channel: channel.name)
 @pytest.mark.parametrize("part", [-0.9, -0.3, 0.0, 0.5, 0.95])
-def test_what_stands_still_is_shown_within_half_a_step(channel, part: float) -> None:
+def test_a_constant_signal_is_shown_within_half_a_step(channel, part: float) -> None:
     low, high = channel.range_v
     volts = 0.5 * (low + high) + part * 0.5 * (high - low)
     value = (volts - channel.bias_v) / channel.sensitivity_v
@@ -67,7 +67,7 @@ def test_output_is_limited_to_the_range_of_the_conditioner(channel) -> None:
         np.testing.assert_allclose(seen, expected, rtol=0, atol=abs(channel.scale))
 
 
-def test_counts_end_at_the_converter() -> None:
+def test_counts_are_limited_by_the_converter() -> None:
     hammer = default_table().channels["hammer"]
     # A conditioner that reaches the converter's limits, with noise beyond them.
     loud = hammer.model_copy(update={"range_v": (-5.0, 5.0), "noise_v": 1.0, "adc_bits": 16})
@@ -81,7 +81,7 @@ def test_counts_end_at_the_converter() -> None:
 
 
 @pytest.mark.parametrize("group", list(default_table().groups))
-def test_noise_is_as_loud_as_the_table_says(group: str) -> None:
+def test_noise_has_the_level_of_the_table(group: str) -> None:
     samples = 20_000
     counts = counts_of(group_of(group), np.zeros((2 * samples, N_ROW)), seed=7)
     assert counts.shape == (samples, len(group_of(group).channels))
@@ -101,7 +101,7 @@ def noisy(groups: str, seed: int) -> dict[str, np.ndarray]:
     return {name: samples[group].values[:, c] for group in samples for c, name in enumerate(group_of(group).names)}
 
 
-def test_noise_is_that_of_the_seed_and_of_the_channel_alone() -> None:
+def test_noise_depends_only_on_seed_and_channel() -> None:
     everything = '["probes", "forces", "accelerations", "drive", "hammer"]'
     first, again, other = noisy(everything, 1), noisy(everything, 1), noisy(everything, 2)
     alone = noisy('["hammer", "forces"]', 1)
@@ -113,7 +113,7 @@ def test_noise_is_that_of_the_seed_and_of_the_channel_alone() -> None:
             np.testing.assert_array_equal(alone[name], counts)
 
 
-def test_channels_have_noise_of_their_own() -> None:
+def test_channels_have_independent_noise() -> None:
     noise = {}
     for name, group in default_table().groups.items():
         counts = counts_of(group, np.zeros((8_000, N_ROW)))
@@ -125,7 +125,7 @@ def test_channels_have_noise_of_their_own() -> None:
 
 @pytest.mark.parametrize("cuts", [[1], [3, 1, 20, 7], [799, 1], [33]])
 @pytest.mark.parametrize("rate_hz", [ROW_RATE, 20_000, 8_000, 51_200, 102_400])
-def test_cutting_the_rows_anywhere_changes_no_count(cuts: list[int], rate_hz: int) -> None:
+def test_the_division_of_rows_changes_no_count(cuts: list[int], rate_hz: int) -> None:
     rows = np.random.default_rng(1).normal(size=(801, N_ROW))
     group = group_of("accelerations").model_copy(update={"rate_hz": rate_hz})
     whole = Conditioner([group], row_rate_hz=ROW_RATE, seed=1, noise=True).counts(rows)[group.name]
@@ -139,7 +139,7 @@ def test_cutting_the_rows_anywhere_changes_no_count(cuts: list[int], rate_hz: in
     np.testing.assert_array_equal(np.concatenate(pieces), whole)
 
 
-def test_more_channels_than_lanes_are_taken_in_several_passes() -> None:
+def test_more_channels_than_lanes_need_several_passes() -> None:
     # The same twenty-two channels one group at a time, and in one pass; a group crosses the border.
     groups = [group_of(name) for name in ("probes", "forces", "accelerations", "drive")]
     twice = [group.model_copy(update={"name": f"{group.name}-again"}) for group in (*groups[:2],)]
@@ -224,7 +224,7 @@ def test_the_chain_is_the_closed_form_of_its_filters_at_any_rate(rate_hz: int, o
 
 
 @pytest.mark.parametrize("rate_hz", RATES)
-def test_a_ramp_is_behind_by_the_filters_own_delay(rate_hz: int) -> None:
+def test_a_ramp_is_delayed_by_the_filter(rate_hz: int) -> None:
     # A cubic reproduces a ramp exactly; a Butterworth low-pass delays it by the sum of 1 / -pole.
     channel = default_table().channels["disk_x"].model_copy(update={"rate_hz": rate_hz})
     group = group_of("probes").model_copy(update={"channels": (channel,), "rate_hz": rate_hz})
@@ -386,7 +386,7 @@ def test_poles_are_butterworths(order: int) -> None:
         assert abs(direct + sums - analogue(channel, frequency_hz)) < 1e-9
 
 
-def test_filters_of_one_pole_are_not_taken_for_each_other() -> None:
+def test_different_filters_of_one_pole_are_distinguished() -> None:
     # A first-order low-pass and an AC coupling at one corner have the same pole.
     base = default_table().channels["P_E"]
     low = base.model_copy(update={"name": "low", "filter_order": 1, "bandwidth_hz": 50.0})

@@ -120,7 +120,7 @@ def test_the_stream_begins_with_start_and_ends_with_end_and_its_rows() -> None:
     assert listener.statuses[-1]["state"] == "ended"
 
 
-def test_a_scene_that_is_not_a_whole_number_of_blocks_ends_where_it_should() -> None:
+def test_a_scene_with_a_partial_last_block_ends_on_time() -> None:
     summary, listener = run(FakeSimulation(duration_s=0.033))
     assert summary["tick"] == 33_000
     assert [len(block.values) for block in listener.blocks[wire.sensor_key("probes")]] == [200, 200, 200, 60]
@@ -228,7 +228,7 @@ def test_the_console_raises_the_rigs_own_line() -> None:
             rig.console.speed(float("nan"))
 
 
-def test_step_is_refused_where_nothing_waits_for_it() -> None:
+def test_step_is_refused_outside_lockstep() -> None:
     with (
         Running(FakeSimulation(duration_s=None), RealTime()) as rig,
         pytest.raises(RefusedError, match="--pace lockstep; instead received --pace real-time"),
@@ -236,7 +236,7 @@ def test_step_is_refused_where_nothing_waits_for_it() -> None:
         rig.console.step(BLOCK)
 
 
-def test_lockstep_runs_what_was_granted_and_answers_when_it_is_published() -> None:
+def test_lockstep_runs_the_granted_steps_and_replies_after_publishing() -> None:
     simulation = FakeSimulation(duration_s=1.0)
     with Running(simulation, Lockstep()) as rig:
         key = wire.sensor_key("probes")
@@ -274,7 +274,7 @@ def test_lockstep_without_a_partner_ends_as_a_failure() -> None:
     )
 
 
-def test_stop_ends_the_run_and_refuses_what_comes_later() -> None:
+def test_stop_ends_the_run_and_refuses_later_commands() -> None:
     with Running(FakeSimulation(duration_s=None), RealTime()) as rig:
         assert rig.console.stop().command == "stop"
         rig.join()
@@ -284,7 +284,7 @@ def test_stop_ends_the_run_and_refuses_what_comes_later() -> None:
             rig.console.stop()
 
 
-def test_a_step_that_can_no_longer_be_done_is_answered() -> None:
+def test_a_step_after_the_end_gets_a_reply() -> None:
     with Running(FakeSimulation(duration_s=None, fail_at_tick=50_000), Lockstep()) as rig:
         with pytest.raises(RefusedError, match="a run that ended: failed"):
             rig.console.step(100_000)
@@ -302,7 +302,7 @@ def test_a_failing_simulation_ends_the_stream_and_raises() -> None:
     assert listener.events[-1]["rows"][wire.sensor_key("probes")] == 600
 
 
-def test_a_stream_that_cannot_be_published_is_told_and_ends_neither_the_run_nor_the_other_streams() -> None:
+def test_a_stream_that_cannot_be_published_does_not_end_the_run() -> None:
     class Broken(MemoryServer):
         def publish(self, key: str, payload: bytes) -> None:
             if key == wire.sensor_key("forces"):
@@ -322,7 +322,7 @@ def test_a_stream_that_cannot_be_published_is_told_and_ends_neither_the_run_nor_
     assert end["rows"][wire.sensor_key("forces")] == 10_000, "whoever lacks them learns it"
 
 
-def test_a_status_that_cannot_be_made_is_told_and_the_run_goes_on() -> None:
+def test_an_error_in_the_status_does_not_end_the_run() -> None:
     class Unwell(FakeSimulation):
         def health(self) -> dict[str, Any]:
             return {**super().health(), "engine": {"name": object()}}
@@ -332,7 +332,7 @@ def test_a_status_that_cannot_be_made_is_told_and_the_run_goes_on() -> None:
     assert any("publishing the status failed: TypeError" in event["text"] for event in listener.named("warning"))
 
 
-def test_an_unknown_command_is_refused_with_those_that_are_known() -> None:
+def test_an_unknown_command_is_refused_with_the_known_ones() -> None:
     with Running(FakeSimulation(duration_s=None), Lockstep()) as rig:
         for name in ("explode", "Hammer", "%s", "x" * 5000):
             reply = wire.decode_document(rig.listener.client.request(wire.command_key(name), b"{}"))
@@ -343,13 +343,13 @@ def test_an_unknown_command_is_refused_with_those_that_are_known() -> None:
             assert len(reply["error"]) < 1000
 
 
-def test_a_refusal_names_the_field_and_what_it_must_be_for_programs_too() -> None:
+def test_a_refusal_names_field_and_limits_in_machine_readable_form() -> None:
     with Running(FakeSimulation(duration_s=1.0), Lockstep()) as rig:
         reply = wire.decode_document(rig.listener.client.request(wire.command_key("step"), b'{"ticks": 0}'))
         assert (reply["field"], reply["must"]) == ("step.ticks", "greater than 0")
 
 
-def test_what_latecomers_are_told_of_the_commands_is_bounded_in_bytes() -> None:
+def test_the_commands_in_the_scene_are_bounded_in_bytes() -> None:
     simulation = FakeSimulation(duration_s=None)
     with Running(simulation, Lockstep()) as rig:
         request = wire.encode_document({"force_n": 1.0, "padding": "x" * 9_900})
@@ -384,7 +384,7 @@ class Gate(MemoryServer):
         super().publish(key, payload)
 
 
-def test_a_paced_run_drops_whole_blocks_and_counts_them_while_it_keeps_every_event() -> None:
+def test_a_paced_run_drops_and_counts_blocks_but_keeps_events() -> None:
     server = Gate()
     listener = Listener(server)
     now = [0]
@@ -453,7 +453,7 @@ def test_reports_of_clients_are_in_the_status_with_their_lag() -> None:
         assert "5 client reports could not be read" in status["warnings"]
 
 
-def test_a_client_that_says_goodbye_is_not_one_that_lags() -> None:
+def test_a_client_that_leaves_is_not_a_lagging_one() -> None:
     with Running(FakeSimulation(duration_s=None), Lockstep()) as rig:
         client = rig.listener.client
         for document in ({"received_index": 5}, {"received_index": 5, "done": True}):
@@ -481,7 +481,7 @@ class Slow(MemoryServer):
         return {"links": 1, "stalled_links": int(self.calls < self.stalled_calls)}
 
 
-def test_at_the_end_the_rig_stays_for_a_stalled_link_but_not_for_ever() -> None:
+def test_at_the_end_the_wait_for_a_stalled_link_is_limited() -> None:
     server = Slow(stalled_calls=8)
     Service(FakeSimulation(duration_s=0.1), server, FreeRun(), block_ticks=BLOCK).run()
     assert server.calls >= 8
@@ -490,7 +490,7 @@ def test_at_the_end_the_rig_stays_for_a_stalled_link_but_not_for_ever() -> None:
     assert forever.calls >= 2
 
 
-def test_commands_of_a_rig_that_is_not_prepared_are_not_answered() -> None:
+def test_commands_get_no_reply_before_the_rig_is_prepared() -> None:
     server = MemoryServer()
     Service(FakeSimulation(), server, FreeRun(), block_ticks=BLOCK)
     with pytest.raises(NoReplyError):

@@ -44,7 +44,7 @@ INCONCLUSIVE = COMMANDS[-1]
 
 
 @pytest.mark.parametrize("arguments", COMMANDS, ids=lambda arguments: " ".join(map(str, arguments[:2])))
-def test_command_prints_tables_that_are_legible(arguments: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
+def test_command_prints_legible_tables(arguments: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
     expected = 3 if arguments is INCONCLUSIVE else 0
     status, printed, complaints = said(capsys, *arguments)
     assert status == expected, complaints
@@ -54,19 +54,19 @@ def test_command_prints_tables_that_are_legible(arguments: list[Any], capsys: py
     assert (status, bool(json.loads(printed))) == (expected, True)
 
 
-def test_an_encoding_that_lacks_a_character_shows_it_escaped() -> None:
+def test_a_character_outside_the_encoding_is_escaped() -> None:
     environment = os.environ | {"PYTHONIOENCODING": "ascii"}
     found = subprocess.run([sys.executable, "-m", "rig", "laws"], env=environment, capture_output=True, timeout=120)
     assert found.returncode == 0, found.stderr.decode()
     assert b"\\xb5" in found.stdout
 
 
-def test_json_has_null_for_what_is_no_number(capsys: pytest.CaptureFixture[str]) -> None:
+def test_json_has_null_for_missing_numbers(capsys: pytest.CaptureFixture[str]) -> None:
     echo_json({"a": math.nan, "b": [math.inf, 1.0], "c": ({"d": -math.inf},)})
     assert json.loads(capsys.readouterr().out) == {"a": None, "b": [None, 1.0], "c": [{"d": None}]}
 
 
-def test_width_of_the_terminal_is_nothing_to_a_pipe(
+def test_a_pipe_ignores_the_width_of_the_terminal(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     printed = []
@@ -153,7 +153,7 @@ def test_any_table_is_legible(width: int) -> None:
     assert told == ([] if width == 300 else ["without unit, source: see --wide"])
 
 
-def test_what_is_too_long_for_any_terminal_is_folded_and_not_cut() -> None:
+def test_long_text_is_folded_and_not_cut() -> None:
     table, name = new_table("", "name", ">value"), "x" * 150
     table.add_row(name, "1.25")
     lines = lines_of(table)
@@ -184,7 +184,7 @@ def test_a_number_and_its_unit_stay_on_one_line(width: int) -> None:
 
 
 @pytest.mark.parametrize("command", [["scenes"], ["keys", "--json"], ["-h"]])
-def test_a_reader_that_has_gone_is_told_by_the_status_alone(command: list[str]) -> None:
+def test_a_closed_pipe_only_sets_the_exit_status(command: list[str]) -> None:
     ours, theirs = os.pipe()
     os.close(ours)
     found = subprocess.run([sys.executable, "-m", "rig", *command], stdout=theirs, stderr=subprocess.PIPE, timeout=120)
@@ -199,7 +199,7 @@ def test_a_status_line_is_one_line_of_whole_parts() -> None:
     assert fit_width(parts, 5) == parts[0]
 
 
-def test_info_tells_a_blow_once_and_how_far_it_has_read(capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_reports_an_impact_once_and_its_progress(capsys: pytest.CaptureFixture[str]) -> None:
     from recorder.reader import Recording
 
     told: list[float] = []
@@ -210,7 +210,7 @@ def test_info_tells_a_blow_once_and_how_far_it_has_read(capsys: pytest.CaptureFi
     assert sum("hammer: " in line for line in shown(capsys, "info", HAMMER).splitlines()) == 1
 
 
-def test_a_command_and_its_effect_are_told_once_and_what_had_none_is_told_too() -> None:
+def test_commands_are_reported_once_with_or_without_effect() -> None:
     def command(tick: int, name: str, number: int, **request: float) -> dict[str, Any]:
         taken = {"event": "command", "id": number, "command": name, "request": request, "from": f"me {number}"}
         return {**taken, "tick": tick, "time_s": tick / 1e6}
@@ -226,7 +226,7 @@ def test_a_command_and_its_effect_are_told_once_and_what_had_none_is_told_too() 
     ]  # fmt: skip
 
 
-def test_compiling_is_told_as_long_as_it_lasts(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_compilation_is_reported_while_it_lasts(monkeypatch: pytest.MonkeyPatch) -> None:
     from types import SimpleNamespace
 
     from rig.cli.output import compiling

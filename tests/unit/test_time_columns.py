@@ -47,7 +47,7 @@ def test_a_column_of_times_has_the_unit_of_its_heading(tmp_path: Path, heading: 
 
 
 @pytest.mark.parametrize(("unit", "per_s"), [("s", 1), ("ms", 1000), ("us", 10**6), ("ns", 10**9)])
-def test_a_time_since_1970_without_a_unit_is_known_by_its_size(tmp_path: Path, unit: str, per_s: int) -> None:
+def test_the_unit_of_a_time_since_1970_follows_from_its_size(tmp_path: Path, unit: str, per_s: int) -> None:
     texts = [str(EPOCH_S * per_s + n * per_s // 1000) if per_s > 1 else str(EPOCH_S + n) for n in range(20)]
     times_s = stamps(open_source(log(tmp_path, "timestamp", texts), FileOptions()))
     step_s = STEP_S if per_s > 1 else 1.0
@@ -55,7 +55,7 @@ def test_a_time_since_1970_without_a_unit_is_known_by_its_size(tmp_path: Path, u
 
 
 @pytest.mark.parametrize("unit", ["M", "bananas", "mm", "weeks"])
-def test_a_column_of_times_in_an_unknown_unit_is_asked_for(tmp_path: Path, unit: str) -> None:
+def test_a_time_column_with_an_unknown_unit_must_be_specified(tmp_path: Path, unit: str) -> None:
     path = log(tmp_path, f"time [{unit}]", [str(n) for n in range(20)])
     with pytest.raises(InputError, match=rf"file.time_unit must be given .*instead received '{unit}'"):
         open_source(path, FileOptions())
@@ -63,7 +63,7 @@ def test_a_column_of_times_in_an_unknown_unit_is_asked_for(tmp_path: Path, unit:
     np.testing.assert_allclose(times_s, 60.0 * np.arange(20))
 
 
-def test_a_mapping_takes_any_spelling_of_a_unit_of_time_and_no_other_unit() -> None:
+def test_a_mapping_accepts_any_spelling_of_time_units_only() -> None:
     channels = {"P_E": {"source": "P_E", "unit": "N"}}
     for unit in ("s", "sec", "ms", "us", "\u00b5s", "ns", "min", "h", "datetime", "Minutes", "d", "epoch ms"):
         parse_mapping({"file": {"time_unit": unit}, "channels": channels}, name="m")

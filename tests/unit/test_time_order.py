@@ -95,7 +95,7 @@ def test_a_log_with_stamps_out_of_order_is_imported_or_refused_in_one_line(
 
 
 @pytest.mark.parametrize("name", STAMPS)
-def test_stamps_out_of_order_do_not_choose_how_rows_of_counts_are_judged(
+def test_stamps_out_of_order_do_not_change_the_digital_path(
     name: str, session: Path, counts: np.ndarray, tmp_path: Path
 ) -> None:
     times_s, told = STAMPS[name]
@@ -111,7 +111,7 @@ def test_stamps_out_of_order_do_not_choose_how_rows_of_counts_are_judged(
     assert ("stamps that go back" in failing) == bool((np.diff(times_s) < 0.0).any())
 
 
-def test_stamps_that_make_no_rate_do_not_change_how_values_are_judged(
+def test_stamps_without_a_rate_do_not_change_the_analogue_path(
     session: Path, counts: np.ndarray, tmp_path: Path
 ) -> None:
     cards = [
@@ -128,7 +128,7 @@ def test_stamps_that_make_no_rate_do_not_change_how_values_are_judged(
 
 
 @pytest.mark.parametrize("name", NO_RATE)
-def test_stamps_that_make_no_rate_are_refused_as_a_line_too(name: str) -> None:
+def test_stamps_without_a_rate_are_refused_in_one_line(name: str) -> None:
     with pytest.raises(InputError, match=r"ascending by 1 ns or more on average .*disk_x, "):
         axis_of_stamps(STAMPS[name][0], line=True, what="disk_x")
     assert axis_of_stamps(1e-9 * ROWS, line=True, what="disk_x").rate_hz == pytest.approx(1e9)

@@ -16,7 +16,7 @@ class Counting(MemoryServer):
         return self.counts
 
 
-def test_clients_of_all_transports_hear_ask_report_and_see_the_token() -> None:
+def test_clients_of_all_transports_subscribe_request_and_report() -> None:
     servers = [MemoryServer(), MemoryServer()]
     both = Fanout(servers)
     heard: list[tuple[int, str, bytes]] = []
@@ -39,7 +39,7 @@ def test_clients_of_all_transports_hear_ask_report_and_see_the_token() -> None:
     assert tokens == [(0, True), (1, True), (0, False), (1, False)]
 
 
-def test_the_counts_of_all_are_in_the_status() -> None:
+def test_the_status_has_the_counts_of_all_transports() -> None:
     both = Fanout([Counting(links=1), Counting(other=2)], figures=lambda: {"can_frames": 3})
     assert both.congestion() == {"links": 1, "other": 2, "can_frames": 3}
     assert Fanout([Counting(links=1)]).congestion() == {"links": 1}

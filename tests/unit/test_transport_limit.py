@@ -26,7 +26,7 @@ def let_through(limit: CommandLimit, sender: str, count: int) -> int:
     return passed
 
 
-def test_a_flood_is_refused_at_once_but_for_a_burst_and_a_rate() -> None:
+def test_a_flood_is_refused_beyond_a_burst_and_a_rate() -> None:
     clock = Clock()
     limit = CommandLimit(20.0, 50, now_s=clock)
     assert let_through(limit, "a", 2000) == 50
@@ -44,7 +44,7 @@ def test_a_flood_is_refused_at_once_but_for_a_burst_and_a_rate() -> None:
         limit.check("a")
 
 
-def test_one_sender_does_not_shut_out_another_and_made_up_names_meet_the_common_bound() -> None:
+def test_senders_have_separate_limits_and_false_names_a_common_one() -> None:
     clock = Clock()
     limit = CommandLimit(20.0, 50, now_s=clock)
     assert let_through(limit, "loud", 2000) == 50

@@ -25,7 +25,7 @@ def test_key_expressions(expression: str, key: str, matches: bool) -> None:
     assert key_matches(expression, key) is matches
 
 
-def test_messages_arrive_in_order_with_history_for_those_who_ask() -> None:
+def test_messages_arrive_in_order_with_history_on_request() -> None:
     server = MemoryServer()
     early, late, without = [], [], []
     MemoryClient(server).subscribe("rig/**", lambda key, payload: early.append((key, payload)))

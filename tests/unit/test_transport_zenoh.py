@@ -47,7 +47,7 @@ def test_a_host_other_than_loopback_must_be_allowed_by_name() -> None:
         ZenohServer("0.0.0.0:7999")
 
 
-def test_a_port_in_use_is_one_clear_line(server: ZenohServer) -> None:
+def test_a_port_in_use_is_refused_in_one_line(server: ZenohServer) -> None:
     with pytest.raises(InputError, match=r"listen must be a free address .*instead received '127\.0\.0\.1") as caught:
         ZenohServer(server.endpoint)
     assert "\n" not in str(caught.value)
@@ -77,13 +77,13 @@ def test_only_the_named_loopback_address_is_listened_on(server: ZenohServer) -> 
     assert datagrams == []
 
 
-def test_without_a_rig_the_error_names_the_endpoint_and_the_way_out() -> None:
+def test_without_a_rig_the_error_names_the_endpoint_and_the_remedy() -> None:
     endpoint = free_endpoint()
     with pytest.raises(NoReplyError, match=rf"no rig answers at {endpoint}; start one with: rig run"):
         ZenohClient(endpoint, wait_s=0.1)
 
 
-def test_a_command_waits_for_a_rig_that_listens_until_it_is_ready(server: ZenohServer) -> None:
+def test_a_command_waits_until_a_listening_rig_is_ready(server: ZenohServer) -> None:
     announced = threading.Timer(0.5, server.announce)
     announced.start()
     with Connection(server.endpoint, wait_s=20.0).client() as client:
@@ -91,7 +91,9 @@ def test_a_command_waits_for_a_rig_that_listens_until_it_is_ready(server: ZenohS
         assert announced.finished.is_set()
 
 
-def test_keys_that_the_environment_names_are_told_so(server: ZenohServer, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_errors_in_key_files_name_the_environment_variable(
+    server: ZenohServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("RIG_TLS", "nowhere")
     for folder, name in (("nowhere", "RIG_TLS"), ("other", "--tls")):
         with (
@@ -101,7 +103,7 @@ def test_keys_that_the_environment_names_are_told_so(server: ZenohServer, monkey
             pass
 
 
-def test_a_client_waits_for_a_rig_that_comes_later() -> None:
+def test_a_client_waits_for_a_rig_that_starts_later() -> None:
     endpoint = free_endpoint()
     servers: list[ZenohServer] = []
     timer = threading.Timer(0.7, lambda: servers.append(ZenohServer(endpoint)))
@@ -115,7 +117,7 @@ def test_a_client_waits_for_a_rig_that_comes_later() -> None:
             server.close()
 
 
-def test_a_request_ends_when_the_rig_that_was_asked_goes(server: ZenohServer) -> None:
+def test_a_request_ends_when_its_rig_ends(server: ZenohServer) -> None:
     asked = threading.Event()
 
     def never(_: str, __: bytes) -> Future[bytes]:
@@ -131,7 +133,7 @@ def test_a_request_ends_when_the_rig_that_was_asked_goes(server: ZenohServer) ->
         goes.join()
 
 
-def test_requests_are_answered_and_a_failing_handler_answers_the_next_one(server: ZenohServer) -> None:
+def test_a_failing_handler_still_handles_the_next_request(server: ZenohServer) -> None:
     def handler(payload: bytes) -> bytes:
         if payload == b"bad":
             raise RuntimeError("no reply for this")
@@ -150,7 +152,7 @@ def test_requests_are_answered_and_a_failing_handler_answers_the_next_one(server
             client.request("rig/nothing", timeout_s=0.1)
 
 
-def test_an_answer_may_come_later_and_holds_up_no_other(server: ZenohServer) -> None:
+def test_a_delayed_reply_does_not_delay_others(server: ZenohServer) -> None:
     later: list[Future[bytes]] = []
 
     def handler(key: str, _: bytes) -> bytes | Future[bytes]:
@@ -208,7 +210,7 @@ def test_the_token_appears_when_announced_and_vanishes_on_close() -> None:
         assert seen == [True, False]
 
 
-def test_a_subscriber_with_history_misses_nothing_whenever_it_comes(server: ZenohServer) -> None:
+def test_a_subscriber_with_history_misses_nothing_at_any_start(server: ZenohServer) -> None:
     """Several keys at a time, with heartbeats: zenoh's own history lost messages here."""
     keys = [f"rig/sensors/g{n}" for n in range(6)]
     stop = threading.Event()
@@ -309,7 +311,7 @@ class Subscription:
 
 
 @pytest.mark.parametrize("seed", range(60))
-def test_whatever_is_dropped_everything_is_delivered_once_in_order_or_reported(seed: int) -> None:
+def test_dropped_messages_are_recovered_in_order_or_reported(seed: int) -> None:
     """Random drops, silences and heartbeats; caches that contain all, or too little."""
     draw = random.Random(seed)
     publisher = Publisher(cache=draw.choice((3000, 3000, 40)))
@@ -350,7 +352,7 @@ def test_whatever_is_dropped_everything_is_delivered_once_in_order_or_reported(s
             assert rows.got == list(range(publisher.sent))
 
 
-def test_a_gap_is_always_asked_for_though_a_heartbeat_came_just_before_it() -> None:
+def test_a_gap_is_requested_even_just_after_a_heartbeat() -> None:
     publisher = Publisher()
     rows = Subscription(publisher, history=False)
     rows.stream.take(publisher.send())
@@ -364,7 +366,7 @@ def test_a_gap_is_always_asked_for_though_a_heartbeat_came_just_before_it() -> N
     assert rows.missed == 0
 
 
-def test_what_waited_while_the_process_was_stopped_is_not_taken_for_a_duplicate() -> None:
+def test_messages_queued_during_a_stop_are_not_duplicates() -> None:
     """The messages in the channel are older than all that the cache still contains."""
     publisher = Publisher(cache=30)
     rows = Subscription(publisher, history=True)
@@ -377,7 +379,7 @@ def test_what_waited_while_the_process_was_stopped_is_not_taken_for_a_duplicate(
     assert rows.missed == 71
 
 
-def test_recovery_comes_in_portions_and_what_is_surely_gone_is_not_asked_for() -> None:
+def test_recovery_is_split_and_lost_messages_are_not_requested() -> None:
     publisher = Publisher()
     rows = Subscription(publisher, history=False)
     rows.stream.take(publisher.send())
@@ -389,7 +391,7 @@ def test_recovery_comes_in_portions_and_what_is_surely_gone_is_not_asked_for() -
     assert rows.pauses == 0
 
 
-def test_a_cache_that_is_silent_for_a_moment_is_asked_again() -> None:
+def test_a_silent_cache_is_queried_again() -> None:
     publisher = Publisher()
     rows = Subscription(publisher, history=False)
     rows.stream.take(publisher.send())
@@ -401,7 +403,7 @@ def test_a_cache_that_is_silent_for_a_moment_is_asked_again() -> None:
     assert rows.pauses > 0
 
 
-def test_a_rig_that_is_gone_is_given_up_and_the_gap_is_reported() -> None:
+def test_the_gap_is_reported_when_the_rig_has_ended() -> None:
     publisher = Publisher()
     rows = Subscription(publisher, history=False)
     rows.stream.take(publisher.send())
@@ -414,7 +416,7 @@ def test_a_rig_that_is_gone_is_given_up_and_the_gap_is_reported() -> None:
     assert rows.pauses <= 3
 
 
-def test_without_history_nothing_from_before_is_taken_and_nothing_after_is_lost() -> None:
+def test_without_history_only_later_messages_are_received() -> None:
     publisher = Publisher()
     rows = Subscription(publisher, history=False)
     for _ in range(10):
@@ -448,7 +450,7 @@ def test_the_history_of_a_restarted_rig_is_fetched_too() -> None:
     assert sorted(got[1:]) == [b"second 0", b"second 1", b"second 2"]
 
 
-def test_a_callback_that_blocks_holds_up_neither_requests_nor_the_token_nor_its_own_recovery(
+def test_a_blocking_callback_delays_neither_requests_nor_recovery(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Small channel, fast heartbeats: with one link for everything, this never ended."""
@@ -480,7 +482,7 @@ def test_a_callback_that_blocks_holds_up_neither_requests_nor_the_token_nor_its_
     assert missed == []
 
 
-def test_closing_does_not_fail_though_a_callback_never_returns(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_close_works_even_if_a_callback_never_returns(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("rig.serve.transport.zenoh._FIFO", 10)
     never = threading.Event()
 
@@ -543,7 +545,7 @@ def test_a_callback_that_raises_is_reported_and_does_not_block_the_link(
     assert reported == [ZeroDivisionError]
 
 
-def test_congestion_counts_links_and_sees_no_stall_where_there_is_none(server: ZenohServer) -> None:
+def test_congestion_counts_links_without_a_false_stall(server: ZenohServer) -> None:
     with ZenohClient(server.endpoint) as client:
         client.subscribe("rig/**", lambda *_: None)
         server.publish("rig/status", b"x")
@@ -551,7 +553,7 @@ def test_congestion_counts_links_and_sees_no_stall_where_there_is_none(server: Z
         assert server.congestion()["stalls"] == 0
 
 
-def test_backlog_counts_what_the_other_side_has_not_read() -> None:
+def test_backlog_counts_unread_messages() -> None:
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))
         listener.listen()
@@ -565,7 +567,7 @@ def test_backlog_counts_what_the_other_side_has_not_read() -> None:
             assert backlog_of(port) == {peer: 100_000}
 
 
-def test_what_a_slow_plain_subscriber_missed_comes_from_the_cache_as_the_documentation_says(
+def test_a_plain_subscriber_recovers_from_the_cache_as_documented(
     server: ZenohServer,
 ) -> None:
     import json

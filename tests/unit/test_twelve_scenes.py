@@ -102,7 +102,7 @@ def hand_made() -> list[dict[str, Any]]:
     ]
 
 
-def test_ratios_of_rows_given_by_hand() -> None:
+def test_ratios_of_given_rows() -> None:
     found = compare(hand_made(), "0.01")
     assert found == {
         "drop": Ratio(2.0, 0.5), "run-up": Ratio(0.0, 0.0), "smoothed": Ratio(math.inf, math.inf)

@@ -113,7 +113,7 @@ def test_an_ambiguous_spelling_is_no_unit_and_the_choices_are_named(text: str, c
      ("Vrms", "V"), ("grms", "g"), ("g pk", "g"), ("µm p-p", "um"), ("um 0-pk", "um"),
      ("mm peak to peak", "mm"), ("Vpp", "V")],
 )  # fmt: skip
-def test_a_detectors_suffix_is_asked_for_and_never_dropped(text: str, unit: str) -> None:
+def test_a_detectors_suffix_must_be_explained_and_is_never_dropped(text: str, unit: str) -> None:
     assert not units.known(text)
     with pytest.raises(InputError, match=f"such as {unit} .* is the reading of a detector"):
         units.parse(text, field="x")
@@ -129,7 +129,7 @@ def test_an_unknown_unit_is_refused_with_its_spelling(text: str) -> None:
         units.parse(text, field="x")
 
 
-def test_temperatures_of_another_zero_are_not_scaled() -> None:
+def test_temperatures_with_an_offset_are_not_scaled() -> None:
     assert units.factor("°C", "degC", field="x") == 1.0
     with pytest.raises(InputError, match="x must be degC, as degF counts from another zero"):
         units.factor("degF", "degC", field="x")
@@ -184,12 +184,12 @@ def test_a_sensitivity_is_in_volts_per_unit_of_the_channel(text: str, target: st
         "2 bananas/mm",
     ],
 )
-def test_what_is_no_sensitivity_is_refused(text: str) -> None:
+def test_invalid_sensitivities_are_refused(text: str) -> None:
     with pytest.raises(InputError, match=r'x must be volts per unit, such as "7.87 V/mm"'):
         units.sensitivity_v(text, "mm", field="x")
 
 
-def test_a_sensitivity_of_another_quantity_is_refused_with_the_units_that_fit() -> None:
+def test_a_sensitivity_of_another_quantity_is_refused_with_valid_units() -> None:
     for text in ("1 V/N", "1 V/bananas", "1 V/M"):
         with pytest.raises(InputError, match=r"x must be volts per unit of length \(m, cm, .*thou.*\); instead"):
             units.sensitivity_v(text, "mm", field="x")
@@ -208,7 +208,7 @@ def test_factors_between_units_are_ratios_of_their_sizes() -> None:
     assert units.factor("bananas", "bananas", field="x") == 1.0
 
 
-def test_a_unit_that_cannot_be_converted_is_refused_with_what_can() -> None:
+def test_an_unconvertible_unit_is_refused_with_valid_ones() -> None:
     with pytest.raises(InputError, match="x must be bananas, the unit of the channel, which has no conversion"):
         units.factor("mm", "bananas", field="x")
     with pytest.raises(InputError, match=r"x must be a unit of length \(m, cm, [^)]*\); instead received 'N'"):
@@ -221,7 +221,7 @@ def test_a_unit_that_cannot_be_converted_is_refused_with_what_can() -> None:
         units.factor("bananas", "mm", field="x")
 
 
-def test_a_plural_is_the_unit_and_a_letter_s_after_a_symbol_is_none() -> None:
+def test_a_plural_name_is_a_unit_but_not_a_plural_symbol() -> None:
     plurals = {"mils": "mil", "volts": "V", "Newtons": "N", "gs": "g", "lbs": "lbf", "hrs": "h", "metres": "m"}
     assert {text: units.canonical(text) for text in plurals} == plurals
     assert [text for text in ("Vs", "mVs", "as", "Ks", "HRSs") if units.known(text)] == []

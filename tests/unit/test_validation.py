@@ -92,7 +92,7 @@ def test_wrong_criteria_are_refused_with_their_field(tmp_path: Path, old: str, n
         load_criteria(path)
 
 
-def test_the_first_criterion_that_fits_holds() -> None:
+def test_the_first_matching_criterion_applies() -> None:
     criteria = load_criteria()
     keyphasor, probe = criteria.trajectory_of("keyphasor"), criteria.trajectory_of("disk_x")
     assert keyphasor is not None
@@ -104,7 +104,7 @@ def test_the_first_criterion_that_fits_holds() -> None:
     assert spin.relative < force.relative
 
 
-def test_what_is_missing_is_called_missing(tmp_path: Path) -> None:
+def test_missing_data_are_reported_as_missing(tmp_path: Path) -> None:
     path = tmp_path / "own.toml"
     path.write_text("[window]\nlongest_s = 1.0\n", encoding="utf-8")
     with pytest.raises(InputError, match=r"^own\.toml\.title must be given; instead received nothing$"):
@@ -122,7 +122,7 @@ def test_distance_of_spectra() -> None:
     assert spectrum_distance(turn, 1.1 * turn) == pytest.approx(0.1 / math.sqrt(1.0 + 1.1**2))
 
 
-def test_phases_are_found_where_they_are() -> None:
+def test_phases_are_found_at_their_times() -> None:
     times = np.arange(0.0, 2.0, 1e-3)
     radius = np.select([times < 0.3, times < 0.6, times < 1.5], [0.1, 0.5 + 0.6 * (np.sin(40 * times) > 0), 1.01], 0.1)
     angle = np.where(times >= 0.6, -2 * np.pi * 30.0 * times, 0.3)
@@ -155,7 +155,7 @@ def test_the_same_build_gives_the_same_bits(hammer: Recording) -> None:
     assert sum(stream.rows for stream in found.bits.values()) == 5 * 120 + 4 * 6
 
 
-def test_a_pass_needs_rows_or_criteria_that_were_judged(hammer: Recording) -> None:
+def test_a_pass_needs_judged_rows_or_criteria(hammer: Recording) -> None:
     found = validate(hammer)
     rows = sum(one.rows for one in found.bits.values())
     nothing = {key: replace(one, rows=0) for key, one in found.bits.items()}
@@ -172,7 +172,7 @@ def test_a_pass_needs_rows_or_criteria_that_were_judged(hammer: Recording) -> No
     assert outcomes[Outcome.INCONCLUSIVE][0].verdict_line.startswith(f"inconclusive: {rows // 50} of ")
 
 
-def test_a_recording_that_was_cut_off_is_inconclusive(hammer: Recording, tmp_path: Path) -> None:
+def test_a_truncated_recording_is_inconclusive(hammer: Recording, tmp_path: Path) -> None:
     """Every count present is right, and the number of missing ones is unknown."""
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(hammer.path.read_bytes()[:-100])  # all samples are there, because it is short
@@ -184,7 +184,7 @@ def test_a_recording_that_was_cut_off_is_inconclusive(hammer: Recording, tmp_pat
     assert wrong.outcome is Outcome.FAIL
 
 
-def test_one_count_is_found_with_its_time(hammer: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_changed_count_is_found_with_its_time(hammer: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
     blocks = Recording.blocks
 
     def off(self: Recording, key: str):
@@ -251,7 +251,7 @@ def test_another_seed_changes_sensors_and_not_the_motion(hammer: Recording) -> N
     assert "truth is equal to the bit" in found.bits_line
 
 
-def test_json_of_an_imported_log_keeps_earlier_words_beside_the_names_of_defects(hammer: Recording) -> None:
+def test_json_of_an_imported_log_has_earlier_words_and_names_of_defects(hammer: Recording) -> None:
     found = validate(hammer)
     law = Explanation.of(np.zeros(1), kind="sensor", name="P_N freeze", change="", value=0.0, explained=1.0, to_s=1.0)
     faults = [
@@ -282,7 +282,7 @@ def test_few_channels_and_no_truth_are_enough(tmp_path: Path) -> None:
     assert all(one.limit and one.line for one in wrong.failures)
 
 
-def test_rows_of_another_clock_lie_between_the_models_own(
+def test_rows_of_another_clock_are_between_the_models(
     hammer: Recording, heard: tuple[dict[str, Measured], Prediction]
 ) -> None:
     """A recorder at 1/3 of a millisecond past every row: no row of the model coincides."""
@@ -327,7 +327,7 @@ def with_fault(parts: dict[str, Measured], group: str, matrix: np.ndarray, shift
         (np.eye(4)[[1, 0, 2, 3]], 0.0, "disk_x and disk_y", "swapped"),
     ],
 )
-def test_a_sensor_fault_is_called_one(
+def test_a_sensor_fault_is_classified_as_one(
     hammer: Recording,
     heard: tuple[dict[str, Measured], Prediction],
     matrix: np.ndarray,
@@ -356,7 +356,7 @@ def test_a_late_clock_is_called_time(hammer: Recording, heard: tuple[dict[str, M
     assert found.ranked[0].value == pytest.approx(2e-4, abs=2e-6)
 
 
-def test_two_that_explain_it_alike_are_both_named(tmp_path: Path) -> None:
+def test_two_equal_explanations_are_both_named(tmp_path: Path) -> None:
     """Transducers at rest show the preload alone, or an offset of the same size."""
     recording = record(tmp_path / "rest.mcap", "stable-run", sensors__groups=["forces"])
     found = validate(recording, changes={"house.preload": 2990.0})
@@ -366,7 +366,7 @@ def test_two_that_explain_it_alike_are_both_named(tmp_path: Path) -> None:
     assert any(name.startswith("P_") for name in [one.name for one in found.explained.ranked])
 
 
-def test_a_second_cause_behind_the_first_is_named_with_it(tmp_path: Path) -> None:
+def test_a_second_cause_is_named_with_the_first(tmp_path: Path) -> None:
     """Damping is identified before the impacts, friction only in them."""
     both = {"shaft__damping_ratio_x": 0.03, "contact__friction": 0.24}
     recording = record(tmp_path / "two.mcap", sensors__rate_hz=20_000, duration_s=0.045, **both)
@@ -384,7 +384,7 @@ def test_a_second_cause_behind_the_first_is_named_with_it(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize(("left", "nearest"), [(1.0, False), (31.0, True)])
-def test_the_nearest_candidate_is_no_explanation_where_more_than_noise_is_left(left: float, nearest: bool) -> None:
+def test_the_best_candidate_is_no_explanation_if_more_than_noise_remains(left: float, nearest: bool) -> None:
     one = Explanation("model", "ring.clearance", "+2 %", 0.02, "", 0.97, left, 1e4 * left**2, 10_000, 0.3)
     conclusion, names = conclude([one], [], load_criteria().attribution, end_s=0.3)
     assert conclusion.startswith("nothing alone explains it") == nearest

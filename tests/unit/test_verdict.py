@@ -81,7 +81,7 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Recording:
 WHIRL = {"whirl frequency, ring probes", "whirl frequency, disk probes", "sense of rotation"}
 
 
-def test_a_simulated_hammer_run_is_good(good: Recording) -> None:
+def test_a_simulated_hammer_run_passes(good: Recording) -> None:
     verdict = judge(good)
     assert verdict.good, verdict.rows
     rows = {row.quantity: row for row in verdict.rows}
@@ -113,11 +113,11 @@ def test_figures_are_those_of_the_model(good: Recording) -> None:
     assert figures.reaction_x_n == pytest.approx(np.ptp(pair) / 2, rel=0.1)
 
 
-def test_the_same_recording_written_again_is_good(good: Recording, tmp_path: Path) -> None:
+def test_a_rewritten_recording_passes(good: Recording, tmp_path: Path) -> None:
     assert judge(rewritten(good, tmp_path / "again.mcap")) == judge(good)
 
 
-def test_probes_with_the_sign_of_y_wrong_in_the_table_are_not_good(good: Recording, tmp_path: Path) -> None:
+def test_probes_with_a_wrong_sign_of_y_do_not_pass(good: Recording, tmp_path: Path) -> None:
     catalogue = copy.deepcopy(good.catalogue)
     flipped = 0
     for channel in catalogue["table"]["groups"]["probes"]["channels"]:
@@ -136,7 +136,7 @@ def changed_block(payload: bytes, key: str, change: Callable[[np.ndarray], np.nd
     return wire.encode_block(dataclasses.replace(block, values=change(block.values)))
 
 
-def test_probes_with_crossed_cables_are_not_good(good: Recording, tmp_path: Path) -> None:
+def test_probes_with_crossed_cables_do_not_pass(good: Recording, tmp_path: Path) -> None:
     def crossed(key: str, payload: bytes) -> list[bytes]:
         if key != wire.sensor_key("probes"):
             return [payload]
@@ -145,7 +145,7 @@ def test_probes_with_crossed_cables_are_not_good(good: Recording, tmp_path: Path
     assert bad(judge(rewritten(good, tmp_path / "crossed.mcap", crossed))) >= WHIRL
 
 
-def test_a_probe_pair_that_is_alone_wrong_is_found(good: Recording, tmp_path: Path) -> None:
+def test_a_single_wrong_probe_pair_is_found(good: Recording, tmp_path: Path) -> None:
     def crossed(key: str, payload: bytes) -> list[bytes]:
         if key != wire.sensor_key("probes"):
             return [payload]
@@ -154,7 +154,7 @@ def test_a_probe_pair_that_is_alone_wrong_is_found(good: Recording, tmp_path: Pa
     assert bad(judge(rewritten(good, tmp_path / "disk.mcap", crossed))) == {"whirl frequency, disk probes"}
 
 
-def test_a_lost_block_is_not_good(good: Recording, tmp_path: Path) -> None:
+def test_a_lost_block_does_not_pass(good: Recording, tmp_path: Path) -> None:
     seen = {"blocks": 0}
 
     def lossy(key: str, payload: bytes) -> list[bytes]:
@@ -169,7 +169,7 @@ def test_a_lost_block_is_not_good(good: Recording, tmp_path: Path) -> None:
     assert next(row.measured for row in verdict.rows if row.quantity == "samples lost").startswith("2000 of ")
 
 
-def test_a_recording_that_was_cut_off_is_not_good(good: Recording, tmp_path: Path) -> None:
+def test_a_truncated_recording_does_not_pass(good: Recording, tmp_path: Path) -> None:
     path = tmp_path / "cut.mcap"
     data = good.path.read_bytes()
     path.write_bytes(data[: len(data) - 200])
@@ -200,7 +200,7 @@ LATENESS_MS = {"p50": 0.1, "p99": 10.5, "max": 30.0}
         ({"energy": {"residual_j": 1e-3, "dissipated_j": 0.5}}, {"energy residual"}),
     ],
 )
-def test_what_the_rig_said_of_itself_counts(
+def test_warnings_of_the_rig_affect_the_verdict(
     good: Recording, tmp_path: Path, changes: dict[str, Any], expected: set[str]
 ) -> None:
     verdict = judge(rewritten(good, tmp_path / "status.mcap", status=status(**changes)))
@@ -221,7 +221,7 @@ def test_a_recording_without_a_hammer_pulse_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("duration_s", [0.03, 0.4, 0.9])
-def test_a_recording_that_is_too_short_is_refused(tmp_path: Path, duration_s: float) -> None:
+def test_a_short_recording_is_refused(tmp_path: Path, duration_s: float) -> None:
     short = simulated(tmp_path / "short.mcap", duration_s=duration_s)
     with pytest.raises(InputError, match=r"^recording must be long enough for a whirl"):
         judge(short)
@@ -233,7 +233,7 @@ def test_a_recording_without_the_instruments_is_refused(tmp_path: Path, groups: 
         judge(simulated(tmp_path / "few.mcap", sensors__groups=groups, duration_s=0.1))
 
 
-def test_a_hammer_pulse_that_dies_out_is_not_good(tmp_path: Path) -> None:
+def test_a_decaying_response_does_not_pass(tmp_path: Path) -> None:
     command = '[{ at_s = 0.02, command = "hammer", duration_ms = 2.0 }]'
     verdict = judge(simulated(tmp_path / "weak.mcap", commands=command))
     assert bad(verdict) >= {"whirl frequency, ring probes", "orbit in the ring"}

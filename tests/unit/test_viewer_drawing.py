@@ -47,7 +47,7 @@ def test_noise_alone_is_no_whirl() -> None:
     assert orbit.reading_of(whirl_of(z, RATE_HZ))[0] == "no whirl"
 
 
-def test_screen_turns_y_over_so_that_up_is_up_and_the_sense_stays() -> None:
+def test_screen_coordinates_flip_y_and_keep_the_sense() -> None:
     # In a view whose y points down, a visibly clockwise motion has a growing angle.
     up, east = orbit.screen(np.array([1j, 1.0 + 0.0j]))
     assert up[1] < 0.0 < east[0]
@@ -56,7 +56,7 @@ def test_screen_turns_y_over_so_that_up_is_up_and_the_sense_stays() -> None:
     assert np.all(np.diff(angle) > 0.0)
 
 
-def test_orbit_shows_a_few_turns_of_a_fast_whirl_and_not_more_than_a_limit_of_a_slow_one() -> None:
+def test_orbit_shows_a_few_turns_within_a_time_limit() -> None:
     fast, slow = whirl_of(whirling(-83.0, 0.9), RATE_HZ), whirl_of(whirling(2.0, 0.9), RATE_HZ)
     assert 2.0 <= orbit.shown_s(fast) * 83.0 <= 6.0
     assert orbit.shown_s(slow) < 0.5
@@ -113,7 +113,7 @@ def test_envelope_keeps_every_row_in_a_window() -> None:
     np.testing.assert_array_equal(kept[np.isin(at, times[inside]), 0], values[inside, 0])
 
 
-def test_envelope_between_windows_that_are_close_together_is_thinned_as_far_as_it_goes() -> None:
+def test_envelope_between_close_windows_is_decimated_if_possible() -> None:
     times, values = np.arange(20_000) / 2000.0, np.arange(20_000.0)[:, None]
     windows = [(0.21 * number - 0.05, 0.21 * number + 0.05) for number in range(48)]
     envelope = Envelope(bucket=8)
@@ -127,7 +127,7 @@ def test_envelope_between_windows_that_are_close_together_is_thinned_as_far_as_i
 
 
 @pytest.mark.parametrize("chunk", [1, 7, 50, 999])
-def test_envelope_does_not_depend_on_how_the_rows_come(chunk: int) -> None:
+def test_envelope_does_not_depend_on_the_blocks(chunk: int) -> None:
     times, values = np.arange(1000) / 1000.0, np.sin(np.arange(1000.0))[:, None]
     whole, parts = Envelope(bucket=30), Envelope(bucket=30)
     whole.add(times, values)
@@ -157,7 +157,7 @@ def test_reaction_is_the_difference_of_the_opposed_pair() -> None:
     np.testing.assert_array_equal(reaction_of(group)(values), [[-7.0, 6.0]])
 
 
-def test_contact_has_hysteresis_and_goes_on_across_blocks() -> None:
+def test_contact_has_hysteresis_and_continues_across_blocks() -> None:
     radius = np.array([0.0, 0.9, 1.0, 0.99, 1.0, 0.97, 1.0, 0.5])
     times = np.arange(8.0)
     whole = Touch(enter=1.0, leave=0.98).changes(times, radius)
@@ -173,7 +173,7 @@ def test_probe_resolution_is_far_below_the_clearance() -> None:
     assert 1e-5 < resolution_mm(ring) < 1e-3
 
 
-def test_wall_clock_joins_marks_and_goes_on_at_the_wall_s_pace() -> None:
+def test_wall_clock_follows_marks_and_then_real_time() -> None:
     clock = WallClock()
     assert clock.at(np.array([1.0])) is None
     clock.mark(0.0, 100.0)
@@ -186,7 +186,7 @@ def test_wall_clock_joins_marks_and_goes_on_at_the_wall_s_pace() -> None:
     assert len(clock) < 5000
 
 
-def test_geometry_takes_lengths_in_their_unit_and_names_what_it_assumes() -> None:
+def test_geometry_converts_lengths_and_names_its_assumptions() -> None:
     document = {
         "values": {"ring.clearance": {"value": 0.5, "unit": "mm"}, "shaft.arm_ring": {"value": "rule", "unit": "m"}}
     }

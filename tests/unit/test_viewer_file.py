@@ -85,7 +85,7 @@ def test_orbit_of_the_free_run_is_forward(painted: Any, recording: Synthetic) ->
     assert all(first.startswith("FORWARD") for first, _ in before)
 
 
-def test_clearance_circles_are_fixed_and_of_the_right_size(painted: Any) -> None:
+def test_clearance_circles_are_static_and_have_their_size(painted: Any) -> None:
     _, saved, _ = painted
     for plane, radius in (("ring", CLEARANCE_MM), ("disk", CLEARANCE_MM * DISK_RATIO)):
         circle = saved[f"/orbit/{plane}/clearance", "LineStrips2D:strips"]
@@ -116,7 +116,7 @@ def test_spectrum_peaks_at_minus_83_hertz(painted: Any) -> None:
     assert abscissa.min() == -spectrum.LIMIT_HZ
 
 
-def test_waterfall_is_one_image_of_bounded_height_with_the_whirl_above_the_free_run(painted: Any) -> None:
+def test_waterfall_is_one_image_of_bounded_height(painted: Any) -> None:
     _, saved, _ = painted
     level = saved["/spectrum/waterfall/level", "DepthImage:buffer"]
     assert len(level.values) == 1
@@ -156,7 +156,7 @@ def test_curves_are_decimated_but_whole_around_the_hammer(painted: Any, recordin
     assert np.abs(reaction).max() == pytest.approx(523.0, rel=0.02)
 
 
-def test_contact_is_told_apart_by_source(painted: Any, recording: Synthetic) -> None:
+def test_contact_is_labelled_by_source(painted: Any, recording: Synthetic) -> None:
     summary, saved, _ = painted
     for path in ("/contact/sensed_by_ring_probes", "/contact/truth_of_the_model"):
         states = saved[path, "StateChange:state"]
@@ -172,7 +172,7 @@ def test_events_are_a_log_with_levels(painted: Any) -> None:
     assert [level for (level,) in saved["/events", "TextLog:level"].values] == ["INFO", "INFO", "WARN", "INFO"]
 
 
-def test_everything_has_simulated_and_wall_time_and_no_other(painted: Any) -> None:
+def test_all_entities_have_only_simulated_and_wall_time(painted: Any) -> None:
     _, saved, _ = painted
     assert saved.timelines == {SIMULATED, WALL}
     ring = saved["/sensors/probes/ring", "Scalars:scalars"]
@@ -267,7 +267,7 @@ def test_event_texts_are_one_line() -> None:
     assert event_text({"event": "end", "reason": "completed", "rows": {"a": 1}})[1] == "end: reason completed"
 
 
-def test_other_channels_get_the_views_that_they_can_fill() -> None:
+def test_other_channels_get_the_matching_views() -> None:
     table = default_table()
     assert not_drawn(table) == []
     foreign = table.groups["forces"].model_copy(
@@ -292,7 +292,7 @@ def _views(container: Any) -> list[Any]:
     return [view for inner in container.contents for view in _views(inner)]
 
 
-def test_the_command_takes_parts_and_shows_notes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_accepts_parts_and_shows_notes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     written = list(stream(BLOCKS))
     note = {"event": "note", "tick": 5000, "time_s": 0.005, "text": "bearing is warm", "tags": ["look"]}
     half = next(n for n, (key, _) in enumerate(written) if n > len(written) / 2 and key == wire.sensor_key("probes"))
@@ -306,7 +306,7 @@ def test_the_command_takes_parts_and_shows_notes(tmp_path: Path, capsys: pytest.
     assert "note: bearing is warm #look" in [text for (text,) in saved["/events", "TextLog:text"].values]
 
 
-def test_a_picture_has_its_name_only_when_it_is_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_picture_gets_its_name_only_when_complete(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     recorded, target = tmp_path / "run.mcap", tmp_path / "run.rrd"
     write_recording(recorded, list(stream(20)))
     seen: list[list[str]] = []

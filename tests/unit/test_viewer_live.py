@@ -80,7 +80,7 @@ def recording() -> Synthetic:
     return Synthetic(duration_s=1.5)
 
 
-def test_live_view_draws_what_the_rig_sends_and_ends_with_it(recording: Synthetic, tmp_path: Path) -> None:
+def test_live_view_draws_the_stream_and_ends_with_it(recording: Synthetic, tmp_path: Path) -> None:
     client = ScriptedClient(recording, payloads_of(recording))
     reason, view, saved = run(client, tmp_path / "live.rrd", wall=lambda: 1.8e9)
     assert reason == "the rig ended: completed"
@@ -101,7 +101,7 @@ def test_live_view_draws_what_the_rig_sends_and_ends_with_it(recording: Syntheti
     assert max(row[0] for row in ring.values) == pytest.approx(RADIUS_MM, abs=3e-3)
 
 
-def test_blocks_are_taken_without_asking_for_lost_ones_again(recording: Synthetic, tmp_path: Path) -> None:
+def test_lost_blocks_are_not_requested_again(recording: Synthetic, tmp_path: Path) -> None:
     client = ScriptedClient(recording, payloads_of(recording)[-1:])
     run(client, tmp_path / "options.rrd")
     for key, options in client.options.items():
@@ -110,7 +110,7 @@ def test_blocks_are_taken_without_asking_for_lost_ones_again(recording: Syntheti
     assert f"{wire.SENSORS}/*" in client.options
 
 
-def test_heartbeat_tells_what_was_received(recording: Synthetic, tmp_path: Path) -> None:
+def test_heartbeat_reports_received_rows(recording: Synthetic, tmp_path: Path) -> None:
     client = ScriptedClient(recording, payloads_of(recording))
     run(client, tmp_path / "beat.rrd", wall=lambda: 42.0)
     assert client.reports
@@ -130,7 +130,7 @@ def test_a_killed_rig_is_noticed(recording: Synthetic, tmp_path: Path) -> None:
     assert saved["/events", "TextLog:level"].values[-1] == ["WARN"]
 
 
-def test_lost_blocks_are_counted_told_and_leave_a_hole(recording: Synthetic, tmp_path: Path) -> None:
+def test_lost_blocks_are_counted_reported_and_shown_as_a_gap(recording: Synthetic, tmp_path: Path) -> None:
     payloads = list(stream_of(recording))
     kept = [message for number, block in enumerate(payloads) if number not in (20, 21) for message in block]
     _, view, saved = run(ScriptedClient(recording, kept), tmp_path / "lost.rrd")
@@ -142,7 +142,7 @@ def test_lost_blocks_are_counted_told_and_leave_a_hole(recording: Synthetic, tmp
     assert not ((ring.times_s > 0.2001) & (ring.times_s < 0.2199)).any()
 
 
-def test_payloads_that_are_none_are_counted_and_passed_over(recording: Synthetic, tmp_path: Path) -> None:
+def test_invalid_payloads_are_counted_and_skipped(recording: Synthetic, tmp_path: Path) -> None:
     good = payloads_of(recording)
     bad = [
         (wire.sensor_key("probes"), b"no block"),
@@ -157,7 +157,7 @@ def test_payloads_that_are_none_are_counted_and_passed_over(recording: Synthetic
     assert view.received == 5 * len(recording.times_s)
 
 
-def test_a_viewer_that_is_behind_forgets_the_oldest_and_says_so(recording: Synthetic, tmp_path: Path) -> None:
+def test_a_slow_viewer_drops_the_oldest_blocks_and_reports_it(recording: Synthetic, tmp_path: Path) -> None:
     long = Synthetic(duration_s=9.0)
     reason, view, saved = run(ScriptedClient(long, payloads_of(long)), tmp_path / "behind.rrd")
     assert reason == "the rig ended: completed"
@@ -215,9 +215,7 @@ def test_closing_the_viewer_ends_the_view(recording: Synthetic, tmp_path: Path) 
     assert reason == "the viewer was closed"
 
 
-def test_a_window_that_takes_nothing_is_not_drawn_for(
-    recording: Synthetic, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_stalled_window_is_not_drawn(recording: Synthetic, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Canvas, "keeps_up", lambda self, *, timeout_s: False)
     monkeypatch.setattr(live, "_CHECK_INTERVAL_S", 0.0)
     blocks = list(stream_of(recording))

@@ -45,7 +45,7 @@ class Viewer:
 
 
 @pytest.mark.parametrize("cost_s", [0.01, 0.1, 0.5, 1.5, 4.0])
-def test_a_viewer_of_any_speed_is_held(cost_s: float) -> None:
+def test_a_viewer_of_any_speed_stays_current(cost_s: float) -> None:
     viewer = Viewer(cost_s)
     viewer.run(300.0)
     assert max(viewer.behind_s) < 2.0 + 2.5 * cost_s
@@ -54,7 +54,7 @@ def test_a_viewer_of_any_speed_is_held(cost_s: float) -> None:
     assert 0.6 * could < len(viewer.drawn) / 300.0 < 1.1 * could
 
 
-def test_a_viewer_that_becomes_slow_and_fast_again() -> None:
+def test_the_frame_rate_follows_a_viewer_that_slows_down_and_recovers() -> None:
     viewer = Viewer(0.01)
     viewer.run(20.0)
     assert viewer.pace.every_s == pytest.approx(MIN_INTERVAL_S)
@@ -67,7 +67,7 @@ def test_a_viewer_that_becomes_slow_and_fast_again() -> None:
     assert viewer.behind_s[-1] < 0.2
 
 
-def test_a_viewer_that_takes_nothing_gets_a_picture_now_and_then() -> None:
+def test_a_stalled_viewer_gets_an_occasional_picture() -> None:
     viewer = Viewer(math.inf)
     viewer.run(100.0)
     late = [time for time in viewer.drawn if time > 2.0]
@@ -75,7 +75,7 @@ def test_a_viewer_that_takes_nothing_gets_a_picture_now_and_then() -> None:
     assert viewer.pace.behind_s(viewer.now_s) is None
 
 
-def test_nobody_looks() -> None:
+def test_without_a_viewer_nothing_is_drawn() -> None:
     pace = Pace()
     drawn = 0
     for tick in range(1000):

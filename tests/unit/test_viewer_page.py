@@ -58,7 +58,7 @@ def post(address: str, body: bytes) -> str:
         return reply.read().decode()
 
 
-def test_the_page_is_the_viewers_own_with_a_script_and_asks_no_other_site(served: tuple[page.Page, str]) -> None:
+def test_the_page_adds_a_script_and_uses_no_other_site(served: tuple[page.Page, str]) -> None:
     with urllib.request.urlopen(served[1], timeout=10) as reply:
         body = reply.read()
         assert reply.url.endswith("/?url=x")
@@ -67,7 +67,7 @@ def test_the_page_is_the_viewers_own_with_a_script_and_asks_no_other_site(served
     assert b"googleapis" not in body
 
 
-def test_the_slowest_browser_counts(served: tuple[page.Page, str]) -> None:
+def test_the_slowest_browser_sets_the_rate(served: tuple[page.Page, str]) -> None:
     shown, address = served
     assert shown.taken() is None
     shown.title = "rig: 0.1 s behind"
@@ -88,7 +88,7 @@ def test_the_slowest_browser_counts(served: tuple[page.Page, str]) -> None:
         {"Host": "example.com"},
     ],
 )
-def test_pages_of_other_sites_are_not_heard(served: tuple[page.Page, str], headers: dict[str, str]) -> None:
+def test_reports_of_other_sites_are_refused(served: tuple[page.Page, str], headers: dict[str, str]) -> None:
     for data in (STATE, None) if "Host" in headers else (STATE,):
         request = urllib.request.Request(f"{served[1]}/state?a", data=data, headers=headers)
         with pytest.raises(urllib.error.HTTPError, match="400"):
@@ -97,7 +97,7 @@ def test_pages_of_other_sites_are_not_heard(served: tuple[page.Page, str], heade
 
 
 @pytest.mark.parametrize("begun", [b"GET /?url=x", b"POST /state?a"])
-def test_a_browser_that_goes_in_the_middle_prints_nothing(
+def test_a_browser_that_disconnects_prints_nothing(
     served: tuple[page.Page, str], begun: bytes, capfd: pytest.CaptureFixture[str]
 ) -> None:
     host = served[1].removeprefix("http://")
@@ -123,7 +123,7 @@ def test_a_browser_that_goes_in_the_middle_prints_nothing(
         ("PUT", "/state?a", "0", 501),
     ],
 )
-def test_what_is_no_word_of_the_page_is_refused(
+def test_invalid_reports_are_refused(
     served: tuple[page.Page, str], method: str, path: str, size: str, status: int
 ) -> None:
     connection = http.client.HTTPConnection(served[1].removeprefix("http://"), timeout=10)
@@ -142,7 +142,7 @@ def test_pages_are_not_without_number(served: tuple[page.Page, str]) -> None:
 
 
 @pytest.mark.parametrize("cut", range(0, len(STATE), 7))
-def test_a_state_that_breaks_off_is_none_or_the_same(cut: int) -> None:
+def test_a_truncated_state_is_refused_or_unchanged(cut: int) -> None:
     assert page.end_of(SIMULATED, STATE[:cut]) in (0, 5_699_950_000)
 
 

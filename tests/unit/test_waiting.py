@@ -16,12 +16,12 @@ def test_a_wait_for_a_process_that_has_ended_fails_at_once_with_its_output() -> 
         until(lambda: False, of=child)
 
 
-def test_what_has_come_before_the_process_ended_is_no_failure() -> None:
+def test_a_condition_met_before_the_process_ended_is_no_failure() -> None:
     with python("-S", "-c", ENDS) as child:
         until(lambda: child.poll() is not None, of=child)
 
 
-def test_a_line_that_never_comes_is_told_with_those_that_came() -> None:
+def test_a_missing_line_is_reported_with_the_received_ones() -> None:
     told = r"status 0 and without 'listening on':\ncompiling"
     silent = python("-S", "-c", "import sys; print('compiling', file=sys.stderr)")
     with silent as child, pytest.raises(AssertionError, match=told):

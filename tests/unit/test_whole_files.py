@@ -18,7 +18,7 @@ from rig.serve.transport.exposure.certificates import holder_in, make
 
 
 @pytest.mark.parametrize("error", [OSError(28, "No space left on device"), RuntimeError("System error."), ValueError()])
-def test_whatever_a_library_raises_is_one_line_that_names_the_file(error: Exception, tmp_path: Path) -> None:
+def test_any_library_error_is_one_line_with_the_file(error: Exception, tmp_path: Path) -> None:
     path = tmp_path / "a.wav"
     path.write_text("old")
     with pytest.raises(DiskError, match=r"a\.wav could not be written"), whole_file(path) as draft:  # noqa: PT012
@@ -32,7 +32,7 @@ def test_a_fault_of_the_program_is_not_blamed_on_the_disk(tmp_path: Path) -> Non
         raise TypeError
 
 
-def test_what_is_read_is_not_written_to_by_another_name(tmp_path: Path) -> None:
+def test_an_input_is_not_overwritten_through_another_name(tmp_path: Path) -> None:
     source = tmp_path / "a.mcap"
     source.touch()
     (tmp_path / "other").symlink_to(tmp_path)
@@ -43,7 +43,7 @@ def test_what_is_read_is_not_written_to_by_another_name(tmp_path: Path) -> None:
     check_not_among([source], tmp_path / "c.mcap")
 
 
-def test_names_that_are_too_long_are_wrong_input(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_long_file_names_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(InputError, match="output must be a file name"):
         check_new_file(tmp_path / ("x" * 300 + ".csv"), field="output", suffixes=(".csv",), force=True)
     for command in ("run", "recover"):
@@ -88,7 +88,7 @@ def test_a_value_of_another_type_is_shown(words: list[str], field: str, capsys: 
     assert said.endswith("must be a valid number; instead received 'abc'\n")
 
 
-def test_a_key_that_others_may_read_is_refused(tmp_path: Path) -> None:
+def test_a_key_readable_by_others_is_refused(tmp_path: Path) -> None:
     make(tmp_path / "keys")
     holder_in(tmp_path / "keys", server=True)
     (tmp_path / "keys" / "server" / "key.pem").chmod(0o640)
@@ -96,7 +96,7 @@ def test_a_key_that_others_may_read_is_refused(tmp_path: Path) -> None:
         holder_in(tmp_path / "keys", server=True)
 
 
-def test_a_number_in_quotes_is_none() -> None:
+def test_a_quoted_number_is_refused() -> None:
     assert parse_scene({"duration_s": 1}).duration_s == 1.0
     with pytest.raises(InputError, match="duration_s must be a number; instead received '1'"):
         parse_scene({"duration_s": "1"})

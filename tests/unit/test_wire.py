@@ -50,7 +50,7 @@ def small() -> Block:
 
 
 @given(block=blocks())
-def test_block_there_and_back(block: Block) -> None:
+def test_block_is_decoded_unchanged(block: Block) -> None:
     back = decode_block(encode_block(block), schema(block))
     assert (back.tick, back.index, back.rate_hz, back.tick_rate_hz) == (
         block.tick,
@@ -81,7 +81,7 @@ def test_values_of_any_memory_order_are_sent_row_after_row() -> None:
 
 
 @pytest.mark.parametrize("values", [np.zeros((2, 2), np.float32), np.zeros((2, 2), np.int64), np.zeros(4, np.int32)])
-def test_values_of_another_kind_are_not_encoded(values: np.ndarray) -> None:
+def test_values_of_another_type_are_not_encoded(values: np.ndarray) -> None:
     with pytest.raises(TypeError, match="int32 or float64 in columns"):
         encode_block(Block(0, 0, 1.0, 1.0, values))
 
@@ -97,7 +97,7 @@ def test_every_truncation_is_refused(kind: str) -> None:
 
 
 @given(block=blocks(), tail=st.binary(min_size=1, max_size=20))
-def test_bytes_behind_the_message_are_refused(block: Block, tail: bytes) -> None:
+def test_bytes_after_the_message_are_refused(block: Block, tail: bytes) -> None:
     with pytest.raises(ValueError, match="payload must hold whole rows"):
         decode_block(encode_block(block) + tail, schema(block))
 
@@ -114,9 +114,7 @@ def test_truth_is_no_sample_block(block: Block) -> None:
     kind=st.sampled_from([SAMPLE_SCHEMA, TRUTH_SCHEMA]),
 )
 @settings(max_examples=300)
-def test_damaged_head_gives_a_whole_block_or_value_error(
-    block: Block, damage: list[tuple[int, int]], kind: str
-) -> None:
+def test_a_damaged_header_gives_a_block_or_value_error(block: Block, damage: list[tuple[int, int]], kind: str) -> None:
     payload = bytearray(encode_block(block))
     for place, value in damage:
         payload[place] = value
@@ -183,12 +181,12 @@ documents = st.dictionaries(
 
 
 @given(document=documents)
-def test_document_there_and_back(document: dict) -> None:
+def test_document_is_decoded_unchanged(document: dict) -> None:
     assert decode_document(encode_document(document)) == document
 
 
 @pytest.mark.parametrize("number", [float("nan"), float("inf"), -float("inf")])
-def test_numbers_that_json_does_not_know_are_not_encoded(number: float) -> None:
+def test_numbers_outside_json_are_not_encoded(number: float) -> None:
     with pytest.raises(ValueError, match="JSON compliant"):
         encode_document({"value": number})
 
@@ -222,7 +220,7 @@ def test_schemas_follow_from_the_key() -> None:
         assert wire.schema_of(key) is None, key
 
 
-def test_schemas_say_what_the_bytes_are() -> None:
+def test_schemas_describe_the_bytes() -> None:
     sizes = {"int64": 8, "float64": 8, "uint32": 4}
     for name, last in ((SAMPLE_SCHEMA, "int32[] values"), (TRUTH_SCHEMA, "float64[] values")):
         lines = [line.split("#")[0].split() for line in wire.SCHEMAS[name].splitlines()]
@@ -261,7 +259,7 @@ def test_continuity_finds_every_lost_run_with_its_size(sent: list[tuple[str, int
     assert continuity.lost == {key: sum(gap.size for gap in expected if gap.key == key) for key in met}
 
 
-def test_a_step_back_is_a_gap_that_loses_nothing() -> None:
+def test_a_backward_jump_is_a_gap_without_loss() -> None:
     continuity = Continuity()
     assert continuity.follow("k", 100, 10) is None
     assert continuity.follow("k", 50, 10) == Gap(key="k", index=110, size=-60)
