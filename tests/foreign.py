@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 SPIN_HZ, WHIRL_HZ = 6.2, 21.0
-HIT_S, BLOW_S, BLOW_N = 0.55, 5e-3, 92.0
+IMPACT_S, PULSE_LENGTH_S, PULSE_FORCE_N = 0.55, 5e-3, 92.0
 DURATION_S = 1.2
 RAMP, PULSE_S = 4, 8e-3
 """Keyphasor pulse: rise [samples] and length [s]; half height at (k + 0.3) / SPIN_HZ."""
@@ -29,16 +29,16 @@ def edges() -> np.ndarray:
 
 def orbit(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the position of the disk [mm]."""
-    wide = np.clip((t - HIT_S) / 0.2, 0.0, 1.0)
-    spin, whirl = 2 * np.pi * SPIN_HZ * t, 2 * np.pi * WHIRL_HZ * (t - HIT_S)
+    wide = np.clip((t - IMPACT_S) / 0.2, 0.0, 1.0)
+    spin, whirl = 2 * np.pi * SPIN_HZ * t, 2 * np.pi * WHIRL_HZ * (t - IMPACT_S)
     x = 0.11 * np.cos(spin) + wide * 0.9 * np.cos(whirl)
     y = 0.11 * np.sin(spin) - wide * 0.9 * np.sin(whirl)
     return x, y
 
 
 def hammer(t: np.ndarray) -> np.ndarray:
-    part = (t - HIT_S) / BLOW_S
-    return np.where((part > 0) & (part < 1), BLOW_N * np.sin(np.pi * np.clip(part, 0, 1)), 0.0)
+    part = (t - IMPACT_S) / PULSE_LENGTH_S
+    return np.where((part > 0) & (part < 1), PULSE_FORCE_N * np.sin(np.pi * np.clip(part, 0, 1)), 0.0)
 
 
 def keyphasor(t: np.ndarray) -> np.ndarray:
@@ -51,8 +51,8 @@ def signals(rate_hz: float, *, seed: int = 0) -> dict[str, np.ndarray]:
     """Return the rig's channels in its units (mm, N, m/s^2, Hz) with white noise, each of shape (n,)."""
     t, generator = instants(rate_hz), np.random.default_rng(seed)
     x, y = orbit(t)
-    wide = np.clip((t - HIT_S) / 0.2, 0.0, 1.0)
-    ring = np.exp(-np.maximum(t - HIT_S, 0.0) / 0.02) * np.sin(2 * np.pi * 900 * t) * (t > HIT_S)
+    wide = np.clip((t - IMPACT_S) / 0.2, 0.0, 1.0)
+    ring = np.exp(-np.maximum(t - IMPACT_S, 0.0) / 0.02) * np.sin(2 * np.pi * 900 * t) * (t > IMPACT_S)
     found = {
         "disk_x": x, "disk_y": y, "ring_x": 0.62 * x, "ring_y": 0.62 * y,
         "P_N": PRELOAD_N + 300 * wide * y, "P_S": PRELOAD_N + 40 - 300 * wide * y,

@@ -63,13 +63,13 @@ MUTATED = (
     "replays/recordings/validation",
     "rig/base/units.py",
 )
-_TURNED = {
+_INVERSE_OPERATORS = {
     ast.Lt: ">=", ast.LtE: ">", ast.Gt: "<=", ast.GtE: "<", ast.Eq: "!=", ast.NotEq: "==", ast.In: "not in",
     ast.NotIn: "in", ast.Is: "is not", ast.IsNot: "is",
 }  # fmt: skip
 _DISPLAY_FUNCTIONS = ("__repr__", "__str__", "picture", "verdict_line", "describe")
 """Functions whose places are skipped: their results are only displayed."""
-PICKED = (
+PICKED_MUTANTS = (
     ("replays/score/card/scorecard.py", "shown=PASS in verdicts and not self.doubts", "shown=not self.doubts"),
     ("replays/score/card/scorecard.py", "shown=PASS in verdicts and not self.doubts", "shown=PASS in verdicts"),
     ("replays/score/card/scorecard.py", "limit.low <= low and high <= limit.high", "limit.low <= value <= limit.high"),
@@ -174,7 +174,7 @@ class _Places(ast.NodeVisitor):
 
     def visit_Compare(self, node: ast.Compare) -> None:
         if len(node.ops) == 1:
-            self._between(node.left, node.comparators[0], _TURNED[type(node.ops[0])], "comparison turned")
+            self._between(node.left, node.comparators[0], _INVERSE_OPERATORS[type(node.ops[0])], "comparison turned")
         self.generic_visit(node)
 
     def visit_BoolOp(self, node: ast.BoolOp) -> None:
@@ -233,7 +233,7 @@ def _parses(text: str) -> bool:
 def chosen(count: int, seed: int) -> list[Mutant]:
     """Return `count` mutants: the picked ones, then equally many of each module, drawn at random."""
     found = []
-    for file, old, new in PICKED:
+    for file, old, new in PICKED_MUTANTS:
         text = (ROOT / file).read_text(encoding="utf-8")
         if text.count(old) != 1:
             print(f"a picked place must stand once in {file}; received {text.count(old)} times: {old}")

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from tests.score_files import COUNTED, FORMATS, WRITERS, write_taken, write_values
+from tests.score_files import COUNT_FORMATS, FORMATS, WRITERS, write_taken, write_values
 from tests.score_sessions import RATE_HZ, Sent, Sessions
 
 Generator = np.random.Generator
@@ -129,7 +129,7 @@ def perfect(number: int, seed: int, sessions: Sessions, stem: Path) -> Case:
     kind = CYCLE[(number // len(FORMATS) + number) % len(CYCLE)]
     bits = int(g.choice([12, 14, 16, 18, 20, 24, 24, 24, 32]))
     bits = min(bits, 24) if form in ("candump", "asc", "blf") else bits  # the limit of its frames
-    digital = form in COUNTED or bool(number % 2)
+    digital = form in COUNT_FORMATS or bool(number % 2)
     groups = str(g.choice(["two", "eight", "all"], p=[0.7, 0.2, 0.1]))
     groups = "all" if form == "asc" else groups  # a classic frame has channels of several groups
     physics = kind in ("hammer", "stable-run")
@@ -160,7 +160,7 @@ def perfect(number: int, seed: int, sessions: Sessions, stem: Path) -> Case:
             bias = np.array([c.bias_v for c in sent.channels])
             quiet = bias + g.standard_normal((still, len(bias))) * [c.noise_v for c in sent.channels]
             counts[:still] = sent.quantised(quiet)
-        if form in COUNTED:
+        if form in COUNT_FORMATS:
             return Case(label, write_taken(form, stem, sent, counts, first), sent)
         unit = str(g.choice(["unit", "V", "counts"]))
         times = np.arange(rows) / RATE_HZ if stamps else None

@@ -15,7 +15,9 @@ from tests.score_sessions import FORMULAS, RATE_HZ, Sent, Sessions
 _RESIDUE = frozenset({"noise", "effective bits", "dynamic range", "SINAD", "ENOB", "SFDR"})
 """Quantities of the residual after the known signal: all that is not linear and constant in time affects them."""
 _LOSS = frozenset({"lost samples", "doubled samples", "missing samples"})
-_ABSENT = frozenset({"mapping", "channel", "channels", "recorded", "missing channel", "missing channels", "presence"})
+_ABSENCE_ROWS = frozenset(
+    {"mapping", "channel", "channels", "recorded", "missing channel", "missing channels", "presence"}
+)
 _ROWS, _BEGIN_ROWS = 14_000, 900
 """Samples of a DAQ with its own clock, and rows of the session before its first."""
 Signal = Callable[[str, np.ndarray], np.ndarray]
@@ -111,7 +113,7 @@ def _digital(number: int, seed: int, sessions: Sessions, stem: Path) -> Case:
     elif what == "missing channel":
         columns = in_unit(sent, counts, unit)
         del columns[sent.channels[channel].name]
-        right = set(_ABSENT)
+        right = set(_ABSENCE_ROWS)
     else:
         strange = np.rint(np.std(counts, axis=0) * g.standard_normal((several, len(sent.channels)))).astype(np.int64)
         if g.random() < 0.5:
@@ -269,6 +271,8 @@ def _analogue(number: int, seed: int, sessions: Sessions, stem: Path, base: Call
         del columns[name]
     form = str(g.choice([each for each in WRITERS if each not in ("semicolon", "tab")]))
     file = write_values(form, stem, columns, np.arange(len(volts)) / rate, rate)
-    right = {"missing channel": _ABSENT, "lost sample": _LOSS, "doubled sample": _LOSS}.get(what, frozenset({what}))
+    right = {"missing channel": _ABSENCE_ROWS, "lost sample": _LOSS, "doubled sample": _LOSS}.get(
+        what, frozenset({what})
+    )
     text = f"analogue {what}, {sent.kind}, {form}, {name}, x{halves:.1f}"
     return Case(text, file, sent, "analogue", right, _CONSEQUENCES.get(what, frozenset()))

@@ -101,9 +101,9 @@ WRITERS: dict[str, tuple[str, Callable[..., None]]] = {
     "parquet": (".parquet", _parquet), "mdf": (".mf4", _mdf), "tdms": (".tdms", _tdms), "uff": (".uff", _uff),
 }  # fmt: skip
 """Suffix and writer of the formats for arbitrary values."""
-COUNTED = ("wav", "mcap", "candump", "asc", "blf")
+COUNT_FORMATS = ("wav", "mcap", "candump", "asc", "blf")
 """Formats for counts of a DAQ."""
-FORMATS = (*WRITERS, *COUNTED)
+FORMATS = (*WRITERS, *COUNT_FORMATS)
 
 
 def write_values(form: str, stem: Path, columns: Columns, times_s: np.ndarray | None, rate_hz: float) -> Path:
@@ -116,7 +116,7 @@ def write_values(form: str, stem: Path, columns: Columns, times_s: np.ndarray | 
 
 
 def write_taken(form: str, stem: Path, sent: Sent, counts: np.ndarray, first: int) -> Path:
-    """Write counts of consecutive rows of a session in one of `COUNTED`."""
+    """Write counts of consecutive rows of a session in one of `COUNT_FORMATS`."""
     if form == "wav":
         import soundfile
 

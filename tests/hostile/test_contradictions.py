@@ -108,7 +108,7 @@ def channel(group: str, **fields: Any) -> Spoil:
 
 
 GAP = {"kind": "rows", "key": PROBES, "index": 1000, "size": 7, "time_s": 0.0, "wall_s": 0.0}
-MISSED = {"kind": "messages", "key": PROBES, "index": -1, "size": 7, "time_s": 0.0, "wall_s": 0.0}
+MISSED_NOTE = {"kind": "messages", "key": PROBES, "index": -1, "size": 7, "time_s": 0.0, "wall_s": 0.0}
 COMMAND = {"event": "command", "tick": 20_000, "id": 1, "command": "hammer", "request": {"force_n": 50.0}}
 SPEED = {"event": "command", "tick": 100_000, "id": 1, "command": "speed", "request": {"speed_hz": 5.0}}
 
@@ -186,7 +186,7 @@ CONTRADICTIONS: dict[str, tuple[Spoil, str]] = {
     "begun and ended": (metadata("end", ended="2020-01-01T00:00:00+00:00"), "ended 2020-01-01T00:00:00+00:00, before"),
     "gaps": (metadata("end", gaps="3"), "gaps: 3 in metadata end but 0 in recorder/gaps"),
     "lost rows": (metadata("end", lost_rows=json.dumps({PROBES: 7})), f"lost rows: {{'{PROBES}': 7}} in metadata end"),
-    "missed": (more("recorder/gaps", MISSED), "missed messages: {} in metadata end but {'rig/sensors/probes': 7}"),
+    "missed": (more("recorder/gaps", MISSED_NOTE), "missed messages: {} in metadata end but {'rig/sensors/probes': 7}"),
     "gap that is none": (more("recorder/gaps", GAP), f"7 rows of {PROBES} from 1000 on: noted as missing, but"),
     "gap not noted": (
         blocks(PROBES, lambda block, _: ({"values": block.values[:-7]}, 0), number=2),

@@ -236,7 +236,7 @@ def _slower(document: dict[str, Any]) -> None:
         each["rate_hz"] = 10_000
 
 
-_LIES: dict[str, tuple[Callable[[Layout], object], str]] = {
+_CORRUPTIONS: dict[str, tuple[Callable[[Layout], object], str]] = {
     "first": (lambda layout: _without(layout, {_of(layout)[0]}), f"20 rows of {PROBES} are missing"),
     "middle": (lambda layout: _without(layout, {_of(layout)[1]}), f"20 rows of {PROBES} are missing"),
     "last": (lambda layout: _without(layout, {_of(layout)[-1]}), f"20 rows of {PROBES} are missing"),
@@ -272,12 +272,12 @@ def _rig(*arguments: str) -> int:
     return end.value.code
 
 
-@pytest.mark.parametrize("lie", _LIES)
+@pytest.mark.parametrize("lie", _CORRUPTIONS)
 def test_missing_or_inconsistent_rows_are_reported_despite_valid_checksums(
     lie: str, layout: Layout, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     changed = copy.deepcopy(layout)
-    spoil, told = _LIES[lie]
+    spoil, told = _CORRUPTIONS[lie]
     assert Recording.open(changed.write(tmp_path / "same.mcap")).doubts == ()
     spoil(changed)
     path = changed.write(tmp_path / "x.mcap")

@@ -18,7 +18,7 @@ from tests.house.layout import ROOTS, build, floors
 
 ROOT = Path(__file__).parents[2]
 PICTURE = ROOT / "replays/figures/architecture.svg"
-OPENED = ("replays.recordings", "replays.studies")
+OPEN_PACKAGES = ("replays.recordings", "replays.studies")
 """Packages whose contents are drawn."""
 COMMANDS = "rig.cli"
 TITLES = {
@@ -93,9 +93,9 @@ class Box:
 
 
 def box_of(name: str, graph: grimp.ImportGraph) -> Box:
-    """Build the box of a package, with packages of `OPENED` opened; the rig's own modules are named."""
+    """Build the box of a package, with packages of `OPEN_PACKAGES` opened; the rig's own modules are named."""
     title = name.rpartition(".")[2] + ("/" if graph.find_children(name) else "")
-    if name in ROOTS or name in OPENED:
+    if name in ROOTS or name in OPEN_PACKAGES:
         rows = [[box_of(room, graph) for room in floor if room != COMMANDS] for floor in floors(graph, name)]
         return Box(name, f"{title}: {TITLES[name]}", [row for row in rows if row])
     if name.startswith("rig."):

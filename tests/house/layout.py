@@ -11,7 +11,7 @@ import sys
 import grimp
 
 ROOTS = ("rig", "drivers", "recorder", "replays")
-MOST_ROOMS, MOST_FLOORS = 10, 6
+MAX_ROOMS, MAX_FLOORS = 10, 6
 LIKE_ENTRIES = frozenset({"rig.cli.commands"})
 """Folders of entries of one kind, without a limit of their number."""
 

@@ -28,7 +28,7 @@ from rig.cli.app import COMMANDS
 from tests.house.allowance import AllowanceContract
 
 ROOT = Path(__file__).parents[2]
-HEAVY = (
+HEAVY_MODULES = (
     "numba",
     "scipy",
     "zenoh",
@@ -204,7 +204,7 @@ for arguments in [[], *([name] for name in {names!r})]:
         main([*arguments, "--help"])
     except SystemExit as end:
         assert end.code == 0, arguments
-print("HEAVY", *sorted(set({HEAVY!r}) & {{name.partition(".")[0] for name in sys.modules}}))
+print("HEAVY", *sorted(set({HEAVY_MODULES!r}) & {{name.partition(".")[0] for name in sys.modules}}))
 """
     done = subprocess.run(
         [sys.executable, "-c", code],

@@ -34,7 +34,7 @@ MODULES = (
     "rig.run.simulation",
     "rig.base.text",
 )
-CALLED = (
+NOTEBOOK_FUNCTIONS = (
     *(getattr(rig, name) for name in rig.__all__), contacts.restitution_factor, contacts.returned_restitution,
     contacts.linear_damping_ratio, contacts.fit_power, contacts.free_impact, magnets.field_sum_force,
     magnets.cylinder_force, magnets.pair_force, Recording, Daq, Console,
@@ -74,7 +74,7 @@ def test_the_notebook_plots_as_documented(tmp_path: Path, monkeypatch: pytest.Mo
     matplotlib.pyplot.close("all")
 
 
-@pytest.mark.parametrize("called", CALLED, ids=lambda called: called.__name__)
+@pytest.mark.parametrize("called", NOTEBOOK_FUNCTIONS, ids=lambda called: called.__name__)
 def test_functions_for_notebooks_have_an_example(called: object) -> None:
     assert ">>> " in (called.__doc__ or "")
     assert getattr(called, "__module__", "") in MODULES

@@ -5,7 +5,7 @@ from __future__ import annotations
 import grimp
 import pytest
 
-from tests.house.layout import LIKE_ENTRIES, MOST_FLOORS, MOST_ROOMS, ROOTS, build, floors, packages, rooms
+from tests.house.layout import LIKE_ENTRIES, MAX_FLOORS, MAX_ROOMS, ROOTS, build, floors, packages, rooms
 
 
 @pytest.fixture(scope="module")
@@ -17,10 +17,10 @@ def test_packages_have_few_rooms_on_few_floors(graph: grimp.ImportGraph) -> None
     wrong = []
     for package in packages(graph):
         count = len(rooms(graph, package))
-        if count > MOST_ROOMS and package not in LIKE_ENTRIES:
-            wrong.append(f"{package} has {count} rooms, at most {MOST_ROOMS}: give those that belong together a folder")
-        if (high := len(floors(graph, package))) > MOST_FLOORS:
-            wrong.append(f"{package} has {high} floors, at most {MOST_FLOORS}: python -m tests.house.layout {package}")
+        if count > MAX_ROOMS and package not in LIKE_ENTRIES:
+            wrong.append(f"{package} has {count} rooms, at most {MAX_ROOMS}: give those that belong together a folder")
+        if (high := len(floors(graph, package))) > MAX_FLOORS:
+            wrong.append(f"{package} has {high} floors, at most {MAX_FLOORS}: python -m tests.house.layout {package}")
     assert not wrong, "\n".join(wrong)
 
 

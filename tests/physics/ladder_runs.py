@@ -18,7 +18,7 @@ from replays.studies.ladder.search import Ladder, search
 from rig.base.errors import InputError
 
 QUESTIONS = ("whirl_frequency", "reaction_amplitude", "time_to_roll")
-ASKED, BUDGET_S = 0.01, 300.0
+TOLERANCE, BUDGET_S = 0.01, 300.0
 
 
 def exact(found: Ladder) -> Candidate:
@@ -30,14 +30,14 @@ def row(study: StudyScene, name: str) -> tuple[str, bool]:
     """Return a row of the table, and whether the model meets the limit."""
     scene = study.load().model_copy(update={"duration_s": study.window_s})
     try:
-        found = search(scene, {name: ASKED}, budget_s=BUDGET_S)
+        found = search(scene, {name: TOLERANCE}, budget_s=BUDGET_S)
     except InputError as error:
         return f"| {study.title} | {name} | none: {error} | | | | |", True
     picked, full = found.picked, found.full
     checked = measure(scene, exact(found), (name,), runs=1)
     error = QUANTITIES[name].error(picked.values[name], checked.values[name])
     left_out = ", ".join(f"{level} {part:.0%}" for level, part in found.savings.items()) or "nothing"
-    holds = math.isfinite(error) and error <= 2.0 * ASKED
+    holds = math.isfinite(error) and error <= 2.0 * TOLERANCE
     given = picked.cpu_s / found.given.cpu_s
     cells = study.title, name, picked.candidate.label, left_out, f"{given:.2f}", f"{picked.cpu_s / full.cpu_s:.2f}"
     return f"| {' | '.join(cells)} | {error:.1e}{'' if holds else ' MISSED'} |", holds

@@ -127,7 +127,7 @@ def test_choice_of_a_companion(engine: str, tolerance: float, friction: str, com
     assert choose_companion(engine, tolerance, friction) == pytest.approx(companion)
 
 
-def held_against_taylor(scene: str, changes: dict[str, Any], duration_s: float) -> tuple[float, float, Simulation]:
+def compare_with_taylor(scene: str, changes: dict[str, Any], duration_s: float) -> tuple[float, float, Simulation]:
     """Return the real errors of radius [m] and force [N], and the run."""
     given = {**BARE, **changes}
     exact = simulate(
@@ -142,7 +142,7 @@ def held_against_taylor(scene: str, changes: dict[str, Any], duration_s: float) 
 
 
 # No companion of the same engine could detect the first two: it takes the same steps.
-WRONG: dict[str, tuple[str, dict[str, Any], float]] = {
+HARD_CASES: dict[str, tuple[str, dict[str, Any], float]] = {
     "steps of the grid": ("hammer", {"engine.name": "tsit5", "engine.tolerance": 1e-3, "engine.companion": True}, 0.1),
     "frictionless": (
         "hammer",
@@ -153,9 +153,9 @@ WRONG: dict[str, tuple[str, dict[str, Any], float]] = {
 }
 
 
-@pytest.mark.parametrize("name", WRONG)
+@pytest.mark.parametrize("name", HARD_CASES)
 def test_an_error_of_radius_or_force_warns(name: str) -> None:
-    radius, force, simulation = held_against_taylor(*WRONG[name])
+    radius, force, simulation = compare_with_taylor(*HARD_CASES[name])
     found = simulation.health()["accuracy"]["quantities"]
     assert radius * 1e6 > found["radius"]["tolerance"] or force > found["force"]["tolerance"]
     assert found["radius"]["exceeded_s"] is not None or found["force"]["exceeded_s"] is not None
@@ -180,7 +180,7 @@ def test_only_a_run_with_an_angle_limit_warns_of_the_angle() -> None:
 
 def test_a_tighter_limit_makes_the_run_finer() -> None:
     found = [
-        held_against_taylor("hammer", {"engine.limits.radius_um": limit} if limit else {}, 0.2)
+        compare_with_taylor("hammer", {"engine.limits.radius_um": limit} if limit else {}, 0.2)
         for limit in (None, 0.03, 0.001)
     ]
     tolerances = [simulation.scene.engine.tolerance for *_, simulation in found]
@@ -201,13 +201,13 @@ def test_settled_whirl_is_off_in_angle_only() -> None:
     assert 0.0 < health["accuracy"]["quantities"]["angle"]["error"] < 2.0
 
 
-OLD = {"estimate": 9.9e-3, "growth_per_s": 0.4, "doubted_s": 23.178}
+OLD_FIGURES = {"estimate": 9.9e-3, "growth_per_s": 0.4, "doubted_s": 23.178}
 
 
 @pytest.mark.parametrize(
     ("accuracy", "text"),
     [
-        (OLD, "0.0099 (scaled)"),
+        (OLD_FIGURES, "0.0099 (scaled)"),
         (
             {"quantities": {"radius": {"label": "whirl radius", "unit": "um", "error": 0.09, "tolerance": 0.2778}}},
             "whirl radius 0.09 um (tolerance 0.28)",

@@ -30,9 +30,9 @@ KEYS = (
     "contact.friction", "contact.restitution", "magnet.stiffness", "house.pair_stiffness_vertical",
     "shaft.unbalance_eccentricity",
 )  # fmt: skip
-_OFF = 1.02
+_START_FACTOR = 1.02
 """Start of the search relative to the truth."""
-_BY_CHANCE = 0.999
+_CONFIDENCE = 0.999
 """An interval is too narrow if the probability of so low a share by chance is below 1 minus this."""
 
 
@@ -43,7 +43,9 @@ def held(recording: Recording, keys: tuple[str, ...]) -> tuple[dict[str, bool], 
     """
     experiment = Experiment.of(recording)
     truth = {key: value_of(experiment, key) for key in keys}
-    found = identify(ask(recording, experiment, keys, start={key: _OFF * value for key, value in truth.items()}))
+    found = identify(
+        ask(recording, experiment, keys, start={key: _START_FACTOR * value for key, value in truth.items()})
+    )
     given = [one for one in found.judgement.findings if one.standing == "identified"]
     off = {one.unknown.key: abs(one.value - truth[one.unknown.key]) / one.half_width for one in given}
     together = bool(max(off.values()) < found.judgement.together) if len(off) == len(keys) else None
@@ -75,6 +77,6 @@ def test_intervals_have_their_nominal_coverage(tmp_path: Path) -> None:
         shares = binomtest(sum(found), len(found), 0.95, alternative="less")
         ci = binomtest(sum(found), len(found)).proportion_ci(method="wilson")
         print(f"{name}: {sum(found)} of {len(found)}, Wilson {ci.low:.3f} to {ci.high:.3f}")
-        if shares.pvalue < 1.0 - _BY_CHANCE:
+        if shares.pvalue < 1.0 - _CONFIDENCE:
             low.append(name)
     assert not low

@@ -17,7 +17,9 @@ from replays.recordings.validation import validate
 from replays.recordings.whirl import parameter_si
 from replays.sessions import FOLDER, SESSIONS, make
 
-AGAIN = "make them anew by `rig sessions -o replays/sessions --force` if physics has changed on purpose, and review it"
+REMEDY = (
+    "regenerate them by `rig sessions -o replays/sessions --force` if physics was changed on purpose, and review it"
+)
 
 
 def test_every_session_exists_and_is_small() -> None:
@@ -42,7 +44,7 @@ def test_the_same_build_writes_the_same_bytes(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", SESSIONS)
 def test_a_session_is_reproduced(name: str) -> None:
     found = validate(Recording.open(FOLDER / f"{name}.mcap"), declared=True)
-    assert found.good, f"{found.verdict_line}; {AGAIN}"
+    assert found.good, f"{found.verdict_line}; {REMEDY}"
     # The text file next to it describes the same recording.
     phases = tomllib.loads((FOLDER / f"{name}.toml").read_text(encoding="utf-8"))["phases"]
     assert [phase["name"] for phase in phases] == [phase.name for phase in found.phases]

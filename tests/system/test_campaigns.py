@@ -239,7 +239,7 @@ def test_an_inconclusive_case_is_an_error_of_that_type_and_ends_with_status_3(tm
     assert told == [[], ["error"], ["failure"], ["skipped"]]
 
 
-THERE = """
+EXTERNAL_CAMPAIGN = """
 title = "On a rig that is there"
 duration_s = 0.5
 
@@ -274,7 +274,7 @@ def test_a_campaign_runs_on_a_recording_and_on_a_running_rig(folder: Path) -> No
         ("passed", ""),
     ]
     assert played["cases"][1]["measurements"][2]["value"] == pytest.approx(-81.7, abs=0.5)
-    (folder / "there.campaign.toml").write_text(THERE, encoding="utf-8")
+    (folder / "there.campaign.toml").write_text(EXTERNAL_CAMPAIGN, encoding="utf-8")
     with processes.rig("run", "stable-run", "--listen", "127.0.0.1:0", "--name", "there-for-a-campaign") as rig:
         processes.line_of(rig, "listening on")
         _, there = campaign(folder, "there.campaign.toml", "--url", "there-for-a-campaign", status=0)

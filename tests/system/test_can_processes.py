@@ -203,7 +203,7 @@ def test_nodes_are_informed_of_a_killed_hub(own_hub: Bench) -> None:
         bus.send(can.Message(arbitration_id=1))
 
 
-CARELESS = """
+UNCLOSED_PROGRAM = """
 import sys, threading, can
 bus = can.Bus("can0", interface="zenoh", endpoint=sys.argv[1])
 notifier = can.Notifier(bus, [lambda message: None])
@@ -214,14 +214,14 @@ print("sent", flush=True)
 
 
 def test_a_script_without_close_ends(hub: Bench) -> None:
-    with process("-c", CARELESS, hub.endpoint) as child:
+    with process("-c", UNCLOSED_PROGRAM, hub.endpoint) as child:
         output, _ = child.communicate(timeout=PATIENCE_S)
     assert child.returncode == 0, output
     assert "sent" in output
     hub.nodes(0)
 
 
-IDLE = """
+IDLE_PROGRAM = """
 import sys, time, can
 bus = can.Bus("can0", interface="zenoh", endpoint=sys.argv[1])
 bus.send(can.Message(arbitration_id=7))
@@ -234,7 +234,7 @@ time.sleep(600)
 def test_a_stalled_or_killed_endpoint_does_not_delay_others(hub: Bench, how: signal.Signals) -> None:
     count = 20_000
     sender, receiver = hub.bus(), hub.bus()
-    with process("-c", IDLE, hub.endpoint) as child:
+    with process("-c", IDLE_PROGRAM, hub.endpoint) as child:
         line_of(child, "up")
         assert take(receiver, 1)[0].arbitration_id == 7
         child.send_signal(how)

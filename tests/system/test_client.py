@@ -123,7 +123,7 @@ def test_rows_removed_by_a_fault_end_a_piece_and_the_next_reports_the_gap() -> N
     ({"channels": ["disk_x"], "truth": ["contacts"]}, "truth must be one of the rig's tables, such as contact"),
     ({"channels": ["disk_x"], "rate_hz": 3000.0}, "rate_hz must be 20000 divided by a whole number"),
 ])  # fmt: skip
-def test_unknown_channels_of_a_client_are_reported(settings: dict[str, Any], says: str, unstepped: str) -> None:
+def test_impossible_client_settings_are_refused(settings: dict[str, Any], says: str, unstepped: str) -> None:
     with (
         pytest.raises((InputError, UnknownNameError)) as caught,
         rig.connect(unstepped, wait_s=PATIENCE_S, **settings),

@@ -62,7 +62,7 @@ def written(folder: Path, text: str = MINE) -> Path:
     return path
 
 
-def test_the_file_contains_only_differences(tmp_path: Path) -> None:
+def test_the_file_changes_only_its_listed_settings(tmp_path: Path) -> None:
     table, own = read_channels(written(tmp_path)), default_table().channels
     assert {name: group.names for name, group in table.groups.items()} == {
         "probes": ("disk_x", "disk_y", "ring_x", "ring_y"),

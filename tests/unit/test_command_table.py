@@ -138,7 +138,7 @@ FORCE = Quantity("N", "Force, in N.", CanField("tilt", 15, 16, 0.1, "Force"))
 FIELD = Annotated[FiniteFloat, Field(ge=0.0, le=10.0), FORCE]
 EVENT = max(EventKind) + 1
 KIND = next(kind for kind in range(256) if all((kind ^ other).bit_count() >= 4 for other in CommandKind))
-FREE = next(number for number in range(1, 16) if number not in {
+FREE_CAN_NUMBER = next(number for number in range(1, 16) if number not in {
     each.quantity.can.number for entry in COMMANDS.values() for each in entry.quantities().values() if each.quantity.can
 })  # fmt: skip
 WHOLE: dict[str, Any] = {
@@ -180,7 +180,7 @@ def sized(**quantity: Any) -> Any:
         (half(sized(can=None)), "field force_n has no CAN signal"),
         (
             half(sized(can=CanField("tilt", 1, 16, 0.1, ""))),
-            f"CAN number 1 of field force_n is that of force_n of hammer; {FREE} is free",
+            f"CAN number 1 of field force_n is that of force_n of hammer; {FREE_CAN_NUMBER} is free",
         ),
         (half(sized(can=CanField("tilt", 15, 4, 0.1, ""))), "the largest force_n, 10, does not fit"),
         (half(sized(can=CanField("tilt", 15, 40, 0.1, ""))), "the CAN signals have 40 bits"),

@@ -77,7 +77,7 @@ for module in ("my_wrong.missing", "my_wrong.exits", "my_wrong.lame"):
     ENGINES["own"] = ENGINES["heun"]._replace(module=module)
     line(load_chosen_engine, "own")
 """
-ASK = """
+QUESTION_PROGRAM = """
 import rig
 from replays.studies.chart.methods import competitors
 from rig.physics.engines import ENGINES
@@ -158,7 +158,7 @@ def python(code: str, package: Path) -> list[str]:
 
 
 def test_an_external_engine_is_used_like_a_built_in_one(package: Path) -> None:
-    names, takes, wrong, gone, digest = python(ASK, package)
+    names, takes, wrong, gone, digest = python(QUESTION_PROGRAM, package)
     assert names == "heun ours", "the rig's own engines keep their names"
     assert takes == "True"
     assert "my_engine.heun:ORDER must be a rig.physics.engines.Method with a module" in wrong
@@ -166,7 +166,7 @@ def test_an_external_engine_is_used_like_a_built_in_one(package: Path) -> None:
     assert digest != source_digest(), "numba's cache must not serve code of another version of it"
     module = package / "my_engine/heun.py"
     module.write_text(module.read_text().replace("[0.5, 0.5]", "[0.4, 0.6]"))
-    assert python(ASK, package)[-1] not in (digest, source_digest())
+    assert python(QUESTION_PROGRAM, package)[-1] not in (digest, source_digest())
 
 
 def test_an_external_engine_converges_at_its_order(package: Path) -> None:

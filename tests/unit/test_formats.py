@@ -95,7 +95,7 @@ def noted(recording: Recording, tmp_path_factory: pytest.TempPathFactory) -> Rec
     return Recording.open(path)
 
 
-HAPPENED = [
+EXPECTED_EVENTS = [
     (0.0, "start", "start: scene hammer, seed 7, pace none"),
     (0.02, "hammer", "hammer: force_n 100.0, duration_ms 5.0, direction x"),
     (0.05, "speed", "speed: speed_hz 5.2, from a console"),
@@ -111,7 +111,7 @@ def test_mdf_has_events_attachments_and_readable_comments(noted: Recording, tmp_
     written(noted, path)
     with MDF(path) as mdf:
         events: list[Any] = list(mdf.events)
-        assert [(round(event.value, 9), event.name, event.comment) for event in events] == HAPPENED
+        assert [(round(event.value, 9), event.name, event.comment) for event in events] == EXPECTED_EVENTS
         assert {(event.event_type, event.sync_type) for event in events} == {(6, 1)}, "markers in seconds"
         attached = {str(block.file_name): mdf.extract_attachment(n)[0] for n, block in enumerate(mdf.attachments)}
         assert json.loads(attached.pop("catalogue.json")) == noted.catalogue
@@ -135,13 +135,15 @@ def test_events_and_documents_are_exported_if_the_format_allows(noted: Recording
     for suffix in written_suffixes():
         _, (made[suffix],) = written(noted, tmp_path / f"x{suffix}", "probes")
     told = TdmsFile.read_metadata(tmp_path / "x.tdms").properties
-    assert told["events"].splitlines() == [f"{time_s:.6f} s  {text}" for time_s, _, text in HAPPENED]
+    assert told["events"].splitlines() == [f"{time_s:.6f} s  {text}" for time_s, _, text in EXPECTED_EVENTS]
     assert json.loads(told["scene.json"]) == {**noted.scene, "taken": noted.commands}
     metadata = parquet.read_schema(tmp_path / "x.parquet").metadata
     assert json.loads(metadata[b"parameters.json"]) == noted.parameters
     beside = json.loads((tmp_path / "x.csv.json").read_text())
     for events in (json.loads(metadata[b"events"]), beside["events"]):
-        assert [(each["time_s"], each["event"]) for each in events] == [(time_s, name) for time_s, name, _ in HAPPENED]
+        assert [(each["time_s"], each["event"]) for each in events] == [
+            (time_s, name) for time_s, name, _ in EXPECTED_EVENTS
+        ]
         assert (events[2]["from"], events[3]["text"]) == ("a console", "bearing is wärm")
     assert beside["documents"]["scene"] == {**noted.scene, "taken": noted.commands}
     assert beside["documents"]["catalogue"] == noted.catalogue

@@ -156,8 +156,8 @@ def test_samples_are_not_changed_without_a_request(
     np.testing.assert_allclose(edges, foreign.edges()[: len(edges)], rtol=0, atol=5e-9)
     assert len(edges) == 8
     assert len(conversion.pulses) == 1
-    assert conversion.pulses[0].force_n == pytest.approx(foreign.BLOW_N, rel=0.01)
-    assert conversion.pulses[0].at_s == pytest.approx(foreign.HIT_S, abs=2e-4)
+    assert conversion.pulses[0].force_n == pytest.approx(foreign.PULSE_FORCE_N, rel=0.01)
+    assert conversion.pulses[0].at_s == pytest.approx(foreign.IMPACT_S, abs=2e-4)
     assert not recording.doubts
     promises = Catalogue.read(recording.catalogue).promises()
     for name in recording.table.groups:

@@ -68,7 +68,7 @@ def test_identification_writes_a_usable_parameter_set_and_a_report(
     assert sorted(entry.name for entry in tmp_path.iterdir()) == ["fitted.toml", "page.html"]
 
 
-def test_json_omits_missing_numbers(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_json_has_null_for_unidentified_values(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(file, "--fit", "contact.friction,magnet.stiffness", "--from", "0", "--to", "0.018", "--json") == 0
     document = json.loads(capsys.readouterr().out)
     friction, magnet = document["values"]["contact.friction"], document["values"]["magnet.stiffness"]

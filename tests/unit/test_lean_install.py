@@ -54,7 +54,7 @@ def test_commands_of_the_full_install_explain_how_to_get_it() -> None:
     assert re.search(f"rig.simulate needs {need}", lean("import rig; rig.simulate('hammer')").stderr)
 
 
-NEEDING = {
+FULL_ARGUMENTS = {
     "score": "{rec} --against {rec}",
     "import": "{rec} --template x.toml", "validate": "{rec}", "identify": "{rec} --fit contact.friction",
     "view": "{rec}", "sessions": "-o {folder}", "campaign": "hammer", "run": "hammer",
@@ -70,7 +70,7 @@ def test_the_help_names_the_commands_that_need_the_whole_rig(tmp_path: Path) -> 
     shown = " ".join(lean("from rig.cli.main import main; main(['-h'])").stdout.split())
     assert shown.endswith(f"{WHOLE_RIG}: {', '.join(NEED_FULL)}.")
     assert set(NEED_FULL) <= {name for commands in COMMANDS.values() for name in commands}
-    given = {name: NEEDING.get(name, "").format(rec=RECORDING, folder=tmp_path).split() for name in NEED_FULL}
+    given = {name: FULL_ARGUMENTS.get(name, "").format(rec=RECORDING, folder=tmp_path).split() for name in NEED_FULL}
     done = lean(
         f"from rig.cli.main import main\nfor name, rest in {given!r}.items():\n"
         "    try:\n        main([name, *rest])\n    except SystemExit as end:\n        print(name, end.code)"
@@ -98,7 +98,7 @@ def test_the_lean_install_writes_the_same_csv(tmp_path: Path) -> None:
 
 
 OTHER_EXTRAS = {"asammdf", "nptdms", "pyuff", "soundfile", "pytest", "xdist", "mcap_ros2", "hypothesis"}
-PROMISED = {
+LEAN_ARGUMENTS = {
     "info": "{rec}", "info --json": "{rec}", "cut": "{rec} --from 0.1 --to 0.2 -o {folder}/cut.mcap",
     "recover": "{rec} --force -o {folder}/recovered.mcap", "export": "{rec} --to 0.1 -o {folder}/run.csv",
     "keys init": "{folder}/keys --host 127.0.0.1", "completion": "bash", "hammer": "-h", "speed": "-h", "release": "-h",
@@ -109,7 +109,9 @@ PROMISED = {
 
 
 def test_each_promised_command_runs_without_any_extra(tmp_path: Path) -> None:
-    given = [[*name.split(), *rest.format(rec=RECORDING, folder=tmp_path).split()] for name, rest in PROMISED.items()]
+    given = [
+        [*name.split(), *rest.format(rec=RECORDING, folder=tmp_path).split()] for name, rest in LEAN_ARGUMENTS.items()
+    ]
     done = lean(
         f"sys.modules |= dict.fromkeys({OTHER_EXTRAS!r})\nfrom rig.cli.main import main\nfor words in {given!r}:\n"
         "    try:\n        main(words)\n    except SystemExit as end:\n        print('END', words[0], end.code)"

@@ -333,7 +333,7 @@ def check_line(line: str, case: Case) -> None:
     assert len(line) < 400, "one line that can be read"
 
 
-OF_TWO_FILES = ("outside the ring", *(f"set: {each}" for each in ("bad rule", "rule where none is", "out of range",
+TWO_FILE_CASES = ("outside the ring", *(f"set: {each}" for each in ("bad rule", "rule where none is", "out of range",
                                                                   "nan", "inf")))  # fmt: skip
 
 
@@ -354,7 +354,7 @@ def test_is_refused_in_one_line(
     assert end.value.code == 2
     assert printed.out == ""
     # A range is in the set below the file's, and the ring in the set of the scene.
-    read = [name for name in case.files if name in case.arguments and case.what not in OF_TWO_FILES]
+    read = [name for name in case.files if name in case.arguments and case.what not in TWO_FILE_CASES]
     assert not read or any(name in printed.err for name in read), "the file is not named"
     check_line(printed.err, case)
     assert state(tmp_path) == before

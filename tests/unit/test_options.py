@@ -36,7 +36,7 @@ def commands() -> dict[str, Any]:
 
 
 COMMAND = commands()
-IN_ALL = sum(map(len, COMMANDS.values()))
+COMMAND_COUNT = sum(map(len, COMMANDS.values()))
 
 
 def options() -> list[tuple[str, str, Any]]:
@@ -99,7 +99,7 @@ def test_help_is_told_once_and_fits_80_columns(capsys: pytest.CaptureFixture[str
     [
         (
             "rnu",
-            f"command must be one of `rig -h`, such as run ({IN_ALL} in all); instead received 'rnu'",
+            f"command must be one of `rig -h`, such as run ({COMMAND_COUNT} in all); instead received 'rnu'",
         ),
         ("can lod", "command must be one of `rig can -h`, such as load (3 in all); instead received 'lod'"),
         (

@@ -11,7 +11,7 @@ from tests.fault_cases import MONITORED, MONITORED_PULSES
 from tests.unit import protection_acceptance as table
 from tests.unit.protection_acceptance import monitor, outcome, sine
 
-SETTLED = {"startup_s": 2.0}
+SETTLED_START = {"startup_s": 2.0}
 """The high-pass of 0.5 Hz has settled."""
 
 
@@ -21,7 +21,7 @@ def kinds(settings: Any, rows: list[Any]) -> set[str]:
 
 @pytest.mark.parametrize(("peak_to_peak_um", "expected"), table.ALARMS.items())
 def test_alarms_are_within_1_percent_of_their_set_points(peak_to_peak_um: float, expected: set[str]) -> None:
-    actions = outcome(monitor(**SETTLED), sine(peak_to_peak_um, duration_s=2.5))
+    actions = outcome(monitor(**SETTLED_START), sine(peak_to_peak_um, duration_s=2.5))
     assert {(action.kind, action.name) for action in actions if action.kind != "trip"} == {
         (kind, name) for kind in expected - {"trip"} for name in ("disk_x", "disk_y")
     }
@@ -31,8 +31,8 @@ def test_alarms_are_within_1_percent_of_their_set_points(peak_to_peak_um: float,
 @pytest.mark.parametrize(("frequency_hz", "measure", "level_um"), table.VALUES)
 def test_channel_values_are_accurate_to_1_percent(frequency_hz: float, measure: Any, level_um: float) -> None:
     rows = sine(800.0, frequency_hz, duration_s=2.5)
-    assert kinds(monitor(**SETTLED, measure=measure, alert_um=0.99 * level_um), rows) == {"alert"}
-    assert kinds(monitor(**SETTLED, measure=measure, alert_um=1.01 * level_um, danger_um=2000.0), rows) == set()
+    assert kinds(monitor(**SETTLED_START, measure=measure, alert_um=0.99 * level_um), rows) == {"alert"}
+    assert kinds(monitor(**SETTLED_START, measure=measure, alert_um=1.01 * level_um, danger_um=2000.0), rows) == set()
 
 
 @pytest.mark.parametrize(("times", "gain"), table.CORNER)

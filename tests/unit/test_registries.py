@@ -22,7 +22,7 @@ from rig.run.commands.command import SceneCommand
 from rig.run.commands.table import TimedCommand
 from rig.run.scenes import load_scene
 
-UNCOMPUTED = textwrap.dedent(
+UNCOMPUTED_SIGNAL = textwrap.dedent(
     """
     import importlib.util, sys
     import rig.physics.kernels  # not yet the table of signals
@@ -61,7 +61,7 @@ UNCOMPUTED = textwrap.dedent(
 
 def test_a_signal_that_no_stage_computes_is_refused_by_name() -> None:
     run = subprocess.run(
-        [sys.executable, "-c", UNCOMPUTED], env={**os.environ, "NUMBA_DISABLE_JIT": "1"}, text=True,
+        [sys.executable, "-c", UNCOMPUTED_SIGNAL], env={**os.environ, "NUMBA_DISABLE_JIT": "1"}, text=True,
         capture_output=True, check=False,
     )  # fmt: skip
     assert not run.returncode, run.stderr

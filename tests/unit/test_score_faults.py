@@ -28,10 +28,10 @@ from tests.score_daqs import Tones, write_parquet, write_session
 RATE_HZ, ROWS_HZ, SECONDS, TURN_HZ = 20_000, 100_000, 0.5, 15.0
 GROUPS = [default_table().groups[name] for name in ("probes", "forces", "accelerations", "drive")]
 CHANNELS = [channel for group in GROUPS for channel in group.channels if channel.name != "speed"]
-DUE = [channel.name for channel in CHANNELS]
+REQUESTED_CHANNELS = [channel.name for channel in CHANNELS]
 
 
-SIZED = ("gain", "offset", "late", "clock", "jitter", "crosstalk")
+SIZED_KINDS = ("gain", "offset", "late", "clock", "jitter", "crosstalk")
 """Kinds with the size of a quantity of the scorecard."""
 Sessions = dict[bool, tuple[Path, dict[str, np.ndarray]]]
 
@@ -122,7 +122,7 @@ def test_a_daq_with_its_own_clock(kinds: tuple[str, ...], rig: Rig, sessions: Se
         daq(tmp_path / "daq.parquet", rig.counts(kinds, noisy=True)),
         [sessions[False][0]],
         path="analogue",
-        channels=DUE,
+        channels=REQUESTED_CHANNELS,
     )
     assert red(card) == declared(kinds)
     for kind in kinds:
@@ -131,14 +131,16 @@ def test_a_daq_with_its_own_clock(kinds: tuple[str, ...], rig: Rig, sessions: Se
         if defect.score:
             assert DEFECT_OF[kind] in card.defects[name], f"{kind} of {name}"
             row, size = card.row(defect.score[0], name), size_of(kind, numbers, name)
-            if size is not None and kind in SIZED:
+            if size is not None and kind in SIZED_KINDS:
                 size *= {("", "ppm"): 1e6, ("s", "ns"): 1e9}.get((defect.unit, row.unit), 1.0)
                 assert row.low <= size <= row.high, f"{kind} of {name}"
 
 
 @pytest.mark.parametrize("kinds", together(5), ids=len)
 def test_a_daq_that_records_counts(kinds: tuple[str, ...], rig: Rig, sessions: Sessions, tmp_path: Path) -> None:
-    card = judge(daq(tmp_path / "daq.parquet", rig.counts(kinds, noisy=True)), [sessions[True][0]], channels=DUE)
+    card = judge(
+        daq(tmp_path / "daq.parquet", rig.counts(kinds, noisy=True)), [sessions[True][0]], channels=REQUESTED_CHANNELS
+    )
     assert card.path == "digital"
     assert red(card) == declared(kinds, {"altered values"})
 
@@ -166,18 +168,18 @@ def picked(rows: np.ndarray) -> Callable[[dict[str, np.ndarray]], None]:
 
 
 WRONG = (changed("disk_x [V]", 1.0005), changed("P_N [V]", plus=0.25), changed("P_S [V]", -1.0), swapped)
-BACK, ALL = ("all groups", "stamps that go back"), "all groups"
+BACKWARD_STAMPS, ALL = ("all groups", "stamps that go back"), "all groups"
 FILE_DEFECTS: dict[str, tuple[Callable[[dict[str, np.ndarray]], Any], set[tuple[str, str]]]] = {
     "sound": (lambda _: None, set()),
     "a row and a block lost": (picked(np.delete(ROWS, np.r_[4321, 6000:6200])), {(ALL, "missing rows")}),
-    "a block twice": (picked(np.insert(ROWS, 4200, ROWS[4000:4200])), {(ALL, "doubled rows"), BACK}),
-    "a block late, and two rows swapped": (picked(LATE_BLOCK_ROWS), {(ALL, "swapped rows"), BACK}),
+    "a block twice": (picked(np.insert(ROWS, 4200, ROWS[4000:4200])), {(ALL, "doubled rows"), BACKWARD_STAMPS}),
+    "a block late, and two rows swapped": (picked(LATE_BLOCK_ROWS), {(ALL, "swapped rows"), BACKWARD_STAMPS}),
     "wrong sensitivity, zero, sign and wires": (
         lambda columns: [change(columns) for change in WRONG],
         {("disk_x", "scale"), ("P_N", "offset"), ("P_S", "polarity"), ("disk_y", "mapping"), ("P_E", "mapping")},
     ),
     "a fast clock of the stamps": (changed("time [s]", 1.0003), {(ALL, "stamp rate")}),
-    "stale stamps": (changed("time [s]", plus=-0.01 * (ROWS % 200 == 150)), {BACK}),
+    "stale stamps": (changed("time [s]", plus=-0.01 * (ROWS % 200 == 150)), {BACKWARD_STAMPS}),
 }
 
 
@@ -216,7 +218,7 @@ def test_a_logger_of_a_can_bus(suffix: str, fd: bool, sessions: Sessions, tmp_pa
 @pytest.mark.parametrize("defect", FILE_DEFECTS)
 def test_defects_of_the_daqs_file(defect: str, sessions: Sessions, tmp_path: Path) -> None:
     (session, counts), (change, declares) = sessions[True], FILE_DEFECTS[defect]
-    assert red(judge(daq(tmp_path / "daq.parquet", counts, change), [session], channels=DUE)) == declares
+    assert red(judge(daq(tmp_path / "daq.parquet", counts, change), [session], channels=REQUESTED_CHANNELS)) == declares
 
 
 def test_stamps_of_the_computers_clock_show_latency(sessions: Sessions, tmp_path: Path) -> None:

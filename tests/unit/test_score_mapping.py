@@ -40,7 +40,7 @@ def mapped(numbers: dict[str, Any]) -> Any:
     return parse_mapping({"channels": channels}, name="map.toml")
 
 
-WAYS = {
+UNIT_FORMS = {
     "volts": ({"unit": "V"}, lambda c: c * CHANNEL.lsb_v),
     "millivolts": ({"unit": "mV"}, lambda c: 1e3 * c * CHANNEL.lsb_v),
     "fractions": ({"unit": "FS"}, lambda c: c / 2.0**23),
@@ -51,9 +51,9 @@ WAYS = {
 }
 
 
-@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("way", UNIT_FORMS)
 def test_a_mapping_gives_names_and_units(way: str, session: Path, counts: np.ndarray, tmp_path: Path) -> None:
-    numbers, made = WAYS[way]
+    numbers, made = UNIT_FORMS[way]
     card = judge(write(tmp_path / "daq.parquet", made(counts[1000:])), [session], mapping=mapped(numbers))
     assert (card.path, card.outcome) == ("digital", "pass"), card.verdict_line
 
@@ -63,7 +63,7 @@ def test_values_are_those_of_the_mapping_on_the_analogue_path(
     way: str, session: Path, counts: np.ndarray, tmp_path: Path
 ) -> None:
     gains = []
-    for numbers, made in (({"unit": "mm"}, PROBES.engineering), WAYS[way]):
+    for numbers, made in (({"unit": "mm"}, PROBES.engineering), UNIT_FORMS[way]):
         daq = write(tmp_path / "daq.parquet", made(counts[1000:]))
         gains.append(judge(daq, [session], mapping=mapped(numbers), path="analogue").row("gain", "disk_x").value)
     assert gains[1] == pytest.approx(gains[0], abs=20.0)

@@ -163,7 +163,7 @@ def test_repeated_last_rows_of_a_session_are_not_a_start(tmp_path: Path) -> None
     assert {"doubled rows", "swapped rows"} & {quantity for quantity, _ in red(card)}
 
 
-STALE = {
+STALE_RANGES = {
     "the end first": [(15_000, 20_000), (3000, 8600)],
     "the end first, a row lost after it": [(15_000, 20_000), (3000, 5000), (5001, 8600)],
     "the begin last": [(3000, 14_000), (0, 7000)],
@@ -171,12 +171,12 @@ STALE = {
 """Rows of the session in a record, in its order."""
 
 
-@pytest.mark.parametrize(("which", "repeats"), [*((which, False) for which in STALE), ("the end first", True)])
-def test_rows_of_the_session_are_not_assigned_outside_it(which: str, repeats: bool, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("which", "repeats"), [*((which, False) for which in STALE_RANGES), ("the end first", True)])
+def test_a_record_of_stale_rows_does_not_pass(which: str, repeats: bool, tmp_path: Path) -> None:
     g = np.random.default_rng(0)
     whole = repeating(20_000, 4, g) if repeats else g.integers(-50, 50, (20_000, 4))
     session = write_session(tmp_path / "session.mcap", {"probes": whole})
-    daq = np.concatenate([whole[first:last] for first, last in STALE[which]])
+    daq = np.concatenate([whole[first:last] for first, last in STALE_RANGES[which]])
     card = judge(write_parquet(tmp_path / "daq.parquet", columns_of(daq)), [session])
     assert card.outcome != "pass", card.remarks
     told = "\n".join(card.doubts)
@@ -194,7 +194,7 @@ def test_stale_rows_in_one_table_of_several_do_not_pass(tmp_path: Path) -> None:
     assert "probes: unjudged rows after the session equal a run of rows in it" in card.doubts
 
 
-def test_a_start_without_unequal_rows_wins_over_longer_overlaps() -> None:
+def test_a_start_without_unequal_rows_is_found_despite_longer_overlaps() -> None:
     whole = repeating(40_000, 1, np.random.default_rng(1))[:, 0]
     places = find_begins([whole[29_500:]], [whole[:30_000]], 1, 500)
     assert 29_500 in places

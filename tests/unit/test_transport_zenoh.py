@@ -91,9 +91,7 @@ def test_a_command_waits_until_a_listening_rig_is_ready(server: ZenohServer) -> 
         assert announced.finished.is_set()
 
 
-def test_errors_in_key_files_name_the_environment_variable(
-    server: ZenohServer, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_missing_key_folder_is_refused_with_its_source(server: ZenohServer, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("RIG_TLS", "nowhere")
     for folder, name in (("nowhere", "RIG_TLS"), ("other", "--tls")):
         with (

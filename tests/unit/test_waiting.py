@@ -7,17 +7,21 @@ import pytest
 from tests.processes import line_of, python
 from tests.waiting import PATIENCE_S, sooner_than, until
 
-ENDS = "print('out of order', flush=True); raise SystemExit(3)"
+FAILING_PROGRAM = "print('out of order', flush=True); raise SystemExit(3)"
 
 
 def test_a_wait_for_a_process_that_has_ended_fails_at_once_with_its_output() -> None:
     told = r"ended with status 3 before that:\nout of order"
-    with python("-S", "-c", ENDS) as child, sooner_than(PATIENCE_S), pytest.raises(AssertionError, match=told):
+    with (
+        python("-S", "-c", FAILING_PROGRAM) as child,
+        sooner_than(PATIENCE_S),
+        pytest.raises(AssertionError, match=told),
+    ):
         until(lambda: False, of=child)
 
 
 def test_a_condition_met_before_the_process_ended_is_no_failure() -> None:
-    with python("-S", "-c", ENDS) as child:
+    with python("-S", "-c", FAILING_PROGRAM) as child:
         until(lambda: child.poll() is not None, of=child)
 
 
