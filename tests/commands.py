@@ -15,7 +15,7 @@ from rig.cli.output.tables import Table, table_console
 TERMINAL = 80
 
 
-def lines_of(table: Table, *, width: int | None = TERMINAL) -> list[str]:
+def render_lines(table: Table, *, width: int | None = TERMINAL) -> list[str]:
     """Return the lines of a table on a terminal of this width, or in a pipe."""
     console = table_console(wide=True)
     console.file, console.width = io.StringIO(), width or console.width
@@ -27,7 +27,7 @@ def check_legible(table: Table, *, width: int = TERMINAL) -> None:
     """Check that no cell is cut, that hidden columns are announced, and that a row in a pipe is one line with all its
     cells.
     """
-    lines = lines_of(table, width=width)
+    lines = render_lines(table, width=width)
     assert max(map(cell_len, lines), default=0) <= width, lines
     text = "\n".join(lines)
     told = re.search(r"^without (.*): see --wide\Z", text, re.MULTILINE | re.DOTALL)
@@ -44,7 +44,7 @@ def check_legible(table: Table, *, width: int = TERMINAL) -> None:
                 folded = cell_len(part) > width // (table.keys + 1) - 2
                 assert folded or part in text, f"{part!r} of {heading} is not whole"
     headed, title = any(table.headings), bool(table.title)
-    rows = lines_of(table, width=None)[title:]
+    rows = render_lines(table, width=None)[title:]
     assert len(rows) == headed + len(table.rows)
     for row, (cells, _) in zip(rows[headed:], table.rows, strict=True):
         whole = [cell.plain.strip() or "-" for cell in cells]
@@ -69,15 +69,15 @@ def run(*arguments: object) -> int:
     return int(ended.value.code or 0)
 
 
-def said(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
+def run_captured(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
     """Run a command and return its exit status, output and error output."""
     status = run(*arguments)
     captured = capsys.readouterr()
     return status, captured.out, captured.err
 
 
-def shown(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+def run_for_output(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
     """Run a command that must succeed and return its output."""
-    status, output, complaints = said(capsys, *arguments)
+    status, output, complaints = run_captured(capsys, *arguments)
     assert status == 0, complaints
     return output

@@ -177,7 +177,7 @@ def _in_turn(tests: list[str]) -> list[str]:
     return sorted(tests, key=lambda test: turns[test])
 
 
-def ordered(record: Record, texts: dict[str, str], file: str, first: int, last: int) -> list[str]:
+def order_tests(record: Record, texts: dict[str, str], file: str, first: int, last: int) -> list[str]:
     """Return tests in the order in which a mutant should meet them.
 
     Args:

@@ -22,12 +22,12 @@ def instants(rate_hz: float) -> np.ndarray:
     return np.arange(round(DURATION_S * rate_hz)) / rate_hz
 
 
-def edges() -> np.ndarray:
+def pulse_times() -> np.ndarray:
     """Return the times at which keyphasor pulses cross half height [s]."""
     return (np.arange(int(SPIN_HZ * DURATION_S) + 1) + 0.3) / SPIN_HZ
 
 
-def orbit(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def compute_orbit(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the position of the disk [mm]."""
     wide = np.clip((t - IMPACT_S) / 0.2, 0.0, 1.0)
     spin, whirl = 2 * np.pi * SPIN_HZ * t, 2 * np.pi * WHIRL_HZ * (t - IMPACT_S)
@@ -41,16 +41,16 @@ def hammer(t: np.ndarray) -> np.ndarray:
     return np.where((part > 0) & (part < 1), PULSE_FORCE_N * np.sin(np.pi * np.clip(part, 0, 1)), 0.0)
 
 
-def keyphasor(t: np.ndarray) -> np.ndarray:
+def make_keyphasor(t: np.ndarray) -> np.ndarray:
     """Return the keyphasor signal, from 0 to 1."""
-    since, ramp_s = t[:, None] - edges()[None, :], RAMP * t[1]
+    since, ramp_s = t[:, None] - pulse_times()[None, :], RAMP * t[1]
     return np.sum(np.clip(since / ramp_s + 0.5, 0, 1) - np.clip((since - PULSE_S) / ramp_s + 0.5, 0, 1), axis=1)
 
 
-def signals(rate_hz: float, *, seed: int = 0) -> dict[str, np.ndarray]:
+def make_signals(rate_hz: float, *, seed: int = 0) -> dict[str, np.ndarray]:
     """Return the rig's channels in its units (mm, N, m/s^2, Hz) with white noise, each of shape (n,)."""
     t, generator = instants(rate_hz), np.random.default_rng(seed)
-    x, y = orbit(t)
+    x, y = compute_orbit(t)
     wide = np.clip((t - IMPACT_S) / 0.2, 0.0, 1.0)
     ring = np.exp(-np.maximum(t - IMPACT_S, 0.0) / 0.02) * np.sin(2 * np.pi * 900 * t) * (t > IMPACT_S)
     found = {
@@ -59,7 +59,7 @@ def signals(rate_hz: float, *, seed: int = 0) -> dict[str, np.ndarray]:
         "P_E": PRELOAD_N - 25 + 300 * wide * x, "P_W": PRELOAD_N - 300 * wide * x,
         "inner_x": 60 * ring + 9 * wide * x, "inner_y": 40 * ring + 9 * wide * y,
         "outer_x": 25 * ring + 4 * wide * x, "outer_y": 15 * ring + 4 * wide * y,
-        "speed": SPIN_HZ - 0.05 * wide, "keyphasor": keyphasor(t), "hammer": hammer(t),
+        "speed": SPIN_HZ - 0.05 * wide, "keyphasor": make_keyphasor(t), "hammer": hammer(t),
     }  # fmt: skip
     noise = {"mm": 3e-4, "N": 0.5, "a": 0.05, "speed": 2e-3, "keyphasor": 0.0, "hammer": 0.05}
     kinds = {name: "mm" if name[:4] in ("disk", "ring") else "N" if name[0] == "P" else "a" for name in found}
@@ -69,7 +69,7 @@ def signals(rate_hz: float, *, seed: int = 0) -> dict[str, np.ndarray]:
     }
 
 
-def mdf_of_three_rates(path: Path) -> dict[str, tuple[float, np.ndarray]]:
+def write_mdf(path: Path) -> dict[str, tuple[float, np.ndarray]]:
     """Write an MDF file at 51.2 kHz, 20 kHz (clock 80 ppm fast) and 12.5 Hz; keyphasor and speed in separate groups.
 
     Returns:
@@ -89,7 +89,7 @@ def mdf_of_three_rates(path: Path) -> dict[str, tuple[float, np.ndarray]]:
     kept = {}
     with MDF(version="4.10") as mdf:
         for rate, members in names.items():
-            made, channels = signals(rate), []
+            made, channels = make_signals(rate), []
             for name, channel in members.items():
                 unit = "mm" if name.startswith("Prox") else "N" if name.startswith("F_") else "m/s^2"
                 scale, unit, factor = scales.get(name, (None, unit, 1.0))
@@ -119,7 +119,7 @@ VOLTS = {
 """Name in the file, volts per unit of the rig, unit and size of the sensitivity, volts at zero, by channel."""
 
 
-def tdms_in_volts(path: Path, *, rate_hz: float = 25_600.0) -> dict[str, tuple[float, np.ndarray]]:
+def write_tdms(path: Path, *, rate_hz: float = 25_600.0) -> dict[str, tuple[float, np.ndarray]]:
     """Write a TDMS file in volts, with the sensors' sensitivities in properties.
 
     Returns:
@@ -127,7 +127,7 @@ def tdms_in_volts(path: Path, *, rate_hz: float = 25_600.0) -> dict[str, tuple[f
     """
     from nptdms import ChannelObject, TdmsWriter
 
-    made, kept, objects = signals(rate_hz), {}, []
+    made, kept, objects = make_signals(rate_hz), {}, []
     began = np.datetime64("2026-11-21T10:00:00.000000")
     about = {"unit_string": "V", "wf_increment": 1.0 / rate_hz, "wf_start_time": began}
     for channel, (name, per_unit_v, unit, size, bias_v) in VOLTS.items():
@@ -151,13 +151,13 @@ GERMAN = {
 """Heading, unit, and factor from the rig's unit, by channel."""
 
 
-def german_csv(path: Path, *, rate_hz: float = 5000.0) -> dict[str, tuple[float, np.ndarray]]:
+def write_german_csv(path: Path, *, rate_hz: float = 5000.0) -> dict[str, tuple[float, np.ndarray]]:
     """Write a CSV file with semicolons, decimal commas, units in the headings, umlauts in latin-1 and times of day.
 
     Returns:
         Rate [Hz] and values in the file, by channel of the rig.
     """
-    made = signals(rate_hz)
+    made = make_signals(rate_hz)
     kept = {channel: (rate_hz, np.round(made[channel] * size, 6)) for channel, (_, _, size) in GERMAN.items()}
     micros = np.rint(instants(rate_hz) * 1e6).astype(int)
     lines = ["Prüfstand;Fanglager", ";".join(["Uhrzeit", *(f"{name} [{unit}]" for name, unit, _ in GERMAN.values())])]
@@ -170,7 +170,7 @@ def german_csv(path: Path, *, rate_hz: float = 5000.0) -> dict[str, tuple[float,
     return kept
 
 
-def csv_without_names(
+def write_nameless_csv(
     path: Path, *, rate_hz: float = 10_000.0, ppm: float = 80.0
 ) -> dict[str, tuple[float, np.ndarray]]:
     """Write a CSV file with units and numbers only, a clock that is off, and probes in micrometres without place or
@@ -180,7 +180,7 @@ def csv_without_names(
         True rate [Hz] and values in the file, by channel of the rig, in their order.
     """
     rate = rate_hz * (1.0 + ppm * 1e-6)
-    made = signals(rate)
+    made = make_signals(rate)
     order = {"ring_x": ("CH1", "um", 1e3), "ring_y": ("CH2", "um", 1e3), "disk_x": ("CH3", "um", 1e3),
              "disk_y": ("CH4", "um", 1e3), "P_E": ("CH5", "N", 1.0), "P_N": ("CH6", "N", 1.0), "P_W": ("CH7", "N", 1.0),
              "P_S": ("CH8", "N", 1.0), "hammer": ("CH9", "N", 1.0), "speed": ("CH10", "", 60.0),

@@ -30,7 +30,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tests.covering_tests import ORDER, RECORD, TRACED, Record, ordered
+from tests.covering_tests import ORDER, RECORD, TRACED, Record, order_tests
 
 ROOT = Path(__file__).parent.parent
 CPU_S = 20
@@ -214,7 +214,7 @@ class _Places(ast.NodeVisitor):
         self.generic_visit(node)
 
 
-def places(file: str) -> list[Mutant]:
+def find_mutants(file: str) -> list[Mutant]:
     """Return all mutants of a file; some may not be valid Python."""
     text = (ROOT / file).read_text(encoding="utf-8")
     visitor = _Places(file, text)
@@ -230,7 +230,7 @@ def _parses(text: str) -> bool:
     return True
 
 
-def chosen(count: int, seed: int) -> list[Mutant]:
+def choose_mutants(count: int, seed: int) -> list[Mutant]:
     """Return `count` mutants: the picked ones, then equally many of each module, drawn at random."""
     found = []
     for file, old, new in PICKED_MUTANTS:
@@ -243,7 +243,7 @@ def chosen(count: int, seed: int) -> list[Mutant]:
     for module in MUTATED:
         files = [module] if module.endswith(".py") else [str(p.relative_to(ROOT)) for p in (ROOT / module).glob("*.py")]
         kinds: dict[str, list[Mutant]] = {}
-        for each in (mutant for file in sorted(files) for mutant in places(file)):
+        for each in (mutant for file in sorted(files) for mutant in find_mutants(file)):
             kinds.setdefault(each.kind, []).append(each)
         for each in kinds.values():
             draw.shuffle(each)
@@ -260,7 +260,7 @@ def _in_turn(stacks: list[list[Mutant]]) -> list[Mutant]:
     return [stack[n] for n in range(longest) for stack in stacks if n < len(stack)]
 
 
-def tests_of(file: str) -> list[str]:
+def find_tests(file: str) -> list[str]:
     """Return the test files of a module."""
     names = next(names for prefix, names in TESTS.items() if file.startswith(prefix))
     found = {p for name in names for p in (ROOT / "tests/unit").glob(f"test_{name}.py")}
@@ -274,7 +274,7 @@ def mutated_files() -> list[str]:
     return sorted(found + [str(path.relative_to(ROOT)) for folder in folders for path in folder])
 
 
-def measured(tree: Path, tests: list[str], known: dict[str, dict[str, Any]], journal: Path) -> Record | None:
+def measure_tests(tree: Path, tests: list[str], known: dict[str, dict[str, Any]], journal: Path) -> Record | None:
     """Return the lines that tests execute, from the journal or measured; None if a test fails."""
     files, record = mutated_files(), Record()
     own = ("mutants.py", "covering_tests.py")
@@ -307,7 +307,7 @@ def _keep(journal: Path, known: dict[str, dict[str, Any]], line: dict[str, Any])
         file.write(json.dumps(line) + "\n")
 
 
-def copied(folder: Path) -> Path:
+def copy_tree(folder: Path) -> Path:
     """Update the copy of the tree; unchanged files are not written."""
     tree = folder / "tree"
     words = ("git", "ls-files", "--cached", "--others", "--exclude-standard", "-z")
@@ -361,16 +361,16 @@ def main(words: list[str] | None = None) -> int:
     parser.add_argument("--only", type=int, help="run one mutant, by its number, whatever the journal has of it")
     parser.add_argument("--list", action="store_true", help="print the mutants and run nothing")
     asked = parser.parse_args(words)
-    mutants = chosen(asked.n, asked.seed)
+    mutants = choose_mutants(asked.n, asked.seed)
     texts = {each.file: (ROOT / each.file).read_text(encoding="utf-8") for each in mutants}
     if asked.list:
         print("\n".join(f"{n:3} {each.told(texts[each.file])}" for n, each in enumerate(mutants)))
         return 0
-    tree = copied(asked.folder)
+    tree = copy_tree(asked.folder)
     journal = asked.folder / "journal.jsonl"
     known = {line["key"]: line for line in _lines(journal)}
-    all_tests = sorted({test for mutant in mutants for test in tests_of(mutant.file)})
-    record = measured(tree, all_tests, known, journal)
+    all_tests = sorted({test for mutant in mutants for test in find_tests(mutant.file)})
+    record = measure_tests(tree, all_tests, known, journal)
     if record is None:
         return 2
     sources = {file: (ROOT / file).read_text(encoding="utf-8") for file in mutated_files()}
@@ -378,11 +378,11 @@ def main(words: list[str] | None = None) -> int:
     for number, mutant in enumerate(mutants):
         if asked.only not in (None, number):
             continue
-        tests, text = tests_of(mutant.file), texts[mutant.file]
+        tests, text = find_tests(mutant.file), texts[mutant.file]
         told = mutant.told(text)
         own = {test: ran for test, ran in record.items() if test.partition("::")[0] in tests}
         first, last = (text.count("\n", 0, place) + 1 for place in (mutant.begin, mutant.end))
-        ids = json.dumps(ordered(own, sources, mutant.file, first, last))
+        ids = json.dumps(order_tests(own, sources, mutant.file, first, last))
         key = _key(told, text, ids, *((ROOT / test).read_text(encoding="utf-8") for test in tests))
         if key not in known or asked.only is not None:
             order.write_text(ids, encoding="utf-8")

@@ -29,7 +29,7 @@ def free_endpoint() -> str:
 
 
 @contextmanager
-def python(*arguments: str, **settings: Any) -> Iterator[subprocess.Popen[str]]:
+def start_python(*arguments: str, **settings: Any) -> Iterator[subprocess.Popen[str]]:
     """Start a Python process in the tree's root, with both outputs as pipes unless the settings differ."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"}
     usual = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "env": environment, "cwd": ROOT}
@@ -41,9 +41,9 @@ def python(*arguments: str, **settings: Any) -> Iterator[subprocess.Popen[str]]:
             child.kill()
 
 
-def rig(*arguments: str, **settings: Any) -> Any:
+def start_rig(*arguments: str, **settings: Any) -> Any:
     """Start a command of `rig` as a process."""
-    return python("-m", "rig", *arguments, **settings)
+    return start_python("-m", "rig", *arguments, **settings)
 
 
 @contextmanager
@@ -59,15 +59,15 @@ def running_rig(scene: str, *arguments: str, says: str = "") -> Iterator[tuple[s
         The process and its address.
     """
     endpoint = free_endpoint()
-    with rig("run", scene, "--listen", endpoint, "--duration-s", "86400", *arguments) as child:
+    with start_rig("run", scene, "--listen", endpoint, "--duration-s", "86400", *arguments) as child:
         for words in filter(None, (says, "listening on")):  # then it is compiled and connected to its CAN bus
-            line_of(child, words)
+            read_line(child, words)
         yield child, endpoint
         child.terminate()
         child.communicate(timeout=60.0)
 
 
-def line_of(child: subprocess.Popen[str], words: str) -> str:
+def read_line(child: subprocess.Popen[str], words: str) -> str:
     """Return the first line with these words from its error output, or from its only output.
 
     Raises:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from tests.score_files import COUNT_FORMATS, FORMATS, WRITERS, write_taken, write_values
+from tests.score_files import COUNT_FORMATS, FORMATS, WRITERS, write_samples, write_values
 from tests.score_sessions import RATE_HZ, Sent, Sessions
 
 Generator = np.random.Generator
@@ -51,7 +51,7 @@ class Case:
 # Columns of a DAQ's file.
 
 
-def in_unit(sent: Sent, counts: np.ndarray, unit: str) -> dict[str, tuple[str, np.ndarray]]:
+def convert_counts(sent: Sent, counts: np.ndarray, unit: str) -> dict[str, tuple[str, np.ndarray]]:
     """Return columns of counts, as engineering values, volts or counts, by name."""
     found = {}
     for n, channel in enumerate(sent.channels):
@@ -111,7 +111,7 @@ class Converter:
         return found
 
 
-def as_columns(sent: Sent, volts: np.ndarray, unit: str) -> dict[str, tuple[str, np.ndarray]]:
+def make_columns(sent: Sent, volts: np.ndarray, unit: str) -> dict[str, tuple[str, np.ndarray]]:
     """Return columns of volts, unchanged or in the channels' units."""
     return {
         c.name: ("V", volts[:, n]) if unit == "V" else (c.unit, (volts[:, n] - c.bias_v) / c.sensitivity_v)
@@ -122,7 +122,7 @@ def as_columns(sent: Sent, volts: np.ndarray, unit: str) -> dict[str, tuple[str,
 # Perfect DAQs.
 
 
-def perfect(number: int, seed: int, sessions: Sessions, stem: Path) -> Case:
+def make_perfect_case(number: int, seed: int, sessions: Sessions, stem: Path) -> Case:
     """Return a DAQ without a defect."""
     g = np.random.default_rng([seed, 2, number])
     form = FORMATS[number % len(FORMATS)]
@@ -161,17 +161,19 @@ def perfect(number: int, seed: int, sessions: Sessions, stem: Path) -> Case:
             quiet = bias + g.standard_normal((still, len(bias))) * [c.noise_v for c in sent.channels]
             counts[:still] = sent.quantised(quiet)
         if form in COUNT_FORMATS:
-            return Case(label, write_taken(form, stem, sent, counts, first), sent)
+            return Case(label, write_samples(form, stem, sent, counts, first), sent)
         unit = str(g.choice(["unit", "V", "counts"]))
         times = np.arange(rows) / RATE_HZ if stamps else None
-        return Case(f"{label} {unit}", write_values(form, stem, in_unit(sent, counts, unit), times, RATE_HZ), sent)
+        return Case(
+            f"{label} {unit}", write_values(form, stem, convert_counts(sent, counts, unit), times, RATE_HZ), sent
+        )
     rate = float(g.choice([20e3, 20e3, 25.6e3, 48e3])) if rows < 10 * RATE_HZ else 20e3
     box = Converter(
         (first + g.random()) / RATE_HZ, round(rows * rate / RATE_HZ), rate, ppm=float(g.uniform(-150.0, 150.0)),
         idle_s=sent.first / RATE_HZ if way == "idle" else -1e9,
     )  # fmt: skip
     unit = str(g.choice(["unit", "V"]))
-    columns, times = as_columns(sent, box.volts(sent, g), unit), np.arange(box.rows) / rate
+    columns, times = make_columns(sent, box.volts(sent, g), unit), np.arange(box.rows) / rate
     label += f" {unit} {rate:g} Hz {'noisy' if sent.noisy else 'clean'} session"
     return Case(label, write_values(form, stem, columns, times, rate), sent)
 
@@ -212,7 +214,7 @@ FOREIGN = (
 )  # fmt: skip
 
 
-def foreign(number: int, seed: int, sessions: Sessions, stem: Path) -> Case:
+def make_foreign_case(number: int, seed: int, sessions: Sessions, stem: Path) -> Case:
     """Return a record that differs from the session with which it is compared."""
     g = np.random.default_rng([seed, 1, number])
     kind, label = CYCLE[number // len(FOREIGN) % len(CYCLE)], FOREIGN[number % len(FOREIGN)]

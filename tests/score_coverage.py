@@ -216,7 +216,7 @@ def _alias(generator: np.random.Generator, noise: Callable[..., Noise], seed: in
 KINDS = {"waveforms": _waveforms, "corner": _corner, "sine": _sine, "alias": _alias}
 
 
-def estimates(seed: int, noise: str, kinds: Sequence[str] = tuple(KINDS)) -> dict[str, Estimate]:
+def compute_estimates(seed: int, noise: str, kinds: Sequence[str] = tuple(KINDS)) -> dict[str, Estimate]:
     """Return each quantity of one fit: value, low and high end of its interval, and its true value."""
     found: dict[str, Estimate] = {}
     for kind in kinds:
@@ -225,7 +225,7 @@ def estimates(seed: int, noise: str, kinds: Sequence[str] = tuple(KINDS)) -> dic
     return found
 
 
-def cell(found: Sequence[Estimate]) -> tuple[int, float]:
+def summarise_cell(found: Sequence[Estimate]) -> tuple[int, float]:
     """Return the number of intervals that contain the truth, and their median half width over 1.96 standard deviations
     of
     the error.
@@ -251,7 +251,7 @@ def main(words: list[str] | None = None) -> int:
         for noise in asked.noise:
             for key in [(noise, seed, kind) for seed in seeds for kind in asked.kind]:
                 if key not in done:
-                    done[key] = estimates(key[1], noise, [key[2]])
+                    done[key] = compute_estimates(key[1], noise, [key[2]])
                     line = {"noise": noise, "seed": key[1], "kind": key[2], "found": done[key]}
                     file.write(json.dumps(line) + "\n")
                     file.flush()
@@ -264,7 +264,7 @@ def main(words: list[str] | None = None) -> int:
     for quantity, by_noise in by_quantity.items():
         cells = []
         for noise in asked.noise:
-            held, width = cell(found := by_noise[noise])
+            held, width = summarise_cell(found := by_noise[noise])
             right = MIN_HELD / FITS <= held / len(found) <= MAX_HELD / FITS and width <= MAX_WIDTH
             mark = " " if right else "k" if (quantity, noise) in KNOWN else "*"
             good &= mark != "*"

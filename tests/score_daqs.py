@@ -10,14 +10,14 @@ import numpy as np
 from recorder.writer import RecordingWriter
 from rig.base.wire import CATALOGUE, PARAMETERS, SCENE, Block, encode_block, sensor_key
 from rig.channels.table import default_table
-from tests.unit.recorder_stream import TICK_RATE_HZ, documents
+from tests.unit.recorder_stream import TICK_RATE_HZ, make_documents
 
 RATE_HZ = 20_000
 
 
 def write_session(path: Path, groups: dict[str, np.ndarray], *, index: int = 0) -> Path:
     """Write a session of counts by group, each of shape (n, channels), in blocks of 10 ms."""
-    told = documents()
+    told = make_documents()
     writer = RecordingWriter(path, catalogue=told[CATALOGUE], parameters=told[PARAMETERS], scene=told[SCENE])
     rows = RATE_HZ // 100
     for start in range(0, max(map(len, groups.values())), rows):
@@ -30,7 +30,7 @@ def write_session(path: Path, groups: dict[str, np.ndarray], *, index: int = 0) 
     return path
 
 
-def counts_of(group: str, values: np.ndarray, generator: np.random.Generator | None) -> np.ndarray:
+def make_counts(group: str, values: np.ndarray, generator: np.random.Generator | None) -> np.ndarray:
     """Return counts of engineering values, shape (n, channels), with the channels' noise if there is a generator."""
     channels = default_table().groups[group].channels
     volts = np.column_stack([c.bias_v + c.sensitivity_v * v for c, v in zip(channels, values.T, strict=True)])
@@ -62,7 +62,7 @@ class Tones:
         return passed
 
 
-def chips(seed: int, seconds: float, *, rate_hz: float = RATE_HZ) -> np.ndarray:
+def make_chips(seed: int, seconds: float, *, rate_hz: float = RATE_HZ) -> np.ndarray:
     """Return a pseudo-random binary sequence of 1 and -1 with chips of four rows, shape (n,)."""
     rows = round(seconds * rate_hz)
     return np.repeat(np.random.default_rng(seed).integers(0, 2, rows // 4 + 1) * 2.0 - 1.0, 4)[:rows]

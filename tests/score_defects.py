@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from tests.score_cases import CYCLE, Case, Converter, as_columns, in_unit
+from tests.score_cases import CYCLE, Case, Converter, convert_counts, make_columns
 from tests.score_files import WRITERS, write_values
 from tests.score_sessions import FORMULAS, RATE_HZ, Sent, Sessions
 
@@ -32,7 +32,7 @@ ANALOGUE_DEFECTS = (
 )  # fmt: skip
 
 
-def defect(number: int, seed: int, sessions: Sessions, stem: Path, base: Callable[[Case], Any]) -> Case:
+def make_defect_case(number: int, seed: int, sessions: Sessions, stem: Path, base: Callable[[Case], Any]) -> Case:
     """Return a DAQ with one defect.
 
     Args:
@@ -76,7 +76,7 @@ def _digital(number: int, seed: int, sessions: Sessions, stem: Path) -> Case:
         right = {"altered values"}
     elif what in ("gain", "offset"):
         unit = "unit" if unit == "counts" else unit
-        columns = in_unit(sent, counts, unit)
+        columns = convert_counts(sent, counts, unit)
         name = sent.channels[channel].name
         told, values = columns[name]
         if what == "gain":
@@ -91,14 +91,14 @@ def _digital(number: int, seed: int, sessions: Sessions, stem: Path) -> Case:
             columns[name] = told, values + size * int(g.choice([-1, 1])) * round(np.exp(g.uniform(0.0, np.log(1000))))
             right, allowed = {"offset", "altered values"}, set()
     elif what == "swapped channels":
-        columns = in_unit(sent, counts, unit)
+        columns = convert_counts(sent, counts, unit)
         a, b = sent.channels[channel].name, sent.channels[other].name
         columns[a], columns[b] = (columns[a][0], columns[b][1]), (columns[b][0], columns[a][1])
         # Swapped channels of different sensitivity also have each other's scale.
         right, allowed = {"mapping"}, {"scale", "offset"} if unit == "unit" else set()
     elif what == "inverted":
         unit = "unit" if unit == "counts" else unit
-        columns = in_unit(sent, counts, unit)
+        columns = convert_counts(sent, counts, unit)
         name = sent.channels[channel].name
         columns[name] = columns[name][0], -columns[name][1]
         right, allowed = {"polarity"}, {"offset"}
@@ -111,7 +111,7 @@ def _digital(number: int, seed: int, sessions: Sessions, stem: Path) -> Case:
         counts[:, channel] = sent.sent(first - int(g.integers(1, 100)), rows)[:, channel]
         right = {"altered values"}
     elif what == "missing channel":
-        columns = in_unit(sent, counts, unit)
+        columns = convert_counts(sent, counts, unit)
         del columns[sent.channels[channel].name]
         right = set(_ABSENCE_ROWS)
     else:
@@ -121,7 +121,7 @@ def _digital(number: int, seed: int, sessions: Sessions, stem: Path) -> Case:
         else:
             counts[at : at + several] = strange
             right = {"foreign rows", "altered values"}
-    columns = in_unit(sent, counts, unit) if columns is None else columns
+    columns = convert_counts(sent, counts, unit) if columns is None else columns
     if what in ("lost rows", "doubled rows", "foreign rows"):
         # Stamps that count the DAQ's own rows jump relative to the session's, by 10 ms per second.
         allowed = {"stamp rate"}
@@ -205,7 +205,7 @@ def _beyond(what: str, sent: Sent, channel: str, rate: float, stem: Path, base: 
     rows = int(_ROWS * rate / RATE_HZ)
     volts = Converter((sent.first + _BEGIN_ROWS + 0.4) / RATE_HZ, rows, rate, ppm=20.0).volts(sent, generator)
     stem = stem.with_name(f"base-{sent.kind}")
-    file = write_values("parquet", stem, as_columns(sent, volts, "V"), np.arange(rows) / rate, rate)
+    file = write_values("parquet", stem, make_columns(sent, volts, "V"), np.arange(rows) / rate, rate)
     card = base(Case(f"base {sent.kind}", file, sent, "analogue"))
     for row in card.rows:
         if row.quantity == what and (row.channel in (channel, "") or what == "skew") and row.limit is not None:
@@ -263,7 +263,7 @@ def _analogue(number: int, seed: int, sessions: Sessions, stem: Path, base: Call
         volts = np.delete(volts, place, axis=0)
     elif what == "doubled sample":
         volts = np.insert(volts, place, volts[place], axis=0)
-    columns = as_columns(sent, volts, str(g.choice(["V", "unit"])))
+    columns = make_columns(sent, volts, str(g.choice(["V", "unit"])))
     if what == "mapping":
         other = sent.channels[(one + 1) % count].name
         columns[name], columns[other] = (columns[name][0], columns[other][1]), (columns[other][0], columns[name][1])

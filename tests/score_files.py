@@ -115,7 +115,7 @@ def write_values(form: str, stem: Path, columns: Columns, times_s: np.ndarray | 
     return path
 
 
-def write_taken(form: str, stem: Path, sent: Sent, counts: np.ndarray, first: int) -> Path:
+def write_samples(form: str, stem: Path, sent: Sent, counts: np.ndarray, first: int) -> Path:
     """Write counts of consecutive rows of a session in one of `COUNT_FORMATS`."""
     if form == "wav":
         import soundfile

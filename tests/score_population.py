@@ -27,8 +27,8 @@ from typing import Any
 from replays.score.card.scorecard import FAIL, Scorecard
 from replays.score.judgement import judge
 from rig.base.errors import InputError
-from tests.score_cases import Case, foreign, perfect
-from tests.score_defects import defect
+from tests.score_cases import Case, make_foreign_case, make_perfect_case
+from tests.score_defects import make_defect_case
 from tests.score_sessions import Sessions
 
 SIZES = {"foreign": 200, "perfect": 200, "defects": 300}
@@ -55,8 +55,8 @@ class Population:
         for file in self._folder.glob(f"{stem.name}.*"):
             file.unlink()
         if self.name == "defects":
-            return defect(number, self.seed, self._sessions, stem, self._base)
-        make = foreign if self.name == "foreign" else perfect
+            return make_defect_case(number, self.seed, self._sessions, stem, self._base)
+        make = make_foreign_case if self.name == "foreign" else make_perfect_case
         return make(number, self.seed, self._sessions, stem)
 
     def _base(self, case: Case) -> Scorecard:
@@ -112,7 +112,7 @@ def _by_command(case: Case, folder: Path) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def bounds(count: int, of: int) -> tuple[float, float]:
+def binomial_interval(count: int, of: int) -> tuple[float, float]:
     """Return the 95 % interval of a part, by Clopper and Pearson."""
     from scipy.stats import beta
 
@@ -121,11 +121,11 @@ def bounds(count: int, of: int) -> tuple[float, float]:
 
 
 def _part(name: str, count: int, of: int) -> str:
-    low, high = bounds(count, of)
+    low, high = binomial_interval(count, of)
     return f"{name}: {count} of {of} = {count / max(1, of):.1%} ({low:.1%} to {high:.1%})"
 
 
-def figures(name: str, lines: list[dict[str, Any]]) -> tuple[list[str], bool]:
+def summarise(name: str, lines: list[dict[str, Any]]) -> tuple[list[str], bool]:
     """Return the figures of a population in lines, and whether its goal is met."""
     count, outcomes = len(lines), Counter(line["outcome"] for line in lines)
     told = [_part(outcome, outcomes[outcome], count) for outcome in sorted({*outcomes, "pass", "fail", "inconclusive"})]
@@ -182,7 +182,7 @@ def main(words: list[str] | None = None) -> int:
             print(
                 f"{line['number']:4} {line['outcome']:12} {line['label']}: red {line['red'][:4]} {line['reason'][:160]}"
             )
-    told, good = figures(asked.population, lines)
+    told, good = summarise(asked.population, lines)
     print("\n".join([*told, "the goal is met" if good else "THE GOAL IS MISSED"]))
     return 0 if good else 1
 

@@ -15,7 +15,7 @@ from rig.base.wire import CATALOGUE, PARAMETERS, SCENE, Block, encode_block, sen
 from rig.channels.generators import Source
 from rig.channels.table import Channel, ChannelTable, default_table
 from rig.run.scenes import Scene, load_scene, scene_document
-from tests.unit.recorder_stream import TICK_RATE_HZ, documents
+from tests.unit.recorder_stream import TICK_RATE_HZ, make_documents
 
 RATE_HZ = 20_000
 PHYSICS_S = 8.0
@@ -39,7 +39,7 @@ _HALF_TAPS = 64
 
 
 @cache
-def scene_of(kind: str) -> Scene:
+def make_scene(kind: str) -> Scene:
     """Return the scene of a kind of session."""
     return load_scene(_SCENE_OF.get(kind, kind), {"duration_s": PHYSICS_S, **SCENES[kind]})
 
@@ -59,7 +59,7 @@ def _physics_volts(kind: str, seed: int) -> dict[str, np.ndarray]:
     return {name: run.counts[name].astype(float) * channels[name].lsb_v for name in channels}
 
 
-def table_with(bits: int, groups: Sequence[str]) -> ChannelTable:
+def make_table(bits: int, groups: Sequence[str]) -> ChannelTable:
     """Return the rig's channel table with some of its groups and converters of another width."""
     document = default_table().model_dump(mode="json")
     document["groups"] = {name: document["groups"][name] for name in groups}
@@ -94,13 +94,13 @@ class Sent:
     _sources: dict[str, Source] = field(init=False)
 
     def __post_init__(self) -> None:
-        self._sources = scene_of(self.kind).sources() if self.generated else {}
+        self._sources = make_scene(self.kind).sources() if self.generated else {}
         self.counts = self.sent(self.first, self.rows)
 
     @property
     def generated(self) -> bool:
         """True if a test signal replaces the model."""
-        return scene_of(self.kind).generator is not None
+        return make_scene(self.kind).generator is not None
 
     @property
     def channels(self) -> list[Channel]:
@@ -168,9 +168,9 @@ def _between(values: np.ndarray, places: np.ndarray) -> np.ndarray:
 
 def write_counts(path: Path, sent: Sent, counts: np.ndarray, first: int) -> Path:
     """Write counts as a recording of the session's scene, starting at a row of the run."""
-    told = documents()
+    told = make_documents()
     told[CATALOGUE]["table"] = sent.table.model_dump(mode="json")
-    scene = scene_of(sent.kind)
+    scene = make_scene(sent.kind)
     scene = scene.model_copy(update={"sensors": scene.sensors.model_copy(update={"noise": sent.noisy})})
     told[SCENE] = {"name": scene.name, "seed": sent.seed, "scene": scene_document(scene)}
     writer = RecordingWriter(path, catalogue=told[CATALOGUE], parameters=told[PARAMETERS], scene=told[SCENE])
@@ -204,7 +204,7 @@ class Sessions:
         key = kind, seed, groups, bits, noisy, first_s, seconds
         if key not in self._made:
             path = self._folder / f"{'-'.join(map(str, key))}.mcap"
-            table = table_with(bits, GROUPS[groups])
+            table = make_table(bits, GROUPS[groups])
             first, rows = round(first_s * RATE_HZ), round(seconds * RATE_HZ)
             sent = Sent(kind, seed, table, noisy, path, first, rows)
             if not path.exists():

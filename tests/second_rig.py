@@ -170,7 +170,7 @@ class Motion:
     contacts: int
 
 
-def run(
+def simulate_pulse(
     rig: Rig | None = None,
     *,
     speed_hz: float = 6.2,
@@ -220,7 +220,7 @@ def run(
     return Motion(1.0 / (STEP_S * every), dict(zip(_NAMES, rows.T.copy(), strict=True)), before_s, contacts)
 
 
-def log(
+def record_log(
     motion: Motion,
     *,
     seed: int,

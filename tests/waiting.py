@@ -51,7 +51,7 @@ def _output_of(ended: subprocess.Popen[str]) -> str:
 
 
 @contextmanager
-def sooner_than(limit_s: float) -> Iterator[None]:
+def time_limit(limit_s: float) -> Iterator[None]:
     """Fail if the body takes longer: a limit on a wait that must not occur, never a speed."""
     begin = time.monotonic()
     yield

@@ -15,7 +15,7 @@ from rig.base.errors import DiskError, InputError
 MAX_INPUT_S = 20.0
 
 
-def inputs(default: int) -> int:
+def input_count(default: int) -> int:
     """Return the number of inputs of a test: `default` in the suite, RIG_FUZZ_INPUTS in a long run."""
     return int(os.environ.get("RIG_FUZZ_INPUTS", default))
 
@@ -47,7 +47,7 @@ class Door:
             self.faults["too long"] = what
 
 
-def tell(doors: dict[str, Door]) -> None:
+def check_doors(doors: dict[str, Door]) -> None:
     """Print the counts, and fail if there is a fault."""
     for name, door in doors.items():
         print(f"{name}: {door.taken} taken, {door.refused} refused, {len(door.faults)} kinds of faults")

@@ -41,7 +41,7 @@ JUNK = (
 )
 
 
-def documents(random: np.random.Generator, count: int, examples: list[dict[str, Any]]) -> Iterator[bytes]:
+def generate_documents(random: np.random.Generator, count: int, examples: list[dict[str, Any]]) -> Iterator[bytes]:
     """Yield payloads: an example with one to three changes, or an unrelated document."""
     fields = sorted({name for example in examples for name in example})
     for _ in range(count):

@@ -19,16 +19,16 @@ from recorder.contents.metadata import Beginning
 from recorder.reader import Recording
 from recorder.writer import RecordingWriter
 from rig.base.wire import CATALOGUE, PARAMETERS, SCENE, Block, encode_block, encode_document, sensor_key
-from tests.unit.recorder_stream import documents, stream
+from tests.unit.recorder_stream import generate_stream, make_documents
 
 SESSIONS = Path(replays.__file__).with_name("sessions")
 Rng = np.random.Generator
 PROBES = sensor_key("probes")
 
 
-def write(path: Path, *, leave: bool = False, blocks: int = 3, **changes: Any) -> Path:
+def write_file(path: Path, *, leave: bool = False, blocks: int = 3, **changes: Any) -> Path:
     """Write a short recording; with `leave` in the state that a killed recorder leaves."""
-    about = documents()
+    about = make_documents()
     session = Recording.open(SESSIONS / "hammer-5.2.mcap")
     scene = session.scene["scene"]
     scene |= {"seed": 7, "duration_s": 1e-3 * blocks, "commands": []}  # as in the stream
@@ -40,7 +40,7 @@ def write(path: Path, *, leave: bool = False, blocks: int = 3, **changes: Any) -
         sync_every_s=0.0, wall_ns=lambda: 1_700_000_000_000_000_000,
         beginning=Beginning(metadata={"series": {"id": "a1", "number": "0", "previous": "", "due": "{}"}}), **changes,
     )  # fmt: skip
-    for number, (key, payload) in enumerate(stream(blocks, block_ms=1)):
+    for number, (key, payload) in enumerate(generate_stream(blocks, block_ms=1)):
         file.write(key, payload, number)
     note = {"event": "note", "tick": 0, "time_s": 0.0, "text": "a note", "tags": ["x"]}
     command = {"event": "command", "tick": 0, "time_s": 0.0, "id": 2, "command": "hammer", "request": {"force_n": 1.0}}
@@ -59,7 +59,7 @@ def write(path: Path, *, leave: bool = False, blocks: int = 3, **changes: Any) -
     return path
 
 
-def contents(recording: Recording) -> tuple[Any, ...]:
+def read_contents(recording: Recording) -> tuple[Any, ...]:
     """Return everything that a reader obtains from a recording."""
     rows = [recording.samples(name) for name in recording.table.groups]
     return (
@@ -69,7 +69,7 @@ def contents(recording: Recording) -> tuple[Any, ...]:
     )  # fmt: skip
 
 
-def attachments_of(data: bytes) -> list[tuple[int, int]]:
+def find_attachments(data: bytes) -> list[tuple[int, int]]:
     """Start and end of the body of each attachment."""
     found, position = [], 8
     while position + 9 <= len(data):
@@ -272,14 +272,14 @@ class Layout:
 
 
 @contextlib.contextmanager
-def unheard() -> Iterator[io.StringIO]:
+def capture_output() -> Iterator[io.StringIO]:
     """Capture output and error output."""
     out = io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(out):
         yield out
 
 
-def far_block(tick: int, index: int) -> bytes:
+def make_far_block(tick: int, index: int) -> bytes:
     """Return a block of probes far ahead in time."""
     return encode_block(Block(tick, index, 20_000.0, 1e6, np.zeros((20, 4), np.int32)))
 
@@ -287,7 +287,7 @@ def far_block(tick: int, index: int) -> bytes:
 Use = Callable[[Path, Path], object]
 
 
-def uses() -> dict[str, Use]:
+def list_operations() -> dict[str, Use]:
     """Return the operations on a recording, each through the function that its command uses."""
     from recorder.reader import join
     from recorder.rewrite import cut, recover
@@ -301,7 +301,7 @@ def uses() -> dict[str, Use]:
 
     def told(path: Path, _: Path) -> object:
         recording = join([path])
-        with unheard():
+        with capture_output():
             with contextlib.suppress(typer.Exit):  # the verdict is irrelevant here
                 info.info([path], form=Form())
             return json.dumps(info.describe(recording, quick=True))

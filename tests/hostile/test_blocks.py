@@ -34,9 +34,9 @@ from rig.channels.table import default_table
 from rig.serve.stream_check import Catalogue, Intake
 from rig.serve.transport.memory import MemoryClient, MemoryServer
 from rig.serve.transport.zenoh import ZenohClient, ZenohServer
-from tests.hostile import inputs
+from tests.hostile import input_count
 from tests.processes import free_endpoint
-from tests.unit.recorder_stream import TRUTH_COLUMNS, ScriptedClient, block_of, documents
+from tests.unit.recorder_stream import TRUTH_COLUMNS, ScriptedClient, make_block, make_documents
 from tests.waiting import until
 
 pytestmark = [pytest.mark.wallclock, pytest.mark.timeout(7200)]
@@ -57,8 +57,8 @@ class Truth:
     """Valid blocks of the rig, cheap to generate: those of the first instant, renumbered."""
 
     def __init__(self) -> None:
-        self._first = {key: bytearray(wire.encode_block(block_of(key, 0))) for key in KEYS}
-        self.rows = {key: len(block_of(key, 0).values) for key in KEYS}
+        self._first = {key: bytearray(wire.encode_block(make_block(key, 0))) for key in KEYS}
+        self.rows = {key: len(make_block(key, 0).values) for key in KEYS}
 
     def payload(self, key: str, number: int) -> bytes:
         made = bytearray(self._first[key])
@@ -66,7 +66,7 @@ class Truth:
         return bytes(made)
 
 
-def forged(rng: np.random.Generator, truth: Truth, number: int, near: dict[str, set[int]]) -> tuple[str, bytes]:
+def forge_message(rng: np.random.Generator, truth: Truth, number: int, near: dict[str, set[int]]) -> tuple[str, bytes]:
     """Return key and payload of a message that the rig did not send, before its block `number` of each stream.
 
     Two forged blocks that follow each other and are both plausible look like a restarted rig. `near` holds the numbers
@@ -94,12 +94,12 @@ def forged(rng: np.random.Generator, truth: Truth, number: int, near: dict[str, 
     elif kind in (2, 3):  # far away, and consistent in itself
         step = int(rng.choice([1, -1])) * int(10 ** rng.uniform(0, 12))
         far = max(0, number + step + (step > 0))
-        if far == number or crowded(near[key], far):
+        if far == number or is_crowded(near[key], far):
             return key, b"\x00"
         struct.pack_into("<qq", payload, 4, far * 10_000, far * rows)
     elif kind == 4:  # repeated
         past = max(0, number - int(rng.integers(1, 50)))
-        return key, truth.payload(key, past) if past < number and not crowded(near[key], past) else b"\x00"
+        return key, truth.payload(key, past) if past < number and not is_crowded(near[key], past) else b"\x00"
     elif kind == 5:  # of another kind
         dtype = np.float64 if key.startswith(wire.SENSORS) else np.int32
         values = np.ones((rows, columns), dtype)
@@ -122,7 +122,7 @@ def forged(rng: np.random.Generator, truth: Truth, number: int, near: dict[str, 
         rate_hz = float(rng.choice([1.0, 1000.0, 19_999.0, 40_000.0]))
         HEAD.pack_into(payload, 4, tick, index, rate_hz, tick_rate_hz, columns, size)
     elif kind == 12:
-        return wire.EVENTS, odd_event(rng)
+        return wire.EVENTS, make_odd_event(rng)
     else:
         document = {name: odd(rng) for name in ("state", "tick", "time_s", "clients", "warnings")}
         if document["state"] == "ended":
@@ -131,7 +131,7 @@ def forged(rng: np.random.Generator, truth: Truth, number: int, near: dict[str, 
     return key, bytes(payload)
 
 
-def crowded(near: set[int], number: int) -> bool:
+def is_crowded(near: set[int], number: int) -> bool:
     """Return whether a block would continue another forged one, or exceed the limit of forged blocks."""
     if len(near) > 8 or near & {number - 1, number, number + 1}:
         return True
@@ -143,7 +143,7 @@ def odd(rng: np.random.Generator) -> Any:
     return ODD_VALUES[rng.integers(len(ODD_VALUES))]
 
 
-def odd_event(rng: np.random.Generator) -> bytes:
+def make_odd_event(rng: np.random.Generator) -> bytes:
     """Return an event with an invalid field; an `end` never has a form that could be the rig's."""
     document: dict[str, Any] = {"event": str(rng.choice(NAMES)), "tick": 5, "time_s": 5e-6}
     for name in rng.choice(FIELDS, size=3):
@@ -155,7 +155,7 @@ def odd_event(rng: np.random.Generator) -> bytes:
     return json.dumps(document).encode()
 
 
-def mixed(count: int, seed: int) -> Iterator[tuple[str, bytes, bool]]:
+def generate_mixed(count: int, seed: int) -> Iterator[tuple[str, bytes, bool]]:
     """Yield `count` forged payloads among valid ones as (key, payload, whether valid), and the valid end."""
     truth, rng = Truth(), np.random.default_rng(seed)
     number, sent = 0, 0
@@ -166,14 +166,14 @@ def mixed(count: int, seed: int) -> Iterator[tuple[str, bytes, bool]]:
         number += 1
         near: dict[str, set[int]] = {key: {number - 1} for key in KEYS}
         for _ in range(int(rng.integers(0, 30)) if sent < count else 0):
-            yield *forged(rng, truth, number, near), False
+            yield *forge_message(rng, truth, number, near), False
             sent += 1
     rows = {key: number * truth.rows[key] for key in KEYS}
     end = {"event": "end", "tick": number * 10_000, "time_s": number * 0.01, "reason": "completed", "rows": rows}
     yield wire.EVENTS, wire.encode_document(end), True
 
 
-def fed(
+def record_fed(
     session: RecordingSession, client: ScriptedClient, count: int, seed: int
 ) -> tuple[Summary, dict[str, list[int]]]:
     """Record what is fed from another thread; return the summary, and the row numbers of the valid blocks."""
@@ -182,7 +182,7 @@ def fed(
     def feed() -> None:
         while wire.STATUS not in client.subscribed:
             time.sleep(0.002)
-        for key, payload, is_true in mixed(count, seed):
+        for key, payload, is_true in generate_mixed(count, seed):
             while session.waiting > 2000:
                 time.sleep(0.001)
             client.publish(key, payload)
@@ -206,9 +206,9 @@ def _short_waits(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_recording_contains_only_valid_rows(tmp_path: Path, limits: Limits) -> None:
     client = ScriptedClient()
     session = RecordingSession(client, tmp_path / "run.mcap", limits=limits)
-    summary, true = fed(session, client, inputs(3000), seed=1)
+    summary, true = record_fed(session, client, input_count(3000), seed=1)
     assert (summary.reason, summary.error, summary.losses) == ("completed", "", ())
-    assert summary.refused > inputs(3000) / 3
+    assert summary.refused > input_count(3000) / 3
     recording = join(summary.files)
     assert recording.complete
     for key in KEYS:
@@ -232,7 +232,7 @@ def test_captures_end_and_contain_only_valid_rows(tmp_path: Path) -> None:
     triggers = tuple(map(Trigger.parse, ("note", "hammer", "P_N>1e9", "speed<-1e9")))
     capture = Capture(triggers, pre_s=0.2, post_s=0.2, longest_s=2.0, again="ignore")
     session = RecordingSession(client, tmp_path / "run.mcap", capture=capture)
-    summary, _ = fed(session, client, inputs(3000), seed=2)
+    summary, _ = record_fed(session, client, input_count(3000), seed=2)
     assert (summary.reason, summary.error, summary.losses) == (
         "completed" if summary.reason == "completed" else "1000 captures made",
         "",
@@ -252,7 +252,7 @@ def test_captures_end_and_contain_only_valid_rows(tmp_path: Path) -> None:
             assert found == list(range(found[0], found[-1] + 1, Truth().rows[key])) if found else number == 0, key
 
 
-def ready(daq: Daq) -> Samples | None:
+def read_available(daq: Daq) -> Samples | None:
     """Return what can be read without waiting."""
     try:
         return daq.read(timeout_s=0.0)
@@ -261,17 +261,17 @@ def ready(daq: Daq) -> Samples | None:
 
 
 def test_a_daq_reads_on_and_gets_the_true_rows(monkeypatch: pytest.MonkeyPatch) -> None:
-    count, server = inputs(3000), MemoryServer(cache=10)
-    for key, document in documents().items():
+    count, server = input_count(3000), MemoryServer(cache=10)
+    for key, document in make_documents().items():
         server.answer(key, lambda _, document=document: wire.encode_document(document))
     server.announce()
     daq = Daq(RigSource(MemoryClient(server)), channels=["disk_x", "P_N"], buffer_s=1e6)
-    block = block_of(PROBES, 0)
+    block = make_block(PROBES, 0)
     expected = default_table().groups["probes"].engineering(block.values)[:, 0]
     rows = 0
-    for key, payload, _ in mixed(count, seed=3):
+    for key, payload, _ in generate_mixed(count, seed=3):
         server.publish(key, payload)
-        while (samples := ready(daq)) is not None:
+        while (samples := read_available(daq)) is not None:
             assert (samples.index, samples.gap) == (rows, 0)
             np.testing.assert_array_equal(samples["disk_x"], expected)
             rows += len(samples)
@@ -310,7 +310,7 @@ class Still:
 
 def test_the_live_view_draws_the_true_rows(monkeypatch: pytest.MonkeyPatch) -> None:
     client = ScriptedClient()
-    described = live.Described(Catalogue.read(documents()[wire.CATALOGUE]), None, ("penetration", "normal_force"))  # type: ignore[arg-type]
+    described = live.Described(Catalogue.read(make_documents()[wire.CATALOGUE]), None, ("penetration", "normal_force"))  # type: ignore[arg-type]
     still = Still()
     with monkeypatch.context() as patch:
         patch.setattr(live, "Painter", lambda *_, **__: still)
@@ -318,7 +318,7 @@ def test_the_live_view_draws_the_true_rows(monkeypatch: pytest.MonkeyPatch) -> N
             client, type("Canvas", (), {"clock": type("Clock", (), {"mark": lambda *_: None})()})(), described
         )
     rows = 0
-    for number, (key, payload, is_true) in enumerate(mixed(inputs(3000), seed=4)):
+    for number, (key, payload, is_true) in enumerate(generate_mixed(input_count(3000), seed=4)):
         view.take(key, payload)
         if is_true and key.startswith(wire.SENSORS):
             rows += len(wire.decode_block(payload, wire.SAMPLE_SCHEMA).values)
@@ -327,7 +327,7 @@ def test_the_live_view_draws_the_true_rows(monkeypatch: pytest.MonkeyPatch) -> N
     view.take_in()
     assert (view.received, view.lost, still.rows) == (rows, 0, rows)
     assert view.ended == "completed"
-    assert view.malformed > inputs(3000) / 3
+    assert view.malformed > input_count(3000) / 3
 
 
 def test_a_jump_is_accepted_only_with_a_following_block() -> None:
@@ -342,7 +342,7 @@ def test_a_jump_is_accepted_only_with_a_following_block() -> None:
         ([5, 6, 5, 7, 8], [5, 6, 7, 8], 1),  # repeated
         ([5, 6, 900, 3, 900, 7, 8], [5, 6, 7, 8], 3),
     ):
-        intake = Intake(Catalogue.read(documents()[wire.CATALOGUE]))
+        intake = Intake(Catalogue.read(make_documents()[wire.CATALOGUE]))
         found = []
         for number in numbers:
             rows = truth.rows[PROBES]
@@ -367,7 +367,7 @@ def test_a_jump_is_accepted_only_with_a_following_block() -> None:
 )  # fmt: skip
 def test_recorder_and_daq_refuse_an_invalid_catalogue_in_one_line(tmp_path: Path, change: dict[str, Any]) -> None:
     client = ScriptedClient()
-    client.replies[wire.CATALOGUE] = wire.encode_document({**documents()[wire.CATALOGUE], **change})
+    client.replies[wire.CATALOGUE] = wire.encode_document({**make_documents()[wire.CATALOGUE], **change})
     with pytest.raises(InputError, match="catalogue"):
         RecordingSession(client, tmp_path / "run.mcap").run()
     with pytest.raises(InputError, match="catalogue"):

@@ -42,8 +42,8 @@ from drivers.sources.can import CanSource
 from rig.base import wire
 from rig.channels.table import default_table
 from rig.serve.transport.memory import MemoryClient, MemoryServer
-from tests.hostile import inputs
-from tests.hostile.documents import documents
+from tests.hostile import input_count
+from tests.hostile.documents import generate_documents
 from tests.unit import link_memory as memory
 from tests.unit.instruments_fake import FakeRig
 from tests.waiting import until
@@ -53,7 +53,7 @@ pytestmark = [pytest.mark.wallclock, pytest.mark.timeout(3600)]
 _channels = itertools.count()
 
 
-def mutated(random: np.random.Generator, data: bytes) -> bytes:
+def mutate(random: np.random.Generator, data: bytes) -> bytes:
     """Return the data with bits flipped or bytes changed, cut, added or repeated."""
     found = bytearray(data)
     for _ in range(random.integers(1, 4)):
@@ -112,7 +112,7 @@ def is_command(message: can.Message, last: int) -> bool:
     return (message.arbitration_id, data) == command_frame(kind, data[1], **values[kind])
 
 
-def a_frame(random: np.random.Generator, last: int) -> can.Message:
+def make_frame(random: np.random.Generator, last: int) -> can.Message:
     """Return a command frame, nearly a command frame, or any other frame."""
     kind = tuple(CommandKind)[random.integers(len(CommandKind))]
     counter = (last + int(random.integers(-3, MAX_LEAD + 4))) % 256
@@ -125,7 +125,7 @@ def a_frame(random: np.random.Generator, last: int) -> can.Message:
     flags: dict[str, Any] = {"is_extended_id": False}
     choice = random.integers(10)
     if choice < 4:
-        data = mutated(random, data)[:64]
+        data = mutate(random, data)[:64]
     elif choice == 4:  # consistent except for one thing: fields outside their range, reserved bits, another key
         data = bytes([data[0], data[1], *random.bytes(4), KEY if random.random() < 0.8 else 0, 0])
         data = data[:7] + bytes([checksum(identifier, data)])
@@ -164,8 +164,8 @@ def test_a_command_is_carried_out_only_where_its_frame_is_exactly_valid() -> Non
         Gateway(MemoryClient(rig.server), own, Schedule()) as gateway,
     ):
         valid = 0
-        for number in range(inputs(3000)):
-            message = a_frame(random, gateway.commands.counter)
+        for number in range(input_count(3000)):
+            message = make_frame(random, gateway.commands.counter)
             good = is_command(message, gateway.commands.counter)
             before = len(rig.taken)
             gateway.commands.take_message(message)
@@ -184,7 +184,7 @@ def test_a_command_is_carried_out_only_where_its_frame_is_exactly_valid() -> Non
         # The bus, and how the gateway's own thread handles its traffic.
         for _ in range(2000):
             with contextlib.suppress(can.CanError, ValueError):
-                other.send(a_frame(random, gateway.commands.counter))
+                other.send(make_frame(random, gateway.commands.counter))
         before = len(rig.taken)
         time.sleep(0.3)
         until(lambda: not gateway.commands.waiting)
@@ -211,9 +211,9 @@ def test_false_blocks_events_and_states_do_not_stop_a_gateway() -> None:
         can.Bus(channel, interface="virtual", ignore_config=True) as other,
         Gateway(MemoryClient(rig.server), own, Schedule(1000, 10_000)) as gateway,
     ):
-        for number, document in enumerate(documents(random, inputs(1000), events)):
+        for number, document in enumerate(generate_documents(random, input_count(1000), events)):
             gateway.guard(gateway.unpack, keys[random.integers(len(keys))], document)
-            gateway.guard(gateway.unpack, keys[random.integers(len(keys))], mutated(random, block))
+            gateway.guard(gateway.unpack, keys[random.integers(len(keys))], mutate(random, block))
             if number % 100 == 0:
                 while other.recv(0) is not None:
                     pass
@@ -229,7 +229,7 @@ def test_false_blocks_events_and_states_do_not_stop_a_gateway() -> None:
 # Messages and requests to the hub.
 
 
-def an_offer(random: np.random.Generator, secret: bytes) -> tuple[bytes, list[codec.Record]]:
+def make_offer(random: np.random.Generator, secret: bytes) -> tuple[bytes, list[codec.Record]]:
     """Return a datagram to the hub, and its frames if it is a valid offer."""
     rows = []
     for _ in range(random.integers(1, 20)):
@@ -242,11 +242,11 @@ def an_offer(random: np.random.Generator, secret: bytes) -> tuple[bytes, list[co
     message = codec.encode(pack_records(rows))
     kind = random.integers(8)
     if kind == 0:
-        return mutated(random, secret + message), []
+        return mutate(random, secret + message), []
     if kind == 1:
         return random.bytes(16) + message, []
     if kind == 2:
-        return secret + mutated(random, message), []
+        return secret + mutate(random, message), []
     return secret + message, rows
 
 
@@ -268,7 +268,7 @@ def test_hostile_messages_to_the_hub_have_no_effect_on_others() -> None:
         for example in examples[1:3]:
             example["endpoint"] = sender.name
         secret = bytes.fromhex(villain.secret or "")
-        requests = documents(random, inputs(500), examples)
+        requests = generate_documents(random, input_count(500), examples)
         got: list[int] = []
         strangers = sent = 0
 
@@ -284,7 +284,7 @@ def test_hostile_messages_to_the_hub_have_no_effect_on_others() -> None:
                     assert find_fault(codec.make_record(item)) is None
 
         for number, request in enumerate(requests):
-            payload, _ = an_offer(random, secret)
+            payload, _ = make_offer(random, secret)
             victim = names[random.integers(len(names))]
             # Under another client's name always with a wrong secret; under its own name at a rate that leaves the bus
             # some capacity.
@@ -322,7 +322,7 @@ def test_hostile_messages_to_the_hub_have_no_effect_on_others() -> None:
 # Text.
 
 
-def is_send(text: bytes) -> tuple[int, bool, bool, bytes | int] | None:
+def parse_send(text: bytes) -> tuple[int, bool, bool, bytes | int] | None:
     """Return the frame of a socketcand `send` or `sendrtr`, from its documentation; None if it is not one."""
     if not text.isascii() or len(text) > 510 or not text.decode().isprintable():
         return None
@@ -351,7 +351,7 @@ def fields_of(message: can.Message) -> tuple[int, bool, bool, bytes | int]:
     return message.arbitration_id, message.is_extended_id, remote, message.dlc if remote else bytes(message.data)
 
 
-def a_command(random: np.random.Generator) -> bytes:
+def make_command_text(random: np.random.Generator) -> bytes:
     """Return the text of a command, without brackets."""
     word = ("send", "sendrtr", "subscribe", "unsubscribe", "echo", "statistics", "rawmode", "add", "open")[
         random.integers(9)
@@ -366,16 +366,16 @@ def a_command(random: np.random.Generator) -> bytes:
         text = f" {word} 0 {random.integers(10**6)} {identifier} "
     else:
         text = f" {word} "
-    return text.encode() if random.random() < 0.5 else mutated(random, text.encode())
+    return text.encode() if random.random() < 0.5 else mutate(random, text.encode())
 
 
 def test_socketcand_text_gives_a_frame_only_if_valid() -> None:
     random = np.random.default_rng(4)
     made = 0
     splitter = socketcand.Splitter()
-    for _ in range(inputs(3000)):
-        command = a_command(random).replace(b"<", b"").replace(b">", b"")
-        stream, expected = b"<" + command + b">", is_send(command)
+    for _ in range(input_count(3000)):
+        command = make_command_text(random).replace(b"<", b"").replace(b">", b"")
+        stream, expected = b"<" + command + b">", parse_send(command)
         cut = int(random.integers(len(stream) + 1))
         found = [*splitter.feed(stream[:cut]), *splitter.feed(stream[cut:])]
         assert len(found) == 1
@@ -387,7 +387,7 @@ def test_socketcand_text_gives_a_frame_only_if_valid() -> None:
         assert frame_ == expected, command
         made += expected is not None
     assert made > 100
-    for _ in range(inputs(3000)):
+    for _ in range(input_count(3000)):
         for each in splitter.feed(
             random.choice((b"<", b">", b" ", b"x" * 600, b"\xff\0", b"send 1 0", random.bytes(9)))
         ):
@@ -438,9 +438,9 @@ def test_hostile_text_does_not_stop_a_socketcand_server() -> None:
                     client.setblocking(False)
                     flood = Flood(client.fileno())
                     flood.write(b"< open can0 >< rawmode >")
-                    for _ in range(inputs(1500) // 30):
-                        texts = [b"<" + a_command(random) + b">" for _ in range(10)]
-                        flood.write(mutated(random, b"".join(texts)) if random.random() < 0.3 else b"".join(texts))
+                    for _ in range(input_count(1500) // 30):
+                        texts = [b"<" + make_command_text(random) + b">" for _ in range(10)]
+                        flood.write(mutate(random, b"".join(texts)) if random.random() < 0.3 else b"".join(texts))
                         while (item := other.recv(0)) is not None:
                             assert item.is_error_frame or find_fault(codec.make_record(item)) is None
                     flood.quiet()
@@ -451,7 +451,7 @@ def test_hostile_text_does_not_stop_a_socketcand_server() -> None:
             assert server.warnings() == []
 
 
-def is_line(line: bytes) -> tuple[Any, ...] | None:
+def parse_line(line: bytes) -> tuple[Any, ...] | None:
     """Return the frame of an SLCAN line, from the manuals; None if it is not one."""
     match = re.fullmatch(
         rb"(?:([tdbr])([0-9A-Fa-f]{3})|([TDBR])([0-9A-Fa-f]{8}))([0-9A-Fa-f])((?:[0-9A-Fa-f]{2})*)", line
@@ -475,14 +475,14 @@ def a_line(random: np.random.Generator) -> bytes:
     length = (*range(9), 12, 16, 20, 24, 32, 48, 64)[code]
     identifier = f"{random.integers(1 << 29):0{digits}X}"[-digits:]
     line = f"{kind}{identifier}{code:X}{'' if kind in 'rR' else random.bytes(length).hex().upper()}".encode()
-    return line if random.random() < 0.5 else mutated(random, line)
+    return line if random.random() < 0.5 else mutate(random, line)
 
 
 def test_slcan_lines_give_a_frame_only_if_valid() -> None:
     random = np.random.default_rng(6)
     lines = slcan.Lines()
     made = 0
-    for _ in range(inputs(3000)):
+    for _ in range(input_count(3000)):
         line = a_line(random).replace(b"\r", b"").replace(b"\n", b"")
         (text,) = lines.feed(line + b"\r")
         found = None
@@ -492,14 +492,14 @@ def test_slcan_lines_give_a_frame_only_if_valid() -> None:
                 found = (
                     *fields_of(message)[:3], message.is_fd, message.bitrate_switch, fields_of(message)[3]
                 )  # fmt: skip
-        assert found == (None if len(line) > 160 else is_line(line)), line
+        assert found == (None if len(line) > 160 else parse_line(line)), line
         made += found is not None
     assert made > 100
     with Hub(BusModel("1M/8M"), "can0") as hub, HubBus(hub) as other, SlcanPort(lambda: HubBus(hub)) as port:
         descriptor = os.open(port.path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
         try:
             flood = Flood(descriptor)
-            for _ in range(inputs(1500) // 10):
+            for _ in range(input_count(1500) // 10):
                 flood.write(b"\r".join(a_line(random) for _ in range(10)) + b"\r")
                 while (item := other.recv(0)) is not None:
                     assert item.is_error_frame or find_fault(codec.make_record(item)) is None
@@ -515,7 +515,7 @@ def test_slcan_lines_give_a_frame_only_if_valid() -> None:
 # Instruments.
 
 
-def a_request(random: np.random.Generator, codec: Codec) -> bytes:
+def make_request(random: np.random.Generator, codec: Codec) -> bytes:
     """Return a valid request, one with other values, or one that is nearly valid."""
     kinds = list(codec.kinds)
     code = kinds[random.integers(len(kinds))] if random.random() < 0.9 else int(random.integers(256))
@@ -534,17 +534,17 @@ def a_request(random: np.random.Generator, codec: Codec) -> bytes:
     if kind is not None and kind.TAIL is not None:
         texts = (b"x", b"nan", b"1e5", b"-y", b"\xff", b"\0\x1b[2J", "é".encode(), b"1_0", random.bytes(24), b"9" * 400)
         body += texts[random.integers(len(texts))]
-    return head + body if random.random() < 0.6 else mutated(random, head + body)
+    return head + body if random.random() < 0.6 else mutate(random, head + body)
 
 
 def test_instruments_reply_to_all_requests_and_execute_valid_ones_only() -> None:
     random = np.random.default_rng(7)
     rig = FakeRig(MemoryServer())
     with Twins(MemoryClient(rig.server)) as twins:
-        served = [twins.serve(kind, MessagePort(memory.pair()[0], "memory:")) for kind in TWINS]
-        for number in range(inputs(3000)):
+        served = [twins.serve(kind, MessagePort(memory.make_pair()[0], "memory:")) for kind in TWINS]
+        for number in range(input_count(3000)):
             twin = served[random.integers(len(served))]
-            request, before = a_request(random, twin.CODEC), len(rig.commands)
+            request, before = make_request(random, twin.CODEC), len(rig.commands)
             _, reply = twin.CODEC.decode(twin.answer(request))
             try:
                 sequence, message = twin.CODEC.decode(request)
@@ -568,9 +568,9 @@ def test_frames_of_a_serial_line_are_whole_or_dropped() -> None:
     random = np.random.default_rng(8)
     deframer = Deframer(1000)
     taken = 0
-    for _ in range(inputs(3000)):
+    for _ in range(input_count(3000)):
         message = random.bytes(int(random.integers(0, 1200)))
-        line = encode_frame(message) if random.random() < 0.3 else mutated(random, encode_frame(message))
+        line = encode_frame(message) if random.random() < 0.3 else mutate(random, encode_frame(message))
         good = []
         for part in line.split(b"\0"):
             with contextlib.suppress(ValueError):
@@ -600,7 +600,7 @@ def test_instruments_on_a_bus_survive_hostile_transport_frames() -> None:
     with Twins(MemoryClient(rig.server)) as twins, can.Bus(channel, interface="virtual", ignore_config=True) as villain:
         twins.serve_can(f"virtual:{channel}")
         identifiers = [TO_INSTRUMENT + kind.CODEC.address.number for kind in TWINS]
-        for number in range(inputs(1000)):
+        for number in range(input_count(1000)):
             data = random.bytes(int(random.integers(0, 9)))
             if data and random.random() < 0.8:
                 # Single, first and consecutive frames and flow control of ISO 15765-2, with wrong lengths.
@@ -658,7 +658,7 @@ def test_false_frames_do_not_stop_a_daq_and_are_counted() -> None:
             names = list(source.streams())
             source.start(names, None, lambda name, samples: taken.append(samples), lambda name, why: ended.append(why))
             rows = [row for row in table.messages if row.name not in ("Rates", "Heartbeat")]
-            for number in range(inputs(3000)):
+            for number in range(input_count(3000)):
                 row = rows[random.integers(len(rows))]
                 size = row.length if random.random() < 0.7 else int(random.integers(9))
                 source.take(row.identifier, random.bytes(size))
@@ -693,8 +693,8 @@ def test_a_node_for_links_outlives_frames_of_all_kinds() -> None:
     try:
         node.listen(0x601, heard.append)
         with can.Bus(channel, interface="virtual", ignore_config=True) as villain:
-            for _ in range(inputs(1000)):
-                villain.send(a_frame(random, 0))
+            for _ in range(input_count(1000)):
+                villain.send(make_frame(random, 0))
             villain.send(can.Message(arbitration_id=0x601, data=b"end", is_extended_id=False))
             until(lambda: bool(heard) and bytes(heard[-1].data) == b"end")
         assert {frame.arbitration_id for frame in heard} == {0x601}

@@ -50,7 +50,7 @@ def metadata(name: str, **entries: str) -> Spoil:
     return lambda layout: layout.metadata.setdefault(name, {}).update(entries)
 
 
-def event(name: str, **fields: Any) -> Spoil:
+def edit_event(name: str, **fields: Any) -> Spoil:
     """Change an event, and its message's time with its tick; without fields, remove it."""
 
     def spoil(layout: Layout) -> None:
@@ -64,11 +64,11 @@ def event(name: str, **fields: Any) -> Spoil:
     return spoil
 
 
-def more(topic: str, document: dict[str, Any], time_ns: int = 0) -> Spoil:
+def add_message(topic: str, document: dict[str, Any], time_ns: int = 0) -> Spoil:
     return lambda layout: layout.messages.insert(1, (topic, encode_document(document), time_ns))
 
 
-def blocks(key: str, change: Callable[[Block, int], tuple[dict[str, Any], int]], *, number: int) -> Spoil:
+def change_block(key: str, change: Callable[[Block, int], tuple[dict[str, Any], int]], *, number: int) -> Spoil:
     """Change fields of one block of a stream, and shift the time of its message [ns]."""
 
     def spoil(layout: Layout) -> None:
@@ -82,7 +82,7 @@ def blocks(key: str, change: Callable[[Block, int], tuple[dict[str, Any], int]],
     return spoil
 
 
-def longer(layout: Layout) -> None:
+def append_block(layout: Layout) -> None:
     """Append one block to one group, with continued numbers and times, and adapt the closing counts."""
     at = [n for n, (topic, *_) in enumerate(layout.messages) if topic == PROBES][-1]
     block = decode_block(layout.messages[at][1], schema_of(PROBES) or "")
@@ -93,7 +93,7 @@ def longer(layout: Layout) -> None:
     layout.metadata["end"] |= {"rows": json.dumps(rows), "last_time_s": "0.699800000"}
 
 
-def readme(layout: Layout) -> bytes:
+def read_readme(layout: Layout) -> bytes:
     """Return README.txt in the words of this version; the text of other versions is not checked."""
     documents = [json.loads(layout.attachments[f"{name}.json"]) for name in ("catalogue", "parameters", "scene")]
     return next(data for name, _, data in Head(*documents).attachments({}) if name == "README.txt")
@@ -115,11 +115,11 @@ SPEED = {"event": "command", "tick": 100_000, "id": 1, "command": "speed", "requ
 CONTRADICTIONS: dict[str, tuple[Spoil, str]] = {
     "scene, metadata": (metadata("rig", scene="drop"), "scene: hammer in scene.json but drop in its metadata"),
     "scene, inside": (scene(lambda s: s.update(name="drop")), "scene: hammer in scene.json but drop in scene.json, "),
-    "scene, start": (event("start", scene="drop"), "scene: hammer in scene.json but drop in rig/events"),
-    "scene, status": (more(STATUS, {"scene": "drop"}), "scene: hammer in scene.json but drop in rig/status"),
+    "scene, start": (edit_event("start", scene="drop"), "scene: hammer in scene.json but drop in rig/events"),
+    "scene, status": (add_message(STATUS, {"scene": "drop"}), "scene: hammer in scene.json but drop in rig/status"),
     "seed, metadata": (metadata("rig", seed="2"), "seed: 2 in its metadata but 1 in scene.json"),
     "seed, inside": (scene(lambda s: s.update(seed=2)), "seed: 1 in its metadata but 2 in scene.json, its scene"),
-    "seed, start": (event("start", seed=2), "seed: 1 in its metadata but 2 in rig/events"),
+    "seed, start": (edit_event("start", seed=2), "seed: 1 in its metadata but 2 in rig/events"),
     "set, metadata": (metadata("rig", parameter_set="dtu-2019"), "parameter set: dtu-2019 in its metadata but correc"),
     "set, scene": (scene(lambda s: s.update(parameters="as-printed")), "parameter set: corrected in its metadata but"),
     "ticks": (metadata("rig", tick_rate_hz="1000"), "tick rate: 1000 in its metadata but 1000000 in catalogue"),
@@ -152,7 +152,7 @@ CONTRADICTIONS: dict[str, tuple[Spoil, str]] = {
     ),
     "truth rate": (scene(lambda s: s["sensors"].update(truth_rate_hz=200)), f"rate of {STATE}: 100 in catalogue.json"),
     "text": (
-        lambda layout: layout.attachments.update({"README.txt": readme(layout) + b"x"}),
+        lambda layout: layout.attachments.update({"README.txt": read_readme(layout) + b"x"}),
         "README.txt differs from catalogue.json",
     ),
     "hammer, scene": (
@@ -163,41 +163,50 @@ CONTRADICTIONS: dict[str, tuple[Spoil, str]] = {
         scene(lambda s: s["commands"][0].update(at_s=0.03)),
         "hammer at 0.02 s in rig/events without a scene entry or a command",
     ),
-    "hammer, did not happen": (event("hammer"), "hammer at 0.02 s is requested, but did not happen in rig/events"),
-    "command, did not happen": (more(EVENTS, SPEED, 10**8), "speed at 0.1 s is requested, but did not happen"),
+    "hammer, did not happen": (edit_event("hammer"), "hammer at 0.02 s is requested, but did not happen in rig/events"),
+    "command, did not happen": (add_message(EVENTS, SPEED, 10**8), "speed at 0.1 s is requested, but did not happen"),
     "command, twice": (
         together(
-            more(EVENTS, COMMAND, 20_000_000),
+            add_message(EVENTS, COMMAND, 20_000_000),
             attached("scene", lambda d: d.update(taken=[{**COMMAND, "request": {"force_n": 60.0}}])),
         ),
         "command 1: request: {'force_n': 60.0} in scene.json, taken but {'force_n': 50.0} in rig/events",
     ),
-    "time of an event": (event("hammer", time_s=0.03), f"{EVENTS} with contradictory times: 1"),
-    "two starts": (more(EVENTS, {"event": "start", "tick": 0}), "more than one start of the run among the events"),
-    "end, metadata": (event("end", reason="stopped"), "end: completed in metadata end but stopped in rig/events"),
-    "end, none": (event("end"), "end: completed in metadata end but no end of the run in rig/events"),
-    "end, early": (event("end", tick=500_000, time_s=0.5), "end: completed at 0.5 s in rig/events but 0.6 s long"),
-    "end, behind": (event("end", tick=500_000, time_s=0.5), f"{PROBES} continues to 0.599800 s, after the end"),
+    "time of an event": (edit_event("hammer", time_s=0.03), f"{EVENTS} with contradictory times: 1"),
+    "two starts": (
+        add_message(EVENTS, {"event": "start", "tick": 0}),
+        "more than one start of the run among the events",
+    ),
+    "end, metadata": (edit_event("end", reason="stopped"), "end: completed in metadata end but stopped in rig/events"),
+    "end, none": (edit_event("end"), "end: completed in metadata end but no end of the run in rig/events"),
+    "end, early": (edit_event("end", tick=500_000, time_s=0.5), "end: completed at 0.5 s in rig/events but 0.6 s long"),
+    "end, behind": (edit_event("end", tick=500_000, time_s=0.5), f"{PROBES} continues to 0.599800 s, after the end"),
     "duration": (scene(lambda s: s.update(duration_s=0.1)), "rows up to 0.599800 s of a scene that ends at 0.1 s"),
-    "published": (event("end", rows={PROBES: 2999}), f"{PROBES} continues to row 3000, but the rig published 2999"),
-    "one group longer": (longer, f"{PROBES} continues to row 3500, but the rig published 3000"),
+    "published": (
+        edit_event("end", rows={PROBES: 2999}),
+        f"{PROBES} continues to row 3000, but the rig published 2999",
+    ),
+    "one group longer": (append_block, f"{PROBES} continues to row 3500, but the rig published 3000"),
     "first row": (metadata("end", first_time_s="0.1"), "first row: at 0.100000 s in metadata end but at 0.000000 s"),
     "last row": (metadata("end", last_time_s="9.9"), "last row: at 9.900000 s in metadata end but at 0.599800 s"),
     "begun and ended": (metadata("end", ended="2020-01-01T00:00:00+00:00"), "ended 2020-01-01T00:00:00+00:00, before"),
     "gaps": (metadata("end", gaps="3"), "gaps: 3 in metadata end but 0 in recorder/gaps"),
     "lost rows": (metadata("end", lost_rows=json.dumps({PROBES: 7})), f"lost rows: {{'{PROBES}': 7}} in metadata end"),
-    "missed": (more("recorder/gaps", MISSED_NOTE), "missed messages: {} in metadata end but {'rig/sensors/probes': 7}"),
-    "gap that is none": (more("recorder/gaps", GAP), f"7 rows of {PROBES} from 1000 on: noted as missing, but"),
+    "missed": (
+        add_message("recorder/gaps", MISSED_NOTE),
+        "missed messages: {} in metadata end but {'rig/sensors/probes': 7}",
+    ),
+    "gap that is none": (add_message("recorder/gaps", GAP), f"7 rows of {PROBES} from 1000 on: noted as missing, but"),
     "gap not noted": (
-        blocks(PROBES, lambda block, _: ({"values": block.values[:-7]}, 0), number=2),
+        change_block(PROBES, lambda block, _: ({"values": block.values[:-7]}, 0), number=2),
         f"7 rows of {PROBES} from 1493 on: missing, and no gap is noted",
     ),
     "time of a block": (
-        blocks(FORCES, lambda block, _: ({"tick": block.tick + 5000}, 0), number=2),
+        change_block(FORCES, lambda block, _: ({"tick": block.tick + 5000}, 0), number=2),
         f"messages of {FORCES} with contradictory times: 1",
     ),
     "time and row number": (
-        blocks(FORCES, lambda block, _: ({"tick": block.tick + 5000}, 5_000_000), number=2),
+        change_block(FORCES, lambda block, _: ({"tick": block.tick + 5000}, 5_000_000), number=2),
         f"1 blocks of {FORCES} have a time that does not fit their row number",
     ),
     "cut, from": (metadata("cut", from_s="0.2", to_s="inf"), f"{PROBES} begins at 0.000000 s, before the start"),

@@ -17,8 +17,8 @@ from rig.serve.request_handler import REQUESTS
 from rig.serve.service import COMMANDS, Service
 from rig.serve.transport.limit import CommandLimit
 from rig.serve.transport.memory import MemoryClient, MemoryServer
-from tests.hostile import inputs
-from tests.hostile.documents import documents
+from tests.hostile import input_count
+from tests.hostile.documents import generate_documents
 from tests.unit.service_fake import FakeSimulation
 
 EXAMPLES: dict[str, list[dict[str, Any]]] = {
@@ -75,7 +75,7 @@ def test_every_command_gets_a_reply_and_only_valid_ones_are_accepted(served: Any
     random = np.random.default_rng(11)
     accepted = 0
     for name, examples in EXAMPLES.items():
-        for payload in documents(random, inputs(4200) // len(EXAMPLES), examples):
+        for payload in generate_documents(random, input_count(4200) // len(EXAMPLES), examples):
             if name == "stop":
                 continue
             reply = asked(client, name, payload)
@@ -97,7 +97,7 @@ def test_hostile_reports_do_not_stop_the_status(served: Any) -> None:
     statuses: list[bytes] = []
     client.subscribe(wire.STATUS, lambda _, payload: statuses.append(payload))
     random = np.random.default_rng(12)
-    for number, payload in enumerate(documents(random, inputs(4000), REPORTS)):
+    for number, payload in enumerate(generate_documents(random, input_count(4000), REPORTS)):
         name = ("x", f"made up {number}", "\x1b[2J", "")[random.integers(4)]
         client.report(f"{wire.CLIENTS}/{name}", payload)
         if number % 50 == 0:

@@ -26,20 +26,30 @@ from recorder.reader import Recording, join
 from recorder.rewrite import is_whole, recover
 from rig.base.errors import InputError
 from rig.cli.main import main
-from tests.hostile import Door, inputs, tell
-from tests.hostile.files import PROBES, SESSIONS, Layout, attachments_of, contents, far_block, spoil_bytes, uses, write
+from tests.hostile import Door, check_doors, input_count
+from tests.hostile.files import (
+    PROBES,
+    SESSIONS,
+    Layout,
+    find_attachments,
+    list_operations,
+    make_far_block,
+    read_contents,
+    spoil_bytes,
+    write_file,
+)
 
 pytestmark = pytest.mark.filterwarnings("default::RuntimeWarning")
 
 
 @pytest.fixture(scope="module")
 def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write(tmp_path_factory.mktemp("hostile") / "run.mcap")
+    return write_file(tmp_path_factory.mktemp("hostile") / "run.mcap")
 
 
 @pytest.fixture(scope="module")
 def part(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write(tmp_path_factory.mktemp("hostile") / "left.mcap", leave=True)
+    return write_file(tmp_path_factory.mktemp("hostile") / "left.mcap", leave=True)
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +66,7 @@ def test_each_of_600_flipped_bits_in_attachments_is_reported(
     path: Path, part: Path, finished: bool, tmp_path: Path
 ) -> None:
     data = (path if finished else part).read_bytes()
-    places = [at for start, end in attachments_of(data) for at in range(start, end)]
+    places = [at for start, end in find_attachments(data) for at in range(start, end)]
     rng = np.random.default_rng(1)
     spoilt = tmp_path / ("x.mcap" if finished else "x.mcap.part")
     told = 0
@@ -107,17 +117,17 @@ def test_every_changed_byte_that_alters_contents_is_reported(
     path: Path, part: Path, finished: bool, tmp_path: Path
 ) -> None:
     source = path if finished else part
-    data, before = source.read_bytes(), contents(Recording.open(source))
+    data, before = source.read_bytes(), read_contents(Recording.open(source))
     messages = before[0]
     spoilt = tmp_path / ("x.mcap" if finished else "x.mcap.part")
-    rng = np.random.default_rng([2 + finished, inputs(150)])
+    rng = np.random.default_rng([2 + finished, input_count(150)])
     door, same, shorter = Door(), 0, 0
-    for number in range(inputs(150)):
+    for number in range(input_count(150)):
         changed = spoil_bytes(data, rng)
         spoilt.write_bytes(changed)
         with door.tried(number):
             recording = Recording.open(spoilt)
-            found = contents(recording)
+            found = read_contents(recording)
             if found == before and recording.complete == finished:
                 same += 1
                 continue
@@ -127,8 +137,8 @@ def test_every_changed_byte_that_alters_contents_is_reported(
             sure = found[0] if not recording.unchecked else found[0][: -_unsure(recording)]
             assert sure == messages[: len(sure)], "a message is another one"
             assert found[3:6] == before[3:6], "a document is another one"
-    tell({f"bytes ({same} the same, {shorter} told to be shorter)": door})
-    assert door.refused > 0.3 * inputs(150)
+    check_doors({f"bytes ({same} the same, {shorter} told to be shorter)": door})
+    assert door.refused > 0.3 * input_count(150)
 
 
 def _unsure(recording: Recording) -> int:
@@ -137,14 +147,14 @@ def _unsure(recording: Recording) -> int:
 
 
 def test_a_malformed_file_is_read_or_refused_without_a_traceback(layout: Layout, tmp_path: Path) -> None:
-    rng = np.random.default_rng([4, inputs(160)])
-    doors = {name: Door() for name in uses()}
-    for number in range(inputs(160)):
+    rng = np.random.default_rng([4, input_count(160)])
+    doors = {name: Door() for name in list_operations()}
+    for number in range(input_count(160)):
         path = layout.spoilt(rng).write(tmp_path / "x.mcap", rng)
-        name, use = list(uses().items())[number % len(doors)]
+        name, use = list(list_operations().items())[number % len(doors)]
         with doors[name].tried(number):
             use(path, tmp_path)
-    tell(doors)
+    check_doors(doors)
     assert all(door.taken for door in doors.values())
 
 
@@ -153,9 +163,9 @@ def test_a_block_in_a_far_future_costs_neither_time_nor_memory(layout: Layout, t
     begin = time.monotonic()
     for tick, index in ((2**52, 2**52), (1_003_000, 2**52), (2**52, 60), (2**53, 2**53 - 20), (3_000, 60)):
         changed = copy.copy(layout)
-        changed.messages = [*layout.messages, ("rig/sensors/probes", far_block(tick, index), 2**62)]
+        changed.messages = [*layout.messages, ("rig/sensors/probes", make_far_block(tick, index), 2**62)]
         path = changed.write(tmp_path / "x.mcap")
-        for use in uses().values():
+        for use in list_operations().values():
             with contextlib.suppress(InputError):
                 use(path, tmp_path)
     peak = tracemalloc.get_traced_memory()[1]
@@ -327,7 +337,7 @@ def test_a_chunk_missing_in_the_index_is_reported_and_statistics_are_optional(pa
         if opcode == 8:
             with pytest.raises(InputError, match="does not fit the file"):
                 Recording.open(spoilt)
-    assert contents(Recording.open(spoilt)) == contents(Recording.open(path))
+    assert read_contents(Recording.open(spoilt)) == read_contents(Recording.open(path))
 
 
 def test_parts_of_a_series_with_another_calibration_are_not_joined(layout: Layout, tmp_path: Path) -> None:

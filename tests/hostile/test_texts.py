@@ -37,8 +37,8 @@ from rig.cli.main import main
 from rig.cli.output import tables
 from rig.physics.parameters import SETS, load_parameters
 from rig.run.scenes import SCENES, load_scene, parse_scene, read_value, scene_document, scene_names
-from tests.hostile import Door, inputs, tell
-from tests.hostile.files import Layout, Rng, spoil_bytes, spoil_document, write
+from tests.hostile import Door, check_doors, input_count
+from tests.hostile.files import Layout, Rng, spoil_bytes, spoil_document, write_file
 
 PIECES = (
     "9" * 5000, "0x" + "f" * 5000, "1e400", "nan", "-inf", "2" * 30, "[" * 3000, "{a=" * 500, '"""', "true", "-1",
@@ -72,7 +72,7 @@ def spoil_toml(text: str, rng: Rng) -> bytes:
 
 
 def test_any_toml_is_accepted_or_refused_in_one_line(tmp_path: Path) -> None:
-    rng = np.random.default_rng([5, inputs(120)])
+    rng = np.random.default_rng([5, input_count(120)])
 
     def text(path: Path) -> str:
         return path.read_bytes().decode(errors="replace")
@@ -89,14 +89,14 @@ def test_any_toml_is_accepted_or_refused_in_one_line(tmp_path: Path) -> None:
         ),
     }
     doors = {name: Door() for name in kinds}
-    for number in range(inputs(120)):
+    for number in range(input_count(120)):
         name = list(kinds)[number % len(kinds)]
         texts, load = kinds[name]
         path = tmp_path / f"x{name.strip('-')}.toml"
         path.write_bytes(data := spoil_toml(texts[int(rng.integers(0, len(texts)))], rng))
         with doors[name].tried(data[:200]):
             load(path)
-    tell(doors)
+    check_doors(doors)
 
 
 def test_any_document_is_accepted_or_refused_in_one_line(tmp_path: Path) -> None:
@@ -108,9 +108,9 @@ def test_any_document_is_accepted_or_refused_in_one_line(tmp_path: Path) -> None
         "mapping": ([read_toml(tmp_path / "m.toml")], lambda document: check(Mapping, document, field="")),
         "criteria": ([read_toml(DEFAULT)], lambda document: check(Criteria, document, field="")),
     }
-    rng = np.random.default_rng([7, inputs(200)])
+    rng = np.random.default_rng([7, input_count(200)])
     doors = {name: Door() for name in kinds}
-    for number in range(inputs(200)):
+    for number in range(input_count(200)):
         name = list(kinds)[number % len(kinds)]
         documents, load = kinds[name]
         document = documents[int(rng.integers(0, len(documents)))]
@@ -120,7 +120,7 @@ def test_any_document_is_accepted_or_refused_in_one_line(tmp_path: Path) -> None
             continue
         with doors[name].tried(number):
             load(document)
-    tell(doors)
+    check_doors(doors)
 
 
 @pytest.mark.parametrize(
@@ -154,7 +154,7 @@ RATE_HZ = 1000.0
 X = "[channels]\ndisk_x = { source = 'x', unit = 'mm' }\n"
 
 
-def logs(folder: Path) -> dict[str, bytes]:
+def make_logs(folder: Path) -> dict[str, bytes]:
     """Return a small log of each format, by suffix."""
     import nptdms
     import pyarrow
@@ -201,16 +201,16 @@ def logs(folder: Path) -> dict[str, bytes]:
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
 def test_foreign_logs_are_accepted_or_refused_in_one_line(tmp_path: Path) -> None:
     (tmp_path / "whole").mkdir()
-    whole = logs(tmp_path / "whole")
+    whole = make_logs(tmp_path / "whole")
     (tmp_path / "m.toml").write_text(X)
     mapping = load_mapping(tmp_path / "m.toml")
-    rng = np.random.default_rng([6, inputs(80)])
+    rng = np.random.default_rng([6, input_count(80)])
     doors = {suffix: Door() for suffix in whole}
     logging.disable(logging.CRITICAL)
     for suffix in whole:  # the unchanged file is accepted
         if not suffix.endswith(".json"):
             convert([tmp_path / "whole" / f"a{suffix}"], mapping)
-    for number in range(inputs(80)):
+    for number in range(input_count(80)):
         suffix = list(whole)[number % len(whole)]
         data = whole[suffix]
         for _ in range(int(rng.integers(1, 3))):
@@ -232,7 +232,7 @@ def test_foreign_logs_are_accepted_or_refused_in_one_line(tmp_path: Path) -> Non
                 Recording.open(tmp_path / "out.mcap")
     logging.disable(logging.NOTSET)
     gc.collect()  # unclosed files are allowed here
-    tell(doors)
+    check_doors(doors)
 
 
 @pytest.mark.parametrize(("method", "rate_hz"), [("linear", 1_000_000), ("polyphase", 1_000_000), ("none", None)])
@@ -263,7 +263,7 @@ def printed_safely(text: str) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_info_escapes_control_sequences_in_names(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    layout = Layout(Recording.open(write(tmp_path / "run.mcap")))
+    layout = Layout(Recording.open(write_file(tmp_path / "run.mcap")))
     text = json.dumps(name)[1:-1]
     for old in ('"disk_x"', '"hammer"', '"forces"'):
         for file in ("catalogue.json", "scene.json"):
@@ -292,7 +292,7 @@ def test_info_escapes_control_sequences_in_names(name: str, tmp_path: Path, caps
 @pytest.mark.parametrize("name", [*NAMES[:7], 'a","b', "\n    -1\n    -1\n    58"])
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_names_do_not_change_the_format_of_exports(name: str, tmp_path: Path) -> None:
-    layout = Layout(Recording.open(write(tmp_path / "run.mcap")))
+    layout = Layout(Recording.open(write_file(tmp_path / "run.mcap")))
     catalogue = json.loads(layout.attachments["catalogue.json"])
     for channel in catalogue["table"]["groups"]["probes"]["channels"][:1]:
         channel["name"] = channel["unit"] = channel["label"] = name
@@ -341,7 +341,7 @@ def test_paths_with_such_names_end_no_command(
     monkeypatch.chdir(tmp_path)
     folder = tmp_path / name
     folder.mkdir(parents=True)
-    write(folder / "run.mcap")
+    write_file(folder / "run.mcap")
     (folder / "x.csv").write_text("time,x [mm]\n" + "\n".join(f"{k / 1000},{k}" for k in range(50)))
     (folder / "m.toml").write_text(X)
     for arguments in (

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import grimp
 
-from tests.house.layout import ROOTS, build, floors
+from tests.house.layout import ROOTS, build_graph, find_floors
 
 ROOT = Path(__file__).parents[2]
 PICTURE = ROOT / "replays/figures/architecture.svg"
@@ -92,11 +92,11 @@ class Box:
         return [shape, text, *itertools.chain(*(box.drawn() for box in itertools.chain(*self.rows)))]
 
 
-def box_of(name: str, graph: grimp.ImportGraph) -> Box:
+def build_box(name: str, graph: grimp.ImportGraph) -> Box:
     """Build the box of a package, with packages of `OPEN_PACKAGES` opened; the rig's own modules are named."""
     title = name.rpartition(".")[2] + ("/" if graph.find_children(name) else "")
     if name in ROOTS or name in OPEN_PACKAGES:
-        rows = [[box_of(room, graph) for room in floor if room != COMMANDS] for floor in floors(graph, name)]
+        rows = [[build_box(room, graph) for room in floor if room != COMMANDS] for floor in find_floors(graph, name)]
         return Box(name, f"{title}: {TITLES[name]}", [row for row in rows if row])
     if name.startswith("rig."):
         inside = sorted(room.rpartition(".")[2] for room in graph.find_children(name) if "__" not in room)
@@ -112,17 +112,17 @@ def imports(graph: grimp.ImportGraph, importer: str, imported: str) -> bool:
     return any(graph.find_modules_directly_imported_by(name) & below for name in graph.find_descendants(importer))
 
 
-def arrow(*points: tuple[float, float], root: str) -> str:
+def draw_arrow(*points: tuple[float, float], root: str) -> str:
     """Return a line through points with an arrowhead at the last."""
     way = " ".join(f"{x:.0f},{y:.0f}" for x, y in points)
     return f'<polyline points="{way}" fill="none" stroke="{STROKE[root]}" stroke-width="2" marker-end="url(#{root})"/>'
 
 
-def picture() -> str:
+def draw_picture() -> str:
     """Return the picture as SVG."""
-    graph = build()
+    graph = build_graph()
     commands = Box(COMMANDS, f"rig/cli/: {TITLES[COMMANDS]}")
-    boxes = {name: box_of(name, graph) for name in ROOTS}
+    boxes = {name: build_box(name, graph) for name in ROOTS}
     for box in boxes.values():
         box.measure()
     full = max(boxes["replays"].width, boxes["rig"].width, boxes["recorder"].width + boxes["drivers"].width + 2 * GAP)
@@ -152,13 +152,13 @@ def picture() -> str:
         f'<rect width="{width:.0f}" height="{height:.0f}" fill="#ffffff"/>',
         *commands.drawn(),
         *itertools.chain(*(box.drawn() for box in boxes.values())),
-        *arrows(graph, commands, boxes),
+        *draw_arrows(graph, commands, boxes),
         "</svg>",
         "",
     ])  # fmt: skip
 
 
-def arrows(graph: grimp.ImportGraph, commands: Box, boxes: dict[str, Box]) -> list[str]:
+def draw_arrows(graph: grimp.ImportGraph, commands: Box, boxes: dict[str, Box]) -> list[str]:
     """Draw imports between packages: straight down if the way is free, otherwise around the outside."""
     replays, recorder, drivers, rig = (boxes[name] for name in ("replays", "recorder", "drivers", "rig"))
     right, drawn = replays.left + replays.width, []
@@ -166,13 +166,13 @@ def arrows(graph: grimp.ImportGraph, commands: Box, boxes: dict[str, Box]) -> li
     def down(importer: Box, imported: Box, x: float) -> None:
         if imports(graph, importer.name, imported.name):
             root = importer.name.partition(".")[0]
-            drawn.append(arrow((x, importer.top + importer.height), (x, imported.top - 1), root=root))
+            drawn.append(draw_arrow((x, importer.top + importer.height), (x, imported.top - 1), root=root))
 
     def around(importer: Box, imported: Box, x: float, edge: float, at: float) -> None:
         if imports(graph, importer.name, imported.name):
             root = importer.name.partition(".")[0]
             y, z = importer.top + importer.height / 2, imported.top + at
-            drawn.append(arrow((edge, y), (x, y), (x, z), (edge + (-1 if x < edge else 1), z), root=root))
+            drawn.append(draw_arrow((edge, y), (x, y), (x, z), (edge + (-1 if x < edge else 1), z), root=root))
 
     down(commands, replays, commands.left + commands.width / 2)
     down(replays, recorder, recorder.left + recorder.width / 2)
@@ -187,4 +187,4 @@ def arrows(graph: grimp.ImportGraph, commands: Box, boxes: dict[str, Box]) -> li
 
 
 if __name__ == "__main__":
-    PICTURE.write_text(picture(), encoding="utf-8")
+    PICTURE.write_text(draw_picture(), encoding="utf-8")

@@ -16,12 +16,12 @@ LIKE_ENTRIES = frozenset({"rig.cli.commands"})
 """Folders of entries of one kind, without a limit of their number."""
 
 
-def build() -> grimp.ImportGraph:
+def build_graph() -> grimp.ImportGraph:
     """Build the graph of all imports of the product, those inside functions included."""
     return grimp.build_graph(*ROOTS, cache_dir=None)
 
 
-def rooms(graph: grimp.ImportGraph, package: str) -> dict[str, set[str]]:
+def find_rooms(graph: grimp.ImportGraph, package: str) -> dict[str, set[str]]:
     """Return the rooms of a package, each with the rooms of this package that it imports; without `__main__`."""
     found = sorted(name for name in graph.find_children(package) if not name.endswith(".__main__"))
     inside = {name: {name, *graph.find_descendants(name)} for name in found}
@@ -32,13 +32,13 @@ def rooms(graph: grimp.ImportGraph, package: str) -> dict[str, set[str]]:
     return {name: {each for each in found if each != name and imported[name] & inside[each]} for name in found}
 
 
-def floors(graph: grimp.ImportGraph, package: str) -> list[list[str]]:
+def find_floors(graph: grimp.ImportGraph, package: str) -> list[list[str]]:
     """Return the rooms of a package by floor, the highest first.
 
     Raises:
         ValueError: Rooms import each other in a circle.
     """
-    waiting, found = rooms(graph, package), list[list[str]]()
+    waiting, found = find_rooms(graph, package), list[list[str]]()
     while waiting:
         floor = [name for name, imported in waiting.items() if not imported & waiting.keys()]
         if not floor:
@@ -49,13 +49,13 @@ def floors(graph: grimp.ImportGraph, package: str) -> list[list[str]]:
     return found
 
 
-def packages(graph: grimp.ImportGraph) -> list[str]:
+def list_packages(graph: grimp.ImportGraph) -> list[str]:
     """Return all packages of the product."""
     return sorted(name for name in graph.modules if graph.find_children(name))
 
 
 def _tell(package: str) -> None:
-    for number, floor in enumerate(reversed(floors(build(), package)), 1):
+    for number, floor in enumerate(reversed(find_floors(build_graph(), package)), 1):
         print(number, *(name.rpartition(".")[2] for name in floor))
 
 

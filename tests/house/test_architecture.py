@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from tests.house.architecture import PICTURE, ROOT, picture
+from tests.house.architecture import PICTURE, ROOT, draw_picture
 
 
 def test_picture_is_up_to_date() -> None:
-    assert PICTURE.read_text(encoding="utf-8") == picture(), "make it anew: python -m tests.house.architecture"
+    assert PICTURE.read_text(encoding="utf-8") == draw_picture(), "make it anew: python -m tests.house.architecture"
 
 
 def test_readme_shows_the_picture() -> None:

@@ -117,7 +117,7 @@ def graph() -> grimp.ImportGraph:
     return grimp.build_graph(*PACKAGES, include_external_packages=True, cache_dir=None)
 
 
-def contract_named(words: str) -> Contract:
+def find_contract(words: str) -> Contract:
     """Return the only contract with these words in its name."""
     found: list[dict[str, Any]] = [each for each in CONFIGURATION["contracts_options"] if words in each["name"]]
     assert len(found) == 1, (words, [each["name"] for each in found])
@@ -133,7 +133,7 @@ def test_contracts_hold() -> None:
 
 @pytest.mark.parametrize(("importer", "imported", "words"), BREACHES)
 def test_contracts_detect_forbidden_imports(graph: grimp.ImportGraph, importer: str, imported: str, words: str) -> None:
-    contract = contract_named(words)
+    contract = find_contract(words)
     broken = copy.deepcopy(graph)
     assert importer in broken.modules, f"{importer} has moved: name another"
     if imported.partition(".")[0] in PACKAGES:
@@ -154,7 +154,7 @@ def test_each_contract_detects_a_breach() -> None:
 def test_contracts_ask_where_a_new_module_belongs(graph: grimp.ImportGraph, package: str) -> None:
     grown = copy.deepcopy(graph)
     grown.add_module(f"{package}.utils")
-    check = contract_named(f"Inside the {package}").check(grown, verbose=False)
+    check = find_contract(f"Inside the {package}").check(grown, verbose=False)
     assert not check.kept
     assert "utils" in str(check.metadata)
 

@@ -70,7 +70,7 @@ EXCEPTIONS = {
 """Modules with their own implementation, each with the reason."""
 
 
-def names_of(tree: ast.Module) -> dict[str, str]:
+def get_import_names(tree: ast.Module) -> dict[str, str]:
     """Return the full names of the imports of a module, by local name."""
     found: dict[str, str] = {}
     for node in ast.walk(tree):
@@ -104,9 +104,9 @@ def is_normal(node: ast.AST, names: dict[str, str]) -> bool:
     )
 
 
-def mechanisms(tree: ast.Module) -> Iterator[tuple[int, str, str]]:
+def find_mechanisms(tree: ast.Module) -> Iterator[tuple[int, str, str]]:
     """Yield uses of a library's mechanisms: line, mechanism, full name."""
-    names = names_of(tree)
+    names = get_import_names(tree)
     for node in ast.walk(tree):
         name = full_name(node, names)
         yield from ((node.lineno, LIBRARY[one], name) for one in LIBRARY if f"{name}.".startswith(f"{one}."))
@@ -114,13 +114,13 @@ def mechanisms(tree: ast.Module) -> Iterator[tuple[int, str, str]]:
             yield node.lineno, SQUARES, NORMAL  # pyright: ignore[reportAttributeAccessIssue]
 
 
-def second_ones() -> dict[tuple[str, str], str]:
+def find_second_homes() -> dict[tuple[str, str], str]:
     """Return mechanisms outside their homes: the first place, by path and mechanism."""
     found: dict[tuple[str, str], str] = {}
     for path in paths():
         if is_generated(path):
             continue
-        for line, mechanism, name in mechanisms(ast.parse((ROOT / path).read_text(encoding="utf-8"))):
+        for line, mechanism, name in find_mechanisms(ast.parse((ROOT / path).read_text(encoding="utf-8"))):
             if path != HOMES[mechanism]:
                 home = HOMES[mechanism]
                 found.setdefault((path, mechanism), f"{path}:{line} has {mechanism} of its own ({name}): use {home}")
@@ -128,7 +128,7 @@ def second_ones() -> dict[tuple[str, str], str]:
 
 
 def test_each_mechanism_of_estimation_has_one_home() -> None:
-    found = second_ones()
+    found = find_second_homes()
     wrong = [text for place, text in found.items() if place not in EXCEPTIONS]
     wrong += [
         f"{path} no longer has {mechanism}: take it off EXCEPTIONS" for path, mechanism in EXCEPTIONS.keys() - found
@@ -139,7 +139,7 @@ def test_each_mechanism_of_estimation_has_one_home() -> None:
 def test_homes_contain_their_mechanism() -> None:
     for mechanism, home in HOMES.items():
         tree = ast.parse((ROOT / home).read_text(encoding="utf-8"))
-        assert any(found == mechanism for _, found, _ in mechanisms(tree)), f"{home} has no {mechanism}"
+        assert any(found == mechanism for _, found, _ in find_mechanisms(tree)), f"{home} has no {mechanism}"
 
 
 @pytest.mark.parametrize(
@@ -165,7 +165,7 @@ def test_homes_contain_their_mechanism() -> None:
     ],
 )
 def test_a_second_implementation_is_found_with_any_form_of_import(text: str, mechanism: str) -> None:
-    assert {found for _, found, _ in mechanisms(ast.parse(text))} == {mechanism}
+    assert {found for _, found, _ in find_mechanisms(ast.parse(text))} == {mechanism}
 
 
 @pytest.mark.parametrize(
@@ -180,4 +180,4 @@ def test_a_second_implementation_is_found_with_any_form_of_import(text: str, mec
     ],
 )
 def test_similar_code_is_not_reported(text: str) -> None:
-    assert not list(mechanisms(ast.parse(text)))
+    assert not list(find_mechanisms(ast.parse(text)))

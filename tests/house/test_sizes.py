@@ -63,13 +63,13 @@ def tree_of(path: str) -> ast.Module:
     return ast.parse((ROOT / path).read_text(encoding="utf-8"))
 
 
-def beginning(tree: ast.Module) -> str:
+def get_summary(tree: ast.Module) -> str:
     """Return the summary of the docstring and the next paragraph, on one line."""
     return " ".join(" ".join((ast.get_docstring(tree) or "").split("\n\n")[:2]).split())
 
 
 def is_generated(path: str) -> bool:
-    return re.search(r"\b(Generated|Made) by `", beginning(tree_of(path))) is not None
+    return re.search(r"\b(Generated|Made) by `", get_summary(tree_of(path))) is not None
 
 
 def code_lines(text: str) -> int:
@@ -83,22 +83,22 @@ def code_lines(text: str) -> int:
     return len({line for lines in used for line in lines} - texts)
 
 
-def folder_of(path: str) -> str:
+def get_folder(path: str) -> str:
     """Return the folder that a file counts for: the first two parts of its path, or the package alone."""
     package, *rest = Path(path).parent.parts
     return f"{package}/{rest[0]}" if rest else package
 
 
-def sizes() -> Counter[str]:
+def count_sizes() -> Counter[str]:
     """Return the lines of code by folder."""
     found: Counter[str] = Counter()
     for path in paths():
         if not is_generated(path):
-            found[folder_of(path)] += code_lines((ROOT / path).read_text(encoding="utf-8"))
+            found[get_folder(path)] += code_lines((ROOT / path).read_text(encoding="utf-8"))
     return found
 
 
-def functions(node: ast.AST, name: str = "") -> Iterator[tuple[str, int]]:
+def iterate_functions(node: ast.AST, name: str = "") -> Iterator[tuple[str, int]]:
     """Yield every function in a tree with its length, decorators and nested functions included."""
     for child in ast.iter_child_nodes(node):
         inner = name
@@ -107,7 +107,7 @@ def functions(node: ast.AST, name: str = "") -> Iterator[tuple[str, int]]:
             if not isinstance(child, ast.ClassDef):
                 first = min([child.lineno, *(decorator.lineno for decorator in child.decorator_list)])
                 yield inner, (child.end_lineno or first) - first + 1
-        yield from functions(child, inner)
+        yield from iterate_functions(child, inner)
 
 
 def test_functions_fit_on_two_screens() -> None:
@@ -115,7 +115,7 @@ def test_functions_fit_on_two_screens() -> None:
         f"{path}::{name} must have at most {LONGEST_FUNCTION} lines and has {length}"
         for path in paths()
         if not is_generated(path)
-        for name, length in functions(tree_of(path))
+        for name, length in iterate_functions(tree_of(path))
         if length > LONGEST_FUNCTION
     ]
     assert not long, "\n".join(long)
@@ -123,13 +123,13 @@ def test_functions_fit_on_two_screens() -> None:
 
 def test_generated_files_name_the_test_that_compares_them() -> None:
     for path in filter(is_generated, paths()):
-        named = re.search(r"tests/\S+\.py", beginning(tree_of(path)))
+        named = re.search(r"tests/\S+\.py", get_summary(tree_of(path)))
         assert named, f"{path} must name the test that compares it with what its command makes"
         assert (ROOT / named[0]).is_file(), f"{path} names {named[0]}, which is no file"
 
 
 def test_folders_keep_their_budgets() -> None:
-    found = sizes()
+    found = count_sizes()
     assert found.keys() == BUDGETS.keys(), "each folder of the product has a budget, and no other"
     wrong = [
         f"{folder} has {found[folder]} lines of code, and its budget is {budget}: "

@@ -13,7 +13,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 
 
-def clean(*command: str | Path) -> None:
+def check_tool(*command: str | Path) -> None:
     """Run a tool over the project, and fail with its output where it finds anything."""
     done = subprocess.run(
         command,
@@ -27,7 +27,7 @@ def clean(*command: str | Path) -> None:
     assert done.returncode == 0, done.stdout
 
 
-def pyrefly() -> Path:
+def find_pyrefly() -> Path:
     """Return the path of pyrefly's program.
 
     `python -m pyrefly` searches only this environment's folder, and the package may be installed in another.
@@ -38,12 +38,12 @@ def pyrefly() -> Path:
 
 @pytest.mark.wallclock
 def test_ruff_reports_nothing() -> None:
-    clean(sys.executable, "-m", "ruff", "check", "--no-cache")
+    check_tool(sys.executable, "-m", "ruff", "check", "--no-cache")
 
 
 @pytest.mark.wallclock
 def test_code_is_formatted() -> None:
-    clean(sys.executable, "-m", "ruff", "format", "--check", "--no-cache")
+    check_tool(sys.executable, "-m", "ruff", "format", "--check", "--no-cache")
 
 
 @pytest.mark.wallclock
@@ -61,6 +61,6 @@ def test_pyrefly_reports_nothing(pytestconfig: pytest.Config) -> None:
         return
     # One thread takes a quarter less processor time than two.
     options = ("--threads", "1", "--summary=none", "--min-severity", "error", "--color", "never")
-    clean(pyrefly(), "check", *options, "--python-interpreter-path", sys.executable)
+    check_tool(find_pyrefly(), "check", *options, "--python-interpreter-path", sys.executable)
     if cache is not None:
         cache.set("house/right types", said.hexdigest())

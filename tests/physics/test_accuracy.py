@@ -23,7 +23,7 @@ CLEARANCE = 0.926e-3
 STATIC_N, RIPPLE_N, WHIRL_HZ = 350.0, 5.0, 70.0
 
 
-def whirl(n: int, *, angle: float = 0.0, radius: float = 0.0, force: float = 0.0, hz: float = 0.0) -> np.ndarray:
+def make_whirl(n: int, *, angle: float = 0.0, radius: float = 0.0, force: float = 0.0, hz: float = 0.0) -> np.ndarray:
     """Return rows of a perturbed backward whirl whose force has a ripple of two cycles per turn, shape (n, N_ROW)."""
     phi = -2.0 * np.pi * (WHIRL_HZ + hz) * 1e-3 * np.arange(n) + angle
     rows = np.zeros((n, S.N_ROW))
@@ -36,7 +36,7 @@ def whirl(n: int, *, angle: float = 0.0, radius: float = 0.0, force: float = 0.0
 
 def compared(limits: dict[str, float] | None = None, **off: float) -> tuple[Accuracy, list[tuple[float, str]]]:
     accuracy = Accuracy(3e-4, CLEARANCE, 1e-3, limits or {})
-    return accuracy, accuracy.compare(whirl(256), whirl(256, **off), 1e-3 * np.arange(256))
+    return accuracy, accuracy.compare(make_whirl(256), make_whirl(256, **off), 1e-3 * np.arange(256))
 
 
 @pytest.mark.parametrize(
@@ -87,17 +87,17 @@ def test_a_limit_replaces_the_tolerance_of_its_quantity(
 
 
 def test_a_limit_of_the_spin_angle_is_in_degrees() -> None:
-    turned = whirl(256)
+    turned = make_whirl(256)
     turned[:, COLUMN["theta"]] += np.radians(0.3)
     for limit, warned in ((0.2, True), (0.4, False)):
         accuracy = Accuracy(3e-4, CLEARANCE, 1e-3, {"spin_angle": limit})
-        accuracy.compare(whirl(256), turned, 1e-3 * np.arange(256))
+        accuracy.compare(make_whirl(256), turned, 1e-3 * np.arange(256))
         assert (f"spin angle off by 0.3 deg (limit {limit})" in accuracy.warning()) == warned
 
 
 def test_different_impacts_are_not_explained_by_an_angle() -> None:
     rng = np.random.default_rng(5)
-    rows, other = whirl(128), whirl(128)
+    rows, other = make_whirl(128), make_whirl(128)
     rows[:, COLUMN["normal_force"]] = np.where(rng.random(128) < 0.2, 400.0, 0.0)
     other[:, COLUMN["normal_force"]] = np.roll(rows[:, COLUMN["normal_force"]], 3)
     accuracy = Accuracy(3e-4, CLEARANCE, 1e-3)
@@ -107,7 +107,7 @@ def test_different_impacts_are_not_explained_by_an_angle() -> None:
 
 def test_an_unfinished_window_counts_and_changes_nothing() -> None:
     accuracy = Accuracy(3e-4, CLEARANCE, 1e-3)
-    assert accuracy.compare(whirl(10), whirl(10, radius=1e-6), 1e-3 * np.arange(10)) == []
+    assert accuracy.compare(make_whirl(10), make_whirl(10, radius=1e-6), 1e-3 * np.arange(10)) == []
     before = copy.deepcopy(accuracy)
     assert "whirl radius off by 1 um (tolerance 0.28)" in accuracy.completed().warning()
     assert np.array_equal(accuracy.errors, before.errors)

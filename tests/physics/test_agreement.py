@@ -175,7 +175,7 @@ def test_rig_of_the_paper_sags_out_of_a_centred_ring() -> None:
     assert abs(model.sag) > contact.clearance
 
 
-def whirl_of(run: Run, *, from_s: float) -> dict[str, float]:
+def measure_whirl(run: Run, *, from_s: float) -> dict[str, float]:
     """Return the figures of the whirl from the model's own signals: phase slope of the shaft in the ring."""
     kept = run.times_s >= from_s
     phase = np.unwrap(np.angle(run["ring_x"][kept] + 1j * run["ring_y"][kept]))
@@ -196,7 +196,7 @@ def test_whirl_rolls_backward_and_its_force_grows_as_spin_squared() -> None:
     speeds, forces = [], []
     for speed_hz in (3.2, 4.2, 5.2, 6.2):
         run = simulate(load_scene("hammer", {"drive.speed_hz": speed_hz, "sensors.noise": False}))
-        figures = whirl_of(run, from_s=1.5)
+        figures = measure_whirl(run, from_s=1.5)
         assert figures["hz"] < 0.0
         assert figures["hz"] == pytest.approx(figures["law_hz"], rel=2e-3)
         surface = 2 * math.pi * figures["spin_hz"] * run.simulation.model.constants.shaft.radius

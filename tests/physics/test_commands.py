@@ -28,7 +28,7 @@ def run_with(rate_hz: int, *commands: dict[str, Any]) -> Run:
     return simulate(load_scene("hammer", changes))
 
 
-def effect(rate_hz: int, command: dict[str, Any]) -> tuple[np.ndarray, float]:
+def measure_effect(rate_hz: int, command: dict[str, Any]) -> tuple[np.ndarray, float]:
     """Return the change of the scaled state by a command, shape (N_STATE,), and the hammer's work [J]."""
     look = round(LOOK_S * rate_hz)
     given, free = run_with(rate_hz, command), run_with(rate_hz)
@@ -39,8 +39,8 @@ def effect(rate_hz: int, command: dict[str, Any]) -> tuple[np.ndarray, float]:
 @pytest.mark.parametrize("command", [HAMMER, SPEED, RELEASE], ids=lambda command: command["command"])
 @pytest.mark.parametrize("rate_hz", [500, 100])
 def test_a_low_row_rate_does_not_change_a_command(rate_hz: int, command: dict[str, Any]) -> None:
-    change, work = effect(rate_hz, command)
-    true_change, true_work = effect(20_000, command)
+    change, work = measure_effect(rate_hz, command)
+    true_change, true_work = measure_effect(20_000, command)
     assert np.abs(true_change).max() > 1e-6, "it has an effect"
     # The impulse, by all that it has set in motion, and the energy supplied with it.
     np.testing.assert_allclose(change, true_change, rtol=0.0, atol=1e-6 * np.abs(true_change).max())

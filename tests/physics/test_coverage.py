@@ -36,7 +36,7 @@ _CONFIDENCE = 0.999
 """An interval is too narrow if the probability of so low a share by chance is below 1 minus this."""
 
 
-def held(recording: Recording, keys: tuple[str, ...]) -> tuple[dict[str, bool], bool | None]:
+def check_intervals(recording: Recording, keys: tuple[str, ...]) -> tuple[dict[str, bool], bool | None]:
     """Return which intervals contain the true value, and whether all wider ones do at once.
 
     Without an interval there is no entry, and None.
@@ -64,8 +64,8 @@ def test_intervals_have_their_nominal_coverage(tmp_path: Path) -> None:
         write_run(Simulation(scene), path, force=True)
         recording = Recording.open(path)
         for key in KEYS:
-            counts.setdefault(f"{key}, alone", []).append(held(recording, (key,))[0].get(key))
-        each, together = held(recording, KEYS)
+            counts.setdefault(f"{key}, alone", []).append(check_intervals(recording, (key,))[0].get(key))
+        each, together = check_intervals(recording, KEYS)
         for key in KEYS:
             counts.setdefault(f"{key}, of five", []).append(each.get(key))
         counts.setdefault("all five at once", []).append(together)

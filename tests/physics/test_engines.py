@@ -34,7 +34,7 @@ _MEASURED = [0, 1, 3, 4, 7, 8, 9]
 EXACT = [name for name, method in ENGINES.items() if "exact" in method.frictions]
 
 
-def ready(scene: str, engine: str, smoothing_speed: float | None = None, **changes: Any) -> Simulation:
+def make_simulation(scene: str, engine: str, smoothing_speed: float | None = None, **changes: Any) -> Simulation:
     """Prepare a simulation with rows 1 ms apart.
 
     Dots of dotted keys are written `__`; v_s [m/s] may be below the limit of a scene.
@@ -48,23 +48,23 @@ def ready(scene: str, engine: str, smoothing_speed: float | None = None, **chang
     return simulation
 
 
-def motion(simulation: Simulation, duration_s: float) -> np.ndarray:
+def compute_motion(simulation: Simulation, duration_s: float) -> np.ndarray:
     """Return scaled states on a grid of 1 ms, shape (n, 7)."""
     rows = simulation.advance(round(duration_s * 1e6)).rows
     return rows[:, _MEASURED] / S.STATE_SCALE[_MEASURED]
 
 
-def distance(one: np.ndarray, other: np.ndarray) -> float:
+def rms_distance(one: np.ndarray, other: np.ndarray) -> float:
     """Return the RMS difference over states and time."""
     return float(np.sqrt(np.mean((one - other) ** 2)))
 
 
-def slope(steps: list[Any], errors: list[float]) -> float:
+def fit_slope(steps: list[Any], errors: list[float]) -> float:
     """Return the fitted exponent of the error as a function of the step."""
     return float(np.polyfit(np.log(steps), np.log(errors), 1)[0])
 
 
-def of_engine(engine: str, table: dict[str, Any], what: str) -> Any:
+def get_engine_row(engine: str, table: dict[str, Any], what: str) -> Any:
     """Return an engine's row of a table of this module, or fail with the table that lacks it."""
     assert engine in table, f"{engine} must have a row in {what}"
     return table[engine]
@@ -90,7 +90,7 @@ def test_order_on_the_smooth_problem(engine: str, monkeypatch: pytest.MonkeyPatc
             monkeypatch.setattr(module, "METHOD", module.METHOD._replace(order=0.0))
 
     # Undamped free flight at 220 Hz on stiff, hardening magnets, in a ring too wide to touch: smooth and nonlinear.
-    simulation = ready(
+    simulation = make_simulation(
         "stable-run", "rk8", ring__clearance=15.0, initial__position="given", initial__x_mm=0.8, initial__y_mm=0.4,
         magnet__stiffness=1000.0, shaft__damping_ratio_x=0.0, shaft__damping_ratio_y=0.0, drive__speed_hz=8.0,
     )  # fmt: skip
@@ -106,9 +106,9 @@ def test_order_on_the_smooth_problem(engine: str, monkeypatch: pytest.MonkeyPatc
         return rows[:, [0, 1, 7, 8]] / np.array([1e-2, 1e-2, 10.0, 10.0])
 
     exact = swing("rk8", 20)
-    steps = of_engine(engine, SMOOTH_STEPS, "SMOOTH_STEPS: four or more steps [us] at which its order shows")
+    steps = get_engine_row(engine, SMOOTH_STEPS, "SMOOTH_STEPS: four or more steps [us] at which its order shows")
     errors = [float(np.linalg.norm(swing(engine, step) - exact)) for step in steps]
-    assert slope(steps, errors) == pytest.approx(load_engine(engine).order, abs=0.15)
+    assert fit_slope(steps, errors) == pytest.approx(load_engine(engine).order, abs=0.15)
 
 
 SCENES: dict[str, tuple[str, dict[str, Any], float, float]] = {
@@ -124,19 +124,19 @@ SCENES: dict[str, tuple[str, dict[str, Any], float, float]] = {
 @pytest.mark.parametrize("name", SCENES)
 def test_split_keeps_its_tolerance_on_every_scene(name: str) -> None:
     scene, changes, start_s, duration_s = SCENES[name]
-    first = ready(scene, "split", **changes)
+    first = make_simulation(scene, "split", **changes)
     if start_s:
         first.advance(round(start_s * 1e6))
 
     def run(engine: str, **choice: Any) -> tuple[np.ndarray, Simulation]:
-        simulation = ready(scene, engine, **changes, **choice)
+        simulation = make_simulation(scene, engine, **changes, **choice)
         simulation.tick, simulation._motion.y = first.tick, first._motion.y.copy()
-        return motion(simulation, duration_s), simulation
+        return compute_motion(simulation, duration_s), simulation
 
     exact, reference = run("rk8", engine__step_us=5, engine__tolerance=1e-13)
     assert (reference._motion.memory[CONTACTS] > 0) == (name != "stable run")
     tolerances = [1e-2, 1e-3, 1e-4]
-    errors = [distance(run("split", engine__tolerance=tolerance)[0], exact) for tolerance in tolerances]
+    errors = [rms_distance(run("split", engine__tolerance=tolerance)[0], exact) for tolerance in tolerances]
     assert all(error < 10.0 * tolerance for error, tolerance in zip(errors, tolerances, strict=True)), errors
 
 
@@ -175,7 +175,7 @@ def test_whirl_is_accurate_as_long_as_its_error_growth_allows() -> None:
 
 @pytest.mark.parametrize("engine", ["rk8", "tsit5", "taylor"])
 def test_rolling_holds_the_sliding_speed_at_zero(engine: str) -> None:
-    simulation = ready("hammer", engine)
+    simulation = make_simulation("hammer", engine)
     simulation.advance(200_000)
     assert simulation._motion.memory[PHASE] == ROLLING
     rows = simulation.advance(300_000).rows
@@ -185,10 +185,13 @@ def test_rolling_holds_the_sliding_speed_at_zero(engine: str) -> None:
 
 
 def test_smoothed_friction_is_as_far_from_exact_as_its_smoothing_speed() -> None:
-    exact = motion(ready("hammer", "rk8"), 0.15)
+    exact = compute_motion(make_simulation("hammer", "rk8"), 0.15)
     speeds = [5e-3, 2.5e-3, 1e-3, 0.5e-3]
-    errors = [distance(motion(ready("hammer", "rk8", v, model__friction="smoothed"), 0.15), exact) for v in speeds]
-    assert slope(speeds, errors) == pytest.approx(1.0, abs=0.15)
+    errors = [
+        rms_distance(compute_motion(make_simulation("hammer", "rk8", v, model__friction="smoothed"), 0.15), exact)
+        for v in speeds
+    ]
+    assert fit_slope(speeds, errors) == pytest.approx(1.0, abs=0.15)
 
 
 # Error over the first 0.05 s after the hammer pulse: sixteen impacts, which amplify small errors a thousand times.
@@ -205,17 +208,17 @@ CLASS = {
 
 @pytest.mark.parametrize("engine", EXACT)
 def test_engines_agree_on_exact_friction(engine: str) -> None:
-    exact = motion(ready("hammer", "rk8", engine__tolerance=1e-10), 0.05)
-    choice, limit = of_engine(engine, CLASS, "CLASS: how it is run, and how far it may be from rk8 after 0.05 s")
-    assert distance(motion(ready("hammer", engine, **choice), 0.05), exact) < limit
+    exact = compute_motion(make_simulation("hammer", "rk8", engine__tolerance=1e-10), 0.05)
+    choice, limit = get_engine_row(engine, CLASS, "CLASS: how it is run, and how far it may be from rk8 after 0.05 s")
+    assert rms_distance(compute_motion(make_simulation("hammer", engine, **choice), 0.05), exact) < limit
 
 
 @pytest.mark.parametrize("engine", EXACT)
 def test_without_a_drive_only_contact_brakes_the_shaft(engine: str) -> None:
     free = {"drive__torque_gain": 0.0, "shaft__unbalance_eccentricity": 0.0}
-    spin = ready("stable-run", engine, **free).advance(100_000).rows[:, S.COLUMN["theta_rate"]]
+    spin = make_simulation("stable-run", engine, **free).advance(100_000).rows[:, S.COLUMN["theta_rate"]]
     np.testing.assert_allclose(spin, spin[0], rtol=1e-9)  # a sagging shaft turns as evenly, except for its tilt
-    simulation = ready("hammer", engine, **free)
+    simulation = make_simulation("hammer", engine, **free)
     spin = simulation.advance(100_000).rows[:, S.COLUMN["theta_rate"]]
     assert spin[-1] < spin[0] - 1.0
     energy = simulation.health()["energy"]
@@ -225,25 +228,27 @@ def test_without_a_drive_only_contact_brakes_the_shaft(engine: str) -> None:
 @pytest.mark.parametrize("engine", [name for name in ENGINES if name not in EXACT])
 def test_engines_without_exact_friction_refuse_it(engine: str) -> None:
     with pytest.raises(InputError, match="friction"):
-        ready("hammer", engine, model__friction="exact")
+        make_simulation("hammer", engine, model__friction="exact")
 
 
 @pytest.mark.parametrize("smoothing_speed", [1e-4, 1e-6])
 def test_linearly_implicit_engine_is_stable_at_any_smoothing_speed(smoothing_speed: float) -> None:
-    exact = motion(ready("hammer", "rk8"), 0.15)
-    implicit = ready("hammer", "rosenbrock", smoothing_speed, model__friction="smoothed", engine__tolerance=1e-6)
-    assert distance(motion(implicit, 0.15), exact) < 4e-3
+    exact = compute_motion(make_simulation("hammer", "rk8"), 0.15)
+    implicit = make_simulation(
+        "hammer", "rosenbrock", smoothing_speed, model__friction="smoothed", engine__tolerance=1e-6
+    )
+    assert rms_distance(compute_motion(implicit, 0.15), exact) < 4e-3
     assert implicit._motion.memory[CEILING] == 0.0
     assert abs(implicit.health()["energy"]["residual_share"]) < 3e-5
 
     # An explicit step of 25 us is some hundred times too long: it adds energy, and the ledger reports it.
-    explicit = ready("hammer", "rk4", smoothing_speed, model__friction="smoothed", engine__step_us=25)
-    assert distance(motion(explicit, 0.15), exact) > 1e-2
+    explicit = make_simulation("hammer", "rk4", smoothing_speed, model__friction="smoothed", engine__step_us=25)
+    assert rms_distance(compute_motion(explicit, 0.15), exact) > 1e-2
     assert abs(explicit.health()["energy"]["residual_share"]) > 1e-2
     # The same with error control: several times the work.
     if smoothing_speed == 1e-4:
-        adaptive = ready("hammer", "rk8", smoothing_speed, model__friction="smoothed")
-        motion(adaptive, 0.15)
+        adaptive = make_simulation("hammer", "rk8", smoothing_speed, model__friction="smoothed")
+        compute_motion(adaptive, 0.15)
         assert adaptive._motion.memory[EVALUATIONS] > 2.0 * implicit._motion.memory[EVALUATIONS]
 
 
@@ -253,8 +258,8 @@ def test_linearly_implicit_engine_is_stable_at_any_smoothing_speed(smoothing_spe
 )
 def test_other_friction_laws(engine: str, friction: str) -> None:
     # The two low orders at 1 us and up to the second impact only.
-    exact = motion(ready("hammer", "rk8", model__friction=friction), 0.034)
+    exact = compute_motion(make_simulation("hammer", "rk8", model__friction=friction), 0.034)
     choice = {} if ENGINES[engine].tolerance else {"engine__step_us": 1}
-    run = ready("hammer", engine, model__friction=friction, **choice)
-    assert distance(motion(run, 0.034), exact) < (1e-4 if ENGINES[engine].tolerance else 2e-2)
+    run = make_simulation("hammer", engine, model__friction=friction, **choice)
+    assert rms_distance(compute_motion(run, 0.034), exact) < (1e-4 if ENGINES[engine].tolerance else 2e-2)
     assert run._motion.memory[CONTACTS] >= 1.0

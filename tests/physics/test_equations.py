@@ -36,7 +36,7 @@ REMOTE_RING = {"clearance": 10.0, "offset_x": 0.0, "offset_y": 0.0}
 UNDAMPED = {"damping_x": 0.0, "damping_y": 0.0}
 
 
-def rig_of(
+def make_constants(
     levels: dict[str, Any] | None = None,
     *,
     shaft: dict[str, float] | None = None,
@@ -56,7 +56,7 @@ def rig_of(
     )
 
 
-def rates(
+def compute_rates(
     constants: Constants, inputs: Inputs, y: np.ndarray, *, t: float = 0.0, onset_speed: float | None = None
 ) -> np.ndarray:
     """Return the rates of the 14 states, in a contact with an onset speed or in flight, shape (14,)."""
@@ -69,24 +69,24 @@ def run(constants: Constants, inputs: Inputs, y0: np.ndarray, *, ticks: int, eve
     return move("rk8", constants, inputs, y0, ticks=ticks, every=every, tolerance=1e-12)
 
 
-def axis(q: np.ndarray) -> np.ndarray:
+def compute_axis(q: np.ndarray) -> np.ndarray:
     """Return the unit vector along the shaft, in space."""
     G, b = q[0], q[1]
     return np.array([math.sin(b), -math.sin(G) * math.cos(b), math.cos(G) * math.cos(b)])
 
 
-def slope(values: list[np.ndarray], h: float) -> np.ndarray:
+def differentiate(values: list[np.ndarray], h: float) -> np.ndarray:
     """Return the derivative of fourth order, from values at -2, -1, 1 and 2 h."""
     return (values[0] - 8 * values[1] + 8 * values[2] - values[3]) / (12 * h)
 
 
 def axis_rate(q: np.ndarray, qd: np.ndarray) -> np.ndarray:
     h = 1e-4 / (1 + np.abs(qd).max())
-    return slope([axis(q + k * h * qd) for k in (-2, -1, 1, 2)], h)
+    return differentiate([compute_axis(q + k * h * qd) for k in (-2, -1, 1, 2)], h)
 
 
 def angular_momentum(constants: Constants, q: np.ndarray, qd: np.ndarray) -> np.ndarray:
-    a, G = axis(q), q[0]
+    a, G = compute_axis(q), q[0]
     # Rotation of the frame, from its two rotations in space: G' about x, b' about the y axis rotated by G.
     turning = np.array([qd[0], qd[1] * math.cos(G), qd[1] * math.sin(G)])
     w = turning @ a + qd[2]
@@ -104,7 +104,7 @@ def random_state(rng: np.random.Generator, size: float) -> np.ndarray:
 @pytest.mark.parametrize("ideal", [False, True])
 @pytest.mark.parametrize("seed", range(6))
 def test_angular_momentum_grows_by_the_moments_in_space(seed: int, ideal: bool) -> None:
-    constants = rig_of(
+    constants = make_constants(
         shaft={"unbalance": 4e-3}, magnet={"damping_x": 11.0, "damping_y": 17.0, "a5": 2e6, "a7": 3e9},
         contact={"stiffness": 1e6, "smoothing_speed": 0.1}, house={"preload": 1e9}, gain=0.1,
     )  # fmt: skip
@@ -112,11 +112,11 @@ def test_angular_momentum_grows_by_the_moments_in_space(seed: int, ideal: bool) 
     y = random_state(np.random.default_rng(seed), 0.3)
     along = np.array([math.cos(0.7), math.sin(0.7), 0.0])
     inputs = quiet_inputs(spin=50.0, magnets=True, ideal=ideal, pulse=(40.0, 0, 1_000_000))
-    out = rates(constants, inputs._replace(hammer_x=along[0], hammer_y=along[1]), y, t=0.3, onset_speed=0.5)
+    out = compute_rates(constants, inputs._replace(hammer_x=along[0], hammer_y=along[1]), y, t=0.3, onset_speed=0.5)
     q, qd, qdd = y[:3], y[7:10], out[7:10]
-    a, ad, h = axis(q), axis_rate(q, qd), 1e-5
+    a, ad, h = compute_axis(q), axis_rate(q, qd), 1e-5
     moved = [angular_momentum(constants, q + k * h * qd, qd + k * h * qdd) for k in (-2, -1, 1, 2)]
-    rate = slope(moved, h)
+    rate = differentiate(moved, h)
 
     def moment(arm: float, force: np.ndarray) -> np.ndarray:
         return arm * np.cross(a, force)
@@ -157,7 +157,7 @@ def test_angular_momentum_grows_by_the_moments_in_space(seed: int, ideal: bool) 
 @pytest.mark.parametrize("angle", [0.4, 2.0, 3.9, 5.5])
 def test_the_shaft_turns_with_its_scene(angle: float) -> None:
     gain, aim = 0.1, 20.0
-    constants = rig_of(
+    constants = make_constants(
         {"stator": "rigid"}, shaft=FREE, magnet={"damping_x": 3.0, "damping_y": 3.0},
         contact={"stiffness": 1e6, "smoothing_speed": 0.1, "offset_x": 0.0, "offset_y": 0.0}, gain=gain,
     )  # fmt: skip
@@ -166,14 +166,14 @@ def test_the_shaft_turns_with_its_scene(angle: float) -> None:
     turn = np.array([[math.cos(angle), -math.sin(angle), 0], [math.sin(angle), math.cos(angle), 0], [0, 0, 1.0]])
 
     def motion(y: np.ndarray) -> tuple[np.ndarray, np.ndarray, float, np.ndarray, float]:
-        qdd = rates(constants, quiet_inputs(spin=aim, magnets=True), y, onset_speed=0.4)[7:10]
+        qdd = compute_rates(constants, quiet_inputs(spin=aim, magnets=True), y, onset_speed=0.4)[7:10]
         h = 1e-4
         before, after = (axis_rate(y[:3] + k * h * y[7:10], y[7:10] + k * h * qdd) for k in (-1, 1))
         w = y[9] + y[7] * math.sin(y[1])
         # The drive acts on theta', which is w less the frame's own rotation about the axis: this is subtracted.
         w_rate = qdd[2] + qdd[0] * math.sin(y[1]) + y[7] * y[8] * math.cos(y[1])
         w_rate -= gain / constants.shaft.polar_inertia * (aim - y[9])
-        return axis(y[:3]), axis_rate(y[:3], y[7:10]), w, (after - before) / (2 * h), w_rate
+        return compute_axis(y[:3]), axis_rate(y[:3], y[7:10]), w, (after - before) / (2 * h), w_rate
 
     a, ad, w, add, w_rate = motion(y)
     a2, ad2 = turn @ a, turn @ ad
@@ -192,7 +192,7 @@ def test_the_shaft_turns_with_its_scene(angle: float) -> None:
 
 def test_level_top_precesses_steadily_at_large_angles() -> None:
     # An axis that stays level precesses about the vertical at M g l / (Izz w), whatever the angle.
-    constants = rig_of(shaft={"unbalance": 0.0}, magnet=UNDAMPED, contact=REMOTE_RING)
+    constants = make_constants(shaft={"unbalance": 0.0}, magnet=UNDAMPED, contact=REMOTE_RING)
     shaft, w = constants.shaft, 2000.0
     rate = shaft.mass * shaft.gravity * shaft.arm_centre / (shaft.polar_inertia * w)
     motion = run(constants, quiet_inputs(), state(beta_rate=rate, theta_rate=w), ticks=1_000_000, every=200_000)
@@ -202,7 +202,7 @@ def test_level_top_precesses_steadily_at_large_angles() -> None:
     assert motion.column("theta_rate") == pytest.approx(w, rel=1e-10)
 
 
-def lateral(motion: Motion) -> np.ndarray:
+def get_lateral(motion: Motion) -> np.ndarray:
     """Return x + i y of the axis at unit arm, small angles, shape (n,)."""
     return motion.column("beta") - 1j * motion.column("Gamma")
 
@@ -210,7 +210,7 @@ def lateral(motion: Motion) -> np.ndarray:
 @pytest.mark.parametrize("spin", [SPIN, 400.0, -400.0, 5000.0])
 @pytest.mark.parametrize("which", [0, 1])
 def test_small_whirl_has_the_gyroscopic_frequencies(spin: float, which: int) -> None:
-    constants = rig_of({"magnet": "linear"}, shaft=FREE, magnet=UNDAMPED, contact=REMOTE_RING)
+    constants = make_constants({"magnet": "linear"}, shaft=FREE, magnet=UNDAMPED, contact=REMOTE_RING)
     shaft, size = constants.shaft, 1e-6
     spring = constants.magnet.stiffness * shaft.arm_magnet**2
     roots = np.roots([shaft.transverse_inertia, -shaft.polar_inertia * spin, -spring])
@@ -219,11 +219,13 @@ def test_small_whirl_has_the_gyroscopic_frequencies(spin: float, which: int) -> 
     every = 25 * round(8e4 / abs(whirl))
     motion = run(constants, quiet_inputs(spin=spin, magnets=True, ideal=True), y0, ticks=4 * every, every=every)
     assert len(motion.times) == 4
-    assert lateral(motion) == pytest.approx(size * np.exp(1j * whirl * motion.times), abs=1e-8 * size)
+    assert get_lateral(motion) == pytest.approx(size * np.exp(1j * whirl * motion.times), abs=1e-8 * size)
 
 
 def test_unbalance_drives_the_linear_rotors_forced_whirl() -> None:
-    constants = rig_of({"magnet": "linear"}, shaft={**FREE, "unbalance": 1.28e-7}, magnet=UNDAMPED, contact=REMOTE_RING)
+    constants = make_constants(
+        {"magnet": "linear"}, shaft={**FREE, "unbalance": 1.28e-7}, magnet=UNDAMPED, contact=REMOTE_RING
+    )
     shaft, spin = constants.shaft, 30.0
     spring = constants.magnet.stiffness * shaft.arm_magnet**2
     stiffness = spring - (shaft.transverse_inertia - shaft.polar_inertia) * spin**2
@@ -231,16 +233,16 @@ def test_unbalance_drives_the_linear_rotors_forced_whirl() -> None:
     v0 = 1j * spin * u0
     y0 = state(beta=u0.real, Gamma=-u0.imag, beta_rate=v0.real, Gamma_rate=-v0.imag, theta_rate=spin)
     motion = run(constants, quiet_inputs(spin=spin, magnets=True, ideal=True), y0, ticks=350_000, every=50_000)
-    assert lateral(motion) == pytest.approx(u0 * np.exp(1j * spin * motion.times), abs=1e-8 * abs(u0))
+    assert get_lateral(motion) == pytest.approx(u0 * np.exp(1j * spin * motion.times), abs=1e-8 * abs(u0))
 
 
 def test_drive_and_hammer_alone() -> None:
-    constants = rig_of(shaft=FREE, magnet=UNDAMPED, contact=REMOTE_RING, gain=0.02)
+    constants = make_constants(shaft=FREE, magnet=UNDAMPED, contact=REMOTE_RING, gain=0.02)
     motion = run(constants, quiet_inputs(spin=SPIN), state(), ticks=25_000, every=5000)
     grown = 1 - np.exp(-0.02 / constants.shaft.polar_inertia * motion.times)
     assert motion.column("theta_rate") == pytest.approx(SPIN * grown, rel=1e-9)
 
-    constants = rig_of(shaft=FREE, magnet=UNDAMPED, contact=REMOTE_RING)
+    constants = make_constants(shaft=FREE, magnet=UNDAMPED, contact=REMOTE_RING)
     inputs = quiet_inputs(pulse=(100.0, 2000, 7000))
     wanted = constants.shaft.arm_disk * 100.0 * 5e-3 * 2 / math.pi / constants.shaft.transverse_inertia
     for (x, y), rate in (((1.0, 0.0), "beta_rate"), ((0.0, -1.0), "Gamma_rate")):
@@ -252,7 +254,7 @@ def test_drive_and_hammer_alone() -> None:
 def test_sliding_impact_has_coulombs_impulse(sense: float) -> None:
     # No spin inertia and a held speed: no gyroscopic moment, and the surface never stops sliding. A hard contact: the
     # normal must not turn while it lasts.
-    constants = rig_of(
+    constants = make_constants(
         {"stator": "rigid", "shaft": "planar", "friction": "exact"}, shaft={**FREE, "polar_inertia": 1e-12},
         magnet=UNDAMPED, contact={"stiffness": 1e15, "offset_x": 0.0, "offset_y": 0.0},
     )  # fmt: skip
@@ -270,12 +272,12 @@ def test_sliding_impact_has_coulombs_impulse(sense: float) -> None:
 
 
 def test_house_under_a_steady_load_is_springs() -> None:
-    constants = rig_of(contact=REMOTE_RING)
+    constants = make_constants(contact=REMOTE_RING)
     house, Fx, Fy = constants.house, 300.0, -200.0
     x_oh, y_oh = Fx / house.pair_stiffness_horizontal, Fy / house.outer_beam_stiffness
     x_ih, y_ih = x_oh + Fx / house.inner_beam_stiffness, y_oh + Fy / house.pair_stiffness_vertical
     y = state(x_ih=x_ih, y_ih=y_ih, x_oh=x_oh, y_oh=y_oh)
-    found = rates(constants, quiet_inputs(), y)[10:14]
+    found = compute_rates(constants, quiet_inputs(), y)[10:14]
     assert found == pytest.approx([-Fx / house.inner_mass, -Fy / house.inner_mass, 0.0, 0.0], abs=1e-9 * Fx)
     # Up loads north, east loads east: half of the load each, about the preload.
     row = run(constants, quiet_inputs(), y, ticks=25)
@@ -285,11 +287,11 @@ def test_house_under_a_steady_load_is_springs() -> None:
 
 def test_lost_preload_halves_the_stiffness() -> None:
     P0, undamped = 100.0, {"inner_beam_damping": 0.0, "outer_beam_damping": 0.0}
-    constants = rig_of(shaft=FREE, magnet=UNDAMPED, contact=REMOTE_RING, house={"preload": P0, **undamped})
+    constants = make_constants(shaft=FREE, magnet=UNDAMPED, contact=REMOTE_RING, house={"preload": P0, **undamped})
     house = constants.house
     k, u0 = house.pair_stiffness_vertical, 2 * P0 / house.pair_stiffness_vertical
     for u, force in ((0.5 * u0, P0), (3 * u0, 2 * P0 + k / 2 * 2 * u0)):
-        assert rates(constants, quiet_inputs(), state(y_ih=u))[11] == pytest.approx(-force / house.inner_mass)
+        assert compute_rates(constants, quiet_inputs(), state(y_ih=u))[11] == pytest.approx(-force / house.inner_mass)
     # The round trip conserves the energy: an oscillation well into the half-open range.
     y0 = state(vx_ih=0.2, vy_ih=0.3)
     motion = move("taylor", constants, quiet_inputs(), y0, ticks=10_000, every=250, tolerance=1e-12)

@@ -35,7 +35,7 @@ def recorded(path: Path, scene: str, **changes: Any) -> Recording:
     return Recording.open(path)
 
 
-def off(identification: Identification, truth: dict[str, float]) -> dict[str, float]:
+def scaled_errors(identification: Identification, truth: dict[str, float]) -> dict[str, float]:
     """Return the errors in half widths of the reported intervals."""
     return {
         finding.unknown.key: (finding.value - truth[finding.unknown.key]) / finding.half_width
@@ -57,7 +57,7 @@ def test_truth_is_recovered_from_a_hammer_recording(tmp_path: Path, truth: dict[
     recording = recorded(tmp_path / "h.mcap", "hammer", duration_s=0.1, engine__name=engine, seed=11, **changes)
     experiment = Experiment.of(recording).changed({"parameters": "corrected", "set": {}, "engine.name": "split"})
     found = identify(ask(recording, experiment, KEYS))
-    errors = off(found, truth)
+    errors = scaled_errors(found, truth)
     assert set(errors) == set(KEYS)
     assert max(map(abs, errors.values())) < (2.0 if engine == "split" else 3.0)
     for finding in found.judgement.findings:
@@ -78,7 +78,7 @@ def test_a_start_ten_per_cent_off_converges(tmp_path: Path) -> None:
         "contact.stiffness": 1.1 * right["contact.stiffness"],
     }
     found = identify(ask(recording, experiment, tuple(right), start=start))
-    errors = off(found, right)
+    errors = scaled_errors(found, right)
     assert set(errors) == set(right)
     assert max(map(abs, errors.values())) < 2.0
 

@@ -33,7 +33,7 @@ STEP_US = 2
 LIMIT = 1e-3
 
 
-def limit_of(engine: str) -> float:
+def get_limit(engine: str) -> float:
     """Return the limit of the distance between an engine and the reference, as a share of the states' scale.
 
     An adaptive engine's error per step is its tolerance: 300 of these allow for some thirty steps per impact, and for
@@ -49,7 +49,7 @@ def limit_of(engine: str) -> float:
     return 5.0 * LIMIT if load_engine(engine).order < 2 else LIMIT
 
 
-def falling(engine: str, field: str, law: str, friction: str, **choice: object) -> Simulation:
+def make_falling(engine: str, field: str, law: str, friction: str, **choice: object) -> Simulation:
     """Prepare a simulation shortly before its first impact."""
     return ready(
         "drop", engine, initial__position="given", initial__x_mm=0.35, initial__y_mm=-0.8, drive__speed_hz=6.2,
@@ -59,19 +59,19 @@ def falling(engine: str, field: str, law: str, friction: str, **choice: object) 
 
 
 @cache
-def reference(field: str, law: str, friction: str) -> np.ndarray:
+def compute_reference(field: str, law: str, friction: str) -> np.ndarray:
     """Return the scaled states of the reference, shape (n, 7)."""
-    return moved(falling("rk8", field, law, friction, engine__step_us=5, engine__tolerance=1e-12))
+    return run_bouncing(make_falling("rk8", field, law, friction, engine__step_us=5, engine__tolerance=1e-12))
 
 
-def moved(simulation: Simulation) -> np.ndarray:
+def run_bouncing(simulation: Simulation) -> np.ndarray:
     """Return the scaled states of a run that bounces, shape (n, 7)."""
     states = motion(simulation, DURATION_S)
     assert simulation.health()["contacts"] >= 3
     return states
 
 
-def taken(engine: str, field: str, law: str) -> tuple[Simulation, str]:
+def choose_friction(engine: str, field: str, law: str) -> tuple[Simulation, str]:
     """Return the simulation by an engine with the first friction law that it accepts; skip the test if it accepts
     none.
     """
@@ -79,7 +79,7 @@ def taken(engine: str, field: str, law: str) -> tuple[Simulation, str]:
     refusals = []
     for friction in FRICTIONS:
         try:
-            return falling(engine, field, law, friction, **choice), friction
+            return make_falling(engine, field, law, friction, **choice), friction
         except InputError as error:
             refusals.append(str(error))
     pytest.skip("; ".join(refusals))
@@ -88,13 +88,13 @@ def taken(engine: str, field: str, law: str) -> tuple[Simulation, str]:
 @pytest.mark.parametrize(("field", "law"), LAWS)
 @pytest.mark.parametrize("engine", ENGINES)
 def test_law_is_the_same_in_every_engine(engine: str, field: str, law: str) -> None:
-    simulation, friction = taken(engine, field, law)
-    assert distance(moved(simulation), reference(field, law, friction)) < limit_of(engine)
+    simulation, friction = choose_friction(engine, field, law)
+    assert distance(run_bouncing(simulation), compute_reference(field, law, friction)) < get_limit(engine)
 
 
 @pytest.mark.parametrize(("field", "law"), LAWS)
 def test_limits_detect_a_law_that_is_ten_per_cent_stronger(field: str, law: str) -> None:
-    simulation = falling("rk8", field, law, "exact")
+    simulation = make_falling("rk8", field, law, "exact")
     constants = simulation.model.constants
     stronger = {
         name: 1.1 * getattr(constants.contact, name) for name in ("stiffness", "damping_factor", "viscous_damping")
@@ -102,4 +102,4 @@ def test_limits_detect_a_law_that_is_ten_per_cent_stronger(field: str, law: str)
     simulation.model = dataclasses.replace(
         simulation.model, constants=constants._replace(contact=constants.contact._replace(**stronger))
     )
-    assert distance(moved(simulation), reference(field, law, "exact")) > LIMIT
+    assert distance(run_bouncing(simulation), compute_reference(field, law, "exact")) > LIMIT

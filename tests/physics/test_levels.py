@@ -83,7 +83,7 @@ def test_planar_model_agrees_on_two_engines(friction: str) -> None:
     assert np.abs(euler["beta"] - rk8["beta"]).max() > 5e-7 * 5e-3
 
 
-def tops(run: Run) -> list[float]:
+def find_tops(run: Run) -> list[float]:
     """Return the heights between impacts above the ring's lowest point [m]."""
     y = run["ring_y"]
     found = []
@@ -99,7 +99,7 @@ def test_drop_on_a_rigid_ring_rebounds_by_the_closed_form() -> None:
     shaft, contact = run.constants.shaft, run.constants.contact
     clearance, e = contact.clearance, contact.restitution
     height = 2.0 * clearance
-    found = tops(run)
+    found = find_tops(run)
     assert found[:3] == pytest.approx([1.50e-3, 1.215e-3, 0.984e-3], rel=2e-3)
     assert found[:8] == pytest.approx([height * e ** (2 * n) for n in range(1, 9)], rel=1e-3)
     # A pendulum: to the square of the angle the ring's point falls straight, at this rate.
@@ -150,7 +150,7 @@ def test_oblique_impact_has_coulombs_impulse(friction: float, *, sticks: bool) -
     assert abs(run.residual_share) < 1e-4
 
 
-def whirl(run: Run) -> float:
+def measure_whirl(run: Run) -> float:
     """Return the frequency of the last 0.2 s [Hz], from the slope of the phase."""
     phase = np.unwrap(np.arctan2(run["ring_y"], run["ring_x"]))[-200:]
     return float(np.polyfit(run.times[-200:], phase, 1)[0]) / (2.0 * math.pi)
@@ -165,7 +165,7 @@ def test_rigid_impacts_whirl_by_the_kinematics() -> None:
     assert 1e-6 < depth < 2e-5
     assert radius.mean() == pytest.approx(clearance + depth, abs=1e-7)
     spin = (run["theta"][-1] - run["theta"][-200]) / (run.times[-1] - run.times[-200]) / (2.0 * math.pi)
-    frequency = whirl(run)
+    frequency = measure_whirl(run)
     assert frequency == pytest.approx(-spin * shaft.radius / radius.mean(), rel=1e-3)
     impulse = run["contact_impulse"]
     force = (impulse[-1] - impulse[-200]) / (run.times[-1] - run.times[-200])
@@ -182,7 +182,7 @@ def test_rigid_ring_hits_harder_and_whirls_faster() -> None:
     impacts = Run("hammer", 1.0, **IMPACT)
     peaks = [run.simulation.health()["peak_normal_force_n"] for run in (houses, rigid)]
     assert peaks[1] / peaks[0] == pytest.approx(1.57, abs=0.06)
-    f = [whirl(run) for run in (houses, rigid, impacts)]
+    f = [measure_whirl(run) for run in (houses, rigid, impacts)]
     assert 1.001 < f[1] / f[0] < 1.006
     assert f[2] == pytest.approx(f[1], rel=2e-4)  # the same law once it rolls
     # An impact has no force; the contact that lasts has.

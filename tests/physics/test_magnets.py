@@ -64,7 +64,9 @@ def model_of(level: str, **changes: float | str) -> Model:
     return build_model(parameters, ModelLevels.model_validate({"magnet": level}))
 
 
-def disc(geometry: MagnetGeometry, radius: float, *, points: int = 400, seed: int = 5) -> tuple[np.ndarray, np.ndarray]:
+def sample_disc(
+    geometry: MagnetGeometry, radius: float, *, points: int = 400, seed: int = 5
+) -> tuple[np.ndarray, np.ndarray]:
     """Return random places on a disc, its rim included."""
     rng = np.random.default_rng(seed)
     r = radius * np.sqrt(np.concatenate([rng.uniform(size=points), np.ones(points // 4)]))
@@ -171,7 +173,7 @@ def test_quadrature_is_refined_at_small_gaps(gap: float) -> None:
 
 @pytest.mark.parametrize("geometry", [TABLE_1, FLAT._replace(number=5), TABLE_1._replace(number=3)])
 def test_cylinders_add_up(geometry: MagnetGeometry) -> None:
-    x, y = disc(geometry, geometry.reach, points=20)
+    x, y = sample_disc(geometry, geometry.reach, points=20)
     expected = np.zeros((x.size, 2))
     for n in range(geometry.number):
         # The first magnet is directly below.
@@ -249,7 +251,7 @@ def test_cylinder_map_follows_the_cylinders(number: int, over_reach: float, over
     assert fitted.stiffness == cylinder_stiffness(geometry)
     errors = []
     for radius in (REACH, 4e-3):
-        x, y = disc(geometry, radius)
+        x, y = sample_disc(geometry, radius)
         exact = np.asarray(cylinder_force(x, y, geometry))
         missed = np.linalg.norm(map_force(x, y, fitted) - exact, axis=-1).max()
         errors.append(missed / np.linalg.norm(exact, axis=-1).max())
@@ -261,7 +263,7 @@ def test_cylinder_map_follows_the_cylinders(number: int, over_reach: float, over
 
 def test_ripple_is_worth_its_term() -> None:
     fitted = fit_cylinder_map(TABLE_1)
-    x, y = disc(TABLE_1, REACH)
+    x, y = sample_disc(TABLE_1, REACH)
     exact = cylinder_force(x, y, TABLE_1)
 
     def missed(magnet_map: MagnetMap) -> float:
@@ -290,7 +292,7 @@ def test_force_is_the_gradient_of_the_potential(magnet_map: MagnetMap) -> None:
     m = magnet_map
     terms = [1.0, m.a3, m.a5, m.a7]
     h = 1e-6
-    for x, y in zip(*disc(TABLE_1, 0.9 * REACH, points=40), strict=True):
+    for x, y in zip(*sample_disc(TABLE_1, 0.9 * REACH, points=40), strict=True):
         r, angle = math.hypot(x, y), math.atan2(x, -y)
         potential = sum(a * r ** (2 * i + 2) / (2 * i + 2) for i, a in enumerate(terms))
         potential += m.ripple * r**m.number * (1 + m.growth * r * r) * math.cos(m.number * angle)
@@ -305,7 +307,7 @@ def test_force_is_the_gradient_of_the_potential(magnet_map: MagnetMap) -> None:
 
 
 def test_force_turns_with_the_magnets(magnet_map: MagnetMap) -> None:
-    x, y = disc(TABLE_1, REACH, points=40)
+    x, y = sample_disc(TABLE_1, REACH, points=40)
     plain = map_force(x, y, magnet_map) @ [1.0, 1j]
     turn = np.exp(2j * math.pi / magnet_map.number)
     there = turn * (x + 1j * y)
@@ -399,7 +401,7 @@ def test_errors_are_found_nowhere_else_larger(number: int) -> None:
     far_field, cylinders = fit_map(geometry), fit_cylinder_map(geometry)
     sum_k, exact_k = field_sum_stiffness(geometry), cylinder_stiffness(geometry)
     for index, radius in enumerate((REACH, travel)):
-        x, y = disc(geometry, radius, points=2000)
+        x, y = sample_disc(geometry, radius, points=2000)
         r, place = np.hypot(x, y), np.stack([x, y], axis=-1)
         hard = 1 + far_field.a3 * r**2 + far_field.a5 * r**4 + far_field.a7 * r**6
         shape = {

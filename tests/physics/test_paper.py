@@ -63,7 +63,7 @@ def held(speed_hz: float, stator: str = "two-houses") -> Outcome:
     return outcome(Pulse(changes=changes, speed_hz=speed_hz, force_n=150.0))
 
 
-def rolling(speed_hz: float) -> tuple[float, float]:
+def solve_rolling(speed_hz: float) -> tuple[float, float]:
     """Return whirl frequency [rad/s] and penetration [m], found as a root."""
 
     def residual(depth: float) -> float:
@@ -104,7 +104,7 @@ def test_first_contact_of_the_drop_is_between_a_free_and_a_fixed_house(parameter
 
 @pytest.mark.parametrize("speed_hz", [3.2, 6.2, 9.0])
 def test_whirl_frequency_agrees_with_rolling(speed_hz):
-    whirl, depth = rolling(speed_hz)
+    whirl, depth = solve_rolling(speed_hz)
     assert held(speed_hz).outcome == "backward whirl"
     assert held(speed_hz).whirl_hz == pytest.approx(-whirl / (2 * math.pi), rel=1e-3)
     own, own_depth = condition.rolling_whirl(base_model(ModelLevels()).constants, 2 * math.pi * speed_hz)
@@ -113,7 +113,7 @@ def test_whirl_frequency_agrees_with_rolling(speed_hz):
 
 @pytest.mark.parametrize("speed_hz", [3.2, 6.2])
 def test_force_in_whirl_bends_the_path(speed_hz):
-    whirl, depth = rolling(speed_hz)
+    whirl, depth = solve_rolling(speed_hz)
     force = (R0 + depth) * (MASS * whirl**2 - STIFFNESS)
     # The magnets harden, and the shaft sags 3.4 mm into them: about 1 N more stiffness than at their centre.
     assert held(speed_hz, "rigid").normal_n == pytest.approx(force, rel=1.5e-2)
@@ -131,7 +131,7 @@ def test_slowest_whirl_accelerated_by_friction(mu):
 
 @pytest.mark.parametrize("spin_hz", [6.2, 9.0])
 def test_minimum_friction_for_whirl(spin_hz):
-    whirl, depth = rolling(spin_hz)
+    whirl, depth = solve_rolling(spin_hz)
     normal, drag = (R0 + depth) * (MASS * whirl**2 - STIFFNESS), DAMPING * (R0 + depth) * whirl
     (found,) = condition.sustain_thresholds((spin_hz,))
     assert found.bare == pytest.approx(drag / normal, rel=5e-3)
@@ -222,7 +222,7 @@ def test_free_decay_is_faster_than_the_nominal_damping_ratio():
 
 def test_unbalance_in_whirl_is_a_line_of_its_force():
     found = outcome(Pulse(changes={"drive.mode": "ideal", "model.stator": "rigid"}, duration_s=4.0))
-    spin, whirl = 2 * math.pi * 6.2, rolling(6.2)[0]
+    spin, whirl = 2 * math.pi * 6.2, solve_rolling(6.2)[0]
     unbalance = (
         P["shaft.mass"] * P["shaft.unbalance_eccentricity"] * spin**2 * P["shaft.arm_disk"] / P["shaft.arm_ring"]
     )

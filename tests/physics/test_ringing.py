@@ -39,13 +39,13 @@ def constants_of(changes: dict[str, Any]) -> Constants:
     return build_model(scene.load_parameters(), scene.model).constants
 
 
-def in_python(kernel: Any) -> Any:
+def get_python_function(kernel: Any) -> Any:
     """Return the uncompiled function of a kernel."""
     return getattr(kernel, "py_func", kernel)
 
 
 def matrices_of(constants: Constants) -> np.ndarray:
-    return in_python(body_matrices)(packed(constants)[0], packed(INPUTS)[0])[1]
+    return get_python_function(body_matrices)(packed(constants)[0], packed(INPUTS)[0])[1]
 
 
 @pytest.mark.parametrize(

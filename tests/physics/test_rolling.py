@@ -40,7 +40,7 @@ from rig.run.simulation import Simulation
 from tests.scenes import QUIET
 
 
-def ready(engine: str, tolerance: float, **changes: Any) -> Simulation:
+def make_simulation(engine: str, tolerance: float, **changes: Any) -> Simulation:
     """Return a hammer run by `split` with collocation, without companion, rows 1 ms apart; `__` represents a dot."""
     dotted = {key.replace("__", "."): value for key, value in changes.items()}
     choice = {"engine.name": engine, "engine.tolerance": tolerance, "engine.companion": False}
@@ -58,7 +58,7 @@ def scaled_error(rows: np.ndarray, reference: np.ndarray) -> float:
     return float(np.sqrt(np.mean(away**2)))
 
 
-def in_python(kernel: Any) -> Any:
+def get_python_function(kernel: Any) -> Any:
     """Return the uncompiled function of a kernel."""
     return getattr(kernel, "py_func", kernel)
 
@@ -77,7 +77,7 @@ def test_nodes_and_weights_integrate_powers() -> None:
 @pytest.mark.parametrize("part", [0.0, 0.3, 1.0])
 def test_interpolation_is_exact_for_polynomials(with_start: bool, part: float) -> None:
     weights, points = np.empty(STAGES + 1), np.concatenate([[0.0], NODES])
-    in_python(interpolation)(with_start, part, weights)
+    get_python_function(interpolation)(with_start, part, weights)
     for power in range(STAGES + with_start):
         assert weights @ points**power == pytest.approx(part**power, abs=1e-10)
 
@@ -86,13 +86,15 @@ def test_interpolation_is_exact_for_polynomials(with_start: bool, part: float) -
 def test_linear_bodies_respond_as_in_closed_form(parameters: str, monkeypatch: pytest.MonkeyPatch) -> None:
     from scipy.linalg import expm
 
-    monkeypatch.setattr("rig.physics.engines.split.radau.invert", in_python(invert))
+    monkeypatch.setattr("rig.physics.engines.split.radau.invert", get_python_function(invert))
     scene, power = load_scene("hammer", {"parameters": parameters}), 3
-    shafts, houses = in_python(body_matrices)(build_model(scene.load_parameters(), scene.model).constants, INPUTS)
+    shafts, houses = get_python_function(body_matrices)(
+        build_model(scene.load_parameters(), scene.model).constants, INPUTS
+    )
     for Z in (*shafts, *houses):
         n, h = len(Z), 0.5 / np.abs(np.linalg.eigvals(Z)).max()
         free, forced = np.empty((n, n, STAGES)), np.empty((n, STAGES, STAGES))
-        in_python(collocate)(Z, n // 2, -2.0, h, free, forced)
+        get_python_function(collocate)(Z, n // 2, -2.0, h, free, forced)
         # z' = Z z - 2 u on the driven component, u = (t/h)^3: u and its derivatives are states too.
         whole = np.zeros((n + power + 1, n + power + 1))
         whole[:n, :n], whole[n // 2, n] = Z, -2.0
@@ -124,7 +126,7 @@ def test_collocation_is_the_default_of_split_only() -> None:
 
 @pytest.mark.parametrize("changes", [{}, {"model__stator": "rigid"}, {"parameters": "dtu-2019"}])
 def test_linear_bodies_are_the_kernels(changes: dict[str, Any]) -> None:
-    constants = ready("split", 1e-3, model__magnet="linear", **changes).model.constants
+    constants = make_simulation("split", 1e-3, model__magnet="linear", **changes).model.constants
     # Weight turns the shaft, and with it the spin: no part of a linear body.
     constants = constants._replace(shaft=constants.shaft._replace(gravity=0.0))
     shafts, houses = body_matrices(packed(constants)[0], packed(INPUTS)[0])
@@ -148,8 +150,8 @@ def test_linear_bodies_are_the_kernels(changes: dict[str, Any]) -> None:
 
 @pytest.mark.parametrize(("tolerance", "error"), [(1e-2, 2e-3), (1e-4, 1e-4), (1e-6, 2e-6)])
 def test_settled_whirl_agrees_with_the_series(tolerance: float, error: float) -> None:
-    reference = ready("taylor", 1e-11).advance(300_000).rows
-    run = ready("split", tolerance)
+    reference = make_simulation("taylor", 1e-11).advance(300_000).rows
+    run = make_simulation("split", tolerance)
     first = run.first_row.copy()
     rows = run.advance(300_000).rows
     memory = memory_of(run)
@@ -166,8 +168,8 @@ def test_settled_whirl_agrees_with_the_series(tolerance: float, error: float) ->
 @pytest.mark.parametrize("smoothing_speed", [5.0, 0.5])
 def test_smoothed_friction_creeps_by_collocation(smoothing_speed: float) -> None:
     changes = {"model__friction": "smoothed", "contact__smoothing_speed": smoothing_speed}
-    exact = ready("taylor", 1e-11, **changes).advance(250_000).rows
-    run = ready("split", 1e-4, **changes)
+    exact = make_simulation("taylor", 1e-11, **changes).advance(250_000).rows
+    run = make_simulation("split", 1e-4, **changes)
     first = run.first_row.copy()
     rows = run.advance(250_000).rows
     assert memory_of(run)[ROLLED_S] > 0.1
@@ -183,8 +185,8 @@ def test_smoothed_friction_creeps_by_collocation(smoothing_speed: float) -> None
 @pytest.mark.parametrize("tolerance", [1e-2, 3e-4])
 def test_the_companion_also_rolls_and_estimates_the_error(tolerance: float) -> None:
     """Its steps are shorter. At equal steps it would share the error, because it uses the same constraint."""
-    exact = ready("taylor", 1e-11).advance(600_000).rows
-    run = ready("split", tolerance, engine__companion=True)
+    exact = make_simulation("taylor", 1e-11).advance(600_000).rows
+    run = make_simulation("split", tolerance, engine__companion=True)
     rows = run.advance(600_000).rows
     own, finer = (run.snapshot().changing[name].memory for name in ("_motion", "_companion"))
     assert finer[ROLLED_S] > 0.4
@@ -195,15 +197,15 @@ def test_the_companion_also_rolls_and_estimates_the_error(tolerance: float) -> N
 
 
 def test_results_do_not_depend_on_the_division_into_calls() -> None:
-    whole = ready("split", 1e-3).advance(200_000).rows.copy()
-    run = ready("split", 1e-3)
+    whole = make_simulation("split", 1e-3).advance(200_000).rows.copy()
+    run = make_simulation("split", 1e-3)
     parts = np.concatenate([run.advance(1000 * n).rows.copy() for n in (61, 1, 1, 7, 30, 100)])
     assert memory_of(run)[layout.ROLLING_STEPS] > 0
     assert np.array_equal(whole, parts)
 
 
 def test_a_command_ends_rolling_at_once() -> None:
-    reference, run = ready("taylor", 1e-11), ready("split", 1e-4)
+    reference, run = make_simulation("taylor", 1e-11), make_simulation("split", 1e-4)
     for simulation in (reference, run):
         simulation.advance(150_000)
         simulation.submit("hammer", {"force_n": 40.0, "duration_ms": 3.0, "direction": "y"})
@@ -217,7 +219,7 @@ def test_a_command_ends_rolling_at_once() -> None:
 def test_slipping_contact_returns_to_a_series() -> None:
     # A drive that brakes hard: the normal force falls with the whirl, until friction can no longer hold.
     changes = {"drive__ramp_rate": 20.0, "drive__torque_gain": 1.0}
-    reference, run = ready("taylor", 1e-11, **changes), ready("split", 1e-4, **changes)
+    reference, run = make_simulation("taylor", 1e-11, **changes), make_simulation("split", 1e-4, **changes)
     for simulation in (reference, run):
         simulation.advance(200_000)
         simulation.submit("speed", {"speed_hz": 1.0})

@@ -31,7 +31,7 @@ from replays.studies.stability.scenes.scene_atlas import (
     outcomes,
 )
 from rig.base.errors import InputError
-from tests.commands import said
+from tests.commands import run_captured
 from tests.physics import ladder_runs
 
 ENGINES = ["split", "verlet", "semi-implicit-euler"]
@@ -83,7 +83,7 @@ def test_an_unknown_scene_is_refused() -> None:
 
 @pytest.mark.parametrize("more", [["--full"], ["--random", "3"]])
 def test_an_option_of_another_study_is_refused(more: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    status, _, error = said(capsys, "stability", "--scenes", *more)
+    status, _, error = run_captured(capsys, "stability", "--scenes", *more)
     assert status == 2
     assert "--scenes must be given without --full and --random; instead received" in error
 
@@ -96,7 +96,7 @@ def test_a_stopped_atlas_shows_its_measurements(
         raise KeyboardInterrupt
 
     monkeypatch.setattr(scene_atlas, "outcomes", stopped)
-    status, shown, error = said(capsys, "stability", "--scenes", "--json", "-o", tmp_path)
+    status, shown, error = run_captured(capsys, "stability", "--scenes", "--json", "-o", tmp_path)
     assert (status, "no picture was drawn" in error) == (130, True)
     assert [one["kind"] for one in json.loads(shown)["outcomes"]] == ["right"]
     assert not list(tmp_path.iterdir())

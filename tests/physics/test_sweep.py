@@ -62,7 +62,7 @@ def test_another_law_is_detected() -> None:
     assert measure(scene, [DEFAULT], other)["tested"][0]["error"] > 1e-3
 
 
-def stub(shifts: dict[str, float], own: dict[str, dict[str, Any]] | None = None, *, grows: float = 1.0):
+def make_stub(shifts: dict[str, float], own: dict[str, dict[str, Any]] | None = None, *, grows: float = 1.0):
     """Return a stub of runs at rest, each engine off by a shift in the error's norm; `own`: other fields by engine."""
 
     def run(task: Task) -> Run:
@@ -92,7 +92,7 @@ def stub(shifts: dict[str, float], own: dict[str, dict[str, Any]] | None = None,
     ],
 )
 def test_status_of_a_scene(shifts: dict[str, float], grows: float, status: str, odd: str | None) -> None:
-    row = measure(SCENE, [DEFAULT], stub(shifts, grows=grows))
+    row = measure(SCENE, [DEFAULT], make_stub(shifts, grows=grows))
     assert (row["status"], row["odd"]) == (status, odd)
     assert row["growth"] == pytest.approx(grows, rel=1e-6)
     assert (row["tested"][0]["error"] is None) == (status != "decided")
@@ -114,7 +114,7 @@ def test_status_of_a_scene(shifts: dict[str, float], grows: float, status: str, 
     ],
 )
 def test_faults_of_a_run(shift: float, own: dict[str, Any], faults: list[str]) -> None:
-    row = {"number": 4} | measure(SCENE, [DEFAULT], stub({DEFAULT: shift}, {DEFAULT: own}))
+    row = {"number": 4} | measure(SCENE, [DEFAULT], make_stub({DEFAULT: shift}, {DEFAULT: own}))
     found = summary([row], [DEFAULT])["engines"][DEFAULT]
     kinds = ("wrong", "silent", "false_alarms", "absurd", "crashes", "hangs")
     assert [kind for kind in kinds if found[kind]] == faults
@@ -123,19 +123,19 @@ def test_faults_of_a_run(shift: float, own: dict[str, Any], faults: list[str]) -
 
 def test_an_ill_posed_scene_counts_no_fault() -> None:
     wild = {"peak_normal_force_n": 1e15}
-    run = stub({}, {"taylor": wild, "rk8": wild, DEFAULT: {"failure": "crash", "health": {}}})
+    run = make_stub({}, {"taylor": wild, "rk8": wild, DEFAULT: {"failure": "crash", "health": {}}})
     row = {"number": 4} | measure(SCENE, [DEFAULT], run)
     assert row["status"] == "unbounded"
     assert summary([row], [DEFAULT])["engines"][DEFAULT]["crashes"] == []
 
 
 def test_an_accurate_run_with_a_warning_is_excluded() -> None:
-    row = measure(SCENE, [DEFAULT], stub({"rk8": 0.5}, {"rk8": {"warnings": [DOUBT]}}))
+    row = measure(SCENE, [DEFAULT], make_stub({"rk8": 0.5}, {"rk8": {"warnings": [DOUBT]}}))
     assert (row["status"], row["distance"], len(row["accurate"])) == ("decided", 0.0, 3)
 
 
 def test_an_engine_is_not_compared_with_itself() -> None:
-    row = measure(SCENE, ["taylor"], stub({"rk8": 1e-3}))
+    row = measure(SCENE, ["taylor"], make_stub({"rk8": 1e-3}))
     assert row["tested"][0]["error"] == pytest.approx(1e-3)
 
 
@@ -162,7 +162,7 @@ def test_a_scene_is_its_numbers_alone_and_scenes_are_wide() -> None:
 def test_the_stored_scene_equals_the_scene() -> None:
     for number in range(20):
         scene = draw_scene(5, number)
-        kept = measure(scene, [], stub({}))["scene"]
+        kept = measure(scene, [], make_stub({}))["scene"]
         assert parse_scene({**kept, "engine": scene.engine.model_dump()}) == scene
 
 
@@ -182,7 +182,7 @@ def test_a_stopped_sweep_continues(tmp_path) -> None:
         calls.append(task)
         return run_stub(task)
 
-    run_stub = stub({})
+    run_stub = make_stub({})
     first = list(sweep([0, 2], seed=1, engines=[DEFAULT, "rk4"], folder=tmp_path, run=run))
     with (tmp_path / NAME).open("a") as file:
         file.write('{"seed": 1, "numb')  # a killed sweep

@@ -50,19 +50,21 @@ from rig.run.simulation import Simulation
 from tests.scenes import QUIET
 
 
-def ready(scene: str = "hammer", engine: str = "taylor", tolerance: float = 1e-9, **changes: Any) -> Simulation:
+def make_simulation(
+    scene: str = "hammer", engine: str = "taylor", tolerance: float = 1e-9, **changes: Any
+) -> Simulation:
     """Prepare a simulation with rows 1 ms apart; dots of dotted keys are written `__`."""
     dotted = {key.replace("__", "."): value for key, value in changes.items()}
     choice = {"engine.name": engine, "engine.tolerance": tolerance}
     return Simulation(load_scene(scene, {**QUIET, **choice, **dotted}))
 
 
-def series_in(memory: np.ndarray) -> np.ndarray:
+def get_series(memory: np.ndarray) -> np.ndarray:
     """Return the coefficients in an engine's memory, shape (ORDER + 1, WIDTH)."""
     return memory[SERIES:][: (ORDER + 1) * WIDTH].reshape(ORDER + 1, WIDTH)
 
 
-def states(simulation: Simulation, duration_s: float) -> np.ndarray:
+def compute_states(simulation: Simulation, duration_s: float) -> np.ndarray:
     """Return states on a grid of 1 ms, shape (n, 14)."""
     return simulation.advance(round(duration_s * 1e6)).rows[:, : S.N_STATE].copy()
 
@@ -79,7 +81,7 @@ def test_series_of_a_cosine_ends_with_its_own_remainder() -> None:
     engine = load_engine("taylor")
     engine.start(constants, inputs, y, memory, 1.0, 1e-1)
     engine.advance(constants, inputs, y, memory, 0, 1, 1, 1, rows)
-    series = series_in(memory)
+    series = get_series(memory)
     times = np.array([2.0, 2.5, 3.0, 3.5]) / angular
     errors = []
     for time in times:
@@ -95,7 +97,7 @@ def test_series_of_a_cosine_ends_with_its_own_remainder() -> None:
 @pytest.mark.parametrize("phase", [FLIGHT, FORWARD, BACKWARD, ROLLING])
 @pytest.mark.parametrize("mode", ["torque", "ideal"])
 def test_first_coefficients_are_the_equations(phase: int, mode: str) -> None:
-    simulation = ready(drive__mode=mode, model__magnet="cylinders")
+    simulation = make_simulation(drive__mode=mode, model__magnet="cylinders")
     simulation.advance(22_000)  # into the impact
     constants, inputs = simulation.model.constants, simulation._inputs()
     # A state of that phase: in the ring or pushed into it, spinning either way.
@@ -112,7 +114,7 @@ def test_first_coefficients_are_the_equations(phase: int, mode: str) -> None:
     memory[PHASE], memory[ONSET] = phase, 0.1
     before = y.copy()
     engine.advance(constants, inputs, y, memory, simulation.tick, 1, 0, 1, np.empty((0, S.N_ROW)))
-    series = series_in(memory)
+    series = get_series(memory)
 
     def rates(at: np.ndarray, fraction: float) -> np.ndarray:
         dy, out = np.empty(S.N_VECTOR), np.empty(S.N_OBSERVED)
@@ -178,14 +180,14 @@ def test_first_impacts_agree_with_heyoka() -> None:
     problem = cut_window(load_scene("hammer"), end_s=0.05, sample_s=1e-3, friction="exact")
     peer = PEERS["heyoka"].solve(problem, Setting("1e-15", 1e-15), budget_s=100.0)
     assert peer.failure is None
-    simulation = ready(tolerance=1e-12)
-    assert scaled_error(states(simulation, 0.05), peer.states[:50]) < 1e-9
+    simulation = make_simulation(tolerance=1e-12)
+    assert scaled_error(compute_states(simulation, 0.05), peer.states[:50]) < 1e-9
     assert simulation._motion.memory[CONTACTS] == len(peer.onsets) == 16
     # Sixteen impacts of a hundred steps each, by a series in time alone.
     assert simulation._motion.memory[CONTACT_STEPS] < 30 * 16
 
 
-def scaled(motion: np.ndarray) -> np.ndarray:
+def scale_states(motion: np.ndarray) -> np.ndarray:
     """Return states in units of their scales."""
     from rig.physics.engines.common.method import PER_SCALE
 
@@ -210,9 +212,12 @@ CASES: dict[str, tuple[str, dict[str, Any]]] = {
 @pytest.mark.parametrize("case", CASES)
 def test_agrees_with_rk8(case: str) -> None:
     scene, changes = CASES[case]
-    one, other = ready(scene, tolerance=1e-11, **changes), ready(scene, "rk8", 1e-11, engine__step_us=5, **changes)
+    one, other = (
+        make_simulation(scene, tolerance=1e-11, **changes),
+        make_simulation(scene, "rk8", 1e-11, engine__step_us=5, **changes),
+    )
     # Sixteen impacts amplify an error a thousand times: compare up to the fourth.
-    first, second = scaled(states(one, 0.034)), scaled(states(other, 0.034))
+    first, second = scale_states(compute_states(one, 0.034)), scale_states(compute_states(other, 0.034))
     assert one._motion.memory[CONTACTS] == other._motion.memory[CONTACTS] > 0
     assert np.sqrt(np.mean((first - second) ** 2)) < 1e-8
     # The ledger's columns against the largest of their kind.
@@ -223,11 +228,11 @@ def test_agrees_with_rk8(case: str) -> None:
 
 
 def test_the_error_falls_with_the_tolerance_and_the_ledger_closes() -> None:
-    exact = scaled(states(ready(tolerance=1e-13), 0.05))
+    exact = scale_states(compute_states(make_simulation(tolerance=1e-13), 0.05))
     errors = []
     for tolerance in (1e-5, 1e-6, 1e-7, 1e-8, 1e-9):
-        simulation = ready(tolerance=tolerance)
-        errors.append(float(np.sqrt(np.mean((scaled(states(simulation, 0.05)) - exact) ** 2))))
+        simulation = make_simulation(tolerance=tolerance)
+        errors.append(float(np.sqrt(np.mean((scale_states(compute_states(simulation, 0.05)) - exact) ** 2))))
         assert abs(simulation.health()["energy"]["residual_share"]) < 100.0 * tolerance
         assert simulation._motion.memory[CEILING] == 0.0
     assert all(fine < 0.3 * coarse for coarse, fine in pairwise(errors)), errors
@@ -235,22 +240,22 @@ def test_the_error_falls_with_the_tolerance_and_the_ledger_closes() -> None:
 
 
 def test_rows_change_no_bit_and_a_new_input_ends_a_series() -> None:
-    dense = ready(sensors__rate_hz=40_000, sensors__truth_rate_hz=40_000)
-    sparse = ready()
+    dense = make_simulation(sensors__rate_hz=40_000, sensors__truth_rate_hz=40_000)
+    sparse = make_simulation()
     rows = np.concatenate([dense.advance(25).rows.copy() for _ in range(30_000 // 25)])
     assert rows[::40].tobytes() == sparse.advance(30_000).rows.tobytes()
     # A series of a quiet flight extends beyond the command: it is not valid there.
-    early, late = ready("stable-run"), ready("stable-run", "rk8", 1e-11)
+    early, late = make_simulation("stable-run"), make_simulation("stable-run", "rk8", 1e-11)
     for simulation in (early, late):
         simulation.advance(7_000)
         simulation.submit("hammer", {"force_n": 20.0, "duration_ms": 2.0})
-    one, other = scaled(states(early, 0.02)), scaled(states(late, 0.02))
+    one, other = scale_states(compute_states(early, 0.02)), scale_states(compute_states(late, 0.02))
     assert np.abs(other[:, 8]).max() > 1e-2
     assert np.abs(one - other).max() < 1e-9
 
 
 def test_a_long_flight_takes_few_steps() -> None:
-    simulation = ready("stable-run")
+    simulation = make_simulation("stable-run")
     simulation.advance(500_000)
     assert simulation._motion.memory[STEPS] <= 150
     motion = move("taylor", simulation.model.constants, quiet_inputs(magnets=True), state(beta=1e-4), ticks=1000)
@@ -281,7 +286,7 @@ def test_motion_along_a_line_continues_after_contact(friction: float, force: flo
         simulate("hammer", {**changes, "engine.name": name}, duration_s=0.05).simulation for name in ("taylor", "rk8")
     )
     assert one._motion.memory[CONTACTS] == other._motion.memory[CONTACTS] > 1
-    assert np.abs(scaled(one._motion.y[: S.N_STATE]) - scaled(other._motion.y[: S.N_STATE])).max() < 1e-6
+    assert np.abs(scale_states(one._motion.y[: S.N_STATE]) - scale_states(other._motion.y[: S.N_STATE])).max() < 1e-6
     assert one._motion.memory[STEPS] < 400
     assert not one.health()["warnings"]
 
@@ -297,7 +302,7 @@ def test_a_stiff_linear_contact_rolls() -> None:
     rows = []
     for name in ("taylor", "rk8"):
         law = {"contact__stiffness": 5.8e11, "contact__damping_factor": "kelvin-voigt"}
-        simulation = ready("drop", name, **law)
+        simulation = make_simulation("drop", name, **law)
         simulation.advance(310_000)  # to rest, 20 pm deep
         parts = []
         for force in (2.0, 100.0):  # along the ring: friction stops the shaft under one of them
@@ -307,4 +312,4 @@ def test_a_stiff_linear_contact_rolls() -> None:
     one, other = (each[:, S.N_VECTOR + S.FRICTION_FORCE] for each in rows)
     assert np.abs(other).max() > 7.0
     np.testing.assert_allclose(one, other, atol=0.01)
-    assert np.abs(scaled(rows[0][:, : S.N_STATE] - rows[1][:, : S.N_STATE])).max() < 1e-4
+    assert np.abs(scale_states(rows[0][:, : S.N_STATE] - rows[1][:, : S.N_STATE])).max() < 1e-4

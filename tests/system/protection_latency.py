@@ -25,18 +25,18 @@ OPTIONS = (
 PARTS = {"p50": 50.0, "p99": 99.0, "p99.9": 99.9, "most": 100.0}
 
 
-def latencies_ms(trips: int, block_ms: str) -> tuple[np.ndarray, dict]:
+def measure_latencies_ms(trips: int, block_ms: str) -> tuple[np.ndarray, dict]:
     """Return the latency of each trip [ms], shape (trips,), infinite if missing; and the rig's status at the end."""
     endpoint, found = processes.free_endpoint(), []
     rng = np.random.default_rng(1)
     with (
-        processes.rig(
+        processes.start_rig(
             "run", "stable-run", "--listen", endpoint, "--block-ms", block_ms, "--duration-s", str(60 + 4 * trips),
             stdout=None, stderr=None,
         ) as child,
         rig.connect(url := f"zenoh:{endpoint}", wait_s=processes.COMPILE_S) as machine,
         # Nothing reads its output: a pipe would fill up and block it.
-        processes.python("-m", "drivers.protection", url, *OPTIONS, stdout=subprocess.DEVNULL, stderr=None),
+        processes.start_python("-m", "drivers.protection", url, *OPTIONS, stdout=subprocess.DEVNULL, stderr=None),
     ):  # fmt: skip
         machine.event(lambda event: "on" in event.get("tags", ()), timeout_s=60.0)
         time.sleep(0.5)
@@ -72,7 +72,7 @@ def _again(machine: Rig) -> bool:
 
 def main(trips: str = "1000", block_ms: str = "1") -> None:
     """Print the latency's distribution."""
-    found, status = latencies_ms(int(trips), block_ms)
+    found, status = measure_latencies_ms(int(trips), block_ms)
     told = [f"p{part:g} {np.percentile(found, part):.2f} ms" for part in (0, 10, 50, 99, 99.9, 100)]
     missed = f"{np.isinf(found).sum()} missed, blocks of {block_ms} ms"
     print(f"{trips} trips, {missed}: {', '.join(told)}; lateness of the rig [ms]: {status['lateness_ms']}")

@@ -27,7 +27,7 @@ from rig.serve.transport.exposure.access import DOORS, PLAIN, ROLES, WITH_TRUTH,
 from rig.serve.transport.exposure.certificates import SIGNER, Issue, holder_in, make, subject_of, write_holder
 from rig.serve.transport.zenoh import Exposure, ZenohClient, ZenohServer
 from tests.processes import free_endpoint
-from tests.waiting import PATIENCE_S, sooner_than, until
+from tests.waiting import PATIENCE_S, time_limit, until
 
 pytestmark = pytest.mark.wallclock
 
@@ -41,7 +41,7 @@ def example(pattern: str, chunk: str = "a") -> str:
     return pattern.replace("**", chunk).replace("*", chunk)
 
 
-def everything(session: zenoh.Session, selector: str) -> Iterator[zenoh.Reply]:
+def get_all_replies(session: zenoh.Session, selector: str) -> Iterator[zenoh.Reply]:
     """Return all replies, also if several have one key."""
     none, anything = zenoh.ConsolidationMode.NONE, zenoh.ReplyKeyExpr.ANY
     return iter(session.get(selector, timeout=2.0, consolidation=none, accept_replies=anything))
@@ -67,7 +67,7 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def settings_in(folder: Path) -> dict[str, Any]:
+def read_settings(folder: Path) -> dict[str, Any]:
     """Return settings as `Holder.settings` does, of a folder that our own checks would refuse."""
     return {
         "root_ca_certificate": str(folder / "authority.pem"),
@@ -78,7 +78,7 @@ def settings_in(folder: Path) -> dict[str, Any]:
 
 
 @contextmanager
-def hostile(locator: str, mode: str = "client", folder: Path | None = None) -> Iterator[zenoh.Session]:
+def open_hostile_session(locator: str, mode: str = "client", folder: Path | None = None) -> Iterator[zenoh.Session]:
     """Open a plain zenoh session, without the checks of our client."""
     config = zenoh.Config()
     settings: dict[str, Any] = {
@@ -90,7 +90,7 @@ def hostile(locator: str, mode: str = "client", folder: Path | None = None) -> I
         "connect/exit_on_failure": True,
     }
     if folder is not None:
-        settings["transport/link/tls"] = settings_in(folder)
+        settings["transport/link/tls"] = read_settings(folder)
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))
     with zenoh.open(config) as session:
@@ -169,7 +169,7 @@ class Try:
         self.kept.append(self.session.declare_subscriber(key, callback))
 
     def answered(self, selector: str) -> set[str]:
-        replies = everything(self.session, selector)
+        replies = get_all_replies(self.session, selector)
         return {str(reply.ok.key_expr) for reply in replies if reply.ok and reply.ok.payload.to_bytes() == b"honest"}
 
     def history(self) -> set[str]:
@@ -196,8 +196,10 @@ def test_each_role_has_exactly_the_rights_of_the_table(name: str | None, mode: s
     with (
         ZenohServer(plain, exposed=Exposure(exposed, holder_in(folders / "server", server=True))) as server,
         Honest(plain) as honest,
-        hostile(f"tcp/{plain}") as beside,
-        hostile(f"tcp/{plain}" if name is None else f"tls/{exposed}", mode, name and folders / name) as session,
+        open_hostile_session(f"tcp/{plain}") as beside,
+        open_hostile_session(
+            f"tcp/{plain}" if name is None else f"tls/{exposed}", mode, name and folders / name
+        ) as session,
     ):
         rig = Rig(server)
         honest.subscribe("rig/**", lambda key, payload: seen.append((key, payload)), lossless=False)
@@ -208,7 +210,7 @@ def test_each_role_has_exactly_the_rights_of_the_table(name: str | None, mode: s
         history = attempt.history()
         # The rig's own configuration is not accessible either: only the session's own replies.
         own = {str(session.info.zid())}
-        assert {str(reply.replier_id.zid) for reply in everything(session, "@/**") if reply.replier_id} <= own
+        assert {str(reply.replier_id.zid) for reply in get_all_replies(session, "@/**") if reply.replier_id} <= own
         time.sleep(0.3)
         rig.publish()
         allowed = receivable(doors)
@@ -221,7 +223,7 @@ def test_each_role_has_exactly_the_rights_of_the_table(name: str | None, mode: s
         asked = {honest.request(key) for key in keys_of(DOORS, Verb.ASK)}
         selectors = ("rig/command/unknown", "rig/**", "rig/**/@adv/**?_max=1", "rig/sensors/unknown/@adv/**")
         victims = (honest.session, beside)
-        replies = [reply for victim in victims for selector in selectors for reply in everything(victim, selector)]
+        replies = [reply for victim in victims for selector in selectors for reply in get_all_replies(victim, selector)]
         for token in attempt.tokens:
             token.undeclare()
         rig.announce()
@@ -257,10 +259,10 @@ def test_a_client_without_a_valid_certificate_is_refused(who: str | None, why: s
     with ZenohServer(plain, exposed=Exposure(exposed, holder)) as server:
         server.announce()
         for locator in (f"tls/{exposed}", f"tcp/{exposed}"):
-            with pytest.raises(zenoh.ZError), hostile(locator, folder=who and folders / who):
+            with pytest.raises(zenoh.ZError), open_hostile_session(locator, folder=who and folders / who):
                 pytest.fail(f"let in by {locator}, though its certificate is {why}")
         # And an admitted client stays admitted.
-        with hostile(f"tls/{exposed}", folder=folders / "viewer"):
+        with open_hostile_session(f"tls/{exposed}", folder=folders / "viewer"):
             until(lambda: server.congestion().get("links_viewer") == 1)
 
 
@@ -278,7 +280,7 @@ def test_a_link_ends_when_its_certificate_expires(folders: Path, tmp_path: Path)
     with ZenohServer(plain, exposed=Exposure(exposed, holder_in(tmp_path, server=True))) as server:
         for valid_s in (3, 30):  # on a busy machine the first connection may take longer than the shorter one
             write("viewer", Issue(signing, timedelta(seconds=valid_s)), Usage.CLIENT_AUTH)
-            with contextlib.suppress(zenoh.ZError), hostile(f"tls/{exposed}", folder=tmp_path / "viewer"):
+            with contextlib.suppress(zenoh.ZError), open_hostile_session(f"tls/{exposed}", folder=tmp_path / "viewer"):
                 if server.congestion().get("links_viewer") == 1:
                     until(lambda: "links_viewer" not in server.congestion(), every_s=0.1)
                     return
@@ -296,7 +298,7 @@ def test_clients_report_the_reason_of_a_refusal(folders: Path) -> None:
             assert str(viewer.connection).startswith("TLS as viewer, valid until ")
             assert str(viewer.connection).endswith("; the rig is the rig")
             denied = rf"^the rig at {exposed} denies rig/command/hammer to viewer$"
-            with sooner_than(PATIENCE_S), pytest.raises(NoReplyError, match=denied):
+            with time_limit(PATIENCE_S), pytest.raises(NoReplyError, match=denied):
                 viewer.request("rig/command/hammer", timeout_s=2 * PATIENCE_S)  # refused at once
             with pytest.raises(NoReplyError, match=rf"^the rig at {exposed} does not answer rig/parameters$"):
                 viewer.request("rig/parameters", timeout_s=0.2)
@@ -325,14 +327,14 @@ def test_an_exposed_rig_limits_links_and_message_size(folders: Path) -> None:
         holder = holder_in(folders / "server", server=True)
         server = stack.enter_context(ZenohServer(plain, exposed=Exposure(exposed, holder)))
         server.hear("rig/clients/*", lambda _, payload: heard.append(len(payload)))
-        session = stack.enter_context(hostile(f"tls/{exposed}", folder=folders / "recorder"))
+        session = stack.enter_context(open_hostile_session(f"tls/{exposed}", folder=folders / "recorder"))
         for size in (100, 500_000, 2 << 20, 101):
             session.put("rig/clients/a", bytes(size), congestion_control=zenoh.CongestionControl.BLOCK)
         until(lambda: bool(heard) and heard[-1] == 101)
         assert heard == [100, 500_000, 101]
         for _ in range(31):
-            stack.enter_context(hostile(f"tls/{exposed}", folder=folders / "viewer"))
-        with pytest.raises(zenoh.ZError), hostile(f"tls/{exposed}", folder=folders / "viewer"):
+            stack.enter_context(open_hostile_session(f"tls/{exposed}", folder=folders / "viewer"))
+        with pytest.raises(zenoh.ZError), open_hostile_session(f"tls/{exposed}", folder=folders / "viewer"):
             pytest.fail("there is a bound")
 
 

@@ -108,9 +108,9 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def campaign(folder: Path, *arguments: str, status: int) -> tuple[str, dict[str, Any]]:
+def run_campaign(folder: Path, *arguments: str, status: int) -> tuple[str, dict[str, Any]]:
     """Run a campaign; return its output, and its results by case."""
-    with processes.rig("campaign", *arguments, "-o", "out", cwd=folder) as child:
+    with processes.start_rig("campaign", *arguments, "-o", "out", cwd=folder) as child:
         out, err = child.communicate(timeout=processes.COMPILE_S)
     assert child.returncode == status, out + err
     document = json.loads((folder / "out/results.json").read_text(encoding="utf-8"))
@@ -118,7 +118,7 @@ def campaign(folder: Path, *arguments: str, status: int) -> tuple[str, dict[str,
 
 
 def test_a_device_in_lockstep_gets_the_same_verdict_each_time(folder: Path) -> None:
-    out, both = campaign(folder, "x.campaign.toml", "test_x.py", status=1)
+    out, both = run_campaign(folder, "x.campaign.toml", "test_x.py", status=1)
     well, dies, again, fixtures, behind = both["cases"]
     assert [case["outcome"] for case in both["cases"]] == ["passed", "failed", "passed", "failed", "inconclusive"]
     told = {each["name"]: each for each in well["measurements"]}
@@ -173,7 +173,7 @@ def test_ctrl_c_ends_all_processes_and_reports_finished_cases(tmp_path: Path) ->
     (tmp_path / "long.campaign.toml").write_text(SLOW_CAMPAIGN, encoding="utf-8")
     (tmp_path / "test_a.py").write_text("def test_a(measure):\n    measure('a', 1, 'mm', '<=', 2)\n", encoding="utf-8")
     arguments = ("campaign", "test_a.py", "long.campaign.toml", "-j", "2", "-o", "out")
-    with processes.rig(*arguments, cwd=tmp_path, start_new_session=True) as child:
+    with processes.start_rig(*arguments, cwd=tmp_path, start_new_session=True) as child:
 
         def devices() -> int:
             return sum("time.sleep" in " ".join(each.cmdline()) for each in descendants(child.pid))
@@ -220,16 +220,16 @@ def test_skip():
 
 def test_an_inconclusive_case_is_an_error_of_that_type_and_ends_with_status_3(tmp_path: Path) -> None:
     (tmp_path / "test_open.py").write_text(OPEN, encoding="utf-8")
-    out, document = campaign(
+    out, document = run_campaign(
         tmp_path, "test_open.py", "-k", "test_pass or test_skip or (test_open and not fail)", status=3
     )
     assert [case["outcome"] for case in document["cases"]] == ["passed", "inconclusive", "skipped"]
     assert "OPEN  test_open.py::test_open: gap must be <= 1 mm; inconclusive: nothing moved" in out
     (error,) = ElementTree.parse(tmp_path / "out/junit.xml").getroot().iter("error")
     assert error.get("type") == "inconclusive"
-    campaign(tmp_path, "test_open.py", "-k", "test_skip", status=3)
-    campaign(tmp_path, "test_open.py", "-k", "test_pass", status=0)
-    _, document = campaign(tmp_path, "test_open.py", status=1)
+    run_campaign(tmp_path, "test_open.py", "-k", "test_skip", status=3)
+    run_campaign(tmp_path, "test_open.py", "-k", "test_pass", status=0)
+    _, document = run_campaign(tmp_path, "test_open.py", status=1)
     assert document["cases"][2]["reason"].startswith("gap must be <= 1 mm; instead received 2 mm")
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--junitxml=plain.xml", "test_open.py"]
     found = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
@@ -268,16 +268,16 @@ must = "<= 2 s"
 
 def test_a_campaign_runs_on_a_recording_and_on_a_running_rig(folder: Path) -> None:
     session = processes.ROOT / "replays/sessions/hammer-6.2.mcap"
-    _, played = campaign(folder, "hammer", "--replay", str(session), status=0)
+    _, played = run_campaign(folder, "hammer", "--replay", str(session), status=0)
     assert [(case["outcome"], case["reason"]) for case in played["cases"]] == [
         ("skipped", "the recording has drive.speed_hz = 6.2, not 5.2"),
         ("passed", ""),
     ]
     assert played["cases"][1]["measurements"][2]["value"] == pytest.approx(-81.7, abs=0.5)
     (folder / "there.campaign.toml").write_text(EXTERNAL_CAMPAIGN, encoding="utf-8")
-    with processes.rig("run", "stable-run", "--listen", "127.0.0.1:0", "--name", "there-for-a-campaign") as rig:
-        processes.line_of(rig, "listening on")
-        _, there = campaign(folder, "there.campaign.toml", "--url", "there-for-a-campaign", status=0)
+    with processes.start_rig("run", "stable-run", "--listen", "127.0.0.1:0", "--name", "there-for-a-campaign") as rig:
+        processes.read_line(rig, "listening on")
+        _, there = run_campaign(folder, "there.campaign.toml", "--url", "there-for-a-campaign", status=0)
         rig.terminate()
         rig.communicate(timeout=60.0)
     assert [(case["outcome"], case["reason"]) for case in there["cases"]] == [

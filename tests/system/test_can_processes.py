@@ -18,11 +18,11 @@ from drivers.can.bus import codec
 from drivers.can.interface import ZenohBus
 from rig.cli.main import main
 from rig.serve.transport.zenoh import ZenohClient
-from tests.processes import free_endpoint, line_of, python
+from tests.processes import free_endpoint, read_line, start_python
 from tests.waiting import PATIENCE_S, until
 
 pytestmark = pytest.mark.wallclock
-process = partial(python, stdin=subprocess.PIPE, stderr=subprocess.STDOUT)
+process = partial(start_python, stdin=subprocess.PIPE, stderr=subprocess.STDOUT)
 """Both outputs in one stream."""
 
 
@@ -32,7 +32,7 @@ def hub_process() -> Iterator[tuple[subprocess.Popen[str], str]]:
     endpoint = free_endpoint()
     arguments = ("can", "hub", "can0", "can1", "--speed", "1M/8M", "--listen", endpoint)
     with process("-m", "rig", *arguments) as child:
-        line_of(child, "Ctrl-C ends it")  # the first start after a change compiles, with a message
+        read_line(child, "Ctrl-C ends it")  # the first start after a change compiles, with a message
         yield child, endpoint
 
 
@@ -81,7 +81,7 @@ def own_hub() -> Iterator[Bench]:
         yield Bench(stack, *stack.enter_context(hub_process()))
 
 
-def end(child: subprocess.Popen[str]) -> str:
+def end_process(child: subprocess.Popen[str]) -> str:
     """End it as Ctrl-C does, and return its output."""
     child.send_signal(signal.SIGINT)
     output, _ = child.communicate(timeout=PATIENCE_S)
@@ -89,7 +89,7 @@ def end(child: subprocess.Popen[str]) -> str:
     return output
 
 
-def messages(count: int) -> list[can.Message]:
+def make_messages(count: int) -> list[can.Message]:
     """Return classic, extended and FD frames, all different."""
     found = []
     for number in range(count):
@@ -104,7 +104,7 @@ def messages(count: int) -> list[can.Message]:
     return found
 
 
-def content(found: list[can.Message]) -> list[tuple[int, bool, bool, bytes]]:
+def sort_contents(found: list[can.Message]) -> list[tuple[int, bool, bool, bytes]]:
     """Return the fields that a log must keep, in the order of the numbers."""
     rows = [(item.arbitration_id, item.is_extended_id, item.is_fd, bytes(item.data)) for item in found]
     return sorted(rows, key=lambda row: row[3][:4])
@@ -128,24 +128,24 @@ def test_stock_logger_and_player_keep_every_frame(hub: Bench, tmp_path: Path) ->
     logger = hub.tool("logger", "-f", str(path))
     hub.nodes(1)
     sender = hub.bus()
-    for item in messages(count):
+    for item in make_messages(count):
         sender.send(item, timeout=10.0)
     until(lambda: hub.status()["counts"]["frames"] - before["frames"] == count)
 
     def has_all() -> bool:
         """Return whether the logger has written the last message; repeats of it make the logger empty its buffer."""
-        sender.send_records(codec.make_records(messages(count)[-1:] * 100), timeout=PATIENCE_S)
+        sender.send_records(codec.make_records(make_messages(count)[-1:] * 100), timeout=PATIENCE_S)
         return path.exists() and path.read_text(encoding="utf-8").count("\n") >= count
 
     until(has_all, of=logger, every_s=0.05)
     sender.shutdown()
     hub.nodes(1)
-    assert "Connected to ZenohBus: zenoh can0" in end(logger)
+    assert "Connected to ZenohBus: zenoh can0" in end_process(logger)
     everything = log(path)
     logged = everything[:count]
-    assert content(logged) == content(messages(count))
+    assert sort_contents(logged) == sort_contents(make_messages(count))
     assert [item.timestamp for item in logged] == sorted(item.timestamp for item in logged)
-    assert content(everything[count:]) == content(messages(count)[-1:] * (len(everything) - count))
+    assert sort_contents(everything[count:]) == sort_contents(make_messages(count)[-1:] * (len(everything) - count))
 
     hub.nodes(0)
     between = hub.status()["counts"]
@@ -155,7 +155,7 @@ def test_stock_logger_and_player_keep_every_frame(hub: Bench, tmp_path: Path) ->
     found = take(receiver, len(everything))
     output, _ = player.communicate(timeout=PATIENCE_S)
     assert player.returncode == 0, output
-    assert content(found) == content(everything)
+    assert sort_contents(found) == sort_contents(everything)
     assert hub.status()["counts"] == {**between, "frames": between["frames"] + len(everything)}
 
 
@@ -172,7 +172,7 @@ def test_stock_bridge_joins_two_channels(hub: Bench) -> None:
         assert bytes(take(one, 1)[0].data) == b"there"
         one.send(can.Message(arbitration_id=2, data=b"back"))
         assert bytes(take(zero, 1)[0].data) == b"back"
-        end(bridge)
+        end_process(bridge)
 
 
 def test_stock_viewer_knows_the_interface() -> None:
@@ -190,7 +190,7 @@ def test_a_signal_ends_the_hub_and_it_sums_up(own_hub: Bench) -> None:
         one.send(can.Message(arbitration_id=1))
         take(other, 1)
     until(lambda: hub.status()["nodes"] == [])
-    output = end(hub.child)
+    output = end_process(hub.child)
     assert [line.split()[0] for line in output.splitlines()] == ["can0", "can1"]
     assert "frames 1" in output
 
@@ -235,7 +235,7 @@ def test_a_stalled_or_killed_endpoint_does_not_delay_others(hub: Bench, how: sig
     count = 20_000
     sender, receiver = hub.bus(), hub.bus()
     with process("-c", IDLE_PROGRAM, hub.endpoint) as child:
-        line_of(child, "up")
+        read_line(child, "up")
         assert take(receiver, 1)[0].arbitration_id == 7
         child.send_signal(how)
         data = bytes(60)
@@ -272,7 +272,7 @@ with can.Bus("can0", interface="zenoh", endpoint=sys.argv[1]) as bus:
     bus = hub.bus()
     before = hub.status()["counts"]["frames"]
     with process("-c", echo, hub.endpoint) as child:
-        line_of(child, "up")
+        read_line(child, "up")
         for number in range(1000):
             bus.send(can.Message(arbitration_id=1, data=number.to_bytes(8, "big")))
             (answer,) = take(bus, 1)

@@ -29,7 +29,7 @@ from rig.serve.service import Service
 from rig.serve.transport.fanout import Fanout
 from rig.serve.transport.memory import MemoryClient, MemoryServer
 from rig.serve.transport.zenoh import ZenohClient
-from tests.processes import COMPILE_S, free_endpoint, rig, running_rig
+from tests.processes import COMPILE_S, free_endpoint, running_rig, start_rig
 from tests.waiting import PATIENCE_S, until
 
 pytestmark = pytest.mark.wallclock
@@ -260,7 +260,7 @@ def test_an_infeasible_schedule_is_refused_before_the_run() -> None:
 
 
 def test_an_overloaded_bus_drops_counts_and_does_not_slow_the_rig() -> None:
-    with rig("run",
+    with start_rig("run",
         "stable-run", "--duration-s", "2", "--listen", free_endpoint(),
         "--can", f"zenoh:can0?endpoint={free_endpoint()}",
         "--can-fd", "--can-bitrate", "500k/1M", "--can-overload",

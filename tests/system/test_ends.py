@@ -14,8 +14,8 @@ import pytest
 
 from rig.base import wire
 from rig.serve.transport.zenoh import ZenohClient
-from tests.processes import free_endpoint, line_of, python
-from tests.processes import rig as command
+from tests.processes import free_endpoint, read_line, start_python
+from tests.processes import start_rig as command
 from tests.waiting import PATIENCE_S, until
 
 pytestmark = pytest.mark.wallclock
@@ -38,8 +38,8 @@ time.sleep(60.0)
 def test_a_slow_subscriber_does_not_delay_the_end(mode: str) -> None:
     endpoint = free_endpoint()
     with command("run", "stable-run", "--listen", endpoint) as rig:
-        line_of(rig, "listening on")
-        with python("-c", SLOW, endpoint, mode) as slow, ZenohClient(endpoint, wait_s=5.0) as client:
+        read_line(rig, "listening on")
+        with start_python("-c", SLOW, endpoint, mode) as slow, ZenohClient(endpoint, wait_s=5.0) as client:
             assert slow.stdout is not None
             assert slow.stdout.readline() == "ready\n"
 
@@ -74,7 +74,7 @@ def test_a_signal_at_any_time_ends_a_rig_in_good_order(number: signal.Signals, i
     # Only a rig that ignores the signal ends at its duration: another could end before the signal arrives.
     arguments = ("run", "stable-run", "--listen", free_endpoint(), *(("--duration-s", "1") if deaf else ()))
     with command(*arguments, preexec_fn=ignoring) as rig:
-        line_of(rig, words)
+        read_line(rig, words)
         rig.send_signal(number)
         output, errors = rig.communicate(timeout=60.0)
     assert "Traceback" not in errors
@@ -124,12 +124,12 @@ with zenoh.open(config) as session:
 """
     endpoint = free_endpoint()
     with command("run", "stable-run", "--listen", endpoint) as rig:
-        line_of(rig, "listening on")
+        read_line(rig, "listening on")
         stamps: list[float] = []
         with ZenohClient(endpoint, wait_s=5.0) as client:
             client.subscribe(wire.STATUS, lambda *_: stamps.append(time.monotonic()))
             until(lambda: bool(stamps), of=rig)
-            with python("-c", flood, endpoint, stdin=subprocess.PIPE) as hostile:
+            with start_python("-c", flood, endpoint, stdin=subprocess.PIPE) as hostile:
                 assert hostile.stdout is not None
                 assert hostile.stdout.readline().startswith("sent in")
                 begin = time.monotonic()

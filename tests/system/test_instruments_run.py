@@ -23,14 +23,14 @@ from drivers.sources.samples import StreamEndedError
 from rig.base.errors import RefusedError
 from rig.serve.transport.zenoh import ZenohClient
 from tests.processes import free_endpoint, running_rig
-from tests.processes import rig as command
+from tests.processes import start_rig as command
 from tests.waiting import PATIENCE_S
 
 pytestmark = pytest.mark.wallclock
 
 
 @contextmanager
-def twins(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], dict[str, list[str]]]]:
+def start_twins(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], dict[str, list[str]]]]:
     """Start `rig twins`; yield it, and its URLs by instrument."""
     links = sum(name in arguments for name in ("--zenoh", "--pty"))
     with command("twins", *arguments) as child:
@@ -55,7 +55,7 @@ def test_drivers_and_daq_show_the_same_rig() -> None:
         running_rig("hammer", "--seed", "3") as (rig, endpoint),
         ZenohClient(endpoint, wait_s=PATIENCE_S) as client,
     ):
-        with twins("--zenoh", "--pty", "--listen", free_endpoint(), "--connect", endpoint) as (child, urls):
+        with start_twins("--zenoh", "--pty", "--listen", free_endpoint(), "--connect", endpoint) as (child, urls):
             assert set(urls) == {*drivers, "magnet"}
             assert all([url.partition(":")[0] for url in found] == ["zenoh", "pty"] for found in urls.values())
             with Daq.open(f"zenoh:{endpoint}") as daq:
@@ -122,7 +122,7 @@ def test_drivers_and_daq_show_the_same_rig() -> None:
     ],
 )
 def test_errors_are_one_line(arguments: tuple[str, ...], message: str) -> None:
-    with twins(*arguments) as (child, _):
+    with start_twins(*arguments) as (child, _):
         _, errors = child.communicate(timeout=60.0)
     assert child.returncode == 2
     assert errors.startswith(message)

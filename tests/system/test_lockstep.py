@@ -54,14 +54,14 @@ def bench(*arguments: str) -> Iterator[tuple[Rig, str]]:
         yield machine, endpoint
 
 
-def reactions(slow_s: float) -> tuple[list[str], list[dict[str, Any]]]:
+def run_devices(slow_s: float) -> tuple[list[str], list[dict[str, Any]]]:
     """Return the reports of two devices, over zenoh and over CAN by plain sockets, and the events of the stream."""
     hub, port = processes.free_port(), processes.free_port()
     can = ("--can", f"zenoh:can0?endpoint=127.0.0.1:{hub}", "--can-socketcand", f"127.0.0.1:{port}")
     with (
         bench(*can) as (machine, endpoint),
-        processes.python("-c", DEVICE, f"zenoh:{endpoint}", str(slow_s)) as guard,
-        processes.python("-I", SOCKET_DEVICE, str(port)) as plain,
+        processes.start_python("-c", DEVICE, f"zenoh:{endpoint}", str(slow_s)) as guard,
+        processes.start_python("-I", SOCKET_DEVICE, str(port)) as plain,
     ):
         joined = [machine.event("device", timeout_s=60.0) for _ in range(2)]
         assert {event["device"]: (event["state"], event["tick"]) for event in joined} == {
@@ -81,7 +81,7 @@ def reactions(slow_s: float) -> tuple[list[str], list[dict[str, Any]]]:
 
 
 def test_devices_over_zenoh_and_can_react_at_the_same_ticks_at_any_speed() -> None:
-    one, two = reactions(0.0), reactions(0.02)
+    one, two = run_devices(0.0), run_devices(0.02)
     assert one == two
     (guard, plain), (slower, guard_left, halt, plain_left) = one
     tick, rows = map(int, guard.split())
@@ -97,7 +97,7 @@ def test_devices_over_zenoh_and_can_react_at_the_same_ticks_at_any_speed() -> No
 
 
 def test_a_killed_device_is_reported_and_the_rig_continues() -> None:
-    with bench() as (machine, endpoint), processes.python("-c", WAITS, f"zenoh:{endpoint}", "0.5") as device:
+    with bench() as (machine, endpoint), processes.start_python("-c", WAITS, f"zenoh:{endpoint}", "0.5") as device:
         machine.event("device", timeout_s=60.0)
         machine.step(10_000)
         device.kill()
@@ -109,7 +109,7 @@ def test_a_killed_device_is_reported_and_the_rig_continues() -> None:
 
 
 def test_a_client_is_informed_that_the_rig_waits_for_a_device() -> None:
-    with bench() as (machine, endpoint), processes.python("-c", WAITS, f"zenoh:{endpoint}", "60") as device:
+    with bench() as (machine, endpoint), processes.start_python("-c", WAITS, f"zenoh:{endpoint}", "60") as device:
         machine.event("device", timeout_s=60.0)
         device.send_signal(signal.SIGSTOP)
         with pytest.raises(NoReplyError, match=r"does not answer rig/command/step; it waits for a \(\d+ s\)$"):

@@ -164,7 +164,7 @@ class Reader:
             running.log.close()
 
 
-def blocks_of(page: Path) -> list[tuple[str, str, str]]:
+def read_blocks(page: Path) -> list[tuple[str, str, str]]:
     """Return directive, language and text of a page's blocks."""
     return [(found[1] or "", found[2], found[3]) for found in _BLOCK.finditer(page.read_text(encoding="utf-8"))]
 
@@ -188,7 +188,7 @@ def reader(tmp_path: Path) -> Iterator[Reader]:
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_commands_and_code_of_a_page_run(page: Path, reader: Reader) -> None:
     shutil.copytree(ROOT / "docs", reader.folder, dirs_exist_ok=True)  # files next to the page
-    blocks = [block for block in blocks_of(page) if not block[0].endswith(" command")]
+    blocks = [block for block in read_blocks(page) if not block[0].endswith(" command")]
     assert blocks or page.stem in ("install", "development")
     for block in blocks:
         reader.do(*block)
@@ -197,14 +197,14 @@ def test_commands_and_code_of_a_page_run(page: Path, reader: Reader) -> None:
 
 def test_the_readmes_two_install_commands_differ_only_in_extras() -> None:
     commands = {
-        directive: text for directive, _, text in blocks_of(ROOT / "README.md") if directive.endswith(" command")
+        directive: text for directive, _, text in read_blocks(ROOT / "README.md") if directive.endswith(" command")
     }
     assert set(commands) == {"demo command", "test command"}
     for text in commands.values():
         assert re.fullmatch(r"python3 -m venv \.venv && \.venv/bin/pip install -q (-e )?'\.\[\w+\]' && .*\n", text)
 
 
-def spans_of(text: str) -> Iterator[list[str]]:
+def find_commands(text: str) -> Iterator[list[str]]:
     """Yield the words of each command of `rig` in a text, in its blocks or between backticks."""
     for span in re.findall(r"(?<!`)`(rig [^`]+)`", text) + re.findall(r"^(rig [^#|>\n]+)", text, re.MULTILINE):
         yield span.split()[1:]
@@ -216,7 +216,7 @@ def test_every_command_in_the_docs_exists_with_its_options(page: Path) -> None:
     from rig.cli.command import Group
 
     found = 0
-    for words in spans_of(page.read_text(encoding="utf-8")):
+    for words in find_commands(page.read_text(encoding="utf-8")):
         command: Any = rig()
         rest = list(words)
         while isinstance(command, Group) and rest and not rest[0].startswith("-"):

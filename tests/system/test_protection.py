@@ -19,13 +19,13 @@ OPTIONS = ("--alert-um", "500", "--danger-um", "1500", "--startup-s", "0.02", "-
 BLOCK_TICKS = 10_000
 
 
-def trip() -> tuple[list[str], list[dict[str, Any]], list[Samples]]:
+def run_until_trip() -> tuple[list[str], list[dict[str, Any]], list[Samples]]:
     """Return the monitor's lines, its events in the stream, and the rows before and after an impact."""
     changes = ("--pace", "lockstep", "--set", "commands=[]", "--block-ms", str(BLOCK_TICKS // 1000))
     with processes.running_rig("hammer", *changes) as (child, endpoint):
         url = f"zenoh:{endpoint}"
         with rig.connect(url, channels=["disk_x", "disk_y", "speed"], wait_s=PATIENCE_S) as machine:
-            with processes.python("-m", "drivers.protection", url, *OPTIONS) as device:
+            with processes.start_python("-m", "drivers.protection", url, *OPTIONS) as device:
                 assert machine.event("device", timeout_s=60.0)["state"] == "joined"
                 rows = [machine.advance(0.1)]
                 machine.hammer(force_n=120.0, direction=30.0)
@@ -41,8 +41,8 @@ def trip() -> tuple[list[str], list[dict[str, Any]], list[Samples]]:
 
 
 def test_an_impact_trips_the_rig_at_the_end_of_its_block_reproducibly() -> None:
-    lines, events, rows = trip()
-    again = trip()
+    lines, events, rows = run_until_trip()
+    again = run_until_trip()
     assert (again[0], again[1]) == (lines, events)
     assert all(np.array_equal(one.values, other.values) for one, other in zip(rows, again[2], strict=True))
     # The same rows at once, fed to the same rules.

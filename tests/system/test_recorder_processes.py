@@ -26,7 +26,7 @@ from rig.base.wire import (
     sensor_key,
 )
 from rig.serve.transport.zenoh import ZenohServer
-from tests.processes import free_port, line_of, python
+from tests.processes import free_port, read_line, start_python
 from tests.waiting import PATIENCE_S, until
 
 from ..unit.recorder_stream import documents, stream
@@ -120,14 +120,14 @@ def publisher(port: int) -> Iterator[Publisher]:
 
 
 @contextmanager
-def recorder(path: Path, port: int, options: str = "", *, before: str = "") -> Iterator[subprocess.Popen[str]]:
+def start_recorder(path: Path, port: int, options: str = "", *, before: str = "") -> Iterator[subprocess.Popen[str]]:
     """Start `rig record` in a separate process, which always ends."""
     code = before + (
         "import sys; from pathlib import Path; from rig.cli.groups import expand_groups; "
         "from rig.cli.commands.record import record; "
         f"expand_groups(record)(Path(sys.argv[1]), connect='127.0.0.1:{port}', {options})"
     )
-    with python("-c", code, str(path)) as process:
+    with start_python("-c", code, str(path)) as process:
         yield process
 
 
@@ -139,7 +139,7 @@ def received(rig: Publisher) -> int:
 def test_a_whole_run_arrives_without_loss(tmp_path, history):
     port = free_port()
     path = tmp_path / "run.mcap"
-    with publisher(port) as rig, recorder(path, port, f"history={history}") as process:
+    with publisher(port) as rig, start_recorder(path, port, f"history={history}") as process:
         until(lambda: received(rig) > 0, of=process)
         joined = {key: len(payloads) for key, payloads in rig.sent.items()}
         until(lambda: rig.blocks() > 150)
@@ -165,7 +165,7 @@ def test_a_killed_recorder_loses_half_a_second_at_most_and_the_rest_reads(tmp_pa
         for trial in range(4):
             path = tmp_path / f"run{trial}.mcap"
             rig.beats.clear()
-            with recorder(path, port) as process:
+            with start_recorder(path, port) as process:
                 until(lambda: received(rig) > 0, of=process)
                 first = rig.blocks()
                 time.sleep(0.3 + rng.random())
@@ -200,9 +200,9 @@ threading.Event().wait()
 def test_a_killed_rig_leaves_a_finished_file(tmp_path):
     port = free_port()
     path = tmp_path / "run.mcap"
-    with python("-c", RIG, str(port), stderr=subprocess.STDOUT) as rig:
-        line_of(rig, "ready")
-        with recorder(path, port) as process:
+    with start_python("-c", RIG, str(port), stderr=subprocess.STDOUT) as rig:
+        read_line(rig, "ready")
+        with start_recorder(path, port) as process:
             part = path.with_name(path.name + ".part")
             until(lambda: part.exists() and part.stat().st_size > 300_000, of=process)
             rig.kill()
@@ -219,7 +219,7 @@ def test_a_killed_rig_leaves_a_finished_file(tmp_path):
 def test_a_signal_ends_the_recording_well(tmp_path, number):
     port = free_port()
     path = tmp_path / "run.mcap"
-    with publisher(port) as rig, recorder(path, port) as process:
+    with publisher(port) as rig, start_recorder(path, port) as process:
         until(lambda: received(rig) > 0, of=process)
         process.send_signal(number)
         output, errors = process.communicate(timeout=PATIENCE_S)
@@ -231,7 +231,7 @@ def test_a_signal_ends_the_recording_well(tmp_path, number):
 def test_a_duration_ends_the_recording(tmp_path):
     port = free_port()
     path = tmp_path / "run.mcap"
-    with publisher(port), recorder(path, port, "duration_s=0.5") as process:
+    with publisher(port), start_recorder(path, port, "duration_s=0.5") as process:
         output, errors = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 0, errors
     assert "ended: duration reached" in output
@@ -240,7 +240,7 @@ def test_a_duration_ends_the_recording(tmp_path):
 
 
 def test_without_a_rig_the_recorder_prints_one_line_and_writes_no_file(tmp_path):
-    with recorder(tmp_path / "run.mcap", free_port()) as process:
+    with start_recorder(tmp_path / "run.mcap", free_port()) as process:
         output, errors = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 1
     assert "no rig answers" in errors.splitlines()[-1]
@@ -251,7 +251,7 @@ def test_without_a_rig_the_recorder_prints_one_line_and_writes_no_file(tmp_path)
 def test_a_rotating_recorder_loses_nothing_between_files(tmp_path):
     port = free_port()
     path = tmp_path / "run.mcap"
-    with publisher(port) as rig, recorder(path, port, "rotate_s=0.4") as process:
+    with publisher(port) as rig, start_recorder(path, port, "rotate_s=0.4") as process:
         until(lambda: received(rig) > 0, of=process)
         begun = rig.blocks()
         until(lambda: rig.blocks() > begun + 200)
@@ -271,7 +271,7 @@ def test_a_rotating_recorder_loses_nothing_between_files(tmp_path):
 
 def test_a_recorder_waits_for_a_rig_that_starts_later(tmp_path):
     port = free_port()
-    with recorder(tmp_path / "run.mcap", port, "wait_s=30.0, duration_s=0.3, keep_free_mb=0.0") as process:
+    with start_recorder(tmp_path / "run.mcap", port, "wait_s=30.0, duration_s=0.3, keep_free_mb=0.0") as process:
         time.sleep(3.0)  # longer than a recorder waits without that option
         assert process.poll() is None
         with publisher(port):
@@ -283,7 +283,7 @@ def test_a_recorder_waits_for_a_rig_that_starts_later(tmp_path):
 def test_a_trigger_writes_a_separate_file(tmp_path):
     port = free_port()
     options = "trigger=['hammer'], pre_s=0.2, post_s=0.3, trigger_count=1"
-    with publisher(port) as rig, recorder(tmp_path / "run.mcap", port, options) as process:
+    with publisher(port) as rig, start_recorder(tmp_path / "run.mcap", port, options) as process:
         until(lambda: received(rig) > 0, of=process)
         begun = rig.blocks()
         until(lambda: rig.blocks() > begun + 60)  # longer than the history before a trigger
@@ -303,7 +303,7 @@ def test_a_recorder_continues_after_a_stop_longer_than_its_link_lease(tmp_path):
     port = free_port()
     path = tmp_path / "run.mcap"
     code = "import rig.serve.transport.session; rig.serve.transport.session._LEASE_S = 1.0; "
-    with publisher(port) as rig, recorder(path, port, before=code) as process:
+    with publisher(port) as rig, start_recorder(path, port, before=code) as process:
         until(lambda: received(rig) > 0, of=process)
         links = rig.server.congestion()["links"]
         process.send_signal(signal.SIGSTOP)
@@ -328,7 +328,7 @@ def test_a_recorder_continues_after_a_stop_longer_than_its_link_lease(tmp_path):
 
 def test_a_failed_run_sets_the_exit_status(tmp_path):
     port = free_port()
-    with publisher(port) as rig, recorder(tmp_path / "run.mcap", port) as process:
+    with publisher(port) as rig, start_recorder(tmp_path / "run.mcap", port) as process:
         until(lambda: received(rig) > 0, of=process)
         rig.end("failed: SimulationError: not finite")
         output, _ = process.communicate(timeout=PATIENCE_S)
@@ -340,9 +340,9 @@ def test_a_failed_run_sets_the_exit_status(tmp_path):
 def test_a_second_recorder_to_the_same_file_is_refused(tmp_path):
     port = free_port()
     path = tmp_path / "run.mcap"
-    with publisher(port) as rig, recorder(path, port) as first:
+    with publisher(port) as rig, start_recorder(path, port) as first:
         until(lambda: received(rig) > 0, of=first)
-        with recorder(path, port, "force=True") as second, recorder(tmp_path / "other.mcap", port) as third:
+        with start_recorder(path, port, "force=True") as second, start_recorder(tmp_path / "other.mcap", port) as third:
             _, errors = second.communicate(timeout=PATIENCE_S)
             assert second.returncode == 1
             assert "no other recording is writing to" in errors
@@ -363,7 +363,7 @@ def test_after_a_full_disk_recover_completes_the_recording(tmp_path):
     path = tmp_path / "run.mcap"
     # A limit on the size of a file replaces a full disk.
     code = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (1_500_000, -1)); "
-    with publisher(port) as rig, recorder(path, port, "keep_free_mb=0.0", before=code) as process:
+    with publisher(port) as rig, start_recorder(path, port, "keep_free_mb=0.0", before=code) as process:
         output, errors = process.communicate(timeout=PATIENCE_S)
         assert process.returncode == 1
         assert "ended: disk error" in output

@@ -28,21 +28,21 @@ from rig.base.errors import RefusedError
 from rig.cli.connections.can_output import CanMessages, CanOptions, CanOutput
 from rig.serve.pacing import FreeRun, RealTime
 from rig.serve.transport.zenoh import ZenohClient, ZenohServer
-from tests.processes import free_endpoint, line_of
-from tests.processes import rig as command
+from tests.processes import free_endpoint, read_line
+from tests.processes import start_rig as command
 from tests.system.test_can_run import check_against_recording
-from tests.unit.player_recording import BLOCKS, by_key, write_recording
-from tests.unit.recorder_stream import stream
+from tests.unit.player_recording import BLOCKS, group_by_key, write_recording
+from tests.unit.recorder_stream import generate_stream
 from tests.waiting import PATIENCE_S, until
 
 pytestmark = pytest.mark.wallclock
 _channels = itertools.count()
 
 
-def payloads() -> Iterator[tuple[str, bytes]]:
+def generate_payloads() -> Iterator[tuple[str, bytes]]:
     """Yield a short run whose end event has the number of rows."""
     rows: dict[str, int] = {}
-    for key, payload in stream(BLOCKS):
+    for key, payload in generate_stream(BLOCKS):
         schema = wire.schema_of(key)
         if schema is not None:
             block = wire.decode_block(payload, schema)
@@ -54,11 +54,11 @@ def payloads() -> Iterator[tuple[str, bytes]]:
 
 @pytest.fixture(scope="module")
 def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_recording(tmp_path_factory.mktemp("replay") / "first.mcap", payloads())
+    return write_recording(tmp_path_factory.mktemp("replay") / "first.mcap", generate_payloads())
 
 
 @contextmanager
-def playing(path: Path, clock: RealTime | FreeRun, **options: Any) -> Iterator[tuple[Player, str]]:
+def start_player(path: Path, clock: RealTime | FreeRun, **options: Any) -> Iterator[tuple[Player, str]]:
     """Start a player that waits for one client, at a new endpoint."""
     endpoint = free_endpoint()
     with ZenohServer(endpoint, wait=not isinstance(clock, RealTime)) as server:
@@ -76,9 +76,9 @@ def playing(path: Path, clock: RealTime | FreeRun, **options: Any) -> Iterator[t
 @pytest.mark.parametrize("clock", [RealTime, FreeRun])
 def test_a_recording_of_a_replay_is_identical_byte_for_byte(path: Path, tmp_path: Path, clock: type[FreeRun]) -> None:
     again = tmp_path / "again.mcap"
-    with playing(path, clock()) as (_, endpoint), ZenohClient(endpoint, wait_s=10.0) as client:
+    with start_player(path, clock()) as (_, endpoint), ZenohClient(endpoint, wait_s=10.0) as client:
         RecordingSession(client, again, name="recorder").run()
-    assert by_key(_payloads(again)) == by_key(payloads())
+    assert group_by_key(_payloads(again)) == group_by_key(generate_payloads())
     first, second = Recording.open(path), Recording.open(again)
     assert (second.catalogue, second.parameters, second.scene) == (first.catalogue, first.parameters, first.scene)
     assert second.gaps == []
@@ -95,7 +95,10 @@ def _payloads(path: Path) -> Iterator[tuple[str, bytes]]:
 
 def test_a_daq_gets_every_row_of_a_burst(path: Path) -> None:
     # Capacity far below the recording: the reader must wait for it.
-    with playing(path, FreeRun()) as (_, endpoint), Daq.open(f"zenoh:{endpoint}", buffer_s=0.1, wait_s=10.0) as daq:
+    with (
+        start_player(path, FreeRun()) as (_, endpoint),
+        Daq.open(f"zenoh:{endpoint}", buffer_s=0.1, wait_s=10.0) as daq,
+    ):
         got = list(daq.blocks(1000))
         assert (got[0].index, sum(map(len, got))) == (0, 200 * BLOCKS)
         assert (daq.dropped, daq.unmatched, sum(daq.lost.values())) == (0, 0, 0)
@@ -106,7 +109,7 @@ def test_a_daq_gets_every_row_of_a_burst(path: Path) -> None:
 def test_passes_without_end_have_consecutive_rows_for_a_daq(path: Path) -> None:
     passes = 5
     options = {"part": Part(loops=None), "renumber": True}
-    with playing(path, FreeRun(), **options) as (_, endpoint), Daq.open(f"zenoh:{endpoint}", wait_s=10.0) as daq:
+    with start_player(path, FreeRun(), **options) as (_, endpoint), Daq.open(f"zenoh:{endpoint}", wait_s=10.0) as daq:
         rows = 200 * BLOCKS * passes
         got = [daq.read(1000) for _ in range(rows // 1000)]
         assert [samples.index for samples in got] == list(range(0, rows, 1000))
@@ -115,7 +118,7 @@ def test_passes_without_end_have_consecutive_rows_for_a_daq(path: Path) -> None:
 
 
 def test_two_replays_at_one_endpoint_are_refused(path: Path) -> None:
-    with playing(path, RealTime()) as (_, endpoint), command("replay", str(path), "--listen", endpoint) as child:
+    with start_player(path, RealTime()) as (_, endpoint), command("replay", str(path), "--listen", endpoint) as child:
         _, errors = child.communicate(timeout=30.0)
     assert child.returncode == 2
     assert errors.count("\n") == 1
@@ -144,17 +147,17 @@ def test_frames_on_a_bus_are_those_of_the_recording(path: Path) -> None:
 
 
 @contextmanager
-def replaying(path: Path, *arguments: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
+def start_replay(path: Path, *arguments: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
     """Start `rig replay`, and wait until it listens."""
     endpoint = free_endpoint()
     with command("replay", str(path), "--listen", endpoint, *arguments) as child:
-        line_of(child, "listening on")
+        read_line(child, "listening on")
         yield child, endpoint
 
 
 def test_the_command_is_led_from_elsewhere_and_stopped(path: Path) -> None:
     with (
-        replaying(path, "--pause") as (child, endpoint),
+        start_replay(path, "--pause") as (child, endpoint),
         ZenohClient(endpoint, wait_s=PATIENCE_S) as client,
     ):
         console = Console(client)
@@ -174,7 +177,7 @@ def test_the_command_is_led_from_elsewhere_and_stopped(path: Path) -> None:
 def test_ctrl_c_ends_the_stream_with_a_message(path: Path) -> None:
     events: list[dict] = []
     with (
-        replaying(path, "--rate", "0.01") as (child, endpoint),
+        start_replay(path, "--rate", "0.01") as (child, endpoint),
         ZenohClient(endpoint, wait_s=PATIENCE_S) as client,
     ):
         client.subscribe(wire.EVENTS, lambda _, payload: events.append(json.loads(payload)))

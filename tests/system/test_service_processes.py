@@ -17,7 +17,7 @@ from rig.base import wire
 from rig.base.errors import InputError, RefusedError
 from rig.cli import app
 from rig.serve.transport.zenoh import ZenohClient, ZenohServer
-from tests.processes import free_endpoint, line_of, python
+from tests.processes import free_endpoint, read_line, start_python
 from tests.waiting import PATIENCE_S, until
 
 pytestmark = pytest.mark.wallclock
@@ -27,8 +27,8 @@ pytestmark = pytest.mark.wallclock
 def rig(pace: str, *duration_s: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
     endpoint = free_endpoint()
     arguments = ("-m", "tests.unit.service_fake", endpoint.rpartition(":")[2], pace, *duration_s)
-    with python(*arguments, stdin=subprocess.PIPE, stderr=subprocess.STDOUT) as child:
-        line_of(child, "ready")
+    with start_python(*arguments, stdin=subprocess.PIPE, stderr=subprocess.STDOUT) as child:
+        read_line(child, "ready")
         yield child, endpoint
 
 
@@ -138,7 +138,7 @@ print(len(numbers), numbers == sorted(set(numbers)), sum(missed))
 """
 
 
-def stalled_subscriber(messages: int) -> tuple[str, dict[str, float]]:
+def run_stalled_subscriber(messages: int) -> tuple[str, dict[str, float]]:
     """Stop a subscriber, publish far more than its link buffers, and let it continue.
 
     Returns:
@@ -153,7 +153,7 @@ def stalled_subscriber(messages: int) -> tuple[str, dict[str, float]]:
 
         server.answer("rig/scene", answer)
         server.publish("rig/sensors/a", (0).to_bytes(8, "little"))
-        with python("-c", SUBSCRIBER, server.endpoint, str(messages), stderr=None) as child:
+        with start_python("-c", SUBSCRIBER, server.endpoint, str(messages), stderr=None) as child:
             assert ready.wait(PATIENCE_S)
             child.send_signal(signal.SIGSTOP)
             for number in range(1, messages):
@@ -166,7 +166,7 @@ def stalled_subscriber(messages: int) -> tuple[str, dict[str, float]]:
 
 def test_a_stopped_subscriber_is_reported_and_then_receives_everything() -> None:
     # 50 MB, ten times the sockets' buffers; within the cache.
-    report, congestion = stalled_subscriber(2500)
+    report, congestion = run_stalled_subscriber(2500)
     assert report.split() == ["2500", "True", "0"]
     if congestion["backlog_bytes"]:
         assert congestion["stalled_links"] == congestion["stalls"] == 1
@@ -175,7 +175,7 @@ def test_a_stopped_subscriber_is_reported_and_then_receives_everything() -> None
 
 
 def test_messages_dropped_from_the_cache_are_reported_as_missed() -> None:
-    report, _ = stalled_subscriber(8000)
+    report, _ = run_stalled_subscriber(8000)
     received, in_order, missed = report.split()
     assert in_order == "True"
     assert int(missed) > 0
@@ -190,7 +190,7 @@ def test_a_script_without_close_still_ends() -> None:
     )
     with ZenohServer(free_endpoint()) as server:
         server.announce()
-        with python("-c", script, server.endpoint) as child:
+        with start_python("-c", script, server.endpoint) as child:
             assert child.wait(timeout=30.0) == 0
 
 

@@ -13,8 +13,8 @@ from drivers.console import Console
 from rig.base.errors import InputError
 from rig.cli.options import SceneChanges
 from rig.serve.transport.zenoh import ZenohClient
-from tests.commands import said
-from tests.processes import COMPILE_S, free_endpoint, line_of, python
+from tests.commands import run_captured
+from tests.processes import COMPILE_S, free_endpoint, read_line, start_python
 from tests.waiting import PATIENCE_S, until
 
 PROGRAM = """
@@ -35,7 +35,7 @@ except InputError as error:
 def rig_run(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
     endpoint = free_endpoint()
     listen = [] if "--listen" in arguments else ["--listen", endpoint]
-    with python("-c", PROGRAM, *arguments, *listen) as child:
+    with start_python("-c", PROGRAM, *arguments, *listen) as child:
         yield child, endpoint
 
 
@@ -56,7 +56,7 @@ def test_a_free_run_ends_with_a_summary() -> None:
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_ctrl_c_ends_the_run_in_good_order(number: signal.Signals) -> None:
     with rig_run("stable-run") as (child, endpoint):
-        line_of(child, "listening on")  # compiled
+        read_line(child, "listening on")  # compiled
         with ZenohClient(endpoint, wait_s=PATIENCE_S) as client:
             console = Console(client, timeout_s=PATIENCE_S)
             until(lambda: console.status()["tick"] > 0, of=child)
@@ -85,7 +85,7 @@ def test_ctrl_c_ends_the_run_in_good_order(number: signal.Signals) -> None:
 def test_malformed_options_are_refused_in_one_line(
     arguments: tuple[str, ...], message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    status, output, errors = said(capsys, "run", *arguments)
+    status, output, errors = run_captured(capsys, "run", *arguments)
     assert status == 2
     assert output == ""
     assert errors.startswith(f"rig: {message}")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.commands import run, said
+from tests.commands import run, run_captured
 
 
 @pytest.fixture(scope="module")
@@ -19,7 +19,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_fresh_recording_is_bit_exact(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    code, out, _ = said(capsys, "validate", str(recording))
+    code, out, _ = run_captured(capsys, "validate", str(recording))
     assert code == 0
     assert "bit-exact" in out
     assert "pass, bit by bit" in out
@@ -29,7 +29,7 @@ def test_a_failure_ends_in_1_and_a_report_names_the_cause(
     recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     report = tmp_path / "r.html"
-    code, out, _ = said(
+    code, out, _ = run_captured(
         capsys, "validate", str(recording), "--set", "contact.restitution=0.88", "--report", str(report)
     )
     assert code == 1
@@ -49,7 +49,7 @@ def test_a_failure_ends_in_1_and_a_report_names_the_cause(
 
 
 def test_json_and_another_engine(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    code, out, _ = said(capsys, "validate", str(recording), "--engine", "rk8", "--json")
+    code, out, _ = run_captured(capsys, "validate", str(recording), "--engine", "rk8", "--json")
     document = json.loads(out)
     assert document["good"] is (code == 0)
     assert not document["bit_exact"]
@@ -67,7 +67,7 @@ def test_json_and_another_engine(recording: Path, capsys: pytest.CaptureFixture[
 def test_wrong_input_ends_in_2(
     recording: Path, arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    code, out, error = said(capsys, "validate", str(recording), *arguments)
+    code, out, error = run_captured(capsys, "validate", str(recording), *arguments)
     assert code == 2
     assert error.startswith(f"rig: {message}")
     assert error.count("\n") == 1
@@ -76,24 +76,24 @@ def test_wrong_input_ends_in_2(
 
 def test_several_files_are_read_as_one(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     first, second = tmp_path / "a.mcap", tmp_path / "b.mcap"
-    assert said(capsys, "cut", str(recording), "-o", str(first), "--to", "0.04")[0] == 0
-    assert said(capsys, "cut", str(recording), "-o", str(second), "--from", "0.04")[0] == 0
-    code, out, _ = said(capsys, "validate", str(second), str(first))
+    assert run_captured(capsys, "cut", str(recording), "-o", str(first), "--to", "0.04")[0] == 0
+    assert run_captured(capsys, "cut", str(recording), "-o", str(second), "--from", "0.04")[0] == 0
+    code, out, _ = run_captured(capsys, "validate", str(second), str(first))
     assert code == 0
     assert out.startswith("a.mcap and 1 more")
     assert "pass, bit by bit" in out
 
 
 def test_a_new_folder_is_made_for_sessions(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert said(capsys, "sessions", "drop", "-o", str(tmp_path / "new"))[0] == 0
+    assert run_captured(capsys, "sessions", "drop", "-o", str(tmp_path / "new"))[0] == 0
     assert (tmp_path / "new" / "drop.mcap").is_file()
-    assert said(capsys, "sessions", "drop", "-o", str(tmp_path / "no" / "new"))[0] == 2
+    assert run_captured(capsys, "sessions", "drop", "-o", str(tmp_path / "no" / "new"))[0] == 2
 
 
 def test_sessions_are_written_only_to_allowed_folders(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert said(capsys, "sessions", "drop", "-o", str(tmp_path))[0] == 0
+    assert run_captured(capsys, "sessions", "drop", "-o", str(tmp_path))[0] == 0
     assert {path.name for path in tmp_path.iterdir()} == {"drop.mcap", "drop.toml"}
-    code, _, error = said(capsys, "sessions", "drop", "-o", str(tmp_path))
+    code, _, error = run_captured(capsys, "sessions", "drop", "-o", str(tmp_path))
     assert code == 2
     assert "--force" in error
-    assert said(capsys, "sessions", "hammer", "-o", str(tmp_path))[0] == 2
+    assert run_captured(capsys, "sessions", "hammer", "-o", str(tmp_path))[0] == 2

@@ -19,32 +19,32 @@ import pytest
 
 from recorder.viewer import window
 from recorder.viewer.window import Window, WindowError, environment, free_port
-from tests.processes import ROOT, free_endpoint, line_of, python
-from tests.unit.viewer_recording import Saved, Synthetic, documents_of, stream_of
+from tests.processes import ROOT, free_endpoint, read_line, start_python
+from tests.unit.viewer_recording import Saved, Synthetic, generate_messages, make_replies
 
 pytestmark = pytest.mark.wallclock
 
 VIEW = ["-c", "from rig.cli.main import main; main()", "view"]
 
 
-def quiet() -> dict[str, str]:
+def make_environment() -> dict[str, str]:
     """Return the environment of a machine without a screen."""
     kept = {key: value for key, value in os.environ.items() if key not in ("DISPLAY", "WAYLAND_DISPLAY", "CI")}
     return {**kept, "PYTHONPATH": str(ROOT)}
 
 
 @contextlib.contextmanager
-def started(command: list[str]) -> Iterator[subprocess.Popen[str]]:
+def start_process(command: list[str]) -> Iterator[subprocess.Popen[str]]:
     """Start a process, and end it afterwards."""
-    with python(*command, env=quiet(), stderr=subprocess.STDOUT, bufsize=1) as process:
+    with start_python(*command, env=make_environment(), stderr=subprocess.STDOUT, bufsize=1) as process:
         yield process
 
 
 @contextlib.contextmanager
 def rig(*, duration_s: float) -> Iterator[tuple[subprocess.Popen[str], int]]:
     port = int(free_endpoint().rpartition(":")[2])
-    with started(["-m", "tests.system.viewer_rig", str(port), str(duration_s)]) as process:
-        line_of(process, "ready")
+    with start_process(["-m", "tests.system.viewer_rig", str(port), str(duration_s)]) as process:
+        read_line(process, "ready")
         yield process, port
 
 
@@ -57,10 +57,10 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     recording = Synthetic(duration_s=1.2)
     path = tmp_path_factory.mktemp("recorded") / "whirl.mcap"
     with MemoryServer() as server:
-        for key, reply in documents_of(recording).items():
+        for key, reply in make_replies(recording).items():
             server.answer(key, lambda _, reply=reply: reply)
         server.announce()
-        for block in stream_of(recording):
+        for block in generate_messages(recording):
             for key, payload in block:
                 server.publish(key, payload)
         summary = RecordingSession(MemoryClient(server), path, history=True).run()
@@ -73,7 +73,7 @@ def test_a_recording_becomes_an_rrd(recorded: Path, tmp_path: Path) -> None:
     done = subprocess.run(
         [sys.executable, *VIEW, str(recorded), "--save", str(target)],
         cwd=ROOT,
-        env=quiet(),
+        env=make_environment(),
         text=True,
         capture_output=True,
         timeout=120,
@@ -119,7 +119,7 @@ def test_live_view_until_the_rig_ends(tmp_path: Path) -> None:
     target = tmp_path / "live.rrd"
     with (
         rig(duration_s=2.0) as (server, port),
-        started([*VIEW, "--live", "--connect", f"127.0.0.1:{port}", "--save", str(target)]) as viewer,
+        start_process([*VIEW, "--live", "--connect", f"127.0.0.1:{port}", "--save", str(target)]) as viewer,
     ):
         out, _ = viewer.communicate(timeout=60)
         assert (viewer.returncode, out) == (0, "the rig ended: completed\n")
@@ -138,9 +138,9 @@ def test_live_view_notices_that_the_rig_was_killed(tmp_path: Path) -> None:
     target = tmp_path / "killed.rrd"
     with (
         rig(duration_s=30.0) as (server, port),
-        started([*VIEW, "--live", "--connect", f"127.0.0.1:{port}", "--save", str(target)]) as viewer,
+        start_process([*VIEW, "--live", "--connect", f"127.0.0.1:{port}", "--save", str(target)]) as viewer,
     ):
-        line_of(server, "rig/clients/viewer")
+        read_line(server, "rig/clients/viewer")
         server.send_signal(signal.SIGKILL)
         out, _ = viewer.communicate(timeout=60)
     assert viewer.returncode == 1
@@ -151,8 +151,8 @@ def test_live_view_notices_that_the_rig_was_killed(tmp_path: Path) -> None:
 def test_the_web_viewer_uses_loopback_only_and_ends_with_the_command(recorded: Path) -> None:
     import psutil
 
-    with started([*VIEW, str(recorded)]) as viewer:
-        address = re.search(r"http://127\.0\.0\.1:\d+/\S*", line_of(viewer, "http://"))
+    with start_process([*VIEW, str(recorded)]) as viewer:
+        address = re.search(r"http://127\.0\.0\.1:\d+/\S*", read_line(viewer, "http://"))
         assert address is not None
         assert len(address[0]) <= 30
         with urllib.request.urlopen(address[0], timeout=10) as page:
@@ -263,7 +263,7 @@ def test_a_picture_where_this_machine_can_draw(recorded: Path, tmp_path: Path) -
     done = subprocess.run(
         [sys.executable, *VIEW, str(recorded), "--screenshot", str(picture)],
         cwd=ROOT,
-        env=quiet(),
+        env=make_environment(),
         text=True,
         capture_output=True,
         timeout=180,

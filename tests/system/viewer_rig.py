@@ -8,15 +8,15 @@ import time
 
 from rig.base import wire
 from rig.serve.transport.zenoh import ZenohServer
-from tests.unit.viewer_recording import Synthetic, documents_of, stream_of
+from tests.unit.viewer_recording import Synthetic, generate_messages, make_replies
 
 
 def main(port: int, duration_s: float) -> None:
     """Serve a synthetic recording from the first report of a client on, then stay for a second."""
     recording = Synthetic(duration_s=duration_s)
-    blocks = list(stream_of(recording))
+    blocks = list(generate_messages(recording))
     with ZenohServer(f"127.0.0.1:{port}") as server:
-        for key, reply in documents_of(recording).items():
+        for key, reply in make_replies(recording).items():
             server.answer(key, lambda _, reply=reply: reply)
         met = threading.Event()
 

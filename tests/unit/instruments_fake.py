@@ -14,7 +14,7 @@ RATE_HZ = 20_000
 BLOCK = 200
 
 
-def counts_of(group: str, index: int, rows: int) -> np.ndarray:
+def make_counts(group: str, index: int, rows: int) -> np.ndarray:
     """Return 24-bit counts that identify their group, row and column, zeros and negative ones included."""
     columns = len(default_table().groups[group].channels)
     number = np.arange(index, index + rows, dtype=np.int64)[:, None]
@@ -22,10 +22,10 @@ def counts_of(group: str, index: int, rows: int) -> np.ndarray:
     return np.where(number % 50 == 0, 0, mixed - (1 << 23)).astype(np.int32)
 
 
-def values_of(group: str, index: int, rows: int, step: int = 1) -> np.ndarray:
+def expected_values(group: str, index: int, rows: int, step: int = 1) -> np.ndarray:
     """Return the values that an instrument must show for these rows, from the definition of a channel's scale."""
     channels = default_table().groups[group].channels
-    counts = counts_of(group, index, rows)[::step]
+    counts = make_counts(group, index, rows)[::step]
     columns = [
         (counts[:, n] * (2.0 * channel.adc_v / 2.0**channel.adc_bits) - channel.bias_v) / channel.sensitivity_v
         for n, channel in enumerate(channels)
@@ -67,7 +67,7 @@ class FakeRig:
         for _ in range(blocks):
             for group in groups:
                 index = self.index.get(group, 0) + skip * BLOCK
-                block = wire.Block(index * 50, index, float(RATE_HZ), 1e6, counts_of(group, index, BLOCK))
+                block = wire.Block(index * 50, index, float(RATE_HZ), 1e6, make_counts(group, index, BLOCK))
                 self.server.publish(wire.sensor_key(group), wire.encode_block(block))
                 self.index[group] = index + BLOCK
             skip = 0

@@ -42,7 +42,7 @@ class MemoryLink:
         self._outbox.close()
 
 
-def pair(*, room: int = QUEUE_MESSAGES) -> tuple[MemoryLink, MemoryLink]:
+def make_pair(*, room: int = QUEUE_MESSAGES) -> tuple[MemoryLink, MemoryLink]:
     """Return two ends of one link.
 
     Args:

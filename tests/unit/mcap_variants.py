@@ -73,7 +73,7 @@ def _rewrite(source: Path, target: Path, options: dict[str, Any]) -> None:
         writer.finish()
 
 
-def records(data: bytes) -> list[tuple[int, bytes]]:
+def read_records(data: bytes) -> list[tuple[int, bytes]]:
     """Return opcode and body of each record outside chunks."""
     found, position = [], len(MAGIC)
     while position < len(data) - len(MAGIC):
@@ -88,12 +88,12 @@ def joined(rows: list[tuple[int, bytes]]) -> bytes:
 
 
 def _split(data: bytes) -> tuple[list[tuple[int, bytes]], list[tuple[int, bytes]]]:
-    rows = records(data)
+    rows = read_records(data)
     end = next(number for number, (opcode, _) in enumerate(rows) if opcode == Opcode.DATA_END)
     return rows[:end], rows[end + 1 : -1]
 
 
-def finished(data: bytes, summary: bytes = b"", *, checked: bool = True) -> bytes:
+def finish_file(data: bytes, summary: bytes = b"", *, checked: bool = True) -> bytes:
     """Return a file of a data section and a summary."""
     body = MAGIC + data
     body += struct.pack("<BQI", Opcode.DATA_END, 4, zlib.crc32(body) if checked else 0)
@@ -103,22 +103,22 @@ def finished(data: bytes, summary: bytes = b"", *, checked: bool = True) -> byte
 
 def _padded_data(data: bytes) -> bytes:
     plain = (Opcode.MESSAGE, Opcode.CHUNK)
-    return finished(joined([(one, body + PADDING * (one not in plain)) for one, body in _split(data)[0]]))
+    return finish_file(joined([(one, body + PADDING * (one not in plain)) for one, body in _split(data)[0]]))
 
 
 def _padded_summary(data: bytes) -> bytes:
     rows, summary = _split(data)
-    return finished(joined(rows), joined([(one, body + PADDING) for one, body in summary]))
+    return finish_file(joined(rows), joined([(one, body + PADDING) for one, body in summary]))
 
 
 def _private(data: bytes) -> bytes:
     mixed = [row for each in _split(data)[0] for row in (each, (0x80, b"private"), (0x42, b"of a later version"))]
-    return finished(joined(mixed), checked=False)
+    return finish_file(joined(mixed), checked=False)
 
 
 def _private_summary(data: bytes) -> bytes:
     rows, summary = _split(data)
-    return finished(joined(rows), joined([(0x91, b""), *summary, (0x7F, b"later")]))
+    return finish_file(joined(rows), joined([(0x91, b""), *summary, (0x7F, b"later")]))
 
 
 def _one_message_outside(data: bytes) -> bytes:
@@ -131,7 +131,7 @@ def _one_message_outside(data: bytes) -> bytes:
     size, name = struct.unpack_from("<Q", body, 16)[0], struct.unpack_from("<I", body, 28)[0]
     packed = body[32 + name + 8 :]
     loose = zstandard.ZstdDecompressor().decompress(packed, max_output_size=size) if name else packed
-    return finished(
+    return finish_file(
         joined(rows[:last]) + loose + joined([row for row in rows[last + 1 :] if row[0] != Opcode.MESSAGE_INDEX])
     )
 
@@ -145,7 +145,7 @@ def _without_sums(data: bytes) -> bytes:
         elif opcode == Opcode.CHUNK:
             body = body[:24] + bytes(4) + body[28:]
         rows.append((opcode, body))
-    return finished(joined(rows), joined(_split(data)[1]), checked=False)
+    return finish_file(joined(rows), joined(_split(data)[1]), checked=False)
 
 
 BY_HAND: dict[str, Callable[[bytes], bytes]] = {
@@ -153,8 +153,8 @@ BY_HAND: dict[str, Callable[[bytes], bytes]] = {
     "padded summary": _padded_summary,
     "private records": _private,
     "private records in the summary": _private_summary,
-    "without a summary": lambda data: finished(joined(_split(data)[0])),
-    "without a summary and checksums": lambda data: finished(joined(_split(data)[0]), checked=False),
+    "without a summary": lambda data: finish_file(joined(_split(data)[0])),
+    "without a summary and checksums": lambda data: finish_file(joined(_split(data)[0]), checked=False),
     "a chunk and messages outside": _one_message_outside,
     "without any checksum": _without_sums,
 }

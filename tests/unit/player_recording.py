@@ -8,7 +8,7 @@ from pathlib import Path
 
 from recorder.writer import RecordingWriter
 from rig.base.wire import CATALOGUE, PARAMETERS, SCENE
-from tests.unit.recorder_stream import documents, stream
+from tests.unit.recorder_stream import generate_stream, make_documents
 
 BLOCKS = 60
 BLOCK_NS = 10_000_000
@@ -21,7 +21,7 @@ def write_recording(
 ) -> Path:
     """Write payloads as the recorder does."""
     ticks = count()
-    written = documents()
+    written = make_documents()
     writer = RecordingWriter(
         path,
         catalogue=written[CATALOGUE],
@@ -31,13 +31,13 @@ def write_recording(
         sync_every_s=float(chunk_messages),
         monotonic_s=lambda: float(next(ticks)),
     )
-    for number, (key, payload) in enumerate(stream(BLOCKS) if payloads is None else payloads):
+    for number, (key, payload) in enumerate(generate_stream(BLOCKS) if payloads is None else payloads):
         writer.write(key, payload, 1_700_000_000_000_000_000 + 1_000_000 * number)
     writer.finish("completed")
     return path
 
 
-def by_key(payloads: Iterable[tuple[str, bytes]]) -> Payloads:
+def group_by_key(payloads: Iterable[tuple[str, bytes]]) -> Payloads:
     """Return the payloads of each key, in order."""
     found: Payloads = {}
     for key, payload in payloads:
@@ -45,8 +45,8 @@ def by_key(payloads: Iterable[tuple[str, bytes]]) -> Payloads:
     return found
 
 
-def key_by_key() -> Iterator[tuple[str, bytes]]:
+def order_by_key() -> Iterator[tuple[str, bytes]]:
     """Yield the same payloads in the order in which a recorder receives them from history."""
-    for key, payloads in by_key(stream(BLOCKS)).items():
+    for key, payloads in group_by_key(generate_stream(BLOCKS)).items():
         for payload in payloads:
             yield key, payload

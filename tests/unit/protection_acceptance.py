@@ -28,7 +28,7 @@ BEGIN_S, END_S = 0.25, 0.75
 """Start and end of a fault [s]: after the start-up, and longer than all delays."""
 
 
-def monitor(**changes: Any) -> Settings:
+def make_settings(**changes: Any) -> Settings:
     """Return the monitor's settings: alarms after 0.1 s, over 0.25 s."""
     base = {
         "alert_um": ALERT_UM,
@@ -41,16 +41,16 @@ def monitor(**changes: Any) -> Settings:
     return Settings(**{**base, **changes})
 
 
-def stream(group: str, changes: dict[str, Any], scene: str = "test-sine") -> Iterator[Samples]:
+def simulate_stream(group: str, changes: dict[str, Any], scene: str = "test-sine") -> Iterator[Samples]:
     """Yield blocks of a channel group as the rig sends them."""
     simulation = Simulation(load_scene(scene, {"sensors.groups": [group], "drive.speed_hz": 6.2, **changes}))
     while simulation.tick < simulation.end_tick:
         for message in simulation.advance(min(100_000, simulation.end_tick - simulation.tick)).messages:
             if message.key.endswith(f"/{group}") and len(message.block.values):
-                yield samples_of(simulation, group, message.block)
+                yield convert_block(simulation, group, message.block)
 
 
-def samples_of(simulation: Simulation, group: str, block: Block) -> Samples:
+def convert_block(simulation: Simulation, group: str, block: Block) -> Samples:
     """Convert a block to engineering units."""
     table = simulation.table.groups[group]
     units = tuple(channel.unit for channel in table.channels)
@@ -58,13 +58,13 @@ def samples_of(simulation: Simulation, group: str, block: Block) -> Samples:
     return Samples(block.index, block.tick, block.rate_hz, block.tick_rate_hz, table.names, units, values)
 
 
-def outcome(settings: Settings, rows: list[Samples]) -> list[Action]:
+def run_monitor(settings: Settings, rows: list[Samples]) -> list[Action]:
     """Feed rows to a monitor and return its actions."""
     device = Protection(settings)
     return [action for samples in rows for action in device.feed(samples)]
 
 
-def signal(peak_to_peak_um: float, frequency_hz: float, duration_s: float) -> dict[str, Any]:
+def sine_changes(peak_to_peak_um: float, frequency_hz: float, duration_s: float) -> dict[str, Any]:
     """Return changes that make `test-sine` a sine on both probes, y a quarter period late."""
     return {
         "generator.amplitude_v": 3.94 * 0.5e-3 * peak_to_peak_um, "generator.frequency_hz": frequency_hz,
@@ -72,9 +72,11 @@ def signal(peak_to_peak_um: float, frequency_hz: float, duration_s: float) -> di
     }  # fmt: skip
 
 
-def sine(peak_to_peak_um: float, frequency_hz: float = 10.0, duration_s: float = 1.5, **changes: Any) -> list[Samples]:
+def simulate_sine(
+    peak_to_peak_um: float, frequency_hz: float = 10.0, duration_s: float = 1.5, **changes: Any
+) -> list[Samples]:
     """Return rows of that sine."""
-    return list(stream("probes", {**signal(peak_to_peak_um, frequency_hz, duration_s), **changes}))
+    return list(simulate_stream("probes", {**sine_changes(peak_to_peak_um, frequency_hz, duration_s), **changes}))
 
 
 ALARMS = {
@@ -109,7 +111,7 @@ LIMITS = [
 ]
 
 
-def fault(kind: str, **numbers: Any) -> dict[str, Any]:
+def make_fault(kind: str, **numbers: Any) -> dict[str, Any]:
     """Return a fault of disk_x as a command of a scene."""
     given = {"channel": "disk_x", **numbers}
     return {"at_s": BEGIN_S, "command": "fault", "kind": kind, "for_s": END_S - BEGIN_S, **given}
@@ -118,10 +120,10 @@ def fault(kind: str, **numbers: Any) -> dict[str, Any]:
 VOTES = (("1oo2", "leaves"), ("2oo2", "leaves"), ("2oo2", "for"), ("1oo2", "for"))
 
 
-def keyphasor(kind: str, **numbers: Any) -> list[Samples]:
+def simulate_keyphasor(kind: str, **numbers: Any) -> list[Samples]:
     """Return rows of a shaft at rest between its probes, turning at 6.2 Hz, with a fault of its keyphasor."""
     command = {"at_s": 0.4, "command": "fault", "channel": "keyphasor", "kind": kind, **numbers}
-    rows = stream("drive", {"duration_s": 1.2, "commands": [command]}, "stable-run")
+    rows = simulate_stream("drive", {"duration_s": 1.2, "commands": [command]}, "stable-run")
     return [
         replace(each, names=("disk_x", "disk_y", "keyphasor"), units=("mm", "mm", "1"),
                 values=np.column_stack([np.zeros((len(each), 2)), each["keyphasor"]]))
@@ -129,9 +131,9 @@ def keyphasor(kind: str, **numbers: Any) -> list[Samples]:
     ]  # fmt: skip
 
 
-def judged(rows: list[Samples], vote: str, not_ok: str) -> str:
+def classify_actions(rows: list[Samples], vote: str, not_ok: str) -> str:
     """Classify the actions: T, a trip; N, NOT OK; a, an alarm without a trip; -, nothing."""
-    kinds = {each.kind for each in outcome(monitor(vote=vote, not_ok=not_ok), rows)}
+    kinds = {each.kind for each in run_monitor(make_settings(vote=vote, not_ok=not_ok), rows)}
     found = "T" if "trip" in kinds else "a" if kinds & {"alert", "danger"} else ""
     return (found + ("N" if "not-ok" in kinds else "")) or "-"
 
@@ -146,7 +148,9 @@ FULL_S = 0.05
 """Contact time for an established whirl, a twentieth of it excepted, with backward rotation [s]."""
 
 
-def whirls(ramp_hz_s: float, delay_s: float, force_n: float = 100.0, block_ticks: int = 10_000) -> tuple[float, bool]:
+def simulate_trip(
+    ramp_hz_s: float, delay_s: float, force_n: float = 100.0, block_ticks: int = 10_000
+) -> tuple[float, bool]:
     """Simulate an impact at 0.1 s with the monitor in the loop; return the time to the trip [s], and whether whirl is
     established.
     """
@@ -161,7 +165,8 @@ def whirls(ramp_hz_s: float, delay_s: float, force_n: float = 100.0, block_ticks
         frame = simulation.advance(block_ticks)
         rows.append(frame.rows[:, [COLUMN[name] for name in ("normal_force", "ring_x", "ring_y")]])
         if any(
-            action.kind == "trip" for action in device.feed(samples_of(simulation, "probes", frame.samples["probes"]))
+            action.kind == "trip"
+            for action in device.feed(convert_block(simulation, "probes", frame.samples["probes"]))
         ):
             simulation.submit("speed", {"speed_hz": 0.0})
             trip_s = 1e-6 * simulation.tick - 0.1
@@ -173,15 +178,15 @@ def whirls(ramp_hz_s: float, delay_s: float, force_n: float = 100.0, block_ticks
     return trip_s, bool(((contact > 0.95) & (turns < -0.25)).any())
 
 
-def noise(hours: float) -> tuple[list[Action], float]:
+def run_noise(hours: float) -> tuple[list[Action], float]:
     """Feed hours at 98 % of the alert with the probes' noise; return the monitor's actions and the run time [s]."""
     begin = time.monotonic()
-    device, actions = Protection(monitor(startup_s=2.0)), []
-    for samples in stream("probes", signal(0.98 * ALERT_UM, 83.0, 3600.0 * hours)):
+    device, actions = Protection(make_settings(startup_s=2.0)), []
+    for samples in simulate_stream("probes", sine_changes(0.98 * ALERT_UM, 83.0, 3600.0 * hours)):
         actions += device.feed(samples)
     return actions, time.monotonic() - begin
 
 
 if __name__ == "__main__":
-    found, took_s = noise(float((sys.argv[1:] or ["1"])[0]))
+    found, took_s = run_noise(float((sys.argv[1:] or ["1"])[0]))
     print(*found, f"{len(found)} actions, {took_s:.0f} s", sep="\n")

@@ -175,13 +175,13 @@ MUTANTS = [
 ]  # fmt: skip
 
 
-def matrix() -> dict[str, list[str]]:
+def compute_matrix() -> dict[str, list[str]]:
     """Return the scenarios that detect each mutant."""
     return {mutant.name: [name for name in SCENARIOS if mutant.fails(name)] for mutant in MUTANTS}
 
 
 if __name__ == "__main__":
-    found = matrix()
+    found = compute_matrix()
     for mutant in MUTANTS:
         others = [name for name in found[mutant.name] if name != mutant.told_by]
         mark = "killed" if mutant.told_by in found[mutant.name] else "LIVES"

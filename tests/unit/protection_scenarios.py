@@ -1,6 +1,6 @@
 """Requirements of a protection monitor as scenarios with hand-computed rows, for the real one and for mutants.
 
-Rows are 1 ms apart. `swing` makes a signal whose peak-to-peak over two rows is specified row by row, so that the times
+Rows are 1 ms apart. `make_swing` makes a signal with a peak-to-peak over two rows specified row by row: the times
 above a set point are exact: if its amplitude steps at row n, the level is half way at n and complete at n + 1.
 """
 
@@ -34,7 +34,7 @@ def settings(**changes: Any) -> Settings:
     return Settings(**{**base, **changes})
 
 
-def swing(rows: int, *steps: tuple[int, float]) -> np.ndarray:
+def make_swing(rows: int, *steps: tuple[int, float]) -> np.ndarray:
     """Return a signal [mm] with steps of its level, each a row and the level from there on [um]."""
     level = np.zeros(rows)
     for row, um in steps:
@@ -78,13 +78,13 @@ def a_sine_is_measured_from_peak_to_peak(device: Any) -> None:
 
 @scenario
 def set_points_are_in_micrometres(device: Any) -> None:
-    _, actions = run(device, settings(), swing(300, (100, 490.0), (200, 510.0)))
+    _, actions = run(device, settings(), make_swing(300, (100, 490.0), (200, 510.0)))
     assert told(actions) == [("alert", "disk_x", 201)]
 
 
 @scenario
 def an_alarm_is_of_its_own_probe(device: Any) -> None:
-    _, actions = run(device, settings(), 0.0, swing(200, (100, 1200.0)))
+    _, actions = run(device, settings(), 0.0, make_swing(200, (100, 1200.0)))
     assert told(actions, "alert", "danger") == [("alert", "disk_y", 100), ("danger", "disk_y", 101)]
 
 
@@ -111,33 +111,33 @@ def at_its_corner_the_high_pass_leaves_1_in_root_2(device: Any) -> None:
 @scenario
 def an_alarm_comes_after_its_delay(device: Any) -> None:
     # Above 500 at row 100, above 1000 at row 101.
-    _, actions = run(device, settings(alert_delay_s=0.02, danger_delay_s=0.0495), swing(300, (100, 1200.0)))
+    _, actions = run(device, settings(alert_delay_s=0.02, danger_delay_s=0.0495), make_swing(300, (100, 1200.0)))
     assert told(actions, "alert", "danger") == [("alert", "disk_x", 120), ("danger", "disk_x", 151)]
-    _, actions = run(device, settings(danger_delay_s=0.05), swing(300, (100, 1200.0), (150, 0.0)))
+    _, actions = run(device, settings(danger_delay_s=0.05), make_swing(300, (100, 1200.0), (150, 0.0)))
     assert told(actions, "danger") == [], "it lasted from row 101 to 149"
 
 
 @scenario
 def a_delay_begins_anew(device: Any) -> None:
-    x = swing(300, (100, 1200.0), (130, 0.0), (140, 1200.0))
+    x = make_swing(300, (100, 1200.0), (130, 0.0), (140, 1200.0))
     _, actions = run(device, settings(danger_delay_s=0.05), x)
     assert told(actions, "danger") == [("danger", "disk_x", 191)]
 
 
 @scenario
 def a_danger_stays_and_an_alert_goes(device: Any) -> None:
-    monitor, actions = run(device, settings(), swing(400, (100, 1200.0), (200, 0.0)))
+    monitor, actions = run(device, settings(), make_swing(400, (100, 1200.0), (200, 0.0)))
     assert told(actions, "clear") == [("clear", "alert disk_x", 201)]
     assert set(monitor.active) == {("danger", "disk_x"), ("trip", "")}
-    _, actions = run(device, settings(latch_alert=True, latch_danger=False), swing(400, (100, 1200.0), (200, 0.0)))
+    _, actions = run(device, settings(latch_alert=True, latch_danger=False), make_swing(400, (100, 1200.0), (200, 0.0)))
     assert told(actions, "clear") == [("clear", "danger disk_x", 200)]
 
 
 @scenario
 def a_reset_ends_what_is_over(device: Any) -> None:
-    monitor, _ = run(device, settings(), swing(300, (100, 1200.0), (200, 0.0)))
+    monitor, _ = run(device, settings(), make_swing(300, (100, 1200.0), (200, 0.0)))
     monitor.reset()
-    actions = monitor.feed(samples(300, disk_x=swing(100, (50, 1200.0)), disk_y=0.0))
+    actions = monitor.feed(samples(300, disk_x=make_swing(100, (50, 1200.0)), disk_y=0.0))
     assert told(actions) == [
         ("reset", "danger disk_x", 300), ("reset", "trip", 300), ("alert", "disk_x", 350), ("danger", "disk_x", 351),
         ("trip", "danger disk_x", 351),
@@ -146,11 +146,11 @@ def a_reset_ends_what_is_over(device: Any) -> None:
 
 @scenario
 def no_reset_while_the_cause_lasts(device: Any) -> None:
-    monitor, actions = run(device, settings(), swing(200, (100, 1200.0)))
+    monitor, actions = run(device, settings(), make_swing(200, (100, 1200.0)))
     assert monitor.tripped
     before = dict(monitor.active)
     monitor.reset()
-    assert monitor.feed(samples(200, disk_x=swing(100, (0, 1200.0)), disk_y=0.0)) == []
+    assert monitor.feed(samples(200, disk_x=make_swing(100, (0, 1200.0)), disk_y=0.0)) == []
     assert monitor.active == before
     assert monitor.tripped
     assert len(told(actions, "trip")) == 1
@@ -158,7 +158,7 @@ def no_reset_while_the_cause_lasts(device: Any) -> None:
 
 @scenario
 def an_alarm_ends_below_its_set_point_by_the_hysteresis(device: Any) -> None:
-    x = swing(400, (100, 600.0), (200, 460.0), (300, 430.0))
+    x = make_swing(400, (100, 600.0), (200, 460.0), (300, 430.0))
     _, actions = run(device, settings(hysteresis=0.1), x)
     assert told(actions) == [("alert", "disk_x", 101), ("clear", "alert disk_x", 300)]
 
@@ -185,7 +185,7 @@ def ok_comes_back_after_its_time_without_a_break(device: Any) -> None:
 
 @scenario
 def a_probe_that_is_not_ok_raises_no_alarm(device: Any) -> None:
-    x = swing(900, (150, 1200.0), (250, 0.0))
+    x = make_swing(900, (150, 1200.0), (250, 0.0))
     x[100] = 2.5
     _, actions = run(device, settings(), x)
     assert told(actions) == [("not-ok", "disk_x", 100), ("clear", "not-ok disk_x", 601)]
@@ -193,14 +193,14 @@ def a_probe_that_is_not_ok_raises_no_alarm(device: Any) -> None:
 
 @scenario
 def two_out_of_two_need_both(device: Any) -> None:
-    both = swing(300, (100, 1200.0)), swing(300, (150, 1200.0))
+    both = make_swing(300, (100, 1200.0)), make_swing(300, (150, 1200.0))
     assert told(run(device, settings(vote="2oo2"), *both)[1], "trip") == [("trip", "danger disk_x", 151)]
     assert told(run(device, settings(vote="2oo2"), both[0])[1], "trip") == []
 
 
 @scenario
 def one_out_of_two_needs_one(device: Any) -> None:
-    both = swing(300, (150, 1200.0)), swing(300, (100, 1200.0))
+    both = make_swing(300, (150, 1200.0)), make_swing(300, (100, 1200.0))
     assert told(run(device, settings(vote="1oo2"), *both)[1], "trip") == [("trip", "danger disk_y", 101)]
 
 
@@ -217,7 +217,7 @@ VOTES = {
 
 @scenario
 def a_probe_that_is_not_ok_votes_as_is_told(device: Any) -> None:
-    danger, broken, still = swing(300, (100, 1200.0)), 2.5 * (np.arange(300) >= 50), np.zeros(300)
+    danger, broken, still = make_swing(300, (100, 1200.0)), 2.5 * (np.arange(300) >= 50), np.zeros(300)
     for (vote, rule), expected in VOTES.items():
         given = {"vote": vote, "not_ok": rule}
         found = (
@@ -231,7 +231,7 @@ def a_probe_that_is_not_ok_votes_as_is_told(device: Any) -> None:
 
 @scenario
 def a_bypassed_channel_raises_no_alarm(device: Any) -> None:
-    x = swing(300, (100, 1200.0))
+    x = make_swing(300, (100, 1200.0))
     assert run(device, settings(bypass=("disk_x",)), x)[1] == []
     monitor = device.Protection(settings())
     monitor.bypassed.add("disk_x")
@@ -246,7 +246,7 @@ def a_bypassed_channel_raises_no_alarm(device: Any) -> None:
 def a_trip_multiply_raises_the_set_points(device: Any) -> None:
     monitor = device.Protection(settings())
     monitor.multiply = 3.0
-    assert told(monitor.feed(samples(disk_x=swing(300, (100, 1400.0), (200, 1600.0)), disk_y=0.0))) == [
+    assert told(monitor.feed(samples(disk_x=make_swing(300, (100, 1400.0), (200, 1600.0)), disk_y=0.0))) == [
         ("alert", "disk_x", 201)
     ]
 
@@ -287,30 +287,32 @@ def pulses_that_stay_away_are_an_alarm(device: Any) -> None:
 
 @scenario
 def what_came_first_is_known(device: Any) -> None:
-    monitor, actions = run(device, settings(), swing(300, (110, 1200.0)), swing(300, (100, 1200.0), (250, 0.0)))
+    monitor, actions = run(
+        device, settings(), make_swing(300, (110, 1200.0)), make_swing(300, (100, 1200.0), (250, 0.0))
+    )
     order = [("alert", "disk_y"), ("danger", "disk_y"), ("alert", "disk_x"), ("danger", "disk_x")]
     assert monitor.first_out == order
     assert told(actions, "trip") == [("trip", "danger disk_y", 101)]
     monitor.reset()
-    monitor.feed(samples(300, disk_x=swing(10, (0, 1200.0)), disk_y=0.0))
+    monitor.feed(samples(300, disk_x=make_swing(10, (0, 1200.0)), disk_y=0.0))
     assert monitor.first_out == order[2:]
 
 
 @scenario
 def no_alarm_while_it_starts(device: Any) -> None:
     given = settings(startup_s=0.3, danger_delay_s=0.05, speed_lost_s=0.1)
-    _, actions = run(device, given, swing(600, (0, 1200.0)), keyphasor=0.0)
+    _, actions = run(device, given, make_swing(600, (0, 1200.0)), keyphasor=0.0)
     assert told(actions) == [
         ("alert", "disk_x", 300), ("danger", "disk_x", 350), ("trip", "danger disk_x", 350),
         ("speed-lost", "keyphasor", 400),
     ]  # fmt: skip
     # The hysteresis does not hold an alarm that was above a set point only then.
-    assert run(device, settings(startup_s=0.3, hysteresis=0.1), swing(600, (0, 600.0), (100, 470.0)))[1] == []
+    assert run(device, settings(startup_s=0.3, hysteresis=0.1), make_swing(600, (0, 600.0), (100, 470.0)))[1] == []
 
 
 @scenario
 def it_trips_once(device: Any) -> None:
-    x = swing(500, (100, 1200.0), (200, 0.0), (300, 1200.0))
+    x = make_swing(500, (100, 1200.0), (200, 0.0), (300, 1200.0))
     _, actions = run(device, settings(latch_danger=False), x)
     assert told(actions, "danger", "trip") == [
         ("danger", "disk_x", 101), ("trip", "danger disk_x", 101), ("danger", "disk_x", 301)
@@ -340,7 +342,7 @@ def a_trip_is_sent_once_and_first(device: Any) -> None:
         given, machine, lines = settings(trip=trip), Machine(), []
         monitor = device.Protection(given)
         for first in (0, 200, 400):
-            x = swing(200, (100 if first == 0 else 0, 1200.0))
+            x = make_swing(200, (100 if first == 0 else 0, 1200.0))
             device.act(machine, given, monitor.feed(samples(first, disk_x=x, disk_y=0.0)), lines.append)
         assert machine.asked == expected
         assert lines[1] == "0.101000 s  danger  disk_x  1200"
@@ -366,7 +368,7 @@ class Watched(Machine):
 
 @scenario
 def a_note_of_others_resets_it(device: Any) -> None:
-    blow, still = swing(200, (100, 1200.0), (150, 0.0)), np.zeros(200)
+    blow, still = make_swing(200, (100, 1200.0), (150, 0.0)), np.zeros(200)
     command = {"event": "speed", "speed_hz": 1.0}
     for tags, expected in ((["reset"], ["reset", "reset"]), (["protection", "reset"], []), (["again"], [])):
         machine = Watched(
@@ -379,7 +381,7 @@ def a_note_of_others_resets_it(device: Any) -> None:
         assert notes == ["alert", "danger", "trip", "clear", *expected]
 
 
-def eventful(rows: int = 6000) -> tuple[Settings, Samples]:
+def make_eventful_rows(rows: int = 6000) -> tuple[Settings, Samples]:
     """Return rows in which most cases occur."""
     rng = np.random.default_rng(1)
     x = 0.3 * np.sin(2.0 * math.pi * 10.0 * np.arange(rows) / RATE) * np.repeat(rng.uniform(0.2, 3.0, rows // 300), 300)
@@ -396,7 +398,7 @@ def eventful(rows: int = 6000) -> tuple[Settings, Samples]:
 
 @scenario
 def blocks_change_nothing(device: Any) -> None:
-    given, rows = eventful()
+    given, rows = make_eventful_rows()
     whole = device.Protection(given).feed(rows)
     assert {each.kind for each in whole} == {"alert", "danger", "trip", "clear", "not-ok", "overspeed", "speed-lost"}
     rng = np.random.default_rng(2)
@@ -422,7 +424,7 @@ def rows_that_are_missing_are_taken_as_the_last(device: Any) -> None:
 
 @scenario
 def rows_that_come_twice_count_once(device: Any) -> None:
-    given, rows = eventful()
+    given, rows = make_eventful_rows()
     whole, monitor = device.Protection(given).feed(rows), device.Protection(given)
     parts = [rows.rows(begin, begin + 100) for begin in range(0, 6000, 100)]
     # Row 0 again would be that of another run.
@@ -434,7 +436,7 @@ def rows_that_come_twice_count_once(device: Any) -> None:
 def where_too_many_rows_are_missing_no_probe_is_ok(device: Any) -> None:
     for first in (900, 0):
         monitor, _ = run(device, settings(window_s=0.1), np.zeros(400))
-        actions = monitor.feed(samples(first, disk_x=swing(700, (100, 1200.0), (300, 0.0)), disk_y=0.0))
+        actions = monitor.feed(samples(first, disk_x=make_swing(700, (100, 1200.0), (300, 0.0)), disk_y=0.0))
         assert told(actions) == [
             ("rows-lost", "", first), ("not-ok", "disk_x", first), ("not-ok", "disk_y", first),
             ("clear", "not-ok disk_x", first + 500), ("clear", "not-ok disk_y", first + 500),

@@ -27,7 +27,7 @@ TICK_RATE_HZ = 1_000_000
 TRUTH_COLUMNS = {"state": 28, "contact": 5}
 
 
-def documents() -> dict[str, dict[str, Any]]:
+def make_documents() -> dict[str, dict[str, Any]]:
     """Return the catalogue, parameters and scene by key."""
     truth = {
         table: {
@@ -49,7 +49,7 @@ def documents() -> dict[str, dict[str, Any]]:
     }
 
 
-def block_of(key: str, number: int, *, block_ms: int = 10, seed: int = 1) -> Block:
+def make_block(key: str, number: int, *, block_ms: int = 10, seed: int = 1) -> Block:
     """Return block `number` of a stream, the same on every call."""
     tick = number * block_ms * 1000
     rng = np.random.default_rng([seed, number, len(key)])
@@ -66,7 +66,7 @@ def block_of(key: str, number: int, *, block_ms: int = 10, seed: int = 1) -> Blo
     return Block(tick=tick, index=number * rows, rate_hz=20_000.0, tick_rate_hz=TICK_RATE_HZ, values=counts)
 
 
-def stream(blocks: int, *, block_ms: int = 10) -> Iterator[tuple[str, bytes]]:
+def generate_stream(blocks: int, *, block_ms: int = 10) -> Iterator[tuple[str, bytes]]:
     """Yield keys and payloads of a short run: start, blocks of all streams, one edge per block, two statuses per
     second,
     end.
@@ -75,7 +75,7 @@ def stream(blocks: int, *, block_ms: int = 10) -> Iterator[tuple[str, bytes]]:
     keys = [sensor_key(group) for group in default_table().groups] + [truth_key(table) for table in TRUTH_COLUMNS]
     for number in range(blocks):
         for key in keys:
-            yield key, encode_block(block_of(key, number, block_ms=block_ms))
+            yield key, encode_block(make_block(key, number, block_ms=block_ms))
         tick = number * block_ms * 1000
         edge = Block(tick, number, 0.0, TICK_RATE_HZ, np.array([[0.25]]) + np.arange(1)[:, None])
         yield EDGES, encode_block(edge)
@@ -92,7 +92,7 @@ class ScriptedClient:
     rig = "a rig"
 
     def __init__(self) -> None:
-        self.replies = {key: encode_document(document) for key, document in documents().items()}
+        self.replies = {key: encode_document(document) for key, document in make_documents().items()}
         self.reported: list[tuple[str, bytes]] = []
         self.subscribed: list[str] = []
         self.on_alive: Callable[[bool], None] = lambda alive: None

@@ -36,7 +36,7 @@ RANDOM = ("intermittent", "spikes")
 """Kinds with random times."""
 
 
-def found_in(recording: Recording) -> tuple[list[Explanation], set[str]]:
+def find_faults(recording: Recording) -> tuple[list[Explanation], set[str]]:
     """Return the findings of a blind validation, and the channels that differ."""
     experiment = Experiment.of(recording).without_faults()
     parts, bits = measured(recording, experiment.scene), Bits(recording, experiment.simulation().table)
@@ -48,7 +48,7 @@ def found_in(recording: Recording) -> tuple[list[Explanation], set[str]]:
     return told, {name for part in parts for name in bits.off(part)}
 
 
-def right(told: list[Explanation], channel: str, kind: str) -> bool:
+def is_named_right(told: list[Explanation], channel: str, kind: str) -> bool:
     """Return whether there is one certain finding, on the channel, with a name of the kind."""
     if len(told) != 1 or not told[0].sure:
         return False
@@ -67,8 +67,8 @@ def test_a_fault_has_its_name(kind: str, numbers: dict[str, Any], tmp_path: Path
     recording = recorded(
         tmp_path / "a.mcap", "hammer", duration_s=duration_s, drive__speed_hz=12.0, commands=[pulse, fault]
     )
-    told, differ = found_in(recording)
-    assert right(told, channel, kind), [(one.name, one.change, one.left) for one in told]
+    told, differ = find_faults(recording)
+    assert is_named_right(told, channel, kind), [(one.name, one.change, one.left) for one in told]
     assert differ == {channel, *([numbers["other"]] if kind == "swap" else [])}
     size, defect, what = size_of(kind, numbers, channel), DEFECT_OF[kind], told[0].channels_and_defect[1]
     # Another number of a law, such as the end of a drift, has another unit; there are few pulses in 0.4 s.
@@ -159,12 +159,12 @@ def test_random_faults_have_their_names(tmp_path: Path) -> None:
         recording = recorded(
             tmp_path / f"{n}.mcap", "hammer", duration_s=0.8, drive__speed_hz=speed, commands=[pulse, fault]
         )
-        told, differ = found_in(recording)
+        told, differ = find_faults(recording)
         (tmp_path / f"{n}.mcap").unlink()
         if not differ:
             continue
         seen += 1
-        if not right(told, fault["channel"], fault["kind"]):
+        if not is_named_right(told, fault["channel"], fault["kind"]):
             line = f"{n}: {speed:.4g} Hz, {pulse['force_n']:.4g} N, {fault}: {[(o.name, o.change) for o in told]}"
             (wrong if any(one.sure for one in told) else unnamed).append(line)
     print(f"{seen} faults: {len(wrong)} wrong, {len(unnamed)} unnamed", *wrong, *unnamed, sep="\n")
@@ -195,6 +195,6 @@ def test_a_fault_that_changes_is_not_named_by_its_start(tmp_path: Path) -> None:
         {"at_s": 2.05, "command": "fault", "channel": "P_N", "kind": "polarity"},
     ]
     recording = recorded(tmp_path / "a.mcap", "stable-run", duration_s=2.5, commands=faults)
-    (told,), _ = found_in(recording)
+    (told,), _ = find_faults(recording)
     assert not told.sure
     assert "and at its end" in told.change

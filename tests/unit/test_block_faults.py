@@ -122,7 +122,7 @@ def test_a_fault_on_one_transport_does_not_affect_the_other(sound: dict[str, Sen
     assert len(run(fault, door="can")[0][PROBES]) == len(sound[PROBES]) - 20
 
 
-def through(what: Any, blocks: int, seed: int = 5) -> list[int]:
+def send_through(what: Any, blocks: int, seed: int = 5) -> list[int]:
     """Return the numbers of the received blocks, in their order."""
     sending, found = Sending(), list[int]()
     sending.active.append(Active(1, what, (), 0, {"": Draws(seed, 1, 0)}, PROBES))
@@ -137,16 +137,16 @@ def through(what: Any, blocks: int, seed: int = 5) -> list[int]:
 @pytest.mark.parametrize("part", [0.1, 0.6])
 def test_random_faults_have_their_rate_and_are_independent(part: float) -> None:
     n = 2000
-    came = np.isin(np.arange(n), through(LoseBlocks(part=part), n))
+    came = np.isin(np.arange(n), send_through(LoseBlocks(part=part), n))
     sigma = math.sqrt(part * (1.0 - part) / n)
     assert abs(1.0 - came.mean() - part) < 4.0 * sigma
     x = came - came.mean()
     assert abs(float(x[1:] @ x[:-1]) / float(x @ x)) < 4.0 / math.sqrt(n)
-    assert through(LoseBlocks(part=part), 300) != through(LoseBlocks(part=part), 300, seed=6)
-    twice = through(DuplicateBlocks(part=part), n)
+    assert send_through(LoseBlocks(part=part), 300) != send_through(LoseBlocks(part=part), 300, seed=6)
+    twice = send_through(DuplicateBlocks(part=part), n)
     assert sorted(set(twice)) == list(range(n))
     assert abs(len(twice) / n - 1.0 - part) < 4.0 * sigma
-    order = through(ReorderBlocks(part=part), n)
+    order = send_through(ReorderBlocks(part=part), n)
     assert sorted(order) == list(range(n))
     # A delayed block never overtakes another delayed one: every change of order is a delayed block before another.
     swapped = sum(one > other for one, other in pairwise(order))

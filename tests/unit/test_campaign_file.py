@@ -9,7 +9,7 @@ import pytest
 from replays.campaigns.files.campaign import Campaign, campaign_path, load_campaign, read_title, shipped
 from replays.campaigns.files.line_numbers import lines_of
 from rig.base.errors import InputError
-from tests.commands import said
+from tests.commands import run_captured
 
 HEAD = 'title = "T"\nscene = "hammer"\n'
 PEAK = '[[expect]]\nsignal = "disk_x"\nmust = "<= 2 mm"\n'
@@ -206,7 +206,7 @@ def test_errors_are_one_line_with_file_and_line_number(name: str, tmp_path: Path
 def test_the_command_prints_the_error_and_exits_with_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "x.campaign.toml"
     file.write_text(HEAD + PEAK.replace("mm", "N"), encoding="utf-8")
-    status, out, err = said(capsys, "campaign", file)
+    status, out, err = run_captured(capsys, "campaign", file)
     assert (status, out) == (2, "")
     assert err.startswith(f"rig: {file}:5: expect.must must be in a unit of length")
     file.write_text(HEAD + PEAK, encoding="utf-8")
@@ -217,7 +217,7 @@ def test_the_command_prints_the_error_and_exits_with_2(tmp_path: Path, capsys: p
         ([file, "--url", "zenoh:127.0.0.1:1", "-j", "2"], "--jobs must be 1 with --url"),
         ([file, "--against", tmp_path], "results.json"),
     ):
-        status, _, err = said(capsys, "campaign", *arguments)
+        status, _, err = run_captured(capsys, "campaign", *arguments)
         assert (status, err.count("\n")) == (2, 1), err
         assert says in err
 
@@ -231,7 +231,7 @@ SHIPPED = {
 
 def test_shipped_campaigns_are_listed_by_name_and_load(capsys: pytest.CaptureFixture[str]) -> None:
     assert list(shipped()) == list(SHIPPED)
-    status, out, err = said(capsys, "campaign")
+    status, out, err = run_captured(capsys, "campaign")
     assert (status, err) == (0, "")
     for name, count in SHIPPED.items():
         path = campaign_path(name)

@@ -32,7 +32,7 @@ from rig.base.outcome import Outcome
 from rig.channels.orbit import whirl_frequency
 from rig.channels.table import default_table
 from tests.processes import ROOT
-from tests.score_daqs import counts_of, write_parquet, write_session
+from tests.score_daqs import make_counts, write_parquet, write_session
 
 
 @pytest.fixture(scope="module")
@@ -111,7 +111,7 @@ def test_a_scorecard_is_an_expectation(seen: CaseRecording) -> None:
 
 
 def test_missing_rows_can_be_expected(tmp_path: Path) -> None:
-    counts = counts_of("probes", np.cumsum(np.random.default_rng(1).normal(size=(4000, 4)), axis=0) * 1e-3, None)
+    counts = make_counts("probes", np.cumsum(np.random.default_rng(1).normal(size=(4000, 4)), axis=0) * 1e-3, None)
     session = CaseRecording(Recording.open(write_session(tmp_path / "sent.mcap", {"probes": counts})), tmp_path)
     names = default_table().groups["probes"].names
     kept = np.delete(counts, slice(1000, 1100), axis=0)
@@ -128,7 +128,7 @@ def test_missing_rows_can_be_expected(tmp_path: Path) -> None:
 
 
 def test_all_requires_every_sent_channel_and_row_except_allowed_losses(tmp_path: Path) -> None:
-    counts = counts_of("probes", np.cumsum(np.random.default_rng(1).normal(size=(4000, 4)), axis=0) * 1e-3, None)
+    counts = make_counts("probes", np.cumsum(np.random.default_rng(1).normal(size=(4000, 4)), axis=0) * 1e-3, None)
     session = CaseRecording(Recording.open(write_session(tmp_path / "sent.mcap", {"probes": counts})), tmp_path)
     names, times_s = default_table().groups["probes"].names, np.arange(4000) / 20_000
 
@@ -160,7 +160,7 @@ def test_all_requires_every_sent_channel_and_row_except_allowed_losses(tmp_path:
 def test_a_run_stopped_early_fails_unless_expected(tmp_path: Path) -> None:
     stop = {"event": "command", "command": "stop", "from": "guard", "tick": 10_000, "time_s": 0.01}
     end = {"event": "end", "reason": "stopped", "tick": 10_000, "time_s": 0.01}
-    counts = counts_of("probes", np.zeros((200, 4)), None)
+    counts = make_counts("probes", np.zeros((200, 4)), None)
     recording = Recording.open(write_session(tmp_path / "sent.mcap", {"probes": counts}))
     case = next(iter(load_campaign(shipped()["hammer"]).cases))
 

@@ -27,7 +27,7 @@ from rig.channels.channel_file import read_channels
 from rig.channels.table import default_table
 from rig.cli.connections.can_output import CanMessages, CanOptions, CanOutput
 from rig.run.commands.table import COMMANDS
-from tests.commands import said, shown
+from tests.commands import run_captured, run_for_output
 
 TABLE = default_messages()
 DATABASE = dbc.database()
@@ -35,17 +35,19 @@ SAMPLED = (*TABLE.classic, *TABLE.fd)
 
 
 def test_the_command_shows_and_writes_the_dbc(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert shown(capsys, "can", "dbc") == dbc.text()
-    shown(capsys, "can", "dbc", "-o", tmp_path / "rig.dbc")
+    assert run_for_output(capsys, "can", "dbc") == dbc.text()
+    run_for_output(capsys, "can", "dbc", "-o", tmp_path / "rig.dbc")
     assert (tmp_path / "rig.dbc").read_text(encoding="utf-8") == dbc.text()
 
 
 def test_the_load_command_shows_every_message(capsys: pytest.CaptureFixture[str]) -> None:
-    output = shown(capsys, "can", "load")
+    output = run_for_output(capsys, "can", "load")
     for name in (row.name for row in Schedule().messages()):
         assert name in output
     assert "load: at most 69.2 % of the bus" in output
-    assert "load: at most 126.1 % of the bus" in shown(capsys, "can", "load", "--can-fd", "--can-bitrate", "1M/5M")
+    assert "load: at most 126.1 % of the bus" in run_for_output(
+        capsys, "can", "load", "--can-fd", "--can-bitrate", "1M/5M"
+    )
 
 
 def test_an_overloaded_bus_is_refused_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -57,7 +59,7 @@ def test_an_overloaded_bus_is_refused_in_one_line(tmp_path: Path, capsys: pytest
         "instead received 80.7 % with 6 frames an instant (a lower --can-rate or --can-fd helps)\n"
     )
     for command in (["can", "load"], ["can", "dbc"]):
-        assert said(capsys, *command, "--channels", str(path))[2] == warning
+        assert run_captured(capsys, *command, "--channels", str(path))[2] == warning
     table = read_channels(path)
     assert warning in f"{CanOutput('virtual:full', channels=table)}\n"
     # Messages that are still transmitted are only reported; missing ones are refused.
@@ -71,7 +73,7 @@ def test_an_overloaded_bus_is_refused_in_one_line(tmp_path: Path, capsys: pytest
 
 def test_the_default_bus_is_not_overloaded(capsys: pytest.CaptureFixture[str]) -> None:
     for command in (["can", "load"], ["can", "dbc"], ["can", "load", "--can-fd"]):
-        assert said(capsys, *command)[2] == ""
+        assert run_captured(capsys, *command)[2] == ""
 
 
 def test_cantools_sees_the_messages_of_the_table() -> None:

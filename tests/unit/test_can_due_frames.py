@@ -147,7 +147,7 @@ TABLE = default_messages()
 SYNC, EVENT = TABLE.by_name["Sync"], TABLE.by_name["Event"]
 
 
-def outbox_at_5_s(bus: can.BusABC, room: int) -> tuple[Outbox, list[float]]:
+def make_outbox(bus: can.BusABC, room: int) -> tuple[Outbox, list[float]]:
     """Return an outbox at the arrival of a block of 10 ms that begins at 0, and the list that sets its clock."""
     clock = [5.0001]
     outbox = Outbox(bus, room=room, paced=True, now=lambda: clock[0])
@@ -157,7 +157,7 @@ def outbox_at_5_s(bus: can.BusABC, room: int) -> tuple[Outbox, list[float]]:
 
 def test_frames_of_a_block_go_to_the_bus_at_once_in_the_order_of_their_slots() -> None:
     bus = Holding()
-    outbox, clock = outbox_at_5_s(bus, 1000)
+    outbox, clock = make_outbox(bus, 1000)
     data = np.zeros((10, SYNC.length), np.uint8)
     outbox.put(SYNC, data, np.arange(1, 11) * 1e-3)
     outbox.put_one(EVENT, 4e-3, event=1)
@@ -175,7 +175,7 @@ def test_frames_of_a_block_go_to_the_bus_at_once_in_the_order_of_their_slots() -
 
 def test_long_blocks_are_sent_in_parts_and_never_late() -> None:
     bus = Holding()
-    outbox, clock = outbox_at_5_s(bus, 1000)
+    outbox, clock = make_outbox(bus, 1000)
     outbox.put(SYNC, np.zeros((100, SYNC.length), np.uint8), np.arange(1, 101) * 1e-3)
     steps, late = 0, []
     while outbox.undue:
@@ -192,7 +192,7 @@ def test_long_blocks_are_sent_in_parts_and_never_late() -> None:
 @pytest.mark.parametrize("many", [20, 60])
 def test_a_bus_that_gets_many_frames_a_slot_holds_few_of_them(many: int) -> None:
     bus = Holding()
-    outbox, clock = outbox_at_5_s(bus, 100_000)
+    outbox, clock = make_outbox(bus, 100_000)
     times_s = np.repeat(np.arange(1, 11) * 1e-3, many)
     outbox.put(SYNC, np.zeros((len(times_s), SYNC.length), np.uint8), times_s)
     outbox.send_due()
@@ -206,7 +206,7 @@ def test_a_bus_that_gets_many_frames_a_slot_holds_few_of_them(many: int) -> None
 def test_a_full_bus_drops_only_the_oldest_frames_in_excess() -> None:
     bus = Holding()
     bus.full = True
-    outbox, clock = outbox_at_5_s(bus, 4)
+    outbox, clock = make_outbox(bus, 4)
     outbox.put(SYNC, np.arange(10, dtype=np.uint8)[:, None].repeat(SYNC.length, 1), np.arange(1, 11) * 1e-3)
     outbox.send_due()
     assert (outbox.waiting, outbox.dropped) == (4, 6)

@@ -113,7 +113,7 @@ def test_a_fault_is_acknowledged_with_its_number_and_ends() -> None:
         assert max(steps()) >= 1000
 
 
-def frames(*faults: dict[str, Any]) -> dict[str, list[bytes]]:
+def record_frames(*faults: dict[str, Any]) -> dict[str, list[bytes]]:
     """Return all frames of some messages of a run."""
     scene = parse_scene({**scene_document(SCENE), "commands": [], "faults": faults})
     with rig(Simulation(scene), schedule=Schedule(1000, 10_000)) as setup:  # type: ignore[arg-type]
@@ -126,12 +126,12 @@ def frames(*faults: dict[str, Any]) -> dict[str, list[bytes]]:
 
 @pytest.fixture(scope="module")
 def sound() -> dict[str, list[bytes]]:
-    return frames()
+    return record_frames()
 
 
 @pytest.mark.parametrize("kind", BLOCKS)
 def test_faults_of_blocks_show_on_the_bus_and_on_their_stream_alone(kind: str, sound: dict[str, list[bytes]]) -> None:
-    there = frames({"at_s": 0.1, "channel": "probes", "kind": kind, "for_s": 0.2, **BLOCKS[kind]})
+    there = record_frames({"at_s": 0.1, "channel": "probes", "kind": kind, "for_s": 0.2, **BLOCKS[kind]})
     assert there["Forces"] == sound["Forces"]
     shown = ("Sync",) if kind == "stale-stamps" else ("Probes", "Samples_1")
     if kind != "late-blocks":  # a run without the clock sends the same frames in the same order

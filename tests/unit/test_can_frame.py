@@ -94,7 +94,7 @@ ENCODED = (
 )
 
 
-def remainder(bits: list[int], polynomial: int, *, first: int = 0) -> int:
+def crc_remainder(bits: list[int], polynomial: int, *, first: int = 0) -> int:
     """Return the remainder of long division of the bits as one number, with the CRC's number of zeros appended.
 
     `first` inverts the CRC register's bits before the first bit.
@@ -205,9 +205,9 @@ def any_frame(draw: st.DrawFn) -> Frame:
 def test_long_division_gives_the_published_check_values():
     """Catalogue of parametrised CRC algorithms (Greg Cook): check values for the digits 1 to 9."""
     bits = [byte >> k & 1 for byte in b"123456789" for k in range(7, -1, -1)]
-    assert remainder(bits, CRC15) == 0x059E
-    assert remainder(bits, CRC17) == 0x04F03
-    assert remainder(bits, CRC21) == 0x0ED841
+    assert crc_remainder(bits, CRC15) == 0x059E
+    assert crc_remainder(bits, CRC17) == 0x04F03
+    assert crc_remainder(bits, CRC21) == 0x0ED841
 
 
 def test_frame_stuffed_by_hand():
@@ -222,7 +222,7 @@ def test_frame_stuffed_by_hand():
     encoded = encode(Frame(0x14, b"\x01"))
     assert "".join(map(str, encoded.bits)) == expected
     plain = "0" "00000010100" "000" "0001" "00000001"  # fmt: skip
-    assert encoded.crc == remainder([int(bit) for bit in plain], CRC15) == 0x7753
+    assert encoded.crc == crc_remainder([int(bit) for bit in plain], CRC15) == 0x7753
     assert frame_bits(Frame(0x14, b"\x01")) == (58, 0)
     assert speed("500k").duration(Frame(0x14, b"\x01")) == pytest.approx(58 * 2e-6, abs=1e-15)
 
@@ -249,11 +249,11 @@ def test_a_receiver_gets_the_frame_back(frame: Frame):
     if frame.fd:
         width, polynomial = (17, CRC17) if len(frame.data) <= 16 else (21, CRC21)
         covered = [bit for bit, fixed in zip(inside, encoded.fixed[:-13], strict=True) if not fixed]
-        assert remainder(covered, polynomial, first=1 << (width - 1)) == 0
+        assert crc_remainder(covered, polynomial, first=1 << (width - 1)) == 0
         assert int(encoded.fixed.sum()) == (6 if width == 17 else 7)
     else:
         plain = [bit for bit, stuff in zip(inside, encoded.stuff[:-13], strict=True) if not stuff]
-        assert remainder(plain, CRC15) == 0
+        assert crc_remainder(plain, CRC15) == 0
 
 
 @settings(deadline=None, max_examples=300)

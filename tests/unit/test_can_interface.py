@@ -31,7 +31,7 @@ from rig.base import wire
 from rig.base.errors import InputError
 from rig.cli.commands import can as can_command
 from rig.serve.transport.zenoh import ZenohServer
-from tests.hostile import inputs
+from tests.hostile import input_count
 from tests.processes import free_endpoint
 from tests.waiting import PATIENCE_S, until
 
@@ -593,7 +593,7 @@ def test_asyncio_readers_work(rig: Rig) -> None:
 # The hub as one node of several.
 
 
-def fuzz(rng: random.Random) -> bytes:
+def make_payload(rng: random.Random) -> bytes:
     """Return random bytes, or a message of frames with some of its bytes changed."""
     if rng.random() < 0.3:
         return rng.randbytes(rng.choice([0, 1, 7, 8, 32, 88, 500]))
@@ -608,9 +608,9 @@ def test_random_payloads_do_not_change_the_hub() -> None:
     with Rig("process", "1M/8M") as rig:
         villain, sender, receiver = rig.bus(), rig.bus(), rig.bus()
         secret = bytes.fromhex(villain.secret)
-        count = inputs(20_000)
+        count = input_count(20_000)
         for number in range(count):
-            payload = fuzz(rng)
+            payload = make_payload(rng)
             rig.hub.offer(villain.name if number % 2 else rng.choice(["", "x"]), secret + payload)
             if number % 50 == 0:
                 rig.hub.reply(
@@ -638,9 +638,9 @@ def test_random_payloads_over_zenoh_do_not_change_the_hub() -> None:
         client = villain.client
         for number in range(5000):
             name = villain.name if number % 2 else "stranger"
-            client.report(codec.offer_key("can0", name), bytes.fromhex(villain.secret) + fuzz(rng))
-            client.report(codec.bus_key("can0"), fuzz(rng))
-            client.report(f"rig/can/can0/{rng.choice(['join', 'offer', 'node/x'])}", fuzz(rng))
+            client.report(codec.offer_key("can0", name), bytes.fromhex(villain.secret) + make_payload(rng))
+            client.report(codec.bus_key("can0"), make_payload(rng))
+            client.report(f"rig/can/can0/{rng.choice(['join', 'offer', 'node/x'])}", make_payload(rng))
         until(lambda: rig.hub.status()["counts"]["malformed"] > 100)
         sender.send(message(0x7A5, b"unique"))
         while (found := read(receiver, 1)[0]).data != b"unique":
@@ -649,7 +649,7 @@ def test_random_payloads_over_zenoh_do_not_change_the_hub() -> None:
         assert nodes[receiver.name]["state"] == 0
 
 
-def join(hub: Hub, name: str, *, token: bool = False, **more: Any) -> dict[str, Any]:
+def join_hub(hub: Hub, name: str, *, token: bool = False, **more: Any) -> dict[str, Any]:
     """Return the reply to an endpoint of another process that joins."""
     if token:
         hub.watch(codec.node_key("can0", name), True)
@@ -658,26 +658,26 @@ def join(hub: Hub, name: str, *, token: bool = False, **more: Any) -> dict[str, 
 
 def test_the_number_of_endpoints_is_bounded_and_those_of_this_process_always_get_in() -> None:
     with Rig("process", "1M") as rig:
-        first = join(rig.hub, "e0", token=True)
+        first = join_hub(rig.hub, "e0", token=True)
         for number in range(1, endpoints.MAX_ENDPOINTS):
-            join(rig.hub, f"e{number}", token=True)
+            join_hub(rig.hub, f"e{number}", token=True)
         for token in (False, True):
             with pytest.raises(InputError, match=r"endpoint must be one of at most 64; .*one more than 64"):
-                join(rig.hub, "late", token=token)
+                join_hub(rig.hub, "late", token=token)
         sender, receiver = rig.bus(), rig.bus()
         sender.send(message(7))
         assert read(receiver, 1)[0].arbitration_id == 7
-        assert "node" in join(rig.hub, "e0", secret=first["secret"])
+        assert "node" in join_hub(rig.hub, "e0", secret=first["secret"])
 
 
 def test_endpoints_without_a_token_are_replaced_first() -> None:
     with Rig("process", "1M") as rig:
         for number in range(1000):
-            join(rig.hub, f"ghost{number}")
+            join_hub(rig.hub, f"ghost{number}")
         names = [row["name"] for row in rig.hub.status()["nodes"]]
         assert names == [f"ghost{number}" for number in range(1000 - endpoints.MAX_TOKENLESS, 1000)]
         for number in range(endpoints.MAX_ENDPOINTS):
-            join(rig.hub, f"e{number}", token=True)
+            join_hub(rig.hub, f"e{number}", token=True)
         assert [row["name"] for row in rig.hub.status()["nodes"]] == [f"e{n}" for n in range(endpoints.MAX_ENDPOINTS)]
         # However many tokens a node declares, the newest counts.
         for number in range(5000):
@@ -724,15 +724,15 @@ def test_requests_under_the_name_of_another_node_are_refused(rig: Rig) -> None:
 
 def test_an_endpoint_can_rejoin_under_its_name() -> None:
     with Rig("process", "1M") as rig:
-        first = join(rig.hub, "mine", token=True)
+        first = join_hub(rig.hub, "mine", token=True)
         with pytest.raises(InputError, match="endpoint must be unused"):
-            join(rig.hub, "mine")
-        second = join(rig.hub, "mine", secret=first["secret"])
+            join_hub(rig.hub, "mine")
+        second = join_hub(rig.hub, "mine", secret=first["secret"])
         assert second["secret"] != first["secret"]
         with pytest.raises(InputError, match="endpoint must be unused"):
             rig.hub.answer("flush", {"endpoint": "mine", "secret": first["secret"]})
         rig.hub.watch(codec.node_key("can0", "mine"), False)
-        third = join(rig.hub, "mine")
+        third = join_hub(rig.hub, "mine")
         assert rig.hub.answer("flush", {"endpoint": "mine", "secret": third["secret"]}) == {}
 
 

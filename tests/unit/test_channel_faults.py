@@ -18,7 +18,7 @@ from rig.cli.commands import fault as command
 from rig.run.commands.table import check_command
 from rig.run.scenes import load_scene, parse_scene, scene_document
 from rig.run.simulation import Simulation
-from tests.commands import said
+from tests.commands import run_captured
 from tests.fault_cases import EXAMPLES
 from tests.physics.test_identification import recorded
 
@@ -49,7 +49,7 @@ def step(simulation: Simulation, cut: int, found: Any, edges: Any, events: Any) 
     events += frame.events
 
 
-def differs(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> dict[str, tuple[int, int]]:
+def find_differences(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> dict[str, tuple[int, int]]:
     """Return the first and last rows that differ, by channel."""
     rows = {name: np.flatnonzero(one[name] != other[name]) for name in one if name != "edges"}
     return {name: (int(each[0]), int(each[-1])) for name, each in rows.items() if len(each)}
@@ -81,7 +81,7 @@ def test_an_unknown_parameter_is_refused_with_the_known_ones(kind: str, capsys: 
             check_command("fault", {"channel": "disk_x", "kind": kind, name: 1})
         assert str(caught.value) == f"fault.{kind}.{name} {words}1"
     option = f"--{min(others).replace('_', '-')}"
-    status, _, line = said(capsys, "fault", "disk_x", kind, option, "1")
+    status, _, line = run_captured(capsys, "fault", "disk_x", kind, option, "1")
     assert (status, line.startswith(f"rig: {option} of {kind} {words}")) == (2, True), line
 
 
@@ -90,7 +90,7 @@ def test_a_fault_is_on_its_channels_and_rows_alone(kind: str, sound: dict[str, n
     """Independent of the cuts; after its end, every count is the original."""
     channel = "keyphasor" if KINDS[kind].channel_only else "disk_x"
     there, events = run(example(kind, channel))
-    found = differs(there, sound)
+    found = find_differences(there, sound)
     (begun,) = (event for event in events if event["event"] == "fault")
     assert set(found) == set(begun["channels"])
     (rate_hz,) = {SCENE.table.channels[name].rate_hz for name in found}
@@ -106,7 +106,7 @@ def test_a_fault_is_on_its_channels_and_rows_alone(kind: str, sound: dict[str, n
             "edge-jitter",
         )
     finely, _ = run(example(kind, channel), cut=1_000)
-    assert not differs(there, finely)
+    assert not find_differences(there, finely)
     np.testing.assert_array_equal(there["edges"], finely["edges"])
 
 
@@ -126,7 +126,7 @@ def test_every_kind_has_an_effect_on_every_channel_or_is_refused(kind: str, soun
     assert len(faults) == 1 if KINDS[kind].channel_only else len(faults) >= len(CHANNELS) - 2
     # On all channels at once, except for kinds that make one channel show another.
     for together in [[fault] for fault in faults] if other else [faults]:
-        found = differs(run(*together)[0], sound)
+        found = find_differences(run(*together)[0], sound)
         for channel in (fault["channel"] for fault in together):
             # A hammer at rest and a nearly constant spin show no fault that acts on their motion.
             still = channel in ("hammer", "speed") and kind in (
@@ -205,8 +205,8 @@ def test_one_of_several_faults_on_a_group_can_be_cleared(sound: dict[str, np.nda
     hum = {"channel": "probes", "kind": "hum", "amplitude_v": 0.2}
     there, _ = run(hum, {"channel": "disk_x", "kind": "noise", "factor": 4.0, "at_s": 0.15, "for_s": 0.05})
     alone, _ = run(hum)
-    assert set(differs(there, sound)) == {"disk_x", "disk_y", "ring_x", "ring_y"}
-    first, last = differs(there, alone)["disk_x"]
+    assert set(find_differences(there, sound)) == {"disk_x", "disk_y", "ring_x", "ring_y"}
+    first, last = find_differences(there, alone)["disk_x"]
     assert 3000 <= first <= last < 4000
     scales = {name: abs(SCENE.table.channels[name].lsb_v) for name in ("disk_x", "ring_y")}
     one, other = (scales[name] * (alone[name] - sound[name]) for name in scales)
@@ -297,7 +297,7 @@ def test_a_clock_fault_of_a_group_leaves_each_channel_its_own_noise(kind: str) -
     assert (rough[:4].std(axis=1) / loud[:4] / math.sqrt(20.0) < 1.2).all()
 
 
-def plugged_volts(scene: Any, *faults: dict[str, Any]) -> dict[str, float]:
+def measure_forces_v(scene: Any, *faults: dict[str, Any]) -> dict[str, float]:
     """Return the mean force signals after 0.2 s [V], of inputs of 1.1, 2.2, 3.3, 4.4 V at P_N, P_S, P_E, P_W."""
     found, _ = run(*faults, scene=scene)
     table = scene.table.channels
@@ -321,7 +321,7 @@ def test_swaps_with_a_common_channel_are_applied_in_order(
     names, volts = ("P_N", "P_S", "P_E", "P_W"), (1.1, 2.2, 3.3, 4.4)
     if physics:
         scene = load_scene("stable-run", {"duration_s": 0.22, "sensors.groups": ["forces"]})
-        still = plugged_volts(scene)
+        still = measure_forces_v(scene)
     else:
         scene = load_scene(
             "test-sine", {"duration_s": 0.22, "sensors.groups": ["forces"], "generator.amplitude_v": 1e-3}
@@ -333,7 +333,7 @@ def test_swaps_with_a_common_channel_are_applied_in_order(
         for name, v in zip(names, volts, strict=True)
     ]
     changed = [{"channel": a, "kind": "swap", "other": b, "at_s": 0.15} for a, b in swaps]
-    found = plugged_volts(scene, *offsets, *changed)
+    found = measure_forces_v(scene, *offsets, *changed)
     assert tuple(found.values()) == pytest.approx([1.1 * volts for volts in shown], abs=0.02)
 
 
@@ -345,8 +345,8 @@ def test_the_end_of_a_swap_restores_the_other_swaps() -> None:
     never, _ = run(swaps[0], swaps[2], scene=scene)
     all_, _ = run(*swaps, scene=scene)
     # The filters of channels that remain swapped retain it for some samples.
-    assert all(first >= 2000 and last < 3100 for first, last in differs(ended, never).values())
-    assert all(first >= 3000 for first, _ in differs(ended, all_).values())
+    assert all(first >= 2000 and last < 3100 for first, last in find_differences(ended, never).values())
+    assert all(first >= 3000 for first, _ in find_differences(ended, all_).values())
 
 
 def test_the_numbers_of_a_random_fault_are_functions_of_its_place() -> None:

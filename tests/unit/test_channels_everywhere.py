@@ -26,8 +26,8 @@ from rig.physics.engines import ENGINES
 from rig.run.scenes import Scene, load_scene
 from rig.run.simulation import Simulation
 from rig.serve.transport.memory import MemoryClient, MemoryServer
-from tests.commands import shown
-from tests.unit.test_validation import record
+from tests.commands import run_for_output
+from tests.unit.test_validation import record_scene
 
 ROOT = Path(__file__).parents[2]
 TABLE = ROOT / "docs/daq24.toml"
@@ -39,7 +39,7 @@ _names = itertools.count()
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     path = tmp_path_factory.mktemp("channels") / "daq24.mcap"
-    return record(path, channels=str(TABLE), sensors__rate_hz=0)
+    return record_scene(path, channels=str(TABLE), sensors__rate_hz=0)
 
 
 def test_a_recording_contains_the_table_and_is_reproduced_bit_for_bit(recording: Recording) -> None:
@@ -55,7 +55,9 @@ def test_a_recording_contains_the_table_and_is_reproduced_bit_for_bit(recording:
 
 
 def test_an_export_has_the_channels_and_their_instants(recording: Recording, capsys, tmp_path: Path) -> None:
-    shown(capsys, "export", str(recording.path), "-o", str(tmp_path / "x.csv"), "--channels", "end_u,inner_beam")
+    run_for_output(
+        capsys, "export", str(recording.path), "-o", str(tmp_path / "x.csv"), "--channels", "end_u,inner_beam"
+    )
     table = np.loadtxt(tmp_path / "x.csv", delimiter=",", skiprows=1)
     np.testing.assert_allclose(table[:, 0], np.arange(len(table)) / 51_200, rtol=0, atol=1e-12)
     np.testing.assert_allclose(table[:, 1], recording.samples("probes")["end_u"], rtol=1e-6)

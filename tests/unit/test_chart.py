@@ -75,7 +75,7 @@ def test_store_writes_one_table_in_two_formats(tmp_path: Path) -> None:
     assert pyarrow.csv.read_csv(csv).column_names == table.column_names
 
 
-def hand_made(shift: float) -> tuple[Problem, Reference, Run]:
+def make_run(shift: float) -> tuple[Problem, Reference, Run]:
     """Return a reference at rest, and a run that is off by `shift` scales in one of seven states, half the time."""
     problem = problem_of("exact", "first-impacts", "", end_s=4e-3)
     problem = Problem(**{**problem.__dict__, "times": problem.times[:4]})
@@ -95,7 +95,7 @@ def hand_made(shift: float) -> tuple[Problem, Reference, Run]:
 def test_error_and_verdict_of_a_hand_made_run(
     monkeypatch: pytest.MonkeyPatch, shift: float, contacts: int, failure: str
 ) -> None:
-    problem, reference, done = hand_made(shift)
+    problem, reference, done = make_run(shift)
     done.solution.onsets = [(0.0, 0.1)] * contacts
     done.solution.failure = "the state is not finite" if failure == "nan" else None
     monkeypatch.setattr(measure, "run", lambda *_: done)

@@ -31,13 +31,13 @@ HEADINGS = ["time [s]", *(f"{STATE[column].name} [{STATE[column].unit}]" for col
 KEYS = {"solver": "mine", "phase": PHASE, "setting": "1e-4", "cpu_s": "0.25", "contacts": "3"}
 
 
-def text_of(times: np.ndarray, states: np.ndarray, **keys: str) -> str:
+def make_results(times: np.ndarray, states: np.ndarray, **keys: str) -> str:
     """Return the text of a file of results."""
     rows = [",".join(map(repr, row)) for row in np.column_stack([times, states]).tolist()]
     return "\n".join([*(f"# {key}: {value}" for key, value in (KEYS | keys).items()), ",".join(HEADINGS), *rows, ""])
 
 
-def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+def run_refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
     """Run a command that must be refused, and return its last line."""
     with pytest.raises(SystemExit) as end:
         main(["chart", *arguments])
@@ -72,7 +72,7 @@ def test_submitted_results_of_an_engine_equal_its_own_point(tmp_path: Path) -> N
     arguments = []
     for name, (values, count) in versions.items():
         path = tmp_path / f"{name}.csv"
-        path.write_text(text_of(problem.times, values, solver=name, contacts=str(count)), encoding="utf-8")
+        path.write_text(make_results(problem.times, values, solver=name, contacts=str(count)), encoding="utf-8")
         arguments += ["--add", str(path)]
     folder = tmp_path / "out"
     with pytest.raises(SystemExit) as end:
@@ -90,7 +90,9 @@ def test_submitted_results_of_an_engine_equal_its_own_point(tmp_path: Path) -> N
     assert (row["cpu_s"], row["speed"], row["tolerance"], row["rung"]) == (0.25, pytest.approx(0.2), 1e-4, "1e-4")
     assert {rows[name]["family"] for name in versions} == {ADDED_FAMILY}
     # The same solver, setting and phase again: the later file replaces the earlier one only.
-    (tmp_path / "right.csv").write_text(text_of(problem.times, states, solver="right", cpu_s="0.5"), encoding="utf-8")
+    (tmp_path / "right.csv").write_text(
+        make_results(problem.times, states, solver="right", cpu_s="0.5"), encoding="utf-8"
+    )
     session.add_solvers(folder, [tmp_path / "right.csv"])
     again = {row["method"]: row for row in read_table(folder)}
     assert (again["right"]["cpu_s"], len(again)) == (0.5, len(rows))
@@ -98,7 +100,7 @@ def test_submitted_results_of_an_engine_equal_its_own_point(tmp_path: Path) -> N
 
 def at_rest(**keys: str) -> str:
     times = problem_of("exact", PHASE, "").times
-    return text_of(times, np.zeros((len(times), len(ERROR_COLUMNS))), **keys)
+    return make_results(times, np.zeros((len(times), len(ERROR_COLUMNS))), **keys)
 
 
 def change_line(number: int, change: Callable[[str], str]) -> Callable[[str], str]:
@@ -149,7 +151,7 @@ def test_a_wrong_file_is_refused_in_one_line(
 ) -> None:
     path = tmp_path / "mine.csv"
     path.write_text(change(at_rest(**keys)), encoding="utf-8")
-    line = refused(capsys, "--add", str(path), "-o", str(tmp_path / "out"))
+    line = run_refused(capsys, "--add", str(path), "-o", str(tmp_path / "out"))
     assert words in line
     assert "instead received" in line
     assert not (tmp_path / "out").exists()
@@ -158,13 +160,13 @@ def test_a_wrong_file_is_refused_in_one_line(
 def test_wrong_options_are_refused_in_one_line(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     path, folder = tmp_path / "mine.csv", tmp_path / "out"
     path.write_text(at_rest(), encoding="utf-8")
-    assert "file must be a file that can be read" in refused(capsys, "--add", f"{path}x", "-o", str(folder))
-    assert "the only option besides" in refused(capsys, "--add", str(path), "--full", "-o", str(folder))
-    assert "the only option besides" in refused(capsys, "--problem", "drop", "--draw", "-o", str(folder))
-    assert "the only option besides" in refused(capsys, "--problem", "drop", "--add", str(path), "-o", str(folder))
-    assert "phase must be one of" in refused(capsys, "--problem", "rub", "-o", str(folder))
+    assert "file must be a file that can be read" in run_refused(capsys, "--add", f"{path}x", "-o", str(folder))
+    assert "the only option besides" in run_refused(capsys, "--add", str(path), "--full", "-o", str(folder))
+    assert "the only option besides" in run_refused(capsys, "--problem", "drop", "--draw", "-o", str(folder))
+    assert "the only option besides" in run_refused(capsys, "--problem", "drop", "--add", str(path), "-o", str(folder))
+    assert "phase must be one of" in run_refused(capsys, "--problem", "rub", "-o", str(folder))
     assert not folder.exists()
-    assert "must be a folder" in refused(capsys, "--problem", "drop", "-o", str(path))
+    assert "must be a folder" in run_refused(capsys, "--problem", "drop", "-o", str(path))
 
 
 def test_a_chart_of_other_code_is_not_extended(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
@@ -175,7 +177,7 @@ def test_a_chart_of_other_code_is_not_extended(capsys: pytest.CaptureFixture[str
     columns = {"mode": "quick", "panel": "exact", "phase": PHASE, "case": "", "method": "rk4", "rung": "5 us"}
     store.add(columns)
     before = [path.read_bytes() for path in store.write("quick")]
-    assert "output must be a folder with a chart by this code" in refused(
+    assert "output must be a folder with a chart by this code" in run_refused(
         capsys, "--add", str(path), "-o", str(tmp_path / "out")
     )
     assert before == [(tmp_path / "out" / name).read_bytes() for name in ("chart.parquet", "chart.csv")]

@@ -149,7 +149,7 @@ class Links:
         return self.counts
 
 
-def settle_s(
+def measure_delay_s(
     monkeypatch: pytest.MonkeyPatch, clients: Clients, time_: Time, beat: Any = None, **counts: float
 ) -> float:
     """Return the delay of a run's end in simulated wall time [s]."""
@@ -170,17 +170,17 @@ def test_the_end_waits_only_for_a_recorder_with_progress(
     monkeypatch: pytest.MonkeyPatch, clients: Clients, time_: Time
 ) -> None:
     has = iter(range(0, 10_000, 20))
-    held = settle_s(monkeypatch, clients, time_, lambda: report(clients, "r", received_index=next(has)), links=1)
+    held = measure_delay_s(monkeypatch, clients, time_, lambda: report(clients, "r", received_index=next(has)), links=1)
     assert 5.0 < held < 7.0
     clients = Clients(now_s=time_)
-    held = settle_s(monkeypatch, clients, time_, lambda: report(clients, "r", received_index=0), links=1)
+    held = measure_delay_s(monkeypatch, clients, time_, lambda: report(clients, "r", received_index=0), links=1)
     assert 3.0 < held < 5.0
 
 
 def test_the_end_waits_longer_for_a_recorder_than_for_other_clients(
     monkeypatch: pytest.MonkeyPatch, clients: Clients, time_: Time
 ) -> None:
-    assert settle_s(monkeypatch, clients, time_, links=1, stalled_links=1) < 1.5
+    assert measure_delay_s(monkeypatch, clients, time_, links=1, stalled_links=1) < 1.5
     report(clients, "stopped", received_index=10)
-    assert settle_s(monkeypatch, clients, time_, links=1, stalled_links=1) > 9.5
-    assert settle_s(monkeypatch, clients, time_, links=0) == 0.0
+    assert measure_delay_s(monkeypatch, clients, time_, links=1, stalled_links=1) > 9.5
+    assert measure_delay_s(monkeypatch, clients, time_, links=0) == 0.0

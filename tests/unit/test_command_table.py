@@ -37,7 +37,7 @@ _VALUE_BITS = 32
 """Bits of the fields in the frame of a command."""
 
 
-def missing_in(name: str, entry: type[SceneCommand]) -> Iterator[str]:
+def find_missing(name: str, entry: type[SceneCommand]) -> Iterator[str]:
     """Yield the missing parts of an entry, each in one line that names its place."""
     where = f"{entry.__module__.replace('.', '/')}.py"
     if entry.model_fields["command"].default != name:
@@ -106,7 +106,7 @@ def missing_in(name: str, entry: type[SceneCommand]) -> Iterator[str]:
 
 
 def test_all_entries_are_complete() -> None:
-    missing = [line for name, entry in COMMANDS.items() for line in missing_in(name, entry)]
+    missing = [line for name, entry in COMMANDS.items() for line in find_missing(name, entry)]
     if missing:
         pytest.fail("\n".join(missing), pytrace=False)
 
@@ -190,12 +190,12 @@ def sized(**quantity: Any) -> Any:
     ],
 )
 def test_an_incomplete_entry_is_reported_with_the_missing_part(entry: Any, words: str) -> None:
-    found = [line for line in missing_in("tilt", entry) if ("SUMMARIES" in line) == ("SUMMARIES" in words)]
+    found = [line for line in find_missing("tilt", entry) if ("SUMMARIES" in line) == ("SUMMARIES" in words)]
     assert words in " ".join(found)
     assert len(found) == 1 or all("CAN kind" in line for line in found)  # two commands share the number
 
 
-def request_of(entry: type[SceneCommand]) -> dict[str, Any]:
+def make_request(entry: type[SceneCommand]) -> dict[str, Any]:
     """Return fields of a command that a rig accepts."""
     needed = {field: max(each.low, 1.0) for field, each in entry.quantities().items() if each.required}
     return {"channel": "disk_x", "kind": "gain", "factor": 2.0} if "channel" in entry.model_fields else needed
@@ -204,7 +204,7 @@ def request_of(entry: type[SceneCommand]) -> dict[str, Any]:
 @pytest.mark.parametrize("name", COMMANDS)
 def test_a_command_takes_effect_with_an_event_of_its_name(name: str) -> None:
     run = Simulation("stable-run")
-    command = COMMANDS[name](**request_of(COMMANDS[name]))
+    command = COMMANDS[name](**make_request(COMMANDS[name]))
     assert command.command == name
     before = command.check(run, [])
     assert isinstance(before, dict)
@@ -245,7 +245,7 @@ def test_the_console_has_each_command_with_the_fields_of_the_table(name: str) ->
             taken.append((key, payload))
             return b'{"accepted": true, "id": 1, "tick": 0, "time_s": 0.0}'
 
-    Console(Rig()).send(name, **request_of(COMMANDS[name]))
+    Console(Rig()).send(name, **make_request(COMMANDS[name]))
     assert taken[0][0] == f"rig/command/{name}"
 
 

@@ -36,14 +36,14 @@ from rig.base.wire import Continuity
 from rig.channels.table import default_table
 from rig.serve.transport.memory import MemoryClient, MemoryServer
 from rig.serve.transport.zenoh import ZenohClient, ZenohServer
-from tests.processes import free_endpoint, python
-from tests.unit.instruments_fake import BLOCK, FakeRig, counts_of, values_of
+from tests.processes import free_endpoint, start_python
+from tests.unit.instruments_fake import BLOCK, FakeRig, expected_values, make_counts
 
 pytestmark = pytest.mark.wallclock
 _numbers = itertools.count()
 
 
-def part(index: int, rows: int, *, name: str = "a", columns: int = 1, rate_hz: float = 1000.0) -> Samples:
+def make_rows(index: int, rows: int, *, name: str = "a", columns: int = 1, rate_hz: float = 1000.0) -> Samples:
     """Return rows whose values encode their number."""
     values = np.arange(index, index + rows, dtype=float)[:, None] + np.arange(columns) * 1e6
     names = tuple(f"{name}{n}" for n in range(columns))
@@ -55,19 +55,19 @@ def part(index: int, rows: int, *, name: str = "a", columns: int = 1, rate_hz: f
 
 def test_rows_that_are_missing_late_or_twice_are_counted() -> None:
     rows = Continuity()
-    kept = [follow(rows, part(*each)) for each in [(100, 10), (110, 10), (115, 10), (105, 5), (135, 5), (125, 10)]]
+    kept = [follow(rows, make_rows(*each)) for each in [(100, 10), (110, 10), (115, 10), (105, 5), (135, 5), (125, 10)]]
     assert [(new.index, len(new), new.gap) if new else None for new in kept] == [
         (100, 10, 0), (110, 10, 0), (120, 5, 0), None, (135, 5, 10), None,
     ]  # fmt: skip
     assert (rows.lost, rows.stale, rows.runs) == ({"": 10}, 5 + 5 + 10, {"": 0})
-    again = follow(rows, part(0, 10))
+    again = follow(rows, make_rows(0, 10))
     assert again is not None
     assert (again.gap, rows.runs) == (0, {"": 1})
 
 
 def test_a_buffer_returns_the_requested_rows_and_never_across_a_gap() -> None:
     pile = RowBuffer()
-    for samples in (part(0, 10), part(10, 10)):
+    for samples in (make_rows(0, 10), make_rows(10, 10)):
         pile.add(samples)
     assert pile.take(25, ended=False) is None
     first = pile.take(15, ended=False)
@@ -87,7 +87,7 @@ def test_a_buffer_returns_the_requested_rows_and_never_across_a_gap() -> None:
 def test_an_unread_buffer_stays_small_and_reports_lost_rows() -> None:
     pile = RowBuffer(50)
     for n in range(100):
-        pile.add(part(10 * n, 10))
+        pile.add(make_rows(10 * n, 10))
     assert (pile.rows, pile.dropped) == (50, 950)
     lowest = pile.take(None, ended=False)
     assert lowest is not None
@@ -103,20 +103,20 @@ def aligner(room: int = 1000) -> Aligner:
 
 def test_rows_are_merged_by_number_with_columns_in_the_requested_order() -> None:
     made = aligner()
-    assert made.feed("a", part(0, 10, columns=2)) == []
-    (first,) = made.feed("b", part(4, 4, name="b", columns=2))
+    assert made.feed("a", make_rows(0, 10, columns=2)) == []
+    (first,) = made.feed("b", make_rows(4, 4, name="b", columns=2))
     assert first.names == ("a1", "b1", "a0")
     assert (first.index, first.tick) == (4, 4000)
     np.testing.assert_array_equal(first.values[:, 2], np.arange(4, 8))
     np.testing.assert_array_equal(first.values[:, 0], first.values[:, 1])
-    (second,) = made.feed("b", part(8, 10, name="b", columns=2))
+    (second,) = made.feed("b", make_rows(8, 10, name="b", columns=2))
     assert (second.index, len(second), second.gap) == (8, 2, 0)
 
 
 def test_a_gap_in_one_stream_is_a_gap_in_all_with_its_name() -> None:
     made = aligner()
-    out = made.feed("a", part(0, 30, columns=2)) + made.feed("b", part(0, 10, name="b", columns=2))
-    out += made.feed("b", part(17, 13, name="b", columns=2))
+    out = made.feed("a", make_rows(0, 30, columns=2)) + made.feed("b", make_rows(0, 10, name="b", columns=2))
+    out += made.feed("b", make_rows(17, 13, name="b", columns=2))
     assert [(each.index, len(each), each.gap) for each in out] == [(0, 10, 0), (17, 13, 7)]
     assert [(gap.key, gap.index, gap.size) for gap in made.gaps] == [("b", 10, 7)]
     assert made.lost == {"a": 0, "b": 7}
@@ -128,7 +128,7 @@ def test_portions_of_any_size_in_any_order_give_the_same_rows() -> None:
     while min(position.values()) < 500:
         name = str(random.choice(["a", "b"]))
         rows = int(random.integers(1, 40))
-        out += made.feed(name, part(position[name], rows, name=name, columns=2))
+        out += made.feed(name, make_rows(position[name], rows, name=name, columns=2))
         position[name] += rows
     joined = np.concatenate([each.values for each in out])
     assert len(joined) == min(position.values())
@@ -139,20 +139,20 @@ def test_portions_of_any_size_in_any_order_give_the_same_rows() -> None:
 def test_a_stream_without_its_partner_is_bounded() -> None:
     made = aligner(room=100)
     for n in range(100):
-        assert made.feed("a", part(10 * n, 10, columns=2)) == []
+        assert made.feed("a", make_rows(10 * n, 10, columns=2)) == []
     assert made.unmatched == 900
-    (out,) = made.feed("b", part(995, 5, name="b", columns=2))
+    (out,) = made.feed("b", make_rows(995, 5, name="b", columns=2))
     assert (out.index, len(out)) == (995, 5)
 
 
 def test_rows_of_different_runs_are_never_joined() -> None:
     made = aligner()
-    assert made.feed("a", part(1000, 50, columns=2)) == []
-    assert len(made.feed("b", part(1000, 20, name="b", columns=2))) == 1
+    assert made.feed("a", make_rows(1000, 50, columns=2)) == []
+    assert len(made.feed("b", make_rows(1000, 20, name="b", columns=2))) == 1
     # The rig was restarted; `a` is the first to notice.
-    assert made.feed("a", part(0, 10, columns=2)) == []
-    assert made.feed("b", part(1020, 20, name="b", columns=2)) == []
-    (out,) = made.feed("b", part(0, 10, name="b", columns=2))
+    assert made.feed("a", make_rows(0, 10, columns=2)) == []
+    assert made.feed("b", make_rows(1020, 20, name="b", columns=2)) == []
+    (out,) = made.feed("b", make_rows(0, 10, name="b", columns=2))
     assert (out.index, len(out), out.gap) == (0, 10, 0)
 
 
@@ -173,7 +173,7 @@ GROUPS = ("probes", "forces", "hammer")
 
 def expected(index: int, rows: int, step: int = 1) -> np.ndarray:
     columns = {"P_W": ("forces", 3), "disk_x": ("probes", 0), "hammer": ("hammer", 0)}
-    return np.stack([values_of(columns[c][0], index, rows, step)[:, columns[c][1]] for c in CHANNELS], axis=1)
+    return np.stack([expected_values(columns[c][0], index, rows, step)[:, columns[c][1]] for c in CHANNELS], axis=1)
 
 
 def test_chosen_channels_come_aligned_in_engineering_units() -> None:
@@ -387,7 +387,7 @@ def test_frames_reproduce_the_counts_of_the_recording(layout: str, step: int) ->
         rows = instants * form.rows
         counts = np.stack(
             [
-                counts_of(channel.group, index, rows * step)[
+                make_counts(channel.group, index, rows * step)[
                     ::step, default_table().groups[channel.group].names.index(channel.name)
                 ]
                 for channel in form.channels
@@ -520,7 +520,7 @@ def test_the_examples_are_short_and_all_run_here() -> None:
 @pytest.mark.wallclock
 def test_an_example_without_a_rig_prints_one_line() -> None:
     file = Path(drivers.examples.__file__).with_name("callback.py")
-    with python(str(file), f"zenoh:{free_endpoint()}") as child:
+    with start_python(str(file), f"zenoh:{free_endpoint()}") as child:
         output, complaints = child.communicate(timeout=60.0)
     assert (child.returncode, output, complaints.count("\n")) == (2, "", 1)
     assert complaints.startswith("no rig answers at 127.0.0.1:")

@@ -40,7 +40,7 @@ def scene(kind: str) -> Any:
 
 
 @cache
-def published(kind: str) -> list[tuple[str, bytes]]:
+def simulate_messages(kind: str) -> list[tuple[str, bytes]]:
     """Return the messages that a rig publishes, in order."""
     simulation, rows = Simulation(scene(kind)), wire.Continuity()
     found = [(wire.EVENTS, {"event": "start", "tick": 0, "time_s": 0.0})]
@@ -98,7 +98,7 @@ def rows(payloads: list[bytes]) -> list[int]:
 
 @pytest.mark.parametrize("kind", BLOCKS)
 def test_a_recorder_of_a_faulty_stream_ends_normally_with_all_blocks(kind: str, tmp_path: Path) -> None:
-    items = published(kind)
+    items = simulate_messages(kind)
     summary = recorded(tmp_path / "live.mcap", kind, items)
     assert (summary.good, summary.losses, summary.refused) == (True, (), 0)
     write_run(Simulation(scene(kind)), tmp_path / "offline.mcap")
@@ -120,7 +120,7 @@ def test_a_recorder_of_a_faulty_stream_ends_normally_with_all_blocks(kind: str, 
 )
 def test_late_fault_events_are_used(kind: str, behind: int, tmp_path: Path) -> None:
     """Blocks and fault events come on separate threads; the events are late by a number of blocks."""
-    items = published(kind)
+    items = simulate_messages(kind)
     told, held = [item for item in items if item[0] == wire.FAULTS], list[tuple[str, bytes]]()
     blocks = 0
     for item in items:
@@ -138,7 +138,7 @@ def test_late_fault_events_are_used(kind: str, behind: int, tmp_path: Path) -> N
 @pytest.mark.parametrize("seed", [25, 34, 40, 57])
 def test_fault_events_may_arrive_in_bursts(seed: int, tmp_path: Path) -> None:
     """Renumbered blocks and the events that report it, each in order, one randomly ahead of the other."""
-    rng, items = random.Random(seed), list(published("restart"))
+    rng, items = random.Random(seed), list(simulate_messages("restart"))
     end, held = items.pop(), list[tuple[str, bytes]]()
     streams = [[item for item in items if (item[0] == wire.FAULTS) == told] for told in (True, False)]
     while any(streams):
@@ -150,7 +150,7 @@ def test_fault_events_may_arrive_in_bursts(seed: int, tmp_path: Path) -> None:
 
 
 def test_fault_events_may_arrive_after_the_end(tmp_path: Path) -> None:
-    items = published("restart")
+    items = simulate_messages("restart")
     last = max(n for n, (key, payload) in enumerate(items) if key == wire.FAULTS and json.loads(payload).get("blocks"))
     summary = recorded(tmp_path / "late.mcap", "restart", items[:last] + items[last + 1 :], late=(items[last],))
     assert (summary.losses, summary.refused) == ((), 0)
@@ -158,7 +158,7 @@ def test_fault_events_may_arrive_after_the_end(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kind", ["lose-blocks", "reorder-blocks"])
 def test_lost_rows_are_counted_exactly_in_addition_to_faults(kind: str, tmp_path: Path) -> None:
-    items = published(kind)
+    items = simulate_messages(kind)
     places = [n for n, (key, _) in enumerate(items) if key == PROBES]
     gone = {places[n] for n in (3, 14, 17)}
     summary = recorded(tmp_path / "gone.mcap", kind, [item for n, item in enumerate(items) if n not in gone])
@@ -167,14 +167,14 @@ def test_lost_rows_are_counted_exactly_in_addition_to_faults(kind: str, tmp_path
 
 
 def test_a_client_without_fault_events_reports_losses(tmp_path: Path) -> None:
-    items = [item for item in published("dropout") if item[0] != wire.FAULTS]
+    items = [item for item in simulate_messages("dropout") if item[0] != wire.FAULTS]
     summary = recorded(tmp_path / "untold.mcap", "dropout", items)
     assert summary.lost == {PROBES: 4000}
 
 
 @pytest.mark.parametrize("kind", ["dropout", "reorder-blocks", "stale-stamps", "restart"])
 def test_fault_events_work_across_files_and_triggers(kind: str, tmp_path: Path) -> None:
-    items = published(kind)
+    items = simulate_messages(kind)
     summary = recorded(tmp_path / "parts.mcap", kind, items, limits=Limits(rotate_s=0.13))
     assert summary.good
     parts = join(list(summary.files))

@@ -19,7 +19,7 @@ from rig.physics.engine_choice import FINEST_TOLERANCE, SCALES, EngineChoice, Li
 from rig.run.model_choice import Pick
 from rig.run.scenes import Scene, change_scene, load_scene, parse_scene, scene_document
 from rig.run.simulation import Simulation
-from tests.commands import said, shown
+from tests.commands import run_captured, run_for_output
 
 LIMITS = {"engine.limits.radius_um": 0.03, "engine.limits.angle_deg": 0.5}
 RUN_CHANGES = {"duration_s": 0.2, "sensors.rate_hz": 2000, "sensors.truth_rate_hz": 1000}
@@ -101,7 +101,7 @@ def test_a_bad_limit_is_refused_in_one_line(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, key: str, value: str, must: str
 ) -> None:
     target = tmp_path / "run.csv"
-    status, output, complaint = said(capsys, "simulate", "hammer", "--set", f"{key}={value}", "-o", target)
+    status, output, complaint = run_captured(capsys, "simulate", "hammer", "--set", f"{key}={value}", "-o", target)
     assert (status, output, complaint.count("\n")) == (2, "", 1)
     assert f"{key} must be {must}" in complaint
     assert not target.exists()
@@ -157,8 +157,8 @@ def test_a_recording_keeps_its_limits_and_is_validated(capsys: pytest.CaptureFix
         ),
         path,
     )
-    shown(capsys, "validate", path)
-    status, output, _ = said(capsys, "info", path)
+    run_for_output(capsys, "validate", path)
+    status, output, _ = run_captured(capsys, "info", path)
     told = " ".join(output.split())
     assert status == 3, "inconclusive, as with each warning of the rig"
     assert "whirl angle off by" in told
@@ -169,7 +169,7 @@ def test_a_recording_keeps_its_limits_and_is_validated(capsys: pytest.CaptureFix
     assert experiment.scene.engine.limits == Limits(radius_um=0.03, angle_deg=1e-9)
     reduced = bare(experiment).scene.engine
     assert (reduced.limits.given(), reduced.companion, reduced.tolerance) == ({}, False, 3e-3)
-    shown(capsys, "export", path, "-o", table)
-    shown(capsys, "import", table, "--template", mapping)
+    run_for_output(capsys, "export", path, "-o", table)
+    run_for_output(capsys, "import", table, "--template", mapping)
     changes = tomllib.loads(mapping.read_text())["experiment"]["set"]
     assert load_scene("hammer", changes).engine == experiment.scene.engine

@@ -29,7 +29,7 @@ from tests.waiting import until
 SENSORS = {"groups": ["probes", "forces"]}
 
 
-def named_in_the_code() -> set[str]:
+def find_event_kinds() -> set[str]:
     """Return the kinds of events in the code, in `_event("...")` and in `{"event": "..."}`."""
     found = set[str]()
     folder = Path(rig.__file__).parent
@@ -48,7 +48,7 @@ def named_in_the_code() -> set[str]:
 
 
 def test_the_table_of_events_is_complete() -> None:
-    assert set(COMMANDS) | named_in_the_code() == set(EVENT_KINDS)
+    assert set(COMMANDS) | find_event_kinds() == set(EVENT_KINDS)
 
 
 def test_every_kind_of_event_is_recorded_and_validated(tmp_path: Path) -> None:

@@ -30,7 +30,7 @@ def kind(name: str, **numbers: Any) -> Kind:
     return KINDS[name].model_validate({"kind": name, **numbers})
 
 
-def at(rows: slice = slice(None), kept: dict[str, float] | None = None) -> At:
+def make_state(rows: slice = slice(None), kept: dict[str, float] | None = None) -> At:
     """Return rows of the channel, with the state of one fault."""
     none = np.empty(0)
     return At(
@@ -39,7 +39,7 @@ def at(rows: slice = slice(None), kept: dict[str, float] | None = None) -> At:
     )  # fmt: skip
 
 
-def at_edges() -> At:
+def make_edge_state() -> At:
     """Return the edges of a shaft that turns evenly, one per turn."""
     angle, rate = 2.0 * np.pi * np.arange(1, 400), np.full(399, 2.0 * np.pi * TURNS_HZ)
     return At(1e-6 * TICKS, np.arange(399), CHANNEL, Draws(3, 1, 0), {}, lambda _: SOURCE_V, angle, rate, lambda x: x)
@@ -54,7 +54,7 @@ def at_edges() -> At:
     ("stuck", {}, np.full(ROWS, X[0])), ("nonlinear", {"end": 0.5}, 0.5 * np.tanh(2.0 * X)),
 ])  # fmt: skip
 def test_transducers(name: str, numbers: dict[str, float], expected: np.ndarray) -> None:
-    np.testing.assert_allclose(kind(name, **numbers).signal(X, at()), expected, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(kind(name, **numbers).signal(X, make_state()), expected, rtol=1e-9, atol=1e-12)
 
 
 def test_a_resonance_settles_to_the_response_of_an_oscillator() -> None:
@@ -62,10 +62,10 @@ def test_a_resonance_settles_to_the_response_of_an_oscillator() -> None:
     fault, drive = kind("resonance", frequency_hz=80.0, quality=3.0), 37.0 / 80.0
     response = 1.0 / (1.0 - drive**2 + 1j * drive / 3.0)
     settled = 0.1 + 0.8 * np.imag(response * np.exp(1j * (2.0 * np.pi * 37.0 * T + 0.4)))
-    whole = fault.signal(X, at())
+    whole = fault.signal(X, make_state())
     np.testing.assert_allclose(whole[3000:], settled[3000:], atol=2e-4)
     kept: dict[str, float] = {}
-    parts = [fault.signal(X[rows], at(rows, kept)) for rows in (slice(0, 7), slice(7, 8), slice(8, ROWS))]
+    parts = [fault.signal(X[rows], make_state(rows, kept)) for rows in (slice(0, 7), slice(7, 8), slice(8, ROWS))]
     np.testing.assert_allclose(np.concatenate(parts), whole, atol=1e-9)
 
 
@@ -80,7 +80,7 @@ def test_a_resonance_settles_to_the_response_of_an_oscillator() -> None:
     ("saturation", {"part": 0.2}, np.clip(V, -11.6, -8.4)),
 ])  # fmt: skip
 def test_cables_and_conditioners(name: str, numbers: dict[str, Any], expected: np.ndarray) -> None:
-    np.testing.assert_allclose(kind(name, **numbers).volts(V, at()), expected, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(kind(name, **numbers).volts(V, make_state()), expected, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize(("name", "numbers", "expected_us"), [
@@ -89,8 +89,8 @@ def test_cables_and_conditioners(name: str, numbers: dict[str, Any], expected: n
     ("jitter", {"rms_us": 3.0}, 3.0 * (4.0 + np.clip(Draws(3, 1, 0).normal(N), -4.0, 4.0))),
 ])  # fmt: skip
 def test_clocks(name: str, numbers: dict[str, float], expected_us: np.ndarray) -> None:
-    np.testing.assert_allclose(1e6 * kind(name, **numbers).late_s(at()), expected_us, atol=1e-9)
-    assert kind("gain", factor=2.0).late_s(at()).tolist() == [0.0] * ROWS
+    np.testing.assert_allclose(1e6 * kind(name, **numbers).late_s(make_state()), expected_us, atol=1e-9)
+    assert kind("gain", factor=2.0).late_s(make_state()).tolist() == [0.0] * ROWS
 
 
 @pytest.mark.parametrize(("name", "numbers", "expected"), [
@@ -103,7 +103,7 @@ def test_clocks(name: str, numbers: dict[str, float], expected_us: np.ndarray) -
     ("clip", {"part": 0.5}, np.clip(COUNTS, -(2.0**22), 2.0**22 - 1.0)), ("freeze", {}, np.full(ROWS, COUNTS[0])),
 ])  # fmt: skip
 def test_converters(name: str, numbers: dict[str, float], expected: np.ndarray) -> None:
-    found = kind(name, **numbers).counts(COUNTS, at())
+    found = kind(name, **numbers).counts(COUNTS, make_state())
     np.testing.assert_array_equal(found, expected)
     assert name == "freeze" or 0 < np.sum(found != COUNTS) < ROWS
 
@@ -116,8 +116,8 @@ def test_converters(name: str, numbers: dict[str, float], expected: np.ndarray) 
     ("stuck", {}, TICKS[:0]), ("open", {}, TICKS[:0]), ("freeze", {}, TICKS[:0]),
 ])  # fmt: skip
 def test_pulses(name: str, numbers: dict[str, float], expected: np.ndarray) -> None:
-    np.testing.assert_allclose(kind(name, **numbers).edges(TICKS, at_edges()), expected, rtol=1e-12)
-    assert len(kind(name, **numbers).edges(TICKS[:0], at_edges())) == 0
+    np.testing.assert_allclose(kind(name, **numbers).edges(TICKS, make_edge_state()), expected, rtol=1e-12)
+    assert len(kind(name, **numbers).edges(TICKS[:0], make_edge_state())) == 0
 
 
 @pytest.mark.parametrize("name", sorted(name for name, each in KINDS.items() if not each.of_blocks))
@@ -129,6 +129,6 @@ def test_a_fault_changes_only_its_stage(name: str) -> None:
     }  # fmt: skip
     for stage, (method, values) in methods.items():
         if fault.stage not in (stage, "keyphasor"):
-            assert method(values, at()) is values
-    assert fault.stage == "clock" or not fault.late_s(at()).any()
+            assert method(values, make_state()) is values
+    assert fault.stage == "clock" or not fault.late_s(make_state()).any()
     assert fault.stage == "filter" or fault.chain(CHANNEL) is CHANNEL

@@ -18,7 +18,7 @@ from rig.channels.table import Channel
 from rig.run.scenes import load_scene, parse_scene
 from rig.run.simulation import Simulation
 from tests.fault_cases import EXAMPLES
-from tests.unit.test_channel_faults import differs, run
+from tests.unit.test_channel_faults import find_differences, run
 
 SCENE = load_scene("stable-run", {"duration_s": 0.2, "sensors.groups": ["probes", "forces", "drive"]})
 TOO_SMALL_FAULTS: dict[str, tuple[str, dict[str, Any], str]] = {
@@ -39,7 +39,7 @@ TOO_RARE_FAULTS: dict[str, tuple[str, str]] = {
 }  # fmt: skip
 
 
-def refused(request: dict[str, Any], scene: Any = SCENE) -> str:
+def submit_refused(request: dict[str, Any], scene: Any = SCENE) -> str:
     """Return the message with which a live command is refused; a fault of the scene must be refused with the same."""
     with pytest.raises(InputError) as caught:
         Simulation(scene).submit("fault", request)
@@ -61,7 +61,7 @@ def test_every_kind_with_a_size_has_a_case() -> None:
 @pytest.mark.parametrize("kind", TOO_SMALL_FAULTS)
 def test_a_fault_below_a_step_is_refused_with_the_smallest_size(kind: str) -> None:
     channel, numbers, field = TOO_SMALL_FAULTS[kind]
-    text = refused({"channel": channel, "kind": kind, **numbers})
+    text = submit_refused({"channel": channel, "kind": kind, **numbers})
     found = re.match(rf"{field} must be at (least|most) (\S+) to change a count of {channel}, whose", text)
     assert found is not None, text
     enough = {"channel": channel, "kind": kind, **numbers, field: float(found[2])}
@@ -73,7 +73,7 @@ def test_a_fault_below_a_step_is_refused_with_the_smallest_size(kind: str) -> No
         less = 1.25 * float(found[2])
     elif kind == "clip":
         less = float(found[2]) + 1e-4
-    refused({**enough, field: less})
+    submit_refused({**enough, field: less})
 
 
 @pytest.mark.parametrize(("kind", "numbers"), [
@@ -82,27 +82,27 @@ def test_a_fault_below_a_step_is_refused_with_the_smallest_size(kind: str) -> No
 def test_the_smallest_size_changes_counts(kind: str, numbers: dict[str, Any]) -> None:
     channel, tiny, field = TOO_SMALL_FAULTS[kind]
     given = {"channel": channel, "kind": kind, **tiny, **numbers}
-    size = float(refused(given).split()[5])
+    size = float(submit_refused(given).split()[5])
     sound, _ = run(scene=SCENE)
     there, _ = run({**given, field: size, "at_s": 0.05}, scene=SCENE)
-    assert set(differs(there, sound)) == {channel}
+    assert set(find_differences(there, sound)) == {channel}
 
 
 @pytest.mark.parametrize("kind", TOO_RARE_FAULTS)
 def test_a_random_fault_that_never_happens_is_refused(kind: str) -> None:
     channel, field = TOO_RARE_FAULTS[kind]
     tiny = {"channel": channel, "kind": kind, "for_s": 0.1, field: 1e-9}
-    found = re.match(rf"{field} must be above (\S+) to happen once", refused(tiny))
+    found = re.match(rf"{field} must be above (\S+) to happen once", submit_refused(tiny))
     assert found is not None
     often = 1.01 * float(found[1])
     Simulation(SCENE).submit("fault", {**tiny, field: often})
     if kind in ("intermittent", "spikes"):
         sound, _ = run(scene=SCENE)
         there, _ = run({**tiny, field: often, "at_s": 0.0}, scene=SCENE)
-        assert set(differs(there, sound)) == {channel}
+        assert set(find_differences(there, sound)) == {channel}
 
 
-def coarse(bits: int, noise_v: float) -> Any:
+def make_coarse_scene(bits: int, noise_v: float) -> Any:
     """Return the scene with a converter of few bits at P_E."""
     table = SCENE.table
     change = {"adc_bits": bits, "noise_v": noise_v}
@@ -118,32 +118,32 @@ def coarse(bits: int, noise_v: float) -> Any:
     return load_scene("stable-run", {"duration_s": 0.2, "channels": document, "sensors.groups": ["forces", "probes"]})
 
 
-def noise_of(scene: Any, *faults: dict[str, Any]) -> float:
+def measure_noise(scene: Any, *faults: dict[str, Any]) -> float:
     """Return the standard deviation of P_E's counts after 0.05 s."""
     found, _ = run(*faults, scene=scene)
     return float(np.std(found["P_E"][1000:]))
 
 
 def test_noise_of_a_coarse_converter_is_refused_until_it_shows() -> None:
-    scene = coarse(12, 0.002)
+    scene = make_coarse_scene(12, 0.002)
     channel: Channel = scene.table.channels["P_E"]
     assert channel.noise_v / channel.lsb_v == pytest.approx(0.41, abs=0.01)
     noise = {"channel": "P_E", "kind": "noise"}
-    text = refused({**noise, "factor": 1.1}, scene)
+    text = submit_refused({**noise, "factor": 1.1}, scene)
     least = float(text.split()[5])
     assert 1.5 < least < 1.7
-    sound = noise_of(scene)
-    more = noise_of(scene, {**noise, "factor": least, "at_s": 0.0})
+    sound = measure_noise(scene)
+    more = measure_noise(scene, {**noise, "factor": least, "at_s": 0.0})
     # Rounding to counts adds a twelfth of a step squared to both.
     added = (least**2 - 1.0) * (channel.noise_v / channel.lsb_v) ** 2
     assert more == pytest.approx(math.sqrt(sound**2 + added), rel=0.15)
 
 
 def test_crosstalk_below_a_step_of_a_coarse_converter_is_refused() -> None:
-    scene, given = coarse(12, 0.002), {"channel": "P_E", "kind": "crosstalk", "source": "P_N"}
-    least = float(refused({**given, "db": -100.0}, scene).split()[5])
+    scene, given = make_coarse_scene(12, 0.002), {"channel": "P_E", "kind": "crosstalk", "source": "P_N"}
+    least = float(submit_refused({**given, "db": -100.0}, scene).split()[5])
     Simulation(scene).submit("fault", {**given, "db": least})
-    refused({**given, "db": least - 1.0}, scene)
+    submit_refused({**given, "db": least - 1.0}, scene)
     Simulation(SCENE).submit("fault", {**given, "db": -100.0})
 
 
@@ -167,7 +167,7 @@ def test_a_fault_that_ends_before_the_next_sample_is_refused(
 
 
 def test_a_block_delay_of_zero_is_refused() -> None:
-    assert "delay_s must be" in refused({"channel": "probes", "kind": "late-blocks", "delay_s": 1e-9})
+    assert "delay_s must be" in submit_refused({"channel": "probes", "kind": "late-blocks", "delay_s": 1e-9})
 
 
 @pytest.mark.parametrize("kind", sorted({*TOO_SMALL_FAULTS} - {"edge-jitter"}))

@@ -18,7 +18,7 @@ RATE_HZ, ROWS = 20_000, 6000
 TIMES = np.arange(ROWS) / RATE_HZ
 
 
-def signals(group: str, seed: int = 3) -> tuple[Measured, np.ndarray]:
+def make_signals(group: str, seed: int = 3) -> tuple[Measured, np.ndarray]:
     """Return a group with independent smooth signals in each channel, and the expected signals."""
     channels, rng = default_table().groups[group].channels, np.random.default_rng(seed)
     floor = np.array([channel.noise_v / channel.sensitivity_v for channel in channels])
@@ -36,11 +36,11 @@ def signals(group: str, seed: int = 3) -> tuple[Measured, np.ndarray]:
     return part, clean
 
 
-def told(change: Callable[[np.ndarray, np.ndarray], None], group: str = "probes") -> list[tuple[str, float]]:
+def find_faults(change: Callable[[np.ndarray, np.ndarray], None], group: str = "probes") -> list[tuple[str, float]]:
     """Return names and sizes of the faults found after a change of columns; `change` receives values and
     expectation.
     """
-    part, clean = signals(group)
+    part, clean = make_signals(group)
     values = part.values.copy()
     change(values, clean)
     found = sensor_faults({group: replace(part, values=values)}, Prediction({group: clean}, {}, 1000), 1.0)
@@ -48,7 +48,7 @@ def told(change: Callable[[np.ndarray, np.ndarray], None], group: str = "probes"
 
 
 def test_signals_without_a_fault_have_no_finding() -> None:
-    assert told(lambda values, clean: None) == []
+    assert find_faults(lambda values, clean: None) == []
 
 
 @pytest.mark.parametrize("factor", [0.97, 1.02, 25.4, 1e-3, 2e-4])
@@ -56,7 +56,7 @@ def test_gain(factor: float) -> None:
     def change(values: np.ndarray, clean: np.ndarray) -> None:
         values[:, 2] += (factor - 1.0) * clean[:, 2]
 
-    ((name, value),) = told(change)
+    ((name, value),) = find_faults(change)
     assert name == ("ring_x signal" if factor < 1e-3 else "ring_x gain")
     assert value == pytest.approx(factor - 1.0, abs=1e-3)
 
@@ -66,7 +66,7 @@ def test_polarity_and_offset_of_a_preloaded_transducer() -> None:
         values[:, 0] = 6000.0 - values[:, 0]
         values[:, 2] += 4.0
 
-    assert [name for name, _ in told(change, "forces")] == ["P_N polarity", "P_E offset"]
+    assert [name for name, _ in find_faults(change, "forces")] == ["P_N polarity", "P_E offset"]
 
 
 @pytest.mark.parametrize("rows", [1, 7, 30])
@@ -74,7 +74,7 @@ def test_equal_delays_are_reported_together(rows: int) -> None:
     def change(values: np.ndarray, clean: np.ndarray) -> None:
         values[rows:, :2] += clean[:-rows, :2] - clean[rows:, :2]
 
-    ((name, value),) = told(change)
+    ((name, value),) = find_faults(change)
     assert name == "disk_x, disk_y delay"
     assert value == pytest.approx(rows / RATE_HZ, rel=0.01)
 
@@ -86,7 +86,7 @@ def test_a_channel_with_an_equal_delay_and_small_residues_is_grouped() -> None:
         values[8:, :2] += clean[:-8, :2] - clean[8:, :2]
         values[:, 1] += 2e-4 * clean[:, 1] + 2e-4 * values[:, 1].std()
 
-    ((name, _),) = told(change)
+    ((name, _),) = find_faults(change)
     assert name == "disk_x, disk_y delay"
 
 
@@ -96,7 +96,7 @@ def test_samples_at_uneven_times_are_jitter(rms_s: float) -> None:
         taken_s = TIMES - rms_s * np.random.default_rng(5).standard_normal(ROWS)
         values[:, 2] += np.interp(taken_s, TIMES, clean[:, 2]) - clean[:, 2]
 
-    ((name, value),) = told(change)
+    ((name, value),) = find_faults(change)
     assert name == "ring_x jitter"
     assert value == pytest.approx(rms_s, rel=0.08)
 
@@ -104,10 +104,10 @@ def test_samples_at_uneven_times_are_jitter(rms_s: float) -> None:
 @pytest.mark.parametrize("factor", [5.0, 20.0])
 def test_white_noise_is_noise_and_no_jitter(factor: float) -> None:
     def change(values: np.ndarray, clean: np.ndarray) -> None:
-        floor = signals("probes")[0].floor[2]
+        floor = make_signals("probes")[0].floor[2]
         values[:, 2] += factor * floor * np.random.default_rng(5).standard_normal(ROWS)
 
-    ((name, value),) = told(change)
+    ((name, value),) = find_faults(change)
     assert name == "ring_x noise"
     assert value == pytest.approx(math.hypot(1.0, factor), rel=0.02)
 
@@ -120,13 +120,13 @@ def test_swapped_and_turned() -> None:
         c, s = math.cos(0.2), math.sin(0.2)
         values[:, 2:] += clean[:, 2:] @ np.array([[c - 1.0, s], [-s, c - 1.0]])
 
-    assert [name for name, _ in told(swap)] == ["disk_x and disk_y"]
-    ((name, value),) = told(turn)
+    assert [name for name, _ in find_faults(swap)] == ["disk_x and disk_y"]
+    ((name, value),) = find_faults(turn)
     assert (name, value) == ("ring_x and ring_y angle", pytest.approx(-0.2, abs=1e-3))
 
 
 def test_faults_visible_without_a_prediction() -> None:
-    part, _ = signals("forces")
+    part, _ = make_signals("forces")
     assert signal_faults({"forces": part}) == []
     values = part.values.copy()
     values[2000:2300, 0] = values[2000, 0]
@@ -140,7 +140,7 @@ def test_faults_visible_without_a_prediction() -> None:
 
 
 def test_coarse_numbers_are_not_stuck() -> None:
-    part, _ = signals("drive")
+    part, _ = make_signals("drive")
     values = np.round(part.values, 1)
     assert steady_rows(values[:, 0]).any()
     assert signal_faults({"drive": replace(part, values=values)}) == []

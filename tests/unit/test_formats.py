@@ -32,7 +32,7 @@ from rig.base.wire import EVENTS, Block, encode_block, encode_document, sensor_k
 from rig.cli.main import main
 from rig.run.scenes import load_scene
 from rig.run.simulation import Simulation
-from tests.commands import said
+from tests.commands import run_captured
 
 DURATION_S = 0.12
 
@@ -531,7 +531,7 @@ def test_a_package_that_a_format_needs_is_named(
     monkeypatch.chdir(tmp_path)
     Path("pyuff.py").write_text(module)
     Path("run.uff").write_text("    -1\n")
-    status, output, complaints = said(capsys, "import", "run.uff", "--template", "mapping.toml")
+    status, output, complaints = run_captured(capsys, "import", "run.uff", "--template", "mapping.toml")
     assert (status, output, complaints.count("\n")) == (2, "", 1)
     assert complaints.startswith(f"rig: UFF files need the package pyuff, which is {says}")
     assert not Path("mapping.toml").exists()

@@ -12,7 +12,7 @@ from rig.base.errors import InputError
 from rig.run.scenes import load_scene, parse_scene, scene_document
 from rig.run.simulation import Simulation
 from tests.fault_cases import EXAMPLES
-from tests.unit.test_channel_faults import differs, run
+from tests.unit.test_channel_faults import find_differences, run
 
 SCENE = load_scene(
     "test-sine", {"duration_s": 0.4, "sensors.groups": ["probes", "forces", "drive"], "generator.frequency_hz": 1000.0}
@@ -39,15 +39,15 @@ def test_a_fault_is_on_its_channels_and_rows_alone_or_refused(kind: str, sound: 
         return
     there, events = run(fault(kind), scene=SCENE)
     (begun,) = (event for event in events if event["event"] == "fault")
-    found = differs(there, sound)
+    found = find_differences(there, sound)
     assert set(found) == set(begun["channels"])
     for first, last in found.values():
         assert FROM * RATE_HZ <= first <= last < TO * RATE_HZ
         assert first <= FROM * RATE_HZ + 4 or kind in ("intermittent", "spikes", "nonlinear", "saturation")
-    assert not differs(there, run(fault(kind), scene=SCENE, cut=10_000)[0])
+    assert not find_differences(there, run(fault(kind), scene=SCENE, cut=10_000)[0])
 
 
-def tone(counts: np.ndarray) -> complex:
+def measure_tone(counts: np.ndarray) -> complex:
     """Return the amplitude at the signal's frequency in whole periods of the faulty rows [counts]."""
     part = counts[round(0.2 * RATE_HZ) : round(0.3 * RATE_HZ)]
     hz = SCENE.sources()["disk_x"].signal.frequency_hz
@@ -56,12 +56,14 @@ def tone(counts: np.ndarray) -> complex:
 
 
 def test_fault_sizes_are_recovered_from_the_counts(sound: dict[str, np.ndarray]) -> None:
-    plain, hz = tone(sound["disk_x"]), SCENE.sources()["disk_x"].signal.frequency_hz or 0.0
-    gain = tone(run(fault("gain", factor=0.7), scene=SCENE)[0]["disk_x"]) / plain
+    plain, hz = measure_tone(sound["disk_x"]), SCENE.sources()["disk_x"].signal.frequency_hz or 0.0
+    gain = measure_tone(run(fault("gain", factor=0.7), scene=SCENE)[0]["disk_x"]) / plain
     assert gain == pytest.approx(0.7, abs=1e-4)
-    late = tone(run(fault("late", late_us=731.0), scene=SCENE)[0]["disk_x"]) / plain
+    late = measure_tone(run(fault("late", late_us=731.0), scene=SCENE)[0]["disk_x"]) / plain
     assert late == pytest.approx(np.exp(-2j * math.pi * hz * 731e-6), abs=1e-4)
-    resonance = tone(run(fault("resonance", frequency_hz=3.0 * hz, quality=5.0), scene=SCENE)[0]["disk_x"]) / plain
+    resonance = (
+        measure_tone(run(fault("resonance", frequency_hz=3.0 * hz, quality=5.0), scene=SCENE)[0]["disk_x"]) / plain
+    )
     x = 1.0 / 3.0
     assert resonance == pytest.approx(1.0 / (1.0 - x**2 + 1j * x / 5.0), rel=0.01)
 

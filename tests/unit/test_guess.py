@@ -21,7 +21,7 @@ from replays.recordings.formats.mapping import parse_mapping
 from rig.base.wire import sensor_key
 from rig.serve.stream_check import Catalogue
 from tests import foreign
-from tests.commands import said, shown
+from tests.commands import run_captured, run_for_output
 
 
 @pytest.mark.parametrize(
@@ -64,8 +64,8 @@ def test_the_o_of_compass_points_is_recognised_from_the_others() -> None:
 
 
 LOGS = {
-    "m.mf4": foreign.mdf_of_three_rates, "t.tdms": foreign.tdms_in_volts, "g.csv": foreign.german_csv,
-    "c.csv": foreign.csv_without_names,
+    "m.mf4": foreign.write_mdf, "t.tdms": foreign.write_tdms, "g.csv": foreign.write_german_csv,
+    "c.csv": foreign.write_nameless_csv,
 }  # fmt: skip
 LINES_TO_CHECK = {"m.mf4": 1, "t.tdms": 4, "g.csv": 1, "c.csv": 5}
 """Lines to check: filters of all; which probe is x, and pulses per turn; the side of nameless forces."""
@@ -142,7 +142,7 @@ def test_samples_are_not_changed_without_a_request(
     """Imported as guessed, without an edit: values, rates and edges are those of the log, and it can be played."""
     path, kept, text, _ = log
     conversion, recording = imported(path, text, tmp_path)
-    truth = {rate: foreign.signals(rate) for rate in {rate for rate, _ in kept.values()}}
+    truth = {rate: foreign.make_signals(rate) for rate in {rate for rate, _ in kept.values()}}
     assert [channel.time.split("; ")[1] for channel in conversion.channels] == ["samples as they were"] * len(kept)
     for channel, (rate, _) in kept.items():
         samples = recording.samples(channel)
@@ -153,7 +153,7 @@ def test_samples_are_not_changed_without_a_request(
         within = {"keyphasor": 1e-3, "hammer": 0.006 if path.suffix == ".mf4" else 1e-3}.get(channel, 1e-3)
         np.testing.assert_allclose(samples[channel], scale * truth[rate][channel], rtol=0, atol=within)
     edges = recording.edges()
-    np.testing.assert_allclose(edges, foreign.edges()[: len(edges)], rtol=0, atol=5e-9)
+    np.testing.assert_allclose(edges, foreign.pulse_times()[: len(edges)], rtol=0, atol=5e-9)
     assert len(edges) == 8
     assert len(conversion.pulses) == 1
     assert conversion.pulses[0].force_n == pytest.approx(foreign.PULSE_FORCE_N, rel=0.01)
@@ -277,14 +277,14 @@ def test_resampling_gains_are_those_of_the_filters() -> None:
 
 def test_a_log_is_imported_in_one_step(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "g.csv"
-    foreign.german_csv(path, rate_hz=2000.0)
-    printed = shown(capsys, "import", path)
+    foreign.write_german_csv(path, rate_hz=2000.0)
+    printed = run_for_output(capsys, "import", path)
     assert "Kraft O [N]" in printed
     assert "Not contained in the logs:\n  [defaults] bandwidth_hz = HZ: the anti-aliasing low-pass" in printed
     assert list(tmp_path.iterdir()) == [path], "nothing is written unasked"
-    found = json.loads(shown(capsys, "import", path, "--json"))
+    found = json.loads(run_for_output(capsys, "import", path, "--json"))
     assert {one["signal"]: one["channel"] for one in found}["Kraft O"] == "P_E"
-    printed = shown(capsys, "import", path, "-o", tmp_path / "g.mcap")
+    printed = run_for_output(capsys, "import", path, "-o", tmp_path / "g.mcap")
     assert "imported by the guess" in printed
     assert "assumed, not in the mapping: [defaults] bandwidth_hz" in printed
     assert len(Recording.open(tmp_path / "g.mcap").table.channels) == 13
@@ -346,7 +346,7 @@ def test_wrong_input_is_refused_in_one_line(
     monkeypatch.chdir(tmp_path)
     Path("x.csv").write_text("x [mm]\n1\n2\n3\n")
     Path("m.toml").write_text("[channels.disk_x]\nsource = 'x'\n")
-    status, _, complaints = said(capsys, "import", *arguments)
+    status, _, complaints = run_captured(capsys, "import", *arguments)
     assert (status, complaints.count("\n")) == (2, 1), complaints
     assert complaint in complaints
     assert {path.name for path in tmp_path.iterdir()} == {"x.csv", "m.toml"}

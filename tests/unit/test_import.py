@@ -26,7 +26,7 @@ from replays.recordings.resimulation.experiment import Experiment
 from rig.base import units
 from rig.base.errors import InputError
 from rig.cli.main import main
-from tests.commands import shown
+from tests.commands import run_for_output
 
 
 def imported(folder: Path, files: list[Path], mapping: str, *, name: str = "out") -> tuple[Conversion, Recording]:
@@ -445,7 +445,7 @@ def test_probes_at_any_angles_become_x_and_y(angles: tuple[float, float], tmp_pa
     np.testing.assert_allclose(samples["ring_y"], y, rtol=0, atol=1e-9)
 
 
-def trigger(t: np.ndarray, at: tuple[float, ...]) -> np.ndarray:
+def make_trigger(t: np.ndarray, at: tuple[float, ...]) -> np.ndarray:
     """Return ramps of 2 ms from 0 to 5 V, half way at the given times."""
     up = [np.clip((t - when) / 2e-3 + 0.5, 0, 1) for when in at]
     down = [np.clip((t - when - 0.05) / 2e-3 + 0.5, 0, 1) for when in at]
@@ -457,9 +457,9 @@ def two_clocks(folder: Path, *, offset_s: float, ppm: float) -> list[Path]:
     other = np.arange(9000) / 5000  # its own clock; true time is offset + (1 + ppm) other
     true = offset_s + (1 + ppm * 1e-6) * other
     return [
-        rows_csv(folder / "a.csv", {"time": t, "trig": trigger(t, (0.5, 1.6)), "F [N]": 100 * np.sin(40 * t)}),
+        rows_csv(folder / "a.csv", {"time": t, "trig": make_trigger(t, (0.5, 1.6)), "F [N]": 100 * np.sin(40 * t)}),
         rows_csv(
-            folder / "b.csv", {"time": other, "trig": trigger(true, (0.5, 1.6)), "d [um]": 100 * np.sin(40 * true)}
+            folder / "b.csv", {"time": other, "trig": make_trigger(true, (0.5, 1.6)), "d [um]": 100 * np.sin(40 * true)}
         ),
     ]  # fmt: skip
 
@@ -969,7 +969,7 @@ def test_the_import_is_reported_in_one_line_per_channel(tmp_path: Path, capsys: 
     units_of = {"disk_x": ("a", "mm"), "ring_y": ("b", "um"), "inner_x": ("c", "m/s^2")}
     mapping = "".join(f"[channels.{n}]\nsource = '{s}'\nunit = '{u}'\n" for n, (s, u) in units_of.items())
     (tmp_path / "m.toml").write_text(mapping + "bias = -2.0\n")
-    lines = shown(capsys, "import", path, "-m", tmp_path / "m.toml", "-o", tmp_path / "o.mcap").splitlines()
+    lines = run_for_output(capsys, "import", path, "-m", tmp_path / "m.toml", "-o", tmp_path / "o.mcap").splitlines()
     (x,), (y,), (a,) = ([line.split() for line in lines if line.startswith(f"{name} ")] for name in units_of)
     assert x[:3] == ["disk_x", "a", "source"]
     assert x[-1] == "mm"

@@ -40,7 +40,7 @@ def test_a_wrong_path_is_no_module(name: str) -> None:
         import_module(name)
 
 
-def imported(folder: Path, code: str, script: str = "script.py") -> str:
+def run_script(folder: Path, code: str, script: str = "script.py") -> str:
     """Return the output of a script in a folder, or the last line of its error."""
     (folder / script).write_text(code)
     command = [sys.executable, str(folder / script)]
@@ -55,7 +55,9 @@ def test_a_users_folder_hides_no_module_of_the_rig(package: str, tmp_path: Path)
     (tmp_path / package / "mine.py").write_text("VALUE = 7")
     module = {"drivers": "drivers.daq", "recorder": "recorder.reader", "replays": "replays.report.canvas"}[package]
     code = f"import rig, {package}.mine, {module}\nfrom rig import connect\n"
-    told = imported(tmp_path, f"{code}print({package}.MINE, {package}.mine.VALUE, {module}.__name__, connect.__name__)")
+    told = run_script(
+        tmp_path, f"{code}print({package}.MINE, {package}.mine.VALUE, {module}.__name__, connect.__name__)"
+    )
     assert told == f"True 7 {module} connect"
 
 
@@ -65,13 +67,13 @@ def test_a_users_file_hides_no_module_of_the_rig(package: str, first: str, tmp_p
     (tmp_path / f"{package}.py").write_text("MINE = True")
     module = {"drivers": "drivers.link", "recorder": "recorder.viewer", "replays": "replays.report"}[package]
     code = f"{first}import rig, {package}, {module}\n".format(package=package)
-    assert imported(tmp_path, f"{code}print({package}.MINE, {module}.__name__)") == f"True {module}"
+    assert run_script(tmp_path, f"{code}print({package}.MINE, {module}.__name__)") == f"True {module}"
 
 
 @pytest.mark.parametrize("package", ["drivers", "recorder", "replays"])
 def test_a_script_named_like_a_module_runs_once(package: str, tmp_path: Path) -> None:
     code = f"print('once')\nimport rig, {package}\nprint({package}.__path__[0].endswith('{package}'))"
-    assert imported(tmp_path, code, script=f"{package}.py") == "once\nTrue"
+    assert run_script(tmp_path, code, script=f"{package}.py") == "once\nTrue"
 
 
 def test_the_client_is_recognised_by_its_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -89,7 +91,7 @@ def test_a_users_module_that_replaces_one_of_the_rig_is_named(tmp_path: Path) ->
     (tmp_path / "drivers").mkdir()
     (tmp_path / "drivers/__init__.py").touch()
     (tmp_path / "drivers/client.py").touch()
-    told = imported(tmp_path, "import rig\nrig.connect()")
+    told = run_script(tmp_path, "import rig\nrig.connect()")
     assert told == (
         f"ImportError: drivers.client must be the rig's own; received {tmp_path}/drivers/client.py; rename it"
     )

@@ -41,8 +41,8 @@ from rig.serve.transport.memory import MemoryClient, MemoryServer
 from rig.serve.transport.zenoh import ZenohClient, ZenohServer
 from tests.processes import free_endpoint
 from tests.unit import link_memory as memory
-from tests.unit.instruments_fake import BLOCK, FakeRig, values_of
-from tests.waiting import PATIENCE_S, sooner_than, until
+from tests.unit.instruments_fake import BLOCK, FakeRig, expected_values
+from tests.waiting import PATIENCE_S, time_limit, until
 
 pytestmark = pytest.mark.wallclock
 
@@ -86,7 +86,7 @@ class Bench:
         """Open the host's end of a link to an instrument, which is started on it."""
         kind = KINDS[name]
         if self.link == "memory":
-            near, far = memory.pair()
+            near, far = memory.make_pair()
             self.twins.serve(kind, MessagePort(near, "memory:"))
             return far
         if self.link == "pty":
@@ -179,7 +179,7 @@ def test_the_same_engineering_values_come_over_every_link(bench: Bench) -> None:
             assert samples.names == told.channels == table.names
             assert samples.units == tuple(channel.unit for channel in table.channels)
             assert (samples.index, samples.tick, samples.gap, samples.rate_hz) == (0, 0, 0, 20_000.0)
-            np.testing.assert_allclose(samples.values, values_of(group, 0, 2 * BLOCK), rtol=0, atol=1e-9)
+            np.testing.assert_allclose(samples.values, expected_values(group, 0, 2 * BLOCK), rtol=0, atol=1e-9)
             np.testing.assert_allclose(samples.times_s, np.arange(2 * BLOCK) / 20_000.0, atol=1e-12)
 
 
@@ -193,7 +193,7 @@ def test_channels_and_a_slower_rate_can_be_chosen(bench: Bench) -> None:
     rows = -(-5 * BLOCK // 7)
     samples = driver.read(rows)
     assert len(samples) == rows
-    np.testing.assert_allclose(samples.values, values_of(group, 0, 5 * BLOCK, 7)[:, [1, 3]], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(samples.values, expected_values(group, 0, 5 * BLOCK, 7)[:, [1, 3]], rtol=0, atol=1e-9)
     np.testing.assert_allclose(samples.times_s, np.arange(rows) * 7 / 20_000.0, atol=1e-12)
 
 
@@ -222,7 +222,7 @@ def test_a_gap_is_reported_with_its_size(bench: Bench) -> None:
     before, after = driver.read(3 * BLOCK), driver.read(2 * BLOCK)
     assert (before.index, len(before), before.gap) == (0, BLOCK, 0)
     assert (after.index, len(after), after.gap) == (4 * BLOCK, 2 * BLOCK, 3 * BLOCK)
-    np.testing.assert_allclose(after.values, values_of(group, 4 * BLOCK, 2 * BLOCK), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(after.values, expected_values(group, 4 * BLOCK, 2 * BLOCK), rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", ACTS)
@@ -253,7 +253,9 @@ def test_a_command_is_executed_while_data_stream(bench: Bench) -> None:
     bench.rig.publish("hammer", blocks=5)
     assert hammer.trigger().id == 1
     bench.rig.publish("hammer", blocks=5)
-    np.testing.assert_allclose(hammer.read(10 * BLOCK).values, values_of("hammer", 0, 10 * BLOCK), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(
+        hammer.read(10 * BLOCK).values, expected_values("hammer", 0, 10 * BLOCK), rtol=0, atol=1e-9
+    )
 
 
 def test_twins_and_daq_read_only_sensors_and_events(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -279,7 +281,7 @@ def test_instruments_reconnect_to_a_restarted_rig() -> None:
         closing.callback(first.close)
         rig = FakeRig(first)
         twins = closing.enter_context(Twins(closing.enter_context(ZenohClient(endpoint))))
-        near, far = memory.pair()
+        near, far = memory.make_pair()
         twins.serve(KINDS["force"], MessagePort(near, "memory:"))
         force = closing.enter_context(Force(far, timeout_s=20.0))
         force.start()
@@ -293,7 +295,7 @@ def test_instruments_reconnect_to_a_restarted_rig() -> None:
         force.start()
         with publishing(rig):
             samples = force.read(3 * BLOCK, timeout_s=20.0)
-        np.testing.assert_allclose(samples.values, values_of("forces", samples.index, len(samples)), atol=1e-9)
+        np.testing.assert_allclose(samples.values, expected_values("forces", samples.index, len(samples)), atol=1e-9)
 
 
 def read_on(force: Force) -> None:
@@ -456,7 +458,7 @@ def test_the_asyncio_drivers_agree(memory_bench: Bench, name: str) -> None:
                 await instrument.start()
                 reading = asyncio.create_task(instrument.read(BLOCK))
                 memory_bench.rig.publish(group, blocks=3)
-                np.testing.assert_allclose((await reading).values, values_of(group, 0, BLOCK), atol=1e-9)
+                np.testing.assert_allclose((await reading).values, expected_values(group, 0, BLOCK), atol=1e-9)
                 memory_bench.rig.end()
                 assert [len(samples) async for samples in instrument.blocks(150)] == [150, 150, 100]
             for method in {"hammer": ["trigger"], "drive": ["set_speed"], "magnet": ["release"]}.get(name, []):
@@ -532,11 +534,11 @@ def test_a_wrong_version_and_a_wrong_length_are_named() -> None:
 
 
 def test_a_host_that_does_not_read_loses_a_reported_number_of_rows(memory_bench: Bench) -> None:
-    near, far = memory.pair(room=5)
+    near, far = memory.make_pair(room=5)
     twin = memory_bench.twins.serve(KINDS["force"], MessagePort(near, "memory:", room=16_000))
     driver = Force(far)
     driver.start()
-    with sooner_than(PATIENCE_S):
+    with time_limit(PATIENCE_S):
         memory_bench.rig.publish("forces", blocks=400)
     rows, missing = drain(driver)
     memory_bench.rig.publish("forces")
@@ -658,7 +660,7 @@ def test_a_spoilt_line_is_counted_and_used_again(memory_bench: Bench) -> None:
 def test_an_unread_line_does_not_block_the_writer() -> None:
     line, path = open_pty()
     host = open_serial(path)
-    with sooner_than(PATIENCE_S), pytest.raises(LinkTimeoutError, match="accepted no data"):
+    with time_limit(PATIENCE_S), pytest.raises(LinkTimeoutError, match="accepted no data"):
         line.send(b"x" * 60_000, timeout_s=0.2)
     # A new reader is synchronised after the truncated frame.
     reader = threading.Thread(target=lambda: line.send(b"last", timeout_s=5.0))

@@ -12,13 +12,13 @@ from replays.studies.laws import compare, draw, returned_over_speeds
 from rig.cli.main import main
 from rig.physics.contacts import DAMPING, KELVIN_VOIGT, STIFFNESS
 from rig.physics.parameters import load_parameters
-from tests.commands import shown
+from tests.commands import run_for_output
 
 DEFAULT = load_parameters()
 
 
 def run(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
-    return shown(capsys, "laws", *arguments)
+    return run_for_output(capsys, "laws", *arguments)
 
 
 def document(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict[str, Any]:
@@ -147,7 +147,7 @@ def test_wrong_input_is_refused_in_one_line(
 
 
 def test_params_shows_the_error_of_the_fit(capsys: pytest.CaptureFixture[str]) -> None:
-    told = shown(capsys, "params", "--set", "contact.stiffness=johnson-cylinder")
+    told = run_for_output(capsys, "params", "--set", "contact.stiffness=johnson-cylinder")
     rows = {line.split()[0]: line.split() for line in told.splitlines() if line.startswith("contact.")}
     assert rows["contact.stiffness"][1].startswith("8.91")
     assert rows["contact.stiffness"][4] == "johnson-cylinder"

@@ -29,7 +29,7 @@ CLIENTS = (
 )  # fmt: skip
 
 
-def lean(code: str) -> subprocess.CompletedProcess[str]:
+def run_lean(code: str) -> subprocess.CompletedProcess[str]:
     """Run a program as on a machine without the extra."""
     program = LEAN.format(full=set(FULL)) + code
     return subprocess.run([sys.executable, "-c", program], cwd=ROOT, text=True, capture_output=True, timeout=120)
@@ -42,16 +42,16 @@ def test_the_message_names_the_extra() -> None:
 
 
 def test_clients_need_no_more_than_the_lean_install() -> None:
-    done = lean("\n".join(f"import {module}" for module in CLIENTS))
+    done = run_lean("\n".join(f"import {module}" for module in CLIENTS))
     assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_commands_of_the_full_install_explain_how_to_get_it() -> None:
-    done = lean("from rig.cli.main import main; main(['simulate', 'hammer', '-o', 'never.csv'])")
+    done = run_lean("from rig.cli.main import main; main(['simulate', 'hammer', '-o', 'never.csv'])")
     need = r"numba, which comes with the whole rig: pip install 'rotor-stator-rig\[full\]'"
     assert done.returncode == 2
     assert re.fullmatch(f"rig: this needs {need}\n", done.stderr)
-    assert re.search(f"rig.simulate needs {need}", lean("import rig; rig.simulate('hammer')").stderr)
+    assert re.search(f"rig.simulate needs {need}", run_lean("import rig; rig.simulate('hammer')").stderr)
 
 
 FULL_ARGUMENTS = {
@@ -67,11 +67,11 @@ FULL_ARGUMENTS = {
 def test_the_help_names_the_commands_that_need_the_whole_rig(tmp_path: Path) -> None:
     from rig.cli.app import COMMANDS, NEED_FULL
 
-    shown = " ".join(lean("from rig.cli.main import main; main(['-h'])").stdout.split())
+    shown = " ".join(run_lean("from rig.cli.main import main; main(['-h'])").stdout.split())
     assert shown.endswith(f"{WHOLE_RIG}: {', '.join(NEED_FULL)}.")
     assert set(NEED_FULL) <= {name for commands in COMMANDS.values() for name in commands}
     given = {name: FULL_ARGUMENTS.get(name, "").format(rec=RECORDING, folder=tmp_path).split() for name in NEED_FULL}
-    done = lean(
+    done = run_lean(
         f"from rig.cli.main import main\nfor name, rest in {given!r}.items():\n"
         "    try:\n        main([name, *rest])\n    except SystemExit as end:\n        print(name, end.code)"
     )
@@ -85,7 +85,7 @@ def test_the_lean_install_writes_the_same_csv(tmp_path: Path) -> None:
 
     for unit in ("engineering", "counts"):
         arguments = ["export", str(RECORDING), "--to", "0.05", "--unit", unit, "-o"]
-        done = lean(f"from rig.cli.main import main; main({[*arguments, str(tmp_path / 'lean.csv'), '--force']!r})")
+        done = run_lean(f"from rig.cli.main import main; main({[*arguments, str(tmp_path / 'lean.csv'), '--force']!r})")
         assert (done.returncode, done.stderr) == (0, "")
         with pytest.raises(SystemExit) as end:
             main([*arguments, str(tmp_path / "whole.csv"), "--force"])
@@ -112,7 +112,7 @@ def test_each_promised_command_runs_without_any_extra(tmp_path: Path) -> None:
     given = [
         [*name.split(), *rest.format(rec=RECORDING, folder=tmp_path).split()] for name, rest in LEAN_ARGUMENTS.items()
     ]
-    done = lean(
+    done = run_lean(
         f"sys.modules |= dict.fromkeys({OTHER_EXTRAS!r})\nfrom rig.cli.main import main\nfor words in {given!r}:\n"
         "    try:\n        main(words)\n    except SystemExit as end:\n        print('END', words[0], end.code)"
     )

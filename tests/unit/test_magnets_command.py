@@ -12,7 +12,7 @@ from replays.studies.magnets import compare, draw
 from rig.cli.main import main
 from rig.physics.model import build_model
 from rig.physics.parameters import load_parameters
-from tests.commands import shown as run
+from tests.commands import run_for_output as run
 
 FAMILY = ["linear", "far-field map", "far-field sum", "cylinder map", "exact cylinders"]
 
@@ -21,7 +21,7 @@ def document(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict[str, A
     return json.loads(run(capsys, "magnets", "--json", *arguments))
 
 
-def numbers(lines: list[str], title: str) -> dict[str, list[float]]:
+def read_numbers(lines: list[str], title: str) -> dict[str, list[float]]:
     """Return the rows of the table of forces under a title: the columns of numbers by model."""
     start = next(n for n, line in enumerate(lines) if line.startswith(title)) + 2
     rows = {name: lines[start + n] for n, name in enumerate(FAMILY)}
@@ -51,8 +51,8 @@ def test_document_contains_the_family_and_its_errors(capsys: pytest.CaptureFixtu
 
 def test_tables_agree_with_the_document(capsys: pytest.CaptureFixture[str]) -> None:
     found, lines = document(capsys), run(capsys, "magnets").splitlines()
-    same_magnets = numbers(lines, "force toward the centre, same magnets (corrected)")
-    same_stiffness = numbers(lines, "force at 1.7 kN/m")
+    same_magnets = read_numbers(lines, "force toward the centre, same magnets (corrected)")
+    same_stiffness = read_numbers(lines, "force at 1.7 kN/m")
     for model in found["models"]:
         name = model["name"]
         assert same_magnets[name] == pytest.approx(

@@ -16,7 +16,7 @@ from rig.base.errors import RefusedError
 from rig.serve.pacing import Lockstep
 from rig.serve.service import Service
 from rig.serve.transport.memory import MemoryClient, MemoryServer
-from tests.unit.recorder_stream import documents
+from tests.unit.recorder_stream import make_documents
 from tests.unit.service_fake import FakeSimulation
 
 pytestmark = pytest.mark.wallclock
@@ -26,7 +26,7 @@ class Simulation(FakeSimulation):
     """The fake simulation with a catalogue that a recorder can use."""
 
     def catalogue(self) -> dict:
-        return documents()[wire.CATALOGUE]
+        return make_documents()[wire.CATALOGUE]
 
 
 def test_a_note_is_recorded_with_its_time_and_is_no_command(tmp_path: Path) -> None:

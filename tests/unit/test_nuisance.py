@@ -60,7 +60,7 @@ source = "keyphasor"
 )
 
 
-def imported(folder: Path, columns: dict[str, np.ndarray], mapping: str, head: str = HEAD) -> Recording:
+def import_log(folder: Path, columns: dict[str, np.ndarray], mapping: str, head: str = HEAD) -> Recording:
     """Import columns of another recorder; return the recording."""
     import pyarrow as pa
     from pyarrow import parquet
@@ -73,13 +73,13 @@ def imported(folder: Path, columns: dict[str, np.ndarray], mapping: str, head: s
 
 @pytest.fixture(scope="module")
 def motion() -> second_rig.Motion:
-    return second_rig.run(turned=TURNED, after_s=0.3, settled_s=2.0)
+    return second_rig.simulate_pulse(turned=TURNED, after_s=0.3, settled_s=2.0)
 
 
 @pytest.fixture(scope="module")
 def mils(motion: second_rig.Motion, tmp_path_factory: pytest.TempPathFactory) -> Recording:
     """Two probes at 45 degrees in mils, a tachometer in 1/min, a hammer in pounds; nothing else."""
-    own_s, v = second_rig.log(motion, seed=3, rate_hz=12_800.0, ppm=PPM)
+    own_s, v = second_rig.record_log(motion, seed=3, rate_hz=12_800.0, ppm=PPM)
     columns = {
         "time [s]": own_s,
         "A [mil]": (v["ring_x"] + v["ring_y"]) / math.sqrt(2.0) / 0.0254,
@@ -87,15 +87,19 @@ def mils(motion: second_rig.Motion, tmp_path_factory: pytest.TempPathFactory) ->
         "tacho [rpm]": 60.0 * v["speed"],
         "blow [lbf]": v["hammer"] / 4.4482216152605,
     }
-    return imported(tmp_path_factory.mktemp("mils"), columns, MILS)
+    return import_log(tmp_path_factory.mktemp("mils"), columns, MILS)
 
 
-def whole(folder: Path, motion: second_rig.Motion, *, seed: int, case: faulty_logs.Case | None = None) -> Recording:
+def import_all_channels(
+    folder: Path, motion: second_rig.Motion, *, seed: int, case: faulty_logs.Case | None = None
+) -> Recording:
     """Return a recording of all channels with a fault."""
     fault = faulty_logs.Case("", "") if case is None else case
-    own_s, values = second_rig.log(motion, seed=seed, ppm=fault.ppm, edit=lambda values: fault.signals(values, motion))
+    own_s, values = second_rig.record_log(
+        motion, seed=seed, ppm=fault.ppm, edit=lambda values: fault.signals(values, motion)
+    )
     own_s, values = fault.samples(own_s, values)
-    return imported(folder, {"time": own_s, **values}, WHOLE)
+    return import_log(folder, {"time": own_s, **values}, WHOLE)
 
 
 def test_the_second_rig_is_one_of_this_kind(motion: second_rig.Motion) -> None:
@@ -162,8 +166,8 @@ def test_a_contradicting_channel_is_ignored() -> None:
 
 
 def test_an_aligned_log_passes(tmp_path: Path) -> None:
-    motion = second_rig.run(turned=TURNED, before_s=0.2, after_s=0.1, settled_s=2.0)
-    found = validate(whole(tmp_path, motion, seed=8))
+    motion = second_rig.simulate_pulse(turned=TURNED, before_s=0.2, after_s=0.1, settled_s=2.0)
+    found = validate(import_all_channels(tmp_path, motion, seed=8))
     assert found.good, found.verdict_line
     assert found.window_s[1] > 0.215
 
@@ -173,8 +177,8 @@ def test_a_log_of_another_contact_law_does_not_pass(number: str, tmp_path: Path)
     """Its phases are within their limits; no fit continues through the first contact."""
     name, _, value = number.partition(" = ")
     other = {"c": damping_factor(float(value))} if name == "e" else {name: float(value)}
-    motion = second_rig.run(second_rig.Rig(**other), turned=1.0, before_s=0.2, after_s=0.1)
-    found = validate(whole(tmp_path, motion, seed=5))
+    motion = second_rig.simulate_pulse(second_rig.Rig(**other), turned=1.0, before_s=0.2, after_s=0.1)
+    found = validate(import_all_channels(tmp_path, motion, seed=5))
     assert "ends before the first contact" in found.verdict_line
     assert found.explained is not None
     assert "--fit contact.friction" in found.explained.conclusion
@@ -190,13 +194,13 @@ commands = []
 
 def test_the_hum_of_the_mains_has_a_name(motion: second_rig.Motion, tmp_path: Path) -> None:
     """Mains hum on one probe is not a fault of the model."""
-    own_s, values = second_rig.log(motion, seed=7, rate_hz=10_000.0, bandwidth_hz=4000.0, ppm=PPM)
+    own_s, values = second_rig.record_log(motion, seed=7, rate_hz=10_000.0, bandwidth_hz=4000.0, ppm=PPM)
     few = ("disk_x", "disk_y", "ring_x", "ring_y", "speed")
     mapping = "".join(f"[channels.{one}" for one in WHOLE.split("[channels.") if one.partition("]")[0] in few)
     quiet = own_s < 0.4
     columns = {"time": own_s[quiet], **{name: values[name][quiet] for name in few}}
     columns["disk_y"] += 0.01 * np.sin(100.0 * math.pi * own_s[quiet])
-    found = validate(imported(tmp_path, columns, mapping.replace("5000", "4000"), QUIET)).explained
+    found = validate(import_log(tmp_path, columns, mapping.replace("5000", "4000"), QUIET)).explained
     assert found is not None
     assert found.best == ("disk_y hum",)
     assert "50.0" in found.conclusion
@@ -205,10 +209,10 @@ def test_the_hum_of_the_mains_has_a_name(motion: second_rig.Motion, tmp_path: Pa
 @pytest.mark.parametrize("name", ["quiet", pytest.param("contact", marks=MATRIX)])
 def test_a_log_without_a_pulse_is_resumed(name: str, motion: second_rig.Motion, tmp_path: Path) -> None:
     """Its shaft turned before. If it was in contact already, the origin of its motion is unknown."""
-    own_s, values = second_rig.log(motion, seed=7, rate_hz=10_000.0, bandwidth_hz=4000.0, ppm=PPM)
+    own_s, values = second_rig.record_log(motion, seed=7, rate_hz=10_000.0, bandwidth_hz=4000.0, ppm=PPM)
     rows = own_s < 0.4 if name == "quiet" else own_s > 1.0
     part = {channel: one[rows] for channel, one in values.items()}
-    found = validate(imported(tmp_path, {"time": own_s[: rows.sum()], **part}, WHOLE.replace("5000", "4000"), QUIET))
+    found = validate(import_log(tmp_path, {"time": own_s[: rows.sum()], **part}, WHOLE.replace("5000", "4000"), QUIET))
     assert found.good == (name == "quiet")
     if found.explained is not None:
         assert found.explained.conclusion.startswith("the log begins in contact")
@@ -216,8 +220,8 @@ def test_a_log_without_a_pulse_is_resumed(name: str, motion: second_rig.Motion, 
 
 @MATRIX
 def test_contact_without_a_pulse_is_no_fault_of_sensors(motion: second_rig.Motion, tmp_path: Path) -> None:
-    own_s, values = second_rig.log(motion, seed=7, rate_hz=10_000.0, bandwidth_hz=4000.0, ppm=PPM)
-    found = validate(imported(tmp_path, {"time": own_s, **values}, WHOLE.replace("5000", "4000"), QUIET)).explained
+    own_s, values = second_rig.record_log(motion, seed=7, rate_hz=10_000.0, bandwidth_hz=4000.0, ppm=PPM)
+    found = validate(import_log(tmp_path, {"time": own_s, **values}, WHOLE.replace("5000", "4000"), QUIET)).explained
     assert found is not None
     assert not found.best
     assert "a hammer pulse that the mapping does not tell" in found.conclusion
@@ -227,23 +231,23 @@ def test_unpredicted_pulses_are_no_fault(motion: second_rig.Motion, tmp_path: Pa
     """One pulse before the hammer gives the angle by the speed, as contact slows the shaft afterwards; no pulse gives
     nothing.
     """
-    own_s, values = second_rig.log(motion, seed=7, rate_hz=10_000.0, bandwidth_hz=4000.0, ppm=PPM)
+    own_s, values = second_rig.record_log(motion, seed=7, rate_hz=10_000.0, bandwidth_hz=4000.0, ppm=PPM)
     few = ("ring_x", "ring_y", "speed", "hammer", "keyphasor")
     columns = {"time": own_s[: (own_s > 0.63).sum()], **{name: values[name][own_s > 0.63] for name in few}}
     keyphasor, *channels = WHOLE.replace("5000", "4000").split("[channels.")
     mapping = "".join(f"[channels.{one}" for one in channels if one.partition("]")[0] in few)
     (told := tmp_path / "told").mkdir()
-    recording = imported(told, columns, keyphasor + mapping)
+    recording = import_log(told, columns, keyphasor + mapping)
     begin, (before, *_) = Experiment.of(recording).begin, recording.edges()
     assert begin is not None
     assert math.remainder(begin.angle + 2.0 * math.pi * 6.2 * before, 2.0 * math.pi) == pytest.approx(0.0, abs=2e-3)
-    assert validate(imported(tmp_path, columns, mapping)).good
+    assert validate(import_log(tmp_path, columns, mapping)).good
 
 
 def test_a_log_has_to_begin_before_the_pulse(motion: second_rig.Motion, tmp_path: Path) -> None:
-    own_s, values = second_rig.log(motion, seed=7, ppm=PPM)
+    own_s, values = second_rig.record_log(motion, seed=7, ppm=PPM)
     late = {name: one[own_s > 0.795] for name, one in values.items()}
-    recording = imported(tmp_path, {"time": own_s[: len(late["speed"])], **late}, WHOLE)
+    recording = import_log(tmp_path, {"time": own_s[: len(late["speed"])], **late}, WHOLE)
     with pytest.raises(InputError, match="begins more than 10 ms before the hammer pulse"):
         validate(recording)
 
@@ -255,8 +259,8 @@ PULSE = ("hammer.1.force_n", "hammer.1.duration_ms")
 
 def test_contact_parameters_are_identified_from_a_part_of_a_run(tmp_path: Path) -> None:
     """Also from a restitution that is too far off for a descent along the slope."""
-    motion = second_rig.run(second_rig.Rig(mu=0.235), turned=1.0, before_s=0.2, after_s=0.06, settled_s=1.5)
-    recording, rules = whole(tmp_path, motion, seed=5), load_criteria().imported
+    motion = second_rig.simulate_pulse(second_rig.Rig(mu=0.235), turned=1.0, before_s=0.2, after_s=0.06, settled_s=1.5)
+    recording, rules = import_all_channels(tmp_path, motion, seed=5), load_criteria().imported
     found = identify_log(
         recording, Experiment.of(recording), tuple(TRUTH), variants=[one.set for one in rules.variants],
         bandwidth=rules.bandwidth, start={"contact.restitution": 0.8},
@@ -301,12 +305,12 @@ def test_intervals_have_their_nominal_coverage(tmp_path: Path) -> None:
         )  # fmt: skip
         turned, speed_hz = rng.uniform(0.0, 6.28), float(rng.choice([4.2, 5.2, 6.2]))
         pulse = rng.uniform(80.0, 120.0), rng.uniform(4.5, 5.5)
-        motion = second_rig.run(
+        motion = second_rig.simulate_pulse(
             rig, turned=turned, speed_hz=speed_hz, force_n=pulse[0], duration_ms=pulse[1],
             settled_s=1.5 + rng.uniform(0.0, 0.2), after_s=0.1,
         )  # fmt: skip
         (folder := tmp_path / str(seed)).mkdir()
-        recording = whole(
+        recording = import_all_channels(
             folder, motion, seed=seed, case=faulty_logs.Case("", "", ppm=rng.uniform(-80.0, 80.0))
         )  # fmt: skip
         found = identify_log(
@@ -328,8 +332,8 @@ def test_intervals_have_their_nominal_coverage(tmp_path: Path) -> None:
 def test_a_wrong_model_gives_no_wrong_number(number: str, tmp_path: Path) -> None:
     name, _, value = number.partition(" = ")
     wrong = {"c": damping_factor(float(value))} if name == "e" else {name: float(value)}
-    motion = second_rig.run(second_rig.Rig(**wrong), turned=1.0, settled_s=1.5, after_s=0.1)
-    recording, rules = whole(tmp_path, motion, seed=3), load_criteria().imported
+    motion = second_rig.simulate_pulse(second_rig.Rig(**wrong), turned=1.0, settled_s=1.5, after_s=0.1)
+    recording, rules = import_all_channels(tmp_path, motion, seed=3), load_criteria().imported
     found = identify_log(
         recording, Experiment.of(recording), ("contact.friction", "magnet.stiffness"),
         variants=[one.set for one in rules.variants], bandwidth=rules.bandwidth,
@@ -343,15 +347,15 @@ def test_a_wrong_model_gives_no_wrong_number(number: str, tmp_path: Path) -> Non
 def test_aligned_logs_pass(seed: int, tmp_path: Path) -> None:
     """Four speeds, hard and soft pulses: whirl, or impacts that decay; independent angles and noise."""
     speed_hz, force_n = (3.2, 4.2, 5.2, 6.2)[seed % 4], (100.0, 60.0)[seed // 4 % 2]
-    aligned = second_rig.run(speed_hz=speed_hz, force_n=force_n, turned=0.9 * seed, settled_s=1.5)
-    found = validate(whole(tmp_path, aligned, seed=200 + seed))
+    aligned = second_rig.simulate_pulse(speed_hz=speed_hz, force_n=force_n, turned=0.9 * seed, settled_s=1.5)
+    found = validate(import_all_channels(tmp_path, aligned, seed=200 + seed))
     assert found.good, [one.line for one in found.failures]
 
 
 @MATRIX
 @pytest.mark.parametrize("case", faulty_logs.CASES, ids=lambda case: case.name)
 def test_every_fault_has_its_name(case: faulty_logs.Case, motion: second_rig.Motion, tmp_path: Path) -> None:
-    found = validate(whole(tmp_path, motion, seed=100 + faulty_logs.CASES.index(case), case=case))
+    found = validate(import_all_channels(tmp_path, motion, seed=100 + faulty_logs.CASES.index(case), case=case))
     assert case.named_by(found), (found.explained, found.faults)
 
 
@@ -363,8 +367,8 @@ def test_every_fault_has_its_name(case: faulty_logs.Case, motion: second_rig.Mot
 ])  # fmt: skip
 def test_a_changed_model_parameter_is_not_reported_as_a_sensor_fault(number: str, told: str, tmp_path: Path) -> None:
     name, _, value = number.partition(" = ")
-    other = second_rig.run(second_rig.Rig(**{name: float(value)}), turned=1.0, settled_s=1.5, after_s=0.1)
-    found = validate(whole(tmp_path, other, seed=4))
+    other = second_rig.simulate_pulse(second_rig.Rig(**{name: float(value)}), turned=1.0, settled_s=1.5, after_s=0.1)
+    found = validate(import_all_channels(tmp_path, other, seed=4))
     assert found.explained is not None
     assert re.search(told, found.explained.conclusion)
 

@@ -22,24 +22,24 @@ from rig.cli.options import parse_pairs, split_names
 from rig.physics.engine_choice import Limits
 from rig.physics.engines import ENGINES
 from rig.run.scenes import Scene
-from tests.commands import said, shown
+from tests.commands import run_captured, run_for_output
 
 ROOT = Path(__file__).parents[2]
 SHARED = ("--from", "--to", "--force", "--report", "--connect")
 
 
-def commands() -> dict[str, Any]:
+def list_commands() -> dict[str, Any]:
     """Return every command and subcommand, by its name after `rig`."""
     root = rig()
     found = {name: root.get_command(None, name) for name in root.list_commands(None)}
     return found | {f"{name} {part}": found[name].get_command(None, part) for name in GROUPS for part in GROUPS[name]}
 
 
-COMMAND = commands()
+COMMAND = list_commands()
 COMMAND_COUNT = sum(map(len, COMMANDS.values()))
 
 
-def options() -> list[tuple[str, str, Any]]:
+def list_options() -> list[tuple[str, str, Any]]:
     """Return command, flag and parameter of every option."""
     return [
         (name, flag, parameter)
@@ -52,14 +52,14 @@ def options() -> list[tuple[str, str, Any]]:
 
 @pytest.mark.parametrize("shared", SHARED)
 def test_a_shared_option_is_worded_once(shared: str) -> None:
-    found = [parameter for _, flag, parameter in options() if flag == shared]
+    found = [parameter for _, flag, parameter in list_options() if flag == shared]
     assert len(found) > 1
     assert len({(one.help, one.metavar, *one.opts, *one.secondary_opts) for one in found}) == 1
 
 
 def test_one_option_has_one_name_in_all_commands() -> None:
     others = {"--from-s", "--to-s", "--window", "--channel", "--overwrite", "--out", "--html"}
-    assert [(name, flag) for name, flag, _ in options() if flag in others] == []
+    assert [(name, flag) for name, flag, _ in list_options() if flag in others] == []
 
 
 def test_names_and_pairs() -> None:
@@ -83,12 +83,12 @@ def test_the_help_lists_the_summary_of_each_command() -> None:
 
 
 def test_help_is_told_once_and_fits_80_columns(capsys: pytest.CaptureFixture[str]) -> None:
-    alone = shown(capsys)
-    assert alone == shown(capsys, "-h") == shown(capsys, "--help")
+    alone = run_for_output(capsys)
+    assert alone == run_for_output(capsys, "-h") == run_for_output(capsys, "--help")
     assert alone.count("Usage:") == 1
     assert {line.split()[0] for line in alone.splitlines() if line.startswith("  ")} > set(rig().list_commands(None))
     for name, command in COMMAND.items():
-        page = shown(capsys, *name.split(), "-h")
+        page = run_for_output(capsys, *name.split(), "-h")
         assert f"Usage: rig {name} " in page
         assert max(map(len, page.splitlines())) < 80, name
         assert isinstance(command, Group) or page.count("-h, --help") == 1
@@ -158,7 +158,7 @@ def test_help_is_told_once_and_fits_80_columns(capsys: pytest.CaptureFixture[str
     ],
 )
 def test_a_wrong_command_line_is_refused_in_one_line(capsys: pytest.CaptureFixture[str], line: str, says: str) -> None:
-    assert said(capsys, *line.split()) == (2, "", f"rig: {says}\n")
+    assert run_captured(capsys, *line.split()) == (2, "", f"rig: {says}\n")
 
 
 def completed(line: str, shell: str = "zsh") -> list[str]:

@@ -16,7 +16,7 @@ from rig.physics.contacts import DAMPING, STIFFNESS, WORKING_FORCES, fit_power, 
 from rig.physics.law_file import read_law
 from rig.physics.model import build_model, contact_pair
 from rig.physics.parameters import load_parameters
-from tests.commands import said, shown
+from tests.commands import run_captured, run_for_output
 
 LIU = "pi/2 * E * L * delta * sqrt(delta / (2 * (r0 + delta)))"
 PAIR = contact_pair(load_parameters())
@@ -122,7 +122,7 @@ def test_a_wrong_law_file_is_refused_in_one_line(
 ) -> None:
     path = tmp_path / "x.toml"
     path.write_text(text)
-    status, out, err = said(capsys, "laws", "--law", str(path))
+    status, out, err = run_captured(capsys, "laws", "--law", str(path))
     assert (status, out) == (2, "")
     assert words in err
     assert err.count("\n") == 1
@@ -131,7 +131,9 @@ def test_a_wrong_law_file_is_refused_in_one_line(
 def test_laws_are_compared_with_the_file_s(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "x.toml"
     path.write_text(LAW)
-    laws = {law["name"]: law for law in json.loads(shown(capsys, "laws", "--law", str(path), "--json"))["damping"]}
+    laws = {
+        law["name"]: law for law in json.loads(run_for_output(capsys, "laws", "--law", str(path), "--json"))["damping"]
+    }
     own, known = laws["0.75 * (1 - e**2)"], laws["lankarani-nikravesh"]
     assert (own["in_use"], known["in_use"]) == (True, False)
     for column in ("damping_factor", "returned", "peak_force_n", "contact_time_ms"):

@@ -34,7 +34,7 @@ from replays.studies.paper.scans.spread import (
 from replays.studies.paper.statement import SETS, Statement, claims, distribution, number, printed_values, statements
 from rig.cli.main import main
 from rig.physics.parameters import load_parameters
-from tests.commands import shown
+from tests.commands import run_for_output
 
 ASSUMPTIONS = {"hammer.duration", "hammer.at", "transducer.bandwidth"}
 """Assumptions of the report in addition to the parameters."""
@@ -313,7 +313,7 @@ def test_symbols_powers_and_signs_are_set_as_in_print():
 
 def test_terminal_shows_every_statement_and_the_rule(findings: Findings, capsys, monkeypatch):
     monkeypatch.setattr("replays.studies.paper.findings.find", lambda **_: findings)
-    printed = shown(capsys, "paper", "--quick")
+    printed = run_for_output(capsys, "paper", "--quick")
     said = " ".join(printed.split())
     for line in [*findings.lines, *findings.claims]:
         assert " ".join(line.row().cells[-2:]) in said

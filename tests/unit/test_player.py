@@ -27,8 +27,16 @@ from rig.serve.pacing import FreeRun, RealTime
 from rig.serve.service import REPLAY_COMMANDS, Service
 from rig.serve.transport.clients import Clients
 from rig.serve.transport.memory import MemoryClient, MemoryServer
-from tests.unit.player_recording import BLOCK_NS, BLOCKS, DURATION_NS, Payloads, by_key, key_by_key, write_recording
-from tests.unit.recorder_stream import documents, stream
+from tests.unit.player_recording import (
+    BLOCK_NS,
+    BLOCKS,
+    DURATION_NS,
+    Payloads,
+    group_by_key,
+    order_by_key,
+    write_recording,
+)
+from tests.unit.recorder_stream import generate_stream, make_documents
 from tests.unit.service_fake import FakeSimulation
 from tests.unit.test_pacing import FakeTime
 from tests.waiting import until
@@ -68,7 +76,7 @@ class Heard:
 
     @property
     def payloads(self) -> Payloads:
-        return by_key(self.all)
+        return group_by_key(self.all)
 
     @property
     def events(self) -> list[dict[str, Any]]:
@@ -97,7 +105,7 @@ def play(track: Track, **options: Any) -> tuple[Heard, dict[str, Any]]:
 @pytest.mark.parametrize("by", By)
 def test_every_payload_is_played_once_in_the_order_of_its_key(track: Track, by: By) -> None:
     played = [(item.key, item.payload) for batch in Timeline(track, by).play(0) for item in batch]
-    assert by_key(played) == by_key(stream(BLOCKS))
+    assert group_by_key(played) == group_by_key(generate_stream(BLOCKS))
 
 
 def test_a_block_is_due_at_its_end_and_a_document_at_its_own_time(track: Track) -> None:
@@ -115,14 +123,14 @@ def test_deadlines_by_arrival_are_those_of_the_recorder(track: Track) -> None:
 
 
 def test_payloads_recorded_key_by_key_are_played_by_time(folder: Path) -> None:
-    history = Track([write_recording(folder / "history.mcap", key_by_key())])
+    history = Track([write_recording(folder / "history.mcap", order_by_key())])
     due: list[int] = []
     played: list[tuple[str, bytes]] = []
     for batch in Timeline(history).play(0):
         due.append(batch[0].due_ns)
         played += [(item.key, item.payload) for item in batch]
     assert due == sorted(set(due))
-    assert by_key(played) == by_key(stream(BLOCKS))
+    assert group_by_key(played) == group_by_key(generate_stream(BLOCKS))
 
 
 @pytest.mark.parametrize("from_ms", [0, 5, 10, 333])
@@ -141,7 +149,7 @@ def test_chunks_contain_every_message_once_with_its_time(folder: Path, path: Pat
         files = [folder / "chunks.mcap.part"]
         files[0].write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     elif kind == "parts":
-        written = list(stream(BLOCKS))
+        written = list(generate_stream(BLOCKS))
         half = next(n for n, (key, _) in enumerate(written) if n > len(written) / 2 and key == PROBES)
         parts = {"first": written[:half], "second": written[half:]}
         files = [write_recording(folder / f"chunks-{name}.mcap", part) for name, part in parts.items()]
@@ -161,7 +169,7 @@ def test_chunks_contain_every_message_once_with_its_time(folder: Path, path: Pat
 
 def test_a_replay_is_the_recording_byte_for_byte(track: Track) -> None:
     heard, summary = play(track)
-    assert heard.payloads == by_key(stream(BLOCKS))
+    assert heard.payloads == group_by_key(generate_stream(BLOCKS))
     assert summary["reason"] == "completed"
     assert summary["left_out"] == 0
     assert heard.all[-1][0] == wire.EVENTS, "the end comes last"
@@ -202,7 +210,7 @@ def test_documents_come_from_the_file_and_the_status_names_the_replay(track: Tra
     player.prepare()
     client = MemoryClient(server)
     for key in (wire.CATALOGUE, wire.PARAMETERS, wire.SCENE):
-        assert client.request(key) == wire.encode_document(documents()[key])
+        assert client.request(key) == wire.encode_document(make_documents()[key])
     status = wire.decode_document(client.request(wire.STATUS))
     assert status["pace"] == "replay"
     assert status["replay"]["paused"] is True
@@ -218,7 +226,7 @@ def test_a_truncated_file_is_played_to_its_last_message(folder: Path, path: Path
     data = path.read_bytes()
     short.write_bytes(data[: int(cut * len(data))])
     heard, summary = play(Track([short]))
-    recording, whole = Recording.open(short), by_key(stream(BLOCKS))
+    recording, whole = Recording.open(short), group_by_key(generate_stream(BLOCKS))
     assert 0 < recording.messages[PROBES] < BLOCKS
     for key, payloads in heard.payloads.items():
         expected = whole[key][: recording.messages[key]]
@@ -230,12 +238,12 @@ def test_a_truncated_file_is_played_to_its_last_message(folder: Path, path: Path
 
 
 def test_parts_are_one_recording(folder: Path) -> None:
-    payloads = list(stream(BLOCKS))
+    payloads = list(generate_stream(BLOCKS))
     half = next(n for n, (key, _) in enumerate(payloads) if n > len(payloads) / 2 and key == PROBES)
     parts = [write_recording(folder / "a.mcap", payloads[:half]), write_recording(folder / "b.mcap", payloads[half:])]
     for order in (parts, parts[::-1]):
         heard, _ = play(Track(order))
-        assert heard.payloads == by_key(payloads)
+        assert heard.payloads == group_by_key(payloads)
 
 
 def test_a_cut_off_file_can_be_sought_in(folder: Path, path: Path) -> None:
@@ -272,7 +280,7 @@ def test_passes_with_original_numbers_step_back(track: Track) -> None:
 
 def test_complete_passes_keep_every_payload_except_intermediate_ends(track: Track) -> None:
     heard, summary = play(track, part=Part(loops=2))
-    once = by_key(stream(BLOCKS))
+    once = group_by_key(generate_stream(BLOCKS))
     for key, payloads in once.items():
         if key != wire.EVENTS:
             assert heard.payloads[key] == 2 * payloads
@@ -292,7 +300,9 @@ def test_new_numbers_run_on_through_passes_and_belong_together(track: Track) -> 
     probes = heard.blocks()
     assert (probes[0].index, probes[0].tick) == (0, 0)
     assert len(probes) == 10 + 20 + 20
-    recorded = [wire.decode_block(payload, wire.SAMPLE_SCHEMA) for payload in by_key(stream(BLOCKS))[PROBES]]
+    recorded = [
+        wire.decode_block(payload, wire.SAMPLE_SCHEMA) for payload in group_by_key(generate_stream(BLOCKS))[PROBES]
+    ]
     numbers = [*range(20, 30), *range(10, 30), *range(10, 30)]
     for block, number in zip(probes, numbers, strict=True):
         assert np.array_equal(block.values, recorded[number].values)
@@ -335,7 +345,7 @@ def test_a_renamed_key_keeps_its_payloads(track: Track) -> None:
     new = wire.sensor_key("probes2")
     heard, _ = play(track, edit=edit(track, keys={PROBES: new}))
     assert PROBES not in heard.payloads
-    assert heard.payloads[new] == by_key(stream(BLOCKS))[PROBES]
+    assert heard.payloads[new] == group_by_key(generate_stream(BLOCKS))[PROBES]
     assert heard.events[-1]["rows"][new] == 200 * BLOCKS
 
 
@@ -348,7 +358,9 @@ def test_channels_change_with_their_calibration(track: Track) -> None:
     now = ChannelTable.model_validate(changed.catalogue["table"])
     assert {name: group.names for name, group in now.groups.items()} == {"probes": (first, second), "forces": (force,)}
     assert now.channels[first].sensitivity_v == table.channels[second].sensitivity_v
-    recorded = [wire.decode_block(payload, wire.SAMPLE_SCHEMA) for payload in by_key(stream(BLOCKS))[PROBES]]
+    recorded = [
+        wire.decode_block(payload, wire.SAMPLE_SCHEMA) for payload in group_by_key(generate_stream(BLOCKS))[PROBES]
+    ]
     for block, before in zip(heard.blocks(), recorded, strict=True):
         assert np.array_equal(block.values, before.values[:, [1, 0]])
         assert (block.index, block.tick) == (before.index, before.tick)
@@ -358,7 +370,7 @@ def test_channels_change_with_their_calibration(track: Track) -> None:
 
 def test_the_truth_can_stay_out(track: Track) -> None:
     heard, _ = play(track, edit=edit(track, truth=False))
-    whole = by_key(stream(BLOCKS))
+    whole = group_by_key(generate_stream(BLOCKS))
     assert {key for key in whole if key not in heard.payloads} == {key for key in whole if key.startswith(wire.TRUTH)}
     assert edit(track, truth=False).catalogue["truth"] == {}
 
@@ -383,7 +395,7 @@ def test_changes_that_make_no_sense_are_refused(track: Track, options: dict[str,
 def test_swapped_keys_are_no_clash(track: Track) -> None:
     forces = wire.sensor_key("forces")
     heard, _ = play(track, edit=edit(track, keys={PROBES: forces, forces: PROBES}))
-    assert heard.payloads[forces] == by_key(stream(BLOCKS))[PROBES]
+    assert heard.payloads[forces] == group_by_key(generate_stream(BLOCKS))[PROBES]
 
 
 # Commands.
@@ -477,7 +489,7 @@ def test_pause_resume_rate_and_the_end(track: Track) -> None:
         console.rate(1000.0)
         until(lambda: bool(heard.events) and heard.events[-1]["event"] == "end")
         assert len(heard.all) > held
-        assert heard.payloads == by_key(stream(BLOCKS))
+        assert heard.payloads == group_by_key(generate_stream(BLOCKS))
 
 
 def test_a_stop_ends_the_stream_well(track: Track) -> None:
@@ -540,7 +552,7 @@ def test_the_wait_for_clients_is_limited(track: Track) -> None:
 
 def test_the_scene_contains_earlier_commands_for_late_clients(folder: Path) -> None:
     command = {"event": "command", "id": 1, "tick": 200_000, "time_s": 0.2, "command": "hammer", "request": {}}
-    payloads = list(stream(BLOCKS))
+    payloads = list(generate_stream(BLOCKS))
     payloads.insert(len(payloads) // 2, (wire.EVENTS, wire.encode_document(command)))
     track = Track([write_recording(folder / "command.mcap", payloads)])
     with running(track, paused=True) as (_, heard, console):
@@ -555,15 +567,15 @@ def test_the_scene_contains_earlier_commands_for_late_clients(folder: Path) -> N
 
 def test_a_premature_end_event_keeps_its_position(folder: Path) -> None:
     late = {"event": "warning", "tick": 600_000, "time_s": 0.6, "text": "went on"}
-    payloads = [*stream(BLOCKS), (wire.EVENTS, wire.encode_document(late))]
+    payloads = [*generate_stream(BLOCKS), (wire.EVENTS, wire.encode_document(late))]
     heard, _ = play(Track([write_recording(folder / "on.mcap", payloads)]))
     assert [event["event"] for event in heard.events] == ["start", "end", "warning", "end"]
-    assert heard.payloads[wire.EVENTS][:3] == by_key(payloads)[wire.EVENTS]
+    assert heard.payloads[wire.EVENTS][:3] == group_by_key(payloads)[wire.EVENTS]
 
 
 def test_late_documents_keep_their_position(folder: Path) -> None:
     told = [{"event": "command", "id": 1, "tick": tick, "time_s": tick / 1e6} for tick in (300_000, 295_000, 301_000)]
-    payloads = list(stream(BLOCKS))
+    payloads = list(generate_stream(BLOCKS))
     for number, event in enumerate(told):
         payloads.insert(len(payloads) // 2 + number, (wire.EVENTS, wire.encode_document(event)))
     heard, _ = play(Track([write_recording(folder / "late.mcap", payloads)]))
@@ -572,11 +584,11 @@ def test_late_documents_keep_their_position(folder: Path) -> None:
 
 def test_a_status_that_the_run_has_ended_comes_after_the_end(folder: Path) -> None:
     ended = wire.encode_document({"tick": 600_000, "time_s": 0.6, "state": "ended"})
-    payloads = list(stream(BLOCKS))
+    payloads = list(generate_stream(BLOCKS))
     payloads.insert(len(payloads) - 1, (wire.STATUS, ended))
     heard, _ = play(Track([write_recording(folder / "status.mcap", payloads)]))
     assert [key for key, _ in heard.all[-2:]] == [wire.EVENTS, wire.STATUS]
-    assert heard.payloads == by_key(payloads)
+    assert heard.payloads == group_by_key(payloads)
 
 
 def test_a_file_that_is_damaged_while_it_is_played_ends_the_stream_and_says_so(folder: Path, path: Path) -> None:

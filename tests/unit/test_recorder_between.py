@@ -74,13 +74,13 @@ def in_order(rows: list[tuple[str, bytes]]) -> list[tuple[str, bytes]]:
     return rows
 
 
-def late(rows: list[tuple[str, bytes]]) -> list[tuple[str, bytes]]:
+def move_block(rows: list[tuple[str, bytes]]) -> list[tuple[str, bytes]]:
     """Move a block of the middle to the end, as after a lost link."""
     place = next(n for n, (key, _) in enumerate(rows) if key == PROBES and n > len(rows) // 2)
     return [*rows[:place], *rows[place + 1 :], rows[place]]
 
 
-def long(rows: list[tuple[str, bytes]]) -> list[tuple[str, bytes]]:
+def merge_blocks(rows: list[tuple[str, bytes]]) -> list[tuple[str, bytes]]:
     """Merge all blocks of a stream into one, as an import may have it."""
     blocks = [decode_block(data, schema_of(key) or "") for key, data in rows if key == PROBES]
     first, values = blocks[0], [row for block in blocks for row in block.values.tolist()]
@@ -94,12 +94,12 @@ def _as(block: Block, values: list[list[int]]) -> Any:
     return np.array(values, dtype=block.values.dtype)
 
 
-def faulty(rows: list[tuple[str, bytes]]) -> list[tuple[str, bytes]]:
+def append_fault(rows: list[tuple[str, bytes]]) -> list[tuple[str, bytes]]:
     """Append a document on faults; such a file is read as a whole."""
     return [*rows, (FAULTS, encode_document({"event": "begin", "tick": 5, "id": 1, "time_s": 5e-6}))]
 
 
-@pytest.mark.parametrize("form", [in_order, late, long, faulty])
+@pytest.mark.parametrize("form", [in_order, move_block, merge_blocks, append_fault])
 def test_a_cut_of_a_part_equals_the_cut_of_the_whole(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, form: Any
 ) -> None:
@@ -130,7 +130,7 @@ def test_a_part_reads_few_chunks(
 def test_an_export_of_a_part_equals_the_export_of_the_whole(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    source = write(tmp_path / "run.mcap", late(items()))
+    source = write(tmp_path / "run.mcap", move_block(items()))
     assert run("export", source, "-o", tmp_path / "part.csv", "--from", 0.41, "--to", 0.43, "--channels", "probes") == 0
     shown = capsys.readouterr().out
     monkeypatch.setattr(Recording, "between", lambda self, from_s, to_s: self)

@@ -27,7 +27,7 @@ def _channel(name: str) -> Channel:
     return default_table().channels[name]
 
 
-def volts_of(name: str) -> np.ndarray:
+def make_volts(name: str) -> np.ndarray:
     """Return a normal channel: its noise on a whirl of 84 Hz with a few impacts [V]."""
     channel = _channel(name)
     rng = np.random.default_rng(len(name) + ord(name[-1]))
@@ -49,7 +49,7 @@ def record(path: Path, changed: dict[str, np.ndarray] | None = None, **options: 
         ppm, late = float(str(options.get("ppm", 0.0))), options.get("late")
         for name in GROUPS:
             group = default_table().groups[name]
-            volts = [(changed or {}).get(channel.name, volts_of(channel.name)) for channel in group.channels]
+            volts = [(changed or {}).get(channel.name, make_volts(channel.name)) for channel in group.channels]
             scales = np.array([channel.lsb_v for channel in group.channels])
             counts = np.rint(np.stack(volts, axis=1) / scales).astype(np.int32)
             for start in range(0, ROWS, 200):
@@ -105,7 +105,7 @@ FAULTS = {
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_fault_is_found_on_its_channel_alone(tmp_path, fault):
     name, spoil, finding = FAULTS[fault]
-    health = record(tmp_path / "a.mcap", {name: spoil(volts_of(name))})
+    health = record(tmp_path / "a.mcap", {name: spoil(make_volts(name))})
     for each in health.channels:
         if each.name == name:
             assert any(re.search(finding, found) for found in each.findings), each.findings
@@ -115,7 +115,7 @@ def test_a_fault_is_found_on_its_channel_alone(tmp_path, fault):
 
 def test_the_amplitude_of_the_hum_is_reported(tmp_path):
     hum = 0.02 / abs(_channel("outer_x").sensitivity_v)
-    health = record(tmp_path / "a.mcap", {"outer_x": volts_of("outer_x") + 0.02 * np.sin(100.0 * np.pi * TIME_S)})
+    health = record(tmp_path / "a.mcap", {"outer_x": make_volts("outer_x") + 0.02 * np.sin(100.0 * np.pi * TIME_S)})
     (finding,) = channel(health, "outer_x").findings
     assert float(finding.split()[3]) == pytest.approx(hum, rel=0.05)
 

@@ -34,7 +34,7 @@ def writer(path: Path, **options: Any) -> RecordingWriter:
     )
 
 
-def write(path: Path, items: list[tuple[str, bytes]]) -> Path:
+def write_recording(path: Path, items: list[tuple[str, bytes]]) -> Path:
     """Write a recording with chunks of the largest size."""
     with writer(path, sync_every_s=1e9) as file:
         for number, (key, payload) in enumerate(items):
@@ -57,7 +57,7 @@ def items() -> list[tuple[str, bytes]]:
 
 @pytest.fixture(scope="module")
 def path(tmp_path_factory, items) -> Path:
-    return write(tmp_path_factory.mktemp("rewrite") / "run.mcap", items)
+    return write_recording(tmp_path_factory.mktemp("rewrite") / "run.mcap", items)
 
 
 @pytest.fixture(scope="module")
@@ -250,10 +250,10 @@ def test_consecutive_cuts_join_to_the_whole(path, tmp_path):
 @pytest.fixture(scope="module")
 def short(tmp_path_factory) -> Recording:
     """280 ms in blocks of 7 ms, which no round time divides."""
-    return Recording.open(write(tmp_path_factory.mktemp("short") / "run.mcap", list(stream(40, block_ms=7))))
+    return Recording.open(write_recording(tmp_path_factory.mktemp("short") / "run.mcap", list(stream(40, block_ms=7))))
 
 
-def rows(recording: Recording, key: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def read_rows(recording: Recording, key: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return ticks, numbers and values of all rows."""
     blocks = list(recording.blocks(key))
     ticks = [
@@ -285,12 +285,12 @@ def test_pieces_contain_each_row_once_and_join_to_the_whole(short, tmp_path_fact
             pieces.append(cut(short, folder / f"{len(pieces)}.mcap", from_s=from_s, to_s=to_s).path)
     joined = Recording.open(cut(join(pieces), folder / "joined.mcap").path)
     for key in (PROBES, truth_key("state"), EDGES):
-        for found, expected in zip(rows(joined, key), rows(short, key), strict=True):
+        for found, expected in zip(read_rows(joined, key), read_rows(short, key), strict=True):
             assert np.array_equal(found, expected)
         assert joined.streams[key].lost == 0
     for piece, (from_s, to_s) in zip(pieces, pairwise(edges_s), strict=len(pieces) == 3):
         if len(pieces) == 3 and PROBES in (recording := Recording.open(piece)).messages:
-            ticks = rows(recording, PROBES)[0]
+            ticks = read_rows(recording, PROBES)[0]
             assert ticks[0] >= from_s * 1e6 - 1e-6
             assert ticks[-1] < to_s * 1e6 - 1e-6
 
@@ -315,7 +315,9 @@ def test_a_cut_contains_earlier_commands(tmp_path, items):
         about = {"event": "command", "tick": tick, "id": number, "command": "speed", "request": {"speed_hz": 2.0}}
         return EVENTS, encode_document(about)
 
-    path = write(tmp_path / "run.mcap", [*items[:200], command(1, 100_000), command(2, 500_000), *items[200:]])
+    path = write_recording(
+        tmp_path / "run.mcap", [*items[:200], command(1, 100_000), command(2, 500_000), *items[200:]]
+    )
     recording = Recording.open(cut(Recording.open(path), tmp_path / "cut.mcap", from_s=0.3).path)
     assert [entry["id"] for entry in recording.scene["taken"]] == [1]
     assert [event["id"] for event in recording.events if event["event"] == "command"] == [2]

@@ -50,7 +50,7 @@ def event(name: str, time_s: float, **fields: Any) -> tuple[str, bytes]:
     return EVENTS, encode_document({"event": name, "tick": round(time_s * 1e6), "time_s": time_s, **fields})
 
 
-def feed(file: Captures, blocks: range, events: dict[int, list[tuple[str, bytes]]] | None = None) -> None:
+def feed_blocks(file: Captures, blocks: range, events: dict[int, list[tuple[str, bytes]]] | None = None) -> None:
     """Feed blocks of 10 ms of probes and forces; events follow the block that contains them, as the rig sends them."""
     for number in blocks:
         for key in (PROBES, FORCES):
@@ -66,7 +66,7 @@ def extent(path: Path, key: str = PROBES) -> tuple[float, float]:
 
 def test_an_impact_is_captured_with_the_time_before_and_after(tmp_path):
     file = captures(tmp_path / "run.mcap", "hammer", pre_s=0.2, post_s=0.5)
-    feed(file, range(300), {100: [event("hammer", 1.0)]})
+    feed_blocks(file, range(300), {100: [event("hammer", 1.0)]})
     file.finish("completed")
     (path,) = file.files
     assert path.name == "run.hammer-001.mcap"
@@ -86,7 +86,7 @@ def test_an_impact_is_captured_with_the_time_before_and_after(tmp_path):
 
 def test_without_a_trigger_there_is_no_file(tmp_path):
     file = captures(tmp_path / "run.mcap", "hammer")
-    feed(file, range(100), {50: [event("speed", 0.5)]})
+    feed_blocks(file, range(100), {50: [event("speed", 0.5)]})
     file.finish("completed")
     assert file.files == list(tmp_path.iterdir()) == []
 
@@ -119,7 +119,7 @@ def test_a_level_trigger_fires_once_per_crossing(tmp_path, trigger, sign):
 @pytest.mark.parametrize(("again", "files", "end_s"), [("extend", 1, 1.8), ("ignore", 1, 1.5)])
 def test_a_trigger_during_a_capture(tmp_path, again, files, end_s):
     file = captures(tmp_path / "run.mcap", "hammer", pre_s=0.1, post_s=0.5, again=again)
-    feed(file, range(300), {100: [event("hammer", 1.0)], 130: [event("hammer", 1.3)]})
+    feed_blocks(file, range(300), {100: [event("hammer", 1.0)], 130: [event("hammer", 1.3)]})
     file.finish("completed")
     assert len(file.files) == files
     assert extent(file.files[0])[1] == pytest.approx(end_s, abs=0.011)
@@ -131,13 +131,13 @@ def test_a_trigger_during_a_capture(tmp_path, again, files, end_s):
 
 def test_the_time_before_a_trigger_is_complete_even_after_a_capture(tmp_path):
     file = captures(tmp_path / "run.mcap", "hammer", pre_s=0.5, post_s=0.2)
-    feed(file, range(300), {100: [event("hammer", 1.0)], 150: [event("hammer", 1.5)]})
+    feed_blocks(file, range(300), {100: [event("hammer", 1.0)], 150: [event("hammer", 1.5)]})
     file.finish("completed")
     assert [path.name for path in file.files] == ["run.hammer-001.mcap", "run.hammer-002.mcap"]
     assert extent(file.files[1])[0] == pytest.approx(1.0, abs=0.011)
 
 
-def pulses(file: Captures, rows: list[int], blocks: range) -> None:
+def feed_pulses(file: Captures, rows: list[int], blocks: range) -> None:
     """Feed blocks of 10 ms of probes, at rest except for single rows of 0.3 mm."""
     group = default_table().groups["probes"]
     channel = group.channels[0]
@@ -152,7 +152,9 @@ def pulses(file: Captures, rows: list[int], blocks: range) -> None:
 
 def test_the_time_after_counts_from_the_last_crossing_even_in_one_block(tmp_path):
     file = captures(tmp_path / "run.mcap", "disk_x>0.2", pre_s=0.0, post_s=0.0205, again="extend")
-    pulses(file, [200, 220, 399], range(10))  # the second block begins beyond the level: a crossing at a block's edge
+    feed_pulses(
+        file, [200, 220, 399], range(10)
+    )  # the second block begins beyond the level: a crossing at a block's edge
     (path,) = file.files
     recording = Recording.open(path)
     assert recording.metadata["trigger"]["time_s"] == "0.010000000"
@@ -215,7 +217,7 @@ def test_an_impact_extends_a_capture_and_a_level_does_not(tmp_path):
 
 def test_stored_and_received_rows_are_counted_separately(tmp_path):
     file = captures(tmp_path / "run.mcap", "hammer", pre_s=0.2, post_s=0.5)
-    feed(file, range(300), {100: [event("hammer", 1.0)]})
+    feed_blocks(file, range(300), {100: [event("hammer", 1.0)]})
     (kept,) = file.kept()
     assert kept.rows[PROBES] == Recording.open(file.files[0]).streams[PROBES].rows == 71 * 200
     assert kept.extent_ns / 1e9 == pytest.approx(0.71, abs=1e-3)
@@ -228,7 +230,9 @@ def test_the_budget_holds_for_captures(tmp_path):
     )
     for number in range(3000):
         if not file.ended:
-            feed(file, range(number, number + 1), {number: [event("hammer", number / 100)]} if not number % 150 else {})
+            feed_blocks(
+                file, range(number, number + 1), {number: [event("hammer", number / 100)]} if not number % 150 else {}
+            )
     file.finish(file.ended)
     assert file.ended == "the budget of 5 MB is used up"
     assert file.out_of_room
@@ -240,10 +244,10 @@ def test_the_budget_holds_for_captures(tmp_path):
 
 def test_endless_triggers_use_bounded_memory(tmp_path):
     file = captures(tmp_path / "run.mcap", "note", pre_s=0.0, post_s=1.0)
-    feed(file, range(5))
+    feed_blocks(file, range(5))
     for number in range(3000):
         file.take(Payload.read(*event("note", 0.04, text=str(number)), number))
-    feed(file, range(5, 300))
+    feed_blocks(file, range(5, 300))
     assert file.held < 300
     end = Recording.open(file.files[0]).metadata["end"]
     assert (end["trigger_count"], len(json.loads(end["triggers"]))) == ("3000", 1000)
@@ -252,7 +256,7 @@ def test_endless_triggers_use_bounded_memory(tmp_path):
 def test_an_event_far_ahead_does_not_block_the_buffer(tmp_path):
     file = captures(tmp_path / "run.mcap", "hammer", pre_s=0.1, post_s=0.1)
     file.take(Payload.read(*event("command", 1e6, id=1, command="speed", request={}), 0))
-    feed(file, range(500))
+    feed_blocks(file, range(500))
     assert file.held < 200
 
 
@@ -271,7 +275,7 @@ def test_delayed_streams_are_awaited(tmp_path):
 
 def test_the_number_of_captures_is_limited(tmp_path):
     file = captures(tmp_path / "run.mcap", "hammer", pre_s=0.1, post_s=0.1, count=2)
-    feed(file, range(400), {at: [event("hammer", at / 100)] for at in (50, 100, 150, 200)})
+    feed_blocks(file, range(400), {at: [event("hammer", at / 100)] for at in (50, 100, 150, 200)})
     assert file.ended == "2 captures made"
     assert not file.out_of_room
     assert len(file.files) == 2
@@ -279,7 +283,7 @@ def test_the_number_of_captures_is_limited(tmp_path):
 
 def test_a_capture_truncated_by_the_end_is_marked(tmp_path):
     file = captures(tmp_path / "run.mcap", "note", pre_s=0.1, post_s=5.0)
-    feed(file, range(100), {50: [event("note", 0.5, text="now")]})
+    feed_blocks(file, range(100), {50: [event("note", 0.5, text="now")]})
     file.finish("completed")
     assert Recording.open(file.files[0]).end_reason == "completed, before the capture was over"
 
@@ -289,7 +293,7 @@ def test_a_capture_contains_only_earlier_commands(tmp_path):
     commands = {
         at: [event("command", at / 100, id=at, command="speed", request={"speed_hz": 1.0})] for at in (10, 70, 95)
     }
-    feed(file, range(300), {**commands, 100: [event("hammer", 1.0)]})
+    feed_blocks(file, range(300), {**commands, 100: [event("hammer", 1.0)]})
     file.finish("completed")
     recording = Recording.open(file.files[0])
     assert [entry["id"] for entry in recording.scene["taken"]] == [10, 70]

@@ -9,8 +9,8 @@ import pytest
 
 from recorder.reader import Recording
 from recorder.rewrite import cut, is_whole, recover
-from tests.hostile.files import contents
-from tests.hostile.files import write as write_recording
+from tests.hostile.files import read_contents
+from tests.hostile.files import write_file as write_recording
 from tests.unit import mcap_variants
 from tests.unit.mcap_variants import NAMES
 
@@ -25,7 +25,7 @@ def test_a_variant_is_read_like_the_rigs_own_file(source: Path, tmp_path: Path, 
     ours, path = Recording.open(source), mcap_variants.write(source, tmp_path / "x.mcap", name)
     theirs = Recording.open(path)
     assert theirs.complete
-    assert contents(theirs) == contents(ours)
+    assert read_contents(theirs) == read_contents(ours)
     assert (theirs.doubts, theirs.streams) == (ours.doubts, ours.streams)
     assert ("checksum" in name or name in ("without anything", "private records")) == bool(theirs.unchecked)
     assert is_whole(path)

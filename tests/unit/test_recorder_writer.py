@@ -63,7 +63,7 @@ def path(tmp_path_factory, items) -> Path:
     return path
 
 
-def foreign(path: Path, topic: str) -> list:
+def decode_topic(path: Path, topic: str) -> list:
     """Read a topic by the decoder of an independent project."""
     from mcap.reader import make_reader
     from mcap_ros2.decoder import DecoderFactory
@@ -86,7 +86,7 @@ def test_every_payload_is_read_byte_for_byte(path, items):
 
 
 def test_log_time_is_simulated_time_and_publish_time_is_arrival(path, items):
-    messages = [message for message, _ in foreign(path, PROBES)]
+    messages = [message for message, _ in decode_topic(path, PROBES)]
     assert [message.log_time for message in messages] == [number * 10_000_000 for number in range(40)]
     first = next(number for number, (key, _) in enumerate(items) if key == PROBES)
     assert messages[0].publish_time == 1_700_000_000_000_000_000 + first
@@ -94,7 +94,7 @@ def test_log_time_is_simulated_time_and_publish_time_is_arrival(path, items):
 
 @pytest.mark.parametrize("key", [PROBES, sensor_key("hammer"), truth_key("state")])
 def test_a_foreign_reader_decodes_the_blocks(path, key):
-    for number, (_, message) in enumerate(foreign(path, key)):
+    for number, (_, message) in enumerate(decode_topic(path, key)):
         block = block_of(key, number)
         assert (message.tick, message.index, message.columns) == (block.tick, block.index, block.values.shape[1])
         assert (message.rate_hz, message.tick_rate_hz) == (block.rate_hz, block.tick_rate_hz)
@@ -123,7 +123,7 @@ def test_plots_are_labelled_and_show_the_samples(path):
     table = default_table()
     seen = set()
     for topic in (topic for topic in recording.messages if topic.startswith("view/") and topic != "view/events"):
-        messages = [message for _, message in foreign(path, topic)]
+        messages = [message for _, message in decode_topic(path, topic)]
         assert len(messages) == 0.4 * 500
         times_s = [message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec for message in messages]
         np.testing.assert_allclose(times_s, np.arange(200) / 500, atol=1e-9)
@@ -201,7 +201,7 @@ def test_a_view_row_with_a_missing_group_is_nan_there(tmp_path):
     del items[3]  # the second block of the forces
     write(path, items)
     topic = next(topic for topic in Recording.open(path).messages if topic.startswith("view/probes"))
-    messages = [message for _, message in foreign(path, topic)]
+    messages = [message for _, message in decode_topic(path, topic)]
     assert len(messages) == 15
     efforts = np.array([message.effort for message in messages])
     positions = np.array([message.position for message in messages])
@@ -211,7 +211,7 @@ def test_a_view_row_with_a_missing_group_is_nan_there(tmp_path):
 
 
 def test_events_become_log_messages(path):
-    logs = [message for _, message in foreign(path, "view/events")]
+    logs = [message for _, message in decode_topic(path, "view/events")]
     assert [log.msg for log in logs] == ["start: scene hammer, seed 7", "end: reason completed"]
     assert [log.level for log in logs] == [20, 20]
     assert logs[1].stamp.nanosec == 400_000_000

@@ -40,9 +40,9 @@ from rig.base.outcome import Outcome
 from rig.channels.table import default_table
 from rig.run.scenes import load_scene
 from rig.run.simulation import Simulation
-from tests.commands import said
+from tests.commands import run_captured
 from tests.processes import ROOT
-from tests.score_daqs import RATE_HZ, Tones, chips, counts_of, write_parquet, write_session
+from tests.score_daqs import RATE_HZ, Tones, make_chips, make_counts, write_parquet, write_session
 
 TABLE = default_table()
 PROBES = TABLE.groups["probes"].channels
@@ -63,7 +63,7 @@ def sent(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, np.ndarray]:
     """A session and its counts."""
     t = (400 + np.arange(RATE_HZ)) / RATE_HZ
     values = np.column_stack([signal(t) for signal in SIGNALS.values()])
-    counts = counts_of("probes", values, np.random.default_rng(1))
+    counts = make_counts("probes", values, np.random.default_rng(1))
     return write_session(tmp_path_factory.mktemp("sent") / "session.mcap", {"probes": counts}, index=400), counts
 
 
@@ -201,7 +201,7 @@ def test_a_broken_channel_does_not_affect_the_row_assignment() -> None:
 # Analogue: formulas of tones, sampled by the DAQ's own clock.
 
 
-def recorded(
+def record_tones(
     generator: np.random.Generator, *, ppm: float = 0.0, jitter_s: float = 0.0, skew_s: float = 0.0, gain: float = 1.0,
     offset: float = 0.0, wires: tuple[int, ...] = (0, 1, 2, 3),
     turned: int = -1, corner_hz: float = 0.0, seconds: float = SECONDS,
@@ -236,7 +236,7 @@ def recorded(
 def test_each_defect_fails_exactly_its_declared_quantities(
     sent: tuple[Path, np.ndarray], tmp_path: Path, defects: dict[str, float], declared: set[str]
 ) -> None:
-    columns = recorded(np.random.default_rng(3), **defects)  # type: ignore[arg-type]
+    columns = record_tones(np.random.default_rng(3), **defects)  # type: ignore[arg-type]
     card = judge(write_parquet(tmp_path / "daq.parquet", columns), [sent[0]], formulas=SIGNALS)
     assert card.path == "analogue"
     assert red(card) == declared
@@ -250,7 +250,7 @@ def test_each_defect_fails_exactly_its_declared_quantities(
 def test_without_a_formula_the_sessions_noise_makes_small_defects_inconclusive(
     sent: tuple[Path, np.ndarray], tmp_path: Path
 ) -> None:
-    columns = recorded(np.random.default_rng(3))
+    columns = record_tones(np.random.default_rng(3))
     card = judge(write_parquet(tmp_path / "daq.parquet", columns), [sent[0]])
     assert red(card) == set()
     assert card.row("gain", "disk_x").verdict == PASS
@@ -263,7 +263,7 @@ def test_fifteen_channels_are_mapped_by_two_seconds_of_chips() -> None:
 
     generator = np.random.default_rng(8)
     names = list(TABLE.channels)
-    sent = {name: (chips(n, 2.2) + 0.01 * generator.standard_normal(44_000), 20e3) for n, name in enumerate(names)}
+    sent = {name: (make_chips(n, 2.2) + 0.01 * generator.standard_normal(44_000), 20e3) for n, name in enumerate(names)}
     order = generator.permutation(15)
     order[3] = order[7]  # one is recorded twice
     signs = generator.choice([-1, 1], 15)
@@ -325,7 +325,7 @@ def test_bits_and_distortion_of_a_sine_agree_with_closed_forms() -> None:
     assert found.thd_db[0] == pytest.approx(10.0 * math.log10(5e-6 / 16.0), abs=0.2)
     assert found.sfdr_db[0] == pytest.approx(20.0 * math.log10(4.0 / 2e-3), abs=0.5)
     assert is_sine(clean[:5000], 2e-3)
-    assert not is_sine(chips(1, 1.0), 0.1)
+    assert not is_sine(make_chips(1, 1.0), 0.1)
 
 
 def test_interpolation_has_an_error_of_a_millionth() -> None:
@@ -407,7 +407,7 @@ def test_the_command_writes_report_junit_and_json(
     daq = write_parquet(tmp_path / "daq.parquet", in_units(np.delete(counts, 777, axis=0)))
     made = [tmp_path / name for name in ("r.html", "r.xml", "r.json")]
     files = ("-o", made[0], "--junit", made[1], "--json", made[2])
-    status, out, _ = said(capsys, "score", daq, "--against", session, *files)
+    status, out, _ = run_captured(capsys, "score", daq, "--against", session, *files)
     assert status == 1
     assert "digital path: fail: 27 pass, 1 fail (missing rows)" in out
     suite = ElementTree.parse(made[1]).getroot()[0]
@@ -422,7 +422,7 @@ def test_the_command_writes_report_junit_and_json(
 def test_the_report_draws_the_channels_of_the_analogue_path(sent: tuple[Path, np.ndarray], tmp_path: Path) -> None:
     from replays.score.report import make_report
 
-    columns = recorded(np.random.default_rng(3), seconds=0.3)
+    columns = record_tones(np.random.default_rng(3), seconds=0.3)
     card = judge(write_parquet(tmp_path / "daq.parquet", columns), [sent[0]], formulas=SIGNALS)
     card.pictures = {name: card.pictures[name] for name in ("analogue disk_x",)}
     write_report(make_report(card), tmp_path / "r.html")
@@ -445,7 +445,7 @@ def test_wrong_inputs_are_refused_in_one_line(
         (["--against", str(session), "--junit", "r.txt"], "--junit must be"),
         (["--against", str(session)], "of which nothing is"),
     ):
-        status, _, err = said(capsys, "score", other, *arguments)
+        status, _, err = run_captured(capsys, "score", other, *arguments)
         assert (status, err.count("\n")) == (2, 1), err
         assert told in err
     with pytest.raises(InputError, match="no counts can be told"):

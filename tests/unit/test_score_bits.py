@@ -11,7 +11,7 @@ import pytest
 from replays.score.card.scorecard import FAIL, Scorecard
 from replays.score.judgement import judge
 from rig.channels.table import default_table
-from tests.score_daqs import RATE_HZ, counts_of, write_parquet, write_session
+from tests.score_daqs import RATE_HZ, make_counts, write_parquet, write_session
 
 PROBES = default_table().groups["probes"]
 ROWS = 5000
@@ -25,7 +25,7 @@ def red(card: Scorecard) -> set[tuple[str, str]]:
 @pytest.fixture(scope="module")
 def counts() -> np.ndarray:
     """A quarter of a second of noise on the probes, within the converters' range."""
-    return counts_of("probes", 0.25 * np.random.default_rng(7).standard_normal((ROWS, 4)), None)
+    return make_counts("probes", 0.25 * np.random.default_rng(7).standard_normal((ROWS, 4)), None)
 
 
 @pytest.fixture(scope="module")
@@ -80,7 +80,7 @@ def test_a_daq_of_other_bits_may_begin_early(
     form: str, before: str, session: Path, counts: np.ndarray, tmp_path: Path
 ) -> None:
     g = np.random.default_rng(8)
-    ahead = counts_of("probes", 0.2 * g.standard_normal((70_000, 4)), None)
+    ahead = make_counts("probes", 0.2 * g.standard_normal((70_000, 4)), None)
     ahead = ahead if before == "noise" else np.rint(40.0 * g.standard_normal((70_000, 4))).astype(np.int64)
     card = judge(write_parquet(tmp_path / "daq.parquet", FORMS[form](np.r_[ahead, counts])), [session])
     assert (card.path, red(card), card.outcome) == ("digital", set(), "pass"), card.verdict_line

@@ -83,7 +83,7 @@ def declared(kinds: tuple[str, ...], what: set[str] | None = None) -> set[tuple[
     return {(name, row) for kind in kinds for name in names_of(kind) for row in what or DEFECTS[DEFECT_OF[kind]].score}
 
 
-def daq(
+def write_daq(
     path: Path, counts: dict[str, np.ndarray], change: Callable[[dict[str, np.ndarray]], Any] = lambda _: None
 ) -> Path:
     """Write a file of volts."""
@@ -100,7 +100,7 @@ def names_of(kind: str) -> set[str]:
     return {SCORED[kind].channel, SCORED[kind].numbers.get("other", SCORED[kind].channel)}
 
 
-def together(most: int) -> list[tuple[str, ...]]:
+def group_kinds(most: int) -> list[tuple[str, ...]]:
     """Return sets of at most `most` kinds, no two of which are on one channel."""
     sets: list[tuple[str, ...]] = []
     for kind in SCORED:
@@ -116,10 +116,10 @@ def together(most: int) -> list[tuple[str, ...]]:
     return sets
 
 
-@pytest.mark.parametrize("kinds", together(13), ids=len)
+@pytest.mark.parametrize("kinds", group_kinds(13), ids=len)
 def test_a_daq_with_its_own_clock(kinds: tuple[str, ...], rig: Rig, sessions: Sessions, tmp_path: Path) -> None:
     card = judge(
-        daq(tmp_path / "daq.parquet", rig.counts(kinds, noisy=True)),
+        write_daq(tmp_path / "daq.parquet", rig.counts(kinds, noisy=True)),
         [sessions[False][0]],
         path="analogue",
         channels=REQUESTED_CHANNELS,
@@ -136,10 +136,12 @@ def test_a_daq_with_its_own_clock(kinds: tuple[str, ...], rig: Rig, sessions: Se
                 assert row.low <= size <= row.high, f"{kind} of {name}"
 
 
-@pytest.mark.parametrize("kinds", together(5), ids=len)
+@pytest.mark.parametrize("kinds", group_kinds(5), ids=len)
 def test_a_daq_that_records_counts(kinds: tuple[str, ...], rig: Rig, sessions: Sessions, tmp_path: Path) -> None:
     card = judge(
-        daq(tmp_path / "daq.parquet", rig.counts(kinds, noisy=True)), [sessions[True][0]], channels=REQUESTED_CHANNELS
+        write_daq(tmp_path / "daq.parquet", rig.counts(kinds, noisy=True)),
+        [sessions[True][0]],
+        channels=REQUESTED_CHANNELS,
     )
     assert card.path == "digital"
     assert red(card) == declared(kinds, {"altered values"})
@@ -218,13 +220,16 @@ def test_a_logger_of_a_can_bus(suffix: str, fd: bool, sessions: Sessions, tmp_pa
 @pytest.mark.parametrize("defect", FILE_DEFECTS)
 def test_defects_of_the_daqs_file(defect: str, sessions: Sessions, tmp_path: Path) -> None:
     (session, counts), (change, declares) = sessions[True], FILE_DEFECTS[defect]
-    assert red(judge(daq(tmp_path / "daq.parquet", counts, change), [session], channels=REQUESTED_CHANNELS)) == declares
+    assert (
+        red(judge(write_daq(tmp_path / "daq.parquet", counts, change), [session], channels=REQUESTED_CHANNELS))
+        == declares
+    )
 
 
 def test_stamps_of_the_computers_clock_show_latency(sessions: Sessions, tmp_path: Path) -> None:
     session, counts = sessions[True]
     late_s = 3e-3 + 1e-4 * np.random.default_rng(3).standard_normal(len(ROWS))
-    row = judge(daq(tmp_path / "daq.parquet", counts, changed("time [s]", plus=1.7e9 + late_s)), [session]).row(
+    row = judge(write_daq(tmp_path / "daq.parquet", counts, changed("time [s]", plus=1.7e9 + late_s)), [session]).row(
         "latency", ALL
     )
     assert row.low < late_s.mean() < row.high < row.low + 2e-5

@@ -14,8 +14,8 @@ from replays.score.judgement import judge
 from rig.base.errors import InputError
 from rig.base.outcome import Outcome
 from rig.channels.table import default_table
-from tests.commands import said
-from tests.score_daqs import counts_of, write_parquet, write_session
+from tests.commands import run_captured
+from tests.score_daqs import make_counts, write_parquet, write_session
 
 PROBES = default_table().groups["probes"]
 
@@ -32,7 +32,7 @@ def columns_of(counts: np.ndarray, *names: str) -> dict[str, np.ndarray]:
 @pytest.fixture(scope="module")
 def counts() -> np.ndarray:
     """Noise on the probes."""
-    return counts_of("probes", np.random.default_rng(7).standard_normal((4000, 4)), None)
+    return make_counts("probes", np.random.default_rng(7).standard_normal((4000, 4)), None)
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +74,7 @@ def test_a_channel_missing_in_the_session_is_refused_in_one_line(
     session: Path, counts: np.ndarray, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     daq = write_parquet(tmp_path / "daq.parquet", columns_of(counts))
-    status, _, err = said(capsys, "score", daq, "--against", str(session), "--channels", "disk_x,disk_z")
+    status, _, err = run_captured(capsys, "score", daq, "--against", str(session), "--channels", "disk_x,disk_z")
     assert (status, err.count("\n")) == (2, 1), err
     assert "--channels must be" in err
     assert "disk_z" in err
@@ -87,7 +87,7 @@ def test_dead_channels_fail_with_a_junit_file(
 ) -> None:
     columns = {f"{name} [{unit}]": np.full(4000, value) for name in PROBES.names}
     daq, report = write_parquet(tmp_path / "daq.parquet", columns), tmp_path / "score.xml"
-    status, _, _ = said(capsys, "score", daq, "--against", str(session), "--junit", str(report))
+    status, _, _ = run_captured(capsys, "score", daq, "--against", str(session), "--junit", str(report))
     assert status == 1
     assert report.read_text().count("<failure") >= len(PROBES.names)
 
@@ -107,7 +107,7 @@ def test_no_channel_at_all_is_refused(
 ) -> None:
     """From an empty variable of a shell: no channel would be judged, and each record would pass."""
     daq = write_parquet(tmp_path / "daq.parquet", columns_of(counts))
-    status, _, err = said(capsys, "score", daq, "--against", str(session), "--channels", channels)
+    status, _, err = run_captured(capsys, "score", daq, "--against", str(session), "--channels", channels)
     assert (status, err.count("\n")) == (2, 1), err
     assert "--channels must be names of channels or groups" in err
 
@@ -117,7 +117,7 @@ def test_an_unknown_channel_of_a_mapping_is_named_with_its_line(
 ) -> None:
     daq, mapping = write_parquet(tmp_path / "daq.parquet", columns_of(counts)), tmp_path / "m.toml"
     mapping.write_text('[channels.disk_z]\nsource = "disk_x"\n', encoding="utf-8")
-    status, _, err = said(capsys, "score", daq, "--against", str(session), "-m", str(mapping))
+    status, _, err = run_captured(capsys, "score", daq, "--against", str(session), "-m", str(mapping))
     assert (status, err.count("\n")) == (2, 1), err
     assert "channels.disk_z must be named as a channel" in err
 

@@ -18,7 +18,7 @@ from replays.score.quantities.rounding import Converter, undithered, widen
 from replays.score.records.recorded import Table
 from replays.score.waveform import Waveform
 from rig.channels.table import default_table
-from tests.score_coverage import NOISES, ROWS, Estimate, cell, estimates
+from tests.score_coverage import NOISES, ROWS, Estimate, compute_estimates, summarise_cell
 
 PROBE = default_table().channels["disk_x"]
 NOISE_V = math.hypot(1e-3, PROBE.lsb_v / math.sqrt(12.0))
@@ -143,9 +143,9 @@ def test_intervals_have_coverage_for_coloured_and_drifting_noise(noise: str) -> 
         found["offset"].append((offset, offset - half, offset + half, mean))
         fit = Waveform(1.0, 0.0, 0.0, 0.0, 0.0, np.eye(5), np.ones(5), 0.15, 0.15, t, series, flat, flat, residual)
         found["noise"].append((*split_noise(fit).noise, level))
-        found["SINAD"].append(estimates(seed, noise, ["sine"])["SINAD"])
+        found["SINAD"].append(compute_estimates(seed, noise, ["sine"])["SINAD"])
     for quantity, each in found.items():
-        held, width = cell(each)
+        held, width = summarise_cell(each)
         assert held >= 33, (quantity, held)
         assert width < 1.8, (quantity, width)
 

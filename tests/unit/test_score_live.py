@@ -22,8 +22,8 @@ from rig.base.errors import InputError, RefusedError
 from rig.base.wire import STATUS, encode_block, sensor_key
 from rig.channels.table import default_table
 from rig.serve.transport import Client
-from tests.commands import said
-from tests.score_daqs import RATE_HZ, counts_of, write_session
+from tests.commands import run_captured
+from tests.score_daqs import RATE_HZ, make_counts, write_session
 
 from .recorder_stream import ScriptedClient, block_of
 
@@ -44,7 +44,7 @@ def red(card: Scorecard) -> set[str]:
 def counts() -> np.ndarray:
     """Two seconds of noise."""
     volts = np.random.default_rng(1).standard_normal((2 * RATE_HZ, 4))
-    return counts_of("probes", volts, None)
+    return make_counts("probes", volts, None)
 
 
 def test_latency_is_relative_to_the_arrival_of_the_rigs_block(counts: np.ndarray, tmp_path: Path) -> None:
@@ -175,6 +175,6 @@ def test_wrong_options_are_refused_in_one_line(
         (["-"], "fed by a pipe"),
     ):
         monkeypatch.setattr("sys.stdin.isatty", lambda: True)
-        status, _, err = said(capsys, "score", *arguments)
+        status, _, err = run_captured(capsys, "score", *arguments)
         assert (status, err.count("\n")) == (2, 1), err
         assert told in err

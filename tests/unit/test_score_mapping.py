@@ -13,8 +13,8 @@ from replays.score.card.scorecard import FAIL
 from replays.score.judgement import judge
 from rig.base.errors import InputError
 from rig.channels.table import default_table
-from tests.commands import said
-from tests.score_daqs import counts_of, write_parquet, write_session
+from tests.commands import run_captured
+from tests.score_daqs import make_counts, write_parquet, write_session
 
 PROBES = default_table().groups["probes"]
 CHANNEL = PROBES.channels[0]
@@ -23,7 +23,7 @@ CHANNEL = PROBES.channels[0]
 @pytest.fixture(scope="module")
 def counts() -> np.ndarray:
     """Noise on the probes, within the converters' range."""
-    return counts_of("probes", 0.25 * np.random.default_rng(7).standard_normal((4000, 4)), None)
+    return make_counts("probes", 0.25 * np.random.default_rng(7).standard_normal((4000, 4)), None)
 
 
 @pytest.fixture(scope="module")
@@ -83,13 +83,13 @@ def test_an_unknown_unit_must_be_given(
 ) -> None:
     columns = {f"{name} [{unit}]": PROBES.engineering(counts)[:, n] for n, name in enumerate(PROBES.names)}
     daq = write_parquet(tmp_path / "daq.parquet", columns)
-    status, _, err = said(capsys, "score", daq, "--against", str(session))
+    status, _, err = run_captured(capsys, "score", daq, "--against", str(session))
     assert (status, err.count("\n")) == (2, 1), err
     assert "unit of disk_x" in err
     assert "-m" in err
     lines = [f'[channels.{name}]\nsource = "{name}"\nunit = "mm"\n' for name in PROBES.names]
     (tmp_path / "map.toml").write_text("".join(lines))
-    status, out, err = said(capsys, "score", daq, "--against", str(session), "-m", str(tmp_path / "map.toml"))
+    status, out, err = run_captured(capsys, "score", daq, "--against", str(session), "-m", str(tmp_path / "map.toml"))
     assert (status, err) == (0, ""), out
 
 

@@ -13,7 +13,7 @@ from replays.score.alignment.overlap import find_begins
 from replays.score.card.scorecard import FAIL, Scorecard
 from replays.score.judgement import judge
 from rig.channels.table import default_table
-from tests.score_daqs import RATE_HZ, counts_of, write_parquet, write_session
+from tests.score_daqs import RATE_HZ, make_counts, write_parquet, write_session
 
 PROBES = default_table().groups["probes"]
 
@@ -30,7 +30,7 @@ def columns_of(counts: np.ndarray) -> dict[str, np.ndarray]:
 @pytest.fixture(scope="module")
 def counts() -> np.ndarray:
     """Noise on the probes."""
-    return counts_of("probes", np.random.default_rng(7).standard_normal((12_000, 4)), None)
+    return make_counts("probes", np.random.default_rng(7).standard_normal((12_000, 4)), None)
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +44,7 @@ def test_a_daq_that_began_early_and_ends_late_is_judged_where_both_overlap(
 ) -> None:
     rows = 70_000
     ahead = {
-        "noise": counts_of("probes", np.random.default_rng(8).standard_normal((rows, 4)), None),
+        "noise": make_counts("probes", np.random.default_rng(8).standard_normal((rows, 4)), None),
         "silence": np.zeros((rows, 4), dtype=np.int64),
         "one row": np.tile(counts[9:10], (rows, 1)),
         "its end, 3 counts off": np.tile(counts[-3500:], (20, 1)) + 3,
@@ -138,7 +138,7 @@ def test_channels_of_noise_use_the_start_found_by_others(which: str, tmp_path: P
 PERIOD = 1500
 
 
-def repeating(rows: int, channels: int, generator: np.random.Generator) -> np.ndarray:
+def make_repeating(rows: int, channels: int, generator: np.random.Generator) -> np.ndarray:
     """Return counts of a repeating signal, with noise below one count: a few in 10,000 are off by one."""
     counts = generator.integers(-50, 50, (PERIOD, channels))[np.arange(rows) % PERIOD]
     return counts + (generator.random(counts.shape) < 3e-4)
@@ -147,7 +147,7 @@ def repeating(rows: int, channels: int, generator: np.random.Generator) -> np.nd
 @pytest.mark.parametrize(("first", "last"), [(7200, 11_000), (0, 3800)], ids=["after", "before"])
 def test_rows_outside_a_session_are_not_assigned_one_period_away(first: int, last: int, tmp_path: Path) -> None:
     """Nearly all of them are equal one period away, where more rows of the record would be in the session."""
-    whole = repeating(11_000, 4, np.random.default_rng(0))
+    whole = make_repeating(11_000, 4, np.random.default_rng(0))
     session = write_session(tmp_path / "session.mcap", {"probes": whole[2700:8700]})
     card = judge(write_parquet(tmp_path / "daq.parquet", columns_of(whole[first:last])), [session])
     assert (card.path, red(card), card.outcome) == ("digital", set(), "pass"), card.verdict_line
@@ -156,7 +156,7 @@ def test_rows_outside_a_session_are_not_assigned_one_period_away(first: int, las
 
 
 def test_repeated_last_rows_of_a_session_are_not_a_start(tmp_path: Path) -> None:
-    whole = repeating(6000, 4, np.random.default_rng(0))
+    whole = make_repeating(6000, 4, np.random.default_rng(0))
     session = write_session(tmp_path / "session.mcap", {"probes": whole})
     daq = np.concatenate([whole[5700:], whole[1300:5300]])
     card = judge(write_parquet(tmp_path / "daq.parquet", columns_of(daq)), [session])
@@ -174,7 +174,7 @@ STALE_RANGES = {
 @pytest.mark.parametrize(("which", "repeats"), [*((which, False) for which in STALE_RANGES), ("the end first", True)])
 def test_a_record_of_stale_rows_does_not_pass(which: str, repeats: bool, tmp_path: Path) -> None:
     g = np.random.default_rng(0)
-    whole = repeating(20_000, 4, g) if repeats else g.integers(-50, 50, (20_000, 4))
+    whole = make_repeating(20_000, 4, g) if repeats else g.integers(-50, 50, (20_000, 4))
     session = write_session(tmp_path / "session.mcap", {"probes": whole})
     daq = np.concatenate([whole[first:last] for first, last in STALE_RANGES[which]])
     card = judge(write_parquet(tmp_path / "daq.parquet", columns_of(daq)), [session])
@@ -195,6 +195,6 @@ def test_stale_rows_in_one_table_of_several_do_not_pass(tmp_path: Path) -> None:
 
 
 def test_a_start_without_unequal_rows_is_found_despite_longer_overlaps() -> None:
-    whole = repeating(40_000, 1, np.random.default_rng(1))[:, 0]
+    whole = make_repeating(40_000, 1, np.random.default_rng(1))[:, 0]
     places = find_begins([whole[29_500:]], [whole[:30_000]], 1, 500)
     assert 29_500 in places

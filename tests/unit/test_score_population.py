@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.score_population import Population, bounds, figures
+from tests.score_population import Population, binomial_interval, summarise
 
 
 @pytest.fixture(scope="module")
@@ -37,13 +37,13 @@ def test_one_defect_fails_its_own_quantity(seed: int, number: int, folder: Path)
 def test_one_wrong_verdict_misses_the_goal() -> None:
     line = {"outcome": "fail", "right": True, "other": [], "cpu_s": 0.0, "by": "function"}
     refused, passed = line | {"outcome": "refused"}, line | {"outcome": "pass"}
-    assert figures("foreign", [refused] * 20)[1]
-    assert not figures("foreign", [refused] * 19 + [passed])[1]
-    assert figures("perfect", [passed] * 19 + [line | {"outcome": "inconclusive"}])[1]
-    assert not figures("perfect", [passed] * 18 + [line | {"outcome": "inconclusive"}] * 2)[1]
-    assert not figures("perfect", [passed] * 19 + [line])[1]
-    assert not figures("perfect", [passed] * 19 + [refused])[1]
-    assert figures("defects", [line] * 19 + [line | {"other": ["clock"]}])[1]
-    assert not figures("defects", [line] * 18 + [line | {"right": False}] * 2)[1]
-    assert not figures("defects", [line] * 19 + [line | {"outcome": "crashed"}])[1]
-    assert bounds(0, 200)[1] == pytest.approx(1.0 - 0.025 ** (1.0 / 200.0))  # the closed form of 0 of n
+    assert summarise("foreign", [refused] * 20)[1]
+    assert not summarise("foreign", [refused] * 19 + [passed])[1]
+    assert summarise("perfect", [passed] * 19 + [line | {"outcome": "inconclusive"}])[1]
+    assert not summarise("perfect", [passed] * 18 + [line | {"outcome": "inconclusive"}] * 2)[1]
+    assert not summarise("perfect", [passed] * 19 + [line])[1]
+    assert not summarise("perfect", [passed] * 19 + [refused])[1]
+    assert summarise("defects", [line] * 19 + [line | {"other": ["clock"]}])[1]
+    assert not summarise("defects", [line] * 18 + [line | {"right": False}] * 2)[1]
+    assert not summarise("defects", [line] * 19 + [line | {"outcome": "crashed"}])[1]
+    assert binomial_interval(0, 200)[1] == pytest.approx(1.0 - 0.025 ** (1.0 / 200.0))  # the closed form of 0 of n

@@ -20,7 +20,7 @@ from replays.score.quantities.step import step_response
 from replays.score.records.recorded import Recorded
 from rig.channels.table import ChannelTable, default_table
 from tests.score_daqs import write_parquet
-from tests.score_sessions import Sent, table_with, write_counts
+from tests.score_sessions import Sent, make_table, write_counts
 
 RATE_HZ, NOISE = 20e3, 1e-3
 SEEDS = 20
@@ -28,7 +28,7 @@ MIN_HITS = 17
 """Number of 20 intervals of 95 % that contain the truth, in 99 of 100 cases."""
 
 
-def held(true: float, judged: Callable[[np.random.Generator], Interval | None], width: float) -> None:
+def check_coverage(true: float, judged: Callable[[np.random.Generator], Interval | None], width: float) -> None:
     """Check how many intervals contain a value, and their largest width."""
     found = [judged(np.random.default_rng(seed)) for seed in range(SEEDS)]
     whole = [each for each in found if each is not None]
@@ -53,7 +53,7 @@ def test_intermodulation_agrees_with_a_polynomial(square: float, cube: float) ->
         return intermodulation(t, known, y - matrix @ parts, float(parts[0]))
 
     # The gain of a cube is 1 + 9/4 a3 A^2.
-    held(true - 20.0 * math.log10(1.0 + 2.25 * cube * a**2), judged, 0.5)
+    check_coverage(true - 20.0 * math.log10(1.0 + 2.25 * cube * a**2), judged, 0.5)
 
 
 @pytest.mark.parametrize(
@@ -91,7 +91,7 @@ def test_intermodulation_needs_two_tones(kind: str) -> None:
     assert transfer_curve(t, known, known, 20.0) is None
 
 
-def ramp(rows: int, period: int) -> tuple[np.ndarray, np.ndarray]:
+def make_ramp(rows: int, period: int) -> tuple[np.ndarray, np.ndarray]:
     """Return times and a ramp from -10 to 10 V."""
     n = np.arange(rows)
     return n / RATE_HZ, 20.0 * ((n / period + 0.1) % 1.0) - 10.0
@@ -100,7 +100,7 @@ def ramp(rows: int, period: int) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize(("square", "cube"), [(1e-4, 0.0), (0.0, 4e-5)])
 def test_inl_agrees_with_a_polynomial(square: float, cube: float) -> None:
     # From the best line, a2 x^2 on +-h deviates by at most 2/3 a2 h^2, and a3 x^3 by 2/5 a3 h^3, both at the ends.
-    t, x = ramp(12_000, 12_000)
+    t, x = make_ramp(12_000, 12_000)
     h = 10.0 - 80 * 20.0 / 12_000 - 4.0 * NOISE
     true = max(2.0 / 3.0 * square * h**2, 0.4 * cube * h**3) / 20.0 * 1e6
 
@@ -110,13 +110,13 @@ def test_inl_agrees_with_a_polynomial(square: float, cube: float) -> None:
         found = transfer_curve(t, known, y, 20.0)
         return None if found is None else found.inl
 
-    held(true, judged, 60.0)
+    check_coverage(true, judged, 60.0)
 
 
 @pytest.mark.parametrize("wider", [0.0, 0.7])
 def test_dnl_agrees_with_one_wide_code(wider: float) -> None:
     # 8 bits: code 100 includes a part of the next one.
-    t, x = ramp(20_000, 20_000)
+    t, x = make_ramp(20_000, 20_000)
     step = 20.0 / 256
 
     def judged(generator: np.random.Generator) -> Interval | None:
@@ -129,11 +129,11 @@ def test_dnl_agrees_with_one_wide_code(wider: float) -> None:
         assert found.inl is not None
         return found.dnl
 
-    held(wider, judged, 1.4)
+    check_coverage(wider, judged, 1.4)
 
 
 def test_too_few_samples_per_code_and_half_a_ramp_are_inconclusive() -> None:
-    t, x = ramp(20_000, 50_000)
+    t, x = make_ramp(20_000, 50_000)
     y = np.rint(x / 20.0 * 2**16) * 20.0 / 2**16
     found = transfer_curve(t, x, y, 20.0)
     assert found is not None
@@ -151,7 +151,7 @@ def test_crosstalk_is_the_worst_entry_of_the_mixing_matrix(parts: tuple[float, .
         assert worst == np.argmax(np.abs(parts))
         return part
 
-    held(max(map(abs, parts)), judged, 1e-4)
+    check_coverage(max(map(abs, parts)), judged, 1e-4)
 
 
 @pytest.mark.parametrize("same", ["own", "another"])
@@ -179,7 +179,9 @@ def test_errors_of_a_slow_reference_are_not_crosstalk(hz: float, amplitude: floa
     assert part is None or part[1] < 1e-4
 
 
-def steps(respond: Callable[[np.ndarray], np.ndarray], generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def make_steps(
+    respond: Callable[[np.ndarray], np.ndarray], generator: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
     """Return a square wave and a DAQ's record of it, whose rows are 0.37 rows after the steps and decreasing."""
     n = np.arange(9700)
     known, values = np.where(n // 600 % 2, 2.0, -2.0), np.full(len(n), -2.0)
@@ -195,10 +197,10 @@ def test_a_low_pass_of_first_order_rises_in_2_2_time_constants(quantity: str) ->
     true = {"rise_rows": tau * math.log(9.0), "settling_rows": tau * math.log(50.0)}[quantity]
 
     def judged(generator: np.random.Generator) -> Interval | None:
-        found = step_response(*steps(lambda since: 1.0 - np.exp(-since / tau), generator))
+        found = step_response(*make_steps(lambda since: 1.0 - np.exp(-since / tau), generator))
         return None if found is None else getattr(found, quantity)
 
-    held(true, judged, 0.2 if quantity == "rise_rows" else 4.0)
+    check_coverage(true, judged, 0.2 if quantity == "rise_rows" else 4.0)
 
 
 @pytest.mark.parametrize("zeta", [0.3, 0.6])
@@ -211,14 +213,14 @@ def test_overshoot_of_a_second_order_low_pass_follows_its_damping(zeta: float) -
         return 1.0 - np.exp(-zeta * w * since) * turned
 
     def judged(generator: np.random.Generator) -> Interval | None:
-        found = step_response(*steps(respond, generator))
+        found = step_response(*make_steps(respond, generator))
         return None if found is None else found.overshoot
 
-    held(true, judged, 0.2)
+    check_coverage(true, judged, 0.2)
 
 
 def test_an_ideal_step_is_within_its_resolution() -> None:
-    found = step_response(*steps(lambda since: (since > 0.0) * 1.0, np.random.default_rng(1)))
+    found = step_response(*make_steps(lambda since: (since > 0.0) * 1.0, np.random.default_rng(1)))
     assert found is not None
     assert found.rise_rows[1:] == (0.0, pytest.approx(2.0))
     assert abs(found.overshoot[0]) < 0.1
@@ -241,7 +243,7 @@ def test_a_matrix_has_the_worst_verdict_of_each_quantity_and_channel() -> None:
 
 
 def test_an_inverting_sensor_has_the_same_scorecard(tmp_path: Path) -> None:
-    document = table_with(16, ["probes"]).model_dump(mode="json")
+    document = make_table(16, ["probes"]).model_dump(mode="json")
     for channel in document["groups"]["probes"]["channels"]:
         channel["sensitivity_v"] *= -1.0
     sent = Sent("test-prbs", 1, ChannelTable.model_validate(document), True, tmp_path / "session.mcap", 40_000, 8000)

@@ -18,7 +18,7 @@ def followed(sent: np.ndarray, recorded: np.ndarray, start: int = 0, pieces: int
     return found
 
 
-def wrong(found: Followed) -> list[int]:
+def list_wrong_rows(found: Followed) -> list[int]:
     """Return the numbers of missing, foreign, repeated, swapped and altered rows."""
     events = found.foreign, found.doubled, found.swapped
     missing = int(np.sum(found.lost[:, 1] - found.lost[:, 0] + 1))
@@ -29,14 +29,14 @@ def wrong(found: Followed) -> list[int]:
 @pytest.mark.parametrize("offset", OFFSETS)
 def test_a_perfect_record_has_every_row_at_any_start(offset: int, pieces: int) -> None:
     found = followed(_RANDOM, _RANDOM[offset : offset + 14_000], 0, pieces)
-    assert (wrong(found), found.first, found.last) == ([0] * 5, offset, offset + 13_999)
+    assert (list_wrong_rows(found), found.first, found.last) == ([0] * 5, offset, offset + 13_999)
 
 
 @pytest.mark.parametrize("offset", OFFSETS)
 def test_a_loss_of_any_length_is_these_rows(offset: int) -> None:
     at = 3000
     found = followed(_RANDOM, np.delete(_RANDOM[: offset + 14_000], np.s_[at : at + offset], axis=0))
-    assert wrong(found) == [offset, 0, 0, 0, 0]
+    assert list_wrong_rows(found) == [offset, 0, 0, 0, 0]
     assert offset == 0 or found.lost.tolist() == [[at, at + offset - 1]]
 
 
@@ -45,5 +45,5 @@ def test_a_loss_of_any_length_is_these_rows(offset: int) -> None:
 def test_a_periodic_record_has_every_row_in_order(period: int, early: int) -> None:
     sent = _RANDOM[np.arange(40_000) % period]
     found = followed(sent, sent[9012 : 9012 + 14_000], early)
-    assert wrong(found) == [0] * 5
+    assert list_wrong_rows(found) == [0] * 5
     assert (found.first - 9012) % period == 0

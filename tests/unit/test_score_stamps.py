@@ -12,7 +12,7 @@ from replays.score.card.scorecard import FAIL
 from replays.score.judgement import judge
 from replays.score.records.recorded import Table
 from rig.channels.table import default_table
-from tests.score_daqs import RATE_HZ, counts_of, write_parquet, write_session
+from tests.score_daqs import RATE_HZ, make_counts, write_parquet, write_session
 
 PROBES = default_table().groups["probes"]
 ROWS = 6000
@@ -21,7 +21,7 @@ ROWS = 6000
 @pytest.fixture(scope="module")
 def counts() -> np.ndarray:
     """Noise on the probes."""
-    return counts_of("probes", np.random.default_rng(7).standard_normal((ROWS, 4)), None)
+    return make_counts("probes", np.random.default_rng(7).standard_normal((ROWS, 4)), None)
 
 
 @pytest.fixture(scope="module")

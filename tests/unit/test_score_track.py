@@ -21,8 +21,8 @@ from replays.score.records.stimulus import Exact
 from replays.score.records.wiring import Wire, find_wires
 from replays.score.waveform import fit_stretch
 from rig.channels.table import default_table
-from tests.score_cases import Converter, as_columns
-from tests.score_daqs import RATE_HZ, Tones, counts_of, write_parquet, write_session
+from tests.score_cases import Converter, make_columns
+from tests.score_daqs import RATE_HZ, Tones, make_counts, write_parquet, write_session
 from tests.score_files import write_values
 from tests.score_sessions import Sessions
 
@@ -34,7 +34,7 @@ def two_tones(t: np.ndarray) -> np.ndarray:
     return 0.4 * np.sin(2.0 * np.pi * 80.0 * t) + 0.2 * np.sin(2.0 * np.pi * 1000.0 * t)
 
 
-def track(
+def follow_track(
     signal: object, kept: np.ndarray, *, ppm_s: float = 0.0, ppm: float = 30.0, span_s: tuple[float, float] = (0.0, 0.8)
 ) -> Track:
     """Follow a record at 30 ppm or another rate, with some rows removed, from rows 1000 to 4000."""
@@ -63,7 +63,7 @@ def track(
 def test_a_step_by_whole_samples_is_found_at_its_row(
     signal: object, kept: np.ndarray, steps: list[tuple[int, int]]
 ) -> None:
-    found = track(signal, kept)
+    found = follow_track(signal, kept)
     assert [size for _, _, size in found.steps()] == [size for _, size in steps]
     for (first, last, _), (row, _) in zip(found.steps(), steps, strict=True):
         assert first <= row <= last <= first + 2
@@ -80,7 +80,7 @@ def tone(t: np.ndarray) -> np.ndarray:
 def test_a_step_near_an_end_is_found_at_its_row(signal: object, row: int, size: int) -> None:
     row %= len(ROWS)
     kept = np.delete(ROWS, np.arange(row, row + size)) if size > 0 else np.insert(ROWS, row, row)
-    found = track(signal, kept)
+    found = follow_track(signal, kept)
     ((first, last, moved),) = found.steps()
     assert moved == size
     assert first <= (row if size > 0 else row + 1) <= last <= first + 10
@@ -89,13 +89,13 @@ def test_a_step_near_an_end_is_found_at_its_row(signal: object, row: int, size: 
 
 @pytest.mark.parametrize("row", [3, -4])
 def test_a_jump_within_eight_rows_of_an_end_equals_a_late_start(row: int) -> None:
-    assert track(TONES, np.delete(ROWS, row)).steps() == []
+    assert follow_track(TONES, np.delete(ROWS, row)).steps() == []
 
 
 def test_a_disturbed_end_is_no_step() -> None:
     """No other part of the session explains the last rows."""
     values = np.concatenate([ROWS[:-100], np.random.default_rng(3).permutation(ROWS[-100:])])
-    found = track(TONES, values)
+    found = follow_track(TONES, values)
     assert found.steps() == []
     assert 100 <= len(ROWS) - found.explained < 600
 
@@ -103,7 +103,7 @@ def test_a_disturbed_end_is_no_step() -> None:
 def test_a_jump_is_found_at_its_row_despite_a_large_clock_error() -> None:
     """From the stretch to the ends of the record its time is off by up to 30 samples."""
     for row in (300, 12_000):
-        found = track(TONES, np.delete(ROWS, row), ppm=3000.0)
+        found = follow_track(TONES, np.delete(ROWS, row), ppm=3000.0)
         ((first, last, size),) = found.steps()
         assert size == 1
         assert first <= row <= last <= first + 2
@@ -111,17 +111,17 @@ def test_a_jump_is_found_at_its_row_despite_a_large_clock_error() -> None:
 
 
 def test_a_missing_half_and_exchanged_parts_are_followed() -> None:
-    missing = track(TONES, np.r_[0:4500, 8000:14_000])
+    missing = follow_track(TONES, np.r_[0:4500, 8000:14_000])
     ((first, last, size),) = missing.steps()
     assert size == 3500
     assert 4350 < first <= 4500 <= last < 4650
-    exchanged = track(TONES, np.r_[0:4200, 9100:14_000, 4200:9100])
+    exchanged = follow_track(TONES, np.r_[0:4200, 9100:14_000, 4200:9100])
     assert [size for *_, size in exchanged.steps()] == [4900, -9800]
 
 
 def test_unexplained_rows_are_not_judged() -> None:
     order = np.concatenate([ROWS[:5000], np.random.default_rng(3).permutation(ROWS[5000:10_000])])
-    assert track(TONES, order).explained == pytest.approx(5000, abs=300)
+    assert follow_track(TONES, order).explained == pytest.approx(5000, abs=300)
 
 
 @pytest.mark.parametrize("doubled", [None, 9900])
@@ -145,13 +145,13 @@ def test_a_record_does_not_cycle_at_an_end_of_a_session(doubled: int | None) -> 
 
 
 def test_rows_outside_the_session_are_outside() -> None:
-    found = track(TONES, ROWS, span_s=(0.1, 0.5))
+    found = follow_track(TONES, ROWS, span_s=(0.1, 0.5))
     assert found.inside == (1001, 9001)
     assert found.explained == 8000
 
 
 def test_a_drifting_clock_is_followed() -> None:
-    found = track(TONES, ROWS, ppm_s=60.0)
+    found = follow_track(TONES, ROWS, ppm_s=60.0)
     assert found.steps() == []
     assert 2.0 * RATE_HZ * found.line(2500.0)[2] == pytest.approx(-60e-6, rel=0.01)
 
@@ -181,7 +181,7 @@ SLOW_RATE_HZ = 3e3
 """Rate of records of slow signals, which keeps tests of several turns short [Hz]."""
 
 
-def slow_sources(
+def make_slow_sources(
     signals: Sequence[Callable[[np.ndarray], np.ndarray]], kept: np.ndarray, *, begin_s: float, found_s: float,
     end_s: float, noise: float,
 ) -> list[Source]:  # fmt: skip
@@ -206,7 +206,7 @@ def test_a_start_without_jumps_is_preferred() -> None:
 
     lost, signals = 1000, [lambda t: np.cos(angle(t)), lambda t: np.sin(angle(t))]
     kept = np.delete(np.arange(3301), lost)
-    found = align(slow_sources(signals, kept, begin_s=1.3, found_s=1.1, end_s=2.0, noise=6e-3))
+    found = align(make_slow_sources(signals, kept, begin_s=1.3, found_s=1.1, end_s=2.0, noise=6e-3))
     assert found is not None
     assert found.begin_s == pytest.approx(0.2, abs=2e-5)
     ((first, last, size),) = found.track.steps()
@@ -224,7 +224,7 @@ def test_a_longer_overlap_does_not_favour_an_inverted_start(begin_s: float) -> N
 
     found_s = begin_s - 0.5 if begin_s > 0.0 else begin_s + 0.5
     signals = [tones_of(0.0), tones_of(1.0)]
-    sources = slow_sources(signals, np.arange(3900), begin_s=begin_s, found_s=found_s, end_s=1.0, noise=1e-3)
+    sources = make_slow_sources(signals, np.arange(3900), begin_s=begin_s, found_s=found_s, end_s=1.0, noise=1e-3)
     found = align(sources)
     assert found is not None
     assert found.upright == len(sources)
@@ -239,7 +239,7 @@ TRUE_S = 0.05 + np.arange(8001) / RATE_HZ * (1.0 - 30e-6)
 @pytest.fixture(scope="module")
 def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
     t = np.arange(int(0.6 * RATE_HZ)) / RATE_HZ
-    counts = counts_of("probes", np.column_stack([two_tones(t + 0.001 * n) for n in range(4)]), None)
+    counts = make_counts("probes", np.column_stack([two_tones(t + 0.001 * n) for n in range(4)]), None)
     return write_session(tmp_path_factory.mktemp("sent") / "session.mcap", {"probes": counts})
 
 
@@ -282,7 +282,7 @@ def test_a_repeated_sample_of_a_whirl_keeps_one_start_for_all_channels(tmp_path:
     volts = box.volts(sent, np.random.default_rng(3))
     volts = np.insert(volts, 60, volts[60], axis=0)
     times_s = np.arange(len(volts)) / rate_hz
-    file = write_values("parquet", tmp_path / "daq", as_columns(sent, volts, "unit"), times_s, rate_hz)
+    file = write_values("parquet", tmp_path / "daq", make_columns(sent, volts, "unit"), times_s, rate_hz)
     assert red(judge(file, [sent.path], path="analogue")) == {("doubled samples", "")}
 
 
@@ -291,7 +291,7 @@ def test_rows_before_a_frozen_channel_stay_inside_the_session(tmp_path: Path) ->
     sent = Sessions(tmp_path / "sessions").get("test-sine")
     volts = Converter(2.05, 24_000).volts(sent, np.random.default_rng(9))
     volts[9000:9200, 1] = volts[9000, 1]
-    columns = as_columns(sent, volts, "unit")
+    columns = make_columns(sent, volts, "unit")
     file = write_values("parquet", tmp_path / "daq", columns, np.arange(len(volts)) / RATE_HZ, RATE_HZ)
     card = judge(file, [sent.path], path="analogue")
     assert {channel for _, channel in red(card)} == {sent.channels[1].name}
@@ -304,7 +304,7 @@ def test_a_replaced_block_does_not_move_the_record_out_of_the_session(at: int, n
     sent = Sessions(tmp_path / "sessions").get("test-two-tone", first_s=61.0)
     volts = Converter(61.2, 20_000).volts(sent, np.random.default_rng(3))
     volts[at : at + 200] = volts[at - 200 : at]
-    columns = dict(list(as_columns(sent, volts, "unit").items())[:names])
+    columns = dict(list(make_columns(sent, volts, "unit").items())[:names])
     file = write_values("parquet", tmp_path / "daq", columns, np.arange(len(volts)) / RATE_HZ, RATE_HZ)
     card = judge(file, [sent.path], path="analogue", channels=list(columns))
     assert card.outcome == "fail"
@@ -395,7 +395,7 @@ def test_an_inverted_record_fails_if_its_polarity_is_determined(
     """A sine is inverted half a period later, which leaves its polarity open; a bias does not."""
     sent = Sessions(tmp_path / "sessions").get(kind, first_s=61.0)
     volts = Converter(61.2, 8000).volts(sent, np.random.default_rng(9))
-    columns = {name: (told, -values) for name, (told, values) in as_columns(sent, volts, unit).items()}
+    columns = {name: (told, -values) for name, (told, values) in make_columns(sent, volts, unit).items()}
     file = write_values("parquet", tmp_path / "daq", columns, np.arange(len(volts)) / RATE_HZ, RATE_HZ)
     card = judge(file, [sent.path], path="analogue")
     assert card.outcome == outcome, card.verdict_line
@@ -435,7 +435,7 @@ def test_quiet_rows_outside_a_repeating_session_are_not_judged(
     volts = Converter(begin_s, rows, ppm=40.0, idle_s=61.0).volts(sent, generator)
     for n, channel in enumerate(sent.channels):
         volts[rows - round(after_s * RATE_HZ) :, n] = channel.bias_v
-    file = write_values("parquet", tmp_path / "daq", as_columns(sent, volts, "V"), np.arange(rows) / RATE_HZ, RATE_HZ)
+    file = write_values("parquet", tmp_path / "daq", make_columns(sent, volts, "V"), np.arange(rows) / RATE_HZ, RATE_HZ)
     card = judge(file, [sent.path], path="analogue")
     assert (red(card), card.outcome) == (set(), "pass")
     assert card.row("judged part").value == pytest.approx(1.0, abs=0.002)

@@ -20,7 +20,7 @@ from rig.run.simulation import Simulation
 CHANNELS = ("disk_x", "ring_y", "P_E", "inner_x", "speed", "hammer")
 
 
-def rows(names: tuple[str, ...], times_s: np.ndarray, **own: Any) -> dict[str, Measured]:
+def make_rows(names: tuple[str, ...], times_s: np.ndarray, **own: Any) -> dict[str, Measured]:
     """Return rows of some channels, each a group; `own` changes their calibration."""
     found = {}
     for name in names:
@@ -33,7 +33,7 @@ def rows(names: tuple[str, ...], times_s: np.ndarray, **own: Any) -> dict[str, M
 
 def shown(experiment: Experiment, *names: str, start_s: float = 0.0, end_s: float = 0.03, **own: Any) -> np.ndarray:
     times_s = np.arange(round(start_s * 20_000), round(end_s * 20_000)) / 20_000
-    found = Predictor(experiment, (), rows(names, times_s, **own)).predict(())
+    found = Predictor(experiment, (), make_rows(names, times_s, **own)).predict(())
     return np.concatenate([found.values[name] for name in names], axis=1)
 
 
@@ -75,7 +75,7 @@ def test_a_late_start_is_the_same_as_from_the_start(sent: tuple[SentCommand, ...
 def test_experiments_share_the_run_before_their_first_difference() -> None:
     pulse = {"at_s": 0.46, "command": "hammer", "force_n": 60.0, "duration_ms": 5.0, "direction": "x"}
     experiment = bare(Experiment(scene=load_scene("hammer", {"duration_s": 0.5, "commands": [pulse]})))
-    parts = rows(("ring_x", "hammer"), np.arange(9000, 10_000) / 20_000)
+    parts = make_rows(("ring_x", "hammer"), np.arange(9000, 10_000) / 20_000)
     lead_ins = LeadIns()
     for values in ({}, {"hammer.1.force_n": 90.0}, {"hammer.1.at_s": 0.2}, {"shaft.unbalance_phase": 0.1}):
         changed = with_values(experiment, values)
@@ -112,7 +112,7 @@ def test_a_late_fast_clock_shows_earlier_values(experiment: Experiment) -> None:
     from scipy.interpolate import CubicSpline
 
     times_s = np.arange(200, 600) / 20_000
-    predictor = Predictor(experiment, ("clock.offset_s", "clock.rate_ppm"), rows(("ring_x",), times_s))
+    predictor = Predictor(experiment, ("clock.offset_s", "clock.rate_ppm"), make_rows(("ring_x",), times_s))
     found = predictor.predict((1e-4, 2000.0)).values["ring_x"][:, 0]
     model = shown(experiment, "ring_x", end_s=0.04)[:, 0]
     there_s = times_s - 1e-4 - 2e-3 * (times_s - times_s[0])
@@ -122,7 +122,7 @@ def test_a_late_fast_clock_shows_earlier_values(experiment: Experiment) -> None:
 
 def test_derivatives_are_secants_of_small_steps(experiment: Experiment) -> None:
     keys = ("magnet.stiffness", "contact.stiffness", "contact.friction", "hammer.1.force_n")
-    parts = rows(("ring_x", "P_E"), np.arange(680) / 20_000)
+    parts = make_rows(("ring_x", "P_E"), np.arange(680) / 20_000)
     predictor = Predictor(experiment, keys, parts)
     found = predictor.derivatives(predictor.start)
     assert found.smooth.all()
@@ -138,7 +138,7 @@ def test_derivatives_are_secants_of_small_steps(experiment: Experiment) -> None:
 
 def test_the_length_of_a_pulse_acts_through_impacts_by_its_impulse_above_all(experiment: Experiment) -> None:
     """Apart from the force's slope, its slope is a secant at constant impulse: ticks of length bend the rest."""
-    parts = rows(("ring_x", "P_E"), np.arange(1200) / 20_000)
+    parts = make_rows(("ring_x", "P_E"), np.arange(1200) / 20_000)
     predictor = Predictor(experiment, ("hammer.1.duration_ms", "hammer.1.force_n"), parts)
     length_ms, force_n = predictor.start
     by_length, by_force = predictor.derivatives(predictor.start).slopes
@@ -154,7 +154,7 @@ def test_the_length_of_a_pulse_acts_through_impacts_by_its_impulse_above_all(exp
 
 def test_a_value_without_effect_has_no_derivative(experiment: Experiment) -> None:
     predictor = Predictor(
-        experiment, ["contact.friction"], rows(CHANNELS, np.arange(400) / 20_000)
+        experiment, ["contact.friction"], make_rows(CHANNELS, np.arange(400) / 20_000)
     )  # before the impact
     assert not any(slope.any() for slope in predictor.derivatives(predictor.start).slopes[0].values())
 
@@ -184,7 +184,7 @@ def test_commands_of_all_sources_are_numbered_by_time() -> None:
 
 def test_times_of_impacts_are_interpolated_between_rows(experiment: Experiment) -> None:
     """A half sine that begins between two rows: its impulse about any time is that of the formula."""
-    parts = rows(("hammer",), np.arange(600) / 20_000)
+    parts = make_rows(("hammer",), np.arange(600) / 20_000)
     parts = {"hammer": replace(parts["hammer"], ideal=True)}
     predictor = Predictor(experiment, ["hammer.1.duration_ms"], parts)
     low, middle, high = (predictor.predict([value]).values["hammer"].sum() for value in (5.0, 5.01, 5.025))
@@ -193,6 +193,6 @@ def test_times_of_impacts_are_interpolated_between_rows(experiment: Experiment) 
 
 
 def test_an_impact_after_the_window_is_not_simulated(experiment: Experiment) -> None:
-    predictor = Predictor(experiment, ["hammer.1.duration_ms"], rows(("ring_x",), np.arange(200) / 20_000))
+    predictor = Predictor(experiment, ["hammer.1.duration_ms"], make_rows(("ring_x",), np.arange(200) / 20_000))
     predictor.predict([5.01])
     assert predictor.runs == 1

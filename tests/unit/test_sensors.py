@@ -33,17 +33,17 @@ def group_of(name: str) -> Group:
     return default_table().groups[name]
 
 
-def counts_of(group: Group, rows: np.ndarray, *, seed: int = 1, noise: bool = True) -> np.ndarray:
+def compute_counts(group: Group, rows: np.ndarray, *, seed: int = 1, noise: bool = True) -> np.ndarray:
     """Return the counts of a group's converters, shape (samples, channels), with the last row repeated."""
     rows = np.concatenate([rows, rows[-1:]])
     return Conditioner([group], row_rate_hz=ROW_RATE, seed=seed, noise=noise).counts(rows)[group.name]
 
 
-def shown(name: str, signal_si: np.ndarray, *, seed: int = 1, noise: bool = False) -> np.ndarray:
+def compute_values(name: str, signal_si: np.ndarray, *, seed: int = 1, noise: bool = False) -> np.ndarray:
     """Return one channel's samples of its ideal signal, in its own unit, at its sample rate."""
     channel = default_table().channels[name]
     group = group_of(channel.group)
-    counts = counts_of(group, rows_of(channel.signal, signal_si), seed=seed, noise=noise)
+    counts = compute_counts(group, rows_of(channel.signal, signal_si), seed=seed, noise=noise)
     return group.engineering(counts)[:, group.names.index(name)]
 
 
@@ -53,7 +53,7 @@ def test_a_constant_signal_is_shown_within_half_a_step(channel, part: float) -> 
     low, high = channel.range_v
     volts = 0.5 * (low + high) + part * 0.5 * (high - low)
     value = (volts - channel.bias_v) / channel.sensitivity_v
-    seen = shown(channel.name, np.full(40, value * channel.si))
+    seen = compute_values(channel.name, np.full(40, value * channel.si))
     # Half a step of the converter, and the rounding of a filter that runs on volts.
     assert np.abs(seen - value).max() <= 0.5 * abs(channel.scale) * (1.0 + 1e-6)
 
@@ -63,7 +63,7 @@ def test_output_is_limited_to_the_range_of_the_conditioner(channel) -> None:
     for volts, limit in zip((-1e3, 1e3), channel.range_v, strict=True):
         value = (volts - channel.bias_v) / channel.sensitivity_v
         expected = (limit - channel.bias_v) / channel.sensitivity_v
-        seen = shown(channel.name, np.full(40, value * channel.si))
+        seen = compute_values(channel.name, np.full(40, value * channel.si))
         np.testing.assert_allclose(seen, expected, rtol=0, atol=abs(channel.scale))
 
 
@@ -74,7 +74,7 @@ def test_counts_are_limited_by_the_converter() -> None:
     group = group_of("hammer").model_copy(update={"channels": (loud,)})
     for sign, end in ((1.0, 2**15 - 1), (-1.0, -(2**15))):
         rows = rows_of("hammer_force", np.full(400, sign * 1e4))
-        counts = counts_of(group, rows)[:, 0]
+        counts = compute_counts(group, rows)[:, 0]
         assert counts.max() <= 2**15 - 1
         assert counts.min() >= -(2**15)
         assert np.count_nonzero(counts == end) > 50, "about half of the samples lie beyond"
@@ -83,7 +83,7 @@ def test_counts_are_limited_by_the_converter() -> None:
 @pytest.mark.parametrize("group", list(default_table().groups))
 def test_noise_has_the_level_of_the_table(group: str) -> None:
     samples = 20_000
-    counts = counts_of(group_of(group), np.zeros((2 * samples, N_ROW)), seed=7)
+    counts = compute_counts(group_of(group), np.zeros((2 * samples, N_ROW)), seed=7)
     assert counts.shape == (samples, len(group_of(group).channels))
     for c, channel in enumerate(group_of(group).channels):
         volts = counts[:, c] * channel.lsb_v
@@ -116,7 +116,7 @@ def test_noise_depends_only_on_seed_and_channel() -> None:
 def test_channels_have_independent_noise() -> None:
     noise = {}
     for name, group in default_table().groups.items():
-        counts = counts_of(group, np.zeros((8_000, N_ROW)))
+        counts = compute_counts(group, np.zeros((8_000, N_ROW)))
         noise |= {f"{name}.{channel}": counts[:, c].astype(float) for c, channel in enumerate(group.names)}
     related = np.corrcoef(np.array(list(noise.values()))) - np.eye(len(noise))
     # 4000 samples: standard error 1.6 %.
@@ -149,7 +149,7 @@ def test_more_channels_than_lanes_need_several_passes() -> None:
     assert list(both) == [*(group.name for group in groups), "probes-again", "forces-again"]
     for name, counts in both.items():
         group = group_of(name.removesuffix("-again"))
-        np.testing.assert_array_equal(counts, counts_of(group, rows, seed=3), err_msg=name)
+        np.testing.assert_array_equal(counts, compute_counts(group, rows, seed=3), err_msg=name)
 
 
 @pytest.mark.parametrize("seed", [1, 2**31])
@@ -176,11 +176,11 @@ def test_noise_is_normal() -> None:
 
 
 def test_without_noise_there_is_none() -> None:
-    counts = counts_of(group_of("probes"), np.zeros((400, N_ROW)), noise=False)
+    counts = compute_counts(group_of("probes"), np.zeros((400, N_ROW)), noise=False)
     assert len(np.unique(counts)) == 1
 
 
-def analogue(channel: Channel, frequency_hz: float) -> complex:
+def compute_transfer(channel: Channel, frequency_hz: float) -> complex:
     """Return the transfer function of a channel's filters in continuous time, from scipy's analogue designs."""
     from scipy.signal import butter, freqs
 
@@ -192,14 +192,14 @@ def analogue(channel: Channel, frequency_hz: float) -> complex:
     return complex(found)
 
 
-def response(channel: Channel, frequency_hz: float, *, seconds: float) -> complex:
+def measure_response(channel: Channel, frequency_hz: float, *, seconds: float) -> complex:
     """Return gain and phase of a channel for a sine, fitted to the second half of its samples."""
     group = group_of(channel.group).model_copy(update={"channels": (channel,), "rate_hz": channel.rate_hz})
     times = np.arange(round(seconds * ROW_RATE)) / ROW_RATE
     amplitude = 0.4 * min(channel.range_v[1] - channel.bias_v, channel.bias_v - channel.range_v[0])
     amplitude *= channel.si / abs(channel.sensitivity_v)
     rows = rows_of(channel.signal, amplitude * np.sin(2 * math.pi * frequency_hz * times))
-    seen = group.engineering(counts_of(group, rows, noise=False))[:, 0] * channel.si / amplitude
+    seen = group.engineering(compute_counts(group, rows, noise=False))[:, 0] * channel.si / amplitude
     at = 2 * math.pi * frequency_hz * np.arange(len(seen)) / channel.rate_hz
     half = slice(len(seen) // 2, None)
     waves = np.stack([np.sin(at), np.cos(at), np.ones_like(at)])
@@ -216,11 +216,11 @@ def test_the_chain_is_the_closed_form_of_its_filters_at_any_rate(rate_hz: int, o
     for name in ("P_E", "inner_x"):
         channel = default_table().channels[name].model_copy(update={"rate_hz": rate_hz, "filter_order": order})
         for frequency_hz in (150.0, 1_000.0, 2_500.0, 5_000.0):
-            measured = response(channel, frequency_hz, seconds=0.08)
+            measured = measure_response(channel, frequency_hz, seconds=0.08)
             # Error of a cubic through four rows of 25 us for a sine: (2 pi f T)^4 / 24 at most.
             cubic = (2.0 * math.pi * frequency_hz / ROW_RATE) ** 4 / 24.0
             settled = 2e-4 if channel.highpass_hz else 2e-6
-            assert abs(measured - analogue(channel, frequency_hz)) < cubic + settled, (name, frequency_hz)
+            assert abs(measured - compute_transfer(channel, frequency_hz)) < cubic + settled, (name, frequency_hz)
 
 
 @pytest.mark.parametrize("rate_hz", RATES)
@@ -229,7 +229,7 @@ def test_a_ramp_is_delayed_by_the_filter(rate_hz: int) -> None:
     channel = default_table().channels["disk_x"].model_copy(update={"rate_hz": rate_hz})
     group = group_of("probes").model_copy(update={"channels": (channel,), "rate_hz": rate_hz})
     times = np.arange(800) / ROW_RATE
-    seen = group.engineering(counts_of(group, rows_of("disk_x", 0.05 * times), noise=False))[:, 0] * 1e-3
+    seen = group.engineering(compute_counts(group, rows_of("disk_x", 0.05 * times), noise=False))[:, 0] * 1e-3
     at = np.arange(len(seen)) / rate_hz
     delay = 1.3065629648763766 / (math.pi * channel.bandwidth_hz)  # 83.2 us at 5 kHz
     settled = (at > 0.005) & (at < 0.019)
@@ -243,7 +243,7 @@ def test_a_step_is_answered_in_closed_form() -> None:
     channel = default_table().channels["P_E"].model_copy(update={"rate_hz": 51_200})
     group = group_of("forces").model_copy(update={"channels": (channel,), "rate_hz": 51_200})
     rows = rows_of("P_E", np.where(np.arange(200) < 100, 0.0, 5_000.0))
-    seen = group.engineering(counts_of(group, rows, noise=False))[:, 0]
+    seen = group.engineering(compute_counts(group, rows, noise=False))[:, 0]
     fine = np.arange(0, 200 * 64) / (ROW_RATE * 64)
     u = np.zeros(len(fine))
     for n in range(3, 199):
@@ -259,7 +259,7 @@ def test_a_step_is_answered_in_closed_form() -> None:
 
 def test_corner_is_at_minus_3_db() -> None:
     for name, frequency_hz, seconds in (("P_E", 5_000.0, 0.1), ("speed", 200.0, 0.3), ("inner_x", 0.5, 12.0)):
-        measured = abs(response(default_table().channels[name], frequency_hz, seconds=seconds))
+        measured = abs(measure_response(default_table().channels[name], frequency_hz, seconds=seconds))
         assert measured == pytest.approx(math.sqrt(0.5), rel=1e-2 if frequency_hz > 1e3 else 1e-3)
 
 
@@ -267,16 +267,16 @@ def test_a_slower_rate_has_a_lower_corner() -> None:
     group = default_table().only(("forces",), 2_000).groups["forces"]
     times = np.arange(8_000) / ROW_RATE
     rows = rows_of("P_E", 5_000.0 * np.sin(2 * math.pi * 5_000.0 * times))
-    seen = group.engineering(counts_of(group, rows, noise=False))
+    seen = group.engineering(compute_counts(group, rows, noise=False))
     assert len(seen) == 400
     # 5 kHz would fold back to 1 kHz; the corner of 500 Hz attenuates it by ten to the fourth.
-    assert np.abs(seen[200:]).max() < 5_000.0 * abs(analogue(group.channels[0], 5_000.0)) * 1.1
+    assert np.abs(seen[200:]).max() < 5_000.0 * abs(compute_transfer(group.channels[0], 5_000.0)) * 1.1
 
 
 def test_ac_coupling_forgets_a_step_with_its_time_constant() -> None:
     corner = default_table().channels["inner_x"].highpass_hz
     step = np.where(np.arange(ROW_RATE) < 4_000, 0.0, 100.0)
-    seen = shown("inner_x", step)
+    seen = compute_values("inner_x", step)
     at = np.arange(len(seen)) / 20_000 - 0.1
     later = at > 0.01
     np.testing.assert_allclose(seen[later], 100.0 * np.exp(-2 * math.pi * corner * at[later]), rtol=2e-3)
@@ -287,7 +287,7 @@ def test_ac_coupling_forgets_a_step_with_its_time_constant() -> None:
 def test_instruments_are_settled_at_sample_0(name: str) -> None:
     channel = default_table().channels[name]
     value = 0.7 * channel.si * (channel.range_v[1] - channel.bias_v) / abs(channel.sensitivity_v)
-    seen = shown(name, np.full(4_000, value))
+    seen = compute_values(name, np.full(4_000, value))
     expected = 0.0 if channel.highpass_hz else value / channel.si
     np.testing.assert_allclose(seen, expected, rtol=0, atol=abs(channel.scale))
 
@@ -383,7 +383,7 @@ def test_poles_are_butterworths(order: int) -> None:
             0.5 * (r / (s - p) + r.conjugate() / (s - p.conjugate())) if abs(p.imag) > 1e-6 else r / (s - p)
             for p, r in zip(poles, residues, strict=True)
         )
-        assert abs(direct + sums - analogue(channel, frequency_hz)) < 1e-9
+        assert abs(direct + sums - compute_transfer(channel, frequency_hz)) < 1e-9
 
 
 def test_different_filters_of_one_pole_are_distinguished() -> None:
@@ -392,8 +392,8 @@ def test_different_filters_of_one_pole_are_distinguished() -> None:
     low = base.model_copy(update={"name": "low", "filter_order": 1, "bandwidth_hz": 50.0})
     high = base.model_copy(update={"name": "high", "bandwidth_hz": 30_000.0, "highpass_hz": 50.0})
     rows = rows_of("P_E", np.where(np.arange(400) < 200, 0.0, 1_000.0))
-    alone = [counts_of(group_of("forces").model_copy(update={"channels": (one,)}), rows, noise=False)[:, 0]
+    alone = [compute_counts(group_of("forces").model_copy(update={"channels": (one,)}), rows, noise=False)[:, 0]
              for one in (low, high)]  # fmt: skip
-    both = counts_of(group_of("forces").model_copy(update={"channels": (low, high)}), rows, noise=False)
+    both = compute_counts(group_of("forces").model_copy(update={"channels": (low, high)}), rows, noise=False)
     np.testing.assert_array_equal(both, np.stack(alone, axis=1))
     assert np.abs(both[:, 0] - both[:, 1]).max() > 1_000

@@ -22,7 +22,7 @@ from rig.cli.commands.stability import peers_table, trials_table
 from rig.cli.output.display import fit_width
 from rig.cli.output.tables import echo_json, fact_table, new_table
 from rig.physics.engines import ENGINES
-from tests.commands import check_legible, lines_of, said, shown
+from tests.commands import check_legible, render_lines, run_captured, run_for_output
 
 SESSIONS = Path(__file__).parents[2] / "replays" / "sessions"
 HAMMER = SESSIONS / "hammer-6.2.mcap"
@@ -46,11 +46,11 @@ INCONCLUSIVE = COMMANDS[-1]
 @pytest.mark.parametrize("arguments", COMMANDS, ids=lambda arguments: " ".join(map(str, arguments[:2])))
 def test_command_prints_legible_tables(arguments: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
     expected = 3 if arguments is INCONCLUSIVE else 0
-    status, printed, complaints = said(capsys, *arguments)
+    status, printed, complaints = run_captured(capsys, *arguments)
     assert status == expected, complaints
     assert len(printed.splitlines()) > 4
     assert not any(mark in printed for mark in "…│┃─━\x1b")
-    status, printed, _ = said(capsys, *arguments, "--json")
+    status, printed, _ = run_captured(capsys, *arguments, "--json")
     assert (status, bool(json.loads(printed))) == (expected, True)
 
 
@@ -72,9 +72,9 @@ def test_a_pipe_ignores_the_width_of_the_terminal(
     printed = []
     for columns in ("30", "80", "500"):
         monkeypatch.setenv("COLUMNS", columns)
-        printed.append(shown(capsys, "params"))
+        printed.append(run_for_output(capsys, "params"))
     assert printed[0] == printed[1] == printed[2]
-    assert shown(capsys, "params", "--wide") == printed[0]
+    assert run_for_output(capsys, "params", "--wide") == printed[0]
     (row,) = [line.split() for line in printed[0].splitlines() if line.startswith("contact.friction ")]
     assert row[1:3] == ["0.25", "1"]
 
@@ -110,7 +110,7 @@ def lines_of_scenes() -> list[str]:
     table = new_table("", "scene", ">seconds", "what happens", wrapped=["what happens"])
     for name in scene_names():
         table.add_row(name, f"{load_scene(name).duration_s:g}", load_scene(name).title)
-    return lines_of(table)
+    return render_lines(table)
 
 
 def test_trials_are_legible() -> None:
@@ -126,10 +126,10 @@ def test_trials_are_legible() -> None:
     for table in (trials_table(cells, list(ENGINES)), peers_table(cells)):
         for width in (60, 80, 100, 200):
             check_legible(table, width=width)
-        text = "\n".join(lines_of(table, width=80))
+        text = "\n".join(render_lines(table, width=80))
         assert "1.6e+240" in text
         assert "skipped" in text
-    assert not any("without" in line for line in lines_of(trials_table(cells, list(ENGINES))))
+    assert not any("without" in line for line in render_lines(trials_table(cells, list(ENGINES))))
 
 
 def test_timed_cases_are_legible() -> None:
@@ -137,7 +137,7 @@ def test_timed_cases_are_legible() -> None:
     cases = [{**row, "name": case.name, "goal": 300.0, "error_goal": 2e-3, "reached": False} for case in CASES]
     table = cases_table({"cases": cases, "peers": [{**row, "name": "scipy-dop853 1e-10"}]}, runs=5)
     check_legible(table)
-    assert all(any(name in line for line in lines_of(table)) for name in ("12345.7", "300 at 2.0e-03", "NO"))
+    assert all(any(name in line for line in render_lines(table)) for name in ("12345.7", "300 at 2.0e-03", "NO"))
 
 
 @pytest.mark.parametrize("width", [50, 79, 80, 120, 300])
@@ -149,14 +149,14 @@ def test_any_table_is_legible(width: int) -> None:
         table.add_row(f"name_{n}", "m/s^2", *numbers, "words " * 20 * n, "somebody, some Journal 12 (1999) 345")
     table.add_row("all of them")
     check_legible(table, width=width)
-    told = [line for line in lines_of(table, width=width) if line.startswith("without ")]
+    told = [line for line in render_lines(table, width=width) if line.startswith("without ")]
     assert told == ([] if width == 300 else ["without unit, source: see --wide"])
 
 
 def test_long_text_is_folded_and_not_cut() -> None:
     table, name = new_table("", "name", ">value"), "x" * 150
     table.add_row(name, "1.25")
-    lines = lines_of(table)
+    lines = render_lines(table)
     assert max(map(len, lines)) <= 80
     assert "".join(line.split()[0] for line in lines[1:]) == name
     assert "1.25" in lines[1]
@@ -169,7 +169,7 @@ def test_rows_must_fit_their_headings() -> None:
 
 def test_facts_have_no_heading() -> None:
     table = fact_table("rig", [("a", "b " * 60), ("longer", "c")])
-    lines = lines_of(table)
+    lines = render_lines(table)
     assert lines[0] == "rig"
     assert lines[1].startswith("a       b b")
     assert lines[-1] == "longer  c"
@@ -178,7 +178,7 @@ def test_facts_have_no_heading() -> None:
 
 @pytest.mark.parametrize("width", range(30, 60, 3))
 def test_a_number_and_its_unit_stay_on_one_line(width: int) -> None:
-    lines = lines_of(fact_table("so 3.5 kN", [("all", "it took 12.5 ms of 3 MB at 100 N s/m, " * 9)]), width=width)
+    lines = render_lines(fact_table("so 3.5 kN", [("all", "it took 12.5 ms of 3 MB at 100 N s/m, " * 9)]), width=width)
     assert len(lines) > 5
     assert not any(line.endswith(("12.5", "3", "100", "100 N")) for line in lines), lines
 
@@ -207,7 +207,7 @@ def test_info_reports_an_impact_once_and_its_progress(capsys: pytest.CaptureFixt
     assert told == sorted(told)
     assert 0.0 < told[0] <= told[-1] <= 1.0
     assert len(told) > 10
-    assert sum("hammer: " in line for line in shown(capsys, "info", HAMMER).splitlines()) == 1
+    assert sum("hammer: " in line for line in run_for_output(capsys, "info", HAMMER).splitlines()) == 1
 
 
 def test_commands_are_reported_once_with_or_without_effect() -> None:
@@ -278,6 +278,6 @@ def test_every_command_with_tables_has_the_same_options(capsys: pytest.CaptureFi
     commands = {name: ["can", "load"] if name == "can" else [name.rstrip("_")] for name in sorted(found - {"demo"})}
     assert len(commands) >= 14
     for name, command in commands.items():
-        _, usage, _ = said(capsys, *command, "--help")
+        _, usage, _ = run_captured(capsys, *command, "--help")
         assert "--wide" in usage, name
         assert "--json" in usage, name

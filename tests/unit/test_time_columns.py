@@ -10,7 +10,7 @@ from replays.recordings.formats.mapping import FileOptions, parse_mapping
 from replays.recordings.formats.source import Source, open_source
 from rig.base import units
 from rig.base.errors import InputError
-from tests.commands import said
+from tests.commands import run_captured
 
 STEP_S = 1e-3
 EPOCH_S = 1764075600
@@ -107,7 +107,7 @@ def test_a_file_without_a_row_is_refused_in_one_line(tmp_path: Path) -> None:
 def test_an_import_by_guess_refuses_an_unknown_unit(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for unit, must in (("um pk-pk", "detector"), ("M", "unambiguous: m or min"), ("furlong", "a known unit")):
         path = log(tmp_path, "time [s]", [f"{n * STEP_S:g}" for n in range(300)], column=f"disk_x [{unit}]")
-        status, _, line = said(capsys, "import", path, "-o", tmp_path / "out.mcap")
+        status, _, line = run_captured(capsys, "import", path, "-o", tmp_path / "out.mcap")
         assert status == 2
         assert must in line
         assert "unit of disk_x" in line

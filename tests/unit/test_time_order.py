@@ -19,16 +19,16 @@ from replays.score.judgement import judge
 from rig.base.errors import InputError
 from rig.base.wire import EDGES, Block, decode_block, encode_block, schema_of
 from rig.channels.table import default_table
-from tests.commands import said
+from tests.commands import run_captured
 from tests.hostile.files import PROBES, SESSIONS, Layout
-from tests.score_daqs import RATE_HZ, counts_of, write_session
+from tests.score_daqs import RATE_HZ, make_counts, write_session
 
 GROUP = default_table().groups["probes"]
 ROWS = np.arange(2000)
 TIMES_S = ROWS / RATE_HZ
 
 
-def changed(row: int, time_s: float) -> np.ndarray:
+def change_stamp(row: int, time_s: float) -> np.ndarray:
     """Return the stamps with one of them changed."""
     return np.where(row == ROWS, time_s, TIMES_S)
 
@@ -38,19 +38,19 @@ TOO_LARGE = "not finite numbers up to 1e+12 s"
 STAMPS: dict[str, tuple[np.ndarray, str]] = {
     "descending": (TIMES_S[::-1], ASCENDING),
     "in random order": (np.random.default_rng(1).permutation(TIMES_S), ASCENDING),
-    "the last before the first": (changed(1999, -1.0), ASCENDING),
-    "the first far behind": (changed(0, 1e9), ASCENDING),
+    "the last before the first": (change_stamp(1999, -1.0), ASCENDING),
+    "the first far behind": (change_stamp(0, 1e9), ASCENDING),
     "a step back": (np.where(ROWS < 1000, TIMES_S, TIMES_S - 0.03), ASCENDING),
-    "one back": (changed(1000, 0.02), ASCENDING),
+    "one back": (change_stamp(1000, 0.02), ASCENDING),
     "begun again": (TIMES_S % 0.05, ASCENDING),
     "in pairs the wrong way": (TIMES_S[ROWS ^ 1], ASCENDING),
     "all equal": (np.full(2000, 5.0), ASCENDING),
     "equal in pairs": (np.repeat(TIMES_S[::2], 2), ASCENDING),
-    "one equal": (changed(1000, TIMES_S[999]), ASCENDING),
+    "one equal": (change_stamp(1000, TIMES_S[999]), ASCENDING),
     "single precision since 1970": ((1.7e9 + TIMES_S).astype(np.float32).astype(float), ASCENDING),
     "steps of 1e-12 s": (1e-12 * ROWS, ASCENDING),
     "steps of 1e-300 s": (1e-300 * ROWS, ASCENDING),
-    "one step of 1e-12 s": (changed(1000, TIMES_S[999] + 1e-12), ""),
+    "one step of 1e-12 s": (change_stamp(1000, TIMES_S[999] + 1e-12), ""),
     "before zero": (TIMES_S - 100.0, ""),
     "steps of 1e12 s": (1e12 * ROWS, TOO_LARGE),
 }
@@ -60,7 +60,7 @@ NO_RATE = ("descending", "all equal", "steps of 1e-12 s", "steps of 1e-300 s")
 
 @pytest.fixture(scope="module")
 def counts() -> np.ndarray:
-    return counts_of("probes", np.random.default_rng(7).standard_normal((4000, 4)), None)
+    return make_counts("probes", np.random.default_rng(7).standard_normal((4000, 4)), None)
 
 
 @pytest.fixture(scope="module")
@@ -85,7 +85,7 @@ def test_a_log_with_stamps_out_of_order_is_imported_or_refused_in_one_line(
 ) -> None:
     times_s, told = STAMPS[name]
     path, target = log(tmp_path, times_s, counts), tmp_path / "out.mcap"
-    status, _, line = said(capsys, "import", path, "-o", target)
+    status, _, line = run_captured(capsys, "import", path, "-o", target)
     if told:
         assert (status, line.count("\n"), target.exists()) == (2, 1, False), line
         assert told in line
@@ -176,9 +176,9 @@ def test_blocks_out_of_order_in_time_are_a_doubt_in_each_command(
     doubts = [line for line in Recording.open(path).doubts if told in line]
     assert len(doubts) == 1, Recording.open(path).doubts
     assert key in doubts[0]
-    status, shown, _ = said(capsys, "info", path)
+    status, shown, _ = run_captured(capsys, "info", path)
     assert status == 1
     assert told in " ".join(shown.split())
-    status, _, lines = said(capsys, "export", path, "-o", tmp_path / "x.csv")
+    status, _, lines = run_captured(capsys, "export", path, "-o", tmp_path / "x.csv")
     assert status == 0
     assert told in lines

@@ -31,7 +31,7 @@ from rig.run.simulation import Simulation
 RUN_CHANGES = {"sensors.rate_hz": 2000, "sensors.truth_rate_hz": 100, "duration_s": 0.06}
 
 
-def record(
+def record_scene(
     path: Path, scene: str = "hammer", *, truth: bool = True, leave_out: tuple[int, ...] = (), **changes: object
 ) -> Recording:
     """Record a scene; the frames of 0.01 s in `leave_out` are missing."""
@@ -58,10 +58,10 @@ def record(
 
 @pytest.fixture(scope="module")
 def hammer(tmp_path_factory: pytest.TempPathFactory) -> Recording:
-    return record(tmp_path_factory.mktemp("validation") / "hammer.mcap")
+    return record_scene(tmp_path_factory.mktemp("validation") / "hammer.mcap")
 
 
-def with_candidates(*names: str) -> Criteria:
+def make_criteria(*names: str) -> Criteria:
     """Return the default criteria with these parameters as the only candidates for a cause."""
     criteria = load_criteria()
     few = tuple(one for one in criteria.attribution.candidates if one.name in names)
@@ -180,7 +180,7 @@ def test_a_truncated_recording_is_inconclusive(hammer: Recording, tmp_path: Path
     assert found.bit_exact
     assert found.outcome is Outcome.INCONCLUSIVE
     assert found.verdict_line.startswith("inconclusive: the recording is not complete")
-    wrong = validate(Recording.open(cut), criteria=with_candidates(), changes={"contact.friction": 0.2})
+    wrong = validate(Recording.open(cut), criteria=make_criteria(), changes={"contact.friction": 0.2})
     assert wrong.outcome is Outcome.FAIL
 
 
@@ -224,7 +224,7 @@ def test_of_some_channels_the_bits_are_compared_by_name(
 
 
 def test_gaps_and_a_late_begin_are_passed_over(tmp_path: Path) -> None:
-    found = validate(record(tmp_path / "gap.mcap", leave_out=(0, 3)), declared=True)
+    found = validate(record_scene(tmp_path / "gap.mcap", leave_out=(0, 3)), declared=True)
     assert found.bit_exact
     assert found.good
     assert found.bits[sensor_key("probes")].rows == 80
@@ -268,7 +268,7 @@ def test_json_of_an_imported_log_has_earlier_words_and_names_of_defects(hammer: 
 
 
 def test_few_channels_and_no_truth_are_enough(tmp_path: Path) -> None:
-    recording = record(tmp_path / "few.mcap", truth=False, sensors__groups=["accelerations"])
+    recording = record_scene(tmp_path / "few.mcap", truth=False, sensors__groups=["accelerations"])
     found = validate(recording, declared=True)
     assert found.good
     assert [phase.name for phase in found.phases] == ["free run"]
@@ -358,7 +358,7 @@ def test_a_late_clock_is_called_time(hammer: Recording, heard: tuple[dict[str, M
 
 def test_two_equal_explanations_are_both_named(tmp_path: Path) -> None:
     """Transducers at rest show the preload alone, or an offset of the same size."""
-    recording = record(tmp_path / "rest.mcap", "stable-run", sensors__groups=["forces"])
+    recording = record_scene(tmp_path / "rest.mcap", "stable-run", sensors__groups=["forces"])
     found = validate(recording, changes={"house.preload": 2990.0})
     assert not found.good
     assert found.explained is not None
@@ -369,8 +369,8 @@ def test_two_equal_explanations_are_both_named(tmp_path: Path) -> None:
 def test_a_second_cause_is_named_with_the_first(tmp_path: Path) -> None:
     """Damping is identified before the impacts, friction only in them."""
     both = {"shaft__damping_ratio_x": 0.03, "contact__friction": 0.24}
-    recording = record(tmp_path / "two.mcap", sensors__rate_hz=20_000, duration_s=0.045, **both)
-    criteria = with_candidates("contact.friction", "shaft.damping_ratio_x")
+    recording = record_scene(tmp_path / "two.mcap", sensors__rate_hz=20_000, duration_s=0.045, **both)
+    criteria = make_criteria("contact.friction", "shaft.damping_ratio_x")
     right = {"shaft.damping_ratio_x": 0.016, "contact.friction": 0.25}
     found = validate(recording, criteria=criteria, changes=right).explained
     assert found is not None
@@ -394,7 +394,7 @@ def test_the_best_candidate_is_no_explanation_if_more_than_noise_remains(left: f
 def test_a_document_is_json_throughout(hammer: Recording) -> None:
     import json
 
-    criteria = with_candidates("contact.restitution", "contact.friction")
+    criteria = make_criteria("contact.restitution", "contact.friction")
     found = validate(hammer, criteria=criteria, changes={"contact.restitution": 0.85}, declared=True)
     document = json.loads(json.dumps(found.document(), allow_nan=False))
     assert document["good"] is False

@@ -44,7 +44,7 @@ def unchanged(key: str, payload: bytes) -> list[bytes]:
     return [payload]
 
 
-def rewritten(
+def rewrite(
     good: Recording,
     path: Path,
     change: Change = unchanged,
@@ -114,7 +114,7 @@ def test_figures_are_those_of_the_model(good: Recording) -> None:
 
 
 def test_a_rewritten_recording_passes(good: Recording, tmp_path: Path) -> None:
-    assert judge(rewritten(good, tmp_path / "again.mcap")) == judge(good)
+    assert judge(rewrite(good, tmp_path / "again.mcap")) == judge(good)
 
 
 def test_probes_with_a_wrong_sign_of_y_do_not_pass(good: Recording, tmp_path: Path) -> None:
@@ -125,7 +125,7 @@ def test_probes_with_a_wrong_sign_of_y_do_not_pass(good: Recording, tmp_path: Pa
             channel["sensitivity_v"] *= -1.0
             flipped += 1
     assert flipped == 2
-    verdict = judge(rewritten(good, tmp_path / "flipped.mcap", catalogue=catalogue))
+    verdict = judge(rewrite(good, tmp_path / "flipped.mcap", catalogue=catalogue))
     assert not verdict.good
     assert bad(verdict) >= WHIRL
     assert {row.measured for row in verdict.rows if row.quantity == "sense of rotation"} == {"forward"}
@@ -142,7 +142,7 @@ def test_probes_with_crossed_cables_do_not_pass(good: Recording, tmp_path: Path)
             return [payload]
         return [changed_block(payload, key, lambda values: values[:, [1, 0, 3, 2]])]
 
-    assert bad(judge(rewritten(good, tmp_path / "crossed.mcap", crossed))) >= WHIRL
+    assert bad(judge(rewrite(good, tmp_path / "crossed.mcap", crossed))) >= WHIRL
 
 
 def test_a_single_wrong_probe_pair_is_found(good: Recording, tmp_path: Path) -> None:
@@ -151,7 +151,7 @@ def test_a_single_wrong_probe_pair_is_found(good: Recording, tmp_path: Path) -> 
             return [payload]
         return [changed_block(payload, key, lambda values: values[:, [1, 0, 2, 3]])]
 
-    assert bad(judge(rewritten(good, tmp_path / "disk.mcap", crossed))) == {"whirl frequency, disk probes"}
+    assert bad(judge(rewrite(good, tmp_path / "disk.mcap", crossed))) == {"whirl frequency, disk probes"}
 
 
 def test_a_lost_block_does_not_pass(good: Recording, tmp_path: Path) -> None:
@@ -163,7 +163,7 @@ def test_a_lost_block_does_not_pass(good: Recording, tmp_path: Path) -> None:
         seen["blocks"] += 1
         return [] if seen["blocks"] == 7 else [payload]
 
-    verdict = judge(rewritten(good, tmp_path / "lossy.mcap", lossy))
+    verdict = judge(rewrite(good, tmp_path / "lossy.mcap", lossy))
     assert bad(verdict) == {"samples lost"}
     # Blocks of 0.1 s.
     assert next(row.measured for row in verdict.rows if row.quantity == "samples lost").startswith("2000 of ")
@@ -203,7 +203,7 @@ LATENESS_MS = {"p50": 0.1, "p99": 10.5, "max": 30.0}
 def test_warnings_of_the_rig_affect_the_verdict(
     good: Recording, tmp_path: Path, changes: dict[str, Any], expected: set[str]
 ) -> None:
-    verdict = judge(rewritten(good, tmp_path / "status.mcap", status=status(**changes)))
+    verdict = judge(rewrite(good, tmp_path / "status.mcap", status=status(**changes)))
     assert bad(verdict) == expected
     # A run without a clock has an energy figure, and no pace.
     assert len(verdict.rows) == len(judge(good).rows) + 2

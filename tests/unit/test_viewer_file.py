@@ -23,7 +23,7 @@ from rig.cli.main import main
 from rig.run.scenes import parse_scene
 from rig.run.simulation import Simulation
 from tests.unit.player_recording import BLOCKS, write_recording
-from tests.unit.recorder_stream import stream
+from tests.unit.recorder_stream import generate_stream
 from tests.unit.viewer_recording import (
     CLEARANCE_MM,
     DISK_RATIO,
@@ -293,7 +293,7 @@ def _views(container: Any) -> list[Any]:
 
 
 def test_the_command_accepts_parts_and_shows_notes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    written = list(stream(BLOCKS))
+    written = list(generate_stream(BLOCKS))
     note = {"event": "note", "tick": 5000, "time_s": 0.005, "text": "bearing is warm", "tags": ["look"]}
     half = next(n for n, (key, _) in enumerate(written) if n > len(written) / 2 and key == wire.sensor_key("probes"))
     halves = [[*written[:half], (wire.EVENTS, wire.encode_document(note))], written[half:]]
@@ -308,7 +308,7 @@ def test_the_command_accepts_parts_and_shows_notes(tmp_path: Path, capsys: pytes
 
 def test_a_picture_gets_its_name_only_when_complete(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     recorded, target = tmp_path / "run.mcap", tmp_path / "run.rrd"
-    write_recording(recorded, list(stream(20)))
+    write_recording(recorded, list(generate_stream(20)))
     seen: list[list[str]] = []
     paint = file.paint
 

@@ -15,8 +15,8 @@ from recorder.viewer.canvas import Canvas, new_stream
 from rig.base import wire
 from rig.serve.transport import NoReplyError
 from rig.serve.transport.memory import key_matches
-from tests.unit.viewer_recording import RADIUS_MM, RATE_HZ, Saved, Synthetic, documents_of, stream_of
-from tests.waiting import PATIENCE_S, sooner_than
+from tests.unit.viewer_recording import RADIUS_MM, RATE_HZ, Saved, Synthetic, generate_messages, make_replies
+from tests.waiting import PATIENCE_S, time_limit
 
 pytestmark = pytest.mark.wallclock
 
@@ -28,7 +28,7 @@ class ScriptedClient:
     rig = "a rig"
 
     def __init__(self, recording: Synthetic, payloads: Iterable[tuple[str, bytes]], *, killed: bool = False) -> None:
-        self._replies = documents_of(recording)
+        self._replies = make_replies(recording)
         self._payloads = list(payloads)
         self._killed = killed
         self._callbacks: list[tuple[str, Callable[[str, bytes], None]]] = []
@@ -72,7 +72,7 @@ def run(client: ScriptedClient, path: Path, **options: Any) -> tuple[str, live.L
 
 
 def payloads_of(recording: Synthetic) -> list[tuple[str, bytes]]:
-    return [message for block in stream_of(recording) for message in block]
+    return [message for block in generate_messages(recording) for message in block]
 
 
 @pytest.fixture(scope="module")
@@ -131,7 +131,7 @@ def test_a_killed_rig_is_noticed(recording: Synthetic, tmp_path: Path) -> None:
 
 
 def test_lost_blocks_are_counted_reported_and_shown_as_a_gap(recording: Synthetic, tmp_path: Path) -> None:
-    payloads = list(stream_of(recording))
+    payloads = list(generate_messages(recording))
     kept = [message for number, block in enumerate(payloads) if number not in (20, 21) for message in block]
     _, view, saved = run(ScriptedClient(recording, kept), tmp_path / "lost.rrd")
     assert view.lost == 5 * 400
@@ -173,7 +173,7 @@ def test_the_picture_is_drawn_at_the_pace_of_the_viewer_not_of_the_rig(recording
 
 @pytest.mark.parametrize("prompt", [True, False])
 def test_a_slow_viewer_gets_fewer_pictures_with_all_peaks(recording: Synthetic, tmp_path: Path, prompt: bool) -> None:
-    blocks = list(stream_of(recording))
+    blocks = list(generate_messages(recording))
     client = ScriptedClient(recording, [])
     stream = new_stream("paced")
     stream.save(tmp_path / "paced.rrd")
@@ -208,7 +208,7 @@ def test_closing_the_viewer_ends_the_view(recording: Synthetic, tmp_path: Path) 
     stream = new_stream("closed")
     stream.save(tmp_path / "closed.rrd")
     client = ScriptedClient(recording, payloads_of(recording)[:10])
-    with sooner_than(PATIENCE_S):
+    with time_limit(PATIENCE_S):
         reason = live.LiveView(client, Canvas(stream), live.ask(client)).run(stop=lambda: True)
     stream.flush()
     stream.disconnect()
@@ -218,7 +218,7 @@ def test_closing_the_viewer_ends_the_view(recording: Synthetic, tmp_path: Path) 
 def test_a_stalled_window_is_not_drawn(recording: Synthetic, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Canvas, "keeps_up", lambda self, *, timeout_s: False)
     monkeypatch.setattr(live, "_CHECK_INTERVAL_S", 0.0)
-    blocks = list(stream_of(recording))
+    blocks = list(generate_messages(recording))
     early = [message for block in blocks[:10] for message in block]
     late = [message for block in blocks[10:] for message in block]
     client = ScriptedClient(recording, early)

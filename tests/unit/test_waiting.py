@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from tests.processes import line_of, python
-from tests.waiting import PATIENCE_S, sooner_than, until
+from tests.processes import read_line, start_python
+from tests.waiting import PATIENCE_S, time_limit, until
 
 FAILING_PROGRAM = "print('out of order', flush=True); raise SystemExit(3)"
 
@@ -13,22 +13,22 @@ FAILING_PROGRAM = "print('out of order', flush=True); raise SystemExit(3)"
 def test_a_wait_for_a_process_that_has_ended_fails_at_once_with_its_output() -> None:
     told = r"ended with status 3 before that:\nout of order"
     with (
-        python("-S", "-c", FAILING_PROGRAM) as child,
-        sooner_than(PATIENCE_S),
+        start_python("-S", "-c", FAILING_PROGRAM) as child,
+        time_limit(PATIENCE_S),
         pytest.raises(AssertionError, match=told),
     ):
         until(lambda: False, of=child)
 
 
 def test_a_condition_met_before_the_process_ended_is_no_failure() -> None:
-    with python("-S", "-c", FAILING_PROGRAM) as child:
+    with start_python("-S", "-c", FAILING_PROGRAM) as child:
         until(lambda: child.poll() is not None, of=child)
 
 
 def test_a_missing_line_is_reported_with_the_received_ones() -> None:
     told = r"status 0 and without 'listening on':\ncompiling"
-    silent = python("-S", "-c", "import sys; print('compiling', file=sys.stderr)")
+    silent = start_python("-S", "-c", "import sys; print('compiling', file=sys.stderr)")
     with silent as child, pytest.raises(AssertionError, match=told):
-        line_of(child, "listening on")
-    with python("-S", "-c", "print('no rig'); print('ready')", stderr=None) as child:
-        assert line_of(child, "ready") == "ready\n"
+        read_line(child, "listening on")
+    with start_python("-S", "-c", "print('no rig'); print('ready')", stderr=None) as child:
+        assert read_line(child, "ready") == "ready\n"

@@ -158,7 +158,7 @@ class Saved:
         return self.columns[key]
 
 
-def stream_of(recording: Synthetic, *, block_s: float = 0.01) -> Iterator[list[tuple[str, bytes]]]:
+def generate_messages(recording: Synthetic, *, block_s: float = 0.01) -> Iterator[list[tuple[str, bytes]]]:
     """Yield the messages of a rig for a recording: keys and payloads, a list for each block time."""
     rows = round(block_s * RATE_HZ)
     counts = {name: _counts(group, recording.values[name]) for name, group in recording.table.groups.items()}
@@ -185,7 +185,7 @@ def _counts(group: Group, values: np.ndarray) -> np.ndarray:
     return np.round((values - offset) / scale).astype(np.int32)
 
 
-def documents_of(recording: Synthetic) -> dict[str, bytes]:
+def make_replies(recording: Synthetic) -> dict[str, bytes]:
     """Return the replies to the rig's queries."""
     table = recording.table.model_dump(mode="json")
     catalogue = {"root": "rig", "tick_rate_hz": 1e6, "table": table, **recording.catalogue}
