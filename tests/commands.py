@@ -30,8 +30,8 @@ def check_legible(table: Table, *, width: int = TERMINAL) -> None:
     lines = render_lines(table, width=width)
     assert max(map(cell_len, lines), default=0) <= width, lines
     text = "\n".join(lines)
-    told = re.search(r"^without (.*): see --wide\Z", text, re.MULTILINE | re.DOTALL)
-    gone = set(" ".join(told[1].split()).split(", ")) if told else set()
+    note = re.search(r"^without (.*): see --wide\Z", text, re.MULTILINE | re.DOTALL)
+    gone = set(" ".join(note[1].split()).split(", ")) if note else set()
     assert gone <= {table.headings[at] for at in table.spare}
     for at, heading in enumerate(table.headings):
         cells = [cells[at].plain for cells, _ in table.rows if len(cells) == len(table.headings)]

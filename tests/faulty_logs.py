@@ -47,12 +47,12 @@ class Case:
 
     def named_by(self, found: Validation) -> bool:
         """Return whether a validation names the fault."""
-        said = (
+        messages = (
             [one.line for one in found.faults]
             + found.beyond
             + ([found.explained.conclusion] if found.explained else [])
         )
-        return not found.good and any(re.search(self.told, one) for one in said)
+        return not found.good and any(re.search(self.told, one) for one in messages)
 
 
 def _gain(names: tuple[str, ...], factor: float, offset: float = 0.0) -> Callable[[Values, float], Values]:

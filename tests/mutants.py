@@ -379,11 +379,11 @@ def main(words: list[str] | None = None) -> int:
         if asked.only not in (None, number):
             continue
         tests, text = find_tests(mutant.file), texts[mutant.file]
-        told = mutant.told(text)
+        description = mutant.told(text)
         own = {test: ran for test, ran in record.items() if test.partition("::")[0] in tests}
         first, last = (text.count("\n", 0, place) + 1 for place in (mutant.begin, mutant.end))
         ids = json.dumps(order_tests(own, sources, mutant.file, first, last))
-        key = _key(told, text, ids, *((ROOT / test).read_text(encoding="utf-8") for test in tests))
+        key = _key(description, text, ids, *((ROOT / test).read_text(encoding="utf-8") for test in tests))
         if key not in known or asked.only is not None:
             order.write_text(ids, encoding="utf-8")
             target = tree / mutant.file
@@ -392,9 +392,9 @@ def main(words: list[str] | None = None) -> int:
                 result, used_s = run(tree, tests, CPU_S, {ORDER: str(order)})
             finally:
                 target.write_text(text, encoding="utf-8")
-            _keep(journal, known, {"key": key, "mutant": told, "result": result, "cpu_s": used_s})
+            _keep(journal, known, {"key": key, "mutant": description, "result": result, "cpu_s": used_s})
         results.append(str(known[key]["result"]))
-        print(f"{number:3} {results[-1]:12} {known[key]['cpu_s']:5} s  {told}", flush=True)
+        print(f"{number:3} {results[-1]:12} {known[key]['cpu_s']:5} s  {description}", flush=True)
     killed = results.count("killed")
     print(
         f"{killed} of {len(results)} killed; {results.count('out of time')} out of time, {results.count('lived')} lived"

@@ -195,12 +195,12 @@ def _sine(generator: np.random.Generator, noise: Callable[..., Noise], seed: int
     turn = 2.0 * np.pi * generator.uniform(0.01, 0.045)
     second, third = LEVEL * generator.uniform([1.5, 0.2], [3.0, 0.4])
     values = np.sin(turn * n) + second * np.sin(2.0 * turn * n + 1.0) + third * np.sin(3.0 * turn * n) + series
-    told, bad = quality(fit_sine(values)), level**2 + 0.5 * (second**2 + third**2)
+    quality_figures, bad = quality(fit_sine(values)), level**2 + 0.5 * (second**2 + third**2)
     sinad_db = 10.0 * math.log10(0.5 / bad)
     return {
-        "SINAD": (*told.sinad_db, sinad_db), "ENOB": (*told.enob, (sinad_db - 1.76) / 6.02),
-        "THD": (*told.thd_db, 20.0 * math.log10(math.hypot(second, third))),
-        "SFDR": (*told.sfdr_db, -20.0 * math.log10(second)),
+        "SINAD": (*quality_figures.sinad_db, sinad_db), "ENOB": (*quality_figures.enob, (sinad_db - 1.76) / 6.02),
+        "THD": (*quality_figures.thd_db, 20.0 * math.log10(math.hypot(second, third))),
+        "SFDR": (*quality_figures.sfdr_db, -20.0 * math.log10(second)),
     }  # fmt: skip
 
 

@@ -17,8 +17,10 @@ RATE_HZ = 20_000
 
 def write_session(path: Path, groups: dict[str, np.ndarray], *, index: int = 0) -> Path:
     """Write a session of counts by group, each of shape (n, channels), in blocks of 10 ms."""
-    told = make_documents()
-    writer = RecordingWriter(path, catalogue=told[CATALOGUE], parameters=told[PARAMETERS], scene=told[SCENE])
+    document = make_documents()
+    writer = RecordingWriter(
+        path, catalogue=document[CATALOGUE], parameters=document[PARAMETERS], scene=document[SCENE]
+    )
     rows = RATE_HZ // 100
     for start in range(0, max(map(len, groups.values())), rows):
         tick = (index + start) * TICK_RATE_HZ // RATE_HZ

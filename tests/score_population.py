@@ -128,7 +128,9 @@ def _part(name: str, count: int, of: int) -> str:
 def summarise(name: str, lines: list[dict[str, Any]]) -> tuple[list[str], bool]:
     """Return the figures of a population in lines, and whether its goal is met."""
     count, outcomes = len(lines), Counter(line["outcome"] for line in lines)
-    told = [_part(outcome, outcomes[outcome], count) for outcome in sorted({*outcomes, "pass", "fail", "inconclusive"})]
+    parts = [
+        _part(outcome, outcomes[outcome], count) for outcome in sorted({*outcomes, "pass", "fail", "inconclusive"})
+    ]
     wrong = outcomes["crashed"]
     if name == "perfect":
         good = not outcomes["fail"] and not outcomes["refused"] and outcomes["inconclusive"] <= MAX_INCONCLUSIVE * count
@@ -136,11 +138,11 @@ def summarise(name: str, lines: list[dict[str, Any]]) -> tuple[list[str], bool]:
         good = not outcomes["pass"]
     else:
         right, none = sum(line["right"] for line in lines), sum(not line["other"] for line in lines)
-        told += [_part("the right quantity is red", right, count), _part("no other is red", none, count)]
+        parts += [_part("the right quantity is red", right, count), _part("no other is red", none, count)]
         good = not outcomes["pass"] and right >= MIN_RIGHT * count and none >= MIN_NO_OTHER * count
     used_s, by_command = sum(line["cpu_s"] for line in lines), sum(line["by"] == "command" for line in lines)
-    told.append(f"{used_s:.0f} s of processor time, {by_command} by the command")
-    return told, good and not wrong
+    parts.append(f"{used_s:.0f} s of processor time, {by_command} by the command")
+    return parts, good and not wrong
 
 
 def main(words: list[str] | None = None) -> int:
@@ -182,8 +184,8 @@ def main(words: list[str] | None = None) -> int:
             print(
                 f"{line['number']:4} {line['outcome']:12} {line['label']}: red {line['red'][:4]} {line['reason'][:160]}"
             )
-    told, good = summarise(asked.population, lines)
-    print("\n".join([*told, "the goal is met" if good else "THE GOAL IS MISSED"]))
+    summary, good = summarise(asked.population, lines)
+    print("\n".join([*summary, "the goal is met" if good else "THE GOAL IS MISSED"]))
     return 0 if good else 1
 
 

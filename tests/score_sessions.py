@@ -168,12 +168,14 @@ def _between(values: np.ndarray, places: np.ndarray) -> np.ndarray:
 
 def write_counts(path: Path, sent: Sent, counts: np.ndarray, first: int) -> Path:
     """Write counts as a recording of the session's scene, starting at a row of the run."""
-    told = make_documents()
-    told[CATALOGUE]["table"] = sent.table.model_dump(mode="json")
+    document = make_documents()
+    document[CATALOGUE]["table"] = sent.table.model_dump(mode="json")
     scene = make_scene(sent.kind)
     scene = scene.model_copy(update={"sensors": scene.sensors.model_copy(update={"noise": sent.noisy})})
-    told[SCENE] = {"name": scene.name, "seed": sent.seed, "scene": scene_document(scene)}
-    writer = RecordingWriter(path, catalogue=told[CATALOGUE], parameters=told[PARAMETERS], scene=told[SCENE])
+    document[SCENE] = {"name": scene.name, "seed": sent.seed, "scene": scene_document(scene)}
+    writer = RecordingWriter(
+        path, catalogue=document[CATALOGUE], parameters=document[PARAMETERS], scene=document[SCENE]
+    )
     size, column = RATE_HZ // 100, 0
     spans = {}
     for name, group in sent.table.groups.items():

@@ -254,8 +254,8 @@ class Layout:
                 if name != "metadata.json":
                     mcap.add_attachment(0, 0, name, "", data)
             if strange < 0.95:
-                told = {name: entries for name, entries in self.metadata.items() if name != "end"}
-                mcap.add_attachment(0, 0, "metadata.json", "", json.dumps(told).encode())
+                kept = {name: entries for name, entries in self.metadata.items() if name != "end"}
+                mcap.add_attachment(0, 0, "metadata.json", "", json.dumps(kept).encode())
             if 0.5 < strange < 0.53:
                 mcap.add_metadata("rig", self.metadata["rig"])
             schema = mcap.register_schema("x", "jsonschema", b"{}")

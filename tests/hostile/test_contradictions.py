@@ -56,9 +56,9 @@ def edit_event(name: str, **fields: Any) -> Spoil:
     def spoil(layout: Layout) -> None:
         for at, (topic, payload, time_ns) in enumerate(layout.messages):
             if topic == EVENTS and json.loads(payload)["event"] == name:
-                told = {**json.loads(payload), **fields}
-                time_ns = told["tick"] * 1000 if "tick" in fields else time_ns
-                layout.messages[at : at + 1] = [(EVENTS, encode_document(told), time_ns)] if fields else []
+                changed = {**json.loads(payload), **fields}
+                time_ns = changed["tick"] * 1000 if "tick" in fields else time_ns
+                layout.messages[at : at + 1] = [(EVENTS, encode_document(changed), time_ns)] if fields else []
                 return
 
     return spoil
@@ -228,10 +228,10 @@ def doubts_of(path: Path) -> tuple[str, ...]:
 @pytest.mark.parametrize("name", CONTRADICTIONS)
 def test_a_contradiction_in_a_file_is_reported_in_one_line(name: str, layout: Layout, tmp_path: Path) -> None:
     changed = copy.deepcopy(layout)
-    spoil, told = CONTRADICTIONS[name]
+    spoil, message = CONTRADICTIONS[name]
     spoil(changed)
     found = doubts_of(changed.write(tmp_path / "x.mcap"))
-    assert any(line.startswith(told) or told in line for line in found), found
+    assert any(line.startswith(message) or message in line for line in found), found
 
 
 def test_topic_metadata_is_compared_with_the_catalogue(layout: Layout, tmp_path: Path) -> None:
@@ -248,14 +248,14 @@ def test_info_and_validate_report_a_contradiction_and_validate_exits_with_1(
 ) -> None:
     changed = copy.deepcopy(layout)
     changed.messages = [one for one in changed.messages if one[2] <= 10_000_000 or one[0] == EVENTS]
-    spoil, told = CONTRADICTIONS[name]
+    spoil, message = CONTRADICTIONS[name]
     spoil(changed)
     path = changed.write(tmp_path / "x.mcap")
     for command, status in (("info", 1), ("validate", 1)):
         with pytest.raises(SystemExit) as end:
             main([command, str(path)])
         assert end.value.code == status
-        assert told in capsys.readouterr().out.replace("\n", " ")
+        assert message in capsys.readouterr().out.replace("\n", " ")
 
 
 @pytest.mark.parametrize("path", [*sorted(SESSIONS.glob("*.mcap")), *sorted(Path("tests/recordings").glob("*.mcap"))])

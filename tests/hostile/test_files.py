@@ -69,14 +69,14 @@ def test_each_of_600_flipped_bits_in_attachments_is_reported(
     places = [at for start, end in find_attachments(data) for at in range(start, end)]
     rng = np.random.default_rng(1)
     spoilt = tmp_path / ("x.mcap" if finished else "x.mcap.part")
-    told = 0
+    reported = 0
     for at, bit in zip(rng.choice(places, 600), rng.integers(0, 8, 600), strict=True):
         spoilt.write_bytes(flipped(data, int(at), int(bit)))
         with pytest.raises(InputError):
             Recording.open(spoilt)
         assert not is_whole(spoilt)
-        told += 1
-    assert told == 600
+        reported += 1
+    assert reported == 600
 
 
 def test_a_changed_calibration_is_never_recovered_as_complete(path: Path, tmp_path: Path) -> None:
@@ -142,8 +142,8 @@ def test_every_changed_byte_that_alters_contents_is_reported(
 
 
 def _unsure(recording: Recording) -> int:
-    (told,) = recording.unchecked
-    return int(told.split()[2])
+    (unchecked,) = recording.unchecked
+    return int(unchecked.split()[2])
 
 
 def test_a_malformed_file_is_read_or_refused_without_a_traceback(layout: Layout, tmp_path: Path) -> None:
@@ -287,21 +287,21 @@ def test_missing_or_inconsistent_rows_are_reported_despite_valid_checksums(
     lie: str, layout: Layout, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     changed = copy.deepcopy(layout)
-    spoil, told = _CORRUPTIONS[lie]
+    spoil, message = _CORRUPTIONS[lie]
     assert Recording.open(changed.write(tmp_path / "same.mcap")).doubts == ()
     spoil(changed)
     path = changed.write(tmp_path / "x.mcap")
-    assert any(told in line for line in Recording.open(path).doubts)
+    assert any(message in line for line in Recording.open(path).doubts)
     assert _rig("info", str(path)) == 1
     printed = capsys.readouterr().out
-    assert told in printed
-    if "missing" in told:
-        assert re.search(f"^lost .*{told}", printed, re.MULTILINE)
+    assert message in printed
+    if "missing" in message:
+        assert re.search(f"^lost .*{message}", printed, re.MULTILINE)
         assert not is_whole(path)
-        assert recover(path, tmp_path / "new.mcap").short == (told,)
-        assert told in Recording.open(tmp_path / "new.mcap").metadata["recovered"]["short"]
+        assert recover(path, tmp_path / "new.mcap").short == (message,)
+        assert message in Recording.open(tmp_path / "new.mcap").metadata["recovered"]["short"]
         assert _rig("export", str(path), "-o", str(tmp_path / "y.parquet")) == 0
-        assert told in capsys.readouterr().err
+        assert message in capsys.readouterr().err
     if lie in ("channel", "ticks"):
         assert _rig("info", "--json", str(path)) == 1
         channels = json.loads(capsys.readouterr().out)["health"]["channels"]

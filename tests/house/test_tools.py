@@ -50,17 +50,17 @@ def test_code_is_formatted() -> None:
 @pytest.mark.timeout(600)
 def test_pyrefly_reports_nothing(pytestconfig: pytest.Config) -> None:
     # 15 s on one core, so the result is reused while files and packages are unchanged.
-    said = hashlib.sha256((ROOT / "pyproject.toml").read_bytes())
+    digest = hashlib.sha256((ROOT / "pyproject.toml").read_bytes())
     for package in ("rig", "drivers", "recorder", "replays"):
         for path in sorted((ROOT / package).rglob("*.py")):
-            said.update(str(path.relative_to(ROOT)).encode() + b"\0" + path.read_bytes() + b"\0")
+            digest.update(str(path.relative_to(ROOT)).encode() + b"\0" + path.read_bytes() + b"\0")
     for installed in sorted(f"{each.name} {each.version}" for each in metadata.distributions()):
-        said.update(installed.encode() + b"\0")
+        digest.update(installed.encode() + b"\0")
     cache = getattr(pytestconfig, "cache", None)  # not with -p no:cacheprovider
-    if cache is not None and cache.get("house/right types", None) == said.hexdigest():
+    if cache is not None and cache.get("house/right types", None) == digest.hexdigest():
         return
     # One thread takes a quarter less processor time than two.
     options = ("--threads", "1", "--summary=none", "--min-severity", "error", "--color", "never")
     check_tool(find_pyrefly(), "check", *options, "--python-interpreter-path", sys.executable)
     if cache is not None:
-        cache.set("house/right types", said.hexdigest())
+        cache.set("house/right types", digest.hexdigest())

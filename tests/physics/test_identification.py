@@ -106,11 +106,11 @@ def test_moduli_act_only_together(tmp_path: Path) -> None:
     shaft, ring, friction = found.judgement.findings
     assert shaft.standing == ring.standing == "only together"
     assert friction.standing == "identified"
-    told = re.search(r"\+(\S+) Pa is compensated by ring.young_modulus by (\S+) Pa", shaft.words)
-    assert told is not None
+    match = re.search(r"\+(\S+) Pa is compensated by ring.young_modulus by (\S+) Pa", shaft.words)
+    assert match is not None
     parameters = Experiment.of(recording).scene.load_parameters()
     ratio = (parameters["ring.young_modulus"] / parameters["shaft.young_modulus"]) ** 2
-    assert float(told[2]) / float(told[1]) == pytest.approx(-ratio, rel=0.02)
+    assert float(match[2]) / float(match[1]) == pytest.approx(-ratio, rel=0.02)
 
 
 def test_a_drop_identifies_neither_friction_nor_magnets(tmp_path: Path) -> None:

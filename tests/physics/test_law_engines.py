@@ -22,7 +22,7 @@ from rig.physics.contacts import DAMPING, STIFFNESS
 from rig.physics.engines import ENGINES, load_engine
 from rig.run.simulation import Simulation
 
-from .test_engines import distance, motion, ready
+from .test_engines import compute_motion, make_simulation, rms_distance
 
 LAWS = [*(("damping_factor", name) for name in DAMPING), *(("stiffness", name) for name in STIFFNESS)]
 FRICTIONS = {"exact": {}, "smoothed": {"contact__smoothing_speed": 10.0}, "none": {}}
@@ -51,7 +51,7 @@ def get_limit(engine: str) -> float:
 
 def make_falling(engine: str, field: str, law: str, friction: str, **choice: object) -> Simulation:
     """Prepare a simulation shortly before its first impact."""
-    return ready(
+    return make_simulation(
         "drop", engine, initial__position="given", initial__x_mm=0.35, initial__y_mm=-0.8, drive__speed_hz=6.2,
         contact__restitution=0.7, model__friction=friction, **{f"contact__{field}": law},
         **FRICTIONS[friction], **choice,
@@ -66,7 +66,7 @@ def compute_reference(field: str, law: str, friction: str) -> np.ndarray:
 
 def run_bouncing(simulation: Simulation) -> np.ndarray:
     """Return the scaled states of a run that bounces, shape (n, 7)."""
-    states = motion(simulation, DURATION_S)
+    states = compute_motion(simulation, DURATION_S)
     assert simulation.health()["contacts"] >= 3
     return states
 
@@ -89,7 +89,7 @@ def choose_friction(engine: str, field: str, law: str) -> tuple[Simulation, str]
 @pytest.mark.parametrize("engine", ENGINES)
 def test_law_is_the_same_in_every_engine(engine: str, field: str, law: str) -> None:
     simulation, friction = choose_friction(engine, field, law)
-    assert distance(run_bouncing(simulation), compute_reference(field, law, friction)) < get_limit(engine)
+    assert rms_distance(run_bouncing(simulation), compute_reference(field, law, friction)) < get_limit(engine)
 
 
 @pytest.mark.parametrize(("field", "law"), LAWS)
@@ -102,4 +102,4 @@ def test_limits_detect_a_law_that_is_ten_per_cent_stronger(field: str, law: str)
     simulation.model = dataclasses.replace(
         simulation.model, constants=constants._replace(contact=constants.contact._replace(**stronger))
     )
-    assert distance(run_bouncing(simulation), compute_reference(field, law, "exact")) > LIMIT
+    assert rms_distance(run_bouncing(simulation), compute_reference(field, law, "exact")) > LIMIT

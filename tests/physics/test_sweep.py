@@ -241,10 +241,10 @@ def test_command_prints_stores_and_draws(tmp_path, capsys: pytest.CaptureFixture
     command = ["stability", "--random", "1", "--seed", "7", "--only", "2", "--engines", DEFAULT, "-o", str(tmp_path)]
     with pytest.raises(SystemExit, match="0"):
         main([*command, "--json"])
-    told = json.loads(capsys.readouterr().out)
-    assert told["scenes"] == {"decided": 1, "chaotic": 0, "undecided": 0, "untold": 0, "unbounded": 0}
-    assert told["engines"][DEFAULT]["told"] == 1
-    assert all(Path(picture).is_file() for picture in told["pictures"])
+    document = json.loads(capsys.readouterr().out)
+    assert document["scenes"] == {"decided": 1, "chaotic": 0, "undecided": 0, "untold": 0, "unbounded": 0}
+    assert document["engines"][DEFAULT]["told"] == 1
+    assert all(Path(picture).is_file() for picture in document["pictures"])
     with pytest.raises(SystemExit, match="0"):
         main(command)
     assert "random scenes of seed 7: 1 decided, 0 chaotic" in capsys.readouterr().out

@@ -73,9 +73,9 @@ def _again(machine: Rig) -> bool:
 def main(trips: str = "1000", block_ms: str = "1") -> None:
     """Print the latency's distribution."""
     found, status = measure_latencies_ms(int(trips), block_ms)
-    told = [f"p{part:g} {np.percentile(found, part):.2f} ms" for part in (0, 10, 50, 99, 99.9, 100)]
+    quantiles = [f"p{part:g} {np.percentile(found, part):.2f} ms" for part in (0, 10, 50, 99, 99.9, 100)]
     missed = f"{np.isinf(found).sum()} missed, blocks of {block_ms} ms"
-    print(f"{trips} trips, {missed}: {', '.join(told)}; lateness of the rig [ms]: {status['lateness_ms']}")
+    print(f"{trips} trips, {missed}: {', '.join(quantiles)}; lateness of the rig [ms]: {status['lateness_ms']}")
 
 
 if __name__ == "__main__":

@@ -121,10 +121,10 @@ def test_a_device_in_lockstep_gets_the_same_verdict_each_time(folder: Path) -> N
     out, both = run_campaign(folder, "x.campaign.toml", "test_x.py", status=1)
     well, dies, again, fixtures, behind = both["cases"]
     assert [case["outcome"] for case in both["cases"]] == ["passed", "failed", "passed", "failed", "inconclusive"]
-    told = {each["name"]: each for each in well["measurements"]}
-    assert told["time to trip"]["good"]
-    assert told["time to trip"]["resolution"] == "1 tick, 1 us; 10 ms blocks, in lockstep"
-    assert 1e3 * told["time to trip"]["at_s"] % 10.0 == 0.0  # the end of a block
+    measurements = {each["name"]: each for each in well["measurements"]}
+    assert measurements["time to trip"]["good"]
+    assert measurements["time to trip"]["resolution"] == "1 tick, 1 us; 10 ms blocks, in lockstep"
+    assert 1e3 * measurements["time to trip"]["at_s"] % 10.0 == 0.0  # the end of a block
     assert "exit status of protection must be == 0; instead received 1 (its last line: out of order)" in out
     assert "\n      time to trip must be <= 20 ms; instead received nothing (no note tags=trip occurred)" in out
     assert dies["reason"].startswith("exit status of protection must be == 0")
@@ -235,8 +235,8 @@ def test_an_inconclusive_case_is_an_error_of_that_type_and_ends_with_status_3(tm
     found = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert "1 failed, 1 passed, 1 skipped, 1 error" in found.stdout, found.stdout + found.stderr
     cases = list(ElementTree.parse(tmp_path / "plain.xml").getroot().iter("testcase"))
-    told = [[each.tag for each in case if each.tag != "properties"] for case in cases]
-    assert told == [[], ["error"], ["failure"], ["skipped"]]
+    tags = [[each.tag for each in case if each.tag != "properties"] for case in cases]
+    assert tags == [[], ["error"], ["failure"], ["skipped"]]
 
 
 EXTERNAL_CAMPAIGN = """

@@ -31,9 +31,9 @@ def run_until_trip() -> tuple[list[str], list[dict[str, Any]], list[Samples]]:
                 machine.hammer(force_n=120.0, direction=30.0)
                 rows.append(machine.advance(0.4))
                 machine.stop()
-                said, errors = device.communicate(timeout=30.0)
+                output, errors = device.communicate(timeout=30.0)
                 assert (device.returncode, errors) == (0, "")
-            lines = said.splitlines()[1:]
+            lines = output.splitlines()[1:]
             # A note at its start, one for each line, and the trip's command.
             events = [machine.event(lambda event: event["event"] in ("speed", "note")) for _ in range(len(lines) + 2)]
         child.wait(timeout=PATIENCE_S)

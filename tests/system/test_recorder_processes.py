@@ -29,12 +29,12 @@ from rig.serve.transport.zenoh import ZenohServer
 from tests.processes import free_port, read_line, start_python
 from tests.waiting import PATIENCE_S, until
 
-from ..unit.recorder_stream import documents, stream
+from ..unit.recorder_stream import generate_stream, make_documents
 
 pytestmark = pytest.mark.wallclock
 PROBES = sensor_key("probes")
 BLOCK_S = 0.01
-CYCLE = list(stream(50))[1:-1]
+CYCLE = list(generate_stream(50))[1:-1]
 """Half a second of all streams; later halves differ only in ticks and row numbers."""
 
 
@@ -53,7 +53,7 @@ class Publisher:
 
     def __init__(self, port: int) -> None:
         self.server = ZenohServer(f"127.0.0.1:{port}")
-        for key, document in documents().items():
+        for key, document in make_documents().items():
             self.server.answer(key, lambda _, document=document: encode_document(document))
         self.beats: list[dict] = []
         self.reached: set[str] = set()

@@ -42,8 +42,8 @@ def test_a_failure_ends_in_1_and_a_report_names_the_cause(
     assert page.count("data:image/png") == 7  # overview, five groups, orbits and spectra
     assert page.index("Fail, ") < page.index("data:image/png") < page.index("<table>")
     head = page[: page.index("data:image/png")]
-    for told in (recording.name, "--set contact.restitution=0.88", "corrected", "<dt>seed</dt>", "<dt>made</dt>"):
-        assert told in head
+    for text in (recording.name, "--set contact.restitution=0.88", "corrected", "<dt>seed</dt>", "<dt>made</dt>"):
+        assert text in head
     assert 'src="http' not in page
     assert page.index("Criteria that fail") < page.index("What explains the difference") < page.index(">Bits<")
 

@@ -123,8 +123,8 @@ def test_live_view_until_the_rig_ends(tmp_path: Path) -> None:
     ):
         out, _ = viewer.communicate(timeout=60)
         assert (viewer.returncode, out) == (0, "the rig ended: completed\n")
-        heard = server.communicate(timeout=30)[0]
-    beats = re.findall(r'rig/clients/viewer .*"received_index":(\d+)', heard)
+        output = server.communicate(timeout=30)[0]
+    beats = re.findall(r'rig/clients/viewer .*"received_index":(\d+)', output)
     assert beats
     saved = Saved(target)
     first, _ = saved["/orbit/disk/reading", "Points2D:labels"].values[-1]

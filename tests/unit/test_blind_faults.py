@@ -42,19 +42,19 @@ def find_faults(recording: Recording) -> tuple[list[Explanation], set[str]]:
     parts, bits = measured(recording, experiment.scene), Bits(recording, experiment.simulation().table)
     nominal = predict(experiment, parts, follow=bits.follow)
     bits.finish()
-    told = own_faults(
+    explanations = own_faults(
         parts, nominal, bits.apart, recording.edges(), bits.edges_s(), lambda other: predict(experiment, other)
     )
-    return told, {name for part in parts for name in bits.off(part)}
+    return explanations, {name for part in parts for name in bits.off(part)}
 
 
-def is_named_right(told: list[Explanation], channel: str, kind: str) -> bool:
+def is_named_right(explanations: list[Explanation], channel: str, kind: str) -> bool:
     """Return whether there is one certain finding, on the channel, with a name of the kind."""
-    if len(told) != 1 or not told[0].sure:
+    if len(explanations) != 1 or not explanations[0].sure:
         return False
-    names, what = told[0].channels_and_defect
+    names, what = explanations[0].channels_and_defect
     looks_alike = DEFECTS[DEFECT_OF[kind]].validation or [DEFECT_OF[kind]]
-    return channel in names.split() and not {*alternatives(what or told[0].change)}.isdisjoint(looks_alike)
+    return channel in names.split() and not {*alternatives(what or explanations[0].change)}.isdisjoint(looks_alike)
 
 
 @pytest.mark.parametrize(("kind", "numbers"), [(kind, n) for kind, (_, sizes) in BLIND_SIZES.items() for n in sizes])
@@ -67,16 +67,16 @@ def test_a_fault_has_its_name(kind: str, numbers: dict[str, Any], tmp_path: Path
     recording = recorded(
         tmp_path / "a.mcap", "hammer", duration_s=duration_s, drive__speed_hz=12.0, commands=[pulse, fault]
     )
-    told, differ = find_faults(recording)
-    assert is_named_right(told, channel, kind), [(one.name, one.change, one.left) for one in told]
+    explanations, differ = find_faults(recording)
+    assert is_named_right(explanations, channel, kind), [(one.name, one.change, one.left) for one in explanations]
     assert differ == {channel, *([numbers["other"]] if kind == "swap" else [])}
-    size, defect, what = size_of(kind, numbers, channel), DEFECT_OF[kind], told[0].channels_and_defect[1]
+    size, defect, what = size_of(kind, numbers, channel), DEFECT_OF[kind], explanations[0].channels_and_defect[1]
     # Another number of a law, such as the end of a drift, has another unit; there are few pulses in 0.4 s.
     unit = unit_of(defect, default_table().channels[channel].unit)
-    if size is not None and (what, told[0].unit) == (defect, unit) and channel != "keyphasor":
-        assert told[0].value == pytest.approx(size, rel=0.5 if kind in RANDOM else 0.05)
+    if size is not None and (what, explanations[0].unit) == (defect, unit) and channel != "keyphasor":
+        assert explanations[0].value == pytest.approx(size, rel=0.5 if kind in RANDOM else 0.05)
     # There is one pulse per turn; samples are immediate.
-    assert told[0].from_s == pytest.approx(0.05, abs=0.2 if channel == "keyphasor" or kind in RANDOM else 0.03)
+    assert explanations[0].from_s == pytest.approx(0.05, abs=0.2 if channel == "keyphasor" or kind in RANDOM else 0.03)
 
 
 @pytest.mark.parametrize("kind", [kind for kind in BLOCKS if DEFECTS[DEFECT_OF[kind]].doubts])
@@ -159,14 +159,16 @@ def test_random_faults_have_their_names(tmp_path: Path) -> None:
         recording = recorded(
             tmp_path / f"{n}.mcap", "hammer", duration_s=0.8, drive__speed_hz=speed, commands=[pulse, fault]
         )
-        told, differ = find_faults(recording)
+        explanations, differ = find_faults(recording)
         (tmp_path / f"{n}.mcap").unlink()
         if not differ:
             continue
         seen += 1
-        if not is_named_right(told, fault["channel"], fault["kind"]):
-            line = f"{n}: {speed:.4g} Hz, {pulse['force_n']:.4g} N, {fault}: {[(o.name, o.change) for o in told]}"
-            (wrong if any(one.sure for one in told) else unnamed).append(line)
+        if not is_named_right(explanations, fault["channel"], fault["kind"]):
+            line = (
+                f"{n}: {speed:.4g} Hz, {pulse['force_n']:.4g} N, {fault}: {[(o.name, o.change) for o in explanations]}"
+            )
+            (wrong if any(one.sure for one in explanations) else unnamed).append(line)
     print(f"{seen} faults: {len(wrong)} wrong, {len(unnamed)} unnamed", *wrong, *unnamed, sep="\n")
     assert len(wrong) <= 0.01 * seen
     assert len(unnamed) <= 0.05 * seen
@@ -195,6 +197,6 @@ def test_a_fault_that_changes_is_not_named_by_its_start(tmp_path: Path) -> None:
         {"at_s": 2.05, "command": "fault", "channel": "P_N", "kind": "polarity"},
     ]
     recording = recorded(tmp_path / "a.mcap", "stable-run", duration_s=2.5, commands=faults)
-    (told,), _ = find_faults(recording)
-    assert not told.sure
-    assert "and at its end" in told.change
+    (explanation,), _ = find_faults(recording)
+    assert not explanation.sure
+    assert "and at its end" in explanation.change

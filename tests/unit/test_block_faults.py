@@ -28,7 +28,7 @@ def run(
     *faults: dict[str, Any], cut: int = 10_000, door: str = "zenoh"
 ) -> tuple[dict[str, Sent], list[dict[str, Any]]]:
     """Return index, tick and counts of the messages of every stream, and the fault events."""
-    simulation, found, told = Simulation(SCENE), dict[str, Sent](), list[Any]()
+    simulation, found, fault_events = Simulation(SCENE), dict[str, Sent](), list[Any]()
     while simulation.tick < simulation.end_tick:
         if simulation.tick == FROM * 1e6:
             for fault in faults:
@@ -38,8 +38,8 @@ def run(
             if door in message.doors:
                 block = message.block
                 found.setdefault(message.key, []).append((block.index, block.tick, block.values.copy()))
-        told += frame.told
-    return found, told
+        fault_events += frame.told
+    return found, fault_events
 
 
 def rows(sent: Sent) -> list[tuple[int, int]]:
@@ -53,7 +53,7 @@ def sound() -> dict[str, Sent]:
 
 @pytest.mark.parametrize("kind", BLOCKS)
 def test_a_fault_affects_only_its_stream_and_rows_and_is_reported(kind: str, sound: dict[str, Sent]) -> None:
-    there, told = run({"kind": kind, **BLOCKS[kind]})
+    there, fault_events = run({"kind": kind, **BLOCKS[kind]})
     assert {
         key for key in sound if rows(there[key]) != rows(sound[key]) or kind in ("stale-stamps", "late-blocks")
     } >= {PROBES}
@@ -63,7 +63,7 @@ def test_a_fault_affects_only_its_stream_and_rows_and_is_reported(kind: str, sou
             np.testing.assert_array_equal(values, other[2])
     # The events restore, row by row, the original counts.
     first, last = round(FROM * 20_000), round(TO * 20_000)
-    entries = [entry for each in told if each["event"] == "blocks" for entry in each["blocks"]]
+    entries = [entry for each in fault_events if each["event"] == "blocks" for entry in each["blocks"]]
     assert [(entry["row"], entry["rows"]) for entry in entries] == [(row, 200) for row in range(first, last, 200)]
     counts = np.concatenate([values for _, _, values in sound[PROBES]])
     others = (*range(0, first, 200), *range(last, 8000, 200))
@@ -78,7 +78,7 @@ def test_a_fault_affects_only_its_stream_and_rows_and_is_reported(kind: str, sou
     assert [(index, tick) for index, tick, _ in there[PROBES]] == [each[1:3] for each in expected]
     for (_, _, values), (row, *_) in zip(there[PROBES], expected, strict=True):
         np.testing.assert_array_equal(values, counts[row : row + 200])
-    assert [each["event"] for each in told if each["event"] != "blocks"] == ["fault", "clear"]
+    assert [each["event"] for each in fault_events if each["event"] != "blocks"] == ["fault", "clear"]
 
 
 @pytest.mark.parametrize("kind", BLOCKS)

@@ -60,8 +60,12 @@ def test_values_of_signals_are_those_of_their_rows(seen: CaseRecording) -> None:
     assert one(seen, signal="disk_x", take="value", at_s=0.3, must="<= 9 mm").value == pytest.approx(x[1500], rel=1e-11)
     radius = np.hypot(x, y)
     first = times_s[np.argmax(radius > 0.5)]
-    told = one(seen, signal=["disk_x", "disk_y"], take="first beyond", beyond="500 um", must="< 1 s")
-    assert (told.value, told.at_s, told.resolution) == (pytest.approx(first), pytest.approx(first), "1 row, 200 us")
+    measurement = one(seen, signal=["disk_x", "disk_y"], take="first beyond", beyond="500 um", must="< 1 s")
+    assert (measurement.value, measurement.at_s, measurement.resolution) == (
+        pytest.approx(first),
+        pytest.approx(first),
+        "1 row, 200 us",
+    )
     since = one(
         seen,
         signal=["disk_x", "disk_y"],
@@ -117,9 +121,13 @@ def test_missing_rows_can_be_expected(tmp_path: Path) -> None:
     kept = np.delete(counts, slice(1000, 1100), axis=0)
     write_parquet(tmp_path / "daq.parquet", dict(zip(names, kept.T, strict=True)))
     for must, good, margin in (("== 100", True, 0.0), (">= 1", True, 99.0), ("<= 50", False, -50.0)):
-        told = one(session, score="missing rows", file="daq.parquet", must=must)
-        assert (told.value, told.good, told.must.margin(told.value)) == (100.0, good, margin)
-        assert told.note == "rows 1000 to 1099"
+        measurement = one(session, score="missing rows", file="daq.parquet", must=must)
+        assert (measurement.value, measurement.good, measurement.must.margin(measurement.value)) == (
+            100.0,
+            good,
+            margin,
+        )
+        assert measurement.note == "rows 1000 to 1099"
     assert not one(session, score="missing rows", file="daq.parquet").good
     scale = one(session, score="scale", channel="disk_x", file="daq.parquet", must="-1 to 1 ppm")
     assert (scale.value, scale.good) == (0.0, True)
@@ -196,16 +204,20 @@ def test_only_a_device_that_must_be_killed_fails(tmp_path: Path) -> None:
     ("!=", 3.0, 3.0, 0.0, False), ("between", (1.0, 3.0), 2.5, 0.5, True), ("between", (1.0, 3.0), 0.5, -0.5, False),
 ])  # fmt: skip
 def test_margin_and_verdict(op: str, limit: Any, value: float, margin: float, good: bool) -> None:
-    told = judge_value("time", value, "ms", op, limit)
-    assert (told.good, told.document()["margin"]) == (good, margin)
+    judged = judge_value("time", value, "ms", op, limit)
+    assert (judged.good, judged.document()["margin"]) == (good, margin)
     text = f"{limit[0]} to {limit[1]} ms" if op == "between" else f"{op} {limit} ms"
-    assert Must.parse(text, field="") == told.must
+    assert Must.parse(text, field="") == judged.must
 
 
 def test_a_measurement_takes_units_and_refuses_wrong_ones() -> None:
-    told = judge_value("gap", 0.15, "mm", "<=", 200, unit_of_limit="um", source="datasheet")
-    assert (told.good, told.must.limit, told.document()["margin"]) == (True, pytest.approx(0.2), pytest.approx(0.05))
-    assert dict(told.properties())["gap.source"] == "datasheet"
+    judged = judge_value("gap", 0.15, "mm", "<=", 200, unit_of_limit="um", source="datasheet")
+    assert (judged.good, judged.must.limit, judged.document()["margin"]) == (
+        True,
+        pytest.approx(0.2),
+        pytest.approx(0.05),
+    )
+    assert dict(judged.properties())["gap.source"] == "datasheet"
     for given, says in (
         (("gap", 0.15, "mm", "<=", 2.0, "N"), "unit_of_limit must be in a unit of length, as gap is in mm"),
         (("gap", 0.15, "mm", "=<", 2.0, None), "op must be one of"),
@@ -220,11 +232,11 @@ def test_a_measurement_takes_units_and_refuses_wrong_ones() -> None:
 def results(**margins: float) -> dict[str, Any]:
     cases = []
     for name, margin in margins.items():
-        told = judge_value("peak", 1.0 - margin, "mm", "<=", 1.0, source="a datasheet", note="a <note>\x1b", at_s=0.3)
-        outcome = "passed" if told.good else "failed"
+        judged = judge_value("peak", 1.0 - margin, "mm", "<=", 1.0, source="a datasheet", note="a <note>\x1b", at_s=0.3)
+        outcome = "passed" if judged.good else "failed"
         cases.append({
-            "id": f"x.campaign.toml::{name}", "outcome": outcome, "reason": "" if told.good else told.line,
-            "title": "T", "measurements": [told.document()], "evidence": [], "bench": None,
+            "id": f"x.campaign.toml::{name}", "outcome": outcome, "reason": "" if judged.good else judged.line,
+            "title": "T", "measurements": [judged.document()], "evidence": [], "bench": None,
             "resolution": "10 ms blocks, in lockstep",
             "troubles": [], "repeat": f"rig campaign x.campaign.toml::{name}",
         })  # fmt: skip

@@ -355,8 +355,8 @@ def test_drops_are_a_warning_in_the_status_and_one_event_each_time_while_they_ha
     now = 0.0
     with rig(Fake(duration_s=None), paced=True, bus=bus) as setup:
         setup.gateway.dropping = Rising("CAN: {} frames were dropped", clock=lambda: now)
-        told = []
-        setup.client.subscribe(wire.EVENTS, lambda _, payload: told.append(wire.decode_document(payload)))
+        replies = []
+        setup.client.subscribe(wire.EVENTS, lambda _, payload: replies.append(wire.decode_document(payload)))
         setup.start()
 
         def warned() -> list[str]:
@@ -378,7 +378,7 @@ def test_drops_are_a_warning_in_the_status_and_one_event_each_time_while_they_ha
             until(lambda: setup.gateway.outbox.waiting == 0)
             warned()
             until(over)
-            assert len([row for row in told if "frames were dropped" in row.get("text", "")]) == round_ + 1
+            assert len([row for row in replies if "frames were dropped" in row.get("text", "")]) == round_ + 1
 
 
 def test_a_run_without_the_clock_waits_for_the_bus() -> None:

@@ -283,8 +283,10 @@ def test_random_frames_are_not_commands_at_the_rate_of_the_checksum() -> None:
 
 def test_device_frames_are_decoded_and_all_others_refused() -> None:
     message = TABLE.by_name["Device"]
-    said = {kind: parse_command(*device_frame(message, kind, 7, block=300, patience_s=2.5), 0) for kind in DeviceKind}
-    assert said == {
+    decoded = {
+        kind: parse_command(*device_frame(message, kind, 7, block=300, patience_s=2.5), 0) for kind in DeviceKind
+    }
+    assert decoded == {
         DeviceKind.JOIN: DeviceRequest(DeviceKind.JOIN, 7, {"device": "CAN 7", "patience_s": 2.5}),
         DeviceKind.DONE: DeviceRequest(DeviceKind.DONE, 7, {"device": "CAN 7", "block": 300}),
         DeviceKind.LEAVE: DeviceRequest(DeviceKind.LEAVE, 7, {"device": "CAN 7"}),

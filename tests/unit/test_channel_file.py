@@ -271,11 +271,11 @@ def test_a_wrong_table_is_refused_with_channel_and_field(what: str, tmp_path: Pa
     path = written(tmp_path, text)
     with pytest.raises(InputError) as caught:
         load_scene("hammer", {"channels": str(path)})
-    said = str(caught.value)
-    assert "\n" not in said
-    assert len(said) < 400
-    assert line in said, said
-    assert "mine.toml" in said or what == "rate of too many places"  # that limit belongs to the whole scene
+    message = str(caught.value)
+    assert "\n" not in message
+    assert len(message) < 400
+    assert line in message, message
+    assert "mine.toml" in message or what == "rate of too many places"  # that limit belongs to the whole scene
 
 
 INLINE = {

@@ -238,7 +238,7 @@ def test_an_end_that_overtakes_blocks_waits_for_them() -> None:
 
 def test_an_end_does_not_overtake_rows_being_delivered() -> None:
     """Blocks and events arrive on separate threads: the end, while the last block is still being delivered."""
-    heard, held, on_the_way = [], threading.Event(), threading.Event()
+    received, held, on_the_way = [], threading.Event(), threading.Event()
 
     class Threads(MemoryClient):
         def subscribe(self, key: str, callback: Any, **_: Any) -> None:
@@ -255,7 +255,7 @@ def test_an_end_does_not_overtake_rows_being_delivered() -> None:
             keeper.subscribe(key, sent.__setitem__)
         rows = stream.RigStream(client)
         rows.listen(wire.sensor_key("forces"), hold, lambda _: None)
-        rows.listen(wire.sensor_key("forces"), lambda block: heard.append(len(block.values)), heard.append)
+        rows.listen(wire.sensor_key("forces"), lambda block: received.append(len(block.values)), received.append)
         rig.publish("forces")
         rig.end()
         threads = [threading.Thread(target=takes[key], args=each) for each in sent.items() for key in each[:1]]
@@ -266,7 +266,7 @@ def test_an_end_does_not_overtake_rows_being_delivered() -> None:
         held.set()
         for thread in threads:
             thread.join(5.0)
-    assert heard == [BLOCK, "the rig's run has ended: completed"]
+    assert received == [BLOCK, "the rig's run has ended: completed"]
 
 
 def test_an_end_without_row_numbers_allows_time_for_the_last_blocks(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -121,15 +121,15 @@ def test_a_recorder_of_a_faulty_stream_ends_normally_with_all_blocks(kind: str, 
 def test_late_fault_events_are_used(kind: str, behind: int, tmp_path: Path) -> None:
     """Blocks and fault events come on separate threads; the events are late by a number of blocks."""
     items = simulate_messages(kind)
-    told, held = [item for item in items if item[0] == wire.FAULTS], list[tuple[str, bytes]]()
+    fault_events, held = [item for item in items if item[0] == wire.FAULTS], list[tuple[str, bytes]]()
     blocks = 0
     for item in items:
         held += [item] if item[0] != wire.FAULTS else []
         blocks += item[0] == PROBES
         if item[0] == PROBES and blocks > 10 + behind:
-            held += told[:2]
-            told = [each for each in told if each not in held]
-    held += told
+            held += fault_events[:2]
+            fault_events = [each for each in fault_events if each not in held]
+    held += fault_events
     summary = recorded(tmp_path / "late.mcap", kind, held)
     assert (summary.good, summary.losses) == (True, ())
     assert summary.rows[PROBES] == 8000
@@ -140,7 +140,7 @@ def test_fault_events_may_arrive_in_bursts(seed: int, tmp_path: Path) -> None:
     """Renumbered blocks and the events that report it, each in order, one randomly ahead of the other."""
     rng, items = random.Random(seed), list(simulate_messages("restart"))
     end, held = items.pop(), list[tuple[str, bytes]]()
-    streams = [[item for item in items if (item[0] == wire.FAULTS) == told] for told in (True, False)]
+    streams = [[item for item in items if (item[0] == wire.FAULTS) == is_fault] for is_fault in (True, False)]
     while any(streams):
         most = rng.randint(1, rng.choice((3, 15, 60)))
         stream = streams[0 if rng.random() < 0.5 else 1]

@@ -159,10 +159,10 @@ def test_a_recording_keeps_its_limits_and_is_validated(capsys: pytest.CaptureFix
     )
     run_for_output(capsys, "validate", path)
     status, output, _ = run_captured(capsys, "info", path)
-    told = " ".join(output.split())
+    printed = " ".join(output.split())
     assert status == 3, "inconclusive, as with each warning of the rig"
-    assert "whirl angle off by" in told
-    assert "deg (limit 1e-09)" in told
+    assert "whirl angle off by" in printed
+    assert "deg (limit 1e-09)" in printed
     recording = Recording.open(path)
     experiment = Experiment.of(recording)
     assert {event["event"] for event in recording.events} >= {"hammer", "warning"}

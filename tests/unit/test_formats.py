@@ -122,9 +122,9 @@ def test_mdf_has_events_attachments_and_readable_comments(noted: Recording, tmp_
         assert about.startswith("Virtual rotor-stator rig, scene hammer (Hammer during a stable run")
         assert "{" not in about
         assert (mdf.header.project, mdf.header.subject) == ("rotor-stator-rig", "hammer")
-        told = mdf.get("disk_x").comment
-        assert told.startswith("Disk displacement, horizontal (EAST +), from the ring's centre line; Eddy-current")
-        assert told.endswith("24 bits over +-20 V, to 5000 Hz; 3.94 V per mm, -10 V at 0; calibration assumed")
+        comment = mdf.get("disk_x").comment
+        assert comment.startswith("Disk displacement, horizontal (EAST +), from the ring's centre line; Eddy-current")
+        assert comment.endswith("24 bits over +-20 V, to 5000 Hz; 3.94 V per mm, -10 V at 0; calibration assumed")
 
 
 def test_events_and_documents_are_exported_if_the_format_allows(noted: Recording, tmp_path: Path) -> None:
@@ -134,9 +134,9 @@ def test_events_and_documents_are_exported_if_the_format_allows(noted: Recording
     made = {}
     for suffix in written_suffixes():
         _, (made[suffix],) = written(noted, tmp_path / f"x{suffix}", "probes")
-    told = TdmsFile.read_metadata(tmp_path / "x.tdms").properties
-    assert told["events"].splitlines() == [f"{time_s:.6f} s  {text}" for time_s, _, text in EXPECTED_EVENTS]
-    assert json.loads(told["scene.json"]) == {**noted.scene, "taken": noted.commands}
+    properties = TdmsFile.read_metadata(tmp_path / "x.tdms").properties
+    assert properties["events"].splitlines() == [f"{time_s:.6f} s  {text}" for time_s, _, text in EXPECTED_EVENTS]
+    assert json.loads(properties["scene.json"]) == {**noted.scene, "taken": noted.commands}
     metadata = parquet.read_schema(tmp_path / "x.parquet").metadata
     assert json.loads(metadata[b"parameters.json"]) == noted.parameters
     beside = json.loads((tmp_path / "x.csv.json").read_text())
@@ -584,5 +584,5 @@ def test_tables_are_made_without_pandas() -> None:
         "t = arrow_table([np.arange(3.0), np.arange(6.0)[::2]], float_schema(['a', 'b'])); "
         "print(t.to_pydict(), 'pandas' in sys.modules)"
     )
-    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert told.strip() == "{'a': [0.0, 1.0, 2.0], 'b': [0.0, 2.0, 4.0]} False"
+    output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert output.strip() == "{'a': [0.0, 1.0, 2.0], 'b': [0.0, 2.0, 4.0]} False"

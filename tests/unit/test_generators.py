@@ -153,9 +153,9 @@ def test_channels_of_a_prbs_differ_by_their_shift() -> None:
 
 @pytest.mark.parametrize("crest", [None, 2.0, 3.5, 7.0])
 def test_a_multisine_has_the_documented_crest_factor(crest: float | None) -> None:
-    told = {} if crest is None else {"crest": crest}
+    options = {} if crest is None else {"crest": crest}
     frequencies = [257.0 * k for k in range(1, 32)]
-    source = scene_of({"kind": "multisine", "amplitude_v": 3.0, "frequencies": frequencies, **told}).sources()["P_N"]
+    source = scene_of({"kind": "multisine", "amplitude_v": 3.0, "frequencies": frequencies, **options}).sources()["P_N"]
     period_s = 1.0 / 257.0
     volts = source.volts(np.arange(100_000) * period_s / 100_000)
     assert np.abs(volts).max() == pytest.approx(3.0, rel=1e-4)
@@ -188,21 +188,21 @@ def test_the_residual_is_the_noise_of_the_sensor() -> None:
 
 
 def test_amplitude_in_units_uses_the_channels_calibration() -> None:
-    told = {"amplitude": 1.5, "offset": 0.25, "frequency_hz": 50.0, "channels": {"P_N": {"amplitude_v": 1.0}}}
-    run = simulate(scene_of({"kind": "sine", **told}, sensors={"noise": False}))
+    settings = {"amplitude": 1.5, "offset": 0.25, "frequency_hz": 50.0, "channels": {"P_N": {"amplitude_v": 1.0}}}
+    run = simulate(scene_of({"kind": "sine", **settings}, sensors={"noise": False}))
     disk, force = run.samples["disk_x"], run.samples["P_N"]
     assert (disk.max(), disk.min()) == pytest.approx((1.75, -1.25), abs=1e-6)
     assert force.max() == pytest.approx(1000.25, abs=1e-2)  # 1 mV/N
 
 
 def test_edges_and_drive_channels_follow_the_nominal_speed_and_are_quiet_without() -> None:
-    told = {"kind": "quiet"}
-    run = simulate(scene_of(told, drive={"speed_hz": 13.7}, sensors={"noise": False}))
+    settings = {"kind": "quiet"}
+    run = simulate(scene_of(settings, drive={"speed_hz": 13.7}, sensors={"noise": False}))
     assert run.edges_s == pytest.approx(np.arange(1, 3) / 13.7, abs=2e-12)
     assert run.samples["speed"] == pytest.approx(13.7, abs=1e-5)
     rising = np.flatnonzero(np.diff(run.samples["keyphasor"]) > 0.5) + 1
     assert np.array_equal(rising, np.ceil(run.edges_s * 20_000))
-    assert simulate(scene_of(told)).edges_s.size == 0
+    assert simulate(scene_of(settings)).edges_s.size == 0
 
 
 def test_a_waveform_repeats_its_points() -> None:

@@ -184,9 +184,9 @@ def test_noise_reduced_by_resampling_is_not_reported(method: str, gain: float, t
     conversion, recording = imported(path, text, tmp_path)
     samples = recording.samples("probes")
     left = samples["disk_x"][200:-200] - np.sin(40 * samples.times_s[200:-200])
-    told = recording.table.channels["disk_x"].noise_v
+    noise_v = recording.table.channels["disk_x"].noise_v
     assert float(left.std()) == pytest.approx(gain * 0.003, rel=0.02)
-    assert told == pytest.approx(float(left.std()), rel=0.04)
+    assert noise_v == pytest.approx(float(left.std()), rel=0.04)
     said_gain = float(conversion.channels[0].time.split("; noise ")[1].split(" ")[0])
     assert said_gain == pytest.approx(gain, rel=0.01)
 
@@ -205,9 +205,9 @@ def test_noise_of_any_colour_and_where_it_ends(corner_hz: float | None) -> None:
     white = 1e-3 * generator.standard_normal(40_000 * several)
     if corner_hz is not None:
         white = behind_a_low_pass(white, corner_hz, rate * several)
-    heard = white[::several]
-    signal = heard + 0.5 * np.sin(2 * np.pi * 6.2 * np.arange(len(heard)) / rate)
-    assert noise.estimate_noise(signal) == pytest.approx(float(heard.std()), rel=0.07)
+    recorded = white[::several]
+    signal = recorded + 0.5 * np.sin(2 * np.pi * 6.2 * np.arange(len(recorded)) / rate)
+    assert noise.estimate_noise(signal) == pytest.approx(float(recorded.std()), rel=0.07)
     found = noise.corner_hz(signal, float(rate))
     assert found is None if corner_hz is None else found == pytest.approx(corner_hz, rel=0.05)
 
@@ -227,9 +227,9 @@ def test_a_detected_corner_is_proposed_for_confirmation(tmp_path: Path) -> None:
     assert mapping.channels["inner_y"].bandwidth_hz == pytest.approx(4000.0, rel=0.06)
 
 
-@pytest.mark.parametrize(("taken", "told"), [("evenly", '[time]\nstamps = "line"\n'), ("when stamped", "[resample]\n"),
+@pytest.mark.parametrize(("taken", "entry"), [("evenly", '[time]\nstamps = "line"\n'), ("when stamped", "[resample]\n"),
                                              ("at rest", 'stamps = "line"    # PLEASE CHECK')])  # fmt: skip
-def test_whether_samples_or_only_their_stamps_are_uneven(taken: str, told: str, tmp_path: Path) -> None:
+def test_whether_samples_or_only_their_stamps_are_uneven(taken: str, entry: str, tmp_path: Path) -> None:
     generator, path = np.random.default_rng(3), tmp_path / "x.csv"
     even = np.arange(3000) / 1000
     stamps = even + generator.uniform(-2e-4, 2e-4, 3000)
@@ -238,7 +238,7 @@ def test_whether_samples_or_only_their_stamps_are_uneven(taken: str, told: str, 
     rows = np.column_stack([stamps, values])
     np.savetxt(path, rows, delimiter=",", header="time,P_N [N]", comments="", fmt="%.9f")
     text, _ = guess_mapping([path])
-    assert told in text
+    assert entry in text
     conversion, recording = imported(path, text, tmp_path)
     assert ("samples as they were" in conversion.channels[0].time) == (taken != "when stamped")
     found, at_s = recording.samples("P_N"), conversion.document["zero_s"]

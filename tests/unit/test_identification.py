@@ -46,10 +46,10 @@ def test_identification_writes_a_usable_parameter_set_and_a_report(
     keys = "contact.friction,contact.stiffness,contact.smoothing_speed,hammer.1.force_n"
     window = ("--from", "0.015", "--to", "0.03")
     status = run(file, "--fit", keys, "--parameters", "corrected", *window, "-o", fitted, "--report", page)
-    told = capsys.readouterr().out
+    output = capsys.readouterr().out
     assert status == 0
-    assert "contact.smoothing_speed" in told
-    assert "not seen" in told
+    assert "contact.smoothing_speed" in output
+    assert "not seen" in output
     document = tomllib.loads(fitted.read_text(encoding="utf-8"))
     assert document["base"] == "corrected"
     assert set(document["contact"]) == {"friction", "stiffness"}  # an unidentified value stays unchanged
@@ -158,9 +158,9 @@ def test_wrong_input_is_refused_in_one_line(
     file: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
 ) -> None:
     assert run(file, *arguments) == 2
-    told = capsys.readouterr().err
-    assert message in told
-    assert told.count("\n") == 1
+    errors = capsys.readouterr().err
+    assert message in errors
+    assert errors.count("\n") == 1
 
 
 def test_no_truth_is_read(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -191,8 +191,8 @@ def test_a_wrong_model_yields_no_value(tmp_path: Path, capsys: pytest.CaptureFix
     write_run(Simulation(load_scene("hammer", {"duration_s": 0.035, "contact.restitution": 0.88})), wrong)
     arguments = ("--fit", "contact.friction,magnet.stiffness", "--parameters", "corrected", "-o", fitted)
     assert run(wrong, *arguments, "--json") == 1
-    told = capsys.readouterr()
-    document = json.loads(told.out)
+    captured = capsys.readouterr()
+    document = json.loads(captured.out)
     assert document["fits"] is False
     for key, truth in (("contact.friction", 0.25), ("magnet.stiffness", 1.7)):
         value = document["values"][key]
@@ -201,7 +201,7 @@ def test_a_wrong_model_yields_no_value(tmp_path: Path, capsys: pytest.CaptureFix
         assert found is not None
         assert abs(float(found[1]) - truth) < float(found[2]) < 0.2 * truth
     assert not fitted.exists()
-    assert "not written" in told.err
+    assert "not written" in captured.err
 
 
 @pytest.mark.parametrize(("lacking", "widened"), [(0.0, False), (0.8, True)])

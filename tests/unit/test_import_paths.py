@@ -55,10 +55,10 @@ def test_a_users_folder_hides_no_module_of_the_rig(package: str, tmp_path: Path)
     (tmp_path / package / "mine.py").write_text("VALUE = 7")
     module = {"drivers": "drivers.daq", "recorder": "recorder.reader", "replays": "replays.report.canvas"}[package]
     code = f"import rig, {package}.mine, {module}\nfrom rig import connect\n"
-    told = run_script(
+    output = run_script(
         tmp_path, f"{code}print({package}.MINE, {package}.mine.VALUE, {module}.__name__, connect.__name__)"
     )
-    assert told == f"True 7 {module} connect"
+    assert output == f"True 7 {module} connect"
 
 
 @pytest.mark.parametrize("first", ["", "import {package}\n"])
@@ -91,7 +91,7 @@ def test_a_users_module_that_replaces_one_of_the_rig_is_named(tmp_path: Path) ->
     (tmp_path / "drivers").mkdir()
     (tmp_path / "drivers/__init__.py").touch()
     (tmp_path / "drivers/client.py").touch()
-    told = run_script(tmp_path, "import rig\nrig.connect()")
-    assert told == (
+    output = run_script(tmp_path, "import rig\nrig.connect()")
+    assert output == (
         f"ImportError: drivers.client must be the rig's own; received {tmp_path}/drivers/client.py; rename it"
     )

@@ -171,12 +171,12 @@ def test_the_same_engineering_values_come_over_every_link(bench: Bench) -> None:
     for name in SAMPLERS:
         group = group_of(name)
         with bench.open(name) as driver:
-            told = driver.configure()
+            configuration = driver.configure()
             driver.start()
             bench.rig.publish(group, blocks=2)
             samples = driver.read(2 * BLOCK)
             table = default_table().groups[group]
-            assert samples.names == told.channels == table.names
+            assert samples.names == configuration.channels == table.names
             assert samples.units == tuple(channel.unit for channel in table.channels)
             assert (samples.index, samples.tick, samples.gap, samples.rate_hz) == (0, 0, 0, 20_000.0)
             np.testing.assert_allclose(samples.values, expected_values(group, 0, 2 * BLOCK), rtol=0, atol=1e-9)
@@ -186,8 +186,8 @@ def test_the_same_engineering_values_come_over_every_link(bench: Bench) -> None:
 def test_channels_and_a_slower_rate_can_be_chosen(bench: Bench) -> None:
     group = group_of("force")
     driver = bench.open("force")
-    told = driver.configure(channels=["P_W", "P_S"], rate_hz=20_000 / 7)
-    assert told.channels == ("P_S", "P_W")
+    configuration = driver.configure(channels=["P_W", "P_S"], rate_hz=20_000 / 7)
+    assert configuration.channels == ("P_S", "P_W")
     driver.start()
     bench.rig.publish(group, blocks=5)
     rows = -(-5 * BLOCK // 7)

@@ -147,11 +147,11 @@ def test_wrong_input_is_refused_in_one_line(
 
 
 def test_params_shows_the_error_of_the_fit(capsys: pytest.CaptureFixture[str]) -> None:
-    told = run_for_output(capsys, "params", "--set", "contact.stiffness=johnson-cylinder")
-    rows = {line.split()[0]: line.split() for line in told.splitlines() if line.startswith("contact.")}
+    output = run_for_output(capsys, "params", "--set", "contact.stiffness=johnson-cylinder")
+    rows = {line.split()[0]: line.split() for line in output.splitlines() if line.startswith("contact.")}
     assert rows["contact.stiffness"][1].startswith("8.91")
     assert rows["contact.stiffness"][4] == "johnson-cylinder"
-    assert "within 3.3% of its force" in told
+    assert "within 3.3% of its force" in output
     assert rows["contact.exponent"][1].startswith("1.118")
     assert rows["contact.exponent"][4] == "law"
 

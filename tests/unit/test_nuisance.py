@@ -266,10 +266,10 @@ def test_contact_parameters_are_identified_from_a_part_of_a_run(tmp_path: Path) 
         bandwidth=rules.bandwidth, start={"contact.restitution": 0.8},
     )  # fmt: skip
     assert found.judgement.fits
-    told = {finding.unknown.key: finding for finding in found.judgement.findings}
+    findings = {finding.unknown.key: finding for finding in found.judgement.findings}
     for key, truth in zip((*TRUTH, *PULSE), (0.235, 0.9, 1.7, 100.0, 5.0), strict=True):
-        assert told[key].standing == "identified"
-        assert abs(told[key].value - truth) < told[key].half_width < 0.02 * truth
+        assert findings[key].standing == "identified"
+        assert abs(findings[key].value - truth) < findings[key].half_width < 0.02 * truth
 
 
 def damping_factor(restitution: float) -> float:
@@ -317,9 +317,9 @@ def test_intervals_have_their_nominal_coverage(tmp_path: Path) -> None:
             recording, Experiment.of(recording), FIVE, variants=[one.set for one in rules.variants],
             bandwidth=rules.bandwidth,
         )  # fmt: skip
-        told = {one.unknown.key: one for one in found.judgement.findings}
+        findings = {one.unknown.key: one for one in found.judgement.findings}
         pairs = zip(keys, (*truth, *pulse), strict=True)
-        off = np.array([(told[key].value - t) / told[key].half_width for key, t in pairs])
+        off = np.array([(findings[key].value - t) / findings[key].half_width for key, t in pairs])
         held += np.abs(off) < 1.0
         print(seed, f"to {found.window.end_s:.3f} s:", " ".join(f"{one:+.2f}" for one in off), held, flush=True)
     assert held.min() >= 0.85 * seeds
@@ -360,17 +360,17 @@ def test_every_fault_has_its_name(case: faulty_logs.Case, motion: second_rig.Mot
 
 
 @MATRIX
-@pytest.mark.parametrize(("number", "told"), [
+@pytest.mark.parametrize(("number", "verdict"), [
     ("r0 = 0.945e-3", "model: ring.clearance"), ("P0 = 3300.0", "model: house.preload"),
     ("eps = 0.11e-3", "model: shaft.unbalance_eccentricity"), ("K_mag = 1751.0", "model: magnet.stiffness"),
     ("Ixx = 0.0848", "shaft.transverse_inertia|nearest|neither|no "),
 ])  # fmt: skip
-def test_a_changed_model_parameter_is_not_reported_as_a_sensor_fault(number: str, told: str, tmp_path: Path) -> None:
+def test_a_changed_model_parameter_is_not_reported_as_a_sensor_fault(number: str, verdict: str, tmp_path: Path) -> None:
     name, _, value = number.partition(" = ")
     other = second_rig.simulate_pulse(second_rig.Rig(**{name: float(value)}), turned=1.0, settled_s=1.5, after_s=0.1)
     found = validate(import_all_channels(tmp_path, other, seed=4))
     assert found.explained is not None
-    assert re.search(told, found.explained.conclusion)
+    assert re.search(verdict, found.explained.conclusion)
 
 
 def test_a_missing_pulse_is_reported_anywhere() -> None:
@@ -379,6 +379,6 @@ def test_a_missing_pulse_is_reported_anywhere() -> None:
     edges = np.concatenate([[0.0], np.cumsum(turns)])
     assert not edge_faults(edges, 0.5, 6.25)
     for gone in (1, 2, 3, 12):
-        (told,) = edge_faults(np.delete(edges, gone), 0.5, 6.25)
-        assert told.line.startswith("keyphasor miss-pulses: ")
-        assert (told.from_s, told.to_s) == (pytest.approx(edges[gone - 1]), pytest.approx(edges[gone + 1]))
+        (fault,) = edge_faults(np.delete(edges, gone), 0.5, 6.25)
+        assert fault.line.startswith("keyphasor miss-pulses: ")
+        assert (fault.from_s, fault.to_s) == (pytest.approx(edges[gone - 1]), pytest.approx(edges[gone + 1]))

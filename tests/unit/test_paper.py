@@ -314,12 +314,12 @@ def test_symbols_powers_and_signs_are_set_as_in_print():
 def test_terminal_shows_every_statement_and_the_rule(findings: Findings, capsys, monkeypatch):
     monkeypatch.setattr("replays.studies.paper.findings.find", lambda **_: findings)
     printed = run_for_output(capsys, "paper", "--quick")
-    said = " ".join(printed.split())
+    text = " ".join(printed.split())
     for line in [*findings.lines, *findings.claims]:
-        assert " ".join(line.row().cells[-2:]) in said
-    assert not re.search(r"\d+ (agree|differ)", said), "no headline of counts"
-    assert "more than 2/5" in said
-    assert "no file written" in said
+        assert " ".join(line.row().cells[-2:]) in text
+    assert not re.search(r"\d+ (agree|differ)", text), "no headline of counts"
+    assert "more than 2/5" in text
+    assert "no file written" in text
 
 
 def test_a_folder_for_pictures_is_created(findings: Findings, tmp_path, capsys, monkeypatch):

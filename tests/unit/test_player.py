@@ -92,11 +92,11 @@ def play(track: Track, **options: Any) -> tuple[Heard, dict[str, Any]]:
     """Play to the end with a simulated clock; return the published messages and the summary."""
     time = FakeTime(oversleep_ns=700_000)
     server = MemoryServer()
-    heard = Heard(server, time)
+    played = Heard(server, time)
     clock = RealTime(now_ns=time.now_ns, sleep=time.sleep)
-    heard.begin_ns = time.ns  # type: ignore[attr-defined]
+    played.begin_ns = time.ns  # type: ignore[attr-defined]
     summary = Player(track, server, clock, **options).run()
-    return heard, summary
+    return played, summary
 
 
 # Order and deadlines.
@@ -168,23 +168,23 @@ def test_chunks_contain_every_message_once_with_its_time(folder: Path, path: Pat
 
 
 def test_a_replay_is_the_recording_byte_for_byte(track: Track) -> None:
-    heard, summary = play(track)
-    assert heard.payloads == group_by_key(generate_stream(BLOCKS))
+    played, summary = play(track)
+    assert played.payloads == group_by_key(generate_stream(BLOCKS))
     assert summary["reason"] == "completed"
     assert summary["left_out"] == 0
-    assert heard.all[-1][0] == wire.EVENTS, "the end comes last"
+    assert played.all[-1][0] == wire.EVENTS, "the end comes last"
 
 
 @pytest.mark.parametrize("rate", [0.01, 1.0, 1000.0])
 def test_late_sleeps_do_not_accumulate(track: Track, rate: float) -> None:
-    heard, summary = play(track, rate=rate)
-    begin_ns = heard.begin_ns  # type: ignore[attr-defined]
-    for (key, payload), at_ns in zip(heard.all, heard.at_ns, strict=True):
+    played, summary = play(track, rate=rate)
+    begin_ns = played.begin_ns  # type: ignore[attr-defined]
+    for (key, payload), at_ns in zip(played.all, played.at_ns, strict=True):
         schema = wire.schema_of(key)
         if schema is not None:
             due_ns = begin_ns + (wire.decode_block(payload, schema).tick * 1000 + BLOCK_NS) / rate
             assert -1 <= at_ns - due_ns <= 700_001
-    assert heard.at_ns[-1] - begin_ns - DURATION_NS / rate <= 700_001
+    assert played.at_ns[-1] - begin_ns - DURATION_NS / rate <= 700_001
     assert summary["lateness_ms"]["max"] <= 0.701
 
 
@@ -225,15 +225,15 @@ def test_a_truncated_file_is_played_to_its_last_message(folder: Path, path: Path
     short = folder / f"cut-{cut}.mcap"
     data = path.read_bytes()
     short.write_bytes(data[: int(cut * len(data))])
-    heard, summary = play(Track([short]))
+    played, summary = play(Track([short]))
     recording, whole = Recording.open(short), group_by_key(generate_stream(BLOCKS))
     assert 0 < recording.messages[PROBES] < BLOCKS
-    for key, payloads in heard.payloads.items():
+    for key, payloads in played.payloads.items():
         expected = whole[key][: recording.messages[key]]
         assert payloads[: len(expected)] == expected
         assert len(payloads) == len(expected) + (key == wire.EVENTS)
-    assert heard.events[-1]["event"] == "end"
-    assert heard.events[-1]["rows"][PROBES] == 200 * recording.messages[PROBES]
+    assert played.events[-1]["event"] == "end"
+    assert played.events[-1]["rows"][PROBES] == 200 * recording.messages[PROBES]
     assert summary["reason"] == "completed"
 
 
@@ -242,8 +242,8 @@ def test_parts_are_one_recording(folder: Path) -> None:
     half = next(n for n, (key, _) in enumerate(payloads) if n > len(payloads) / 2 and key == PROBES)
     parts = [write_recording(folder / "a.mcap", payloads[:half]), write_recording(folder / "b.mcap", payloads[half:])]
     for order in (parts, parts[::-1]):
-        heard, _ = play(Track(order))
-        assert heard.payloads == group_by_key(payloads)
+        played, _ = play(Track(order))
+        assert played.payloads == group_by_key(payloads)
 
 
 def test_a_cut_off_file_can_be_sought_in(folder: Path, path: Path) -> None:
@@ -261,43 +261,43 @@ def test_a_cut_off_file_can_be_sought_in(folder: Path, path: Path) -> None:
 
 
 def test_a_range_begins_and_ends_with_events_of_its_own(track: Track) -> None:
-    heard, summary = play(track, part=Part(from_s=0.2, to_s=0.4))
-    assert [event["event"] for event in heard.events] == ["start", "end"]
-    assert heard.events[0]["time_s"] == 0.2
-    assert heard.events[0]["pace"] == "replay"
-    assert heard.events[-1]["rows"][PROBES] == 8000
-    assert [block.index for block in heard.blocks()] == [200 * number for number in range(20, 40)]
+    played, summary = play(track, part=Part(from_s=0.2, to_s=0.4))
+    assert [event["event"] for event in played.events] == ["start", "end"]
+    assert played.events[0]["time_s"] == 0.2
+    assert played.events[0]["pace"] == "replay"
+    assert played.events[-1]["rows"][PROBES] == 8000
+    assert [block.index for block in played.blocks()] == [200 * number for number in range(20, 40)]
     assert summary["played_s"] == pytest.approx(0.2)
 
 
 def test_passes_with_original_numbers_step_back(track: Track) -> None:
-    heard, summary = play(track, part=Part(from_s=0.1, to_s=0.3, loops=3))
-    assert [block.index for block in heard.blocks()] == 3 * [200 * number for number in range(10, 30)]
-    assert [event["event"] for event in heard.events] == ["start", "end"]
+    played, summary = play(track, part=Part(from_s=0.1, to_s=0.3, loops=3))
+    assert [block.index for block in played.blocks()] == 3 * [200 * number for number in range(10, 30)]
+    assert [event["event"] for event in played.events] == ["start", "end"]
     assert summary["replay"]["pass"] == 3
     assert summary["played_s"] == pytest.approx(0.6)
 
 
 def test_complete_passes_keep_every_payload_except_intermediate_ends(track: Track) -> None:
-    heard, summary = play(track, part=Part(loops=2))
+    played, summary = play(track, part=Part(loops=2))
     once = group_by_key(generate_stream(BLOCKS))
     for key, payloads in once.items():
         if key != wire.EVENTS:
-            assert heard.payloads[key] == 2 * payloads
-    assert [event["event"] for event in heard.events] == ["start", "start", "end"]
+            assert played.payloads[key] == 2 * payloads
+    assert [event["event"] for event in played.events] == ["start", "start", "end"]
     assert summary["left_out"] == 1
 
 
 def test_new_numbers_run_on_through_passes_and_belong_together(track: Track) -> None:
-    heard, _ = play(track, part=Part(from_s=0.1, to_s=0.3, start_s=0.2, loops=3), renumber=True)
+    played, _ = play(track, part=Part(from_s=0.1, to_s=0.3, start_s=0.2, loops=3), renumber=True)
     continuity = wire.Continuity()
-    keys = [key for key in heard.payloads if wire.schema_of(key) is not None]
+    keys = [key for key in played.payloads if wire.schema_of(key) is not None]
     for key in keys:
-        for block in heard.blocks(key):
+        for block in played.blocks(key):
             assert continuity.follow(key, block.index, len(block.values)) is None
             if key != wire.EDGES:
                 assert block.tick * block.rate_hz == block.index * block.tick_rate_hz
-    probes = heard.blocks()
+    probes = played.blocks()
     assert (probes[0].index, probes[0].tick) == (0, 0)
     assert len(probes) == 10 + 20 + 20
     recorded = [
@@ -306,10 +306,10 @@ def test_new_numbers_run_on_through_passes_and_belong_together(track: Track) -> 
     numbers = [*range(20, 30), *range(10, 30), *range(10, 30)]
     for block, number in zip(probes, numbers, strict=True):
         assert np.array_equal(block.values, recorded[number].values)
-    assert [event["event"] for event in heard.events] == ["start", "end"]
-    assert heard.events[0]["tick"] == 0
-    assert heard.events[-1]["rows"][PROBES] == 50 * 200
-    assert heard.events[-1]["tick"] == 50 * 10_000
+    assert [event["event"] for event in played.events] == ["start", "end"]
+    assert played.events[0]["tick"] == 0
+    assert played.events[-1]["rows"][PROBES] == 50 * 200
+    assert played.events[-1]["tick"] == 50 * 10_000
 
 
 @pytest.mark.parametrize(
@@ -343,10 +343,10 @@ def edit(track: Track, **options: Any) -> Edit:
 
 def test_a_renamed_key_keeps_its_payloads(track: Track) -> None:
     new = wire.sensor_key("probes2")
-    heard, _ = play(track, edit=edit(track, keys={PROBES: new}))
-    assert PROBES not in heard.payloads
-    assert heard.payloads[new] == group_by_key(generate_stream(BLOCKS))[PROBES]
-    assert heard.events[-1]["rows"][new] == 200 * BLOCKS
+    played, _ = play(track, edit=edit(track, keys={PROBES: new}))
+    assert PROBES not in played.payloads
+    assert played.payloads[new] == group_by_key(generate_stream(BLOCKS))[PROBES]
+    assert played.events[-1]["rows"][new] == 200 * BLOCKS
 
 
 def test_channels_change_with_their_calibration(track: Track) -> None:
@@ -354,24 +354,24 @@ def test_channels_change_with_their_calibration(track: Track) -> None:
     first, second = table.groups["probes"].names[:2]
     force = table.groups["forces"].names[1]
     changed = edit(track, channels=[second, first, force], names={first: second, second: first})
-    heard, summary = play(track, edit=changed)
+    played, summary = play(track, edit=changed)
     now = ChannelTable.model_validate(changed.catalogue["table"])
     assert {name: group.names for name, group in now.groups.items()} == {"probes": (first, second), "forces": (force,)}
     assert now.channels[first].sensitivity_v == table.channels[second].sensitivity_v
     recorded = [
         wire.decode_block(payload, wire.SAMPLE_SCHEMA) for payload in group_by_key(generate_stream(BLOCKS))[PROBES]
     ]
-    for block, before in zip(heard.blocks(), recorded, strict=True):
+    for block, before in zip(played.blocks(), recorded, strict=True):
         assert np.array_equal(block.values, before.values[:, [1, 0]])
         assert (block.index, block.tick) == (before.index, before.tick)
-    assert wire.sensor_key("drive") not in heard.payloads
+    assert wire.sensor_key("drive") not in played.payloads
     assert summary["left_out"] == (len(table.groups) - 2) * BLOCKS
 
 
 def test_the_truth_can_stay_out(track: Track) -> None:
-    heard, _ = play(track, edit=edit(track, truth=False))
+    played, _ = play(track, edit=edit(track, truth=False))
     whole = group_by_key(generate_stream(BLOCKS))
-    assert {key for key in whole if key not in heard.payloads} == {key for key in whole if key.startswith(wire.TRUTH)}
+    assert {key for key in whole if key not in played.payloads} == {key for key in whole if key.startswith(wire.TRUTH)}
     assert edit(track, truth=False).catalogue["truth"] == {}
 
 
@@ -394,8 +394,8 @@ def test_changes_that_make_no_sense_are_refused(track: Track, options: dict[str,
 
 def test_swapped_keys_are_no_clash(track: Track) -> None:
     forces = wire.sensor_key("forces")
-    heard, _ = play(track, edit=edit(track, keys={PROBES: forces, forces: PROBES}))
-    assert heard.payloads[forces] == group_by_key(generate_stream(BLOCKS))[PROBES]
+    played, _ = play(track, edit=edit(track, keys={PROBES: forces, forces: PROBES}))
+    assert played.payloads[forces] == group_by_key(generate_stream(BLOCKS))[PROBES]
 
 
 # Commands.
@@ -404,14 +404,14 @@ def test_swapped_keys_are_no_clash(track: Track) -> None:
 @contextmanager
 def running(track: Track, **options: Any) -> Iterator[tuple[Player, Heard, Console]]:
     server = MemoryServer()
-    heard = Heard(server)
+    played = Heard(server)
     clock = options.pop("clock", None) or RealTime()
     player = Player(track, server, clock, **options)
     player.prepare()
-    thread = threading.Thread(target=lambda: heard.summary.update(player.run()))
+    thread = threading.Thread(target=lambda: played.summary.update(player.run()))
     thread.start()
     try:
-        yield player, heard, Console(MemoryClient(server), name="a test")
+        yield player, played, Console(MemoryClient(server), name="a test")
     finally:
         player.stop()
         thread.join(20.0)
@@ -544,10 +544,10 @@ def test_waiting_is_ended_by_commands(track: Track, ends: str) -> None:
 
 def test_the_wait_for_clients_is_limited(track: Track) -> None:
     server = MemoryServer()
-    heard = Heard(server)
+    played = Heard(server)
     with pytest.raises(RefusedError, match=r"0 of 1 clients were present after 0\.05 s"):
         Player(track, server, FreeRun(), wait_for=1, wait_s=0.05).run()
-    assert [event["reason"] for event in heard.events] == ["failed: 0 of 1 clients were present after 0.05 s"]
+    assert [event["reason"] for event in played.events] == ["failed: 0 of 1 clients were present after 0.05 s"]
 
 
 def test_the_scene_contains_earlier_commands_for_late_clients(folder: Path) -> None:
@@ -568,27 +568,29 @@ def test_the_scene_contains_earlier_commands_for_late_clients(folder: Path) -> N
 def test_a_premature_end_event_keeps_its_position(folder: Path) -> None:
     late = {"event": "warning", "tick": 600_000, "time_s": 0.6, "text": "went on"}
     payloads = [*generate_stream(BLOCKS), (wire.EVENTS, wire.encode_document(late))]
-    heard, _ = play(Track([write_recording(folder / "on.mcap", payloads)]))
-    assert [event["event"] for event in heard.events] == ["start", "end", "warning", "end"]
-    assert heard.payloads[wire.EVENTS][:3] == group_by_key(payloads)[wire.EVENTS]
+    played, _ = play(Track([write_recording(folder / "on.mcap", payloads)]))
+    assert [event["event"] for event in played.events] == ["start", "end", "warning", "end"]
+    assert played.payloads[wire.EVENTS][:3] == group_by_key(payloads)[wire.EVENTS]
 
 
 def test_late_documents_keep_their_position(folder: Path) -> None:
-    told = [{"event": "command", "id": 1, "tick": tick, "time_s": tick / 1e6} for tick in (300_000, 295_000, 301_000)]
+    command_events = [
+        {"event": "command", "id": 1, "tick": tick, "time_s": tick / 1e6} for tick in (300_000, 295_000, 301_000)
+    ]
     payloads = list(generate_stream(BLOCKS))
-    for number, event in enumerate(told):
+    for number, event in enumerate(command_events):
         payloads.insert(len(payloads) // 2 + number, (wire.EVENTS, wire.encode_document(event)))
-    heard, _ = play(Track([write_recording(folder / "late.mcap", payloads)]))
-    assert [event.get("tick") for event in heard.events] == [0, 300_000, 295_000, 301_000, 600_000]
+    played, _ = play(Track([write_recording(folder / "late.mcap", payloads)]))
+    assert [event.get("tick") for event in played.events] == [0, 300_000, 295_000, 301_000, 600_000]
 
 
 def test_a_status_that_the_run_has_ended_comes_after_the_end(folder: Path) -> None:
     ended = wire.encode_document({"tick": 600_000, "time_s": 0.6, "state": "ended"})
     payloads = list(generate_stream(BLOCKS))
     payloads.insert(len(payloads) - 1, (wire.STATUS, ended))
-    heard, _ = play(Track([write_recording(folder / "status.mcap", payloads)]))
-    assert [key for key, _ in heard.all[-2:]] == [wire.EVENTS, wire.STATUS]
-    assert heard.payloads == group_by_key(payloads)
+    played, _ = play(Track([write_recording(folder / "status.mcap", payloads)]))
+    assert [key for key, _ in played.all[-2:]] == [wire.EVENTS, wire.STATUS]
+    assert played.payloads == group_by_key(payloads)
 
 
 def test_a_file_that_is_damaged_while_it_is_played_ends_the_stream_and_says_so(folder: Path, path: Path) -> None:
@@ -596,7 +598,7 @@ def test_a_file_that_is_damaged_while_it_is_played_ends_the_stream_and_says_so(f
     data = bytearray(path.read_bytes())
     damaged.write_bytes(data)
     server = MemoryServer()
-    heard = Heard(server)
+    played = Heard(server)
     player = Player(Track([damaged]), server, FreeRun())
     chunk = Track([path]).chunks[10]
     data[chunk.offset + chunk.length // 2] ^= 0xFF
@@ -605,9 +607,9 @@ def test_a_file_that_is_damaged_while_it_is_played_ends_the_stream_and_says_so(f
         Track([damaged])
     with pytest.raises(InputError, match="file must be an intact recording"):
         player.run()
-    assert heard.events[-1]["event"] == "end"
-    assert heard.events[-1]["reason"].startswith("failed: file must be an intact recording")
-    assert heard.blocks(), "what came before went out"
+    assert played.events[-1]["event"] == "end"
+    assert played.events[-1]["reason"].startswith("failed: file must be an intact recording")
+    assert played.blocks(), "what came before went out"
 
 
 def test_a_clock_reports_its_position() -> None:

@@ -13,7 +13,7 @@ from recorder.writer import RecordingWriter
 from rig.base.wire import CATALOGUE, EVENTS, PARAMETERS, SCENE
 from tests.commands import run
 
-from .recorder_stream import documents, stream
+from .recorder_stream import generate_stream, make_documents
 
 FAULT = {"channel": "disk_x", "kind": "gain", "factor": 2.0}
 COMMAND = {"event": "command", "tick": 20_000, "time_s": 0.02, "id": 1, "command": "fault", "request": FAULT}
@@ -41,9 +41,9 @@ def test_an_invalid_recorded_command_is_a_doubt(tmp_path: Path, capsys: pytest.C
 
 
 def _write(path: Path, events: list[dict[str, Any]]) -> Path:
-    about = documents()
+    about = make_documents()
     with RecordingWriter(path, catalogue=about[CATALOGUE], parameters=about[PARAMETERS], scene=about[SCENE]) as file:
-        rows = list(stream(3))
+        rows = list(generate_stream(3))
         for key, payload in [*rows[:-1], *((EVENTS, json.dumps(each).encode()) for each in events), rows[-1]]:
             file.write(key, payload, 1_700_000_000_000_000_000)
         file.finish("completed")

@@ -29,7 +29,7 @@ from rig.base.wire import (
 from tests.commands import run
 
 from . import mcap_variants
-from .recorder_stream import documents, stream
+from .recorder_stream import generate_stream, make_documents
 
 PROBES = sensor_key("probes")
 BLOCKS = 80
@@ -37,7 +37,7 @@ HAMMER = {"event": "command", "tick": 100, "time_s": 1e-4, "id": 1, "command": "
 
 
 def write(path: Path, items: list[tuple[str, bytes]]) -> Path:
-    about = documents()
+    about = make_documents()
     with RecordingWriter(path, catalogue=about[CATALOGUE], parameters=about[PARAMETERS], scene=about[SCENE]) as file:
         for number, (key, payload) in enumerate(items):
             file.write(key, payload, 1_700_000_000_000_000_000 + number * 1_000_000)
@@ -48,7 +48,7 @@ def write(path: Path, items: list[tuple[str, bytes]]) -> Path:
 
 
 def items() -> list[tuple[str, bytes]]:
-    return [(EVENTS, encode_document(HAMMER)), *stream(BLOCKS)]
+    return [(EVENTS, encode_document(HAMMER)), *generate_stream(BLOCKS)]
 
 
 @pytest.fixture(scope="module")

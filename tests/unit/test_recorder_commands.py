@@ -18,7 +18,7 @@ from rig.cli.commands.record import run_session, tell
 from rig.cli.main import main
 from tests.commands import run
 
-from .recorder_stream import documents, stream
+from .recorder_stream import generate_stream, make_documents
 
 NOTE = {"event": "note", "tick": 100_000, "time_s": 0.1, "text": "bearing is warm", "tags": ["look"], "from": "me"}
 
@@ -26,11 +26,11 @@ NOTE = {"event": "note", "tick": 100_000, "time_s": 0.1, "text": "bearing is war
 @pytest.fixture(scope="module")
 def path(tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("commands") / "run.mcap"
-    about = documents()
+    about = make_documents()
     with RecordingWriter(
         path, catalogue=about[CATALOGUE], parameters=about[PARAMETERS], scene=about[SCENE], sync_every_s=1e9
     ) as file:
-        for number, (key, payload) in enumerate([*stream(60), (EVENTS, encode_document(NOTE))]):
+        for number, (key, payload) in enumerate([*generate_stream(60), (EVENTS, encode_document(NOTE))]):
             if number not in (100, 101, 102):
                 file.write(key, payload, 1_700_000_000_000_000_000 + number * 1_000_000)
         file.finish("completed")
@@ -243,11 +243,11 @@ def in_chunks(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A recording without gaps in chunks of 64 KiB; see `_damaged`."""
     from tests.unit import mcap_variants
 
-    folder, about = tmp_path_factory.mktemp("chunks"), documents()
+    folder, about = tmp_path_factory.mktemp("chunks"), make_documents()
     with RecordingWriter(
         folder / "whole.mcap", catalogue=about[CATALOGUE], parameters=about[PARAMETERS], scene=about[SCENE]
     ) as file:
-        for number, (key, payload) in enumerate(stream(40)):
+        for number, (key, payload) in enumerate(generate_stream(40)):
             file.write(key, payload, 1_700_000_000_000_000_000 + number * 1_000_000)
         file.finish("completed")
     return mcap_variants.write(folder / "whole.mcap", folder / "run.mcap", "zstd")

@@ -16,7 +16,7 @@ from recorder.writer import RecordingWriter
 from rig.base.wire import CATALOGUE, EVENTS, PARAMETERS, SCENE, STATUS, Block, encode_block, encode_document, sensor_key
 from rig.channels.table import Channel, default_table
 
-from .recorder_stream import TICK_RATE_HZ, documents
+from .recorder_stream import TICK_RATE_HZ, make_documents
 
 ROWS, RATE_HZ = 100_000, 20_000
 TIME_S = np.arange(ROWS) / RATE_HZ
@@ -41,7 +41,7 @@ def make_volts(name: str) -> np.ndarray:
 
 def record(path: Path, changed: dict[str, np.ndarray] | None = None, **options: Any) -> Health:
     """Write the channels, some of them changed, and examine the recording."""
-    about = documents()
+    about = make_documents()
     scene = {**about[SCENE], "scene": {"sensors": options.get("sensors", {})}, **dict(options.get("about", {}))}
     with RecordingWriter(
         path, catalogue=about[CATALOGUE], parameters=about[PARAMETERS], scene=scene, view_rate_hz=0.0

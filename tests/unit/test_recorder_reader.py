@@ -15,13 +15,13 @@ from rig.base.samples import joined
 from rig.base.wire import CATALOGUE, EDGES, PARAMETERS, SCENE, STATUS, sensor_key, truth_key
 from rig.channels.table import default_table
 
-from .recorder_stream import TRUTH_COLUMNS, block_of, documents, stream
+from .recorder_stream import TRUTH_COLUMNS, generate_stream, make_block, make_documents
 
 BLOCKS = 60
 
 
 def write(path: Path, *, blocks: int = BLOCKS) -> None:
-    about = documents()
+    about = make_documents()
     now_s = [0.0]
     with RecordingWriter(
         path,
@@ -31,7 +31,7 @@ def write(path: Path, *, blocks: int = BLOCKS) -> None:
         sync_every_s=0.05,
         monotonic_s=lambda: now_s[0],
     ) as file:
-        for number, (key, payload) in enumerate(stream(blocks)):
+        for number, (key, payload) in enumerate(generate_stream(blocks)):
             now_s[0] = number * 0.00125  # eight payloads per block: a flush every five blocks
             file.write(key, payload, number)
         file.finish("completed")
@@ -53,7 +53,7 @@ def recording(path) -> Recording:
 def test_samples_are_the_published_counts_in_engineering_units(recording, group):
     samples = recording.samples(group)
     key = sensor_key(group)
-    counts = np.concatenate([block_of(key, number).values for number in range(BLOCKS)])
+    counts = np.concatenate([make_block(key, number).values for number in range(BLOCKS)])
     table = default_table().groups[group]
     np.testing.assert_allclose(samples.values, table.engineering(counts), rtol=1e-12, atol=1e-15)
     np.testing.assert_array_equal(samples.index, np.arange(200 * BLOCKS))
@@ -68,7 +68,7 @@ def test_samples_are_the_published_counts_in_engineering_units(recording, group)
 @pytest.mark.parametrize("table", list(TRUTH_COLUMNS))
 def test_truth_equals_the_published_truth(recording, table):
     samples = recording.truth(table)
-    values = np.concatenate([block_of(truth_key(table), number).values for number in range(BLOCKS)])
+    values = np.concatenate([make_block(truth_key(table), number).values for number in range(BLOCKS)])
     np.testing.assert_array_equal(samples.values, values)
     np.testing.assert_array_equal(samples.index, np.arange(20 * BLOCKS))
     assert samples.names[0] == f"{table}_0"

@@ -20,7 +20,7 @@ from recorder.writer import RecordingWriter
 from rig.base.errors import InputError
 from rig.base.wire import CATALOGUE, EDGES, EVENTS, PARAMETERS, SCENE, STATUS, encode_document, sensor_key, truth_key
 
-from .recorder_stream import documents, stream
+from .recorder_stream import generate_stream, make_documents
 
 PROBES = sensor_key("probes")
 HEAD = 9
@@ -28,7 +28,7 @@ HEAD = 9
 
 
 def writer(path: Path, **options: Any) -> RecordingWriter:
-    about = documents()
+    about = make_documents()
     return RecordingWriter(
         path, catalogue=about[CATALOGUE], parameters=about[PARAMETERS], scene=about[SCENE], **options
     )
@@ -52,7 +52,7 @@ def of(items: list[tuple[str, bytes]]) -> dict[str, list[bytes]]:
 
 @pytest.fixture(scope="module")
 def items() -> list[tuple[str, bytes]]:
-    return list(stream(100))
+    return list(generate_stream(100))
 
 
 @pytest.fixture(scope="module")
@@ -172,7 +172,7 @@ def test_a_file_truncated_in_its_calibration_is_refused_without_output(path, tmp
 
 
 def test_a_file_cut_at_any_byte_loses_nothing_that_was_flushed(tmp_path):
-    items = list(stream(4, block_ms=2))
+    items = list(generate_stream(4, block_ms=2))
     file = writer(tmp_path / "run.mcap", sync_every_s=0.0, view_rate_hz=100.0)
     flushed = [(file.part.stat().st_size, 0)]
     for number, (key, payload) in enumerate(items):
@@ -250,7 +250,9 @@ def test_consecutive_cuts_join_to_the_whole(path, tmp_path):
 @pytest.fixture(scope="module")
 def short(tmp_path_factory) -> Recording:
     """280 ms in blocks of 7 ms, which no round time divides."""
-    return Recording.open(write_recording(tmp_path_factory.mktemp("short") / "run.mcap", list(stream(40, block_ms=7))))
+    return Recording.open(
+        write_recording(tmp_path_factory.mktemp("short") / "run.mcap", list(generate_stream(40, block_ms=7)))
+    )
 
 
 def read_rows(recording: Recording, key: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

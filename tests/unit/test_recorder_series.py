@@ -38,7 +38,7 @@ from rig.base.wire import (
 )
 from rig.channels.table import default_table
 
-from .recorder_stream import TICK_RATE_HZ, block_of, documents, stream
+from .recorder_stream import TICK_RATE_HZ, generate_stream, make_block, make_documents
 
 PROBES = sensor_key("probes")
 
@@ -46,7 +46,7 @@ PROBES = sensor_key("probes")
 def series(
     path: Path, *, force: bool = False, monotonic_s: Callable[[], float] = time.monotonic, **limits: Any
 ) -> Series:
-    about = documents()
+    about = make_documents()
     calls = count()
 
     def open_file(name: Path, scene: dict[str, Any], beginning: Beginning) -> RecordingWriter:
@@ -74,7 +74,7 @@ def write(file: Series, items: list[tuple[str, bytes]]) -> None:
 
 @pytest.fixture(scope="module")
 def items() -> list[tuple[str, bytes]]:
-    return list(stream(100))
+    return list(generate_stream(100))
 
 
 @pytest.fixture(scope="module")
@@ -152,9 +152,9 @@ def test_a_part_contains_earlier_commands(tmp_path, items):
 
 
 def test_rows_lost_at_a_seam_are_a_gap(tmp_path):
-    missing = {(PROBES, encode_block(block_of(PROBES, number))) for number in (29, 30, 31)}
+    missing = {(PROBES, encode_block(make_block(PROBES, number))) for number in (29, 30, 31)}
     file = series(tmp_path / "run.mcap", rotate_s=0.3)
-    write(file, [item for item in stream(60) if item not in missing])
+    write(file, [item for item in generate_stream(60) if item not in missing])
     assert [Recording.open(part).gaps for part in file.files] == [[], [Gap(PROBES, 5800, 600)]]
     assert {key: lost for key, lost in file.counts().lost.items() if lost} == {PROBES: 600}
     assert join(file.files).streams[PROBES].lost == 600
@@ -180,13 +180,13 @@ def test_history_received_stream_by_stream_is_in_the_first_part(tmp_path, items)
 def test_a_missing_stream_does_not_delay_rotation_for_long(tmp_path, monkeypatch):
     monkeypatch.setattr(recorder.output.series, "_CATCH_UP_S", 0.0)
     file = series(tmp_path / "run.mcap", rotate_s=0.1)
-    write(file, [(PROBES, encode_block(block_of(PROBES, number))) for number in range(100)])
+    write(file, [(PROBES, encode_block(make_block(PROBES, number))) for number in range(100)])
     assert len(file.files) == 10
 
 
 def test_rotation_by_size(tmp_path):
     file = series(tmp_path / "run.mcap", rotate_mb=1.0)
-    write(file, list(stream(200)))
+    write(file, list(generate_stream(200)))
     sizes = [part.stat().st_size for part in file.files]
     assert len(sizes) >= 3
     assert all(1_000_000 < size < 1_300_000 for size in sizes[:-1])
@@ -194,7 +194,7 @@ def test_rotation_by_size(tmp_path):
 
 def test_the_budget_ends_a_recording_with_a_finished_file(tmp_path):
     file = series(tmp_path / "run.mcap", budget_mb=5.0)
-    write(file, list(stream(400)))
+    write(file, list(generate_stream(400)))
     assert file.ended == "the budget of 5 MB is used up"
     assert file.out_of_room
     assert 4_500_000 < (tmp_path / "run.mcap").stat().st_size <= 5_000_000
@@ -203,7 +203,7 @@ def test_the_budget_ends_a_recording_with_a_finished_file(tmp_path):
 
 def test_the_oldest_files_are_deleted_on_request(tmp_path):
     file = series(tmp_path / "run.mcap", rotate_mb=1.0, budget_mb=5.0, when_full="remove-oldest")
-    write(file, list(stream(500)))
+    write(file, list(generate_stream(500)))
     assert file.ended == ""
     assert file.removed > 0
     assert file.files == sorted(tmp_path.iterdir())
@@ -215,7 +215,7 @@ def test_the_oldest_files_are_deleted_on_request(tmp_path):
 @pytest.mark.parametrize("more", [{"budget_mb": 5.0, "when_full": "remove-oldest"}, {}])
 def test_the_counts_are_those_of_the_existing_files(tmp_path, more):
     """Rows, gaps, invalid payloads, and times: deleted files do not count."""
-    file, items = series(tmp_path / "run.mcap", rotate_mb=1.0, **more), list(stream(500))
+    file, items = series(tmp_path / "run.mcap", rotate_mb=1.0, **more), list(generate_stream(500))
     lost = [item for number, item in enumerate(items) if item[0] != PROBES or number % 100]
     write(file, [*lost[:50], (PROBES, b"no block"), *lost[50:-9], (PROBES, b"no block"), *lost[-9:]])
     assert (file.removed > 0) == bool(more)
@@ -235,7 +235,7 @@ def test_the_oldest_files_are_deleted_on_a_full_disk(tmp_path, monkeypatch):
 
     monkeypatch.setattr(os, "statvfs", statvfs)
     file = series(tmp_path / "run.mcap", rotate_mb=1.0, keep_free_mb=0.0, when_full="remove-oldest")
-    write(file, list(stream(700)))
+    write(file, list(generate_stream(700)))
     assert (file.ended, file.files) == ("", sorted(tmp_path.iterdir()))
     assert file.removed > 0
     assert sum(part.stat().st_size for part in file.files) <= disk_bytes
@@ -247,7 +247,7 @@ def test_free_space_is_kept_on_the_disk(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "statvfs", lambda _: SimpleNamespace(f_bavail=free[0], f_frsize=1_000_000))
     now_s = [0.0]
     file = series(tmp_path / "run.mcap", monotonic_s=lambda: now_s[0], keep_free_mb=50.0)
-    items = list(stream(40))
+    items = list(generate_stream(40))
     for key, payload in items[:160]:
         file.take(Payload.read(key, payload, 0))
     assert file.ended == ""
@@ -315,7 +315,7 @@ def test_a_file_that_cannot_be_deleted_ends_the_recording_normally(tmp_path, ite
 
     file = series(tmp_path / "run.mcap", rotate_mb=1.0, budget_mb=5.0, when_full="remove-oldest")
     monkeypatch.setattr(Path, "unlink", refused)
-    write(file, list(stream(600)))
+    write(file, list(generate_stream(600)))
     assert "Read-only file system" in file.ended
     assert file.out_of_room
     assert all(Recording.open(part).complete for part in file.files)
@@ -353,7 +353,7 @@ def test_a_recovered_part_and_cuts_of_parts_join(parts, tmp_path):
 
 
 def test_files_of_different_runs_are_not_joined(tmp_path, items):
-    about = documents()
+    about = make_documents()
     for name, seed in (("a", 1), ("b", 2)):
         with RecordingWriter(
             tmp_path / f"{name}.mcap",

@@ -41,7 +41,7 @@ from rig.channels.table import default_table
 from rig.serve.transport import NoReplyError
 from rig.serve.transport.memory import MemoryClient, MemoryServer
 
-from .recorder_stream import ScriptedClient, block_of, documents, stream
+from .recorder_stream import ScriptedClient, generate_stream, make_block, make_documents
 
 pytestmark = pytest.mark.wallclock
 PROBES = sensor_key("probes")
@@ -90,7 +90,7 @@ def record(
 
 def test_records_to_the_end_of_the_stream(path):
     client = ScriptedClient()
-    items = list(stream(30))
+    items = list(generate_stream(30))
     progress: list[Progress] = []
     summary = record(RecordingSession(client, path), client, play(client, items), progress)
     assert (summary.reason, summary.error, summary.path) == ("completed", "", path)
@@ -117,8 +117,8 @@ def test_each_block_and_each_document_is_decoded_once(path, monkeypatch):
         return count
 
     client = ScriptedClient()
-    told = {"event": "fault", "tick": 0, "time_s": 0.0, "fault": 1}
-    items = [(FAULTS, encode_document(told)), *stream(30)]
+    fault_event = {"event": "fault", "tick": 0, "time_s": 0.0, "fault": 1}
+    items = [(FAULTS, encode_document(fault_event)), *generate_stream(30)]
     act = play(client, items)
 
     def count_and_act() -> None:
@@ -138,7 +138,7 @@ def test_each_block_and_each_document_is_decoded_once(path, monkeypatch):
 @pytest.mark.parametrize(("status", "short", "reason"), [(True, 0, "completed"), (False, 0, "late"), (True, 1, "late")])
 def test_the_last_status_ends_a_session_only_with_all_rows(path, status, short, reason):
     client = ScriptedClient()
-    *items, _ = stream(3)
+    *items, _ = generate_stream(3)
     end = {"event": "end", "tick": 30_000, "time_s": 0.03, "reason": "completed", "rows": {PROBES: 600 + short}}
     items.append((EVENTS, encode_document(end)))
     if status:
@@ -153,12 +153,12 @@ def test_the_last_status_ends_a_session_only_with_all_rows(path, status, short, 
 
 def test_over_the_memory_transport(path):
     server = MemoryServer()
-    for key, document in documents().items():
+    for key, document in make_documents().items():
         server.answer(key, lambda _, document=document: encode_document(document))
     beats: list[dict] = []
     server.hear(f"{CLIENTS}/*", lambda _, payload: beats.append(decode_document(payload)))
     server.announce()
-    items = list(stream(20))
+    items = list(generate_stream(20))
     for item in items[:60]:
         server.publish(*item)
 
@@ -180,7 +180,7 @@ def test_over_the_memory_transport(path):
 
 def test_blocks_overtaken_by_the_end_event_are_awaited(path):
     client = ScriptedClient()
-    items = list(stream(10))
+    items = list(generate_stream(10))
     end = decode_document(items[-1][1]) | {"rows": {PROBES: 2000, truth_key("state"): 200}}
     late = [item for item in items if item[0] == PROBES][5:]
 
@@ -201,7 +201,7 @@ def test_blocks_overtaken_by_the_end_event_are_awaited(path):
 
 def test_missing_last_blocks_are_a_gap_at_the_end(path):
     client = ScriptedClient()
-    items = [item for item in stream(10) if item[0] in (PROBES, EVENTS)]
+    items = [item for item in generate_stream(10) if item[0] in (PROBES, EVENTS)]
     end = decode_document(items[-1][1]) | {"rows": {PROBES: 2000}}
 
     def act() -> None:
@@ -216,7 +216,7 @@ def test_missing_last_blocks_are_a_gap_at_the_end(path):
 
 def test_gaps_and_transport_losses_are_in_summary_and_file(path):
     client = ScriptedClient()
-    items = [item for number, item in enumerate(stream(10)) if number not in (10, 11, 12)]
+    items = [item for number, item in enumerate(generate_stream(10)) if number not in (10, 11, 12)]
 
     def act() -> None:
         assert client.on_miss is not None
@@ -236,7 +236,7 @@ def test_gaps_and_transport_losses_are_in_summary_and_file(path):
 
 def test_ends_after_a_simulated_time(path):
     client = ScriptedClient()
-    blocks = [(PROBES, encode_block(block_of(PROBES, number))) for number in range(100, 150)]
+    blocks = [(PROBES, encode_block(make_block(PROBES, number))) for number in range(100, 150)]
     summary = record(RecordingSession(client, path, duration_s=0.2), client, play(client, blocks))
     assert summary.reason == "duration reached"
     assert summary.first_time_s == pytest.approx(1.0)
@@ -246,7 +246,7 @@ def test_ends_after_a_simulated_time(path):
 
 def test_a_time_to_record_ends_for_all_streams_at_the_same_block(path):
     client = ScriptedClient()
-    items = list(stream(60))
+    items = list(generate_stream(60))
     summary = record(RecordingSession(client, path, duration_s=0.205), client, play(client, items[:-1]))
     assert summary.reason == "duration reached"
     streams = Recording.open(path).streams
@@ -258,8 +258,8 @@ def test_a_time_to_record_ends_for_all_streams_at_the_same_block(path):
 
 def test_streams_starting_a_block_apart_have_the_full_duration(path):
     client = ScriptedClient()
-    items = [item for item in stream(60) if schema_of(item[0])]
-    place = items.index((sensor_key("hammer"), encode_block(block_of(sensor_key("hammer"), 3))))
+    items = [item for item in generate_stream(60) if schema_of(item[0])]
+    place = items.index((sensor_key("hammer"), encode_block(make_block(sensor_key("hammer"), 3))))
     summary = record(RecordingSession(client, path, duration_s=0.2), client, play(client, items[place:]))
     streams = Recording.open(path).streams
     assert {streams[sensor_key(group)].rows for group in default_table().groups} == {4000}
@@ -268,7 +268,7 @@ def test_streams_starting_a_block_apart_have_the_full_duration(path):
 
 def test_a_restarted_rig_is_not_mixed_into_the_recording(path):
     client = ScriptedClient()
-    items = list(stream(20))[1:-1]
+    items = list(generate_stream(20))[1:-1]
 
     def act() -> None:
         for item in items:
@@ -291,7 +291,7 @@ def test_a_restarted_rig_is_not_mixed_into_the_recording(path):
 
 def test_an_internal_error_is_reported_and_the_file_finished(path, monkeypatch):
     client = ScriptedClient()
-    blocks = [(PROBES, encode_block(block_of(PROBES, number))) for number in range(20)]
+    blocks = [(PROBES, encode_block(make_block(PROBES, number))) for number in range(20)]
     real = RecordingWriter.take
     calls = [0]
 
@@ -311,7 +311,7 @@ def test_an_internal_error_is_reported_and_the_file_finished(path, monkeypatch):
 def test_blocks_with_impossible_times_are_skipped_and_odd_documents_kept(path):
     client = ScriptedClient()
     head = struct.Struct("<qqddII")
-    good = encode_block(block_of(PROBES, 0))
+    good = encode_block(make_block(PROBES, 0))
     wrong = []
     for tick, index, rate_hz, tick_rate_hz in (
         (2**62, 0, 20e3, 1e6),
@@ -336,9 +336,9 @@ def test_blocks_with_impossible_times_are_skipped_and_odd_documents_kept(path):
         (EVENTS, b'{"event":"start","tick":true}'),
         (EVENTS, b"9" * 5000),
     ]
-    items = [(PROBES, good), *wrong, *notes, (PROBES, encode_block(block_of(PROBES, 1)))]
+    items = [(PROBES, good), *wrong, *notes, (PROBES, encode_block(make_block(PROBES, 1)))]
     summary = record(
-        RecordingSession(client, path, duration_s=1.0), client, play(client, [*items, list(stream(1))[-1]])
+        RecordingSession(client, path, duration_s=1.0), client, play(client, [*items, list(generate_stream(1))[-1]])
     )
     assert (summary.reason, summary.error) == ("completed", "")
     assert (summary.malformed, summary.refused) == (5, len(wrong))
@@ -355,7 +355,7 @@ def test_blocks_with_impossible_times_are_skipped_and_odd_documents_kept(path):
 def test_stop_keeps_everything_received(path):
     client = ScriptedClient()
     session = RecordingSession(client, path)
-    blocks = [(PROBES, encode_block(block_of(PROBES, number))) for number in range(200)]
+    blocks = [(PROBES, encode_block(make_block(PROBES, number))) for number in range(200)]
 
     def act() -> None:
         for block in blocks:
@@ -368,7 +368,7 @@ def test_stop_keeps_everything_received(path):
 
 def test_a_rig_that_returns_with_the_same_run_continues_with_a_gap(path):
     client = ScriptedClient()
-    items = list(stream(40))
+    items = list(generate_stream(40))
     third = len(items) // 3
 
     def act() -> None:
@@ -393,7 +393,7 @@ def test_a_lost_rig_closes_the_file_well(path):
     client = ScriptedClient()
 
     def act() -> None:
-        for item in list(stream(10))[:-1]:
+        for item in list(generate_stream(10))[:-1]:
             client.publish(*item)
         client.on_alive(False)
 
@@ -411,7 +411,7 @@ def test_the_end_event_counts_even_if_the_rig_has_ended(path):
 
     def act() -> None:
         client.on_alive(False)
-        for item in stream(3):
+        for item in generate_stream(3):
             client.publish(*item)
 
     assert record(RecordingSession(client, path), client, act).reason == "completed"
@@ -440,7 +440,7 @@ def test_a_full_inbox_refuses_blocks_counts_them_and_leaves_a_gap(path, monkeypa
         done.append(payload)
 
     monkeypatch.setattr(RecordingWriter, "take", slow)
-    blocks = [(PROBES, encode_block(block_of(PROBES, number))) for number in range(50)]
+    blocks = [(PROBES, encode_block(make_block(PROBES, number))) for number in range(50)]
 
     def act() -> None:
         for block in blocks[:-1]:
@@ -479,7 +479,7 @@ def test_a_disk_error_ends_the_session_with_the_written_part(path, monkeypatch):
 
     def act() -> None:
         for number in range(1000):
-            client.publish(PROBES, encode_block(block_of(PROBES, number)))
+            client.publish(PROBES, encode_block(make_block(PROBES, number)))
             if stop.wait(0.01):
                 return
 
@@ -504,7 +504,7 @@ def test_heartbeats_report_the_recorders_progress(path):
     summary = record(
         RecordingSession(client, path, name="recorder-1"),
         client,
-        play(client, list(stream(10))),
+        play(client, list(generate_stream(10))),
     )
     assert summary.reason == "completed"
     assert {key for key, _ in client.reported} == {f"{CLIENTS}/recorder-1"}
@@ -548,7 +548,7 @@ def test_the_output_file_is_named(path):
 def test_the_summary_of_triggers_describes_the_files(path):
     client = ScriptedClient()
     capture = Capture((Trigger.parse("note"), Trigger.parse("P_N>-1e9")), pre_s=0.1, post_s=0.2)
-    items = list(stream(100))
+    items = list(generate_stream(100))
     note = encode_document({"event": "note", "tick": 500_000, "time_s": 0.5, "text": "now"})
     items.insert(len(items) // 2, (EVENTS, note))
     progress: list[Progress] = []
@@ -566,7 +566,7 @@ def test_the_summary_of_triggers_describes_the_files(path):
 def test_without_a_trigger_nothing_is_counted_as_recorded(path):
     client = ScriptedClient()
     session = RecordingSession(client, path, capture=Capture((Trigger.parse("hammer"),)))
-    summary = record(session, client, play(client, list(stream(50))))
+    summary = record(session, client, play(client, list(generate_stream(50))))
     assert (summary.files, summary.fired, summary.duration_s, summary.rows) == ((), 0, 0.0, {})
     assert summary.received_s == pytest.approx(0.5, abs=0.01)
 

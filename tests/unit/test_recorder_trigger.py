@@ -22,13 +22,13 @@ from rig.base.errors import InputError
 from rig.base.wire import CATALOGUE, EVENTS, PARAMETERS, SCENE, Block, encode_block, encode_document, sensor_key
 from rig.channels.table import default_table
 
-from .recorder_stream import TICK_RATE_HZ, block_of, documents
+from .recorder_stream import TICK_RATE_HZ, make_block, make_documents
 
 PROBES, FORCES = sensor_key("probes"), sensor_key("forces")
 
 
 def captures(path: Path, *triggers: str, force: bool = False, limits: Limits | None = None, **options: Any) -> Captures:
-    about = documents()
+    about = make_documents()
 
     def open_file(name: Path, scene: dict[str, Any], beginning: Beginning) -> RecordingWriter:
         return RecordingWriter(
@@ -54,7 +54,7 @@ def feed_blocks(file: Captures, blocks: range, events: dict[int, list[tuple[str,
     """Feed blocks of 10 ms of probes and forces; events follow the block that contains them, as the rig sends them."""
     for number in blocks:
         for key in (PROBES, FORCES):
-            file.take(Payload.read(key, encode_block(block_of(key, number)), number))
+            file.take(Payload.read(key, encode_block(make_block(key, number)), number))
         for item in (events or {}).get(number, []):
             file.take(Payload.read(*item, number))
 
@@ -78,7 +78,7 @@ def test_an_impact_is_captured_with_the_time_before_and_after(tmp_path):
         assert extent(path, key) == (pytest.approx(0.8, abs=0.01), pytest.approx(1.51 - 50e-6))
         payloads = [payload for _, payload in recording.payloads(key)]
         first = round(recording.streams[key].first_time_s * 100)
-        assert payloads == [encode_block(block_of(key, number)) for number in range(first, 151)]
+        assert payloads == [encode_block(make_block(key, number)) for number in range(first, 151)]
     assert [found["event"] for found in recording.events] == ["hammer"]
     assert recording.metadata["trigger"]["time_s"] == "1.000000000"
     assert file.counts().rows[PROBES] == 60_000
@@ -262,13 +262,13 @@ def test_an_event_far_ahead_does_not_block_the_buffer(tmp_path):
 
 def test_delayed_streams_are_awaited(tmp_path):
     file = captures(tmp_path / "run.mcap", "hammer", pre_s=0.1, post_s=0.2)
-    file.take(Payload.read(FORCES, encode_block(block_of(FORCES, 0)), 0))
+    file.take(Payload.read(FORCES, encode_block(make_block(FORCES, 0)), 0))
     for number in range(100, 140):
-        file.take(Payload.read(PROBES, encode_block(block_of(PROBES, number)), number))
+        file.take(Payload.read(PROBES, encode_block(make_block(PROBES, number)), number))
         if number == 110:
             file.take(Payload.read(*event("hammer", 1.1), number))
     for number in range(100, 140):
-        file.take(Payload.read(FORCES, encode_block(block_of(FORCES, number)), number))
+        file.take(Payload.read(FORCES, encode_block(make_block(FORCES, number)), number))
     file.finish("completed")
     assert extent(file.files[0], FORCES) == extent(file.files[0], PROBES)
 

@@ -31,13 +31,13 @@ from rig.base.wire import (
 )
 from rig.channels.table import default_table
 
-from .recorder_stream import block_of, documents, stream
+from .recorder_stream import generate_stream, make_block, make_documents
 
 PROBES = sensor_key("probes")
 
 
 def writer(path: Path, **options) -> RecordingWriter:
-    about = documents()
+    about = make_documents()
     return RecordingWriter(
         path, catalogue=about[CATALOGUE], parameters=about[PARAMETERS], scene=about[SCENE], **options
     )
@@ -53,7 +53,7 @@ def write(path: Path, items, **options) -> RecordingWriter:
 
 @pytest.fixture(scope="module")
 def items() -> list[tuple[str, bytes]]:
-    return list(stream(40))
+    return list(generate_stream(40))
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +95,7 @@ def test_log_time_is_simulated_time_and_publish_time_is_arrival(path, items):
 @pytest.mark.parametrize("key", [PROBES, sensor_key("hammer"), truth_key("state")])
 def test_a_foreign_reader_decodes_the_blocks(path, key):
     for number, (_, message) in enumerate(decode_topic(path, key)):
-        block = block_of(key, number)
+        block = make_block(key, number)
         assert (message.tick, message.index, message.columns) == (block.tick, block.index, block.values.shape[1])
         assert (message.rate_hz, message.tick_rate_hz) == (block.rate_hz, block.tick_rate_hz)
         np.testing.assert_array_equal(np.reshape(message.values, block.values.shape), block.values)
@@ -112,7 +112,7 @@ def test_channel_metadata_turns_counts_into_units(path):
     group = default_table().groups["probes"]
     assert about["names"] == list(group.names)
     assert about["units"] == ["mm"] * 4
-    counts = block_of(PROBES, 3).values
+    counts = make_block(PROBES, 3).values
     np.testing.assert_allclose(
         counts * np.array(about["scales"]) + np.array(about["offsets"]), group.engineering(counts), rtol=1e-14
     )
@@ -160,7 +160,7 @@ def test_view_does_not_depend_on_the_size_of_the_blocks(tmp_path):
         rows = np.arange(2800, dtype=np.int32)[:, None] * np.ones(4, dtype=np.int32)
         blocks = []
         for start in range(0, 2800, 20 * block_ms):
-            whole = block_of(PROBES, 0)
+            whole = make_block(PROBES, 0)
             values = rows[start : start + 20 * block_ms]
             block = type(whole)(start * 50, start, whole.rate_hz, whole.tick_rate_hz, values)
             blocks.append((PROBES, encode_block(block)))
@@ -188,7 +188,7 @@ def test_missing_groups_do_not_block_the_others_for_ever(monkeypatch):
     views = Views(table, rate_hz=500.0)
     counts = []
     for number in range(6):
-        shown = views.add(table.groups["probes"], block_of(PROBES, number), number * 10_000_000)
+        shown = views.add(table.groups["probes"], make_block(PROBES, number), number * 10_000_000)
         assert shown is not None
         counts.append(len(shown[1][0]))
     assert counts == [0, 0, 0, 5, 5, 5]
@@ -197,7 +197,7 @@ def test_missing_groups_do_not_block_the_others_for_ever(monkeypatch):
 def test_a_view_row_with_a_missing_group_is_nan_there(tmp_path):
     path = tmp_path / "run.mcap"
     forces = sensor_key("forces")
-    items = [(key, encode_block(block_of(key, number))) for number in range(3) for key in (PROBES, forces)]
+    items = [(key, encode_block(make_block(key, number))) for number in range(3) for key in (PROBES, forces)]
     del items[3]  # the second block of the forces
     write(path, items)
     topic = next(topic for topic in Recording.open(path).messages if topic.startswith("view/probes"))
@@ -232,7 +232,7 @@ def test_impossible_viewing_rate_is_refused(tmp_path, rate):
 
 def test_calibration_parameters_and_scene_are_in_the_file(path):
     recording = Recording.open(path)
-    about = documents()
+    about = make_documents()
     assert recording.catalogue == about[CATALOGUE]
     assert recording.parameters == about[PARAMETERS]
     assert recording.scene == about[SCENE]
@@ -268,13 +268,13 @@ def test_gaps_are_recorded_at_their_place(tmp_path, items):
 @pytest.mark.parametrize(("from_start", "gaps"), [(True, [Gap(PROBES, 0, 600)]), (False, [])])
 def test_a_late_start_is_a_gap_only_if_the_whole_run_was_requested(tmp_path, from_start, gaps):
     path = tmp_path / "run.mcap"
-    late = [(PROBES, encode_block(block_of(PROBES, number))) for number in (3, 4)]
+    late = [(PROBES, encode_block(make_block(PROBES, number))) for number in (3, 4)]
     write(path, late, beginning=Beginning(from_start=from_start))
     assert Recording.open(path).gaps == gaps
 
 
 def test_a_catalogue_without_a_table_is_refused(tmp_path):
-    about = documents()
+    about = make_documents()
     with pytest.raises(InputError, match="catalogue must be a document with a channel table"):
         RecordingWriter(
             tmp_path / "run.mcap", catalogue={"root": "rig"}, parameters=about[PARAMETERS], scene=about[SCENE]
@@ -296,7 +296,7 @@ def test_losses_of_the_transport_are_recorded(tmp_path, items):
 def test_rows_missing_at_the_end_are_a_gap(tmp_path):
     path = tmp_path / "run.mcap"
     with writer(path) as file:
-        file.write(PROBES, encode_block(block_of(PROBES, 0)), 0)
+        file.write(PROBES, encode_block(make_block(PROBES, 0)), 0)
         assert file.tally.short_of({PROBES: 200}) == {}
         assert file.tally.short_of({PROBES: 300, truth_key("state"): 9}) == {PROBES: 300}
         file.note_short({PROBES: 300}, 0)
@@ -318,8 +318,8 @@ def test_payloads_that_contradict_their_key_are_kept(tmp_path, items):
 
 def test_unknown_streams_are_recorded(tmp_path):
     path = tmp_path / "run.mcap"
-    block = encode_block(block_of(PROBES, 0))
-    write(path, [("rig/sensors/later", block), ("rig/truth/later", encode_block(block_of(truth_key("state"), 0)))])
+    block = encode_block(make_block(PROBES, 0))
+    write(path, [("rig/sensors/later", block), ("rig/truth/later", encode_block(make_block(truth_key("state"), 0)))])
     recording = Recording.open(path)
     assert [payload for _, payload in recording.payloads("rig/sensors/later")] == [block]
     assert recording.streams["rig/truth/later"].rows == 20
@@ -371,7 +371,7 @@ def test_a_full_disk_ends_the_recording_and_keeps_its_data(tmp_path):
 
     def fill() -> None:
         for number in range(1000):
-            file.write(PROBES, encode_block(block_of(PROBES, number)), 0)
+            file.write(PROBES, encode_block(make_block(PROBES, number)), 0)
             written.append(number)
 
     with writer(path, sync_every_s=0.0) as file:
@@ -383,7 +383,7 @@ def test_a_full_disk_ends_the_recording_and_keeps_its_data(tmp_path):
             resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
         assert file.closed
         with pytest.raises(RecordingError, match="is closed"):
-            file.write(PROBES, encode_block(block_of(PROBES, 0)), 0)
+            file.write(PROBES, encode_block(make_block(PROBES, 0)), 0)
     assert len(written) > 10
     assert not path.exists()
     recording = Recording.open(file.part)
@@ -421,7 +421,7 @@ def test_clock_pairs_join_simulated_and_wall_time(tmp_path):
     path = tmp_path / "run.mcap"
     with writer(path) as file:
         for number in range(200):
-            file.write(PROBES, encode_block(block_of(PROBES, number)), 10_000_000_000 + number * 10_000_000)
+            file.write(PROBES, encode_block(make_block(PROBES, number)), 10_000_000_000 + number * 10_000_000)
         file.finish("completed")
     pairs = Recording.open(path).clock
     assert pairs.shape == (4, 2)
@@ -447,7 +447,7 @@ def test_recording_continues_after_the_wall_clock_is_set_back(tmp_path):
     with writer(tmp_path / "run.mcap") as file:
         for number in range(400):
             wall_ns = 10**18 + number * 10_000_000 - (3600 * 10**9 if number >= 200 else 0)
-            file.write(PROBES, encode_block(block_of(PROBES, number)), wall_ns)
+            file.write(PROBES, encode_block(make_block(PROBES, number)), wall_ns)
         file.finish("completed")
     clock = Recording.open(tmp_path / "run.mcap").clock
     assert len(clock) == 8

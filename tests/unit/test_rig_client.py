@@ -13,7 +13,7 @@ from drivers.link import LinkTimeoutError
 from drivers.sources.samples import ALL_AVAILABLE, RowReader, Samples
 from rig.base.wire import STATUS, encode_block, encode_document, truth_key
 
-from .recorder_stream import ScriptedClient, block_of
+from .recorder_stream import ScriptedClient, make_block
 
 CONTACT = truth_key("contact")
 ROWS = 20
@@ -46,11 +46,11 @@ def machine(client: SettledClient) -> Rig:
 
 def send(client: SettledClient, *numbers: int) -> None:
     for number in numbers:
-        client.publish(CONTACT, encode_block(block_of(CONTACT, number)))
+        client.publish(CONTACT, encode_block(make_block(CONTACT, number)))
 
 
 def values_of(*numbers: int) -> np.ndarray:
-    return np.concatenate([block_of(CONTACT, number).values for number in numbers])
+    return np.concatenate([make_block(CONTACT, number).values for number in numbers])
 
 
 def test_received_truth_is_read_once(client: SettledClient, machine: Rig) -> None:
@@ -63,7 +63,7 @@ def test_received_truth_is_read_once(client: SettledClient, machine: Rig) -> Non
 
 
 def test_forged_truth_is_skipped(client: SettledClient, machine: Rig) -> None:
-    forged = block_of(CONTACT, 1)
+    forged = make_block(CONTACT, 1)
     send(client, 0)
     for payload in (
         b"",

@@ -414,8 +414,8 @@ def test_the_command_writes_report_junit_and_json(
     failed = [case.get("name") for case in suite if case.find("failure") is not None]
     assert (suite.get("failures"), failed) == ("2", ["outcome", "missing rows probes"])
     assert suite.get("skipped") == "0"
-    told = json.loads(made[2].read_text(encoding="utf-8"))
-    assert told["runs"] == {"missing rows probes": [[1177, 1177]]}
+    document = json.loads(made[2].read_text(encoding="utf-8"))
+    assert document["runs"] == {"missing rows probes": [[1177, 1177]]}
     assert made[0].read_text(encoding="utf-8").count("<img") == 0  # there are no stamps to draw
 
 
@@ -438,7 +438,7 @@ def test_wrong_inputs_are_refused_in_one_line(
     other = write_parquet(tmp_path / "other.parquet", {"x": noise, "one": np.ones(5000), "none": np.full(5000, np.nan)})
     few = write_parquet(tmp_path / "few.parquet", {"disk_x [mm]": in_units(counts)["disk_x [mm]"].astype(np.float16)})
     (tmp_path / "mine.toml").write_text('title = "x"\n[analogue.gian]\nhigh = 1\nkind = "assumed"\nsource = "me"\n')
-    for arguments, told in (
+    for arguments, message in (
         (["--against", str(session), "--limits", "api-671"], "limits must be"),
         (["--against", str(session), "--limits", str(tmp_path / "mine.toml")], "such as gain"),
         (["--against", str(tmp_path / "none.mcap")], "none.mcap"),
@@ -447,7 +447,7 @@ def test_wrong_inputs_are_refused_in_one_line(
     ):
         status, _, err = run_captured(capsys, "score", other, *arguments)
         assert (status, err.count("\n")) == (2, 1), err
-        assert told in err
+        assert message in err
     with pytest.raises(InputError, match="no counts can be told"):
         judge(few, [session], path="digital")
 

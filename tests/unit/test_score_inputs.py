@@ -123,7 +123,7 @@ def test_an_unknown_channel_of_a_mapping_is_named_with_its_line(
 
 
 @pytest.mark.parametrize(
-    ("ends", "told"),
+    ("ends", "message"),
     [
         ("low = 20.0, high = -20.0", "low = 20, high = -20"),
         ("low = 1, high = 0", "low = 1, high = 0"),
@@ -132,12 +132,12 @@ def test_an_unknown_channel_of_a_mapping_is_named_with_its_line(
         ('high = 1.0, measures = "lenght"', "lenght"),
     ],
 )
-def test_a_limit_that_always_or_never_passes_is_refused(ends: str, told: str, tmp_path: Path) -> None:
+def test_a_limit_that_always_or_never_passes_is_refused(ends: str, message: str, tmp_path: Path) -> None:
     file = tmp_path / "ours.toml"
     file.write_text(f'title = "x"\n[analogue]\ngain = {{ {ends}, kind = "assumed", source = "me" }}\n')
     with pytest.raises(InputError) as error:
         load_limits(file)
-    assert told in str(error.value)
+    assert message in str(error.value)
 
 
 def test_a_limit_reversed_by_the_channel_table_is_refused(tmp_path: Path) -> None:

@@ -177,8 +177,8 @@ def test_a_pass_needs_a_quantity_that_passes_and_no_doubt(
 def test_limits_from_the_table_agree_with_closed_forms() -> None:
     limits = load_limits()
 
-    def ends(quantity: str, **told: float) -> tuple[float, float] | None:
-        found = limits.bounds("analogue", quantity, PROBE, **told)
+    def ends(quantity: str, **numbers: float) -> tuple[float, float] | None:
+        found = limits.bounds("analogue", quantity, PROBE, **numbers)
         return None if found is None else (found.low, found.high)
 
     noise_mm = NOISE_V / 3.94

@@ -25,7 +25,7 @@ from rig.serve.transport import Client
 from tests.commands import run_captured
 from tests.score_daqs import RATE_HZ, make_counts, write_session
 
-from .recorder_stream import ScriptedClient, block_of
+from .recorder_stream import ScriptedClient, make_block
 
 PROBES = default_table().groups["probes"]
 HEADING = ",".join(f"{name} [mm]" for name in PROBES.names) + "\n"
@@ -91,7 +91,7 @@ class Deliverer:
         with os.fdopen(self._sink, "w") as pipe:
             pipe.write(HEADING)
             for number in range(self._blocks):
-                block = block_of(sensor_key("probes"), number)
+                block = make_block(sensor_key("probes"), number)
                 self.client.publish(sensor_key("probes"), encode_block(block))
                 kept = [n for n in range(len(block.values)) if block.index + n not in self._without]
                 pipe.write(lines(block.values[kept]))
@@ -129,7 +129,7 @@ def test_an_interruption_keeps_the_complete_lines(tmp_path: Path) -> None:
     daq = Deliverer(blocks=20)
     read, write = os.pipe()
     daq.source = read
-    os.write(write, (HEADING + lines(block_of(sensor_key("probes"), 0).values) + "0.1,0.").encode())
+    os.write(write, (HEADING + lines(make_block(sensor_key("probes"), 0).values) + "0.1,0.").encode())
     threading.Timer(0.5, daq.stopped.set).start()
     found = daq.collect(tmp_path)
     assert found.remarks[0].endswith(", until it was interrupted")
@@ -167,7 +167,7 @@ def test_errors_during_a_live_run_are_reported(
 def test_wrong_options_are_refused_in_one_line(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for arguments, told in (
+    for arguments, message in (
         (["-", "--against", "sent.mcap"], "--against must be left out"),
         (["daq.csv"], "--against must be given"),
         (["daq.csv", "--against", "sent.mcap", "--for-s", "3"], "--for-s must be left out"),
@@ -177,4 +177,4 @@ def test_wrong_options_are_refused_in_one_line(
         monkeypatch.setattr("sys.stdin.isatty", lambda: True)
         status, _, err = run_captured(capsys, "score", *arguments)
         assert (status, err.count("\n")) == (2, 1), err
-        assert told in err
+        assert message in err

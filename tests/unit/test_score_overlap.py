@@ -53,9 +53,9 @@ def test_a_daq_that_began_early_and_ends_late_is_judged_where_both_overlap(
     daq = np.concatenate([ahead, counts, ahead[:700] + 1])
     card = judge(write_parquet(tmp_path / "daq.parquet", columns_of(daq)), [session])
     assert (card.path, red(card), card.outcome) == ("digital", set(), "pass"), card.verdict_line
-    told = "\n".join(card.remarks)
-    assert f"the first {rows} rows are not judged" in told
-    assert "the last 700 rows are not judged" in told
+    remarks = "\n".join(card.remarks)
+    assert f"the first {rows} rows are not judged" in remarks
+    assert "the last 700 rows are not judged" in remarks
     daq = np.delete(daq, rows + 9000, axis=0)
     assert red(judge(write_parquet(tmp_path / "daq.parquet", columns_of(daq)), [session])) == {
         ("missing rows", "probes")
@@ -179,8 +179,8 @@ def test_a_record_of_stale_rows_does_not_pass(which: str, repeats: bool, tmp_pat
     daq = np.concatenate([whole[first:last] for first, last in STALE_RANGES[which]])
     card = judge(write_parquet(tmp_path / "daq.parquet", columns_of(daq)), [session])
     assert card.outcome != "pass", card.remarks
-    told = "\n".join(card.doubts)
-    assert "equal a run of rows in it" in told or {"doubled rows", "swapped rows"} & {row for row, _ in red(card)}
+    doubts = "\n".join(card.doubts)
+    assert "equal a run of rows in it" in doubts or {"doubled rows", "swapped rows"} & {row for row, _ in red(card)}
 
 
 def test_stale_rows_in_one_table_of_several_do_not_pass(tmp_path: Path) -> None:

@@ -152,10 +152,10 @@ def test_the_last_status_has_the_error_estimate_energy_and_warnings_of_the_end()
     simulation = Estimating(duration_s=0.1)
     simulation.warn_at_tick = 100_000
     _, listener = run(simulation, status_period_s=60.0)
-    told = listener.statuses[-1]
-    assert accuracy_text(told["accuracy"]) == "whirl radius 0.1 um (tolerance 0.28)"
-    assert told["energy"]["residual_j"] == 100_000
-    assert [event["text"] for event in listener.named("warning")] == told["warnings"] == ["energy does not close"]
+    status = listener.statuses[-1]
+    assert accuracy_text(status["accuracy"]) == "whirl radius 0.1 um (tolerance 0.28)"
+    assert status["energy"]["residual_j"] == 100_000
+    assert [event["text"] for event in listener.named("warning")] == status["warnings"] == ["energy does not close"]
 
 
 def test_a_command_is_answered_with_its_tick_and_becomes_an_event() -> None:

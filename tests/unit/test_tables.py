@@ -149,8 +149,8 @@ def test_any_table_is_legible(width: int) -> None:
         table.add_row(f"name_{n}", "m/s^2", *numbers, "words " * 20 * n, "somebody, some Journal 12 (1999) 345")
     table.add_row("all of them")
     check_legible(table, width=width)
-    told = [line for line in render_lines(table, width=width) if line.startswith("without ")]
-    assert told == ([] if width == 300 else ["without unit, source: see --wide"])
+    notes = [line for line in render_lines(table, width=width) if line.startswith("without ")]
+    assert notes == ([] if width == 300 else ["without unit, source: see --wide"])
 
 
 def test_long_text_is_folded_and_not_cut() -> None:

@@ -83,12 +83,12 @@ def log(folder: Path, times_s: np.ndarray, counts: np.ndarray) -> Path:
 def test_a_log_with_stamps_out_of_order_is_imported_or_refused_in_one_line(
     name: str, counts: np.ndarray, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    times_s, told = STAMPS[name]
+    times_s, message = STAMPS[name]
     path, target = log(tmp_path, times_s, counts), tmp_path / "out.mcap"
     status, _, line = run_captured(capsys, "import", path, "-o", target)
-    if told:
+    if message:
         assert (status, line.count("\n"), target.exists()) == (2, 1, False), line
-        assert told in line
+        assert message in line
     else:
         assert status == 0, line
         assert sum(len(block.values) for block in Recording.open(target).blocks(PROBES)) == len(times_s)
@@ -98,9 +98,9 @@ def test_a_log_with_stamps_out_of_order_is_imported_or_refused_in_one_line(
 def test_stamps_out_of_order_do_not_change_the_digital_path(
     name: str, session: Path, counts: np.ndarray, tmp_path: Path
 ) -> None:
-    times_s, told = STAMPS[name]
+    times_s, message = STAMPS[name]
     path = log(tmp_path, times_s, counts)
-    if told == TOO_LARGE:
+    if message == TOO_LARGE:
         with pytest.raises(InputError, match="not finite numbers up to"):
             judge(path, [session])
         return
@@ -166,19 +166,19 @@ def layout() -> Layout:
 def test_blocks_out_of_order_in_time_are_a_doubt_in_each_command(
     name: str, layout: Layout, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    key, change, told = TICKS[name]
+    key, change, doubt = TICKS[name]
     spoilt, numbers = copy.deepcopy(layout), iter(range(1000))
     for at, (topic, payload, time_ns) in enumerate(spoilt.messages):
         if topic == key:
             block = decode_block(payload, schema_of(topic) or "")
             spoilt.messages[at] = (topic, encode_block(replace(block, **change(block, next(numbers)))), time_ns)
     path = spoilt.write(tmp_path / "x.mcap")
-    doubts = [line for line in Recording.open(path).doubts if told in line]
+    doubts = [line for line in Recording.open(path).doubts if doubt in line]
     assert len(doubts) == 1, Recording.open(path).doubts
     assert key in doubts[0]
     status, shown, _ = run_captured(capsys, "info", path)
     assert status == 1
-    assert told in " ".join(shown.split())
+    assert doubt in " ".join(shown.split())
     status, _, lines = run_captured(capsys, "export", path, "-o", tmp_path / "x.csv")
     assert status == 0
-    assert told in lines
+    assert doubt in lines

@@ -49,12 +49,12 @@ def test_a_closed_client_receives_nothing_more() -> None:
 
 
 def test_requests_reports_and_the_token() -> None:
-    server, heard, seen = MemoryServer(), [], []
+    server, received, seen = MemoryServer(), [], []
     client = MemoryClient(server)
     with pytest.raises(NoReplyError, match="rig/status"):
         client.request("rig/status")
     server.answer("rig/status", lambda payload: payload + b"!")
-    server.hear("rig/clients/*", lambda *report: heard.append(report))
+    server.hear("rig/clients/*", lambda *report: received.append(report))
     client.watch("rig/alive", seen.append)
     assert seen == []
     server.announce()
@@ -62,7 +62,7 @@ def test_requests_reports_and_the_token() -> None:
     assert client.request("rig/status", b"well") == b"well!"
     client.report("rig/clients/me", b"1")
     client.report("rig/others/me", b"2")
-    assert heard == [("rig/clients/me", b"1")]
+    assert received == [("rig/clients/me", b"1")]
     server.close()
     server.close()
     assert seen == [True, True, False, False]

@@ -376,10 +376,10 @@ def test_a_second_cause_is_named_with_the_first(tmp_path: Path) -> None:
     assert found is not None
     assert found.best[0] == "shaft.damping_ratio_x"
     assert re.search(r"of the difference to 0\.02\d s", found.conclusion)
-    told = re.search(r"second cause, contact.friction (\S+) % with shaft.damping_ratio_x (\S+) %", found.conclusion)
-    assert told is not None
-    assert float(told[1]) == pytest.approx(-4.0, abs=0.1)
-    assert float(told[2]) == pytest.approx(87.5, abs=1.0)
+    match = re.search(r"second cause, contact.friction (\S+) % with shaft.damping_ratio_x (\S+) %", found.conclusion)
+    assert match is not None
+    assert float(match[1]) == pytest.approx(-4.0, abs=0.1)
+    assert float(match[2]) == pytest.approx(87.5, abs=1.0)
     assert found.to_s == pytest.approx(0.05, abs=2e-3)
 
 

@@ -83,9 +83,9 @@ def test_a_value_of_another_type_is_shown(words: list[str], field: str, capsys: 
     with pytest.raises(SystemExit) as ended:
         start(words)
     assert ended.value.code == 2
-    said = capsys.readouterr().err
-    assert said.startswith(f"rig: {field}")
-    assert said.endswith("must be a valid number; instead received 'abc'\n")
+    errors = capsys.readouterr().err
+    assert errors.startswith(f"rig: {field}")
+    assert errors.endswith("must be a valid number; instead received 'abc'\n")
 
 
 def test_a_key_readable_by_others_is_refused(tmp_path: Path) -> None:
