@@ -94,7 +94,7 @@ def size_of(kind: str, numbers: dict[str, Any], channel: str) -> float | None:
     return scale * (numbers.get(name, KINDS[kind].model_fields[name].default) - defect.neutral)
 
 
-class Declared(NamedTuple):
+class FaultCase(NamedTuple):
     """A fault on a channel; the table of defects lists the scorecard quantities that it makes fail."""
 
     channel: str
@@ -102,35 +102,35 @@ class Declared(NamedTuple):
 
 
 SCORED = {
-    "gain": Declared("disk_x", {"factor": 1.001}),
-    "offset": Declared("disk_y", {"value": 0.01}),
-    "drift": Declared("ring_x", {"rate": 0.1}),
-    "polarity": Declared("P_N", {}),
-    "resonance": Declared("P_W", {"frequency_hz": 800.0, "quality": 5.0}),
-    "stuck": Declared("P_S", {}),
-    "nonlinear": Declared("P_E", {"end": 4000.0}),
-    "open": Declared("outer_y", {}),
-    "short": Declared("inner_x", {}),
-    "intermittent": Declared("inner_y", {"slot_s": 0.002}),
-    "hum": Declared("outer_x", {"amplitude_v": 0.02}),
-    "crosstalk": Declared("P_W", {"source": "disk_x", "db": -30.0}),
-    "saturation": Declared("disk_x", {"part": 0.2}),
-    "swap": Declared("disk_y", {"other": "ring_x"}),
-    "no-filter": Declared("P_N", {}),
-    "bandwidth": Declared("P_S", {"corner_hz": 500.0}),
-    "late": Declared("P_E", {"late_us": 3.0}),
-    "clock": Declared("P_W", {"ppm": 500.0}),
-    "jitter": Declared("ring_y", {"rms_us": 0.5}),
-    "wander": Declared("inner_y", {"amplitude_us": 1.0, "period_s": 0.1}),
-    "noise": Declared("outer_x", {"factor": 3.0}),
-    "spikes": Declared("outer_y", {"rate_hz": 50.0, "size_v": 0.5}),
-    "bits": Declared("disk_x", {"lost": 13}),
-    "stuck-bit": Declared("disk_y", {"bit": 14}),
-    "clip": Declared("ring_x", {"part": 0.55}),
-    "freeze": Declared("P_N", {}),
-    "miss-pulses": Declared("keyphasor", {"part": 1.0}),
-    "extra-pulses": Declared("keyphasor", {"part": 1.0}),
-    "edge-jitter": Declared("keyphasor", {"rms_us": 300.0}),
+    "gain": FaultCase("disk_x", {"factor": 1.001}),
+    "offset": FaultCase("disk_y", {"value": 0.01}),
+    "drift": FaultCase("ring_x", {"rate": 0.1}),
+    "polarity": FaultCase("P_N", {}),
+    "resonance": FaultCase("P_W", {"frequency_hz": 800.0, "quality": 5.0}),
+    "stuck": FaultCase("P_S", {}),
+    "nonlinear": FaultCase("P_E", {"end": 4000.0}),
+    "open": FaultCase("outer_y", {}),
+    "short": FaultCase("inner_x", {}),
+    "intermittent": FaultCase("inner_y", {"slot_s": 0.002}),
+    "hum": FaultCase("outer_x", {"amplitude_v": 0.02}),
+    "crosstalk": FaultCase("P_W", {"source": "disk_x", "db": -30.0}),
+    "saturation": FaultCase("disk_x", {"part": 0.2}),
+    "swap": FaultCase("disk_y", {"other": "ring_x"}),
+    "no-filter": FaultCase("P_N", {}),
+    "bandwidth": FaultCase("P_S", {"corner_hz": 500.0}),
+    "late": FaultCase("P_E", {"late_us": 3.0}),
+    "clock": FaultCase("P_W", {"ppm": 500.0}),
+    "jitter": FaultCase("ring_y", {"rms_us": 0.5}),
+    "wander": FaultCase("inner_y", {"amplitude_us": 1.0, "period_s": 0.1}),
+    "noise": FaultCase("outer_x", {"factor": 3.0}),
+    "spikes": FaultCase("outer_y", {"rate_hz": 50.0, "size_v": 0.5}),
+    "bits": FaultCase("disk_x", {"lost": 13}),
+    "stuck-bit": FaultCase("disk_y", {"bit": 14}),
+    "clip": FaultCase("ring_x", {"part": 0.55}),
+    "freeze": FaultCase("P_N", {}),
+    "miss-pulses": FaultCase("keyphasor", {"part": 1.0}),
+    "extra-pulses": FaultCase("keyphasor", {"part": 1.0}),
+    "edge-jitter": FaultCase("keyphasor", {"rms_us": 300.0}),
 }
 
 BLIND_SIZES: dict[str, tuple[str, list[dict[str, Any]]]] = {

@@ -281,7 +281,7 @@ def test_a_daq_reads_on_and_gets_the_true_rows(monkeypatch: pytest.MonkeyPatch) 
     daq.close()
 
 
-class Still:
+class CountingPainter:
     """A painter that only counts frames."""
 
     def __init__(self, *_: Any, **__: Any) -> None:
@@ -311,7 +311,7 @@ class Still:
 def test_the_live_view_draws_the_true_rows(monkeypatch: pytest.MonkeyPatch) -> None:
     client = ScriptedClient()
     described = live.Described(Catalogue.read(make_documents()[wire.CATALOGUE]), None, ("penetration", "normal_force"))  # type: ignore[arg-type]
-    still = Still()
+    still = CountingPainter()
     with monkeypatch.context() as patch:
         patch.setattr(live, "Painter", lambda *_, **__: still)
         view = live.LiveView(

@@ -26,7 +26,7 @@ COMMANDS: dict[int, list[tuple[str, dict[str, Any]]]] = {
 
 
 @dataclass(frozen=True)
-class Whole:
+class RunOutput:
     """Everything that a run published, as one piece."""
 
     rows: np.ndarray
@@ -37,7 +37,7 @@ class Whole:
     health: dict[str, Any]
 
 
-def run(*cuts: int, scene: str = "hammer", overrides: dict[str, Any] | None = None) -> Whole:
+def run_with_cuts(*cuts: int, scene: str = "hammer", overrides: dict[str, Any] | None = None) -> RunOutput:
     """Run with advances of these lengths in turn, each shortened to the next command or the end."""
     simulation = Simulation(load_scene(scene, {"drive.speed_hz": 6.2, **(overrides or {})}))
     lengths = cycle(cuts)
@@ -65,7 +65,7 @@ def run(*cuts: int, scene: str = "hammer", overrides: dict[str, Any] | None = No
             assert frame.edges.index == seen.get("edges", 0)
             seen["edges"] = frame.edges.index + len(frame.edges.values)
             edges.append(frame.edges.tick + frame.edges.values[:, 0])
-    return Whole(
+    return RunOutput(
         rows=np.concatenate(rows),
         samples={name: np.concatenate(blocks) for name, blocks in samples.items()},
         truth={name: np.concatenate(blocks) for name, blocks in truth.items()},
@@ -75,7 +75,7 @@ def run(*cuts: int, scene: str = "hammer", overrides: dict[str, Any] | None = No
     )
 
 
-def assert_same(one: Whole, other: Whole) -> None:
+def assert_same(one: RunOutput, other: RunOutput) -> None:
     assert one.rows.tobytes() == other.rows.tobytes()
     for made, again in ((one.samples, other.samples), (one.truth, other.truth)):
         assert made.keys() == again.keys()
@@ -89,12 +89,12 @@ def assert_same(one: Whole, other: Whole) -> None:
 
 
 @pytest.fixture(scope="module")
-def whole() -> Whole:
+def whole() -> RunOutput:
     """The run with the smallest number of cuts that the commands allow."""
-    return run(END)
+    return run_with_cuts(END)
 
 
-def test_the_run_has_rows_to_compare(whole: Whole) -> None:
+def test_the_run_has_rows_to_compare(whole: RunOutput) -> None:
     assert [event["event"] for event in whole.events] == ["hammer", "speed", "hammer", "release"]
     assert [event["tick"] for event in whole.events] == [20_000, 150_000, 205_000, 400_000]
     assert whole.health["contacts"] > 10
@@ -109,14 +109,14 @@ def test_the_run_has_rows_to_compare(whole: Whole) -> None:
 @pytest.mark.parametrize(
     "cuts", [(500,), (1_000,), (10_000,), (250_000,), (10_000, 1_000, 250_000), (500, 37_500, 99_500)]
 )
-def test_cuts_change_no_bit(whole: Whole, cuts: tuple[int, ...]) -> None:
-    assert_same(whole, run(*cuts))
+def test_cuts_change_no_bit(whole: RunOutput, cuts: tuple[int, ...]) -> None:
+    assert_same(whole, run_with_cuts(*cuts))
 
 
 @given(cuts=st.lists(st.integers(1, 400).map(lambda n: 500 * n), min_size=1, max_size=8))
 @settings(max_examples=8, deadline=None)
-def test_no_mix_of_cuts_changes_a_bit(whole: Whole, cuts: list[int]) -> None:
-    assert_same(whole, run(*cuts))
+def test_no_mix_of_cuts_changes_a_bit(whole: RunOutput, cuts: list[int]) -> None:
+    assert_same(whole, run_with_cuts(*cuts))
 
 
 @pytest.mark.parametrize(
@@ -129,17 +129,17 @@ def test_no_mix_of_cuts_changes_a_bit(whole: Whole, cuts: list[int]) -> None:
     ids=["rk4", "slow", "ideal"],
 )
 def test_cuts_change_no_bit_of_other_scenes(overrides: dict[str, Any]) -> None:
-    assert_same(run(END, overrides=overrides), run(15_000, 5_000, overrides=overrides))
+    assert_same(run_with_cuts(END, overrides=overrides), run_with_cuts(15_000, 5_000, overrides=overrides))
 
 
 def test_cuts_change_no_bit_of_a_doubt() -> None:
     # Without friction the shaft keeps bouncing, and errors grow until the estimate exceeds its limit, which is an
     # event.
-    whole = run(END, overrides={"model.friction": "none"})
+    whole = run_with_cuts(END, overrides={"model.friction": "none"})
     # A second event follows when another quantity, the whirl frequency, exceeds its tolerance.
     expected = ["hammer", "speed", "hammer", "warning", "release", "warning"]
     assert [event["event"] for event in whole.events] == expected
-    assert_same(whole, run(15_000, 5_000, overrides={"model.friction": "none"}))
+    assert_same(whole, run_with_cuts(15_000, 5_000, overrides={"model.friction": "none"}))
 
 
 def test_commands_of_one_tick_take_effect_in_order() -> None:
@@ -168,9 +168,9 @@ def test_an_impact_of_the_scene_may_meet_a_running_impact() -> None:
     assert frame.rows[:, COLUMN["hammer_force"]].max() == pytest.approx(50.0, rel=1e-3), "the first one goes on"
 
 
-def test_same_seed_same_bits_and_another_seed_only_another_noise(whole: Whole) -> None:
-    assert_same(whole, run(END))
-    other = run(END, overrides={"seed": 2})
+def test_same_seed_same_bits_and_another_seed_only_another_noise(whole: RunOutput) -> None:
+    assert_same(whole, run_with_cuts(END))
+    other = run_with_cuts(END, overrides={"seed": 2})
     assert other.rows.tobytes() == whole.rows.tobytes()
     assert other.events == whole.events
     for name, counts in whole.samples.items():

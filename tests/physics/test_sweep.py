@@ -205,7 +205,7 @@ def test_a_run_over_its_limit_and_one_that_breaks_are_results(monkeypatch: pytes
     assert (broken.failure, broken.message.partition(":")[0]) == ("crash", "ZeroDivisionError")
 
 
-class _Hangs:
+class _HangingScene:
     """An invalid scene: reading its fields never returns."""
 
     def model_dump(self) -> Any:
@@ -214,7 +214,7 @@ class _Hangs:
             pass
 
 
-class _Dies:
+class _ExitingScene:
     """An invalid scene: reading its fields ends the process."""
 
     def model_dump(self) -> Any:
@@ -222,7 +222,7 @@ class _Dies:
 
 
 def test_a_process_that_hangs_or_ends_gives_a_result() -> None:
-    lost: list[Any] = [_Hangs(), _Dies()]
+    lost: list[Any] = [_HangingScene(), _ExitingScene()]
     with Worker() as worker:
         hung, died = (worker.run(Task(scene, "rk4")) for scene in lost)
         good = worker.run(Task(change_scene(SCENE, {"duration_s": 0.003}), "rk4"))

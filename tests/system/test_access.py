@@ -97,7 +97,7 @@ def open_hostile_session(locator: str, mode: str = "client", folder: Path | None
         yield session
 
 
-class Honest(ZenohClient):
+class NormalClient(ZenohClient):
     """A normal client whose session the test can use directly."""
 
     @property
@@ -142,7 +142,7 @@ def receivable(doors: tuple[Door, ...]) -> set[str]:
     return keys_of(doors, Verb.RECEIVE)
 
 
-class Try:
+class Attempt:
     """All that a subject does, and its effects as the subject observes them."""
 
     def __init__(self, session: zenoh.Session) -> None:
@@ -195,7 +195,7 @@ def test_each_role_has_exactly_the_rights_of_the_table(name: str | None, mode: s
     seen: list[tuple[str, bytes]] = []
     with (
         ZenohServer(plain, exposed=Exposure(exposed, holder_in(folders / "server", server=True))) as server,
-        Honest(plain) as honest,
+        NormalClient(plain) as honest,
         open_hostile_session(f"tcp/{plain}") as beside,
         open_hostile_session(
             f"tcp/{plain}" if name is None else f"tls/{exposed}", mode, name and folders / name
@@ -204,7 +204,7 @@ def test_each_role_has_exactly_the_rights_of_the_table(name: str | None, mode: s
         rig = Rig(server)
         honest.subscribe("rig/**", lambda key, payload: seen.append((key, payload)), lossless=False)
         beside.declare_subscriber("rig/**", lambda sample: seen.append((str(sample.key_expr), bytes(sample.payload))))
-        attempt = Try(session)
+        attempt = Attempt(session)
         # A link keeps its order: after the reply to a request everything before it has been received.
         answers = {key: attempt.answered(key) for key in map(example, KEYS)}
         history = attempt.history()

@@ -194,7 +194,7 @@ def test_a_script_without_close_still_ends() -> None:
             assert child.wait(timeout=30.0) == 0
 
 
-class Printed(StringIO):
+class PrintedOutput(StringIO):
     """Standard output of a command, with an action at its first line."""
 
     def __init__(self, at_first_line: Callable[[], object] = bool) -> None:
@@ -211,7 +211,7 @@ class Printed(StringIO):
 
 def invoke(endpoint: str, *arguments: str, at_first_line: Callable[[], object] = bool) -> str:
     """Run a command and return its output; exceptions pass."""
-    with redirect_stdout(Printed(at_first_line)) as printed:
+    with redirect_stdout(PrintedOutput(at_first_line)) as printed:
         app.rig().main([*arguments, "--connect", endpoint], standalone_mode=False)
     return printed.getvalue()
 

@@ -58,13 +58,13 @@ MUTANTS = [
         "math.floor(duration_s * self._rate_hz + 1e-6)",
     ),
     Mutant(
-        "delay goes on after a break", "a_delay_begins_anew", "= self._run((kind, name), above)",
+        "delay goes on after a break", "a_delay_restarts_after_an_interruption", "= self._run((kind, name), above)",
         "= np.cumsum(above) + 0 * self._run((kind, name), above)",
     ),
-    Mutant("latch lost", "a_danger_stays_and_an_alert_goes", _LATCHED, "on, value"),
-    Mutant("all latched", "a_danger_stays_and_an_alert_goes", _LATCHED.partition(" if ")[2], "True else on, value"),
-    Mutant("reset during the alarm", "no_reset_while_the_cause_lasts", "and not self._causes[alarm]]", "]"),
-    Mutant("reset does nothing", "a_reset_ends_what_is_over", "self._to_reset = True", "self._to_reset = False"),
+    Mutant("latch lost", "only_a_danger_is_latched", _LATCHED, "on, value"),
+    Mutant("all latched", "only_a_danger_is_latched", _LATCHED.partition(" if ")[2], "True else on, value"),
+    Mutant("reset during the alarm", "no_reset_while_the_cause_exists", "and not self._causes[alarm]]", "]"),
+    Mutant("reset does nothing", "a_reset_ends_past_alarms", "self._to_reset = True", "self._to_reset = False"),
     Mutant(
         "OK limits ignored", "a_probe_beyond_its_ok_limits_is_not_ok",
         "(volts >= settings.ok_low_v) & (volts <= settings.ok_high_v)", "volts > -1e9",
@@ -74,14 +74,14 @@ MUTANTS = [
         "(volts >= settings.ok_low_v) & (volts <= settings.ok_high_v)", "volts <= settings.ok_high_v",
     ),
     Mutant(
-        "OK again at once", "ok_comes_back_after_its_time_without_a_break", "each) > recovery for", "each) > 0 for",
+        "OK again at once", "ok_returns_after_an_uninterrupted_time", "each) > recovery for", "each) > 0 for",
     ),
     Mutant(
         "alarm of a probe that is NOT OK", "a_probe_that_is_not_ok_raises_no_alarm",
         "okay & armed &", "armed &",
     ),
     Mutant(
-        "NOT OK stays in the vote", "a_probe_that_is_not_ok_votes_as_is_told", "np.array(dangers), off | bad",
+        "NOT OK stays in the vote", "a_probe_that_is_not_ok_votes_by_the_rule", "np.array(dangers), off | bad",
         "np.array(dangers), off & bad",
     ),
     Mutant("2oo2 as 1oo2", "two_out_of_two_need_both", 'if self.settings.vote == "1oo2":', "if True:"),
@@ -96,11 +96,11 @@ MUTANTS = [
         "probes - 0.0 * np.array(means)[:, 1:]",
     ),
     Mutant(
-        "corner in rad/s", "at_its_corner_the_high_pass_leaves_1_in_root_2", "-2.0 * math.pi * settings.corner_hz",
+        "corner in rad/s", "the_high_pass_has_minus_3_db_at_its_corner", "-2.0 * math.pi * settings.corner_hz",
         "-settings.corner_hz",
     ),
     Mutant(
-        "wrong axis", "an_alarm_is_of_its_own_probe",
+        "wrong axis", "each_probe_has_its_own_alarm",
         "zip(probes, levels, good", "zip(probes, levels[::-1], good",
     ),
     Mutant("a thousandth of a unit", "set_points_are_in_micrometres", '"um", field=', '"mm", field='),
@@ -109,11 +109,11 @@ MUTANTS = [
         "high * (1.0 - settings.hysteresis)", "high",
     ),
     Mutant(
-        "overspeed the wrong way", "turns_that_are_too_fast_trip", "self._speed_hz > settings.overspeed_hz",
+        "overspeed the wrong way", "overspeed_trips", "self._speed_hz > settings.overspeed_hz",
         "0.0 < self._speed_hz < settings.overspeed_hz",
     ),
     Mutant(
-        "overspeed of one turn", "turns_that_are_too_fast_trip", "fast >= settings.overspeed_turns", "fast >= 1",
+        "overspeed of one turn", "overspeed_trips", "fast >= settings.overspeed_turns", "fast >= 1",
     ),
     Mutant(
         "edges counted twice", "a_pulse_is_counted_once",
@@ -121,17 +121,17 @@ MUTANTS = [
     ),
     Mutant("pulse without hysteresis", "a_pulse_is_counted_once", "_PULSE = (0.6, 0.4)", "_PULSE = (0.5, 0.5)"),
     Mutant(
-        "speed lost is not told", "pulses_that_stay_away_are_an_alarm", "(lost & enabled", "(lost & ~enabled",
+        "speed lost is not told", "missing_pulses_are_an_alarm", "(lost & enabled", "(lost & ~enabled",
     ),
     Mutant("bypass ignored", "a_bypassed_channel_raises_no_alarm", " & (name not in self.bypassed)", ""),
     Mutant("multiply ignored", "a_trip_multiply_raises_the_set_points", "self.multiply * set_um", "set_um"),
     Mutant(
-        "first-out lost", "what_came_first_is_known", "self.first_out.append(alarm)",
+        "first-out lost", "the_first_alarm_is_marked", "self.first_out.append(alarm)",
         "self.first_out = sorted([*self.first_out, alarm])",
     ),
-    Mutant("start-up for ever", "no_alarm_while_it_starts", "index >= self._armed", "index >= 10**9"),
-    Mutant("no start-up", "no_alarm_while_it_starts", "first + self._rows(settings.startup_s)", "first"),
-    Mutant("trips again and again", "it_trips_once", "np.logical_or.accumulate(trip) | self.tripped", "trip"),
+    Mutant("start-up for ever", "no_alarm_during_start_up", "index >= self._armed", "index >= 10**9"),
+    Mutant("no start-up", "no_alarm_during_start_up", "first + self._rows(settings.startup_s)", "first"),
+    Mutant("trips again and again", "a_monitor_trips_once", "np.logical_or.accumulate(trip) | self.tripped", "trip"),
     Mutant(
         "trip not sent", "a_trip_is_sent_once_and_first", "        machine.speed(0.0)", "        pass", runner,
     ),
@@ -144,32 +144,32 @@ MUTANTS = [
         'if action.kind != "clear"]\n    machine.speed(0.0) if len(trips) > 1 else None', runner,
     ),
     Mutant(
-        "its own notes reset it", "a_note_of_others_resets_it", ' and "protection" not in event["tags"]', "", runner,
+        "its own notes reset it", "a_note_of_others_resets_alarms", ' and "protection" not in event["tags"]', "", runner,
     ),
     Mutant(
-        "state of each block", "blocks_change_nothing",
+        "state of each block", "the_division_into_blocks_has_no_effect",
         "if not started or not 0 <= missing", "if missing == 0 or not 0 <= missing",
     ),
     Mutant(
-        "delay of each block", "blocks_change_nothing",
+        "delay of each block", "the_division_into_blocks_has_no_effect",
         "-1 - self._runs.get(what, 0)", '-1 - self._runs.get(what, 0) * (what[0] == "ok")',
     ),
     Mutant(
-        "window of each block", "blocks_change_nothing",
+        "window of each block", "the_division_into_blocks_has_no_effect",
         "rows[:, rows.shape[1] - self._window + 1 :]", "0 * self._tail",
     ),
     Mutant(
-        "a row off in all blocks but the first", "blocks_change_nothing",
+        "a row off in all blocks but the first", "the_division_into_blocks_has_no_effect",
         "first = samples.index + len(samples) - signals.shape[1]",
         "first = samples.index + len(samples) - signals.shape[1] + (samples.index > 0)",
     ),
-    Mutant("missing rows left out", "rows_that_are_missing_are_taken_as_the_last", "elif missing:", "elif False:"),
+    Mutant("missing rows left out", "missing_rows_are_replaced_by_the_last", "elif missing:", "elif False:"),
     Mutant(
-        "rows that come twice", "rows_that_come_twice_count_once", "fresh = follow(self._received, samples)",
+        "rows that come twice", "repeated_rows_count_once", "fresh = follow(self._received, samples)",
         "fresh = samples",
     ),
     Mutant(
-        "OK where rows are lost", "where_too_many_rows_are_missing_no_probe_is_ok", "0 if started else self._rows",
+        "OK where rows are lost", "too_many_missing_rows_make_all_probes_not_ok", "0 if started else self._rows",
         "self._rows",
     ),
 ]  # fmt: skip

@@ -83,7 +83,7 @@ def set_points_are_in_micrometres(device: Any) -> None:
 
 
 @scenario
-def an_alarm_is_of_its_own_probe(device: Any) -> None:
+def each_probe_has_its_own_alarm(device: Any) -> None:
     _, actions = run(device, settings(), 0.0, make_swing(200, (100, 1200.0)))
     assert told(actions, "alert", "danger") == [("alert", "disk_y", 100), ("danger", "disk_y", 101)]
 
@@ -101,7 +101,7 @@ def an_orbit_is_measured_from_its_mean(device: Any) -> None:
 
 
 @scenario
-def at_its_corner_the_high_pass_leaves_1_in_root_2(device: Any) -> None:
+def the_high_pass_has_minus_3_db_at_its_corner(device: Any) -> None:
     x = 0.5 * np.sin(2.0 * math.pi * 2.0 * np.arange(6000) / RATE)
     for part, expected in ((0.69, 2), (0.725, 0)):
         given = settings(alert_um=1000.0 * part, danger_um=1e6, window_s=0.5, corner_hz=2.0, startup_s=4.0)
@@ -118,14 +118,14 @@ def an_alarm_comes_after_its_delay(device: Any) -> None:
 
 
 @scenario
-def a_delay_begins_anew(device: Any) -> None:
+def a_delay_restarts_after_an_interruption(device: Any) -> None:
     x = make_swing(300, (100, 1200.0), (130, 0.0), (140, 1200.0))
     _, actions = run(device, settings(danger_delay_s=0.05), x)
     assert told(actions, "danger") == [("danger", "disk_x", 191)]
 
 
 @scenario
-def a_danger_stays_and_an_alert_goes(device: Any) -> None:
+def only_a_danger_is_latched(device: Any) -> None:
     monitor, actions = run(device, settings(), make_swing(400, (100, 1200.0), (200, 0.0)))
     assert told(actions, "clear") == [("clear", "alert disk_x", 201)]
     assert set(monitor.active) == {("danger", "disk_x"), ("trip", "")}
@@ -134,7 +134,7 @@ def a_danger_stays_and_an_alert_goes(device: Any) -> None:
 
 
 @scenario
-def a_reset_ends_what_is_over(device: Any) -> None:
+def a_reset_ends_past_alarms(device: Any) -> None:
     monitor, _ = run(device, settings(), make_swing(300, (100, 1200.0), (200, 0.0)))
     monitor.reset()
     actions = monitor.feed(samples(300, disk_x=make_swing(100, (50, 1200.0)), disk_y=0.0))
@@ -145,7 +145,7 @@ def a_reset_ends_what_is_over(device: Any) -> None:
 
 
 @scenario
-def no_reset_while_the_cause_lasts(device: Any) -> None:
+def no_reset_while_the_cause_exists(device: Any) -> None:
     monitor, actions = run(device, settings(), make_swing(200, (100, 1200.0)))
     assert monitor.tripped
     before = dict(monitor.active)
@@ -176,7 +176,7 @@ def a_probe_beyond_its_ok_limits_is_not_ok(device: Any) -> None:
 
 
 @scenario
-def ok_comes_back_after_its_time_without_a_break(device: Any) -> None:
+def ok_returns_after_an_uninterrupted_time(device: Any) -> None:
     x = np.zeros(1500)
     x[100:200] = x[400] = 2.5
     _, actions = run(device, settings(danger_um=1e6, alert_um=1e6), x)
@@ -216,7 +216,7 @@ VOTES = {
 
 
 @scenario
-def a_probe_that_is_not_ok_votes_as_is_told(device: Any) -> None:
+def a_probe_that_is_not_ok_votes_by_the_rule(device: Any) -> None:
     danger, broken, still = make_swing(300, (100, 1200.0)), 2.5 * (np.arange(300) >= 50), np.zeros(300)
     for (vote, rule), expected in VOTES.items():
         given = {"vote": vote, "not_ok": rule}
@@ -252,7 +252,7 @@ def a_trip_multiply_raises_the_set_points(device: Any) -> None:
 
 
 @scenario
-def turns_that_are_too_fast_trip(device: Any) -> None:
+def overspeed_trips(device: Any) -> None:
     given = settings(overspeed_hz=9.0, overspeed_turns=3)
     # Turns of 125 ms, then, from row 425, of 100 ms: the third ends at row 725.
     key = pulses(1500, 50, 175, 300, 425, 525, 625, 725, 825)
@@ -277,7 +277,7 @@ def a_pulse_is_counted_once(device: Any) -> None:
 
 
 @scenario
-def pulses_that_stay_away_are_an_alarm(device: Any) -> None:
+def missing_pulses_are_an_alarm(device: Any) -> None:
     monitor, actions = run(device, settings(speed_lost_s=0.2), 0.0, keyphasor=pulses(900, 50, 150, 250, 700))
     assert told(actions) == [
         ("speed-lost", "keyphasor", 450), ("clear", "speed-lost keyphasor", 700), ("speed-lost", "keyphasor", 900)
@@ -286,7 +286,7 @@ def pulses_that_stay_away_are_an_alarm(device: Any) -> None:
 
 
 @scenario
-def what_came_first_is_known(device: Any) -> None:
+def the_first_alarm_is_marked(device: Any) -> None:
     monitor, actions = run(
         device, settings(), make_swing(300, (110, 1200.0)), make_swing(300, (100, 1200.0), (250, 0.0))
     )
@@ -299,7 +299,7 @@ def what_came_first_is_known(device: Any) -> None:
 
 
 @scenario
-def no_alarm_while_it_starts(device: Any) -> None:
+def no_alarm_during_start_up(device: Any) -> None:
     given = settings(startup_s=0.3, danger_delay_s=0.05, speed_lost_s=0.1)
     _, actions = run(device, given, make_swing(600, (0, 1200.0)), keyphasor=0.0)
     assert told(actions) == [
@@ -311,7 +311,7 @@ def no_alarm_while_it_starts(device: Any) -> None:
 
 
 @scenario
-def it_trips_once(device: Any) -> None:
+def a_monitor_trips_once(device: Any) -> None:
     x = make_swing(500, (100, 1200.0), (200, 0.0), (300, 1200.0))
     _, actions = run(device, settings(latch_danger=False), x)
     assert told(actions, "danger", "trip") == [
@@ -319,7 +319,7 @@ def it_trips_once(device: Any) -> None:
     ]  # fmt: skip
 
 
-class Machine:
+class FakeMachine:
     """A rig that stores requests."""
 
     def __init__(self) -> None:
@@ -339,7 +339,7 @@ class Machine:
 def a_trip_is_sent_once_and_first(device: Any) -> None:
     notes = [("note", ["protection", kind]) for kind in ("alert", "danger", "trip")]
     for trip, expected in (("speed 0", [("speed", 0.0), *notes]), ("stop", [*notes, ("stop", None)])):
-        given, machine, lines = settings(trip=trip), Machine(), []
+        given, machine, lines = settings(trip=trip), FakeMachine(), []
         monitor = device.Protection(given)
         for first in (0, 200, 400):
             x = make_swing(200, (100 if first == 0 else 0, 1200.0))
@@ -348,7 +348,7 @@ def a_trip_is_sent_once_and_first(device: Any) -> None:
         assert lines[1] == "0.101000 s  danger  disk_x  1200"
 
 
-class Watched(Machine):
+class EventRig(FakeMachine):
     """A rig with blocks, and events between them."""
 
     def __init__(self, *blocks: tuple[list[dict[str, Any]], Samples]) -> None:
@@ -367,11 +367,11 @@ class Watched(Machine):
 
 
 @scenario
-def a_note_of_others_resets_it(device: Any) -> None:
+def a_note_of_others_resets_alarms(device: Any) -> None:
     blow, still = make_swing(200, (100, 1200.0), (150, 0.0)), np.zeros(200)
     command = {"event": "speed", "speed_hz": 1.0}
     for tags, expected in ((["reset"], ["reset", "reset"]), (["protection", "reset"], []), (["again"], [])):
-        machine = Watched(
+        machine = EventRig(
             ([], samples(disk_x=blow, disk_y=0.0)),
             ([command, {"event": "note", "tags": tags}], samples(200, disk_x=still, disk_y=0.0)),
             ([], samples(400, disk_x=still, disk_y=0.0)),
@@ -397,7 +397,7 @@ def make_eventful_rows(rows: int = 6000) -> tuple[Settings, Samples]:
 
 
 @scenario
-def blocks_change_nothing(device: Any) -> None:
+def the_division_into_blocks_has_no_effect(device: Any) -> None:
     given, rows = make_eventful_rows()
     whole = device.Protection(given).feed(rows)
     assert {each.kind for each in whole} == {"alert", "danger", "trip", "clear", "not-ok", "overspeed", "speed-lost"}
@@ -411,7 +411,7 @@ def blocks_change_nothing(device: Any) -> None:
 
 
 @scenario
-def rows_that_are_missing_are_taken_as_the_last(device: Any) -> None:
+def missing_rows_are_replaced_by_the_last(device: Any) -> None:
     given, x = settings(window_s=0.1, danger_delay_s=0.05), np.zeros(400)
     x[100:300] = 1.2
     parts = [samples(0, disk_x=x[:120], disk_y=0.0), samples(180, disk_x=x[180:], disk_y=0.0)]
@@ -423,7 +423,7 @@ def rows_that_are_missing_are_taken_as_the_last(device: Any) -> None:
 
 
 @scenario
-def rows_that_come_twice_count_once(device: Any) -> None:
+def repeated_rows_count_once(device: Any) -> None:
     given, rows = make_eventful_rows()
     whole, monitor = device.Protection(given).feed(rows), device.Protection(given)
     parts = [rows.rows(begin, begin + 100) for begin in range(0, 6000, 100)]
@@ -433,7 +433,7 @@ def rows_that_come_twice_count_once(device: Any) -> None:
 
 
 @scenario
-def where_too_many_rows_are_missing_no_probe_is_ok(device: Any) -> None:
+def too_many_missing_rows_make_all_probes_not_ok(device: Any) -> None:
     for first in (900, 0):
         monitor, _ = run(device, settings(window_s=0.1), np.zeros(400))
         actions = monitor.feed(samples(first, disk_x=make_swing(700, (100, 1200.0), (300, 0.0)), disk_y=0.0))

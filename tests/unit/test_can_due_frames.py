@@ -26,7 +26,7 @@ pytestmark = pytest.mark.wallclock
 MS = 1_000_000
 
 
-class Counting(HubBus):
+class CountingNode(HubBus):
     """A node that counts the messages of its hub that carry frames."""
 
     heard = 0
@@ -81,7 +81,7 @@ def test_an_immediate_frame_does_not_wait_for_future_ones() -> None:
 def test_a_hub_hands_out_frames_of_a_lone_endpoint_in_few_messages_and_those_with_a_listener_soon() -> None:
     with ExitStack() as stack:
         hub = stack.enter_context(Hub(BusModel("1M"), "can0"))
-        sender = stack.enter_context(Counting(hub))
+        sender = stack.enter_context(CountingNode(hub))
         delays = np.arange(300) * MS
         sender.schedule_records(make(range(300)), time.monotonic_ns() + delays, 1.0)
         until(lambda: sender.done == 300)
@@ -120,7 +120,7 @@ def test_a_window_of_frames_that_are_not_due_is_full() -> None:
         sender.flush_tx_buffer()
 
 
-class Holding(can.BusABC):
+class HoldingBus(can.BusABC):
     """A bus that holds frames until they are due, and stores them."""
 
     def __init__(self) -> None:
@@ -156,7 +156,7 @@ def make_outbox(bus: can.BusABC, room: int) -> tuple[Outbox, list[float]]:
 
 
 def test_frames_of_a_block_go_to_the_bus_at_once_in_the_order_of_their_slots() -> None:
-    bus = Holding()
+    bus = HoldingBus()
     outbox, clock = make_outbox(bus, 1000)
     data = np.zeros((10, SYNC.length), np.uint8)
     outbox.put(SYNC, data, np.arange(1, 11) * 1e-3)
@@ -174,7 +174,7 @@ def test_frames_of_a_block_go_to_the_bus_at_once_in_the_order_of_their_slots() -
 
 
 def test_long_blocks_are_sent_in_parts_and_never_late() -> None:
-    bus = Holding()
+    bus = HoldingBus()
     outbox, clock = make_outbox(bus, 1000)
     outbox.put(SYNC, np.zeros((100, SYNC.length), np.uint8), np.arange(1, 101) * 1e-3)
     steps, late = 0, []
@@ -191,7 +191,7 @@ def test_long_blocks_are_sent_in_parts_and_never_late() -> None:
 
 @pytest.mark.parametrize("many", [20, 60])
 def test_a_bus_that_gets_many_frames_a_slot_holds_few_of_them(many: int) -> None:
-    bus = Holding()
+    bus = HoldingBus()
     outbox, clock = make_outbox(bus, 100_000)
     times_s = np.repeat(np.arange(1, 11) * 1e-3, many)
     outbox.put(SYNC, np.zeros((len(times_s), SYNC.length), np.uint8), times_s)
@@ -204,7 +204,7 @@ def test_a_bus_that_gets_many_frames_a_slot_holds_few_of_them(many: int) -> None
 
 
 def test_a_full_bus_drops_only_the_oldest_frames_in_excess() -> None:
-    bus = Holding()
+    bus = HoldingBus()
     bus.full = True
     outbox, clock = make_outbox(bus, 4)
     outbox.put(SYNC, np.arange(10, dtype=np.uint8)[:, None].repeat(SYNC.length, 1), np.arange(1, 11) * 1e-3)

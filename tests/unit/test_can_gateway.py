@@ -48,7 +48,7 @@ BLOCK = 10_000
 _channels = itertools.count()
 
 
-class Fake(FakeSimulation):
+class FakeChannels(FakeSimulation):
     """The simulation that counts, with the rig's channel table or a part of it."""
 
     groups = tuple(GROUPS)
@@ -172,7 +172,7 @@ def samples_of(tap: Tap, name: str) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("paced", [False, True])
 def test_every_sample_is_sent_in_both_layouts(paced: bool) -> None:
-    with rig(Fake(duration_s=0.4), paced=paced) as setup:
+    with rig(FakeChannels(duration_s=0.4), paced=paced) as setup:
         setup.start()
         setup.join()
         last = {"Probes": 800, "Drive": 400, "Hammer": 200, "Samples_1": 400, "Samples_5": 400}
@@ -201,7 +201,7 @@ def test_every_sample_is_sent_in_both_layouts(paced: bool) -> None:
 
 
 def test_slow_messages_contain_the_status_and_the_decimation() -> None:
-    with rig(Fake(duration_s=None), paced=True) as setup:
+    with rig(FakeChannels(duration_s=None), paced=True) as setup:
         setup.start()
         until(lambda: len(setup.tap.of("Status")) >= 3)
         # A run that is delayed while it begins is preparing for more than one heartbeat.
@@ -219,7 +219,7 @@ def test_slow_messages_contain_the_status_and_the_decimation() -> None:
 
 
 def test_edges_keep_the_fraction_of_their_microsecond() -> None:
-    with rig(Fake(duration_s=None), paced=True) as setup:
+    with rig(FakeChannels(duration_s=None), paced=True) as setup:
         block = wire.Block(1000, 7, 1e6, 1e6, np.array([[12.25], [2_000_000.5]]))
         setup.gateway.unpack(wire.EDGES, wire.encode_block(block))
         setup.gateway.outbox.send_due()
@@ -230,7 +230,7 @@ def test_edges_keep_the_fraction_of_their_microsecond() -> None:
 
 
 def test_absent_channels_are_marked() -> None:
-    class Part(Fake):
+    class Part(FakeChannels):
         groups = ("forces", "hammer")
 
     with rig(Part(duration_s=0.05)) as setup:
@@ -245,7 +245,7 @@ def test_absent_channels_are_marked() -> None:
 
 
 def test_a_gap_of_the_stream_loses_whole_frames_and_is_counted() -> None:
-    with rig(Fake(duration_s=None), schedule=Schedule(None, 10_000)) as setup:
+    with rig(FakeChannels(duration_s=None), schedule=Schedule(None, 10_000)) as setup:
         for index in (0, 200, 430):
             values = np.repeat(np.arange(index, index + 200, dtype=np.int32)[:, None], 4, axis=1)
             block = wire.Block(50 * index, index, 20_000.0, 1e6, values)
@@ -258,7 +258,7 @@ def test_a_gap_of_the_stream_loses_whole_frames_and_is_counted() -> None:
     assert np.array_equal(values[::5, 0], numbers)
 
 
-class Stubborn(can.BusABC):
+class RefusingBus(can.BusABC):
     """A bus that refuses frames, or is slow."""
 
     def __init__(self, *, seconds: float = 0.0, refuse: bool = False) -> None:
@@ -278,8 +278,8 @@ class Stubborn(can.BusABC):
 
 
 def test_a_stalled_bus_loses_the_oldest_blocks_and_does_not_slow_the_rig() -> None:
-    bus = Stubborn(seconds=0.05)
-    with rig(Fake(duration_s=1.0), paced=True, bus=bus, queue_seconds=0.1) as setup:
+    bus = RefusingBus(seconds=0.05)
+    with rig(FakeChannels(duration_s=1.0), paced=True, bus=bus, queue_seconds=0.1) as setup:
         setup.start()
         setup.join()
         assert setup.summary["reason"] == "completed"
@@ -293,7 +293,7 @@ def test_a_stalled_bus_loses_the_oldest_blocks_and_does_not_slow_the_rig() -> No
 
 def test_blocks_that_find_no_room_never_take_the_place_of_an_event(monkeypatch: pytest.MonkeyPatch) -> None:
     documents, probes = [wire.EVENTS, wire.STATUS, wire.FAULTS, wire.BLOCK], wire.sensor_key("probes")
-    with rig(Fake(duration_s=None), paced=True, bus=Stubborn()) as setup:
+    with rig(FakeChannels(duration_s=None), paced=True, bus=RefusingBus()) as setup:
         unpacked: list[str] = []
         begun, may_go_on = threading.Event(), threading.Event()
 
@@ -313,7 +313,7 @@ def test_blocks_that_find_no_room_never_take_the_place_of_an_event(monkeypatch: 
 
 
 def test_frames_refused_by_the_bus_are_counted() -> None:
-    with rig(Fake(duration_s=0.6), paced=True, bus=Stubborn(refuse=True)) as setup:
+    with rig(FakeChannels(duration_s=0.6), paced=True, bus=RefusingBus(refuse=True)) as setup:
         setup.start()
         setup.join()
     assert setup.gateway.outbox.sent == 0
@@ -324,7 +324,7 @@ def test_frames_refused_by_the_bus_are_counted() -> None:
 @pytest.mark.parametrize("refuse", [False, True])
 def test_future_frames_do_not_keep_a_closed_gateway_busy(refuse: bool) -> None:
     before = set(threading.enumerate())
-    with rig(Fake(duration_s=None), paced=True, bus=Stubborn(refuse=refuse)) as setup:
+    with rig(FakeChannels(duration_s=None), paced=True, bus=RefusingBus(refuse=refuse)) as setup:
         for index in (0, 10**9):
             # The number of its first row says when it is due, in 14 hours.
             block = wire.Block(50 * (index % 1000), index, 20_000.0, 1e6, np.zeros((200, 4), np.int32))
@@ -336,8 +336,8 @@ def test_future_frames_do_not_keep_a_closed_gateway_busy(refuse: bool) -> None:
 
 
 def test_frames_without_room_are_sent_later_in_order() -> None:
-    bus = Stubborn(refuse=True)
-    with rig(Fake(duration_s=0.5), paced=True, bus=bus, schedule=Schedule(None, 10_000)) as setup:
+    bus = RefusingBus(refuse=True)
+    with rig(FakeChannels(duration_s=0.5), paced=True, bus=bus, schedule=Schedule(None, 10_000)) as setup:
         setup.start()
         until(lambda: setup.gateway.outbox.waiting > 1000)
         bus.refuse = False
@@ -351,9 +351,9 @@ def test_frames_without_room_are_sent_later_in_order() -> None:
 
 
 def test_drops_are_a_warning_in_the_status_and_one_event_each_time_while_they_happen() -> None:
-    bus = Stubborn()
+    bus = RefusingBus()
     now = 0.0
-    with rig(Fake(duration_s=None), paced=True, bus=bus) as setup:
+    with rig(FakeChannels(duration_s=None), paced=True, bus=bus) as setup:
         setup.gateway.dropping = Rising("CAN: {} frames were dropped", clock=lambda: now)
         replies = []
         setup.client.subscribe(wire.EVENTS, lambda _, payload: replies.append(wire.decode_document(payload)))
@@ -382,8 +382,8 @@ def test_drops_are_a_warning_in_the_status_and_one_event_each_time_while_they_ha
 
 
 def test_a_run_without_the_clock_waits_for_the_bus() -> None:
-    bus = Stubborn(seconds=2e-5)
-    with rig(Fake(duration_s=1.0), bus=bus) as setup:
+    bus = RefusingBus(seconds=2e-5)
+    with rig(FakeChannels(duration_s=1.0), bus=bus) as setup:
         setup.start()
         setup.join()
         expected = 7500 + 5000 + 10
@@ -393,7 +393,7 @@ def test_a_run_without_the_clock_waits_for_the_bus() -> None:
 
 
 def test_a_hammer_pulse_is_acknowledged_with_its_time() -> None:
-    with rig(Fake(duration_s=None), paced=True) as setup:
+    with rig(FakeChannels(duration_s=None), paced=True) as setup:
         setup.start()
         until(lambda: bool(setup.tap.of("Probes")))
         reply = setup.tap.ask(*command_frame(CommandKind.HAMMER, 1, force_n=100.0, duration_ms=5.0))
@@ -407,7 +407,7 @@ def test_a_hammer_pulse_is_acknowledged_with_its_time() -> None:
 
 
 def test_an_acknowledge_does_not_wait_for_the_end_of_a_block() -> None:
-    with rig(Fake(duration_s=None), paced=True, block_ticks=500_000) as setup:
+    with rig(FakeChannels(duration_s=None), paced=True, block_ticks=500_000) as setup:
         setup.start()
         until(lambda: bool(setup.tap.of("Probes")))
         commands = [command_frame(CommandKind.SPEED, counter, speed_hz=6.2) for counter in range(1, 11)]
@@ -417,7 +417,7 @@ def test_an_acknowledge_does_not_wait_for_the_end_of_a_block() -> None:
 
 
 def test_refusals_name_their_reason_and_are_counted() -> None:
-    with rig(Fake(duration_s=None), paced=True) as setup:
+    with rig(FakeChannels(duration_s=None), paced=True) as setup:
         setup.start()
         until(lambda: bool(setup.tap.of("Probes")))
         identifier, good = command_frame(CommandKind.HAMMER, 1, force_n=100.0, duration_ms=5.0)
@@ -450,7 +450,7 @@ def test_refusals_name_their_reason_and_are_counted() -> None:
     ],
 )
 def test_a_refusal_names_the_exceeded_limit(kind: CommandKind, values: Any, field: Field, limit: float) -> None:
-    class Checked(Fake):
+    class Checked(FakeChannels):
         """Refuses as the rig's own simulation does."""
 
         def parameters_document(self) -> dict[str, Any]:
@@ -479,7 +479,7 @@ def test_limits_of_commands_are_those_of_the_rig() -> None:
 
 
 def test_other_frames_on_the_identifier_of_commands_are_ignored() -> None:
-    with rig(Fake(duration_s=None), paced=True) as setup:
+    with rig(FakeChannels(duration_s=None), paced=True) as setup:
         setup.start()
         identifier, data = command_frame(CommandKind.STOP, 1)
         setup.tap.bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=True))
@@ -491,7 +491,7 @@ def test_other_frames_on_the_identifier_of_commands_are_ignored() -> None:
 
 
 def test_a_stop_ends_the_run() -> None:
-    with rig(Fake(duration_s=None), paced=True) as setup:
+    with rig(FakeChannels(duration_s=None), paced=True) as setup:
         setup.start()
         until(lambda: bool(setup.tap.of("Probes")))
         assert setup.tap.ask(*command_frame(CommandKind.STOP, 1))["result"] == Result.ACCEPTED
@@ -500,7 +500,7 @@ def test_a_stop_ends_the_run() -> None:
         until(lambda: setup.gateway.state == RigState.ENDED)
 
 
-class Silent(MemoryClient):
+class SilentRig(MemoryClient):
     """A rig that replies to commands only on request."""
 
     def __init__(self, server: MemoryServer) -> None:
@@ -517,9 +517,9 @@ def test_commands_without_a_reply_time_out_and_too_many_are_refused() -> None:
     channel = f"gateway-{next(_channels)}"
     tap, own = Tap(channel), can.Bus(channel, interface="virtual", ignore_config=True)
     server = MemoryServer(cache=0)
-    service = Service(Fake(duration_s=None), server, FreeRun(), block_ticks=BLOCK)
+    service = Service(FakeChannels(duration_s=None), server, FreeRun(), block_ticks=BLOCK)
     service.prepare()
-    client = Silent(server)
+    client = SilentRig(server)
     try:
         with Gateway(client, own, Schedule(), command_timeout_s=0.3) as gateway:
             for counter in range(1, 18):
@@ -538,7 +538,7 @@ def test_commands_without_a_reply_time_out_and_too_many_are_refused() -> None:
 def test_gateway_threads_survive_errors_and_send_a_command_once(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    with rig(Fake(duration_s=None), paced=True) as setup:
+    with rig(FakeChannels(duration_s=None), paced=True) as setup:
         setup.start()
         until(lambda: bool(setup.tap.of("Probes")))
         good, asked = setup.client.request, []
@@ -564,7 +564,7 @@ def test_gateway_threads_survive_errors_and_send_a_command_once(
 
 
 def test_100_000_random_frames_are_no_command_and_few_are_answered() -> None:
-    with rig(Fake(duration_s=None), paced=True) as setup:
+    with rig(FakeChannels(duration_s=None), paced=True) as setup:
         random = np.random.default_rng(1)
         data = random.integers(0, 256, (100_000, 8), dtype=np.uint8).tobytes()
         start = time.monotonic()
@@ -590,7 +590,7 @@ def test_a_rig_that_does_not_fit_the_messages_is_refused(change: Any, message: s
     document = {"tick_rate_hz": 1_000_000, "table": change(default_table()).model_dump(mode="json")}
     server.answer(wire.CATALOGUE, lambda _: wire.encode_document(document))
     with pytest.raises(InputError) as caught:
-        Gateway(MemoryClient(server), Stubborn(), Schedule(None, 10_000))
+        Gateway(MemoryClient(server), RefusingBus(), Schedule(None, 10_000))
     assert str(caught.value).startswith(message)
 
 
@@ -607,7 +607,7 @@ def test_an_invalid_catalogue_is_refused_in_one_line(payload: bytes, field: str)
     server = MemoryServer()
     server.answer(wire.CATALOGUE, lambda _: payload)
     with pytest.raises(InputError) as caught:
-        Gateway(MemoryClient(server), Stubborn(), Schedule(None, 10_000))
+        Gateway(MemoryClient(server), RefusingBus(), Schedule(None, 10_000))
     assert caught.value.field == field
 
 
@@ -661,7 +661,7 @@ def test_a_serial_converter_works_as_well() -> None:
     firmware = Firmware()
     try:
         own = can.Bus(firmware.path, interface="slcan", ignore_config=True, sleep_after_open=0.0)
-        with rig(Fake(duration_s=None), schedule=Schedule(), paced=True, bus=own) as setup:
+        with rig(FakeChannels(duration_s=None), schedule=Schedule(), paced=True, bus=own) as setup:
             setup.start()
             until(lambda: len(firmware.of("Samples_5")) >= 100)
             firmware.send(*command_frame(CommandKind.HAMMER, 1, force_n=100.0, duration_ms=5.0))

@@ -725,7 +725,7 @@ def test_a_failed_bus_ends_the_connection_and_can_be_reopened() -> None:
         assert [terminal.ask("C"), terminal.ask("O")] == [b"\r", b"\r"]
 
 
-class Echo(Outlet):
+class EchoBus(Outlet):
     """A port that returns its input, without a bus."""
 
     def _take(self, data: bytes) -> None:
@@ -737,7 +737,7 @@ def test_messages_are_bounded_and_never_split_by_short_reads() -> None:
     with ours, theirs:
         ours.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)
         ours.setblocking(False)
-        outlet = Echo(ours.fileno(), name="echo", room=50)
+        outlet = EchoBus(ours.fileno(), name="echo", room=50)
         messages = [b"<%d %s>" % (number, b"x" * (number % 700)) for number in range(400)]
         thread = threading.Thread(target=outlet.serve)
         thread.start()
@@ -765,7 +765,7 @@ def test_each_write_contains_complete_messages() -> None:
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     with ours, theirs:
         ours.setblocking(False)
-        outlet = Echo(ours.fileno(), name="echo")
+        outlet = EchoBus(ours.fileno(), name="echo")
         messages = [b"< frame %03X 1.000000 %s >" % (number, b"AB" * (number % 9)) for number in range(1000)]
         for each in messages:
             assert outlet.put(each)

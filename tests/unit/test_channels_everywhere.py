@@ -63,7 +63,7 @@ def test_an_export_has_the_channels_and_their_instants(recording: Recording, cap
     np.testing.assert_allclose(table[:, 1], recording.samples("probes")["end_u"], rtol=1e-6)
 
 
-class Played:
+class PublishingRig:
     """A rig in this process, whose blocks are published as they are produced."""
 
     def __init__(self, server: MemoryServer) -> None:
@@ -88,7 +88,7 @@ class Played:
 
 def test_a_daq_reads_every_channel_of_the_table() -> None:
     with MemoryServer(cache=10) as server, MemoryClient(server) as client:
-        played = Played(server)
+        played = PublishingRig(server)
         with Daq(RigSource(client), channels=["end_v", "P_N", "pivot_h"]) as daq:
             played.publish(10)
             got = daq.read(4_000)
@@ -103,7 +103,7 @@ def test_a_bus_carries_the_table_and_a_client_with_another_is_refused() -> None:
 
     channel = f"channels{next(_names)}"
     with MemoryServer(cache=10) as server, MemoryClient(server) as client:
-        played = Played(server)
+        played = PublishingRig(server)
         schedule = Schedule(classic_hz=None, fd_hz=6_400, table=messages_for(played.simulation.table))
         bus = can.Bus(channel, "virtual", protocol=can.CanProtocol.CAN_FD)
         gateway = Gateway(client, bus, schedule, paced=False)

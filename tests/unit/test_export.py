@@ -166,11 +166,11 @@ def test_folders_are_not_made_and_not_replaced(tmp_path: Path) -> None:
         check_run_output(tmp_path / "run.csv", force=True)
 
 
-class Stop(Exception):
+class WriteError(Exception):
     """An error during writing."""
 
 
-@pytest.mark.parametrize("error", [Stop, KeyboardInterrupt])
+@pytest.mark.parametrize("error", [WriteError, KeyboardInterrupt])
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_interrupted_writer_leaves_nothing(suffix: str, error: type[BaseException], tmp_path: Path) -> None:
     path = tmp_path / f"run{suffix}"
@@ -191,9 +191,9 @@ def test_interrupted_writer_keeps_the_existing_file(suffix: str, tmp_path: Path)
     path = tmp_path / f"run{suffix}"
     path.write_text("precious")
     simulation = Simulation(load_scene("drop"))
-    with pytest.raises(Stop), writer_for(path, simulation, force=True) as writer:  # noqa: PT012
+    with pytest.raises(WriteError), writer_for(path, simulation, force=True) as writer:  # noqa: PT012
         writer.write(simulation.advance(50_000))
-        raise Stop
+        raise WriteError
     assert path.read_text() == "precious"
     assert list(tmp_path.iterdir()) == [path]
 

@@ -116,8 +116,8 @@ def test_a_device_that_hangs_is_removed_and_the_rig_continues() -> None:
     assert (lost["tick"], lost["reason"]) == (BLOCK, reason)
 
 
-@pytest.mark.parametrize("done_tick", [BLOCK - 1, 2 * BLOCK, 2**62])
-def test_a_device_that_reports_a_future_block_is_removed(done_tick: int) -> None:
+@pytest.mark.parametrize("end_tick", [BLOCK - 1, 2 * BLOCK, 2**62])
+def test_a_device_that_reports_a_future_block_is_removed(end_tick: int) -> None:
     with running() as rig:
         device = Device(rig, "a")
         device.join()
@@ -125,11 +125,11 @@ def test_a_device_that_reports_a_future_block_is_removed(done_tick: int) -> None
         device.wait(1)
         with pytest.raises(
             RefusedError,
-            match=rf"done must be with tick {BLOCK}, the end of the last block \(1\); instead received tick {done_tick}",
+            match=rf"done must be with tick {BLOCK}, the end of the last block \(1\); instead received tick {end_tick}",
         ):
-            device.done(done_tick)
+            device.done(end_tick)
         (reply,) = steps.join()
-        reason = f"it was done with tick {done_tick}; the block that it was given ends at tick {BLOCK}"
+        reason = f"it was done with tick {end_tick}; the block that it was given ends at tick {BLOCK}"
         assert reply.lost == {"a": reason}
         assert rig.console.step(BLOCK).lost == {}
 

@@ -22,7 +22,7 @@ from tests.unit.service_fake import FakeSimulation
 pytestmark = pytest.mark.wallclock
 
 
-class Simulation(FakeSimulation):
+class NotesSimulation(FakeSimulation):
     """The fake simulation with a catalogue that a recorder can use."""
 
     def catalogue(self) -> dict:
@@ -31,7 +31,7 @@ class Simulation(FakeSimulation):
 
 def test_a_note_is_recorded_with_its_time_and_is_no_command(tmp_path: Path) -> None:
     server = MemoryServer()
-    service = Service(Simulation(duration_s=1.0), server, Lockstep(timeout_s=20.0), block_ticks=10_000)
+    service = Service(NotesSimulation(duration_s=1.0), server, Lockstep(timeout_s=20.0), block_ticks=10_000)
     service.prepare()
     run = threading.Thread(target=service.run)
     session = RecordingSession(MemoryClient(server), tmp_path / "run.mcap", history=True)

@@ -59,7 +59,7 @@ def track(path: Path) -> Track:
     return Track([path])
 
 
-class Heard:
+class Received:
     """Everything that was published, with its time."""
 
     def __init__(self, server: MemoryServer, time: FakeTime | None = None) -> None:
@@ -88,11 +88,11 @@ class Heard:
         return [wire.decode_block(payload, schema) for payload in self.payloads.get(key, [])]
 
 
-def play(track: Track, **options: Any) -> tuple[Heard, dict[str, Any]]:
+def play(track: Track, **options: Any) -> tuple[Received, dict[str, Any]]:
     """Play to the end with a simulated clock; return the published messages and the summary."""
     time = FakeTime(oversleep_ns=700_000)
     server = MemoryServer()
-    played = Heard(server, time)
+    played = Received(server, time)
     clock = RealTime(now_ns=time.now_ns, sleep=time.sleep)
     played.begin_ns = time.ns  # type: ignore[attr-defined]
     summary = Player(track, server, clock, **options).run()
@@ -402,9 +402,9 @@ def test_swapped_keys_are_no_clash(track: Track) -> None:
 
 
 @contextmanager
-def running(track: Track, **options: Any) -> Iterator[tuple[Player, Heard, Console]]:
+def running(track: Track, **options: Any) -> Iterator[tuple[Player, Received, Console]]:
     server = MemoryServer()
-    played = Heard(server)
+    played = Received(server)
     clock = options.pop("clock", None) or RealTime()
     player = Player(track, server, clock, **options)
     player.prepare()
@@ -544,7 +544,7 @@ def test_waiting_is_ended_by_commands(track: Track, ends: str) -> None:
 
 def test_the_wait_for_clients_is_limited(track: Track) -> None:
     server = MemoryServer()
-    played = Heard(server)
+    played = Received(server)
     with pytest.raises(RefusedError, match=r"0 of 1 clients were present after 0\.05 s"):
         Player(track, server, FreeRun(), wait_for=1, wait_s=0.05).run()
     assert [event["reason"] for event in played.events] == ["failed: 0 of 1 clients were present after 0.05 s"]
@@ -598,7 +598,7 @@ def test_a_file_that_is_damaged_while_it_is_played_ends_the_stream_and_says_so(f
     data = bytearray(path.read_bytes())
     damaged.write_bytes(data)
     server = MemoryServer()
-    played = Heard(server)
+    played = Received(server)
     player = Player(Track([damaged]), server, FreeRun())
     chunk = Track([path]).chunks[10]
     data[chunk.offset + chunk.length // 2] ^= 0xFF
