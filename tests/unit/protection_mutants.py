@@ -144,7 +144,7 @@ MUTANTS = [
         'if action.kind != "clear"]\n    machine.speed(0.0) if len(trips) > 1 else None', runner,
     ),
     Mutant(
-        "its own notes reset it", "a_note_of_others_resets_alarms", ' and "protection" not in event["tags"]', "", runner,
+        "own notes reset it", "a_note_of_others_resets_alarms", ' and "protection" not in event["tags"]', "", runner,
     ),
     Mutant(
         "state of each block", "the_division_into_blocks_has_no_effect",
