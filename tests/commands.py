@@ -31,11 +31,11 @@ def check_legible(table: Table, *, width: int = TERMINAL) -> None:
     assert max(map(cell_len, lines), default=0) <= width, lines
     text = "\n".join(lines)
     note = re.search(r"^without (.*): see --wide\Z", text, re.MULTILINE | re.DOTALL)
-    gone = set(" ".join(note[1].split()).split(", ")) if note else set()
-    assert gone <= {table.headings[at] for at in table.spare}
+    hidden_columns = set(" ".join(note[1].split()).split(", ")) if note else set()
+    assert hidden_columns <= {table.headings[at] for at in table.spare}
     for at, heading in enumerate(table.headings):
         cells = [cells[at].plain for cells, _ in table.rows if len(cells) == len(table.headings)]
-        if heading in gone:
+        if heading in hidden_columns:
             continue
         for word in re.split(r"[ -]+", heading):
             assert word in text, f"{heading} is not there"

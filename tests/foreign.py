@@ -89,11 +89,11 @@ def write_mdf(path: Path) -> dict[str, tuple[float, np.ndarray]]:
     kept = {}
     with MDF(version="4.10") as mdf:
         for rate, members in names.items():
-            made, channels = make_signals(rate), []
+            signals, channels = make_signals(rate), []
             for name, channel in members.items():
                 unit = "mm" if name.startswith("Prox") else "N" if name.startswith("F_") else "m/s^2"
                 scale, unit, factor = scales.get(name, (None, unit, 1.0))
-                values = made[channel] * factor
+                values = signals[channel] * factor
                 if scale is not None:
                     codes = np.round(values / scale).astype(np.int16)
                     kept[channel] = (rate, codes * scale)
@@ -127,14 +127,14 @@ def write_tdms(path: Path, *, rate_hz: float = 25_600.0) -> dict[str, tuple[floa
     """
     from nptdms import ChannelObject, TdmsWriter
 
-    made, kept, objects = make_signals(rate_hz), {}, []
+    signals, kept, objects = make_signals(rate_hz), {}, []
     began = np.datetime64("2026-11-21T10:00:00.000000")
     about = {"unit_string": "V", "wf_increment": 1.0 / rate_hz, "wf_start_time": began}
     for channel, (name, per_unit_v, unit, size, bias_v) in VOLTS.items():
-        kept[channel] = (rate_hz, bias_v + per_unit_v * made[channel])
+        kept[channel] = (rate_hz, bias_v + per_unit_v * signals[channel])
         told = {"sensitivity": size, "sensitivity_unit": unit, **({"bias": bias_v, "bias_unit": "V"} if bias_v else {})}
         objects.append(ChannelObject("AI", name, kept[channel][1], {**about, **told}))
-    kept["keyphasor"] = (rate_hz, 5.0 * made["keyphasor"])
+    kept["keyphasor"] = (rate_hz, 5.0 * signals["keyphasor"])
     objects.append(ChannelObject("AI", "tacho", kept["keyphasor"][1], about))
     with TdmsWriter(path) as writer:
         writer.write_segment(objects)
@@ -157,8 +157,8 @@ def write_german_csv(path: Path, *, rate_hz: float = 5000.0) -> dict[str, tuple[
     Returns:
         Rate [Hz] and values in the file, by channel of the rig.
     """
-    made = make_signals(rate_hz)
-    kept = {channel: (rate_hz, np.round(made[channel] * size, 6)) for channel, (_, _, size) in GERMAN.items()}
+    signals = make_signals(rate_hz)
+    kept = {channel: (rate_hz, np.round(signals[channel] * size, 6)) for channel, (_, _, size) in GERMAN.items()}
     micros = np.rint(instants(rate_hz) * 1e6).astype(int)
     lines = ["Prüfstand;Fanglager", ";".join(["Uhrzeit", *(f"{name} [{unit}]" for name, unit, _ in GERMAN.values())])]
     columns = [values for _, values in kept.values()]
@@ -180,12 +180,12 @@ def write_nameless_csv(
         True rate [Hz] and values in the file, by channel of the rig, in their order.
     """
     rate = rate_hz * (1.0 + ppm * 1e-6)
-    made = make_signals(rate)
+    signals = make_signals(rate)
     order = {"ring_x": ("CH1", "um", 1e3), "ring_y": ("CH2", "um", 1e3), "disk_x": ("CH3", "um", 1e3),
              "disk_y": ("CH4", "um", 1e3), "P_E": ("CH5", "N", 1.0), "P_N": ("CH6", "N", 1.0), "P_W": ("CH7", "N", 1.0),
              "P_S": ("CH8", "N", 1.0), "hammer": ("CH9", "N", 1.0), "speed": ("CH10", "", 60.0),
              "keyphasor": ("CH11", "V", 5.0)}  # fmt: skip
-    kept = {channel: (rate, np.round(made[channel] * size, 4)) for channel, (_, _, size) in order.items()}
+    kept = {channel: (rate, np.round(signals[channel] * size, 4)) for channel, (_, _, size) in order.items()}
     heads = [f"{name} [{unit}]" if unit else name for name, unit, _ in order.values()]
     rows = np.column_stack([instants(rate), *(values for _, values in kept.values())])
     np.savetxt(

@@ -360,23 +360,23 @@ def main(words: list[str] | None = None) -> int:
     parser.add_argument("--folder", type=Path, default=Path(tempfile.gettempdir()) / "rig-mutants")
     parser.add_argument("--only", type=int, help="run one mutant, by its number, whatever the journal has of it")
     parser.add_argument("--list", action="store_true", help="print the mutants and run nothing")
-    asked = parser.parse_args(words)
-    mutants = choose_mutants(asked.n, asked.seed)
+    options = parser.parse_args(words)
+    mutants = choose_mutants(options.n, options.seed)
     texts = {each.file: (ROOT / each.file).read_text(encoding="utf-8") for each in mutants}
-    if asked.list:
+    if options.list:
         print("\n".join(f"{n:3} {each.told(texts[each.file])}" for n, each in enumerate(mutants)))
         return 0
-    tree = copy_tree(asked.folder)
-    journal = asked.folder / "journal.jsonl"
+    tree = copy_tree(options.folder)
+    journal = options.folder / "journal.jsonl"
     known = {line["key"]: line for line in _lines(journal)}
     all_tests = sorted({test for mutant in mutants for test in find_tests(mutant.file)})
     record = measure_tests(tree, all_tests, known, journal)
     if record is None:
         return 2
     sources = {file: (ROOT / file).read_text(encoding="utf-8") for file in mutated_files()}
-    results, order = [], asked.folder / "order.json"
+    results, order = [], options.folder / "order.json"
     for number, mutant in enumerate(mutants):
-        if asked.only not in (None, number):
+        if options.only not in (None, number):
             continue
         tests, text = find_tests(mutant.file), texts[mutant.file]
         description = mutant.told(text)
@@ -384,7 +384,7 @@ def main(words: list[str] | None = None) -> int:
         first, last = (text.count("\n", 0, place) + 1 for place in (mutant.begin, mutant.end))
         ids = json.dumps(order_tests(own, sources, mutant.file, first, last))
         key = _key(description, text, ids, *((ROOT / test).read_text(encoding="utf-8") for test in tests))
-        if key not in known or asked.only is not None:
+        if key not in known or options.only is not None:
             order.write_text(ids, encoding="utf-8")
             target = tree / mutant.file
             try:

@@ -243,13 +243,13 @@ def main(words: list[str] | None = None) -> int:
     parser.add_argument("--noise", nargs="*", choices=list(NOISES), default=list(NOISES))
     parser.add_argument("--kind", nargs="*", choices=list(KINDS), default=list(KINDS))
     parser.add_argument("--journal", type=Path, default=Path(tempfile.gettempdir()) / "rig-score-coverage.jsonl")
-    asked = parser.parse_args(words)
-    seeds = range(asked.first, asked.first + asked.n)
-    lines = asked.journal.read_text(encoding="utf-8").splitlines() if asked.journal.exists() else []
+    options = parser.parse_args(words)
+    seeds = range(options.first, options.first + options.n)
+    lines = options.journal.read_text(encoding="utf-8").splitlines() if options.journal.exists() else []
     done = {(line["noise"], line["seed"], line["kind"]): line["found"] for line in map(json.loads, lines)}
-    with asked.journal.open("a", encoding="utf-8") as file:
-        for noise in asked.noise:
-            for key in [(noise, seed, kind) for seed in seeds for kind in asked.kind]:
+    with options.journal.open("a", encoding="utf-8") as file:
+        for noise in options.noise:
+            for key in [(noise, seed, kind) for seed in seeds for kind in options.kind]:
                 if key not in done:
                     done[key] = compute_estimates(key[1], noise, [key[2]])
                     line = {"noise": noise, "seed": key[1], "kind": key[2], "found": done[key]}
@@ -257,13 +257,13 @@ def main(words: list[str] | None = None) -> int:
                     file.flush()
     good, by_quantity = True, dict[str, dict[str, list[Estimate]]]()
     for (noise, seed, kind), found in done.items():
-        if noise in asked.noise and kind in asked.kind and seed in seeds:
+        if noise in options.noise and kind in options.kind and seed in seeds:
             for quantity, estimate in found.items():
                 by_quantity.setdefault(quantity, {}).setdefault(noise, []).append(cast(Estimate, tuple(estimate)))
-    print(f"{'':16}" + "".join(f"{noise:>14}" for noise in asked.noise))
+    print(f"{'':16}" + "".join(f"{noise:>14}" for noise in options.noise))
     for quantity, by_noise in by_quantity.items():
         cells = []
-        for noise in asked.noise:
+        for noise in options.noise:
             held, width = summarise_cell(found := by_noise[noise])
             right = MIN_HELD / FITS <= held / len(found) <= MAX_HELD / FITS and width <= MAX_WIDTH
             mark = " " if right else "k" if (quantity, noise) in KNOWN else "*"

@@ -86,12 +86,12 @@ def _uff(path: Path, columns: Columns, times_s: np.ndarray | None, rate_hz: floa
         file = pyuff.UFF(str(path))
         for number, (name, (unit, values)) in enumerate(columns.items(), 1):
             x = (0.0 if times_s is None else times_s[0]) + np.arange(len(values)) / rate_hz
-            made = pyuff.prepare_58(
+            record = pyuff.prepare_58(
                 binary=1, func_type=1, rsp_node=number, rsp_dir=1, ref_dir=1, ref_node=1, data=values.astype(float),
                 x=x, id1=name, rsp_ent_name=name[:10], ref_ent_name="NONE", abscissa_spacing=1,
                 ordinate_axis_units_lab=unit or "NONE", orddenom_spec_data_type=0,
             )  # fmt: skip
-            file.write_sets(made, "add")
+            file.write_sets(record, "add")
         del file
         gc.collect()
 

@@ -92,9 +92,9 @@ def _by_function(case: Case) -> dict[str, Any]:
 def _by_command(case: Case, folder: Path) -> dict[str, Any]:
     from rig.cli.main import main
 
-    made = folder / "card.json"
-    made.unlink(missing_ok=True)
-    words = ["score", str(case.file), "--against", str(case.sent.path), "--json", str(made), "--force"]
+    card_path = folder / "card.json"
+    card_path.unlink(missing_ok=True)
+    words = ["score", str(case.file), "--against", str(case.sent.path), "--json", str(card_path), "--force"]
     words += ["--path", case.path] if case.path else []
     out, err = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
@@ -102,7 +102,7 @@ def _by_command(case: Case, folder: Path) -> dict[str, Any]:
             status = main(words)
         except SystemExit as ended:
             status = ended.code
-    document = json.loads(made.read_text(encoding="utf-8")) if made.exists() else {"rows": []}
+    document = json.loads(card_path.read_text(encoding="utf-8")) if card_path.exists() else {"rows": []}
     outcome = _STATUS.get(int(status or 0), f"status {status}")
     red = [(row["quantity"], row["channel"] or "") for row in document["rows"] if row["verdict"] == FAIL]
     reason = "; ".join(document.get("doubts") or document.get("remarks") or []) or err.getvalue().strip()[-300:]
@@ -157,17 +157,17 @@ def main(words: list[str] | None = None) -> int:
     parser.add_argument("--folder", type=Path, default=Path(tempfile.gettempdir()) / "rig-score-population")
     parser.add_argument("--command", type=int, default=0, metavar="EVERY", help="judge every so many by `rig score`")
     parser.add_argument("--only", type=int, help="judge one case and print its scorecard")
-    asked = parser.parse_args(words)
-    size = SIZES[asked.population] if asked.n is None else asked.n
-    command: Callable[[int], bool] = lambda n: bool(asked.command) and n % asked.command == asked.command - 1  # noqa: E731
-    population = Population(asked.population, asked.seed, asked.folder)
-    if asked.only is not None:
-        line = population.judged(asked.only, command=command(asked.only))
+    options = parser.parse_args(words)
+    size = SIZES[options.population] if options.n is None else options.n
+    command: Callable[[int], bool] = lambda n: bool(options.command) and n % options.command == options.command - 1  # noqa: E731
+    population = Population(options.population, options.seed, options.folder)
+    if options.only is not None:
+        line = population.judged(options.only, command=command(options.only))
         print(json.dumps(line, indent=1))
         return 0
-    journal = asked.journal or asked.folder / f"{asked.population}-{asked.seed}.jsonl"
+    journal = options.journal or options.folder / f"{options.population}-{options.seed}.jsonl"
     lines = [json.loads(each) for each in journal.read_text(encoding="utf-8").splitlines()] if journal.exists() else []
-    lines = [each for each in lines if (each["population"], each["seed"]) == (asked.population, asked.seed)]
+    lines = [each for each in lines if (each["population"], each["seed"]) == (options.population, options.seed)]
     done = {each["number"] for each in lines}
     with journal.open("a", encoding="utf-8") as file:
         for number in range(size):
@@ -178,13 +178,13 @@ def main(words: list[str] | None = None) -> int:
     lines = [each for each in lines if each["number"] < size]
     for line in lines:
         bad = {"foreign": line["outcome"] == "pass", "perfect": line["outcome"] != "pass"}.get(
-            asked.population, line["outcome"] == "pass" or not line["right"] or bool(line["other"])
+            options.population, line["outcome"] == "pass" or not line["right"] or bool(line["other"])
         )
         if bad or line["outcome"] == "crashed":
             print(
                 f"{line['number']:4} {line['outcome']:12} {line['label']}: red {line['red'][:4]} {line['reason'][:160]}"
             )
-    summary, good = summarise(asked.population, lines)
+    summary, good = summarise(options.population, lines)
     print("\n".join([*summary, "the goal is met" if good else "THE GOAL IS MISSED"]))
     return 0 if good else 1
 

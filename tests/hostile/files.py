@@ -193,12 +193,12 @@ class Layout:
 
     def spoilt(self, rng: Rng) -> Layout:
         """Return a copy with one to three faults."""
-        made = copy.copy(self)
-        made.metadata, made.attachments = copy.deepcopy(self.metadata), dict(self.attachments)
-        made.messages = list(self.messages)
+        layout = copy.copy(self)
+        layout.metadata, layout.attachments = copy.deepcopy(self.metadata), dict(self.attachments)
+        layout.messages = list(self.messages)
         for _ in range(int(rng.integers(1, 4))):
-            made.spoil(rng)
-        return made
+            layout.spoil(rng)
+        return layout
 
     def spoil(self, rng: Rng) -> None:
         kind = int(rng.integers(0, 10))

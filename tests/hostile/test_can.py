@@ -371,7 +371,7 @@ def make_command_text(random: np.random.Generator) -> bytes:
 
 def test_socketcand_text_gives_a_frame_only_if_valid() -> None:
     random = np.random.default_rng(4)
-    made = 0
+    frames = 0
     splitter = socketcand.Splitter()
     for _ in range(input_count(3000)):
         command = make_command_text(random).replace(b"<", b"").replace(b">", b"")
@@ -385,8 +385,8 @@ def test_socketcand_text_gives_a_frame_only_if_valid() -> None:
             with contextlib.suppress(codec.CodecError):
                 frame_ = fields_of(socketcand.parse_frame(words[1:], remote=words[0] == "sendrtr"))
         assert frame_ == expected, command
-        made += expected is not None
-    assert made > 100
+        frames += expected is not None
+    assert frames > 100
     for _ in range(input_count(3000)):
         for each in splitter.feed(
             random.choice((b"<", b">", b" ", b"x" * 600, b"\xff\0", b"send 1 0", random.bytes(9)))
@@ -481,7 +481,7 @@ def a_line(random: np.random.Generator) -> bytes:
 def test_slcan_lines_give_a_frame_only_if_valid() -> None:
     random = np.random.default_rng(6)
     lines = slcan.Lines()
-    made = 0
+    frames = 0
     for _ in range(input_count(3000)):
         line = a_line(random).replace(b"\r", b"").replace(b"\n", b"")
         (text,) = lines.feed(line + b"\r")
@@ -493,8 +493,8 @@ def test_slcan_lines_give_a_frame_only_if_valid() -> None:
                     *fields_of(message)[:3], message.is_fd, message.bitrate_switch, fields_of(message)[3]
                 )  # fmt: skip
         assert found == (None if len(line) > 160 else parse_line(line)), line
-        made += found is not None
-    assert made > 100
+        frames += found is not None
+    assert frames > 100
     with Hub(BusModel("1M/8M"), "can0") as hub, HubBus(hub) as other, SlcanPort(lambda: HubBus(hub)) as port:
         descriptor = os.open(port.path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
         try:

@@ -325,12 +325,12 @@ def test_a_chunk_missing_in_the_index_is_reported_and_statistics_are_optional(pa
     start, checksum_at = struct.unpack_from("<Q", data, len(data) - 28)[0], len(data) - 12
     spoilt = tmp_path / "x.mcap"
     for opcode in (8, 11):
-        summary, position, gone = b"", start, False
+        summary, position, ended = b"", start, False
         while position < len(data) - 37:
             one, length = struct.unpack_from("<BQ", data, position)
             record = data[position : position + 9 + length]
-            summary += b"" if one == opcode and not gone else record
-            gone |= one == opcode
+            summary += b"" if one == opcode and not ended else record
+            ended |= one == opcode
             position += 9 + length
         end = summary + data[len(data) - 37 : checksum_at]
         spoilt.write_bytes(data[:start] + end + struct.pack("<I", zlib.crc32(end)) + MAGIC)

@@ -394,8 +394,8 @@ def test_all_output_uses_the_common_module() -> None:
                 and (node.module or "").startswith("rich")
                 and id(node) not in only_typed
             ):
-                made = {"Console", "Progress", "TextColumn"} & {alias.name for alias in node.names}
-                found += [f"{path.name}: imports {name}" for name in made]
+                imported = {"Console", "Progress", "TextColumn"} & {alias.name for alias in node.names}
+                found += [f"{path.name}: imports {name}" for name in imported]
             if isinstance(node, ast.Call):
                 name = ast.unparse(node.func)
                 if name in ("typer.echo", "print", "typer.secho", "rich.print", "sys.stdout.write", "sys.stderr.write"):

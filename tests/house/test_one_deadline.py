@@ -103,9 +103,9 @@ def waits(tree: ast.AST) -> set[str]:
 
 def test_no_other_module_waits_until_a_deadline() -> None:
     found = {f"{path}:{name}" for path in paths() if path != HOME for name in waits(tree_of(path))}
-    new, gone = sorted(found - set(EXCEPTIONS)), sorted(set(EXCEPTIONS) - found)
+    new, obsolete = sorted(found - set(EXCEPTIONS)), sorted(set(EXCEPTIONS) - found)
     assert not new, f"wait with Deadline or wait_until of {HOME}, not with a loop of your own: {', '.join(new)}"
-    assert not gone, f"take these out of EXCEPTIONS: {', '.join(gone)}"
+    assert not obsolete, f"take these out of EXCEPTIONS: {', '.join(obsolete)}"
 
 
 @pytest.mark.parametrize(

@@ -123,15 +123,15 @@ def hit(engine: str = "split") -> Simulation:
 @pytest.mark.parametrize(("steps", "stride"), [(400, 1), (400, 2), (401, 4), (1, 1)])
 def test_engine_writes_every_value_of_every_row(engine: str, steps: int, stride: int) -> None:
     simulation, module = hit(engine), load_engine(engine)
-    made = []
+    created = []
     for poison in (np.nan, 1e300):
         y, memory = simulation._motion.y.copy(), simulation._motion.memory.copy()
         rows = np.full((-(-steps // stride), S.N_ROW), poison)
         arguments = (simulation.model.constants, simulation._inputs(), y, memory, simulation.tick, 25, steps, stride)
         module.advance(*arguments, rows)
-        made.append((rows, y, memory))
-    assert np.isfinite(made[0][0]).all()
-    for one, other in zip(*made, strict=True):
+        created.append((rows, y, memory))
+    assert np.isfinite(created[0][0]).all()
+    for one, other in zip(*created, strict=True):
         assert one.tobytes() == other.tobytes(), "what lay in the output leaks into the result"
 
 

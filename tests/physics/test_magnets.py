@@ -322,16 +322,16 @@ def test_force_turns_with_the_magnets(magnet_map: MagnetMap) -> None:
 
 
 def test_levels_use_their_maps() -> None:
-    made = {level: model_of(level).constants.magnet for level in LEVELS}
-    assert {level: magnet.terms for level, magnet in made.items()} == {
+    magnets = {level: model_of(level).constants.magnet for level in LEVELS}
+    assert {level: magnet.terms for level, magnet in magnets.items()} == {
         "linear": LINEAR,
         "map": RADIAL,
         "cylinders": RIPPLED,
     }
-    assert {magnet.stiffness for magnet in made.values()} == {1700.0}, "a number sets K of every level"
-    slopes = {level: -magnet_force(1e-6, 0.0, magnet)[0] / 1e-6 for level, magnet in made.items()}
+    assert {magnet.stiffness for magnet in magnets.values()} == {1700.0}, "a number sets K of every level"
+    slopes = {level: -magnet_force(1e-6, 0.0, magnet)[0] / 1e-6 for level, magnet in magnets.items()}
     assert all(slope == pytest.approx(1700.0, rel=1e-6) for slope in slopes.values())
-    assert made["cylinders"].ripple == fit_cylinder_map(TABLE_1).ripple, "the shape does not depend on K"
+    assert magnets["cylinders"].ripple == fit_cylinder_map(TABLE_1).ripple, "the shape does not depend on K"
 
 
 @pytest.mark.parametrize("level", LEVELS)

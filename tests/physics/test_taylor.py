@@ -139,8 +139,10 @@ def test_first_coefficients_are_the_equations(phase: int, mode: str) -> None:
 def test_the_code_of_the_series_is_up_to_date() -> None:
     code = "import sys; from rig.physics.engines.tape.taylor import source; sys.stdout.write(source())"
     environment = {**os.environ, "NUMBA_DISABLE_JIT": "1"}
-    made = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
-    assert made.stdout == CODE.read_text(), (
+    generated = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
+    )
+    assert generated.stdout == CODE.read_text(), (
         "make it anew: NUMBA_DISABLE_JIT=1 python -m rig.physics.engines.tape.taylor"
     )
 

@@ -204,7 +204,7 @@ def test_rig_run_on_a_virtual_bus_between_processes(tmp_path: Path, options: lis
             session = RecordingSession(client, tmp_path / "run.mcap", name="recorder", history=True)
             recorder = threading.Thread(target=session.run)
             recorder.start()
-            asked = stopped = False
+            requested = stopped = False
             links: dict[str, float] = {}
             while True:
                 if (message := bus.recv(20.0)) is None:
@@ -212,11 +212,11 @@ def test_rig_run_on_a_virtual_bus_between_processes(tmp_path: Path, options: lis
                     break  # the last frame was dropped
                 assert not message.is_error_frame
                 frames.setdefault(message.arbitration_id, []).append(bytes(message.data))
-                if message.arbitration_id == TABLE.by_name["Sync"].identifier and not asked:
-                    asked = True
+                if message.arbitration_id == TABLE.by_name["Sync"].identifier and not requested:
+                    requested = True
                     identifier, data = command_frame(CommandKind.HAMMER, 1, force_n=100.0, duration_ms=5.0)
                     bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
-                if message.arbitration_id == TABLE.by_name["Status"].identifier and asked:
+                if message.arbitration_id == TABLE.by_name["Status"].identifier and requested:
                     links = links or console.status()["congestion"]
                 if not stopped and links and all(len(frames.get(each, ())) >= enough[each] for each in enough):
                     stopped = True

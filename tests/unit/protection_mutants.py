@@ -33,8 +33,8 @@ class Mutant:
         assert text.count(self.text) == 1, f"{self.name}: its text stands there {text.count(self.text)} times"
         module = ModuleType(self.source.__name__)
         exec(compile(text.replace(self.text, self.instead), self.name, "exec"), module.__dict__)
-        made = {name: getattr(module, name) for name in ("Protection", "act", "protect") if hasattr(module, name)}
-        return SimpleNamespace(**{**vars(sound()), **made})
+        members = {name: getattr(module, name) for name in ("Protection", "act", "protect") if hasattr(module, name)}
+        return SimpleNamespace(**{**vars(sound()), **members})
 
     def fails(self, scenario: str) -> bool:
         """Return whether a scenario detects it: its result is wrong; an exception in the mutant does not count."""

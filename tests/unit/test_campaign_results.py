@@ -145,8 +145,8 @@ def test_all_requires_every_sent_channel_and_row_except_allowed_losses(tmp_path:
             tmp_path / f"{rows}{columns}.parquet",
             {"time_s": times_s[rows], **dict(zip(columns, counts[rows].T, strict=False))},
         )
-        made = one(session, score="all", file=file.name, **more)
-        return made.good, made.note
+        measurement = one(session, score="all", file=file.name, **more)
+        return measurement.good, measurement.note
 
     whole, part, half = slice(None), slice(1000, 3600), slice(None, None, 2)
     assert told(whole, list(names))[0]

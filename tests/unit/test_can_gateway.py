@@ -541,15 +541,15 @@ def test_gateway_threads_survive_errors_and_send_a_command_once(
     with rig(FakeChannels(duration_s=None), paced=True) as setup:
         setup.start()
         until(lambda: bool(setup.tap.of("Probes")))
-        good, asked = setup.client.request, []
+        good, requests = setup.client.request, []
 
         def bad(key: str, payload: bytes = b"", *, timeout_s: float = 2.0) -> bytes:
-            asked.append((key, good(key, payload, timeout_s=timeout_s)))
+            requests.append((key, good(key, payload, timeout_s=timeout_s)))
             raise ZeroDivisionError("spoilt")
 
         monkeypatch.setattr(setup.client, "request", bad)
         assert setup.tap.ask(*command_frame(CommandKind.SPEED, 1, speed_hz=5.0))["result"] == Result.TIMED_OUT
-        assert len(asked) == 1
+        assert len(requests) == 1
         gateway = setup.gateway
         for owner, name in ((gateway, "unpack"), (gateway.commands, "take_message"), (gateway.outbox, "send_due")):
             monkeypatch.setattr(owner, name, lambda *_: 1 / 0)

@@ -153,8 +153,8 @@ def test_formulas_have_the_bits_of_numpy_wherever_their_numbers_are_computed() -
     formulas = Formulas({"shaft.arm_disk": 0.36}, curves)
     for name, signal in enumerate(cases):
         formulas.column(str(name), signal)
-    for signal, made in zip(cases, formulas.values(rows).T, strict=True):
-        assert made.tobytes() == cases[signal].tobytes(), signal
+    for signal, computed in zip(cases, formulas.values(rows).T, strict=True):
+        assert computed.tobytes() == cases[signal].tobytes(), signal
 
 
 def test_the_bench_times_a_laboratory_of_24_channels() -> None:

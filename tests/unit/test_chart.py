@@ -289,9 +289,9 @@ def test_a_small_chart_resumes_and_lists_missing_points(tmp_path: Path, monkeypa
     assert second.measured == 3
     assert second.failures == 0
     names = {path.name for path in second.files}
-    made = [("chart", "parquet"), ("chart", "csv")]
-    made += [(stem, suffix) for stem in ("chart", "chart-exact", "chart-work") for suffix in ("png", "svg")]
-    assert names == {f"{stem}.{suffix}" for stem, suffix in made}
+    outputs = [("chart", "parquet"), ("chart", "csv")]
+    outputs += [(stem, suffix) for stem in ("chart", "chart-exact", "chart-work") for suffix in ("png", "svg")]
+    assert names == {f"{stem}.{suffix}" for stem, suffix in outputs}
     for path in second.files:
         assert path.stat().st_size > 500
     assert "eers left out on request" in (tmp_path / "out" / "chart.svg").read_text(encoding="utf-8")

@@ -102,33 +102,33 @@ def aligner(room: int = 1000) -> Aligner:
 
 
 def test_rows_are_merged_by_number_with_columns_in_the_requested_order() -> None:
-    made = aligner()
-    assert made.feed("a", make_rows(0, 10, columns=2)) == []
-    (first,) = made.feed("b", make_rows(4, 4, name="b", columns=2))
+    merged = aligner()
+    assert merged.feed("a", make_rows(0, 10, columns=2)) == []
+    (first,) = merged.feed("b", make_rows(4, 4, name="b", columns=2))
     assert first.names == ("a1", "b1", "a0")
     assert (first.index, first.tick) == (4, 4000)
     np.testing.assert_array_equal(first.values[:, 2], np.arange(4, 8))
     np.testing.assert_array_equal(first.values[:, 0], first.values[:, 1])
-    (second,) = made.feed("b", make_rows(8, 10, name="b", columns=2))
+    (second,) = merged.feed("b", make_rows(8, 10, name="b", columns=2))
     assert (second.index, len(second), second.gap) == (8, 2, 0)
 
 
 def test_a_gap_in_one_stream_is_a_gap_in_all_with_its_name() -> None:
-    made = aligner()
-    out = made.feed("a", make_rows(0, 30, columns=2)) + made.feed("b", make_rows(0, 10, name="b", columns=2))
-    out += made.feed("b", make_rows(17, 13, name="b", columns=2))
+    merged = aligner()
+    out = merged.feed("a", make_rows(0, 30, columns=2)) + merged.feed("b", make_rows(0, 10, name="b", columns=2))
+    out += merged.feed("b", make_rows(17, 13, name="b", columns=2))
     assert [(each.index, len(each), each.gap) for each in out] == [(0, 10, 0), (17, 13, 7)]
-    assert [(gap.key, gap.index, gap.size) for gap in made.gaps] == [("b", 10, 7)]
-    assert made.lost == {"a": 0, "b": 7}
+    assert [(gap.key, gap.index, gap.size) for gap in merged.gaps] == [("b", 10, 7)]
+    assert merged.lost == {"a": 0, "b": 7}
 
 
 def test_portions_of_any_size_in_any_order_give_the_same_rows() -> None:
     random = np.random.default_rng(4)
-    made, out, position = aligner(10_000), [], {"a": 0, "b": 0}
+    merged, out, position = aligner(10_000), [], {"a": 0, "b": 0}
     while min(position.values()) < 500:
         name = str(random.choice(["a", "b"]))
         rows = int(random.integers(1, 40))
-        out += made.feed(name, make_rows(position[name], rows, name=name, columns=2))
+        out += merged.feed(name, make_rows(position[name], rows, name=name, columns=2))
         position[name] += rows
     joined = np.concatenate([each.values for each in out])
     assert len(joined) == min(position.values())
@@ -137,22 +137,22 @@ def test_portions_of_any_size_in_any_order_give_the_same_rows() -> None:
 
 
 def test_a_stream_without_its_partner_is_bounded() -> None:
-    made = aligner(room=100)
+    merged = aligner(room=100)
     for n in range(100):
-        assert made.feed("a", make_rows(10 * n, 10, columns=2)) == []
-    assert made.unmatched == 900
-    (out,) = made.feed("b", make_rows(995, 5, name="b", columns=2))
+        assert merged.feed("a", make_rows(10 * n, 10, columns=2)) == []
+    assert merged.unmatched == 900
+    (out,) = merged.feed("b", make_rows(995, 5, name="b", columns=2))
     assert (out.index, len(out)) == (995, 5)
 
 
 def test_rows_of_different_runs_are_never_joined() -> None:
-    made = aligner()
-    assert made.feed("a", make_rows(1000, 50, columns=2)) == []
-    assert len(made.feed("b", make_rows(1000, 20, name="b", columns=2))) == 1
+    merged = aligner()
+    assert merged.feed("a", make_rows(1000, 50, columns=2)) == []
+    assert len(merged.feed("b", make_rows(1000, 20, name="b", columns=2))) == 1
     # The rig was restarted; `a` is the first to notice.
-    assert made.feed("a", make_rows(0, 10, columns=2)) == []
-    assert made.feed("b", make_rows(1020, 20, name="b", columns=2)) == []
-    (out,) = made.feed("b", make_rows(0, 10, name="b", columns=2))
+    assert merged.feed("a", make_rows(0, 10, columns=2)) == []
+    assert merged.feed("b", make_rows(1020, 20, name="b", columns=2)) == []
+    (out,) = merged.feed("b", make_rows(0, 10, name="b", columns=2))
     assert (out.index, len(out), out.gap) == (0, 10, 0)
 
 

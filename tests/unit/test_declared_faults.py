@@ -160,8 +160,8 @@ def test_fault_events_may_arrive_after_the_end(tmp_path: Path) -> None:
 def test_lost_rows_are_counted_exactly_in_addition_to_faults(kind: str, tmp_path: Path) -> None:
     items = simulate_messages(kind)
     places = [n for n, (key, _) in enumerate(items) if key == PROBES]
-    gone = {places[n] for n in (3, 14, 17)}
-    summary = recorded(tmp_path / "gone.mcap", kind, [item for n, item in enumerate(items) if n not in gone])
+    lost_places = {places[n] for n in (3, 14, 17)}
+    summary = recorded(tmp_path / "gone.mcap", kind, [item for n, item in enumerate(items) if n not in lost_places])
     assert summary.lost == {PROBES: 3 * 200}
     assert not summary.good
 

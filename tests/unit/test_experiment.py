@@ -155,8 +155,8 @@ def test_commands_are_sent_at_their_ticks_however_long_the_chunks_are() -> None:
     ends = []
     for chunk_s in (0.01, 1.0):
         simulation = Simulation(scene)
-        made = list(frames(simulation, chunk_s=chunk_s, commands=commands))
-        events = [(event["event"], event["tick"]) for frame in made for event in frame.events]
+        produced = list(frames(simulation, chunk_s=chunk_s, commands=commands))
+        events = [(event["event"], event["tick"]) for frame in produced for event in frame.events]
         assert events == [("hammer", 40_000), ("speed", 120_000)]
-        ends.append(made[-1].rows[-1].copy())
+        ends.append(produced[-1].rows[-1].copy())
     np.testing.assert_array_equal(ends[0], ends[1])

@@ -37,8 +37,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         with pytest.raises(SystemExit) as end:
             main(["simulate", "hammer", "-o", str(folder / f"run{suffix}"), *changes, "--duration-s", str(DURATION_S)])
         assert end.value.code == 0
-    made = ["run.csv", "run.mcap", "run.parquet", "run.wav", "run.wav.json"]
-    assert sorted(path.name for path in folder.iterdir()) == made, "no part is left"
+    names = ["run.csv", "run.mcap", "run.parquet", "run.wav", "run.wav.json"]
+    assert sorted(path.name for path in folder.iterdir()) == names, "no part is left"
     return folder
 
 

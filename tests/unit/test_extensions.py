@@ -158,11 +158,11 @@ def python(code: str, package: Path) -> list[str]:
 
 
 def test_an_external_engine_is_used_like_a_built_in_one(package: Path) -> None:
-    names, takes, wrong, gone, digest = python(QUESTION_PROGRAM, package)
+    names, takes, wrong, missing, digest = python(QUESTION_PROGRAM, package)
     assert names == "heun ours", "the rig's own engines keep their names"
     assert takes == "True"
     assert "my_engine.heun:ORDER must be a rig.physics.engines.Method with a module" in wrong
-    assert "my_engine.missing:ROW cannot be loaded: ModuleNotFoundError" in gone
+    assert "my_engine.missing:ROW cannot be loaded: ModuleNotFoundError" in missing
     assert digest != source_digest(), "numba's cache must not serve code of another version of it"
     module = package / "my_engine/heun.py"
     module.write_text(module.read_text().replace("[0.5, 0.5]", "[0.4, 0.6]"))

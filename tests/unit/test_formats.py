@@ -131,9 +131,9 @@ def test_events_and_documents_are_exported_if_the_format_allows(noted: Recording
     from nptdms import TdmsFile
     from pyarrow import parquet
 
-    made = {}
+    files = {}
     for suffix in written_suffixes():
-        _, (made[suffix],) = written(noted, tmp_path / f"x{suffix}", "probes")
+        _, (files[suffix],) = written(noted, tmp_path / f"x{suffix}", "probes")
     properties = TdmsFile.read_metadata(tmp_path / "x.tdms").properties
     assert properties["events"].splitlines() == [f"{time_s:.6f} s  {text}" for time_s, _, text in EXPECTED_EVENTS]
     assert json.loads(properties["scene.json"]) == {**noted.scene, "taken": noted.commands}
@@ -149,8 +149,8 @@ def test_events_and_documents_are_exported_if_the_format_allows(noted: Recording
     assert beside["documents"]["catalogue"] == noted.catalogue
     assert [(one["tick"], one["request"]) for one in noted.commands] == [(50_000, {"speed_hz": 5.2})]
     left_out = "5 events, catalogue, parameters and scene: left out, as UFF58 has no place for them"
-    assert made[".uff"].documents == left_out
-    assert made[".wav"].documents.endswith(": in x.wav.json")
+    assert files[".uff"].documents == left_out
+    assert files[".wav"].documents.endswith(": in x.wav.json")
     short = select(noted, channels=["disk_x"], from_s=0.03, to_s=0.06)
     assert [event.name for event in short.events] == ["speed"]
 
@@ -399,17 +399,17 @@ def test_volts_equal_the_converter_input(recording: Recording, tmp_path: Path) -
 
 def test_a_range_holds_its_ends_and_several_rates_make_several_tables(recording: Recording, tmp_path: Path) -> None:
     selection = select(recording, channels=["disk_x", "truth.contact"], from_s=0.01, to_s=0.05, merged=True)
-    made = export(selection, tmp_path / "x.csv")
-    assert [entry.path.name for entry in made] == ["x-20000Hz.csv", "x-2000Hz.csv"]
-    times = np.loadtxt(made[1].path, delimiter=",", skiprows=1)[:, 0]
+    files = export(selection, tmp_path / "x.csv")
+    assert [entry.path.name for entry in files] == ["x-20000Hz.csv", "x-2000Hz.csv"]
+    times = np.loadtxt(files[1].path, delimiter=",", skiprows=1)[:, 0]
     np.testing.assert_allclose(times, np.arange(20, 101) / 2000, rtol=0, atol=1e-12)
-    assert made[0].tables[0][2] == 801
+    assert files[0].tables[0][2] == 801
 
 
 def test_one_rate_by_a_declared_method(recording: Recording, tmp_path: Path) -> None:
     selection = select(recording, channels=["ring_x", "truth.contact.normal_force"], merged=True)
-    made = export(selection, tmp_path / "x.parquet", rate_hz=5000, method="linear")
-    assert made[0].tables[0][1:3] == (5000, int((DURATION_S - 1 / 2000) * 5000 + 1e-6) + 1)
+    files = export(selection, tmp_path / "x.parquet", rate_hz=5000, method="linear")
+    assert files[0].tables[0][1:3] == (5000, int((DURATION_S - 1 / 2000) * 5000 + 1e-6) + 1)
     with pytest.raises(InputError, match=r"^unit must be engineering or volts"):
         export(select(recording, unit="counts"), tmp_path / "y.tdms", rate_hz=1000)
 
@@ -430,8 +430,8 @@ def test_missing_rows_are_omitted_or_nan(gappy: Recording, tmp_path: Path) -> No
     np.testing.assert_array_equal(found[~np.isnan(found)], samples["disk_x"][order])
     with pytest.raises(InputError, match=r"^range must be free of missing rows for a WAV file"):
         written(gappy, tmp_path / "x.wav", "disk_x")
-    _, made = written(gappy, tmp_path / "x.mf4")
-    assert made[0].tables[0][3] == 200
+    _, summary = written(gappy, tmp_path / "x.mf4")
+    assert summary[0].tables[0][3] == 200
     assert {path.suffix for path in tmp_path.iterdir()} == {".csv", ".json", ".tdms", ".mf4"}
 
 
@@ -446,8 +446,8 @@ def test_one_row_is_exported_and_zero_rows_are_refused(suffix: str, recording: R
             for block in list(recording.blocks(key))[:rows]:
                 payload = encode_block(replace(block, values=np.ascontiguousarray(block.values[:1])))
                 writer.write(key, payload, 0)
-    _, made = written(Recording.open(tmp_path / "1.mcap"), tmp_path / f"x{suffix}")
-    assert made[0].tables[0][2] == 1
+    _, summary = written(Recording.open(tmp_path / "1.mcap"), tmp_path / f"x{suffix}")
+    assert summary[0].tables[0][2] == 1
     with pytest.raises(InputError, match=r"^file must be a recording with samples; instead received '.*0\.mcap'"):
         written(Recording.open(tmp_path / "0.mcap"), tmp_path / f"y{suffix}")
     with pytest.raises(InputError, match=r"^file must be a recording with two samples of a channel"):

@@ -220,9 +220,9 @@ def test_a_detected_corner_is_proposed_for_confirmation(tmp_path: Path) -> None:
     rows = np.column_stack([np.arange(len(heard)) / rate, heard])
     np.savetxt(path, rows, delimiter=",", header="time,inner_x [m/s^2],inner_y [m/s^2]", comments="", fmt="%.9f")
     text, _ = guess_mapping([path])
-    asked = [line for line in text.splitlines() if CHECK in line]
-    assert len(asked) == 1
-    assert asked[0].endswith(f"# {CHECK}: the noise of 2 of 2 signals ends there, as after a low-pass of order 4")
+    questions = [line for line in text.splitlines() if CHECK in line]
+    assert len(questions) == 1
+    assert questions[0].endswith(f"# {CHECK}: the noise of 2 of 2 signals ends there, as after a low-pass of order 4")
     mapping = parse_mapping(tomllib.loads(text), name="m.toml")
     assert mapping.channels["inner_y"].bandwidth_hz == pytest.approx(4000.0, rel=0.06)
 

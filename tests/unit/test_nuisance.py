@@ -378,7 +378,7 @@ def test_a_missing_pulse_is_reported_anywhere() -> None:
     turns = np.r_[np.full(3, 0.16), 0.16 * np.linspace(1.0, 2.0, 20)]
     edges = np.concatenate([[0.0], np.cumsum(turns)])
     assert not edge_faults(edges, 0.5, 6.25)
-    for gone in (1, 2, 3, 12):
-        (fault,) = edge_faults(np.delete(edges, gone), 0.5, 6.25)
+    for missing in (1, 2, 3, 12):
+        (fault,) = edge_faults(np.delete(edges, missing), 0.5, 6.25)
         assert fault.line.startswith("keyphasor miss-pulses: ")
-        assert (fault.from_s, fault.to_s) == (pytest.approx(edges[gone - 1]), pytest.approx(edges[gone + 1]))
+        assert (fault.from_s, fault.to_s) == (pytest.approx(edges[missing - 1]), pytest.approx(edges[missing + 1]))

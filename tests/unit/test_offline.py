@@ -67,13 +67,13 @@ def test_help_starts_with_an_example() -> None:
 def test_signals_are_those_of_the_frames(run: Run) -> None:
     scene = load_scene("hammer", {"drive.speed_hz": 5.2, "contact.friction": 0.3})
     simulation = Simulation(scene)
-    made = list(frames(simulation, chunk_s=0.25))
-    rows = np.concatenate([frame.rows[::2] for frame in made[-1:]])
+    produced = list(frames(simulation, chunk_s=0.25))
+    rows = np.concatenate([frame.rows[::2] for frame in produced[-1:]])
     assert simulation.tick == simulation.end_tick == 2_000_000
-    assert len(made) == 8
+    assert len(produced) == 8
     assert run.signals[-len(rows) :].tobytes() == rows.tobytes()
     for group, names in ((group.name, group.names) for group in simulation.table.groups.values()):
-        counts = np.concatenate([frame.samples[group].values for frame in made])
+        counts = np.concatenate([frame.samples[group].values for frame in produced])
         for c, name in enumerate(names):
             np.testing.assert_array_equal(run.counts[name], counts[:, c])
 

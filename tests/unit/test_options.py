@@ -208,8 +208,8 @@ def test_a_new_shell_completes_after_installation(shell: str, tmp_path: Path) ->
     for path in (path for path in tmp_path.iterdir() if path.name.endswith("shrc")):
         assert path.read_text().count("completion --install") == 1
     if shell == "fish":
-        asked = [shell, "-c", "complete -C 'rig run ham'"]
-        assert subprocess.check_output(asked, **settings).startswith(b"hammer\tHammer during a stable run")
+        command_ = [shell, "-c", "complete -C 'rig run ham'"]
+        assert subprocess.check_output(command_, **settings).startswith(b"hammer\tHammer during a stable run")
         return
     terminal = [sys.executable, "-c", f"import pty; pty.spawn(['{shell}', '-i'])"]
     with subprocess.Popen(terminal, stdin=subprocess.PIPE, stdout=subprocess.PIPE, **settings) as child:

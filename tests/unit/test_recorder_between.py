@@ -143,8 +143,8 @@ def test_an_export_of_a_part_equals_the_export_of_the_whole(
 @pytest.mark.parametrize("name", ["without a chunk index", "without chunks", "without statistics"])
 def test_a_part_of_a_file_without_an_index_is_the_same(source: Path, tmp_path: Path, name: str) -> None:
     other = mcap_variants.write(source, tmp_path / "other.mcap", name)
-    for path, made in ((source, "a.mcap"), (other, "b.mcap")):
-        rewrite.cut(join([path], in_part=True), tmp_path / made, from_s=0.41, to_s=0.43)
+    for path, target in ((source, "a.mcap"), (other, "b.mcap")):
+        rewrite.cut(join([path], in_part=True), tmp_path / target, from_s=0.41, to_s=0.43)
     assert payloads(tmp_path / "a.mcap") == payloads(tmp_path / "b.mcap")
 
 

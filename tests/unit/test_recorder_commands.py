@@ -267,17 +267,17 @@ def test_recover_ends_with_1_and_info_counts_each_row_that_is_lost(
         "first": chunks[:1], "middle": chunks[middle : middle + 1], "last": chunks[-1:],
         "first and last": [chunks[0], chunks[-1]], "all but the first": chunks[1:], "all but the last": chunks[:-1],
     }[which]  # fmt: skip
-    source, made = _damaged(in_chunks, tmp_path / "x.mcap", hit), tmp_path / "made.mcap"
-    assert run("recover", source, "-o", made) == 1
+    source, target = _damaged(in_chunks, tmp_path / "x.mcap", hit), tmp_path / "made.mcap"
+    assert run("recover", source, "-o", target) == 1
     assert f"{len(hit)} damaged record{'s' * (len(hit) > 1)} skipped" in capsys.readouterr().out
-    whole, kept = recording.streams, Recording.open(made).streams
-    assert run("info", "--json", made) == 1
+    whole, kept = recording.streams, Recording.open(target).streams
+    assert run("info", "--json", target) == 1
     streams = json.loads(capsys.readouterr().out)["streams"]
-    gone = {key: whole[key].rows - kept[key].rows for key in kept}
-    assert {key: each["lost"] for key, each in streams.items()} == gone
-    assert run("info", made) == 1
-    assert f"{sum(gone.values())} rows in " in capsys.readouterr().out
-    assert set(Recording.open(made).doubts) <= set(recording.doubts)
+    lost_rows = {key: whole[key].rows - kept[key].rows for key in kept}
+    assert {key: each["lost"] for key, each in streams.items()} == lost_rows
+    assert run("info", target) == 1
+    assert f"{sum(lost_rows.values())} rows in " in capsys.readouterr().out
+    assert set(Recording.open(target).doubts) <= set(recording.doubts)
 
 
 def test_recover_writes_no_file_if_all_chunks_are_unreadable(

@@ -99,10 +99,10 @@ def test_a_recovered_file_is_finished_with_the_sources_messages(path, chunks, tm
     part = _part(tmp_path / "run.mcap.part", path.read_bytes()[: chunks[-1][1] - 1000])
     source = Recording.open(part)
     raw = part.read_bytes()
-    made = recover(part)
-    assert made.path == tmp_path / "run.recovered.mcap"
+    recovered = recover(part)
+    assert recovered.path == tmp_path / "run.recovered.mcap"
     assert part.read_bytes() == raw
-    recording = Recording.open(made.path)
+    recording = Recording.open(recovered.path)
     assert recording.complete
     assert recording.end_reason == "recovered"
     assert recording.metadata["recovered"]["source"] == "run.mcap.part"
@@ -125,9 +125,9 @@ def test_a_damaged_chunk_is_passed_over_and_its_rows_are_a_gap(path, chunks, ite
     data[(start + end) // 2] ^= 0xFF
     damaged = tmp_path / "run.mcap"
     damaged.write_bytes(data)
-    made = recover(damaged)
-    assert made.damaged == 1
-    recording = Recording.open(made.path)
+    recovered = recover(damaged)
+    assert recovered.damaged == 1
+    recording = Recording.open(recovered.path)
     assert [payload for _, payload in recording.payloads(PROBES)] != of(items)[PROBES]
     rows = recording.streams[PROBES].rows
     assert 0 < rows < 20_000
@@ -211,8 +211,8 @@ def test_the_name_of_a_recovered_file():
 
 
 def test_a_cut_keeps_the_rows_between_two_times_and_complete_payloads(path, items, tmp_path):
-    made = cut(Recording.open(path), tmp_path / "cut.mcap", from_s=0.2034, to_s=0.75)
-    recording = Recording.open(made.path)
+    piece = cut(Recording.open(path), tmp_path / "cut.mcap", from_s=0.2034, to_s=0.75)
+    recording = Recording.open(piece.path)
     assert recording.complete
     whole = Recording.open(path)
     for group in whole.table.groups:
@@ -238,8 +238,8 @@ def test_consecutive_cuts_join_to_the_whole(path, tmp_path):
     pieces = []
     for number, (start, end) in enumerate([(0.0, 0.31234), (0.31234, 0.6), (0.6, 9.0)]):
         pieces.append(cut(whole, tmp_path / f"{number}.mcap", from_s=start, to_s=end).path)
-    made = cut(join(pieces[::-1]), tmp_path / "joined.mcap")
-    again = Recording.open(made.path)
+    joined = cut(join(pieces[::-1]), tmp_path / "joined.mcap")
+    again = Recording.open(joined.path)
     for group in whole.table.groups:
         np.testing.assert_array_equal(again.samples(group).values, whole.samples(group).values)
         np.testing.assert_array_equal(again.samples(group).index, whole.samples(group).index)
@@ -345,11 +345,11 @@ def test_a_foreign_reader_reads_them(path, chunks, tmp_path):
     from mcap_ros2.decoder import DecoderFactory
 
     part = _part(tmp_path / "run.mcap.part", path.read_bytes()[: chunks[1][1] - 500])
-    for made in (recover(part), cut(Recording.open(path), tmp_path / "cut.mcap", from_s=0.1, to_s=0.2)):
-        with made.path.open("rb") as file:
+    for result in (recover(part), cut(Recording.open(path), tmp_path / "cut.mcap", from_s=0.1, to_s=0.2)):
+        with result.path.open("rb") as file:
             reader = make_reader(file, decoder_factories=[DecoderFactory()])
             rows = sum(
                 len(row.decoded_message.values) // row.decoded_message.columns
                 for row in reader.iter_decoded_messages(topics=[PROBES])
             )
-        assert rows == made.counts.rows[PROBES] > 0
+        assert rows == result.counts.rows[PROBES] > 0

@@ -65,13 +65,13 @@ def test_a_signal_that_no_stage_computes_is_refused_by_name() -> None:
         capture_output=True, check=False,
     )  # fmt: skip
     assert not run.returncode, run.stderr
-    of_run, asked, channel, formula = run.stdout.splitlines()
+    of_run, requested, channel, formula = run.stdout.splitlines()
     assert "one of the signals it keeps" in of_run
     computed = "must be a signal that engine rk4 computes"
-    assert asked.startswith(f"signals {computed}")
+    assert requested.startswith(f"signals {computed}")
     assert channel.startswith(f"channel disk_x.signal {computed}")
     assert formula.startswith(f"channel disk_x.signal {computed}")
-    assert all("'outer_vx_seen'" in line for line in (of_run, asked, channel, formula))
+    assert all("'outer_vx_seen'" in line for line in (of_run, requested, channel, formula))
 
 
 class Siren(SceneCommand):

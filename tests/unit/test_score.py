@@ -405,18 +405,18 @@ def test_the_command_writes_report_junit_and_json(
 ) -> None:
     session, counts = sent
     daq = write_parquet(tmp_path / "daq.parquet", in_units(np.delete(counts, 777, axis=0)))
-    made = [tmp_path / name for name in ("r.html", "r.xml", "r.json")]
-    files = ("-o", made[0], "--junit", made[1], "--json", made[2])
+    reports = [tmp_path / name for name in ("r.html", "r.xml", "r.json")]
+    files = ("-o", reports[0], "--junit", reports[1], "--json", reports[2])
     status, out, _ = run_captured(capsys, "score", daq, "--against", session, *files)
     assert status == 1
     assert "digital path: fail: 27 pass, 1 fail (missing rows)" in out
-    suite = ElementTree.parse(made[1]).getroot()[0]
+    suite = ElementTree.parse(reports[1]).getroot()[0]
     failed = [case.get("name") for case in suite if case.find("failure") is not None]
     assert (suite.get("failures"), failed) == ("2", ["outcome", "missing rows probes"])
     assert suite.get("skipped") == "0"
-    document = json.loads(made[2].read_text(encoding="utf-8"))
+    document = json.loads(reports[2].read_text(encoding="utf-8"))
     assert document["runs"] == {"missing rows probes": [[1177, 1177]]}
-    assert made[0].read_text(encoding="utf-8").count("<img") == 0  # there are no stamps to draw
+    assert reports[0].read_text(encoding="utf-8").count("<img") == 0  # there are no stamps to draw
 
 
 def test_the_report_draws_the_channels_of_the_analogue_path(sent: tuple[Path, np.ndarray], tmp_path: Path) -> None:

@@ -53,8 +53,8 @@ UNIT_FORMS = {
 
 @pytest.mark.parametrize("way", UNIT_FORMS)
 def test_a_mapping_gives_names_and_units(way: str, session: Path, counts: np.ndarray, tmp_path: Path) -> None:
-    numbers, made = UNIT_FORMS[way]
-    card = judge(write(tmp_path / "daq.parquet", made(counts[1000:])), [session], mapping=mapped(numbers))
+    numbers, columns = UNIT_FORMS[way]
+    card = judge(write(tmp_path / "daq.parquet", columns(counts[1000:])), [session], mapping=mapped(numbers))
     assert (card.path, card.outcome) == ("digital", "pass"), card.verdict_line
 
 

@@ -116,15 +116,15 @@ def test_a_client_waits_for_a_rig_that_starts_later() -> None:
 
 
 def test_a_request_ends_when_its_rig_ends(server: ZenohServer) -> None:
-    asked = threading.Event()
+    requested = threading.Event()
 
     def never(_: str, __: bytes) -> Future[bytes]:
-        asked.set()
+        requested.set()
         return Future()
 
     server.answer_all("rig/command/*", never)
     with ZenohClient(server.endpoint) as client:
-        goes = threading.Thread(target=lambda: (asked.wait(20.0), server.close()))
+        goes = threading.Thread(target=lambda: (requested.wait(20.0), server.close()))
         goes.start()
         with pytest.raises(NoReplyError, match=f"^the rig at {server.endpoint} was lost before the reply to rig/com"):
             client.request("rig/command/step", timeout_s=600.0)
