@@ -6,7 +6,7 @@ from tests.house.architecture import PICTURE, ROOT, draw_picture
 
 
 def test_picture_is_up_to_date() -> None:
-    assert PICTURE.read_text(encoding="utf-8") == draw_picture(), "make it anew: python -m tests.house.architecture"
+    assert PICTURE.read_text(encoding="utf-8") == draw_picture(), "regenerate it: python -m tests.house.architecture"
 
 
 def test_readme_shows_the_picture() -> None:

@@ -28,7 +28,7 @@ simulation.warm_up()
 before = known()
 while simulation.tick < 500_000:
     frame = simulation.advance(simulation.block_ticks)
-assert simulation.health()["engine"]["rolling_share"] > 0.3, "no whirl, in which much is called for the first time"
+assert simulation.health()["engine"]["rolling_share"] > 0.3, "no whirl, which calls much for the first time"
 print(*(each.py_func.__qualname__ for each, count in known().items() if count > before.get(each, 0)))
 """
 

@@ -143,7 +143,7 @@ def test_the_code_of_the_series_is_up_to_date() -> None:
         [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
     )
     assert generated.stdout == CODE.read_text(), (
-        "make it anew: NUMBA_DISABLE_JIT=1 python -m rig.physics.engines.tape.taylor"
+        "regenerate it: NUMBA_DISABLE_JIT=1 python -m rig.physics.engines.tape.taylor"
     )
 
 

@@ -98,7 +98,7 @@ def test_text_with_semicolons_and_decimal_commas(daq_text: tuple[Path, np.ndarra
         half = 0.5 * abs(recording.table.channels[name].scale)
         assert np.abs(samples[name] - values).max() <= half * (1 + 1e-6)
         reach = np.abs(values - recording.table.channels[name].offset).max()
-        assert half < 2.0**-29 * reach, "nothing that a 24-bit converter could have told is lost"
+        assert half < 2.0**-29 * reach, "no resolution of a 24-bit converter is lost"
     assert recording.table.channels["ring_x"].sensitivity_v == pytest.approx(-7.874, abs=1e-3)
     ring = recording.table.channels["ring_x"]
     volts = np.concatenate([b.values[:, 0] for b in recording.blocks("rig/sensors/probes")]) * ring.lsb_v

@@ -83,7 +83,7 @@ def test_a_block_waits_for_all_devices_and_their_commands_are_exact() -> None:
     assert [(end["block"], end["tick"], end["time_s"]) for end in ends] == [(1, BLOCK, 0.01), (2, 2 * BLOCK, 0.02)]
     assert ends[1]["messages"].items() >= {wire.sensor_key("probes"): 1, wire.truth_key("state"): 1}.items()
     order = rig.listener.order
-    assert order[order.index(wire.BLOCK) - 1] == wire.truth_key("energy"), "behind all of the block"
+    assert order[order.index(wire.BLOCK) - 1] == wire.truth_key("energy"), "after all of the block"
     assert events_of(rig) == [
         (0, "one", "joined"), (0, "two", "joined"), (2 * BLOCK, "one", "left"), (2 * BLOCK, "two", "left"),
     ]  # fmt: skip
@@ -111,7 +111,7 @@ def test_a_device_that_hangs_is_removed_and_the_rig_continues() -> None:
         ill.leave()
         steps = Steps(rig, BLOCK)
         well.done(well.wait(3))
-        assert steps.join()[0].lost == {}, "told once"
+        assert steps.join()[0].lost == {}, "the second report has no effect"
     (lost,) = [event for event in rig.listener.named("device") if event["state"] == "lost"]
     assert (lost["tick"], lost["reason"]) == (BLOCK, reason)
 
@@ -142,7 +142,7 @@ def test_a_device_that_leaves_within_a_step_does_not_block_others() -> None:
         device.wait(1)
         device.leave()
         assert [(each.tick, each.lost) for each in steps.join()] == [(3 * BLOCK, {})]
-        assert len(device.ends) == 1, "nobody is told where nobody has joined"
+        assert len(device.ends) == 1, "no report without devices"
 
 
 def test_the_last_step_is_answered_when_all_devices_are_done() -> None:

@@ -78,7 +78,7 @@ def test_a_block_that_took_too_long_is_caught_up_without_waiting_and_counted() -
     fake.work(0.055)
     for n in range(2, 7):
         clock.release(n * BLOCK)
-    assert len(fake.slept) == 1, "no wait while behind"
+    assert len(fake.slept) == 1, "no wait while late"
     clock.release(7 * BLOCK)
     assert fake.ns - start == 70_000_000, "back on the first grid"
     statistics = clock.statistics()

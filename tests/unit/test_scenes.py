@@ -190,7 +190,7 @@ def test_overrides_reach_scene_and_parameters() -> None:
     assert scene.set == {"contact.friction": 0.3, "contact.stiffness": "external-sphere"}
     assert scene.load_parameters()["contact.friction"] == 0.3
     assert (scene.sensors.noise, scene.duration_s, scene.sensors.groups) == (False, 0.5, ("probes", "drive"))
-    assert scene.sensors.truth_rate_hz == 2_000, "fields beside the changed one keep their values"
+    assert scene.sensors.truth_rate_hz == 2_000, "other fields keep their values"
     assert load_scene("hammer").set == {}, "the shipped scene stays as it is"
 
 

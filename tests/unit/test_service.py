@@ -447,7 +447,7 @@ def test_reports_of_clients_are_in_the_status_with_their_lag() -> None:
         status = rig.console.status()
         assert status["samples_published"] == 2_000
         assert status["clients"].keys() == {"recorder", "early"}
-        assert status["clients"]["early"]["lag_s"] == 0.0, "who has just come is behind nothing"
+        assert status["clients"]["early"]["lag_s"] == 0.0, "a new client has no lag"
         row = status["clients"]["recorder"]
         assert (row["received_index"], row["lost"], row["lag_s"]) == (1_000, 3, 0.05)
         assert "5 client reports could not be read" in status["warnings"]
