@@ -276,7 +276,7 @@ class McapRun:
     def _write(self, frame: Frame) -> None:
         for event in frame.events:
             self._event(event)
-        for fault in frame.told:
+        for fault in frame.documents:
             self._writer.write(wire.FAULTS, wire.encode_document(fault), self._wall(frame.tick))
         for message in frame.messages:
             if "zenoh" in message.doors:

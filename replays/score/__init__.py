@@ -1,5 +1,5 @@
-"""What a DAQ under test recorded, held against what the rig sent: by rows where it took counts, else by least squares.
+"""Scorecards of a DAQ under test: its recording compared with the rig's samples, by counts or by least squares.
 
-`judgement` makes a `scorecard` of a file and a session: `digital` follows row by row, `analogue` fits the known signal.
-The two never stand in one verdict.
+`judgement` returns a `scorecard` for a file and a session: `digital` compares rows, `analogue` fits the known signal.
+The two never share a verdict.
 """

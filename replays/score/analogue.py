@@ -1,4 +1,4 @@
-"""The analogue path: the DAQ sampled by itself, so the known signal is fitted to each channel that it recorded."""
+"""Analogue path: the DAQ sampled with its own converter, so the known signal is fitted to each recorded channel."""
 
 from __future__ import annotations
 
@@ -26,66 +26,66 @@ from replays.score.card.scorecard import (
     text_row,
 )
 from replays.score.quantities.noise import split_noise
-from replays.score.quantities.rounding import Converter, find_step, undithered, widen
+from replays.score.quantities.rounding import Converter, find_step, find_undithered, widen_intervals
 from replays.score.records.recorded import Recorded
-from replays.score.records.sent import LOUD, Formula, Session
-from replays.score.records.stimulus import Exact, Sampled, Stimulus, parted, without_noise
+from replays.score.records.sent import MIN_SIGNAL_NOISES, Formula, Session
+from replays.score.records.stimulus import Exact, Sampled, Stimulus, remove_noise, split_at_rate
 from replays.score.records.wiring import Wire
 from replays.score.waveform import (
     Response,
     Waveform,
-    behind_filter,
+    fit_linear_response,
     fit_waveform,
+    fit_with_filter,
     response,
-    through,
 )
 from rig.base import units
 from rig.channels.table import Channel
 
-_AS_WELL = 1.1
-"""A low-pass of Butterworth's is taken where it leaves at most this much of what any linear response leaves."""
-_GOOD = 0.9
-"""Part of the power that the known signal, behind the channel's filter, must explain for a fit to be one of it."""
-_SOME = 0.05
-"""The same without the filter, for one to be looked for."""
+_MAX_RESIDUAL_RATIO = 1.1
+"""Largest residual with a Butterworth low-pass, over that with any linear response, for which the former is used."""
+_MIN_LIKENESS = 0.9
+"""Part of the power that the known signal, with the channel's filter, must explain for a fit to be valid."""
+_MIN_UNFILTERED_LIKENESS = 0.05
+"""Part of the power that it must explain without the filter, for a filter to be searched."""
 _OWN_CLOCK = 3.0, 1e-6
-"""A clock is a channel's own where it is off the others' by more than so many half intervals, and by so much."""
+"""Deviation from which a channel has its own clock: in half intervals of the other clocks, and absolute."""
 _SINE = ("SINAD", "ENOB", "THD", "SFDR")
-_SEEN = 4.0
-"""Noises of a channel that what is above half of the rate has to come to."""
-_LONGEST = 1 << 14
-"""Samples by which a signal is told to be a sine."""
-_MANY = 1000
-"""Rows from which what was sent must be found."""
-_NAMED = 5
+_MIN_ALIAS_NOISES = 4.0
+"""Smallest component above half of the rate that is fitted, in noises of the channel."""
+_MAX_SINE_SAMPLES = 1 << 14
+"""Samples by which a signal is classified as a sine."""
+_MIN_ROWS = 1000
+"""Rows from which a sent signal must be found."""
+_STEPS = 5
 """Steps that are named in a note; the JSON has all."""
-_EDGE = 100
-"""Rows outside the session from which a remark says so: its ends are not interpolated."""
+_EDGE_ROWS = 100
+"""Rows outside the session above which a remark is added: its ends are not interpolated."""
 
-_AMBIGUOUS = "what was sent repeats, and other begins explain the record as well"
-_ODD = "behind a low-pass that is none of Butterworth's"
-_OTHER_CORNER = "behind another low-pass, whose delay is known by its order and corner only"
-_SAME_CORNER = 0.1
-"""Part by which corners differ that have one nominal value: capacitors of 5 % in a filter of second order."""
+_AMBIGUOUS = "the sent signal repeats, and other begins explain the record equally well"
+_FILTER = "with a low-pass that is not a Butterworth one"
+_OTHER_CORNER = "with another low-pass, whose delay is known only from its order and corner"
+_CORNER_TOLERANCE = 0.1
+"""Relative difference of corners with the same nominal value: capacitors of 5 % in a filter of second order."""
 
 
 @dataclass(frozen=True)
 class Fitted:
-    """One channel's fits.
+    """Fits of one channel.
 
     Attributes:
-        name: Of the recorded signal.
-        channel: What it is of.
-        low: The fit, behind a low-pass where the channel shows one: gain, offset and time at low frequencies.
-        clean: The fit of which noise is left: `low`, or behind any linear response if it is `odd`.
-        shown: The response; None where the signal does not show it.
-        corner_hz: Where it has fallen by 3 dB, with its 95 % interval; None where it does not.
-        odd: Whether there is a low-pass that is none of the known ones.
-        values: As recorded, in the channel's unit.
-        known_noise: What the known signal has, by the session's noise and converter [unit rms]; 0 by a formula.
-        folds: What is left of the signal above half of the rate, over its part below [1]; None where it has nothing.
-        alias: The same as recorded [unit], shape (n,).
-        rounding: Converters whose steps the noise does not hide.
+        name: Name of the recorded signal.
+        channel: Its channel.
+        low: Fit with a low-pass if the channel has one: gain, offset and time at low frequencies.
+        clean: Fit whose residual is noise: `low`, or with any linear response if it is `odd`.
+        shown: Frequency response; None if the signal does not determine it.
+        corner_hz: Frequency of -3 dB, with its 95 % interval [Hz]; None if the gain does not fall that far.
+        odd: Whether there is a low-pass that is not a Butterworth one.
+        values: Recorded values, in the channel's unit.
+        known_noise: Noise of the known signal, by the session's noise and converter [unit rms]; 0 for a formula.
+        folds: Aliased part of the signal above half of the rate, over the sent part [1], or None.
+        alias: Aliased signal as recorded [unit], shape (n,).
+        rounding: Converters whose steps are not dithered by the noise.
     """
 
     name: str
@@ -103,12 +103,12 @@ class Fitted:
 
     @property
     def good(self) -> bool:
-        """Whether the known signal explains enough of the record."""
-        return self.clean.likeness >= _GOOD
+        """True if the known signal explains enough of the record."""
+        return self.clean.likeness >= _MIN_LIKENESS
 
     @property
-    def rounded(self) -> str:
-        """A note on rounding that does not average out, if there is any."""
+    def rounding_note(self) -> str:
+        """Note on rounding that does not average out, or empty."""
         return "steps of a converter are larger than its noise" if self.rounding else ""
 
 
@@ -118,7 +118,7 @@ def fit_channels(
 ) -> tuple[list[Fitted], list[Alignment]]:  # fmt: skip
     """Fit all connected signals, and align their tables with the session.
 
-    A signal that may be of several channels is fitted only where its channel explains it.
+    A signal with several possible channels is fitted only if its channel explains it.
     """
     zero_s = min((signal.first_s for signal in recorded.values() if signal.first_s is not None), default=0.0)
     tables: dict[int, list[Source]] = {}
@@ -130,19 +130,19 @@ def fit_channels(
         channel = session.channels[wire.channel]
         if signal.rate_hz is None:
             remarks.append(f"{name}: the file gives no sample rate; the session's, {channel.rate_hz:g} Hz, is assumed")
-        values, told = in_unit(signal, channel)
-        if not told:
+        values, has_unit = in_unit(signal, channel)
+        if not has_unit:
             given = "no unit" if signal.unit in ("", "1") else f"the unit {signal.unit}"
             remarks.append(f"{name}: the file gives {given}; {channel.unit} is assumed")
         sent, first_s, sent_hz = session.whole(wire.channel)
         formula, rate_hz = formulas.get(wire.channel), signal.rate_hz or sent_hz
         if formula is None:
-            cleaned = without_noise(sent, _converter(session, channel).error)
+            cleaned = remove_noise(sent, _converter(session, channel).error)
             stimulus: Stimulus = Sampled(cleaned, first_s, sent_hz)
         else:
             stimulus = Exact(formula, (first_s, first_s + len(sent) / sent_hz), rate_hz)
-        least = _SEEN * math.hypot(channel.noise_v, channel.lsb_v) / abs(channel.sensitivity_v)
-        parts = parts_of[name] = parted(stimulus, rate_hz, sent_hz, least)
+        least = _MIN_ALIAS_NOISES * math.hypot(channel.noise_v, channel.lsb_v) / abs(channel.sensitivity_v)
+        parts = parts_of[name] = split_at_rate(stimulus, rate_hz, sent_hz, least)
         begin_s = 0.0 if signal.first_s is None else signal.first_s - zero_s
         within_s = wire.within_s[0] + begin_s, wire.within_s[1] + begin_s
         wire = replace(wire, own_s=wire.own_s - begin_s, within_s=within_s)
@@ -162,12 +162,12 @@ def fit_channels(
 
 
 def _converter(session: Session, channel: Channel) -> Converter:
-    """Return the converter that a channel's samples in the session went through."""
+    """Return the converter of a channel's samples in the session."""
     return Converter(abs(channel.scale), channel.noise_v * session.noisy / abs(channel.sensitivity_v))
 
 
 def in_unit(signal: Recorded, channel: Channel) -> tuple[np.ndarray, bool]:
-    """Values in the channel's unit, and whether the file tells how; volts go through the channel's sensitivity."""
+    """Return values in the channel's unit, and whether the file has a unit; volts are divided by the sensitivity."""
     if signal.unit == channel.unit:
         return signal.values, True
     if units.kind(signal.unit) == "voltage":
@@ -185,25 +185,25 @@ def _fit(
     whole = fit_waveform(values, times_s, stimulus, curve)
     if whole is None:
         return None
-    shown = response(whole) if whole.likeness >= _SOME else None
+    shown = response(whole) if whole.likeness >= _MIN_UNFILTERED_LIKENESS else None
     low = clean = whole
     corner_hz, odd = None, False
     if shown is not None and shown.corner_hz is not None:
-        corner_hz, odd, clean = shown.corner_hz, True, through(whole)
-        behind = behind_filter(whole, stimulus, shown)
-        if behind is not None and np.var(behind[0].residual) < _AS_WELL * np.var(clean.residual):
+        corner_hz, odd, clean = shown.corner_hz, True, fit_linear_response(whole)
+        behind = fit_with_filter(whole, stimulus, shown)
+        if behind is not None and np.var(behind[0].residual) < _MAX_RESIDUAL_RATIO * np.var(clean.residual):
             (low, corner_hz), odd = behind, False
             clean = low
     folds, alias = None, 0.0
     if parts is not None:
         at_s = clean.times_s + low.late_at(clean.times_s)
-        alias, amounts = _folded(clean, [each(at_s)[0] for each in parts[1:]])
+        alias, amounts = _fit_alias(clean, [each(at_s)[0] for each in parts[1:]])
         folds = scale_interval(amounts, 1.0 / abs(low.gain))
         clean = replace(clean, residual=clean.residual - alias)
     if known and isinstance(stimulus, Sampled):
-        known = replace(known, values=stimulus.nearest(clean.times_s + low.late_at(clean.times_s)))
-    rounding = undithered(clean, find_step(source.values), known)
-    low = widen(low, rounding)
+        known = replace(known, values=stimulus.find_nearest(clean.times_s + low.late_at(clean.times_s)))
+    rounding = find_undithered(clean, find_step(source.values), known)
+    low = widen_intervals(low, rounding)
     return Fitted(
         name,
         channel,
@@ -220,12 +220,12 @@ def _fit(
     )
 
 
-def _folded(found: Waveform, above: Sequence[np.ndarray]) -> tuple[np.ndarray, tuple[float, float, float]]:
-    """What of a residual is of frequencies above half of the rate, and times what was sent with its 95 % interval.
+def _fit_alias(found: Waveform, above: Sequence[np.ndarray]) -> tuple[np.ndarray, tuple[float, float, float]]:
+    """Return the aliased part of a residual, and its gain relative to the sent part with its 95 % interval.
 
     Args:
-        found: A fit of what is below.
-        above: What is above at the fitted instants, and that a quarter of a period later, each shape (n,).
+        found: A fit of the part below half of the rate.
+        above: The part above at the fitted instants, and a quarter of a period later, each shape (n,).
     """
     matrix = np.column_stack([*above, found.known, found.slope, np.ones(len(found.known))])
     parts = solve(matrix, found.residual)
@@ -246,7 +246,7 @@ def score_analogue(
     _score_rows(card, alignments, recorded)
     for name, wire in wires.items():
         if name not in fitted:
-            note = "nothing that was sent explains it" if wire.channel else "no channel is like it"
+            note = "no sent signal explains it" if wire.channel else "no channel is similar"
             card.add("gain", name, None, note=note)
     ambiguous = {name for each in alignments if each.ambiguous for name in each.names}
     _score_time(card, [one for one in found if one.good], ambiguous)
@@ -265,7 +265,7 @@ def score_analogue(
 
 
 def _score_rows(card: Scorecard, alignments: list[Alignment], recorded: Mapping[str, Recorded]) -> None:
-    """Lost and doubled samples, and the part of each table that is judged."""
+    """Add lost and doubled samples, and the judged part of each table."""
     if not alignments:
         card.doubts.append("no channel is found in the session")
         for quantity in ("lost samples", "doubled samples", "judged part"):
@@ -276,48 +276,48 @@ def _score_rows(card: Scorecard, alignments: list[Alignment], recorded: Mapping[
         note = "up to whole periods" if alignment.ambiguous else ""
         for quantity, sign in (("lost samples", 1), ("doubled samples", -1)):
             if steps is None:
-                card.add(quantity, name, None, note="the signal is too slow for a step by one sample to show")
+                card.add(quantity, name, None, note="the signal is too slow to show a step by one sample")
                 continue
             here = [(first, last, sign * size) for first, last, size in steps if sign * size > 0]
             rows = ", ".join(
                 f"{size} at row {last}" if first == last else f"{size} in rows {first} to {last}"
-                for first, last, size in here[:_NAMED]
+                for first, last, size in here[:_STEPS]
             )
-            told = "; ".join(each for each in (rows, f"and {len(here) - _NAMED} more" * (len(here) > _NAMED)) if each)
+            text = "; ".join(each for each in (rows, f"and {len(here) - _STEPS} more" * (len(here) > _STEPS)) if each)
             count = float(sum(size for _, _, size in here))
-            said = "; ".join(each for each in (told, note) if each)
-            card.add(quantity, name, (count, count, count), note=said)
+            full_note = "; ".join(each for each in (text, note) if each)
+            card.add(quantity, name, (count, count, count), note=full_note)
             if alignment.steps_doubted and not count:
-                about, why = ANALOGUE[quantity], "from another begin, which explains more rows, there are some"
+                about, why = ANALOGUE[quantity], "there are some from another begin, which explains more rows"
                 card.rows[-1] = replace(card.rows[-1], verdict=INCONCLUSIVE, run=about.run, note=why)
             card.runs[f"{quantity} {name}".strip()] = [(first, last) for first, last, _ in here]
-        for channel, lost in _rows_without_value(alignment, recorded).items():
+        for channel, lost in _count_missing_values(alignment, recorded).items():
             card.add("lost samples", channel, (lost, lost, lost), note="rows without a value")
-        # At an end of the record such rows are in the judged part only: a DAQ may start before its input is connected.
-        foreign = alignment.track.foreign
-        count, rows = float(sum(b - a + 1 for a, b in foreign)), ", ".join(f"{a} to {b}" for a, b in foreign[:_NAMED])
+        # At an end of the record such rows affect the judged part only: a DAQ may start before its input is connected.
+        foreign = alignment.track.unexplained
+        count, rows = float(sum(b - a + 1 for a, b in foreign)), ", ".join(f"{a} to {b}" for a, b in foreign[:_STEPS])
         card.add("foreign rows", name, (count, count, count), note=f"rows {rows}" if foreign else "")
         card.runs[f"foreign rows {name}".strip()] = foreign
-        card.add("judged part", name, (judged := alignment.judged(), judged, judged))
+        card.add("judged part", name, (judged := alignment.explained_part(), judged, judged))
         one = recorded[alignment.names[0]]
         stamps, (explained, at) = Stamps(one.table), alignment.track.places(alignment.rows)
         stamps.times_s = np.concatenate([part[:, 0] for part in one.table.parts([one.column])])
-        stamps.take(0.0, at / alignment.rate_hz, np.flatnonzero(explained), alignment.rows)
-        estimates = stamps.judged(None)
+        stamps.add_rows(0.0, at / alignment.rate_hz, np.flatnonzero(explained), alignment.rows)
+        estimates = stamps.estimate_all(None)
         for quantity in ("stamp rate", "stamp jitter", "stamps that go back"):
             card.add(quantity, name, estimates[quantity])
         for rows, what in zip(
             (alignment.track.inside[0], alignment.rows - alignment.track.inside[1]),
             ("before the session's begin", "after the session's end"), strict=True,
         ):  # fmt: skip
-            if rows > _EDGE:
-                card.remarks.append(f"{rows / alignment.rate_hz:.6g} s of the record lie {what} and are not judged")
+            if rows > _EDGE_ROWS:
+                card.remarks.append(f"{rows / alignment.rate_hz:.6g} s of the record are {what} and are not judged")
 
 
-def _rows_without_value(alignment: Alignment, recorded: Mapping[str, Recorded]) -> dict[str, float]:
+def _count_missing_values(alignment: Alignment, recorded: Mapping[str, Recorded]) -> dict[str, float]:
     """Return the number of rows in the session without a value, of the signals that lack some.
 
-    A row before the first value of all signals, or after the last one, is not lost.
+    Rows before the first value of all signals, or after the last one, are not lost.
     """
     inside = slice(*alignment.track.inside)
     held = {name: np.isfinite(recorded[name].values[inside]) for name in alignment.names}
@@ -327,12 +327,12 @@ def _rows_without_value(alignment: Alignment, recorded: Mapping[str, Recorded]) 
 
 
 def _score_time(card: Scorecard, found: list[Fitted], ambiguous: set[str]) -> None:
-    """Clock of all channels together, start of one in the middle of them, and skew of the others against it."""
-    # One channel that is off has no say in what the others are: the reference is in the middle of them.
+    """Add the common clock of all channels, the start of the middle one, and the skew of the others against it."""
+    # The median channel is the reference, so that a single wrong one does not change the others' results.
     middle_s = float(np.median([one.low.middle_s for one in found])) if found else 0.0
 
     def late_s(one: Fitted) -> float:
-        # Of the same instant, by the mean time error and the clock: the drift alone is not known as well.
+        # At the same instant, by the mean time error and the clock: the drift alone is known less well.
         return one.low.late_s + one.low.drift * (middle_s - one.low.middle_s)
 
     inner = sorted((one for one in found if not one.odd), key=late_s) or found
@@ -348,16 +348,16 @@ def _score_time(card: Scorecard, found: list[Fitted], ambiguous: set[str]) -> No
     bends = np.array([one.low.bend for one in found])
     for quantity, values, half, others in (("clock", drifts, halves, own), ("clock drift", bends, bend_halves, own)):
         weights = np.where(others, 0.0, half**-2.0)
-        told = [("", *pool_estimates(values, weights, equal_errors=any(one.rounding for one in found)))]
-        told += [(found[n].name, values[n], half[n]) for n in np.flatnonzero(others) if quantity == "clock"]
-        for name, value, wide in told:
-            # Its clock runs fast where the session's time goes slowly over its own.
-            note = "off the clock of the others" if name else ""
+        clocks = [("", *pool_estimates(values, weights, equal_errors=any(one.rounding for one in found)))]
+        clocks += [(found[n].name, values[n], half[n]) for n in np.flatnonzero(others) if quantity == "clock"]
+        for name, value, wide in clocks:
+            # Its clock runs fast if the session's time advances slowly relative to it.
+            note = "differs from the clock of the others" if name else ""
             slow = value / (1.0 + value) if quantity == "clock" else value
             card.add(quantity, name, make_interval(-slow, wide, 1e6), note=note)
     open_ = reference.name in ambiguous
     note = _AMBIGUOUS if open_ else ""
-    # To time zero of the file, at its own clock.
+    # To time zero of the file, by its own clock.
     back = np.array([0.0, 0.0, 1.0, -low.middle_s, 0.5 * low.middle_s**2 - low.half_s**2 / 6.0])
     spread = math.sqrt(back @ low.covariance @ back)
     start = make_interval(float(low.late_at(np.zeros(1))[0]), float(student(low.freedom[2:].min())) * spread)
@@ -368,8 +368,8 @@ def _score_time(card: Scorecard, found: list[Fitted], ambiguous: set[str]) -> No
         if one is not reference:
             apart = late_s(one) - late_s(reference)
             both = math.hypot(one.low.half[2], low.half[2])
-            odd = _ODD if one.odd or reference.odd else ""
-            filtered = "" if _same_corner(one, reference) else _OTHER_CORNER
+            odd = _FILTER if one.odd or reference.odd else ""
+            filtered = "" if _has_same_corner(one, reference) else _OTHER_CORNER
             said = "; ".join(each for each in (f"against {reference.name}", note, odd or filtered) if each)
             skew = None if odd else make_interval(apart, both, 1e9)
             card.add("skew", one.name, skew, of=one.channel, note=said)
@@ -378,26 +378,26 @@ def _score_time(card: Scorecard, found: list[Fitted], ambiguous: set[str]) -> No
                 card.rows[-1] = replace(card.rows[-1], verdict=INCONCLUSIVE, run=ANALOGUE["skew"].run)
 
 
-def _same_corner(one: Fitted, other: Fitted) -> bool:
-    """Return whether two channels have low-passes alike, whose delays cancel in their skew, or none."""
+def _has_same_corner(one: Fitted, other: Fitted) -> bool:
+    """Return whether two channels have equal low-passes, whose delays cancel in their skew, or none."""
     if one.corner_hz is None or other.corner_hz is None:
         return one.corner_hz is other.corner_hz
-    return abs(one.corner_hz[0] / other.corner_hz[0] - 1.0) < _SAME_CORNER
+    return abs(one.corner_hz[0] / other.corner_hz[0] - 1.0) < _CORNER_TOLERANCE
 
 
 def _is_biased(signal: Recorded, channel: Channel) -> bool:
     """Return whether an inverted signal would show in its offset: it is in volts, and the channel has a bias."""
-    return units.kind(signal.unit) == "voltage" and abs(channel.bias_v) > LOUD * channel.noise_v
+    return units.kind(signal.unit) == "voltage" and abs(channel.bias_v) > MIN_SIGNAL_NOISES * channel.noise_v
 
 
 def _score_wires(
     card: Scorecard, recorded: Mapping[str, Recorded], wires: Mapping[str, Wire], found: list[Fitted],
     ambiguous: set[str], session: Session, alignments: Sequence[Alignment],
 ) -> None:  # fmt: skip
-    """Mapping and polarity of the signals whose gain is found; a name of the rig's has to be that channel."""
+    """Add mapping and polarity of the signals with a gain; a signal with a channel's name must be that channel."""
     fits = {one.name: one for one in found if one.good}
     signs = {name: one.low.gain > 0.0 for name, one in fits.items()}
-    # A begin half a period later turns all channels of a table, but no bias: one whose sign is known fixes the others'.
+    # A begin half a period later inverts all channels of a table, not their biases: one known sign fixes the others.
     fixed = {
         name for each in alignments for name in each.names
         if any(not wires[n].turned or _is_biased(recorded[n], fits[n].channel) for n in each.names if n in fits)
@@ -405,19 +405,19 @@ def _score_wires(
     open_ = {name for name in fits if name in ambiguous and wires[name].turned and name not in fixed}
     mixed = len({signs[name] for name in open_}) > 1
     if open_ and not mixed:
-        card.remarks.append(f"the polarity of {', '.join(sorted(open_))} is open: half a period later it is inverted")
+        card.remarks.append(f"the polarity of {', '.join(sorted(open_))} is open: it is inverted half a period later")
     rows = []
     for name, wire in wires.items():
         verdict: Verdict = NO_LIMIT
         note = f"correlation {wire.likeness:.4f}"
-        absent = not wire.channel and name in session.channels and recorded[name].rows >= _MANY
+        absent = not wire.channel and name in session.channels and recorded[name].rows >= _MIN_ROWS
         if absent and session.is_loud(name, [end for each in alignments for end in each.inside_s]):
-            verdict, note = FAIL, "nothing of what was sent is in it"
+            verdict, note = FAIL, "it has no component of what was sent"
         elif name in fits and name in session.channels and name not in (wire.channel, *wire.rivals):
             verdict = FAIL
         elif not wire.channel or wire.rivals or name not in fits:
             verdict = INCONCLUSIVE
-            note += f"; as like {', '.join(wire.rivals)}" if wire.rivals else ""
+            note += f"; equally similar to {', '.join(wire.rivals)}" if wire.rivals else ""
         elif name in session.channels:
             verdict = PASS
         rows.append(text_row(card.path, "mapping", name, wire.channel or "-", verdict, note))
@@ -428,9 +428,9 @@ def _score_wires(
         if name not in fits:
             verdict = INCONCLUSIVE
         elif name in open_ and not (mixed and not upright):
-            verdict, note = INCONCLUSIVE, "half a period later it would be the other"
+            verdict, note = INCONCLUSIVE, "inverted half a period later"
         elif name in open_:
-            note = "turned against the others, from whichever begin"
+            note = "inverted relative to the others, from any begin"
         rows.append(text_row(card.path, "polarity", name, "as sent" if upright else "turned", verdict, note))
     card.rows[:0] = rows
 
@@ -441,10 +441,10 @@ def _score_fit(card: Scorecard, one: Fitted) -> None:
     def add(quantity: str, estimate: Interval | None, note: str = "") -> None:
         card.add(quantity, one.name, estimate, of=channel, unit=channel.unit, note=note)
 
-    note = _ODD if one.odd else "" if one.good else f"what was sent explains {max(0.0, one.clean.likeness):.1%} of it"
-    add("gain", None if note else make_interval(abs(low.gain) - 1.0, low.half[0], 1e6), note or one.rounded)
-    add("offset", make_interval(low.offset, low.half[1]) if one.good else None, one.rounded)
-    # Nothing tells whether the rig's own noise, which is in its samples, was in what the DAQ was given.
+    note = _FILTER if one.odd else "" if one.good else f"the signal explains {max(0.0, one.clean.likeness):.1%} of it"
+    add("gain", None if note else make_interval(abs(low.gain) - 1.0, low.half[0], 1e6), note or one.rounding_note)
+    add("offset", make_interval(low.offset, low.half[1]) if one.good else None, one.rounding_note)
+    # It is unknown whether the rig's own noise, which is in its samples, was in the DAQ's input.
     split = split_noise(one.clean, floor=one.known_noise, steps=bool(one.rounding))
     noise = split.noise if one.good else split.left
     add("noise", noise)
@@ -462,7 +462,7 @@ def _score_fit(card: Scorecard, one: Fitted) -> None:
         if limit is not None and highest >= limit.low:
             estimate, note = (highest, highest, math.inf), "no fall by 3 dB up to there"
         else:
-            note = f"no fall by 3 dB up to {highest:.0f} Hz, beyond which the signal shows nothing"
+            note = f"no fall by 3 dB up to {highest:.0f} Hz, the signal's highest frequency"
     add("corner", estimate, note)
     if one.folds is not None:
         value, low_db, high_db = (-20.0 * math.log10(each) if each else math.inf for each in one.folds)
@@ -470,16 +470,16 @@ def _score_fit(card: Scorecard, one: Fitted) -> None:
 
 
 def _score_sine(card: Scorecard, one: Fitted) -> bool:
-    """The standard's sine fit beside the known signal; whether that is a sine, and no value is missing."""
+    """Add the quantities of the standard's sine fit; return whether the signal is a sine with no missing value."""
     # The longest stretch without a lost sample.
     gaps = np.flatnonzero(~np.isfinite(np.concatenate([[np.nan], one.values, [np.nan]])))
     at = int(np.argmax(np.diff(gaps)))
     values = one.values[gaps[at] : gaps[at + 1] - 1]
-    # A session's samples that are a sine to their own noise may have harmonics below it.
-    if one.known_noise or len(values) < _MANY or not is_sine(one.low.known[:_LONGEST], 0.0):
+    # A session's samples that are a sine within their noise may have harmonics below it.
+    if one.known_noise or len(values) < _MIN_ROWS or not is_sine(one.low.known[:_MAX_SINE_SAMPLES], 0.0):
         return False
     fit = fit_sine(values)
-    told = quality(fit)
-    for quantity, estimate in zip(_SINE, (told.sinad_db, told.enob, told.thd_db, told.sfdr_db), strict=True):
+    found = quality(fit)
+    for quantity, estimate in zip(_SINE, (found.sinad_db, found.enob, found.thd_db, found.sfdr_db), strict=True):
         card.add(quantity, one.name, estimate, of=one.channel, amplitude=fit.amplitude[0])
     return True

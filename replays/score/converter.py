@@ -1,4 +1,4 @@
-"""Quantities of the analogue path that need a test signal of their own, or several channels."""
+"""Quantities of the analogue path that need a special test signal, or several channels."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from replays.score.analogue import Fitted
 from replays.score.card.scorecard import Scorecard
 from replays.score.quantities.crosstalk import find_crosstalk
 from replays.score.quantities.nonlinearity import intermodulation, transfer_curve
-from replays.score.quantities.rounding import rounding_errors
+from replays.score.quantities.rounding import find_rounding_errors
 from replays.score.quantities.step import BAND, has_steps, step_response
 
 _QUANTITIES = ("IMD", "INL", "DNL", "crosstalk", "rise time", "overshoot", "settling time")
 _MAX_ROWS = 1 << 17
-"""Rows by which crosstalk is judged: more cost time, and 1e5 show -100 dB."""
+"""Rows by which crosstalk is judged: more cost time, and 1e5 resolve -100 dB."""
 
 
 def score_converter(card: Scorecard, found: Sequence[Fitted]) -> None:
@@ -41,7 +41,7 @@ def _score_nonlinearity(card: Scorecard, one: Fitted) -> None:
     found = transfer_curve(low.times_s, low.known, low.values, 2.0 * channel.adc_v / abs(channel.sensitivity_v))
     if found is not None:
         card.add("INL", one.name, found.inl, of=channel, note=f"over {found.coverage:.0%} of the range")
-        card.add("DNL", one.name, found.dnl, of=channel, note=f"{found.code_samples:.3g} samples a code")
+        card.add("DNL", one.name, found.dnl, of=channel, note=f"{found.code_samples:.3g} samples per code")
 
 
 def _score_steps(card: Scorecard, one: Fitted) -> None:
@@ -51,7 +51,7 @@ def _score_steps(card: Scorecard, one: Fitted) -> None:
     response = step_response(low.known, low.values)
     row_s = float(np.median(np.diff(low.times_s)))
     rise = settling = overshoot = None
-    note = "too few steps with plateaus that are long enough"
+    note = "too few steps with long enough plateaus"
     if response is not None:
         rise, overshoot = scale_interval(response.rise_rows, row_s), response.overshoot
         settling = None if response.settling_rows is None else scale_interval(response.settling_rows, row_s)
@@ -75,10 +75,10 @@ def _score_crosstalk(card: Scorecard, one: Fitted, others: Sequence[Fitted]) -> 
     volts = clean.residual[rows] * abs(one.channel.sensitivity_v)
     size_v = abs(one.channel.sensitivity_v)
     own = [size_v * clean.known[rows], clean.slope[rows]]
-    errors = size_v * rounding_errors(clean, one.rounding, rows)
+    errors = size_v * find_rounding_errors(clean, one.rounding, rows)
     worst, part = find_crosstalk(volts, own, sources, size_v * one.known_noise, errors)
     if part is None:
-        card.add("crosstalk", one.name, None, of=one.channel, note=f"other signals are the same as {names[worst]}'s")
+        card.add("crosstalk", one.name, None, of=one.channel, note=f"other signals equal that of {names[worst]}")
         return
     value, low, high = (20.0 * math.log10(max(each, 1e-15)) for each in part)
     card.add("crosstalk", one.name, (value, low, high), of=one.channel, note=f"from {names[worst]}")

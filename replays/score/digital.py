@@ -1,7 +1,7 @@
-"""The digital path: the DAQ took the rig's counts, so every row has to be there once, in order, with every count.
+"""Digital path: the DAQ recorded the rig's counts, so each row must be there once, in order, with all counts correct.
 
-Rows are followed among those sent (`rows`); counts are recovered by a scale that is found for each channel and must
-then be exact. Time stamps are held against the times of the rows that they stand beside.
+Rows are compared with those sent (`rows`). The scale of each channel is found first, and counts must then be exact.
+Time stamps are compared with the times of their rows.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from itertools import chain
 import numpy as np
 
 from replays.score.alignment.overlap import holds_session_rows
-from replays.score.alignment.placing import Taken
+from replays.score.alignment.placing import SignalRows
 from replays.score.alignment.stamps import Stamps
 from replays.score.card.scorecard import Interval, Scorecard
 from replays.score.records.live import Arrivals
@@ -25,25 +25,25 @@ from replays.score.records.wiring import Wire
 from rig.channels.table import Channel
 
 _BACKLOG_S = 1.0
-"""Rows that wait in a pipe have come by then [s]."""
-_NAMED = 5
-"""Rows that are named in a line; all stand in the document."""
-_REPEATING = 0.5
-"""Part of the rows that recur, from which a loss of whole periods is taken for possible."""
-_BESIDE = 1 << 17
+"""Time after which rows that waited in a pipe have arrived [s]."""
+_NAMES = 5
+"""Rows that are named in a line; the document has all."""
+_REPEATING_PART = 0.5
+"""Part of recurring rows above which a loss of whole periods is possible."""
+_EDGE_ROWS = 1 << 17
 """Rows on each side of an end of the session that are compared with all of the session."""
 
 
 def score_digital(
-    card: Scorecard, recorded: Mapping[str, Recorded], wires: Mapping[str, Wire], taken: Mapping[str, Taken],
+    card: Scorecard, recorded: Mapping[str, Recorded], wires: Mapping[str, Wire], taken: Mapping[str, SignalRows],
     session: Session, arrivals: Arrivals | None = None,
 ) -> None:  # fmt: skip
-    """Put the rows of the digital path onto a scorecard; latency, too, where it is known when the rows came."""
+    """Add the rows of the digital path to a scorecard, with the latency if the arrival times of rows are known."""
     for name, each in taken.items():
         _score_scale(card, name, each.scale, session.channels[wires[name].channel])
     coarse = [each.scale for each in taken.values() if each.scale.rounding]
     for bits, rounding in dict.fromkeys((scale.bits, scale.rounding) for scale in coarse):
-        card.remarks.append(f"counts of {bits} bits, rounded {rounding}, are compared; lower bits of the rig's are not")
+        card.remarks.append(f"counts of {bits} bits, rounded {rounding}, are compared; the rig's lower bits are not")
     tables: dict[tuple[float, ...], list[str]] = {}
     for name in sorted(taken, key=lambda each: not taken[each].scale.known):
         rate_hz = session.rate_hz(session.channels[wires[name].channel].group)
@@ -58,24 +58,24 @@ def _exact(count: float) -> Interval:
 
 
 def _score_scale(card: Scorecard, name: str, scale: Scale, channel: Channel) -> None:
-    note = f"{scale.what}: {scale.each:.9g} a count, {scale.zero + 0.0:.9g} at zero"
-    note += "" if scale.known else ", as no stretch of rows shows another: its values are not what was sent"
+    note = f"{scale.what}: {scale.each:.9g} per count, {scale.zero + 0.0:.9g} at zero"
+    note += "" if scale.known else ", assumed: the values are not the counts that were sent"
     for quantity, off in (("scale", scale.gain_ppm), ("offset", scale.zero_counts)):
         card.add(quantity, name, _exact(off) if scale.known else None, of=channel, note=note)
 
 
 def _score_rows(
     card: Scorecard, names: Sequence[str], wires: Mapping[str, Wire], recorded: Mapping[str, Recorded],
-    taken: Mapping[str, Taken], session: Session, arrivals: Arrivals | None,
+    taken: Mapping[str, SignalRows], session: Session, arrivals: Arrivals | None,
 ) -> None:  # fmt: skip
-    """Follow the rows of signals that are as long as each other, and judge what became of them and of their stamps."""
+    """Compare the rows of signals of equal length, and add their events and stamps to a scorecard."""
     groups = list(dict.fromkeys(session.channels[wires[name].channel].group for name in names))
     table = "all groups" if len(groups) == len(session.groups) > 1 else ", ".join(groups)
     by_name, one = {name: taken[name].scale for name in names}, taken[names[0]]
     sound = sum(scale.known for scale in by_name.values())
     if not sound:
         for name in names:
-            card.add("altered values", name, None, note="no signal beside it shows which row is which")
+            card.add("altered values", name, None, note="no other signal identifies the rows")
         return
     sent = Sent(session, groups, one.step, one.phase)
     columns = [sent.names.index(wires[name].channel) for name in names]
@@ -95,8 +95,8 @@ def _score_rows(
             found = {name: by_name[name].counts(values) for name, values in columns}
             yield np.column_stack([found[name] for name in names])
 
-    def made(sent: Sent) -> Iterator[np.ndarray]:
-        """Counts that a DAQ with these converters has of those sent."""
+    def adapt(sent: Sent) -> Iterator[np.ndarray]:
+        """Yield the counts that a DAQ with these converters records of those sent."""
         for chunk in sent:
             cut = chunk[:, columns] >> bits << bits
             if not repeats:
@@ -106,72 +106,74 @@ def _score_rows(
     bits = np.array([recorded[name].lost_bits for name in names])
     coarse = any(scale.rounding for scale in by_name.values())
     found, trigger, at, repeats = Followed(), None, one.early, list[float]()
-    for places, found in follow(made(sent), counts(one.early), sound, one.start):  # noqa: B007
+    for places, found in follow(adapt(sent), counts(one.early), sound, one.start):  # noqa: B007
         known = np.flatnonzero(places >= 0)
         since_s = sent.since_s(places[known]) if len(known) else np.empty(0)
-        stamps.take(sent.first_s, since_s, known, len(places))
+        stamps.add_rows(sent.first_s, since_s, known, len(places))
         if arrivals is not None and len(known):
             came_s = arrivals.since_s(at + known)
             settled = came_s > _BACKLOG_S
             sent_s = session.arrived_s(groups, sent.first_s + since_s[settled]) - arrivals.unix_s[0]
             delays.times_s = came_s[settled]
-            delays.take(0.0, sent_s, np.arange(len(sent_s)), len(sent_s))
+            delays.add_rows(0.0, sent_s, np.arange(len(sent_s)), len(sent_s))
             longest_s = max(longest_s, float(np.max(delays.times_s - sent_s, initial=-math.inf)))
         if trigger is None and session.trigger_s is not None and len(known):
-            behind = np.flatnonzero(sent.first_s + since_s >= session.trigger_s)
-            # Row 0 is behind whatever was before the recording.
-            trigger = at + int(known[behind[0]]) if len(behind) and at + known[behind[0]] else None
+            after = np.flatnonzero(sent.first_s + since_s >= session.trigger_s)
+            # Row 0 follows any time before the recording.
+            trigger = at + int(known[after[0]]) if len(after) and at + known[after[0]] else None
         at += len(places)
 
     def add(quantity: str, channel: str, runs: np.ndarray, rows: float | None = None, *, numbered: bool = True) -> None:
         note = ""
         if len(runs):
-            told = [(a, b) for a, b in (sent.numbers(runs) if numbered else runs).tolist()]
-            card.runs[f"{quantity} {channel}"] = told
-            note = "rows " + ", ".join(f"{a}" if a == b else f"{a} to {b}" for a, b in told[:_NAMED])
-            note += f" and {len(told) - _NAMED} more stretches" if len(told) > _NAMED else ""
+            ranges = [(a, b) for a, b in (sent.numbers(runs) if numbered else runs).tolist()]
+            card.runs[f"{quantity} {channel}"] = ranges
+            note = "rows " + ", ".join(f"{a}" if a == b else f"{a} to {b}" for a, b in ranges[:_NAMES])
+            note += f" and {len(ranges) - _NAMES} more stretches" if len(ranges) > _NAMES else ""
         card.add(quantity, channel, _exact(np.sum(runs[:, 1] - runs[:, 0] + 1) if rows is None else rows), note=note)
 
-    if repeats and repeats[0] > _REPEATING:
-        card.doubts.append(f"{table}: what was sent repeats row by row, so that a loss of whole periods does not show")
+    if repeats and repeats[0] > _REPEATING_PART:
+        card.doubts.append(f"{table}: the sent rows repeat, so that a loss of whole periods is not visible")
     add("missing rows", table, found.lost)
     for quantity, pairs in (("doubled rows", found.doubled), ("swapped rows", found.swapped)):
         add(quantity, table, stretches(np.unique(pairs[:, 0])), len(pairs))
 
     def hashes() -> Iterator[np.ndarray]:
-        return (row_hashes(each[:, :sound]).view(np.int64) for each in made(Sent(session, groups, one.step, one.phase)))
+        return (
+            row_hashes(each[:, :sound]).view(np.int64) for each in adapt(Sent(session, groups, one.step, one.phase))
+        )
 
     foreign, early = found.foreign, one.early
-    early += int(np.sum(foreign == np.arange(len(foreign)))) if early else 0  # to some rows, where some are lost
+    early += int(np.sum(foreign == np.arange(len(foreign)))) if early else 0  # approximately, if some are lost
     after = foreign[(foreign + found.last - found.last_row >= found.sent) & (foreign > found.last_row)]
     foreign = foreign[early - one.early : len(foreign) - len(after)]
-    # Rows ahead of a session may be equal to some of it that are judged, as those that a DAQ had recorded before.
+    # Rows before a session may equal judged rows of it, as rows do that a DAQ had recorded earlier.
     ends = ((early, early, "first", "before"), (len(after), at - len(after), "last", "after"))
     for rows, edge, which, side in (each for each in ends if each[0]):
-        card.remarks.append(f"{table}: the {which} {rows} rows are not judged: they stand {side} the session's {which}")
-        first, judged = max(0, edge - _BESIDE), range(found.first, found.last + 1) if which == "first" else range(0)
-        near = row_hashes(take_rows(counts(first), 0, 2 * _BESIDE, len(names))[:, :sound]).view(np.int64)
+        card.remarks.append(f"{table}: the {which} {rows} rows are not judged: they are {side} the session's {which}")
+        first, judged = max(0, edge - _EDGE_ROWS), range(found.first, found.last + 1) if which == "first" else range(0)
+        near = row_hashes(take_rows(counts(first), 0, 2 * _EDGE_ROWS, len(names))[:, :sound]).view(np.int64)
         outside = (np.arange(len(near)) < edge - first) == (which == "first")
         if holds_session_rows(near, outside, judged, hashes):
             card.doubts.append(f"{table}: unjudged rows {side} the session equal a run of rows in it")
     add("foreign rows", table, stretches(foreign + one.early), numbered=False)
     for name, altered in zip(names, found.altered, strict=True):
         add("altered values", name, altered.pairs(), altered.rows)
-    told = {
+    estimates = {
         "row step": _exact(one.step),
         "rows before the first": _exact(max(0, found.first)),
-        "rows after the last": _exact(found.sent - 1 - found.last), **stamps.judged(session.wall_s),
+        "rows after the last": _exact(found.sent - 1 - found.last), **stamps.estimate_all(session.wall_s),
         "trigger row": None if trigger is None else _exact(trigger),
     }  # fmt: skip
     notes = {}
     if arrivals is not None:
-        told["latency"] = delays.judged(0.0, apart_s=math.inf)["latency"]
+        estimates["latency"] = delays.estimate_all(0.0, apart_s=math.inf)["latency"]
         notes["latency"] = (
-            f"arrival here less that of the rig's block, from {_BACKLOG_S:g} s on; {longest_s:.2g} s at most; "
+            f"arrival here less that of the rig's block, after {_BACKLOG_S:g} s; at most {longest_s:.2g} s; "
             f"a line through a pipe takes {arrivals.floor_s:.2g} s"
         )
-        if (late := told["latency"]) is not None:  # without a limit, its row is not among the first
-            card.remarks.append(f"{table}: latency {1e3 * late[0]:.3g} ms, {1e3 * longest_s:.2g} ms at most")
-    for quantity, estimate in told.items():
+        if (late := estimates["latency"]) is not None:  # without a limit, its row is not one of the first
+            card.remarks.append(f"{table}: latency {1e3 * late[0]:.3g} ms, at most {1e3 * longest_s:.2g} ms")
+    for quantity, estimate in estimates.items():
         card.add(quantity, table, estimate, note=notes.get(quantity, ""))
-    card.pictures[f"stamps {table}"] = stamps.picture()
+    card.pictures[f"stamps {table}"] = stamps.batch_means()

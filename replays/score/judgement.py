@@ -1,4 +1,4 @@
-"""A file of a DAQ under test against the session that the rig sent: which path it is, and its scorecard."""
+"""Judgement of a DAQ's file by the session that the rig sent: choice of the path, and the scorecard."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from replays.recordings.formats import mapping as formats
-from replays.score.alignment.placing import Taken, settle
+from replays.score.alignment.placing import SignalRows, identify_signals
 from replays.score.analogue import score_analogue
 from replays.score.card.limits import Limits, load_limits
 from replays.score.card.scorecard import (
@@ -36,12 +36,12 @@ from rig.base import units
 from rig.base.errors import InputError, UnknownNameError, Words
 from rig.channels.table import Channel
 
-_NEAR = 0.01
-"""Part by which the rate of a DAQ that took rows may be off by its stamps."""
-_CLEAR = 0.7
-"""Correlation from which a signal may be of a channel with another kind of unit."""
+_RATE_TOLERANCE = 0.01
+"""Largest relative error of the rate by stamps, of a DAQ that recorded rows."""
+_MIN_LIKENESS = 0.7
+"""Correlation from which a signal may be a channel with another kind of unit."""
 _CORE = {"digital": "altered values", "analogue": "gain"}
-"""Quantity without which nothing is known of a channel."""
+"""Quantity that each channel must have for a pass."""
 
 
 def judge(
@@ -50,23 +50,23 @@ def judge(
     options: formats.FileOptions | None = None, arrivals: Arrivals | None = None,
     channels: Sequence[str] | None = None, mapping: formats.Mapping | None = None,
 ) -> Scorecard:  # fmt: skip
-    """Make the scorecard of a DAQ.
+    """Return the scorecard for a DAQ's file.
 
     Args:
-        file: What it recorded, in any format that `rig import` reads, or a recording.
-        against: The session that the rig sent, in one file or its parts.
-        limits: What is asked; the set `as-calibrated` unless given.
-        path: Which of the two; None: digital where counts can be told from what most signals have, else analogue.
-        formulas: What was sent exactly, by channel: value [unit] of the session's time [s]; otherwise as the scene's
-            test signal has it, or its own samples.
-        options: How a text file is read, where it does not say so itself.
-        arrivals: When the lines of a text file came, headings included, where it was delivered live.
-        channels: Channels or groups of the session that were to be recorded; all unless given.
-        mapping: How the file is read, and which of its signals is which channel, in which unit; of its tables only
-            [file] and [channels] are used.
+        file: Recording of the DAQ, in any format that `rig import` reads, or of the rig.
+        against: Session that the rig sent, in one file or its parts.
+        limits: Limits; the set `as-calibrated` by default.
+        path: Path; None: digital if the counts of most signals can be recovered, otherwise analogue.
+        formulas: Exact signals by channel: functions from the session's times [s] to values [unit]; by default the
+            scene's test signal, or the session's samples.
+        options: Format of a text file, if it does not say so itself.
+        arrivals: Arrival times of the lines of a text file, including headings, if delivered live.
+        channels: Channels or groups of the session that were to be recorded; all by default.
+        mapping: Format of the file, and source and unit of each channel; only its tables [file] and [channels] are
+            used.
 
     Raises:
-        InputError: A file cannot be read, or nothing in it is like what was sent.
+        InputError: A file cannot be read, or none of its signals was sent.
     """
     limits = load_limits() if limits is None else limits
     session = Session(against)
@@ -80,32 +80,32 @@ def judge(
         _, early = session.early(group)
         sent |= {name: (early[:, n], session.rate_hz(group)) for n, name in enumerate(names)}
     rate = max(each for _, each in sent.values())
-    recorded = _by_name(separate_rates(opened, rate))
+    recorded = _name_signals(separate_rates(opened, rate))
     wires: dict[str, Wire] = {}
-    rows: dict[str, Taken] = {}
+    rows: dict[str, SignalRows] = {}
     if path != "analogue":
-        # Rows of counts come as they were sent, whatever their stamps say: at last they are read without any.
+        # Rows of counts are in the order in which they were sent, whatever their stamps: the last trial ignores stamps.
         for trial in (recorded, {name: replace(each, timed=False) for name, each in recorded.items()}):
             wires = _connect(
-                trial, sent, session.channels, {name: _near(each.rate_hz or rate, rate) for name, each in trial.items()}
+                trial, sent, session.channels, {name: _snap(each.rate_hz or rate, rate) for name, each in trial.items()}
             )
-            wires, rows = settle(trial, wires, session)
+            wires, rows = identify_signals(trial, wires, session)
             if 2 * sum(each.scale.known for each in rows.values()) > len(wires):
                 break
     if path is None:
-        told = sum(each.scale.known for each in rows.values())
-        path = "digital" if 2 * told > len(wires) else "analogue"
+        known = sum(each.scale.known for each in rows.values())
+        path = "digital" if 2 * known > len(wires) else "analogue"
     if path == "analogue":
         whole = {name: (values, hz) for name in session.channels for values, _, hz in [session.whole(name)]}
         rates = {name: each.rate_hz or rate for name, each in recorded.items()}
         wires = _connect(recorded, whole, session.channels, rates, whole=True)
     if not any(wire.channel for wire in wires.values()) and recorded.keys().isdisjoint(session.channels):
-        raise InputError("FILE", f"a recording of what {session.path.name} has", Words(f"{file}, of which nothing is"))
+        raise InputError("FILE", f"a recording of channels of {session.path.name}", Words(f"{file}, which has none"))
     for name, wire in wires.items():
         if (wire.channel or name in session.channels) and (unit := recorded[name].unit) not in COUNTS:
             units.parse(unit, field=f"unit of {name}, or that of -m MAPPING,", also=COUNTS)
     if path == "digital" and not rows:
-        raise InputError("--path", "analogue, as no counts can be told from the values", path)
+        raise InputError("--path", "analogue, as the values are not counts", path)
     card = Scorecard(f"{file.name} against {session.path.name}", path, limits.title, limits.bounds, remarks=remarks)
     _score_wires(card, wires, session, rows if path == "digital" else {})
     _score_recorded(card, recorded, wires, due)
@@ -122,10 +122,10 @@ def judge(
 
 
 def _missing_evidence(card: Scorecard, due: Sequence[str]) -> list[str]:
-    """Return the reasons why channels that were to be recorded are not shown to be right.
+    """Return the reasons why channels that were to be recorded are inconclusive.
 
-    A channel is shown by its core quantity: on the digital path its counts, on the analogue path its gain. Where a
-    limit asks for that quantity, its whole interval must lie within the limit or outside.
+    A channel is conclusive by its core quantity: on the digital path its counts, on the analogue path its gain. If that
+    quantity has a limit, its whole interval must be inside or outside the limit.
     """
     core, found = _CORE[card.path], []
     signals = {str(row.value): row.channel for row in card.rows if row.quantity == "mapping"}
@@ -139,20 +139,20 @@ def _missing_evidence(card: Scorecard, due: Sequence[str]) -> list[str]:
     return found
 
 
-def _near(rate_hz: float, sent_hz: float) -> float:
-    """The rate itself, or that of every n-th row that was sent, if it is nearly that."""
+def _snap(rate_hz: float, sent_hz: float) -> float:
+    """Return a rate, or that of every n-th row that was sent if it is nearly equal."""
     exact = sent_hz / max(1, round(sent_hz / rate_hz))
-    return exact if abs(rate_hz / exact - 1.0) < _NEAR else rate_hz
+    return exact if abs(rate_hz / exact - 1.0) < _RATE_TOLERANCE else rate_hz
 
 
 def _connect(
     recorded: Mapping[str, Recorded], sent: Mapping[str, tuple[np.ndarray, float]], channels: Mapping[str, Channel],
     rates: Mapping[str, float], *, whole: bool = False,
 ) -> dict[str, Wire]:  # fmt: skip
-    """Wires of all signals that have values; those that have stamps of their own need not begin with the others.
+    """Return the wires of all signals that have values; tables with separate stamps need not begin together.
 
-    The whole record is searched, or its first rows. A signal in a unit of another kind than a channel's is of that
-    channel only where it is clearly like it.
+    The whole record is searched, or its first rows. A signal in another kind of unit than a channel's is assigned to
+    that channel only if it is clearly similar.
     """
     tables: dict[int, dict[str, tuple[np.ndarray, float]]] = {}
     for name, signal in recorded.items():
@@ -163,13 +163,13 @@ def _connect(
     for name, wire in wires.items():
         kind = units.kind(recorded[name].unit)
         other = wire.channel and kind not in ("", "voltage", "number", units.kind(channels[wire.channel].unit))
-        if other and wire.likeness < _CLEAR:
+        if other and wire.likeness < _MIN_LIKENESS:
             wires[name] = replace(wire, channel="", rivals=())
     return {name: wires[name] for name in recorded if name in wires}
 
 
-def _by_name(signals: Sequence[Recorded]) -> dict[str, Recorded]:
-    """Signals by name, with a number behind one that comes again."""
+def _name_signals(signals: Sequence[Recorded]) -> dict[str, Recorded]:
+    """Return signals by name, with a number after a repeated name."""
     found: dict[str, Recorded] = {}
     for signal in signals:
         name, number = signal.name, 2
@@ -179,8 +179,8 @@ def _by_name(signals: Sequence[Recorded]) -> dict[str, Recorded]:
     return found
 
 
-def _score_wires(card: Scorecard, wires: Mapping[str, Wire], session: Session, rows: Mapping[str, Taken]) -> None:
-    """Mapping and polarity on the digital path: a name of the rig's has to be that channel."""
+def _score_wires(card: Scorecard, wires: Mapping[str, Wire], session: Session, rows: Mapping[str, SignalRows]) -> None:
+    """Add mapping and polarity on the digital path: a signal with a channel's name must be that channel."""
     for name, wire in (wires if card.path == "digital" else {}).items():
         known = session.channels.keys()
         verdict: Verdict = NO_LIMIT
@@ -189,7 +189,7 @@ def _score_wires(card: Scorecard, wires: Mapping[str, Wire], session: Session, r
         certain = not wire.rivals if scale is None else scale.known
         if not wire.channel or not certain:
             verdict = INCONCLUSIVE
-            note += f"; as like {', '.join(wire.rivals)}" if wire.rivals else ""
+            note += f"; equally similar to {', '.join(wire.rivals)}" if wire.rivals else ""
         elif name in known:
             verdict = PASS if wire.channel == name else FAIL
         card.rows.append(text_row(card.path, "mapping", name, wire.channel or "-", verdict, note))
@@ -197,7 +197,7 @@ def _score_wires(card: Scorecard, wires: Mapping[str, Wire], session: Session, r
             turned = wire.polarity < 0 if scale is None else scale.turned
             open_ = wire.turned if scale is None else not scale.known
             verdict = INCONCLUSIVE if open_ else FAIL if turned else PASS
-            note = "half a period later it would be the other" if wire.turned and open_ else ""
+            note = "inverted half a period later" if wire.turned and open_ else ""
             card.rows.append(text_row(card.path, "polarity", name, "turned" if turned else "as sent", verdict, note))
     taken = [wire.channel for wire in wires.values() if wire.channel]
     for channel in dict.fromkeys(each for each in taken if taken.count(each) > 1):
@@ -209,13 +209,13 @@ def _select_channels(session: Session, channels: Sequence[str] | None) -> list[s
     """Return the names of the channels that were to be recorded.
 
     Raises:
-        InputError: There are no names.
+        InputError: The list is empty.
         UnknownNameError: A name is neither a channel nor a group of the session.
     """
     if channels is None:
         return list(session.channels)
     if not channels:
-        raise InputError("--channels", "names of channels or groups, or left out for all", "")
+        raise InputError("--channels", "names of channels or groups, or omitted for all", "")
     for name in channels:
         if name not in session.channels and name not in session.groups:
             known = (*session.channels, *session.groups)
@@ -226,7 +226,7 @@ def _select_channels(session: Session, channels: Sequence[str] | None) -> list[s
 def _score_recorded(
     card: Scorecard, recorded: Mapping[str, Recorded], wires: Mapping[str, Wire], due: Sequence[str]
 ) -> None:
-    """Add for each channel that was to be recorded whether the file has it: by its name, or by what is in it."""
+    """Add for each channel that was to be recorded whether the file has it, by its name or its values."""
     found = {wire.channel for wire in wires.values()}
     found |= {name for name, signal in recorded.items() if np.isfinite(signal.early).any()}
     about = QUANTITIES[card.path]["recorded"]

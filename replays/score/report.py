@@ -1,4 +1,4 @@
-"""The report of a scorecard: its rows, and pictures of what is left over, of the response, and of the time."""
+"""Report of a scorecard: its rows, and plots of residuals, frequency response and time errors."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ if TYPE_CHECKING:
 
 _MARKS: dict[Verdict, Mark] = {FAIL: "bad", INCONCLUSIVE: "open", PASS: "good", NO_LIMIT: "plain"}
 _MATRIX_COLUMNS = 8
-"""Channels beside one another in a matrix: more are too wide for a page."""
+"""Largest number of channels side by side in a matrix, for the width of a page."""
 _STRETCHES = 100
-"""Parts of a record of which the lateness is shown."""
+"""Parts of a record whose time errors are plotted."""
 
 
 def make_report(card: Scorecard, *, origin: Mapping[str, str] | None = None) -> Report:
-    """All of a scorecard as a report.
+    """Return a scorecard as a report.
 
     Args:
         card: The scorecard.
-        origin: What the report is made by, each by name.
+        origin: Facts about the origin of the report, by name.
     """
     verdict = card.verdict_line
     report = Report(
@@ -67,20 +67,20 @@ def make_report(card: Scorecard, *, origin: Mapping[str, str] | None = None) -> 
         report.heading("Inconclusive in this run")
         report.table(("quantity", "what to run"), list(unshown.items()))
     report.heading("Limits and methods")
-    told = {(row.quantity, row.method, row.limit.source if row.limit else "nothing asks") for row in card.rows}
-    report.table(("quantity", "method of the interval", "source of the limit"), sorted(told))
+    methods = {(row.quantity, row.method, row.limit.source if row.limit else "nothing asks") for row in card.rows}
+    report.table(("quantity", "method of the interval", "source of the limit"), sorted(methods))
     for name, about in card.pictures.items():
         if isinstance(about, Fitted):
             report.heading(about.name)
             report.picture(
                 _channel(about),
-                "What is left of the record once the known signal is taken away, in time and by the values that were "
-                "recorded; how late each stretch is against the fitted clock; and the response over that of the lowest "
-                "frequencies, where the signal shows it.",
+                "Residual of the record after subtraction of the known signal, over time and by recorded value; time "
+                "error of each stretch against the fitted clock; and response relative to that of the lowest "
+                "frequencies, where the signal determines it.",
             )
         elif len(about):
             report.heading(name)
-            report.picture(_stamps(about), "Time stamps less the time of the rows that they stand beside.")
+            report.picture(_stamps(about), "Time stamps less the times of their rows.")
     return report
 
 
@@ -98,9 +98,7 @@ def _channel(one: Fitted) -> Figure:
     left.set(title="Residual", xlabel="time [s]", ylabel=label_of("residual", unit))
     good = one.values[np.isfinite(one.values)]
     values.hist(good, bins=256, color=BLUE)
-    values.set(
-        title="How often each value was recorded", xlabel=label_of(one.name, unit), ylabel="samples", yscale="log"
-    )
+    values.set(title="Recorded values", xlabel=label_of(one.name, unit), ylabel="samples", yscale="log")
     middle, late_s = lateness(one)
     time.plot(middle, 1e9 * late_s, ".", color=ORANGE, ms=4)
     time.set(title="Time error", xlabel="time [s]", ylabel="late [ns]")
@@ -112,7 +110,7 @@ def _channel(one: Fitted) -> Figure:
 
 
 def lateness(one: Fitted) -> tuple[np.ndarray, np.ndarray]:
-    """Time [s] and lateness against the fitted clock [s] of stretches of a record, each shape (stretches,)."""
+    """Return the times [s] and time errors [s] of stretches against the fitted clock, each shape (stretches,)."""
     clean = one.clean
     edges = np.linspace(0, len(clean.residual), _STRETCHES + 1).astype(int)[:-1]
     steep = clean.gain * clean.slope

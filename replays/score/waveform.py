@@ -1,8 +1,8 @@
-"""Least squares against the known signal: y = gain s(t + late + drift t + bend t^2 / 2) + offset, and its residual.
+"""Least-squares fit of the known signal: y = gain s(t + late + drift t + bend t^2 / 2) + offset, and its residual.
 
-Intervals of these five are those of the block sandwich: scores of the fit are summed over consecutive blocks, whose
-spread is the covariance, so that noise may have any colour and be larger where the signal is steep. Errors of the known
-signal itself, as of samples between which it is interpolated, are part of what is left, and so of the intervals.
+Intervals of these five parameters are those of the block sandwich: the covariance is the spread of scores summed over
+consecutive blocks, so that noise may have any spectrum and be larger where the signal is steep. Errors of the known
+signal itself, as between its samples, are part of the residual, and so of the intervals.
 """
 
 from __future__ import annotations
@@ -17,37 +17,37 @@ from replays.estimate.least_squares import inverse_square, solve
 from replays.estimate.spectra import Spectrum, transfer
 from replays.score.records.stimulus import Stimulus
 
-_ROUNDS, _FINAL = 4, 3
-_SETTLED = 1e-3
+_MAX_STEPS, _MAX_FINAL_STEPS = 4, 3
+_STEP_TOLERANCE = 1e-3
 """A step below this part of its standard deviation is the last."""
-_LEAST = 400
+_MIN_SAMPLES = 400
 """Fewest samples that are fitted."""
 _TAPS = 96
 _PASSES = 3
-"""Rounds in which a fit behind a filter takes the signal at the times that the last one found."""
+"""Fits with a filter, each with the signal at the times that the previous one found."""
 _ORDERS = 8
-"""Of the Butterworth low-passes that are tried."""
+"""Orders of Butterworth low-passes that are tried."""
 _SETTLING = 8.0
-"""Periods of the corner at each end of a record that are left out, until a filter has forgotten them."""
-_RISE, _FAR = 1e-4, 0.5
-"""Steps of the corner's logarithm: for its slope, and the farthest from where it was seen."""
-_SEEN = 0.8
-"""Coherence from which the response at a frequency counts as shown."""
+"""Periods of the corner that are excluded at each end of a record, for a filter to settle."""
+_LOG_STEP, _MAX_LOG_CHANGE = 1e-4, 0.5
+"""Steps of the corner's logarithm: for its derivative, and the largest from its first estimate."""
+_MIN_COHERENCE = 0.8
+"""Coherence from which the response at a frequency is valid."""
 
 
 @dataclass(frozen=True)
 class Waveform:
-    """What a fit of one channel comes to.
+    """Result of the fit of one channel.
 
     Attributes:
         gain, offset, late_s, drift, bend: The five [1, unit, s, s/s, 1/s], `late_s` and `drift` means over the record.
-        covariance: Of the five, shape (5, 5).
+        covariance: Covariance of the five, shape (5, 5).
         freedom: Degrees of freedom of the five variances, shape (5,).
-        middle_s, half_s: The middle of the fitted rows by the clock of the file, and half of their length [s].
-        times_s: Of the rows that were fitted, by the clock of the file, shape (n,).
-        values: As recorded [unit], shape (n,).
+        middle_s, half_s: Middle of the fitted rows by the clock of the file, and half of their length [s].
+        times_s: Times of the fitted rows by the clock of the file [s], shape (n,).
+        values: Recorded values [unit], shape (n,).
         known, slope: The signal and its slope there, without gain [unit, unit/s], shape (n,).
-        residual: What is left [unit], shape (n,).
+        residual: Residual [unit], shape (n,).
     """
 
     gain: float
@@ -67,21 +67,21 @@ class Waveform:
 
     @property
     def spread(self) -> np.ndarray:
-        """Standard deviation of the five, shape (5,)."""
+        """Standard deviations of the five, shape (5,)."""
         return np.sqrt(np.diag(self.covariance))
 
     @property
     def half(self) -> np.ndarray:
-        """Half of the 95 % interval of the five, shape (5,)."""
+        """Half of the 95 % intervals of the five, shape (5,)."""
         return student(self.freedom) * self.spread
 
     def late_at(self, times_s: np.ndarray) -> np.ndarray:
-        """Time of the stimulus less time of the record, at times of the record [s], shape (n,)."""
+        """Return the time of the stimulus less time of the record, at times of the record [s], shape (n,)."""
         return np.polynomial.polynomial.polyval(times_s - self.middle_s, self.curve)
 
     @property
     def curve(self) -> tuple[float, float, float]:
-        """The same by powers of the time from the middle [s, 1, 1/s]."""
+        """Coefficients of `late_at` by powers of the time from the middle [s, 1, 1/s]."""
         return self.late_s - self.bend * self.half_s**2 / 6.0, self.drift, 0.5 * self.bend
 
     @property
@@ -94,11 +94,11 @@ class Waveform:
 def fit_waveform(
     values: np.ndarray, times_s: np.ndarray, stimulus: Stimulus, curve: tuple[float, float, float]
 ) -> Waveform | None:
-    """Fit a channel; None where the known signal is not in it, or too little of it.
+    """Fit a channel; return None if the known signal is not in it, or too little of it.
 
     Args:
-        values: Recorded [unit], nan where one is missing, shape (n,).
-        times_s: By the clock of the file, even, shape (n,).
+        values: Recorded values [unit], nan if one is missing, shape (n,).
+        times_s: Even times by the clock of the file [s], shape (n,).
         stimulus: The known signal.
         curve: Time of the stimulus less time of the file, to a part of a period of the signal, by powers of the time
             from the middle of the file [s, 1, 1/s].
@@ -109,7 +109,7 @@ def fit_waveform(
 def fit_stretch(
     values: np.ndarray, times_s: np.ndarray, stimulus: Stimulus, late_s: float, stretch: tuple[int, int]
 ) -> Waveform | None:
-    """Fit a channel over a stretch of its rows only, as `fit_waveform`, without intervals."""
+    """Fit a channel over a stretch of its rows, as `fit_waveform`, without intervals."""
     return _solve(values, times_s, stimulus, (late_s, 0.0, 0.0), slice(*stretch), final=False)
 
 
@@ -117,15 +117,15 @@ def _solve(
     values: np.ndarray, times_s: np.ndarray, stimulus: Stimulus, curve: tuple[float, float, float], rows: slice, *,
     final: bool,
 ) -> Waveform | None:  # fmt: skip
-    """Gauss and Newton's steps over some rows, about their own centre; `curve` is about the centre of all.
+    """Fit some rows by Gauss-Newton steps about their own centre; `curve` is about the centre of all rows.
 
-    The clock's drift is fitted over all rows only; else it has a standard deviation of 1 /s.
+    The clock's drift is fitted over all rows only; otherwise it has a standard deviation of 1 /s.
     """
     y, t = values[rows], times_s[rows]
     low, high = stimulus.span_s
     start_s = np.polynomial.polynomial.polyval(t - 0.5 * (times_s[0] + times_s[-1]), curve)
     held = np.isfinite(y) & (t + start_s >= low) & (t + start_s <= high)
-    if held.sum() < _LEAST:
+    if held.sum() < _MIN_SAMPLES:
         return None
     y, t, start_s = y[held], t[held], start_s[held]
     centre, span = 0.5 * (t[0] + t[-1]), 0.5 * max(t[-1] - t[0], 1e-300)
@@ -135,11 +135,11 @@ def _solve(
     while True:
         at = t + start_s + shape @ moved
         use = (at >= low) & (at <= high)
-        if use.sum() < _LEAST:
+        if use.sum() < _MIN_SAMPLES:
             return None
         s, ds = stimulus(at[use])
         ones = np.ones(len(s))
-        # Gain and offset follow linearly; the step of time is taken about them.
+        # Gain and offset are linear; the step of time is computed about them.
         gain, offset = solve(np.column_stack([s, ones]), y[use])
         if not gain:
             return None
@@ -150,12 +150,12 @@ def _solve(
         moved = moved + step[2:]
         small = (
             np.abs(step[2:])
-            < (_SETTLED if final else 0.1) * np.sqrt(np.diag(inverse)[2:] * np.mean(residual**2)) + 1e-300
+            < (_STEP_TOLERANCE if final else 0.1) * np.sqrt(np.diag(inverse)[2:] * np.mean(residual**2)) + 1e-300
         )
         number += 1
-        if number > 1 and (small.all() or number >= _ROUNDS + (_FINAL if final else 0)):
+        if number > 1 and (small.all() or number >= _MAX_STEPS + (_MAX_FINAL_STEPS if final else 0)):
             break
-    # The curve that the fit began with, about this centre, is part of what was found.
+    # The initial curve, about this centre, is part of the result.
     begun = solve(np.column_stack([np.ones(len(u)), u, u**2 - 1.0 / 3.0]), start_s)
     begun[: len(moved)] += moved
     residual = residual - jacobian @ step
@@ -175,13 +175,13 @@ def _solve(
 
 @dataclass(frozen=True)
 class Response:
-    """Frequency response of a channel where the signal shows it.
+    """Frequency response of a channel at the frequencies at which the signal determines it.
 
     Attributes:
-        frequency_hz: Shape (n,).
-        gain: Amount over the gain of the lowest frequencies, shape (n,).
-        spread: Standard deviation of its logarithm, shape (n,).
-        corner_hz: Where it has fallen by 3 dB, with its 95 % interval; None where it does not.
+        frequency_hz: Frequencies [Hz], shape (n,).
+        gain: Gain over that of the lowest frequencies, shape (n,).
+        spread: Standard deviation of the gain's logarithm, shape (n,).
+        corner_hz: Frequency of -3 dB, with its 95 % interval [Hz]; None if the gain does not fall that far.
     """
 
     frequency_hz: np.ndarray
@@ -191,16 +191,16 @@ class Response:
 
 
 def response(found: Waveform) -> Response | None:
-    """The response, by Welch's cross spectra; None where the signal is at hardly a frequency.
+    """Return the response by Welch's cross spectra; None if the signal has too few frequencies.
 
     Spread: sqrt((1 - coherence) / (2 coherence segments)) (Bendat & Piersol, Random Data, table 9.6). The corner is
-    where a parabola through the logarithms about it passes -3 dB.
+    where a parabola through the logarithms near it passes -3 dB.
     """
     n = len(found.known)
     rate = (n - 1) / (found.times_s[-1] - found.times_s[0])
     length = int(min(2048, n // 16))
     f, power, gain, coherence = transfer(found.known, found.values, rate, length)
-    shown = (coherence > _SEEN) & (power > 1e-5 * power.max()) & (f > 0.0)
+    shown = (coherence > _MIN_COHERENCE) & (power > 1e-5 * power.max()) & (f > 0.0)
     if shown.sum() < 16:
         return None
     f, gain, coherence = f[shown], gain[shown] / abs(found.gain), coherence[shown]
@@ -210,13 +210,13 @@ def response(found: Waveform) -> Response | None:
     weight = spread**-2.0
     base = math.exp(float(np.sum(weight[lowest] * np.log(gain[lowest])) / np.sum(weight[lowest])))
     gain = gain / base
-    return Response(f, gain, spread, _corner(f, np.log(gain), spread))
+    return Response(f, gain, spread, _find_corner(f, np.log(gain), spread))
 
 
-def _corner(f: np.ndarray, log: np.ndarray, spread: np.ndarray) -> tuple[float, float, float] | None:
+def _find_corner(f: np.ndarray, log: np.ndarray, spread: np.ndarray) -> tuple[float, float, float] | None:
     level = -0.5 * math.log(2.0)
     below = log < level
-    # Where it stays below: single lines in the noise do not count.
+    # The gain must stay below: single lines in the noise do not count.
     runs = np.convolve(below, np.ones(5), mode="valid") >= 5
     if not runs.any() or not runs.argmax():
         return None
@@ -234,20 +234,20 @@ def _corner(f: np.ndarray, log: np.ndarray, spread: np.ndarray) -> tuple[float, 
         return None
     root = roots[int(np.argmin(np.abs(roots)))]
     row = np.array([root**2, root, 1.0])
-    # Lines of a Hann window are not independent: 1.9 of them are one.
+    # Lines of a Hann window are not independent: 1.9 of them count as one.
     half = 1.96 * math.sqrt(1.9 * float(row @ inverse @ row)) / max(abs(parts[1] + 2.0 * parts[0] * root), 1e-300)
     return at * math.exp(root), at * math.exp(root - half), at * math.exp(root + half)
 
 
-def _places(times_s: np.ndarray) -> tuple[np.ndarray, float]:
-    """Numbers of rows on an even grid, of which some may be missing, shape (n,), and its step [s]."""
+def _number_rows(times_s: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return the numbers of rows on an even grid, of which some may be missing, shape (n,), and its step [s]."""
     step_s = float(np.median(np.diff(times_s)))
     places = np.rint((times_s - times_s[0]) / step_s).astype(int)
     return places, (times_s[-1] - times_s[0]) / max(1, int(places[-1]))
 
 
-def through(found: Waveform) -> Waveform:
-    """The fit behind the linear response of the channel: 96 taps by least squares, so that what is left is noise."""
+def fit_linear_response(found: Waveform) -> Waveform:
+    """Return the fit with the linear response of the channel, 96 taps by least squares, whose residual is noise."""
     from scipy.linalg import solve_toeplitz
     from scipy.signal import correlate
 
@@ -260,8 +260,8 @@ def through(found: Waveform) -> Waveform:
     taps = np.asarray(solve_toeplitz(auto, cross))
     known = np.convolve(x, taps)[half : half + n]
     slope = np.convolve(found.slope, taps)[half : half + n]
-    places, _ = _places(found.times_s)
-    kept = np.zeros(n, bool)  # where the taps meet no lost sample
+    places, _ = _number_rows(found.times_s)
+    kept = np.zeros(n, bool)  # rows whose taps include no lost sample
     kept[_TAPS:-_TAPS] = places[_TAPS + half : n - half] - places[half : n - _TAPS - half] == _TAPS
     left = (y - known)[kept]
     return replace(
@@ -270,11 +270,11 @@ def through(found: Waveform) -> Waveform:
     )  # fmt: skip
 
 
-def order_of(shown: Response) -> int:
-    """The order of the Butterworth low-pass that is most like a response with a corner."""
+def find_order(shown: Response) -> int:
+    """Return the order of the Butterworth low-pass that matches a response with a corner best."""
     assert shown.corner_hz is not None
     log, weights = np.log(shown.gain), np.maximum(shown.spread, 0.01) ** -2.0
-    # The corner may be off by a little, and more where the order is another.
+    # The corner has an error, which is larger for an incorrect order.
     ratios = shown.frequency_hz[:, None] / (shown.corner_hz[0] * np.linspace(0.9, 1.1, 41))
     left = [np.min(weights @ (log[:, None] + 0.5 * np.log1p(ratios ** (2 * n))) ** 2) for n in range(1, _ORDERS + 1)]
     return int(np.argmin(left)) + 1
@@ -283,49 +283,49 @@ def order_of(shown: Response) -> int:
 Corner = tuple[float, float, float]
 
 
-def behind_filter(found: Waveform, stimulus: Stimulus, shown: Response) -> tuple[Waveform, Corner] | None:
-    """The fit anew with a Butterworth low-pass between signal and record, and its corner with its interval.
+def fit_with_filter(found: Waveform, stimulus: Stimulus, shown: Response) -> tuple[Waveform, Corner] | None:
+    """Return the fit with a Butterworth low-pass between signal and record, and its corner with interval, or None.
 
-    Gain is then that at low frequencies, time without the filter's delay. None where no corner fits.
+    Gain is that at low frequencies, and time is without the filter's delay. None if no corner fits.
 
     Args:
-        found: The fit without it.
+        found: The fit without the filter.
         stimulus: The known signal.
         shown: The response by that fit, with a corner.
     """
     assert shown.corner_hz is not None
-    order, corner_hz, near, late_s = order_of(shown), shown.corner_hz[0], found, None
+    order, corner_hz, near, late_s = find_order(shown), shown.corner_hz[0], found, None
     better = None
     for _ in range(_PASSES):
-        better = _behind(near, stimulus, corner_hz, order, late_s)
+        better = _fit_filter(near, stimulus, corner_hz, order, late_s)
         if better is None:
             return None
-        # Once more, with the signal at the times that are known now.
+        # Repeat with the signal at the updated times.
         fit, (corner_hz, _, _) = better
         known, slope = stimulus(found.times_s + fit.late_at(found.times_s))
         near, late_s = replace(fit, times_s=found.times_s, values=found.values, known=known, slope=slope), 0.0
     assert better is not None
     fit, (corner_hz, low, high) = better
-    true = 1.0 / (1.0 + fit.drift)  # seconds of the file are not those of the session
+    true = 1.0 / (1.0 + fit.drift)  # converts seconds of the file to those of the session
     return fit, (true * corner_hz, true * low, true * high)
 
 
-def _behind(
+def _fit_filter(
     found: Waveform, stimulus: Stimulus, corner_hz: float, order: int, late_s: float | None
 ) -> tuple[Waveform, Corner] | None:
-    """The same about a corner and a delay that are nearly known; without a delay, about that of low frequencies."""
+    """Return the fit near an approximate corner and delay; the default delay is that of low frequencies."""
     span_s = found.times_s[-1] - found.times_s[0]
-    places, step_s = _places(found.times_s)
+    places, step_s = _number_rows(found.times_s)
     n = int(places[-1]) + 1
-    # Unless it is given, by as much as the filter delays low frequencies.
+    # The filter's delay at low frequencies, by default.
     delay_s = 1.0 / (2.0 * math.pi * corner_hz * math.sin(math.pi / (2.0 * order))) if late_s is None else late_s
     cut = math.ceil(_SETTLING / (corner_hz * step_s))
-    # What the ends do to the filter is left out.
+    # Without the transients of the filter at the ends.
     kept = slice(*np.searchsorted(places, (cut, n - cut)))
-    if n < 8 * cut + _LEAST or kept.stop - kept.start < _LEAST:
+    if n < 8 * cut + _MIN_SAMPLES or kept.stop - kept.start < _MIN_SAMPLES:
         return None
     y, known, slope = found.values, found.known, found.slope
-    if n > len(places):  # the filter needs the instants of lost samples, too
+    if n > len(places):  # the filter also needs the instants of lost samples
         even_s = found.times_s[0] + step_s * np.arange(n)
         known, slope = stimulus(even_s + found.late_at(even_s))
     spectra = [Spectrum.of(values, step_s) for values in (known, slope)]
@@ -340,14 +340,14 @@ def _behind(
     u = (2.0 * (found.times_s - found.middle_s) / span_s)[kept]
     ones = np.ones(len(u))
     solved = None
-    for _ in range(2 * _ROUNDS):
+    for _ in range(2 * _MAX_STEPS):
         s, ds = (passed(spectrum, log) for spectrum in spectra)
-        moved = (passed(spectra[0], log + _RISE) - passed(spectra[0], log - _RISE)) / (2.0 * _RISE)
+        moved = (passed(spectra[0], log + _LOG_STEP) - passed(spectra[0], log - _LOG_STEP)) / (2.0 * _LOG_STEP)
         gain = float(solve(np.column_stack([s, ones]), y[kept])[0])
         matrix = np.column_stack([s, ones, gain * ds, gain * ds * u, gain * ds * (u**2 - 1.0 / 3.0), gain * moved])
         parts = solve(matrix, y[kept])
         delay_s, log = delay_s + parts[2], log + float(np.clip(parts[5], -0.2, 0.2))
-        if abs(log - math.log(corner_hz)) > _FAR:
+        if abs(log - math.log(corner_hz)) > _MAX_LOG_CHANGE:
             return None
         solved = s, ds, matrix, parts
         if abs(parts[5]) < 1e-9 and abs(parts[2]) < 1e-13:

@@ -433,7 +433,7 @@ class Service(ServedRun):
         for event in entry.before:
             self._guarded("publishing events", self._publish_event, event)
         if entry.frame is not None:
-            for told in entry.frame.told:
+            for told in entry.frame.documents:
                 self._guarded(
                     "publishing faults", self._server.publish, wire.FAULTS, wire.encode_document(finite(told))
                 )

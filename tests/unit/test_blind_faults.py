@@ -45,7 +45,7 @@ def find_faults(recording: Recording) -> tuple[list[Explanation], set[str]]:
     explanations = own_faults(
         parts, nominal, bits.apart, recording.edges(), bits.edges_s(), lambda other: predict(experiment, other)
     )
-    return explanations, {name for part in parts for name in bits.off(part)}
+    return explanations, {name for part in parts for name in bits.channels_off(part)}
 
 
 def is_named_right(explanations: list[Explanation], channel: str, kind: str) -> bool:

@@ -38,7 +38,7 @@ def run(
             if door in message.doors:
                 block = message.block
                 found.setdefault(message.key, []).append((block.index, block.tick, block.values.copy()))
-        fault_events += frame.told
+        fault_events += frame.documents
     return found, fault_events
 
 

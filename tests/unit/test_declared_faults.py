@@ -47,7 +47,7 @@ def simulate_messages(kind: str) -> list[tuple[str, bytes]]:
     items = [(key, wire.encode_document(each)) for key, each in found]
     while simulation.tick < simulation.end_tick:
         frame = simulation.advance(10_000)
-        items += [(wire.FAULTS, wire.encode_document(each)) for each in frame.told]
+        items += [(wire.FAULTS, wire.encode_document(each)) for each in frame.documents]
         for message in frame.messages:
             rows.follow(message.key, message.row, len(message.block.values), late_rows=1e9)
             items.append((message.key, wire.encode_block(message.block)))

@@ -443,12 +443,12 @@ def test_wrong_inputs_are_refused_in_one_line(
         (["--against", str(session), "--limits", str(tmp_path / "mine.toml")], "such as gain"),
         (["--against", str(tmp_path / "none.mcap")], "none.mcap"),
         (["--against", str(session), "--junit", "r.txt"], "--junit must be"),
-        (["--against", str(session)], "of which nothing is"),
+        (["--against", str(session)], "which has none"),
     ):
         status, _, err = run_captured(capsys, "score", other, *arguments)
         assert (status, err.count("\n")) == (2, 1), err
         assert message in err
-    with pytest.raises(InputError, match="no counts can be told"):
+    with pytest.raises(InputError, match="the values are not counts"):
         judge(few, [session], path="digital")
 
 

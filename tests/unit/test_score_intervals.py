@@ -14,7 +14,7 @@ from replays.score.alignment.stamps import Stamps
 from replays.score.card.limits import load_limits
 from replays.score.card.scorecard import FAIL, INCONCLUSIVE, PASS, Bounds, Scorecard, judge_row
 from replays.score.quantities.noise import split_noise
-from replays.score.quantities.rounding import Converter, undithered, widen
+from replays.score.quantities.rounding import Converter, find_undithered, widen_intervals
 from replays.score.records.recorded import Table
 from replays.score.waveform import Waveform
 from rig.channels.table import default_table
@@ -62,14 +62,14 @@ def test_two_levels_rounded_by_the_session_leave_the_gain_inconclusive() -> None
     # 204.8 counts, rounded to 205 with noise of a tenth of a step: off by 976 ppm, and by up to 0.4 / 205 from others.
     fit = _two_levels(204.8 / 205.0, 0.1)
     session = Converter(1.0, 0.1, values=fit.known)
-    half = widen(fit, undithered(fit, 0.0, session)).half[0]
+    half = widen_intervals(fit, find_undithered(fit, 0.0, session)).half[0]
     assert 976e-6 < half < 0.5 / 205.0
 
 
 def test_noise_of_one_step_removes_the_rounding_error() -> None:
     fit = _two_levels(1.0, 1.0)
-    assert undithered(fit, 1.0, Converter(1.0, 1.0, values=fit.known)) == ()
-    assert widen(fit, ()) is fit
+    assert find_undithered(fit, 1.0, Converter(1.0, 1.0, values=fit.known)) == ()
+    assert widen_intervals(fit, ()) is fit
 
 
 def test_intervals_of_noise_and_jitter_are_two_standard_deviations_to_each_side() -> None:
@@ -114,8 +114,8 @@ def test_the_interval_of_stamp_jitter_follows_chi_squared() -> None:
     table = Table(n, 1, lambda columns: [np.zeros((n, 1 + len(columns)))])
     stamps, since_s = Stamps(table, shown=True), np.arange(n) / 20e3
     stamps.times_s = 0.25 + since_s * (1.0 + 5e-5) + 1e-6 * np.random.default_rng(5).standard_normal(n)
-    stamps.take(0.0, since_s, np.arange(n), n)
-    found = stamps.judged(None)
+    stamps.add_rows(0.0, since_s, np.arange(n), n)
+    found = stamps.estimate_all(None)
     assert found["stamp jitter"] is not None
     value, low, high = found["stamp jitter"]
     freedom = n // 16 * 15

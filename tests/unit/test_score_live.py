@@ -59,7 +59,7 @@ def test_latency_is_relative_to_the_arrival_of_the_rigs_block(counts: np.ndarray
     latency = card.row("latency", "probes")
     assert (red(card), latency.verdict) == (set(), NO_LIMIT)
     assert latency.value == pytest.approx(0.025, rel=1e-3)
-    assert "0.03 s at most; a line through a pipe takes 0.0001 s" in latency.note
+    assert "at most 0.03 s; a line through a pipe takes 0.0001 s" in latency.note
     assert "latency" not in {row.quantity for row in judge(daq, [session]).rows if row.verdict == NO_LIMIT}
 
 
@@ -110,7 +110,7 @@ class Deliverer:
 
 @pytest.fixture(autouse=True)
 def _short_waits(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(live, "_BEHIND_S", 0.05)
+    monkeypatch.setattr(live, "_MARGIN_S", 0.05)
     monkeypatch.setattr(live, "_FLOOR_LINES", 10)
 
 

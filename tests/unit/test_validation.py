@@ -94,11 +94,11 @@ def test_wrong_criteria_are_refused_with_their_field(tmp_path: Path, old: str, n
 
 def test_the_first_matching_criterion_applies() -> None:
     criteria = load_criteria()
-    keyphasor, probe = criteria.trajectory_of("keyphasor"), criteria.trajectory_of("disk_x")
+    keyphasor, probe = criteria.find_trajectory("keyphasor"), criteria.find_trajectory("disk_x")
     assert keyphasor is not None
     assert probe is not None
     assert keyphasor.peak > probe.peak
-    spin, force = criteria.statistic_of("whirl", "spin"), criteria.statistic_of("impacts", "spin")
+    spin, force = criteria.find_statistic("whirl", "spin"), criteria.find_statistic("impacts", "spin")
     assert spin is not None
     assert force is not None
     assert spin.relative < force.relative

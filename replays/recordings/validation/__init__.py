@@ -1,4 +1,4 @@
-"""A recording held against the model: bit by bit, then by declared criteria, and where they fail, what explains it."""
+"""Validation of the model by a recording: bit by bit, by declared criteria, and with explanations of failures."""
 
 from __future__ import annotations
 

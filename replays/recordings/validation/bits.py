@@ -1,6 +1,6 @@
-"""Payload against payload: every recorded block beside the same rows of a re-simulation, encoded again.
+"""Comparison of payloads: every recorded block with the encoded rows of a re-simulation.
 
-Columns are matched by name: of a recording that was cut to some channels, these are compared.
+Columns are matched by name: of a recording with some channels only these are compared.
 """
 
 from __future__ import annotations
@@ -16,25 +16,25 @@ from rig.base.wire import EDGES, Block, encode_block, schema_of, sensor_key, tru
 from rig.channels.table import ChannelTable
 from rig.run.simulation import TICK_RATE_HZ, Frame
 
-_MOST = 400_000
-"""So many rows that differ are looked at."""
+_MAX_DIFFERENT = 400_000
+"""Largest number of differing rows that are kept."""
 _EDGE_S = 0.05
-"""Streams may begin and end apart by this [s]: a recorder that starts between blocks receives those of one first."""
+"""Largest difference of streams' begins and ends [s]: a recorder may start between the blocks of two streams."""
 
 
 @dataclass
 class StreamBits:
-    """How one stream compares.
+    """Comparison of one stream.
 
     Attributes:
-        rows: Rows compared.
-        different: Payloads that differ.
-        first_s: Simulated time of the first row that differs [s]; None where none does.
-        first_column: Its column.
+        rows: Number of compared rows.
+        different: Number of different payloads.
+        first_s: Simulated time of the first different row [s], or None.
+        first_column: Column of the first difference.
         largest: Largest difference, in counts or SI.
-        skipped: Rows that the recording lost.
-        beyond: Rows with nothing to hold them against.
-        columns: Columns recorded, and columns that the rig makes, where they are not the same in the same order.
+        skipped: Number of rows that the recording lost.
+        beyond: Number of rows without a counterpart.
+        columns: Number of recorded and of simulated columns, if they or their order differ.
     """
 
     rows: int = 0
@@ -48,12 +48,12 @@ class StreamBits:
 
     @property
     def equal(self) -> bool:
-        """Every payload is equal, byte for byte, in the columns that were recorded."""
+        """True if every payload is equal, byte for byte, in the recorded columns."""
         return self.different == 0 and self.beyond == 0
 
     @property
     def picked(self) -> str:
-        """Which columns were compared, in words; empty where all are there, in their order."""
+        """Compared columns as text; empty if all are present in their order."""
         if self.columns is None:
             return ""
         here, there = self.columns
@@ -61,14 +61,14 @@ class StreamBits:
 
 
 class Bits:
-    """Follows a re-simulation frame by frame; only rows that recorded blocks still wait for are kept."""
+    """Comparison with a re-simulation, frame by frame; only rows for which recorded blocks wait are kept."""
 
     def __init__(self, recording: Recording, made: ChannelTable) -> None:
-        """Begin.
+        """Prepare the comparison.
 
         Args:
-            recording: What was recorded.
-            made: The channels of the re-simulation.
+            recording: The recording.
+            made: Channel table of the re-simulation.
         """
         keys = sorted(key for key in recording.messages if schema_of(key) is not None and key in recording.streams)
         self._edges: list[np.ndarray] = []
@@ -84,7 +84,7 @@ class Bits:
                 follower.found.columns = (len(group.names), len(there))
 
     def follow(self, frame: Frame) -> None:
-        """Take the next frame."""
+        """Compare the next frame."""
         blocks = {sensor_key(name): block for name, block in frame.samples.items()}
         blocks |= {truth_key(name): block for name, block in frame.truth.items()}
         if frame.edges is not None:
@@ -94,37 +94,37 @@ class Bits:
             if key in self.streams:
                 self.streams[key].take(block)
 
-    def apart(self, group: str) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        """Rows in which a group's counts differ, shape (n,), and by channel, recorded less made again, shape (n,)."""
-        kept = self.streams[sensor_key(group)].apart if sensor_key(group) in self.streams else []
+    def differences(self, group: str) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        """Return the rows in which a group's counts differ, and the differences by channel, each shape (n,)."""
+        kept = self.streams[sensor_key(group)].differences if sensor_key(group) in self.streams else []
         if not kept:
             return np.empty(0, np.int64), {}
         counts = np.concatenate([counts for _, counts in kept])
         return np.concatenate([rows for rows, _ in kept]), dict(zip(self._names[group], counts.T, strict=True))
 
-    def off(self, group: str) -> list[str]:
-        """Channels of a group whose counts differ."""
-        return [name for name, counts in self.apart(group)[1].items() if counts.any()]
+    def channels_off(self, group: str) -> list[str]:
+        """Return the channels of a group whose counts differ."""
+        return [name for name, counts in self.differences(group)[1].items() if counts.any()]
 
     def edges_s(self) -> np.ndarray:
-        """Keyphasor edges that were made again [s]; none where none were recorded."""
+        """Return the simulated keyphasor edges [s]; empty if none were recorded."""
         if EDGES not in self.streams:
             return np.empty(0)
         return np.concatenate([np.empty(0), *self._edges]) / TICK_RATE_HZ
 
     def finish(self) -> dict[str, StreamBits]:
-        """The outcome, by key."""
+        """Return the results by key."""
         return {key: follower.finish() for key, follower in self.streams.items()}
 
 
 def missing_rows(recording: Recording) -> dict[str, tuple[int, int]]:
-    """Count the sample rows that a recording lacks, whatever it is told of them.
+    """Return the number of sample rows that a recording lacks, without use of its documents on faults.
 
     Args:
         recording: The recording.
 
     Returns:
-        By key of a stream that lacks rows: how many, and how many there should be in the span of all streams.
+        Number of missing rows, and of all rows in the span of all streams, by key of each incomplete stream.
     """
     groups = {sensor_key(name): group.rate_hz for name, group in recording.table.groups.items()}
     filled = [one for key, one in recording.streams.items() if key != EDGES and one.rows]
@@ -151,10 +151,10 @@ class _Follower:
     key: str
     recorded: Iterator[Block]
     picked: list[int] | None = None
-    """Columns of the re-simulation that were recorded, in that order; None for all."""
+    """Recorded columns of the re-simulation, in their order; None for all."""
     found: StreamBits = field(default_factory=StreamBits)
-    apart: list[tuple[np.ndarray, np.ndarray]] = field(default_factory=list)
-    """Numbers of rows that differ, and by how much, of as many as are looked at."""
+    differences: list[tuple[np.ndarray, np.ndarray]] = field(default_factory=list)
+    """Numbers of differing rows, and their differences, up to a limit."""
     _waiting: Block | None = None
     _rows: list[np.ndarray] = field(default_factory=list)
     _first: int = 0
@@ -163,7 +163,7 @@ class _Follower:
 
     def take(self, block: Block) -> None:
         values = block.values if self.picked is None else block.values[:, self.picked]
-        if self.key == EDGES:  # ticks from the block's own tick: to the rig's tick zero, exactly
+        if self.key == EDGES:  # ticks from the block's tick, converted to ticks from the rig's tick zero
             values = values + block.tick
         if not self._rows:
             self._first = block.index
@@ -188,7 +188,7 @@ class _Follower:
             found.skipped += max(0, recorded.index - self._next)
         self._next = recorded.index + n
         if recorded.index < self._first and len(values) and self._first > recorded.index:
-            found.beyond += n  # an older block again: its rows are gone
+            found.beyond += n  # an older block again: its rows have been released
             return
         if n == 0:
             return
@@ -209,8 +209,8 @@ class _Follower:
             off = np.abs(values.astype(float) - recorded.values)
             found.largest = max(found.largest, float(off.max()))
             rows = np.flatnonzero(off.any(axis=1))
-            if sum(len(n) for n, _ in self.apart) < _MOST:
-                self.apart.append((recorded.index + rows, (recorded.values.astype(float) - values)[rows]))
+            if sum(len(n) for n, _ in self.differences) < _MAX_DIFFERENT:
+                self.differences.append((recorded.index + rows, (recorded.values.astype(float) - values)[rows]))
             row, column = (int(k) for k in np.argwhere(values != recorded.values)[0]) if off.any() else (0, 0)
         if found.first_s is None:
             rate = recorded.rate_hz
@@ -218,7 +218,7 @@ class _Follower:
             found.first_s, found.first_column = float(recorded.tick + offset) / TICK_RATE_HZ, column
 
     def finish(self) -> StreamBits:
-        """Count what nothing came for."""
+        """Count the rows without a counterpart."""
         while (waiting := self._upcoming()) is not None:
             self.found.beyond += len(waiting.values)
             self._waiting = None

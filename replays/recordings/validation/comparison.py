@@ -1,4 +1,4 @@
-"""A recording held against its own experiment: done again, and compared by bits, sample by sample and by phase."""
+"""Comparison of a recording with a re-simulation of its experiment: by bits, sample by sample and by phase."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from replays.recordings.validation.explanations.attribution import (
     FEW_CHANNELS,
     Explained,
     attribute,
+    explain_by_defects,
     explain_log,
-    own_explained,
 )
 from replays.recordings.validation.explanations.explanation import Explanation
-from replays.recordings.validation.explanations.faults import late_together
-from replays.recordings.validation.explanations.numbers import changes_of
+from replays.recordings.validation.explanations.faults import find_common_delay
+from replays.recordings.validation.explanations.numbers import find_changes
 from replays.recordings.validation.explanations.signals import SignalFault, edge_faults, signal_faults
-from replays.recordings.validation.explanations.single_channels import as_faults, own_faults
+from replays.recordings.validation.explanations.single_channels import make_signal_faults, own_faults
 from replays.recordings.validation.outcome import Validation
 from replays.recordings.validation.phases import CONTACT, PHASES, Phase
 from replays.recordings.validation.statistics import perturbed, statistics
@@ -39,8 +39,8 @@ from replays.recordings.validation.trajectory import foreseeable_s, residuals
 from replays.recordings.validation.truth import judge_truth, recorded_truth
 from rig.base.wire import TRUTH
 
-_MOST_HELD = 3
-"""Of numbers of the model that are named, so many are held against the phases."""
+_MAX_CHECKED = 3
+"""Largest number of named numbers of the model that are checked by the phases."""
 
 
 def validate(
@@ -52,19 +52,19 @@ def validate(
     blind: bool = False,
     step: Callable[[str], None] = lambda _text: None,
 ) -> Validation:
-    """Hold a recording against its own experiment.
+    """Validate a recording by a re-simulation of its experiment.
 
     Args:
         recording: The recording.
-        criteria: What is asked; None for the rig's own.
-        changes: Other values of scene or parameters than the recorded ones, by dotted key.
-        declared: Judge by the declared comparison even where every bit is equal: what another build, on which it is
-            not, would be judged by.
-        blind: As if nothing were known of the faults that the rig was told to have.
-        step: Told what is being done.
+        criteria: Criteria; None for the default set.
+        changes: Changed values of scene or parameters, by dotted key.
+        declared: Whether the declared criteria decide even if every bit is equal, as for a recording of another
+            build.
+        blind: Whether to ignore the faults that were injected on command.
+        step: Function that is called with the current step.
 
     Raises:
-        InputError: The recording is none that can be done again, or a change is none.
+        InputError: The recording cannot be resimulated, or a change is invalid.
     """
     criteria = load_criteria() if criteria is None else criteria
     experiment = Experiment.of(recording)
@@ -73,7 +73,7 @@ def validate(
     recording = recording.untold() if blind else recording.truly()
     if blind:
         experiment = experiment.without_faults()
-    again = _done_again(recording, experiment, criteria, step)
+    again = _resimulate(recording, experiment, criteria, step)
     begin, end, reason = _window(again)
     trajectory = residuals(again.parts, again.nominal, again.others, again.criteria, end_s=end)
     tables = recorded_truth(recording, longest_s=begin + criteria.window.longest_s)
@@ -83,7 +83,7 @@ def validate(
     doubts += [f"{rows} of {due} rows of {key} are missing" for key, (rows, due) in lost.items()]
     back = [name for name, part in again.parts.items() if (np.diff(part.times_s) <= 0.0).any()]
     doubts += [f"times of {name} do not ascend: no quantity of its motion is judged" for name in back]
-    # Test signals have no phases of motion, and none of its causes; instants out of order have no spectrum.
+    # Test signals have no phases of motion, and no causes in it; unordered instants have no spectrum.
     moves = experiment.scene.generator is None and not back
     phases, judged = [], []
     if moves:
@@ -103,22 +103,22 @@ def validate(
         doubts=tuple(doubts), faults=again.faults, complete=recording.complete,
     )  # fmt: skip
     firsts = [one.first_s for one in trajectory if one.first_s is not None]
-    # Without the truth a number of the model may be it, where that is off from the beginning on.
+    # Without the truth a number of the model may be the cause, if the difference begins with the recording.
     if again.own and (again.same_motion or (not firsts and all(one.sure for one in again.own))):
-        return replace(validation, faults=as_faults(again.own), explained=own_explained(again.own))
+        return replace(validation, faults=make_signal_faults(again.own), explained=explain_by_defects(again.own))
     if validation.good or validation.doubts or not moves:
         return validation
     touching = bool(phases) and phases[0].name not in (PHASES[0], PHASES[-1])
     untold = again.tuned is not None and first_command_s(experiment) == 0.0 and not touching
     if untold and any(one.quantity == "contact_fraction" and one.foretold == 0.0 < one.recorded for one in judged):
         return replace(validation, explained=_unexplained(
-            next(one.from_s for one in phases if one.name in CONTACT), "the shaft touches the ring from there on, and "
-            "what was done, as it is told, brings none: a hammer pulse that the mapping does not tell ([[commands]])",
+            next(one.from_s for one in phases if one.name in CONTACT), "the shaft touches the ring from there on, but "
+            "the known experiment causes no contact: a hammer pulse may be missing from the mapping ([[commands]])",
         ))  # fmt: skip
     if not firsts and again.tuned is not None and not again.faults:
         return replace(validation, explained=_unexplained(
-            end, "until then all channels agree; behind it differs what the shaft meets: contact (`rig identify --fit "
-            "contact.friction,contact.restitution`), ring or house; or a sensor that changes there",
+            end, "up to there all channels agree; the later difference is due to contact (`rig identify --fit "
+            "contact.friction,contact.restitution`), ring or housing, or to a sensor that changes there",
         ))  # fmt: skip
     if not firsts:
         return validation
@@ -129,26 +129,26 @@ def validate(
             step=step,
         )  # fmt: skip
         return replace(validation, explained=explained)
-    explained = _log_explained(again, from_s=min(firsts), end_s=end, touching=touching)
-    late_s = late_together(explained.ranked, again.parts)
+    explained = _explain_log(again, from_s=min(firsts), end_s=end, touching=touching)
+    late_s = find_common_delay(explained.ranked, again.parts)
     if late_s:
         step("the same with channels of a kind late together")
-        other = _log_done_again(recording, experiment, criteria, step, late_s=late_s)
+        other = _resimulate_log(recording, experiment, criteria, step, late_s=late_s)
         if other.tuned is not None and other.tuned.better_than(again.tuned):
-            explained = _log_explained(other, from_s=min(firsts), end_s=min(end, other.tuned.end_s), touching=touching)
-    named = [one for one in explained.ranked if one.kind == "model" and one.name in explained.best][:_MOST_HELD]
+            explained = _explain_log(other, from_s=min(firsts), end_s=min(end, other.tuned.end_s), touching=touching)
+    named = [one for one in explained.ranked if one.kind == "model" and one.name in explained.best][:_MAX_CHECKED]
     if named and any(one.good is False for one in judged):
-        # What takes away the beginning may be no more than what is nearest to it.
+        # A change that removes the first part may only be the closest one.
         off = []
         for one in named:
             step(f"the same with {one.name} {one.change}")
-            changed = with_values(experiment, changes_of(experiment, criteria.attribution, one))
-            other = _log_done_again(recording, changed, criteria, step)
+            changed = with_values(experiment, find_changes(experiment, criteria.attribution, one))
+            other = _resimulate_log(recording, changed, criteria, step)
             _, held = statistics(other.quick, other.parts, other.nominal, tables, other.criteria, other.members)
             off.append(sum(result.good is False for result in held))
         if min(off) > 0:
-            text = f"nearest is {explained.conclusion}; but with that {min(off)} of {len(judged)} quantities are off "
-            text += "behind it: another number, or several at once; `rig identify` fits them"
+            text = f"closest is {explained.conclusion}; but {min(off)} of {len(judged)} quantities are still off"
+            text += ": another number, or several at once; `rig identify` fits them"
             explained = replace(explained, conclusion=text, best=())
     return replace(validation, explained=explained)
 
@@ -157,8 +157,8 @@ def _unexplained(from_s: float, conclusion: str) -> Explained:
     return Explained(from_s, from_s, (), conclusion, ())
 
 
-def _contact(again: _DoneAgain, phases: list[Phase], end_s: float) -> dict[str, float | None]:
-    """When the first contact of a log comes that was not compared, and whether it should have been."""
+def _contact(again: _Resimulation, phases: list[Phase], end_s: float) -> dict[str, float | None]:
+    """Return the first contact of a log that was not compared, and whether it should have been."""
     first_s = next((one.from_s for one in phases if one.name in CONTACT), -math.inf)
     if again.tuned is None or first_s < end_s:
         return {}
@@ -166,21 +166,21 @@ def _contact(again: _DoneAgain, phases: list[Phase], end_s: float) -> dict[str, 
 
 
 @dataclass(frozen=True)
-class _DoneAgain:
-    """The recording done again.
+class _Resimulation:
+    """Re-simulation of a recording.
 
     Attributes:
-        quick: The same motion, with sensors that cost little.
-        criteria: Loosened for an imported log.
-        parts: What was recorded, on the model's clock.
-        nominal: What was predicted.
-        others: The same, as far off as another build, a fit or a model that is as right may be.
-        bits: By key; empty for an imported log.
-        tuned: What was fitted before, of an imported log.
-        faults: What its signals show by themselves, of an imported log.
-        members: The ensemble of an imported log: fits as good, by models as right; else it is made of `quick`.
-        own: What single channels have whose counts differ while others are the same to the bit.
-        same_motion: Whether nothing else can be the reason, as the truth is the same.
+        quick: Experiment with the same motion and fast sensors.
+        criteria: Criteria, widened for an imported log.
+        parts: Recorded channels, on the model's clock.
+        nominal: Prediction.
+        others: Equally valid predictions: of another build, or of other fits and models.
+        bits: Comparison of bits by key; empty for an imported log.
+        tuned: Fit of an imported log.
+        faults: Faults that the signals of an imported log show without a model.
+        members: Ensemble of an imported log: equally good fits of equally valid models; otherwise made from `quick`.
+        own: Defects of single channels whose counts differ while others are equal to the bit.
+        same_motion: Whether the truth is equal, which excludes other causes.
     """
 
     quick: Experiment
@@ -196,28 +196,28 @@ class _DoneAgain:
     same_motion: bool = False
 
 
-def _done_again(
+def _resimulate(
     recording: Recording, experiment: Experiment, criteria: Criteria, step: Callable[[str], None]
-) -> _DoneAgain:
+) -> _Resimulation:
     if is_imported(recording):
         experiment.scene.check_physics()
-        return _log_done_again(recording, experiment, criteria, step)
+        return _resimulate_log(recording, experiment, criteria, step)
     rules = criteria.window
     parts = measured(recording, experiment.scene, longest_s=rules.longest_s)
     bits = Bits(recording, experiment.simulation().table)
     step("re-simulated, payload by payload")
-    # Of channels that were told to misbehave only bits are compared: what is predicted is sound.
+    # Only the bits of channels with injected faults are compared: the prediction has no faults.
     sound = {name: [one for one in part.names if one not in experiment.faulty] for name, part in parts.items()}
     parts = {name: part.only(sound[name]) for name, part in parts.items() if sound[name]} or parts
     nominal = predict(experiment, parts, follow=bits.follow)
     quick = bare(experiment)
-    step("perturbed, to see how far it can be predicted")
+    step("perturbed, to find the predictable part")
     moved = predict(perturbed(quick, rules.parameters, rules.perturbation), parts)
     found = bits.finish()
     truth = [one.equal for key, one in found.items() if key.startswith(TRUTH)]
     same = all(truth) and (bool(truth) or experiment.scene.generator is not None)
     names = [channel.name for part in parts.values() for channel in part.channels]
-    off = {name for part in parts for name in bits.off(part)}
+    off = {name for part in parts for name in bits.channels_off(part)}
     own: list[Explanation] = []
     if (
         not all(one.equal for one in found.values())
@@ -225,26 +225,26 @@ def _done_again(
         and len(off) < (len(names) if same else FEW_CHANNELS * len(names))
     ):
         own = own_faults(
-            parts, nominal, bits.apart, recording.edges(), bits.edges_s(), partial(predict, experiment), step
+            parts, nominal, bits.differences, recording.edges(), bits.edges_s(), partial(predict, experiment), step
         )  # fmt: skip
-    return _DoneAgain(quick, criteria, parts, nominal, (moved,), found, None, own=tuple(own), same_motion=same)
+    return _Resimulation(quick, criteria, parts, nominal, (moved,), found, None, own=tuple(own), same_motion=same)
 
 
-def _log_done_again(
+def _resimulate_log(
     recording: Recording,
     experiment: Experiment,
     criteria: Criteria,
     step: Callable[[str], None],
     late_s: dict[str, float] | None = None,
-) -> _DoneAgain:
-    """A log of another system: what it does not tell is fitted, and what it cannot know counts as floor."""
+) -> _Resimulation:
+    """Return the re-simulation of a log: unknown numbers are fitted, and their uncertainty is added to the floor."""
     rules = criteria.imported
     tuned = tune(recording, experiment, rules.nuisances, late_s=late_s, progress=lambda text: step(f"log: {text}"))
     whole, longest_s = measured(recording, tuned.begun.scene), criteria.window.longest_s
     begin_s = window_start_s(tuned.begun)
     parts = {name: part.until(float(part.times_s[0]) + longest_s).starting_at(begin_s) for name, part in whole.items()}
     nominal = tuned.predict(parts)
-    step("perturbed, and by models that are as right, to see how far it can be predicted")
+    step("perturbed, and with equally valid models, to find the predictable part")
     generator = np.random.default_rng(0)  # the same in every validation
     others = [tuned.undo_last_growth().predict(parts)]
     models = [tuned, *(tuned.changed(variant.set) for variant in rules.variants)]
@@ -254,36 +254,36 @@ def _log_done_again(
     others += [replace(nominal, values=gains)]
     until_s = first_command_s(tuned.begun) or math.inf
     if np.count_nonzero(recording.edges() < until_s) < 2:
-        # Nothing tells well enough when a pulse is due: it is as likely as not, at any time.
-        others.insert(1, _with_pulses(parts, nominal, lambda pulses: 1.0 - pulses))
+        # The phase of the pulses is unknown: a pulse is possible at any time.
+        others.insert(1, _replace_pulses(parts, nominal, lambda pulses: 1.0 - pulses))
     drawn = [models[n % len(models)].draw_values(generator) for n in range(criteria.ensemble.members)]
     faults = signal_faults(whole)
     faults += edge_faults(recording.edges(), until_s, tuned.begun.scene.drive.speed_hz)
-    return _DoneAgain(
+    return _Resimulation(
         faults=tuple(faults), members=tuple(one.predict(parts) for one in drawn),
-        quick=bare(tuned.experiment), criteria=criteria.of_log(),
+        quick=bare(tuned.experiment), criteria=criteria.for_log(),
         parts=tuned.to_model_clock(parts),
         nominal=nominal, others=tuple(others), bits={}, tuned=tuned,
     )  # fmt: skip
 
 
-def _with_pulses(
+def _replace_pulses(
     parts: dict[str, Measured], nominal: Prediction, change: Callable[[np.ndarray], np.ndarray]
 ) -> Prediction:
-    """A prediction with other pulses of the keyphasor."""
+    """Return a prediction with other pulses of the keyphasor."""
     pulses = {name: [channel.name == "keyphasor" for channel in part.channels] for name, part in parts.items()}
     return replace(nominal, values={k: np.where(pulses[k], change(v), v) for k, v in nominal.values.items()})
 
 
-def _window(again: _DoneAgain) -> tuple[float, float, str]:
-    """Begin and end of what is compared sample by sample [s], and how the end was found."""
+def _window(again: _Resimulation) -> tuple[float, float, str]:
+    """Return begin and end of the comparison sample by sample [s], and the reason of the end."""
     rules, parts = again.criteria.window, again.parts
     begin = min(float(part.times_s[0]) for part in parts.values())
     if again.tuned is not None:
-        # What the fit leaves open, and what is not known of filters, makes a floor and no end.
+        # The uncertainty of the fit and of filters is added to the floor and does not end the window.
         parted = foreseeable_s(parts, again.nominal, again.others[1:-2], share=1.0)
         end = min(again.tuned.end_s, math.inf if parted is None else parted)
-        return begin, end, "as far as fit and model go together" if end == again.tuned.end_s else "models part there"
+        return begin, end, "as far as fit and model agree" if end == again.tuned.end_s else "models differ from there"
     parted = foreseeable_s(parts, again.nominal, again.others, share=rules.share)
     change = f"a change of {rules.perturbation:g}"
     if parted is None:
@@ -292,8 +292,8 @@ def _window(again: _DoneAgain) -> tuple[float, float, str]:
     return begin, parted, f"{change} reaches {rules.share:g} of a channel's noise at {parted:.4f} s"
 
 
-def _log_explained(again: _DoneAgain, *, from_s: float, end_s: float, touching: bool) -> Explained:
-    # Numbers of the model hang together with what was fitted: `rig identify` fits all.
+def _explain_log(again: _Resimulation, *, from_s: float, end_s: float, touching: bool) -> Explained:
+    # Numbers of the model are correlated with the fitted ones: `rig identify` fits all.
     assert again.tuned is not None
     return explain_log(
         again.parts, again.nominal, again.others, again.tuned, again.criteria.attribution, from_s=from_s, end_s=end_s,
@@ -302,9 +302,9 @@ def _log_explained(again: _DoneAgain, *, from_s: float, end_s: float, touching: 
 
 
 def calibration(recording: Recording, experiment: Experiment) -> list[str]:
-    """How the recording's channels differ from the table of its scene, the rig's own where that has none."""
+    """Return the differences of the recording's channels from the scene's table, by default the rig's own."""
     if is_imported(recording):
         mapped = recording.scene["import"]["mapping"]["channels"]
         lacking = [name for name, entry in mapped.items() if "bandwidth_hz" not in entry]
-        return [f"no bandwidth told of {', '.join(lacking)}: taken for half of the rate"] if lacking else []
+        return [f"no bandwidth given for {', '.join(lacking)}: half of the rate is assumed"] if lacking else []
     return calibration_off(recording.table, experiment.scene.table)

@@ -1,4 +1,4 @@
-"""What a validation asks for: a TOML file, checked; one comes with the rig."""
+"""Criteria of a validation: a checked TOML file, with a default set."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from rig.physics.parameters import load_parameters
 
 DEFAULT = Path(__file__).with_name("default.toml")
 
-_LASTING = 2.0
-"""Times what noise may drift by: what a fit leaves is none, and its mean over a stretch does not shrink."""
+_DRIFT_FACTOR = 2.0
+"""Factor on the drift limit of a log: residuals of a fit are not noise, and their means do not shrink."""
 
 Positive = Annotated[FiniteFloat, Field(gt=0.0)]
 NotNegative = Annotated[FiniteFloat, Field(ge=0.0)]
@@ -27,17 +27,17 @@ class _Section(BaseModel):
 
 
 class WindowRules(_Section):
-    """How long a trajectory can be predicted, and how much of a recording is compared at all."""
+    """Limits of the predictable part of a trajectory, and of the compared part of a recording."""
 
     reason: Reason
     perturbation: Positive
-    """Relative change of the perturbed parameters: what another build may do."""
+    """Relative change of the perturbed parameters, as large as the difference between two builds."""
     parameters: tuple[str, ...]
-    """Parameters that are changed by it."""
+    """Parameters that are perturbed."""
     share: Positive
-    """The window ends where the perturbed run is off by this part of any channel's noise floor."""
+    """The window ends when the perturbed run differs by this part of any channel's noise floor."""
     longest_s: Positive
-    """Time from the first sample on that is compared [s]; bits are compared to the end."""
+    """Compared time from the first sample [s]; bits are compared to the end."""
 
     @field_validator("parameters")
     @classmethod
@@ -45,41 +45,41 @@ class WindowRules(_Section):
         entries = load_parameters().entries
         for key in keys:
             if key not in entries or isinstance(entries[key].value, str):
-                raise ValueError(f"parameters that are numbers; {key} is none")
+                raise ValueError(f"parameters that are numbers; {key} is not one")
         if not keys:
             raise ValueError("at least one parameter")
         return keys
 
 
 class TrajectoryCriterion(_Section):
-    """Limits of the residual over its noise floor, sample by sample inside the window."""
+    """Limits of the residual over its noise floor, sample by sample within the window."""
 
     channels: tuple[str, ...]
-    """Patterns of channel names, such as `P_*`; of several criteria the first that fits a channel holds."""
+    """Patterns of channel names, such as `P_*`; the first criterion that matches a channel applies."""
     reason: Reason
     rms: Positive
-    """Largest RMS of residual over floor, ..."""
+    """Largest RMS of the residual over the floor, without its standard error."""
     sigmas: NotNegative
-    """... plus so many standard errors of it."""
+    """Number of standard errors that are added to `rms`."""
     peak: Positive
     """Largest single residual [floors]."""
     drift: Positive
-    """Largest mean over a stretch [standard errors of such a mean]."""
+    """Largest mean over a stretch [standard errors of the mean]."""
 
 
 class StatisticCriterion(_Section):
-    """Limits of a quantity of a phase: recorded against predicted."""
+    """Limits of the difference between the recorded and the predicted quantity of a phase."""
 
     phases: tuple[str, ...]
     quantities: tuple[str, ...]
-    """Patterns of names; of several criteria the first that fits phase and quantity holds."""
+    """Patterns of names; the first criterion that matches phase and quantity applies."""
     reason: Reason
     relative: NotNegative = 0.0
-    """Part of the predicted value (a distance of spectra is a part already: then of 1), ..."""
+    """First term of the limit: part of the predicted value, or of 1 for a distance of spectra."""
     absolute: NotNegative = 0.0
-    """... plus so much in the quantity's own unit, ..."""
+    """Second term of the limit, in the quantity's unit."""
     spread: NotNegative
-    """... plus so many times the standard deviation over the ensemble."""
+    """Third term of the limit: number of standard deviations over the ensemble."""
 
     @field_validator("phases")
     @classmethod
@@ -93,24 +93,24 @@ class StatisticCriterion(_Section):
 
 
 class Ensemble(_Section):
-    """Re-simulations that show how far a quantity can be predicted: perturbed, each with noise of its own."""
+    """Perturbed re-simulations with independent noise, which show how well a quantity can be predicted."""
 
     reason: Reason
     members: Annotated[int, Field(ge=3, le=100)]
     perturbation: Positive
-    """Relative, of the window's parameters."""
+    """Relative change of the window's parameters."""
 
 
 class TruthCriterion(_Section):
-    """Limit for the truth, where it was recorded, inside the window."""
+    """Limit for the recorded truth, within the window."""
 
     reason: Reason
     relative: Positive
-    """Largest difference as a part of each column's largest value, beyond that of the perturbed run."""
+    """Largest difference relative to each column's largest value, in addition to that of the perturbed run."""
 
 
 class Variant(_Section):
-    """A model that is as right as ours."""
+    """An equally valid model."""
 
     reason: Reason
     set: dict[str, Any]
@@ -118,53 +118,53 @@ class Variant(_Section):
 
 
 class Imported(_Section):
-    """What is asked of logs of other systems, which tell less exactly what was done and how loud their sensors are."""
+    """Additional tolerances for logs of other systems, whose experiment and noise are known less exactly."""
 
     reason: Reason
     title: str = ""
-    """What they are judged by; "" for the title of all."""
+    """Title of the criteria; "" for the title of all."""
     nuisances: tuple[str, ...]
     """Numbers that are fitted before anything is compared."""
     noise: NotNegative
-    """By this part the noise may be off that was read off the log."""
+    """Relative error of the noise estimated from the log."""
     bandwidth: Positive
-    """Corner of a real anti-alias filter over the one that is told."""
+    """Corner of a real anti-alias filter over the stated one."""
     calibration: NotNegative
-    """By this part of what it shows a channel may be off: calibrations are no better."""
+    """Relative calibration error of a channel."""
     statistics: NotNegative
-    """By this part of it a quantity of a phase may be off beside its spread."""
+    """Relative tolerance of a quantity of a phase, in addition to its spread."""
     variants: tuple[Variant, ...]
 
 
 class Candidate(_Section):
-    """What may be off: numbers of the experiment that are changed together."""
+    """Numbers of the experiment that are changed together to explain a difference."""
 
     name: str
     keys: Annotated[tuple[str, ...], Field(min_length=1)]
     """Parameters, numbers of the scene, or of a command (`hammer.1.force_n`)."""
     unit: str = ""
-    """With a unit the change is added, in that unit; without, it is a part of the value."""
+    """Unit of the change, which is added; without a unit the change is relative."""
     largest: Positive
-    """The fit goes no further than this, either way."""
+    """Largest change of a fit, in either direction."""
     step: Positive = 1.0e-5
-    """Of the difference quotient, as `largest`."""
+    """Step of the difference quotient, in the unit of `largest`."""
 
 
 class Attribution(_Section):
-    """How a failure is explained."""
+    """Limits for the explanation of a failure."""
 
     reason: Reason
     longest_s: Positive
-    """Time behind the first difference that the fits see [s]."""
+    """Time after the first difference that is fitted [s]."""
     equal: NotNegative
-    """Candidates whose explained parts differ by less than this cannot be told apart."""
+    """Smallest difference of the explained parts by which two candidates are distinguished."""
     enough: Positive
-    """A candidate that explains less than this part of the residual is no explanation."""
+    """Smallest part of the residual that an explanation must explain."""
     candidates: tuple[Candidate, ...]
 
 
 class Criteria(_Section):
-    """All of it."""
+    """All criteria of a validation."""
 
     title: str
     window: WindowRules
@@ -175,24 +175,24 @@ class Criteria(_Section):
     attribution: Attribution
     imported: Imported
 
-    def of_log(self) -> Criteria:
-        """For channels whose noise is known only to a part of it, and quantities that models as right leave open."""
+    def for_log(self) -> Criteria:
+        """Return the criteria for a log: wider by the uncertainty of its noise and of equally valid models."""
         rules = self.imported
         wide = 1.0 + rules.noise
         wider = tuple(
-            c.model_copy(update={"rms": c.rms * wide, "peak": c.peak * wide, "drift": c.drift * wide * _LASTING})
+            c.model_copy(update={"rms": c.rms * wide, "peak": c.peak * wide, "drift": c.drift * wide * _DRIFT_FACTOR})
             for c in self.trajectory
         )
         more = tuple(c.model_copy(update={"relative": c.relative + rules.statistics}) for c in self.statistics)
         title = rules.title or self.title
         return self.model_copy(update={"title": title, "trajectory": wider, "statistics": more})
 
-    def trajectory_of(self, channel: str) -> TrajectoryCriterion | None:
-        """The criterion of a channel."""
+    def find_trajectory(self, channel: str) -> TrajectoryCriterion | None:
+        """Return the criterion of a channel, or None."""
         return next((c for c in self.trajectory if any(fnmatchcase(channel, p) for p in c.channels)), None)
 
-    def statistic_of(self, phase: str, quantity: str) -> StatisticCriterion | None:
-        """The criterion of a quantity of a phase."""
+    def find_statistic(self, phase: str, quantity: str) -> StatisticCriterion | None:
+        """Return the criterion of a quantity of a phase, or None."""
         fits = (
             c
             for c in self.statistics
@@ -204,7 +204,7 @@ class Criteria(_Section):
 def _known_names(patterns: tuple[str, ...], known: tuple[str, ...]) -> tuple[str, ...]:
     for pattern in patterns:
         if not any(fnmatchcase(name, pattern) for name in known):
-            raise ValueError(f"patterns that fit one of {', '.join(known)}")
+            raise ValueError(f"patterns that match one of {', '.join(known)}")
     return patterns
 
 
@@ -212,7 +212,7 @@ def load_criteria(path: Path | None = None) -> Criteria:
     """Load criteria, the rig's own by default.
 
     Raises:
-        InputError: The one thing that is wrong, with its field.
+        InputError: The file is invalid; the message has the first error and its field.
     """
     path = DEFAULT if path is None else path
     data = read_toml(path)

@@ -1,4 +1,4 @@
-"""What a validation comes to: every result with its criterion, the verdict, and the same as a document."""
+"""Result of a validation: all comparisons with their criteria, the verdict, and a JSON document."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ _MIN_JUDGED = 0.99
 
 @dataclass(frozen=True)
 class Failure:
-    """One criterion that is not met, as what reads it wants to say it.
+    """A criterion that is not met, as text.
 
     Attributes:
-        criterion: What is asked for, with its unit.
-        recorded: What the recording has.
-        foretold: What it should have.
-        limit: What is allowed.
+        criterion: Criterion with its unit.
+        recorded: Recorded value.
+        foretold: Predicted value.
+        limit: Allowed difference.
     """
 
     criterion: str
@@ -44,40 +44,40 @@ class Failure:
 
     @property
     def line(self) -> str:
-        """All of it in one line."""
+        """Criterion, values and limit in one line."""
         return f"{self.criterion}: {self.recorded} against {self.foretold} ({self.limit})"
 
 
 @dataclass(frozen=True)
 class Validation:
-    """What a validation came to.
+    """Result of a validation.
 
     Attributes:
         path: The recording.
-        scene: Name of its scene.
+        scene: Name of the scene.
         criteria: Title of the criteria.
-        changes: What was changed against the recording.
-        bits: By key; empty where bits were not compared.
-        bit_exact: Every payload is equal.
-        declared: Judged by the declared comparison even so.
-        window_s: The trajectory is judged from the first to the second of these times [s].
-        window_reason: How its end was found.
-        residuals: Of every channel in the window.
-        truth: Of every truth table in the window.
-        phases: The phases found.
-        statistics: Of every phase.
-        calibration: How the recording's channels differ from the rig's own table, in words.
-        skipped: Rows that the recording lost.
-        explained: Where something failed, what it may come from.
-        fitted: What was fitted before, as an imported log does not tell it exactly.
-        parts: What was recorded.
-        nominal: What was predicted.
-        files: Number of files that the recording was in.
-        faults: What signals of a log show by themselves to be wrong.
-        doubts: What in the recording does not fit the rest of it: then nothing that is left of it is good.
-        complete: The recording was finished.
-        contact_s: First contact of a log that the trajectory does not reach [s]; None where it does, or there is none.
-        due_s: The same where the trajectory would have reached it, had the model explained what is there.
+        changes: Changes relative to the recording.
+        bits: Comparison of bits by key; empty if bits were not compared.
+        bit_exact: Whether every payload is equal.
+        declared: Whether the declared criteria decide even then.
+        window_s: Begin and end of the judged trajectory [s].
+        window_reason: Reason of its end.
+        residuals: Residuals of every channel in the window.
+        truth: Results of every truth table in the window.
+        phases: Phases of the run.
+        statistics: Results of every phase.
+        calibration: Differences of the recording's channels from the rig's channel table, as text.
+        skipped: Number of rows that the recording lost.
+        explained: Explanation of a failure.
+        fitted: Numbers fitted before the comparison, as an imported log does not state them exactly.
+        parts: Recorded channels.
+        nominal: Prediction.
+        files: Number of files of the recording.
+        faults: Faults that a log's signals show without a model.
+        doubts: Inconsistencies within the recording; with any of them the validation fails.
+        complete: Whether the recording was finished.
+        contact_s: First contact of a log, if the trajectory ends before it [s]; otherwise None.
+        due_s: The same if the trajectory would have reached it with a valid model.
     """
 
     path: Path
@@ -108,21 +108,21 @@ class Validation:
 
     @property
     def outcome(self) -> Outcome:
-        """Pass where the recording is bit-exact, or within every criterion, and enough of it was compared."""
+        """Pass if the recording is bit-exact, or within every criterion, and enough of it was compared."""
         held = (self.bit_exact and not self.declared) or not self.failures
         failed = bool(self.doubts or self.faults or self.beyond) or not held
         return Outcome.of(failed=failed, shown=not self.unjudged)
 
     @property
     def good(self) -> bool:
-        """Whether nothing in it is wrong; `outcome` asks whether enough was compared, too."""
+        """True if nothing is wrong; `outcome` also requires that enough was compared."""
         return self.outcome is not Outcome.FAIL
 
     @property
     def unjudged(self) -> str:
-        """Return the reason why too little was compared for a pass; empty where enough was."""
+        """Return the reason why too little was compared for a pass; empty if enough was."""
         if not self.complete:
-            return "the recording is not complete, and how much of it is missing is not known; what is there holds"
+            return "the recording is not complete, by an unknown number of rows; the existing rows pass"
         if self.bit_exact and not self.declared:
             rows = sum(one.rows for one in self.bits.values())
             if rows < _MIN_JUDGED * (rows + self.skipped):
@@ -132,18 +132,18 @@ class Validation:
 
     @property
     def judged(self) -> int:
-        """Number of criteria that were applied."""
+        """Number of applied criteria."""
         asked = sum(one.good is not None for one in (*self.residuals, *self.statistics)) + len(self.truth)
         return asked + (self.due_s is not None)
 
     @property
     def beyond(self) -> list[str]:
-        """What was fitted and is beyond what is known of it, in words: a finding, though everything goes together."""
+        """Fitted numbers outside their known uncertainty, as text; each is a failure even if the model fits."""
         return [one.line for one in self.fitted if one.beyond]
 
     @property
     def failures(self) -> list[Failure]:
-        """Every criterion that is not met."""
+        """Criteria that are not met."""
         found = []
         for one in self.residuals:
             if one.good is False and one.broken is not None:
@@ -155,7 +155,7 @@ class Validation:
             found.append(Failure("trajectory, to the first contact [s]", reached, f"{self.due_s:.4f}", "beyond it"))
         for one in self.truth:
             if not one.good:
-                criterion = f"truth {one.table}.{one.column}, part that it is off"
+                criterion = f"truth {one.table}.{one.column}, relative error"
                 found.append(Failure(criterion, f"{one.relative:.2g}", "0", f"≤ {one.limit:.2g}"))
         for one in self.statistics:
             if one.good is False and one.limit is not None:
@@ -165,12 +165,12 @@ class Validation:
 
     @property
     def title(self) -> str:
-        """Name of the recording, of several parts that of the first."""
+        """Name of the recording; of several parts that of the first."""
         return self.path.name + (f" and {self.files - 1} more" if self.files > 1 else "")
 
     @property
     def calibration_line(self) -> str:
-        """How the recording's channels differ from the rig's own table, in one line; empty where they do not."""
+        """Differences of the recording's channels from the rig's channel table in one line, or empty."""
         if len(self.calibration) < 2:
             return "".join(self.calibration)
         names = [line.partition(":")[0] for line in self.calibration]
@@ -179,15 +179,15 @@ class Validation:
 
     @property
     def bits_line(self) -> str:
-        """How the payloads compare, in one line."""
+        """Comparison of payloads in one line."""
         if not self.bits:
             return "imported: there are no payloads of this rig to compare"
         rows = sum(one.rows for one in self.bits.values())
-        lost = f"; {self.skipped} rows that the recording lost are passed over" if self.skipped else ""
+        lost = f"; {self.skipped} rows that the recording lost are skipped" if self.skipped else ""
         cut = [f"{key.rpartition('/')[2]} {one.picked}" for key, one in self.bits.items() if one.picked]
-        lost += f"; of the channels, by name: {', '.join(cut)}" if cut else ""
+        lost += f"; channels by name: {', '.join(cut)}" if cut else ""
         if self.bit_exact:
-            there = " that are there" if self.doubts else ""
+            there = " present" if self.doubts else ""
             return f"bit-exact: all payloads{there} of {len(self.bits)} streams, {rows} rows{lost}"
         off = [(key, one) for key, one in self.bits.items() if not one.equal]
         if not off:
@@ -201,7 +201,7 @@ class Validation:
 
     @property
     def verdict_line(self) -> str:
-        """The outcome in one line."""
+        """Outcome in one line."""
         if self.outcome is Outcome.INCONCLUSIVE:
             return f"inconclusive: {self.unjudged}"
         if self.outcome is Outcome.PASS:
@@ -210,11 +210,11 @@ class Validation:
             return f"pass, {basis}{unseen}"
         if self.doubts:
             more = f", and {len(self.doubts) - 1} more" if self.doubts[1:] else ""
-            return f"fail, the recording does not fit together: {self.doubts[0]}{more}"
+            return f"fail, the recording is inconsistent: {self.doubts[0]}{more}"
         if self.faults and not self.failures:
             return f"fail, a signal shows a fault: {'; '.join(one.line for one in self.faults)}"
         if self.beyond and not self.failures:
-            return f"fail, beyond what is known of it: {'; '.join(self.beyond)}"
+            return f"fail, outside the known uncertainty: {'; '.join(self.beyond)}"
         channels = [one.channel for one in self.residuals if one.good is False]
         tables = [one.table for one in self.truth if not one.good]
         phases = [one.phase for one in self.statistics if one.good is False]
@@ -228,7 +228,7 @@ class Validation:
         return f"fail, {len(self.failures)} of {self.judged} criteria: {'; '.join(parts)}"
 
     def document(self) -> dict[str, Any]:
-        """All of it but the samples, as a JSON document."""
+        """Return everything except for the samples as a JSON document."""
         json_name = str if self.bits else earlier_name
         explained = None
         if (found := self.explained) is not None:
@@ -268,7 +268,7 @@ def _few(names: list[str]) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """Without numpy's types and numbers that JSON does not have."""
+    """Return a value without numpy's types, and with None for numbers that JSON does not have."""
     if isinstance(value, dict):
         return {key: _plain(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):

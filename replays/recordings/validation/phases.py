@@ -1,4 +1,4 @@
-"""Phases of a run, read off its recording, and the quantities of each; recorded and predicted are read alike."""
+"""Phases of a run, found in its recording, and their quantities, of recorded and predicted signals."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from rig.channels.orbit import full_spectrum, whirl_frequency
 from rig.channels.orbit import phase as phase_of
 
 PHASES = ("free run", "impacts", "whirl", "rest", "decay")
-"""Before the first contact; contact that comes and goes; lasting contact that goes round, or does not; after it."""
+"""Before the first contact; intermittent contact; lasting contact with and without whirl; after the last contact."""
 CONTACT = ("impacts", "whirl", "rest")
-"""Those in which the shaft touches the ring."""
+"""Phases with contact between shaft and ring."""
 WINDOW_S = 0.05
-"""Lasting contact is looked for in windows of this length [s]."""
-LASTING = 0.95
-"""Part of such a window in contact from which it lasts."""
-TURNS = 0.5
-"""Turns about the ring's centre within a window from which it goes round."""
-_SHORTEST_S = 0.02
-_CLEAR = 6.0
-"""Contact is told from noise by so many floors."""
-_LOUD = 10.0
-"""A signal has a spectrum of its own above so many floors."""
+"""Length of the windows in which lasting contact is searched [s]."""
+LASTING_PART = 0.95
+"""Part of a window in contact above which contact is lasting."""
+MIN_WHIRL_TURNS = 0.5
+"""Turns about the ring's centre within a window above which lasting contact is whirl."""
+_MIN_PHASE_S = 0.02
+_CONTACT_FLOORS = 6.0
+"""Reaction above which there is contact, in noise floors."""
+_SIGNAL_FLOORS = 10.0
+"""Standard deviation above which a signal has a spectrum other than that of noise, in floors."""
 
 
 @dataclass(frozen=True)
@@ -41,13 +41,13 @@ class Phase:
 
 @dataclass(frozen=True)
 class View:
-    """A phase of one set of channels, recorded or predicted, without gaps.
+    """Channels of a phase, recorded or predicted, without gaps.
 
     Attributes:
-        times_s: By channel [s], each shape (n,).
-        values: By channel, in its unit, each shape (n,).
-        base: What each force transducer shows at rest [N], by channel.
-        touches: r0 as a contact shows it, from the ring's centre [mm]; nan where it is not known.
+        times_s: Times by channel [s], each shape (n,).
+        values: Values by channel, in its unit, each shape (n,).
+        base: Force of each transducer at rest [N], by channel.
+        touches: Distance from the ring's centre that shows contact [mm]; nan if unknown.
     """
 
     times_s: dict[str, np.ndarray]
@@ -56,27 +56,27 @@ class View:
     touches: float
 
     def has(self, *names: str) -> bool:
-        """Whether all of these channels are there, with samples."""
+        """Return whether all of these channels are present with samples."""
         return all(name in self.values and len(self.values[name]) > 1 for name in names)
 
     def force(self) -> np.ndarray:
-        """Reaction as a vector, (P_E - P_W) + j (P_N - P_S), from its value at rest [N]."""
+        """Return the reaction as a vector, (P_E - P_W) + j (P_N - P_S), relative to rest [N]."""
         v, b = self.values, self.base
         x = (v["P_E"] - v["P_W"]) - (b["P_E"] - b["P_W"])
         return x + 1j * ((v["P_N"] - v["P_S"]) - (b["P_N"] - b["P_S"]))
 
     def radius(self) -> np.ndarray:
-        """Shaft from the ring's centre [mm]."""
+        """Return the distance of the shaft from the ring's centre [mm]."""
         return np.hypot(self.values["ring_x"], self.values["ring_y"])
 
     def contact(self) -> np.ndarray:
-        """Whether the shaft presses into the ring."""
+        """Return whether the shaft is in contact with the ring."""
         return self.radius() > self.touches
 
 
 @dataclass(frozen=True)
 class Reading:
-    """One number of a phase."""
+    """A quantity of a phase."""
 
     unit: str
     title: str
@@ -120,7 +120,7 @@ QUANTITIES = {
                        ("whirl", "rest")),
     "contact_fraction": Reading("", "share of samples in contact", _RING,
                                  lambda view: float(view.contact().mean()), ("impacts", "whirl", "rest")),
-    "impacts": Reading("", "contacts that begin", _RING, _impacts, ("impacts",)),
+    "impacts": Reading("", "number of contacts", _RING, _impacts, ("impacts",)),
     "mean_force": Reading("N", "mean size of the reaction, both axes", _FORCES,
                            lambda view: float(np.abs(view.force()).mean()), ("impacts", "whirl", "rest")),
     "peak_force": Reading("N", "largest reaction", _FORCES, lambda view: float(np.abs(view.force()).max()),
@@ -138,11 +138,11 @@ QUANTITIES = {
     "spin": Reading("Hz", "mean of the tachometer", ("speed",), lambda view: float(view.values["speed"].mean())),
     "spin_lowest": Reading("Hz", "lowest of the tachometer, means over 5 ms", ("speed",),
                             lambda view: _lowest(view), ("impacts",)),
-    # Read off two views at once: see `spectrum_distance`.
+    # Computed from two views: see `spectrum_distance`.
     "spectrum_ring": Reading("", "distance of the full spectra of the shaft in the ring", _RING, lambda _: 0.0),
     "spectrum_disk": Reading("", "distance of the full spectra of the disk", _DISK, lambda _: 0.0),
     "spectrum_force": Reading("", "distance of the full spectra of the reaction", _FORCES, lambda _: 0.0),
-    # From the truth, where it was recorded.
+    # From the truth, if recorded.
     "dissipated": Reading("J", "dissipated within the phase (truth)", (), lambda _: math.nan),
     "drive_work": Reading("J", "work of the drive within the phase (truth)", (), lambda _: math.nan),
 }  # fmt: skip
@@ -156,21 +156,21 @@ def _lowest(view: View) -> float:
 
 
 def spectrum_distance(a: np.ndarray, b: np.ndarray) -> float:
-    """Distance of two two-sided amplitude spectra, as a part of their size: 0 equal, 1 nothing in common.
+    """Return the distance of two two-sided amplitude spectra, relative to their size: 0 equal, 1 nothing in common.
 
-    Hellinger's distance of the two power spectra (of unit power each) with the ratio of their powers in it: half of
-    the squared difference of the amplitudes, over their mean power. Phases do not count.
+    This is Hellinger's distance of the two power spectra (of unit power each), including the ratio of their powers:
+    half of the squared difference of the amplitudes, over their mean power. Phases are ignored.
 
     Args:
         a: Complex signal x + j y, shape (n,).
-        b: Another, shape (n,).
+        b: Another one, shape (n,).
     """
     (_, x), (_, y) = (full_spectrum(signal.real, signal.imag, 1.0) for signal in (a, b))
     total = np.sum(x**2) + np.sum(y**2)
     return float(np.sqrt(np.sum((x - y) ** 2) / total)) if total > 0.0 else 0.0
 
 
-def view_of(
+def select_view(
     parts: dict[str, Measured],
     values: dict[str, np.ndarray],
     phase: Phase,
@@ -178,7 +178,7 @@ def view_of(
     base: dict[str, float],
     touches: float,
 ) -> View:
-    """The rows of a phase, of the longest stretch without a gap."""
+    """Return the rows of a phase, in the longest stretch without a gap."""
     times: dict[str, np.ndarray] = {}
     shown: dict[str, np.ndarray] = {}
     for name, part in parts.items():
@@ -194,7 +194,7 @@ def view_of(
 
 
 def quantities(view: View, phase: str) -> dict[str, float]:
-    """What can be read off one view; spectra are not in it."""
+    """Return the quantities of a view, except for spectra."""
     found = {}
     for name, quantity in QUANTITIES.items():
         if phase in quantity.phases and quantity.needs and name not in SPECTRA and view.has(*quantity.needs):
@@ -205,7 +205,7 @@ def quantities(view: View, phase: str) -> dict[str, float]:
 
 
 def spectra(a: View, b: View, floors: dict[str, float]) -> dict[str, float]:
-    """Distances of the full spectra of two views of the same rows.
+    """Return the distances of the full spectra of two views of the same rows.
 
     Args:
         a: One view.
@@ -219,27 +219,27 @@ def spectra(a: View, b: View, floors: dict[str, float]) -> dict[str, float]:
                 view.force() if channels == _FORCES else view.values[channels[0]] + 1j * view.values[channels[1]]
                 for view in (a, b)
             ]
-            # Of a signal that stands still, only the spectrum of the noise would be compared.
-            if all(signal.std() > _LOUD * floors[name] for signal in pair):
+            # For a constant signal only the spectra of the noise would be compared.
+            if all(signal.std() > _SIGNAL_FLOORS * floors[name] for signal in pair):
                 found[name] = spectrum_distance(*pair)
     return found
 
 
 def find_phases(view: View, *, floor_n: float) -> list[Phase]:
-    """Phases of a whole recording.
+    """Return the phases of a whole recording.
 
-    Contact is seen by the ring's probes; without them by the transducers, of which a contact in lasting whirl is not
-    told from impacts; without either the whole recording is one free run.
+    Contact is detected by the ring's probes; without them by the transducers, which do not distinguish lasting whirl
+    from impacts; without either the whole recording is one free run.
 
     Args:
-        view: All of it.
+        view: The whole recording.
         floor_n: Noise of the reaction [N].
     """
     if view.has(*_RING) and math.isfinite(view.touches):
         times, contact = view.times_s["ring_x"], view.contact()
         angle = phase_of(view.values["ring_x"], view.values["ring_y"]) / (2.0 * math.pi)
     elif view.has(*_FORCES):
-        times, contact = view.times_s["P_E"], np.abs(view.force()) > _CLEAR * floor_n
+        times, contact = view.times_s["P_E"], np.abs(view.force()) > _CONTACT_FLOORS * floor_n
         angle = np.zeros(len(times))
     else:
         times = next(iter(view.times_s.values()))
@@ -250,7 +250,7 @@ def find_phases(view: View, *, floor_n: float) -> list[Phase]:
         return [Phase("free run", begin, end)]
     first, last = float(times[touching[0]]), float(times[touching[-1]])
     phases = [Phase("free run", begin, first)]
-    stretch, kind = _lasting(times, contact, angle)
+    stretch, kind = _find_lasting_contact(times, contact, angle)
     if kind:
         phases += [Phase("impacts", first, stretch[0]), Phase(kind, *stretch)]
         if stretch[1] < last - WINDOW_S:
@@ -258,23 +258,23 @@ def find_phases(view: View, *, floor_n: float) -> list[Phase]:
     else:
         phases.append(Phase("impacts", first, min(end, last + WINDOW_S)))
     phases.append(Phase("decay", phases[-1].to_s, end))
-    return [phase for phase in phases if phase.to_s - phase.from_s > _SHORTEST_S]
+    return [phase for phase in phases if phase.to_s - phase.from_s > _MIN_PHASE_S]
 
 
-def _lasting(times: np.ndarray, contact: np.ndarray, angle: np.ndarray) -> tuple[tuple[float, float], str]:
-    """The longest run of windows with lasting contact of one kind, and its kind; "" where there is none."""
+def _find_lasting_contact(times: np.ndarray, contact: np.ndarray, angle: np.ndarray) -> tuple[tuple[float, float], str]:
+    """Return the longest run of windows with lasting contact of one kind, and this kind or ""."""
     n = max(2, round(WINDOW_S / (times[1] - times[0])))
     starts = range(0, len(times) - n + 1, n)
     kinds = []
     for s in starts:
-        held = contact[s : s + n].mean() > LASTING
-        round_ = abs(angle[s + n - 1] - angle[s]) > TURNS
+        held = contact[s : s + n].mean() > LASTING_PART
+        round_ = abs(angle[s + n - 1] - angle[s]) > MIN_WHIRL_TURNS
         kinds.append(("whirl" if round_ else "rest") if held else "")
-    alike = np.array(kinds)
-    runs = [run for run in split_at(alike[1:] != alike[:-1]) if kinds and kinds[run[0]]]
+    labels = np.array(kinds)
+    runs = [run for run in split_at(labels[1:] != labels[:-1]) if kinds and kinds[run[0]]]
     if not runs:
         return (0.0, 0.0), ""
     first, end = max(runs, key=lambda run: run[1] - run[0])
     stop = min(end * n, len(times) - 1)
-    last_window = end == len(kinds)  # what is left behind the last window is too short to judge
+    last_window = end == len(kinds)  # the rest after the last window is too short to judge
     return (float(times[first * n]), float(times[-1] + 1e-9 if last_window else times[stop])), kinds[first]

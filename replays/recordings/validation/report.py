@@ -1,4 +1,4 @@
-"""The report of a validation: tables, and pictures of what was recorded over what was predicted."""
+"""Report of a validation: tables, and plots of recorded and predicted signals."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _STRETCHES = 160
-"""Stretches of time of which the first picture shows how far recorded and predicted are apart."""
+"""Intervals of time in the overview plot of residuals."""
 _BEFORE_S, _AFTER_S = 5e-3, 60e-3
-"""A closer look begins and ends so long before and behind what is of interest."""
+"""Time before and after an event in a detail plot."""
 _MARKS: dict[bool | None, Mark] = {True: "good", False: "bad", None: "plain"}
 _WORDS = {True: "pass", False: "fail", None: "not asked"}
 
 
 def make_report(found: Validation, *, origin: Mapping[str, str] | None = None) -> Report:
-    """All of a validation as a report.
+    """Return a validation as a report.
 
     Args:
         found: The validation.
-        origin: What the report is made by, each by name.
+        origin: Facts about the origin of the report, by name.
     """
     report = Report(
         f"Validation of {found.title}",
@@ -43,7 +43,7 @@ def make_report(found: Validation, *, origin: Mapping[str, str] | None = None) -
     if found.parts and found.nominal is not None:
         report.picture(
             _overview(found),
-            "How far recorded and predicted are apart, over the noise of each channel: 1 is noise alone.",
+            "Difference of recorded and predicted signals over the noise of each channel: 1 is noise alone.",
         )
     _conclusion(report, found)
     _bits(report, found)
@@ -51,7 +51,7 @@ def make_report(found: Validation, *, origin: Mapping[str, str] | None = None) -
     _phases(report, found)
     if found.calibration:
         report.heading("Calibration")
-        report.text("The recording's own calibration is used throughout. Against the rig's own channel table it has:")
+        report.text("The recording's own calibration is used throughout. Differences from the rig's channel table:")
         report.table(("channel", "differs in"), [tuple(line.partition(": ")[::2]) for line in found.calibration])
     return report
 
@@ -61,7 +61,7 @@ def _sentence(text: str) -> str:
 
 
 def _conclusion(report: Report, found: Validation) -> None:
-    """What comes out of it: first what explains the difference, then every criterion that fails."""
+    """Add the conclusion: first the explanation of the difference, then every criterion that fails."""
     one = found.explained
     if one is not None:
         report.text(f"The first difference is at {one.from_s:.4f} s. {_sentence(one.conclusion)}.")
@@ -72,7 +72,7 @@ def _conclusion(report: Report, found: Validation) -> None:
         report.table(
             ("criterion", "recorded", "predicted", "limit", "verdict"),
             [Row((f.criterion, f.recorded, f.foretold, f.limit, "fail"), "bad") for f in found.failures],
-            caption="Of a residual the first measure beyond its limit; ± is the largest difference.",
+            caption="For a residual, the first measure beyond its limit; ± is the largest difference.",
         )
     if one is None or not one.ranked:
         return
@@ -85,8 +85,8 @@ def _conclusion(report: Report, found: Validation) -> None:
             for e in one.ranked[:20]
         ],
         caption="Each candidate alone, fitted to the recorded channels over their noise; `explains` is the part of "
-        "the residual's sum of squares beyond noise that it takes away, `left` the RMS of the residual that remains "
-        "over the noise: 1 where only noise is left.",
+        "the residual's sum of squares beyond noise that it removes, `left` the RMS of the remaining residual "
+        "over the noise: 1 is noise alone.",
     )  # fmt: skip
 
 
@@ -124,16 +124,16 @@ def _trajectory(report: Report, found: Validation) -> None:
     )  # fmt: skip
     if found.truth:
         report.table(
-            ("truth", "column that is off most", "off by", "limit", "verdict"),
+            ("truth", "column with the largest error", "error", "limit", "verdict"),
             [
                 Row((t.table, t.column, f"{t.relative:.2e}", f"{t.limit:.2e}", _WORDS[t.good]), _MARKS[t.good])
                 for t in found.truth
             ],
         )
     zooms = _zooms(found)
-    told = "".join(f" and from {begin:.3f} to {end:.3f} s ({why})" for why, begin, end in zooms)
+    windows = "".join(f" and from {begin:.3f} to {end:.3f} s ({why})" for why, begin, end in zooms)
     for part in found.parts.values():
-        caption = f"{part.group}: recorded over predicted as a whole{told}, and the residual over its noise."
+        caption = f"{part.group}: recorded and predicted, in whole{windows}, and the residual over its noise."
         report.picture(_group(found, part, zooms), caption)
 
 
@@ -177,7 +177,7 @@ def _foretold(found: Validation, part: Measured) -> np.ndarray:
 
 
 def _zooms(found: Validation) -> list[tuple[str, float, float]]:
-    """Windows that are worth a closer look: why, begin and end [s]; of two that overlap, one for both."""
+    """Return the windows of detail plots: reason, begin and end [s]; overlapping ones are merged."""
     last_s = max(float(part.times_s[-1]) for part in found.parts.values())
     starts = []
     if found.explained is not None:
@@ -198,7 +198,7 @@ def _zooms(found: Validation) -> list[tuple[str, float, float]]:
 
 @house_style()
 def _overview(found: Validation) -> Figure:
-    """Residual over noise of every channel over the whole time."""
+    """Draw the residual over noise of every channel over the whole time."""
     from matplotlib.colors import LogNorm
 
     names = [channel.name for part in found.parts.values() for channel in part.channels]
@@ -228,11 +228,11 @@ def _overview(found: Validation) -> Figure:
 
 @house_style()
 def _group(found: Validation, part: Measured, zooms: list[tuple[str, float, float]]) -> Figure:
-    """Overlay of every channel of a group as a whole; overlay and residual of each closer look."""
+    """Draw recorded and predicted signals of a group in whole, and with residuals in each detail window."""
     whole = ("the whole", float(part.times_s[0]), float(part.times_s[-1]))
     n, looks = len(part.channels), len(zooms or [whole])
     figure = new_figure((1.25 * n + 0.9) * looks + 0.3)
-    # Each closer look has rows of its own, so that a panel stays wide enough to be read.
+    # Each detail window has its own rows, so that a panel is wide enough to read.
     panels = figure.subplots(n * looks, 3, squeeze=False, sharex=False)
     values = _foretold(found, part)
     for look, window in enumerate(zooms or [whole]):

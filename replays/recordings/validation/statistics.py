@@ -1,4 +1,4 @@
-"""Quantities of every phase of a recording, against how far perturbed runs spread them."""
+"""Quantities of every phase of a recording, compared with predictions and their spread over perturbed runs."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from replays.recordings.validation.phases import (
     View,
     find_phases,
     quantities,
+    select_view,
     spectra,
-    view_of,
 )
 from replays.recordings.validation.truth import TruthTables, energy_change
 from rig.physics.kernels.signals import COLUMN
@@ -33,18 +33,18 @@ _ENERGIES = {"dissipated": DISSIPATED, "drive_work": ("drive_work",)}
 
 @dataclass(frozen=True)
 class StatisticResult:
-    """One quantity of one phase.
+    """Result for a quantity of a phase.
 
     Attributes:
-        number: Place of the phase among the phases found.
-        phase: The phase's name.
-        quantity: The quantity's name.
-        unit: Its unit.
-        recorded: Read off the recording.
-        foretold: Median over the ensemble.
+        number: Index of the phase.
+        phase: Name of the phase.
+        quantity: Name of the quantity.
+        unit: Unit.
+        recorded: Value of the recording.
+        foretold: Predicted value: median over the ensemble.
         spread: Standard deviation over the ensemble.
-        limit: Largest difference allowed; None where there is no criterion.
-        reason: The criterion's.
+        limit: Largest allowed difference; None without a criterion.
+        reason: Reason of the criterion.
     """
 
     number: int
@@ -59,21 +59,21 @@ class StatisticResult:
 
     @property
     def title(self) -> str:
-        """The quantity with its unit."""
+        """Quantity with its unit."""
         return f"{self.quantity} [{self.unit}]" if self.unit else self.quantity
 
     @property
     def good(self) -> bool | None:
-        """Within the criterion; None where there is none."""
+        """True if the criterion is met; None without a criterion."""
         if self.limit is None:
             return None
         off = self.recorded - self.foretold
-        # Spectra cannot be too much alike.
+        # A distance of spectra cannot be too small.
         return bool((off if self.quantity in SPECTRA else abs(off)) <= self.limit)
 
 
 def perturbed(experiment: Experiment, keys: tuple[str, ...], part: float) -> Experiment:
-    """The experiment with some of its values larger by a part."""
+    """Return the experiment with some values increased by a relative amount."""
     return with_values(experiment, {key: value_of(experiment, key) * (1.0 + part) for key in keys})
 
 
@@ -90,15 +90,15 @@ def statistics(
     criteria: Criteria,
     members: Sequence[Prediction] = (),
 ) -> tuple[list[Phase], list[StatisticResult]]:
-    """The phases of a recording, and every quantity of each against its spread over perturbed runs.
+    """Return the phases of a recording, and every quantity of each with its spread over perturbed runs.
 
     Args:
-        experiment: What was done, with cheap sensors.
-        parts: What was recorded.
-        nominal: What is predicted.
-        tables: The recorded truth.
-        criteria: What is asked.
-        members: What might have been predicted as well; none: the experiment perturbed.
+        experiment: The experiment, with fast sensors.
+        parts: Recorded channels.
+        nominal: Prediction.
+        tables: Recorded truth.
+        criteria: Criteria.
+        members: Equally valid predictions; if empty, the experiment is perturbed.
     """
     look = _viewer(experiment, parts)
     recorded = {name: part.values for name, part in parts.items()}
@@ -109,7 +109,7 @@ def statistics(
     for number, phase in enumerate(phases):
         seen, there = look(recorded, phase), look(nominal.values, phase)
         others = [look(loud, phase) for loud, _ in shown]
-        samples: dict[str, tuple[float, list[float]]] = {}  # recorded, and of every member
+        samples: dict[str, tuple[float, list[float]]] = {}  # recorded value, and that of each member
         read = [quantities(other, phase.name) for other in others]
         for name, value in quantities(seen, phase.name).items():
             samples[name] = value, [one[name] for one in read]
@@ -127,13 +127,13 @@ def statistics(
 
 
 def _floor(parts: dict[str, Measured], names: tuple[str, ...]) -> float:
-    """Floor of the sum of those channels that are there."""
+    """Return the noise floor of the sum of those channels that are present."""
     floors = [part.floor[c] for part in parts.values() for c, name in enumerate(part.names) if name in names]
     return math.hypot(*floors)
 
 
 def _viewer(experiment: Experiment, parts: dict[str, Measured]) -> Callable[[dict[str, np.ndarray], Phase], View]:
-    """What shows a phase of values, with what the model tells of the transducers at rest and of the clearance."""
+    """Return a function that returns the view of a phase, with the model's force at rest and clearance."""
     model = build_model(experiment.scene.load_parameters(), experiment.scene.model)
     row = experiment.simulation().first_row
     channels = {channel.name: channel for part in parts.values() for channel in part.channels}
@@ -142,14 +142,14 @@ def _viewer(experiment: Experiment, parts: dict[str, Measured]) -> Callable[[dic
     touches = math.nan
     if "ring_x" in channels:
         touches = model.constants.contact.clearance * 1e3 + 6.0 * _floor(parts, ("ring_x",))
-    return lambda values, phase: view_of(parts, values, phase, base=base, touches=touches)
+    return lambda values, phase: select_view(parts, values, phase, base=base, touches=touches)
 
 
 def _ensemble(
     experiment: Experiment, parts: dict[str, Measured], criteria: Criteria, given: Sequence[Prediction]
 ) -> list[tuple[dict[str, np.ndarray], Prediction]]:
-    """Perturbed runs: what the channels show with noise of their own, and what is predicted without."""
-    generator = np.random.default_rng(0)  # of the ensemble's noise and perturbations: the same in every validation
+    """Return perturbed runs: signals with independent noise, and the predictions without."""
+    generator = np.random.default_rng(0)  # the same noise and perturbations in every validation
     members = []
     for number in range(criteria.ensemble.members):
         part = criteria.ensemble.perturbation * generator.uniform(-1.0, 1.0)
@@ -167,7 +167,7 @@ def _judge(
     number: int, phase: Phase, name: str, value: float, sample: list[float], criteria: Criteria
 ) -> StatisticResult:
     predicted, deviation = float(np.median(sample)), float(np.std(sample, ddof=1))
-    criterion = criteria.statistic_of(phase.name, name)
+    criterion = criteria.find_statistic(phase.name, name)
     limit = None
     if criterion is not None:
         size = 1.0 if name in SPECTRA else abs(predicted)

@@ -1,4 +1,4 @@
-"""Sample by sample, as long as the trajectory can be predicted: residuals over their noise floors."""
+"""Residuals over their noise floors, sample by sample, within the predictable part of the trajectory."""
 
 from __future__ import annotations
 
@@ -13,30 +13,30 @@ from replays.recordings.resimulation.prediction import Measured, Prediction
 from replays.recordings.validation.criteria import Criteria, TrajectoryCriterion
 
 STRETCH = 128
-"""Samples that one mean of the drift is taken over."""
-_SURE = 7.0
-"""No noise reaches this."""
+"""Samples of a mean in the drift."""
+_NOISE_LIMIT = 7.0
+"""Residual over its floor that noise never reaches."""
 
 
 @dataclass(frozen=True)
 class ChannelResidual:
-    """What is left of one channel inside the window.
+    """Residual of a channel within the window.
 
     Attributes:
-        group: Its group.
-        channel: Its name.
-        unit: Its unit.
+        group: Channel group.
+        channel: Channel.
+        unit: Unit.
         floor: Noise and rounding [unit].
-        n: Samples.
+        n: Number of samples.
         rms: RMS of residual over floor; 1 is noise alone.
-        peak: Largest of it.
-        drift: Largest mean over a stretch, in standard errors of such a mean.
-        limit: The criterion's limit of `rms`, with its standard errors.
-        peak_limit: That of `peak`.
-        drift_limit: That of `drift`.
-        good: Within the criterion; None where there is none for it.
-        first_s: First time at which a limit is passed [s]; None where none is.
-        reason: The criterion's.
+        peak: Largest residual over floor.
+        drift: Largest mean over a stretch, in standard errors of the mean.
+        limit: Limit of `rms`, including its standard errors.
+        peak_limit: Limit of `peak`.
+        drift_limit: Limit of `drift`.
+        good: Whether the criterion is met; None without a criterion.
+        first_s: First time at which a limit is exceeded [s], or None.
+        reason: Reason of the criterion.
     """
 
     group: str
@@ -56,31 +56,29 @@ class ChannelResidual:
 
     @property
     def broken(self) -> tuple[str, float, float] | None:
-        """The first measure that is beyond its limit, the plainest first: its name, its value, its limit."""
+        """First measure beyond its limit: its name, value and limit; or None."""
         measures = (
             ("RMS", self.rms, self.limit),
             ("largest", self.peak, self.peak_limit),
             ("drift", self.drift, self.drift_limit),
         )
-        return next((one for one in measures if not one[1] <= one[2]), None)  # not a number is beyond, too
+        return next((one for one in measures if not one[1] <= one[2]), None)  # nan is beyond the limit
 
     @staticmethod
     def alone(measure: str) -> str:
-        """What is left where there is noise alone, in words."""
+        """Return the value of a measure for noise alone, as text."""
         return "1" if measure == "RMS" else "noise"
 
 
 def foreseeable_s(
     parts: dict[str, Measured], nominal: Prediction, others: Sequence[Prediction], *, share: float
 ) -> float | None:
-    """First time at which runs that are as right are apart by a part of the noise [s]; None: nowhere."""
+    """Return the first time at which equally valid runs differ by a part of the noise [s]; None if they do not."""
     ends = []
     for name, part in parts.items():
         for other in others:
             apart = np.abs(other.values[name] - nominal.values[name]) > share * part.floor
-            apart[:, [channel.name == "keyphasor" for channel in part.channels]] = (
-                False  # a pulse: a row late is no sign
-            )
+            apart[:, [channel.name == "keyphasor" for channel in part.channels]] = False  # a pulse may shift by a row
             hit = np.flatnonzero(apart.any(axis=1))
             if len(hit):
                 ends.append(float(part.times_s[hit[0]]))
@@ -88,31 +86,31 @@ def foreseeable_s(
 
 
 def floors(part: Measured, values: np.ndarray, others: Sequence[np.ndarray] = ()) -> np.ndarray:
-    """Noise, and how far predictions are from each other that are as right, shape (n, channels).
+    """Return the noise combined with the differences between equally valid predictions, shape (n, channels).
 
     Args:
-        part: What was recorded.
-        values: What was predicted for its first rows, shape (n, channels).
-        others: What might have been predicted as well, each shape (n, channels).
+        part: Recorded channels.
+        values: Prediction of its first rows, shape (n, channels).
+        others: Equally valid predictions, each shape (n, channels).
     """
     squares = sum(((other - values) ** 2 for other in others), np.broadcast_to(part.floor**2, values.shape))
     return np.sqrt(squares)
 
 
 def scaled(part: Measured, values: np.ndarray, others: Sequence[np.ndarray] = ()) -> np.ndarray:
-    """Residuals of recorded against predicted over the floor, shape (n, channels); arguments as of `floors`."""
+    """Return the residuals over the floor, shape (n, channels); arguments as of `floors`."""
     return (part.values[: len(values)] - values) / floors(part, values, others)
 
 
 def residuals(
     parts: dict[str, Measured], nominal: Prediction, others: Sequence[Prediction], criteria: Criteria, *, end_s: float
 ) -> list[ChannelResidual]:
-    """Judge every channel inside the window.
+    """Judge every channel within the window.
 
     Args:
-        parts: What was recorded.
-        nominal: What was predicted.
-        others: What might have been predicted as well.
+        parts: Recorded channels.
+        nominal: Prediction.
+        others: Equally valid predictions.
         criteria: The limits.
         end_s: End of the window [s].
     """
@@ -123,7 +121,7 @@ def residuals(
             continue
         z = scaled(part, nominal.values[name][:n], [other.values[name][:n] for other in others])
         for c, channel in enumerate(part.channels):
-            criterion = criteria.trajectory_of(channel.name)
+            criterion = criteria.find_trajectory(channel.name)
             found.append(_judge(part, c, z[:, c], criterion))
     return found
 
@@ -140,10 +138,10 @@ def _judge(part: Measured, c: int, z: np.ndarray, criterion: TrajectoryCriterion
         peak_limit = criterion.peak
         drift_limit = criterion.drift if random else math.inf
         limit = limit if random else math.inf
-        # Rounding alone is no noise: its mean does not shrink, and its RMS may be its bound.
+        # Rounding is not noise: its mean does not shrink, and its RMS may reach its bound.
         good = peak <= peak_limit and rms <= limit and drift <= drift_limit
         if not good:
-            over = np.flatnonzero(np.abs(z) > min(criterion.peak, _SURE))
+            over = np.flatnonzero(np.abs(z) > min(criterion.peak, _NOISE_LIMIT))
             starts = [float(part.times_s[over[0]])] if len(over) else []
             slow = np.flatnonzero(np.abs(means) > drift_limit)
             starts += [float(part.times_s[slow[0] * STRETCH])] if len(slow) else []

@@ -1,4 +1,4 @@
-"""The model's truth in a recording: table by table against what is predicted, and the energies of a phase."""
+"""Comparison of the recorded truth of the model with its prediction, by table, and energies of a phase."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ TruthTables = dict[str, tuple[np.ndarray, np.ndarray]]
 
 @dataclass(frozen=True)
 class TruthResult:
-    """One truth table inside the window: largest difference as a part of each column's largest value."""
+    """Result for a truth table within the window: largest difference relative to each column's largest value."""
 
     table: str
     column: str
@@ -30,12 +30,12 @@ class TruthResult:
 
     @property
     def good(self) -> bool:
-        """Within the criterion."""
+        """True if the criterion is met."""
         return self.relative <= self.limit
 
 
 def recorded_truth(recording: Recording, *, longest_s: float) -> TruthTables:
-    """Row numbers and values of the truth tables that are as this version makes them."""
+    """Return row numbers and values of the truth tables with the columns of this version."""
     found = {}
     for name, columns in TRUTH.items():
         if name not in recording.catalogue.get("truth", {}):
@@ -55,12 +55,12 @@ def judge_truth(
     *,
     end_s: float,
 ) -> list[TruthResult]:
-    """Hold truth tables against what is predicted, to some time [s]; allowed is ten times what a perturbation does."""
+    """Compare truth tables with the prediction up to a time [s]; limits include ten times a perturbation's effect."""
     found = []
     for name, (index, values) in tables.items():
         here, there = nominal.truth[name], perturbed.truth[name]
         kept = (index < min(len(here), len(there))) & (index < end_s * nominal.truth_rate_hz)
-        if name == "contact":  # at the very centre it has no direction, nor a speed along it
+        if name == "contact":  # at the centre its direction and tangential speed are undefined
             kept &= np.append(here[:, 0], 0.0)[np.minimum(index, len(here))] > _CENTRE * here[:, 0].min()
         rows, recorded = index[kept], values[kept]
         if not len(rows):
@@ -77,7 +77,7 @@ def judge_truth(
 def energy_change(
     table: tuple[np.ndarray, np.ndarray], columns: tuple[str, ...], phase: Phase, prediction: Prediction
 ) -> tuple[float, float]:
-    """Recorded and predicted change of a sum of integrals over a phase [J]."""
+    """Return the recorded and the predicted change of a sum of integrals over a phase [J]."""
     index, values = table
     picked = np.array([TRUTH["energy"].index(column) for column in columns])
     rate = prediction.truth_rate_hz

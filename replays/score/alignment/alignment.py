@@ -1,4 +1,4 @@
-"""Alignment of each table of a record with the session: the begin that explains it, and the track of its rows."""
+"""Alignment of each table of a record with the session: the begin that explains it best, and the track of its rows."""
 
 from __future__ import annotations
 
@@ -8,95 +8,96 @@ from dataclasses import replace
 
 import numpy as np
 
-from replays.score.alignment.begins import FOLLOWED, SAME_BALANCE, Begins, trimmed
-from replays.score.alignment.one_begin import FEWEST, Alignment, Source, busiest, follow
+from replays.score.alignment.begins import EQUAL_BALANCE_PART, MAX_FOLLOWED, Begins, trim_quiet_ends
+from replays.score.alignment.one_begin import MIN_ROWS, Alignment, Source, find_busiest, follow
 
 _STRETCHES_S = (0.25, 0.03)
-"""Lengths of the stretch that is fitted first; the second where clocks are apart, or samples lost, in the first [s]."""
-_ROUNDS = 3
-"""Searches for begins where the signal repeats, each by the clock that the last one found."""
+"""Lengths of the first fitted stretch [s]; the second one if clocks differ, or samples are lost, in the first."""
+_MAX_SEARCHES = 3
+"""Searches for begins of a repeating signal, each by the clock of the previous one."""
 
-_MAX_LOG_APART = math.log(2.0)
-"""Logarithms of residual power, summed over signals, within which begins explain all signals alike."""
+_EQUAL_LOG_POWER = math.log(2.0)
+"""Largest difference in the logarithm of residual power, summed over signals, at which begins count as equal."""
 
 
 def align(sources: Sequence[Source]) -> Alignment | None:
-    """Align the signals of one table with the session; None where none of them is found in it."""
-    if not sources or len(sources[0].values) < FEWEST:
+    """Align the signals of one table with the session; return None if they are not found in it."""
+    if not sources or len(sources[0].values) < MIN_ROWS:
         return None
     one = max(sources, key=lambda each: each.wire.likeness)
     rows = len(one.values)
     within_s = one.wire.within_s
     within = [min(rows, max(0, round((each - one.first_s) * one.rate_hz))) for each in within_s]
-    if within[1] - within[0] < FEWEST:
+    if within[1] - within[0] < MIN_ROWS:
         within = [0, rows]
-    default = [busiest(sources, (within[0], within[1]), round(each * one.rate_hz)) for each in _STRETCHES_S]
+    default = [find_busiest(sources, (within[0], within[1]), round(each * one.rate_hz)) for each in _STRETCHES_S]
 
     def stretches(shift_s: float) -> list[tuple[int, int]]:
-        """Stretches that lie in the session from a begin."""
+        """Return stretches that are in the session from a begin."""
         ends_s = [each - one.late_s - shift_s - one.first_s for each in one.stimulus.span_s]
         first, last = (min(rows, max(0, round(each * one.rate_hz))) for each in ends_s)
-        if last - first < FEWEST or (first <= default[0][0] and default[0][1] <= last):
+        if last - first < MIN_ROWS or (first <= default[0][0] and default[0][1] <= last):
             return default
-        return [busiest(sources, (first, last), round(each * one.rate_hz)) for each in _STRETCHES_S]
+        return [find_busiest(sources, (first, last), round(each * one.rate_hz)) for each in _STRETCHES_S]
 
     if not one.wire.others_s:
         return follow(sources, 0.0, default)
     begins = Begins(one, sources, stretches)
-    begins.try_all([0.0, *(each - one.wire.late_s for each in one.wire.others_s)])
-    for _ in range(_ROUNDS):
-        begins.try_all(begins.repeats())
-    alike, found = _follow_alike(begins, sources)
+    begins.follow_candidates([0.0, *(each - one.wire.late_s for each in one.wire.others_s)])
+    for _ in range(_MAX_SEARCHES):
+        begins.follow_candidates(begins.find_shifts())
+    alike, found = _follow_best(begins, sources)
     if found and all(each.track.steps() for each in found):
-        begins.search_all()
-        alike, found = _follow_alike(begins, sources)
+        begins.search_more_signals()
+        alike, found = _follow_best(begins, sources)
     if not found:
         return follow(sources, 0.0, default)
     most = max(each.balance for each in found)
     left = [_log_residual_power(each, sources) if found[1:] else 0.0 for each in found]
 
     def rank(n: int) -> tuple[bool, bool, int, bool, int, float]:
-        each, alike_in_all = found[n], left[n] <= min(left) + _MAX_LOG_APART
+        each, alike_in_all = found[n], left[n] <= min(left) + _EQUAL_LOG_POWER
         contradicted = any(left[m] < left[n] and _contradicts(other, each) for m, other in enumerate(found))
-        balanced = each.balance > SAME_BALANCE * most
-        return not contradicted, balanced, -begins.unaccounted(each), alike_in_all, each.upright, -abs(each.begin_s)
+        balanced = each.balance > EQUAL_BALANCE_PART * most
+        return not contradicted, balanced, -begins.penalty(each), alike_in_all, each.upright, -abs(each.begin_s)
 
     best = found[max(range(len(found)), key=rank)]
     steps = len(best.track.steps())
     if best.whole and not best.upright:
-        # Half a period later the signal is inverted: more rows in the session are no reason for an inverted record.
+        # Half a period later the signal is inverted: more rows in the session do not justify an inverted record.
         upright = [
             n for n, each in enumerate(found) if each.upright and each.whole and len(each.track.steps()) == steps
         ]
         best = found[max(upright, key=rank)] if upright else best
     doubted = any(each.track.explained > best.track.explained and _contradicts(best, each) for each in found)
-    return replace(trimmed(best, one), ambiguous=len(alike) > 1, steps_doubted=doubted)
+    return replace(trim_quiet_ends(best, one), ambiguous=len(alike) > 1, steps_doubted=doubted)
 
 
-def _follow_alike(begins: Begins, sources: Sequence[Source]) -> tuple[list[Alignment], list[Alignment]]:
-    """Return the begins that none surpasses, by some signals, and the first of them followed by all signals."""
-    alike = begins.alike()
-    shifts_s = [each.begin_s for each in alike[:FOLLOWED]]
+def _follow_best(begins: Begins, sources: Sequence[Source]) -> tuple[list[Alignment], list[Alignment]]:
+    """Return the begins that none surpasses by some signals, and the alignments of the first of them by all signals."""
+    alike = begins.find_best()
+    shifts_s = [each.begin_s for each in alike[:MAX_FOLLOWED]]
     return alike, [each for s in shifts_s if (each := follow(sources, s, begins.stretches(s)))]
 
 
 def _contradicts(other: Alignment, found: Alignment) -> bool:
-    """Return whether an alignment explains the rows about a step of another one without a step.
+    """Return whether an alignment explains the rows about another one's step without a step.
 
-    A lost sample is lost from whichever begin. Where a signal nearly repeats, a wrong begin may need steps in place of
-    the difference, and explain rows after the session's end for these.
+    A lost sample is a step from every begin. Where a signal nearly repeats, an incorrect begin may need steps in place
+    of the difference, and with these explain rows after the session's end.
     """
     return any(
-        run.begin <= max(0, first - FEWEST) and min(found.rows, last + FEWEST) <= run.end
+        run.begin <= max(0, first - MIN_ROWS) and min(found.rows, last + MIN_ROWS) <= run.end
         for first, last, _ in found.track.steps()
         for run in other.track.runs
     )
 
 
 def _log_residual_power(found: Alignment, sources: Sequence[Source]) -> float:
-    """Return the logarithm of the part of each signal's power that one common begin leaves, summed over the signals.
+    """Return the logarithm of the residual part of each signal's power from a common begin, summed over the signals.
 
-    Each signal fits a repeated begin at a time of its own, as a keyphasor whose pulses come at another part of a whirl.
+    Each signal matches a repeated begin at a slightly different time, as a keyphasor does whose pulses occur at another
+    angle of the whirl.
     """
     common_s, total = float(np.median(list(found.own_s.values()))), 0.0
     for one in sources:

@@ -1,4 +1,4 @@
-"""Begins of a record in the session: which of those that are tried explains it."""
+"""Candidate begins of a record in the session, and the choice of those that explain it."""
 
 from __future__ import annotations
 
@@ -10,79 +10,79 @@ from itertools import pairwise
 
 import numpy as np
 
-from replays.score.alignment.one_begin import FEWEST, SOUND, Alignment, Source, busiest, follow
+from replays.score.alignment.one_begin import MIN_LIKENESS, MIN_ROWS, Alignment, Source, find_busiest, follow
 from replays.score.alignment.repeats import find_repeats
 from replays.score.records.stimulus import Exact
 from replays.score.waveform import Waveform, fit_stretch, fit_waveform
 
 _NOISES = 1.2
-"""Nominal noises that a residual may have, for it to be nothing but noise."""
+"""Largest residual, in nominal noises, that counts as noise alone."""
 _BLOCK_ROWS = 200
-"""Rows of a block by which residuals are compared: their variance is known to a tenth."""
-_SEVERAL = 4
-"""Number of begins among which some are upright where a signal is inverted half a period later."""
-_LOUD_PART = 0.25
-"""Power of a block over the mean one, from which a begin shows in it."""
-SAME_BALANCE = 0.98
-"""Part of the most explained rows, from which begins explain as many: a period is cut at the ends."""
-_COMPARED = 3
-"""Signals by which begins are compared: each costs a fit."""
-_SEARCHED = 2
-"""Number of these signals by which a begin is chosen before its record is followed."""
-FOLLOWED = 4
-"""Begins that are followed with all channels: the nearest ones, half a period later among them."""
-_ALIKE = 1.05
-"""Residual power over the least one up to which begins are not distinguished, at least."""
+"""Rows of a block by which residuals are compared: its variance has a standard error of a tenth."""
+_MIN_INVERTED = 4
+"""Number of begins of which some must be upright, if inverted ones are due to a shift by half a period."""
+_MIN_POWER_PART = 0.25
+"""Power of a block over the mean one, above which the block is compared."""
+EQUAL_BALANCE_PART = 0.98
+"""Part of the largest balance above which balances count as equal: the ends of a record cut a period."""
+_MAX_COMPARED = 3
+"""Signals by which begins are compared; each costs a fit."""
+_MAX_SEARCHED = 2
+"""Number of these signals by which a begin is selected for following."""
+MAX_FOLLOWED = 4
+"""Begins that are followed with all channels: the nearest ones, including those half a period later."""
+_MIN_POWER_RATIO = 1.05
+"""Ratio of residual powers below which begins are never distinguished."""
 _DEVIATIONS = 6.0
 """Standard deviations of a residual's power within which begins are not distinguished."""
 _SAME_ROWS = 0.5
-"""Rows within which two begins are one: half of a row is a quarter of the shortest period."""
-_WORSE = 2.0
-"""Residual power of a stretch over the least one, from which a begin is not followed: the clocks may differ."""
+"""Distance of begins that count as the same [rows]: half of a row is a quarter of the shortest period."""
+_MAX_POWER_RATIO = 2.0
+"""Residual power of a stretch over the least one, above which a begin is not followed; clocks may differ."""
 _EDGE_ROWS = 20
-"""Rows that begins may differ by at the ends of a session, as it is not interpolated there."""
-_FAR, _FEW = 10.0, 0.2
-"""Residual over the median one from which a row is faulty, and the part of the rows that may be."""
-_SOUND_PARTS = 0.25
-"""Quantile of the stretches by which begins are compared: after a lost sample, the right one explains none."""
-_PARTS = 6
-"""Parts of a record, of each of which a stretch is compared before all of it is followed."""
+"""Tolerance at the ends of a session [rows], as it is not interpolated there."""
+_OUTLIER_RATIO, _MAX_OUTLIER_PART = 10.0, 0.2
+"""Residual over the median one above which a row is faulty, and the largest part of faulty rows."""
+_STRETCH_QUANTILE = 0.25
+"""Quantile of the stretches by which begins are compared: the correct one explains none after a lost sample."""
+_STRETCHES = 6
+"""Parts of a record, each with one stretch that is compared before the record is followed."""
 
 
 class Begins:
-    """Begins that are tried for a table, by the residual power of some signals in blocks of rows.
+    """Candidate begins of a table, compared by the residual power of some signals in blocks of rows.
 
-    Rows outside the session are not compared: where a signal repeats, begins that explain the same rows alike are told
-    apart by how many rows lie in the session, explained or not.
+    Rows outside the session are not compared. Where a signal repeats, begins that explain their rows equally well are
+    distinguished by the number of rows in the session, explained or not.
     """
 
     def __init__(
         self, one: Source, sources: Sequence[Source], stretches: Callable[[float], Sequence[tuple[int, int]]]
     ) -> None:
-        """Follow one signal, and compare others as well: of these the ones that are least like what repeats."""
+        """Select one signal to follow, and for comparison those that correlate least, as they repeat least."""
         others = sorted((each for each in sources if each is not one), key=lambda each: each.wire.likeness)
         self._one, self._default = one, stretches
-        self._compared = [one, *(each for each in others if each.wire.likeness > SOUND)][:_COMPARED]
+        self._compared = [one, *(each for each in others if each.wire.likeness > MIN_LIKENESS)][:_MAX_COMPARED]
         self._searched = self._compared[:1]
-        self._tried: list[tuple[np.ndarray, Alignment]] = []
+        self._fits: list[tuple[np.ndarray, Alignment]] = []
         self._shifts: list[float] = []
-        self._followed = set[int]()
-        ends = np.linspace(0, len(one.values), _PARTS + 1).astype(int)
+        self._followed_numbers = set[int]()
+        ends = np.linspace(0, len(one.values), _STRETCHES + 1).astype(int)
         length = stretches(0.0)[0][1] - stretches(0.0)[0][0]
         self._parts = [
-            busiest([one], (low, high), length)
+            find_busiest([one], (low, high), length)
             for low, high in pairwise(ends.tolist())
-            if high - low >= FEWEST and np.isfinite(one.values[low:high]).any()
+            if high - low >= MIN_ROWS and np.isfinite(one.values[low:high]).any()
         ]
-        loud = _LOUD_PART * float(np.nanvar(one.values[slice(*stretches(0.0)[0])]))
+        loud = _MIN_POWER_PART * float(np.nanvar(one.values[slice(*stretches(0.0)[0])]))
         self._parts = [each for each in self._parts if np.nanvar(one.values[slice(*each)]) >= loud]
         self._busy = _busy_rows(one.values, stretches(0.0)[0])
-        self._left: list[np.ndarray] = []
-        self._least = math.inf
+        self._residuals: list[np.ndarray] = []
+        self._least_power = math.inf
 
-    def _left_of(self, shift_s: float) -> np.ndarray:
-        """Residual power of the stretches of signals from a begin, nan where nothing explains one, shape (k, n)."""
-        found = np.full((min(_SEARCHED, len(self._compared)), len(self._parts)), np.nan)
+    def _measure_residuals(self, shift_s: float) -> np.ndarray:
+        """Return the residual power of stretches from a begin, nan for unexplained ones, shape (signals, n)."""
+        found = np.full((min(_MAX_SEARCHED, len(self._compared)), len(self._parts)), np.nan)
         for n, part in np.ndindex(found.shape):
             one = self._compared[n]
             fit = fit_stretch(one.values, one.times_s, one.stimulus, one.late_s + shift_s, self._parts[part])
@@ -91,11 +91,11 @@ class Begins:
         return found
 
     def _residual_power(self, found: Alignment, one: Source) -> np.ndarray:
-        """Residual power of a signal by block over that of noise; of all where nothing explains it, nan outside."""
+        """Return the residual power of blocks over that of noise; their whole power where unexplained, nan outside."""
         values, times_s, curve = found.even(one)
         fit = fit_waveform(values, times_s, one.stimulus, curve)
-        if fit is not None and (odd := _outlying(fit)).any():
-            # A fault of some rows would be in all blocks.
+        if fit is not None and (odd := _find_outliers(fit)).any():
+            # Without these rows, as a fault of a few rows would raise the residual of all blocks.
             values[np.rint((fit.times_s[odd] - times_s[0]) * one.rate_hz).astype(int)] = np.nan
             fit = fit_waveform(values, times_s, one.stimulus, curve)
         left = np.full(found.rows, np.nan)
@@ -103,95 +103,93 @@ class Begins:
         if fit is not None:
             left[found.rows_at(fit.times_s)] = fit.residual**2
         power = _block_means((one.values - np.nanmean(one.values)) ** 2)
-        # The DAQ's, and the session's where its samples are the known signal.
+        # Noise of the DAQ, and of the session if its samples are the known signal.
         sources = 1.0 if isinstance(one.stimulus, Exact) else 2.0
         noise = (
             _NOISES * math.hypot(one.channel.noise_v, one.channel.lsb_v / math.sqrt(12.0)) / one.channel.sensitivity_v
         )
-        return np.where(power > _LOUD_PART * np.nanmean(power), _block_means(left), np.nan) / (sources * noise**2)
+        return np.where(power > _MIN_POWER_PART * np.nanmean(power), _block_means(left), np.nan) / (sources * noise**2)
 
-    def _is_worse(self, power: np.ndarray, other: np.ndarray) -> bool:
-        """Return whether a begin leaves more than another, by the median blocks of signals that both explain."""
+    def _exceeds(self, power: np.ndarray, other: np.ndarray) -> bool:
+        """Return whether a begin has a higher residual than another, by the median blocks that both explain."""
         both = np.isfinite(power) & np.isfinite(other)
         compared = both.any(axis=1)
-        limit = max(_ALIKE, 1.0 + _DEVIATIONS * math.sqrt(2.0 / max(1, _BLOCK_ROWS * both.sum())))
+        limit = max(_MIN_POWER_RATIO, 1.0 + _DEVIATIONS * math.sqrt(2.0 / max(1, _BLOCK_ROWS * both.sum())))
         ratios = [
             np.median(here[use]) / max(np.median(there[use]), 1e-300)
             for here, there, use in zip(power[compared], other[compared], both[compared], strict=True)
         ]
         return bool(ratios) and float(np.mean(np.log(np.maximum(ratios, 1e-300)))) > math.log(limit)
 
-    def alike(self) -> list[Alignment]:
-        """Return the begins that none of the others surpasses: with most explained rows first, then the nearest."""
-        kept = [
-            each for power, each in self._tried if not any(self._is_worse(power, other) for other, _ in self._tried)
-        ]
-        if not kept and self._tried:
-            kept = [min(self._tried, key=lambda each: float(np.nanmax(_medians(each[0]))))[1]]
-        # A fault of some rows spoils the residual of all: a begin must not win by leaving these outside the session.
-        least, excess = min(map(self.unaccounted, kept), default=0), self._stretch_excess()
+    def find_best(self) -> list[Alignment]:
+        """Return the begins that no other one surpasses: those with most explained rows first, then the nearest."""
+        kept = [each for power, each in self._fits if not any(self._exceeds(power, other) for other, _ in self._fits)]
+        if not kept and self._fits:
+            kept = [min(self._fits, key=lambda each: float(np.nanmax(_medians(each[0]))))[1]]
+        # A fault of a few rows raises the residual of all: a begin must not win by placing them outside the session.
+        least, excess = min(map(self.penalty, kept), default=0), self._stretch_excess()
         kept += [
-            each for _, each in self._tried
-            if excess[self._shifts.index(each.begin_s)] < math.log(_ALIKE)
-            and self.unaccounted(each) + FEWEST // _EDGE_ROWS < least
+            each for _, each in self._fits
+            if excess[self._shifts.index(each.begin_s)] < math.log(_MIN_POWER_RATIO)
+            and self.penalty(each) + MIN_ROWS // _EDGE_ROWS < least
         ]  # fmt: skip
         most = max((each.balance for each in kept), default=0)
         kept = [each for each in kept if each.balance >= 0.5 * most]
 
         def rank(each: Alignment) -> tuple[bool, int, float]:
-            return each.balance <= SAME_BALANCE * most, self.unaccounted(each), abs(each.begin_s)
+            return each.balance <= EQUAL_BALANCE_PART * most, self.penalty(each), abs(each.begin_s)
 
         return sorted(kept, key=rank)
 
     @property
     def _settled(self) -> bool:
-        """Return whether two begins leave nothing but noise of DAQ and session, and one of them no row unexplained.
+        """True if two begins have a residual of noise alone, and one of them has no unexplained row.
 
-        A begin half a period off inverts the signal, so that one must be upright; where none of several is, the DAQ
-        inverts.
+        A begin that is off by half a period inverts the signal, so one of them must be upright, unless several are
+        inverted: then the DAQ inverts.
         """
-        alike = self.alike() if self._least < 1.0 else []
-        inverts = len(alike) >= _SEVERAL and not any(each.upright for each in alike)
+        alike = self.find_best() if self._least_power < 1.0 else []
+        inverts = len(alike) >= _MIN_INVERTED and not any(each.upright for each in alike)
         return len(alike) > 1 and any(
-            each.whole and (each.upright or inverts) and not self.outside(each) for each in alike
+            each.whole and (each.upright or inverts) and not self.count_outside(each) for each in alike
         )
 
-    def search_all(self) -> None:
-        """Search begins by other signals as well: the first one may repeat where these do not."""
-        self._searched, self._least = self._compared, math.inf
-        self.try_all(self.repeats())
+    def search_more_signals(self) -> None:
+        """Search begins by further signals, which may not repeat where the first one does."""
+        self._searched, self._least_power = self._compared, math.inf
+        self.follow_candidates(self.find_shifts())
 
-    def outside(self, found: Alignment) -> int:
-        """Return how many rows before and behind the session, from a begin, are as loud as those in it."""
+    def count_outside(self, found: Alignment) -> int:
+        """Return the number of rows outside the session, from a begin, that are as loud as those in it."""
         first, last = found.track.inside
-        loud = _LOUD_PART * float(np.nanvar(self._one.values[first:last]))
+        loud = _MIN_POWER_PART * float(np.nanvar(self._one.values[first:last]))
         parts = [self._one.values[self._busy[0] : first], self._one.values[last : self._busy[1]]]
         return sum(len(part) for part in parts if len(part) >= _EDGE_ROWS and np.nanvar(part) >= loud)
 
-    def unaccounted(self, found: Alignment) -> int:
-        """Return how many stretches of rows are loud and outside the session, or inside and not explained.
+    def penalty(self, found: Alignment) -> int:
+        """Return the number of stretches of rows that are loud and outside the session, or in it and unexplained.
 
-        A sample that is lost near an end must not stand outside of the session.
+        A sample lost near an end must not place rows outside the session.
         """
         inside = found.track.inside[1] - found.track.inside[0]
-        return (self.outside(found) + inside - found.track.explained) // _EDGE_ROWS
+        return (self.count_outside(found) + inside - found.track.explained) // _EDGE_ROWS
 
-    def repeats(self) -> list[float]:
-        """Return shifts at which the known signal repeats, by all rows and by those that the best begin explains [s].
+    def find_shifts(self) -> list[float]:
+        """Return shifts at which the known signal repeats [s], by all rows and by those that the best begin explains.
 
-        A lost sample spoils the correlation of all rows, and the begin that then explains its rows best may leave those
+        A lost sample lowers the correlation of all rows, and the begin that then explains most rows may place those
         before the lost sample outside the session.
         """
-        alike = self.alike()
+        alike = self.find_best()
         if not alike or self._settled:
             return []
         parts = [(0, len(self._one.values))]
-        if self.outside(alike[0]) >= FEWEST:
+        if self.count_outside(alike[0]) >= MIN_ROWS:
             parts.append(alike[0].track.inside)
-        return [each for one in self._searched for each in self._repeats_of(one, alike[0], parts)]
+        return [each for one in self._searched for each in self._find_shifts_in(one, alike[0], parts)]
 
-    def _repeats_of(self, one: Source, best: Alignment, parts: Sequence[tuple[int, int]]) -> list[float]:
-        """Return shifts at which a signal is like some parts of its record, by the clock of the best begin [s]."""
+    def _find_shifts_in(self, one: Source, best: Alignment, parts: Sequence[tuple[int, int]]) -> list[float]:
+        """Return the shifts at which a signal matches parts of its record, by the clock of the best begin [s]."""
         values, times_s, curve = best.even(one)
         rows, held = np.arange(len(values)), np.isfinite(values)
         values = np.interp(rows, rows[held], values[held])
@@ -207,15 +205,15 @@ class Begins:
         return [each - one.late_s for each in late_s]
 
     def stretches(self, shift_s: float) -> list[tuple[int, int]]:
-        """Return stretches by which a begin is followed, the last without a lost sample if another one has one."""
-        left = self._left[self._shifts.index(shift_s)][0]
+        """Return the stretches by which a begin is followed; the last one is that with the least residual."""
+        left = self._residuals[self._shifts.index(shift_s)][0]
         best = [] if np.isnan(left).all() else [self._parts[int(np.nanargmin(left))]]
         return [*self._default(shift_s), *best]
 
     def _rows_inside(self, shift_s: float) -> int:
-        """Return how many rows lie in the session from a begin; quiet ones at the ends of the record count against it.
+        """Return the number of rows in the session from a begin, less quiet rows at the ends of the record.
 
-        A DAQ that was started before the session, or stopped after it, has such rows.
+        A DAQ that is started before the session, or stopped after it, records such rows.
         """
         one = self._one
         places = [(each - one.late_s - shift_s - one.first_s) * one.rate_hz for each in one.stimulus.span_s]
@@ -223,74 +221,74 @@ class Begins:
         return round(2.0 * max(0.0, busy) - inside)
 
     def _stretch_excess(self) -> np.ndarray:
-        """Return the logarithm of each begin's residual power over the least, by its soundest stretches."""
-        with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # of stretches that no begin explains
-            apart = np.log(np.array(self._left) / np.nanmin(self._left, axis=0))
-            return np.nanmean(np.nanquantile(apart, _SOUND_PARTS, axis=2), axis=1)
+        """Return the logarithm of each begin's residual power over the least one, by its best stretches."""
+        with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # all-nan: unexplained stretches
+            apart = np.log(np.array(self._residuals) / np.nanmin(self._residuals, axis=0))
+            return np.nanmean(np.nanquantile(apart, _STRETCH_QUANTILE, axis=2), axis=1)
 
-    def try_all(self, shifts: Sequence[float]) -> None:
-        """Follow begins until two are alike and leave nothing but noise.
+    def follow_candidates(self, shifts: Sequence[float]) -> None:
+        """Follow begins until two are equally good and have a residual of noise alone.
 
-        First come those that leave least of stretches; of those that leave as little, those with most rows in the
-        session. Those that were looked at before and not followed count as well.
+        Begins are ordered by the residual of their stretches, and at equal residuals by the number of rows in the
+        session. Earlier candidates that were not followed are included.
         """
         one = self._one
         for shift_s in shifts:
             if all(abs(shift_s - each) * one.rate_hz >= _SAME_ROWS for each in self._shifts):
                 self._shifts.append(shift_s)
-                self._left.append(self._left_of(shift_s))
+                self._residuals.append(self._measure_residuals(shift_s))
         worse = self._stretch_excess()
         rows = np.array([-self._rows_inside(each) for each in self._shifts])
-        order = np.lexsort((rows, np.floor(worse / math.log(_ALIKE))))
-        order = [n for n in order.tolist() if n not in self._followed][:FOLLOWED]
-        # The first of all is what the whole record is most like, with the most rows in the session.
-        for n in order if self._tried else [0, *(each for each in order if each)]:
-            if self._tried and (self._settled or not worse[n] < math.log(_WORSE)):
+        order = np.lexsort((rows, np.floor(worse / math.log(_MIN_POWER_RATIO))))
+        order = [n for n in order.tolist() if n not in self._followed_numbers][:MAX_FOLLOWED]
+        # The very first one has the highest correlation over the whole record, and the most rows in the session.
+        for n in order if self._fits else [0, *(each for each in order if each)]:
+            if self._fits and (self._settled or not worse[n] < math.log(_MAX_POWER_RATIO)):
                 return
-            self._followed.add(n)
+            self._followed_numbers.add(n)
             shift_s = self._shifts[n]
             found = follow([one], shift_s, self.stretches(shift_s))
             own_s = found.own_s[one.name] if found else 0.0
-            near = [abs(own_s - each.own_s[one.name]) * one.rate_hz for _, each in self._tried]
+            near = [abs(own_s - each.own_s[one.name]) * one.rate_hz for _, each in self._fits]
             if found is not None and min(near, default=math.inf) > _SAME_ROWS:
                 power = np.array([self._residual_power(found, each) for each in self._compared])
                 if np.isfinite(power).any():
-                    self._tried.append((power, found))
-                    self._least = min(self._least, float(np.nanmax(_medians(power))))
+                    self._fits.append((power, found))
+                    self._least_power = min(self._least_power, float(np.nanmax(_medians(power))))
 
 
 def _busy_rows(values: np.ndarray, stretch: tuple[int, int]) -> tuple[int, int]:
-    """Return the rows of a record without quiet ones at its ends: the first one, and the one after the last.
+    """Return the rows of a record without quiet ones at its ends: the first row, and the row after the last.
 
     Args:
-        values: Of the record, shape (n,).
-        stretch: Rows in which the signal changes most: the first one, and the one after the last.
+        values: Values of the record, shape (n,).
+        stretch: Rows in which the signal changes most: the first row, and the row after the last.
     """
     centred = values - np.nanmean(values)
     power = _block_means(centred**2) - _block_means(centred) ** 2
-    least = _LOUD_PART * float(np.nanvar(centred[slice(*stretch)]))
-    loud = np.flatnonzero(power >= min(least, _LOUD_PART * float(np.nanmax(power, initial=0.0))))
+    least = _MIN_POWER_PART * float(np.nanvar(centred[slice(*stretch)]))
+    loud = np.flatnonzero(power >= min(least, _MIN_POWER_PART * float(np.nanmax(power, initial=0.0))))
     first, last = (int(loud[0]), int(loud[-1]) + 1) if len(loud) else (0, len(power))
-    # What is left after the last whole block counts as that block does.
+    # The rows after the last whole block are as loud as that block.
     return first * _BLOCK_ROWS, len(values) if last == len(power) else last * _BLOCK_ROWS
 
 
-def _outlying(fit: Waveform) -> np.ndarray:
-    """Return which rows of a fit are far off what most are, if few are, shape (n,)."""
+def _find_outliers(fit: Waveform) -> np.ndarray:
+    """Return whether the residual of each row is an outlier; none is if there are many, shape (n,)."""
     size = np.abs(fit.residual)
-    odd = size > _FAR * float(np.median(size))
-    return odd if odd.mean() < _FEW else np.zeros(len(odd), bool)
+    odd = size > _OUTLIER_RATIO * float(np.median(size))
+    return odd if odd.mean() < _MAX_OUTLIER_PART else np.zeros(len(odd), bool)
 
 
-def trimmed(found: Alignment, one: Source) -> Alignment:
-    """Return an alignment without quiet rows at the ends of the session: the DAQ was not connected yet."""
+def trim_quiet_ends(found: Alignment, one: Source) -> Alignment:
+    """Return an alignment without quiet rows at the ends of the session, when the DAQ was not connected yet."""
     values, times_s, curve = found.even(one)
     fit = fit_waveform(values, times_s, one.stimulus, curve)
     if fit is None:
         return found
-    odd = found.rows_at(fit.times_s[_outlying(fit)])
+    odd = found.rows_at(fit.times_s[_find_outliers(fit)])
     runs, (first, last) = list(found.track.runs), found.track.inside
-    loud = _LOUD_PART * float(np.nanvar(one.values[first:last]))
+    loud = _MIN_POWER_PART * float(np.nanvar(one.values[first:last]))
     begin = int(odd[odd < runs[0].begin + _BLOCK_ROWS].max(initial=runs[0].begin - 1)) + 1
     if runs[0].begin < begin < runs[0].end and np.nanvar(one.values[runs[0].begin : begin]) < loud:
         first, runs[0] = begin, replace(runs[0], begin=begin)
@@ -301,12 +299,12 @@ def trimmed(found: Alignment, one: Source) -> Alignment:
 
 
 def _medians(power: np.ndarray) -> np.ndarray:
-    """Return the median block of each signal, of those that have any."""
+    """Return the median block of each signal that has any."""
     return np.nanmedian(power[np.isfinite(power).any(axis=1)], axis=1)
 
 
 def _block_means(values: np.ndarray) -> np.ndarray:
-    """Return means over blocks of rows; nan where most of a block is nan."""
+    """Return means over blocks of rows; nan for a block with mostly nan."""
     blocks = values[: len(values) // _BLOCK_ROWS * _BLOCK_ROWS].reshape(-1, _BLOCK_ROWS)
     count = np.isfinite(blocks).sum(axis=1)
     return np.where(2 * count >= _BLOCK_ROWS, np.nansum(blocks, axis=1) / np.maximum(count, 1), np.nan)

@@ -1,4 +1,4 @@
-"""A record's rows in the session from one begin: what is known of its signals, and the track of its rows."""
+"""Alignment of a record with the session from one begin: fits of its signals, and the track of its rows."""
 
 from __future__ import annotations
 
@@ -14,37 +14,37 @@ from replays.score.records.wiring import Wire
 from replays.score.waveform import Waveform, fit_stretch
 from rig.channels.table import Channel
 
-FEWEST = 400
-"""Rows of a stretch, at least."""
-SOUND = 0.5
-"""Part of its power that the known signal explains in a channel by which a record is followed."""
-_NEAR_S = 5e-4
-"""Time about a begin in which a stretch is looked for: correlation with clocks apart is off by so much."""
-_SHARPER = 0.7
-"""Part of the residual that the shorter stretch must leave, as it shows less of the clock."""
-_FOLLOWERS = 6
-"""Channels by which a record is followed: more cost time, and fewer may all be faulty."""
-_WHOLE = 0.999
-"""Part of the rows in the session that are explained in a record that lies in it as a whole."""
+MIN_ROWS = 400
+"""Fewest rows of a stretch."""
+MIN_LIKENESS = 0.5
+"""Part of a channel's power that the known signal must explain for the channel to be followed."""
+_SEARCH_RANGE_S = 5e-4
+"""Search range for the begin of a stretch [s]: the error of a correlation if clocks differ."""
+_MAX_RESIDUAL_RATIO = 0.7
+"""Largest ratio of residuals for which the shorter stretch is preferred, as it determines the clock less well."""
+_MAX_FOLLOWERS = 6
+"""Channels by which a record is followed: more cost time, and fewer might all be faulty."""
+_MIN_EXPLAINED_PART = 0.999
+"""Part of the rows in the session that must be explained in a record that is explained as a whole."""
 _MAX_DRIFT = 0.02
-"""Clock error of a DAQ, at most: a fit with more of it found something else."""
-_FINER = 8
-"""Places between two samples at which the begin of a stretch is looked for."""
-_TRIED = 4
-"""Times near a begin from which a stretch is fitted."""
+"""Largest clock error of a DAQ; a fit with a larger one is wrong."""
+_OVERSAMPLING = 8
+"""Places per sample at which the begin of a stretch is searched."""
+_MAX_CANDIDATES = 4
+"""Candidate times near a begin from which a stretch is fitted."""
 
 
 @dataclass
 class Source:
-    """One recorded signal and what is known of it.
+    """A recorded signal, its connection and its known signal.
 
     Attributes:
-        name: Of the signal.
+        name: Name of the signal.
         channel: Its channel in the session.
-        wire: How it is connected.
-        values: As recorded, in the channel's unit, shape (rows,).
+        wire: Its connection.
+        values: Recorded values in the channel's unit, shape (rows,).
         first_s: Time of its first row by the clock of the file [s].
-        rate_hz: Rows a second by that clock [Hz].
+        rate_hz: Sampling rate by that clock [Hz].
         stimulus: The known signal, below half of the rate.
         session_s: Time of the session's first row [s].
     """
@@ -71,17 +71,17 @@ class Source:
 
 @dataclass(frozen=True)
 class Alignment:
-    """Where the rows of a table lie in the session.
+    """Rows of a table in the session.
 
     Attributes:
         names: Signals of the table.
-        track: The rows.
-        own_s: Session less file time where the track's time error is 0, of the signals that were followed [s].
-        first_s, rate_hz, rows: Time of the first row [s], rows a second [Hz], and their number.
+        track: Track of the rows.
+        own_s: Session less file time where the track's time error is 0, by followed signal [s].
+        first_s, rate_hz, rows: Time of the first row [s], sampling rate [Hz], and number of rows.
         upright: Number of signals with a positive gain.
-        begin_s: Time by which the begin is later in the session than the wires have it [s].
-        ambiguous: Whether other begins explain the record as well.
-        steps_doubted: Whether another begin explains more rows, with steps that this one does not need.
+        begin_s: Delay of the begin in the session relative to that of the wires [s].
+        ambiguous: Whether other begins explain the record equally well.
+        steps_doubted: Whether another begin explains more rows, by steps that this one does not need.
     """
 
     names: tuple[str, ...]
@@ -97,11 +97,11 @@ class Alignment:
 
     @property
     def balance(self) -> int:
-        """Explained rows less those in the session that nothing explains."""
+        """Number of explained rows less that of unexplained rows in the session."""
         return 2 * self.track.explained - (self.track.inside[1] - self.track.inside[0])
 
     def even(self, source: Source) -> tuple[np.ndarray, np.ndarray, tuple[float, float, float]]:
-        """Values of a signal at even instants, nan where none is explained.
+        """Return a signal's values at even instants, with nan for unexplained ones.
 
         Returns:
             Values, their times by the clock of the file [s], each shape (n,), and session less file time by powers of
@@ -117,7 +117,7 @@ class Alignment:
         return values, self.first_s + np.arange(low, high + 1) / self.rate_hz, curve
 
     def rows_at(self, times_s: np.ndarray) -> np.ndarray:
-        """Return the rows of the record at some of the times of `even` at which there are values, shape (n,)."""
+        """Return the rows of the record at some times of `even` that have values, shape (n,)."""
         explained, at = self.track.places(self.rows)
         low = int(at.min())
         rows = np.zeros(int(at.max()) - low + 1, int)
@@ -126,24 +126,24 @@ class Alignment:
 
     @property
     def inside_s(self) -> tuple[float, float]:
-        """Times of the session at the first and the last row in it [s]."""
+        """Times of the first and the last row in the session [s]."""
         own_s = self.first_s + next(iter(self.own_s.values()))
         return own_s + self.track.inside[0] / self.rate_hz, own_s + self.track.inside[1] / self.rate_hz
 
     @property
     def whole(self) -> bool:
-        """Return whether nearly all rows in the session are explained."""
-        return self.judged() > _WHOLE
+        """True if nearly all rows in the session are explained."""
+        return self.explained_part() > _MIN_EXPLAINED_PART
 
-    def judged(self) -> float:
-        """Part of the rows in the session that are explained."""
+    def explained_part(self) -> float:
+        """Return the part of the rows in the session that are explained."""
         return self.track.explained / max(1, self.track.inside[1] - self.track.inside[0])
 
 
-def busiest(sources: Sequence[Source], within: tuple[int, int], length: int) -> tuple[int, int]:
-    """The stretch of a table where its signals change most."""
+def find_busiest(sources: Sequence[Source], within: tuple[int, int], length: int) -> tuple[int, int]:
+    """Return the stretch of a table in which its signals change most."""
     first, last = within
-    length = min(last - first, max(FEWEST, length))
+    length = min(last - first, max(MIN_ROWS, length))
     power = np.zeros(last - first)
     for one in sources:
         steps = np.nan_to_num(np.diff(one.values[first:last], append=one.values[last - 1])) ** 2
@@ -153,48 +153,54 @@ def busiest(sources: Sequence[Source], within: tuple[int, int], length: int) -> 
     return begin, begin + length
 
 
-def _begin_fits(sources: Sequence[Source], shift_s: float, stretch: tuple[int, int]) -> dict[str, Waveform]:
-    """Fits of a stretch from one begin, of the signals that are found in it."""
+def _fit_stretches(sources: Sequence[Source], shift_s: float, stretch: tuple[int, int]) -> dict[str, Waveform]:
+    """Return the fits of a stretch from one begin, of the signals that are found in it."""
     found = {}
     for one in sources:
         fit = fit_stretch(one.values, one.times_s, one.stimulus, one.late_s + shift_s, stretch)
-        if fit is not None and fit.likeness > SOUND and abs(fit.drift) < _MAX_DRIFT:
+        if fit is not None and fit.likeness > MIN_LIKENESS and abs(fit.drift) < _MAX_DRIFT:
             found[one.name] = fit
     return found
 
 
-def _refined_s(one: Source, shift_s: float, stretch: tuple[int, int]) -> float:
-    """Return the begin near another one from which a stretch is explained best [s]."""
+def _refine_begin_s(one: Source, shift_s: float, stretch: tuple[int, int]) -> float:
+    """Return the begin near a given one from which a stretch has the least residual [s]."""
     y, period_s = np.nan_to_num(one.values[slice(*stretch)]), 1.0 / one.rate_hz
-    reach, n = math.ceil(_NEAR_S * one.rate_hz * _FINER), len(y)
+    reach, n = math.ceil(_SEARCH_RANGE_S * one.rate_hz * _OVERSAMPLING), len(y)
     first_s = one.first_s + stretch[0] * period_s + one.late_s + shift_s
-    grid_s = first_s + np.arange(-reach, _FINER * (n - 1) + reach + 1) * (period_s / _FINER)
+    grid_s = first_s + np.arange(-reach, _OVERSAMPLING * (n - 1) + reach + 1) * (period_s / _OVERSAMPLING)
     if grid_s[0] < one.stimulus.span_s[0] or grid_s[-1] > one.stimulus.span_s[1]:
         return shift_s
     known, _ = one.stimulus(grid_s)
-    windows = np.lib.stride_tricks.sliding_window_view(known, _FINER * (n - 1) + 1)[:, ::_FINER]
+    windows = np.lib.stride_tricks.sliding_window_view(known, _OVERSAMPLING * (n - 1) + 1)[:, ::_OVERSAMPLING]
     spread = np.maximum(windows.std(axis=1), 1e-12 * max(1e-300, float(known.std())))
     alike = np.abs(windows @ (y - y.mean())) / spread
     at = np.flatnonzero((alike[1:-1] >= alike[:-2]) & (alike[1:-1] > alike[2:])) + 1
-    at = at[np.argsort(-alike[at])][:_TRIED]
-    shifts = [shift_s, *(shift_s + (at - reach) * period_s / _FINER)]
+    at = at[np.argsort(-alike[at])][:_MAX_CANDIDATES]
+    shifts = [shift_s, *(shift_s + (at - reach) * period_s / _OVERSAMPLING)]
     fits = [fit_stretch(one.values, one.times_s, one.stimulus, one.late_s + each, stretch) for each in shifts]
     left = [math.inf if fit is None else float(np.var(fit.residual)) for fit in fits]
     return float(shifts[int(np.argmin(left))])
 
 
 def follow(sources: Sequence[Source], shift_s: float, stretches: Sequence[tuple[int, int]]) -> Alignment | None:
-    """The record from one begin."""
+    """Return the alignment of a record from one begin, or None.
+
+    Args:
+        sources: Signals of the table.
+        shift_s: Shift of the begin relative to that of the wires [s].
+        stretches: Stretches of rows that are tried first.
+    """
     best: tuple[float, tuple[int, int], dict[str, Waveform]] | None = None
-    near_s = _refined_s(sources[0], shift_s, stretches[0])
+    near_s = _refine_begin_s(sources[0], shift_s, stretches[0])
     for n, stretch in enumerate(stretches):
         at_s = shift_s if n else near_s
-        fits = _begin_fits(sources, at_s, stretch)
+        fits = _fit_stretches(sources, at_s, stretch)
         if fits:
             left = float(
                 np.median([np.std(each.residual) / abs(each.gain) / np.std(each.known) for each in fits.values()])
             )
-            if best is None or len(fits) > 2 * len(best[2]) or left < _SHARPER * best[0]:
+            if best is None or len(fits) > 2 * len(best[2]) or left < _MAX_RESIDUAL_RATIO * best[0]:
                 best = left, stretch, fits
     if best is None:
         return None
@@ -207,14 +213,14 @@ def follow(sources: Sequence[Source], shift_s: float, stretches: Sequence[tuple[
         return float(np.mean(fit.slope**2)) * fit.gain**2 / max(float(np.var(fit.residual)), 1e-300)
 
     order = sorted(fits, key=information, reverse=True)
-    pace = float(np.median([fits[name].drift for name in order[:_FOLLOWERS]]))
+    pace = float(np.median([fits[name].drift for name in order[:_MAX_FOLLOWERS]]))
     own_s = {name: float(fits[name].late_at(np.array([middle_s]))[0]) for name in order}
     by_name = {each.name: each for each in sources}
     followers, rows = [], len(one.values)
-    for name in order[:_FOLLOWERS]:
+    for name in order[:_MAX_FOLLOWERS]:
         fit, source = fits[name], by_name[name]
         step = source.channel.lsb_v / abs(source.channel.sensitivity_v)
-        # A slow signal stays on one count for some rows, whose errors are then alike.
+        # A slow signal stays on one count for some rows, whose errors are then equal.
         held_rows = step * one.rate_hz / max(float(np.sqrt(np.mean(fit.slope**2))), 1e-300)
         alike = step * math.sqrt(min(float(rows), max(0.0, held_rows - 1.0)) / 12.0)
         noise = max(float(np.std(fit.residual)), 0.3 * step, 1e-9 * float(np.std(fit.values)))

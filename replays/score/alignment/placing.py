@@ -1,4 +1,4 @@
-"""Where each signal's rows stand in the session, and how its values come from the rig's counts."""
+"""Place of each signal's rows in the session, and the scale from the rig's counts to its values."""
 
 from __future__ import annotations
 
@@ -14,30 +14,30 @@ from replays.score.records.sent import Sent, Session
 from replays.score.records.wiring import Wire
 from rig.channels.table import Channel
 
-_LOOKED = 1 << 16
+_MAX_SCALE_ROWS = 1 << 16
 """Rows of a recording by which its scale is found."""
-_MOST_ROWS = 0.5
-"""Part of the first rows that must be equal for a begin that stamps or correlation tell."""
-_SAMPLED = 64
-"""Of so many values one is looked at for the bits that a DAQ leaves out."""
-_SEARCHED = 3
-"""Signals of a table by which its place in the session is searched over the whole of both."""
+_MIN_EQUAL_PART = 0.5
+"""Part of the first rows that must be equal for a begin found by stamps or correlation."""
+_DECIMATION = 64
+"""Decimation of the values in which a DAQ's unused bits are searched."""
+_MAX_SEARCHES = 3
+"""Signals of a table whose place in the session is searched over the whole of both."""
 _MIN_MOVING = 64
-"""Equal rows that move, from which a begin is shown: fewer are equal by chance at an end of the session."""
+"""Equal rows that change, from which a begin is certain: fewer are equal by chance at an end of the session."""
 _MAX_UNEQUAL = 16
-"""Unequal values of nearly repeating signals that may stand together by chance."""
+"""Unequal values of nearly repeating signals that may be consecutive by chance."""
 
 
 @dataclass(frozen=True)
-class Taken:
-    """What a signal has taken of its channel.
+class SignalRows:
+    """Rows of its channel that a signal has, and their scale.
 
     Attributes:
-        scale: Of its counts.
-        step, phase: Those rows whose number is the phase, modulo the step.
-        early: Number of its first rows that stand before the session.
-        start: Place among those rows of the session at which the first of the others is due.
-        begin: Place of the first row of all, among all rows of the session that are held; below 0 before these.
+        scale: Scale of its counts.
+        step, phase: The signal has the rows whose number modulo the step is the phase.
+        early: Number of its first rows that precede the session.
+        start: Place of the next row, among such rows of the session.
+        begin: Place of the very first row, among all available rows of the session; negative before these.
     """
 
     scale: Scale
@@ -49,11 +49,11 @@ class Taken:
 
 
 class _Search:
-    """The search for the rows and the scale of signals.
+    """Search for the rows and the scale of signals.
 
     Attributes:
         held: Index and counts of the first rows of each group of the session.
-        begins: Place of the first row of each table that is known, by its identity.
+        begins: Place of the first row of each table, if known, by the table's identity.
     """
 
     def __init__(self, recorded: Mapping[str, Recorded], wires: Mapping[str, Wire], session: Session) -> None:
@@ -62,74 +62,74 @@ class _Search:
         self.begins: dict[int, int] = {}
         self._searched: dict[int, set[str]] = {}
 
-    def tried(self, name: str, of: str, begin: int) -> tuple[np.ndarray, str, np.ndarray, Channel]:
-        """Values and counts of the same rows: row j of the file was sent `begin` and j steps behind the first one."""
-        channel, signal, step = self._session.channels[of], self._recorded[name], self.step_of(name, of)
+    def select_rows_from(self, name: str, of: str, begin: int) -> tuple[np.ndarray, str, np.ndarray, Channel]:
+        """Return values, unit, counts and channel of the same rows: row j of the file is row begin + j step there."""
+        channel, signal, step = self._session.channels[of], self._recorded[name], self.find_step(name, of)
         skipped = max(0, -(begin // step))
-        place, few = begin + skipped * step, _LOOKED
+        place, few = begin + skipped * step, _MAX_SCALE_ROWS
         values, there = signal.early[skipped:], self.held[channel.group][1][place:]
-        if skipped and len(values) < min(_LOOKED, signal.rows - skipped):
-            values = signal.table.stretch(skipped, _LOOKED)[:, 1 + signal.column]
-        if place and len(there) < _LOOKED * step:
-            there = self._session.stretch(channel.group, place, _LOOKED * step)
+        if skipped and len(values) < min(_MAX_SCALE_ROWS, signal.rows - skipped):
+            values = signal.table.stretch(skipped, _MAX_SCALE_ROWS)[:, 1 + signal.column]
+        if place and len(there) < _MAX_SCALE_ROWS * step:
+            there = self._session.stretch(channel.group, place, _MAX_SCALE_ROWS * step)
         counts = there[::step, self._session.place(of)]
-        few = min(len(values), len(counts), _LOOKED)
+        few = min(len(values), len(counts), _MAX_SCALE_ROWS)
         return values[:few], signal.unit, counts[:few] >> signal.lost_bits << signal.lost_bits, channel
 
-    def step_of(self, name: str, of: str) -> int:
-        """Rows of the session from one row of a signal to the next, by its rate."""
+    def find_step(self, name: str, of: str) -> int:
+        """Return the rows of the session per row of a signal, by its rate."""
         sent_hz = self._session.rate_hz(self._session.channels[of].group)
         return max(1, round(sent_hz / (self._recorded[name].rate_hz or sent_hz)))
 
-    def taken(self, scale: Scale, step: int, begin: int, group: str) -> Taken:
-        """What a signal has taken whose first row stands at a place of the session."""
+    def make_rows(self, scale: Scale, step: int, begin: int, group: str) -> SignalRows:
+        """Return the rows of a signal whose first row is at a place in the session."""
         index, _ = self.held[group]
         phase = (index + begin) % step
         start = max(0, begin - (phase - index) % step) // step
-        return Taken(scale, step, phase, max(0, -(begin // step)), start, begin)
+        return SignalRows(scale, step, phase, max(0, -(begin // step)), start, begin)
 
     def is_better(self, begin: int, other: int, signals: Iterable[tuple[str, str, Scale]], *, known: bool) -> bool:
-        """Return whether all rows in the session are equal from a begin, and some of these are not from another one.
+        """Return whether all rows in the session are equal from a begin, but not from another one.
 
-        Where a signal nearly repeats, other begins have more rows in the session, of which nearly all are equal. Those
-        that are not stand everywhere; where they stand together, these rows are stale ones.
+        For a nearly repeating signal, other begins have more rows in the session, nearly all of which are equal. The
+        unequal ones are then distributed; if they are consecutive, these rows are stale instead.
 
         Args:
-            begin: Place of the first row in the session, or below 0.
+            begin: Place of the first row in the session, or negative.
             other: Another such place.
             signals: Signals of one table: name, channel and scale.
-            known: Whether another table of the file has this begin. Any unequal row from the other one counts then;
-                otherwise only those that stand in the session from both.
+            known: Whether another table of the file has this begin. If so, any unequal row from the other one counts;
+                if not, only those that are in the session from both.
         """
         moving, unequal, expected = 0, 0, 0.0
         for name, of, scale in signals:
-            longest, part, same = self.agreement(name, of, begin, scale)
+            longest, part, same = self.compare(name, of, begin, scale)
             if part < 1.0:
                 return False
-            wrong, step = ~self.agreement(name, of, other, scale)[2], self.step_of(name, of)
+            wrong, step = ~self.compare(name, of, other, scale)[2], self.find_step(name, of)
             first = max(0, -(begin // step)) - max(0, -(other // step))
             both = wrong if known else wrong[max(0, first) : max(0, first + len(same))]
             moving, unequal = moving + longest, unequal + int(both.sum())
             expected += len(both) * float(wrong.mean()) if len(wrong) else 0.0
         return moving >= _MIN_MOVING and 0 < unequal <= _MAX_UNEQUAL + 1.5 * expected
 
-    def agreement(self, name: str, of: str, begin: int, scale: Scale) -> tuple[int, float, np.ndarray]:
-        """Return how the counts of the first rows in the session agree.
+    def compare(self, name: str, of: str, begin: int, scale: Scale) -> tuple[int, float, np.ndarray]:
+        """Return the agreement of the counts of the first rows in the session.
 
         Returns:
-            Length of the longest run of equal rows, without those that stand still; part of the rows that are equal;
-            whether each is, shape (n,).
+            Length of the longest run of equal rows, not counting constant ones; part of the rows that are equal;
+            whether each row is equal, shape (n,).
         """
-        values, _, there, _ = self.tried(name, of, begin)
+        values, _, there, _ = self.select_rows_from(name, of, begin)
         same = scale.counts(values) == scale.sent(there)
         moving = np.concatenate([[0], np.cumsum(np.append(True, np.diff(there) != 0)[: len(there)])])
         ends = np.concatenate([[-1], np.flatnonzero(~same), [len(same)]])
         longest = int((moving[ends[1:]] - moving[ends[:-1] + 1]).max())
         return longest, float(same.mean()) if len(same) else 0.0, same
 
-    def taken_of(self, name: str, of: str) -> Taken | None:
-        """By where its table begins, as far as that is known; else by where its counts are."""
-        signal, channel, step = self._recorded[name], self._session.channels[of], self.step_of(name, of)
+    def find_rows(self, name: str, of: str) -> SignalRows | None:
+        """Return the rows of a signal, by the begin of its table if known, otherwise by its counts; or None."""
+        signal, channel, step = self._recorded[name], self._session.channels[of], self.find_step(name, of)
         table = id(signal.table)
         _, counts = self.held[channel.group]
         late_s = self._wires[name].late_s, self._wires[name].own_s
@@ -137,19 +137,19 @@ class _Search:
         placed, most = list[tuple[bool, int, int, Scale]](), list[bool]()
 
         def try_begin(begin: int) -> bool:
-            values, unit, there, _ = self.tried(name, of, begin)
+            values, unit, there, _ = self.select_rows_from(name, of, begin)
             if len(values) > 1 and (scale := find_scale(values, unit, there, channel)) is not None:
-                longest, part, _ = self.agreement(name, of, begin, scale)
+                longest, part, _ = self.compare(name, of, begin, scale)
                 placed.append((scale.clean, longest, begin, scale))
-                most.append(scale.clean and part > _MOST_ROWS)
+                most.append(scale.clean and part > _MIN_EQUAL_PART)
                 return scale.clean and part == 1.0
             return False
 
         likely = dict.fromkeys([self.begins.get(table, late[0]), *late, *self.begins.values()])
         if not any(map(try_begin, likely)):
-            early, bits = signal.early[:_LOOKED], signal.lost_bits
+            early, bits = signal.early[:_MAX_SCALE_ROWS], signal.lost_bits
             there = counts[:, self._session.place(of)] >> bits << bits
-            likely = self._overlapping(name, of, step) if not any(most) else []
+            likely = self._find_overlaps(name, of, step) if not any(most) else []
             fewest, known = min(len(early), len(there) // step), scales(signal.unit, channel, signal.early, there)
             found = (find_begins([each.counts(early)], [each.sent(there)], step, fewest) for each in known)
             any(map(try_begin, likely or next((places for places in found if places), [])))
@@ -160,19 +160,19 @@ class _Search:
             if its.clean and self.is_better(other, begin, [(name, of, its)], known=False):
                 begin, scale = other, its
         self.begins.setdefault(table, begin)
-        return self.taken(scale, step, begin, channel.group)
+        return self.make_rows(scale, step, begin, channel.group)
 
-    def _overlapping(self, name: str, of: str, step: int) -> list[int]:
-        """Where the table may begin, by all rows of both; a few of its signals are asked, as each reads both sides."""
+    def _find_overlaps(self, name: str, of: str, step: int) -> list[int]:
+        """Return candidate begins of the table by all rows of both, for a few signals, as each reads both files."""
         signal, channel = self._recorded[name], self._session.channels[of]
         sent, asked = Sent(self._session, [channel.group]), self._searched.setdefault(id(signal.table), set())
         rows = self._session.rows(channel.group)
-        beyond = signal.rows > _LOOKED or rows > len(self.held[channel.group][1])
-        if not beyond or name in asked or len(asked) >= _SEARCHED:
+        beyond = signal.rows > _MAX_SCALE_ROWS or rows > len(self.held[channel.group][1])
+        if not beyond or name in asked or len(asked) >= _MAX_SEARCHES:
             return []
         asked.add(name)
         column, fewest = sent.names.index(of), min(signal.rows, rows // step)
-        some = [_sample(part[:, 1]) for part in signal.table.parts([signal.column])]
+        some = [_decimate(part[:, 1]) for part in signal.table.parts([signal.column])]
         bits = signal.lost_bits
         for scale in scales(signal.unit, channel, np.concatenate(some), self.held[channel.group][1][:, column]):
             here = (scale.counts(part[:, 1]) for part in signal.table.parts([signal.column]))
@@ -182,94 +182,96 @@ class _Search:
         return []
 
 
-def settle(
+def identify_signals(
     recorded: Mapping[str, Recorded], wires: Mapping[str, Wire], session: Session
-) -> tuple[dict[str, Wire], dict[str, Taken]]:
-    """Which channel each signal has the counts of, how scaled and of which rows, by its name in the file.
+) -> tuple[dict[str, Wire], dict[str, SignalRows]]:
+    """Identify the channel, the scale and the rows of each signal by its counts.
 
-    Where most signals show counts, or one has most rows as they were sent, a signal that shows none is looked for in
-    all channels; if it is in none, it is the channel that it is named by, or alone is like, with what its unit says of
-    its scale.
+    If most signals show counts, or one has most rows as sent, a signal without a match is searched in all channels. If
+    none matches, it is assigned to the channel with its name, or to the only similar one, with the scale of its unit.
+
+    Returns:
+        Wires and rows, by the signals' names in the file.
     """
-    search, settled, found = _Search(recorded, wires, session), dict[str, Taken](), dict(wires)
+    search, rows, found = _Search(recorded, wires, session), dict[str, SignalRows](), dict(wires)
     asked = list[str]()
 
-    def look(name: str, likely: Iterable[str]) -> None:
-        # Counts are sure where stamps, by which signals are likened, are not: those of a rig that waits for steps.
+    def identify(name: str, likely: Iterable[str]) -> None:
+        # Counts are certain where stamps, by which signals are correlated, are not: those of a rig in lockstep.
         best, wire = -1, wires[name]
         for of in dict.fromkeys(each for each in likely if each in session.channels):
-            if (one := search.taken_of(name, of)) is None:
+            if (one := search.find_rows(name, of)) is None:
                 continue
-            longest, part, _ = search.agreement(name, of, one.begin, one.scale)
+            longest, part, _ = search.compare(name, of, one.begin, one.scale)
             if longest > best or part == 1.0:
-                best, settled[name] = longest, one
+                best, rows[name] = longest, one
                 found[name] = wire if of == wire.channel else replace(wire, channel=of, rivals=())
             if part == 1.0:
                 break
 
     for name, wire in wires.items():
-        look(name, (wire.channel, name, *wire.rivals))
-    # In a whirl, signals correlate as well with the channels that are a quarter of a turn behind their own.
-    for name in () if settled else list(wires):
-        if settled or len(asked) < _SEARCHED:
+        identify(name, (wire.channel, name, *wire.rivals))
+    # In a whirl, a signal correlates equally well with channels that lag its own by a quarter of a turn.
+    for name in () if rows else list(wires):
+        if rows or len(asked) < _MAX_SEARCHES:
             asked.append(name)
-            look(name, session.channels)
-    # Rows of a table begin together: where one signal is alike from several begins, another one decides.
-    for table in {id(recorded[name].table) for name in settled}:
-        names = [name for name in settled if id(recorded[name].table) == table]
-        choices = list(dict.fromkeys(settled[name].begin for name in names))
+            identify(name, session.channels)
+    # Rows of a table begin together: where one signal matches from several begins, another one decides.
+    for table in {id(recorded[name].table) for name in rows}:
+        names = [name for name in rows if id(recorded[name].table) == table]
+        choices = list(dict.fromkeys(rows[name].begin for name in names))
 
         def agreed(begin: int) -> int:
-            signals = [(each, found[each].channel, begin, settled[each].scale) for each in names]  # noqa: B023
-            return sum(search.agreement(*signal)[0] for signal in signals)
+            signals = [(each, found[each].channel, begin, rows[each].scale) for each in names]  # noqa: B023
+            return sum(search.compare(*signal)[0] for signal in signals)
 
         best = max(choices, key=agreed) if choices[1:] else choices[0]
-        signals = [(each, found[each].channel, settled[each].scale) for each in names]
+        signals = [(each, found[each].channel, rows[each].scale) for each in names]
         for other in dict.fromkeys([*choices, *search.begins.values()]):
             best = other if search.is_better(other, best, signals, known=other not in choices) else best
         search.begins[table] = best
         for name in names:
-            one, group = settled[name], session.channels[found[name].channel].group
-            settled[name] = search.taken(one.scale, one.step, search.begins[table], group)
+            one, group = rows[name], session.channels[found[name].channel].group
+            rows[name] = search.make_rows(one.scale, one.step, search.begins[table], group)
 
     def is_shown(name: str) -> bool:
-        one = settled[name]
-        return one.scale.clean and search.agreement(name, found[name].channel, one.begin, one.scale)[1] > _MOST_ROWS
+        one = rows[name]
+        return one.scale.clean and search.compare(name, found[name].channel, one.begin, one.scale)[1] > _MIN_EQUAL_PART
 
-    # Channels of noise alone correlate with none: their counts are found from the begin that another signal shows.
-    if 2 * len(settled) <= len(wires) and not any(map(is_shown, settled)):
-        return found, settled
+    # Channels of noise alone correlate with none: their counts are found from the begin of another signal.
+    if 2 * len(rows) <= len(wires) and not any(map(is_shown, rows)):
+        return found, rows
     for name, wire in wires.items():
-        used = {found[each].channel for each in settled}
-        for other in () if name in settled else sorted(session.channels, key=lambda each: (each != name, each in used)):
-            if (one := search.taken_of(name, other)) is not None:
-                found[name], settled[name] = replace(wire, channel=other, rivals=()), one
+        used = {found[each].channel for each in rows}
+        for other in () if name in rows else sorted(session.channels, key=lambda each: (each != name, each in used)):
+            if (one := search.find_rows(name, other)) is not None:
+                found[name], rows[name] = replace(wire, channel=other, rivals=()), one
                 break
         named = name if name in session.channels else "" if wire.rivals else wire.channel
-        if name not in settled and named:
-            step = search.step_of(name, named)
+        if name not in rows and named:
+            step = search.find_step(name, named)
             begin = search.begins.get(id(recorded[name].table), 0)
-            values, unit, counts, channel = search.tried(name, named, begin)
+            values, unit, counts, channel = search.select_rows_from(name, named, begin)
 
-            def apart(scale: Scale) -> float:
+            def deviation(scale: Scale) -> float:
                 return float(np.nanmedian(np.abs(scale.each * counts + scale.zero - values)) / scale.each)  # noqa: B023
 
             found[name] = replace(wire, channel=named)
-            scale = replace(min(scales(unit, channel, values[:0], counts), key=apart), known=False)
-            settled[name] = search.taken(scale, step, begin, channel.group)
-    known = {name: each for name, each in settled.items() if each.scale.known}
-    # Bits are left out by the DAQ's converter, so that no signal has more of them; else they are lost on the way.
+            scale = replace(min(scales(unit, channel, values[:0], counts), key=deviation), known=False)
+            rows[name] = search.make_rows(scale, step, begin, channel.group)
+    known = {name: each for name, each in rows.items() if each.scale.known}
+    # A DAQ's converter leaves out bits of all signals equally; if one signal has fewer bits, they are lost later.
     adc_bits = {name: session.channels[found[name].channel].adc_bits for name in known}
     bits = {name: adc_bits[name] - each.scale.lost_bits for name, each in known.items()}
     for name, each in known.items():
         if each.scale.lost_bits and bits[name] < max(bits.values()):
             size = 2.0**-each.scale.lost_bits
             scale = Scale(size * each.scale.each, each.scale.zero, each.scale.what, known=False)
-            settled[name] = replace(each, scale=scale)
-    return found, settled
+            rows[name] = replace(each, scale=scale)
+    return found, rows
 
 
-def _sample(values: np.ndarray) -> np.ndarray:
-    """Return some values, and the least and the largest, of which the bits of a DAQ are found."""
+def _decimate(values: np.ndarray) -> np.ndarray:
+    """Return a sample of the values, with the smallest and the largest, for the search for unused bits."""
     good = values[np.isfinite(values)]
-    return np.append(good[::_SAMPLED], [good.min(), good.max()] if len(good) else [])
+    return np.append(good[::_DECIMATION], [good.min(), good.max()] if len(good) else [])

@@ -1,4 +1,4 @@
-"""Time stamps of a record against the times of its rows in the session."""
+"""Comparison of a record's time stamps with the times of its rows in the session."""
 
 from __future__ import annotations
 
@@ -11,31 +11,38 @@ from replays.estimate.intervals import chi2_mean_ends, make_interval, student
 from replays.score.card.scorecard import Interval
 from replays.score.records.recorded import Table
 
-_BATCHES, _APART = 256, 32
-"""Batches of stamps that are shown, and that are judged."""
-_MOST_BATCH = 1 << 12
-"""Rows of a batch."""
+_MAX_BATCHES, _JUDGED_BATCHES = 256, 32
+"""Batches of stamps in the picture, and in the intervals."""
+_MAX_BATCH_ROWS = 1 << 12
+"""Largest number of rows of a batch."""
 _SAME_CLOCK_S = 10.0
-"""Stamps that are farther from the wall time of the session are of another clock, unless told."""
+"""Largest deviation of stamps from the session's wall time [s]; others are of another clock, by default."""
 
 
 class Stamps:
-    """Time stamps against the times of the rows that they stand beside: offset and rate are two questions.
+    """Time stamps compared with the times of their rows, for offset and rate separately.
 
     Attributes:
-        times_s: Those of the next rows [s], shape (n,).
+        times_s: Stamps of the next rows [s], shape (n,).
     """
 
     def __init__(self, table: Table, *, shown: bool = False) -> None:
-        """Take what they stand in; or others in their place, which are shown then."""
+        """Prepare batches of a table's stamps, or of stamps from elsewhere if `shown`."""
         self.times_s = np.empty(0)
-        self._stamped, self._size = shown or table.stamped, max(4, min(table.rows // _BATCHES, _MOST_BATCH))
+        self._stamped, self._size = shown or table.stamped, max(4, min(table.rows // _MAX_BATCHES, _MAX_BATCH_ROWS))
         self._back, self._last_s = 0, -math.inf
         self._means: list[np.ndarray] = []
         self._squares, self._freedom = 0.0, 0
 
-    def take(self, first_s: float, since_s: np.ndarray, known: np.ndarray, rows: int) -> None:
-        """Take when the first row was sent, how long after it those of the next that are known [s], and which are."""
+    def add_rows(self, first_s: float, since_s: np.ndarray, known: np.ndarray, rows: int) -> None:
+        """Add rows to the batches.
+
+        Args:
+            first_s: Time at which the first row was sent [s].
+            since_s: Time from then to the known ones of the next rows [s].
+            known: Indices of these rows.
+            rows: Number of the next rows.
+        """
         if not self._stamped or not rows:
             return
         times_s, size = self.times_s, self._size
@@ -48,12 +55,12 @@ class Stamps:
             self._squares += float(np.sum((late - late.mean()) ** 2))
             self._freedom += size - 1
 
-    def judged(self, wall_s: float | None, *, apart_s: float = _SAME_CLOCK_S) -> dict[str, Interval | None]:
-        """Offset at the first row [s], rate [ppm], jitter [s], steps back, latency [s], with low and high ends if told.
+    def estimate_all(self, wall_s: float | None, *, apart_s: float = _SAME_CLOCK_S) -> dict[str, Interval | None]:
+        """Return intervals of the offset at the first row [s], rate [ppm], jitter [s], backward steps, and latency [s].
 
         Args:
-            wall_s: Wall time at which what was sent at time zero came to who recorded the session [s].
-            apart_s: Stamps that are farther from it are of another clock [s].
+            wall_s: Wall time at which the recorder of the session received what was sent at time zero [s].
+            apart_s: Largest deviation of stamps of the same clock [s].
         """
         names = ("stamp offset", "stamp rate", "stamp jitter", "stamps that go back", "latency")
         if not self._stamped:
@@ -62,8 +69,8 @@ class Stamps:
         found["stamps that go back"] = (float(self._back),) * 3
         if len(self._means) < 8:
             return found
-        # Rows that came in bursts are not independent: several batches are one here.
-        several = max(1, len(self._means) // _APART)
+        # Rows that arrived in bursts are not independent: several batches count as one.
+        several = max(1, len(self._means) // _JUDGED_BATCHES)
         whole = np.array(self._means[: len(self._means) // several * several])
         since, late = whole.reshape(-1, several, 2).mean(axis=1).T
         line = fit_line(since, late)
@@ -76,6 +83,6 @@ class Stamps:
         found["stamp jitter"] = jitter_s, jitter_s / math.sqrt(high), jitter_s / math.sqrt(low)
         return found
 
-    def picture(self) -> np.ndarray:
-        """Time since the first row, and lateness, of each batch [s], shape (n, 2)."""
+    def batch_means(self) -> np.ndarray:
+        """Return the time since the first row and the lateness of each batch [s], shape (n, 2)."""
         return np.array(self._means).reshape(-1, 2)

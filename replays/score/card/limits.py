@@ -1,4 +1,4 @@
-"""Limits of a scorecard: a TOML file, each limit a number or made of the channel table, with where it is from."""
+"""Limits of a scorecard, from TOML: each is a number or derived from the channel table, and has its source."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from rig.channels.table import Channel
 
 FOLDER = Path(__file__).parent / "sets"
 DEFAULT = "as-calibrated"
-Told = Literal[
+Property = Literal[
     "noise",
     "lsb",
     "full_scale",
@@ -29,35 +29,35 @@ Told = Literal[
 ]
 
 
-class _Of(BaseModel):
-    """A bound made of what the channel table tells: times it, and plus something."""
+class _TableBound(BaseModel):
+    """A bound derived from a property in the channel table: times it, plus a constant."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    of: Told
+    of: Property
     times: FiniteFloat = 1.0
     plus: FiniteFloat = 0.0
 
 
 class Limit(BaseModel):
-    """One limit."""
+    """A limit of a quantity, and its source."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    low: FiniteFloat | _Of | None = None
-    high: FiniteFloat | _Of | None = None
+    low: FiniteFloat | _TableBound | None = None
+    high: FiniteFloat | _TableBound | None = None
     source: Annotated[str, Field(min_length=1)]
-    """Where it is from."""
+    """Source of the limit."""
     kind: Literal["table", "assumed", "standard", "exact"]
     edition: str = ""
     clause: str = ""
     second_hand: bool = False
-    """It was quoted from others' texts; the standard was not at hand."""
+    """True if it is quoted from other texts, as the standard was not available."""
     measures: str | None = None
-    """Only of channels whose unit is of this kind, such as length."""
+    """Kind of unit of the channels that it applies to, such as length; None: all."""
 
     def text(self) -> str:
-        """Where it is from, in words."""
+        """Return the source of the limit as text."""
         parts = [self.source, self.edition, self.clause, "quoted second-hand" if self.second_hand else ""]
         return ", ".join(part for part in (*parts, "assumed" if self.kind == "assumed" else "") if part)
 
@@ -75,13 +75,13 @@ class Limits(BaseModel):
         self, path: Literal["digital", "analogue"], quantity: str, channel: Channel | None = None, *,
         amplitude: float = math.nan,
     ) -> Bounds | None:  # fmt: skip
-        """What is asked of a quantity; None: nothing.
+        """Return the bounds of a quantity, or None.
 
         Args:
-            path: Which of the two.
-            quantity: Its name.
-            channel: Whose it is, by the session's table.
-            amplitude: Of the sine that it was measured with [unit].
+            path: Path of the scorecard.
+            quantity: Name of the quantity.
+            channel: Its channel in the session's table.
+            amplitude: Amplitude of the sine with which it was measured [unit].
         """
         limit = getattr(self, path).get(quantity)
         if limit is None:
@@ -90,10 +90,10 @@ class Limits(BaseModel):
             return None
         ends = []
         for bound, none in ((limit.low, -math.inf), (limit.high, math.inf)):
-            if isinstance(bound, _Of):
+            if isinstance(bound, _TableBound):
                 if channel is None:
                     return None
-                ends.append(bound.times * _told(channel, bound.of, amplitude) + bound.plus)
+                ends.append(bound.times * _read_property(channel, bound.of, amplitude) + bound.plus)
             else:
                 ends.append(none if bound is None else bound)
         if any(map(math.isnan, ends)):
@@ -102,14 +102,14 @@ class Limits(BaseModel):
         return Bounds(ends[0], ends[1], limit.text())
 
 
-def _check_order(field: str, low: float | _Of | None, high: float | _Of | None) -> None:
-    """Raise InputError where the low end of a limit lies above its high end; ends from the table are checked later."""
+def _check_order(field: str, low: float | _TableBound | None, high: float | _TableBound | None) -> None:
+    """Raise InputError if the low end of a limit is above its high end; ends from the table are checked later."""
     if isinstance(low, float) and isinstance(high, float) and low > high:
         raise InputError(field, "with low at most high", Words(f"low = {low:g}, high = {high:g}"))
 
 
-def _told(channel: Channel, what: Told, amplitude: float) -> float:
-    """What the table tells of a channel, in its unit."""
+def _read_property(channel: Channel, what: Property, amplitude: float) -> float:
+    """Return a property of a channel in the table, in the channel's unit."""
     per_volt = 1.0 / abs(channel.sensitivity_v)
     noise_v = math.hypot(channel.noise_v, channel.lsb_v / math.sqrt(12.0))
     sine_db = 20.0 * math.log10(amplitude / math.sqrt(2.0) / (noise_v * per_volt)) if amplitude > 0.0 else math.nan
@@ -127,10 +127,10 @@ def _told(channel: Channel, what: Told, amplitude: float) -> float:
 
 
 def load_limits(given: Path | str | None = None) -> Limits:
-    """Load limits: a set that comes with the rig by its name, or a file.
+    """Load limits: a set of the rig's by its name, or a file.
 
     Raises:
-        InputError: There is none, or the first thing that is wrong in it.
+        InputError: The limits do not exist, or are invalid; the message has the first error.
     """
     path = Path(DEFAULT if given is None else given)
     shipped = {file.stem: file for file in FOLDER.glob("*.toml")}

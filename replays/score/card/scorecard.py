@@ -1,4 +1,4 @@
-"""A scorecard: a row for each quantity and channel, with interval, limit and verdict; as a document and as JUnit."""
+"""Scorecard: a row per quantity and channel, with interval, limit and verdict; as a document and as JUnit."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ Interval = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Quantity:
-    """What is scored.
+    """Definition of a scored quantity.
 
     Attributes:
-        unit: Its unit; empty: that of the channel.
-        method: How its interval is made.
-        run: What to run so that it is shown.
+        unit: Unit; empty for that of the channel.
+        method: Method of the interval.
+        run: Run that makes the quantity conclusive.
     """
 
     unit: str
@@ -41,9 +41,9 @@ _EXACT = "exact, row by row"
 _SANDWICH = "least squares, block sandwich of 64 blocks, Student's t"
 _FOLLOWED = "time error of each block, steps by whole samples by likelihood ratio"
 _SPLIT = "weighted least squares of squared residuals on squared slope, block sandwich, Student's t"
-_LONGER = "a longer run"
+_LONG_RUN = "a longer run"
 _RICH = "a signal of many frequencies on every channel (test-prbs, 2 s)"
-_BEYOND = "a signal beyond the corner (test-chirp, test-prbs)"
+_WIDE_BAND = "a signal beyond the corner (test-chirp, test-prbs)"
 _SINE = "a sine near full scale on the channel (test-sine, 10 s)"
 _TONES = "two tones on the channel (test-two-tone, 10 s)"
 _RAMP = "a slow ramp over the whole range (test-ramp, 20 s)"
@@ -51,7 +51,7 @@ _STEPS = "at least 6 steps with plateaus of 100 samples (test-step, 10 s)"
 _DIGITS = "a recording that keeps every digit of the counts"
 _STAMPED = "a recording that keeps time stamps"
 _RECORDED = Quantity(
-    "1", "by name, equal counts or correlation", "--channels NAME,... where fewer channels were to be recorded"
+    "1", "by name, equal counts or correlation", "--channels NAME,... if fewer channels were to be recorded"
 )
 DIGITAL = {
     "recorded": _RECORDED,
@@ -59,22 +59,22 @@ DIGITAL = {
     "polarity": Quantity("1", "sign of the scale", _RICH),
     "scale": Quantity("ppm", "least squares, then every count equal", _DIGITS),
     "offset": Quantity("counts", "least squares, then every count equal", _DIGITS),
-    "altered values": Quantity("1", _EXACT, _LONGER),
-    "missing rows": Quantity("1", _EXACT, _LONGER),
-    "doubled rows": Quantity("1", _EXACT, _LONGER),
-    "swapped rows": Quantity("1", _EXACT, _LONGER),
-    "foreign rows": Quantity("1", _EXACT, _LONGER),
+    "altered values": Quantity("1", _EXACT, _LONG_RUN),
+    "missing rows": Quantity("1", _EXACT, _LONG_RUN),
+    "doubled rows": Quantity("1", _EXACT, _LONG_RUN),
+    "swapped rows": Quantity("1", _EXACT, _LONG_RUN),
+    "foreign rows": Quantity("1", _EXACT, _LONG_RUN),
     "row step": Quantity("1", "by the rate of the stamps, then equal counts", _STAMPED),
-    "rows before the first": Quantity("1", _EXACT, _LONGER),
-    "rows after the last": Quantity("1", _EXACT, _LONGER),
-    "stamp offset": Quantity("s", "straight line through means of batches, Student's t", _STAMPED),
-    "stamp rate": Quantity("ppm", "straight line through means of batches, Student's t", _STAMPED),
+    "rows before the first": Quantity("1", _EXACT, _LONG_RUN),
+    "rows after the last": Quantity("1", _EXACT, _LONG_RUN),
+    "stamp offset": Quantity("s", "straight line through batch means, Student's t", _STAMPED),
+    "stamp rate": Quantity("ppm", "straight line through batch means, Student's t", _STAMPED),
     "stamp jitter": Quantity("s", "rms within batches, chi squared", _STAMPED),
     "stamps that go back": Quantity("1", _EXACT, _STAMPED),
     "latency": Quantity(
         "s",
         "stamps, or live the rows' arrival, less their arrival at the session's recorder, Student's t",
-        "live, `my-daq | rig score -`; or the DAQ, stamping rows by the computer's clock, beside `rig record`",
+        "live, `my-daq | rig score -`; or with rows stamped by the computer's clock, recorded while `rig record` runs",
     ),
     "trigger row": Quantity("1", _EXACT, "a triggered recording of a scene with a hammer or another command"),
 }
@@ -82,8 +82,8 @@ ANALOGUE = {
     "recorded": _RECORDED,
     "mapping": Quantity("1", "cross-correlation of all pairs", _RICH),
     "polarity": Quantity("1", "cross-correlation of all pairs", _RICH),
-    "gain": Quantity("ppm", _SANDWICH, _LONGER),
-    "offset": Quantity("", _SANDWICH, _LONGER),
+    "gain": Quantity("ppm", _SANDWICH, _LONG_RUN),
+    "offset": Quantity("", _SANDWICH, _LONG_RUN),
     "skew": Quantity("ns", _SANDWICH, _RICH),
     "start": Quantity("s", _SANDWICH, _RICH),
     "clock": Quantity("ppm", f"{_SANDWICH}, weighted mean of channels", "a longer run with a signal above 100 Hz"),
@@ -92,25 +92,25 @@ ANALOGUE = {
     ),
     "lost samples": Quantity("1", _FOLLOWED, "a signal above 100 Hz on every channel"),
     "doubled samples": Quantity("1", _FOLLOWED, "a signal above 100 Hz on every channel"),
-    "foreign rows": Quantity("1", "rows between others in blocks that are not explained", _LONGER),
+    "foreign rows": Quantity("1", "rows in unexplained blocks between explained ones", _LONG_RUN),
     "judged part": Quantity("1", "rows explained over rows in the session", "a signal that does not repeat"),
     **{name: DIGITAL[name] for name in ("stamp rate", "stamp jitter", "stamps that go back")},
-    "noise": Quantity("", _SPLIT, _LONGER),
+    "noise": Quantity("", _SPLIT, _LONG_RUN),
     "jitter": Quantity("ns", _SPLIT, "a steep signal (test-sine at 1 kHz or more, or two tones), 10 s"),
-    "effective bits": Quantity("bit", "of the rms of all that is left, log2(range / (rms sqrt 12))", _LONGER),
-    "dynamic range": Quantity("dB", "of the noise, full-scale sine over it", _LONGER),
-    "corner": Quantity("Hz", "least squares behind a Butterworth low-pass, else cross spectra", _BEYOND),
+    "effective bits": Quantity("bit", "from the rms of the whole residual, log2(range / (rms sqrt 12))", _LONG_RUN),
+    "dynamic range": Quantity("dB", "from the noise, full-scale sine over it", _LONG_RUN),
+    "corner": Quantity("Hz", "least squares with a Butterworth low-pass, else cross spectra", _WIDE_BAND),
     "SINAD": Quantity("dB", "IEEE 1057 four-parameter sine fit, chi squared", _SINE),
     "ENOB": Quantity("bit", "IEEE 1057 four-parameter sine fit, chi squared", _SINE),
     "THD": Quantity("dB", "harmonics 2 to 10 of the sine fit, delta method", _SINE),
     "SFDR": Quantity("dB", "largest line of the sine fit's residual, delta method", _SINE),
     "alias rejection": Quantity(
-        "dB", f"of all that was sent above half of the rate, {_SANDWICH}",
+        "dB", f"of all components above half of the rate, {_SANDWICH}",
         "tones above half of the DAQ's rate, from a session at a higher rate",
     ),
     "IMD": Quantity("dB", "products of second and third order over two tones, least squares, delta method", _TONES),
     "INL": Quantity("ppm", "transfer curve of 64 straight pieces, simultaneous interval, of the range", _RAMP),
-    "DNL": Quantity("LSB", "code density of a ramp, simultaneous interval", f"{_RAMP}, longer for more samples a code"),
+    "DNL": Quantity("LSB", "code density of a ramp, simultaneous interval", f"{_RAMP}, longer for more samples"),
     "crosstalk": Quantity("dB", f"worst of the other channels, in volts, {_SANDWICH}", _RICH),
     "rise time": Quantity("s", "10 to 90 % of the mean step response", _STEPS),
     "overshoot": Quantity("%", "largest value of the mean step response, simultaneous interval", _STEPS),
@@ -122,11 +122,11 @@ QUANTITIES = {"digital": DIGITAL, "analogue": ANALOGUE}
 
 @dataclass(frozen=True)
 class Bounds:
-    """What a quantity must lie between.
+    """Limits of a quantity.
 
     Attributes:
         low, high: The ends, in its unit.
-        source: Where they are from.
+        source: Source of the limits.
     """
 
     low: float
@@ -143,19 +143,19 @@ class Bounds:
 
 @dataclass(frozen=True)
 class ScoreRow:
-    """One row.
+    """A row of a scorecard.
 
     Attributes:
         quantity: A key of `QUANTITIES`.
-        channel: Whose it is; empty: of all, or of a group.
-        value: What it is; nan where nothing is known, a text where it is no number.
-        low, high: Its 95 % interval; equal where it is exact.
-        unit: Of these.
-        method: How the interval is made.
-        limit: What it must lie between; None: nothing asks.
-        verdict: What comes out.
-        run: What to run to show it.
-        note: What else is to be known, such as which rows.
+        channel: Channel, or group; empty for all channels.
+        value: Value; nan if unknown, or a text.
+        low, high: Its 95 % interval; equal if it is exact.
+        unit: Unit of these.
+        method: Method of the interval.
+        limit: Limits, or None.
+        verdict: The verdict.
+        run: Run that makes the quantity conclusive.
+        note: Further information, such as row numbers.
     """
 
     quantity: str
@@ -172,15 +172,15 @@ class ScoreRow:
 
     @property
     def is_known(self) -> bool:
-        """Whether there is a value."""
+        """True if there is a value."""
         return isinstance(self.value, str) or math.isfinite(self.value)
 
     def cells(self) -> tuple[str, ...]:
-        """Quantity, channel, value, interval, unit, limit, verdict."""
+        """Return quantity, channel, value, interval, unit, limit and verdict as text."""
         known = self.is_known
         exact = self.low == self.high or not known
         digits = 6
-        if not exact and math.isfinite(self.high - self.low):  # so many that the two ends differ
+        if not exact and math.isfinite(self.high - self.low):  # enough digits to distinguish the two ends
             largest = max(abs(self.low), abs(self.high))
             digits = min(15, max(6, math.ceil(math.log10(largest / (self.high - self.low))) + 2))
         interval = "" if exact else f"{self.low:.{digits}g} to {self.high:.{digits}g}"
@@ -192,8 +192,8 @@ class ScoreRow:
 
 
 def _is_outside(value: float, low: float, high: float, limit: Bounds, *, rms: bool) -> bool:
-    """Return whether an interval that is longer by `_MARGIN` lies outside of a limit as a whole."""
-    power = 2 if rms else 1  # an interval of a variance is even to both sides about the variance
+    """Return whether an interval that is longer by `_MARGIN` is outside a limit as a whole."""
+    power = 2 if rms else 1  # the interval of a variance is symmetric about the variance
     high = value**power + _MARGIN * (high**power - value**power)
     low = value**power - _MARGIN * (value**power - low**power)
     return high < limit.low or low > limit.high**power
@@ -203,19 +203,19 @@ def judge_row(
     path: Path_, quantity: str, channel: str, estimate: Interval | None, *, unit: str = "",
     limit: Bounds | None = None, note: str = "",
 ) -> ScoreRow:  # fmt: skip
-    """A row with its verdict: the whole interval decides, and one that reaches over a limit shows nothing.
+    """Return a row with its verdict: the whole interval decides, and one that crosses a limit is inconclusive.
 
-    A card has dozens of rows, of which each twentieth interval misses its value: a row fails where an interval of
-    99.7 % lies outside.
+    A card has dozens of rows, and one of twenty intervals misses its value: a row fails if its 99.7 % interval is
+    outside.
 
     Args:
-        path: Which of the two.
+        path: Path of the scorecard.
         quantity: A key of `QUANTITIES`.
-        channel: Whose.
-        estimate: Value, low and high end of the 95 % interval; None: this run does not tell.
-        unit: Of a quantity that has the channel's.
-        limit: What asks.
-        note: What else is to be known.
+        channel: Channel, or group; empty for all channels.
+        estimate: Value, low and high end of the 95 % interval; None if this run does not determine it.
+        unit: Unit of a quantity in the channel's unit.
+        limit: Limits of the quantity.
+        note: Further information.
     """
     about = QUANTITIES[path][quantity]
     value, low, high = (math.nan,) * 3 if estimate is None else estimate
@@ -232,7 +232,7 @@ def judge_row(
 
 
 def text_row(path: Path_, quantity: str, channel: str, value: str, verdict: Verdict, note: str) -> ScoreRow:
-    """Return a row whose value is a text, with a verdict that is known."""
+    """Return a row with a text as its value, and a given verdict."""
     about = QUANTITIES[path][quantity]
     run = about.run if verdict == INCONCLUSIVE else ""
     return ScoreRow(quantity, channel, value, 0.0, 0.0, "1", about.method, None, verdict, run, note)
@@ -240,19 +240,19 @@ def text_row(path: Path_, quantity: str, channel: str, value: str, verdict: Verd
 
 @dataclass
 class Scorecard:
-    """All rows of one path.
+    """All rows of one path, and the outcome.
 
     Attributes:
-        title: Of what.
+        title: Title.
         path: Digital or analogue.
         limits: Title of the limits.
-        asked: What they ask of a path's quantity, on a channel of the session's table.
+        asked: Function that returns the limits of a path's quantity, for a channel of the session's table.
         rows: The rows.
-        remarks: What was assumed.
-        doubts: Reasons why the record shows too little for a pass; without a failing quantity the outcome is
-            inconclusive then.
-        pictures: What pictures are made of, by kind and channel.
-        runs: Numbers of rows by what became of them, as pairs of first and last.
+        remarks: Assumptions.
+        doubts: Reasons why the record shows too little for a pass; the outcome is then inconclusive unless a quantity
+            fails.
+        pictures: Data for plots, by kind and channel.
+        runs: Row numbers by event, as pairs of first and last.
     """
 
     title: str
@@ -267,15 +267,15 @@ class Scorecard:
 
     def add(
         self, quantity: str, channel: str, estimate: Interval | None, *, of: Any = None, unit: str = "", note: str = "",
-        **told: Any,
+        **inputs: Any,
     ) -> None:  # fmt: skip
-        """Add a row that is judged by its limit: as `judge_row`, `of` the session's channel, and what a limit needs."""
-        limit = self.asked(self.path, quantity, of, **told)
+        """Add a row as `judge_row`, with the limit for the session's channel `of` and for further inputs."""
+        limit = self.asked(self.path, quantity, of, **inputs)
         self.rows.append(judge_row(self.path, quantity, channel, estimate, unit=unit, limit=limit, note=note))
 
     @property
     def outcome(self) -> Outcome:
-        """Fail where a quantity fails; pass where one passes and there is no doubt; else inconclusive."""
+        """Fail if a quantity fails; pass if one passes without any doubt; otherwise inconclusive."""
         verdicts = {row.verdict for row in self.rows}
         return Outcome.of(failed=FAIL in verdicts, shown=PASS in verdicts and not self.doubts)
 
@@ -294,7 +294,7 @@ class Scorecard:
 
     @property
     def defects(self) -> dict[str, list[str]]:
-        """Names in the table of defects, by channel, of those that make its failing quantities fail."""
+        """Names in the table of defects that explain the failed quantities, by channel."""
         failed: dict[str, set[str]] = {}
         for row in self.rows:
             if row.verdict == FAIL:
@@ -304,14 +304,14 @@ class Scorecard:
 
     @property
     def findings(self) -> list[str]:
-        """The remarks, and the defects of each channel, as lines."""
+        """Remarks, and defects of each channel, as lines."""
         return [*self.remarks, *(f"{name or 'all'}: {' or '.join(each)}" for name, each in self.defects.items())]
 
     def row(self, quantity: str, channel: str = "") -> ScoreRow:
-        """One of the rows.
+        """Return one of the rows.
 
         Raises:
-            UnknownNameError: There is none.
+            UnknownNameError: The row does not exist.
         """
         for row in self.rows:
             if (row.quantity, row.channel) == (quantity, channel):
@@ -320,10 +320,10 @@ class Scorecard:
         raise UnknownNameError("row", "one of the scorecard's", f"{quantity} {channel}".strip(), names)
 
     def document(self) -> dict[str, Any]:
-        """As a document for JSON."""
+        """Return the scorecard as a document for JSON."""
         rows = [{name: each or None for name, each in asdict(row).items()} for row in self.rows]
-        for row, told in zip(self.rows, rows, strict=True):
-            told |= {"value": row.value, "low": row.low, "high": row.high}
+        for row, entry in zip(self.rows, rows, strict=True):
+            entry |= {"value": row.value, "low": row.low, "high": row.high}
         return finite({
             "title": self.title, "path": self.path, "outcome": self.outcome.value, "good": self.outcome is Outcome.PASS,
             "verdict": self.verdict_line, "doubts": self.doubts, "limits": self.limits, "rows": rows,
@@ -332,7 +332,7 @@ class Scorecard:
 
 
 _MARGIN = 1.5
-"""Length of an interval of 99.7 % over that of 95 %, of a normal estimate."""
+"""Length of a 99.7 % interval over that of a 95 % interval, of a normal estimate."""
 _RMS = ("noise", "jitter", "stamp jitter")
 """Quantities that are roots of variances."""
 MARKS: dict[Verdict, str] = {FAIL: "X", INCONCLUSIVE: "?", PASS: "+", NO_LIMIT: ""}
@@ -340,9 +340,9 @@ MARKS: dict[Verdict, str] = {FAIL: "X", INCONCLUSIVE: "?", PASS: "+", NO_LIMIT: 
 
 
 def make_matrix(card: Scorecard) -> tuple[list[str], list[tuple[str, ...]]]:
-    """Return the channels, and of each quantity its name and a mark for each channel; of several the worst.
+    """Return the channels, and for each quantity its name and the worst mark per channel.
 
-    Quantities of all channels together are those of the channel "all"; without two channels there is no matrix.
+    Quantities of all channels together are in the column "all"; fewer than two channels have an empty matrix.
     """
     names = dict.fromkeys(row.channel for row in card.rows if row.channel)
     columns = [*names, *([""] if any(not row.channel for row in card.rows) else [])]
@@ -354,13 +354,13 @@ def make_matrix(card: Scorecard) -> tuple[list[str], list[tuple[str, ...]]]:
 
 
 def write_junit(card: Scorecard, path: Path) -> None:
-    """Write a scorecard as JUnit's XML.
+    """Write a scorecard as JUnit XML.
 
-    The outcome is one case, and each quantity that passes or fails is one; an inconclusive outcome is an error of that
-    type. Quantities without a verdict, on which the outcome does not depend, are properties and never skipped cases.
+    The outcome is a case, and so is each quantity that passes or fails; an inconclusive outcome is an error of that
+    type. Quantities without a verdict, on which the outcome does not depend, are properties, not skipped cases.
 
     Raises:
-        DiskError: The disk refused.
+        DiskError: The file cannot be written.
     """
     judged = [row for row in card.rows if row.verdict in (PASS, FAIL)]
     others = [(f"{row.quantity} {row.channel}".strip(), _line(row)) for row in card.rows if row not in judged]

@@ -1,6 +1,6 @@
 """Nonlinearity of a converter: intermodulation of two tones, and INL and DNL by a ramp.
 
-Definitions are those of IEEE Std 1241-2010 as papers and tutorials give them; the standard itself was not at hand.
+Definitions follow IEEE Std 1241-2010 as quoted in papers and tutorials; the standard itself was not available.
 """
 
 from __future__ import annotations
@@ -17,45 +17,45 @@ from replays.estimate.runs import block_means, split_at
 from replays.estimate.sine import decibels, fit_sine, fit_tones, tone_columns
 from replays.score.card.scorecard import Interval
 
-_PURITY = 1e-4
-"""Part of its power that a signal of two tones may have besides them: session noise is 1e-6 of it."""
-_ROUGH = 0.05
-"""The same where the tones are fitted one after the other."""
+_MAX_OTHER_POWER = 1e-4
+"""Largest part of its power that a two-tone signal may have in other components: session noise is 1e-6 of it."""
+_MAX_FIRST_RESIDUAL = 0.05
+"""The same limit after fits of the tones one after the other."""
 _TONE_RATIO = 400.0
-"""Power of one tone over the other, at most (26 dB)."""
+"""Largest power of one tone over the other (26 dB)."""
 _SEARCH_ROWS = 1 << 14
 """Rows by which the two tones are found; their frequencies are then refined over all."""
-_SETTLED = 1e-9
-"""Change of a tone's phase over all rows by the last step [cycles]: a thousandth of what session noise leaves open."""
+_PHASE_TOLERANCE = 1e-9
+"""Change of a tone's phase over all rows in the last step [cycles]: a thousandth of the error by session noise."""
 _ORDERS = (1, -1), (1, 1), (2, -1), (-1, 2), (2, 1), (1, 2), (2, 0), (0, 2), (3, 0), (0, 3)
 """Multiples of the two tones that are fitted: products of second and third order, and harmonics."""
-_COUNTED = 4
-"""Of these, the first ones count: second order, and third order near the tones (IEEE 1241)."""
-_JUMP, _STRAIGHT = 0.05, 2e-3
-"""Parts of the full scale by which a ramp jumps back at least, and by which it departs from a line at most, rms."""
+_COUNTED_ORDERS = 4
+"""Number of the first ones that count: second order, and third order near the tones (IEEE 1241)."""
+_JUMP, _MAX_CURVATURE = 0.05, 2e-3
+"""Smallest backward jump of a ramp, and its largest deviation from a line, rms, as parts of the full scale."""
 _RING_ROWS, _SEGMENT_ROWS = 80, 1000
-"""Rows beside a jump that are left out, as the band-limited known signal rings there; rows of a ramp at least."""
+"""Rows excluded next to a jump, as the band-limited known signal rings there, and fewest rows of a ramp."""
 _KNOTS = 64
 """Knots of the transfer curve over the converter's range."""
-_COVERAGE, _SLOW = 0.9, 0.01
-"""Part of the range that a ramp must cover; a signal that covers less than the second is none."""
+_COVERAGE, _MIN_SWEEP = 0.9, 0.01
+"""Part of the range that a ramp must cover for INL, and part below which a signal is not a ramp."""
 _CODE_SAMPLES = 16.0
-"""Samples a code from which code widths are judged."""
-_NOISES = 4.0
-"""Noises from the ends of the ramp within which the converter may limit."""
+"""Samples per code from which code widths are judged."""
+_EDGE_NOISES = 4.0
+"""Distance from the ends of the ramp, in noises, within which the converter may limit."""
 
 
-def _two_tones(n: np.ndarray, known: np.ndarray) -> tuple[list[float], float] | None:
-    """Frequencies [cycles a row] and power [unit^2] of two tones; None where the signal is none of two tones."""
+def _fit_two_tones(n: np.ndarray, known: np.ndarray) -> tuple[list[float], float] | None:
+    """Return the frequencies [cycles per row] and the power [unit^2] of two tones; None for any other signal."""
     if len(known) < _SEGMENT_ROWS or not np.var(known):
         return None
     first = fit_sine(known[:_SEARCH_ROWS])
     second = fit_sine(first.residual)
-    if np.var(second.residual) > _ROUGH * np.var(known):
+    if np.var(second.residual) > _MAX_FIRST_RESIDUAL * np.var(known):
         return None
-    tones, parts, _, left = fit_tones(n, known, np.array([first.frequency[0], second.frequency[0]]), _SETTLED)
+    tones, parts, _, left = fit_tones(n, known, np.array([first.frequency[0], second.frequency[0]]), _PHASE_TOLERANCE)
     powers = 0.5 * (parts[:2] ** 2 + parts[2:4] ** 2)
-    if np.var(left) > _PURITY * np.var(known) or powers.max() > _TONE_RATIO * powers.min():
+    if np.var(left) > _MAX_OTHER_POWER * np.var(known) or powers.max() > _TONE_RATIO * powers.min():
         return None
     return sorted(tones.tolist()), float(powers.sum())
 
@@ -64,27 +64,27 @@ def intermodulation(times_s: np.ndarray, known: np.ndarray, residual: np.ndarray
     """Return the intermodulation distortion [dB]: products of second and third order over the two tones, rms.
 
     Args:
-        times_s: Of the rows, even but for lost ones [s], shape (n,).
+        times_s: Times of the rows, even except for lost ones [s], shape (n,).
         known: The known signal, shape (n,).
-        residual: What is left of the record [unit], shape (n,).
-        gain: Of the record.
+        residual: Residual of the record [unit], shape (n,).
+        gain: Gain of the record.
 
     Returns:
-        Value and 95 % interval (delta method), or None where the known signal is not of two tones.
+        Value and 95 % interval (delta method), or None if the known signal is not two tones.
     """
     n = np.rint((times_s - times_s[0]) / np.median(np.diff(times_s)))
     n -= 0.5 * n[-1]
-    found = _two_tones(n, known)
+    found = _fit_two_tones(n, known)
     if found is None:
         return None
     (low, high), power = found
     least, turns, counted = 2.0 / len(n), list[float](), 0
     for number, (a, b) in enumerate(_ORDERS):
-        # A product beyond half of the rate, or beside a tone or another product, is not known as one of its own.
+        # A product beyond half of the rate, or close to a tone or another product, is not separable.
         product = abs(a * high + b * low)
         if product < 0.5 - least and min(abs(product - each) for each in (0.0, low, high, *turns)) > least:
             turns.append(product)
-            counted += number < _COUNTED
+            counted += number < _COUNTED_ORDERS
     if not counted:
         return None
     basis = tone_columns(n, np.array(turns))
@@ -100,10 +100,10 @@ class Transfer:
     """A converter's transfer curve by a ramp.
 
     Attributes:
-        inl: Largest deviation of the curve from the fitted line [ppm of the range]; None where the ramp is too short.
-        dnl: Largest deviation of a code's width from the mean [LSB]; None where there are too few samples a code.
+        inl: Largest deviation of the curve from the fitted line [ppm of the range]; None if the ramp is too short.
+        dnl: Largest deviation of a code's width from the mean [LSB]; None if there are too few samples per code.
         coverage: Part of the converter's range that the ramp covers.
-        code_samples: Mean samples a code.
+        code_samples: Mean samples per code.
     """
 
     inl: Interval | None
@@ -112,39 +112,39 @@ class Transfer:
     code_samples: float
 
 
-def _ramp(times_s: np.ndarray, known: np.ndarray, span: float) -> np.ndarray | None:
-    """A ramp's lines through the known signal, nan beside its jumps, shape (n,); None where it is none."""
+def _fit_ramp(times_s: np.ndarray, known: np.ndarray, span: float) -> np.ndarray | None:
+    """Return the lines of a ramp through the known signal, nan next to its jumps, shape (n,); or None."""
     ramp = np.full(len(known), np.nan)
     for a, b in split_at(np.abs(np.diff(known)) > _JUMP * span):
         if b - a > _SEGMENT_ROWS + 2 * _RING_ROWS:
             part = slice(a + _RING_ROWS, b - _RING_ROWS)
             line = fit_line(times_s[part], known[part])
             ramp[part] = line(times_s[part])
-            if np.std(line.residual) > _STRAIGHT * span:
+            if np.std(line.residual) > _MAX_CURVATURE * span:
                 return None
     held = np.isfinite(ramp)
-    return ramp if held.any() and np.ptp(ramp[held]) > _SLOW * span else None
+    return ramp if held.any() and np.ptp(ramp[held]) > _MIN_SWEEP * span else None
 
 
 def transfer_curve(times_s: np.ndarray, known: np.ndarray, values: np.ndarray, span: float) -> Transfer | None:
-    """Return INL and DNL by a slow ramp; None where the known signal is none.
+    """Return INL and DNL by a slow ramp; None for another signal.
 
-    The transfer curve is a spline of straight pieces between 64 knots; intervals are simultaneous over knots and codes.
+    The transfer curve is piecewise linear between 64 knots; intervals are simultaneous over knots and codes.
 
     Args:
-        times_s: Of the rows [s], shape (n,).
+        times_s: Times of the rows [s], shape (n,).
         known: The known signal, without gain [unit], shape (n,).
-        values: As recorded [unit], shape (n,).
+        values: Recorded values [unit], shape (n,).
         span: The converter's range, from end to end [unit].
     """
     from scipy.sparse import csr_array
 
-    ramp = _ramp(times_s, known, span)
+    ramp = _fit_ramp(times_s, known, span)
     if ramp is None:
         return None
     low, high = np.nanmin(ramp), np.nanmax(ramp)
     held = np.isfinite(ramp)
-    edge = _NOISES * float(np.std(np.diff(fit_line(ramp[held], values[held]).residual))) / math.sqrt(2.0)
+    edge = _EDGE_NOISES * float(np.std(np.diff(fit_line(ramp[held], values[held]).residual))) / math.sqrt(2.0)
     held[held] = (ramp[held] > low + edge) & (ramp[held] < high - edge)
     if held.sum() < _SEGMENT_ROWS:
         return None
@@ -158,7 +158,7 @@ def transfer_curve(times_s: np.ndarray, known: np.ndarray, values: np.ndarray, s
     inverse = inverse_of((hats.T @ hats).toarray())
     curve = inverse @ (hats.T @ line.residual)
     left = line.residual - hats @ curve
-    block = max(1, len(x) // (8 * _KNOTS))  # noise of a colour has means of blocks that spread more
+    block = max(1, len(x) // (8 * _KNOTS))  # coloured noise has block means with a larger variance
     variance = max(float(np.var(left)), block * float(np.var(block_means(left, block))))
     inl = bound_maximum(np.abs(curve), np.sqrt(np.diag(inverse) * variance))
     coverage = float(high - low) / span
@@ -169,7 +169,7 @@ def transfer_curve(times_s: np.ndarray, known: np.ndarray, values: np.ndarray, s
 
 
 def _code_widths(values: np.ndarray, line: np.ndarray, noise: float) -> tuple[Interval | None, float]:
-    """DNL [LSB] by the code density of a ramp, and the mean samples a code."""
+    """Return the DNL by the code density of a ramp [LSB], and the mean samples per code."""
     codes = np.unique(values)
     steps = np.diff(codes)
     steps = steps[steps > 1e-9 * np.ptp(codes)]
@@ -185,7 +185,7 @@ def _code_widths(values: np.ndarray, line: np.ndarray, noise: float) -> tuple[In
     )
     full = due > 0.5 * samples
     there, due = there[full], due[full]
-    # A transition in noise moves the count by 0.564 noise a sample (IEEE 1241, ramp); two bound a code.
+    # Noise changes the count at a transition by 0.564 noise per sample (IEEE 1241, ramp); a code has two transitions.
     spread = np.sqrt(2.0 * 0.564 * noise / step / due)
     value, low, high = bound_maximum(np.abs(there / due - 1.0), spread)
     return (value, max(0.0, low - 1.0 / samples), high + 1.0 / samples), samples

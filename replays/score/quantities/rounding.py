@@ -1,6 +1,6 @@
-"""Rounding of a converter whose steps exceed the noise: its error repeats with the signal, and does not average.
+"""Rounding of a converter whose steps exceed the noise: its error repeats with the signal and does not average out.
 
-Where noise is larger than half a step, rounding is white noise (Widrow & Kollar 2008, Quantization Noise, ch. 5).
+If the noise exceeds half a step, rounding is white noise (Widrow & Kollar 2008, Quantization Noise, ch. 5).
 """
 
 from __future__ import annotations
@@ -17,40 +17,40 @@ from replays.estimate.least_squares import solve
 from replays.score.waveform import Waveform
 
 _PHASES = 8
-"""Places of the steps against the signal that are tried: the true one is not known to a part of a step."""
-_TURNS = (0.0, 0.25)
-"""Parts of a step by which the signal's peak is moved as well: two levels may stand differently in their steps."""
+"""Tried places of the steps relative to the signal, as the true one is not known to a part of a step."""
+_PEAK_SHIFTS = (0.0, 0.25)
+"""Shifts of the signal's peak in steps, as the places of two levels in their steps may differ."""
 _HARMONICS = 8
-_DITHERED = 0.5
-"""Noise over a step from which the error of rounding is noise: what is left of it is below 1 % of a step."""
-_SMALLEST = 0.05
-"""Step over all that a fit leaves, below which rounding is nothing beside the rest."""
-_LOOKED = 1 << 14
-_MOST_ROWS = 1 << 16
+_MIN_DITHER = 0.5
+"""Noise over a step above which the error of rounding is noise: the rest is below 1 % of a step."""
+_MIN_STEP = 0.05
+"""Step over the residual of a fit, below which rounding is negligible."""
+_MAX_VALUES = 1 << 14
+_MAX_ROWS = 1 << 16
 """Rows by which errors of parameters are estimated."""
-_WHOLE = 1e-3
-"""Part of a step by which differences of values may be off whole numbers of it: rounding of the file."""
+_STEP_TOLERANCE = 1e-3
+"""Largest deviation of differences of values from whole numbers of steps, as a part of a step: rounding of the file."""
 
 
 def find_step(values: np.ndarray) -> float:
-    """Return the step that values are multiples of [unit]; 0 where they have none."""
-    found = np.unique(values[np.isfinite(values)][:_LOOKED])
+    """Return the step of which values are multiples [unit], or 0."""
+    found = np.unique(values[np.isfinite(values)][:_MAX_VALUES])
     apart = np.diff(found)
     apart = apart[apart > 1e-9 * max(1e-300, float(np.abs(found[[0, -1]]).max()))] if len(found) else apart
     if not len(apart):
         return 0.0
     step = float(apart.min())
-    return step if np.abs(apart / step - np.rint(apart / step)).max() < _WHOLE * len(found) ** 0.5 else 0.0
+    return step if np.abs(apart / step - np.rint(apart / step)).max() < _STEP_TOLERANCE * len(found) ** 0.5 else 0.0
 
 
 @dataclass(frozen=True)
 class Converter:
-    """A converter whose rounding may show.
+    """A converter whose rounding may be visible.
 
     Attributes:
-        step: Of its counts [unit].
-        noise: At its input [unit rms].
-        values: What it made of its input next to the rows of a fit [unit], shape (n,); None of the record's own.
+        step: Step of its counts [unit].
+        noise: Noise at its input [unit rms].
+        values: Its output next to the rows of a fit [unit], shape (n,); None for the converter of the record itself.
     """
 
     step: float
@@ -59,40 +59,40 @@ class Converter:
 
     @property
     def error(self) -> float:
-        """Noise and rounding of what came out of it [unit rms]."""
+        """Noise and rounding of its output [unit rms]."""
         return math.hypot(self.noise, self.step / math.sqrt(12.0))
 
 
-def undithered(found: Waveform, step: float, session: Converter | None) -> tuple[Converter, ...]:
-    """Return the converters whose rounding the noise does not hide.
+def find_undithered(found: Waveform, step: float, session: Converter | None) -> tuple[Converter, ...]:
+    """Return the converters whose rounding is not dithered by noise.
 
     Args:
         found: A fit.
-        step: Of the DAQ's converter [unit]; 0 if it has none.
-        session: What the known signal went through; None for one that is known by its formula.
+        step: Step of the DAQ's converter [unit], or 0.
+        session: Converter of the known signal; None if the signal is known by a formula.
     """
-    # The sensor's noise is at the input of the DAQ as it was at that of the session's converter.
+    # The sensor's noise is the same at the input of the DAQ as at that of the session's converter.
     rounding = (step**2 + (session.step**2 if session else 0.0)) / 12.0
     noise = math.sqrt(max(0.0, float(np.mean(found.residual**2)) - rounding))
     both = (Converter(step, noise), *((session,) if session else ()))
-    least = _SMALLEST * float(np.std(found.residual))
-    return tuple(each for each in both if each.step > least and each.noise <= _DITHERED * each.step)
+    least = _MIN_STEP * float(np.std(found.residual))
+    return tuple(each for each in both if each.step > least and each.noise <= _MIN_DITHER * each.step)
 
 
-def rounding_errors(found: Waveform, converters: Sequence[Converter], rows: slice | np.ndarray) -> np.ndarray:
-    """Return the errors that rounding may have left beside the noise of a fit [unit].
+def find_rounding_errors(found: Waveform, converters: Sequence[Converter], rows: slice | np.ndarray) -> np.ndarray:
+    """Return the possible errors of rounding in a fit, in addition to its noise [unit].
 
     Args:
         found: A fit.
-        converters: That may have left them.
-        rows: Of the fit.
+        converters: Converters that may cause them.
+        rows: Rows of the fit.
 
     Returns:
-        Expected error for each of some places of the steps, shape (m, n); (0, n) without converters.
+        Expected error for each of the tried places of the steps, shape (m, n); (0, n) without converters.
     """
     fitted = found.values[rows] - found.residual[rows]
-    errors = np.zeros((len(_TURNS) if converters else 0, _PHASES, len(fitted)))
-    for one, (turn, each) in product(converters, zip(_TURNS, errors, strict=False)):
+    errors = np.zeros((len(_PEAK_SHIFTS) if converters else 0, _PHASES, len(fitted)))
+    for one, (turn, each) in product(converters, zip(_PEAK_SHIFTS, errors, strict=False)):
         values = fitted if one.values is None else one.values[rows]
         around = values - values.mean()
         angle = 2.0 * np.pi * (values / one.step + turn * around / max(float(np.abs(around).max()), 1e-300))
@@ -105,17 +105,17 @@ def rounding_errors(found: Waveform, converters: Sequence[Converter], rows: slic
     return errors.reshape(-1, len(fitted))
 
 
-def widen(found: Waveform, converters: Sequence[Converter]) -> Waveform:
-    """Return a fit whose intervals hold what errors of rounding may have done to its five parameters.
+def widen_intervals(found: Waveform, converters: Sequence[Converter]) -> Waveform:
+    """Return a fit whose intervals include the effect of rounding on its five parameters.
 
     Args:
         found: A fit.
-        converters: Whose rounding may have left errors.
+        converters: Converters whose rounding may cause errors.
     """
     if not converters:
         return found
-    rows = np.unique(np.linspace(0, len(found.residual) - 1, _MOST_ROWS).astype(int))
-    errors = rounding_errors(found, converters, rows)
+    rows = np.unique(np.linspace(0, len(found.residual) - 1, _MAX_ROWS).astype(int))
+    errors = find_rounding_errors(found, converters, rows)
     known, slope, since = found.known[rows], found.slope[rows], found.times_s[rows] - found.middle_s
     late = [slope, slope * since, slope * 0.5 * (since**2 - found.half_s**2 / 3.0)]
     columns = np.column_stack([known, np.ones(len(since)), *(found.gain * each for each in late)])

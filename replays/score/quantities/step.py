@@ -1,6 +1,6 @@
-"""The step response of a channel: rise time, overshoot and settling time.
+"""Step response of a channel: rise time, overshoot and settling time.
 
-Definitions are those of IEEE Std 1057-2017 as papers and tutorials give them; the standard itself was not at hand.
+Definitions follow IEEE Std 1057-2017 as quoted in papers and tutorials; the standard itself was not available.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from replays.estimate.intervals import bound_maximum
 from replays.estimate.spectra import parabola_top
 from replays.score.card.scorecard import Interval
 
-_LEVEL_PART, _BETWEEN_ROWS = 0.1, 3
-"""Part of a step within which a row is at a level, and rows between two levels, at most, of a signal that is steps."""
-_PLATEAU_ROWS, _MAX_ROWS, _STEPS = 100, 4000, 6
-"""Rows of a plateau from which a step counts, those that are averaged at most, and steps that must be there."""
+_LEVEL_PART, _MAX_EDGE_ROWS = 0.1, 3
+"""Distance from a level, as a part of the step, and most rows between two levels, in a signal of steps."""
+_MIN_PLATEAU_ROWS, _MAX_ROWS, _MIN_STEPS = 100, 4000, 6
+"""Fewest rows of a plateau, most rows that are averaged, and fewest steps."""
 _BEFORE_ROWS = 32
 """Rows before a step that are averaged."""
 _RESOLVED_ROWS = 3.0
-"""Rows of a rise from which it is resolved: below, only its upper end is known."""
+"""Rise time from which it is resolved [rows]; of a shorter one only the upper limit is known."""
 BAND = 0.01
 """Part of the step within which a response has settled."""
 
@@ -31,9 +31,9 @@ class StepResponse:
     """A step response, each value with its 95 % interval.
 
     Attributes:
-        rise_rows: From 10 % to 90 % of the step [rows].
-        overshoot: Beyond the final level, over the step [%].
-        settling_rows: From 50 % of the step until it stays within the band [rows]; None where it does not.
+        rise_rows: Rise time from 10 % to 90 % of the step [rows].
+        overshoot: Overshoot above the final level, relative to the step [%].
+        settling_rows: Time from 50 % of the step until it stays within the band [rows]; None if it does not.
         steps: Number of averaged steps.
     """
 
@@ -44,37 +44,37 @@ class StepResponse:
 
 
 def has_steps(known: np.ndarray) -> bool:
-    """Return whether a signal is steps between two levels, sharper than a response to them."""
+    """Return whether a signal consists of steps between two levels that are steeper than a response."""
     low, high = np.percentile(known, (5.0, 95.0))
     near = np.minimum(np.abs(known - low), np.abs(known - high)) < _LEVEL_PART * (high - low)
-    return bool(high > low and np.sum(~near) <= _BETWEEN_ROWS * len(_edges(known)))
+    return bool(high > low and np.sum(~near) <= _MAX_EDGE_ROWS * len(_find_edges(known)))
 
 
-def _edges(known: np.ndarray) -> np.ndarray:
+def _find_edges(known: np.ndarray) -> np.ndarray:
     """Return the rows after which a signal passes the middle of its levels, shape (n,)."""
     above = known > 0.5 * np.sum(np.percentile(known, (5.0, 95.0)))
     return np.flatnonzero(above[1:] != above[:-1])
 
 
 def step_response(known: np.ndarray, values: np.ndarray) -> StepResponse | None:
-    """Return the mean response to all steps whose plateaus are long enough; None where these are too few.
+    """Return the mean response to all steps whose plateaus are long enough; None if these are too few.
 
     Args:
         known: The known signal, shape (n,).
-        values: As recorded, shape (n,).
+        values: Recorded values, shape (n,).
     """
     from scipy.interpolate import PchipInterpolator
 
     middle = known - 0.5 * np.sum(np.percentile(known, (5.0, 95.0)))
-    edges = _edges(known)
+    edges = _find_edges(known)
     gaps = np.diff(edges, prepend=-1, append=len(known))
     plateaus = np.minimum(gaps[:-1], gaps[1:])
-    held = plateaus > max(_PLATEAU_ROWS, 0.5 * float(np.median(plateaus)) if len(plateaus) else 0.0)
-    if held.sum() < _STEPS:
+    held = plateaus > max(_MIN_PLATEAU_ROWS, 0.5 * float(np.median(plateaus)) if len(plateaus) else 0.0)
+    if held.sum() < _MIN_STEPS:
         return None
     rows = min(_MAX_ROWS, int(plateaus[held].min()) - 2)
     places_of = edges + middle[edges] / (middle[edges] - middle[edges + 1])
-    # Where all steps lie alike between two rows, so does the grid, and nothing is interpolated.
+    # If all steps have the same place between two rows, the grid has it as well, and nothing is interpolated.
     grid = np.arange(-_BEFORE_ROWS, rows) - float(np.median((places_of - edges)[held]))
     responses = []
     for edge, at in zip(edges[held], places_of[held], strict=True):
@@ -89,13 +89,13 @@ def step_response(known: np.ndarray, values: np.ndarray) -> StepResponse | None:
     spread = np.sqrt(np.maximum(apart, np.median(apart)) / count)
     after = slice(_BEFORE_ROWS - 1, None)
     over = bound_maximum(mean[after] - 1.0, spread[after])
-    before, peak, behind = mean[np.clip(np.argmax(mean), 1, len(mean) - 2) + np.arange(-1, 2)]
-    _, between = parabola_top(before, peak, behind)
+    before, peak, following = mean[np.clip(np.argmax(mean), 1, len(mean) - 2) + np.arange(-1, 2)]
+    _, between = parabola_top(before, peak, following)
     overshoot = 100.0 * (over[0] + between), 100.0 * over[1], 100.0 * (over[2] + 2.0 * between)
     curve, fine = PchipInterpolator(grid, mean), np.arange(grid[0], grid[-1], 1.0 / 64.0)
 
     def crossing(level: float) -> tuple[float, float]:
-        """Row at which the response first passes a level, and the half width of its interval."""
+        """Return the row at which the response first passes a level, and the half width of its interval."""
         n = int(np.argmax(mean >= level))
         linear = grid[n] - (mean[n] - level) / max(mean[n] - mean[n - 1], 1e-300)
         k = int(np.argmax(curve(fine) >= level))

@@ -1,4 +1,4 @@
-"""What a DAQ on a CAN bus logged, in python-can's formats: the rig's sample messages as signals."""
+"""Logs of a DAQ on a CAN bus, in python-can's formats: the rig's sample messages as signals."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _SUFFIXES = (".log", ".asc", ".blf", ".trc")
 
 
 def is_can_log(path: Path) -> bool:
-    """Whether a file is a log of a CAN bus by its name; an .asc by its first word."""
+    """Return whether a file is a log of a CAN bus, by its suffix and, for .asc, by its first word."""
     if path.suffix.lower() not in _SUFFIXES:
         return False
     if path.suffix.lower() != ".asc":
@@ -28,14 +28,14 @@ def is_can_log(path: Path) -> bool:
 
 
 def open_can_log(path: Path, table: ChannelTable) -> list[Recorded]:
-    """Signals of a log: of messages with samples, in the FD layout where it is in it; others are passed over.
+    """Return the signals of a log's sample messages, in the FD layout if the log has it; other frames are ignored.
 
     Args:
         path: The log: candump, ASC or BLF, or TRC.
         table: Channels of the rig that sent.
 
     Raises:
-        InputError: It cannot be read, or has none of the rig's samples.
+        InputError: The log cannot be read, or has none of the rig's samples.
     """
     import can
 
@@ -58,8 +58,8 @@ def open_can_log(path: Path, table: ChannelTable) -> list[Recorded]:
                     data.append(bytes(frame.data))
                     times_s.append(frame.timestamp)
     except Exception as error:  # whatever python-can raises on a log that it cannot read
-        told = unreadable(path, error) if isinstance(error, OSError) else None
-        raise told or InputError("FILE", "an intact CAN log", Words(f"{path} ({type(error).__name__})")) from None
+        reason = unreadable(path, error) if isinstance(error, OSError) else None
+        raise reason or InputError("FILE", "an intact CAN log", Words(f"{path} ({type(error).__name__})")) from None
     fd = any(messages.by_name[name].fd for name in frames)
     found = []
     for name, (data, stamps) in frames.items():
@@ -71,8 +71,8 @@ def open_can_log(path: Path, table: ChannelTable) -> list[Recorded]:
         parts = SampleDecoder({name: message}).decode(name, data, rates["rate"], step, 0)
         values = np.concatenate([part.values for part in parts])
         times_s = np.repeat(stamps, form.rows)
-        # Its stamps are those of frames: when they came, not how often samples were taken.
-        whole = Table(len(values), values.shape[1], _reading(values, times_s))
+        # Stamps are those of frames, and show when these arrived, not the sampling rate.
+        whole = Table(len(values), values.shape[1], _read_pieces(values, times_s))
         for column, (channel, bits) in enumerate(zip(form.channels, form.shifts.tolist(), strict=True)):
             if not np.isnan(values[:, column]).all():
                 found.append(Recorded(channel.name, channel.unit, whole, column, rates["rate"] / step, bits))
@@ -81,5 +81,5 @@ def open_can_log(path: Path, table: ChannelTable) -> list[Recorded]:
     return found
 
 
-def _reading(values: np.ndarray, times_s: np.ndarray) -> Pieces:
+def _read_pieces(values: np.ndarray, times_s: np.ndarray) -> Pieces:
     return lambda columns: [np.column_stack([times_s, values[:, columns]])]

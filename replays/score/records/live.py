@@ -1,7 +1,7 @@
-"""A DAQ under test that delivers while the rig runs: a bounded stretch of its rows, and beside it what the rig sends.
+"""Recording of a DAQ under test while the rig runs: a limited stretch of its rows, and the rig's samples.
 
-Both lie in files of a folder then, which are judged as any others. What files do not have is when each row came: of
-the DAQ here, of the rig in its session, both by this computer's clock and in this process.
+Both are written to files of a folder and are judged as any other files. The arrival times of rows, which files do not
+have, are measured in this process for the DAQ, and in the recorded session for the rig, both by this computer's clock.
 """
 
 from __future__ import annotations
@@ -24,27 +24,27 @@ if TYPE_CHECKING:
     from recorder.contents.summary import Progress
     from rig.serve.transport import Client
 
-SHORTEST_S, LONGEST_S = 2.0, 600.0
-"""Of a stretch [s], ..."""
-MOST_BYTES = 4 << 30
-"""... and what the DAQ's rows may take of the disk; there the stretch ends."""
+MIN_STRETCH_S, MAX_STRETCH_S = 2.0, 600.0
+"""Limits of the length of a stretch [s]."""
+MAX_BYTES = 4 << 30
+"""Largest size of the DAQ's rows on disk, at which the stretch ends."""
 PATIENCE_S = 30.0
-"""How long the first row may take [s]."""
+"""Timeout for the first row [s]."""
 _READ = 1 << 16
 _LOOK_S = 0.05
-_BEHIND_S = 0.5
-"""So much longer the rig is recorded than the DAQ, and the DAQ is read than a rig that ends [s]."""
+_MARGIN_S = 0.5
+"""Time by which the rig is recorded longer than the DAQ, and the DAQ is read longer than a rig that ends [s]."""
 _FLOOR_LINES, _FLOOR_STEP_S = 100, 2e-3
 
 
 @dataclass(frozen=True)
 class Arrivals:
-    """When rows came.
+    """Arrival times of rows.
 
     Attributes:
-        rows: How many had come, each time that some did, shape (n,).
-        unix_s: When that was [unix s], shape (n,).
-        floor_s: What a line took through a pipe of this computer to here, in 95 of 100 [s].
+        rows: Number of rows received by each arrival, shape (n,).
+        unix_s: Time of each arrival [unix s], shape (n,).
+        floor_s: Latency of a line through a pipe of this computer, 95 % quantile [s].
     """
 
     rows: np.ndarray
@@ -52,20 +52,20 @@ class Arrivals:
     floor_s: float
 
     def since_s(self, numbers: np.ndarray) -> np.ndarray:
-        """When rows came by their numbers from 0, from the first time on [s], shape (n,)."""
+        """Return the arrival times of rows by their numbers from 0, after the first arrival [s], shape (n,)."""
         at = np.searchsorted(self.rows, numbers, side="right")
         return self.unix_s[np.minimum(at, len(self.rows) - 1)] - self.unix_s[0]
 
 
 @dataclass(frozen=True)
 class Delivered:
-    """What came in a stretch.
+    """Files and arrival times of a stretch.
 
     Attributes:
         file: The DAQ's lines.
-        session: What the rig sent.
-        arrivals: When the lines came.
-        remarks: What else is to be known of it.
+        session: The rig's samples.
+        arrivals: Arrival times of the lines.
+        remarks: Remarks for the scorecard.
     """
 
     file: Path
@@ -75,10 +75,10 @@ class Delivered:
 
 
 class Lines:
-    """Takes down what is written into a pipe, and when each line came; reads on beyond, so that nobody is held up."""
+    """Recorder of lines from a pipe with their arrival times; it reads on afterwards, so that no writer blocks."""
 
     def __init__(self, source: int, path: Path) -> None:
-        """Read from a file descriptor into a file, from now on, on a thread of its own."""
+        """Start a thread that reads from a file descriptor and writes to a file."""
         self.count, self.size, self.ended = 0, 0, False
         self._source, self._path = source, path
         self._counts, self._unix_s = array("q"), array("d")
@@ -92,13 +92,13 @@ class Lines:
             with self._lock:
                 if self._file.closed:
                     continue
-                self._take(data, now_s)
+                self._write(data, now_s)
         with self._lock:
-            if not self._file.closed and self.size > self._whole:  # a last line without an end is one
-                self._take(b"\n", time.time())
+            if not self._file.closed and self.size > self._whole:  # a last line without a line end counts
+                self._write(b"\n", time.time())
         self.ended = True
 
-    def _take(self, data: bytes, now_s: float) -> None:
+    def _write(self, data: bytes, now_s: float) -> None:
         self._file.write(data)
         if lines := data.count(b"\n"):
             self._whole = self.size + data.rindex(b"\n") + 1
@@ -108,15 +108,15 @@ class Lines:
         self.size += len(data)
 
     def close(self) -> tuple[np.ndarray, np.ndarray]:
-        """Keep the whole lines; how many there were each time that some came, and when that was, each shape (n,)."""
+        """Close the file after its last whole line; return the number of lines by each arrival, and its time."""
         with self._lock:
             self._file.close()
         os.truncate(self._path, self._whole)
         return np.array(self._counts), np.array(self._unix_s)
 
 
-def _floor_s(folder: Path) -> float:
-    """What a line takes through a pipe to here, in 95 of 100 [s]."""
+def _measure_floor_s(folder: Path) -> float:
+    """Return the latency of a line through a pipe of this computer, 95 % quantile [s]."""
     read, write = os.pipe()
     lines, written_s = Lines(read, folder / "floor.csv"), []
     for _ in range(_FLOOR_LINES):
@@ -135,20 +135,20 @@ def collect(
     client: Client, source: int, folder: Path, for_s: float, *, stopped: threading.Event,
     tell: Callable[[float, str], None],
 ) -> Delivered:  # fmt: skip
-    """Take down what a DAQ delivers as lines of CSV, and what the rig sends meanwhile.
+    """Record the CSV lines that a DAQ delivers, and what the rig sends meanwhile.
 
     Args:
-        client: Connection to the rig; remains the caller's to close.
-        source: File descriptor from which the lines come.
-        folder: Where both are written.
-        for_s: How long, from the first line on [s].
-        stopped: Ends it before.
-        tell: Told how much of it is over, 0 to 1, and what has come.
+        client: Connection to the rig; the caller closes it.
+        source: File descriptor from which the lines are read.
+        folder: Folder for both files.
+        for_s: Length of the stretch from the first line [s].
+        stopped: Event that ends the stretch early.
+        tell: Function that is called with the elapsed part, 0 to 1, and the number of lines.
 
     Raises:
-        InputError: No line comes.
+        InputError: No line arrives.
         RefusedError: The rig cannot be recorded.
-        NoReplyError: No rig answers.
+        NoReplyError: No rig replies.
     """
     from recorder.session import RecordingSession
 
@@ -162,19 +162,19 @@ def collect(
     def record() -> None:
         try:
             summaries.append(session.run(watch))
-        except BaseException as error:  # raised anew where it is waited for
+        except BaseException as error:  # raised again by the caller
             errors.append(error)
         begun.set()
 
     recording = threading.Thread(target=record, name="what the rig sends", daemon=True)
     recording.start()
     try:
-        floor_s = _floor_s(folder)
+        floor_s = _measure_floor_s(folder)
         begun.wait(2.0)  # a rig in lockstep may wait for the DAQ
         lines = Lines(source, folder / "standard-input.csv")
-        why = _watch(lines, recording, for_s, stopped, tell)
+        why = _wait_for_end(lines, recording, for_s, stopped, tell)
         counts, unix_s = lines.close()
-        stopped.wait(_BEHIND_S)
+        stopped.wait(_MARGIN_S)
     finally:
         session.stop()
         recording.join()
@@ -187,16 +187,16 @@ def collect(
     lost = sum(summaries[0].lost.values())
     remarks = (
         f"live: {lines.count} lines in {unix_s[-1] - unix_s[0]:.1f} s, {why}",
-        *((f"{lost} rows of the rig were lost on the way to here: the DAQ's are foreign ones",) if lost else ()),
+        *((f"{lost} rows of the rig were lost in transmission: they count as foreign",) if lost else ()),
     )
     return Delivered(folder / "standard-input.csv", session.path, Arrivals(counts, unix_s, floor_s), remarks)
 
 
-def _watch(
+def _wait_for_end(
     lines: Lines, recording: threading.Thread, for_s: float, stopped: threading.Event,
     tell: Callable[[float, str], None],
 ) -> str:  # fmt: skip
-    """Wait for the end of the stretch; why that was."""
+    """Wait for the end of the stretch; return its reason."""
     due, first, rest = Deadline(PATIENCE_S), False, None
     while True:
         if not first and lines.count:
@@ -205,9 +205,9 @@ def _watch(
             return "until it was interrupted"
         if lines.ended:
             return "to the DAQ's end"
-        if lines.size > MOST_BYTES:
-            return f"until they took {MOST_BYTES / 1e9:.0f} GB"
-        rest = Deadline(_BEHIND_S) if rest is None and not recording.is_alive() else rest
+        if lines.size > MAX_BYTES:
+            return f"until they took {MAX_BYTES / 1e9:.0f} GB"
+        rest = Deadline(_MARGIN_S) if rest is None and not recording.is_alive() else rest
         if rest is not None and rest.passed:
             return "to the end of the rig's run"
         if due.passed:

@@ -1,4 +1,4 @@
-"""What the DAQ under test recorded: the signals of a file, whatever its format, that need not fit into memory."""
+"""Signals of a file that the DAQ under test recorded, in any format; the file need not fit into memory."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from rig.base.wire import sensor_key
 from rig.channels.table import Channel, Group
 
 _PART = 1 << 16
-_EARLY = 1 << 18
-"""Rows by which signals are found, and their scales."""
-_MOST = 1e30
-"""Values that a measurement can have, in any unit."""
-_ALIKE = 0.2
-"""Part by which steps of time stamps that are alike may differ."""
-_REGULAR, _ROUNDED = 0.9, 1.1
-"""Part of the steps that are alike where stamps are not rounded to a coarse resolution, and deviation of such stamps
-from a line, peak to peak, over their largest step, at most."""
+_MAX_EARLY_ROWS = 1 << 18
+"""Rows by which signals and their scales are found."""
+_MAX_VALUE = 1e30
+"""Largest value of a measurement, in any unit."""
+_STEP_TOLERANCE = 0.2
+"""Relative difference of steps of time stamps that count as equal."""
+_REGULAR_PART, _MAX_ROUNDED = 0.9, 1.1
+"""Part of equal steps above which stamps are not rounded to a coarse resolution, and largest deviation of such stamps
+from a line, peak to peak, over their largest step."""
 _MAX_SCATTER, _MIN_GAP = 5.0, 3.0
 """The same over the usual step for stamps of which some go back by jitter, and steps over the usual one from which rows
 are missing: jitter of a quarter of a step, rms, reaches 5 steps peak to peak and steps of 2.5."""
@@ -38,24 +38,24 @@ Pieces = Callable[[Sequence[int]], Iterable[np.ndarray]]
 
 
 class Table:
-    """Signals of a file that have the same time stamps.
+    """Signals of a file with common time stamps.
 
     Attributes:
-        rows: Number of values of each.
-        stamped: Whether there are stamps.
+        rows: Number of rows.
+        stamped: Whether there are time stamps.
     """
 
     def __init__(self, rows: int, columns: int, pieces: Pieces) -> None:
-        """Take what gives stamps [s], nan where there are none, and some columns, in pieces, each shape (n, 1 + k)."""
+        """Store a function that yields stamps [s], or nan, and some columns, each shape (n, 1 + k)."""
         self.rows, self._columns, self._pieces = rows, columns, pieces
 
     def parts(self, columns: Sequence[int]) -> Iterator[np.ndarray]:
-        """Stamps [s] and columns, nan where there is no value that a measurement can have, in parts of one length."""
+        """Yield stamps [s] and columns in parts of equal length, nan for values that no measurement has."""
         held, left = list[np.ndarray](), self.rows
         for piece in self._pieces(columns):
             piece, left = piece[:left], left - len(piece[:left])
             with np.errstate(invalid="ignore"):
-                piece[:, 1:][~(np.abs(piece[:, 1:]) <= _MOST)] = np.nan
+                piece[:, 1:][~(np.abs(piece[:, 1:]) <= _MAX_VALUE)] = np.nan
             held.append(piece)
             if (rows := sum(map(len, held))) >= _PART:
                 whole, cut = np.concatenate(held), rows // _PART * _PART
@@ -66,11 +66,11 @@ class Table:
 
     @cached_property
     def early(self) -> np.ndarray:
-        """Stamps and all columns of its first rows, shape (n, 1 + columns)."""
-        return self.stretch(0, _EARLY)
+        """Stamps and all columns of the first rows, shape (n, 1 + columns)."""
+        return self.stretch(0, _MAX_EARLY_ROWS)
 
     def stretch(self, row: int, rows: int) -> np.ndarray:
-        """Return stamps and all columns of some rows from a row on, as far as there are any, shape (n, 1 + columns)."""
+        """Return stamps and all columns of some rows, as far as there are any, shape (n, 1 + columns)."""
         return take_rows(self.parts(range(self._columns)), row, rows, 1 + self._columns)
 
     def changed(self, by_column: Mapping[int, tuple[float, float]]) -> Table:
@@ -84,7 +84,7 @@ class Table:
         return Table(self.rows, self._columns, pieces)
 
     def select_rows(self, column: int, step: int, first: int) -> Table:
-        """Return a table of every `step`-th row from a row on, or for step 1 of the rows with a value in a column."""
+        """Return a table of every `step`-th row from a row, or for step 1 of the rows with a value in a column."""
 
         def pieces(columns: Sequence[int]) -> Iterator[np.ndarray]:
             at = 0
@@ -98,24 +98,24 @@ class Table:
 
     @property
     def stamped(self) -> bool:
-        """Whether it has time stamps."""
+        """True if there are time stamps."""
         return not np.isnan(self.early[:1, 0]).any()
 
     @cached_property
     def rate_hz(self) -> float | None:
-        """Rate by those steps of its stamps that are alike [Hz], if they are most of it; None where it is not so.
+        """Rate by those steps of the stamps that are equal [Hz]; None if they are a minority.
 
-        None also where the stamps do not ascend on the whole, or faster than a rate can be.
+        None also if the stamps do not ascend on the whole, or faster than a rate can be.
         """
         times_s = self.early[:, 0]
         if not self.stamped or len(times_s) < 2:
             return None
         steps = np.diff(times_s)
         usual = float(np.median(steps))
-        alike = steps[np.abs(steps - usual) < _ALIKE * usual]
-        if usual >= 0.0 and len(alike) < _REGULAR * len(steps):
-            # Stamps of a coarse resolution, whose steps are multiples of it, or with jitter: a line shows the rate.
-            most_s = _ROUNDED * steps.max() if steps.min() >= 0.0 else _MAX_SCATTER * usual
+        alike = steps[np.abs(steps - usual) < _STEP_TOLERANCE * usual]
+        if usual >= 0.0 and len(alike) < _REGULAR_PART * len(steps):
+            # Steps are multiples of a coarse resolution, or have jitter: a line shows the rate.
+            most_s = _MAX_ROUNDED * steps.max() if steps.min() >= 0.0 else _MAX_SCATTER * usual
             gaps, counts = (usual > 0.0) & (steps > _MIN_GAP * usual), np.ones(len(steps))
             late = missing = _fit_line(times_s, counts)
             period_s = usual
@@ -123,7 +123,7 @@ class Table:
                 counts[gaps] = np.rint(steps[gaps] / period_s)
                 missing = _fit_line(times_s, counts)
                 period_s = max(missing[1], 1.0 / MAX_RATE_HZ)
-            scatter_s, period_s = min(late, missing)  # a large step is late stamps, or rows are missing there
+            scatter_s, period_s = min(late, missing)  # a large step is due to late stamps, or to missing rows
             if 0.0 < scatter_s <= most_s and period_s * MAX_RATE_HZ >= 1.0:
                 return 1.0 / period_s
         alike_s, span_s = float(alike.sum()), max(0.0, float(times_s[-1] - times_s[0]))
@@ -132,55 +132,55 @@ class Table:
 
 @dataclass(frozen=True)
 class Recorded:
-    """One signal that the DAQ under test recorded.
+    """A signal that the DAQ under test recorded.
 
     Attributes:
-        name: Its name in the file.
-        unit: As the file spells it; empty where it tells none.
-        table: What it stands in.
-        column: Where there.
-        told_hz: Rate as the file tells it [Hz]; None where it does not.
-        lost_bits: Lowest bits of the counts that it leaves out by its definition.
-        group: Group of the file that it is in.
-        timed: Whether its rate is that of the file; else it is not known.
+        name: Name in the file.
+        unit: Unit as spelled in the file, or empty.
+        table: Table with its values.
+        column: Column of the table.
+        stated_hz: Rate that the file states [Hz]; None if it does not.
+        lost_bits: Lowest bits of the counts that the signal leaves out by definition.
+        group: Group of the file.
+        timed: Whether its rate is that of the file; if not, it is unknown.
     """
 
     name: str
     unit: str
     table: Table
     column: int
-    told_hz: float | None
+    stated_hz: float | None
     lost_bits: int = 0
     group: str = ""
     timed: bool = True
 
     @property
     def rows(self) -> int:
-        """Number of its values."""
+        """Number of values."""
         return self.table.rows
 
     @property
     def early(self) -> np.ndarray:
-        """Its first values, shape (n,)."""
+        """First values, shape (n,)."""
         return self.table.early[:, 1 + self.column]
 
     @property
     def first_s(self) -> float | None:
-        """Time stamp of the first value [s]; None where there are none."""
+        """Time stamp of the first value [s], or None."""
         return float(self.table.early[0, 0]) if self.table.stamped and self.rows else None
 
     @cached_property
     def values(self) -> np.ndarray:
-        """All values in its unit, nan where there is none that a measurement can have, shape (rows,)."""
+        """All values in the unit of the file, nan for values that no measurement has, shape (rows,)."""
         return np.concatenate([part[:, 1] for part in self.table.parts([self.column])])
 
     @property
     def rate_hz(self) -> float | None:
-        """Rate by its file [Hz]; None where it is not known."""
+        """Rate by the file [Hz]; None if unknown."""
         if not self.timed:
             return None
-        told = self.told_hz
-        return self.table.rate_hz or told or (even_rate_hz(self.table.early[:, 0]) if self.table.stamped else None)
+        stated_hz = self.stated_hz
+        return self.table.rate_hz or stated_hz or (even_rate_hz(self.table.early[:, 0]) if self.table.stamped else None)
 
 
 def open_recorded(path: Path, options: FileOptions | None = None, remarks: list[str] | None = None) -> list[Recorded]:
@@ -189,22 +189,22 @@ def open_recorded(path: Path, options: FileOptions | None = None, remarks: list[
     Args:
         path: The file. The last row of a text without a line end is left out: its last number may be cut.
         options: How a text file is read.
-        remarks: Takes lines about what was left out.
+        remarks: List to which lines about omitted rows are added.
 
     Raises:
-        InputError: It cannot be read, or has no signals.
+        InputError: The file cannot be read, or has no signals.
     """
     if path.suffix == ".mcap":
-        return _of_recording(path)
+        return _open_recording(path)
     source, tables = open_source(path, options or FileOptions()), dict[tuple[str, int], list[Entry]]()
-    told = [] if remarks is None else remarks
-    told += [remark for remark in source.remarks if "is cut" in remark]
-    if source.format == "text" and not told and not _ends_with_line_end(path):
-        told.append("the last line has no line end: its row is left out, as its last number may be cut")
+    notes = [] if remarks is None else remarks
+    notes += [remark for remark in source.remarks if "is cut" in remark]
+    if source.format == "text" and not notes and not _ends_with_line_end(path):
+        notes.append("the last line has no line end: its row is omitted, as its last number may be cut")
         source = replace(source, entries=tuple(replace(each, rows=each.rows - 1) for each in source.entries))
     for entry in source.entries:
         tables.setdefault((entry.group, entry.rows), []).append(entry)
-    known = {key: Table(key[1], len(entries), _reading(source, entries)) for key, entries in tables.items()}
+    known = {key: Table(key[1], len(entries), _read_source(source, entries)) for key, entries in tables.items()}
     return [
         Recorded(
             entry.name, units.canonical(entry.unit), known[key := (entry.group, entry.rows)],
@@ -217,12 +217,12 @@ def open_recorded(path: Path, options: FileOptions | None = None, remarks: list[
 def map_signals(
     signals: Sequence[Recorded], mapping: Mapping[str, ChannelMapping], channels: Mapping[str, Channel]
 ) -> list[Recorded]:
-    """Return the signals that a mapping names, as the channels and in the units that it gives.
+    """Return the signals that a mapping names, under the names and in the units of its channels.
 
     Args:
-        signals: Of the file.
-        mapping: Source, unit, bits, sensitivity, sign, factor and bias by channel; those of no channel are left out.
-        channels: Of the session.
+        signals: Signals of the file.
+        mapping: Source, unit, bits, sensitivity, sign, factor and bias by channel; others than channels are omitted.
+        channels: Channels of the session.
 
     Raises:
         InputError: A channel or a source is unknown, or two channels have one source.
@@ -261,13 +261,13 @@ def map_signals(
 
 
 def separate_rates(signals: Sequence[Recorded], rate_hz: float) -> list[Recorded]:
-    """Return signals of which those that have values at a lower, even rate are in tables of their own.
+    """Return signals of which those with values at a lower, even rate are in separate tables.
 
-    A text of several rates has blank cells where a signal has no value.
+    A text file with several rates has blank cells where a signal has no value.
 
     Args:
-        signals: Of a file.
-        rate_hz: Of the rows of a table that gives no rate [Hz].
+        signals: Signals of a file.
+        rate_hz: Row rate of a table that gives none [Hz].
     """
     tables, found = dict[tuple[int, int, int, bytes], Table](), list[Recorded]()
     for signal in signals:
@@ -276,23 +276,23 @@ def separate_rates(signals: Sequence[Recorded], rate_hz: float) -> list[Recorded
             step = round(float(np.median(np.diff(rows))))
             first = int(np.bincount(rows % step).argmax())
             steps_s = np.diff(signal.table.early[rows, 0])
-            if np.mean(rows % step == first) < _REGULAR or (first and not signal.table.stamped):
+            if np.mean(rows % step == first) < _REGULAR_PART or (first and not signal.table.stamped):
                 step = 1
-            if step > 1 or np.all(np.abs(steps_s - np.median(steps_s)) < _ALIKE * np.median(steps_s)):
+            if step > 1 or np.all(np.abs(steps_s - np.median(steps_s)) < _STEP_TOLERANCE * np.median(steps_s)):
                 key = id(signal.table), step, first, b"" if step > 1 else rows.tobytes()
                 if key not in tables:
                     tables[key] = signal.table.select_rows(signal.column, step, first)
-                signal = replace(signal, table=tables[key], told_hz=(signal.rate_hz or rate_hz) / step)
+                signal = replace(signal, table=tables[key], stated_hz=(signal.rate_hz or rate_hz) / step)
         found.append(signal)
     return found
 
 
 def _fit_line(times_s: np.ndarray, counts: np.ndarray) -> tuple[float, float]:
-    """Return how far stamps scatter about a line, peak to peak, and its time between two rows [s].
+    """Return the scatter of stamps about a line, peak to peak, and the line's time per row [s].
 
     Args:
         times_s: The stamps [s], shape (n,).
-        counts: Rows from each to the next, shape (n - 1,).
+        counts: Rows from each stamp to the next, shape (n - 1,).
     """
     rows = np.append(0.0, np.cumsum(counts))
     line = fit_line(rows, times_s)
@@ -305,18 +305,18 @@ def _ends_with_line_end(path: Path) -> bool:
         return file.read(1) in (b"\n", b"\r", b"\0")  # UTF-16 ends with the line end's upper byte
 
 
-def _reading(source: Source, entries: Sequence[Entry]) -> Pieces:
+def _read_source(source: Source, entries: Sequence[Entry]) -> Pieces:
     kept: dict[int, list[np.ndarray]] = {}
 
     def whole(column: int) -> list[np.ndarray]:
-        """Stamps and values of one signal, from the disk where there are many."""
+        """Return stamps and values of one signal, on disk if there are many."""
         if column not in kept:
-            kept[column] = [_spooled(each) for each in _columns([source.read(entries[column])]).T]
+            kept[column] = [_spool(each) for each in _stack_columns([source.read(entries[column])]).T]
         return kept[column]
 
     def pieces(columns: Sequence[int]) -> Iterator[np.ndarray]:
         if source.pieces is not None:
-            yield from map(_columns, source.pieces([entries[column] for column in columns]))
+            yield from map(_stack_columns, source.pieces([entries[column] for column in columns]))
             return
         found = [whole(columns[0])[0], *(whole(column)[1] for column in columns)]
         for begin in range(0, len(found[0]), _PART):
@@ -325,35 +325,35 @@ def _reading(source: Source, entries: Sequence[Entry]) -> Pieces:
     return pieces
 
 
-def _columns(signals: Sequence[FileSignal]) -> np.ndarray:
+def _stack_columns(signals: Sequence[FileSignal]) -> np.ndarray:
     times_s = signals[0].times_s
     stamps = np.full(len(signals[0].values), np.nan) if times_s is None else times_s
     return np.column_stack([stamps, *(signal.physical for signal in signals)])
 
 
-def _spooled(values: np.ndarray) -> np.ndarray:
-    """The same values, on the disk where there are many."""
-    if len(values) <= _EARLY:
+def _spool(values: np.ndarray) -> np.ndarray:
+    """Return the same values, on disk if there are many."""
+    if len(values) <= _MAX_EARLY_ROWS:
         return values
     with tempfile.TemporaryFile() as file:
         np.ascontiguousarray(values).tofile(file)
         return np.memmap(file, values.dtype, "r", shape=values.shape)
 
 
-def _of_recording(path: Path) -> list[Recorded]:
+def _open_recording(path: Path) -> list[Recorded]:
     recording, found = Recording.open(path), list[Recorded]()
     for group in recording.table.groups.values():
         stream = recording.streams.get(sensor_key(group.name))
         if stream is not None and stream.rows:
             rate_hz = next(recording.blocks(sensor_key(group.name))).rate_hz
-            table = Table(stream.rows, len(group.channels), _recalling(recording, group))
+            table = Table(stream.rows, len(group.channels), _read_recording(recording, group))
             found += [Recorded(each.name, each.unit, table, n, rate_hz) for n, each in enumerate(group.channels)]
     if not found:
         raise InputError("FILE", "a recording with samples", str(path))
     return found
 
 
-def _recalling(recording: Recording, group: Group) -> Pieces:
+def _read_recording(recording: Recording, group: Group) -> Pieces:
     def pieces(columns: Sequence[int]) -> Iterator[np.ndarray]:
         scales, offsets = np.array([(group.channels[c].scale, group.channels[c].offset) for c in columns]).T
         for block in recording.blocks(sensor_key(group.name)):

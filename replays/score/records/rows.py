@@ -1,7 +1,7 @@
-"""Which row of what was sent each recorded row is: missing, doubled, swapped and altered ones, of any number of rows.
+"""Identification of recorded rows among those sent: missing, doubled, swapped and altered ones, in any number.
 
-A row is known by the hash of its counts, alone or with the next three, where that is unique among the rows near by; the
-others by their neighbours. Where all is as it was sent, rows are only compared. Kept are the rows near by, and events.
+A row is identified by the hash of its counts, alone or with the next three, if that is unique among the rows nearby, or
+else by its neighbours. Rows that arrive as sent are only compared. Memory holds the rows nearby, and events.
 """
 
 from __future__ import annotations
@@ -13,23 +13,23 @@ from dataclasses import dataclass, field
 import numpy as np
 
 NO_COUNT = np.iinfo(np.int64).min
-"""Stands where a recorded value is none that was sent, whatever the count."""
-_BACK, _PART = 1 << 14, 1 << 12
-"""Rows behind the one that is due among which a row is looked for, and rows that are looked up at a time."""
-_AHEAD, _MOST_AHEAD = 1 << 13, 1 << 22
-"""Rows ahead among which they are looked for at first, and at most."""
-_MOST_STRETCHES = 10_000
-"""Stretches of altered values that are kept of a channel."""
-_BROKEN = 0.5
-"""A channel of whose values more than this part is altered has no say in which row one is."""
-_GRAM = 4
-"""Consecutive rows that are known together where one alone is not."""
-_RUN = 16
-"""Consecutive rows that are doubled behind the last one that was sent: fewer are equal by chance."""
+"""Count of a recorded value that was not sent."""
+_SEARCH_BACK, _PART = 1 << 14, 1 << 12
+"""Rows before the next expected one among which a row is searched, and rows that are searched at a time."""
+_SEARCH_AHEAD, _MAX_SEARCH_AHEAD = 1 << 13, 1 << 22
+"""Rows ahead among which a row is searched first, and at most."""
+_MAX_STRETCHES = 10_000
+"""Largest number of stretches of altered values that are kept per channel."""
+_MAX_ALTERED_PART = 0.5
+"""Part of altered values above which a channel is not used to identify rows."""
+_GROUP_ROWS = 4
+"""Consecutive rows that are identified together if one alone is not unique."""
+_MIN_RUN = 16
+"""Fewest consecutive doubled rows after the last one that was sent: fewer are equal by chance."""
 
 
 def row_hashes(counts: np.ndarray) -> np.ndarray:
-    """A number of each row that hardly another row has, uint64, shape (n,); of counts, int64, shape (n, channels)."""
+    """Return a nearly unique number of each row, uint64, shape (n,), from counts, int64, shape (n, channels)."""
     found = np.zeros(len(counts), dtype=np.uint64)
     for c in range(counts.shape[1]):
         # splitmix64 (Steele, Lea & Flood 2014), with the column as its step.
@@ -40,10 +40,10 @@ def row_hashes(counts: np.ndarray) -> np.ndarray:
     return found
 
 
-def grams(hashes: np.ndarray, step: int = 1) -> np.ndarray:
-    """A number of each row with the next ones, every so many; the last ones have fewer."""
+def group_hashes(hashes: np.ndarray, step: int = 1) -> np.ndarray:
+    """Return a number of each row together with the next ones at a step; the last rows have fewer."""
     found = hashes.copy()
-    for n in range(1, _GRAM):
+    for n in range(1, _GROUP_ROWS):
         found[: -n * step] += hashes[n * step :] * np.uint64(2 * n + 1) ^ np.uint64(n)
     return found
 
@@ -52,17 +52,17 @@ def repeated_part(counts: np.ndarray) -> float:
     """Return the part of rows that recur together with the 63 rows that follow them.
 
     Args:
-        counts: Of the rows, int64, shape (n, channels).
+        counts: Counts of the rows, int64, shape (n, channels).
     """
     hashes = row_hashes(counts)
-    for step in (1, _GRAM, _GRAM**2):
-        hashes = grams(hashes, step)
-    _, inverse, times = np.unique(hashes[: -(_GRAM**3)], return_inverse=True, return_counts=True)
+    for step in (1, _GROUP_ROWS, _GROUP_ROWS**2):
+        hashes = group_hashes(hashes, step)
+    _, inverse, times = np.unique(hashes[: -(_GROUP_ROWS**3)], return_inverse=True, return_counts=True)
     return float(np.mean(times[inverse] > 1)) if len(inverse) else 0.0
 
 
 def take_rows(pieces: Iterable[np.ndarray], first: int, rows: int, columns: int) -> np.ndarray:
-    """Return some rows of a table that comes in pieces, as far as there are any, shape (n, columns).
+    """Return some rows of a table that is read in pieces, as far as there are any, shape (n, columns).
 
     Args:
         pieces: Rows in order, each shape (m, columns).
@@ -80,52 +80,52 @@ def take_rows(pieces: Iterable[np.ndarray], first: int, rows: int, columns: int)
 
 
 class Stretches:
-    """Rows of which some may be too many to keep: how many they are, and the first stretches of them.
+    """Number of rows, and the first stretches of them, as there may be too many to keep.
 
     Attributes:
-        rows: How many rows.
+        rows: Number of rows.
     """
 
     def __init__(self, most: float = math.inf) -> None:
-        """Keep so many stretches."""
+        """Set the largest number of stretches to keep."""
         self.rows, self._most = 0, most
         self._parts: list[np.ndarray] = []
         self._kept = 0
 
     def add(self, places: np.ndarray) -> None:
-        """Take rows, behind those that were taken before, or nearly so, shape (n,)."""
+        """Add rows, approximately in ascending order, shape (n,)."""
         self.rows += len(places)
         if len(places) and self._kept < self._most:
             self._parts.append(stretches(np.unique(places)))
             self._kept += len(self._parts[-1])
 
     def pairs(self) -> np.ndarray:
-        """First and last row of each stretch, shape (n, 2)."""
+        """Return the first and last row of each stretch, shape (n, 2)."""
         found = np.concatenate([*self._parts, np.empty((0, 2), dtype=np.int64)])
         begins = np.append(True, found[1:, 0] != found[:-1, 1] + 1)[: len(found)]
         return np.column_stack([found[begins, 0], found[np.append(begins[1:], True)[: len(found)], 1]])
 
 
 def stretches(places: np.ndarray) -> np.ndarray:
-    """Ascending places as stretches without a gap: first and last of each, shape (n, 2)."""
+    """Return the first and last of each stretch of consecutive ascending places, shape (n, 2)."""
     begins = np.diff(places, prepend=-2) != 1
     return np.column_stack([places[begins], places[np.append(begins[1:], True)[: len(places)]]])
 
 
 @dataclass
 class Followed:
-    """What became of the rows.
+    """Result of the comparison of rows.
 
     Attributes:
         sent: Number of rows that were sent.
         recorded: Number of rows that were recorded.
-        last_row: Number of the last recorded row that is one of those sent; -1 if none is.
-        first, last: The earliest and the latest row that came, by its place among those sent; -1 if none did.
-        doubled: Places of rows that came once more, and numbers of the recorded rows, int64, shape (n, 2).
-        swapped: Places of rows that came behind later ones, and numbers of the recorded rows, shape (n, 2).
-        altered: Of each channel the rows whose value is another.
-        foreign: Numbers of recorded rows that are none of those sent, shape (n,).
-        lost: First and last place of stretches between the first and the last row that did not come, shape (n, 2).
+        last_row: Number of the last recorded row that was sent, or -1.
+        first, last: Earliest and latest received row, by its place among those sent, or -1.
+        doubled: Places of repeatedly received rows, and numbers of the recorded rows, int64, shape (n, 2).
+        swapped: Places of rows received after later ones, and numbers of the recorded rows, shape (n, 2).
+        altered: Rows with a different value, by channel.
+        foreign: Numbers of recorded rows that were not sent, shape (n,).
+        lost: First and last place of stretches between the first and the last row that are missing, shape (n, 2).
     """
 
     sent: int = 0
@@ -141,7 +141,7 @@ class Followed:
 
 
 class _Sent:
-    """The rows near by, of those that were sent, and how often each came; of those let go, which did not."""
+    """Sent rows nearby, with the number of times each was received, and the missing ones among those before them."""
 
     def __init__(self, chunks: Iterable[np.ndarray], by: np.ndarray) -> None:
         self._chunks = iter(chunks)
@@ -152,14 +152,14 @@ class _Sent:
         self.times, self.absent = np.empty(0, dtype=np.uint8), Stretches()
         self.by = by
 
-    def know(self, by: np.ndarray) -> None:
-        """Know rows by other columns than before."""
+    def set_columns(self, by: np.ndarray) -> None:
+        """Set the columns by which rows are identified."""
         if not np.array_equal(by, self.by):
             self.by = by
             self.hashes = row_hashes(self.counts[:, by])
 
-    def hold(self, begin: int, end: int) -> None:
-        """Have rows from one place to another, as far as there are any; those before are let go."""
+    def read_range(self, begin: int, end: int) -> None:
+        """Read rows from one place to another, as far as there are any, and release those before."""
         fresh = []
         while self.end < end and not self.ended:
             chunk = next(self._chunks, None)
@@ -183,31 +183,31 @@ class _Sent:
 def follow(
     sent: Iterable[np.ndarray], recorded: Iterable[np.ndarray], sound: int, start: int = 0
 ) -> Iterator[tuple[np.ndarray, Followed]]:
-    """Follow recorded rows among those sent.
+    """Compare recorded rows with those sent.
 
     Args:
         sent: Counts in chunks, int64, shape (n, channels).
-        recorded: The same of the recorded ones; `NO_COUNT` where a value is no count.
-        sound: Rows are known by so many of the first channels; the others are compared alone.
-        start: Place at which the first recorded row is due.
+        recorded: Recorded counts in chunks; `NO_COUNT` for other values.
+        sound: Number of first channels by which rows are identified; the others are only compared.
+        start: Place at which the first recorded row is expected.
 
     Yields:
-        Place of each recorded row among those sent, -1 of a foreign one, shape (n,), chunk by chunk; and what has been
-        found up to there, whose arrays are complete with the last chunk, which has no rows.
+        Place of each recorded row among those sent, -1 for a foreign one, shape (n,), chunk by chunk; and the results
+        up to there, whose arrays are complete with the last chunk, which has no rows.
     """
     window, found = _Sent(sent, np.arange(sound)), Followed()
     events: dict[str, list[np.ndarray]] = {"doubled": [], "swapped": [], "foreign": []}
     due, highest = start, -1
-    for place in range(0, start - _BACK, 1 << 18):
-        window.hold(place, place + (1 << 18))
+    for place in range(0, start - _SEARCH_BACK, 1 << 18):
+        window.read_range(place, place + (1 << 18))
     for chunk in recorded:
-        found.altered = found.altered or [Stretches(_MOST_STRETCHES) for _ in range(chunk.shape[1])]
+        found.altered = found.altered or [Stretches(_MAX_STRETCHES) for _ in range(chunk.shape[1])]
         before = np.array([each.rows for each in found.altered])
         hashes = row_hashes(chunk[:, window.by])
         places = np.empty(len(chunk), dtype=np.int64)
-        at, low = 0, due - _BACK
+        at, low = 0, due - _SEARCH_BACK
         while at < len(chunk):
-            window.hold(low, due + len(chunk) - at)
+            window.read_range(low, due + len(chunk) - at)
             near = window.hashes[due - window.start : due - window.start + len(chunk) - at]
             same = near == hashes[at : at + len(near)]
             equal = len(near) if same.all() else int(np.argmin(same))
@@ -215,17 +215,17 @@ def follow(
             at, due = at + equal, due + equal
             if at < len(chunk):
                 part = slice(at, at + _PART)
-                places[part] = _look_up(window, hashes[part], due, low)
+                places[part] = _search_places(window, hashes[part], due, low)
                 at = min(at + _PART, len(chunk))
                 known = places[part][places[part] >= 0]
                 due = int(known[-1]) + 1 if len(known) else due + at - part.start
-        highest = _note(found, events, places, chunk, window, highest)
+        highest = _count_events(found, events, places, chunk, window, highest)
         wrong = np.array([each.rows for each in found.altered]) - before
-        by = np.flatnonzero(wrong[:sound] < _BROKEN * len(chunk))
-        window.know(by if len(by) else np.arange(sound))
+        by = np.flatnonzero(wrong[:sound] < _MAX_ALTERED_PART * len(chunk))
+        window.set_columns(by if len(by) else np.arange(sound))
         yield places, found
     while not window.ended:
-        window.hold(window.end, window.end + 1)
+        window.read_range(window.end, window.end + 1)
     window.absent.add(np.flatnonzero(window.times == 0) + window.start)
     found.sent = window.end
     lost = window.absent.pairs()
@@ -236,38 +236,38 @@ def follow(
     yield np.empty(0, dtype=np.int64), found
 
 
-def _look_up(window: _Sent, hashes: np.ndarray, due: int, low: int) -> np.ndarray:
-    """Return places of rows; search farther ahead where few of the last are found, or some may lie beyond."""
-    ahead = _AHEAD
+def _search_places(window: _Sent, hashes: np.ndarray, due: int, low: int) -> np.ndarray:
+    """Return the places of rows; search farther ahead if few of the last are found, or some may be beyond."""
+    ahead = _SEARCH_AHEAD
     while True:
         high = due + len(hashes) + ahead
-        window.hold(low, high)
-        places, known = _places(window, hashes, due, max(low, due - _BACK), high)
+        window.read_range(low, high)
+        places, known = _find_places(window, hashes, due, max(low, due - _SEARCH_BACK), high)
         found = np.flatnonzero(places >= 0)
         inside = len(found) and places[found[-1]] + len(hashes) - found[-1] <= high
         ended = window.ended and high >= window.end
-        if (inside and known[-len(hashes) // 2 :].mean() > 0.5) or ended or ahead >= _MOST_AHEAD:
+        if (inside and known[-len(hashes) // 2 :].mean() > 0.5) or ended or ahead >= _MAX_SEARCH_AHEAD:
             return places
         ahead *= 8
 
 
-def _places(window: _Sent, hashes: np.ndarray, due: int, low: int, high: int) -> tuple[np.ndarray, np.ndarray]:
-    """Place of each row from one to another, and whether it is known by itself; -1 if it is none of them."""
+def _find_places(window: _Sent, hashes: np.ndarray, due: int, low: int, high: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return each row's place in a range, -1 if it has none, and whether it is identified without its neighbours."""
     start = max(window.start, low)
     nearby = window.hashes[start - window.start : high - window.start]
-    if not len(nearby):  # all are due after the last one
+    if not len(nearby):  # all are expected after the last one
         return np.full(len(hashes), -1, dtype=np.int64), np.zeros(len(hashes), dtype=bool)
     end = start + len(nearby)
     n, rows = len(hashes), np.arange(len(hashes))
     places = np.full(n, -1, dtype=np.int64)
     ranks = {}
-    for level, (there, here) in enumerate(((nearby, hashes), (grams(nearby), grams(hashes)))):
+    for level, (there, here) in enumerate(((nearby, hashes), (group_hashes(nearby), group_hashes(hashes)))):
         order = np.argsort(there, kind="stable")
         ordered = there[order]
         left, right = np.searchsorted(ordered, here), np.searchsorted(ordered, here, side="right")
         alone = (right - left == 1) & (places < 0)
         if level:
-            alone &= rows <= n - _GRAM
+            alone &= rows <= n - _GROUP_ROWS
         places[alone] = order[left[alone]] + start
         if not level:
             ranks = {"order": order, "ordered": ordered, "left": left, "right": right}
@@ -285,15 +285,15 @@ def _places(window: _Sent, hashes: np.ndarray, due: int, low: int, high: int) ->
         right_one = inside & (nearby[at] == hashes[open_])
         places[open_[right_one]] = guess[right_one]
     left = np.flatnonzero(places[open_] < 0)
-    if window.ended and end == window.end:  # rows that are due after the last one are not those of earlier periods
+    if window.ended and end == window.end:  # rows after the last one are not those of earlier periods
         left = left[forward[left] < end]
     if len(left):
-        if not known.any():  # of a periodic signal: all follow the first one
-            _by_nearest(places, open_[left[:1]], forward[left[:1]], ranks, start)
+        if not known.any():  # a periodic signal: all rows follow the first one
+            _place_nearest(places, open_[left[:1]], forward[left[:1]], ranks, start)
             forward[left] += max(0, places[open_[left[0]]] - forward[left[0]])
-        _by_nearest(places, open_[left], forward[left], ranks, start)
+        _place_nearest(places, open_[left], forward[left], ranks, start)
     left = np.flatnonzero(places[open_] < 0)
-    # What is none of the rows near by and stands where one is due is that one, altered.
+    # An unidentified row at the place of an expected one is that row, altered.
     stop = np.where(next_[left] < n, places[np.minimum(next_[left], n - 1)], end)
     fits = (forward[left] < stop) & (forward[left] < end)
     places[open_[left[fits]]] = forward[left[fits]]
@@ -301,25 +301,25 @@ def _places(window: _Sent, hashes: np.ndarray, due: int, low: int, high: int) ->
 
 
 def _forget_chance_places(places: np.ndarray, due: int, end: int) -> None:
-    """Take back places of rows behind the last one that was sent, unless all of them follow earlier rows in long runs.
+    """Remove places of rows after the last one that was sent, unless all of them follow earlier rows in long runs.
 
-    What follows a session resembles it where its signal repeats, so that many rows are equal by chance.
+    Rows after a session resemble it if its signal repeats, so that many are equal by chance.
     """
     after = 0 if due >= end else len(places) if (last := np.flatnonzero(places == end - 1)).size == 0 else last[0] + 1
     rest = places[after:]
     begins = np.flatnonzero(np.diff(rest, prepend=-3) != 1)
-    if len(rest) and np.diff(np.append(begins, len(rest))).min() < min(_RUN, len(rest)):
+    if len(rest) and np.diff(np.append(begins, len(rest))).min() < min(_MIN_RUN, len(rest)):
         rest[:] = -1
 
 
-def _by_nearest(places: np.ndarray, rows: np.ndarray, guess: np.ndarray, ranks: dict, start: int) -> None:
-    """Rows that several are equal to: the one that is nearest to where it is due."""
+def _place_nearest(places: np.ndarray, rows: np.ndarray, guess: np.ndarray, ranks: dict, start: int) -> None:
+    """Set the place of rows that equal several sent ones to the one nearest to the expected place."""
     left, right, order = ranks["left"][rows], ranks["right"][rows], ranks["order"]
     several = right > left
     rows, guess, left, right = rows[several], guess[several] - start, left[several], right[several]
     if not len(rows):
         return
-    # Places ascend among equal hashes: one search for all in numbers that have hash and place.
+    # Places ascend among equal hashes: one search for all, in numbers that combine hash and place.
     ordered = ranks["ordered"]
     group = np.cumsum(np.concatenate([[True], ordered[1:] != ordered[:-1]]))
     whole = group * (len(order) + 1) + order
@@ -329,11 +329,11 @@ def _by_nearest(places: np.ndarray, rows: np.ndarray, guess: np.ndarray, ranks: 
     places[rows] = np.where(nearer, order[low], order[high]) + start
 
 
-def _note(
+def _count_events(
     found: Followed, events: dict[str, list[np.ndarray]], places: np.ndarray, counts: np.ndarray, window: _Sent,
     highest: int,
 ) -> int:  # fmt: skip
-    """Count what has come of a chunk; returns the latest place of all."""
+    """Count the events of a chunk; return the latest place of all."""
     numbers = found.recorded + np.arange(len(places))
     found.recorded += len(places)
     real = places >= 0
@@ -344,7 +344,7 @@ def _note(
     found.last_row = int(numbers[-1])
     near, there = came - window.start, window.times
     tops = np.maximum.accumulate(np.concatenate([[highest], came]))
-    if (np.diff(tops) > 0).all():  # each later than all before: neither doubled nor swapped
+    if (np.diff(tops) > 0).all():  # ascending: neither doubled nor swapped
         there[near] = 1
     else:
         again = there[near] > 0

@@ -1,4 +1,4 @@
-"""Scale of a recorded channel: how its values come from the rig's counts, with as many bits as the DAQ has."""
+"""Scale of a recorded channel: the relation of its values to the rig's counts, with the DAQ's number of bits."""
 
 from __future__ import annotations
 
@@ -12,35 +12,35 @@ from replays.score.records.rows import NO_COUNT
 from rig.base import units
 from rig.channels.table import Channel
 
-_NEAR = 0.49
-"""Part of a count by which a recorded one may be off a whole number: rounding of the file."""
-_REFITTED = 8
+_COUNT_TOLERANCE = 0.49
+"""Largest deviation of a recorded count from a whole number, due to rounding in the file."""
+_MAX_REFITTED = 8
 """Stretches on which a scale is fitted although a known one explains others."""
-_PIECE = 512
-"""Most consecutive rows on which a scale is found: a row may be lost before and behind them."""
-_ENOUGH = 0.99
+_PIECE_ROWS = 512
+"""Most consecutive rows on which a scale is found, as rows before and after them may be lost."""
+_MIN_EXPLAINED_PART = 0.99
 """Part of the rows of such a stretch that a scale must explain."""
 _MIN_BITS = 8
 """Bits of the coarsest DAQ that is judged by its counts."""
 COUNTS = ("count", "counts", "lsb", "LSB", "code", "codes", "raw", "FS")
-"""Units by which files name counts."""
+"""Names of counts as a unit in files."""
 _BITS_ROWS = 1 << 12
-"""Values by which the bits that a DAQ leaves out are found."""
+"""Values by which a DAQ's unused bits are found."""
 
 
 @dataclass(frozen=True)
 class Scale:
-    """How recorded values come from counts: value = each * count + zero.
+    """Relation of recorded values to counts: value = each * count + zero.
 
     Attributes:
-        each, zero: The two, in the unit of the file.
+        each, zero: Value per count, and value of count 0 [unit of the file].
         what: Counts, the channel's unit, volts, or fitted.
-        gain_ppm, zero_counts: How far off that they are.
-        turned: Whether it has the other sign.
-        known: Whether some rows have shown it; otherwise it is what the file's unit says.
-        bits, lost_bits: Of the DAQ's converter, and how many lowest ones of the rig's it leaves out.
-        rounding: How it leaves them out: down, nearest (halves up), nearest even, or full scale (2^(bits - 1) - 1 for
-            1); empty where it has all.
+        gain_ppm, zero_counts: Errors of the two.
+        turned: Whether the sign is inverted.
+        known: Whether some rows have confirmed it; if not, it follows from the file's unit.
+        bits, lost_bits: Bits of the DAQ's converter, and number of the rig's lowest bits that it leaves out.
+        rounding: Rounding of the left-out bits: down, nearest (halves up), nearest even, or full scale
+            (2^(bits - 1) - 1 for 1); empty if it has all bits.
     """
 
     each: float
@@ -56,11 +56,11 @@ class Scale:
 
     @property
     def clean(self) -> bool:
-        """Whether neither its gain nor its zero is off."""
+        """True if its gain and its zero are both correct."""
         return not self.gain_ppm and not self.zero_counts
 
     def sent(self, counts: np.ndarray) -> np.ndarray:
-        """Return the counts that a DAQ of this converter makes of those of the rig, int64, shape (n,)."""
+        """Return the counts of a DAQ with this converter for those of the rig, int64, shape (n,)."""
         top = (1 << max(0, self.bits - 1)) - 1
         if self.rounding == "full scale":
             return np.rint(counts * (top / 2.0 ** (self.bits + self.lost_bits - 1))).astype(np.int64)
@@ -70,20 +70,20 @@ class Scale:
         return np.minimum(counts + half >> self.lost_bits, top) if self.rounding else counts
 
     def counts(self, values: np.ndarray) -> np.ndarray:
-        """The counts of values, int64, shape (n,); `NO_COUNT` where a value is none."""
+        """Return the counts of values, int64, shape (n,); `NO_COUNT` if a value is not a count."""
         found = (values - self.zero) / self.each
         whole = np.rint(found)
-        good = np.isfinite(found) & (np.abs(found - whole) <= _NEAR) & (np.abs(whole) < 2.0**53)
+        good = np.isfinite(found) & (np.abs(found - whole) <= _COUNT_TOLERANCE) & (np.abs(whole) < 2.0**53)
         return np.where(good, np.where(good, whole, 0.0).astype(np.int64), NO_COUNT)
 
 
 def find_scale(values: np.ndarray, unit: str, counts: np.ndarray, channel: Channel) -> Scale | None:
-    """The scale of a channel; None where its counts cannot be told from what the file has.
+    """Return the scale of a channel; None if its counts cannot be recovered from the file.
 
     Args:
-        values: Recorded [unit of the file], shape (n,).
-        unit: That unit; empty where the file tells none.
-        counts: Of the same rows as far as none is lost, shape (n,).
+        values: Recorded values [unit of the file], shape (n,).
+        unit: That unit; empty if the file has none.
+        counts: Counts of the same rows, provided that none is lost, shape (n,).
         channel: The channel.
     """
     known, found = scales(unit, channel, values, counts), list[tuple[bool, float, Scale]]()
@@ -97,31 +97,31 @@ def find_scale(values: np.ndarray, unit: str, counts: np.ndarray, channel: Chann
 
 
 def _fit_scale(values: np.ndarray, counts: np.ndarray, candidates: list[Scale]) -> Scale | None:
-    """Return the scale by which values come from the DAQ's counts, of candidates for these; None if there is none."""
-    size = min(_PIECE, max(8, len(values) // 4))
+    """Return the scale between values and the DAQ's counts, with candidates for these, or None."""
+    size = min(_PIECE_ROWS, max(8, len(values) // 4))
     whole = len(values) // size * size
     pieces = [slice(n, n + size) for n in range(0, whole, size)]
-    # Rows that are as most are show nothing of a scale.
+    # Rows with the most frequent count show nothing of a scale.
     there = counts[:whole].reshape(-1, size)
     moving = there != np.median(there, axis=1, keepdims=True) if whole else np.zeros(there.shape, bool)
     movable = moving.sum(axis=1)
 
     def show(scale: Scale, some: slice) -> np.ndarray:
-        """Return which of some pieces a scale explains, shape (pieces,)."""
+        """Return whether a scale explains each of some pieces, shape (pieces,)."""
         same = scale.counts(values[:whole].reshape(-1, size)[some]) == there[some]
         part = (same & moving[some]).sum(axis=1) / np.maximum(movable[some], 1)
-        return np.minimum(same.mean(axis=1), part) >= _ENOUGH
+        return np.minimum(same.mean(axis=1), part) >= _MIN_EXPLAINED_PART
 
     shown = [np.flatnonzero(show(scale, slice(None))).tolist() for scale in candidates]
     best = max(range(len(candidates)), key=lambda n: len(shown[n]))
-    # A small gain shows where counts are large: the pieces with the largest counts come first.
+    # A small gain error shows at large counts: the pieces with the largest counts come first.
     others = [n for n in range(len(pieces)) if n not in shown[best]]
     others.sort(key=lambda n: -int(np.abs(counts[pieces[n]]).max()))
-    for n in others[: _REFITTED if shown[best] else None]:
+    for n in others[: _MAX_REFITTED if shown[best] else None]:
         x, y = counts[pieces[n]].astype(float), values[pieces[n]]
         if not np.isfinite(y).all() or not np.ptp(x):
             continue
-        # The line of least squares.
+        # Least-squares line.
         off, mean = x - x.mean(), float(y.mean())
         each = float(off @ (y - mean) / (off @ off))
         fitted = Scale(each, mean - each * float(x.mean()), "fitted")
@@ -136,22 +136,23 @@ def _fit_scale(values: np.ndarray, counts: np.ndarray, candidates: list[Scale]) 
 
 
 def _judge_fit(fitted: Scale, values: np.ndarray, counts: np.ndarray, candidates: list[Scale]) -> Scale:
-    """Return the scale of all rows that a first one explains, and how far its gain and zero are off the nearest known.
+    """Return the scale of all rows that a first one explains, with the errors of its gain and zero.
 
-    Either a gain or a zero is taken where it alone leaves as little as both: a channel with little spread about a large
-    mean has its gain from the mean. What the digits of the file leave open is neither.
+    The errors are relative to the nearest candidate. A gain or a zero error is assumed alone if its residual is as
+    small as with both: a channel with little variation about a large mean has its gain from the mean. Differences
+    below the resolution of the file count as neither.
     """
     near = min(candidates, key=lambda one: abs(math.log(abs(fitted.each / one.each))))
     same = fitted.counts(values) == counts
     x, sign = counts[same].astype(float), 1.0 if fitted.each / near.each > 0.0 else -1.0
     off = (sign * values[same] - near.zero) / near.each - x
-    x += near.zero / near.each  # a gain acts on values, which are zero there
+    x += near.zero / near.each  # a gain error acts on values, which are zero there
     mean = float(x.mean())
     slope = fit_line(x, off).slope
     alone = float(off @ x / (x @ x)) if x.any() else 0.0
     forms = ((0.0, 0.0), (alone, 0.0), (0.0, float(off.mean())), (slope, float(off.mean()) - slope * mean))
     left = [float(np.sqrt(np.mean((off - gain * x - zero) ** 2))) for gain, zero in forms]
-    # Rounding of 64-bit numbers, and a tenth more than the least.
+    # 64-bit rounding, and a tenth more than the least.
     enough = max(1.1 * left[-1], 1e-14 * (float(np.abs(x).max()) + abs(near.zero / near.each)))
     gain, zero = next(form for form, each in zip(forms, left, strict=True) if each <= enough)
     if (gain, zero) == (0.0, 0.0):
@@ -168,22 +169,22 @@ def _judge_fit(fitted: Scale, values: np.ndarray, counts: np.ndarray, candidates
 
 
 def scales(unit: str, channel: Channel, values: np.ndarray, counts: np.ndarray) -> list[Scale]:
-    """Return the scales that a sound DAQ may have, those with all bits of the rig's converter first.
+    """Return the possible scales of a sound DAQ, those with all bits of the rig's converter first.
 
     Args:
-        unit: Of the file; empty where it tells none.
+        unit: Unit of the file; empty if it has none.
         channel: The channel.
-        values: Some recorded ones [unit of the file], shape (n,).
-        counts: Some of those sent, shape (m,).
+        values: Some recorded values [unit of the file], shape (n,).
+        counts: Some of the counts that were sent, shape (m,).
     """
-    told, kind, bits = units.canonical(unit) != "1", units.kind(unit), channel.adc_bits
-    found = [Scale(1.0, 0.0, "counts")] if kind == "" or not told else []
-    if not told or kind == units.kind(channel.unit):
-        size = units.size_si(channel.unit) / units.size_si(unit) if told else 1.0
+    has_unit, kind, bits = units.canonical(unit) != "1", units.kind(unit), channel.adc_bits
+    found = [Scale(1.0, 0.0, "counts")] if kind == "" or not has_unit else []
+    if not has_unit or kind == units.kind(channel.unit):
+        size = units.size_si(channel.unit) / units.size_si(unit) if has_unit else 1.0
         found.append(Scale(channel.scale * size, channel.offset * size, channel.unit))
-    if not told or kind == "voltage":
-        found.append(Scale(channel.lsb_v / (units.size_si(unit) if told else 1.0), 0.0, "V"))
-    if not told:
+    if not has_unit or kind == "voltage":
+        found.append(Scale(channel.lsb_v / (units.size_si(unit) if has_unit else 1.0), 0.0, "V"))
+    if not has_unit:
         found.append(Scale(2.0 ** (1 - bits), 0.0, "fractions of full scale"))
         found += [Scale(2.0 ** (32 - bits), 0.0, "counts at the upper end of 32 bits")] if bits < 32 else []
     found = found or [Scale(1.0, 0.0, "counts")]
@@ -210,9 +211,9 @@ def scales(unit: str, channel: Channel, values: np.ndarray, counts: np.ndarray) 
 
 
 def _lost_bits(numbers: np.ndarray, most: int) -> int:
-    """Return how many of their lowest bits nearly all numbers leave out."""
+    """Return the number of lowest bits that nearly all numbers leave out."""
     for lost in range(most, 0, -1):
         whole = np.rint(numbers / 2.0**lost)
-        if np.ptp(whole) > 1.0 and np.mean(np.abs(numbers / 2.0**lost - whole) <= 0.1) >= _ENOUGH:
+        if np.ptp(whole) > 1.0 and np.mean(np.abs(numbers / 2.0**lost - whole) <= 0.1) >= _MIN_EXPLAINED_PART:
             return lost
     return 0

@@ -1,4 +1,4 @@
-"""What the rig sent, from its session: all rows, every n-th, or one channel as a signal."""
+"""Samples that the rig sent, from its session: all rows, every n-th one, or one channel as a signal."""
 
 from __future__ import annotations
 
@@ -23,22 +23,22 @@ from rig.run.scenes import Scene, parse_scene
 
 Formula = Callable[[np.ndarray], np.ndarray]
 
-_PART = 1 << 16
+_CHUNK_ROWS = 1 << 16
 _SMOOTH = ("sine", "two-tone", "chirp", "multisine", "quiet", "recorded")
-"""Test signals that are known between samples; in the others an instant lies on this or that side of a jump."""
-LOUD = 4.0
-"""Noises of a channel from which its signal must be found."""
-_EARLY_S = 30.0
-"""So much of a session is looked through for where a recording begins [s]."""
+"""Test signals that are known between samples; the others jump, at an instant known to a sample only."""
+MIN_SIGNAL_NOISES = 4.0
+"""Smallest level of a channel's signal, over its noise, at which the signal must be found."""
+_BEGIN_SEARCH_S = 30.0
+"""Length of a session in which the begin of a recording is searched [s]."""
 
 
 class Session:
-    """What the rig sent.
+    """Samples that the rig sent, and their origin.
 
     Attributes:
-        path, recording: The file, and what is in it.
-        channels: Its channels by name.
-        groups: Its groups that have rows, with the names of their channels.
+        path, recording: The file, and its content.
+        channels: Channels by name.
+        groups: Groups that have rows, with the names of their channels.
     """
 
     def __init__(self, paths: Sequence[Path]) -> None:
@@ -63,19 +63,19 @@ class Session:
         self._firsts: dict[str, tuple[int, float]] = {}
 
     def _first(self, group: str) -> tuple[int, float]:
-        """Return the number of a group's first row and its rate [Hz], which are asked for at each trial."""
+        """Return the number of a group's first row and its rate [Hz], kept for repeated use."""
         if group not in self._firsts:
             block = next(self.recording.blocks(sensor_key(group)))
             self._firsts[group] = int(block.index), block.rate_hz
         return self._firsts[group]
 
     def rate_hz(self, group: str) -> float:
-        """Rows a second of a group [Hz]."""
+        """Return the sampling rate of a group [Hz]."""
         return self._first(group)[1]
 
     @cached_property
     def scene(self) -> Scene | None:
-        """What made it; None where that cannot be told."""
+        """Scene of the session; None if unknown."""
         try:
             return parse_scene(self.recording.scene.get("scene") or {})
         except InputError:
@@ -83,62 +83,62 @@ class Session:
 
     @property
     def trigger_s(self) -> float | None:
-        """When the first command took effect, by which a DAQ may be triggered [s]; None if there was none."""
+        """Time at which the first command took effect, as a trigger of a DAQ [s], or None."""
         ticks = [event["tick"] for event in self.recording.events if event.get("event") in TRIGGERS]
         return ticks[0] / TICKS_HZ if ticks else None
 
     @property
     def wall_s(self) -> float | None:
-        """Wall time at which what was sent at time zero came to its recorder [unix s]; None where that is not told."""
+        """Wall time at which the recorder received what was sent at time zero [unix s]; None if unknown."""
         clock = self.recording.clock
         return float(np.median(clock[:, 1] - clock[:, 0])) if len(clock) else None
 
     def arrived_s(self, groups: Sequence[str], times_s: np.ndarray) -> np.ndarray:
-        """When the rows of some times were there of all of some groups, by their blocks [unix s], shape (n,)."""
+        """Return the arrival times of rows of all of some groups, by their blocks [unix s], shape (n,)."""
         found = []
         for group in groups:
             if group not in self._blocks:
                 key, of = sensor_key(group), self.recording.everything()
                 self._blocks[group] = np.array([(at, wall) for topic, at, wall, _ in of if topic == key]).T * 1e-9
             begins_s, wall_s = self._blocks[group]
-            # A row's time is rounded otherwise than that of its block.
+            # The rounding of a row's time differs from that of its block's time.
             at = np.searchsorted(begins_s, times_s + 0.5 / self.rate_hz(group), side="right") - 1
             found.append(wall_s[np.maximum(at, 0)])
         return np.max(found, axis=0)
 
     @property
     def noisy(self) -> bool:
-        """Whether its samples have the channels' noise, as far as is known."""
+        """True if the samples have the channels' noise, which is assumed if unknown."""
         return self.scene is None or self.scene.sensors.noise
 
     def formulas(self) -> dict[str, Formula]:
-        """What test signals were at the converters by channel: value [unit] of times [s]; not of those that jump."""
+        """Return the smooth test signals at the converters by channel: functions from times [s] to values [unit]."""
         if self.scene is None or self.scene.generator is None:
             return {}
         made = self.scene.sources()
         return {name: _formula(made[name]) for name in self.channels if made[name].signal.kind in _SMOOTH}
 
     def place(self, name: str) -> int:
-        """Column of a channel in its group."""
+        """Return the column of a channel in its group."""
         return self.groups[self.channels[name].group].index(name)
 
     def early(self, group: str) -> tuple[int, np.ndarray]:
-        """Number of the first row of a group, and counts of its first seconds, shape (n, channels)."""
-        return self._first(group)[0], self.stretch(group, 0, round(_EARLY_S * self.rate_hz(group)))
+        """Return the number of the first row of a group, and the counts of its first seconds, shape (n, channels)."""
+        return self._first(group)[0], self.stretch(group, 0, round(_BEGIN_SEARCH_S * self.rate_hz(group)))
 
     def rows(self, group: str) -> int:
         """Return the number of rows of a group."""
         return self.recording.streams[sensor_key(group)].rows
 
     def stretch(self, group: str, place: int, rows: int) -> np.ndarray:
-        """Return counts of some rows of a group from a place on, as far as there are any, shape (n, channels)."""
+        """Return the counts of some rows of a group from a place, as far as there are any, shape (n, channels)."""
         if (group, place, rows) not in self._stretches:
             parts = Sent(self, [group])
             self._stretches = {(group, place, rows): take_rows(parts, place, rows, len(parts.names))}
         return self._stretches[group, place, rows]
 
     def whole(self, name: str) -> tuple[np.ndarray, float, float]:
-        """All of one channel in its unit, time of the first row [s], and rate [Hz].
+        """Return all values of a channel in its unit, the time of the first row [s], and the rate [Hz].
 
         Raises:
             InputError: Rows are missing.
@@ -153,11 +153,11 @@ class Session:
         return values[:, self.place(name)], first_s, rate_hz
 
     def is_loud(self, name: str, ends_s: Sequence[float]) -> bool:
-        """Return whether a channel's signal is well above its noise between two times [s] of the session."""
+        """Return whether a channel's signal is well above its noise between two times of the session [s]."""
         channel, (sent, first_s, rate_hz) = self.channels[name], self.whole(name)
         rows = [round((each - first_s) * rate_hz) for each in (min(ends_s), max(ends_s))] if ends_s else [0, len(sent)]
         part = sent[max(0, rows[0]) : max(0, rows[1])]
-        least = LOUD * math.hypot(channel.noise_v, channel.lsb_v) / abs(channel.sensitivity_v)
+        least = MIN_SIGNAL_NOISES * math.hypot(channel.noise_v, channel.lsb_v) / abs(channel.sensitivity_v)
         return len(part) > 1 and float(np.std(part)) > least
 
 
@@ -172,16 +172,16 @@ def _formula(source: Source) -> Formula:
 
 
 class Sent:
-    """Rows of groups of one rate, those that all of them have: counts in chunks, int64, shape (n, channels).
+    """Rows that all of some groups of one rate have: counts in chunks, int64, shape (n, channels).
 
     Attributes:
         names: Channels of the columns.
-        rate_hz: Of these rows [Hz].
-        first_s: Time of the first row, once there has been one [s].
+        rate_hz: Rate of these rows [Hz].
+        first_s: Time of the first row, once one has been read [s].
     """
 
     def __init__(self, session: Session, groups: Sequence[str], step: int = 1, phase: int = 0) -> None:
-        """Take a session, which of its groups, and of their rows those whose number is the phase, modulo the step."""
+        """Select the rows of some groups whose number, modulo the step, is the phase."""
         self._session, self._groups, self._step, self._phase = session, groups, step, phase
         self.names = [name for group in groups for name in session.groups[group]]
         self.rate_hz, self.first_s = session.rate_hz(groups[0]) / step, math.nan
@@ -191,7 +191,7 @@ class Sent:
     def __iter__(self) -> Iterator[np.ndarray]:
         keys = {sensor_key(group): group for group in self._groups}
         columns = {group: range(len(self._session.groups[group])) for group in self._groups}
-        aligner = Aligner(columns, range(len(self.names)), _PART)
+        aligner = Aligner(columns, range(len(self.names)), _CHUNK_ROWS)
         rows, due = 0, None
         for key, block in self._session.recording.blocks_of(set(keys)):
             names = self._session.groups[keys[key]]
@@ -212,11 +212,11 @@ class Sent:
                 yield values.astype(np.int64)
 
     def numbers(self, places: np.ndarray) -> np.ndarray:
-        """The rig's own numbers of rows by their places among these, as far as they were read, shape (n,)."""
+        """Return the rig's numbers of rows by their places among these, as far as read, shape (n,)."""
         at = np.searchsorted(self._starts, places, side="right") - 1
         return (np.array(self._numbers)[at] + places - np.array(self._starts)[at]) * self._step + self._phase
 
     def since_s(self, places: np.ndarray) -> np.ndarray:
-        """How long after the first row they were sent, by their places [s], shape (n,)."""
+        """Return the times of rows after the first one, by their places [s], shape (n,)."""
         first = self.numbers(np.zeros(1, dtype=np.int64))
         return (self.numbers(places) - first) / (self.rate_hz * self._step)

@@ -1,4 +1,4 @@
-"""The known signal at any time, with its slope: from the samples of a session, or exact from a formula."""
+"""Known signal at any time, with its slope: interpolated from the samples of a session, or exact from a formula."""
 
 from __future__ import annotations
 
@@ -7,47 +7,47 @@ from typing import Any, Protocol, cast
 
 import numpy as np
 
-_FINER = 4
+_RATIO = 4
+"""Oversampling of the splines."""
 _HALF_TAPS, _KAISER, _CUTOFF = 64, 10.0, 0.97
 EDGE = _HALF_TAPS + 4
-"""Samples at each end between which nothing is told."""
+"""Samples at each end at which the signal is not interpolated."""
 _CHUNK = 1 << 18
-_SEGMENT, _SIGNAL = 512, 4.0
-"""Samples of a spectrum, and its power over that of noise from which it holds a signal."""
-_NARROWER, _SPLIT_TAPS = 0.9, 513
-"""A rate is too near to what was sent for anything to be above half of it from here on; and taps between the two."""
+_SEGMENT, _MIN_SIGNAL_TO_NOISE = 512, 4.0
+"""Samples of a spectrum, and its power over that of noise from which it contains a signal."""
+_MAX_RATE_PART, _SPLIT_TAPS = 0.9, 513
+"""Largest rate over the sent one, for a part above half of the rate to exist, and taps of the filter for this part."""
 
 
 class Stimulus(Protocol):
-    """A signal that is known at all times in a span.
+    """A signal that is known at all times of a span.
 
     Attributes:
-        span_s: From when to when [s].
+        span_s: First and last time [s].
     """
 
     span_s: tuple[float, float]
 
     def __call__(self, times_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Values and slopes [unit, unit/s] at ascending times in the span, each shape (n,)."""
+        """Return values and slopes [unit, unit/s] at ascending times in the span, each shape (n,)."""
         ...
 
 
 class Sampled:
-    """Samples with a band-limited signal between them.
+    """Band-limited signal through even samples.
 
-    Kaiser-windowed sinc to four times the rate, then quintic splines: `tests/unit/test_score.py` measures how
-    far off it is.
+    Kaiser-windowed sinc to four times the rate, then quintic splines; `tests/unit/test_score.py` measures the error.
     """
 
     def __init__(self, values: np.ndarray, first_s: float, rate_hz: float) -> None:
-        """Take even samples, shape (n,), the first at a time [s]."""
+        """Store even samples, shape (n,), with the time of the first one [s]."""
         self._values, self._first_s, self._rate_hz = values, first_s, rate_hz
         self._kept: tuple[int, int, Any] | None = None
         last_s = first_s + (len(values) - 1) / rate_hz
         self.span_s = (first_s + EDGE / rate_hz, last_s - EDGE / rate_hz)
 
     def __call__(self, times_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """As `Stimulus`."""
+        """Return values and slopes as `Stimulus` does."""
         at = (times_s - self._first_s) * self._rate_hz
         values, slopes = np.empty(len(at)), np.empty(len(at))
         for begin in range(0, len(at), _CHUNK):
@@ -57,69 +57,71 @@ class Sampled:
                 low = max(0, int(at[part].min()) - EDGE)
                 high = min(high, int(at[part].max()) + EDGE + 1)
             spline = self._spline(low, high)
-            place = (at[part] - low) * _FINER
+            place = (at[part] - low) * _RATIO
             values[part] = spline(place)
-            slopes[part] = spline(place, nu=1) * (_FINER * self._rate_hz)
+            slopes[part] = spline(place, nu=1) * (_RATIO * self._rate_hz)
         return values, slopes
 
-    def nearest(self, times_s: np.ndarray) -> np.ndarray:
-        """Return the sample next to each of some times [s], shape (n,)."""
+    def find_nearest(self, times_s: np.ndarray) -> np.ndarray:
+        """Return the sample nearest to each time [s], shape (n,)."""
         at = np.rint((times_s - self._first_s) * self._rate_hz).astype(int)
         return self._values[np.clip(at, 0, len(self._values) - 1)]
 
     def _spline(self, low: int, high: int) -> Any:
-        """Of some of the samples, by their place at four times the rate; the last one is kept."""
+        """Return a spline of some of the samples, by their place at four times the rate, kept until the next call."""
         from scipy.interpolate import make_interp_spline
         from scipy.signal import firwin, upfirdn
 
         if self._kept is None or self._kept[:2] != (low, high):
             window = cast(Any, ("kaiser", _KAISER))
-            taps = firwin(2 * _HALF_TAPS * _FINER + 1, _CUTOFF / _FINER, window=window) * _FINER
-            finer = upfirdn(taps, self._values[low:high], up=_FINER)[_HALF_TAPS * _FINER : -_HALF_TAPS * _FINER or None]
+            taps = firwin(2 * _HALF_TAPS * _RATIO + 1, _CUTOFF / _RATIO, window=window) * _RATIO
+            finer = upfirdn(taps, self._values[low:high], up=_RATIO)[_HALF_TAPS * _RATIO : -_HALF_TAPS * _RATIO or None]
             self._kept = low, high, make_interp_spline(np.arange(len(finer)), finer, k=5)
         return self._kept[2]
 
 
-def without_noise(values: np.ndarray, noise: float) -> np.ndarray:
-    """Return samples less what of them is white noise: of their short spectra only what stands out of it is kept.
+def remove_noise(values: np.ndarray, noise: float) -> np.ndarray:
+    """Return samples without most of their white noise, by a threshold on their short spectra.
 
-    A fit to noisy samples takes the slope of their noise for that of the signal, and its intervals are too small.
+    A fit to noisy samples takes the slope of the noise for that of the signal, and its intervals are too narrow.
 
     Args:
         values: Even samples, shape (n,).
-        noise: Of them [unit rms].
+        noise: Noise of the samples [unit rms].
     """
     from scipy.ndimage import uniform_filter
     from scipy.signal import istft, stft
 
     found = np.array(values, float)
-    told: dict[str, Any] = {"nperseg": _SEGMENT, "noverlap": 3 * _SEGMENT // 4}
+    options: dict[str, Any] = {"nperseg": _SEGMENT, "noverlap": 3 * _SEGMENT // 4}
     for begin in range(0, len(values) if len(values) > 2 * _SEGMENT else 0, _CHUNK):
         low, high = max(0, begin - _SEGMENT), min(len(values), begin + _CHUNK + _SEGMENT)
         middle = float(np.mean(values[low:high]))
-        _, _, spectra = stft(values[low:high] - middle, boundary="even", **told)
+        _, _, spectra = stft(values[low:high] - middle, boundary="even", **options)
         # The power of white noise in a line is its variance times the sum of the window's squares over its sum squared.
         level = noise**2 * 1.5 / _SEGMENT
-        spectra[uniform_filter(np.abs(spectra) ** 2, 3) < _SIGNAL * level] = 0.0
-        part = istft(spectra, **told)[1][begin - low : high - low] + middle
+        spectra[uniform_filter(np.abs(spectra) ** 2, 3) < _MIN_SIGNAL_TO_NOISE * level] = 0.0
+        part = istft(spectra, **options)[1][begin - low : high - low] + middle
         found[begin : begin + _CHUNK] = part[: len(found[begin : begin + _CHUNK])]
     return found
 
 
-def parted(stimulus: Stimulus, rate_hz: float, sent_hz: float, least: float) -> tuple[Sampled, Sampled, Sampled] | None:
-    """What of a signal is below half of a rate, what is above, and that a quarter of a period later.
+def split_at_rate(
+    stimulus: Stimulus, rate_hz: float, sent_hz: float, least: float
+) -> tuple[Sampled, Sampled, Sampled] | None:
+    """Return the part of a signal below half of a rate, the part above, and the latter a quarter of a period later.
 
     Args:
         stimulus: The signal.
         rate_hz: The rate [Hz].
-        sent_hz: Twice the highest frequency that it may have [Hz].
-        least: None is given where what is above is less than this [unit rms].
+        sent_hz: Twice the highest frequency that the signal may have [Hz].
+        least: Smallest part above for which the parts are returned; None if it is smaller [unit rms].
     """
     from scipy.signal import fftconvolve, firwin, hilbert
 
     low, high = stimulus.span_s
     rows = int((high - low) * 2.0 * sent_hz)
-    if rate_hz > _NARROWER * sent_hz or rows < 4 * _SPLIT_TAPS:
+    if rate_hz > _MAX_RATE_PART * sent_hz or rows < 4 * _SPLIT_TAPS:
         return None
     values, _ = stimulus(low + np.arange(rows) / (2.0 * sent_hz))
     taps = firwin(_SPLIT_TAPS, 0.5 * rate_hz, fs=2.0 * sent_hz, window=cast(Any, ("kaiser", _KAISER)))
@@ -133,15 +135,15 @@ def parted(stimulus: Stimulus, rate_hz: float, sent_hz: float, least: float) -> 
 
 
 class Exact:
-    """A formula of time, whose slope is a central difference: off by 2e-6 of it at half of the rate."""
+    """Signal by a formula of time; slope by central differences, with a relative error of 2e-6 at half of the rate."""
 
     def __init__(
         self, formula: Callable[[np.ndarray], np.ndarray], span_s: tuple[float, float], rate_hz: float
     ) -> None:
-        """Take a formula [unit] of times [s], when it holds, and the rate at which it is recorded [Hz]."""
+        """Store a formula [unit] of times [s], its span, and the rate at which the signal is recorded [Hz]."""
         self._formula, self.span_s, self._step_s = formula, span_s, 0.001 / rate_hz
 
     def __call__(self, times_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """As `Stimulus`."""
+        """Return values and slopes as `Stimulus` does."""
         f, h = self._formula, self._step_s
         return f(times_s), (f(times_s + h) - f(times_s - h)) / (2.0 * h)

@@ -1,4 +1,4 @@
-"""Which channel of the rig each recorded signal is, with which polarity and how late: by correlation, all at once."""
+"""Assignment of recorded signals to the rig's channels, with polarity and delay, by correlation of all pairs."""
 
 from __future__ import annotations
 
@@ -11,45 +11,45 @@ import numpy as np
 from replays.estimate.runs import true_runs
 from replays.estimate.spectra import correlation, spectrum
 
-_ALIKE, _CHANCE = 0.2, 6.0
-"""Correlation from which a signal counts as found, and times the root of its samples: few are by chance."""
-_DISTINCT = 0.95
-"""What correlates by more than this part of the best is not told from it."""
-_CLEAR = 0.98
-"""From which it needs no second look."""
-_QUIET = 1e-4
-"""Power of a stretch over that of the loudest one, from which it is compared in full: behind a hit, what rings on has
+_LIMIT, _CHANCE = 0.2, 6.0
+"""Correlation from which a signal counts as found: absolute, and times the square root of its samples."""
+_EQUAL_PART = 0.95
+"""Part of the best correlation above which another one is not distinguished from it."""
+_CLEAR_PART = 0.98
+"""Part of the best correlation above which another one counts as equal; as a correlation, no second search follows."""
+_MIN_POWER = 1e-4
+"""Power of a stretch over that of the loudest one, above which it is compared in full: the ringing after an impact has
 less than a hundredth."""
-_APART, _FAR_S = 3, 5e-3
-"""Samples that a signal may be off the others; and where nothing is much like it there, so long [s]."""
-_LAGS = 12
-"""Lags that are told beside the likeliest, at most."""
-_MOST = 1 << 17
-"""Samples of a signal that are correlated, at most."""
+_REACH, _WIDE_S = 3, 5e-3
+"""Search range of one signal about the common lag [samples], and the wider range if nothing is similar there [s]."""
+_MAX_LAGS = 12
+"""Largest number of lags that are returned in addition to the most probable one."""
+_MAX_SAMPLES = 1 << 17
+"""Largest number of samples of a signal that are correlated."""
 _PART_S = 30.0
-"""Part of a session that is searched at once [s]; parts overlap by a stretch."""
-_SURE = 0.7
-"""Median likeness of the signals from which another stretch is not tried."""
+"""Part of a session that is searched at a time [s]; parts overlap by a stretch."""
+_MEDIAN_LIKENESS = 0.7
+"""Median correlation of the signals above which no other stretch is tried."""
 _GRID_S = 0.01
-"""Steps by which the busiest stretch is looked for [s]."""
-_TAKEN_S = (2.0, 0.25)
-"""Stretches of a recording that are looked for, the second where clocks are apart, or rows lost, in the first."""
+"""Grid of the search for the busiest stretch [s]."""
+_STRETCHES_S = (2.0, 0.25)
+"""Lengths of the searched stretches [s]; the second one if clocks differ, or rows are lost, in the first."""
 
 
 @dataclass(frozen=True)
 class Wire:
-    """What one recorded signal is connected to.
+    """Connection of a recorded signal.
 
     Attributes:
-        channel: Name of the rig's channel; empty: none is like it.
+        channel: Name of the rig's channel; empty without a similar one.
         polarity: 1 or -1.
-        likeness: Its correlation, 0 to 1.
-        rivals: Other channels that are as alike.
-        turned: Whether the other polarity, at another time, is as alike: as of a sine.
-        late_s: Time in the session less time in the recording, of all signals together [s], ...
-        within_s: ... in this stretch of the recording [s].
-        others_s: What `late_s` might be as well, of what is nearly periodic.
-        own_s: The same as `late_s` of this signal alone, which may be somewhat off the others [s].
+        likeness: Correlation, 0 to 1.
+        rivals: Other channels with an equal correlation.
+        turned: Whether the opposite polarity at another time has an equal correlation, as for a sine.
+        late_s: Time in the session less time in the recording, common to all signals [s].
+        within_s: Stretch of the recording in which `late_s` was found [s].
+        others_s: Other possible values of `late_s`, for nearly periodic signals [s].
+        own_s: `late_s` of this signal alone, which may differ slightly [s].
     """
 
     channel: str
@@ -66,16 +66,16 @@ class Wire:
 def find_wires(
     recorded: Mapping[str, tuple[np.ndarray, float]], sent: Mapping[str, tuple[np.ndarray, float]]
 ) -> dict[str, Wire]:
-    """Connect recorded signals to what was sent.
+    """Connect recorded signals to those that were sent.
 
     Args:
-        recorded: Values and rate [Hz] of each by name, from the beginning of the file.
-        sent: The same of each channel of the rig, from the beginning of the session.
+        recorded: Values and rate [Hz] of each signal by name, from the beginning of the file.
+        sent: Values and rate [Hz] of each channel of the rig, from the beginning of the session.
 
     Returns:
         A wire for each recorded signal.
     """
-    long, short = _TAKEN_S
+    long, short = _STRETCHES_S
     best: dict[str, Wire] = {}
     length_s = max(len(values) / each for values, each in sent.values())
     found_s, here = 0.0, (0.0, dict(sent))
@@ -89,24 +89,24 @@ def find_wires(
                 for name, (values, each) in sent.items()
                 if rows[name].start < len(values)
             }
-            wires = {name: _later(wire, float(part_s)) for name, wire in _find(recorded, part, from_s, long).items()}
-            if all(wire.likeness > _CLEAR and not wire.others_s for wire in wires.values()):
+            wires = {name: _shift(wire, float(part_s)) for name, wire in _find(recorded, part, from_s, long).items()}
+            if all(wire.likeness > _CLEAR_PART and not wire.others_s for wire in wires.values()):
                 return wires
-            if _likeness_of(wires) > _likeness_of(best):
+            if _sum_likeness(wires) > _sum_likeness(best):
                 best, found_s, here = wires, from_s, (float(part_s), part)
-            if np.median([wire.likeness for wire in wires.values()]) > _CLEAR:
+            if np.median([wire.likeness for wire in wires.values()]) > _CLEAR_PART:
                 break
-        if np.median([wire.likeness for wire in best.values()]) > _SURE:
+        if np.median([wire.likeness for wire in best.values()]) > _MEDIAN_LIKENESS:
             break
     wires = best
     more = _find(recorded, here[1], _busiest_s(recorded, found_s, short), short)
-    more = {name: _later(wire, here[0]) for name, wire in more.items()}
+    more = {name: _shift(wire, here[0]) for name, wire in more.items()}
     alike = [sum(wire.likeness for wire in found.values()) for found in (wires, more)]
     first, second = (more, wires) if alike[1] > alike[0] else (wires, more)
     found = {}
     for name, wire in first.items():
         other = second[name]
-        # Clocks that are apart blur fast signals over the long stretch, and a slower channel then correlates better.
+        # Clocks that differ blur fast signals over the long stretch, and a slower channel then correlates better.
         of = max(wire, other, key=lambda each: each.likeness)
         found[name] = replace(
             of, late_s=wire.late_s, own_s=wire.own_s, within_s=wire.within_s,
@@ -115,24 +115,24 @@ def find_wires(
     return found
 
 
-def _likeness_of(wires: Mapping[str, Wire]) -> float:
+def _sum_likeness(wires: Mapping[str, Wire]) -> float:
     return float(np.nansum([wire.likeness for wire in wires.values()])) if wires else -1.0
 
 
-def _later(wire: Wire, shift_s: float) -> Wire:
-    """A wire to a part of the session that begins so much later [s]."""
+def _shift(wire: Wire, shift_s: float) -> Wire:
+    """Return a wire to a part of the session that begins later by a shift [s]."""
     others_s = tuple(each + shift_s for each in wire.others_s)
     return replace(wire, late_s=wire.late_s + shift_s, own_s=wire.own_s + shift_s, others_s=others_s)
 
 
 def _busiest_s(recorded: Mapping[str, tuple[np.ndarray, float]], from_s: float, taken_s: float) -> float:
-    """Begin of the stretch of some length where most signals vary most; a short one lies in a long one [s]."""
-    long, short = _TAKEN_S
+    """Return the begin of the stretch in which most signals vary most [s]; a short one lies in a long one."""
+    long, short = _STRETCHES_S
     within_s = long if taken_s == short else math.inf
     total: np.ndarray | None = None
     for values, each in recorded.values():
         part = np.nan_to_num(values[round(from_s * each) : round(min(from_s + within_s, 1e9) * each)])
-        if len(part) < 2:  # a stamp far from the others makes a rate of less than a row in the stretch
+        if len(part) < 2:  # outlying stamps: less than a row per stretch
             continue
         steps = np.add.reduceat(np.diff(part) ** 2, range(0, max(1, len(part) - 1), max(1, round(_GRID_S * each))))
         power = steps / max(float(steps.sum()), 1e-300)
@@ -149,33 +149,33 @@ def _find(
     recorded: Mapping[str, tuple[np.ndarray, float]], sent: Mapping[str, tuple[np.ndarray, float]], from_s: float,
     taken_s: float,
 ) -> dict[str, Wire]:  # fmt: skip
-    """Wires by a stretch of the recording."""
+    """Return wires found by a stretch of the recording."""
     recorded = {name: (values[round(from_s * each) :], each) for name, (values, each) in recorded.items()}
     rate = max(each for _, each in sent.values())
     length = max(len(values) / each for values, each in sent.values())
     taken_s = min(taken_s, max(len(values) / each for values, each in recorded.values()))
-    rate = min(rate, _MOST / taken_s, 8.0 * _MOST / length)
+    rate = min(rate, _MAX_SAMPLES / taken_s, 8.0 * _MAX_SAMPLES / length)
     behind = math.ceil(taken_s * rate) // 2
-    there, even = _spectra(sent, rate, length, math.ceil((length + taken_s) * rate))
-    taken = {name: _even(values, each, rate, taken_s) for name, (values, each) in recorded.items()}
-    lengths = {n: _lengths(even, behind, n) for n in {len(here) for here in taken.values()}}
+    there, even = _find_spectra(sent, rate, length, math.ceil((length + taken_s) * rate))
+    taken = {name: _resample(values, each, rate, taken_s) for name, (values, each) in recorded.items()}
+    lengths = {n: _stretch_norms(even, behind, n) for n in {len(here) for here in taken.values()}}
     names, found = list(sent), {}
     best: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
     ends: dict[str, tuple[np.ndarray, np.ndarray]] = {}
     for name, here in taken.items():
-        length = lengths[len(here)] / math.sqrt(_step(recorded[name][1], rate))
-        curve = _likeness(here, behind, there, length)
+        length = lengths[len(here)] / math.sqrt(_ratio(recorded[name][1], rate))
+        curve = _correlate(here, behind, there, length)
         alike = np.abs(curve).max(axis=0)
         own = np.abs(curve[names.index(name)]) if name in names else alike
-        best[name] = alike, own, curve.max(axis=0) >= _CLEAR * alike
+        best[name] = alike, own, curve.max(axis=0) >= _CLEAR_PART * alike
         ends[name] = curve.min(axis=1), curve.max(axis=1)
-    lags = _common_lags(list(best.values()), behind + round(from_s * rate))
+    lags = _find_common_lags(list(best.values()), behind + round(from_s * rate))
     lag = lags[0]
-    padded = np.pad(even, ((0, 0), (behind, max(map(len, taken.values())) + round(_FAR_S * rate) + _APART)))
+    padded = np.pad(even, ((0, 0), (behind, max(map(len, taken.values())) + round(_WIDE_S * rate) + _REACH)))
     for name, here in taken.items():
-        length = lengths[len(here)] / math.sqrt(_step(recorded[name][1], rate))
-        for apart in (_APART, round(_FAR_S * rate)):
-            first = max(0, min(lag, length.shape[1] - 1) - apart)  # nothing was found, far into the recording
+        length = lengths[len(here)] / math.sqrt(_ratio(recorded[name][1], rate))
+        for apart in (_REACH, round(_WIDE_S * rate)):
+            first = max(0, min(lag, length.shape[1] - 1) - apart)  # nothing was found, late in the recording
             about = range(first, min(lag + apart + 1, length.shape[1]))
             still = here - here.mean()
             near = np.column_stack([padded[:, at : at + len(here)] @ still for at in about])
@@ -184,22 +184,22 @@ def _find(
             if amounts.max() > 0.5:
                 break
         k = int(np.argmax(amounts))
-        rivals = tuple(names[j] for j in np.flatnonzero(amounts >= _DISTINCT * amounts[k]) if j != k)
-        if name in rivals and name in names:  # its own name decides between equals
+        rivals = tuple(names[j] for j in np.flatnonzero(amounts >= _EQUAL_PART * amounts[k]) if j != k)
+        if name in rivals and name in names:  # the name decides between equals
             rivals = (*(each for each in rivals if each != name), names[k])
             k = names.index(name)
         at = int(np.argmax(np.abs(near[k])))
         peak = near[k][at]
         polarity = 1 if peak >= 0.0 else -1
         turned = max(-polarity * end[k] for end in ends[name]) > 0.9 * amounts[k]
-        known = amounts[k] > max(_ALIKE, _CHANCE / math.sqrt(len(here) / _step(recorded[name][1], rate)))
+        known = amounts[k] > max(_LIMIT, _CHANCE / math.sqrt(len(here) / _ratio(recorded[name][1], rate)))
         late_s = (lag - behind) / rate - from_s
         found[name] = Wire(
             names[k] if known else "", polarity, float(amounts[k]), rivals if known else (), bool(turned),
             late_s, (from_s, from_s + taken_s), tuple((each - behind) / rate - from_s for each in lags[1:]),
             late_s if turned else late_s + (first + at - lag) / rate,
         )  # fmt: skip
-    # Of channels that are as alike, a signal is rather one that no other signal has by its name.
+    # Among equal channels, one that is not named by another signal is preferred.
     taken = {name for name, wire in found.items() if wire.channel == name}
     for name, wire in found.items():
         free = [each for each in (wire.channel, *wire.rivals) if each not in taken]
@@ -209,11 +209,11 @@ def _find(
     return found
 
 
-def _even(values: np.ndarray, rate: float, wanted: float, seconds: float) -> np.ndarray:
+def _resample(values: np.ndarray, rate: float, wanted: float, seconds: float) -> np.ndarray:
     values = np.asarray(values[: math.ceil(seconds * rate) + 2])
     held = np.nan_to_num(values, nan=float(np.nanmean(values)) if np.isfinite(values).any() else 0.0)
     rows = max(2, min(math.floor(seconds * wanted), math.floor((len(held) - 1) / rate * wanted) + 1))
-    if (step := _step(rate, wanted)) > 1:
+    if (step := _ratio(rate, wanted)) > 1:
         even = np.zeros(rows)
         part = held[: -(-rows // step)]
         even[::step] = part - part.mean()
@@ -221,38 +221,38 @@ def _even(values: np.ndarray, rate: float, wanted: float, seconds: float) -> np.
     return np.interp(np.arange(rows) * (rate / wanted), np.arange(len(held)), held)
 
 
-def _step(rate: float, wanted: float) -> int:
-    """How many samples at a rate go from one to the next of what has every n-th of them; 1 where it has not."""
+def _ratio(rate: float, wanted: float) -> int:
+    """Return the samples of a wanted rate per sample at a rate, if a whole number; otherwise 1."""
     step = round(wanted / rate)
     return step if step > 1 and abs(step * rate / wanted - 1.0) < 1e-9 else 1
 
 
-def _spectra(
+def _find_spectra(
     sent: Mapping[str, tuple[np.ndarray, float]], rate: float, length: float, size: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Spectra of what was sent, and its even samples, all of one length."""
+    """Return the spectra and the even samples of the sent signals, all of one length."""
     from scipy.fft import next_fast_len
 
     size = 2 * (next_fast_len(-(-size // 2), real=True) or size)
     rows = []
     for values, each in sent.values():
-        even = _even(values, each, rate, length)
+        even = _resample(values, each, rate, length)
         rows.append(np.pad(even - even.mean(), (0, math.ceil(length * rate) - len(even))))
     return spectrum(np.array(rows, np.float32), size), np.array(rows)
 
 
-def _lengths(sent: np.ndarray, before: int, n: int) -> np.ndarray:
-    """Length of each channel without its mean in stretches of n, from so many samples before the session on."""
+def _stretch_norms(sent: np.ndarray, before: int, n: int) -> np.ndarray:
+    """Return the norm of each channel without its mean in stretches of n, from `before` samples before the session."""
     padded = np.pad(sent, ((0, 0), (before + 1, n)))
     sums, squares = np.cumsum(padded, axis=1), np.cumsum(padded**2, axis=1)
     power = squares[:, n:] - squares[:, :-n] - (sums[:, n:] - sums[:, :-n]) ** 2 / n
     power = power[:, : before + sent.shape[1]]
-    # Where next to nothing was sent, nothing is alike.
-    return np.sqrt(np.maximum(power, np.maximum(_QUIET * power.max(axis=1, keepdims=True), 1e-300)))
+    # A stretch in which almost nothing was sent is not similar to any signal.
+    return np.sqrt(np.maximum(power, np.maximum(_MIN_POWER * power.max(axis=1, keepdims=True), 1e-300)))
 
 
-def _likeness(here: np.ndarray, before: int, there: np.ndarray, lengths: np.ndarray) -> np.ndarray:
-    """Correlation with each channel by lag, from so many samples before the session on."""
+def _correlate(here: np.ndarray, before: int, there: np.ndarray, lengths: np.ndarray) -> np.ndarray:
+    """Return the correlation with each channel by lag, from `before` samples before the session."""
     size = 2 * (there.shape[1] - 1)
     here = (here - here.mean()).astype(np.float32)
     whole = correlation(here, there, size)
@@ -260,29 +260,29 @@ def _likeness(here: np.ndarray, before: int, there: np.ndarray, lengths: np.ndar
     return curve / (lengths * max(float(np.linalg.norm(here)), 1e-150))
 
 
-def _common_lags(curves: list[tuple[np.ndarray, np.ndarray, np.ndarray]], zero: int) -> list[int]:
-    """Lags at which all signals of a file may have begun together, the likeliest first.
+def _find_common_lags(curves: list[tuple[np.ndarray, np.ndarray, np.ndarray]], zero: int) -> list[int]:
+    """Return the lags at which all signals of a file may begin together, the most probable first.
 
-    Of the peaks that are as good as the best, as a sine has one each period, and sequences that begin apart from one
-    another have, that at which most signals are what they are named; of those that at which most have the polarity of
-    the channel that is most alike; of those the nearest to none.
+    A sine has equal peaks at each period, and sequences with different begins have several. Of the peaks that equal
+    the best, that is preferred at which most signals match the channel with their name; then that at which most have
+    the polarity of the most similar channel; then the nearest to zero lag.
 
     Args:
-        curves: How much each signal is like the channel that is most alike, and like that of its name, and whether it
-            has the polarity of the former, by lag.
-        zero: No lag.
+        curves: By lag, each signal's correlation with the most similar channel and with that of its name, and
+            whether it has the polarity of the former.
+        zero: Index of zero lag.
     """
-    clear = [alike for alike, *_ in curves if alike.max() > _ALIKE]
+    clear = [alike for alike, *_ in curves if alike.max() > _LIMIT]
     if not clear:
         return [zero]
     curve = np.mean(clear, axis=0)
-    high = curve >= _DISTINCT * curve.max()
+    high = curve >= _EQUAL_PART * curve.max()
     peaks = [low + int(np.argmax(curve[low:up])) for low, up in true_runs(high)]
 
     def rank(at: int) -> tuple[int, int, bool, int]:
-        named = sum(bool(own[at] >= _CLEAR * alike[at]) for alike, own, _ in curves)
+        named = sum(bool(own[at] >= _CLEAR_PART * alike[at]) for alike, own, _ in curves)
         upright = sum(bool(each[at]) for *_, each in curves)
-        return named, upright, bool(curve[at] >= _CLEAR * curve.max()), -abs(at - zero)
+        return named, upright, bool(curve[at] >= _CLEAR_PART * curve.max()), -abs(at - zero)
 
     first = max(peaks, key=rank)
-    return [first, *sorted(set(peaks) - {first}, key=lambda at: -curve[at])[:_LAGS]]
+    return [first, *sorted(set(peaks) - {first}, key=lambda at: -curve[at])[:_MAX_LAGS]]

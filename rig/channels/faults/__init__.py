@@ -1,4 +1,4 @@
-"""Faults of channels and of blocks, and where they make sense: what is listed here is what is refused by."""
+"""Faults of channels and of blocks, and the checks of where each kind can be injected."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ __all__ = [
 
 
 def supported(kind: type[Kind], table: ChannelTable, setting: Setting = Setting()) -> dict[str, str]:  # noqa: B008
-    """Where a kind makes sense whatever its numbers are.
+    """Return where a kind of fault can be injected, whatever its numbers.
 
     Args:
         kind: The kind.
-        table: The channels that there are.
-        setting: What else decides.
+        table: Channel table.
+        setting: Properties of the scene.
 
     Returns:
-        By the name of every channel, or of every group of a kind that is about blocks, what would have to be given in
-        its place; empty where it makes sense.
+        By channel, or by group for a kind that acts on blocks: what is required instead; empty if the kind is
+        supported.
     """
     if kind.of_blocks:
         return dict.fromkeys(table.groups, "")
     wanted = kind.channel_only
     marks = [name for name, channel in table.channels.items() if channel.signal == wanted]
-    away = f"{' or '.join(marks) or 'a keyphasor'} for {kind.name()}, which is about its pulses"
+    away = f"{' or '.join(marks) or 'a keyphasor'} for {kind.name()}, which acts on its pulses"
     return {
         name: kind.needs(channel, setting) or (away if wanted and name not in marks else "")
         for name, channel in table.channels.items()
@@ -42,18 +42,18 @@ def supported(kind: type[Kind], table: ChannelTable, setting: Setting = Setting(
 def channels_of(
     what: Kind, target: str, table: ChannelTable, *, ideal: bool, noisy: bool, generated: bool = False
 ) -> tuple[str, ...]:
-    """Channels whose counts a fault changes: none of those that are about blocks.
+    """Return the channels whose counts a fault changes; none for a fault of blocks.
 
     Args:
         what: The fault.
         target: A channel, or a group for all of its channels.
-        table: The channels that there are.
-        ideal: Whether the scene leaves filters and noise out.
-        noisy: Whether its sensors are noisy.
-        generated: Whether generators stand for its physics.
+        table: Channel table.
+        ideal: The scene has neither filters nor noise.
+        noisy: The sensors have noise.
+        generated: Test signals replace the physics.
 
     Raises:
-        InputError: There is no such channel, or the fault makes no sense on it; the message says what would.
+        InputError: The channel is unknown, or the kind is not supported on it; the message names what is required.
     """
     if isinstance(what, OfBlocks):
         return ()
@@ -82,20 +82,20 @@ def channels_of(
 
 
 def stream_of(what: OfBlocks, target: str, table: ChannelTable, doors: tuple[str, ...]) -> str:
-    """Group whose blocks a fault is about.
+    """Return the group whose blocks a fault changes.
 
     Args:
         what: The fault.
         target: A group.
-        table: The channels that there are.
-        doors: Where blocks leave the rig.
+        table: Channel table.
+        doors: Outputs of the rig by which blocks are sent.
 
     Raises:
-        InputError: There is no such group, or no such door; the message says what there is.
+        InputError: The group or the door is unknown; the message lists the known ones.
     """
     known = supported(type(what), table)
     if target in table.channels and target not in known:
-        must = f"a group for {what.name()}, as a block is of all its channels, such as {table.channels[target].group}"
+        must = f"a group for {what.name()}, as a block has all its channels, such as {table.channels[target].group}"
         raise InputError("fault.channel", must, target)
     if target not in known:
         raise UnknownNameError("fault.channel", f"one of the groups for {what.name()}", target, known)
@@ -107,16 +107,16 @@ def stream_of(what: OfBlocks, target: str, table: ChannelTable, doors: tuple[str
 
 
 def described(table: ChannelTable, setting: Setting = Setting()) -> list[tuple[str, ...]]:  # noqa: B008
-    """Of each kind its name, stage, equation, numbers with defaults, where it makes sense, and at which doors.
+    """Return each kind's name, stage, equation, numbers with defaults, supported channels or groups, and doors.
 
     Args:
-        table: The channels that there are.
-        setting: What else decides.
+        table: Channel table.
+        setting: Properties of the scene.
     """
     found: list[tuple[str, ...]] = []
     for name, kind in KINDS.items():
         numbers = [
-            key + ("" if field.is_required() else f" ({'none' if field.default is None else _plain(field.default)})")
+            key + ("" if field.is_required() else f" ({'none' if field.default is None else _text(field.default)})")
             for key, field in kind.model_fields.items()
             if key != "kind"
         ]
@@ -136,5 +136,5 @@ def described(table: ChannelTable, setting: Setting = Setting()) -> list[tuple[s
     return found
 
 
-def _plain(value: object) -> str:
+def _text(value: object) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)

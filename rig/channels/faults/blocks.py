@@ -1,7 +1,7 @@
-"""What may go wrong with blocks on their way: kinds of faults of a group's stream, at one door of the rig or at all.
+"""Kinds of faults of a group's blocks in transit, at one door of the rig or at all.
 
-While one acts, rows of the stream go in blocks of block_s from its first row on, however the run is cut; n is the
-number of such a block, and u(n) a uniform number of the fault's own. Counts are never changed.
+While one acts, the rows of the stream are sent in blocks of block_s from its first row, whatever the lengths of frames.
+n is the number of such a block, and u(n) a uniform random number of the fault. Counts are never changed.
 """
 
 from __future__ import annotations
@@ -15,23 +15,23 @@ from rig.base.wire import Block
 from rig.channels.faults.kind import Kind
 
 DOORS = ("zenoh", "can")
-"""Where blocks leave the rig; what a rig without a clock writes is as the first one has it."""
-MOST_LATE_S = 10.0
-"""Longest that a block is held back [s]."""
-Some = Annotated[FiniteFloat, Field(gt=0.0, le=1.0)]
+"""Outputs by which blocks leave the rig; a file written without pace has the blocks of the first."""
+MAX_DELAY_S = 10.0
+"""Longest delay of a block [s]."""
+PartOrAll = Annotated[FiniteFloat, Field(gt=0.0, le=1.0)]
 
 
 class Message(NamedTuple):
-    """A block on its way.
+    """A block in transit.
 
     Attributes:
-        key: Its stream.
-        block: What is sent, with the number and the tick that it is sent with.
+        key: Stream.
+        block: The block, with the number and the tick under which it is sent.
         row: True number of its first row.
-        due: When it is sent [ticks].
-        doors: Where.
-        faults: Numbers of the faults that it has met.
-        behind: It lets another one that is due at the same tick go first.
+        due: Time at which it is sent [ticks].
+        doors: Outputs by which it is sent.
+        faults: Numbers of the faults that acted on it.
+        behind: Whether it is sent after others that are due at the same tick.
     """
 
     key: str
@@ -53,32 +53,32 @@ class OfBlocks(Kind):
 
     @property
     def doors(self) -> tuple[str, ...]:
-        """Where it acts."""
+        """Doors at which it acts."""
         return DOORS if self.door == "all" else (self.door,)
 
     @property
     def ticks(self) -> int:
-        """Length of its blocks."""
+        """Length of its blocks [ticks]."""
         return round(1e6 * self.block_s)
 
     @classmethod
     def needs_at(cls, door: str, group: str, groups: tuple[str, ...]) -> str:
-        """What would have to be given in place of a group, out of all, at one door; empty where it shows there."""
+        """Return what a door requires in place of a group, out of all; empty if the fault shows there."""
         return ""
 
     def sent(self, message: Message, u: float, first: tuple[int, int]) -> list[Message]:
-        """What becomes of a block.
+        """Return the messages that a block becomes.
 
         Args:
             message: The block.
-            u: Its uniform number.
-            first: Number and tick of the first row of the fault.
+            u: Uniform random number of the block.
+            first: Number and tick of the fault's first row.
         """
         raise NotImplementedError
 
 
 class Dropout(OfBlocks, number=30):
-    """No block is sent; the numbers of the rows go on."""
+    """No block is sent; the row numbers continue."""
 
     kind: Literal["dropout"] = "dropout"
 
@@ -87,9 +87,9 @@ class Dropout(OfBlocks, number=30):
 
 
 class _Random(OfBlocks):
-    """A fault of some blocks."""
+    """A fault of randomly selected blocks."""
 
-    part: Some = 0.1
+    part: PartOrAll = 0.1
 
     def chance(self, rate_hz: int) -> tuple[str, float, float]:
         return "part", 1.0, self.block_s
@@ -106,7 +106,7 @@ class LoseBlocks(_Random, number=31):
 
 
 class DuplicateBlocks(_Random, number=32):
-    """Blocks with u(n) < part are sent twice, one right behind the other."""
+    """Blocks with u(n) < part are sent twice in succession."""
 
     kind: Literal["duplicate-blocks"] = "duplicate-blocks"
 
@@ -115,7 +115,7 @@ class DuplicateBlocks(_Random, number=32):
 
 
 class ReorderBlocks(_Random, number=33):
-    """Blocks with u(n) < part are sent block_s later, behind those that are due by then."""
+    """Blocks with u(n) < part are sent block_s later, after those that are due by then."""
 
     kind: Literal["reorder-blocks"] = "reorder-blocks"
     part: Annotated[FiniteFloat, Field(gt=0.0, lt=1.0)] = 0.1  # all of them: late-blocks
@@ -126,17 +126,17 @@ class ReorderBlocks(_Random, number=33):
 
 
 class LateBlocks(OfBlocks, number=34):
-    """Blocks are sent delay_s later, in their order; what is still held back when it ends is sent then."""
+    """Blocks are sent delay_s later, in their order; at its end all delayed blocks are sent."""
 
     kind: Literal["late-blocks"] = "late-blocks"
-    delay_s: Annotated[FiniteFloat, Field(ge=1e-6, le=MOST_LATE_S)]
+    delay_s: Annotated[FiniteFloat, Field(ge=1e-6, le=MAX_DELAY_S)]
 
     def sent(self, message: Message, u: float, first: tuple[int, int]) -> list[Message]:
         return [message._replace(due=message.due + round(1e6 * self.delay_s))]
 
 
 class StaleStamps(OfBlocks, number=35):
-    """The time of all blocks is that of the first row; their numbers go on. On CAN, Sync tells it, of one group."""
+    """All blocks have the time of the first row; row numbers continue. On CAN, Sync has this time, for one group."""
 
     kind: Literal["stale-stamps"] = "stale-stamps"
 
@@ -150,7 +150,7 @@ class StaleStamps(OfBlocks, number=35):
 
 
 class Restart(OfBlocks, number=36):
-    """Numbers and times of rows begin again at 0: index' = index - that of the first row, and the tick likewise."""
+    """Row numbers and times begin again at 0: index' = index - that of the first row, and likewise for the tick."""
 
     kind: Literal["restart"] = "restart"
 

@@ -1,6 +1,6 @@
 """Signals between transducer and converter, with the faults that act there.
 
-All channels are computed side by side, as a block has few rows: time goes into calls, not into numbers.
+All channels are computed together: blocks have few rows, and calls take most of the time.
 """
 
 from __future__ import annotations
@@ -18,23 +18,23 @@ from rig.channels.table import Channel, Group
 from rig.physics.kernels.observe import EDGE, KEYPHASOR_WIDTH
 from rig.physics.kernels.signals import COLUMN, N_ROW
 
-NONE = np.empty(0)
-"""Angles and rates where a fault acts on samples, which have none."""
+NO_ANGLES = np.empty(0)
+"""Empty angles and rates, for a fault that acts on samples."""
 
 
-_AHEAD = ("signal", "volts", "chain", "late_s")
-"""Methods by which a kind acts ahead of the converter; without one, its channel is sound up to there."""
-_PATHS = (Swap, NoFilter)
-"""Kinds that change the path of a signal, by none of the methods of a kind."""
+_ANALOGUE_METHODS = ("signal", "volts", "chain", "late_s")
+"""Methods by which a kind acts before the converter; a channel without one of them is sound up to there."""
+_PATH_KINDS = (Swap, NoFilter)
+"""Kinds that change the path of a signal without any of these methods."""
 
 
 class Plan:
-    """What the faults that act at a time change of the channels of one conditioner.
+    """Assignment of the active faults to the channels of one conditioner.
 
     Attributes:
         faulty: Faults of each faulty channel.
-        homes: Group of each channel, and its column there.
-        twins: Of these channels, those with a chain of their own: sampled as they are, and late.
+        homes: Group and column of each channel.
+        twins: Faulty channels with their own signal chain; under True those with late samples.
         converters: Faults that act on counts, by channel.
     """
 
@@ -45,7 +45,7 @@ class Plan:
         self.twins: dict[bool, dict[str, list[Active]]] = {False: {}, True: {}}
         self.converters: dict[str, list[Active]] = {}
         for name, faults in self.faulty.items():
-            if any(acts(one.what, *_AHEAD) or isinstance(one.what, _PATHS) for one in faults):
+            if any(acts(one.what, *_ANALOGUE_METHODS) or isinstance(one.what, _PATH_KINDS) for one in faults):
                 self.twins[any(acts(one.what, "late_s") for one in faults)][name] = faults
             if last := [one for one in faults if acts(one.what, "counts")]:
                 self.converters[name] = last
@@ -53,15 +53,15 @@ class Plan:
 
 def where(
     one: Active, channel: Channel, n: np.ndarray, times_s: np.ndarray,
-    other: Callable[[str], np.ndarray] | None = None, angle: np.ndarray = NONE, rate: np.ndarray = NONE,
+    other: Callable[[str], np.ndarray] | None = None, angle: np.ndarray = NO_ANGLES, rate: np.ndarray = NO_ANGLES,
 ) -> At:  # fmt: skip
-    """Return where a fault acts on a channel: rows or samples of these numbers and times, shape (n,)."""
+    """Return the place at which a fault acts: rows or samples n of a channel at their times [s], shape (n,)."""
     t = times_s - one.begin / TICKS_HZ
     return At(t, n, channel, one.draws[channel.name], one.kept, other or no_other, angle, rate, seen_mark)
 
 
 class Volts:
-    """What faulty channels feel, in SI, over some rows: signal faults, range, and faults of cables."""
+    """Signals of faulty channels over a block of rows [SI]: faults of transducers, range limits, faults of cables."""
 
     def __init__(
         self, scales: Scales, rows: np.ndarray, made: np.ndarray, tick: int, row_ticks: int, active: Sequence[Active]
@@ -77,7 +77,7 @@ class Volts:
 
     @cached_property
     def _conditioned(self) -> np.ndarray:
-        """What all conditioners put out, with the faults of transducers [V], shape (rows, channels)."""
+        """Outputs of all conditioners, with the faults of transducers [V], shape (rows, channels)."""
         about = self._scales
         source = self.rows if about.columns.max(initial=0) < N_ROW else np.hstack([self.rows, self._made])
         x = np.asfortranarray(source[:, about.columns] / about.si)
@@ -93,7 +93,7 @@ class Volts:
         return self._conditioned[:, about.places[name]] - about.bias_v[about.places[name]]
 
     def signals(self, names: Sequence[str]) -> np.ndarray:
-        """Return the signals [SI] that give what arrives at the converters' filters, shape (rows, channels)."""
+        """Return the signals [SI] equivalent to the inputs of the converters' filters, shape (rows, channels)."""
         about, plugs = self._scales, plugged(self._active)
         volts = self._conditioned[:, [about.places[plugs.get(name, name)] for name in names]]
         for one in self._active:
@@ -107,7 +107,7 @@ class Volts:
 
 
 class Scales:
-    """From signals to volts, of all channels of a table, each an array of shape (channels,)."""
+    """Scales from signals to volts of all channels of a table, each an array of shape (channels,)."""
 
     def __init__(self, channels: Mapping[str, Channel], columns: Mapping[str, int]) -> None:
         self.channels = channels
@@ -121,11 +121,11 @@ class Scales:
 
 
 def seen_mark(angle: np.ndarray) -> np.ndarray:
-    """What the keyphasor sees of its mark, as rows have it (`rig.physics.kernels.observe`), shape (n,)."""
+    """Return the keyphasor's signal at angles of the shaft [rad], as rows of the model have it, shape (n,)."""
     ahead = (angle + math.pi) % (2.0 * math.pi) - math.pi
     return np.clip(0.5 + np.minimum(ahead, KEYPHASOR_WIDTH - ahead) / EDGE, 0.0, 1.0)
 
 
 def no_other(_: str) -> np.ndarray:
-    """Return nothing: a fault of samples reads no other channel."""
-    return NONE
+    """Return an empty array: a fault of samples reads no other channel."""
+    return NO_ANGLES

@@ -1,4 +1,4 @@
-"""Faults of the instants of samples and of the converter: kinds beside those of `rig.channels.faults.kinds`."""
+"""Kinds of faults of the sampling clock and of the converter, in addition to those of `rig.channels.faults.kinds`."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from rig.base.errors import InputError
 from rig.channels.faults.kind import SIGMAS, At, Kind, Part, Positive, Setting, but, late_v
 from rig.channels.table import Channel
 
-MOST_LATE_US = 10_000.0
-"""Latest that a sample may be taken [us]."""
+MAX_DELAY_US = 10_000.0
+"""Largest delay of a sample [us]."""
 
 
 # ---- clock ----
 
 
 class Late(Kind, number=17):
-    """A sample of time s shows what was at s - late_us: a multiplexer's skew. Nothing from before the fault is shown.
+    """A sample of time s shows the signal at s - late_us: a multiplexer's skew. No signal before the fault is shown.
 
-    Nothing can be early: what is not yet cannot be shown. Make all the others late instead.
+    A sample cannot be early, as its future is not known. Delay all other channels instead.
     """
 
     stage = "clock"
     kind: Literal["late"] = "late"
-    late_us: Annotated[FiniteFloat, Field(gt=0.0, le=MOST_LATE_US)]
+    late_us: Annotated[FiniteFloat, Field(gt=0.0, le=MAX_DELAY_US)]
 
     def reach_v(self, channel: Channel, lasts_s: float, source: Channel) -> float:
         return late_v(channel, 1e-6 * self.late_us)
@@ -37,9 +37,9 @@ class Late(Kind, number=17):
 
 
 class Clock(Kind, number=18):
-    """A clock that is fast: a sample of time t since it began is taken at t / (1 + ppm 1e-6), 10 ms late at most.
+    """A fast clock: a sample of time t since it began is taken at t / (1 + ppm 1e-6), at most 10 ms late.
 
-    One that is slow, with ppm below 0, begins 10 ms late, as none can be early, and is right 10 ms / (-1e-6 ppm) on.
+    A slow one, with ppm below 0, begins 10 ms late, as no sample can be early, and is right after 10 ms / (-1e-6 ppm).
     """
 
     stage = "clock"
@@ -50,7 +50,7 @@ class Clock(Kind, number=18):
         return math.inf if self.ppm < 0.0 else late_v(channel, 1e-6 * self.ppm * lasts_s)
 
     def late_s(self, at: At) -> np.ndarray:
-        most_s = 1e-6 * MOST_LATE_US
+        most_s = 1e-6 * MAX_DELAY_US
         begun_s = 0.0 if self.ppm > 0.0 else most_s
         return np.clip(begun_s + at.t * (1.0 - 1.0 / (1.0 + 1e-6 * self.ppm)), 0.0, most_s)
 
@@ -74,7 +74,7 @@ class Wander(Kind, number=20):
 
     stage = "clock"
     kind: Literal["wander"] = "wander"
-    amplitude_us: Annotated[FiniteFloat, Field(gt=0.0, le=MOST_LATE_US / 2.0)]
+    amplitude_us: Annotated[FiniteFloat, Field(gt=0.0, le=MAX_DELAY_US / 2.0)]
     period_s: Annotated[FiniteFloat, Field(ge=0.01, le=3600.0)] = 1.0
 
     def reach_v(self, channel: Channel, lasts_s: float, source: Channel) -> float:
@@ -89,7 +89,7 @@ class Wander(Kind, number=20):
 
 
 class Noise(Kind, number=21):
-    """c' = c + sqrt(factor^2 - 1) noise_v g(n) / step: its noise times factor."""
+    """The channel's noise times factor: c' = c + sqrt(factor^2 - 1) noise_v g(n) / step."""
 
     stage = "converter"
     kind: Literal["noise"] = "noise"
@@ -111,7 +111,7 @@ class Noise(Kind, number=21):
 
 
 class Spikes(Kind, number=22):
-    """c' = c + size_v / step with either sign, in samples whose u(n) < rate_hz / their rate."""
+    """c' = c + size_v / step, of random sign, in samples with u(n) < rate_hz / their rate."""
 
     stage = "converter"
     kind: Literal["spikes"] = "spikes"
@@ -147,7 +147,7 @@ class Bits(Kind, number=23):
 
 
 class StuckBit(Kind, number=24):
-    """One bit of the counts, from 0 for the lowest, is always the same."""
+    """One bit of the counts, 0 being the lowest, has a constant value."""
 
     stage = "converter"
     kind: Literal["stuck-bit"] = "stuck-bit"
@@ -164,7 +164,7 @@ class StuckBit(Kind, number=24):
 
 
 class Clip(Kind, number=25):
-    """A smaller reference: c' = c within part of the converter's range."""
+    """A smaller reference voltage: c' = c, limited to a part of the converter's range."""
 
     stage = "converter"
     kind: Literal["clip"] = "clip"
@@ -181,7 +181,7 @@ class Clip(Kind, number=25):
 
 
 class Freeze(Kind, number=26):
-    """c'(n) = c(0): one and the same number, without noise."""
+    """c'(n) = c(0): a constant count, without noise."""
 
     stage = "converter"
     kind: Literal["freeze"] = "freeze"

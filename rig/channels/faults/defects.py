@@ -1,7 +1,7 @@
-"""Defects: one table of what can be wrong with a channel or a stream, in `defects.toml`.
+"""Table of the defects of channels and streams, read from `defects.toml`.
 
-Faults on command inject them, and `rig validate`, `rig score` and `rig import` recognise them. All of these take
-names, units and the text of sizes from this table, so that one defect has one name.
+Faults inject these defects, and `rig validate`, `rig score` and `rig import` recognise them. All of these use the
+names, units and size texts of this table, so that a defect has the same name everywhere.
 """
 
 from __future__ import annotations
@@ -40,23 +40,29 @@ DEFECTS = {
 
 
 def alternatives(words: str) -> list[str]:
-    """Return the defects that words such as "open, short or stuck" offer."""
+    """Return the names in a list of alternatives such as "open, short or stuck"."""
     return re.split(", | or ", words)
 
 
 def unit_of(words: str, unit: str) -> str:
-    """Return the unit of a defect's size on a channel with a unit; of several defects, that of the first."""
+    """Return the unit of a defect's size on a channel; of several alternatives, that of the first."""
     return DEFECTS[alternatives(words)[0].partition(" and ")[0]].unit.format(unit=unit)
 
 
 def size_text(name: str, value: float, unit: str = "") -> str:
-    """Return the size of a defect, in its unit, as text for a channel with a unit."""
+    """Return the size of a defect as text with its unit.
+
+    Args:
+        name: Name in the table.
+        value: Size in the table's unit.
+        unit: Unit of the channel.
+    """
     also = {"percent": 100.0 * value, "us": 1e6 * value, "degrees": math.degrees(value)}
     return DEFECTS[name].words.format(value=value, unit=unit, **also)
 
 
 def defects_in(words: str) -> tuple[str, ...]:
-    """Return the names in the table of the defects that a validation reports in words."""
+    """Return the names in the table of the defects in a validation's wording."""
     found = list[str]()
     for part in alternatives(words):
         found += [one for one in part.split(" and ") if one in DEFECTS] or [
@@ -66,14 +72,14 @@ def defects_in(words: str) -> tuple[str, ...]:
 
 
 def defects_shown(failed: Collection[str], *, digital: bool) -> list[str]:
-    """Return the defects that make quantities of a scorecard fail, without those that explain a part of them only."""
+    """Return the defects that explain the failed quantities of a scorecard, without those that explain only a part."""
     sets = {name: {*(each.digital if digital else each.score)} for name, each in DEFECTS.items()}
     shown = {name: each for name, each in sets.items() if each and each <= {*failed}}
     return [name for name, each in shown.items() if not any(each < other for other in shown.values())]
 
 
 def earlier_name(words: str) -> str:
-    """Return words with a defect at their end under the name that JSON of imported logs had first."""
+    """Return a text that ends with a defect's name under the name in the JSON of earlier imported logs."""
     for name, each in DEFECTS.items():
         if each.log_name and words.endswith(name):
             return words.removesuffix(name) + each.log_name

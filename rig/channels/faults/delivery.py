@@ -1,8 +1,8 @@
-"""Frames become messages: the one place that all doors and recordings take their blocks from, and faults of blocks act.
+"""Conversion of frames into messages: the source of blocks for all doors and recordings, where block faults act.
 
-A stream without a fault passes as it is. Of one with faults rows are gathered into the blocks of these, on a grid of
-time, so that what is sent does not depend on how the run is cut. What becomes of each such block is told, row by row,
-in documents for `rig.base.wire.FAULTS`.
+A stream without a fault passes unchanged. Rows of a faulty stream are gathered into the blocks of its faults, on a
+fixed grid of time, so that the messages do not depend on the length of a frame. Documents for `rig.base.wire.FAULTS`
+report the result for each such block, row by row.
 """
 
 from __future__ import annotations
@@ -18,23 +18,23 @@ from rig.base.wire import EDGES, Block, sensor_key, truth_key
 from rig.channels.faults import Draws, Kind, Message, OfBlocks
 from rig.channels.sampling import TICKS_HZ, first_row
 
-_NEVER = 1 << 62
+_NO_TICK = 1 << 62
 
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """What one `advance` made.
+    """Result of one `advance`.
 
     Attributes:
-        tick: Start.
-        ticks: Length.
-        samples: ADC counts by sensor group, whatever becomes of them on their way.
-        edges: Keyphasor edges, ticks from the block's tick, or None where there was none.
+        tick: First tick.
+        ticks: Length [ticks].
+        samples: ADC counts by sensor group, before faults of blocks.
+        edges: Keyphasor edges, ticks from the block's tick, or None.
         truth: Truth tables by name.
-        events: What took effect, each with event, tick and time_s.
+        events: Effects of commands, each with event, tick and time_s.
         rows: Observed rows, shape (n, N_ROW); a view that the next `advance` overwrites.
-        sent: What is sent, in this order, where that is not all as it is.
-        told: Documents on faults, for `rig.base.wire.FAULTS`: sent before the messages.
+        sent: Messages in their order; None if all blocks are sent unchanged.
+        documents: Documents on faults, for `rig.base.wire.FAULTS`: sent before the messages.
     """
 
     tick: int
@@ -45,20 +45,20 @@ class Frame:
     events: list[dict[str, Any]]
     rows: np.ndarray = field(repr=False)
     sent: list[Message] | None = field(default=None, repr=False)
-    told: list[dict[str, Any]] = field(default_factory=list, repr=False)
+    documents: list[dict[str, Any]] = field(default_factory=list, repr=False)
 
     @property
     def messages(self) -> list[Message]:
-        """What is sent, in this order."""
-        return [Message(key, block, block.index) for key, block in self._plain()] if self.sent is None else self.sent
+        """Messages in their order."""
+        return [Message(key, block, block.index) for key, block in self._blocks()] if self.sent is None else self.sent
 
     def blocks(self) -> Iterator[tuple[str, Block]]:
-        """Keys and blocks as they are published, but on CAN."""
+        """Return keys and blocks as published by zenoh."""
         if self.sent is None:
-            return self._plain()
+            return self._blocks()
         return ((message.key, message.block) for message in self.sent if "zenoh" in message.doors)
 
-    def _plain(self) -> Iterator[tuple[str, Block]]:
+    def _blocks(self) -> Iterator[tuple[str, Block]]:
         for group, block in self.samples.items():
             if len(block.values):
                 yield sensor_key(group), block
@@ -70,18 +70,18 @@ class Frame:
 
 @dataclass
 class Active:
-    """One fault.
+    """An active fault.
 
     Attributes:
-        id: Its number.
+        id: Number of the fault.
         what: The fault.
         names: Its channels.
-        begin: First tick, a whole row.
-        draws: Its numbers, for each channel; of blocks under "".
-        key: Stream of one that is about blocks.
-        end: Tick from which on there is none, a whole row.
-        kept: What it keeps.
-        noise: Converter noise of each channel whose samples it takes at times of their own.
+        begin: First tick, that of a row.
+        draws: Its random numbers by channel; under "" those of a fault of blocks.
+        key: Stream of a fault of blocks.
+        end: Tick at which it ends, that of a row.
+        kept: State between blocks.
+        noise: Converter noise of the channels whose sampling times it changes.
     """
 
     id: int
@@ -97,7 +97,7 @@ class Active:
 
 @dataclass(frozen=True, slots=True)
 class _Held:
-    """A message that is not sent yet, with the faults that hold it back."""
+    """A message that is not sent yet, with the faults that delay it."""
 
     message: Message
     by: tuple[Active, ...] = ()
@@ -108,7 +108,7 @@ class _Held:
 
 
 class Sending:
-    """What is on its way from the sensors to the doors.
+    """Blocks between the sensors and the doors.
 
     Attributes:
         active: Faults of blocks.
@@ -116,45 +116,45 @@ class Sending:
 
     def __init__(self) -> None:
         self.active: list[Active] = []
-        self._gathered: dict[str, Block] = {}
+        self._incomplete: dict[str, Block] = {}
         self._held: list[_Held] = []
 
     def pass_on(self, frame: Frame, *, last: bool) -> Frame:
-        """A frame with what is sent of it, and of those before, and what is to be told of faults.
+        """Return a frame with its messages, those delayed from earlier frames, and the documents on faults.
 
         Args:
             frame: The frame.
-            last: It is the last of the run: nothing is held back any more.
+            last: Whether it is the last frame of the run, which sends all delayed messages.
         """
-        told = [event for event in frame.events if event["event"] in ("fault", "clear")] if frame.events else []
-        if not (self.active or self._gathered or self._held):
-            return replace(frame, told=told) if told else frame
+        documents = [event for event in frame.events if event["event"] in ("fault", "clear")] if frame.events else []
+        if not (self.active or self._incomplete or self._held):
+            return replace(frame, documents=documents) if documents else frame
         end, sent, blocks = frame.tick + frame.ticks, list[Message](), list[dict[str, Any]]()
-        keys = {*self._gathered, *(one.key for one in self.active), *(held.message.key for held in self._held)}
+        keys = {*self._incomplete, *(one.key for one in self.active), *(held.message.key for held in self._held)}
         for message in frame.messages:
             key, block = message.key, message.block
             if key not in keys:
                 sent.append(message)
                 continue
-            if (before := self._gathered.pop(key, None)) is not None:
+            if (before := self._incomplete.pop(key, None)) is not None:
                 block = replace(before, values=np.concatenate([before.values, block.values]))
             faults = [one for one in self.active if one.key == key]
             for piece, due, here in self._pieces(key, block, faults, last=last):
-                made = _through(Message(key, piece, piece.index, min(due, end)), here)
-                blocks += [_told(piece, key, here, made)] if here else []
+                made = _apply_faults(Message(key, piece, piece.index, min(due, end)), here)
+                blocks += [_describe_blocks(piece, key, here, made)] if here else []
                 self._held += made
         waiting = sorted(self._held, key=lambda held: held.order)
         sent += [held.message for held in waiting if held.order[0] <= end or last]
         self._held = [] if last else [held for held in waiting if held.order[0] > end]
         self.active = [one for one in self.active if one.end > end]
         if blocks:
-            told.append({"event": "blocks", "tick": end, "time_s": end / TICKS_HZ, "blocks": blocks})
-        return replace(frame, sent=sent, told=told)
+            documents.append({"event": "blocks", "tick": end, "time_s": end / TICKS_HZ, "blocks": blocks})
+        return replace(frame, sent=sent, documents=documents)
 
     def _pieces(
         self, key: str, block: Block, faults: list[Active], *, last: bool
     ) -> Iterator[tuple[Block, int, list[Active]]]:
-        """Rows between two ends of blocks of faults: the block, when it is whole [ticks], and the faults there."""
+        """Yield each fault's block of rows, the tick at which it is complete, and the faults that act on it."""
         rate, row, stop = round(block.rate_hz), block.index, block.index + len(block.values)
         while row < stop:
             now = row * TICKS_HZ // rate
@@ -170,14 +170,14 @@ class Sending:
             values = block.values[row - block.index : upto - block.index]
             piece = replace(block, tick=round(row * TICKS_HZ / rate), index=row, values=values)
             if here and not whole and not last:
-                self._gathered[key] = piece
+                self._incomplete[key] = piece
                 return
-            yield piece, _NEVER if due is None else due, here
+            yield piece, _NO_TICK if due is None else due, here
             row = upto
 
 
-def _through(message: Message, faults: list[Active]) -> list[_Held]:
-    """What becomes of a block by some faults, one after the other."""
+def _apply_faults(message: Message, faults: list[Active]) -> list[_Held]:
+    """Return the messages that a block becomes after some faults in turn."""
     found = [_Held(message)]
     now = message.row * TICKS_HZ // round(message.block.rate_hz)
     for one in faults:
@@ -198,7 +198,7 @@ def _through(message: Message, faults: list[Active]) -> list[_Held]:
     return found
 
 
-def _told(piece: Block, key: str, faults: list[Active], made: list[_Held]) -> dict[str, Any]:
+def _describe_blocks(piece: Block, key: str, faults: list[Active], made: list[_Held]) -> dict[str, Any]:
     sent = [
         {"index": each.block.index, "tick": each.block.tick, "due": each.due, "doors": list(each.doors)}
         for each in (held.message for held in made)

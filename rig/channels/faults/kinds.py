@@ -1,8 +1,8 @@
-"""What may go wrong with a channel: kinds of faults by the stage of its chain, each an equation with units and limits.
+"""Kinds of faults of a channel by the stage of its signal chain, each an equation with units and limits.
 
-In the equations x is what the sensor feels [the channel's unit], v the conditioner's output [V], c the converter's
-counts, t the time since the fault began [s], and u(n), g(n) uniform and normal numbers of the fault's own, of row or
-sample n: the same in every run with the same seed, however it is cut into blocks.
+In the equations x is the sensor's input [the channel's unit], v the conditioner's output [V], c the converter's
+counts, t the time since the fault began [s], and u(n), g(n) uniform and normal random numbers of the fault for row or
+sample n. They are the same in every run with the same seed, whatever the lengths of its blocks.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from rig.channels.table import Channel
 NotNegative = Annotated[FiniteFloat, Field(ge=0.0)]
 
 
-def _grown(at: At, ramp_s: float) -> np.ndarray | float:
+def _ramp(at: At, ramp_s: float) -> np.ndarray | float:
     return np.minimum(at.t / ramp_s, 1.0) if ramp_s else 1.0
 
 
-def _grown_to(lasts_s: float, ramp_s: float) -> float:
+def _ramp_end(lasts_s: float, ramp_s: float) -> float:
     return min(lasts_s / ramp_s, 1.0) if ramp_s else 1.0
 
 
@@ -37,7 +37,7 @@ def _grown_to(lasts_s: float, ramp_s: float) -> float:
 
 
 class Gain(Kind, number=1):
-    """Sensitivity: x' = x (1 + (factor - 1) min(t / ramp_s, 1))."""
+    """Sensitivity error: x' = x (1 + (factor - 1) min(t / ramp_s, 1))."""
 
     stage = "transducer"
     kind: Literal["gain"] = "gain"
@@ -46,14 +46,14 @@ class Gain(Kind, number=1):
     neutral = 1.0
 
     def reach_v(self, channel: Channel, lasts_s: float, source: Channel) -> float:
-        return abs(self.factor - 1.0) * swing_v(channel) * _grown_to(lasts_s, self.ramp_s)
+        return abs(self.factor - 1.0) * swing_v(channel) * _ramp_end(lasts_s, self.ramp_s)
 
     def signal(self, x: np.ndarray, at: At) -> np.ndarray:
-        return x * (1.0 + (self.factor - 1.0) * _grown(at, self.ramp_s))
+        return x * (1.0 + (self.factor - 1.0) * _ramp(at, self.ramp_s))
 
 
 class Offset(Kind, number=2):
-    """Zero: x' = x + value min(t / ramp_s, 1); value in the channel's unit."""
+    """Zero error: x' = x + value min(t / ramp_s, 1); value in the channel's unit."""
 
     stage = "transducer"
     kind: Literal["offset"] = "offset"
@@ -61,14 +61,14 @@ class Offset(Kind, number=2):
     ramp_s: NotNegative = 0.0
 
     def reach_v(self, channel: Channel, lasts_s: float, source: Channel) -> float:
-        return abs(self.value * channel.sensitivity_v) * _grown_to(lasts_s, self.ramp_s)
+        return abs(self.value * channel.sensitivity_v) * _ramp_end(lasts_s, self.ramp_s)
 
     def signal(self, x: np.ndarray, at: At) -> np.ndarray:
-        return x + self.value * _grown(at, self.ramp_s)
+        return x + self.value * _ramp(at, self.ramp_s)
 
 
 class Drift(Kind, number=3):
-    """x' = x + rate t, rate in the channel's unit a second; with tau_s: x' = x + rate tau_s (1 - exp(-t / tau_s))."""
+    """x' = x + rate t, rate in the channel's unit per second; with tau_s: x' = x + rate tau_s (1 - exp(-t / tau_s))."""
 
     stage = "transducer"
     kind: Literal["drift"] = "drift"
@@ -95,7 +95,7 @@ class Polarity(Kind, number=4):
 
 
 class Stuck(Kind, number=5):
-    """x'(t) = x(0): what follows in the chain, its noise too, goes on; `freeze` holds the counts."""
+    """x'(t) = x(0): the later stages of the chain and their noise continue; `freeze` holds the counts."""
 
     stage = "transducer"
     kind: Literal["stuck"] = "stuck"
@@ -108,7 +108,7 @@ class Stuck(Kind, number=5):
 
 
 class Nonlinear(Kind, number=6):
-    """Ends of the linear range: x' = end tanh(x / end), end in the channel's unit."""
+    """Limited linear range: x' = end tanh(x / end), end in the channel's unit."""
 
     stage = "transducer"
     kind: Literal["nonlinear"] = "nonlinear"
@@ -126,9 +126,9 @@ class Nonlinear(Kind, number=6):
 
 
 class Resonance(Kind, number=14):
-    """A transducer that rings: x'' = w^2 (x - x') - (w / quality) dx'/dt, w = 2 pi frequency_hz, at rest before.
+    """A ringing transducer: x'' = w^2 (x - x') - (w / quality) dx'/dt, w = 2 pi frequency_hz, initially at rest.
 
-    Between rows of the model x is a straight line, over which this is solved exactly.
+    Between rows of the model x is linear, which makes the solution exact.
     """
 
     stage = "transducer"
@@ -144,7 +144,7 @@ class Resonance(Kind, number=14):
         re, im, before, t = (at.kept.get(name) for name in names)
         values, times = x.tolist(), at.t.tolist()
         z = -r / p * values[0] if re is None or im is None else complex(re, im)
-        # Rows begin with the last one of those before; samples do not.
+        # Blocks of rows begin with the last row of the previous block; blocks of samples do not.
         goes_on = before is not None and t is not None and times[0] > t + 1e-9
         if goes_on:
             values, times = [before, *values], [t, *times]
@@ -186,7 +186,7 @@ class Short(Open, number=8):
 
 
 class Intermittent(Open, number=9):
-    """A loose contact: v' = level_v in those slots of slot_s whose u(slot) < part."""
+    """A loose contact: v' = level_v in the slots of slot_s with u(slot) < part."""
 
     first = ("part",)
     kind: Literal["intermittent"] = "intermittent"  # pyrefly: ignore[bad-override]
@@ -207,9 +207,9 @@ class Intermittent(Open, number=9):
 
 
 class Hum(Kind, number=10):
-    """The mains: v' = v + amplitude_v (sin(2 pi f t) + third sin(6 pi f t)) + offset_v.
+    """Mains hum: v' = v + amplitude_v (sin(2 pi f t) + third sin(6 pi f t)) + offset_v.
 
-    Asked for of a group it is one hum in all its channels, as a loop through the ground makes it.
+    On a group it is the same hum in all its channels, as a ground loop causes it.
     """
 
     stage = "cable"
@@ -252,7 +252,7 @@ class Crosstalk(Kind, number=11):
 
 
 class Saturation(Kind, number=12):
-    """A conditioner that gives less: v' = v within part of its range about the middle."""
+    """A conditioner with a reduced output range: v' = v, limited to a part of its range about the middle."""
 
     stage = "cable"
     kind: Literal["saturation"] = "saturation"
@@ -269,7 +269,7 @@ class Saturation(Kind, number=12):
 
 
 class Swap(Kind, number=13):
-    """Two cables changed over: v' = v of the other channel, and the other way round; several, one after the other."""
+    """Two exchanged cables: v' = v of the other channel, and vice versa; several swaps act one after the other."""
 
     stage = "cable"
     kind: Literal["swap"] = "swap"
@@ -283,15 +283,15 @@ class Swap(Kind, number=13):
         return (*names, self.other)
 
 
-class _Acting(Protocol):
-    """A fault that acts: what it is, and its channels."""
+class _ActiveFault(Protocol):
+    """An active fault: its kind and its channels."""
 
     what: Kind
     names: tuple[str, ...]
 
 
-def plugged(active: Iterable[_Acting]) -> dict[str, str]:
-    """Return whose conditioner each channel of a swap is connected to, after all swaps in their order."""
+def plugged(active: Iterable[_ActiveFault]) -> dict[str, str]:
+    """Return the channel whose conditioner each swapped channel is connected to, after all swaps in their order."""
     found: dict[str, str] = {}
     for one in active:
         if isinstance(one.what, Swap):
@@ -304,26 +304,26 @@ def plugged(active: Iterable[_Acting]) -> dict[str, str]:
 
 
 class NoFilter(Kind, number=15):
-    """No anti-alias filter: what is above half of the rate folds back."""
+    """No anti-alias filter: components above half of the sampling rate fold back."""
 
     stage = "filter"
     kind: Literal["no-filter"] = "no-filter"
 
     @classmethod
     def needs(cls, channel: Channel, setting: Setting) -> str:
-        none = "one that a scene without filters can have, such as clip" if setting.ideal else ""
+        none = "one that a scene without filters supports, such as clip" if setting.ideal else ""
         return none or super().needs(channel, setting)
 
 
 class Bandwidth(NoFilter, number=16):
-    """Another corner of the low-pass [Hz]; its order stays."""
+    """A lower corner of the low-pass [Hz]; its order is unchanged."""
 
     kind: Literal["bandwidth"] = "bandwidth"  # pyrefly: ignore[bad-override]
     corner_hz: Annotated[FiniteFloat, Field(ge=1.0, le=1e6)]
 
     def refuse(self, channel: Channel) -> None:
         if self.corner_hz > channel.bandwidth_hz:
-            must = f"below its bandwidth of {channel.bandwidth_hz:g} Hz; no-filter takes the filter away"
+            must = f"below its bandwidth of {channel.bandwidth_hz:g} Hz; no-filter removes the filter"
             raise InputError("corner_hz", must, self.corner_hz)
         if self.corner_hz == channel.bandwidth_hz:
             raise InputError("corner_hz", f"other than the channel's own, {self.corner_hz:g}", self.corner_hz)

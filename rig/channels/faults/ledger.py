@@ -1,7 +1,7 @@
-"""Rows followed by what is told of faults of blocks: what was never sent, was sent twice, late or with other numbers.
+"""Row counts of streams, corrected by the documents on block faults: dropped, duplicated, late and renumbered blocks.
 
-Blocks say what a device under test sees; the documents on `rig.base.wire.FAULTS` say which rows they truly are. Who may
-read these tells what a fault has taken from what was really lost.
+A block has the number under which the device under test receives it. The documents on `rig.base.wire.FAULTS` give the
+true rows. With both, rows dropped by a fault are distinguished from rows lost in transmission.
 """
 
 from __future__ import annotations
@@ -18,47 +18,47 @@ from rig.base.checks import Count, Outside, check
 from rig.base.errors import InputError
 from rig.base.wire import Block, Continuity, Gap
 
-_MOST = 10_000
-"""Blocks of a stream that were told and have not come."""
-_MOST_STREAMS = 1000
-_AHEAD = 1100
-"""So many blocks wait for an earlier one: those that come while one is held back for longest."""
+_MAX_PENDING = 10_000
+"""Declared blocks of a stream that have not arrived yet."""
+_MAX_STREAMS = 1000
+_MAX_WAITING = 1100
+"""Blocks that wait for an earlier one: as many as arrive during the longest delay of a fault."""
 
 
-class _Sent(Outside, extra="ignore"):
+class _SentBlock(Outside, extra="ignore"):
     index: Count
     tick: Annotated[int, Field(ge=0, le=2**53)]
     doors: list[str]
 
 
-class _Told(Outside, extra="ignore"):
+class _DeclaredBlock(Outside, extra="ignore"):
     key: str
     row: Count
     rows: Annotated[int, Field(gt=0, le=2**40)]
-    sent: Annotated[list[_Sent], Field(max_length=100)]
+    sent: Annotated[list[_SentBlock], Field(max_length=100)]
 
 
 class _Document(Outside, extra="ignore", strict=False):
     event: str
-    blocks: tuple[_Told, ...] = ()
+    blocks: tuple[_DeclaredBlock, ...] = ()
 
 
 def in_order(blocks: Iterator[tuple[str, Block]]) -> Iterator[tuple[str, Block]]:
-    """Blocks of several streams that may come late or twice, each stream in order and once."""
+    """Yield blocks of several streams, which may arrive late or twice, in order and once each."""
     waiting: dict[str, list[tuple[int, int, Block]]] = {}
     due: dict[str, int] = {}
     for n, (key, block) in enumerate(blocks):
         heap = waiting.setdefault(key, [])
         heappush(heap, (block.index, n, block))
         due.setdefault(key, block.index)
-        while heap and (heap[0][0] <= due[key] or len(heap) > _AHEAD):
-            yield from _next(key, heap, due)
+        while heap and (heap[0][0] <= due[key] or len(heap) > _MAX_WAITING):
+            yield from _pop_next(key, heap, due)
     for key, heap in waiting.items():
         while heap:
-            yield from _next(key, heap, due)
+            yield from _pop_next(key, heap, due)
 
 
-def _next(key: str, heap: list[tuple[int, int, Block]], due: dict[str, int]) -> Iterator[tuple[str, Block]]:
+def _pop_next(key: str, heap: list[tuple[int, int, Block]], due: dict[str, int]) -> Iterator[tuple[str, Block]]:
     index, _, block = heappop(heap)
     if index >= due[key]:
         due[key] = index + len(block.values)
@@ -66,10 +66,10 @@ def _next(key: str, heap: list[tuple[int, int, Block]], due: dict[str, int]) -> 
 
 
 class Declared(Continuity):
-    """Follows rows as `Continuity` does, by their true numbers where these are told.
+    """Continuity of rows by their true numbers where documents declare these, otherwise as in `Continuity`.
 
     Attributes:
-        declared: Of the rows that are counted as lost, those that a fault has taken, or that came late by one; by key.
+        declared: Rows counted as lost that a fault dropped, or that arrived late because of a fault; by key.
     """
 
     def __init__(self) -> None:
@@ -77,50 +77,50 @@ class Declared(Continuity):
         self.declared: dict[str, int] = {}
         self._first: dict[str, int] = {}
         self._known: dict[str, dict[tuple[int, int, int], list[int]]] = {}
-        """True row of what was told, and how many are to come, by number, tick and length."""
-        self._before: dict[str, list[tuple[int, int]]] = {}
-        self._holes: dict[str, deque[tuple[int, int]]] = {}
-        self._never: dict[str, deque[tuple[int, int]]] = {}
-        self._untold: dict[str, deque[tuple[int, int, int]]] = {}
-        """Number, tick and length of the latest blocks, since numbers began anew, of which nothing was told."""
-        self._anew: dict[str, tuple[int, int]] = {}
-        """Number behind the last of these that was told since, as it was sent, and as it is."""
+        """True row and number of expected arrivals of a declared block, by number, tick and length."""
+        self._dropped_before: dict[str, list[tuple[int, int]]] = {}
+        self._missing: dict[str, deque[tuple[int, int]]] = {}
+        self._dropped: dict[str, deque[tuple[int, int]]] = {}
+        self._undeclared: dict[str, deque[tuple[int, int, int]]] = {}
+        """Number, tick and length of the latest undeclared blocks since the numbering restarted."""
+        self._renumbered: dict[str, tuple[int, int]] = {}
+        """Number after the last of these blocks that was declared later: as sent, and true."""
 
     def declare(self, document: Mapping[str, Any]) -> bool:
-        """Take note of a document on faults, for those behind zenoh; whether it is one."""
+        """Register a document on faults, of blocks sent by zenoh. Return whether it is such a document."""
         try:
-            told = check(_Document, dict(document), field="faults")
+            found = check(_Document, dict(document), field="faults")
         except InputError:
             return False
-        for one in told.blocks:
-            if one.key not in self._known and len(self._known) >= _MOST_STREAMS:
+        for one in found.blocks:
+            if one.key not in self._known and len(self._known) >= _MAX_STREAMS:
                 continue
             sent, known = [each for each in one.sent if "zenoh" in each.doors], self._known.setdefault(one.key, {})
             if not sent:
-                never = self._never.setdefault(one.key, deque(maxlen=_MOST))
-                if never and sum(never[-1]) == one.row:
-                    never[-1] = (never[-1][0], never[-1][1] + one.rows)
+                dropped = self._dropped.setdefault(one.key, deque(maxlen=_MAX_PENDING))
+                if dropped and sum(dropped[-1]) == one.row:
+                    dropped[-1] = (dropped[-1][0], dropped[-1][1] + one.rows)
                 else:
-                    never.append((one.row, one.rows))
+                    dropped.append((one.row, one.rows))
             for each in sent:
                 if each.index != one.row:
-                    self._untold.setdefault(one.key, deque(maxlen=_AHEAD))
-                if (which := (each.index, each.tick, one.rows)) in self._untold.get(one.key, ()):
-                    self._untold[one.key].remove(which)
-                    self._tell(one.key, each.index + one.rows, one.row + one.rows)
+                    self._undeclared.setdefault(one.key, deque(maxlen=_MAX_WAITING))
+                if (which := (each.index, each.tick, one.rows)) in self._undeclared.get(one.key, ()):
+                    self._undeclared[one.key].remove(which)
+                    self._correct(one.key, each.index + one.rows, one.row + one.rows)
                 else:
                     known.setdefault(which, [one.row, 0])[1] += 1
-            while len(known) > _MOST:
+            while len(known) > _MAX_PENDING:
                 del known[next(iter(known))]
-            self._settle(one.key)
+            self._count_dropped(one.key)
         return True
 
     def knows(self, key: str, block: Block) -> bool:
-        """Whether a block was told."""
+        """Return whether a block has been declared."""
         return (block.index, block.tick, len(block.values)) in self._known.get(key, {})
 
     def true(self, key: str, block: Block) -> Block:
-        """A block with the number and the tick that its rows have."""
+        """Return a block with the true number and tick of its rows."""
         found = self._known.get(key, {}).get((block.index, block.tick, len(block.values)))
         if found is None or found[0] == block.index:
             tick = None if found is None else round(block.index * block.tick_rate_hz / block.rate_hz)
@@ -128,49 +128,55 @@ class Declared(Continuity):
         return replace(block, index=found[0], tick=round(found[0] * block.tick_rate_hz / block.rate_hz))
 
     def take(self, key: str, block: Block) -> Gap | None:
-        """Take the next block; the step before it, but where it is told why there is one back."""
+        """Count the next block. Return the gap before it; None without a gap, or if a late block is declared."""
         known, rows = self._known.get(key, {}), len(block.values)
-        told = known.get(which := (block.index, block.tick, rows))
-        row = block.index if told is None else told[0]
+        declared = known.get(which := (block.index, block.tick, rows))
+        row = block.index if declared is None else declared[0]
         due = self.next.get(key, row)
         self._first.setdefault(key, due)
-        if told is None and (row < due or key in self._untold):
-            self._untold.setdefault(key, deque(maxlen=_AHEAD)).append(which)
-        if (told is not None and row > due == block.index) or (due, row) == self._anew.get(key):
-            # Those before it, of which nothing was told in time, were numbered as it is.
+        if declared is None and (row < due or key in self._undeclared):
+            self._undeclared.setdefault(key, deque(maxlen=_MAX_WAITING)).append(which)
+        if (declared is not None and row > due == block.index) or (due, row) == self._renumbered.get(key):
+            # The earlier blocks, which were not declared in time, were renumbered as this one is.
             self.next[key] = due = row
-            self._know(key)
-        gap = self.follow(key, row, rows) if told is None or row >= due else None
+            self._withdraw_restart(key)
+        gap = self.follow(key, row, rows) if declared is None or row >= due else None
         if gap is not None and gap.size > 0:
-            self._holes.setdefault(key, deque(maxlen=_MOST)).append((due, row))
-        if told is not None:
+            self._missing.setdefault(key, deque(maxlen=_MAX_PENDING)).append((due, row))
+        if declared is not None:
             if row < due:
-                self._fill(key, row, rows)
-            told[1] -= 1
-            if not told[1]:
+                self._count_late(key, row, rows)
+            declared[1] -= 1
+            if not declared[1]:
                 del known[which]
-        self._settle(key)
+        self._count_dropped(key)
         return gap
 
-    def _know(self, key: str) -> None:
-        """What seemed to be numbers that began anew was told to be none."""
+    def _withdraw_restart(self, key: str) -> None:
+        """Withdraw a restart of the numbering that a document has explained."""
         self.runs[key] = max(0, self.runs.get(key, 0) - 1)
-        self._anew.pop(key, None)
+        self._renumbered.pop(key, None)
 
-    def _tell(self, key: str, number: int, row: int) -> None:
-        """The block before a number, as it was sent, was taken, and is the one before a row."""
-        self._anew[key] = number, row
+    def _correct(self, key: str, number: int, row: int) -> None:
+        """Correct the counts for a block that was declared after its arrival.
+
+        Args:
+            key: Stream.
+            number: Row number after the block, as sent.
+            row: True row number after the block.
+        """
+        self._renumbered[key] = number, row
         if self.next.get(key) == number:
             self.next[key] = row
-            self._know(key)
-        elif (number, row) in self._holes.get(key, ()):
-            self._holes[key].remove((number, row))
+            self._withdraw_restart(key)
+        elif (number, row) in self._missing.get(key, ()):
+            self._missing[key].remove((number, row))
             self.declared[key] = self.declared.get(key, 0) + row - number
-            self._know(key)
+            self._withdraw_restart(key)
 
-    def _fill(self, key: str, row: int, rows: int) -> None:
-        """Count a block that came behind later ones: late where its rows were missing, else a second time."""
-        holes = self._holes.get(key, deque())
+    def _count_late(self, key: str, row: int, rows: int) -> None:
+        """Count a block that arrived after later ones: as late if its rows were missing, otherwise as a duplicate."""
+        holes = self._missing.get(key, deque())
         hole = next((each for each in reversed(holes) if each[0] <= row and row + rows <= each[1]), None)
         if hole is None:
             early = row + rows <= self._first[key]
@@ -183,24 +189,24 @@ class Declared(Continuity):
         self.received[key] += rows
         self.declared[key] = self.declared.get(key, 0) + rows
 
-    def _settle(self, key: str) -> None:
-        """Count what a fault has taken up to the row that is due."""
-        never, due = self._never.get(key), self.next.get(key, 0)
-        while never and never[0][0] < due:
-            row, rows = never.popleft()
+    def _count_dropped(self, key: str) -> None:
+        """Count the rows that faults dropped up to the next expected row."""
+        dropped, due = self._dropped.get(key), self.next.get(key, 0)
+        while dropped and dropped[0][0] < due:
+            row, rows = dropped.popleft()
             here = min(row + rows, due) - row
             if here < rows:
-                never.appendleft((row + here, rows - here))
+                dropped.appendleft((row + here, rows - here))
             if row >= self._first.get(key, 0):
                 self.declared[key] = self.declared.get(key, 0) + here
             else:
-                self._before.setdefault(key, []).append((row, here))
+                self._dropped_before.setdefault(key, []).append((row, here))
 
     @property
     def faulty(self) -> set[str]:
-        """Streams that blocks were never sent of."""
-        return {*self._never}
+        """Streams of which a fault dropped blocks."""
+        return {*self._dropped}
 
     def around(self, key: str) -> list[list[int]]:
-        """Rows that were never sent before the first block of a stream, and behind its last: first and number."""
-        return [list(each) for each in (*self._before.get(key, ()), *self._never.get(key, ()))]
+        """Return the dropped rows before the first block of a stream and after its last one: first row and number."""
+        return [list(each) for each in (*self._dropped_before.get(key, ()), *self._dropped.get(key, ()))]

@@ -1,4 +1,4 @@
-"""What may go wrong with the pulses of the keyphasor: kinds about turns, beside those of `faults.kinds`."""
+"""Kinds of faults of the keyphasor's pulses, counted in turns, in addition to those of `faults.kinds`."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from rig.channels.faults.kind import SIGMAS, At, Kind, late_v
 from rig.channels.table import Channel
 
 MAX_TURNS_HZ = 100.0
-"""No shaft here turns faster: a fault of turns has no more of them [1/s]."""
+"""Largest number of turns per second [1/s]; no shaft of the rig is faster."""
 
 
 class MissPulses(Kind, number=27):
-    """No pulse in turns whose u(turn) < part."""
+    """No pulse in turns with u(turn) < part."""
 
     stage = "keyphasor"
     channel_only = "keyphasor"
@@ -27,25 +27,25 @@ class MissPulses(Kind, number=27):
         return "part", 1.0, 1.0 / MAX_TURNS_HZ
 
     def signal(self, x: np.ndarray, at: At) -> np.ndarray:
-        return np.where(_picked(at, self.part), 0.0, x)
+        return np.where(_select_rows(at, self.part), 0.0, x)
 
     def edges(self, ticks: np.ndarray, at: At) -> np.ndarray:
-        return ticks[~_picked(at, self.part)] if len(ticks) else ticks
+        return ticks[~_select_rows(at, self.part)] if len(ticks) else ticks
 
 
 class ExtraPulses(MissPulses, number=28):
-    """A pulse half a turn behind that of turns whose u(turn) < part."""
+    """A second pulse half a turn after that of turns with u(turn) < part."""
 
     kind: Literal["extra-pulses"] = "extra-pulses"  # pyrefly: ignore[bad-override]
 
     def signal(self, x: np.ndarray, at: At) -> np.ndarray:
-        return np.maximum(x, np.where(_picked(at, self.part), at.mark(at.angle - math.pi), 0.0))
+        return np.maximum(x, np.where(_select_rows(at, self.part), at.mark(at.angle - math.pi), 0.0))
 
     def edges(self, ticks: np.ndarray, at: At) -> np.ndarray:
         if not len(ticks):
             return ticks
         extra = ticks + 1e6 * math.pi / at.rate
-        return np.sort(np.concatenate([ticks, extra[_picked(at, self.part)]]))
+        return np.sort(np.concatenate([ticks, extra[_select_rows(at, self.part)]]))
 
 
 class EdgeJitter(Kind, number=29):
@@ -60,7 +60,7 @@ class EdgeJitter(Kind, number=29):
         return late_v(channel, 2e-6 * SIGMAS * self.rms_us)
 
     def _late_s(self, at: At) -> np.ndarray:
-        turns, known = _turns(at)
+        turns, known = _number_turns(at)
         late_s = 1e-6 * self.rms_us * (SIGMAS + np.clip(at.draw.normal(known), -SIGMAS, SIGMAS))
         return late_s[turns - known[0]]
 
@@ -71,15 +71,15 @@ class EdgeJitter(Kind, number=29):
         return ticks + 1e6 * self._late_s(at) if len(ticks) else ticks
 
 
-def _turns(at: At) -> tuple[np.ndarray, np.ndarray]:
-    """Number of each row's turn, counted from a quarter before its mark, shape (n,); and all that there are."""
+def _number_turns(at: At) -> tuple[np.ndarray, np.ndarray]:
+    """Return each row's turn, counted from a quarter turn before the mark, shape (n,), and all turn numbers between."""
     turns = np.floor(at.angle / (2.0 * math.pi) + 0.25).astype(np.int64)
     return turns, np.arange(turns.min(), turns.max() + 1)
 
 
-def _picked(at: At, part: float) -> np.ndarray:
-    """Whether rows are of turns that are hit, shape (n,)."""
-    turns, known = _turns(at)
+def _select_rows(at: At, part: float) -> np.ndarray:
+    """Return whether the fault selects each row's turn, shape (n,)."""
+    turns, known = _number_turns(at)
     return (at.draw.uniform(known)[:, 0] < part)[turns - known[0]]
 
 

@@ -138,12 +138,12 @@ def _judge_live(
     import threading
 
     from replays.score.judgement import judge
-    from replays.score.records.live import LONGEST_S, SHORTEST_S, collect
+    from replays.score.records.live import MAX_STRETCH_S, MIN_STRETCH_S, collect
     from rig.cli.output.progress import reporting
     from rig.cli.signals import stop_on_signals
 
-    if not SHORTEST_S <= for_s <= LONGEST_S:
-        raise InputError("--for-s", f"from {SHORTEST_S:g} to {LONGEST_S:g}", for_s)
+    if not MIN_STRETCH_S <= for_s <= MAX_STRETCH_S:
+        raise InputError("--for-s", f"from {MIN_STRETCH_S:g} to {MAX_STRETCH_S:g}", for_s)
     if sys.stdin.isatty():
         raise InputError("FILE", "fed by a pipe where it is -: my-daq | rig score -", Words("a terminal"))
     stopped = threading.Event()

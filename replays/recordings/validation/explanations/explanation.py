@@ -1,4 +1,4 @@
-"""One thing that may explain a difference, and how much of it: residuals over noise, before and after."""
+"""Possible explanation of a difference, and the part that it explains: residuals over noise, before and after."""
 
 from __future__ import annotations
 
@@ -15,31 +15,31 @@ from rig.channels.faults.defects import defects_in
 
 Kind = Literal["sensor", "time", "command", "model"]
 
-_SIGMAS = 6.0
-"""Residuals are noise while their sum of squares is above its mean by less than so many standard deviations."""
+_NOISE_DEVIATIONS = 6.0
+"""Standard deviations above its mean within which a sum of squares is noise."""
 _NAMES = re.compile(r"((?:\w+(?:, | and ))*\w+) ?(.*)")
 """Channels of a name, and the defects that follow."""
 _UNTIMED = ("keyphasor",)
-"""A pulse is no smooth function of anything."""
+"""Channels that are not smooth functions of time."""
 
 
 @dataclass(frozen=True)
 class Explanation:
-    """One thing that may be off.
+    """A possible explanation of a difference.
 
     Attributes:
         kind: Sensor, time, a command, or model.
-        name: What.
-        change: By how much, in words.
-        value: The same as a number: a part, or in `unit`.
-        unit: Unit of `value`; "" for a part of the value itself.
-        explained: Part of the residual's excess over noise that it takes away.
-        left: RMS of what is left over the floor, in the channels that it is about.
+        name: Name of the changed number, or channels and defect.
+        change: Size of the change as text.
+        value: Size of the change: relative, or in `unit`.
+        unit: Unit of `value`; "" for a relative change.
+        explained: Part of the residual's excess over noise that it removes.
+        left: RMS of the remaining residual over the floor, in the channels concerned.
         squares: Sum of squares of the same.
-        n: Samples in it.
-        to_s: End of the window that this is said of [s]; earlier than the others' where it was given up there.
-        sure: Whether what it leaves is as good as nothing.
-        from_s: Where it begins, where that is known [s].
+        n: Number of samples in it.
+        to_s: End of the window of the fit [s]; earlier than that of others if it was given up there.
+        sure: Whether the remaining residual is negligible.
+        from_s: Begin of the change, if known [s].
     """
 
     kind: Kind
@@ -68,48 +68,48 @@ class Explanation:
         explained: float,
         to_s: float,
     ) -> Explanation:
-        """One that leaves residuals over their floors, shape (n,)."""
+        """Return an explanation that leaves residuals over their floors, shape (n,)."""
         squares, n = float(residuals @ residuals), max(1, len(residuals))
         return cls(kind, name, change, value, unit, explained, math.sqrt(squares / n), squares, n, to_s)
 
     @property
     def channels_and_defect(self) -> tuple[str, str]:
-        """Names of the channels and of their defects in `name`; the second is empty where `change` has them."""
+        """Channels and defects in `name`; the latter are empty if `change` has them."""
         channels, defect = _NAMES.fullmatch(self.name).groups()  # pyrefly: ignore[missing-attribute]
         return channels, defect
 
     @property
     def defects(self) -> tuple[str, ...]:
-        """Names in the table of defects; none where a model, a command or the time of all channels is the cause."""
+        """Names in the table of defects; empty if a model, a command or the time of all channels is the cause."""
         return defects_in(self.channels_and_defect[1] or self.change) if self.kind == "sensor" else ()
 
     @property
     def at_floor(self) -> bool:
-        """Nothing but noise is left."""
-        return _of_noise(self.squares, self.n)
+        """True if the remaining residual is noise."""
+        return _is_noise_sum(self.squares, self.n)
 
 
 def smooth_columns(part: Measured) -> list[int]:
-    """Columns of the channels that are smooth functions of time."""
+    """Return the columns of the channels that are smooth functions of time."""
     return [c for c, channel in enumerate(part.channels) if channel.name not in _UNTIMED]
 
 
 def vector(parts: dict[str, Measured], values: dict[str, np.ndarray]) -> np.ndarray:
-    """Residuals over their floors of all channels, shape (n,)."""
+    """Return the residuals over their floors of all channels, shape (n,)."""
     return np.concatenate(
         [scaled(parts[name], v)[:, smooth_columns(parts[name])].ravel() for name, v in values.items()]
     )
 
 
 def is_noise(residuals: np.ndarray) -> bool:
-    """Whether residuals over their floors are nothing but noise."""
-    return _of_noise(float(residuals @ residuals), len(residuals))
+    """Return whether residuals over their floors are noise."""
+    return _is_noise_sum(float(residuals @ residuals), len(residuals))
 
 
 def excess(residuals: np.ndarray) -> float:
-    """Sum of squares of residuals over their floors beyond that of noise."""
+    """Return the sum of squares of residuals over their floors beyond that of noise."""
     return max(float(residuals @ residuals) - len(residuals), 0.0)
 
 
-def _of_noise(squares: float, n: int) -> bool:
-    return squares < n + _SIGMAS * math.sqrt(2.0 * n)
+def _is_noise_sum(squares: float, n: int) -> bool:
+    return squares < n + _NOISE_DEVIATIONS * math.sqrt(2.0 * n)

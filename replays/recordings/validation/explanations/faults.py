@@ -1,4 +1,4 @@
-"""Faults that no number of the model makes: a channel's gain, offset, polarity or noise, and the recorder's clock."""
+"""Faults that are not numbers of the model: a channel's gain, offset, polarity or noise, and the recorder's clock."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 
 from replays.estimate.least_squares import fit
 from replays.recordings.resimulation.prediction import Measured, Prediction
-from replays.recordings.validation.explanations.channel_fit import DECIDES, FEW, OFF, Shown, gain_words
+from replays.recordings.validation.explanations.channel_fit import MARGIN, MIN_ROWS, OUTLIER, Shown, gain_words
 from replays.recordings.validation.explanations.explanation import (
     Explanation,
     excess,
@@ -25,98 +25,100 @@ from replays.recordings.validation.trajectory import floors
 from rig.channels.faults.defects import DEFECTS, size_text
 from rig.channels.table import Channel
 
-_TURNED_OFF = 0.02
-"""By so much may two probes' signals differ from ones that are turned."""
-_FADED = 1e-3
-"""Part of a level by which a row more or less lets an AC-coupled channel be off."""
-_SURE = 6.0
-"""Times its noise, by which a sample, or the mean of some, is off."""
-SOME = 100
-"""Rows that two channels must share to be a pair."""
-_AROUND_S = 0.1
-"""What comes before a window tells what filters and delays make of it."""
+_TURN_TOLERANCE = 0.02
+"""Largest deviation of two probes' signals from rotated ones."""
+_FADED_PART = 1e-3
+"""Tolerance of an AC-coupled channel's level, due to the begin of the fault between two rows."""
+_OUTLIER_NOISES = 6.0
+"""Deviation of a sample, or of the mean of some, in noises, that is not noise."""
+PAIR_ROWS = 100
+"""Fewest common rows of two channels for them to be a pair."""
+_MARGIN_S = 0.1
+"""Time before a window that affects filtered and delayed signals in it."""
 _SETTLES_S = 2e-3
-"""Filters have forgotten a jump by then."""
-MOST = 0.9
-"""Changes of channels that together explain this part of all are it, though the model leaves something."""
-_ALIKE = 0.2
-"""Changes that differ by less than this part of them may be the same one."""
-_SEARCH = 400
-"""Samples by which the time may be off in the first search, either way."""
+"""Settling time of filters after a jump."""
+MIN_PART = 0.9
+"""Part of the difference that sensors must explain together, if the model is not exact."""
+_EQUAL_PART = 0.2
+"""Relative difference of changes that may be one common change."""
+_SEARCH_ROWS = 400
+"""Range of the first search for a time offset [samples], in either direction."""
 
 
 def sensor_faults(
     parts: dict[str, Measured], nominal: Prediction, end_s: float, others: Sequence[Prediction] = (), *,
     from_s: float = -math.inf,
 ) -> list[Explanation]:  # fmt: skip
-    """What each channel that differs may have, by itself, or as one of a pair.
+    """Return the faults of differing channels, single or in pairs.
 
     Args:
-        parts: What was recorded.
-        nominal: What was predicted.
+        parts: Recorded channels.
+        nominal: Prediction.
         end_s: End of the window [s].
-        others: What might be predicted as well.
-        from_s: About the first difference: a fault that begins on the way is looked for behind it [s].
+        others: Equally valid predictions.
+        from_s: Approximate first difference, after which a fault that begins within the run is fitted [s].
     """
     if math.isfinite(from_s):
-        from_s = _onset_s(parts, nominal, from_s, end_s)
+        from_s = _find_onset_s(parts, nominal, from_s, end_s)
     shown = []
     for name, part in parts.items():
         rows = slice(part.rows_until(from_s), part.rows_until(end_s))
-        foretold, *shown_too = (one.values[name][rows] for one in (nominal, *others))
-        floor = floors(part, foretold, shown_too)
+        expected, *shown_too = (one.values[name][rows] for one in (nominal, *others))
+        floor = floors(part, expected, shown_too)
         shown += [
             Shown(
-                part.channels[c], part.times_s[rows], part.values[rows, c], foretold[:, c], floor[:, c],
+                part.channels[c], part.times_s[rows], part.values[rows, c], expected[:, c], floor[:, c],
                 float(part.floor[c]), beside=partial(beside, parts, nominal, part.channels[c]),
-                around=around(part, nominal.values[name][:, c], rows.start, rows.stop),
+                around=extend(part, nominal.values[name][:, c], rows.start, rows.stop),
             )
             for c in smooth_columns(part)
         ]  # fmt: skip
-    return told_of(shown, end_s)
+    return diagnose(shown, end_s)
 
 
-def told_of(shown: list[Shown], end_s: float, step: Callable[[str], None] = lambda _text: None) -> list[Explanation]:
-    """What channels have: pairs of them first, then each by itself, and what several share as one."""
+def diagnose(shown: list[Shown], end_s: float, step: Callable[[str], None] = lambda _text: None) -> list[Explanation]:
+    """Return the faults of pairs of channels, then of single ones, with equal faults of several channels merged."""
     total = sum(excess(one.apart) for one in shown)
     off = {
-        one.name: one for one in shown if one.counts is not None or (len(one.values) > FEW and not is_noise(one.apart))
+        one.name: one
+        for one in shown
+        if one.counts is not None or (len(one.values) > MIN_ROWS and not is_noise(one.apart))
     }
-    told = _Telling(total, end_s)
+    explain = _ExplanationMaker(total, end_s)
     found, seen = [], set()
     for a, b in combinations(off.values(), 2):
         if {a.name, b.name} & seen:
             continue
         if a.counts is not None:
             times_s = np.intersect1d(a.times_s, b.times_s)
-            if len(times_s) < SOME:
+            if len(times_s) < PAIR_ROWS:
                 continue
             a, b = a.at(times_s), b.at(times_s)
         elif a.unit != b.unit or len(a.values) != len(b.values):
             continue
-        pair = _swapped(a, b, told) or (_turned(a, b, told) if a.counts is None else None)
+        pair = _explain_swap(a, b, explain) or (_explain_turn(a, b, explain) if a.counts is None else None)
         if pair is not None:
             found.append(pair)
             seen |= {a.name, b.name}
     alone = []
     for name, one in off.items():
         if name not in seen:
-            step(f"what {name} has")
-            alone.append(_alone(one, told))
-    return found + _together(alone, told, [one.name for one in shown if one.moves])
+            step(f"faults of {name}")
+            alone.append(_explain_channel(one, explain))
+    return found + _merge_equal(alone, explain, [one.name for one in shown if one.moves])
 
 
-def around(part: Measured, foretold: np.ndarray, begin: int, end: int) -> tuple[np.ndarray, np.ndarray]:
-    """Times and what a channel should show, from shortly before some rows to shortly behind them."""
-    more = round(_AROUND_S * part.channels[0].rate_hz)
-    rows = slice(max(0, begin - more), min(end + more, len(foretold)))
-    return part.times_s[rows], foretold[rows]
+def extend(part: Measured, expected: np.ndarray, begin: int, end: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return times and expected signal of a channel, from shortly before some rows to shortly after them."""
+    more = round(_MARGIN_S * part.channels[0].rate_hz)
+    rows = slice(max(0, begin - more), min(end + more, len(expected)))
+    return part.times_s[rows], expected[rows]
 
 
 def beside(
     parts: Mapping[str, Measured], nominal: Prediction, channel: Channel
 ) -> dict[Channel, tuple[np.ndarray, np.ndarray]]:
-    """Times and what the other channels should show [their units], of those that move."""
+    """Return times and expected signals of the other, varying channels [their units]."""
     found = {}
     for name, part in parts.items():
         values = nominal.values[name]
@@ -127,53 +129,53 @@ def beside(
     return found
 
 
-def _onset_s(parts: dict[str, Measured], nominal: Prediction, from_s: float, end_s: float) -> float:
-    """From when on a channel is not as it should be, with what filters need to settle, if enough is left [s]."""
+def _find_onset_s(parts: dict[str, Measured], nominal: Prediction, from_s: float, end_s: float) -> float:
+    """Return the begin of a fault, after the settling of filters if enough rows remain [s]."""
     onsets = [end_s]
     for name, part in parts.items():
         rows = slice(part.rows_until(from_s), part.rows_until(end_s))
         z = ((part.values - nominal.values[name][: len(part.values)]) / part.floor)[rows, smooth_columns(part)]
         sums = np.cumsum(np.vstack([np.zeros(z.shape[1]), z]), axis=0)
-        lasting = np.abs(sums[FEW:] - sums[:-FEW]) > _SURE * math.sqrt(FEW)
-        # A mean over some rows tells it when it has gone on for a part of them.
-        firsts = np.concatenate([np.flatnonzero((np.abs(z) > _SURE).any(axis=1)),
-                                 np.flatnonzero(lasting.any(axis=1)) + FEW - 1])  # fmt: skip
+        lasting = np.abs(sums[MIN_ROWS:] - sums[:-MIN_ROWS]) > _OUTLIER_NOISES * math.sqrt(MIN_ROWS)
+        # A mean over some rows shows it only after a part of them.
+        firsts = np.concatenate([np.flatnonzero((np.abs(z) > _OUTLIER_NOISES).any(axis=1)),
+                                 np.flatnonzero(lasting.any(axis=1)) + MIN_ROWS - 1])  # fmt: skip
         onsets += [float(part.times_s[rows][firsts.min()])] if len(firsts) else []
     onset_s = min(onsets)
     return onset_s + _SETTLES_S if end_s - onset_s > 3.0 * _SETTLES_S else onset_s
 
 
-def cured_by(sensors: list[Explanation], parts: dict[str, Measured], most: float = MOST) -> bool:
-    """Whether sensors are it: they leave noise, or nearly all is theirs."""
+def are_cause(sensors: list[Explanation], parts: dict[str, Measured], most: float = MIN_PART) -> bool:
+    """Return whether sensors are the cause: they leave noise, or explain nearly all of the difference."""
     return bool(sensors) and (
         all(one.at_floor for one in sensors)
-        or (sum(one.explained for one in sensors) > most and not _whole_kind(sensors, parts))
+        or (sum(one.explained for one in sensors) > most and not _is_whole_kind(sensors, parts))
     )
 
 
-def channels_in(found: list[Explanation], names: Iterable[str]) -> list[str]:
-    """Channels that explanations are about."""
+def select_channels(found: list[Explanation], names: Iterable[str]) -> list[str]:
+    """Return the channels that explanations concern."""
     words = {word for one in found for word in one.name.replace(",", " ").split()}
     return [name for name in names if name in words]
 
 
-def _whole_kind(found: list[Explanation], parts: dict[str, Measured]) -> bool:
-    """Whether all channels of a kind are off, and not alike: then it is what they show, and none of them."""
+def _is_whole_kind(found: list[Explanation], parts: dict[str, Measured]) -> bool:
+    """Return whether all channels of a kind differ, but not equally: then the motion differs, not the channels."""
     kinds: dict[str, list[str]] = {}
     for channel in (channel for part in parts.values() for channel in part.channels):
         kinds.setdefault(channel.unit, []).append(channel.name)
     return any(
         len(names) > 2
-        and channels_in(found, names) == names
-        and sum(bool(channels_in([one], names)) for one in found) > 1
+        and select_channels(found, names) == names
+        and sum(bool(select_channels([one], names)) for one in found) > 1
         for names in kinds.values()
     )
 
 
-def late_together(found: Sequence[Explanation], parts: Mapping[str, Measured]) -> dict[str, float]:
-    """Delay of each of those channels that may be late together [s], as half of their kind was found to be.
+def find_common_delay(found: Sequence[Explanation], parts: Mapping[str, Measured]) -> dict[str, float]:
+    """Return the common delay of the channels of a kind [s], if at least half of them were found to have it.
 
-    What the fit before took for motion hides it in the others.
+    In the other channels the earlier fit has taken the delay for motion.
     """
     units = {channel.name: channel.unit for part in parts.values() for channel in part.channels}
     for one in found:
@@ -185,8 +187,8 @@ def late_together(found: Sequence[Explanation], parts: Mapping[str, Measured]) -
 
 
 @dataclass(frozen=True)
-class _Telling:
-    """Makes explanations of one window: of which excess in all they explain a part, and to where."""
+class _ExplanationMaker:
+    """Constructor of explanations of one window, relative to its total excess."""
 
     total: float
     to_s: float
@@ -200,15 +202,15 @@ class _Telling:
         )
 
 
-def _swapped(a: Shown, b: Shown, told: _Telling) -> Explanation | None:
-    """Two channels that show each other's signal, each at what it shows at rest."""
+def _explain_swap(a: Shown, b: Shown, explain: _ExplanationMaker) -> Explanation | None:
+    """Return the explanation by two exchanged signals, each about its value at rest, or None."""
     crossed, own, before = np.empty(0), np.inf, np.concatenate([a.apart, b.apart])
     signs = set[float]()
     if a.counts is None and not (a.moves and b.moves):
         return None
     for x, y in ((a, b), (b, a)):
-        # Of logs nobody knows which cable, conditioner or name it is; the rig's own cables carry volts.
-        times_s, signal = y.around or (y.times_s, y.foretold)
+        # In a log the exchange may be of cables, conditioners or names; the rig's cables carry volts.
+        times_s, signal = y.around or (y.times_s, y.expected)
         if x.counts is not None:
             volts = np.clip(y.channel.bias_v + y.channel.sensitivity_v * signal, *y.channel.range_v)
             signal = (volts - x.channel.bias_v) / x.channel.sensitivity_v
@@ -218,83 +220,83 @@ def _swapped(a: Shown, b: Shown, told: _Telling) -> Explanation | None:
         if y.moves and signal.std() > x.noise and abs(factors[0] - min(signs)) > 0.1:
             if x.counts is None:
                 return None
-            continue  # its converter may be too small for it: the other of the two tells
+            continue  # it may exceed the range of this converter: the other channel decides
         if not y.moves:
             (level,), left = x.left([x.level], x.values - shown)
-            if abs(level) > OFF * x.noise + _FADED * float(np.abs(shown).max()):
+            if abs(level) > OUTLIER * x.noise + _FADED_PART * float(np.abs(shown).max()):
                 return None
-        own = min(own, excess(x.left([x.foretold, x.level])[1]))
+        own = min(own, excess(x.left([x.expected, x.level])[1]))
         crossed = np.concatenate([crossed, left])
     if not len(crossed):
         return None
     if not is_noise(crossed) and excess(crossed) > 0.01 * (own if a.counts is None else excess(before)):
         return None
     if len(signs) > 1:
-        return None  # one of them inverted, which is a quarter of a turn
+        return None  # one of them is inverted, which is a rotation by a quarter of a turn
     change = DEFECTS["swap"].validation[signs != {1.0}]
-    return told(f"{a.name} and {b.name}", change, 0.0, crossed, before)
+    return explain(f"{a.name} and {b.name}", change, 0.0, crossed, before)
 
 
-def _turned(a: Shown, b: Shown, told: _Telling) -> Explanation | None:
-    """Two probes that sit at another angle than is told: both signals are turned by it."""
-    ones = np.ones(len(a.foretold))
-    (aa, ab, _), left_a = a.left([a.foretold, b.foretold, ones])
-    (ba, bb, _), left_b = b.left([a.foretold, b.foretold, ones])
+def _explain_turn(a: Shown, b: Shown, explain: _ExplanationMaker) -> Explanation | None:
+    """Return the explanation by two probes at another angle, whose signals are rotated by it, or None."""
+    ones = np.ones(len(a.expected))
+    (aa, ab, _), left_a = a.left([a.expected, b.expected, ones])
+    (ba, bb, _), left_b = b.left([a.expected, b.expected, ones])
     angle = math.atan2(ab - ba, aa + bb)
     off = max(abs(aa - bb), abs(ab + ba), abs(math.hypot(aa, ab) - 1.0))
-    if not (a.moves and b.moves) or off > _TURNED_OFF or abs(math.sin(angle)) < 3.0 * off:
+    if not (a.moves and b.moves) or off > _TURN_TOLERANCE or abs(math.sin(angle)) < 3.0 * off:
         return None
     left = np.concatenate([left_a, left_b])
     if not is_noise(left) and excess(left) > 0.01 * (excess(a.apart) + excess(b.apart)):
         return None
     before = np.concatenate([a.apart, b.apart])
-    return told(f"{a.name} and {b.name} angle", size_text("angle", angle), angle, left, before, "rad")
+    return explain(f"{a.name} and {b.name} angle", size_text("angle", angle), angle, left, before, "rad")
 
 
 @dataclass(frozen=True)
-class _Alone:
-    """What one channel has, by itself.
+class _ChannelFault:
+    """Fault of a single channel.
 
     Attributes:
         shown: The channel.
-        told: What it has.
-        cost: Sum of squares that it leaves, and what its numbers cost.
-        numbers: Its gain less 1 and its delay [s], where it has one.
+        explanation: Explanation by the fault.
+        cost: Remaining sum of squares, plus the price of the law's numbers.
+        numbers: Gain error and delay [s], if there are any.
     """
 
     shown: Shown
-    told: Explanation
+    explanation: Explanation
     cost: float
     numbers: Mapping[str, float]
 
     def by(self, kind: str, value: float) -> tuple[float, np.ndarray]:
-        """Cost of nothing but a gain or a delay that others pay for, with an offset or without, and what it leaves."""
+        """Return cost and residual with a given gain error or delay, with or without an offset."""
         one = self.shown
-        shown = (1.0 + value) * one.foretold if kind == "gain" else one.foretold_at(one.times_s - value)
+        shown = (1.0 + value) * one.expected if kind == "gain" else one.expected_at(one.times_s - value)
         _, left = one.left([np.ones(len(shown))], one.values - shown)
         alone = (one.values - shown) / one.floor
         costs = [(float(alone @ alone), alone), (float(left @ left) + one.price, left)]
         return min(costs, key=lambda pair: pair[0])
 
 
-def _alone(one: Shown, told: _Telling) -> _Alone:
+def _explain_channel(one: Shown, explain: _ExplanationMaker) -> _ChannelFault:
     law = law_of(one)
-    found = told(f"{one.name} {law.name}", law.change, law.value, law.left, one.apart, law.unit)
+    found = explain(f"{one.name} {law.name}", law.change, law.value, law.left, one.apart, law.unit)
     found = replace(found, sure=law.sure)
-    return _Alone(one, found, found.squares + one.price * law.count, law.numbers)
+    return _ChannelFault(one, found, found.squares + one.price * law.count, law.numbers)
 
 
-def _together(alone: list[_Alone], told: _Telling, moving: list[str]) -> list[Explanation]:
-    """Channels that are off by the same, told as one: where one number for all costs less than one for each.
+def _merge_equal(alone: list[_ChannelFault], explain: _ExplanationMaker, moving: list[str]) -> list[Explanation]:
+    """Merge channels with equal faults, if one number for all costs less than one for each.
 
-    Where most of those that move are late, it is the others that are early; where all are, it is the time.
+    If most of the varying channels are late, the others are early; if all are, the time is wrong.
     """
     found = []
     for kind in ("gain", "delay"):
         of = {one.shown.name: one.numbers[kind] for one in alone if kind in one.numbers}
         while of:
             near = [
-                [name for name, other in of.items() if abs(other - value) < _ALIKE * max(abs(other), abs(value))]
+                [name for name, other in of.items() if abs(other - value) < _EQUAL_PART * max(abs(other), abs(value))]
                 for value in of.values()
             ]
             names = max(near, key=len)
@@ -313,19 +315,19 @@ def _together(alone: list[_Alone], told: _Telling, moving: list[str]) -> list[Ex
                     continue
                 names, value, change = others, -value, size_text(kind, -value)
             before = np.concatenate([one.shown.apart for one in group])
-            found.append(told(f"{', '.join(names)} {kind}", change, value, left, before, DEFECTS[kind].unit))
-    return found + [one.told for one in alone]
+            found.append(explain(f"{', '.join(names)} {kind}", change, value, left, before, DEFECTS[kind].unit))
+    return found + [one.explanation for one in alone]
 
 
 class Clock:
-    """Residuals where the recording's clock is off by a shift and a rate; what is left out is not smooth in time."""
+    """Residuals with a shifted and scaled clock of the recording; channels that are not smooth in time are excluded."""
 
     def __init__(self, parts: dict[str, Measured], nominal: Prediction, end_s: float) -> None:
-        """Prepare.
+        """Interpolate the prediction.
 
         Args:
-            parts: What was recorded.
-            nominal: What was predicted.
+            parts: Recorded channels.
+            nominal: Prediction.
             end_s: End of the window [s].
         """
         from scipy.interpolate import CubicSpline
@@ -342,9 +344,9 @@ class Clock:
             self._period_s = min(float(np.diff(part.times_s).min()) for part in self._kept.values())
 
     def residuals(self, change: np.ndarray) -> np.ndarray:
-        """Over the noise, at a shift [s], or a shift and a rate [1], shape (n,)."""
+        """Return the residuals over noise at a shift [s], or a shift and a rate [1], shape (n,)."""
         shift, rate = float(change[0]), float(change[1]) if len(change) > 1 else 0.0
-        # Beyond the window the prediction is known as well: a shift does not run out of it.
+        # The prediction continues after the window, so that a shift stays within it.
         values = {
             name: self._splines[name](part.times_s - shift - rate * (part.times_s - self._first_s))
             for name, part in self._kept.items()
@@ -352,19 +354,19 @@ class Clock:
         return vector(self._kept, values)
 
     def coarse_shift(self) -> float:
-        """The shift in time that fits best, to a sample or so [s]; 0 where there are too few rows to tell."""
+        """Return the best shift in time to about a sample [s]; 0 if there are too few rows."""
         if not self._kept:
             return 0.0
-        # Few places are enough to find the one from which the slope leads on.
-        rows = np.unique(np.rint(np.concatenate([np.arange(-16, 17), np.linspace(-_SEARCH, _SEARCH, 101)])))
+        # A coarse grid suffices for the slope to converge.
+        rows = np.unique(np.rint(np.concatenate([np.arange(-16, 17), np.linspace(-_SEARCH_ROWS, _SEARCH_ROWS, 101)])))
         shifts = rows * self._period_s
         return float(min(shifts, key=lambda shift: float(np.sum(self.residuals(np.array([shift])) ** 2))))
 
     def faults(self, start_s: float) -> list[Explanation]:
-        """A shift, and a shift with a rate where that says more; none that takes nothing away.
+        """Return the explanation by a shift, and with a rate if that explains more; empty if they explain nothing.
 
         Args:
-            start_s: Where the search for the shift begins [s].
+            start_s: Initial value of the shift [s].
         """
         before = excess(self.residuals(np.zeros(1))) if self._kept else 0.0
         found: list[Explanation] = []
@@ -378,7 +380,7 @@ class Clock:
             if rates:
                 change, value, unit = f"{change} and {rate * 1e6:+.1f} ppm", rate * 1e6, "ppm"
             explained = 1.0 - excess(done.residuals) / before
-            if explained > 0.0 and (not found or done.squares < found[0].squares - DECIDES):
+            if explained > 0.0 and (not found or done.squares < found[0].squares - MARGIN):
                 found.append(
                     Explanation.of(
                         done.residuals, kind="time", name="clock" if rates else "time offset", change=change,

@@ -1,4 +1,4 @@
-"""What a channel may have by itself: laws with few numbers, fitted to what it shows beside what it should show."""
+"""Laws of a channel's defects with few numbers, fitted to the recorded signal and the expected one."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ import numpy as np
 from replays.estimate.runs import true_runs
 from replays.estimate.spectra import spectrum
 from replays.recordings.validation.explanations.channel_fit import (
-    DECIDES,
-    FEW,
-    OFF,
+    MARGIN,
+    MIN_ROWS,
+    OUTLIER,
     Law,
     Shown,
     gain_words,
@@ -26,108 +26,108 @@ from replays.recordings.validation.explanations.signals import steady_rows
 from replays.recordings.validation.explanations.timing import delayed_by, filtered, late, ringing
 from rig.channels.faults.defects import DEFECTS, size_text
 
-_EXACTLY = 0.01
-"""The same where all else is known to the bit."""
-_NEARLY = 0.05
-"""A change that takes away all but this part is it, though the model leaves something."""
-_PERIODS = 1.5
-"""So many periods of a hum must be there."""
-_HIGHEST_HZ = 1000.0
-"""Of a hum."""
-_BENDS = ("resonance", "wander")
-"""Laws of more numbers that look like simpler ones where little is seen of them."""
-_MORE = {"offset": ("drift", "hum", "crosstalk", "delay", "gain and offset"), "delay": ("clock", "wander", "gain")}
-"""Laws that are one with another number."""
-_TIMES = ("delay", "clock", "wander")
-"""Laws by which noise is drawn again, so that there is exactly that of two draws."""
-_LOUD = 0.5
-"""Less than this part of what it should show is left without its loudest line."""
-_OWN = 0.25
-"""A line of its own, over that of a hum, by which it is not told from it."""
-_HALF = 0.5
-"""What is left where noise was drawn again may be this part of what was there."""
-_ANOTHER = 1.6
-"""What noise beside another seems to be times itself, at least."""
-_DRAWN = 1.6
-"""Of the noise, that the difference of two has at most."""
-_ALL = 0.95
-"""More than this part of the rows is all of them."""
-_SLACK, _FADING = 1e-3, 0.02
-"""Parts of its span by which a channel may be off a level."""
-_ROUNDED = 2
-"""Counts that rounding may make."""
-_NOTHING = 0.02
-"""What shows no more than this part of its signal shows nothing."""
-_CLEARLY = 0.25
-"""Of what a straight line leaves of a log, that a curve may leave: what is off elsewhere bends, too."""
-_STEADY = 0.6
-"""Of what noise is by its deviation, that it is by its median at least."""
-_SPARSE = 0.3
-"""Fewer than this part of the samples are spikes."""
+_EXACT_PART = 0.01
+"""Largest remaining part of a difference, if everything else is known to the bit."""
+_EXPLAINED_PART = 0.05
+"""Largest remaining part of an explained difference, if the model is not exact."""
+_MIN_HUM_PERIODS = 1.5
+"""Fewest periods of a hum."""
+_MAX_HUM_HZ = 1000.0
+"""Highest frequency of a hum."""
+_COMPLEX_LAWS = ("resonance", "wander")
+"""Laws with more numbers that resemble simpler ones over short stretches."""
+_KIN = {"offset": ("drift", "hum", "crosstalk", "delay", "gain and offset"), "delay": ("clock", "wander", "gain")}
+"""Laws that equal the first one with an additional number."""
+_TIME_LAWS = ("delay", "clock", "wander")
+"""Laws by which noise is sampled again, so that the residual is that of two independent noises."""
+_MAX_OTHER_PART = 0.5
+"""Largest part of the expected signal without its main line, for the signal to resemble hum."""
+_MAX_OWN_LINE = 0.25
+"""Largest line of the expected signal relative to a hum that is distinguished from it."""
+_RESAMPLED_PART = 0.5
+"""Largest remaining part of a difference, if noise was sampled again."""
+_MIN_NOISE_RATIO = 1.6
+"""Smallest ratio of noises at which independent additional noise is distinguished from resampled noise."""
+_MAX_NOISE_FACTOR = 1.6
+"""Largest residual of two independent noises, relative to one."""
+_ALL_PART = 0.95
+"""Part of the rows above which all count as affected."""
+_LEVEL_PART, _FADING_PART = 1e-3, 0.02
+"""Tolerance of a level relative to the span, without and with a filter that fades."""
+_MAX_ROUNDING = 2
+"""Largest difference by rounding [counts]."""
+_MIN_VISIBLE_PART = 0.02
+"""Smallest part of a signal that counts as a signal."""
+_MAX_CURVE_PART = 0.25
+"""Largest residual of a curve relative to that of a line for a log, as other errors are curved, too."""
+_MIN_STEADINESS = 0.6
+"""Smallest median estimate of noise relative to its standard deviation."""
+_MAX_SPIKE_PART = 0.3
+"""Largest part of samples that are spikes."""
 
 
 def law_of(one: Shown) -> Law:
-    """The simplest law of a channel that leaves noise, else the one that leaves least."""
+    """Return the simplest law of a channel that leaves noise, or else the one with the least residual."""
     before = one.apart
-    for law in _in_steps(one) if one.counts is None else _by_counts(one, one.counts):
+    for law in _fit_steps(one) if one.counts is None else _fit_counts(one, one.counts):
         return law
     held = steady_rows(one.values) if one.noise > 0.0 and one.counts is None else np.zeros(len(before), dtype=bool)
     if held.any() and excess(before[held]) > 0.5 * excess(before):
         times_s = one.times_s[held]
         return one.law("freeze", 0.0, before[~held], 1, f"from {times_s[0]:.4f} s, {len(times_s)} rows")
-    laws = [*_of_level(one), *_of_time(one)]
+    laws = [*_fit_levels(one), *_fit_times(one)]
     if one.moves or one.counts is not None:
-        laws += _of_others(one)
-        laws += _bent(one)
+        laws += _fit_crosstalk(one)
+        laws += _fit_curves(one)
     if one.moves and one.even:
         laws += [*late(one), *filtered(one)]
     best = min((law for law in laws if law.sure), key=lambda law: one.cost(law.left, law.count))
     rings = cache(lambda: list(ringing(one)))
     if one.counts is not None:
-        # Of a narrow band, a resonance is a gain with a delay, or what has the same band.
-        names = " or ".join([best.name, *_alike(one, best, [*laws, *(rings() if one.moves else ())])])
+        # In a narrow band a resonance equals a gain with a delay, or another law with the same band.
+        names = " or ".join([best.name, *_find_equal_laws(one, best, [*laws, *(rings() if one.moves else ())])])
         best = replace(best, name=" or ".join(dict.fromkeys(names.split(" or "))))
     rms = rms_of(before)
     if one.counts is None:
-        if is_noise(best.left) or rms_of(best.left) < _NEARLY * min(1.0, rms) + 1.0:
+        if is_noise(best.left) or rms_of(best.left) < _EXPLAINED_PART * min(1.0, rms) + 1.0:
             return best
-    elif rms < (_ROUNDED if one.moves else OFF):
+    elif rms < (_MAX_ROUNDING if one.moves else OUTLIER):
         return replace(best, sure=False)
     else:
-        # Late samples have noise of their own, which is as good as none.
-        # Knocks are too sharp to be told between samples: most rows count.
+        # Late samples have other noise, which is expected.
+        # Impacts are too sharp to interpolate: the median over the rows counts.
         typical = 1.48 * float(np.median(np.abs(best.left)))
-        drawn = typical < _DRAWN * one.noise / float(one.floor[0]) and _white(np.sign(best.left))
-        if is_noise(best.left) or rms_of(best.left) < (_HALF if drawn else _EXACTLY) * rms:
+        drawn = typical < _MAX_NOISE_FACTOR * one.noise / float(one.floor[0]) and _is_white(np.sign(best.left))
+        if is_noise(best.left) or rms_of(best.left) < (_RESAMPLED_PART if drawn else _EXACT_PART) * rms:
             return best
         twice = rms_of(best.left) * float(one.floor[0]) / (math.sqrt(2.0) * one.noise) if one.noise > 0.0 else 0.0
-        timed = best.name.split(" or ")[0] in _TIMES and one.cost(best.left, best.count) < one.cost(before, 0)
-        if timed and abs(twice - 1.0) < _EXACTLY + 3.0 / math.sqrt(len(before)) and _white(best.left):
+        timed = best.name.split(" or ")[0] in _TIME_LAWS and one.cost(best.left, best.count) < one.cost(before, 0)
+        if timed and abs(twice - 1.0) < _EXACT_PART + 3.0 / math.sqrt(len(before)) and _is_white(best.left):
             return best
         for law in rings():
-            if rms_of(law.left) < 2.0 * _EXACTLY * rms:  # knocks between samples ring, too
+            if rms_of(law.left) < 2.0 * _EXACT_PART * rms:  # impacts between samples excite it, too
                 return law
-    return next(_at_random(one), replace(best, sure=False))
+    return next(_fit_random(one), replace(best, sure=False))
 
 
-def _alike(one: Shown, best: Law, others: list[Law]) -> dict[str, None]:
-    """Names of other laws than the best that leave as little: what moves evenly, or little, tells them not apart."""
-    least, kind = one.cost(best.left, 0) + DECIDES, best.name.partition(" ")[0]
+def _find_equal_laws(one: Shown, best: Law, others: list[Law]) -> dict[str, None]:
+    """Return the names of other laws with an equal residual, which even or small motion does not distinguish."""
+    least, kind = one.cost(best.left, 0) + MARGIN, best.name.partition(" ")[0]
     return dict.fromkeys(
         law.name
         for law in others
-        if not {law.name, law.name.partition(" ")[0]} & {kind, *_MORE.get(kind, ())}
-        and (law.count <= best.count + 1 or law.name in _BENDS)
+        if not {law.name, law.name.partition(" ")[0]} & {kind, *_KIN.get(kind, ())}
+        and (law.count <= best.count + 1 or law.name in _COMPLEX_LAWS)
         and one.cost(law.left, 0) < least
     )
 
 
-def _white(left: np.ndarray) -> bool:
+def _is_white(left: np.ndarray) -> bool:
     return abs(float(left[1:] @ left[:-1]) / max(float(left @ left), 1e-300)) < 0.1
 
 
-def _by_counts(one: Shown, counts: np.ndarray) -> Iterator[Law]:
-    """What is seen in counts alone, shape (n, 2), and leaves nothing."""
+def _fit_counts(one: Shown, counts: np.ndarray) -> Iterator[Law]:
+    """Yield laws that are visible in counts, shape (n, 2), and explain them exactly."""
     said, sound = counts.T
     none = np.zeros(len(said))
     if (said == said[0]).all() and one.noise > 0.0 and one.at_begin(said[0] * one.channel.scale + one.channel.offset):
@@ -145,57 +145,57 @@ def _by_counts(one: Shown, counts: np.ndarray) -> Iterator[Law]:
     ends = (sound > high).any() or (sound < low).any()
     if ends and (said == np.clip(sound, low, high)).all() and (one.noise > 0.0 or (said == sound).any()):
         part = max(abs(low), abs(high) + 1) / 2.0 ** (one.channel.adc_bits - 1)
-        if part < 1.0:  # every converter has its own ends
+        if part < 1.0:  # every converter has limits
             yield one.law("clip", part, none)
     off = said != sound
     sizes = np.abs(said - sound)[off]
-    if off.mean() < _SPARSE and len(sizes) and sizes.min() == sizes.max() > _ROUNDED:
-        yield _spikes(one, off, none)
+    if off.mean() < _MAX_SPIKE_PART and len(sizes) and sizes.min() == sizes.max() > _MAX_ROUNDING:
+        yield _make_spikes(one, off, none)
 
 
-def _in_steps(one: Shown) -> Iterator[Law]:
-    """A log's numbers that are rounded far more than they should be."""
-    levels, apart = np.unique(one.values), one.values - one.foretold
+def _fit_steps(one: Shown) -> Iterator[Law]:
+    """Yield a coarser rounding of a log's numbers."""
+    levels, apart = np.unique(one.values), one.values - one.expected
     step = float(np.diff(levels).min(initial=np.inf))
     left = (apart - np.clip(apart, -0.5 * step, 0.5 * step)) / one.floor
-    ragged = np.abs((levels - levels[0]) / step % 1.0 - 0.5) < 0.5 - _SLACK
-    if len(levels) > 1 and step > OFF * one.noise and not ragged.any() and is_noise(left):
+    ragged = np.abs((levels - levels[0]) / step % 1.0 - 0.5) < 0.5 - _LEVEL_PART
+    if len(levels) > 1 and step > OUTLIER * one.noise and not ragged.any() and is_noise(left):
         yield one.law("bits", step, left, 1, f"in steps of {step:.4g} {one.unit}", unit=one.unit)
 
 
-def _spikes(one: Shown, rows: np.ndarray, left: np.ndarray) -> Law:
-    size = float(np.median(np.abs(one.values - one.foretold)[rows]))
+def _make_spikes(one: Shown, rows: np.ndarray, left: np.ndarray) -> Law:
+    size = float(np.median(np.abs(one.values - one.expected)[rows]))
     rate = rows.sum() / max(float(one.times_s[-1] - one.times_s[0]), 1e-9)
-    return one.law("spikes", size, left, 2, f"{rows.sum()} of {size:.4g} {one.unit}, {rate:.3g} a second")
+    return one.law("spikes", size, left, 2, f"{rows.sum()} of {size:.4g} {one.unit}, {rate:.3g} per second")
 
 
-def _of_level(one: Shown) -> Iterator[Law]:
-    """Offset, gain and what is left of a signal."""
-    ones, e = one.level, one.foretold
+def _fit_levels(one: Shown) -> Iterator[Law]:
+    """Yield offset, gain and constant signals."""
+    ones, e = one.level, one.expected
     coupled = one.counts is not None and one.channel.highpass_hz > 0.0
     (shift,), left = one.left([ones], one.values - e)
     yield one.law("offset", float(shift), left)
     rests = not one.moves
     if rests and one.counts is None:
         return
-    # Of something that rests, a gain is as good as an offset, but no better.
+    # For a constant signal a gain fits as well as an offset, not better.
     for columns in [[e]] if rests else [[e], [e, ones]]:
         factors, left = one.left(columns)
         what, change = gain_words(gain := float(factors[0]))
         if (what == "signal" and one.counts is not None) or (rests and abs(float(e.mean())) < one.noise):
-            continue  # the level says more
+            continue  # the level is more specific
         if len(columns) > 1 and what == "gain" and not coupled:
             what, change = "gain and offset", f"{change}, {size_text('offset', factors[1], one.unit)}"
         numbers = {"gain": gain - 1.0} if "gain" in what else {}
         yield one.law(what, gain - 1.0, left, len(columns), change, unit="", numbers=numbers)
     if one.counts is not None:
         (level,), left = one.left([ones])
-        yield _level_law(one, float(level), left)
+        yield _make_level(one, float(level), left)
 
 
-def _level_law(one: Shown, level: float, left: np.ndarray) -> Law:
-    """Nothing but a level."""
-    e, volts = one.foretold, one.channel.bias_v + one.channel.sensitivity_v * level
+def _make_level(one: Shown, level: float, left: np.ndarray) -> Law:
+    """Return the law of a constant level."""
+    e, volts = one.expected, one.channel.bias_v + one.channel.sensitivity_v * level
     if one.channel.highpass_hz > 0.0:
         return one.law("open, short or stuck", 0.0, left, 1, "nothing")
     if abs(volts) < 1e-3 * np.ptp(one.channel.range_v):
@@ -207,11 +207,11 @@ def _level_law(one: Shown, level: float, left: np.ndarray) -> Law:
     return one.law("open or saturation" if beyond else "open", volts, left, 1, size_text("open", volts))
 
 
-def _of_time(one: Shown) -> Iterator[Law]:
-    """What is added as a function of time: a drift, a hum."""
+def _fit_times(one: Shown) -> Iterator[Law]:
+    """Yield functions of time that are added: a drift, a hum."""
     if not one.even:
         return
-    t, d = one.times_s - one.times_s[0], one.values - one.foretold
+    t, d = one.times_s - one.times_s[0], one.values - one.expected
     ones, length_s = one.level, float(one.times_s[-1] - one.times_s[0])
     held = 2.0 * math.pi * one.channel.highpass_hz if one.counts is not None else 0.0
     (rate, _), left = one.left([(1.0 - ones) / held if held else t, ones], d)
@@ -230,7 +230,7 @@ def _of_time(one: Shown) -> Iterator[Law]:
     period_s = length_s / (len(t) - 1)
     size = np.abs(spectrum((d - d.mean()) * np.hanning(len(d)), 4 * len(d)))
     hz = np.arange(len(size)) / (4 * len(d) * period_s)
-    within = (hz * length_s > _PERIODS) & (hz < min(_HIGHEST_HZ, 0.45 / period_s))
+    within = (hz * length_s > _MIN_HUM_PERIODS) & (hz < min(_MAX_HUM_HZ, 0.45 / period_s))
     if not within.any():
         return
 
@@ -239,93 +239,93 @@ def _of_time(one: Shown) -> Iterator[Law]:
         return [ones, *(wave(turn) for turn in turns for wave in (np.cos, np.sin))]
 
     peak, span = float(hz[within][size[within].argmax()]), 1.0 / length_s
-    # What is as loud there by itself is not hum, unless that leaves noise.
-    own, rest = one.left(columns(peak), one.foretold)
-    alone = rms_of(rest) < _LOUD * float(one.foretold.std() / one.floor.min())
+    # An expected signal with a line there is not hum, unless the residual is noise.
+    own, rest = one.left(columns(peak), one.expected)
+    alone = rms_of(rest) < _MAX_OTHER_PART * float(one.expected.std() / one.floor.min())
     for third in (False, True):
         f = least_at(
             lambda f, third=third: float(np.sum(one.left(columns(f, third), d)[1] ** 2)), peak - span, peak + span
         )
         factors, left = one.left(columns(f, third), d)
         amplitude = math.hypot(factors[1], factors[2])
-        if alone and math.hypot(*own[1:]) > _OWN * amplitude and not is_noise(left):
+        if alone and math.hypot(*own[1:]) > _MAX_OWN_LINE * amplitude and not is_noise(left):
             continue
         change = f"{f:.5g} Hz, {amplitude:.4g} {one.unit}" + (" with its third" if third else "")
         yield one.law("hum", amplitude, left, 6 if third else 4, change)
 
 
-def _of_others(one: Shown) -> Iterator[Law]:
-    """What comes over from another channel."""
-    d, ones = one.values - one.foretold, one.level
+def _fit_crosstalk(one: Shown) -> Iterator[Law]:
+    """Yield crosstalk from another channel."""
+    d, ones = one.values - one.expected, one.level
     found, count = list[Law](), 4 if one.counts is None else 2
     for other, shown in one.beside().items():
         (part, _), left = one.left([one.coupled(*shown), ones], d)
         through = abs(part * one.channel.sensitivity_v / other.sensitivity_v)
         change = f"{part:.4g} {one.unit} for a {other.unit} of {other.name}"
         if one.counts is not None and through > 1.0:
-            continue  # none is louder there than at home
+            continue  # it cannot be larger than at its source
         if one.counts is not None and through > 0.0:
             change = f"{20.0 * math.log10(through):.3g} dB of {other.name}"
         found.append(one.law("crosstalk", float(part), left, count, change, unit=""))
     if found:
-        # Channels that show the same, as two sides of a ring, are one source.
+        # Channels with equal signals, such as opposite sides of a ring, are one source.
         best = min(found, key=lambda law: one.cost(law.left, count))
-        least = one.cost(best.left, count) + DECIDES
+        least = one.cost(best.left, count) + MARGIN
         alike = [law.change for law in found if one.cost(law.left, count) < least and law is not best]
         yield replace(best, change=" or ".join([best.change, *alike]))
 
 
-def _bent(one: Shown) -> Iterator[Law]:
-    """A curve, or an end, of what it can show."""
-    e, reach, log = one.foretold, float(np.abs(one.foretold).max()), one.counts is None
+def _fit_curves(one: Shown) -> Iterator[Law]:
+    """Yield a curved or limited characteristic."""
+    e, reach, log = one.expected, float(np.abs(one.expected).max()), one.counts is None
     if reach == 0.0:
         return
     starts = [[reach * part] for part in (0.1, 0.3, 0.6, 1.0, 2.0, 5.0, 15.0)]
-    # Of a log, nobody knows about what level.
+    # For a log, the level of the curve's centre is unknown.
     for about in (0.0, float(e.mean())) if log else (0.0,):
         (end,), left = one.fitted(lambda p, at=about: at + p[0] * np.tanh((e - at) / p[0]), starts, [reach])
         plain = min(excess(one.left(line)[1]) for line in ([e], [e - about + one.level])) if log else math.inf
-        if abs(end) > _NOTHING * reach and excess(left) < _CLEARLY * plain:
+        if abs(end) > _MIN_VISIBLE_PART * reach and excess(left) < _MAX_CURVE_PART * plain:
             yield one.law("nonlinear", abs(float(end)), left)
     low, high = float(one.values.min()), float(one.values.max())
-    for _ in range(8):  # the ends of what it shows, less what noise adds to them
+    for _ in range(8):  # limits of the recorded signal, less the effect of noise on them
         over, under = e > high, e < low
         high = float(one.values[over].mean()) if over.any() else high
         low = float(one.values[under].mean()) if under.any() else low
-    # Of a log, knocks behind a slow filter look as if they were cut off.
+    # In a log, impacts through a slow filter look limited.
     cut = (e > high).any() or (e < low).any()
-    if one.counts is not None and cut and max(abs(low), abs(high)) > _NOTHING * reach:
+    if one.counts is not None and cut and max(abs(low), abs(high)) > _MIN_VISIBLE_PART * reach:
         left = (one.values - np.clip(e, low, high)) / one.floor
         change = f"from {low:.4g} to {high:.4g} {one.unit}"
         yield one.law("saturation", max(abs(low), abs(high)), left, 2, change, unit=one.unit)
 
 
-def _at_random(one: Shown) -> Iterator[Law]:
-    """What no sample tells of the next: spikes, a loose contact, jitter, noise."""
-    e, d = one.foretold, one.values - one.foretold
-    off = np.abs(d) > OFF * one.floor
+def _fit_random(one: Shown) -> Iterator[Law]:
+    """Yield random changes: spikes, a loose contact, jitter, noise."""
+    e, d = one.expected, one.values - one.expected
+    off = np.abs(d) > OUTLIER * one.floor
     lengths = [end - begin for begin, end in true_runs(off)]
-    if off.any() and off.mean() < _SPARSE and max(lengths) < 3 and is_noise(one.apart[~off]):
-        yield _spikes(one, off, one.apart[~off])
+    if off.any() and off.mean() < _MAX_SPIKE_PART and max(lengths) < 3 and is_noise(one.apart[~off]):
+        yield _make_spikes(one, off, one.apart[~off])
         return
-    # An AC-coupled one shows nothing of a level but what fades away.
+    # The response of an AC-coupled channel to a level fades.
     fades = one.channel.highpass_hz > 0.0
     if one.counts is not None and one.moves and fades:
-        near = _FADING * float(np.ptp(e)) + 2.0 * OFF * float(one.floor[0])
+        near = _FADING_PART * float(np.ptp(e)) + 2.0 * OUTLIER * float(one.floor[0])
         loud = np.abs(e) > 5.0 * near
         gone, sound = (float((np.abs(left) < near)[loud].mean()) if loud.any() else 0.0 for left in (one.values, d))
-        if gone + sound > _ALL and min(gone, sound) > _FADING:
+        if gone + sound > _ALL_PART and min(gone, sound) > _FADING_PART:
             yield one.law("intermittent", gone, one.apart[~off], 2, f"{gone:.2g} of the time nothing")
             return
     if one.counts is not None and off.any() and not off.all() and one.moves:
         level = float(np.median(one.values[off]))
-        # Filters go towards it.
-        slack = (_FADING if fades else _SLACK) * float(np.ptp(e)) + 2.0 * OFF * one.floor
+        # Filters approach the level.
+        slack = (_FADING_PART if fades else _LEVEL_PART) * float(np.ptp(e)) + 2.0 * OUTLIER * one.floor
         there = off & (np.abs(one.values - level) < slack)
         varied = not fades or float(e[there].std()) > 5.0 * float(slack[0])
-        if varied and there.sum() > max(FEW, 0.5 * off.sum()):
-            if there.mean() > _ALL:  # the rest is on the way
-                yield _level_law(one, level, ((one.values - level) / one.floor)[there])
+        if varied and there.sum() > max(MIN_ROWS, 0.5 * off.sum()):
+            if there.mean() > _ALL_PART:  # the other rows are in transition
+                yield _make_level(one, level, ((one.values - level) / one.floor)[there])
                 return
             part, beyond = float(there.mean()), (e - level) * np.sign(float((e - level)[there].mean()))
             if (beyond[there] > -slack[there]).all() and (beyond[~off] < slack[~off]).all():
@@ -337,32 +337,32 @@ def _at_random(one: Shown) -> Iterator[Law]:
             yield one.law("intermittent", part, one.apart[~off], 2, change)
             return
     (_,), rest = one.left([np.ones(len(d))], d)
-    if one.moves and one.even and (one.counts is not None or _white(rest)):
+    if one.moves and one.even and (one.counts is not None or _is_white(rest)):
         late_s, delayed, slope = delayed_by(one)
         timed, floor = one.values - delayed, (1.0 if one.counts is None else 1.5) * one.noise
         rms_s = math.sqrt(float(timed**2 @ slope**2) / float(slope**2 @ slope**2))
-        bend = rms_s**2 * one.foretold_at.derivative(2)(one.times_s - late_s) / math.sqrt(2.0)
+        bend = rms_s**2 * one.expected_at.derivative(2)(one.times_s - late_s) / math.sqrt(2.0)
         width = np.sqrt((rms_s * slope) ** 2 + bend**2 + floor**2)
         z, plain = (timed - bend / math.sqrt(2.0)) / width, float(rest.std()) * one.floor
-        # The more likely of the two; each has a number of its own.
+        # The more probable of the two laws, each with one number.
         gain = float(np.sum(np.log(plain / width))) + 0.5 * float(rest @ rest / rest.var() - z @ z)
         seen = rms_s * rms_of(slope) > 2.0 * one.noise
-        if gain > DECIDES and seen and (one.counts is None or _white(z)):
+        if gain > MARGIN and seen and (one.counts is None or _is_white(z)):
             change = f"{1e6 * rms_s:.4g} µs about {1e6 * late_s:.4g} µs"
             yield one.law("jitter", rms_s, z / z.std(), 2, change)
             return
     tied = one.moves and abs(float(np.corrcoef(rest, e)[0, 1])) > 0.1
-    # Noise is loud all the time: what is off at impacts alone is none.
-    loud = 1.48 * float(np.median(np.abs(rest - np.median(rest)))) > _STEADY * float(rest.std())
-    if _white(rest) and not tied and loud:
+    # Noise is stationary: differences at impacts alone are not noise.
+    loud = 1.48 * float(np.median(np.abs(rest - np.median(rest)))) > _MIN_STEADINESS * float(rest.std())
+    if _is_white(rest) and not tied and loud:
         ratio = float(rest.std())
         if one.counts is None:
             yield one.law("noise", ratio, rest / ratio)
             return
-        said = (one.channel.scale * one.counts[:, 0] + one.channel.offset - one.foretold).std() / one.noise
+        said = (one.channel.scale * one.counts[:, 0] + one.channel.offset - one.expected).std() / one.noise
         times = math.hypot(1.0, ratio * float(one.floor[0]) / one.noise)
-        if abs(said - 1.0) < abs(said - times) and times > _ANOTHER:
-            change = "as loud as told: samples are taken at other times"
+        if abs(said - 1.0) < abs(said - times) and times > _MIN_NOISE_RATIO:
+            change = "with the nominal level: samples are taken at other times"
             yield one.law("other noise", float(said), rest / ratio, 1, change, unit="")
         else:
             yield one.law("noise", times, rest / ratio)

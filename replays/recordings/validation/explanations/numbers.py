@@ -1,4 +1,4 @@
-"""What one number of the model would explain of a log, beside what its sensors may have."""
+"""Explanation of a log's difference by single numbers of the model, in addition to its sensors."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from replays.recordings.validation.explanations.explanation import Explanation, 
 from replays.recordings.validation.trajectory import floors
 from rig.base.errors import InputError
 
-_SOONER = 0.6
-"""Part of what is behind the hammer pulse that is looked at again."""
+_SHORT_PART = 0.6
+"""Part of the time after the hammer pulse in which the search is repeated."""
 
 
 def numbers_of_the_model(
@@ -32,26 +32,26 @@ def numbers_of_the_model(
     end_s: float,
     shorten: bool = True,
 ) -> list[Explanation]:
-    """What each number of the model explains where all that was fitted moves along with it.
+    """Return the explanation by each number of the model, with all fitted numbers adjusted to it.
 
-    By slopes at what was fitted: exact for what is small, and near enough to tell what hangs together.
-    Where something was fitted beyond what is known of it, only numbers that bring it back.
+    The slopes at the fitted numbers are used: exact for small changes, and sufficient for correlations. If a fitted
+    number is outside its known uncertainty, only numbers that bring it back are returned.
 
     Args:
-        parts: What was recorded, on the model's clock.
-        nominal: What was predicted, on the same rows.
-        others: What might be predicted as well.
-        tuned: What was fitted.
-        rules: The numbers.
-        end_s: How far the model has been followed [s].
-        shorten: If there is none, look again on a shorter part of it.
+        parts: Recorded channels, on the model's clock.
+        nominal: Prediction of the same rows.
+        others: Equally valid predictions.
+        tuned: Fit of the log.
+        rules: Candidates of the model.
+        end_s: Time up to which the model was compared [s].
+        shorten: Whether to search again on a shorter part if nothing is found.
     """
     along = tuple(tuned.values)
-    candidates = [one for one in rules.candidates if _is_in(tuned, one) and not set(one.keys) & set(along)]
+    candidates = [one for one in rules.candidates if _has_numbers(tuned, one) and not set(one.keys) & set(along)]
     keys = (*along, *dict.fromkeys(key for one in candidates for key in one.keys))
     kept = {name: part.until(end_s) for name, part in parts.items()}
     predictor = Predictor(tuned.begun, keys, kept, about_s=tuned.about_s)
-    # The parts are on the model's clock already.
+    # The parts are already on the model's clock.
     at = [0.0 if key.startswith("clock.") else tuned.values.get(key, value_of(tuned.begun, key)) for key in keys]
     slopes = predictor.derivatives(at).slopes
     floor = {
@@ -74,7 +74,7 @@ def numbers_of_the_model(
     far = np.array([one.beyond for one in tuned.fitted])
     found, before = [], excess(z) + float(off[far] @ off[far])
     for one in candidates:
-        relative, sizes = _sizes(tuned.begun, one)
+        relative, sizes = _find_sizes(tuned.begun, one)
         column = sum(size * columns[key] for size, key in zip(sizes, one.keys, strict=True))
         table = np.column_stack([column, *(columns[key] for key in along)])
         square, side = table.T @ table, table.T @ z
@@ -95,28 +95,28 @@ def numbers_of_the_model(
         )  # fmt: skip
     hit_s = first_command_s(tuned.begun)
     if not found and shorten and hit_s < end_s:
-        # Where every number takes what was fitted beyond what is known, impacts have bent what slopes tell.
-        sooner_s = hit_s + _SOONER * (end_s - hit_s)
+        # Every number moves the fitted ones out of their uncertainty: slopes over impacts are not valid.
+        sooner_s = hit_s + _SHORT_PART * (end_s - hit_s)
         return numbers_of_the_model(parts, nominal, others, tuned, rules, end_s=sooner_s, shorten=False)
     return found
 
 
-def changes_of(experiment: Experiment, rules: Attribution, one: Explanation) -> dict[str, float]:
-    """The values that a number of the model has by an explanation, by key."""
+def find_changes(experiment: Experiment, rules: Attribution, one: Explanation) -> dict[str, float]:
+    """Return the values of a number of the model by an explanation, by key."""
     candidate = next(each for each in rules.candidates if each.name == one.name)
-    _, sizes = _sizes(experiment, candidate)
+    _, sizes = _find_sizes(experiment, candidate)
     pairs = zip(candidate.keys, sizes, strict=True)
     return {key: value_of(experiment, key) + one.value * size for key, size in pairs}
 
 
-def _sizes(experiment: Experiment, candidate: Candidate) -> tuple[bool, list[float]]:
-    """Whether a number changes its values by a part, and what each changes by with 1."""
+def _find_sizes(experiment: Experiment, candidate: Candidate) -> tuple[bool, list[float]]:
+    """Return whether a number changes its values relatively, and the change of each per unit of it."""
     values = [value_of(experiment, key) for key in candidate.keys]
     relative = not (candidate.unit or 0.0 in values)
     return relative, values if relative else [1.0] * len(values)
 
 
-def _is_in(tuned: Tuned, candidate: Candidate) -> bool:
+def _has_numbers(tuned: Tuned, candidate: Candidate) -> bool:
     try:
         return all(isinstance(value_of(tuned.begun, key), float) for key in candidate.keys)
     except InputError:

@@ -1,4 +1,4 @@
-"""What single channels have in a recording of this rig, whose counts differ while the motion is the same to the bit."""
+"""Defects of single channels in a recording of this rig, whose counts differ while the motion is equal to the bit."""
 
 from __future__ import annotations
 
@@ -11,28 +11,28 @@ from typing import Any
 import numpy as np
 
 from replays.recordings.resimulation.prediction import Measured, Prediction
-from replays.recordings.validation.explanations.channel_fit import FEW, Shown
+from replays.recordings.validation.explanations.channel_fit import MIN_ROWS, Shown
 from replays.recordings.validation.explanations.explanation import Explanation
-from replays.recordings.validation.explanations.faults import SOME, around, beside, channels_in, told_of
+from replays.recordings.validation.explanations.faults import PAIR_ROWS, beside, diagnose, extend, select_channels
 from replays.recordings.validation.explanations.laws import law_of
 from replays.recordings.validation.explanations.signals import SignalFault
 from rig.channels.faults.defects import alternatives, size_text, unit_of
 from rig.channels.table import Channel
 
-_HELD_S = 0.011
-"""What comes late holds its first value for so long, ..."""
-_PERIODS = 6.0
-"""... and a filter has forgotten it behind so many periods of its corner."""
-_MOST = 20_000
-"""Rows of a channel that are looked at, at most."""
-_AT_END, _ENOUGH = 1e-3, 0.2
-"""Rows so near to an end of what its conditioner puts out tell nothing, where this part of the rows is not."""
+_MAX_DELAY_S = 0.011
+"""Time for which a delayed channel holds its first value."""
+_SETTLING_PERIODS = 6.0
+"""Time in which a filter settles, in periods of its corner."""
+_MAX_ROWS = 20_000
+"""Largest number of rows of a channel that are fitted."""
+_END_PART, _MIN_OTHER_PART = 1e-3, 0.2
+"""Distance from an end of the conditioner's range within which rows are excluded, and the part of other rows needed."""
 _NO_FILTER = 1e4
-"""A corner so many times its own is none."""
-_MOVES = 0.1
-"""Of a turn, by which an edge may move."""
+"""Factor on a corner that removes the filter."""
+_MAX_EDGE_SHIFT = 0.1
+"""Largest shift of an edge, in turns."""
 _EVEN_S = 1e-5
-"""Edges that move by less than this about their mean move alike."""
+"""Standard deviation of shifts of edges that count as equal."""
 
 
 def own_faults(
@@ -40,18 +40,18 @@ def own_faults(
     recorded_s: np.ndarray, made_s: np.ndarray, again: Callable[[dict[str, Measured]], Prediction],
     step: Callable[[str], None] = lambda _text: None,
 ) -> list[Explanation]:  # fmt: skip
-    """What each channel has whose counts are other than those of the same motion done again, to the bit.
+    """Return the defects of channels whose counts differ from those of the same motion resimulated to the bit.
 
-    What a channel shows is taken without its noise: that is the same in both.
+    The noise is equal in both, and is subtracted from the recorded signals.
 
     Args:
-        parts: What was recorded.
-        nominal: What was predicted.
-        apart: Of a group, numbers of the rows that differ, shape (n,), and by channel, by how many counts, shape (n,).
-        recorded_s: Edges of the keyphasor [s].
-        made_s: Edges made again [s].
-        again: Predicts other channels of the same motion.
-        step: Told what is being done.
+        parts: Recorded channels.
+        nominal: Prediction.
+        apart: Function that returns, for a group, the differing rows and by channel their counts, shape (n,).
+        recorded_s: Recorded edges of the keyphasor [s].
+        made_s: Simulated edges [s].
+        again: Function that predicts other channels of the same motion.
+        step: Function that is called with the current step.
     """
     shown, ends = [], dict[str, Callable[[], Shown]]()
     for name, part in parts.items():
@@ -67,36 +67,36 @@ def own_faults(
             if not len(rows):
                 continue
             lasted_s = float(part.times_s[rows[0]]), float(part.times_s[rows[-1]])
-            fine = round(_PERIODS / channel.bandwidth_hz * channel.rate_hz)
-            skips = (max(fine, round(_HELD_S * channel.rate_hz)), fine, 0)
+            fine = round(_SETTLING_PERIODS / channel.bandwidth_hz * channel.rate_hz)
+            skips = (max(fine, round(_MAX_DELAY_S * channel.rate_hz)), fine, 0)
             first = next(int(rows[0]) + skip for skip in skips if rows[-1] - rows[0] >= 3 * skip)
-            # What is behind its end is its filter's.
+            # Rows after its end belong to the filter.
             last = int(rows[-1]) + 1 - (fine if rows[-1] - first > 3 * fine else 0)
-            foretold, dense = nominal.values[name][:, c], 5 * np.count_nonzero(off[first:last]) > last - first
-            made = partial(_shown, part, channel, foretold, off, lasted_s)
+            expected, dense = nominal.values[name][:, c], 5 * np.count_nonzero(off[first:last]) > last - first
+            made = partial(_shown, part, channel, expected, off, lasted_s)
             few = partial(_bare, part, channel, again), partial(beside, parts, nominal, channel)
-            rows = np.arange(first, min(last, first + _MOST))
-            if len(rows) < (FEW if dense else SOME):
-                rows = np.arange(max(0, first - SOME), min(first + SOME, len(off)))
+            rows = np.arange(first, min(last, first + _MAX_ROWS))
+            if len(rows) < (MIN_ROWS if dense else PAIR_ROWS):
+                rows = np.arange(max(0, first - PAIR_ROWS), min(first + PAIR_ROWS, len(off)))
             shown.append(made(rows, *few))
-            if last - first > 2 * _MOST:
-                ends[channel.name] = partial(made, np.arange(last - _MOST, last), *few)
+            if last - first > 2 * _MAX_ROWS:
+                ends[channel.name] = partial(made, np.arange(last - _MAX_ROWS, last), *few)
     about = {one.name: one for one in shown}
     found = []
-    for one in told_of(shown, max((float(one.times_s[-1]) for one in shown), default=0.0), step):
-        its = [about[name] for name in channels_in([one], about)]
-        # Over the noise, not over the steps of the converter.
+    for one in diagnose(shown, max((float(one.times_s[-1]) for one in shown), default=0.0), step):
+        its = [about[name] for name in select_channels([one], about)]
+        # Relative to the noise, not to the steps of the converter.
         steps = max(each.noise / float(each.floor[0]) for each in its)
         begin, end = min(each.lasted_s[0] for each in its), max(each.lasted_s[1] for each in its)
         if one.sure and len(its) == 1 and its[0].name in ends:
-            step(f"what {its[0].name} has at its end")
+            step(f"{its[0].name} at its end")
             later = law_of(ends[its[0].name]())
             if one.name != f"{its[0].name} {later.name}":
                 one = replace(one, sure=False, change=f"{one.change}, and at its end {later.name} {later.change}")
-        # So short, what holds its value for a while is much like anything else, but for what fits to the count.
-        one = replace(one, sure=one.sure and (end - begin > _HELD_S or one.squares == 0.0))
+        # In so short a time, a held value matches almost any law, except for one that matches each count.
+        one = replace(one, sure=one.sure and (end - begin > _MAX_DELAY_S or one.squares == 0.0))
         found.append(replace(one, left=one.left / max(1.0, steps), from_s=begin, to_s=end))
-    # A recording may begin, and end, inside a run.
+    # A recording may begin and end within a run.
     begin_s = min(float(part.times_s[0]) for part in parts.values())
     end_s = max(float(part.times_s[-1]) for part in parts.values())
     others = [one for one in found if not one.name.startswith("keyphasor")]
@@ -106,38 +106,38 @@ def own_faults(
 
 
 def _shown(
-    part: Measured, channel: Channel, foretold: np.ndarray, off: np.ndarray, lasted_s: tuple[float, float],
+    part: Measured, channel: Channel, expected: np.ndarray, off: np.ndarray, lasted_s: tuple[float, float],
     rows: np.ndarray, bare: Callable[[np.ndarray], np.ndarray], others: Callable[[], Mapping[Channel, Any]],
 ) -> Shown:  # fmt: skip
-    """A channel in some rows, of which it is known by how many counts they are off, shape (all rows,)."""
-    volts = channel.bias_v + channel.sensitivity_v * (foretold + channel.scale * off)
+    """Return a channel in some rows, with known differences in counts `off`, shape (all rows,)."""
+    volts = channel.bias_v + channel.sensitivity_v * (expected + channel.scale * off)
     limits = np.array([*channel.range_v, -channel.adc_v, channel.adc_v])
-    at_end = np.abs(volts[:, None] - limits).min(axis=1) < _AT_END * np.ptp(channel.range_v)
-    within = ~np.convolve(at_end, np.ones(2 * FEW + 1), "same").astype(bool)
-    if within[rows].mean() > _ENOUGH:
+    at_end = np.abs(volts[:, None] - limits).min(axis=1) < _END_PART * np.ptp(channel.range_v)
+    within = ~np.convolve(at_end, np.ones(2 * MIN_ROWS + 1), "same").astype(bool)
+    if within[rows].mean() > _MIN_OTHER_PART:
         rows = rows[within[rows]]
     said = np.rint((part.values[rows, part.names.index(channel.name)] - channel.offset) / channel.scale)
     return Shown(
-        channel, part.times_s[rows], (foretold + channel.scale * off)[rows], foretold[rows],
+        channel, part.times_s[rows], (expected + channel.scale * off)[rows], expected[rows],
         np.full(len(rows), 0.5 * abs(channel.scale)), channel.noise_v / abs(channel.sensitivity_v),
         partial(bare, rows), others, np.column_stack([said, said - off[rows]]).astype(np.int64), lasted_s,
-        around(part, foretold, rows[0], rows[-1] + 1),
+        extend(part, expected, rows[0], rows[-1] + 1),
     )  # fmt: skip
 
 
 def _bare(
     part: Measured, channel: Channel, again: Callable[[dict[str, Measured]], Prediction], rows: np.ndarray
 ) -> np.ndarray:
-    """What a channel should show in some rows without its low-pass [its unit]."""
+    """Return the expected signal of a channel in some rows without its low-pass [its unit]."""
     alone = part.first(int(rows[-1]) + 1).only([channel.name]).with_corner_factor(_NO_FILTER)
     return again({part.group: alone}).values[part.group][rows, 0]
 
 
 def _own_edges(recorded_s: np.ndarray, made_s: np.ndarray, *, late: bool) -> Explanation | None:
-    """What keyphasor edges lack, have too many, or how they move; None where the signal, late or not, tells more."""
+    """Return missing or extra keyphasor edges, or their shifts; None if the signal, late or not, shows more."""
     lacking, more = np.setdiff1d(made_s, recorded_s), np.setdiff1d(recorded_s, made_s)
     if 1 <= min(len(lacking), len(more)) == max(len(lacking), len(more)) - 1:  # one may have moved over an end
-        most = _MOVES * float(np.diff(made_s).min(initial=math.inf))
+        most = _MAX_EDGE_SHIFT * float(np.diff(made_s).min(initial=math.inf))
         for part in (slice(1, None), slice(None, -1)):
             fewer = (lacking[part], more) if len(lacking) > len(more) else (lacking, more[part])
             if np.abs(fewer[1] - fewer[0]).max() < most:
@@ -146,7 +146,7 @@ def _own_edges(recorded_s: np.ndarray, made_s: np.ndarray, *, late: bool) -> Exp
     off = np.sort(np.concatenate([lacking, more]))
     moved_s = more - lacking if len(more) == len(lacking) else np.empty(0)
     turns = np.count_nonzero((made_s >= off[0]) & (made_s <= off[-1])) if len(off) else 0
-    if len(moved_s) == 1 and late:  # of one, nobody can tell
+    if len(moved_s) == 1 and late:  # a single edge leaves both open
         what, value = "delay or edge-jitter", float(moved_s[0])
         change = f"{size_text('delay', value)}, one edge"
     elif len(moved_s) > 1 and moved_s.std() > _EVEN_S:
@@ -157,7 +157,7 @@ def _own_edges(recorded_s: np.ndarray, made_s: np.ndarray, *, late: bool) -> Exp
     elif len(lacking) < turns and not len(more):
         what, value, change = "miss-pulses", len(lacking) / turns, f"{len(lacking)} of {turns}"
     elif len(more) > len(lacking):
-        what, value, change = "extra-pulses", len(more) / max(1, turns), f"{len(more)} beside {turns}"
+        what, value, change = "extra-pulses", len(more) / max(1, turns), f"{len(more)} in addition to {turns}"
     else:
         what, value, change = "open, short or miss-pulses", 1.0, f"{len(lacking)} of {turns}"
     unit = unit_of(alternatives(what)[-1], "")
@@ -168,12 +168,12 @@ def _own_edges(recorded_s: np.ndarray, made_s: np.ndarray, *, late: bool) -> Exp
     return replace(found, from_s=float(off[0]))
 
 
-def as_faults(own: Sequence[Explanation]) -> tuple[SignalFault, ...]:
-    """What channels have by themselves, as faults that signals show."""
+def make_signal_faults(own: Sequence[Explanation]) -> tuple[SignalFault, ...]:
+    """Return the defects of channels as faults of signals."""
     found = []
     for one in own:
         names, what = one.channels_and_defect
-        text = one.change if one.sure else f"by no law that has a name here; nearest is {what} {one.change}"
+        text = one.change if one.sure else f"by no known law; closest is {what} {one.change}"
         what, text = (what if one.sure else "differs", f"{text}, ") if what else (one.change, "")
         text += f"from {one.from_s:.4f} to {one.to_s:.4f} s"
         found.append(SignalFault(names, what, one.from_s, one.to_s, text))

@@ -1,4 +1,4 @@
-"""Laws of a channel that is late, or behind another filter."""
+"""Laws of a delayed channel, and of a channel with another filter."""
 
 from __future__ import annotations
 
@@ -11,73 +11,73 @@ import numpy as np
 from replays.estimate.clock import fit_line, time_error
 from replays.estimate.least_squares import solve
 from replays.estimate.spectra import Spectrum
-from replays.recordings.validation.explanations.channel_fit import FEW, Law, Shown, gain_words, least_at, rms_of
+from replays.recordings.validation.explanations.channel_fit import MIN_ROWS, Law, Shown, gain_words, least_at, rms_of
 from rig.channels.faults.defects import size_text
 from rig.channels.sensors.filters import channel_poles
 
-_LATEST_S = 4e-3
-"""How late a channel is looked for [s]."""
-_EARLIEST_S, _HELD_S = -1e-6, 0.011
-"""A log's channel may be early, one of the rig's own may not, as what is not yet cannot be shown; nor so late."""
-_SEGMENTS = 40
-"""Into so many a channel is cut to see how its delay goes."""
-_SETTLED = 5.0
-"""Periods of its corner, behind which a filter has forgotten."""
+_MAX_LOG_DELAY_S = 4e-3
+"""Largest delay of a log's channel in the search."""
+_MIN_DELAY_S, _MAX_DELAY_S = -1e-6, 0.011
+"""Delays of one of the rig's channels: a negative one is impossible, as the future is unknown."""
+_MAX_SEGMENTS = 40
+"""Segments of a channel whose delays are compared."""
+_SETTLING_PERIODS = 5.0
+"""Settling time of a filter, in periods of its corner."""
 _ENDS_S = 1e-3
-"""Before the end of what is known, a filter cannot be taken back."""
-_HARDLY = 0.3
-"""Where this part of what differs is left without the folding, that is looked at too."""
+"""Time before the end of the known signal that a filter's inverse affects."""
+_MAX_ALIAS_PART = 0.3
+"""Remaining part of the difference without the alias above which a missing filter is not tried."""
 _SETTLES_S = 0.02
-"""Behind this it is another filter's."""
-_RINGS_HZ, _RINGS = (20.0, 4000.0), 60
-"""Between these resonances are looked for, at so many."""
-_RINGS_LONGEST = 1000.0
-"""A quality that no transducer has."""
-_CLEARLY, _PASSES = 0.97, 0.1
-"""Of what a delay leaves of a log, that a low-pass may leave at most; and of the signal, that it lets pass."""
-_SEEN = 0.3
-"""Of what differs, that must be left where a filter has settled."""
-_SAME = 0.8
-"""Of the noise, below which what is left has none of its own."""
+"""Time after which the difference is due to the other filter."""
+_RINGS_HZ, _RING_STARTS = (20.0, 4000.0), 60
+"""Range of resonances, and number of initial values in it."""
+_MAX_QUALITY = 1000.0
+"""Quality factor that no transducer reaches."""
+_MAX_RATIO, _MIN_PASS = 0.97, 0.1
+"""For a log: largest residual of a low-pass relative to that of a delay, and smallest passed part of the signal."""
+_MIN_SETTLED_PART = 0.3
+"""Part of the difference that must remain after a filter has settled."""
+_MAX_NOISE_PART = 0.8
+"""Residual over noise below which it contains no independent noise."""
 
 
 def late(one: Shown) -> Iterator[Law]:
-    """A time that is not that of the others."""
-    ones, spline, t = np.ones(len(one.values)), one.foretold_at, one.times_s - one.times_s[0]
+    """Yield laws with another time: delay, clock and wander."""
+    ones, spline, t = np.ones(len(one.values)), one.expected_at, one.times_s - one.times_s[0]
     late_s, delayed, _ = delayed_by(one)
     if one.counts is not None:
         (late_s,), _ = one.fitted(lambda p: spline(one.times_s - p[0]), [[late_s]], [1e-6])
         delayed = spline(one.times_s - late_s)
-    earliest_s, latest_s = (-_LATEST_S, _LATEST_S) if one.counts is None else (_EARLIEST_S, _HELD_S)
-    if earliest_s <= late_s <= latest_s + 2.0 * one.period_s:  # else it is the search's end
+    earliest_s, latest_s = (-_MAX_LOG_DELAY_S, _MAX_LOG_DELAY_S) if one.counts is None else (_MIN_DELAY_S, _MAX_DELAY_S)
+    if earliest_s <= late_s <= latest_s + 2.0 * one.period_s:  # otherwise it is an end of the search range
         (shift,), left = one.left([ones], one.values - delayed)
         change, of = size_text("delay", late_s), {"delay": late_s}
         yield one.law("delay", late_s, (one.values - delayed) / one.floor, numbers=of)
         if abs(shift) > one.noise:
             text = f"{change}, {size_text('offset', shift, one.unit)}"
             yield one.law("delay and offset", late_s, left, 2, text, numbers=of)
-        if one.counts is not None and abs(late_s) < -_EARLIEST_S:
-            return  # there is no delay in it
+        if one.counts is not None and abs(late_s) < -_MIN_DELAY_S:
+            return  # the delay is negligible
         for columns in [[delayed], [delayed, ones]][one.counts is not None :]:
             factors, left = one.left(columns)
             what, also = gain_words(gain := float(factors[0]))
             if what == "signal":
-                continue  # what is not there is not late
+                continue  # a missing signal has no delay
             yield one.law(f"{what} and delay", gain - 1.0, left, 1 + len(columns), f"{also}, {change}", numbers=of)
     if one.counts is None or one.channel.signal == "keyphasor":
-        return  # of a log, the time of all is fitted before; pulses tell by their edges
-    at, delays = _delays(one)
+        return  # a log's common time is fitted earlier; pulses are judged by their edges
+    at, delays = _find_delays(one)
     if len(at) < 6:
         return
     line = fit_line(at, delays)
     (start, rate), left = one.fitted(
         lambda p: spline(one.times_s - p[0] - p[1] * t), [[line.at_zero, line.slope], [0.0, line.slope]], [1e-6, 1e-6]
     )
-    if min(start, start + rate * t[-1]) > _EARLIEST_S:
+    if min(start, start + rate * t[-1]) > _MIN_DELAY_S:
         yield one.law("clock", 1e6 * float(rate), left, 2)
     length_s = float(t[-1])
     starts = []
-    for period_s in 2.0 * length_s / np.arange(1.0, 2.0 * _SEGMENTS / 3.0):
+    for period_s in 2.0 * length_s / np.arange(1.0, 2.0 * _MAX_SEGMENTS / 3.0):
         turn = 2.0 * math.pi * at / period_s
         table = np.column_stack([np.ones(len(at)), np.cos(turn), np.sin(turn)])
         starts.append([*solve(table, delays).tolist(), period_s])
@@ -88,16 +88,16 @@ def late(one: Shown) -> Iterator[Law]:
         starts, [1e-6, 1e-6, 1e-6, length_s],
     )  # fmt: skip
     size = math.hypot(a, b)
-    if mean_s - size > _EARLIEST_S:
+    if mean_s - size > _MIN_DELAY_S:
         yield one.law("wander", size, left, 4, f"{1e6 * size:.4g} µs in {abs(period_s):.4g} s")
 
 
-def _delays(one: Shown) -> tuple[np.ndarray, np.ndarray]:
-    """How the delay goes: middles of pieces behind the first row [s], and how late each is [s]."""
-    spline, t = one.foretold_at, one.times_s - one.times_s[0]
+def _find_delays(one: Shown) -> tuple[np.ndarray, np.ndarray]:
+    """Return the middles of segments after the first row [s], and their delays [s]."""
+    spline, t = one.expected_at, one.times_s - one.times_s[0]
     slope, at, found = spline.derivative(), [], []
-    pieces = np.array_split(np.arange(len(t)), min(_SEGMENTS, len(t) // FEW))
-    late_s = delayed_by(one.at(one.times_s[: max(FEW, len(t) // 8)]))[0]
+    pieces = np.array_split(np.arange(len(t)), min(_MAX_SEGMENTS, len(t) // MIN_ROWS))
+    late_s = delayed_by(one.at(one.times_s[: max(MIN_ROWS, len(t) // 8)]))[0]
     for rows in pieces:
         for _ in range(8):
             places = one.times_s[rows] - late_s
@@ -110,8 +110,8 @@ def _delays(one: Shown) -> tuple[np.ndarray, np.ndarray]:
 
 
 def delayed_by(one: Shown) -> tuple[float, np.ndarray, np.ndarray]:
-    """By how much a channel is late [s], what it should show then, and the slope of that [its unit/s]."""
-    spline = one.foretold_at
+    """Return the delay of a channel [s], its expected signal with it, and the slope of that [its unit/s]."""
+    spline = one.expected_at
     slope, period_s = spline.derivative(), one.period_s
 
     def cost(late_s: float) -> float:
@@ -121,19 +121,19 @@ def delayed_by(one: Shown) -> tuple[float, np.ndarray, np.ndarray]:
         return rms_of(one.left([one.level], one.values - shown)[1])
 
     if one.counts is None:
-        far = np.linspace(-_LATEST_S, _LATEST_S, 81) / period_s
+        far = np.linspace(-_MAX_LOG_DELAY_S, _MAX_LOG_DELAY_S, 81) / period_s
         rows = np.unique(np.rint(np.concatenate([np.arange(-16, 17), far])))
     else:
-        rows = np.arange(0.0, _HELD_S / period_s)
+        rows = np.arange(0.0, _MAX_DELAY_S / period_s)
 
     def refined(late_s: float) -> float:
         for _ in range(6):
             at = one.times_s - late_s
             (_, step, _), _ = one.left([spline(at), -slope(at), np.ones(len(at))])
-            late_s = float(np.clip(late_s + np.clip(step, -period_s, period_s), -_HELD_S, _HELD_S))
+            late_s = float(np.clip(late_s + np.clip(step, -period_s, period_s), -_MAX_DELAY_S, _MAX_DELAY_S))
         return late_s
 
-    # What rings is about as much alike a period later: between rows, another one may be the best.
+    # A ringing signal is similar a period later: between rows another minimum may be the best.
     costs = np.array([cost(late_s) for late_s in rows * period_s])
     least = np.flatnonzero((costs <= np.r_[np.inf, costs[:-1]]) & (costs <= np.r_[costs[1:], np.inf]))
     late_s = min((refined(late_s) for late_s in (rows[least] * period_s).tolist()), key=cost)
@@ -142,16 +142,16 @@ def delayed_by(one: Shown) -> tuple[float, np.ndarray, np.ndarray]:
 
 
 def filtered(one: Shown) -> Iterator[Law]:
-    """A low-pass at another corner."""
+    """Yield a low-pass with another corner."""
     if one.counts is None:
-        slope = one.foretold_at.derivative()(one.times_s)
-        factors, left = one.left([slope, np.gradient(slope, one.times_s)], one.values - one.foretold)
+        slope = one.expected_at.derivative()(one.times_s)
+        factors, left = one.left([slope, np.gradient(slope, one.times_s)], one.values - one.expected)
         lower = "lower" if factors[1] > 0.0 else "higher"
-        yield one.law("bandwidth", float(factors[1]), left, 2, f"{lower} than told", unit="")
+        yield one.law("bandwidth", float(factors[1]), left, 2, f"{lower} than given", unit="")
     channel = one.channel
     if not one.uniform or not channel.bandwidth_hz:
         return
-    begin, wave = _wave(one)
+    begin, wave = _find_wave(one)
 
     def through(corner_hz: float) -> np.ndarray:
         poles, residues, direct = channel_poles(
@@ -161,61 +161,61 @@ def filtered(one: Shown) -> Iterator[Law]:
         shown = np.full(len(turn), complex(direct))
         for pole, residue in zip(poles.tolist(), residues.tolist(), strict=True):
             shown += residue / (turn - pole)
-            if pole.imag:  # one of a pair: their residues are given doubled
+            if pole.imag:  # one of a pair: its residue is doubled
                 shown += 0.5 * (residue.conjugate() / (turn - pole.conjugate()) - residue / (turn - pole))
         return shown
 
-    told = through(channel.bandwidth_hz)
+    nominal = through(channel.bandwidth_hz)
     margin = min(len(one.values) // 8, round(_SETTLES_S / one.period_s))
-    if len(one.values) - margin - round(_ENDS_S / one.period_s) < 2 * FEW:
-        return  # too short to tell
+    if len(one.values) - margin - round(_ENDS_S / one.period_s) < 2 * MIN_ROWS:
+        return  # too short
 
     def left_by(other: np.ndarray | float) -> np.ndarray:
-        left = one.values - wave.through(other / told)[begin:][: len(one.values)]
+        left = one.values - wave.through(other / nominal)[begin:][: len(one.values)]
         left = one.left([one.level], left)[1] if channel.highpass_hz and one.counts is not None else left / one.floor
-        known = slice(margin, -round(_ENDS_S / one.period_s))  # how it goes on tells of what is behind a filter
+        known = slice(margin, -round(_ENDS_S / one.period_s))  # the later signal affects the inverse of a filter
         left[: known.start] = left[known.stop :] = rms_of(left[known])
         return left
 
     def cost(log_hz: float) -> float:
-        settled = min(len(one.values) // 2, round(_SETTLED / math.exp(log_hz) / one.period_s))
+        settled = min(len(one.values) // 2, round(_SETTLING_PERIODS / math.exp(log_hz) / one.period_s))
         return rms_of(left_by(through(math.exp(log_hz)))[max(margin, settled) :])
 
     grid = np.log(np.geomspace(10.0, 0.98 * channel.bandwidth_hz, 40))
     near, step = min(grid, key=cost), grid[1] - grid[0]
     corner_hz = math.exp(least_at(cost, near - step, min(near + step, grid[-1])))
-    margin = max(margin, min(len(one.values) // 2, round(_SETTLED / corner_hz / one.period_s)))
+    margin = max(margin, min(len(one.values) // 2, round(_SETTLING_PERIODS / corner_hz / one.period_s)))
     left, differs = left_by(through(corner_hz)), one.apart[margin : -round(_ENDS_S / one.period_s)]
     if one.counts is None:
         delayed = (one.values - delayed_by(one)[1]) / one.floor
         passed = float((one.values - left * one.floor).std())
-        # Of what is slow beside it, a low-pass makes a delay; and what lets nothing pass is none.
-        if max(1.0, rms_of(left)) < _CLEARLY * rms_of(delayed) and passed > _PASSES * float(one.foretold.std()):
-            yield one.law("bandwidth", corner_hz, left, 1, f"lower than told: {corner_hz:.3g} Hz")
+        # For a slow signal a low-pass is a delay; and a low-pass that passes nothing is not an explanation.
+        if max(1.0, rms_of(left)) < _MAX_RATIO * rms_of(delayed) and passed > _MIN_PASS * float(one.expected.std()):
+            yield one.law("bandwidth", corner_hz, left, 1, f"lower than given: {corner_hz:.3g} Hz")
         return
-    if rms_of(left) < _SAME * max(1.0, one.noise / float(one.floor[0])):  # else noise of another time is in it
-        seen = rms_of(differs) > _SEEN * rms_of(one.apart)
+    if rms_of(left) < _MAX_NOISE_PART * max(1.0, one.noise / float(one.floor[0])):  # else independent noise
+        seen = rms_of(differs) > _MIN_SETTLED_PART * rms_of(one.apart)
         yield one.law("bandwidth", corner_hz, left, sure=seen)
-    if one.bare is not None and (rms_of(left_by(1.0)) < _HARDLY * rms_of(one.apart)):
+    if one.bare is not None and (rms_of(left_by(1.0)) < _MAX_ALIAS_PART * rms_of(one.apart)):
         _, left = one.left([one.level] if channel.highpass_hz else [np.zeros(len(one.values))], one.values - one.bare())
         yield one.law("no-filter", 0.0, left)
 
 
-def _wave(one: Shown) -> tuple[int, Spectrum]:
-    """Return the first row and the spectrum of what it should show, from before to after its rows, there and back."""
-    times_s, e = one.around or (one.times_s, one.foretold)
+def _find_wave(one: Shown) -> tuple[int, Spectrum]:
+    """Return the first row and the spectrum of the expected signal with its margins, followed by its reverse."""
+    times_s, e = one.around or (one.times_s, one.expected)
     round_trip = np.concatenate([e, e[::-1]])
     return int(np.searchsorted(times_s, one.times_s[0])), Spectrum.of(round_trip, one.period_s)
 
 
 def ringing(one: Shown) -> Iterator[Law]:
-    """A transducer with a resonance of its own, which may ring from what was before."""
+    """Yield a transducer with a resonance, which may still ring from before."""
     if not one.uniform or not one.moves:
         return
     from scipy.interpolate import make_interp_spline
     from scipy.optimize import minimize
 
-    begin, wave = _wave(one)
+    begin, wave = _find_wave(one)
     t = one.times_s - one.times_s[0]
 
     def left(logs: np.ndarray) -> np.ndarray:
@@ -228,13 +228,13 @@ def ringing(one: Shown) -> Iterator[Law]:
     def cost(logs: np.ndarray) -> float:
         return math.log(rms_of(left(logs)))
 
-    # x'' = w^2 (e - x) - (w / quality) x' has both numbers, though knocks do not make it exact; else one of many.
+    # x'' = w^2 (e - x) - (w / quality) x' has both numbers, approximately for impacts; else one of many starts.
     shown = make_interp_spline(t, one.values, k=5)
-    pulls = [one.foretold - one.values, -shown.derivative()(t)]
+    pulls = [one.expected - one.values, -shown.derivative()(t)]
     (stiff, damping), _ = one.left(pulls, shown.derivative(2)(t))
     starts = [
         np.log([hz, quality - 0.5])
-        for hz in np.geomspace(*_RINGS_HZ, _RINGS)
+        for hz in np.geomspace(*_RINGS_HZ, _RING_STARTS)
         for quality in (1.0, 10.0, 100.0)
     ]  # fmt: skip
     if stiff > 0.0 and damping > 0.0 and math.sqrt(stiff) > 0.5 * damping:
@@ -242,5 +242,5 @@ def ringing(one: Shown) -> Iterator[Law]:
     close = {"xatol": 1e-7, "fatol": 1e-3}
     found: Any = minimize(cost, min(starts, key=cost), method="Nelder-Mead", options=close)
     hz, quality = math.exp(found.x[0]), 0.5 + math.exp(found.x[1])
-    if 0.5 * _RINGS_HZ[0] < hz < 2.0 * _RINGS_HZ[1] and quality < _RINGS_LONGEST:
+    if 0.5 * _RINGS_HZ[0] < hz < 2.0 * _RINGS_HZ[1] and quality < _MAX_QUALITY:
         yield one.law("resonance", hz, left(found.x), 4, f"at {hz:.4g} Hz, quality {quality:.3g}")
