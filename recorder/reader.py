@@ -22,7 +22,7 @@ from recorder.files.chunks import Chunk
 from rig.base.errors import InputError, UnknownNameError, Words
 from rig.base.samples import Samples, joined
 from rig.base.wire import EDGES, EVENTS, FAULTS, STATUS, Block, Gap, schema_of, sensor_key, truth_key
-from rig.channels.faults.ledger import Declared, in_order
+from rig.channels.faults.ledger import Declared, sort_blocks
 
 
 class Recording:
@@ -273,7 +273,7 @@ class Recording:
             if schema_of(key) is None:
                 raise InputError("key", "a key of blocks (sensors or truth)", key)
         found = self._blocks_as_sent(keys)
-        return in_order(found) if self.true else found
+        return sort_blocks(found) if self.true else found
 
     def _blocks_as_sent(self, keys: set[str]) -> Iterator[tuple[str, Block]]:
         told = Declared() if self.true else None

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from rig.channels.faults import At, Kind, plugged
+from rig.channels.faults import At, Kind, connect_swaps
 from rig.channels.faults.delivery import Active
 from rig.channels.generators import Instants, Source, exact
 from rig.channels.sampling import TICKS_HZ
@@ -129,7 +129,7 @@ class Generated:
     def __init__(self, calibrator: Calibrator, faults: Mapping[str, list[Active]]) -> None:
         self._calibrator, self._faults = calibrator, faults
         swaps = {one.id: one for faults_here in faults.values() for one in faults_here}
-        self._plugs = plugged(swaps[number] for number in sorted(swaps))
+        self._plugs = connect_swaps(swaps[number] for number in sorted(swaps))
         self._channels = {channel.name: channel for group in calibrator.groups for channel in group.channels}
 
     def _ats(self, name: str, n: np.ndarray) -> Iterator[tuple[Kind, At]]:

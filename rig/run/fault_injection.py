@@ -27,13 +27,13 @@ from rig.channels.faults import (
     Restart,
     Setting,
     acts,
-    channels_of,
     check_draws,
     check_size,
     check_time,
-    stream_of,
+    find_channels,
+    find_group,
 )  # fmt: skip
-from rig.channels.faults.cabling import Plan, Scales, Volts, no_other, seen_mark, where
+from rig.channels.faults.cabling import Plan, Scales, Volts, make_place, mark_signal, read_nothing
 from rig.channels.faults.delivery import Active, Sending
 from rig.channels.sampling import TICKS_HZ, first_row
 from rig.channels.sensors.conditioning import Conditioner
@@ -133,10 +133,10 @@ class Faulty:
         """
         what = command.what
         if not isinstance(what, OfBlocks):
-            return channels_of(what, command.channel, self.table, **self._setting._asdict())
+            return find_channels(what, command.channel, self.table, **self._setting._asdict())
         if isinstance(what, Restart) and self._row_at(tick) == 0:
             raise InputError("kind", "one that shows from the first row on, such as dropout", what.name())
-        return self.table.groups[stream_of(what, command.channel, self.table, self.doors)].names
+        return self.table.groups[find_group(what, command.channel, self.table, self.doors)].names
 
     def check_all(self, timed: Iterable[tuple[int, object]]) -> None:
         """Raise an error for the first impossible fault of a scene.
@@ -321,7 +321,7 @@ class Faulty:
                 (group, c), channel = plan.homes[name], self.channels[name]
                 values, t = counts[group][:, c].astype(float), n / rate
                 for one in faults:
-                    values = one.what.counts(values, where(one, channel, n, t))
+                    values = one.what.counts(values, make_place(one, channel, n, t))
                 most = 2.0 ** (channel.adc_bits - 1)
                 counts[group][:, c] = np.clip(values, -most, most - 1.0)
             found |= counts
@@ -373,7 +373,7 @@ class Faulty:
                     angles, rates = np.append(turn, angles), np.append(fast, rates)
             at = At(
                 (here - one.begin) / TICKS_HZ, np.arange(len(here)), self.channels[mark], one.draws[mark], {},
-                no_other, angles, rates, seen_mark,
+                read_nothing, angles, rates, mark_signal,
             )  # fmt: skip
             shown = np.rint(one.what.edges(here, at) * FRACTIONS) / FRACTIONS
             # As with the signal, the true edges apply after the end of the fault.
@@ -463,7 +463,7 @@ class Faulty:
         for c, (channel, faults) in enumerate(zip(channels, faulty, strict=True)):
             late = [one for one in faults if acts(one.what, "late_s")]
             for one in late:
-                late_s[:, c] += one.what.late_s(where(one, channel, n, n / rate))
+                late_s[:, c] += one.what.late_s(make_place(one, channel, n, n / rate))
             loud[:, c] = late[0].noise[channel.name].standard_normal(len(n))
         # Not before the fault, and with enough samples to interpolate.
         here = (n * _OVERSAMPLING)[:, None]

@@ -9,7 +9,7 @@ from importlib.resources import files
 from typing import Any
 
 from rig.base import wire
-from rig.channels.faults import described
+from rig.channels.faults import describe_kinds
 from rig.channels.sampling import SensorChoice
 from rig.physics.kernels import signals
 from rig.run.commands.command import Quantity
@@ -34,7 +34,7 @@ def page() -> str:
         truth_hz=SensorChoice().truth_rate_hz,
         commands=COMMANDS,
         event_kinds=EVENT_KINDS,
-        faults=described(rig_table()),
+        faults=describe_kinds(rig_table()),
         access=access,
     )
 

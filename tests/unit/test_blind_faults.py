@@ -43,7 +43,7 @@ def find_faults(recording: Recording) -> tuple[list[Explanation], set[str]]:
     nominal = predict(experiment, parts, follow=bits.follow)
     bits.finish()
     explanations = own_faults(
-        parts, nominal, bits.apart, recording.edges(), bits.edges_s(), lambda other: predict(experiment, other)
+        parts, nominal, bits.differences, recording.edges(), bits.edges_s(), lambda other: predict(experiment, other)
     )
     return explanations, {name for part in parts for name in bits.channels_off(part)}
 

@@ -11,7 +11,7 @@ import pytest
 
 from rig.base.errors import InputError
 from rig.base.wire import Block, sensor_key
-from rig.channels.faults import KINDS, Draws, supported
+from rig.channels.faults import KINDS, Draws, list_refusals
 from rig.channels.faults.blocks import DuplicateBlocks, LoseBlocks, ReorderBlocks
 from rig.channels.faults.delivery import Active, Frame, Sending
 from rig.run.scenes import load_scene
@@ -181,7 +181,7 @@ def test_listed_combinations_are_accepted_and_others_refused(scene: str) -> None
     simulation.advance(10_000)
     table, setting = simulation.table, simulation.scene.setting
     for kind, cls in KINDS.items():
-        listed = supported(cls, table, setting)
+        listed = list_refusals(cls, table, setting)
         for target in (*table.channels, *table.groups):
             number = {"swap": {"other": "P_N"}, "crosstalk": {"source": "P_N"}}.get(kind, (EXAMPLES | BLOCKS)[kind])
             if kind in ("swap", "crosstalk") and target in ("P_N", "forces"):

@@ -24,7 +24,7 @@ from replays.campaigns.measurement import split_quantity
 from rig.base import units
 from rig.base.checks import Written, check, open_file, parse_toml, unreadable
 from rig.base.errors import InputError, UnknownNameError, Words, such_as
-from rig.channels.faults import channels_of, stream_of
+from rig.channels.faults import find_channels, find_group
 from rig.channels.faults.blocks import OfBlocks
 from rig.physics.kernels import signals
 from rig.run.commands.table import COMMANDS, FaultCommand, TimedCommand, check_command
@@ -401,9 +401,9 @@ def _check_fault(request: FaultCommand, field: str, scene: Scene, *, can: bool) 
     what, setting = request.what, scene.setting
     try:
         if isinstance(what, OfBlocks):
-            stream_of(what, request.channel, scene.table, ("zenoh", "can") if can else ("zenoh",))
+            find_group(what, request.channel, scene.table, ("zenoh", "can") if can else ("zenoh",))
         else:
-            channels_of(
+            find_channels(
                 what, request.channel, scene.table,
                 ideal=setting.ideal, noisy=setting.noisy, generated=setting.generated,
             )  # fmt: skip

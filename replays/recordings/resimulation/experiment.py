@@ -16,7 +16,7 @@ from recorder.reader import Recording
 from rig.base.checks import table_in
 from rig.base.errors import InputError, Words
 from rig.base.wire import EDGES, sensor_key, truth_key
-from rig.channels.faults import channels_of
+from rig.channels.faults import find_channels
 from rig.physics.parameters import DEFAULT_SET, load_parameters, set_names
 from rig.run.commands.table import COMMANDS, MECHANICAL, FaultCommand, check_command
 from rig.run.motion import Begin
@@ -99,7 +99,7 @@ class Experiment:
         sent = [one for one in timed if isinstance(one, FaultCommand)]
         ideal = sensors.chain == "ideal"
         return {
-            name for one in sent for name in channels_of(one.what, one.channel, table, ideal=ideal, noisy=sensors.noise)
+            name for f in sent for name in find_channels(f.what, f.channel, table, ideal=ideal, noisy=sensors.noise)
         }
 
     def simulation(self) -> Simulation:

@@ -41,7 +41,7 @@ _EXACT = "exact, row by row"
 _SANDWICH = "least squares, block sandwich of 64 blocks, Student's t"
 _FOLLOWED = "time error of each block, steps by whole samples by likelihood ratio"
 _SPLIT = "weighted least squares of squared residuals on squared slope, block sandwich, Student's t"
-_LONG_RUN = "a longer run"
+_DURATION = "a longer run"
 _RICH = "a signal of many frequencies on every channel (test-prbs, 2 s)"
 _WIDE_BAND = "a signal beyond the corner (test-chirp, test-prbs)"
 _SINE = "a sine near full scale on the channel (test-sine, 10 s)"
@@ -59,14 +59,14 @@ DIGITAL = {
     "polarity": Quantity("1", "sign of the scale", _RICH),
     "scale": Quantity("ppm", "least squares, then every count equal", _DIGITS),
     "offset": Quantity("counts", "least squares, then every count equal", _DIGITS),
-    "altered values": Quantity("1", _EXACT, _LONG_RUN),
-    "missing rows": Quantity("1", _EXACT, _LONG_RUN),
-    "doubled rows": Quantity("1", _EXACT, _LONG_RUN),
-    "swapped rows": Quantity("1", _EXACT, _LONG_RUN),
-    "foreign rows": Quantity("1", _EXACT, _LONG_RUN),
+    "altered values": Quantity("1", _EXACT, _DURATION),
+    "missing rows": Quantity("1", _EXACT, _DURATION),
+    "doubled rows": Quantity("1", _EXACT, _DURATION),
+    "swapped rows": Quantity("1", _EXACT, _DURATION),
+    "foreign rows": Quantity("1", _EXACT, _DURATION),
     "row step": Quantity("1", "by the rate of the stamps, then equal counts", _STAMPED),
-    "rows before the first": Quantity("1", _EXACT, _LONG_RUN),
-    "rows after the last": Quantity("1", _EXACT, _LONG_RUN),
+    "rows before the first": Quantity("1", _EXACT, _DURATION),
+    "rows after the last": Quantity("1", _EXACT, _DURATION),
     "stamp offset": Quantity("s", "straight line through batch means, Student's t", _STAMPED),
     "stamp rate": Quantity("ppm", "straight line through batch means, Student's t", _STAMPED),
     "stamp jitter": Quantity("s", "rms within batches, chi squared", _STAMPED),
@@ -82,8 +82,8 @@ ANALOGUE = {
     "recorded": _RECORDED,
     "mapping": Quantity("1", "cross-correlation of all pairs", _RICH),
     "polarity": Quantity("1", "cross-correlation of all pairs", _RICH),
-    "gain": Quantity("ppm", _SANDWICH, _LONG_RUN),
-    "offset": Quantity("", _SANDWICH, _LONG_RUN),
+    "gain": Quantity("ppm", _SANDWICH, _DURATION),
+    "offset": Quantity("", _SANDWICH, _DURATION),
     "skew": Quantity("ns", _SANDWICH, _RICH),
     "start": Quantity("s", _SANDWICH, _RICH),
     "clock": Quantity("ppm", f"{_SANDWICH}, weighted mean of channels", "a longer run with a signal above 100 Hz"),
@@ -92,13 +92,13 @@ ANALOGUE = {
     ),
     "lost samples": Quantity("1", _FOLLOWED, "a signal above 100 Hz on every channel"),
     "doubled samples": Quantity("1", _FOLLOWED, "a signal above 100 Hz on every channel"),
-    "foreign rows": Quantity("1", "rows in unexplained blocks between explained ones", _LONG_RUN),
+    "foreign rows": Quantity("1", "rows in unexplained blocks between explained ones", _DURATION),
     "judged part": Quantity("1", "rows explained over rows in the session", "a signal that does not repeat"),
     **{name: DIGITAL[name] for name in ("stamp rate", "stamp jitter", "stamps that go back")},
-    "noise": Quantity("", _SPLIT, _LONG_RUN),
+    "noise": Quantity("", _SPLIT, _DURATION),
     "jitter": Quantity("ns", _SPLIT, "a steep signal (test-sine at 1 kHz or more, or two tones), 10 s"),
-    "effective bits": Quantity("bit", "from the rms of the whole residual, log2(range / (rms sqrt 12))", _LONG_RUN),
-    "dynamic range": Quantity("dB", "from the noise, full-scale sine over it", _LONG_RUN),
+    "effective bits": Quantity("bit", "from the rms of the whole residual, log2(range / (rms sqrt 12))", _DURATION),
+    "dynamic range": Quantity("dB", "from the noise, full-scale sine over it", _DURATION),
     "corner": Quantity("Hz", "least squares with a Butterworth low-pass, else cross spectra", _WIDE_BAND),
     "SINAD": Quantity("dB", "IEEE 1057 four-parameter sine fit, chi squared", _SINE),
     "ENOB": Quantity("bit", "IEEE 1057 four-parameter sine fit, chi squared", _SINE),

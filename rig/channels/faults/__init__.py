@@ -6,17 +6,17 @@ from rig.base.errors import InputError, UnknownNameError
 from rig.channels.faults.blocks import DOORS, Message, OfBlocks, Restart
 from rig.channels.faults.effect import check_draws, check_size, check_time
 from rig.channels.faults.kind import At, Draws, Kind, Setting, acts
-from rig.channels.faults.kinds import KINDS, AnyKind, NoFilter, Swap, plugged
+from rig.channels.faults.kinds import KINDS, AnyKind, NoFilter, Swap, connect_swaps
 from rig.channels.table import ChannelTable
 
 __all__ = [
     "DOORS", "KINDS", "AnyKind", "At", "Draws", "Kind", "Message", "NoFilter", "OfBlocks", "Restart", "Setting",
-    "Swap", "acts", "channels_of", "check_draws",
-    "check_size", "check_time", "described", "plugged", "stream_of", "supported",
+    "Swap", "acts", "check_draws", "check_size", "check_time", "connect_swaps", "describe_kinds",
+    "find_channels", "find_group", "list_refusals",
 ]  # fmt: skip
 
 
-def supported(kind: type[Kind], table: ChannelTable, setting: Setting = Setting()) -> dict[str, str]:  # noqa: B008
+def list_refusals(kind: type[Kind], table: ChannelTable, setting: Setting = Setting()) -> dict[str, str]:  # noqa: B008
     """Return where a kind of fault can be injected, whatever its numbers.
 
     Args:
@@ -39,7 +39,7 @@ def supported(kind: type[Kind], table: ChannelTable, setting: Setting = Setting(
     }
 
 
-def channels_of(
+def find_channels(
     what: Kind, target: str, table: ChannelTable, *, ideal: bool, noisy: bool, generated: bool = False
 ) -> tuple[str, ...]:
     """Return the channels whose counts a fault changes; none for a fault of blocks.
@@ -67,7 +67,7 @@ def channels_of(
             raise UnknownNameError(
                 f"fault.{what.name()}", "with another channel", other, [n for n in known if n not in names]
             )
-    refused = supported(type(what), table, Setting(ideal, noisy, generated))
+    refused = list_refusals(type(what), table, Setting(ideal, noisy, generated))
     if what.channel_only:
         names = tuple(name for name in names if not refused[name]) or names[:1]
     names = what.on(names)
@@ -81,7 +81,7 @@ def channels_of(
     return names
 
 
-def stream_of(what: OfBlocks, target: str, table: ChannelTable, doors: tuple[str, ...]) -> str:
+def find_group(what: OfBlocks, target: str, table: ChannelTable, doors: tuple[str, ...]) -> str:
     """Return the group whose blocks a fault changes.
 
     Args:
@@ -93,7 +93,7 @@ def stream_of(what: OfBlocks, target: str, table: ChannelTable, doors: tuple[str
     Raises:
         InputError: The group or the door is unknown; the message lists the known ones.
     """
-    known = supported(type(what), table)
+    known = list_refusals(type(what), table)
     if target in table.channels and target not in known:
         must = f"a group for {what.name()}, as a block has all its channels, such as {table.channels[target].group}"
         raise InputError("fault.channel", must, target)
@@ -106,7 +106,7 @@ def stream_of(what: OfBlocks, target: str, table: ChannelTable, doors: tuple[str
     return target
 
 
-def described(table: ChannelTable, setting: Setting = Setting()) -> list[tuple[str, ...]]:  # noqa: B008
+def describe_kinds(table: ChannelTable, setting: Setting = Setting()) -> list[tuple[str, ...]]:  # noqa: B008
     """Return each kind's name, stage, equation, numbers with defaults, supported channels or groups, and doors.
 
     Args:
@@ -120,7 +120,7 @@ def described(table: ChannelTable, setting: Setting = Setting()) -> list[tuple[s
             for key, field in kind.model_fields.items()
             if key != "kind"
         ]
-        places = supported(kind, table, setting)
+        places = list_refusals(kind, table, setting)
         on = [place for place, must in places.items() if not must]
         many = "groups" if kind.of_blocks else "channels"
         where = f"all {len(on)} {many}" if len(on) == len(places) else ", ".join(on) or "none"

@@ -11,7 +11,7 @@ from functools import cached_property
 
 import numpy as np
 
-from rig.channels.faults import At, NoFilter, Swap, acts, plugged
+from rig.channels.faults import At, NoFilter, Swap, acts, connect_swaps
 from rig.channels.faults.delivery import Active
 from rig.channels.sampling import TICKS_HZ
 from rig.channels.table import Channel, Group
@@ -51,13 +51,13 @@ class Plan:
                 self.converters[name] = last
 
 
-def where(
+def make_place(
     one: Active, channel: Channel, n: np.ndarray, times_s: np.ndarray,
     other: Callable[[str], np.ndarray] | None = None, angle: np.ndarray = NO_ANGLES, rate: np.ndarray = NO_ANGLES,
 ) -> At:  # fmt: skip
     """Return the place at which a fault acts: rows or samples n of a channel at their times [s], shape (n,)."""
     t = times_s - one.begin / TICKS_HZ
-    return At(t, n, channel, one.draws[channel.name], one.kept, other or no_other, angle, rate, seen_mark)
+    return At(t, n, channel, one.draws[channel.name], one.kept, other or read_nothing, angle, rate, mark_signal)
 
 
 class Volts:
@@ -73,7 +73,7 @@ class Volts:
     def _at(self, one: Active, name: str) -> At:
         angle, rate = self.rows[:, COLUMN["theta"]], self.rows[:, COLUMN["theta_rate"]]
         channel = self._scales.channels[name]
-        return where(one, channel, self._n, self._times_s, self._beyond_bias, angle, rate)
+        return make_place(one, channel, self._n, self._times_s, self._beyond_bias, angle, rate)
 
     @cached_property
     def _conditioned(self) -> np.ndarray:
@@ -94,7 +94,7 @@ class Volts:
 
     def signals(self, names: Sequence[str]) -> np.ndarray:
         """Return the signals [SI] equivalent to the inputs of the converters' filters, shape (rows, channels)."""
-        about, plugs = self._scales, plugged(self._active)
+        about, plugs = self._scales, connect_swaps(self._active)
         volts = self._conditioned[:, [about.places[plugs.get(name, name)] for name in names]]
         for one in self._active:
             if acts(one.what, "volts"):
@@ -120,12 +120,12 @@ class Scales:
         self.low_v, self.high_v = np.array([channel.range_v for channel in channels.values()]).T
 
 
-def seen_mark(angle: np.ndarray) -> np.ndarray:
+def mark_signal(angle: np.ndarray) -> np.ndarray:
     """Return the keyphasor's signal at angles of the shaft [rad], as rows of the model have it, shape (n,)."""
     ahead = (angle + math.pi) % (2.0 * math.pi) - math.pi
     return np.clip(0.5 + np.minimum(ahead, KEYPHASOR_WIDTH - ahead) / EDGE, 0.0, 1.0)
 
 
-def no_other(_: str) -> np.ndarray:
+def read_nothing(_: str) -> np.ndarray:
     """Return an empty array: a fault of samples reads no other channel."""
     return NO_ANGLES

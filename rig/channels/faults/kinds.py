@@ -290,7 +290,7 @@ class _ActiveFault(Protocol):
     names: tuple[str, ...]
 
 
-def plugged(active: Iterable[_ActiveFault]) -> dict[str, str]:
+def connect_swaps(active: Iterable[_ActiveFault]) -> dict[str, str]:
     """Return the channel whose conditioner each swapped channel is connected to, after all swaps in their order."""
     found: dict[str, str] = {}
     for one in active:

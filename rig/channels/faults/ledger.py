@@ -43,7 +43,7 @@ class _Document(Outside, extra="ignore", strict=False):
     blocks: tuple[_DeclaredBlock, ...] = ()
 
 
-def in_order(blocks: Iterator[tuple[str, Block]]) -> Iterator[tuple[str, Block]]:
+def sort_blocks(blocks: Iterator[tuple[str, Block]]) -> Iterator[tuple[str, Block]]:
     """Yield blocks of several streams, which may arrive late or twice, in order and once each."""
     waiting: dict[str, list[tuple[int, int, Block]]] = {}
     due: dict[str, int] = {}

@@ -107,17 +107,19 @@ def _plain(value: Any) -> Any:
 
 
 def _show_kinds(channel: str | None, form: Form) -> None:
-    from rig.channels.faults import described, supported
+    from rig.channels.faults import describe_kinds, list_refusals
     from rig.run.scenes import rig_table
 
     table = rig_table()
-    rows = described(table)
+    rows = describe_kinds(table)
     if channel is not None:
         known = [*table.channels, *table.groups, *KINDS]
         if channel not in known:
             raise UnknownNameError("CHANNEL", "a channel, a group or a kind of fault", channel, known)
         names = {channel, *(table.groups[channel].names if channel in table.groups else ())}
-        kinds = {kind for kind, each in KINDS.items() if any(supported(each, table).get(name) == "" for name in names)}
+        kinds = {
+            kind for kind, each in KINDS.items() if any(list_refusals(each, table).get(name) == "" for name in names)
+        }
         rows = [row for row in rows if row[0] in {channel, *kinds}]
     headings = ("kind", "stage", "what it does", "numbers", "on", "at")
     if form.as_json:

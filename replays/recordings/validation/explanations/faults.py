@@ -79,11 +79,7 @@ def sensor_faults(
 def diagnose(shown: list[Shown], end_s: float, step: Callable[[str], None] = lambda _text: None) -> list[Explanation]:
     """Return the faults of pairs of channels, then of single ones, with equal faults of several channels merged."""
     total = sum(excess(one.apart) for one in shown)
-    off = {
-        one.name: one
-        for one in shown
-        if one.counts is not None or (len(one.values) > MIN_ROWS and not is_noise(one.apart))
-    }
+    off = {x.name: x for x in shown if x.counts is not None or (len(x.values) > MIN_ROWS and not is_noise(x.apart))}
     explain = _ExplanationMaker(total, end_s)
     found, seen = [], set()
     for a, b in combinations(off.values(), 2):
