@@ -99,11 +99,11 @@ class Deliverer:
             pipe.write("0.1,0.2")  # truncated
 
     def collect(self, folder: Path) -> Delivered:
-        def tell(part: float, text: str) -> None:
+        def report(part: float, text: str) -> None:
             self.told.append((part, text))
 
         try:
-            return collect(cast(Client, self.client), self.source, folder, 5.0, stopped=self.stopped, tell=tell)
+            return collect(cast(Client, self.client), self.source, folder, 5.0, stopped=self.stopped, report=report)
         finally:
             self.over.set()
 

@@ -133,7 +133,7 @@ def _measure_floor_s(folder: Path) -> float:
 
 def collect(
     client: Client, source: int, folder: Path, for_s: float, *, stopped: threading.Event,
-    tell: Callable[[float, str], None],
+    report: Callable[[float, str], None],
 ) -> Delivered:  # fmt: skip
     """Record the CSV lines that a DAQ delivers, and what the rig sends meanwhile.
 
@@ -143,7 +143,7 @@ def collect(
         folder: Folder for both files.
         for_s: Length of the stretch from the first line [s].
         stopped: Event that ends the stretch early.
-        tell: Function that is called with the elapsed part, 0 to 1, and the number of lines.
+        report: Function that is called with the elapsed part, 0 to 1, and the number of lines.
 
     Raises:
         InputError: No line arrives.
@@ -172,7 +172,7 @@ def collect(
         floor_s = _measure_floor_s(folder)
         begun.wait(2.0)  # a rig in lockstep may wait for the DAQ
         lines = Lines(source, folder / "standard-input.csv")
-        why = _wait_for_end(lines, recording, for_s, stopped, tell)
+        why = _wait_for_end(lines, recording, for_s, stopped, report)
         counts, unix_s = lines.close()
         stopped.wait(_MARGIN_S)
     finally:
@@ -194,7 +194,7 @@ def collect(
 
 def _wait_for_end(
     lines: Lines, recording: threading.Thread, for_s: float, stopped: threading.Event,
-    tell: Callable[[float, str], None],
+    report: Callable[[float, str], None],
 ) -> str:  # fmt: skip
     """Wait for the end of the stretch; return its reason."""
     due, first, rest = Deadline(PATIENCE_S), False, None
@@ -212,5 +212,5 @@ def _wait_for_end(
             return "to the end of the rig's run"
         if due.passed:
             return "all of the stretch" if first else f"in {PATIENCE_S:g} s"
-        tell(1.0 - due.left_s / for_s if first else 0.0, f"{lines.count} lines")
+        report(1.0 - due.left_s / for_s if first else 0.0, f"{lines.count} lines")
         stopped.wait(_LOOK_S)

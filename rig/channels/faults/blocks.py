@@ -31,7 +31,7 @@ class Message(NamedTuple):
         due: Time at which it is sent [ticks].
         doors: Outputs by which it is sent.
         faults: Numbers of the faults that acted on it.
-        behind: Whether it is sent after others that are due at the same tick.
+        after_others: Whether it is sent after others that are due at the same tick.
     """
 
     key: str
@@ -40,7 +40,7 @@ class Message(NamedTuple):
     due: int = 0
     doors: tuple[str, ...] = DOORS
     faults: tuple[int, ...] = ()
-    behind: bool = False
+    after_others: bool = False
 
 
 class OfBlocks(Kind):
@@ -122,7 +122,7 @@ class ReorderBlocks(_Random, number=33):
 
     def sent(self, message: Message, u: float, first: tuple[int, int]) -> list[Message]:
         later = message.due + self.ticks
-        return [message._replace(due=later, behind=True) if u < self.part else message]
+        return [message._replace(due=later, after_others=True) if u < self.part else message]
 
 
 class LateBlocks(OfBlocks, number=34):

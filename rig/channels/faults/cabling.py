@@ -64,9 +64,9 @@ class Volts:
     """Signals of faulty channels over a block of rows [SI]: faults of transducers, range limits, faults of cables."""
 
     def __init__(
-        self, scales: Scales, rows: np.ndarray, made: np.ndarray, tick: int, row_ticks: int, active: Sequence[Active]
+        self, scales: Scales, rows: np.ndarray, extra: np.ndarray, tick: int, row_ticks: int, active: Sequence[Active]
     ) -> None:
-        self.rows, self._made, self._active, self._scales = rows, made, active, scales
+        self.rows, self._extra, self._active, self._scales = rows, extra, active, scales
         self._times_s = (tick + row_ticks * np.arange(len(rows))) / TICKS_HZ
         self._n = tick // row_ticks + np.arange(len(rows))
 
@@ -79,7 +79,7 @@ class Volts:
     def _conditioned(self) -> np.ndarray:
         """Outputs of all conditioners, with the faults of transducers [V], shape (rows, channels)."""
         about = self._scales
-        source = self.rows if about.columns.max(initial=0) < N_ROW else np.hstack([self.rows, self._made])
+        source = self.rows if about.columns.max(initial=0) < N_ROW else np.hstack([self.rows, self._extra])
         x = np.asfortranarray(source[:, about.columns] / about.si)
         for one in self._active:
             if acts(one.what, "signal"):

@@ -104,7 +104,7 @@ class _Held:
 
     @property
     def order(self) -> tuple[float, bool, int]:
-        return min((self.message.due, *(one.end for one in self.by))), self.message.behind, self.message.row
+        return min((self.message.due, *(one.end for one in self.by))), self.message.after_others, self.message.row
 
 
 class Sending:
@@ -140,9 +140,9 @@ class Sending:
                 block = replace(before, values=np.concatenate([before.values, block.values]))
             faults = [one for one in self.active if one.key == key]
             for piece, due, here in self._pieces(key, block, faults, last=last):
-                made = _apply_faults(Message(key, piece, piece.index, min(due, end)), here)
-                blocks += [_describe_blocks(piece, key, here, made)] if here else []
-                self._held += made
+                results = _apply_faults(Message(key, piece, piece.index, min(due, end)), here)
+                blocks += [_describe_blocks(piece, key, here, results)] if here else []
+                self._held += results
         waiting = sorted(self._held, key=lambda held: held.order)
         sent += [held.message for held in waiting if held.order[0] <= end or last]
         self._held = [] if last else [held for held in waiting if held.order[0] > end]
@@ -193,15 +193,15 @@ def _apply_faults(message: Message, faults: list[Active]) -> list[_Held]:
             if outside:
                 found.append(replace(held, message=held.message._replace(doors=outside)))
             if inside:
-                made = one.what.sent(held.message._replace(doors=inside), u, first)
-                found += [_Held(each, (*held.by, one) if each.due != held.message.due else held.by) for each in made]
+                results = one.what.sent(held.message._replace(doors=inside), u, first)
+                found += [_Held(each, (*held.by, one) if each.due != held.message.due else held.by) for each in results]
     return found
 
 
-def _describe_blocks(piece: Block, key: str, faults: list[Active], made: list[_Held]) -> dict[str, Any]:
+def _describe_blocks(piece: Block, key: str, faults: list[Active], results: list[_Held]) -> dict[str, Any]:
     sent = [
         {"index": each.block.index, "tick": each.block.tick, "due": each.due, "doors": list(each.doors)}
-        for each in (held.message for held in made)
+        for each in (held.message for held in results)
     ]
     return {
         "faults": [one.id for one in faults], "key": key, "row": piece.index, "rows": len(piece.values), "sent": sent,

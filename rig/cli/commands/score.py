@@ -149,7 +149,7 @@ def _judge_live(
     stopped = threading.Event()
     with tempfile.TemporaryDirectory(prefix="rig-score-") as folder:
         with connection.client() as client, reporting() as reporter, stop_on_signals(stopped.set):
-            found = collect(client, sys.stdin.fileno(), Path(folder), for_s, stopped=stopped, tell=reporter.part)
+            found = collect(client, sys.stdin.fileno(), Path(folder), for_s, stopped=stopped, report=reporter.part)
         card = judge(
             found.file, [found.session], limits=limits, path=path, arrivals=found.arrivals, channels=channels,
             mapping=mapping,

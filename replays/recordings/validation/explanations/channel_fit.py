@@ -43,7 +43,7 @@ class Shown:
         floor: Noise combined with the spread of equally valid predictions [its unit], shape (n,).
         noise: Noise alone [its unit].
         bare: Function that returns the expected values without the low-pass [its unit], shape (n,), if known.
-        beside: Function that returns times and expected values of the other, varying channels, by channel.
+        neighbours: Function that returns times and expected values of the other, varying channels, by channel.
         counts: Recorded and expected counts, including noise, shape (n, 2); None if unknown. If known, `values` are
             without noise.
         lasted_s: Times of the first and the last difference [s], if known.
@@ -57,7 +57,7 @@ class Shown:
     floor: np.ndarray
     noise: float
     bare: Callable[[], np.ndarray] | None = None
-    beside: Callable[[], Mapping[Channel, tuple[np.ndarray, np.ndarray]]] = field(default=dict)
+    neighbours: Callable[[], Mapping[Channel, tuple[np.ndarray, np.ndarray]]] = field(default=dict)
     counts: np.ndarray | None = None
     lasted_s: tuple[float, float] = (0.0, math.inf)
     around: tuple[np.ndarray, np.ndarray] | None = None

@@ -68,7 +68,7 @@ def sensor_faults(
         shown += [
             Shown(
                 part.channels[c], part.times_s[rows], part.values[rows, c], expected[:, c], floor[:, c],
-                float(part.floor[c]), beside=partial(beside, parts, nominal, part.channels[c]),
+                float(part.floor[c]), neighbours=partial(find_others, parts, nominal, part.channels[c]),
                 around=extend(part, nominal.values[name][:, c], rows.start, rows.stop),
             )
             for c in smooth_columns(part)
@@ -111,7 +111,7 @@ def extend(part: Measured, expected: np.ndarray, begin: int, end: int) -> tuple[
     return part.times_s[rows], expected[rows]
 
 
-def beside(
+def find_others(
     parts: Mapping[str, Measured], nominal: Prediction, channel: Channel
 ) -> dict[Channel, tuple[np.ndarray, np.ndarray]]:
     """Return times and expected signals of the other, varying channels [their units]."""

@@ -128,27 +128,27 @@ def _is_white(left: np.ndarray) -> bool:
 
 def _fit_counts(one: Shown, counts: np.ndarray) -> Iterator[Law]:
     """Yield laws that are visible in counts, shape (n, 2), and explain them exactly."""
-    said, sound = counts.T
-    none = np.zeros(len(said))
-    if (said == said[0]).all() and one.noise > 0.0 and one.at_begin(said[0] * one.channel.scale + one.channel.offset):
-        level = one.channel.scale * said[0] + one.channel.offset
+    code, sound = counts.T
+    none = np.zeros(len(code))
+    if (code == code[0]).all() and one.noise > 0.0 and one.at_begin(code[0] * one.channel.scale + one.channel.offset):
+        level = one.channel.scale * code[0] + one.channel.offset
         yield one.law("freeze", 0.0, none, 1, f"at {level:.6g} {one.unit}")
         return
     for bit in range(one.channel.adc_bits - 1):
         mask = 1 << bit
         for value, shown in ((1, sound | mask), (0, sound & ~mask)):
-            if (said == shown).all():
+            if (code == shown).all():
                 yield one.law("stuck-bit", float(bit), none, 1, f"bit {bit} is {value}")
-        if bit and (said == sound >> bit << bit).all():
+        if bit and (code == sound >> bit << bit).all():
             yield one.law("bits", float(bit), none)
-    low, high = int(said.min()), int(said.max())
+    low, high = int(code.min()), int(code.max())
     ends = (sound > high).any() or (sound < low).any()
-    if ends and (said == np.clip(sound, low, high)).all() and (one.noise > 0.0 or (said == sound).any()):
+    if ends and (code == np.clip(sound, low, high)).all() and (one.noise > 0.0 or (code == sound).any()):
         part = max(abs(low), abs(high) + 1) / 2.0 ** (one.channel.adc_bits - 1)
         if part < 1.0:  # every converter has limits
             yield one.law("clip", part, none)
-    off = said != sound
-    sizes = np.abs(said - sound)[off]
+    off = code != sound
+    sizes = np.abs(code - sound)[off]
     if off.mean() < _MAX_SPIKE_PART and len(sizes) and sizes.min() == sizes.max() > _MAX_ROUNDING:
         yield _make_spikes(one, off, none)
 
@@ -258,7 +258,7 @@ def _fit_crosstalk(one: Shown) -> Iterator[Law]:
     """Yield crosstalk from another channel."""
     d, ones = one.values - one.expected, one.level
     found, count = list[Law](), 4 if one.counts is None else 2
-    for other, shown in one.beside().items():
+    for other, shown in one.neighbours().items():
         (part, _), left = one.left([one.coupled(*shown), ones], d)
         through = abs(part * one.channel.sensitivity_v / other.sensitivity_v)
         change = f"{part:.4g} {one.unit} for a {other.unit} of {other.name}"
@@ -359,10 +359,10 @@ def _fit_random(one: Shown) -> Iterator[Law]:
         if one.counts is None:
             yield one.law("noise", ratio, rest / ratio)
             return
-        said = (one.channel.scale * one.counts[:, 0] + one.channel.offset - one.expected).std() / one.noise
+        spread = (one.channel.scale * one.counts[:, 0] + one.channel.offset - one.expected).std() / one.noise
         times = math.hypot(1.0, ratio * float(one.floor[0]) / one.noise)
-        if abs(said - 1.0) < abs(said - times) and times > _MIN_NOISE_RATIO:
+        if abs(spread - 1.0) < abs(spread - times) and times > _MIN_NOISE_RATIO:
             change = "with the nominal level: samples are taken at other times"
-            yield one.law("other noise", float(said), rest / ratio, 1, change, unit="")
+            yield one.law("other noise", float(spread), rest / ratio, 1, change, unit="")
         else:
             yield one.law("noise", times, rest / ratio)

@@ -114,9 +114,9 @@ def edge_faults(edges_s: np.ndarray, until_s: float, speed_hz: float) -> list[Si
     steps, found = np.diff(edges_s[edges_s < until_s]), list[SignalFault]()
     even = len(steps) if len(steps) >= 3 else 0
     later = np.diff(edges_s[max(0, even - 1) :])
-    beside = np.maximum([*later[1:2], *later[:-1]], [*later[1:], math.inf]) if len(later) > 1 else later
+    neighbours = np.maximum([*later[1:2], *later[:-1]], [*later[1:], math.inf]) if len(later) > 1 else later
     # A shaft cannot be that much slower for a single turn.
-    for at in np.flatnonzero(later > _MISSED_TURN * beside) + max(0, even - 1):
+    for at in np.flatnonzero(later > _MISSED_TURN * neighbours) + max(0, even - 1):
         begin, end = float(edges_s[at]), float(edges_s[at + 1])
         text = f"none between {begin:.3f} and {end:.3f} s"
         found.append(SignalFault("keyphasor", "miss-pulses", begin, end, text))

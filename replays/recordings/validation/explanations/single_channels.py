@@ -13,7 +13,7 @@ import numpy as np
 from replays.recordings.resimulation.prediction import Measured, Prediction
 from replays.recordings.validation.explanations.channel_fit import MIN_ROWS, Shown
 from replays.recordings.validation.explanations.explanation import Explanation
-from replays.recordings.validation.explanations.faults import PAIR_ROWS, beside, diagnose, extend, select_channels
+from replays.recordings.validation.explanations.faults import PAIR_ROWS, diagnose, extend, find_others, select_channels
 from replays.recordings.validation.explanations.laws import law_of
 from replays.recordings.validation.explanations.signals import SignalFault
 from rig.channels.faults.defects import alternatives, size_text, unit_of
@@ -73,14 +73,14 @@ def own_faults(
             # Rows after its end belong to the filter.
             last = int(rows[-1]) + 1 - (fine if rows[-1] - first > 3 * fine else 0)
             expected, dense = nominal.values[name][:, c], 5 * np.count_nonzero(off[first:last]) > last - first
-            made = partial(_shown, part, channel, expected, off, lasted_s)
-            few = partial(_bare, part, channel, again), partial(beside, parts, nominal, channel)
+            show_rows = partial(_shown, part, channel, expected, off, lasted_s)
+            few = partial(_bare, part, channel, again), partial(find_others, parts, nominal, channel)
             rows = np.arange(first, min(last, first + _MAX_ROWS))
             if len(rows) < (MIN_ROWS if dense else PAIR_ROWS):
                 rows = np.arange(max(0, first - PAIR_ROWS), min(first + PAIR_ROWS, len(off)))
-            shown.append(made(rows, *few))
+            shown.append(show_rows(rows, *few))
             if last - first > 2 * _MAX_ROWS:
-                ends[channel.name] = partial(made, np.arange(last - _MAX_ROWS, last), *few)
+                ends[channel.name] = partial(show_rows, np.arange(last - _MAX_ROWS, last), *few)
     about = {one.name: one for one in shown}
     found = []
     for one in diagnose(shown, max((float(one.times_s[-1]) for one in shown), default=0.0), step):
@@ -116,11 +116,11 @@ def _shown(
     within = ~np.convolve(at_end, np.ones(2 * MIN_ROWS + 1), "same").astype(bool)
     if within[rows].mean() > _MIN_OTHER_PART:
         rows = rows[within[rows]]
-    said = np.rint((part.values[rows, part.names.index(channel.name)] - channel.offset) / channel.scale)
+    recorded = np.rint((part.values[rows, part.names.index(channel.name)] - channel.offset) / channel.scale)
     return Shown(
         channel, part.times_s[rows], (expected + channel.scale * off)[rows], expected[rows],
         np.full(len(rows), 0.5 * abs(channel.scale)), channel.noise_v / abs(channel.sensitivity_v),
-        partial(bare, rows), others, np.column_stack([said, said - off[rows]]).astype(np.int64), lasted_s,
+        partial(bare, rows), others, np.column_stack([recorded, recorded - off[rows]]).astype(np.int64), lasted_s,
         extend(part, expected, rows[0], rows[-1] + 1),
     )  # fmt: skip
 
