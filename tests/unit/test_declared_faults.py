@@ -263,5 +263,5 @@ def test_instants_out_of_order_end_in_a_verdict(kind: str, tmp_path: Path) -> No
     write_run(Simulation(whirl), tmp_path / "a.mcap")
     found = validate(Recording.open(tmp_path / "a.mcap"), blind=True)
     assert not found.good
-    assert found.verdict_line.startswith("fail, the recording does not fit together")
+    assert found.verdict_line.startswith("fail, the recording is inconsistent")
     assert "times of probes do not ascend: no quantity of its motion is judged" in found.doubts

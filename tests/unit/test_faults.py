@@ -150,12 +150,12 @@ def test_pulses() -> None:
     edges_s = np.arange(40) / 6.2
     assert edge_faults(edges_s, 6.0, 6.2) == []
     assert "miss-pulses: in 1 of" in edge_faults(np.delete(edges_s, 7), 6.0, 6.2)[0].line
-    assert "extra-pulses: 2 pulses a turn" in edge_faults(np.arange(40) / 12.4, 6.0, 6.2)[0].line
+    assert "extra-pulses: 2 pulses per turn" in edge_faults(np.arange(40) / 12.4, 6.0, 6.2)[0].line
 
 
 @pytest.mark.parametrize(("change_s", "line"), [
-    (0.5, "extra-pulses: in 2 of"), (0.05, "is -8.065 ms long beside the others: samples are missing in it"),
-    (-0.05, "is +8.065 ms long beside the others: its time jumps"),
+    (0.5, "extra-pulses: in 2 of"), (0.05, "longer than the others by -8.065 ms: samples are missing or doubled in it"),
+    (-0.05, "longer than the others by +8.065 ms: its time jumps"),
 ])  # fmt: skip
 def test_a_pulse_at_the_wrong_time_has_one_name(change_s: float, line: str) -> None:
     """A pulse half a turn after another, and all pulses from the 20th on a fraction of a turn too early."""
