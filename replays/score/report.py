@@ -67,7 +67,7 @@ def make_report(card: Scorecard, *, origin: Mapping[str, str] | None = None) -> 
         report.heading("Inconclusive in this run")
         report.table(("quantity", "what to run"), list(unshown.items()))
     report.heading("Limits and methods")
-    methods = {(row.quantity, row.method, row.limit.source if row.limit else "nothing asks") for row in card.rows}
+    methods = {(row.quantity, row.method, row.limit.source if row.limit else "none") for row in card.rows}
     report.table(("quantity", "method of the interval", "source of the limit"), sorted(methods))
     for name, about in card.pictures.items():
         if isinstance(about, Fitted):

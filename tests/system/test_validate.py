@@ -45,7 +45,7 @@ def test_a_failure_ends_in_1_and_a_report_names_the_cause(
     for text in (recording.name, "--set contact.restitution=0.88", "corrected", "<dt>seed</dt>", "<dt>made</dt>"):
         assert text in head
     assert 'src="http' not in page
-    assert page.index("Criteria that fail") < page.index("What explains the difference") < page.index(">Bits<")
+    assert page.index("Failed criteria") < page.index("Explanations of the difference") < page.index(">Bits<")
 
 
 def test_json_and_another_engine(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -24,7 +24,7 @@ _STRETCHES = 160
 _BEFORE_S, _AFTER_S = 5e-3, 60e-3
 """Time before and after an event in a detail plot."""
 _MARKS: dict[bool | None, Mark] = {True: "good", False: "bad", None: "plain"}
-_WORDS = {True: "pass", False: "fail", None: "not asked"}
+_WORDS = {True: "pass", False: "fail", None: "no limit"}
 
 
 def make_report(found: Validation, *, origin: Mapping[str, str] | None = None) -> Report:
@@ -66,9 +66,9 @@ def _conclusion(report: Report, found: Validation) -> None:
     if one is not None:
         report.text(f"The first difference is at {one.from_s:.4f} s. {_sentence(one.conclusion)}.")
     report.text(f"{_sentence(found.bits_line)}.")
-    report.table(("what", "is"), _about(found))
+    report.table(("item", "value"), _about(found))
     if found.failures and not found.good:
-        report.heading("Criteria that fail")
+        report.heading("Failed criteria")
         report.table(
             ("criterion", "recorded", "predicted", "limit", "verdict"),
             [Row((f.criterion, f.recorded, f.foretold, f.limit, "fail"), "bad") for f in found.failures],
@@ -76,16 +76,16 @@ def _conclusion(report: Report, found: Validation) -> None:
         )
     if one is None or not one.ranked:
         return
-    report.heading("What explains the difference")
+    report.heading("Explanations of the difference")
     report.table(
-        ("kind", "what", "change", "explains", "left", "seen to [s]", "verdict"),
+        ("kind", "candidate", "change", "explained", "residual", "fitted to [s]", "verdict"),
         [
             Row((e.kind, e.name, e.change, f"{e.explained:.2%}", f"{e.left:.3g}", f"{e.to_s:.3f}",
                  "named" if e.name in one.best else ""), "good" if e.name in one.best else "plain")
             for e in one.ranked[:20]
         ],
-        caption="Each candidate alone, fitted to the recorded channels over their noise; `explains` is the part of "
-        "the residual's sum of squares beyond noise that it removes, `left` the RMS of the remaining residual "
+        caption="Each candidate alone, fitted to the recorded channels over their noise; `explained` is the part of "
+        "the residual's sum of squares beyond noise that it removes, `residual` the RMS of the rest "
         "over the noise: 1 is noise alone.",
     )  # fmt: skip
 
@@ -95,7 +95,7 @@ def _bits(report: Report, found: Validation) -> None:
         return
     report.heading("Bits")
     report.table(
-        ("stream", "columns", "rows", "payloads that differ", "first difference [s]", "largest", "lost rows",
+        ("stream", "columns", "rows", "different payloads", "first difference [s]", "largest", "lost rows",
          "verdict"),
         [
             Row((key, b.picked or "all", str(b.rows), str(b.different),

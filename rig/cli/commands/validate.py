@@ -148,9 +148,9 @@ def _counts(one: Explanation) -> bool:
 
 
 def _explanations(explained: Explained) -> Table:
-    headings = ("kind", "what", "change", ">explains", ">left", ">seen to", "verdict")
+    headings = ("kind", "candidate", "change", ">explained", ">residual", ">fitted to", "verdict")
     title = "Candidate explanations of the difference, each alone"
-    table = new_table(title, *headings, wrapped=["change"], spare=("kind", "seen to"))
+    table = new_table(title, *headings, wrapped=["change"], spare=("kind", "fitted to"))
     for one in [one for one in explained.ranked if _counts(one)][:12]:
         told = "named" if one.name in explained.best else ""
         row = (one.kind, one.name, one.change, f"{one.explained:.2%}", f"{one.left:.3g}", f"{one.to_s:.3f} s", told)
