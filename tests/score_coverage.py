@@ -30,7 +30,7 @@ from replays.score.records.recorded import Recorded, Table
 from replays.score.records.sent import Session
 from replays.score.records.stimulus import Exact
 from replays.score.records.wiring import Wire
-from replays.score.waveform import behind_filter, fit_waveform, order_of, response
+from replays.score.waveform import find_order, fit_waveform, fit_with_filter, response
 from rig.channels.table import default_table
 from tests.score_daqs import RATE_HZ, Tones
 
@@ -184,9 +184,9 @@ def _corner(generator: np.random.Generator, noise: Callable[..., Noise], seed: i
     known = Exact(_curve(seed, high_hz=3000.0, tones=40), (0.0, t[-1] + 0.1), RATE_HZ)
     low = fit_waveform(values, t, known, (late_s - 0.3 / corner_hz, 0.0, 0.0))
     shown = None if low is None else response(low)
-    if low is None or shown is None or shown.corner_hz is None or order_of(shown) != 4:
+    if low is None or shown is None or shown.corner_hz is None or find_order(shown) != 4:
         return {}
-    behind = behind_filter(low, known, shown)
+    behind = fit_with_filter(low, known, shown)
     return {} if behind is None else {"corner": (*behind[1], corner_hz)}
 
 
