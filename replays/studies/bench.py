@@ -24,7 +24,7 @@ from replays.studies.peers import PEERS, Problem, Setting, scaled_error
 from replays.studies.peers.common.reference import find_reference
 from replays.studies.peers.common.window import cut_window
 from rig.channels.table import ChannelTable, default_table
-from rig.physics.kernels import compiled_before
+from rig.physics.kernels import has_compiled_kernels
 from rig.physics.kernels.signals import COLUMN, N_STATE
 from rig.run.scenes import Scene, load_scene
 from rig.run.simulation import Simulation
@@ -146,7 +146,7 @@ def measure(*, runs: int, peers: bool, frames: int, progress: Callable[[str], No
         all), error, energy residual, goal and whether it is reached, and the median ratio to the first case of the
         same round; per peer the same; the time of a frame.
     """
-    cached = compiled_before()
+    cached = has_compiled_kernels()
     begin = time.perf_counter()
     progress("loading or compiling the kernels")
     scenes = {case.name: load_scene(case.scene, {**case.changes, "duration_s": case.simulated_s}) for case in CASES}

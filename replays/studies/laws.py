@@ -36,9 +36,9 @@ from rig.physics.contacts import (
     damping_law,
     fit_power,
     free_impact,
-    resolve,
+    match_depth,
+    resolve_law,
     returned_restitution,
-    same_depth,
     stiffness_law,
 )
 from rig.physics.model import contact_pair, normal_law, reference_impact
@@ -148,7 +148,7 @@ def returned_over_speeds(parameters: ParameterSet, speeds: list[float]) -> dict[
     """
     pair, impact = contact_pair(parameters), reference_impact(parameters)
     restitution, floor = parameters["contact.restitution"], parameters["contact.speed_floor"]
-    hertz = resolve(
+    hertz = resolve_law(
         stiffness="internal-sphere", exponent=LAW, damping="exact", viscous=LAW,
         restitution=restitution, pair=pair, impact=impact,
     ).law  # fmt: skip
@@ -274,9 +274,9 @@ def _resolved(
     if damping == KELVIN_VOIGT:
         own = normal_law(parameters).law
         if not isinstance(stiffness, str):
-            stiffness = same_depth(own.stiffness, own.exponent, 1.0, impact)
+            stiffness = match_depth(own.stiffness, own.exponent, 1.0, impact)
         exponent = LAW
-    return resolve(
+    return resolve_law(
         stiffness=stiffness,
         exponent=exponent,
         damping=damping,

@@ -1,1 +1,1 @@
-"""The model: kernels, engines, laws, parameters."""
+"""Physical model: parameters, laws, kernels and integration engines."""

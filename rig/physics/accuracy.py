@@ -1,7 +1,7 @@
-"""The error of a run, estimated by the distance from its companion, one quantity at a time in its own unit.
+"""Error estimate of a run by its distance from a companion run, for each quantity in its own unit.
 
-Both runs are compared in windows of samples at the same instants. A whirl that is ahead or behind in angle has other
-instantaneous values although it is the same motion, so a difference also counts only as far as it remains where both
+Both runs are compared at the same instants, in windows of samples. A whirl that leads or lags in angle has different
+instantaneous values although the motion is the same. A difference therefore counts only as far as it remains when both
 runs are compared at the same whirl angle.
 """
 
@@ -19,7 +19,7 @@ from rig.physics.kernels import signals as S
 from rig.physics.kernels.signals import COLUMN
 
 COMPANION_REFINEMENT = 1.0 / 16.0
-"""Companion's tolerance over engine.tolerance: the difference is then the run's own error to about 6 %."""
+"""Companion's tolerance over engine.tolerance: their difference is then the run's own error within about 6 %."""
 QUANTITIES = {
     "radius": ("whirl radius", "um", 1e6),
     "force": ("contact force", "N", 1.0),
@@ -28,38 +28,37 @@ QUANTITIES = {
     "angle": ("whirl angle", "deg", math.degrees(1.0)),
     "spin_angle": ("spin angle", "deg", math.degrees(1.0)),
 }
-"""Label, unit and units per SI unit of each quantity; the two angles have no tolerance unless a limit is given."""
+"""Label, unit and units per SI unit of each quantity. The two angles have no tolerance unless a limit is set."""
 STATE_FACTOR = 10.0
 """Tolerance of the scaled state over engine.tolerance: the warning level of version 0.1."""
 FORCE_FLOOR_N = 100.0
-"""Smallest force scale [N], the default hammer's peak: a light graze does not warn for millinewtons."""
+"""Smallest force scale [N], the default hammer's peak: a light rub must not warn of millinewtons."""
 FREQUENCY_SCALE_HZ = 100.0
 """Whirl frequency scale [Hz]: the rig whirls at 40 to 130 Hz."""
 _WINDOW_ROWS, _WINDOW_S = 64, 0.064
-"""At least this many samples and this long [s], which is three turns of the slowest whirl that rolls."""
+"""Minimum number and duration [s] of a window's samples; 64 ms are three turns of the slowest rolling whirl."""
 _HARMONICS = np.arange(1, 5)
-"""Harmonics of the whirl angle in what a value is as a function of it; weight and stiffness give the first two."""
+"""Harmonics of the whirl angle in the fit; weight and stiffness excite the first two."""
 _MIN_FIT_ROWS = 30
-"""Samples that a fit of twelve coefficients needs to have a residual that means something."""
+"""Minimum number of samples for a meaningful residual of the fit's twelve coefficients."""
 _MIN_WHIRL_RADIUS = 0.5
-"""Part of the clearance above which an orbit has a whirl angle."""
+"""Minimum orbit radius that has a whirl angle, as a share of the clearance."""
 _COLUMNS = [*range(S.N_STATE), COLUMN["ring_x"], COLUMN["ring_y"], COLUMN["normal_force"]]
-_MOVING = [2 + k for k in range(S.N_STATE) if k != S.THETA]
-"""Columns of a window's differences that are states, without the spin angle; before them are radius and force."""
-_FIRST, _LOST = 1e-9, 0.1
-"""Growth is measured from the first distance above rounding, up to where two runs no longer have to do with each
-other."""
+_SCALED_STATE_COLUMNS = [2 + k for k in range(S.N_STATE) if k != S.THETA]
+"""Columns of a window's differences that hold states, without the spin angle; radius and force come first."""
+_MIN_GROWTH_DISTANCE, _MAX_GROWTH_DISTANCE = 1e-9, 0.1
+"""Range of distances in which growth is measured: above rounding, and below where two runs are unrelated."""
 
 
 def choose_companion(engine: str, tolerance: float, friction: str) -> tuple[str, float]:
     """Return engine and tolerance of the companion.
 
-    A per-step tolerance bounds nothing where the step is limited by the grid, as with `tsit5` at 1e-3: a companion of
-    the same method then shares the error. Other engines are compared with the default engine, or with `rk8` where the
-    default engine does not take the friction law.
+    A tolerance per step has no effect if the grid limits the step, as with `tsit5` at 1e-3: a companion of the same
+    method then has the same error. Other engines are compared with the default engine, or with `rk8` where the default
+    engine does not support the friction law.
 
     Args:
-        engine: Name of the run's own engine.
+        engine: Name of the run's engine.
         tolerance: engine.tolerance of the run.
         friction: Friction law of the model.
     """
@@ -106,7 +105,7 @@ class Accuracy:
             times_s: Instants [s], shape (n,).
 
         Returns:
-            Time [s] and text of a warning for each window in which another quantity exceeded its tolerance.
+            Time [s] and text of a warning for each window in which a further quantity exceeded its tolerance.
         """
         self._waiting.append(np.concatenate([times_s[:, None], rows[:, _COLUMNS], companion[:, _COLUMNS]], axis=1))
         size, warnings = max(_WINDOW_ROWS, math.ceil(_WINDOW_S / self.block_s)), []
@@ -120,19 +119,19 @@ class Accuracy:
         self._waiting = [waiting]
         return warnings
 
-    def completed(self) -> Accuracy:
-        """Return a copy that includes the samples of the window that is not full yet."""
+    def copy_completed(self) -> Accuracy:
+        """Return a copy that includes the samples of the last, incomplete window."""
         done = copy.deepcopy(self)
         done.complete()
         return done
 
     def complete(self) -> None:
-        """Add the samples of the window that is not full yet, filled up by those before them."""
+        """Add the samples of the last, incomplete window, filled up with earlier samples."""
         if count := sum(map(len, self._waiting)):
             self._add_window(np.concatenate([self._window, *self._waiting])[-max(len(self._window), count) :])
 
     def document(self) -> dict[str, Any]:
-        """Return the estimate as JSON: each quantity's largest error and tolerance in its unit, and since when."""
+        """Return the estimate as JSON: largest error, tolerance and time of excess of each quantity, in its unit."""
         tolerances = self._tolerances()
         return {
             "estimate": self.estimate,
@@ -151,7 +150,7 @@ class Accuracy:
         }
 
     def warning(self) -> str:
-        """Return a sentence that names each quantity above its tolerance; empty if there is none."""
+        """Return a sentence that lists the quantities above their tolerance; empty if there is none."""
         parts = [
             f"{one['label']} off by {one['error']:.2g} {one['unit']} "
             f"({'limit' if name in self.limits else 'tolerance'} {one['tolerance']:.2g}) "
@@ -159,20 +158,18 @@ class Accuracy:
             for name, one in self.document()["quantities"].items()
             if one["exceeded_s"] is not None
         ]
-        advice = (
-            f"differences grow by {self.grown_per_s:.3g} 1/s: ask for a finer engine.tolerance ({self.tolerance:g})"
-        )
+        advice = f"differences grow by {self.grown_per_s:.3g} 1/s: set a finer engine.tolerance ({self.tolerance:g})"
         return f"accuracy: {'; '.join(parts)}; {advice}, or use statistics only" if parts else ""
 
     def _tolerances(self) -> dict[str, float]:
         """Return the tolerance of each quantity that has one [SI]."""
         scales = self.clearance, max(self.peak_force, FORCE_FLOOR_N), FREQUENCY_SCALE_HZ, STATE_FACTOR
-        given = {name: limit / QUANTITIES[name][2] for name, limit in self.limits.items()}
-        return {name: self.tolerance * scale for name, scale in zip(QUANTITIES, scales, strict=False)} | given
+        scaled_limits = {name: limit / QUANTITIES[name][2] for name, limit in self.limits.items()}
+        return {name: self.tolerance * scale for name, scale in zip(QUANTITIES, scales, strict=False)} | scaled_limits
 
     def _add_window(self, window: np.ndarray) -> bool:
-        """Update all estimates by one window; return whether another quantity exceeds its tolerance."""
-        # Sums along rows differ in their last bit by the order in memory, which goes by how the run was cut.
+        """Update all estimates by one window; return whether a further quantity exceeds its tolerance."""
+        # The memory order, which depends on how the run was cut, would change the last bit of sums along rows.
         window = np.ascontiguousarray(window)
         times_s, both = window[:, 0], window[:, 1:].reshape(len(window), 2, len(_COLUMNS))
         orbit, force = both[..., -3] + 1j * both[..., -2], both[..., -1:]
@@ -184,12 +181,12 @@ class Accuracy:
         self.peak_force = max(self.peak_force, float(force[:, 0].max()))
         between = np.angle(orbit[:, 0] * np.conj(orbit[:, 1]))
         whirls = radius.min(axis=1) > _MIN_WHIRL_RADIUS * self.clearance
-        errors = self._at_instant(apart)
+        errors = self._largest_errors(apart)
         if len(window) >= _MIN_FIT_ROWS and np.isfinite(apart).all() and (errors > self.errors[[0, 1, 3]]).any():
             phases = np.stack([np.angle(orbit), both[..., S.THETA]], axis=-1)
             (own, other), (phase, phase_other) = values.swapaxes(0, 1), phases.swapaxes(0, 1)
-            same_angle = _apart_at_same_angle(own, other, phase, phase_other, times_s)
-            errors = self._at_instant(np.minimum(apart, same_angle))
+            same_angle = _distance_at_same_angle(own, other, phase, phase_other, times_s)
+            errors = self._largest_errors(np.minimum(apart, same_angle))
         span_s = times_s[-1] - times_s[0]
         frequency = 0.0
         if whirls.all() and span_s >= 0.5 * _WINDOW_S:
@@ -208,32 +205,37 @@ class Accuracy:
         return bool(exceeded)
 
     def _note_growth(self, times_s: np.ndarray, distances: np.ndarray) -> None:
-        """Update the largest distance of all states and its growth, by distances at some instants, shape (n,)."""
+        """Update the largest distance of all states and its growth rate.
+
+        Args:
+            times_s: Instants [s], shape (n,).
+            distances: RMS of the scaled states' differences, shape (n,).
+        """
         self.estimate, begin = max(self.estimate, float(distances.max())), 0
-        if self._first is None and (above := distances > _FIRST).any():
+        if self._first is None and (above := distances > _MIN_GROWTH_DISTANCE).any():
             begin = int(np.argmax(above)) + 1
             self._first = float(times_s[begin - 1]), float(distances[begin - 1])
         if self._first is not None:
-            grown = np.flatnonzero((distances[begin:] > self._first[1]) & (distances[begin:] < _LOST))
+            grown = np.flatnonzero((distances[begin:] > self._first[1]) & (distances[begin:] < _MAX_GROWTH_DISTANCE))
             if len(grown):
                 last = begin + int(grown[-1])
                 self.grown_per_s = math.log(distances[last] / self._first[1]) / float(times_s[last] - self._first[0])
 
     @staticmethod
-    def _at_instant(apart: np.ndarray) -> np.ndarray:
-        """Largest radius [m], force [N] and scaled state (without the spin angle) error, shape (3,)."""
-        rms = np.sqrt(np.sum(apart[:, _MOVING] ** 2, axis=1) / S.N_STATE)
+    def _largest_errors(apart: np.ndarray) -> np.ndarray:
+        """Return the largest error of radius [m], force [N] and scaled state without the spin angle, shape (3,)."""
+        rms = np.sqrt(np.sum(apart[:, _SCALED_STATE_COLUMNS] ** 2, axis=1) / S.N_STATE)
         return np.array([apart[:, 0].max(), apart[:, 1].max(), rms.max()])
 
 
-def _apart_at_same_angle(
+def _distance_at_same_angle(
     own: np.ndarray, other: np.ndarray, phase: np.ndarray, phase_other: np.ndarray, times_s: np.ndarray
 ) -> np.ndarray:
-    """Return how far another run is from this one at the same whirl angle.
+    """Return the distance of another run from this one at the same whirl angle.
 
-    This run's values are fitted as a function of its whirl angle, of that angle from the turning unbalance, and of
-    time; the fit's own residual is added, so that a motion that is no such function, as impacts are, is never explained
-    by an angle.
+    This run's values are fitted as a function of its whirl angle, of that angle relative to the rotating unbalance, and
+    of time. The fit's residual is added: an angle error must not explain motion such as impacts, which is no function
+    of the angle.
 
     Args:
         own: Values of this run, shape (n, k).

@@ -1,16 +1,16 @@
-"""The family of normal contact laws, each resolved to the four numbers that the kernels take.
+"""Normal contact laws, each resolved to the four numbers of the kernels.
 
 F_n = K delta^n (1 + c delta'/v0) + D delta', clamped at 0 (`rig.physics.kernels.laws.contact.normal_force`). A
-stiffness law gives K and n, a damping law c (and D, for the one without memory). Stiffness laws that are no power of
-delta are fitted over the rig's working range, and the fit says how far off it is.
+stiffness law gives K and n; a damping law gives c, or D for the law without memory. Stiffness laws other than powers of
+delta are fitted over the rig's working range, and the fit reports its error.
 
-A law of a user's own is a formula in place of a law's name: c of the restitution `e`, or the elastic force [N] of the
-penetration `delta` [m], with `R_S`, `r0`, `L` and `E` of `ContactPair` [m, Pa].
+A user-defined law is a formula in place of a law's name: c as a function of the restitution `e`, or the elastic force
+[N] as a function of the penetration `delta` [m], with `R_S`, `r0`, `L` and `E` of `ContactPair` [m, Pa].
 
-None of them is validated on this rig. The sphere laws take shaft and ring for spheres; the cylinder laws take them for
-parallel cylinders that touch over the ring's whole width, while this shaft tilts by up to r0 / l0A. Goldsmith's
-cylinder law is left out, as its logarithm has a unit, and Radzimovsky's, as sources differ on whether the contact's
-half or full width stands in it.
+None of the laws is validated on this rig. The sphere laws treat shaft and ring as spheres. The cylinder laws treat them
+as parallel cylinders in contact over the ring's whole width, although this shaft tilts by up to r0 / l0A. Two cylinder
+laws are excluded: Goldsmith's, whose logarithm has a unit, and Radzimovsky's, as sources disagree on whether it
+contains the contact's full or half width.
 """
 
 from __future__ import annotations
@@ -28,14 +28,15 @@ from rig.base.errors import InputError, Words
 from rig.base.maths.expression import Grammar, value_of
 from rig.base.maths.roots import find_root
 from rig.base.text import printable
+from rig.physics.parameters import load_parameters
 
 WORKING_FORCES = (5.0, 3000.0)
-"""Forces that the rig's scenes reach [N]; a law that is no power of delta is fitted over them."""
+"""Range of contact forces in the rig's scenes [N], over which other laws are fitted by a power of delta."""
 LAW = "law"
-"""Rule of exponent and viscous damping: whatever the chosen laws have."""
+"""Rule of exponent and viscous damping: the value of the selected laws."""
 KELVIN_VOIGT = "kelvin-voigt"
-_SMALL = 1e-4
-"""Below this loss or factor the equation of the restitution drowns in rounding, and its series is better."""
+_MIN_LOSS = 1e-4
+"""Loss or factor below which the series replaces the restitution equation, which rounding dominates."""
 
 
 class NormalLaw(NamedTuple):
@@ -48,7 +49,7 @@ class NormalLaw(NamedTuple):
 
 
 class ContactPair(NamedTuple):
-    """Shaft in its ring, as stiffness laws take it."""
+    """Shaft in its ring, as input of the stiffness laws."""
 
     shaft_radius: float  # R_S [m]
     clearance: float  # r0 [m]
@@ -62,7 +63,7 @@ class ContactPair(NamedTuple):
 
 
 class ReferenceImpact(NamedTuple):
-    """The free impact in which laws without memory, and linear stand-ins, are made equal to the others."""
+    """Free impact in which Kelvin-Voigt damping, and a changed exponent, are matched to the other laws."""
 
     shaft_mass: float  # Ixx / l0A^2 [kg]
     house_mass: float  # M_ih, free [kg]
@@ -76,12 +77,12 @@ class ReferenceImpact(NamedTuple):
 
 @dataclass(frozen=True)
 class DampingLaw:
-    """How c (or D) follows from the restitution e that is asked for.
+    """Damping law: c, or D, as a function of the required restitution e.
 
     Attributes:
-        formula: In words of the paper.
-        source: Where it is from.
-        factor: c of e; None for Kelvin-Voigt, which has a D instead.
+        formula: Formula in the paper's symbols.
+        source: Publication.
+        factor: c as a function of e; None for Kelvin-Voigt, which has D instead.
     """
 
     formula: str
@@ -90,26 +91,26 @@ class DampingLaw:
 
 
 class PowerFit(NamedTuple):
-    """K delta^n in place of a stiffness law."""
+    """Power law K delta^n that represents a stiffness law."""
 
     stiffness: float  # K [N/m^n]
     exponent: float  # n [1]
-    error: float  # largest relative error of the force over the range; 0 where the law is a power itself
+    error: float  # largest relative error of the force over the range; 0 for a law that is a power itself
     low: float  # smallest penetration of the range [m]
     high: float  # largest [m]
 
 
 @dataclass(frozen=True)
 class StiffnessLaw:
-    """Force against penetration.
+    """Stiffness law: elastic force as a function of penetration.
 
     Attributes:
-        formula: In words of the paper; P = F/L is the force over the ring's width.
-        source: Where it is from.
-        valid: What it takes for granted.
-        power: K [N/m^n] and n, where it is a power of delta.
-        penetration: delta(F) [m], where it is none.
-        elastic_force: F(delta) [N], where a user's formula gives it.
+        formula: Formula in the paper's symbols; P = F/L is the force per width of the ring.
+        source: Publication.
+        valid: Assumptions.
+        power: K [N/m^n] and n, for a power of delta.
+        penetration: delta(F) [m], for other laws.
+        elastic_force: F(delta) [N], for a user's formula.
     """
 
     formula: str
@@ -120,7 +121,7 @@ class StiffnessLaw:
     elastic_force: Callable[[float, ContactPair], float] | None = None
 
     def depth(self, force: float, pair: ContactPair) -> float:
-        """The law's own delta(F) [m], not the fit's."""
+        """Return delta(F) [m] of the law itself, without its fit."""
         if self.penetration is not None:
             return self.penetration(force, pair)
         assert self.power is not None
@@ -128,7 +129,7 @@ class StiffnessLaw:
         return (force / stiffness) ** (1.0 / exponent)
 
     def force(self, penetration: float, pair: ContactPair) -> float:
-        """The law's own F(delta) [N], not the fit's; nan where the law breaks down before it gets so deep."""
+        """Return F(delta) [N] of the law itself, without its fit; nan beyond the penetration where the law fails."""
         if self.elastic_force is not None:
             return self.elastic_force(penetration, pair)
         if self.power is not None:
@@ -136,7 +137,7 @@ class StiffnessLaw:
             return stiffness * penetration**exponent
         high = 1e-3
         while (depth := self.depth(high, pair)) < penetration:
-            # The logarithms turn back at forces that no line contact bears.
+            # The logarithms decrease above forces that no line contact can carry.
             if self.depth(2.0 * high, pair) <= depth:
                 return math.nan
             high *= 2.0
@@ -144,13 +145,13 @@ class StiffnessLaw:
 
 
 def restitution_factor(restitution: float) -> float:
-    """Damping factor c that returns the restitution asked for in a free impact, for any exponent of the normal law.
+    """Return the damping factor c that gives a restitution in a free impact, for any exponent.
 
-    Solves c (1+e) = ln[(1+c)/(1-c e)]; c = 0.1665 at e = 0.9. Follows from integrating dv/ddelta over one impact of
-    F = K delta^n (1 + c delta'/v0).
+    Solves c (1+e) = ln[(1+c)/(1-c e)]; c = 0.1665 at e = 0.9. The equation follows from integrating dv/ddelta over one
+    impact of F = K delta^n (1 + c delta'/v0).
 
     Raises:
-        InputError: e is below 0.04, where the factor comes within rounding of its pole at 1/e, or above 1.
+        InputError: e is below 0.04, where the factor is within rounding of its pole at 1/e, or above 1.
 
     Example:
         >>> round(restitution_factor(0.9), 4)
@@ -159,21 +160,20 @@ def restitution_factor(restitution: float) -> float:
     if not 0.04 <= restitution <= 1.0:
         raise InputError("contact.restitution", "from 0.04 to 1", restitution)
     loss = 1.0 - restitution
-    if loss < _SMALL:
+    if loss < _MIN_LOSS:
         return 1.5 * loss * (1.0 + loss)
 
     def residual(c: float) -> float:
         return c * (1.0 + restitution) - math.log1p(c) + math.log1p(-c * restitution)
 
-    # c = 0 solves it as well; the wanted root lies between that and the pole at 1/e.
+    # The root lies between c = 0, which also solves the equation, and the pole at 1/e.
     return find_root(residual, loss, (1.0 - 1e-12) / restitution, within=1e-15)
 
 
 def returned_restitution(factor: float) -> float:
-    """Restitution e that F = K delta^n (1 + c delta'/v0) returns in a free impact, whatever K, n, mass and speed.
+    """Return the restitution e of F = K delta^n (1 + c delta'/v0) in a free impact, for any K, n, mass and speed.
 
-    The same equation as `restitution_factor`, solved for e. At an onset slower than the floor of v0 the law has
-    c v/floor in place of c.
+    Solves the equation of `restitution_factor` for e. For an impact slower than the floor of v0, c v/floor replaces c.
 
     Args:
         factor: c [1], from 0.
@@ -182,24 +182,24 @@ def returned_restitution(factor: float) -> float:
         >>> round(returned_restitution(restitution_factor(0.9)), 12)
         0.9
     """
-    if factor < _SMALL:
+    if factor < _MIN_LOSS:
         return 1.0 - 2.0 / 3.0 * factor * (1.0 - 2.0 / 3.0 * factor)
 
     def residual(e: float) -> float:
         return factor * (1.0 + e) - math.log1p(factor) + math.log1p(-factor * e)
 
     high = min(1.0, 1.0 / factor) * (1.0 - 1e-15)
-    if residual(high) > 0.0:  # so damped that e is 1/c to the last digit
+    if residual(high) > 0.0:  # e equals 1/c to the last digit
         return high
     return find_root(residual, 0.0, high, within=1e-15)
 
 
 def linear_damping_ratio(restitution: float) -> float:
-    """Damping ratio of F = K delta + D delta', clamped at 0, that returns the restitution asked for.
+    """Return the damping ratio of F = K delta + D delta', clamped at 0, that gives a restitution.
 
-    The contact ends when the force, not the penetration, comes down to 0: with zeta = cos(a) that is at the phase 2 a,
-    so ln e = -2 a / tan(a). Over-damped below e = exp(-2), with cosh and tanh. Schwager & Poeschel, Granular Matter 9
-    (2007) 465. The usual -ln e / sqrt(pi^2 + ln^2 e) belongs to a contact that may pull.
+    The contact ends when the force, not the penetration, falls to 0. With zeta = cos(a) this is at the phase 2 a, so ln
+    e = -2 a / tan(a). Below e = exp(-2) the contact is over-damped, with cosh and tanh. Schwager & Poeschel, Granular
+    Matter 9 (2007) 465. The usual -ln e / sqrt(pi^2 + ln^2 e) applies to a contact that may pull.
 
     Args:
         restitution: e, above 0 and up to 1.
@@ -261,20 +261,20 @@ DAMPING: dict[str, DampingLaw] = {
     ),
     KELVIN_VOIGT: DampingLaw(
         "c = 0, n = 1, D = 2 zeta sqrt(K m), ln e = -2 a / tan(a), zeta = cos(a)",
-        "Schwager & Poeschel, Granular Matter 9 (2007) 465, clamp included; K as deep as the stiffness law's in the "
-        "reference impact",
+        "Schwager & Poeschel, Granular Matter 9 (2007) 465, clamp included; K keeps the stiffness law's "
+        "penetration in the reference impact",
         None,
     ),
 }
-"""Damping laws: what `contact.damping_factor` may name."""
+"""Damping laws by their name in `contact.damping_factor`."""
 
 
-def _inside(pair: ContactPair) -> tuple[float, float]:
+def _internal_sphere(pair: ContactPair) -> tuple[float, float]:
     reduced = pair.ring_radius * pair.shaft_radius / pair.clearance
     return 4.0 / 3.0 * pair.modulus * math.sqrt(reduced), 1.5
 
 
-def _outside(pair: ContactPair) -> tuple[float, float]:
+def _external_sphere(pair: ContactPair) -> tuple[float, float]:
     reduced = pair.ring_radius * pair.shaft_radius / (pair.ring_radius + pair.shaft_radius)
     return 4.0 / 3.0 * pair.modulus * math.sqrt(reduced), 1.5
 
@@ -305,7 +305,7 @@ def _pereira(pair: ContactPair) -> tuple[float, float]:
         raise InputError("ring.clearance", "from 0.005 to 10 mm with the stiffness pereira-cylinder", clearance)
     shape = 1.51 * math.log(1000.0 * clearance) ** -0.151 if clearance < 0.34954 else 0.0151 * clearance + 1.151
     exponent = shape * clearance**-0.005
-    # N, mm and MPa in their paper.
+    # The paper has N, mm and MPa.
     stiffness = (0.965 * clearance + 0.0965) * (pair.width * 1e3) * (pair.modulus * 1e-6) / clearance
     return stiffness * 1e3**exponent, exponent
 
@@ -323,14 +323,14 @@ STIFFNESS: dict[str, StiffnessLaw] = {
     "internal-sphere": StiffnessLaw(
         "F = 4/3 E* sqrt(R*) delta^1.5, 1/R* = 1/R_S - 1/(R_S + r0)",
         "Hertz 1881",
-        "half-space, point contact, frictionless; shaft and ring are no spheres",
-        power=_inside,
+        "half-space, point contact, frictionless; approximates shaft and ring by spheres",
+        power=_internal_sphere,
     ),
     "external-sphere": StiffnessLaw(
         "F = 4/3 E* sqrt(R*) delta^1.5, 1/R* = 1/R_S + 1/(R_S + r0)",
         "Hertz 1881; a later code of the same laboratory",
         "as internal-sphere, for a shaft outside its ring",
-        power=_outside,
+        power=_external_sphere,
     ),
     "johnson-cylinder": StiffnessLaw(
         "delta = P / (pi E*) [ln(4 pi E* r0 / P) - 1]",
@@ -369,27 +369,28 @@ STIFFNESS: dict[str, StiffnessLaw] = {
         penetration=_liu,
     ),
 }
-"""Stiffness laws: what `contact.stiffness` may name."""
+"""Stiffness laws by their name in `contact.stiffness`."""
 
 
-_MOST_DAMPED = 100.0
-"""Largest c that a formula may give, as large as a number may be."""
 _PENETRATIONS_M = (1e-7, 1e-2)
-"""Penetrations between which a force given by a formula must reach the largest working force [m]; a stiffness given as
-a number has the same upper limit, as 1e14 N/m^1.5 reaches 3 kN at 1e-7 m."""
-_EXPONENTS = (1.0, 2.5)
-"""Exponents of the power fitted to a formula; `contact.exponent` has the same limits."""
+"""Range of penetrations [m] in which a formula must reach the largest working force. A numeric stiffness has the same
+limit: 1e14 N/m^1.5 reaches 3 kN at 1e-7 m."""
 _MAX_FIT_ERROR = 0.25
-"""Largest relative error of the power fitted to a formula: above it, a run would be one of another law."""
+"""Largest relative error of the power fitted to a formula; a larger error would represent another law."""
 _FIT_ROUNDING = 1e-8
-"""Error of a fit below which it is rounding of the root finder, and the law is the power itself."""
+"""Fit error below which it is rounding of the root finder, and the law is the power itself."""
+
+
+def _limits(key: str) -> tuple[float, float]:
+    """Return the limits of a contact law's parameter in the default set; they apply to formulas as well."""
+    return load_parameters().entries[key].range
 
 
 def damping_law(name: str) -> DampingLaw:
-    """Return a damping law by its name, or made of the formula of c that stands in place of one.
+    """Return a damping law by its name or its formula of c.
 
     Raises:
-        InputError: It is no formula of e.
+        InputError: The text is not a formula of e.
     """
     field = "contact.damping_factor"
     if name in DAMPING:
@@ -398,18 +399,19 @@ def damping_law(name: str) -> DampingLaw:
 
     def factor(restitution: float) -> float:
         c = value_of(formula, e=restitution)
-        if not 0.0 <= c <= _MOST_DAMPED:
-            raise InputError(field, f"from 0 to {_MOST_DAMPED:g} at e = {restitution:g}", f"{name} = {c:g}")
+        low, high = _limits(field)
+        if not low <= c <= high:
+            raise InputError(field, f"from {low:g} to {high:g} at e = {restitution:g}", f"{name} = {c:g}")
         return c
 
     return DampingLaw(name, "given as a formula", factor)
 
 
 def stiffness_law(name: str) -> StiffnessLaw:
-    """Return a stiffness law by its name, or made of the formula of the force that stands in place of one.
+    """Return a stiffness law by its name or its formula of the force.
 
     Raises:
-        InputError: It is no formula of the penetration and the contact pair.
+        InputError: The text is not a formula of the penetration and the contact pair.
     """
     field = "contact.stiffness"
     if name in STIFFNESS:
@@ -425,24 +427,23 @@ def stiffness_law(name: str) -> StiffnessLaw:
             return elastic_force(depth, pair) - float(force)
 
         if missing(0.0) < 0.0 < missing(_PENETRATIONS_M[1]):
-            with contextlib.suppress(ValueError):  # the formula has no value at a penetration in between
+            with contextlib.suppress(ValueError):  # the formula has no value at a penetration within the range
                 return find_root(missing, 0.0, _PENETRATIONS_M[1], within=1e-22)
         must = f"a force that passes {force:g} N between penetrations of 0 and {_PENETRATIONS_M[1] * 1e3:g} mm"
         raise InputError(field, must, name)
 
-    return StiffnessLaw(
-        name, "given as a formula", "what its author takes for granted", None, penetration, elastic_force
-    )
+    return StiffnessLaw(name, "given as a formula", "its author's assumptions", None, penetration, elastic_force)
 
 
-@lru_cache(maxsize=64)  # a comparison of laws, and a model that is described, ask for the same fit many times
+@lru_cache(maxsize=64)  # a comparison of laws repeats the same fit many times
 def fit_power(name: str, pair: ContactPair) -> PowerFit:
-    """K delta^n of a stiffness law over `WORKING_FORCES`, with the smallest possible largest relative error.
+    """Fit K delta^n to a stiffness law over `WORKING_FORCES`, with the smallest maximum relative error.
 
-    log F against log delta bends one way only, so the best line has the chord's slope and lies half-way to the bulge.
+    log F as a function of log delta is convex or concave, so the best line has the chord's slope and lies half-way to
+    the largest deviation.
 
     Raises:
-        InputError: The law does not hold for this pair.
+        InputError: The law does not apply to this pair.
 
     Example:
         >>> pair = ContactPair(shaft_radius=0.0125, clearance=0.9e-3, width=0.011, modulus=1e11)
@@ -458,11 +459,11 @@ def fit_power(name: str, pair: ContactPair) -> PowerFit:
     forces = np.geomspace(low, high, 200)
     depths = np.array([law.depth(force, pair) for force in forces])
     if depths[0] <= 0.0 or np.any(np.diff(depths) <= 0.0):
-        raise InputError("contact.stiffness", f"another law: with this ring, {name} breaks down below {high:g} N", name)
+        raise InputError("contact.stiffness", f"another law: with this ring, {name} fails below {high:g} N", name)
     x, y = np.log(depths), np.log(forces)
     slope = (y[-1] - y[0]) / (x[-1] - x[0])
     if law.elastic_force is not None and abs(slope - round(slope, 6)) < _FIT_ROUNDING:
-        # Rounding must not give an n just below 1, where the stiffness at the first touch is infinite.
+        # Rounding must not give an n just below 1, where the stiffness at delta = 0 is infinite.
         slope = round(slope, 6)
     rest = y - slope * x
     error = float(np.expm1(0.5 * (rest.max() - rest.min())))
@@ -479,18 +480,19 @@ def fit_power(name: str, pair: ContactPair) -> PowerFit:
 
 
 def _check_formula_fit(name: str, law: StiffnessLaw, fit: PowerFit, pair: ContactPair) -> None:
-    """Raise an InputError where a formula's force is not what K delta^n can stand for."""
+    """Raise an InputError where K delta^n does not represent a formula's force."""
     field, (low, high) = "contact.stiffness", WORKING_FORCES
     forces = np.array([law.force(depth, pair) for depth in np.geomspace(fit.low, fit.high, 200)])
-    if not np.all(np.diff(forces) > 0.0):  # not a number fails as well
+    if not np.all(np.diff(forces) > 0.0):  # a nan fails as well
         raise InputError(field, f"a force that increases with delta from {low:g} N to {high:g} N", name)
     if fit.high < _PENETRATIONS_M[0]:
         must = f"a force that reaches {high:g} N at a penetration of at least {_PENETRATIONS_M[0] * 1e6:g} µm"
         raise InputError(field, must, Words(f"{printable(name, 80)}, which reaches it at {fit.high * 1e6:.2g} µm"))
-    if not (_EXPONENTS[0] <= fit.exponent <= _EXPONENTS[1] and fit.error <= _MAX_FIT_ERROR):
+    least, most = _limits("contact.exponent")
+    if not (least <= fit.exponent <= most and fit.error <= _MAX_FIT_ERROR):
         must = (
             f"a force that K delta^n follows within {_MAX_FIT_ERROR:.0%} from {low:g} N to {high:g} N, "
-            f"with n from {_EXPONENTS[0]:g} to {_EXPONENTS[1]:g}"
+            f"with n from {least:g} to {most:g}"
         )
         raise InputError(
             field, must, Words(f"{printable(name, 80)}: within {fit.error:.0%}, with n = {fit.exponent:.3g}")
@@ -498,15 +500,15 @@ def _check_formula_fit(name: str, law: StiffnessLaw, fit: PowerFit, pair: Contac
 
 
 class ResolvedLaw(NamedTuple):
-    """The law that the kernels take, and how well it stands for the stiffness law that was named."""
+    """Resolved normal law, and its error against the selected stiffness law."""
 
     law: NormalLaw
     fit_error: float | None
-    """Largest relative error of the elastic force over `WORKING_FORCES`; None where only the depth of the reference
-    impact is kept (another exponent than the stiffness law's own)."""
+    """Largest relative error of the elastic force over `WORKING_FORCES`; None where a changed exponent keeps only the
+    penetration of the reference impact."""
 
 
-def resolve(
+def resolve_law(
     *,
     stiffness: float | str,
     exponent: float | str,
@@ -516,19 +518,19 @@ def resolve(
     pair: ContactPair,
     impact: ReferenceImpact,
 ) -> ResolvedLaw:
-    """Work out K, n, c and D.
+    """Return K, n, c and D.
 
     Args:
         stiffness: K [N/m^n], the name of a stiffness law, or a formula of the force.
         exponent: n, or `LAW`: 1 for Kelvin-Voigt, else the stiffness law's own, else 1.5.
         damping: c, the name of a damping law, or a formula of c.
         viscous: D [N s/m], or `LAW`: Kelvin-Voigt's, else 0.
-        restitution: e that is asked for.
+        restitution: Required restitution e.
         pair: Shaft and ring.
-        impact: Where Kelvin-Voigt returns e, and where a changed exponent keeps the depth.
+        impact: Impact in which Kelvin-Voigt gives e, and in which a changed exponent keeps the penetration.
 
     Raises:
-        InputError: A law does not hold, or two of them exclude each other; the field is named.
+        InputError: A law does not apply, or two laws exclude each other.
     """
     linear = damping == KELVIN_VOIGT
     if linear and exponent not in (LAW, 1.0):
@@ -540,7 +542,7 @@ def resolve(
         wanted = n if exponent == LAW else float(exponent)
         wanted = 1.0 if linear else wanted
         if wanted != n:
-            k, n, error = same_depth(k, n, wanted, impact), wanted, None
+            k, n, error = match_depth(k, n, wanted, impact), wanted, None
     else:
         k = stiffness
         n = (1.0 if linear else 1.5) if exponent == LAW else float(exponent)
@@ -555,10 +557,10 @@ def resolve(
     return ResolvedLaw(NormalLaw(k, n, c, d if isinstance(viscous, str) else viscous), error)
 
 
-def same_depth(stiffness: float, exponent: float, wanted: float, impact: ReferenceImpact) -> float:
-    """K of another exponent that stops the reference impact, without damping, at the same depth.
+def match_depth(stiffness: float, exponent: float, wanted: float, impact: ReferenceImpact) -> float:
+    """Return K of another exponent with the same penetration in the undamped reference impact.
 
-    K delta^(n+1) / (n+1) = m v^2 / 2 for both.
+    K delta^(n+1) / (n+1) = m v^2 / 2 holds for both.
     """
     energy = 0.5 * impact.mass * impact.speed**2
     depth = ((exponent + 1.0) * energy / stiffness) ** (1.0 / (exponent + 1.0))
@@ -566,7 +568,7 @@ def same_depth(stiffness: float, exponent: float, wanted: float, impact: Referen
 
 
 class FreeImpact(NamedTuple):
-    """What one impact of two free bodies does."""
+    """Result of one impact of two free bodies."""
 
     restitution: float  # [1]
     peak_force: float  # [N]
@@ -575,10 +577,10 @@ class FreeImpact(NamedTuple):
 
 
 def free_impact(law: NormalLaw, *, mass: float, speed: float, speed_floor: float = 0.0) -> FreeImpact:
-    """Run one impact without friction, ended by the force's coming down to 0.
+    """Simulate one frictionless impact, which ends when the force falls to 0.
 
     Args:
-        law: The normal law.
+        law: Normal law.
         mass: Reduced mass of the two bodies [kg].
         speed: Approach speed [m/s].
         speed_floor: Floor of v0 [m/s].
@@ -591,7 +593,7 @@ def free_impact(law: NormalLaw, *, mass: float, speed: float, speed_floor: float
     """
     from scipy.integrate import solve_ivp
 
-    # In units of the depth and speed that make the elastic force 1.
+    # Scaled by the penetration and speed at which the elastic force is 1.
     n, scale = law.exponent, (mass * speed**2 / law.stiffness) ** (1.0 / (law.exponent + 1.0))
     c = law.damping_factor * speed / max(speed, speed_floor)
     d = law.viscous_damping * scale / (mass * speed)
@@ -603,7 +605,7 @@ def free_impact(law: NormalLaw, *, mass: float, speed: float, speed_floor: float
         return [y[1], -float(force(y))]
 
     def apart(_: float, y: np.ndarray) -> float:
-        # Without D the force comes down to 0 with the penetration, and does not cross it.
+        # Without D the force reaches 0 with the penetration, without changing sign.
         return float(force(y)) if d > 0.0 else y[0]
 
     apart.terminal, apart.direction = True, -1.0  # pyrefly: ignore[missing-attribute]

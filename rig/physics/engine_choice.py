@@ -1,6 +1,7 @@
-"""Choice of an engine in a scene: method, step, tolerance, and limits of a run's error by quantity.
+"""Engine settings of a scene: method, step, tolerance, and error limits by quantity.
 
-`rig.physics.accuracy` compares the companion's estimate with the limits. A run may exceed a limit; it then warns.
+`rig.physics.accuracy` compares the companion's estimate with the limits. A run that exceeds a limit gives a warning and
+continues.
 """
 
 from __future__ import annotations
@@ -23,17 +24,17 @@ from rig.base.errors import InputError, Words
 from rig.physics.engines import BROKEN, ENGINES, Engine, load_engine
 
 Limit = Annotated[FiniteFloat, Field(gt=0.0, strict=True)] | None
-"""A limit of an error; None: that of engine.tolerance, or of an angle none."""
+"""Error limit; None selects the tolerance derived from engine.tolerance, and no limit for an angle."""
 HALF_TURN_DEG = 180.0
-"""Largest difference between two whirl angles [deg]: a limit above it could not be exceeded."""
+"""Largest difference between two whirl angles [deg]: a higher limit could not be exceeded."""
 SCALES = {"radius_um": 900.0, "force_n": 1000.0, "frequency_hz": 100.0, "angle_deg": 57.3, "spin_angle_deg": 57.3}
-"""Size of each quantity, of which engine.tolerance is a part: clearance, force of an impact, whirl frequency, 1 rad."""
-FINEST_TOLERANCE = 1e-8
-"""Smallest engine.tolerance that limits choose: below it rounding is a part of the companion's difference."""
+"""Scale of each quantity, which engine.tolerance multiplies: clearance, impact force, whirl frequency, 1 rad."""
+MIN_LIMIT_TOLERANCE = 1e-8
+"""Smallest engine.tolerance chosen by limits: below it, rounding contributes to the companion's difference."""
 
 
 class Limits(BaseModel, frozen=True, extra="forbid"):
-    """Largest error of each quantity that a user accepts; those left out have the tolerance of engine.tolerance."""
+    """Largest accepted error of each quantity; an omitted limit follows from engine.tolerance."""
 
     radius_um: Limit = None
     """Whirl radius [um]."""
@@ -46,46 +47,47 @@ class Limits(BaseModel, frozen=True, extra="forbid"):
     spin_angle_deg: Limit = None
     """Spin angle [deg]."""
 
-    def given(self) -> dict[str, float]:
-        """Return the limits that are given, by field."""
+    def as_dict(self) -> dict[str, float]:
+        """Return the limits that are set, by field."""
         return self.model_dump(exclude_none=True)
 
     def by_quantity(self) -> dict[str, float]:
-        """Return the limits that are given, in their units, by the quantity's name in `rig.physics.accuracy`."""
-        return {field.rpartition("_")[0]: limit for field, limit in self.given().items()}
+        """Return the limits that are set, in their units, by the quantity's name in `rig.physics.accuracy`."""
+        return {field.rpartition("_")[0]: limit for field, limit in self.as_dict().items()}
 
     def choose_tolerance(self, own: float) -> float:
-        """Return engine.tolerance for these limits: the smallest limit over its quantity's scale, at most the own one.
+        """Return engine.tolerance for these limits: the smallest ratio of a limit to its quantity's scale.
 
-        Never a coarser one than the engine's own: a limit of one quantity says nothing about the others.
+        It never exceeds the engine's own tolerance, as a limit of one quantity does not bound the others.
 
         Args:
-            own: The engine's own tolerance; 0 where its steps are fixed.
+            own: The engine's own tolerance; 0 for fixed steps.
         """
-        return min([own, *(max(limit / SCALES[field], FINEST_TOLERANCE) for field, limit in self.given().items())])
+        return min([own, *(max(limit / SCALES[field], MIN_LIMIT_TOLERANCE) for field, limit in self.as_dict().items())])
 
 
 class EngineChoice(Written):
-    """Settings of the integration: engine, step, tolerance, limits of the error, companion."""
+    """Integration settings: engine, step, tolerance, error limits, companion."""
 
     name: str = next(iter(ENGINES))
     step_us: Annotated[int, Field(ge=1, le=1000)] = 0
-    """Longest step [us]: steps end on the rows that sensors see, 25 us apart or closer; left out: the engine's own."""
+    """Longest step [us]; the engine's own by default. Steps end on the sensors' samples, at most 25 us apart."""
     limits: Limits = Limits()
-    """Largest errors, by quantity: a companion's estimate above one of them gives a warning."""
+    """Largest errors by quantity; a warning is given when the companion's estimate exceeds one."""
     tolerance: Annotated[FiniteFloat, Field(ge=0.0, le=0.1)] = 0.0
-    """Scaled error: of the whole run with split, of a step with another adaptive engine; left out: the engine's own,
-    or a finer one where limits ask for it."""
+    """Scaled error: of the whole run with split, per step with other adaptive engines. The default is the engine's own,
+    or finer where limits require it."""
     companion: bool = False
-    """A second run at a sixteenth of the tolerance estimates the error; left out: with split only."""
+    """Run a companion at a sixteenth of the tolerance to estimate the error; by default with split only."""
     rolling: Literal["series", "collocation"] = "series"
-    """Method for rolling contact: long steps of a whirl turn (with split only; its own), or as for other motion."""
+    """Method for rolling contact: collocation, with steps of part of a whirl turn (split only, its default), or the
+    series."""
 
     @field_validator("name")
     @classmethod
     def _known(cls, name: str) -> str:
         if name not in ENGINES:
-            reason = f" ({BROKEN[name]})" if name in BROKEN else ""
+            reason = "".join(f"; {each}" for each in BROKEN if each.startswith(f"{name} ("))
             raise ValueError(f"one of {', '.join(ENGINES)}{reason}")
         return name
 
@@ -93,7 +95,7 @@ class EngineChoice(Written):
     @classmethod
     def _own_tolerance(cls, tolerance: float, info: ValidationInfo) -> float:
         if 0.0 < tolerance < 1e-30:
-            raise ValueError("at least 1e-30, far below rounding; 0 is the engine's own")
+            raise ValueError("at least 1e-30, or 0 for the engine's own tolerance")
         if tolerance or not {"name", "limits"} <= info.data.keys():
             return tolerance
         return info.data["limits"].choose_tolerance(ENGINES[info.data["name"]].tolerance)
@@ -112,25 +114,25 @@ class EngineChoice(Written):
         if not isinstance(name, str) or (method := ENGINES.get(name)) is None:
             return data
         own = {"step_us": method.step_us, "companion": method.companion, "rolling": method.rolling, **data}
-        return {**own, "tolerance": data.get("tolerance") or 0.0}  # 0 is what recordings of 0.1 say
+        return {**own, "tolerance": data.get("tolerance") or 0.0}  # recordings of version 0.1 have 0
 
     @model_serializer(mode="wrap")
     def _without_absent_limits(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
         data = handler(self)
-        given = {name: limit for name, limit in data.pop("limits", {}).items() if limit is not None}
-        return {**data, "limits": given} if given else data
+        limits = {name: limit for name, limit in data.pop("limits", {}).items() if limit is not None}
+        return {**data, "limits": limits} if limits else data
 
     @property
     def tolerance_by_limits(self) -> bool:
-        """Whether `tolerance` is the one chosen where it is left out."""
+        """Whether `tolerance` is the default for these limits."""
         return self.tolerance == self.limits.choose_tolerance(ENGINES[self.name].tolerance)
 
 
 def load_chosen_engine(name: str) -> Engine:
-    """Return one of `ENGINES`, ready to run.
+    """Return the engine of a name in `ENGINES`, ready to run.
 
     Raises:
-        InputError: It is another package's, and cannot be imported or lacks what an engine must have.
+        InputError: Another package's engine cannot be imported or is incomplete.
     """
     try:
         return load_engine(name)

@@ -1,4 +1,4 @@
-"""A contact law of a user's own, as a file: `--law FILE.toml` gives a run its numbers or formulas.
+"""User-defined contact law, as a file: `--law FILE.toml` gives a run its numbers or formulas.
 
 title = "Laboratory X, 2025"
 source = "our drop tests"
@@ -20,7 +20,7 @@ from rig.base.errors import InputError, Words
 
 
 class ContactLaw(Written):
-    """What a law's file says; what it leaves out stays as the parameter set has it."""
+    """Contents of a law file; omitted fields keep the parameter set's values."""
 
     title: Annotated[str, a_line(100)]
     source: str = ""
@@ -30,16 +30,16 @@ class ContactLaw(Written):
     viscous_damping: FiniteFloat | str | None = None
 
     def changes(self) -> dict[str, float | str]:
-        """Parameters by dotted key."""
+        """Return the changed parameters by dotted key."""
         numbers = self.model_dump(exclude={"title", "source"}, exclude_none=True)
         return {f"contact.{name}": value for name, value in numbers.items()}
 
 
 def read_law(path: Path) -> ContactLaw:
-    """Read a law's file.
+    """Read a law file.
 
     Raises:
-        InputError: It cannot be read, has a field that no law has, or gives nothing of a law.
+        InputError: The file cannot be read, has an unknown field, or defines nothing of a law.
     """
     data: dict[str, Any] = read_toml(path)
     law = check(ContactLaw, data, field=str(path))

@@ -1,4 +1,4 @@
-"""The ladder of models: how much of the rig's physics a scene asks for, each level by name, the simplest first."""
+"""Model levels: how much of the rig's physics a scene includes, by name, the simplest first."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ FRICTION_LAWS = {"none": NO_FRICTION, "smoothed": SMOOTHED, "switch": SWITCH, "e
 
 
 class ModelLevels(BaseModel, frozen=True, extra="forbid"):
-    """How much of the model takes part. What is left out costs nothing."""
+    """Selected parts of the model. Excluded parts cost no computing time."""
 
     magnet: Literal["linear", "map", "cylinders"] = "map"
-    """A spring; the radial map of the paper's far-field sum; exact finite cylinders."""
+    """Linear spring; radial map of the paper's far-field sum; map of exact finite cylinders."""
     shaft: Literal["planar", "euler"] = "euler"
     """Small angles, or Euler's equations."""
     stator: Literal["rigid", "inner-house", "two-houses"] = "two-houses"
-    """Bodies that move; those that do not pass forces on."""
+    """Housings that move. A fixed housing transmits forces."""
     contact: Literal["impact", "compliant"] = "compliant"
-    """Impacts of a rigid ring (restitution, no force over time), compliant where contact lasts; or compliant always."""
+    """Rigid impacts by restitution, with compliant contact where it lasts; or compliant contact always."""
     friction: Literal["none", "smoothed", "switch", "exact"] = "exact"
-    """None; tanh of the sliding speed; clamped linear; Coulomb's set-valued law."""
+    """None; tanh of the sliding speed; clamped linear law; Coulomb's set-valued law."""
 
     def constants(self) -> Levels:
-        """The levels as the kernels take them."""
+        """Return the levels as constants of the kernels."""
         return Levels(
             euler=self.shaft == "euler",
             inner_house=self.stator != "rigid",

@@ -1,23 +1,23 @@
-"""The family of magnet models, from the paper's far-field sum to exact cylinders, and the maps that the kernels use.
+"""Magnet models, from the paper's far-field sum to exact cylinders, and the fitted maps of the kernels.
 
-| model           | what it is                                                                                      |
+| model           | description                                                                                     |
 |-----------------|-------------------------------------------------------------------------------------------------|
 | linear          | a spring with the stiffness at the centre                                                       |
 | far-field map   | radial polynomial, fitted to the far-field sum                                                  |
-| far-field sum   | the paper's eqs. 35, 38: point dipoles act on a loop of current around the shaft magnet         |
+| far-field sum   | the paper's eqs. 35, 38: point dipoles act on a current loop around the shaft magnet            |
 | cylinder map    | radial polynomial and the first harmonic of the single magnets, fitted to the exact cylinders   |
 | exact cylinders | uniformly magnetised finite cylinders, by charge on their ends (Derby & Olbert 2010)            |
 
-`model_errors` gives each one's error against the next better. Assumed throughout, and not given in the paper: the
-number and length of the magnets; that one of them stands straight below the shaft (so that the rig is symmetric about
-its vertical). Assumed of the cylinders: uniform and rigid magnetisation, no iron about, all of one length, axes
-parallel and middles in one plane. The shaft's tilt is left out: the lateral force is even in it (0.1 % at 10 mm), and
-the torque about the magnet's own middle is 0.1 % of K l0B^2.
+`model_errors` gives the error of each model against the next better one. The paper does not give the number and length
+of the magnets, nor their angular position: one magnet is assumed straight below the shaft, which makes the rig
+symmetric about its vertical. Assumptions of the cylinders: uniform and rigid magnetisation, no iron, equal lengths,
+parallel axes, middles in one plane. The shaft's tilt is neglected: the lateral force is even in it (0.1 % at 10 mm),
+and the torque about the magnet's own middle is 0.1 % of K l0B^2.
 
-The far-field form overstates the force of the cylinders at this spacing (`model_errors` says by how much), which is why
-`magnet.stiffness` sets the scale of either map by itself and the models give only its shape. Eight such cylinders reach
-0.84 kN/m at most, at any length: half of what the rig seems to have, so its magnets are others. No measured force of
-the rig's magnets is known to us: the exact cylinders are exact for their assumptions, not validated on the rig.
+The far-field form overestimates the force of the cylinders at this spacing (`model_errors` gives the factor). Therefore
+`magnet.stiffness` alone sets the scale of both maps, and the models give only their shape. Eight such cylinders reach
+at most 0.84 kN/m at any length, half of the rig's apparent stiffness, so the rig's magnets must differ. No measured
+force of the rig's magnets is known: the exact cylinders are exact for their assumptions, not validated on the rig.
 """
 
 from __future__ import annotations
@@ -34,19 +34,19 @@ from rig.physics.kernels.laws.magnet import LINEAR, RADIAL, RIPPLED, magnet_forc
 
 MU_0 = 4e-7 * np.pi
 """Permeability of vacuum, Table 1 [T m/A]."""
-REACH = 0.010
-"""The maps are fitted over this radius [m], the axes of Fig. 7, where the magnets leave room for it."""
+MAX_REACH_M = 0.010
+"""Largest radius of the fitted maps [m]: the axes of Fig. 7."""
 
-_QUADRATURE = 1e-7
-"""The force between two cylinders is refined until doubling the nodes changes it by no more than this fraction."""
-_NODES = (12, 96)
-"""Fewest and most Gauss nodes along the radius for it."""
-_DEGREE = 47
-"""Of the Chebyshev series of the logarithm of that force over distance."""
+_QUADRATURE_TOLERANCE = 1e-7
+"""Largest relative change of the force between two cylinders when the number of nodes is doubled."""
+_NODE_LIMITS = (12, 96)
+"""Smallest and largest number of Gauss nodes along the radius for that force."""
+_CHEBYSHEV_DEGREE = 47
+"""Degree of the Chebyshev series of the force's logarithm as a function of distance."""
 
 
 class MagnetGeometry(NamedTuple):
-    """The magnets of Table 1, SI."""
+    """Magnets of Table 1 in SI units."""
 
     number: int
     length: float
@@ -57,17 +57,17 @@ class MagnetGeometry(NamedTuple):
 
     @property
     def gap(self) -> float:
-        """Room between the centred shaft magnet and the bearing magnets [m]."""
+        """Gap between the centred shaft magnet and the bearing magnets [m]."""
         return self.bearing_radius - self.bearing_magnet_radius - self.shaft_magnet_radius
 
     @property
     def reach(self) -> float:
-        """Radius over which the models are compared and the maps fitted [m]: short of where the magnets touch."""
-        return min(REACH, 0.92 * self.gap)
+        """Radius of the models' comparison and the maps' fit [m], below that at which the magnets touch."""
+        return min(MAX_REACH_M, 0.92 * self.gap)
 
 
 class MagnetMap(NamedTuple):
-    """What the kernel evaluates (`rig.physics.kernels.laws.magnet`), and how well it follows what it was fitted to."""
+    """Map that the kernel evaluates (`rig.physics.kernels.laws.magnet`), and its error against the fitted model."""
 
     terms: int
     stiffness: float
@@ -78,31 +78,32 @@ class MagnetMap(NamedTuple):
     growth: float
     number: int
     error: float
-    """Largest deviation over the reach in any direction, as a fraction of the largest force."""
+    """Largest deviation within the reach, in any direction, as a fraction of the largest force."""
 
 
 class ModelError(NamedTuple):
-    """How far one model of the magnets is from a better one: largest deviation over largest force of the better."""
+    """Error of one magnet model against a better one: largest deviation over the better model's largest force."""
 
     model: str
     against: str
     equal: str
-    """What both have in common: the stiffness at the centre, or the magnets."""
+    """Property that both share: the stiffness at the centre, or the magnets."""
     over_reach: float
     over_travel: float
 
 
 def field_sum_force(x: np.ndarray, y: np.ndarray, geometry: MagnetGeometry, *, points: int = 180) -> np.ndarray:
-    """Force on the shaft magnet by eqs. 35 and 38.
+    """Return the force on the shaft magnet by eqs. 35 and 38.
 
-    Every bearing magnet is a dipole loop of current M0 L (eq. 35); the force sums I dl x B around the shaft magnet's
-    own loop (eq. 38). All loops lie in one plane and repel. Far-field: too strong within a few radii.
+    Every bearing magnet is a dipole loop of current M0 L (eq. 35); the force is the sum of I dl x B around the shaft
+    magnet's own loop (eq. 38). All loops lie in one plane and repel. As a far-field form it is too strong within a few
+    radii.
 
     Args:
-        x: Displacement of the shaft magnet, horizontal [m], shape (n,).
-        y: The same, vertical [m], shape (n,).
-        geometry: The magnets.
-        points: Points on the shaft magnet's loop.
+        x: Horizontal displacement of the shaft magnet [m], shape (n,).
+        y: Vertical displacement of the shaft magnet [m], shape (n,).
+        geometry: Magnets.
+        points: Number of points on the shaft magnet's loop.
 
     Returns:
         Force [N], shape (n, 2).
@@ -117,32 +118,32 @@ def field_sum_force(x: np.ndarray, y: np.ndarray, geometry: MagnetGeometry, *, p
     outward = np.stack([np.cos(around), np.sin(around)], axis=-1)
     loop = np.stack([x, y], axis=-1)[:, None, :] + geometry.shaft_magnet_radius * outward
     distance = np.linalg.norm(loop[:, :, None, :] - _centres(geometry), axis=-1)
-    # Eq. 35 in the plane of the loops (psi = 90 deg): the field of a dipole that points along +z is along -z beside it.
+    # Eq. 35 in the plane of the loops (psi = 90 deg): there the field of a dipole along +z points along -z.
     field = -MU_0 * current * geometry.bearing_magnet_radius**2 / (4.0 * distance**3)
     # dl x B with B = B z and dl = r_s dphi (-sin, cos) is r_s dphi B (cos, sin).
-    # That points inward where the field opposes: the magnets repel.
+    # The force points inward where the field opposes: the magnets repel.
     width = geometry.shaft_magnet_radius * 2.0 * np.pi / points
     return current * width * np.einsum("npm,pk->nk", field, outward)
 
 
 def field_sum_stiffness(geometry: MagnetGeometry) -> float:
-    """K of the far-field sum at the centre [N/m], by a central difference (to about 1e-6)."""
+    """Return K of the far-field sum at the centre [N/m], by a central difference (error about 1e-6)."""
     h = 1e-3 * geometry.reach
     force = field_sum_force(np.array([h, -h]), np.zeros(2), geometry)[:, 0]
     return float((force[1] - force[0]) / (2.0 * h))
 
 
 def radial_field(rho: np.ndarray, z: np.ndarray | float, radius: float, length: float) -> np.ndarray:
-    """Radial field of a uniformly, axially magnetised cylinder, over mu_0 M [1].
+    """Return the radial field of a uniformly, axially magnetised cylinder, over mu_0 M [1].
 
     Derby & Olbert, Am. J. Phys. 78 (2010) 229, eq. for B_rho; their C(k, 1, 1, -1) is ((m - 2) K(m) + 2 E(m)) / m with
-    m = 1 - k^2. Loses about eps/m^2 far away, where m is small: 1e-10 at a hundred radii.
+    m = 1 - k^2. The rounding error is about eps/m^2, and m is small at large distances: 1e-10 at a hundred radii.
 
     Args:
         rho: Distance from the axis [m], above 0 and not on the rim of an end.
-        z: Height over the middle [m].
-        radius: Of the cylinder [m].
-        length: Of the cylinder [m].
+        z: Height above the middle [m].
+        radius: Radius of the cylinder [m].
+        length: Length of the cylinder [m].
 
     Returns:
         Field, the shape of `rho`.
@@ -160,20 +161,20 @@ def radial_field(rho: np.ndarray, z: np.ndarray | float, radius: float, length: 
 
 @cache
 def _gauss(nodes: int) -> tuple[np.ndarray, np.ndarray]:
-    """Places and weights of Gauss's quadrature over -1 to 1."""
+    """Return nodes and weights of Gauss quadrature from -1 to 1."""
     return np.polynomial.legendre.leggauss(nodes)
 
 
 def pair_force(distance: float, geometry: MagnetGeometry, *, nodes: int = 24) -> float:
-    """Force by which one bearing magnet pushes the shaft magnet away, exact cylinders.
+    """Return the repulsive force of one bearing magnet on the shaft magnet, by exact cylinders.
 
-    The shaft magnet is two disks of magnetic charge +-M0 on its ends; both feel the same lateral field. Gauss in the
-    radius and equal angles, which converge geometrically, the faster the wider the gap.
+    The shaft magnet is two disks of magnetic charge +-M0 on its ends, both in the same lateral field. The quadrature is
+    Gauss in the radius and uniform in the angle; both converge geometrically, faster for a wider gap.
 
     Args:
-        distance: Between the axes [m], above the sum of the radii.
-        geometry: The magnets.
-        nodes: Gauss nodes along the radius, and an eighth of the angles over half the circle.
+        distance: Distance between the axes [m], above the sum of the radii.
+        geometry: Magnets.
+        nodes: Number of Gauss nodes along the radius, and an eighth of the angles over half the circle.
 
     Returns:
         Force [N].
@@ -194,21 +195,21 @@ def pair_force(distance: float, geometry: MagnetGeometry, *, nodes: int = 24) ->
 
 
 def cylinder_force(x: np.ndarray, y: np.ndarray, geometry: MagnetGeometry) -> np.ndarray:
-    """Force on the shaft magnet by exact cylinders, to about 1e-8.
+    """Return the force on the shaft magnet by exact cylinders, with an error of about 1e-8.
 
-    With parallel axes the force of one magnet depends on the distance alone and lies along the line of centres: the
-    integral is done once a geometry, on the nodes of a Chebyshev series.
+    With parallel axes the force of one magnet depends on the distance alone and acts along the line of centres. The
+    integral is computed once for each geometry, at the nodes of a Chebyshev series.
 
     Args:
-        x: Displacement of the shaft magnet, horizontal [m], shape (n,).
-        y: The same, vertical [m], shape (n,).
-        geometry: The magnets.
+        x: Horizontal displacement of the shaft magnet [m], shape (n,).
+        y: Vertical displacement of the shaft magnet [m], shape (n,).
+        geometry: Magnets.
 
     Returns:
         Force [N], shape (n, 2).
 
     Raises:
-        InputError: A displacement beyond the reach.
+        InputError: A displacement exceeds the reach.
 
     Example:
         >>> table_1 = MagnetGeometry(8, 0.0169, 0.006, 0.008, 0.025, 7.05e5)
@@ -228,7 +229,10 @@ def cylinder_force(x: np.ndarray, y: np.ndarray, geometry: MagnetGeometry) -> np
 
 
 def cylinder_stiffness(geometry: MagnetGeometry) -> float:
-    """K of the exact cylinders at the centre [N/m]: half the sum of -f' along and -f/R_b across each magnet's line."""
+    """Return K of the exact cylinders at the centre [N/m].
+
+    It is half the sum, over the magnets, of -f' along and -f/R_b across each magnet's line.
+    """
     series, _ = _pair_series(geometry)
     force = np.exp(chebyshev.chebval(0.0, series))
     slope = force * chebyshev.chebval(0.0, chebyshev.chebder(series)) / geometry.reach
@@ -236,16 +240,16 @@ def cylinder_stiffness(geometry: MagnetGeometry) -> float:
 
 
 def quadrature_error(geometry: MagnetGeometry) -> float:
-    """Largest relative change of the pair force by the last doubling of its quadrature, over the reach.
+    """Return the largest relative change of the pair force by the last doubling of its quadrature nodes.
 
-    The convergence is geometric: the error that is left is far smaller.
+    The convergence is geometric: the remaining error is far smaller.
     """
     return _pair_series(geometry)[1]
 
 
 @cache
 def fit_map(geometry: MagnetGeometry) -> MagnetMap:
-    """Fit the radial map to the field sum, by least squares over the reach and all directions between two magnets."""
+    """Fit the radial map to the field sum, by least squares over the reach and over directions between two magnets."""
     reach = geometry.reach
     x, y, r = _sector(geometry, reach)
     outward = np.stack([x, y], axis=-1) / r[:, None]
@@ -270,9 +274,9 @@ def fit_map(geometry: MagnetGeometry) -> MagnetMap:
 
 @cache
 def fit_cylinder_map(geometry: MagnetGeometry) -> MagnetMap:
-    """Fit the rippled map to the exact cylinders: their K at the centre, the rest by least squares of relative errors.
+    """Fit the rippled map to the exact cylinders: K at the centre is exact, the rest by relative least squares.
 
-    With few magnets the higher harmonics, which the map leaves out, weigh more: look at its error.
+    With few magnets the neglected higher harmonics are larger: check the map's error.
     """
     reach, n, stiffness = geometry.reach, geometry.number, cylinder_stiffness(geometry)
     x, y, r = _sector(geometry, reach)
@@ -282,7 +286,7 @@ def fit_cylinder_map(geometry: MagnetGeometry) -> MagnetMap:
     u = r / reach
     angle = n * np.arctan2(x, -y)
     nothing = np.zeros_like(r)
-    # Each term's force, inward and against the sense of the angle, for a coefficient of 1 N.
+    # Force of each term for a coefficient of 1 N: inward, and opposite to the angle's direction.
     inward = [u**3, u**5, u**7, n * u ** (n - 1) * np.cos(angle), (n + 2) * u ** (n + 1) * np.cos(angle)]
     against = [nothing, nothing, nothing, -n * u ** (n - 1) * np.sin(angle), -n * u ** (n + 1) * np.sin(angle)]
     wanted = np.stack([-np.sum(force * outward, axis=-1) - stiffness * r, -np.sum(force * sideways, axis=-1)])
@@ -290,7 +294,7 @@ def fit_cylinder_map(geometry: MagnetGeometry) -> MagnetMap:
     columns = np.concatenate([np.stack(inward, axis=-1), np.stack(against, axis=-1)]) / np.tile(size, 2)[:, None]
     solved = np.linalg.lstsq(columns, (wanted / size).ravel(), rcond=None)[0]
     cubic, quintic, septic, ripple, grown = (float(c) / (stiffness * reach) for c in solved)
-    # Many magnets far away are round: their ripple is rounding noise, and its power of a length no number.
+    # Many distant magnets have no ripple but rounding noise, whose power of a length underflows.
     rippled = abs(ripple) > 1e-9 and reach ** (n - 2) > 1e-250
     fitted = MagnetMap(
         terms=RIPPLED if rippled else RADIAL,
@@ -307,7 +311,7 @@ def fit_cylinder_map(geometry: MagnetGeometry) -> MagnetMap:
 
 
 def linear_map(geometry: MagnetGeometry) -> MagnetMap:
-    """The far-field map without its hardening; its error is against that map."""
+    """Return the far-field map without its hardening, with its error against that map."""
     hardening = fit_map(geometry)
     spring = hardening._replace(terms=LINEAR, a3=0.0, a5=0.0, a7=0.0)
     x, y, _ = _sector(geometry, geometry.reach)
@@ -315,39 +319,40 @@ def linear_map(geometry: MagnetGeometry) -> MagnetMap:
 
 
 def map_force(x: np.ndarray, y: np.ndarray, magnet_map: MagnetMap | Magnet) -> np.ndarray:
-    """Force of a map [N], shape (n, 2), at displacements [m], each of shape (n,)."""
-    # The kernel as it is written takes arrays: one formula. Without the JIT it is that already.
+    """Return the force of a map [N], shape (n, 2), at displacements [m], each of shape (n,)."""
+    # The kernel's Python function takes arrays; without the JIT the kernel is that function.
     formula = getattr(magnet_force, "py_func", magnet_force)
     force_x, force_y, _ = formula(x, y, magnet_map)
     return np.stack([force_x, force_y], axis=-1)
 
 
 def model_errors(geometry: MagnetGeometry, travel: float) -> tuple[ModelError, ...]:
-    """Each model's error against the next better one, then those of the cheap ones against the best.
+    """Return the error of each model against the next better one, then of the cheap models against the best.
 
     Args:
-        geometry: The magnets.
-        travel: How far the shaft gets from the magnets' centre [m]; cut to the reach.
+        geometry: Magnets.
+        travel: Largest distance of the shaft from the magnets' centre [m]; limited to the reach.
     """
     both = zip(_errors(geometry, geometry.reach), _errors(geometry, min(travel, geometry.reach)), strict=True)
-    return tuple(ModelError(*names, *pair) for names, pair in zip(_CHAIN, both, strict=True))
+    return tuple(ModelError(*names, *pair) for names, pair in zip(_COMPARISONS, both, strict=True))
 
 
-_CENTRE, _MAGNETS = "stiffness at the centre", "magnets"
-_CHAIN = (
-    ("linear", "far-field map", _CENTRE),
-    ("far-field map", "far-field sum", _MAGNETS),
-    ("far-field sum", "exact cylinders", _CENTRE),
-    ("far-field sum", "exact cylinders", _MAGNETS),
-    ("cylinder map", "exact cylinders", _MAGNETS),
-    ("linear", "exact cylinders", _CENTRE),
-    ("far-field map", "exact cylinders", _CENTRE),
+_CENTRE_STIFFNESS, _SAME_MAGNETS = "stiffness at the centre", "magnets"
+_COMPARISONS = (
+    ("linear", "far-field map", _CENTRE_STIFFNESS),
+    ("far-field map", "far-field sum", _SAME_MAGNETS),
+    ("far-field sum", "exact cylinders", _CENTRE_STIFFNESS),
+    ("far-field sum", "exact cylinders", _SAME_MAGNETS),
+    ("cylinder map", "exact cylinders", _SAME_MAGNETS),
+    ("linear", "exact cylinders", _CENTRE_STIFFNESS),
+    ("far-field map", "exact cylinders", _CENTRE_STIFFNESS),
 )
+"""Pairs of models that are compared, and the property that both share."""
 
 
 @cache
 def _errors(geometry: MagnetGeometry, radius: float) -> tuple[float, ...]:
-    """The errors of the chain over a radius [m]."""
+    """Return the errors of all comparisons within a radius [m]."""
     spring, radial, cylinders = linear_map(geometry), fit_map(geometry), fit_cylinder_map(geometry)
     x, y, _ = _sector(geometry, radius)
     exact, far = cylinder_force(x, y, geometry), _sector_field_sum(geometry, radius)
@@ -364,13 +369,17 @@ def _errors(geometry: MagnetGeometry, radius: float) -> tuple[float, ...]:
 
 
 def _centres(geometry: MagnetGeometry) -> np.ndarray:
-    """Axes of the bearing magnets [m], shape (number, 2), the first straight below."""
+    """Return the axes of the bearing magnets [m], shape (number, 2), the first straight below."""
     place = 2.0 * np.pi * np.arange(geometry.number) / geometry.number
     return geometry.bearing_radius * np.stack([np.sin(place), -np.cos(place)], axis=-1)
 
 
 def _sector(geometry: MagnetGeometry, radius: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Places x, y and their radii [m], each of shape (n,), from a magnet half way to the next: the rest is mirrored."""
+    """Return points and their radii from a magnet half-way to the next; the rest is mirrored.
+
+    Returns:
+        x, y and radius [m], each of shape (n,).
+    """
     r, angle = (
         grid.ravel()
         for grid in np.meshgrid(np.linspace(radius / 40, radius, 40), np.linspace(0.0, np.pi / geometry.number, 9))
@@ -380,7 +389,7 @@ def _sector(geometry: MagnetGeometry, radius: float) -> tuple[np.ndarray, np.nda
 
 @cache
 def _sector_field_sum(geometry: MagnetGeometry, radius: float) -> np.ndarray:
-    """The field sum over a sector [N], shape (n, 2): the fit and its errors share the dearest of what they need."""
+    """Return the field sum over a sector [N], shape (n, 2), cached for the fit and its errors."""
     x, y, _ = _sector(geometry, radius)
     force = field_sum_force(x, y, geometry)
     force.setflags(write=False)
@@ -388,26 +397,30 @@ def _sector_field_sum(geometry: MagnetGeometry, radius: float) -> np.ndarray:
 
 
 def _deviation(force: np.ndarray, better: np.ndarray) -> float:
-    """Largest difference of two forces over the largest of the better ones, each of shape (n, 2)."""
+    """Return the largest difference of two forces over the largest better force, each of shape (n, 2)."""
     return float(np.linalg.norm(force - better, axis=-1).max() / np.linalg.norm(better, axis=-1).max())
 
 
 @cache
 def _pair_series(geometry: MagnetGeometry) -> tuple[np.ndarray, float]:
-    """Chebyshev series of ln(pair force) over (distance - R_b)/reach, and the quadrature's largest last change."""
-    nodes = np.cos(np.pi * (np.arange(_DEGREE + 1) + 0.5) / (_DEGREE + 1))
+    """Return the pair force's series and its quadrature error.
+
+    Returns:
+        Chebyshev series of ln(pair force) over (distance - R_b)/reach, and the largest last change of the quadrature.
+    """
+    nodes = np.cos(np.pi * (np.arange(_CHEBYSHEV_DEGREE + 1) + 0.5) / (_CHEBYSHEV_DEGREE + 1))
     forces, changes = [], []
     for node in nodes:
         distance = geometry.bearing_radius + geometry.reach * float(node)
-        size, change = _NODES[0], np.inf
+        size, change = _NODE_LIMITS[0], np.inf
         force = pair_force(distance, geometry, nodes=size)
-        # Only magnets that all but touch need more than the first doubling.
-        while change > _QUADRATURE and size < _NODES[1]:
+        # Only magnets with a very small gap need more than the first doubling.
+        while change > _QUADRATURE_TOLERANCE and size < _NODE_LIMITS[1]:
             size *= 2
             finer = pair_force(distance, geometry, nodes=size)
             force, change = finer, abs(force / finer - 1.0)
         forces.append(force)
         changes.append(change)
-    series = chebyshev.chebfit(nodes, np.log(forces), _DEGREE)
+    series = chebyshev.chebfit(nodes, np.log(forces), _CHEBYSHEV_DEGREE)
     series.setflags(write=False)
     return series, float(max(changes))

@@ -1,4 +1,4 @@
-"""The model: parameters resolved to the kernels' constants, the static equilibrium, and initial states."""
+"""Model of a rig: kernel constants resolved from parameters, the static equilibrium, and initial states."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from rig.base.errors import InputError
 from rig.base.maths.roots import find_root
-from rig.physics.contacts import ContactPair, ReferenceImpact, ResolvedLaw, resolve
+from rig.physics.contacts import ContactPair, ReferenceImpact, ResolvedLaw, resolve_law
 from rig.physics.kernels.constants import Constants, Contact, House, Magnet, Shaft
 from rig.physics.kernels.signals import N_VECTOR
 from rig.physics.levels import ModelLevels
@@ -28,7 +28,7 @@ from rig.physics.parameters import ParameterSet
 
 
 def contact_pair(parameters: ParameterSet) -> ContactPair:
-    """Shaft and ring, as the stiffness laws take them."""
+    """Return the geometry and contact modulus of shaft and ring for the stiffness laws."""
     compliance = sum(
         (1.0 - parameters[f"{body}.poisson_ratio"] ** 2) / parameters[f"{body}.young_modulus"]
         for body in ("shaft", "ring")
@@ -42,7 +42,7 @@ def contact_pair(parameters: ParameterSet) -> ContactPair:
 
 
 def reference_impact(parameters: ParameterSet) -> ReferenceImpact:
-    """The shaft's mass at the ring against the inner house, as if both were free."""
+    """Return the reference impact: shaft mass at the ring against the inner housing, both free."""
     return ReferenceImpact(
         shaft_mass=parameters["shaft.transverse_inertia"] / parameters["shaft.arm_ring"] ** 2,
         house_mass=parameters["house.inner_mass"],
@@ -51,10 +51,10 @@ def reference_impact(parameters: ParameterSet) -> ReferenceImpact:
 
 
 def normal_law(parameters: ParameterSet) -> ResolvedLaw:
-    """The normal contact law: rules and numbers resolved to K, n, c and D.
+    """Resolve the normal contact law's rules and numbers to K, n, c and D.
 
     Raises:
-        InputError: A law does not hold here, or two of them exclude each other.
+        InputError: A law does not apply to this rig, or two laws exclude each other.
     """
     p = parameters
     chosen = {
@@ -66,22 +66,22 @@ def normal_law(parameters: ParameterSet) -> ResolvedLaw:
             ("viscous", "viscous_damping"),
         )
     }
-    return resolve(**chosen, restitution=p["contact.restitution"], pair=contact_pair(p), impact=reference_impact(p))
+    return resolve_law(**chosen, restitution=p["contact.restitution"], pair=contact_pair(p), impact=reference_impact(p))
 
 
 @dataclass(frozen=True)
 class Model:
-    """A rig ready to run.
+    """Rig model that is ready to run.
 
     Attributes:
-        parameters: Where its numbers come from.
-        constants: What the kernels take.
-        magnets: The magnets behind the map.
-        magnet_map: The map of the level, with its error against the model that it was fitted to (its stiffness is that
-            model's, `constants.magnet.stiffness` the one used).
-        travel: Farthest that a ring at rest lets the shaft get from the magnets' centre [m].
-        resolved: Numbers behind the parameters that are rules, in each parameter's unit.
-        sag: Shaft at the ring in static equilibrium with the magnets on [m], vertical.
+        parameters: Source of all numbers.
+        constants: Constants of the kernels.
+        magnets: Geometry of the magnets that the map was fitted to.
+        magnet_map: Map of the selected level, with its error against the fitted model. Its stiffness is the fitted
+            model's; a run uses `constants.magnet.stiffness`.
+        travel: Largest distance of the shaft from the magnets' centre inside a ring at rest [m].
+        resolved: Values of the parameters that are given by rules, in each parameter's unit.
+        sag: Vertical position of the shaft at the ring in static equilibrium on the magnets [m].
     """
 
     parameters: ParameterSet
@@ -101,26 +101,27 @@ class Model:
         spin: float = 0.0,
         angle: float = 0.0,
     ) -> np.ndarray:
-        """A state of the shaft, the houses at their rest.
+        """Return a state of the shaft, with the housings at rest.
 
         Args:
-            ring_x: Shaft in the ring, horizontal, from the ring's centre [m]; None for the equilibrium on the magnets.
-            ring_y: The same, vertical.
-            velocity: Of its centre in the ring, horizontal and vertical [m/s].
+            ring_x: Horizontal position of the shaft from the ring's centre [m]; None for the equilibrium on the
+                magnets.
+            ring_y: Vertical position, as `ring_x`.
+            velocity: Horizontal and vertical velocity of the shaft centre at the ring [m/s].
             spin: theta' [rad/s].
             angle: theta [rad].
 
         Returns:
-            Vector of state and integrals, shape (N_VECTOR,).
+            State and integrals, shape (N_VECTOR,).
 
         Raises:
-            InputError: The shaft is too short to reach there.
+            InputError: The position is beyond the shaft's length.
         """
         contact, arm = self.constants.contact, self.constants.shaft.arm_ring
         x = 0.0 if ring_x is None else ring_x + contact.offset_x
         y = self.sag if ring_y is None else ring_y + contact.offset_y
         if math.hypot(x, y) >= arm:
-            raise InputError("shaft.arm_ring", f"above {math.hypot(x, y):g} m, to reach where it starts", arm)
+            raise InputError("shaft.arm_ring", f"above {math.hypot(x, y):g} m, to reach the start position", arm)
         beta, gamma = x / arm, -y / arm
         if self.constants.levels.euler:
             beta = math.asin(x / arm)
@@ -135,10 +136,10 @@ class Model:
 
 
 def magnet_geometry(parameters: ParameterSet) -> MagnetGeometry:
-    """The magnets of a parameter set.
+    """Return the magnets of a parameter set.
 
     Raises:
-        InputError: They overlap.
+        InputError: The magnets overlap.
     """
     p = parameters
     geometry = MagnetGeometry(
@@ -160,11 +161,11 @@ def magnet_geometry(parameters: ParameterSet) -> MagnetGeometry:
 
 
 def build_model(parameters: ParameterSet, levels: ModelLevels | None = None) -> Model:
-    """Resolve every rule, fit the magnet map, find the equilibrium.
+    """Resolve every rule, fit the magnet map, and find the static equilibrium.
 
     Args:
-        parameters: The numbers.
-        levels: How much of the model takes part; None for all of it.
+        parameters: Parameter set.
+        levels: Model levels; None for the full model.
     """
     levels = levels or ModelLevels()
     p = parameters
@@ -264,7 +265,7 @@ def build_model(parameters: ParameterSet, levels: ModelLevels | None = None) -> 
 
 
 def describe(model: Model) -> dict[str, Any]:
-    """The parameters as a JSON document, rules beside the numbers they give."""
+    """Return the parameters as a JSON document, with the resolved value of each rule."""
     document = model.parameters.document()
     for key, value in model.resolved.items():
         document["values"][key]["resolved"] = value
@@ -282,15 +283,14 @@ def describe(model: Model) -> dict[str, Any]:
 
 
 _MAPS = {"linear": linear_map, "map": fit_map, "cylinders": fit_cylinder_map}
-"""By level."""
+"""Fit of the magnet map by level."""
 
 
 def _sag(shaft: Shaft, magnet: Magnet) -> float:
-    """Height of the shaft at the ring at rest on the magnets [m], negative: torque balance about the pivot."""
+    """Return the height of the shaft at the ring at rest on the magnets [m], negative, by torque balance."""
 
     def torque(gamma: float) -> float:
-        # Both forces are vertical, one of the magnets being straight below, and share the lever cos(Gamma), which
-        # drops out.
+        # Both forces are vertical, as one magnet is straight below; their common lever cos(Gamma) cancels.
         depth = np.array([-shaft.arm_magnet * math.sin(gamma)])
         lift = float(map_force(np.zeros(1), depth, magnet)[0, 1])
         return shaft.arm_magnet * lift - shaft.arm_centre * shaft.mass * shaft.gravity

@@ -1,7 +1,7 @@
-"""Parameter sets: data files in, checked and frozen SI values out. The only module that knows units.
+"""Parameter sets: data files, checked and converted to frozen SI values. Only this module knows units.
 
-A set is a TOML file of values with unit, symbol, source and kind. `corrected` lists every parameter; any other set
-names a `base` and the values in which it differs. A user's own file works the same way.
+A set is a TOML file of values with unit, symbol, source and kind. `corrected` lists every parameter. Any other set, a
+user's file included, names a `base` and the values that differ from it.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ SI = {
     "N/m": 1.0, "kN/m": 1e3, "N/m^n": 1.0, "N s/m": 1.0, "m/s": 1.0, "mm/s": 1e-3, "m/s^2": 1.0,
     "A/m": 1.0, "kA/m": 1e3, "N m s": 1.0, "Hz": 2.0 * math.pi, "Hz/s": 2.0 * math.pi,
 }  # fmt: skip
-"""Every unit that a set may use, in SI (a frequency becomes rad/s)."""
+"""Factor to SI of every unit that a set may use (a frequency becomes rad/s)."""
 
 _NAME = re.compile(r"\s*([^\W\d][\w-]*)?\s*")
-_OF_THE_MODEL = ("range", "rules", "formula")
-"""Fields of a parameter that no file changes and no recording needs."""
+_MODEL_FIELDS = ("range", "rules", "formula")
+"""Parameter fields that belong to the model: no file may change them, and no recording contains them."""
 Kind = Literal["paper", "corrected", "literature", "datasheet", "fitted", "assumed"]
 
 
@@ -47,7 +47,7 @@ def _number(value: float | str) -> float | str:
 
 
 class Parameter(BaseModel, frozen=True, extra="forbid"):
-    """One value with its unit, its place in the paper, its provenance and what the model accepts."""
+    """Parameter value with its unit, symbol in the paper, provenance and accepted values."""
 
     value: Annotated[StrictFloat | StrictInt | StrictStr, AfterValidator(_number)]
     unit: str
@@ -56,9 +56,9 @@ class Parameter(BaseModel, frozen=True, extra="forbid"):
     kind: Kind
     range: tuple[float, float]
     rules: tuple[str, ...] = ()
-    """Names that may stand in place of a number."""
+    """Rules accepted in place of a number."""
     formula: tuple[str, ...] = ()
-    """Variables of a formula that may stand in place of a number; none: no formula may."""
+    """Variables of a formula accepted in place of a number; empty if no formula is accepted."""
 
     @field_validator("unit")
     @classmethod
@@ -72,9 +72,9 @@ class ParameterSet:
     """All parameters of a rig, checked and frozen.
 
     Attributes:
-        name: Name of the set, or the path of a user's file.
-        title: One line on what it is.
-        entries: Every parameter by its dotted key, in file order.
+        name: Name of the set, or path of a user's file.
+        title: One-line description.
+        entries: Parameters by dotted key, in file order.
 
     Example:
         >>> import rig
@@ -96,23 +96,23 @@ class ParameterSet:
             _check(key, entry)
 
     def __getitem__(self, key: str) -> float:
-        """The value of a numeric parameter in SI.
+        """Return the value of a numeric parameter in SI.
 
         Raises:
-            UnknownNameError: No such parameter.
-            TypeError: The value is a rule; the model works it out.
+            UnknownNameError: There is no such parameter.
+            TypeError: The value is a rule; the model computes its number.
         """
         entry = self._entry(key)
         if isinstance(entry.value, str):
-            raise TypeError(f"{key} is the rule {entry.value!r}; its number comes from the model")
+            raise TypeError(f"{key} is the rule {entry.value!r}; the model computes its number")
         return entry.value * SI[entry.unit]
 
     def numbers(self) -> dict[str, float]:
-        """The values that are numbers, in SI."""
+        """Return the numeric values in SI, by key."""
         return {key: self[key] for key, entry in self.entries.items() if not isinstance(entry.value, str)}
 
     def rule(self, key: str) -> str | None:
-        """The name of the rule that gives the value, or None where it is a number."""
+        """Return the name of the rule that gives a value, or None for a number."""
         value = self._entry(key).value
         return value if isinstance(value, str) else None
 
@@ -125,7 +125,7 @@ class ParameterSet:
         return f"ParameterSet({self.name}: {len(self.entries)} parameters)"
 
     def override(self, changes: dict[str, Any], *, kind: Kind = "assumed", source: str = "override") -> ParameterSet:
-        """The set with some values replaced, given in each parameter's own unit.
+        """Return the set with some values replaced, each in its parameter's own unit.
 
         Args:
             changes: New values (numbers or names of rules) by dotted key.
@@ -133,7 +133,7 @@ class ParameterSet:
             source: Source recorded for the changed values.
 
         Raises:
-            InputError: Unknown key, or a value outside what the parameter accepts.
+            InputError: Unknown key, or a value that the parameter does not accept.
         """
         entries = dict(self.entries)
         for key, value in changes.items():
@@ -146,32 +146,32 @@ class ParameterSet:
         return ParameterSet(self.name, self.title, entries)
 
     def document(self) -> dict[str, Any]:
-        """The set as a JSON document: what is recorded beside every stream."""
+        """Return the set as the JSON document that is recorded with every stream."""
         return {
             "set": self.name,
             "title": self.title,
             "values": {
-                key: entry.model_dump(mode="json", exclude=set(_OF_THE_MODEL)) for key, entry in self.entries.items()
+                key: entry.model_dump(mode="json", exclude=set(_MODEL_FIELDS)) for key, entry in self.entries.items()
             },
         }
 
 
 def set_names() -> list[str]:
-    """Names of the sets that come with the rig, the default first."""
+    """Return the names of the built-in sets, the default first."""
     return list(_own_names())
 
 
 @cache
 def _own_names() -> tuple[str, ...]:
-    # Asked for several times by each simulation that is set up, and the files are part of the package.
+    # Each simulation needs the names several times, and the files are part of the package.
     return tuple(sorted((path.stem for path in SETS.glob("*.toml")), key=lambda name: (name != DEFAULT_SET, name)))
 
 
 def load_parameters(name_or_path: str = DEFAULT_SET) -> ParameterSet:
-    """Load a set by name, or a user's file by path.
+    """Load a built-in set by name, or a user's file by path.
 
     Raises:
-        InputError: No such set, not a set file, an unknown key, or a value outside what the model accepts.
+        InputError: No such set, not a set file, an unknown key, or a value that the model does not accept.
 
     Example:
         >>> parameters = load_parameters("as-printed")
@@ -184,20 +184,20 @@ def load_parameters(name_or_path: str = DEFAULT_SET) -> ParameterSet:
     return _load(name_or_path, "parameters", ())
 
 
-def with_changes(parameters: ParameterSet, changes: Mapping[str, Any], *, source: str) -> ParameterSet:
-    """Return `parameters.override(changes)`, the same object for the same changes of the same set.
+def apply_changes(parameters: ParameterSet, changes: Mapping[str, Any], *, source: str) -> ParameterSet:
+    """Return `parameters.override(changes)`; the same changes of the same set return the same object.
 
-    A simulation that is set up asks for its parameters several times.
+    Setting up a simulation needs its parameters several times.
 
     Args:
-        parameters: The set.
+        parameters: Parameter set.
         changes: New values by dotted key, as in `ParameterSet.override`.
         source: Source recorded for the changed values.
 
     Raises:
-        InputError: Unknown key, or a value outside what the parameter accepts.
+        InputError: Unknown key, or a value that the parameter does not accept.
     """
-    # 1, 1.0 and true are equal, and must not be taken for each other.
+    # The type is part of the key: 1, 1.0 and true are equal, but not interchangeable.
     return _overridden(parameters, tuple((key, type(value), value) for key, value in changes.items()), source)
 
 
@@ -207,16 +207,22 @@ def _overridden(parameters: ParameterSet, changes: tuple[tuple[str, type, Any], 
 
 
 def _load(name: Any, field: str, loading: tuple[str, ...]) -> ParameterSet:
-    """Load a set for a field that names it; `loading` are the files that stand on it."""
+    """Load a set for the field that names it.
+
+    Args:
+        name: Name of a built-in set, or path of a file.
+        field: Field to name in errors.
+        loading: Paths of the files that depend on this set, to detect a cycle.
+    """
     if isinstance(name, str) and name in _own_names():
         return _own_set(name)
     path = Path(name) if isinstance(name, str) else None
     if path is None or path.suffix != ".toml" or not path.is_file():
-        known = f"one of {', '.join(set_names())}, or the path of a .toml file that exists"
+        known = f"one of {', '.join(set_names())}, or the path of an existing .toml file"
         raise InputError(field, f"the set that the file changes, {known}" if name is None else known, name)
     place = str(path.resolve())
     if place in loading:
-        raise InputError(field, "another set than the file itself or one that stands on it", name)
+        raise InputError(field, "a set other than the file itself and those based on it", name)
     return _parse(str(name), read_toml(path), path, (*loading, place))
 
 
@@ -237,18 +243,20 @@ def _parse(name: str, data: dict[str, Any], path: Path, loading: tuple[str, ...]
             raise InputError(f"{path.name}: {section}", "a table of parameters", members)
         for member, fields in members.items():
             key = f"{section}.{member}"
-            # A bare number is a user's short form of a table with only a value.
-            given = fields if isinstance(fields, dict) else {"value": fields, "kind": "assumed", "source": path.name}
+            # Users may write a bare number for a table with only a value.
+            changed = fields if isinstance(fields, dict) else {"value": fields, "kind": "assumed", "source": path.name}
             if not foundation and key not in entries:
                 must = such_as(f"a parameter of the set {base}", key, entries)
-                raise InputError(f"{path.name}: {key}", must, given.get("value"))
+                raise InputError(f"{path.name}: {key}", must, changed.get("value"))
             known = entries[key].model_dump() if key in entries else {}
-            for fixed in _OF_THE_MODEL:
-                if fixed in given and known:
-                    raise InputError(f"{path.name}: {key}.{fixed}", "left as the model has it", given[fixed])
-            if "unit" in given and known and given["unit"] != known["unit"]:
-                raise InputError(f"{path.name}: {key}.unit", known["unit"], given["unit"])
-            entries[key] = check(Parameter, {**known, **given}, field=f"{path.name}: {key}")
+            for fixed in _MODEL_FIELDS:
+                if fixed in changed and known:
+                    raise InputError(
+                        f"{path.name}: {key}.{fixed}", "unchanged, as the model defines it", changed[fixed]
+                    )
+            if "unit" in changed and known and changed["unit"] != known["unit"]:
+                raise InputError(f"{path.name}: {key}.unit", known["unit"], changed["unit"])
+            entries[key] = check(Parameter, {**known, **changed}, field=f"{path.name}: {key}")
     return ParameterSet(name, title, entries)
 
 
@@ -276,5 +284,5 @@ def _check(key: str, entry: Parameter) -> None:
 
 
 def _is_unknown_name(value: str, variables: Iterable[str]) -> bool:
-    """True for text like `hunt-crosley`: a misspelt rule, unless it consists of variables, as `R_S-r0` does."""
+    """Return True for text such as `hunt-crosley`, a misspelt rule, and False for variables, as in `R_S-r0`."""
     return _NAME.fullmatch(value) is not None and not set(value.strip().split("-")) <= set(variables)

@@ -22,7 +22,7 @@ from rig.physics.engine_choice import EngineChoice
 from rig.physics.engines import ENGINES
 from rig.physics.kernels.signals import COLUMN
 from rig.physics.levels import ModelLevels
-from rig.physics.parameters import DEFAULT_SET, ParameterSet, load_parameters, with_changes
+from rig.physics.parameters import DEFAULT_SET, ParameterSet, apply_changes, load_parameters
 from rig.run.commands.table import SpeedCommand, TimedCommand, with_faults
 from rig.run.model_choice import Pick, digest, equations_digest
 from rig.run.speed_target import Drive
@@ -123,7 +123,7 @@ class Scene(Written):
             raise InputError("engine.tolerance", must, self.engine.tolerance)
         if self.engine.companion and not self.engine.tolerance:
             raise InputError("engine.companion", "false without an engine.tolerance", True)
-        for name, limit in self.engine.limits.given().items():
+        for name, limit in self.engine.limits.as_dict().items():
             if not self.engine.companion:
                 must = "left out without engine.companion = true, whose estimate it limits"
                 raise InputError(f"engine.limits.{name}", must, limit)
@@ -161,7 +161,7 @@ class Scene(Written):
     def _possible_generator(self) -> Scene:
         if self.generator is not None:
             commands = [one for one in self.commands if one.request.MECHANICAL]
-            limits = self.engine.limits.given()
+            limits = self.engine.limits.as_dict()
             fields = {"commands": commands, "drive.profile": self.drive.profile, "engine.limits": limits}
             for name, given in fields.items():
                 if given:
@@ -257,7 +257,7 @@ class Scene(Written):
     def load_parameters(self) -> ParameterSet:
         """Return the scene's parameters with its changes applied."""
         parameters = load_parameters(self.parameters)
-        return with_changes(parameters, self.set, source=f"scene {self.name}") if self.set else parameters
+        return apply_changes(parameters, self.set, source=f"scene {self.name}") if self.set else parameters
 
 
 def scene_names() -> list[str]:

@@ -298,7 +298,7 @@ class Simulation:
         memory, warnings = self._motion.memory, list[str]()
         share = min(float(memory[ROLLED_S]) * TICK_RATE_HZ / max(self.tick - self._start, 1), 1.0)
         choice = {**self.scene.engine.model_dump(), "step_us": self._step_ticks, "rolling_share": share}
-        accuracy = self._accuracy.completed()
+        accuracy = self._accuracy.copy_completed()
         if text := accuracy.warning():
             warnings.append(text)
         # If little is dissipated, the ledger must account for the stored energy.

@@ -18,7 +18,7 @@ EXCEPTIONS = {
     "drivers/sources/can.py:_read": _SILENCE,
     "recorder/viewer/live.py:_draw_on": _PERIOD,
     "recorder/viewer/live.py:take_in": "drops blocks that are too old to be drawn, and does not wait",
-    "replays/studies/chart/measure.py:_by_frame": "the budget of a measured computation; a chart is tied to this file",
+    "replays/studies/chart/measure.py:_time_frames": "the budget of a measured computation; charts are tied to this",
     "rig/serve/service.py:_publish_all": _PERIOD,
     "rig/serve/service.py:_refresh_health": _PERIOD,
     "rig/serve/transport/clients.py:settle": _SILENCE,

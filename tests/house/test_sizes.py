@@ -43,7 +43,7 @@ BUDGETS = {
     "replays/sessions": 73,
     "replays/studies": 8893,
     "rig": 53,
-    "rig/base": 910,
+    "rig/base": 914,
     "rig/channels": 2411,
     "rig/cli": 5133,
     "rig/physics": 5453,

@@ -226,8 +226,8 @@ def test_a_changed_byte_of_any_kernel_file_changes_the_digest(copied: Path) -> N
 
 CACHE = """
 import numba
-from rig.physics.kernels import compiled_before, source_digest
-print(numba.config.CACHE_DIR, source_digest(), compiled_before())
+from rig.physics.kernels import has_compiled_kernels, source_digest
+print(numba.config.CACHE_DIR, source_digest(), has_compiled_kernels())
 """
 
 

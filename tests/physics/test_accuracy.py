@@ -109,7 +109,7 @@ def test_an_unfinished_window_counts_and_changes_nothing() -> None:
     accuracy = Accuracy(3e-4, CLEARANCE, 1e-3)
     assert accuracy.compare(make_whirl(10), make_whirl(10, radius=1e-6), 1e-3 * np.arange(10)) == []
     before = copy.deepcopy(accuracy)
-    assert "whirl radius off by 1 um (tolerance 0.28)" in accuracy.completed().warning()
+    assert "whirl radius off by 1 um (tolerance 0.28)" in accuracy.copy_completed().warning()
     assert np.array_equal(accuracy.errors, before.errors)
 
 

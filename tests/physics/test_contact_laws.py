@@ -37,10 +37,10 @@ from rig.physics.contacts import (
     fit_power,
     free_impact,
     linear_damping_ratio,
-    resolve,
+    match_depth,
+    resolve_law,
     restitution_factor,
     returned_restitution,
-    same_depth,
 )
 from rig.physics.kernels.laws.contact import normal_force
 from rig.physics.model import build_model, contact_pair, normal_law, reference_impact
@@ -52,7 +52,7 @@ LINE_LAWS = ["johnson-cylinder", "esdu-cylinder", "dubowsky-freudenstein-cylinde
 
 
 def chosen(damping: float | str, restitution: float, *, stiffness: float | str = "internal-sphere") -> NormalLaw:
-    return resolve(
+    return resolve_law(
         stiffness=stiffness, exponent=LAW, damping=damping, viscous=LAW,
         restitution=restitution, pair=PAIR, impact=IMPACT,
     ).law  # fmt: skip
@@ -336,7 +336,7 @@ def test_another_exponent_keeps_the_depth_and_reports_the_lost_fit() -> None:
     resolved = normal_law(DEFAULT.override({"contact.exponent": 1.2}))
     assert resolved.fit_error is None
     own = chosen("none", 0.9)
-    assert resolved.law.stiffness == same_depth(own.stiffness, 1.5, 1.2, IMPACT)
+    assert resolved.law.stiffness == match_depth(own.stiffness, 1.5, 1.2, IMPACT)
     depths = [
         free_impact(law._replace(damping_factor=0.0), mass=IMPACT.mass, speed=IMPACT.speed).depth
         for law in (resolved.law, own)

@@ -21,11 +21,11 @@ from rig import load_scene
 from rig.physics.engines.common.memory import CONTACTS, PEAK_FORCE, STEPS
 from rig.physics.engines.split.condensed import body_matrices
 from rig.physics.engines.split.layout import MEMORY
-from rig.physics.engines.taylor.place import RINGING
-from rig.physics.engines.taylor.ringing import RINGS, add_ringing, let_ring, set_modes
+from rig.physics.engines.taylor.memory import RINGING
+from rig.physics.engines.taylor.ringing import RINGS, add_ringing, set_modes, start_ringing
 from rig.physics.kernels import signals as S
 from rig.physics.kernels.constants import Constants, Inputs
-from rig.physics.kernels.records import packed
+from rig.physics.kernels.records import pack_record
 from rig.physics.model import build_model
 from rig.run.simulation import Simulation
 from tests.scenes import QUIET
@@ -45,7 +45,7 @@ def get_python_function(kernel: Any) -> Any:
 
 
 def matrices_of(constants: Constants) -> np.ndarray:
-    return get_python_function(body_matrices)(packed(constants)[0], packed(INPUTS)[0])[1]
+    return get_python_function(body_matrices)(pack_record(constants)[0], pack_record(INPUTS)[0])[1]
 
 
 @pytest.mark.parametrize(
@@ -71,7 +71,7 @@ def test_ringing_is_the_matrix_exponential(changes: dict[str, Any]) -> None:
     for row, value in zip(ROWS[0] + ROWS[1], (3e-6, -2e-6, 0.01, 0.02, -1e-6, 4e-6, -0.03, 0.01), strict=True):
         start[row] = value * (moves if row in (S.X_OH, S.Y_OH, S.VX_OH, S.VY_OH) else 1.0)
     left = start.copy()
-    assert let_ring(constants, memory, left, -5e-4, 0.0)
+    assert start_ringing(constants, memory, left, -5e-4, 0.0)
     assert memory[RINGING] == 1.0
     assert not left[: S.N_STATE].any()
     times = np.linspace(0.0, 2e-3, 2001)

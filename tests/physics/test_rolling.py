@@ -33,7 +33,7 @@ from rig.physics.kernels import signals as S
 from rig.physics.kernels.constants import Inputs
 from rig.physics.kernels.dynamics import evaluate
 from rig.physics.kernels.laws.contact import FLIGHT, ROLLING
-from rig.physics.kernels.records import packed
+from rig.physics.kernels.records import pack_record
 from rig.physics.model import build_model
 from rig.run.motion import energy_balance
 from rig.run.simulation import Simulation
@@ -129,7 +129,7 @@ def test_linear_bodies_are_the_kernels(changes: dict[str, Any]) -> None:
     constants = make_simulation("split", 1e-3, model__magnet="linear", **changes).model.constants
     # Weight turns the shaft, and with it the spin: no part of a linear body.
     constants = constants._replace(shaft=constants.shaft._replace(gravity=0.0))
-    shafts, houses = body_matrices(packed(constants)[0], packed(INPUTS)[0])
+    shafts, houses = body_matrices(pack_record(constants)[0], pack_record(INPUTS)[0])
     matrix = np.zeros((14, 14))
     for first, block in zip((0, 2, 4, 6, 10), (*shafts, *houses), strict=True):
         matrix[first : first + len(block), first : first + len(block)] = block

@@ -41,7 +41,7 @@ from rig.physics.engines import load_engine
 from rig.physics.engines.common.memory import CEILING, CLAMPS, CONTACT_STEPS, CONTACTS, MEMORY, ONSET, PHASE, STEPS
 from rig.physics.engines.tape.columns import EVENTS, ROOT, WIDTH
 from rig.physics.engines.tape.taylor import SERIES as CODE
-from rig.physics.engines.taylor.place import ORDER, SERIES
+from rig.physics.engines.taylor.memory import ORDER, SERIES
 from rig.physics.engines.taylor.polynomial import first_zero
 from rig.physics.kernels import signals as S
 from rig.physics.kernels.dynamics import evaluate

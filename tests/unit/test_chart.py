@@ -13,10 +13,18 @@ from replays.studies.chart import measure, session
 from replays.studies.chart.drawing import figure
 from replays.studies.chart.drawing.figure import draw
 from replays.studies.chart.drawing.panel import own_speed
-from replays.studies.chart.measure import OFF, Budget, Run, block_statistics, elastic_forces, point, run_engine
+from replays.studies.chart.measure import (
+    BRANCH_ERROR,
+    Budget,
+    Run,
+    block_statistics,
+    elastic_forces,
+    measure_point,
+    run_engine,
+)
 from replays.studies.chart.methods import competitors
-from replays.studies.chart.phases import PANELS, plan, problem_of
-from replays.studies.chart.profile import draw_scene, shares
+from replays.studies.chart.phases import PANELS, build_problem, plan_points
+from replays.studies.chart.profile import draw_scene, profile_curves
 from replays.studies.chart.session import make_chart
 from replays.studies.chart.store import COLUMNS, KEY, Store, read_table
 from replays.studies.peers import PEERS, Setting
@@ -77,7 +85,7 @@ def test_store_writes_one_table_in_two_formats(tmp_path: Path) -> None:
 
 def make_run(shift: float) -> tuple[Problem, Reference, Run]:
     """Return a reference at rest, and a run that is off by `shift` scales in one of seven states, half the time."""
-    problem = problem_of("exact", "first-impacts", "", end_s=4e-3)
+    problem = build_problem("exact", "first-impacts", "", end_s=4e-3)
     problem = Problem(**{**problem.__dict__, "times": problem.times[:4]})
     solution = Solution(problem.times, 1.0).close()
     solution.states = np.zeros((4, N_STATE))
@@ -98,8 +106,8 @@ def test_error_and_verdict_of_a_hand_made_run(
     problem, reference, done = make_run(shift)
     done.solution.onsets = [(0.0, 0.1)] * contacts
     done.solution.failure = "the state is not finite" if failure == "nan" else None
-    monkeypatch.setattr(measure, "run", lambda *_: done)
-    found = point(competitors(peers=False)["rk4"], Setting("5 us", 0.0, step_us=5), problem, reference, ONE_RUN)
+    monkeypatch.setattr(measure, "run_method", lambda *_: done)
+    found = measure_point(competitors(peers=False)["rk4"], Setting("5 us", 0.0, step_us=5), problem, reference, ONE_RUN)
     assert found["failure"] == failure
     assert (found["cpu_s"], found["cpu_min_s"], found["cpu_max_s"]) == (0.2, 0.1, 0.5)
     assert found["speed"] == pytest.approx(problem.duration_s / 0.2)
@@ -107,11 +115,11 @@ def test_error_and_verdict_of_a_hand_made_run(
         assert found["error"] is None
     else:
         assert found["error"] == pytest.approx(shift * math.sqrt(0.5 / 7.0))
-        assert (found["error"] > OFF) == (failure == "branch")
+        assert (found["error"] > BRANCH_ERROR) == (failure == "branch")
 
 
 def test_engine_called_directly_agrees_with_another_code_and_closes_its_ledger() -> None:
-    problem = problem_of("exact", "first-impacts", "", end_s=0.03)
+    problem = build_problem("exact", "first-impacts", "", end_s=0.03)
     done = run_engine("rk4", Setting("10 us", 0.0, step_us=10), problem, ONE_RUN)
     truth = PEERS["scipy-dop853"].solve(problem, Setting("1e-9", 1e-9))
     assert done.failure == ""
@@ -125,7 +133,7 @@ def test_engine_called_directly_agrees_with_another_code_and_closes_its_ledger()
 
 
 def test_engine_without_time_is_a_failure_and_no_error() -> None:
-    problem = problem_of("exact", "first-impacts", "", end_s=0.01)
+    problem = build_problem("exact", "first-impacts", "", end_s=0.01)
     done = run_engine("rk4", Setting("10 us", 0.0, step_us=10), problem, Budget(0.0, 3))
     assert done.failure == "budget"
     assert done.reached_s == pytest.approx(1e-3)
@@ -133,8 +141,8 @@ def test_engine_without_time_is_a_failure_and_no_error() -> None:
 
 
 def test_frames_must_be_whole_steps() -> None:
-    problem = problem_of("exact", "first-impacts", "", end_s=0.01)
-    with pytest.raises(ValueError, match="no whole number of steps"):
+    problem = build_problem("exact", "first-impacts", "", end_s=0.01)
+    with pytest.raises(ValueError, match="must be multiples of"):
         run_engine("rk4", Setting("30 us", 0.0, step_us=30), problem, ONE_RUN)
 
 
@@ -161,7 +169,7 @@ def test_bootstrap_bars_contain_the_mean() -> None:
 
 
 def test_elastic_force_is_hertz() -> None:
-    problem = problem_of("exact", "first-impacts", "", end_s=0.01)
+    problem = build_problem("exact", "first-impacts", "", end_s=0.01)
     shaft, contact = problem.constants.shaft, problem.constants.contact
     states = np.tile(problem.y0, (2, 1))
     beta = math.asin((contact.clearance + 1e-5 + contact.offset_x) / shaft.arm_ring)
@@ -178,7 +186,7 @@ def test_profile_shares_by_hand() -> None:
             ("c", "quick", 1.0, ""), ("c", "slow", 0.1, "target"), ("c", "never", 0.1, "nan"),
         )
     ]  # fmt: skip
-    curves = shares(points)
+    curves = profile_curves(points)
     assert curves["quick"][0].tolist() == [1.0, 1.0, 2.0]
     assert curves["quick"][1].tolist() == pytest.approx([1 / 3, 2 / 3, 1.0])
     assert curves["slow"][0].tolist() == [1.0, 4.0]
@@ -192,7 +200,7 @@ def test_profile_of_a_bound_is_compared_with_the_best_method() -> None:
         {"phase": "b", "method": "led", "cpu_s": 3.0, "own_cpu_s": 2.0, "failure": ""},
         {"phase": "b", "method": "other", "cpu_s": 1.0, "own_cpu_s": None, "failure": ""},
     ]
-    curves = shares(points, column="own_cpu_s")
+    curves = profile_curves(points, column="own_cpu_s")
     assert list(curves) == ["led"]
     assert curves["led"][0].tolist() == [0.5, 2.0]
 
@@ -203,7 +211,7 @@ def test_draws_are_the_same_again_and_differ() -> None:
 
 
 def test_plan_gives_a_method_only_supported_settings() -> None:
-    tasks = plan(competitors(), mode="full", panels=list(PANELS))
+    tasks = plan_points(competitors(), mode="full", panels=list(PANELS))
     assert {task.case for task in tasks if task.panel == "memory"} == {"memory", "no memory"}
     assert not [task for task in tasks if task.panel == "exact" and task.method == "scipy-bdf-no-events"]
     assert len(set(tasks)) == len(tasks)
@@ -308,7 +316,7 @@ def test_a_small_chart_resumes_and_lists_missing_points(tmp_path: Path, monkeypa
 
 
 def test_without_peers_there_is_still_a_reference() -> None:
-    problem = problem_of("exact", "first-impacts", "", end_s=0.03)
+    problem = build_problem("exact", "first-impacts", "", end_s=0.03)
     own = session.own_reference(problem)
     truth = PEERS["scipy-radau"].solve(problem, Setting("1e-9", 1e-9))
     assert own is not None

@@ -13,9 +13,9 @@ import pytest
 
 from replays.studies.chart import session
 from replays.studies.chart.drawing import figure
-from replays.studies.chart.measure import Budget, point, run_engine
+from replays.studies.chart.measure import Budget, measure_point, run_engine
 from replays.studies.chart.methods import ADDED_FAMILY, competitors
-from replays.studies.chart.phases import problem_of
+from replays.studies.chart.phases import build_problem
 from replays.studies.chart.store import Store, read_table
 from replays.studies.chart.submission import write_problem
 from replays.studies.peers import PEERS, Setting
@@ -63,7 +63,7 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("undrawn")
 def test_submitted_results_of_an_engine_equal_its_own_point(tmp_path: Path) -> None:
-    problem, setting = problem_of("exact", PHASE, ""), Setting("25 us", 0.0, step_us=25)
+    problem, setting = build_problem("exact", PHASE, ""), Setting("25 us", 0.0, step_us=25)
     done = run_engine("rk4", setting, problem, Budget(30.0, 1))
     states, contacts = done.solution.states[:, ERROR_COLUMNS], done.solution.contacts
     versions: dict[str, tuple[np.ndarray, int]] = {
@@ -82,7 +82,7 @@ def test_submitted_results_of_an_engine_equal_its_own_point(tmp_path: Path) -> N
     rows = {row["method"]: row for row in read_table(folder)}
     reference = session.find_reference(problem, quick=True)
     assert reference is not None
-    wanted = point(competitors(peers=False)["rk4"], setting, problem, reference, Budget(30.0, 1))
+    wanted = measure_point(competitors(peers=False)["rk4"], setting, problem, reference, Budget(30.0, 1))
     assert wanted["failure"] == ""
     assert rows["right"]["error"] == pytest.approx(wanted["error"], rel=1e-5)
     assert [rows[name]["failure"] for name in versions] == ["", "contacts", "branch"]
@@ -99,7 +99,7 @@ def test_submitted_results_of_an_engine_equal_its_own_point(tmp_path: Path) -> N
 
 
 def at_rest(**keys: str) -> str:
-    times = problem_of("exact", PHASE, "").times
+    times = build_problem("exact", PHASE, "").times
     return make_results(times, np.zeros((len(times), len(ERROR_COLUMNS))), **keys)
 
 
@@ -204,7 +204,7 @@ def test_a_problem_file_contains_exactly_the_documented_fields(phase: str, tmp_p
         main(["chart", "--problem", phase, "-o", str(tmp_path)])
     assert end.value.code == 0
     document = json.loads((tmp_path / f"problem-{phase}.json").read_text(encoding="utf-8"))
-    problem = problem_of("exact", phase, "")
+    problem = build_problem("exact", phase, "")
     assert document["instants_s"] == problem.times.tolist()
     assert document["corners_s"] == list(problem.corners)
     assert list(document["initial_state"].values()) == problem.y0.tolist()

@@ -15,7 +15,7 @@ from replays.recordings.resimulation.experiment import Experiment
 from replays.recordings.resimulation.prediction import bare
 from rig.base.errors import InputError
 from rig.physics.accuracy import QUANTITIES
-from rig.physics.engine_choice import FINEST_TOLERANCE, SCALES, EngineChoice, Limits
+from rig.physics.engine_choice import MIN_LIMIT_TOLERANCE, SCALES, EngineChoice, Limits
 from rig.run.model_choice import Pick
 from rig.run.scenes import Scene, change_scene, load_scene, parse_scene, scene_document
 from rig.run.simulation import Simulation
@@ -44,8 +44,8 @@ def test_each_limit_is_of_a_quantity_of_the_estimate_in_its_unit() -> None:
         ({"radius_um": 50.0}, 3e-4),  # never coarser than the engine's own
         ({"frequency_hz": 1e-3, "spin_angle_deg": 100.0}, 1e-5),
         ({"angle_deg": 0.00573}, 1e-4),
-        ({"force_n": 1e-12}, FINEST_TOLERANCE),
-        ({"force_n": 1e-320}, FINEST_TOLERANCE),
+        ({"force_n": 1e-12}, MIN_LIMIT_TOLERANCE),
+        ({"force_n": 1e-320}, MIN_LIMIT_TOLERANCE),
     ],
 )
 def test_a_default_tolerance_is_the_smallest_limit_over_its_scale(changes: dict[str, float], chosen: float) -> None:
@@ -57,7 +57,7 @@ def test_a_default_tolerance_is_the_smallest_limit_over_its_scale(changes: dict[
 
 def test_an_engine_finer_than_the_finest_choice_keeps_its_own_tolerance() -> None:
     taylor = {"engine.name": "taylor", "engine.companion": True, "engine.limits.force_n": 1e-12}
-    assert tolerance(taylor) == EngineChoice(name="taylor").tolerance < FINEST_TOLERANCE
+    assert tolerance(taylor) == EngineChoice(name="taylor").tolerance < MIN_LIMIT_TOLERANCE
 
 
 def test_changed_limits_choose_a_new_tolerance_unless_it_was_given() -> None:
@@ -145,7 +145,7 @@ def test_a_stored_choice_without_a_companion_omits_the_limits() -> None:
     made = {**levels, "drive": "torque", "sensors": "full", "engine": "split", "step_us": 25, "engine_tolerance": 1e-3}
     for companion, kept in ((False, {}), (True, data["engine"]["limits"])):
         picked = Pick.model_construct(None, **made, companion=companion).apply(data)
-        assert parse_scene(picked).engine.limits.given() == kept
+        assert parse_scene(picked).engine.limits.as_dict() == kept
     assert "limits" in data["engine"]
 
 
@@ -168,7 +168,7 @@ def test_a_recording_keeps_its_limits_and_is_validated(capsys: pytest.CaptureFix
     assert {event["event"] for event in recording.events} >= {"hammer", "warning"}
     assert experiment.scene.engine.limits == Limits(radius_um=0.03, angle_deg=1e-9)
     reduced = bare(experiment).scene.engine
-    assert (reduced.limits.given(), reduced.companion, reduced.tolerance) == ({}, False, 3e-3)
+    assert (reduced.limits.as_dict(), reduced.companion, reduced.tolerance) == ({}, False, 3e-3)
     run_for_output(capsys, "export", path, "-o", table)
     run_for_output(capsys, "import", table, "--template", mapping)
     changes = tomllib.loads(mapping.read_text())["experiment"]["set"]

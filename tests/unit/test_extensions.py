@@ -17,6 +17,9 @@ WRONG = """
 split = my_engine:ROW
 wrong = my_engine.heun:ORDER
 gone = my_engine.missing:ROW
+quits = my_wrong.exits:ROW
+silent = my_wrong.mute:ROW
+homeless = my_wrong.methods:ROW
 [rig.formats]
 bad = my_engine:ROW
 exits = my_wrong.exits:ROW
@@ -36,6 +39,7 @@ MODULES = {
     "__init__": "",
     "exits": "import sys\nsys.exit('no licence')",
     "mute": "class Mute(Exception):\n    def __str__(self): raise ValueError\nraise Mute",
+    "methods": 'from rig.physics.engines import Method\nROW = Method("no module", 5, 0.0, ("none",))',
     "formats": """
 from replays.recordings.formats.source import Format
 NUMBER = Format("n", (".n",), 3)
@@ -93,6 +97,8 @@ print(list(ENGINES)[-1], ENGINES["split"].module or "ours")
 print(competitors(peers=False)["heun"].takes("exact"))
 print(line("wrong"))
 print(line("gone"))
+for name in ("quits", "silent", "homeless"):
+    print(line(name))
 print(source_digest())
 """
 IMPORT = """
@@ -158,11 +164,14 @@ def python(code: str, package: Path) -> list[str]:
 
 
 def test_an_external_engine_is_used_like_a_built_in_one(package: Path) -> None:
-    names, takes, wrong, missing, digest = python(QUESTION_PROGRAM, package)
+    names, takes, wrong, missing, quits, silent, homeless, digest = python(QUESTION_PROGRAM, package)
     assert names == "heun ours", "the rig's own engines keep their names"
     assert takes == "True"
-    assert "my_engine.heun:ORDER must be a rig.physics.engines.Method with a module" in wrong
+    assert "my_engine.heun:ORDER must be a rig.physics.engines.Method" in wrong
     assert "my_engine.missing:ROW cannot be loaded: ModuleNotFoundError" in missing
+    assert "my_wrong.exits:ROW cannot be loaded: SystemExit: no licence" in quits
+    assert "my_wrong.mute:ROW cannot be loaded: Mute" in silent
+    assert "homeless (its Method must name a module)" in homeless
     assert digest != source_digest(), "numba's cache must not serve code of another version of it"
     module = package / "my_engine/heun.py"
     module.write_text(module.read_text().replace("[0.5, 0.5]", "[0.4, 0.6]"))

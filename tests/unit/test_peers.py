@@ -96,10 +96,10 @@ def test_heyoka_has_the_same_equations(changes: dict, phase: int) -> None:
 
     given = replace(problem(0.03, changes=changes), phase=phase, onset_speed=0.1)
     parameters = pack(given)
-    kind = taylor.kind_of(given, phase, hit=True)._replace(exact=phase in (FORWARD, ROLLING))
+    kind = taylor.system_kind(given, phase, pulse_on=True)._replace(exact=phase in (FORWARD, ROLLING))
     variables, rates, _ = taylor.equations(kind)
     function = hy.cfunc(rates, vars=variables)
-    numbers = taylor.numbers_of(given)
+    numbers = taylor.parameter_values(given)
     values = np.array([numbers[name] for name in taylor.PARAMETERS])[: function.nparams]
     ideal = given.inputs.ideal_drive
     for y in states_in_contact(given, count=4):
@@ -119,10 +119,10 @@ def test_diffrax_has_the_equations_of_heyoka(phase: int) -> None:
     from replays.studies.peers.diffrax_solver import evaluate
 
     given = replace(problem(0.03), phase=phase, onset_speed=0.1)
-    kind = taylor.kind_of(given, phase, hit=True)._replace(exact=True)
+    kind = taylor.system_kind(given, phase, pulse_on=True)._replace(exact=True)
     variables, rates, _ = taylor.equations(kind)
     function = hy.cfunc(rates, vars=variables)
-    numbers = taylor.numbers_of(given)
+    numbers = taylor.parameter_values(given)
     values = np.array([numbers[name] for name in taylor.PARAMETERS])
     for y in states_in_contact(given, count=2):
         scaled = taylor.to_series(y, ideal_drive=False)

@@ -18,7 +18,7 @@ from rig.channels.faults.defects import DEFECTS
 from rig.channels.faults.kind import Setting
 from rig.channels.sensors.conditioning import Conditioner
 from rig.channels.table import default_table
-from rig.physics.kernels.observe import EDGE, KEYPHASOR_WIDTH
+from rig.physics.kernels.observe import EDGE_WIDTH, KEYPHASOR_WIDTH
 from rig.physics.kernels.signals import COLUMN, N_ROW
 from rig.run.commands.table import FaultCommand
 from rig.run.fault_injection import Faulty
@@ -45,7 +45,9 @@ class Rig:
         angle = self.rows[:, COLUMN["theta"]] = 2.0 * np.pi * TURN_HZ * t
         self.rows[:, COLUMN["theta_rate"]] = 2.0 * np.pi * TURN_HZ
         ahead = (angle + np.pi) % (2.0 * np.pi) - np.pi
-        self.rows[:, COLUMN["keyphasor"]] = np.clip(0.5 + np.minimum(ahead, KEYPHASOR_WIDTH - ahead) / EDGE, 0.0, 1.0)
+        self.rows[:, COLUMN["keyphasor"]] = np.clip(
+            0.5 + np.minimum(ahead, KEYPHASOR_WIDTH - ahead) / EDGE_WIDTH, 0.0, 1.0
+        )
         tones = [c for group in GROUPS for c in group.channels if c.name != "keyphasor"]
         self.made = np.column_stack([
             Tones(n, c.si / abs(c.sensitivity_v), high_hz=2500.0, tones=80)(t) for n, c in enumerate(tones)

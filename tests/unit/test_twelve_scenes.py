@@ -15,7 +15,7 @@ from replays.studies.chart.drawing.scene_panel import Ratio, compare
 from replays.studies.chart.measure import Budget
 from replays.studies.chart.methods import competitors
 from replays.studies.chart.phases import SCENE_TARGETS, scene_problem
-from replays.studies.chart.profile import cheapest
+from replays.studies.chart.profile import find_cheapest
 from replays.studies.chart.session import make_chart
 from replays.studies.chart.store import COLUMNS, KEY, read_table
 from replays.studies.common.run import Course
@@ -130,12 +130,16 @@ def test_a_method_walks_to_each_target() -> None:
     assert reference is not None
     found, start = [], ""
     for target in SCENE_TARGETS:
-        found.append(cheapest(competitors(peers=False)["tsit5"], problem, reference, Budget(30.0, 1), target, start))
+        found.append(
+            find_cheapest(competitors(peers=False)["tsit5"], problem, reference, Budget(30.0, 1), target, start)
+        )
         start = found[-1]["rung"]
         assert found[-1]["failure"] == ""
         assert found[-1]["error"] <= target
     assert found[1]["tolerance"] < found[0]["tolerance"]
-    from_the_first = cheapest(competitors(peers=False)["tsit5"], problem, reference, Budget(30.0, 1), SCENE_TARGETS[1])
+    from_the_first = find_cheapest(
+        competitors(peers=False)["tsit5"], problem, reference, Budget(30.0, 1), SCENE_TARGETS[1]
+    )
     assert from_the_first["rung"] == start
 
 

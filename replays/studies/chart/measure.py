@@ -1,4 +1,4 @@
-"""One point of a chart: a method at one setting on one problem, timed and held against the reference."""
+"""One point of a chart: a method with one setting on one problem, timed and compared with the reference."""
 
 from __future__ import annotations
 
@@ -22,44 +22,44 @@ from rig.physics.kernels.laws.contact import normal_force
 from rig.physics.kernels.signals import N_ROW, N_STATE
 from rig.run.motion import energy_balance
 
-OFF = 0.5
-"""Scaled error from which a run is on another branch: as far from the reference as the motion is large."""
-_SLACK, _SLACK_SHARE = 2, 0.2
-"""A contact count may be off by this many, or this share, before it is called wrong."""
-_ENOUGH_S = 0.12
-"""Short runs are repeated until they have taken this long together [s] ..."""
-_MOST = 25
-"""... or so often."""
+BRANCH_ERROR = 0.5
+"""Scaled error from which a run follows another branch of the motion: the error is as large as the motion."""
+_CONTACT_TOLERANCE, _CONTACT_TOLERANCE_SHARE = 2, 0.2
+"""Permitted error of a contact count: this number, or this share if larger."""
+_MIN_TIMED_S = 0.12
+"""Minimum total time of repeated short runs [s]."""
+_MAX_REPEATS = 25
+"""Largest number of repeated runs."""
 
 
 class Budget(NamedTuple):
-    """What a point may cost."""
+    """Time limits of a point."""
 
     solve_s: float
     """Wall time of one run [s]."""
     runs: int = 3
     single_s: float = np.inf
-    """A run longer than this [s] is not repeated."""
+    """Run time [s] above which a run is not repeated."""
 
 
 @dataclass
 class Run:
-    """What a method made of a problem."""
+    """Result of a method on a problem."""
 
     solution: Solution
-    """Of an engine of ours each contact began, to a frame, at an unknown speed."""
+    """Solution; its contacts of our engines are timed by frames and have no impact speed."""
     costs: list[float]
-    """Processor time of each run [s]: other load on the machine does not count."""
+    """Processor time of each run [s]; other load on the machine does not count."""
     reached_s: float
-    """Simulated time that was got through [s]."""
+    """Simulated time at the end [s]."""
     own_costs: list[float] = field(default_factory=list)
-    """Of the same runs, processor time inside the library's own calls [s], where a Python loop drives it."""
+    """Processor time inside the library's own calls in the same runs [s], where a Python loop calls it."""
     energy_residual: float | None = None
     worst_frame_s: float | None = None
 
     @property
     def failure(self) -> str:
-        """Kind: "", nan, hammer, budget or error."""
+        """Kind of failure: "", nan, hammer, budget or error."""
         words = self.solution.failure or ""
         kinds = {
             "": not words,
@@ -71,11 +71,11 @@ class Run:
 
 
 def run_engine(name: str, setting: Setting, problem: Problem, budget: Budget) -> Run:
-    """Run an engine of ours: first frame by frame, then in one go for the clock."""
+    """Run one of our engines: frame by frame, then in single calls for timing."""
     times = problem.times
     frame_ticks = round((times[1] - times[0]) / problem.inputs.tick_s)
     if frame_ticks % setting.step_us:
-        raise ValueError(f"frames of {frame_ticks} us are no whole number of steps of {setting.step_us} us")
+        raise ValueError(f"frames must be multiples of {setting.step_us} us; received {frame_ticks} us")
     stride, n = frame_ticks // setting.step_us, len(times) - 1
 
     def begin() -> Course:
@@ -87,45 +87,45 @@ def run_engine(name: str, setting: Setting, problem: Problem, budget: Budget) ->
     clock = time.perf_counter()
     begin().advance(1, 1, rows[:1])
     compile_s = time.perf_counter() - clock
-    frames = _by_frame(begin, rows, stride, budget)
+    frames = _time_frames(begin, rows, stride, budget)
     solution = Solution(times, budget.solve_s, compile_s, failure=frames.failure or None)
     solution.states[:] = rows[:, :N_STATE]
     solution.steps, solution.evaluations = (int(frames.course.memory[name]) for name in (STEPS, EVALUATIONS))
     began = np.repeat(times, np.diff(frames.counts, prepend=0.0).clip(0).astype(int))
     solution.onsets = [(time_s, np.nan) for time_s in began.tolist()]
-    done = Run(solution, [frames.cpu_s], float(times[frames.reached]))
-    if not done.failure:
-        done.costs = _in_one_go(begin, n, stride, budget)
+    run = Run(solution, [frames.cpu_s], float(times[frames.reached]))
+    if not run.failure:
+        run.costs = _time_whole_runs(begin, n, stride, budget)
     if solution.close().failure is None:
         balance = energy_balance(rows, rows[0])
-        done.energy_residual = float(np.max(np.abs(balance["residual"])) / max(float(balance["dissipated"][-1]), 1e-6))
-        done.worst_frame_s = float(frames.best_s.max())
-    return done
+        run.energy_residual = float(np.max(np.abs(balance["residual"])) / max(float(balance["dissipated"][-1]), 1e-6))
+        run.worst_frame_s = float(frames.best_s.max())
+    return run
 
 
 class _Frames(NamedTuple):
-    """The window frame by frame, the last time that it was gone through."""
+    """Last run of the window frame by frame."""
 
     course: Course
     counts: np.ndarray
-    """Contacts begun up to each instant, shape (n + 1,)."""
+    """Number of contacts up to each instant, shape (n + 1,)."""
     best_s: np.ndarray
-    """Least wall time of each frame [s], shape (n,)."""
+    """Minimum wall time of each frame [s], shape (n,)."""
     cpu_s: float
     """Processor time [s]."""
     reached: int
-    """Frames that were got through."""
+    """Number of completed frames."""
     failure: str
 
 
-def _by_frame(begin: Callable[[], Course], rows: np.ndarray, stride: int, budget: Budget) -> _Frames:
-    """Go through the window frame by frame, several times where that is quick.
+def _time_frames(begin: Callable[[], Course], rows: np.ndarray, stride: int, budget: Budget) -> _Frames:
+    """Run the window frame by frame, repeatedly if that is quick.
 
     Args:
-        begin: Starts anew.
-        rows: Filled with a row an instant, nan from where time was over, shape (n + 1, N_ROW).
-        stride: Steps a frame.
-        budget: What it may cost.
+        begin: Return a new course.
+        rows: Out, one row per instant, nan after the time limit, shape (n + 1, N_ROW).
+        stride: Steps per frame.
+        budget: Time limits.
     """
     n = len(rows) - 1
     spent, counts, best = np.empty(n), np.zeros(n + 1), np.full(n, np.inf)
@@ -151,10 +151,10 @@ def _by_frame(begin: Callable[[], Course], rows: np.ndarray, stride: int, budget
     return _Frames(course, counts, best, cpu_s, n, "")
 
 
-def _in_one_go(begin: Callable[[], Course], frames: int, stride: int, budget: Budget) -> list[float]:
-    """Processor time of the whole window in one call [s], as often as a short one needs."""
+def _time_whole_runs(begin: Callable[[], Course], frames: int, stride: int, budget: Budget) -> list[float]:
+    """Return the processor time of the whole window in one call [s], repeated for short windows."""
     whole, costs = np.empty((frames, N_ROW)), []
-    while len(costs) < budget.runs or (sum(costs) < _ENOUGH_S and len(costs) < _MOST):
+    while len(costs) < budget.runs or (sum(costs) < _MIN_TIMED_S and len(costs) < _MAX_REPEATS):
         clock = time.thread_time()
         begin().advance(frames * stride, stride, whole)
         costs.append(time.thread_time() - clock)
@@ -164,7 +164,7 @@ def _in_one_go(begin: Callable[[], Course], frames: int, stride: int, budget: Bu
 
 
 def run_peer(name: str, setting: Setting, problem: Problem, budget: Budget) -> Run:
-    """Run a peer; the first run counts only where it is long, as it may load what the others find loaded."""
+    """Run a peer; a short first run does not count, as it may load libraries."""
     costs: list[float] = []
     own_costs: list[float] = []
     solution: Solution | None = None
@@ -183,29 +183,29 @@ def run_peer(name: str, setting: Setting, problem: Problem, budget: Budget) -> R
     return Run(solution, costs, float(problem.times[max(reached - 1, 0)]), own_costs)
 
 
-def run(contender: Competitor, setting: Setting, problem: Problem, budget: Budget) -> Run:
+def run_method(contender: Competitor, setting: Setting, problem: Problem, budget: Budget) -> Run:
     """Run a method."""
     return (run_engine if contender.ours else run_peer)(contender.name, setting, problem, budget)
 
 
-def point(
+def measure_point(
     contender: Competitor, setting: Setting, problem: Problem, reference: Reference, budget: Budget
 ) -> dict[str, Any]:
-    """Measure a point with a pointwise error, as columns of the store."""
-    done = run(contender, setting, problem, budget)
-    contacts, wanted = done.solution.contacts, reference.solution.contacts
-    error = scaled_error(done.solution.states, reference.solution.states) if not done.failure else None
-    failure, message = done.failure, done.solution.failure or ""
-    if error is not None and error > OFF:
+    """Measure a point with its error against the reference, as columns of the store."""
+    run = run_method(contender, setting, problem, budget)
+    contacts, expected = run.solution.contacts, reference.solution.contacts
+    error = scaled_error(run.solution.states, reference.solution.states) if not run.failure else None
+    failure, message = run.failure, run.solution.failure or ""
+    if error is not None and error > BRANCH_ERROR:
         failure, message = "branch", f"scaled error {error:.2g}: another branch of the motion"
-    elif error is not None and abs(contacts - wanted) > max(_SLACK, _SLACK_SHARE * wanted):
-        failure, message = "contacts", f"{contacts} contacts instead of {wanted}"
+    elif error is not None and abs(contacts - expected) > max(_CONTACT_TOLERANCE, _CONTACT_TOLERANCE_SHARE * expected):
+        failure, message = "contacts", f"{contacts} contacts instead of {expected}"
     return {
-        **_cost(done, problem),
+        **_cost(run, problem),
         "error": error,
         "reference": " / ".join(reference.names) + ("" if reference.independent else " (one right-hand side)"),
         "reference_error": reference.error,
-        "contacts_reference": wanted,
+        "contacts_reference": expected,
         "failure": failure,
         "message": message,
     }
@@ -214,27 +214,31 @@ def point(
 STATISTICS = ("contact_fraction", "rms_force", "impacts_per_s")
 
 
-def statistics_point(
+def measure_statistics(
     contender: Competitor, setting: Setting, problem: Problem, budget: Budget, *, settle_s: float = 1.0
 ) -> dict[str, Any]:
-    """Measure a point of chaotic motion: means over blocks of time, with 95 % bootstrap bars."""
-    done = run(contender, setting, problem, budget)
-    columns: dict[str, Any] = {**_cost(done, problem), "failure": done.failure, "message": done.solution.failure or ""}
-    if done.failure:
+    """Measure a point of chaotic motion: means over blocks of time, with 95 % bootstrap intervals."""
+    run = run_method(contender, setting, problem, budget)
+    columns: dict[str, Any] = {
+        **_cost(run, problem),
+        "failure": run.failure,
+        "message": run.solution.failure or "",
+    }
+    if run.failure:
         return columns
-    force = elastic_forces(problem, done.solution.states)
-    onsets = np.array([time_s for time_s, _ in done.solution.onsets])
+    force = elastic_forces(problem, run.solution.states)
+    onsets = np.array([time_s for time_s, _ in run.solution.onsets])
     for name, (mean, low, high) in block_statistics(problem.times, force, onsets, settle_s=settle_s).items():
         columns |= {name: mean, f"{name}_low": low, f"{name}_high": high}
     return columns
 
 
 def elastic_forces(problem: Problem, states: np.ndarray) -> np.ndarray:
-    """Elastic part of the normal force [N], shape (n,): the part that a state alone tells, the same for every method.
+    """Return the elastic part of the normal force [N], shape (n,), which depends on the state alone.
 
     Args:
-        problem: The problem.
-        states: Shape (n, 14).
+        problem: Problem.
+        states: States, shape (n, 14).
     """
     contact = problem.constants.contact
     forces = np.zeros(len(states))
@@ -248,20 +252,20 @@ def elastic_forces(problem: Problem, states: np.ndarray) -> np.ndarray:
 def block_statistics(
     times: np.ndarray, force: np.ndarray, onsets: np.ndarray, *, settle_s: float, block_s: float = 0.5, draws: int = 400
 ) -> dict[str, tuple[float, float, float]]:
-    """Contact fraction, RMS force [N] and impacts a second: mean and 95 % interval, by a bootstrap over blocks.
+    """Return mean and 95 % interval of contact fraction, RMS force [N] and impacts per second, by a block bootstrap.
 
     Args:
-        times: Shape (n,) [s].
-        force: Normal force, shape (n,) [N].
+        times: Instants [s], shape (n,).
+        force: Normal force [N], shape (n,).
         onsets: Times of impact [s].
-        settle_s: Left out at the start [s].
-        block_s: Length of a block [s], long against the memory of the motion.
-        draws: Bootstrap samples.
+        settle_s: Excluded time at the start [s].
+        block_s: Length of a block [s], long compared with the memory of the motion.
+        draws: Number of bootstrap samples.
     """
     edges = np.arange(settle_s, times[-1] + 1e-9, block_s)
     n = len(edges) - 1
     if n < 2:
-        raise ValueError("statistics need two blocks of time")
+        raise ValueError("statistics need at least two blocks of time")
     which = np.searchsorted(edges, times, side="right") - 1
     inside = (which >= 0) & (which < n)
     size = np.bincount(which[inside], minlength=n)
@@ -283,23 +287,23 @@ def block_statistics(
     }
 
 
-def _cost(done: Run, problem: Problem) -> dict[str, Any]:
-    costs = done.costs or [np.nan]
+def _cost(run: Run, problem: Problem) -> dict[str, Any]:
+    costs = run.costs or [np.nan]
     cost = statistics.median(costs)
     return {
         "simulated_s": problem.duration_s,
-        "runs": len(done.costs),
+        "runs": len(run.costs),
         "cpu_s": cost,
         "cpu_min_s": min(costs),
         "cpu_max_s": max(costs),
-        "speed": done.reached_s / cost,
-        "speed_min": done.reached_s / max(costs),
-        "speed_max": done.reached_s / min(costs),
-        "compile_s": done.solution.compile_s,
-        "own_cpu_s": statistics.median(done.own_costs) if done.own_costs else None,
-        "steps": done.solution.steps,
-        "evaluations": done.solution.evaluations,
-        "contacts": done.solution.contacts,
-        "energy_residual": done.energy_residual,
-        "worst_frame_ms": None if done.worst_frame_s is None else done.worst_frame_s * 1e3,
+        "speed": run.reached_s / cost,
+        "speed_min": run.reached_s / max(costs),
+        "speed_max": run.reached_s / min(costs),
+        "compile_s": run.solution.compile_s,
+        "own_cpu_s": statistics.median(run.own_costs) if run.own_costs else None,
+        "steps": run.solution.steps,
+        "evaluations": run.solution.evaluations,
+        "contacts": run.solution.contacts,
+        "energy_residual": run.energy_residual,
+        "worst_frame_ms": None if run.worst_frame_s is None else run.worst_frame_s * 1e3,
     }

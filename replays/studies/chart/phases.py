@@ -1,4 +1,4 @@
-"""What is compared: windows of scenes, contact laws, and the list of points that make a chart."""
+"""Scope of a chart: windows of scenes, contact laws, and the list of points."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from rig.run.scenes import load_scene, parse_scene
 
 Mode = Literal["quick", "full"]
 FRAME_S = 1e-3
-"""Instants at which states are compared, and the frame that is timed [s]."""
+"""Interval of compared states, and length of a timed frame [s]."""
 SMOOTHING = 5e-3
 """v_s of the smoothed law [m/s]."""
 SMOOTHED_SPEEDS = (5e-3, 5e-4, 1e-4)
-"""v_s whose distance from exact Coulomb is drawn [m/s]."""
+"""v_s whose deviation from exact Coulomb friction is drawn [m/s]."""
 RUB = "rub"
 
 
 @dataclass(frozen=True)
 class Phase:
-    """One window of a scene, from its start."""
+    """Window of a scene from its start."""
 
     name: str
     title: str
@@ -46,9 +46,9 @@ _ALL = (
 )  # fmt: skip
 PHASES = {phase.name: phase for phase in _ALL}
 RUB_SAMPLE_S = 5e-4
-"""Instants that its statistics are taken at [s]."""
+"""Sample interval of the rub's statistics [s]."""
 RUB_SPEED_HZ = 12.0
-"""With these changes two runs that begin 5e-10 rad apart are fully apart after 0.4 s, and stay so."""
+"""Speed of the rub [Hz]: two runs that start 5e-10 rad apart have lost all similarity after 0.4 s."""
 
 PANELS = {
     "exact": "total error against exact Coulomb friction",
@@ -69,14 +69,14 @@ _PANEL_PHASES = {
 }
 MEMORY_CASES = ("memory", "no memory")
 SCENE_TARGETS = (1e-2, 1e-4)
-"""Scaled errors to be reached in the twelve scenes, the largest first."""
+"""Target errors for the twelve scenes, scaled, the largest first."""
 
 
 @dataclass(frozen=True)
 class Task:
-    """One point to measure.
+    """Point to measure.
 
-    `case` tells apart laws within a panel: "" for the panel's own, "smoothed" for a smoothed law measured against
+    `case` distinguishes laws within a panel: "" for the panel's own, "smoothed" for a smoothed law measured against
     exact Coulomb, one of `MEMORY_CASES`, or "floor" and "reference", which no method runs.
     """
 
@@ -89,10 +89,10 @@ class Task:
 
 
 def select(only: str | None, panels: list[str] | None) -> tuple[list[str], str | None]:
-    """Check a choice of phase and panels.
+    """Check a selection of phase and panels.
 
     Raises:
-        InputError: No such phase or panel, or none that has both.
+        InputError: Unknown phase or panel, or no selected panel has the phase.
     """
     if only is not None and only not in PHASES:
         raise InputError("only", f"one of {', '.join(PHASES)}", only)
@@ -107,8 +107,10 @@ def select(only: str | None, panels: list[str] | None) -> tuple[list[str], str |
     return chosen, only
 
 
-def plan(contenders: dict[str, Competitor], *, mode: Mode, panels: list[str], only: str | None = None) -> list[Task]:
-    """Points of a chart, without the profile's and the twelve scenes', those that tell most for their time first."""
+def plan_points(
+    contenders: dict[str, Competitor], *, mode: Mode, panels: list[str], only: str | None = None
+) -> list[Task]:
+    """Return the points of a chart except those of the profile and the twelve scenes, the most informative first."""
     tasks: list[tuple[int, Task]] = []
     for panel in panels:
         for turn, phase in enumerate(_PANEL_PHASES[panel]):
@@ -124,7 +126,7 @@ def plan(contenders: dict[str, Competitor], *, mode: Mode, panels: list[str], on
 
 
 def _points(contender: Competitor, panel: str, phase: str, case: str, turn: int, mode: Mode) -> list[tuple[int, Task]]:
-    friction = friction_of(panel, case)
+    friction = friction_law(panel, case)
     if not contender.takes(friction):
         return []
     if case == "smoothed" and (contender.name != "tsit5" or phase not in ("whirl", "transient")):
@@ -143,17 +145,17 @@ def _points(contender: Competitor, panel: str, phase: str, case: str, turn: int,
     return [(rank, Task(panel, phase, case, contender.name, setting)) for setting in settings]
 
 
-def friction_of(panel: str, case: str) -> Literal["none", "smoothed", "exact"]:
-    """Friction law of a panel's case."""
+def friction_law(panel: str, case: str) -> Literal["none", "smoothed", "exact"]:
+    """Return the friction law of a panel's case."""
     if panel == "memory":
         return "none"
     return "smoothed" if panel == "smoothed" or case == "smoothed" else "exact"
 
 
-def problem_of(
+def build_problem(
     panel: str, phase: str, case: str, *, smoothing_speed: float = SMOOTHING, end_s: float | None = None
 ) -> Problem:
-    """The window that a point is measured on."""
+    """Return the window on which a point is measured."""
     window = PHASES[phase]
     end = window.end_s if end_s is None else end_s
     changes = dict(window.changes)
@@ -169,7 +171,7 @@ def problem_of(
         scene,
         end_s=end,
         sample_s=FRAME_S if panel != RUB else RUB_SAMPLE_S,
-        friction=friction_of(panel, case),
+        friction=friction_law(panel, case),
         smoothing_speed=smoothing_speed,
         **{"damping_factor": 0.0} if case == "no memory" else {},
     )
@@ -180,7 +182,7 @@ def scene_problem(name: str, *, end_s: float | None = None) -> Problem:
 
     Args:
         name: Name of the scene.
-        end_s: Earlier end of the window [s]; None for its own.
+        end_s: Earlier end of the window [s]; None for the scene's own.
     """
     study = TWELVE_SCENES[name]
     end_s = study.window_s if end_s is None else min(end_s, study.window_s)

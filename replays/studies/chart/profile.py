@@ -1,6 +1,6 @@
-"""Performance profile: over many random scenes, how often a method is how much more expensive than the best of them.
+"""Performance profile over many random scenes: share of scenes solved within a cost ratio to the best method.
 
-After Dolan and More, Math. Program. 91 (2002) 201: the share of scenes that a method solves, to the error asked for,
+After Dolan and More, Math. Program. 91 (2002) 201: the share of scenes that a method solves, with the target error,
 within a factor tau of the cheapest method.
 """
 
@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from replays.studies.chart.measure import Budget, point
+from replays.studies.chart.measure import Budget, measure_point
 from replays.studies.chart.methods import Competitor
 from replays.studies.chart.phases import FRAME_S
 from replays.studies.peers.common.problem import Problem
@@ -20,15 +20,15 @@ from replays.studies.peers.common.window import cut_window
 from rig.run.scenes import Scene, parse_scene
 
 TARGET = 1e-3
-"""Scaled error to be reached."""
+"""Target error, scaled."""
 SCENES = {"quick": 12, "full": 100}
 DURATION_S = 0.15
-SHARP = 0.1
-"""A scene counts only where its reference is this much sharper than the target."""
+MAX_REFERENCE_ERROR_RATIO = 0.1
+"""Largest reference error over the target error of a scene that counts."""
 
 
 def draw_scene(seed: int) -> Scene:
-    """A random scene: a hammer pulse at 5 ms, on a rotor and a contact that differ from draw to draw."""
+    """Return a random scene: a hammer pulse at 5 ms, with random speed, friction and restitution."""
     rng = np.random.default_rng([2013, seed])
     return parse_scene(
         {
@@ -53,11 +53,11 @@ def draw_scene(seed: int) -> Scene:
 
 
 def draw_problem(seed: int) -> Problem:
-    """Its window, with exact Coulomb friction."""
+    """Return the window of a random scene, with exact Coulomb friction."""
     return cut_window(draw_scene(seed), sample_s=FRAME_S, friction="exact")
 
 
-def cheapest(
+def find_cheapest(
     contender: Competitor,
     problem: Problem,
     reference: Reference | None,
@@ -65,48 +65,48 @@ def cheapest(
     target: float,
     start: str = "",
 ) -> dict[str, Any]:
-    """Walk down a method's ladder until the target is reached.
+    """Return the cheapest setting of a method's ladder that reaches the target.
 
     Args:
-        contender: The method.
-        problem: The problem.
-        reference: Its reference, or None where there is none.
-        budget: Budget of each run.
-        target: Scaled error to be reached.
-        start: Label of the setting to begin at, such as the cheapest within a larger target; empty for the first.
+        contender: Method.
+        problem: Problem.
+        reference: Reference, or None if there is none.
+        budget: Time limits of each run.
+        target: Target error, scaled.
+        start: Label of the first setting, such as the cheapest for a larger target; empty for the coarsest.
 
     Returns:
-        Columns of that setting's point. Where no setting reaches the target, of the last one tried, with failure
-        "target"; failure "law" where the method cannot run the friction law, and "reference" where the reference is
-        not sharp enough, as in chaotic motion: such a problem counts for nobody.
+        Columns of that setting's point. If no setting reaches the target, the columns of the last one, with failure
+        "target"; failure "law" if the method does not support the friction law, and "reference" if the reference is not
+        accurate enough, as in chaotic motion: such a problem counts for no method.
     """
     friction = "exact" if problem.exact_friction else "smoothed"
     columns: dict[str, Any] = {"friction": friction, "reference_error": reference.error if reference else None}
     if not contender.takes(friction):
         return columns | {"failure": "law", "message": f"cannot run {friction} friction"}
-    if reference is None or reference.error > SHARP * target:
+    if reference is None or reference.error > MAX_REFERENCE_ERROR_RATIO * target:
         return columns | {"failure": "reference", "message": "no reference sharp enough: chaotic motion"}
     for setting in dropwhile(lambda setting: start and setting.label != start, contender.settings):
-        columns |= point(contender, setting, problem, reference, budget._replace(runs=1, single_s=0.0))
+        columns |= measure_point(contender, setting, problem, reference, budget._replace(runs=1, single_s=0.0))
         columns |= {"rung": setting.label, "step_us": setting.step_us, "tolerance": setting.tolerance}
         error = columns["error"]
         if error is not None and error <= target and not columns["failure"]:
-            return columns | point(contender, setting, problem, reference, budget)
+            return columns | measure_point(contender, setting, problem, reference, budget)
         if columns["failure"] == "budget":
             return columns
     return columns | {"failure": columns["failure"] or "target"}
 
 
-def shares(rows: list[dict[str, Any]], column: str = "cpu_s") -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Curves of the profile.
+def profile_curves(rows: list[dict[str, Any]], column: str = "cpu_s") -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Return the curves of the profile.
 
     Args:
-        rows: Points of the profile, one a scene and method.
-        column: Column that a method's cost is read from; methods without it are left out. The best's is its `cpu_s`.
+        rows: Points of the profile, one per scene and method.
+        column: Cost column; methods without it are excluded. The best cost is always from `cpu_s`.
 
     Returns:
-        By method: cost ratios to the best, ascending, shape (n,), and the share of all scenes solved within each,
-        shape (n,); a method that solves none has empty ones.
+        By method: cost ratios to the best, ascending, shape (n,), and the share of all scenes solved within each ratio,
+            shape (n,); both are empty for a method that solves none.
     """
     scenes = sorted({row["phase"] for row in rows})
     cost = {(row["phase"], row["method"]): row["cpu_s"] for row in rows if not row["failure"]}

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from replays.studies.chart import profile
-from replays.studies.chart.measure import Budget, point, run_engine, statistics_point
+from replays.studies.chart.measure import Budget, measure_point, measure_statistics, run_engine
 from replays.studies.chart.methods import RIG_FAMILY, Competitor, competitors, missing_peers
 from replays.studies.chart.phases import (
     PANELS,
@@ -21,9 +21,9 @@ from replays.studies.chart.phases import (
     SMOOTHING,
     Mode,
     Task,
-    friction_of,
-    plan,
-    problem_of,
+    build_problem,
+    friction_law,
+    plan_points,
     scene_problem,
     select,
 )
@@ -221,7 +221,7 @@ class _Work:
         if key not in self.problems:
             end = _RUB_S[self.mode] if phase == RUB else PHASES[phase].end_s
             end = end if self.end_s is None else min(end, self.end_s)
-            self.problems[key] = problem_of(panel, phase, case, smoothing_speed=smoothing_speed, end_s=end)
+            self.problems[key] = build_problem(panel, phase, case, smoothing_speed=smoothing_speed, end_s=end)
         return self.problems[key]
 
     def reference(self, panel: str, phase: str, case: str) -> Reference | None:
@@ -260,7 +260,7 @@ class _Work:
 
 
 def _measure(work: _Work, panels: list[str], only: str | None, outcome: Outcome, progress: Progress) -> None:
-    tasks = plan(work.contenders, mode=work.mode, panels=panels, only=only)
+    tasks = plan_points(work.contenders, mode=work.mode, panels=panels, only=only)
     walks = {} if only else {panel: len(walk[0]) for panel, walk in _walks(work).items() if panel in panels}
     windows = {(task.panel, task.phase, task.case) for task in tasks if task.panel != RUB}
     progress.begin(len(tasks) + len(windows) + sum(walks.values()))
@@ -320,19 +320,19 @@ def _point(work: _Work, task: Task, outcome: Outcome, progress: Progress, deadli
         outcome.left += 1
         return
     budget = BUDGETS[work.mode]
-    row["friction"] = friction_of(task.panel, task.case)
+    row["friction"] = friction_law(task.panel, task.case)
     row["smoothing_speed"] = task.smoothing_speed if row["friction"] == "smoothed" else None
     problem = work.problem(task.panel, task.phase, task.case, task.smoothing_speed)
     if task.panel == RUB:
         budget = budget._replace(solve_s=_RUB_BUDGET_S[work.mode])
         settle = min(1.0, 0.25 * problem.duration_s)
-        columns = statistics_point(contender, task.setting, problem, budget, settle_s=settle)
+        columns = measure_statistics(contender, task.setting, problem, budget, settle_s=settle)
     else:
         reference = work.reference(task.panel, task.phase, task.case)
         if reference is None:
             outcome.left += 1
             return
-        columns = point(contender, task.setting, problem, reference, budget)
+        columns = measure_point(contender, task.setting, problem, reference, budget)
     work.keep(row, columns)
     outcome.measured += 1
 
@@ -369,7 +369,7 @@ def _walk_ladders(work: _Work, panel: str, outcome: Outcome, progress: Progress,
         problem = make()
         reference, reached = work.solve(problem), dict[str, str]()
         for one, case, row in waiting:
-            columns = profile.cheapest(one, problem, reference, budget, cases[case], reached.get(one.name, ""))
+            columns = profile.find_cheapest(one, problem, reference, budget, cases[case], reached.get(one.name, ""))
             reached[one.name] = columns.get("rung", "")
             message = columns.get("message") or f"cheapest setting {columns.get('rung', '')}"
             work.keep(row, {**columns, "rung": "cheapest", "message": message})

@@ -14,9 +14,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from replays.studies.chart.measure import Budget, point
+from replays.studies.chart.measure import Budget, measure_point
 from replays.studies.chart.methods import ADDED_FAMILY, Competitor
-from replays.studies.chart.phases import PHASES, RUB, problem_of
+from replays.studies.chart.phases import PHASES, RUB, build_problem
 from replays.studies.common.journal import prepare_folder
 from replays.studies.peers import PEERS, Library, Peer, Setting
 from replays.studies.peers.common.problem import ERROR_COLUMNS, Problem
@@ -96,7 +96,7 @@ class Submission(NamedTuple):
         name, settings = self.contender.name, self.contender.settings
         PEERS[name] = _RecordedPeer(name, name, Library(ADDED_FAMILY, ""), settings, {"solution": self.solution})
         try:
-            return point(self.contender, settings[0], self.problem, reference, Budget(np.inf, 1))
+            return measure_point(self.contender, settings[0], self.problem, reference, Budget(np.inf, 1))
         finally:
             del PEERS[name]
 
@@ -153,7 +153,7 @@ def read_submission(path: Path) -> Submission:
 def _exact_problem(phase: str) -> Problem:
     if phase not in _PHASES:
         raise UnknownNameError("phase", f"one of {', '.join(_PHASES)}", phase, _PHASES)
-    return problem_of(PANEL, phase, "")
+    return build_problem(PANEL, phase, "")
 
 
 def _number(key: str, texts: dict[str, str], least: float, most: float, place: str = "") -> float:

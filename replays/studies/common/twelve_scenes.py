@@ -1,8 +1,8 @@
-"""Twelve scenes that speed and accuracy are compared on, so that no engine is tuned to one.
+"""Twelve scenes for comparisons of speed and accuracy, so that no engine is tuned to one scene.
 
-Each is a scene of the rig with changes, and a window from its start in which a pointwise reference exists: where the
-motion is chaotic, the window ends before runs of neighbouring states part. A test checks that each scene shows what its
-row states. Nothing here runs an engine.
+Each is a scene of the rig with changes, and a window from its start with a pointwise reference: in chaotic motion, the
+window ends before neighbouring runs diverge. A test checks the motion described in each row. This module runs no
+engine.
 """
 
 from __future__ import annotations
@@ -15,20 +15,20 @@ _HAMMER_300_N = {"at_s": 0.02, "command": "hammer", "force_n": 300.0, "duration_
 
 
 class StudyScene(NamedTuple):
-    """One scene and its window."""
+    """Scene and its window."""
 
     name: str
     """Name in tables."""
     title: str
     """Name in a figure."""
     scene: str
-    """Scene of the rig that it starts from."""
+    """Built-in scene that is changed."""
     window_s: float
     """End of the window [s]."""
     shows: str
     """Motion in the window."""
     changes: dict[str, Any]
-    """Changes of the scene and its parameters by dotted key, as `rig.run.scenes.load_scene` takes them."""
+    """Changes by dotted key, as `rig.run.scenes.load_scene` takes them."""
 
     def load(self) -> Scene:
         """Return the scene with its changes."""

@@ -1,13 +1,13 @@
-"""SUNDIALS CVODE (BDF and Adams), from the shared library that scikit-sundae brings.
+"""SUNDIALS CVODE (BDF and Adams), from the shared library of scikit-sundae.
 
-Compiled: the library is driven through its C interface by a loop that is compiled as well, with the right-hand side
-and the switching functions as C functions; no Python between start and end but for a look at the clock. As installed:
-scikit-sundae's own interface with plain Python callbacks.
+Compiled: a compiled loop calls the library through its C interface, with right-hand side and switching functions as C
+functions; Python only checks the clock now and then. As installed: scikit-sundae's own interface with plain Python
+callbacks.
 
-Either way CVODE locates each change of phase with its root finding, and is started anew there and at the hammer's
-corners; v0 is latched at the located onset. Adams iterates by fixed point, BDF by Newton with a dense matrix that
-CVODE makes by differences: its defaults. Compiled, BDF is tuned to this problem (`_TUNED`), and of Adams both are
-there, tuned and by its defaults; as installed, nothing is.
+In both cases CVODE locates each change of phase by root finding, and is restarted there and at the corners of the
+hammer pulse; v0 is latched at the located onset. By default, Adams uses fixed-point iteration, and BDF Newton's method
+with a dense matrix by differences. Compiled, BDF is tuned for this problem (`_TUNED`), and Adams is available tuned and
+with defaults; as installed, nothing is tuned.
 """
 
 from __future__ import annotations
@@ -27,36 +27,36 @@ from replays.studies.peers.common.right_hand_side import (
     N_STATE,
     N_SWITCH,
     PARAMETERS,
+    change_phase,
     compile_s,
-    follow_sign,
+    follow_gap_sign,
     pack,
     switching,
-    take_switch,
     vector_callbacks,
 )
-from replays.studies.peers.common.solution import MISSED_HAMMER, PROPER, SWITCH_CEILING, Manner, Setting, Solution
+from replays.studies.peers.common.solution import DEFAULT, MISSED_HAMMER, SWITCH_CEILING, Manner, Setting, Solution
 from replays.studies.peers.plain_python import PlainPython
 from rig.physics.kernels.signals import STATE_SCALE
 
 ADAMS, BDF = 1, 2
 ONE_STEP, ROOT_RETURN = 2, 2
-_CHUNK = 5_000
-"""Steps between two looks at the clock."""
-_INSTANT = 1e-14
-"""Less time than this [s] is none."""
-_LATE = -1e-12
-"""Penetration [m] of the wrong sign that tells of a change of phase that root finding has missed."""
+_STEPS_PER_CHECK = 5_000
+"""Number of steps between two checks of the clock."""
+_MIN_INTERVAL_S = 1e-14
+"""Shortest resolved time [s]."""
+_MAX_MISSED_GAP_M = -1e-12
+"""Penetration [m] of the wrong sign that indicates a change of phase missed by root finding."""
 
 _ANDERSON = 1
-"""Earlier iterates that its fixed point looks back to."""
+"""Number of earlier iterates in Anderson's acceleration of the fixed-point iteration."""
 _TUNED: dict[int, tuple[tuple[str, float], ...]] = {
     ADAMS: (("CVodeSetNonlinConvCoef", 0.01), ("CVodeSetMaxNonlinIters", 5)),
     BDF: (("CVodeSetNonlinConvCoef", 0.03), ("CVodeSetLSetupFrequency", 40), ("CVodeSetJacEvalFrequency", 200)),
 }
-"""What is set otherwise than CVODE has it, by method; Adams has Anderson's acceleration, too.
+"""Settings that differ from CVODE's defaults, by method; Adams has Anderson's acceleration, too.
 
-Measured with exact friction, no scene chosen: time over that of CVODE's defaults at the same geometric mean error over
-the scenes, from ladders of six tolerances.
+Measured with exact friction on unselected scenes: time over that of CVODE's defaults at the same geometric mean error
+over the scenes, from ladders of six tolerances.
 
     error                            1e-2  1e-3  1e-4  1e-5
     Adams, whirl, 12 restitutions    0.86  0.79  0.79  0.81
@@ -66,31 +66,31 @@ the scenes, from ladders of six tolerances.
     BDF, transient                   0.96  1.03  0.97  0.97
     BDF, random                      1.00  0.98  0.99  0.99
 
-A coefficient of 0.01 alone is a loss for Adams at loose tolerances (1.95 in whirl): its three iterations no longer
-suffice, and steps are rejected. Five of them without Anderson: 0.85 in the transient, but 1.32 in whirl at 1e-2.
-Coefficients of 0.3, 0.03, 0.003 and 0.001 gain no more. Of BDF, orders below 5, the detection of its stability limit
-and a coefficient of 0.01 lose. In a single scene chance moves an error more than any of this: in the chart's own
-hammer scene it favours Adams' defaults (1e-3 to whirl in 15 ms, tuned in 18 to 27).
+A coefficient of 0.01 alone slows Adams down at coarse tolerances (1.95 in whirl): its three iterations no longer
+suffice, and steps are rejected. Five iterations without Anderson: 0.85 in the transient, but 1.32 in whirl at 1e-2.
+Coefficients of 0.3, 0.03, 0.003 and 0.001 gain no more. BDF is slower with orders below 5, with its stability limit
+detection, and with a coefficient of 0.01. In a single scene, chance changes an error more than any setting: in the
+chart's hammer scene Adams' defaults are faster (1e-3 to whirl in 15 ms, tuned in 18 to 27).
 """
 
 _MESSAGES = {
-    -2: "more accuracy asked than there is",
+    -2: "required accuracy exceeds rounding",
     -3: "error test failed too often",
     -4: "iteration did not converge",
     -8: "right-hand side failed",
     -12: "root finding failed",
 }
 
-# What the compiled loop keeps, by index.
+# Indices of the compiled loop's variables.
 _T, _CORNER, _SAMPLE, _ONSETS, _SWITCHES, _STEPS, _FLAG, _PULSE_SEEN = range(8)
 
 
 @functools.cache
 def _library() -> Any:
-    """The C library with the signatures of what is called here.
+    """Return the C library with the signatures of the functions used here.
 
-    The extension module of scikit-sundae is linked with it, so its handle finds every symbol wherever a wheel has put
-    the library itself.
+    The extension module of scikit-sundae is linked with the library, so its handle finds every symbol wherever a wheel
+    has put the library itself.
     """
     library = ctypes.CDLL(import_module("sksundae._cy_cvode").__file__)
     address, real, integer = c_void_p, c_double, c_int
@@ -133,8 +133,8 @@ def _library() -> Any:
 
 
 @functools.cache
-def _loop() -> tuple[Any, float]:
-    """The compiled loop, and what compiling took [s]. It holds addresses of the library, so it is not cached."""
+def _compile_loop() -> tuple[Any, float]:
+    """Return the compiled loop and its compile time [s]. It contains addresses of the library, so it is not cached."""
     from numba import boolean, from_dtype, njit, types
 
     begin = time.perf_counter()
@@ -149,89 +149,89 @@ def _loop() -> tuple[Any, float]:
         boolean(*[number, number, vector, number, vector], from_dtype(PARAMETERS)[::1], *[vector] * 3, table, table,
                 vector, boolean)
     )  # fmt: skip
-    def run(memory, place, y, spare_place, spare, parameters, times, corners, pulse, states, onsets, now, events):
-        """Go on until the last corner, a failure, or enough work to look at the clock; whether it is done.
+    def run(memory, place, y, spare_place, spare, parameters, times, corners, pulse, states, onsets, progress, events):
+        """Run to the last corner, a failure, or the next check of the clock; return whether it is done.
 
-        One step a call of CVODE, and the samples from its history: asked for samples instead, CVODE would choose the
-        first step after a restart by the distance to the next one.
+        One step per call of CVODE, with samples from its history: with the samples as targets, CVODE would choose
+        the first step after a restart by the distance to the next sample.
         """
         t = np.empty(1)
         found = np.zeros(N_SWITCH, np.int32)
-        sample = int(now[_SAMPLE])
-        for _ in range(_CHUNK):
-            end = corners[int(now[_CORNER])]
+        sample = int(progress[_SAMPLE])
+        for _ in range(_STEPS_PER_CHECK):
+            end = corners[int(progress[_CORNER])]
             flag = step(memory, end, place, t.ctypes, ONE_STEP)
-            now[_FLAG] = flag
+            progress[_FLAG] = flag
             if flag < 0:
                 return True
-            now[_T] = t[0]
-            now[_STEPS] += 1
+            progress[_T] = t[0]
+            progress[_STEPS] += 1
             if pulse[0] < t[0] < pulse[1]:
-                now[_PULSE_SEEN] = 1.0
+                progress[_PULSE_SEEN] = 1.0
             sampled = False
             while sample < len(times) and times[sample] <= t[0]:
                 sampled = True
                 interpolate(memory, times[sample], 0, spare_place)
                 states[sample] = spare
                 sample += 1
-            now[_SAMPLE] = sample
+            progress[_SAMPLE] = sample
             which = -1
             began = False
             if not events:
-                began = follow_sign(t[0], y, parameters)
+                began = follow_gap_sign(t[0], y, parameters)
             elif flag == ROOT_RETURN:
                 root_info(memory, found.ctypes)
                 which = 0 if found[0] != 0 else 1
-            elif sampled and switching(t[0], y, parameters)[0] < _LATE:
+            elif sampled and switching(t[0], y, parameters)[0] < _MAX_MISSED_GAP_M:
                 which = 0
             if which >= 0:
-                now[_SWITCHES] += 1
-                began = take_switch(t[0], y, parameters, which)
+                progress[_SWITCHES] += 1
+                began = change_phase(t[0], y, parameters, which)
             if began:
-                if now[_ONSETS] < len(onsets):
-                    onsets[int(now[_ONSETS]), 0] = t[0]
-                    onsets[int(now[_ONSETS]), 1] = parameters[0].onset_speed
-                now[_ONSETS] += 1
-            # CVODE refuses a first step as short as rounding; nothing moves in it.
-            at_corner = t[0] > end - _INSTANT
+                if progress[_ONSETS] < len(onsets):
+                    onsets[int(progress[_ONSETS]), 0] = t[0]
+                    onsets[int(progress[_ONSETS]), 1] = parameters[0].onset_speed
+                progress[_ONSETS] += 1
+            # CVODE rejects a first step within rounding, in which nothing moves.
+            at_corner = t[0] > end - _MIN_INTERVAL_S
             if at_corner:
-                now[_CORNER] += 1
-                if now[_CORNER] == len(corners):
+                progress[_CORNER] += 1
+                if progress[_CORNER] == len(corners):
                     states[sample:] = y
                     return True
             if at_corner or which >= 0:
                 restart(memory, t[0], place)
-                stop_at(memory, corners[int(now[_CORNER])])
+                stop_at(memory, corners[int(progress[_CORNER])])
         return False
 
     return run, time.perf_counter() - begin
 
 
 def solve(
-    problem: Problem, *, setting: Setting, budget_s: float, method: int, manner: Manner = PROPER, tuned: bool = True
+    problem: Problem, *, setting: Setting, budget_s: float, method: int, manner: Manner = DEFAULT, tuned: bool = True
 ) -> Solution:
     """Solve a problem by CVODE.
 
     Args:
-        problem: The problem.
+        problem: Problem.
         setting: Tolerances.
-        budget_s: Wall time allowed [s].
+        budget_s: Permitted wall time [s].
         method: ADAMS or BDF.
-        manner: How it is driven.
-        tuned: Whether it iterates as suits this problem (`_TUNED`), or as CVODE does by itself.
+        manner: Mode of operation.
+        tuned: Whether to use the settings of `_TUNED`, or CVODE's defaults.
     """
     if manner.plain:
         return _solve_plain(problem, setting=setting, budget_s=budget_s, method=method)
     if not manner.events and problem.exact_friction:
         raise NotImplementedError("exact friction needs events")
-    run, compiling_s = _loop()
+    run, compiling_s = _compile_loop()
     library = _library()
     parameters = pack(problem)
     pulse = problem.pulse
     corners = np.array([*(problem.corners if manner.stops else ()), problem.duration_s])
     onsets = np.empty((SWITCH_CEILING, 2))
-    now = np.zeros(8)
-    now[_SAMPLE] = 1.0
+    progress = np.zeros(8)
+    progress[_SAMPLE] = 1.0
 
     solution = Solution(problem.times, budget_s, compiling_s)
     solution.states[0] = problem.y0
@@ -244,29 +244,29 @@ def solve(
         while not done:
             done = run(
                 session.memory, session.place, session.y, session.spare_place, session.spare, parameters, problem.times,
-                corners, np.array(pulse or (0.0, 0.0)), solution.states, onsets, now, manner.events,
+                corners, np.array(pulse or (0.0, 0.0)), solution.states, onsets, progress, manner.events,
             )  # fmt: skip
-            solution.steps, solution.switches = int(now[_STEPS]), int(now[_SWITCHES])
+            solution.steps, solution.switches = int(progress[_STEPS]), int(progress[_SWITCHES])
             done = done or solution.overrun()
-    flag = int(now[_FLAG])
+    flag = int(progress[_FLAG])
     if solution.failure is None and flag < 0:
-        solution.failure = f"CVODE gave up at {now[_T]:.6g} s: {_MESSAGES.get(flag, f'flag {flag}')}"
-    if solution.failure is None and not manner.stops and pulse is not None and now[_PULSE_SEEN] == 0.0:
+        solution.failure = f"CVODE failed at {progress[_T]:.6g} s: {_MESSAGES.get(flag, f'flag {flag}')}"
+    if solution.failure is None and not manner.stops and pulse is not None and progress[_PULSE_SEEN] == 0.0:
         solution.failure = MISSED_HAMMER
-    solution.onsets = [(float(t), float(speed)) for t, speed in onsets[: int(now[_ONSETS])]]
+    solution.onsets = [(float(t), float(speed)) for t, speed in onsets[: int(progress[_ONSETS])]]
     solution.evaluations = int(parameters[0]["evaluations"])
     return solution.close()
 
 
 class _Session:
-    """One solver of the library, freed with the stack that it is given.
+    """Solver of the library, freed with the exit stack.
 
     Attributes:
         memory: Address of the solver.
-        place: Address of the vector that it works on, whose numbers are `y`.
+        place: Address of the solver's vector, whose numbers are `y`.
         y: State, shape (14,).
-        spare_place: Address of another vector, whose numbers are `spare`.
-        spare: Shape (14,).
+        spare_place: Address of a second vector, whose numbers are `spare`.
+        spare: Second state, shape (14,).
     """
 
     def __init__(
@@ -292,9 +292,9 @@ class _Session:
         tolerances = setting.tolerance * STATE_SCALE if setting.absolute is None else np.full(N_STATE, setting.absolute)
 
         def vector(numbers: np.ndarray) -> int:
-            made = library.N_VMake_Serial(N_STATE, numbers.ctypes.data, context)
-            stack.callback(library.N_VDestroy_Serial, made)
-            return made
+            handle = library.N_VMake_Serial(N_STATE, numbers.ctypes.data, context)
+            stack.callback(library.N_VDestroy_Serial, handle)
+            return handle
 
         self.place, self.spare_place, absolute = vector(self.y), vector(self.spare), vector(tolerances)
         parameters[0]["vector_word"] = _vector_word(self.place, self.y)
@@ -325,13 +325,13 @@ class _Session:
 
 
 def _vector_word(place: int, numbers: np.ndarray) -> int:
-    """Where a vector's content keeps the address of its numbers, in words: an index of 4 or of 8 bytes comes first."""
+    """Return the offset of the data address in a vector's content, in words; an index of 4 or 8 bytes precedes it."""
     content = ctypes.cast(place, ctypes.POINTER(ctypes.c_size_t))[0]
     words = ctypes.cast(content, ctypes.POINTER(ctypes.c_size_t))
     for word in (1, 2):
         if words[word] == numbers.ctypes.data:
             return word
-    raise NotImplementedError("this build of SUNDIALS lays its vectors out in an unknown way")
+    raise NotImplementedError("this build of SUNDIALS has an unknown vector layout")
 
 
 def _check(name: str, flag: int) -> None:
@@ -340,7 +340,7 @@ def _check(name: str, flag: int) -> None:
 
 
 def _solve_plain(problem: Problem, *, setting: Setting, budget_s: float, method: int) -> Solution:
-    """The same through scikit-sundae's own interface; it does not tell its steps."""
+    """Solve a problem through scikit-sundae's own interface, which does not report its steps."""
     sundae: Any = import_module("sksundae.cvode")
     law = PlainPython(problem)
     parameters = pack(problem)
@@ -357,20 +357,20 @@ def _solve_plain(problem: Problem, *, setting: Setting, budget_s: float, method:
     solution.states[0] = y = problem.y0.copy()
     solver = sundae.CVODE(
         rates, method="Adams" if method == ADAMS else "BDF", rtol=setting.tolerance, atol=atol, eventsfn=gap,
-        num_events=1, max_num_steps=_CHUNK,
+        num_events=1, max_num_steps=_STEPS_PER_CHECK,
     )  # fmt: skip
     t, sample = 0.0, 1
     corners = [*problem.corners, problem.duration_s]
     solver.init_step(t, y)
     while corners and not solution.overrun():
-        if sample < len(problem.times) and problem.times[sample] - t < _INSTANT:
+        if sample < len(problem.times) and problem.times[sample] - t < _MIN_INTERVAL_S:
             solution.states[sample] = y
             sample += 1
             continue
         target = float(min(problem.times[sample], corners[0])) if sample < len(problem.times) else corners[0]
         result = solver.step(target, method="normal", tstop=corners[0])
         if not result.success:
-            solution.failure = f"CVODE gave up at {t:.6g} s: {result.message}"
+            solution.failure = f"CVODE failed at {t:.6g} s: {result.message}"
             break
         t, y = float(result.t), np.array(result.y, dtype=float).ravel()
         if sample < len(problem.times) and t >= problem.times[sample]:
@@ -379,7 +379,7 @@ def _solve_plain(problem: Problem, *, setting: Setting, budget_s: float, method:
         switched = result.status == ROOT_RETURN
         if switched:
             solution.switches += 1
-            began = take_switch(t, y, parameters, 0)
+            began = change_phase(t, y, parameters, 0)
             law.phase, law.onset_speed = int(parameters[0]["phase"]), float(parameters[0]["onset_speed"])
             if began:
                 solution.onsets.append((t, law.onset_speed))

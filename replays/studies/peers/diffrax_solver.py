@@ -1,15 +1,15 @@
 """diffrax, on JAX: Dormand and Prince's 8(7) pair with a PI controller, on the equations of `taylor_equations`.
 
-Each phase is compiled by XLA, with its events, which bisection on the step's interpolant locates. The Python loop that
-leads from one phase to the next is that of heyoka (`replays.studies.peers.taylor`); what is spent inside the compiled
-phases is the solution's `own_s`. Processor time is that of the process, as XLA works in threads of its own.
+XLA compiles each phase with its events, which bisection on the step's interpolant locates. The Python loop from phase
+to phase is that of heyoka (`replays.studies.peers.taylor`); the time inside the compiled phases is the solution's
+`own_s`. Processor time is that of the process, as XLA uses its own threads.
 """
 
 from __future__ import annotations
 
 import functools
-import time
 from importlib import import_module
+from time import process_time as clock
 from types import SimpleNamespace
 from typing import Any
 
@@ -17,22 +17,22 @@ import numpy as np
 
 from replays.studies.peers.common.problem import Problem
 from replays.studies.peers.common.solution import Setting, Solution
-from replays.studies.peers.taylor import System, events_of, solve_by_phases
-from replays.studies.peers.taylor_equations import PARAMETERS, Kind, rates_of
+from replays.studies.peers.taylor import CONTACT_SIGNALS, PhaseMethod, System, phase_events, solve_by_phases
+from replays.studies.peers.taylor_equations import PARAMETERS, Kind, system_rates
 from rig.physics.kernels.laws.magnet import RIPPLED
 
-_SAMPLES = 501
-"""Instants of one call: its arrays have one shape, so that each phase is compiled once."""
-_STEPS = 4_096
-"""Most steps of one call."""
+_SAMPLES_PER_CALL = 501
+"""Number of samples per call: with arrays of one shape, each phase is compiled once."""
+_MAX_STEPS_PER_CALL = 4_096
+"""Largest number of steps per call."""
 _FIRST_STEP_S = 1e-6
-"""First step of a phase: a function that is 0 but for rounding at the start shows its sign before it falls again."""
-_TINY = 1e-13
+"""First step of a phase [s]: a function that starts at 0 within rounding shows its sign before it falls again."""
+_EVENT_TOLERANCE = 1e-13
 """Tolerance of the time of an event, relative and in seconds."""
 
 
 def _module(name: str) -> Any:
-    """A library that may not be installed, imported only now."""
+    """Import a module that may not be installed."""
     return import_module(name)
 
 
@@ -40,18 +40,18 @@ def solve(problem: Problem, *, setting: Setting, budget_s: float) -> Solution:
     """Solve a problem by diffrax.
 
     Args:
-        problem: The problem.
+        problem: Problem.
         setting: Tolerance, relative and of the scaled states.
-        budget_s: Wall time allowed [s].
+        budget_s: Permitted wall time [s].
     """
     jax = _module("jax")
 
     with jax.enable_x64(True):
-        return solve_by_phases(problem, setting.tolerance, budget_s, _system, _contact_function, time.process_time)
+        return solve_by_phases(problem, PhaseMethod(setting.tolerance, _system, _contact_function, clock), budget_s)
 
 
 def _library(time_s: Any) -> Any:
-    """The functions that the equations are written with."""
+    """Return the functions used by the equations."""
     jnp = _module("jax.numpy")
 
     def root(x: Any) -> Any:
@@ -61,16 +61,16 @@ def _library(time_s: Any) -> Any:
 
 
 def evaluate(kind: Kind, time_s: Any, state: Any, pars: Any) -> tuple[Any, dict[str, Any], dict[str, Any]]:
-    """Rates, what the events look at, and the numbers by name."""
+    """Return rates, quantities for the events, and parameters by name."""
     jnp = _module("jax.numpy")
 
     numbers = dict(zip(PARAMETERS, pars, strict=True))
-    rates, seen = rates_of(kind, list(state), numbers, _library(time_s))
-    return jnp.stack([jnp.asarray(rate, float) for rate in rates]), seen, numbers
+    rates, signals = system_rates(kind, list(state), numbers, _library(time_s))
+    return jnp.stack([jnp.asarray(rate, float) for rate in rates]), signals, numbers
 
 
 class _Phase:
-    """One phase with heyoka's interface: `propagate_grid` ends at the grid's end or at an event."""
+    """Phase with heyoka's interface: `propagate_grid` ends at the grid's end or at an event."""
 
     order = 13
     """Stages of a step."""
@@ -82,11 +82,11 @@ class _Phase:
         self._rates = _compiled_rates(kind)
 
     def reset_cooldowns(self) -> None:
-        """There are none: an event counts only where its function passes 0 in the right direction."""
+        """Ignore the call: an event counts only where its function passes 0 in the right direction."""
 
     def propagate_grid(self, grid: np.ndarray, max_steps: int) -> tuple[int, None, None, int, None, np.ndarray]:
-        """Go on to the end of a grid, or to an event; see heyoka."""
-        wanted = np.full(_SAMPLES, grid[-1])
+        """Integrate to the end of a grid or to an event, as heyoka does."""
+        wanted = np.full(_SAMPLES_PER_CALL, grid[-1])
         wanted[: len(grid) - 1] = grid[1:]
         time_s, state, samples, which, steps = self._solve(
             self.time, grid[-1], wanted, self.state, self.pars, self._tolerance
@@ -97,7 +97,7 @@ class _Phase:
         return -1 - int(which), None, None, int(steps), None, reached
 
     def update_d_output(self, time_s: float) -> np.ndarray:
-        """State a little beyond the end, by one step of the classical Runge-Kutta method."""
+        """Return the state slightly after the end, by one step of the classical Runge-Kutta method."""
         h, y = time_s - self.time, self.state
         a = self._rates(self.time, y, self.pars)
         b = self._rates(self.time + 0.5 * h, y + 0.5 * h * a, self.pars)
@@ -108,9 +108,9 @@ class _Phase:
 
 @functools.cache
 def _system(kind: Kind, tolerance: float) -> System:
-    """One phase, compiled."""
+    """Return one compiled phase."""
     if kind.terms == RIPPLED:
-        raise NotImplementedError("the map with ripples needs derivatives of the potential")
+        raise NotImplementedError("diffrax does not support the map with ripples")
     phase = _Phase(kind, tolerance)
     phase.propagate_grid(np.array([0.0, 1e-9]), 1)
     return System(phase, phase.following)
@@ -125,24 +125,24 @@ def _compiled_rates(kind: Kind) -> Any:
 
 @functools.cache
 def _compiled(kind: Kind) -> tuple[Any, tuple[int, ...]]:
-    """Solve a phase over a span; the phases that its events lead to."""
+    """Return the compiled solver of a phase over a span, and the phases that follow its events."""
     diffrax, jax, jnp, optimistix = _module("diffrax"), _module("jax"), _module("jax.numpy"), _module("optimistix")
 
     def rates(t: Any, y: Any, pars: Any) -> Any:
         return evaluate(kind, t, y, pars)[0]
 
-    _, seen, numbers = evaluate(kind, 0.0, np.full(14, 1e-2), np.ones(len(PARAMETERS)))
-    events = events_of(kind, seen, numbers)
+    _, signals, numbers = evaluate(kind, 0.0, np.full(14, 1e-2), np.ones(len(PARAMETERS)))
+    events = phase_events(kind, signals, numbers)
 
     def left(t: Any, y: Any, args: Any) -> Any:
-        """The events' functions, each positive within the phase."""
-        _, seen, numbers = evaluate(kind, t, y, args)
-        return jnp.stack([-way * value for value, way, _ in events_of(kind, seen, numbers)])
+        """Return the events' functions, each positive within the phase."""
+        _, signals, numbers = evaluate(kind, t, y, args)
+        return jnp.stack([-way * value for value, way, _ in phase_events(kind, signals, numbers)])
 
-    # One function for all: diffrax's root finders with a bracket take no more.
+    # A single function, as diffrax's bracketing root finders support no more.
     event = diffrax.Event(
         lambda t, y, args, **_: jnp.min(left(t, y, args)),
-        root_finder=optimistix.Bisection(rtol=_TINY, atol=_TINY, flip="detect"),
+        root_finder=optimistix.Bisection(rtol=_EVENT_TOLERANCE, atol=_EVENT_TOLERANCE, flip="detect"),
         direction=False,
     )
 
@@ -151,7 +151,7 @@ def _compiled(kind: Kind) -> tuple[Any, tuple[int, ...]]:
             diffrax.ODETerm(rates), diffrax.Dopri8(), begin, end, _FIRST_STEP_S, y, pars,
             saveat=diffrax.SaveAt(subs=[diffrax.SubSaveAt(ts=wanted), diffrax.SubSaveAt(t1=True)]),
             stepsize_controller=diffrax.PIDController(rtol=tolerance, atol=tolerance, pcoeff=0.3, icoeff=0.4),
-            max_steps=_STEPS, event=event, throw=False,
+            max_steps=_MAX_STEPS_PER_CALL, event=event, throw=False,
         )  # fmt: skip
         time_s, state = found.ts[1][0], found.ys[1][0]
         which = jnp.where(found.event_mask, jnp.argmin(left(time_s, state, pars)), len(events))
@@ -162,15 +162,13 @@ def _compiled(kind: Kind) -> tuple[Any, tuple[int, ...]]:
 
 @functools.cache
 def _contact_function(kind: Kind) -> Any:
-    """Return the function of a scaled state that `solve_by_phases` asks for."""
+    """Return the function of a scaled state that `solve_by_phases` needs."""
     jax, jnp = _module("jax"), _module("jax.numpy")
 
     @jax.jit
     def look(state: Any, pars: Any, time: Any) -> Any:
-        _, seen, _ = evaluate(kind, time, state, pars)
-        return jnp.stack(
-            [jnp.asarray(seen[name], float) for name in ("depth", "rate", "sliding", "normal", "friction")]
-        )
+        _, signals, _ = evaluate(kind, time, state, pars)
+        return jnp.stack([jnp.asarray(signals[name], float) for name in CONTACT_SIGNALS])
 
     def contact_at(state: np.ndarray, pars: np.ndarray, time: float) -> np.ndarray:
         return np.array(look(state, pars, time))

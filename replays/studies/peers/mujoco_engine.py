@@ -1,16 +1,16 @@
-"""MuJoCo, a general physics engine, on the closest model that it can express. Its error is a model error.
+"""MuJoCo, a general physics engine, with the closest model that it can represent. Its error is a model error.
 
-Expressed as they are: the rigid shaft on its pivot (three hinges: Gamma, beta, theta), the two houses on springs and
-dampers (slides), gravity without the houses' weights. Magnets, unbalance, hammer and drive are given to it as
-generalised forces, from Python, once a step.
+Represented exactly: the rigid shaft on its pivot (three hinges: Gamma, beta, theta), the two housings on springs and
+dampers (slides), gravity without the housings' weights. Magnets, unbalance, hammer and drive are generalised forces,
+set from Python once per step.
 
-Not expressed:
+Not represented:
 - a round ring: MuJoCo has no hollow cylinder. The ring is a polygon of flat boxes, the shaft a sphere in its plane;
-- the normal law K delta^1.5 (1 + c delta'/v0): its contact is a linear spring and damper in units of acceleration.
-  They are set to the contact time and the restitution of the rig's own law in an impact at 0.2 m/s;
-- Coulomb's friction as a set-valued law: its cone is regularised, and a contact may creep;
-- transducers that lose their preload (a slide's spring is linear);
-- forces that change within a step: half-sine and magnets are held over it. First order in the step.
+- the normal law K delta^1.5 (1 + c delta'/v0): MuJoCo's contact is a linear spring and damper in units of acceleration.
+They are set to the contact time and the restitution of the rig's law in an impact at 0.2 m/s;
+- Coulomb's friction as a set-valued law: MuJoCo's friction cone is regularised, and a contact may creep;
+- loss of a transducer's preload (a slide's spring is linear);
+- forces that change within a step: half-sine and magnets are constant over it. First order in the step.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def solve(problem: Problem, *, setting: Setting, budget_s: float) -> Solution:
     steps = math.ceil(problem.duration_s / setting.tolerance - 1e-9)
     complaints: list[str] = []
     usual = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(complaints.append)  # which else goes to a file in the working folder
+    mujoco.set_mju_user_warning(complaints.append)  # the default writes to a file in the working folder
     try:
         for step in range(steps):
             t = step * setting.tolerance
@@ -80,7 +80,7 @@ def solve(problem: Problem, *, setting: Setting, budget_s: float) -> Solution:
 
 
 def _state(data: Any) -> np.ndarray:
-    """The 14 states; the inner house's slides are relative to the outer house."""
+    """Return the 14 states; the inner housing's slides are relative to the outer housing."""
     q, v = data.qpos, data.qvel
     return np.array(
         [
@@ -96,17 +96,17 @@ def _set(data: Any, y: np.ndarray) -> None:
 
 
 def _applied(problem: Problem, t: float, y: np.ndarray) -> tuple[float, float, float]:
-    """Generalised forces on Gamma, beta, theta [N m] of all that MuJoCo does not know."""
+    """Return the generalised forces on Gamma, beta, theta [N m] that MuJoCo does not model."""
     shaft, magnet, inputs = problem.constants.shaft, problem.constants.magnet, problem.inputs
     sG, cG, sb, cb = math.sin(y[0]), math.cos(y[0]), math.sin(y[1]), math.cos(y[1])
     unbalance = shaft.unbalance * y[9] * y[9]
     angle = y[2] + shaft.unbalance_phase
-    hit = 0.0
+    hammer = 0.0
     pulse = problem.pulse
     if pulse is not None and pulse[0] <= t < pulse[1]:
-        hit = inputs.hammer_force * math.sin(math.pi * (t - pulse[0]) / (pulse[1] - pulse[0]))
-    Lx = shaft.arm_disk * (unbalance * math.cos(angle) + hit * inputs.hammer_x)
-    Ly = shaft.arm_disk * (unbalance * math.sin(angle) + hit * inputs.hammer_y)
+        hammer = inputs.hammer_force * math.sin(math.pi * (t - pulse[0]) / (pulse[1] - pulse[0]))
+    Lx = shaft.arm_disk * (unbalance * math.cos(angle) + hammer * inputs.hammer_x)
+    Ly = shaft.arm_disk * (unbalance * math.sin(angle) + hammer * inputs.hammer_y)
     if inputs.magnet_engaged:
         lB = shaft.arm_magnet
         Fx, Fy, _ = magnet_force(lB * sb, -lB * sG * cb, magnet)
@@ -117,7 +117,7 @@ def _applied(problem: Problem, t: float, y: np.ndarray) -> tuple[float, float, f
 
 
 def _document(problem: Problem, step: float) -> str:
-    """The model in MuJoCo's XML."""
+    """Return the model in MuJoCo's XML."""
     levels, shaft, _, contact, house, _ = problem.constants
     friction = 0.0 if levels.friction == NO_FRICTION else contact.friction
     stiffness, damping = _contact(problem)
@@ -165,7 +165,7 @@ def _document(problem: Problem, step: float) -> str:
 
 
 def _contact(problem: Problem) -> tuple[float, float]:
-    """Linear stiffness [1/s^2] and damping [1/s] with the law's contact time and restitution in one impact.
+    """Return linear stiffness [1/s^2] and damping [1/s] with the law's contact time and restitution in one impact.
 
     An undamped impact at v with F = K d^n lasts T = 2 sqrt(pi) G(1/(n+1)) / ((n+1) G(1/2 + 1/(n+1))) d_max / v, with
     d_max^(n+1) = (n+1) m v^2 / (2 K); a linear one pi / omega.

@@ -1,7 +1,7 @@
-"""The same equations as a user of an ODE library would type them in: a plain Python callback for "as installed" rows.
+"""Equations as a user of an ODE library would write them: a plain Python callback for "as installed" rows.
 
-Written from the paper in Lagrange's form for the two tilts (the kernels have Euler's equations in the turning frame);
-friction laws that the state alone decides: none and smoothed.
+Derived from the paper in Lagrange's form for the two tilts (the kernels have Euler's equations in the rotating frame).
+Only friction laws that the state determines: none and smoothed.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from rig.physics.kernels.laws.magnet import RADIAL, RIPPLED
 
 
 class PlainPython:
-    """The callbacks of one solve.
+    """Callbacks of one solve.
 
     Attributes:
-        phase: Phase of the contact; the caller keeps it.
-        onset_speed: v0 of the running contact [m/s]; the caller keeps it.
-        evaluations: Calls of the right-hand side.
+        phase: Contact phase, updated by the caller.
+        onset_speed: v0 of the current contact [m/s], updated by the caller.
+        evaluations: Number of calls of the right-hand side.
     """
 
     def __init__(self, problem: Problem) -> None:
@@ -41,7 +41,7 @@ class PlainPython:
         self._begin, self._end = problem.pulse or (0.0, 0.0)
 
     def rates(self, t: float, state: np.ndarray) -> list[float]:
-        """Rates of the 14 states at `t` [s] from the window's start."""
+        """Return the rates of the 14 states at `t` [s] from the window's start."""
         self.evaluations += 1
         shaft, magnet, house, inputs = self._shaft, self._magnet, self._house, self._inputs
         Ixx, Izz, lB, lI = shaft.transverse_inertia, shaft.polar_inertia, shaft.arm_magnet, shaft.arm_disk
@@ -51,11 +51,14 @@ class PlainPython:
         # Lateral forces, each times its arm.
         unbalance = shaft.unbalance * dth * dth
         angle = th + shaft.unbalance_phase
-        hit = 0.0
+        hammer = 0.0
         if self._begin < t < self._end:
-            hit = inputs.hammer_force * math.sin(math.pi * (t - self._begin) / (self._end - self._begin))
-        Lx = lI * (unbalance * math.cos(angle) + hit * inputs.hammer_x)
-        Ly = lI * (unbalance * math.sin(angle) + hit * inputs.hammer_y) - shaft.arm_centre * shaft.mass * shaft.gravity
+            hammer = inputs.hammer_force * math.sin(math.pi * (t - self._begin) / (self._end - self._begin))
+        Lx = lI * (unbalance * math.cos(angle) + hammer * inputs.hammer_x)
+        Ly = (
+            lI * (unbalance * math.sin(angle) + hammer * inputs.hammer_y)
+            - shaft.arm_centre * shaft.mass * shaft.gravity
+        )
         if inputs.magnet_engaged:
             x, y = lB * sb, -lB * sG * cb
             s = x * x + y * y
@@ -95,12 +98,12 @@ class PlainPython:
         ]  # fmt: skip
 
     def switching(self, t: float, state: np.ndarray) -> tuple[float, float]:
-        """Switching functions, as `right_hand_side.switching`: positive inside the phase."""
+        """Return the switching functions, as `right_hand_side.switching`: positive within the phase."""
         penetration = self._ring(state)[0]
         return (-penetration if self.phase == FLIGHT else penetration), 1.0
 
     def _ring(self, state: np.ndarray) -> tuple[float, float, float, float]:
-        """Penetration [m], force on the shaft x, y and friction force [N]."""
+        """Return penetration [m], force on the shaft x, y and friction force [N]."""
         contact, arm = self._contact, self._shaft.arm_ring
         G, b, _, xi, yi, xo, yo, dG, db, dth, vxi, vyi, vxo, vyo = state.tolist()
         sG, cG, sb, cb = math.sin(G), math.cos(G), math.sin(b), math.cos(b)
@@ -123,6 +126,6 @@ class PlainPython:
 
 
 def _pair(displacement: float, stiffness: float, preload: float) -> float:
-    """Restoring force of an opposed pair of pre-compressed transducers [N]."""
+    """Return the restoring force of an opposed pair of pre-compressed transducers [N]."""
     change = 0.5 * stiffness * displacement
     return max(preload + change, 0.0) - max(preload - change, 0.0)

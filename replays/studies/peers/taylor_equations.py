@@ -1,12 +1,12 @@
-"""The rig's equations written down anew for heyoka's Taylor series: phases, numbers, states and rates.
+"""Independent formulation of the rig's equations for heyoka's Taylor series: phases, numbers, states and rates.
 
-Nothing of `rig.physics.kernels` is used but the numbers. The shaft is the direction `u` of its axis (a unit vector)
-instead of two angles: with S = sum of arm times lateral force, w the spin about the axis and L = Ixx u x u' + Izz w u,
+Of `rig.physics.kernels` only the numbers are used. The shaft is the direction `u` of its axis (a unit vector) instead
+of two angles. With S = sum of arm times lateral force, w the spin about the axis and L = Ixx u x u' + Izz w u,
 
     Ixx u'' = S - u (u . S) + Izz w (u x u') - Ixx |u'|^2 u
     Izz w'  = T_drive - R_S F_t
 
-(the component of dL/dt across the axis, turned by u x; u' . u = 0). u_z and u_z' follow from |u| = 1. States are
+(the component of dL/dt across the axis, rotated by u x; u' . u = 0). u_z and u_z' follow from |u| = 1. States are
 divided by `STATE_SCALE`, because heyoka's tolerance is relative to the largest of them.
 """
 
@@ -25,9 +25,9 @@ from rig.physics.kernels.laws.magnet import LINEAR, RIPPLED
 from rig.physics.kernels.signals import STATE_SCALE
 
 SLACK = 5
-"""A phase more than the kernels count: touching, while the normal law would have to pull and the force is held at 0."""
+"""Phase in addition to those of the kernels: in contact, while the normal law would pull and the force is held at 0."""
 SERIES_SCALE = np.where(np.arange(14) == 2, 40.0, STATE_SCALE)
-"""As `STATE_SCALE`, but for the spin angle, which grows to tens of radians and would be the largest state."""
+"""`STATE_SCALE` except for the spin angle, which grows to tens of radians and would be the largest state."""
 
 _PLACES = {
     "Ixx": "shaft.transverse_inertia", "Izz": "shaft.polar_inertia", "lA": "shaft.arm_ring", "lB": "shaft.arm_magnet",
@@ -42,35 +42,35 @@ _PLACES = {
     "k_ew": "house.pair_stiffness_horizontal", "gain": "torque_gain",
     "speed": "", "slope": "", "H_x": "", "H_y": "", "t_hit": "", "T_hit": "",
 }  # fmt: skip
-"""By the paper's symbol, where each number stands in the model; empty where `numbers_of` works it out."""
+"""Attribute of the model by the paper's symbol; empty for numbers that `parameter_values` computes."""
 PARAMETERS = tuple(_PLACES)
-"""Numbers that a compiled system is given, so that it serves every problem of its kind."""
+"""Parameters of a compiled system, which thus serves every problem of its kind."""
 
 
 class Kind(NamedTuple):
-    """What decides a system's form; each form is compiled once a process and tolerance."""
+    """Form of a system; each form is compiled once per process and tolerance."""
 
     phase: int
-    hit: bool
+    pulse_on: bool
     ideal_drive: bool
     smoothed: bool
     exact: bool  # friction
     exponent: float
     damped: bool
     viscous: bool
-    terms: int  # of the magnet map, as the kernels name them; -1 without magnets
-    number: int  # of magnets, where the map has ripples
-    both: bool  # the gap counts the outer house
+    terms: int  # terms of the magnet map, as in the kernels; -1 without magnets
+    number: int  # number of magnets, if the map has ripples
+    both: bool  # the gap includes the outer housing
 
 
-def kind_of(problem: Problem, phase: int, *, hit: bool) -> Kind:
-    """The form that a problem's system has in one phase, with or without the hammer's force."""
+def system_kind(problem: Problem, phase: int, *, pulse_on: bool) -> Kind:
+    """Return the form of a problem's system in one phase, with or without the hammer force."""
     constants, inputs = problem.constants, problem.inputs
     contact, magnet = constants.contact, constants.magnet
     terms = magnet.terms if inputs.magnet_engaged else -1
     return Kind(
         phase=phase,
-        hit=hit,
+        pulse_on=pulse_on,
         ideal_drive=inputs.ideal_drive,
         smoothed=constants.levels.friction == SMOOTHED,
         exact=problem.exact_friction,
@@ -83,8 +83,8 @@ def kind_of(problem: Problem, phase: int, *, hit: bool) -> Kind:
     )
 
 
-def numbers_of(problem: Problem) -> dict[str, float]:
-    """The numbers of a problem by the paper's symbols."""
+def parameter_values(problem: Problem) -> dict[str, float]:
+    """Return the parameters of a problem by the paper's symbols."""
     constants, inputs = problem.constants, problem.inputs
     shaft = constants.shaft
     begin, end = problem.pulse or (0.0, 1.0)
@@ -104,7 +104,7 @@ def numbers_of(problem: Problem) -> dict[str, float]:
 
 
 def to_series(y: np.ndarray, *, ideal_drive: bool) -> np.ndarray:
-    """The 14 states as the series has them: direction of the axis for its angles, spin about it for theta'."""
+    """Return the 14 states of the series: direction of the axis for its angles, spin about it for theta'."""
     G, b, dG, db = y[0], y[1], y[7], y[8]
     sG, cG, sb, cb = math.sin(G), math.cos(G), math.sin(b), math.cos(b)
     x = y.copy()
@@ -116,7 +116,7 @@ def to_series(y: np.ndarray, *, ideal_drive: bool) -> np.ndarray:
 
 
 def from_series(scaled: np.ndarray, *, ideal_drive: bool) -> np.ndarray:
-    """Back again, shape (n, 14)."""
+    """Return the rig's states for those of the series, shape (n, 14)."""
     x = scaled * SERIES_SCALE
     ux, uy, vx, vy = x[:, 0], x[:, 1], x[:, 7], x[:, 8]
     uz = np.sqrt(1.0 - ux * ux - uy * uy)
@@ -132,31 +132,31 @@ def from_series(scaled: np.ndarray, *, ideal_drive: bool) -> np.ndarray:
 
 
 def heyoka() -> Any:
-    """The library, imported only now."""
+    """Import heyoka, which may not be installed."""
     return import_module("heyoka")
 
 
 def parameter(name: str) -> Any:
-    """One number of the problem, as heyoka's expression."""
+    """Return a parameter of the problem as heyoka's expression."""
     return heyoka().par[PARAMETERS.index(name)]
 
 
 def equations(kind: Kind) -> tuple[list[Any], list[Any], dict[str, Any]]:
-    """Scaled states, their rates, and what the events look at, as heyoka's expressions."""
+    """Return scaled states, their rates, and the quantities for the events, as heyoka's expressions."""
     hy = heyoka()
     scaled = hy.make_vars(*[f"q{i}" for i in range(14)])
-    rates, seen = rates_of(kind, scaled, {name: parameter(name) for name in PARAMETERS}, hy)
-    return list(scaled), rates, seen
+    rates, looked_at = system_rates(kind, scaled, {name: parameter(name) for name in PARAMETERS}, hy)
+    return list(scaled), rates, looked_at
 
 
-def rates_of(kind: Kind, scaled: Any, p: dict[str, Any], hy: Any) -> tuple[list[Any], dict[str, Any]]:
-    """Rates of the scaled states, and what the events look at.
+def system_rates(kind: Kind, scaled: Any, p: dict[str, Any], hy: Any) -> tuple[list[Any], dict[str, Any]]:
+    """Return the rates of the scaled states, and the quantities for the events.
 
     Args:
         kind: Form of the system.
         scaled: The 14 scaled states.
-        p: Numbers of the problem, by name.
-        hy: Library of the functions and of the time: heyoka, or another with the same names.
+        p: Parameters of the problem, by name.
+        hy: Library of functions and time: heyoka, or another with the same names.
     """
     ux, uy, theta, xi, yi, xo, yo, vx, vy, spin, vxi, vyi, vxo, vyo = (
         q * float(scale) for q, scale in zip(scaled, SERIES_SCALE, strict=True)
@@ -171,12 +171,12 @@ def rates_of(kind: Kind, scaled: Any, p: dict[str, Any], hy: Any) -> tuple[list[
     w = spin + ux * turn if kind.ideal_drive else spin
     theta_rate = spin if kind.ideal_drive else spin - ux * turn
 
-    # Sum of arm times lateral force, without the contact's.
+    # Sum of arm times lateral force, without the contact force.
     angle = theta + p["phi"]
     unbalance = p["unbalance"] * theta_rate * theta_rate
     Sx = lI * unbalance * hy.cos(angle)
     Sy = lI * unbalance * hy.sin(angle) - p["moment"]
-    if kind.hit:
+    if kind.pulse_on:
         pulse = lI * hy.sin(math.pi * (hy.time - p["t_hit"]) / p["T_hit"])
         Sx, Sy = Sx + p["H_x"] * pulse, Sy + p["H_y"] * pulse
     if kind.terms >= LINEAR:
@@ -201,7 +201,7 @@ def rates_of(kind: Kind, scaled: Any, p: dict[str, Any], hy: Any) -> tuple[list[
     if kind.viscous:
         normal = pull = normal + p["D"] * rate
 
-    # Forces on the houses, without the contact's.
+    # Forces on the housings, without the contact force.
     beam = p["K_bv"] * (xi - xo) + p["D_bv"] * (vxi - vxo)
     ns = p["k_ns"] * (yi - yo)
     axo = (beam - p["k_ew"] * xo) / p["M_oh"]
@@ -209,7 +209,7 @@ def rates_of(kind: Kind, scaled: Any, p: dict[str, Any], hy: Any) -> tuple[list[
     torque = p["gain"] * (p["speed"] + p["slope"] * hy.time - theta_rate)
 
     def accelerations(Fx: Any, Fy: Any, Ft: Any) -> tuple[Any, ...]:
-        """u'', w' and the inner house's accelerations under a force of the ring on the shaft."""
+        """Return u'', w' and the inner housing's accelerations for a force of the ring on the shaft."""
         sx, sy = Sx + lA * Fx, Sy + lA * Fy
         inward = (ux * sx + uy * sy) / Ixx + vx * vx + vy * vy + vz * vz
         gyro = Izz * w / Ixx
@@ -254,7 +254,7 @@ def rates_of(kind: Kind, scaled: Any, p: dict[str, Any], hy: Any) -> tuple[list[
     rates = [vx, vy, theta_rate, vxi, vyi, vxo, vyo, ax, ay, dw, axi, ayi, axo, ayo]
     if kind.ideal_drive:
         rates[9] = p["slope"] + nothing
-    seen = {
+    looked_at = {
         "square": square,
         "depth": depth,
         "rate": rate,
@@ -263,11 +263,11 @@ def rates_of(kind: Kind, scaled: Any, p: dict[str, Any], hy: Any) -> tuple[list[
         "pull": pull,
         "friction": friction,
     }
-    return [value / float(scale) for value, scale in zip(rates, SERIES_SCALE, strict=True)], seen
+    return [value / float(scale) for value, scale in zip(rates, SERIES_SCALE, strict=True)], looked_at
 
 
 def _magnet(kind: Kind, p: dict[str, Any], x: Any, y: Any) -> tuple[Any, Any]:
-    """Force of the magnets; with ripples as the gradient of the map's potential, which heyoka differentiates."""
+    """Return the force of the magnets; with ripples it is the gradient of the map's potential, by heyoka."""
     hy = heyoka()
     if kind.terms == LINEAR:
         return -p["K_m"] * x, -p["K_m"] * y
@@ -275,7 +275,7 @@ def _magnet(kind: Kind, p: dict[str, Any], x: Any, y: Any) -> tuple[Any, Any]:
     stiffness = p["K_m"] * (1.0 + s * (p["a3"] + s * (p["a5"] + s * p["a7"])))
     if kind.terms != RIPPLED:
         return -stiffness * x, -stiffness * y
-    # Re (-Y + i X)^N, the magnets' pattern, from straight below.
+    # Re (-Y + i X)^N, the ripple of the magnets, from straight below.
     X, Y = hy.make_vars("X", "Y")
     re, im = hy.expression(1.0), hy.expression(0.0)
     for _ in range(kind.number):

@@ -15,7 +15,7 @@ from rig.channels.faults import At, NoFilter, Swap, acts, connect_swaps
 from rig.channels.faults.delivery import Active
 from rig.channels.sampling import TICKS_HZ
 from rig.channels.table import Channel, Group
-from rig.physics.kernels.observe import EDGE, KEYPHASOR_WIDTH
+from rig.physics.kernels.observe import EDGE_WIDTH, KEYPHASOR_WIDTH
 from rig.physics.kernels.signals import COLUMN, N_ROW
 
 NO_ANGLES = np.empty(0)
@@ -123,7 +123,7 @@ class Scales:
 def mark_signal(angle: np.ndarray) -> np.ndarray:
     """Return the keyphasor's signal at angles of the shaft [rad], as rows of the model have it, shape (n,)."""
     ahead = (angle + math.pi) % (2.0 * math.pi) - math.pi
-    return np.clip(0.5 + np.minimum(ahead, KEYPHASOR_WIDTH - ahead) / EDGE, 0.0, 1.0)
+    return np.clip(0.5 + np.minimum(ahead, KEYPHASOR_WIDTH - ahead) / EDGE_WIDTH, 0.0, 1.0)
 
 
 def read_nothing(_: str) -> np.ndarray:

@@ -45,13 +45,13 @@ def compile_last() -> None:
     from rig.physics.engines.taylor.march import room_in
     from rig.physics.engines.taylor.series import sliding
     from rig.physics.kernels.constants import Inputs
-    from rig.physics.kernels.records import packed
+    from rig.physics.kernels.records import pack_record
     from rig.physics.kernels.signals import N_ROW
     from rig.run.simulation import Simulation
 
     simulation = Simulation("hammer")
     quiet = Inputs(1e-6, 0.0, 1.0, 0.0, 0, 0, 0.0, 0.0, 0, ideal_drive=False, magnet_engaged=True)
-    constants, inputs = packed(simulation.model.constants), packed(quiet)
+    constants, inputs = pack_record(simulation.model.constants), pack_record(quiet)
     memory = np.zeros(method.MEMORY)
     room = room_in(memory)
     sliding(constants[0], inputs[0], memory, 0.0, 0.0, 0.0, 0.0, room.Y, room.A, room.B, room.D, room.acc)

@@ -1,15 +1,15 @@
-"""Engines: one integration method a file, one protocol, chosen by name in a scene.
+"""Integration engines: one method per file, one protocol, selected by name in a scene.
 
-An engine is a module with `METHOD`, a one-step method that `rig.physics.engines.common.march` takes through events (see
-`rig.physics.engines.common.method`), or with its own `start(constants, inputs, y, memory, step_ticks, tolerance)` and
-`advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)`: it moves state `y` and `memory` (shape
-(MEMORY,), counters first, see `rig.physics.engines.common.memory`) on in place by `steps` steps of `step_ticks` and
-writes one row of `rig.physics.kernels.signals.ROW` every `stride` steps, the first at the start, and that at the end
-where `rows` has room for it. It knows no clock, no I/O and no threads, and its result does not depend on how a run is
-cut into calls. Constants and inputs come to it as records (`rig.physics.kernels.records`); who calls an `Engine` hands
-it the tuples.
+An engine is a module with `METHOD`, a one-step method that `rig.physics.engines.common.march` marches through events
+(see `rig.physics.engines.common.method`), or with its own `start(constants, inputs, y, memory, step_ticks, tolerance)`
+and `advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)`. `advance` moves state `y` and
+`memory` (shape (MEMORY,), counters first, see `rig.physics.engines.common.memory`) in place by `steps` steps of
+`step_ticks`. It writes a row of `rig.physics.kernels.signals.ROW` at the start and every `stride` steps, and the row at
+the end if `rows` has room for it. An engine has no clock, I/O or threads, and its result does not depend on how a run
+is divided into calls. It receives constants and inputs as records (`rig.physics.kernels.records`); an `Engine` takes
+the tuples.
 
-An engine of another package has a row by an entry point of the group `rig.engines`: its name is the engine's, and it
+An engine of another package is added by an entry point of the group `rig.engines`: its name is the engine's, and it
 refers to a `Method` that names the engine's `module`.
 """
 
@@ -18,37 +18,37 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 from importlib import import_module
-from importlib.metadata import entry_points
 from typing import Any, NamedTuple
 
+from rig.base.checks import load_extensions
 from rig.physics.engines.common.memory import MEMORY
 from rig.physics.kernels import ENGINE_GROUP
 from rig.physics.kernels.constants import Constants, Inputs
 
 
 class Method(NamedTuple):
-    """What there is to know of an engine before it is loaded."""
+    """Properties of an engine that are known before it is loaded."""
 
     title: str
     step_us: int
-    """Its own step [us]; of an adaptive engine, the grid that its steps end on."""
+    """Default step [us]; of an adaptive engine, the grid on which its steps end."""
     tolerance: float
-    """Scaled error a step that an adaptive engine aims at; 0: fixed steps."""
+    """Default scaled error per step of an adaptive engine; 0 for fixed steps."""
     frictions: tuple[str, ...]
-    """Friction laws it can take (`rig.physics.levels`)."""
+    """Supported friction laws (`rig.physics.levels`)."""
     contacts: tuple[str, ...] = ("compliant",)
     energy: float = 1e-3
-    """Share of what was dissipated up to which its ledger may be open."""
+    """Largest energy residual as a share of the dissipated energy."""
     companion: bool = False
-    """Whether a run has, unless asked otherwise, a companion that tells its error."""
+    """Default for a companion run, which estimates the error."""
     rolling: str = "series"
-    """Method for rolling contact unless asked otherwise."""
+    """Default method for rolling contact."""
     module: str = ""
-    """Where its code is; empty: beside this file, under its name."""
+    """Module with its code; empty for the module of its name in this package."""
 
     @property
     def advice(self) -> str:
-        """What to try where it fails."""
+        """Advice for a run that fails."""
         return "try a finer engine.tolerance" if self.tolerance else "try a shorter engine.step_us"
 
 
@@ -72,48 +72,32 @@ ENGINES = {
     "semi-implicit-euler": Method("symplectic Euler, order 1, events located", 5, 0.0, _BY_STATE),
     "rosenbrock": Method("RODAS 4(3), linearly implicit, adaptive, events located", 50, 1e-7, (*_BY_STATE, "exact")),
 }
-"""Engines, the default first, those of other packages last."""
-BROKEN: dict[str, str] = {}
-"""Why an entry point for an engine cannot be used, by its name."""
-
-
-def _add_engines() -> None:
-    for point in entry_points(group=ENGINE_GROUP):
-        try:
-            method = point.load()
-        except Exception as error:
-            BROKEN[point.name] = f"{point.value} cannot be loaded: {type(error).__name__}: {error}"
-            continue
-        if point.name in ENGINES:
-            BROKEN[point.name] = f"{point.value} has the name of another engine"
-        elif not isinstance(method, Method) or not method.module:
-            BROKEN[point.name] = f"{point.value} must be a rig.physics.engines.Method with a module"
-        else:
-            ENGINES[point.name] = method
-
-
-_add_engines()
+"""Engines by name, the default first, those of other packages last."""
+_found, BROKEN = load_extensions(ENGINE_GROUP, Method, ENGINES)
+"""Reasons for entry points of engines that cannot be used: `NAME (REASON)`."""
+BROKEN += [f"{name} (its Method must name a module)" for name, method in _found.items() if not method.module]
+ENGINES |= {name: method for name, method in _found.items() if method.module}
 
 
 class Engine(NamedTuple):
-    """An engine that is ready to run."""
+    """Engine that is ready to run."""
 
     start: Callable[..., None]
     advance: Callable[..., None]
     order: int
     memory_size: int = MEMORY
-    """Of `split` with room for rolling by collocation; in one of size MEMORY it rolls by series."""
+    """Size of the memory. `split` with its own size rolls by collocation; with size MEMORY, by series."""
     warm_up: Callable[[Constants, Inputs], None] | None = None
-    """Compiles what `advance` may call later than in its first steps, if there is any."""
+    """Compile the functions that `advance` may call after its first steps, if any."""
 
 
 def load_engine(name: str) -> Engine:
-    """The engine of one of those names (imported only now): a module of its own, or a one-step method for the march.
+    """Import an engine, which is a separate module or a one-step method for the march.
 
     Args:
         name: Key of `ENGINES`.
     """
-    from rig.physics.kernels.records import packed
+    from rig.physics.kernels.records import pack_record
 
     module: Any = import_module(ENGINES[name].module or f"rig.physics.engines.{name.replace('-', '_')}")
     if hasattr(module, "METHOD"):
@@ -123,7 +107,7 @@ def load_engine(name: str) -> Engine:
         start, advance = module.start, module.advance
 
     def on_records(kernel: Callable[..., None], constants: Constants, inputs: Inputs, *others: Any) -> None:
-        kernel(packed(constants), packed(inputs), *others)
+        kernel(pack_record(constants), pack_record(inputs), *others)
 
     size = getattr(module, "MEMORY", MEMORY)
     warm_up = partial(on_records, module.warm_up) if hasattr(module, "warm_up") else None

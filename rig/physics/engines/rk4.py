@@ -1,4 +1,4 @@
-"""Classical Runge-Kutta of order 4, four stages; no error estimate."""
+"""Classical Runge-Kutta method of order 4 in four stages, without error estimate."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Dormand and Prince's Runge-Kutta of order 8, twelve stages, with its estimates of order 5 and 3 (DOP853).
+"""Dormand and Prince's Runge-Kutta method of order 8 in twelve stages, with error estimates of order 5 and 3 (DOP853).
 
-The coefficients are scipy's. The engine of the references: through the first impacts order 4 needs 2 us for what this
-does at 25 us, at a third of the work.
+The coefficients are scipy's. Reference runs use this engine: in the first impacts order 4 needs 2 us for its accuracy
+at 25 us, at three times the work.
 """
 
 from __future__ import annotations

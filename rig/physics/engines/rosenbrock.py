@@ -1,15 +1,15 @@
-"""RODAS, an L-stable Rosenbrock method of order 4(3) in six stages: linearly implicit, for what is stiff.
+"""RODAS, an L-stable Rosenbrock method of order 4(3) in six stages: linearly implicit, for stiff problems.
 
 E. Hairer and G. Wanner, Solving Ordinary Differential Equations II (1996), section IV.7 and its code RODAS (method 1).
 A stage solves one linear system in the Jacobian J, in the form without products of matrices:
 
     (1/(g h) - J) U_i = f(y + sum_j a_ij U_j) + sum_j c_ij U_j / h + g_i h df/dt
 
-J comes by differences, once a step. Positions have their speeds for rates, so the system of 14 folds into one of 7;
-the integrals of the ledger feed back into nothing and follow by substitution.
+J is computed by differences once a step. The rates of the positions are the speeds, so the system of 14 reduces to one
+of 7. The integrals of the ledger affect nothing else and follow by substitution.
 
-A part costs 21 evaluations where rk8 takes 12: this engine pays where the contact is over-damped, or friction smoothed
-over a small speed, which makes every explicit method's step as short.
+A step costs 21 evaluations, against 12 of rk8. This engine pays off where the contact is over-damped, or friction is
+smoothed over a small speed: both make the step of explicit methods equally short.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ _C[5, :5] = [8.083246795921522, -7.981132988064893, -31.52159432874371, 16.31930
 _ALPHA = np.array([0.0, 0.386, 0.21, 0.63, 1.0, 1.0])
 _GAMMAS = np.array([0.25, -0.1043, 0.1035, -0.0362, 0.0, 0.0])
 
-# Rows of the workspace: rates at the start; the stages' U; rates by each state; rates by time; a stage's state; the
-# right-hand side; the folded matrix, its factors in place.
+# Rows of the workspace: rates at the start; the stages' U; derivatives by each state and by time; a stage's state; the
+# right-hand side; the reduced matrix, factorised in place.
 _U = 1
 _J = _U + _STAGES
 _BY_TIME = _J + S.N_STATE
@@ -54,11 +54,11 @@ _LU = _RIGHT + 1
 _ROWS = _LU + _N + 1
 
 _INCREMENTS = 1e-8 * S.STATE_SCALE
-"""Differences in each state: in a sliding speed some nm/s, well below any smoothing speed."""
+"""Increment of each state for differences: in a sliding speed some nm/s, far below any smoothing speed."""
 
 
 class Rosenbrock(NamedTuple):
-    """The method, as `rig.physics.engines.common.march` takes it."""
+    """Rosenbrock method in the form that `rig.physics.engines.common.march` requires."""
 
     rows: int = _ROWS
     order: float = 4.0
@@ -70,7 +70,7 @@ METHOD = Rosenbrock()
 
 @kernel
 def _prepare(method, constants, inputs, step, y, k, z, out):
-    """Jacobian of all rates by the state and by time, as forward differences."""
+    """Compute the Jacobian of all rates by the state and by time, as forward differences."""
     for j in range(S.N_STATE):
         for i in range(S.N_STATE):
             z[i] = y[i]
@@ -91,12 +91,12 @@ def _prepare(method, constants, inputs, step, y, k, z, out):
 
 @kernel
 def _factor(k, g):
-    """Factors of 1/g - J_v - g J_x for speeds v and positions x, rows exchanged as the pivots ask."""
+    """Factorise 1/g - J_v - g J_x for speeds v and positions x, with row pivoting."""
     for i in range(_N):
         for j in range(_N):
             k[_LU + i, j] = -k[_J + _N + j, _N + i] - g * k[_J + j, _N + i]
         k[_LU + i, i] += 1.0 / g
-        k[_LU + i, _N] = float(i)  # which row this was
+        k[_LU + i, _N] = float(i)  # index of the original row
     for p in range(_N):
         best = p
         for i in range(p + 1, _N):

@@ -1,13 +1,14 @@
-"""Semi-implicit (symplectic) Euler: new speeds by the forces at the start, new positions by the new speeds; order 1.
+"""Semi-implicit (symplectic) Euler method of order 1: speeds by the initial forces, then positions by the new speeds.
 
-One evaluation a step and a bounded energy error where forces come from the positions. Explicit in the speeds.
+One evaluation a step; the energy error is bounded for forces that depend on the positions alone. Explicit in the
+speeds.
 """
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
-from rig.physics.engines.common.method import FUNCTIONS, Functions, no_estimate, nothing_to_prepare
+from rig.physics.engines.common.method import FUNCTIONS, Functions, skip_preparation, zero_error
 from rig.physics.kernels import signals as S
 from rig.physics.kernels.stage import kernel
 
@@ -16,7 +17,7 @@ _N = S.N_STATE // 2
 
 
 class SemiImplicitEuler(NamedTuple):
-    """The method, as `rig.physics.engines.common.march` takes it."""
+    """Semi-implicit Euler method in the form that `rig.physics.engines.common.march` requires."""
 
     rows: int = 2
     order: float = 0.0
@@ -37,4 +38,4 @@ def _step(method, constants, inputs, step, y, k, z, end, out):
     return 0
 
 
-FUNCTIONS[SemiImplicitEuler] = Functions(step=_step, error=no_estimate, prepare=nothing_to_prepare)
+FUNCTIONS[SemiImplicitEuler] = Functions(step=_step, error=zero_error, prepare=skip_preparation)

@@ -1,4 +1,4 @@
-"""Tsitouras' adaptive Runge-Kutta of order 5(4), seven stages, the last of which is the next step's first.
+"""Tsitouras' adaptive Runge-Kutta method of order 5(4) in seven stages; the last is the next step's first.
 
 Ch. Tsitouras, Runge-Kutta pairs of order 5(4) satisfying only the first column simplifying assumption, Comput. Math.
 Appl. 62 (2011) 770-775.

@@ -1,15 +1,16 @@
-"""Velocity Verlet: half a kick, a drift, half a kick; order 2.
+"""Velocity Verlet method of order 2: half a velocity step, a position step, half a velocity step.
 
-Forces that depend on the speeds (damping, gyroscopic and centrifugal terms, friction) are taken at the end with the
-speeds that the first force alone would lead to, as is usual. That is of order 2 for them too, as Heun's method is, but
-it is not symplectic: only where forces come from the positions is the energy error bounded. Two evaluations a step.
+Forces that depend on the speeds (damping, gyroscopic and centrifugal terms, friction) are evaluated at the end with the
+speeds predicted by the first force alone, as is usual. For them the order is also 2, as with Heun's method, but the
+method is not symplectic: the energy error is bounded only for forces that depend on the positions alone. Two
+evaluations a step.
 """
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
-from rig.physics.engines.common.method import FUNCTIONS, Functions, no_estimate, nothing_to_prepare, rates
+from rig.physics.engines.common.method import FUNCTIONS, Functions, rates, skip_preparation, zero_error
 from rig.physics.kernels import signals as S
 from rig.physics.kernels.stage import kernel
 
@@ -18,7 +19,7 @@ _N = S.N_STATE // 2
 
 
 class Verlet(NamedTuple):
-    """The method, as `rig.physics.engines.common.march` takes it."""
+    """Verlet method in the form that `rig.physics.engines.common.march` requires."""
 
     rows: int = 3
     order: float = 0.0
@@ -43,4 +44,4 @@ def _step(method, constants, inputs, step, y, k, z, end, out):
     return 1
 
 
-FUNCTIONS[Verlet] = Functions(step=_step, error=no_estimate, prepare=nothing_to_prepare)
+FUNCTIONS[Verlet] = Functions(step=_step, error=zero_error, prepare=skip_preparation)

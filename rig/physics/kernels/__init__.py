@@ -1,11 +1,12 @@
-"""Numba kernels: functions of floats, arrays and NamedTuples, nothing else.
+"""Numba kernels: functions of floats, arrays and NamedTuples only.
 
-numba's own cache looks only at the file of the function it loads: it returns stale machine code when a kernel or a
-constant in *another* file has changed. So the cache folder is named by a digest of every kernel and engine file, of
-installed packages that add an engine too (unless the user set NUMBA_CACHE_DIR), before the first kernel is defined.
+numba's cache checks only the file of the function that it loads: it returns stale machine code when a kernel or a
+constant in *another* file has changed. Therefore a digest of every kernel and engine file, including those of installed
+packages that add an engine, names the cache folder before the first kernel is defined (unless the user set
+NUMBA_CACHE_DIR).
 
-numba also hands a caller's `fastmath` on to what it calls. Kernels that engines share name theirs, so that their bits
-do not depend on which engine was compiled first.
+numba also applies a caller's `fastmath` to the functions that it calls. Kernels shared by engines set their own, so
+that their bits do not depend on which engine was compiled first.
 """
 
 from __future__ import annotations
@@ -14,20 +15,21 @@ import hashlib
 import os
 import sys
 from collections.abc import Iterator
-from importlib.metadata import entry_points
 from importlib.util import find_spec
 from pathlib import Path
 
 from numba.core import config as numba_config
 
+from rig.base.checks import find_entry_points
+
 ENGINE_GROUP = "rig.engines"
-"""Entry points by which an installed package adds an engine (`rig.physics.engines`)."""
+"""Entry-point group of installed packages that add an engine (`rig.physics.engines`)."""
 _KERNELS = Path(__file__).parent
 _SOURCES = (_KERNELS, _KERNELS.parent / "engines", _KERNELS.parents[1] / "channels" / "sensors")
 
 
 def source_digest() -> str:
-    """Digest of all files that hold compiled code, and of their place: numba's cache serves no other."""
+    """Return the digest of all files with compiled code and of their location, which names numba's cache folder."""
     digest = hashlib.sha256(str(Path(__file__).parent).encode())
     own = (path for folder in _SOURCES for path in folder.rglob("*.py"))
     for path in [*sorted(own), *_files_of_other_packages()]:
@@ -36,7 +38,7 @@ def source_digest() -> str:
 
 
 def _files_of_other_packages() -> Iterator[Path]:
-    for package in sorted({point.module.partition(".")[0] for point in entry_points(group=ENGINE_GROUP)}):
+    for package in sorted({point.module.partition(".")[0] for point in find_entry_points(ENGINE_GROUP)}):
         spec = find_spec(package)
         if spec is not None and spec.submodule_search_locations:
             yield from sorted(path for folder in spec.submodule_search_locations for path in Path(folder).rglob("*.py"))
@@ -56,7 +58,7 @@ if "NUMBA_CACHE_DIR" not in os.environ:
     numba_config.CACHE_DIR = str(_cache_folder())  # pyright: ignore[reportAttributeAccessIssue]
 
 
-def compiled_before() -> bool:
-    """True where the cache already holds kernels of exactly these sources: the start will be quick."""
+def has_compiled_kernels() -> bool:
+    """Return True if the cache holds kernels of these sources, so that the start is quick."""
     folder = Path(str(numba_config.CACHE_DIR))  # pyright: ignore[reportAttributeAccessIssue]
     return folder.is_dir() and any(folder.rglob("*.nbc"))

@@ -1,4 +1,4 @@
-"""The numbers of a model as the kernels take them: SI floats in NamedTuples, one a body or law, frozen for a run."""
+"""Model constants of the kernels: SI floats in one NamedTuple per body or law, frozen for a run."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Shaft(NamedTuple):
 
 
 class Magnet(NamedTuple):
-    """Map of the magnets (`kernels.laws.magnet` has its formula), with viscous damping at the same point."""
+    """Magnet map (`kernels.laws.magnet` has its formula), with viscous damping at the same point."""
 
     terms: int  # LINEAR, RADIAL or RIPPLED of rig.physics.kernels.laws.magnet
     stiffness: float  # [N/m] at the centre
@@ -54,7 +54,7 @@ class Contact(NamedTuple):
 
 
 class House(NamedTuple):
-    """Inner and outer bearing house on beams and pre-compressed transducers."""
+    """Inner and outer housing on beams and pre-compressed transducers."""
 
     inner_mass: float  # [kg]
     outer_mass: float  # [kg]
@@ -68,11 +68,11 @@ class House(NamedTuple):
 
 
 class Levels(NamedTuple):
-    """How much of the model takes part; a level that is off costs a predicted branch."""
+    """Selected parts of the model; an excluded part costs a predicted branch."""
 
     euler: bool  # exact rotations and gyroscopic coupling of large tilts; else small angles
-    inner_house: bool  # moves; else it is fixed and passes forces on
-    outer_house: bool  # the same; only with an inner house
+    inner_house: bool  # moves; a fixed one transmits forces
+    outer_house: bool  # moves; only with an inner housing that moves
     compliant: bool  # contact force; else a rigid impact law
     friction: int  # NO_FRICTION ... EXACT of rig.physics.kernels.laws.contact
 
@@ -89,7 +89,7 @@ class Constants(NamedTuple):
 
 
 class Inputs(NamedTuple):
-    """What acts on the rig from outside during one call; constant between commands.
+    """External inputs of the rig, constant between commands and during one call.
 
     Ticks are absolute; the speed target is `speed + speed_slope (t - speed_tick)`.
     """

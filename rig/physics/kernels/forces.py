@@ -1,4 +1,4 @@
-"""Forces on shaft and houses but the ring's: hammer, drive, unbalance, gravity, magnets, beams and transducers."""
+"""Forces on shaft and housings except the ring's: hammer, drive, unbalance, gravity, magnets, beams, transducers."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from rig.physics.kernels.stage import stage
 
 
 class Magnets(NamedTuple):
-    """Force of the magnets on the shaft, and of the damping at the same place."""
+    """Force of the magnets on the shaft, and of the damping at the same point."""
 
     x: float  # [N]
     y: float  # [N]
@@ -31,14 +31,14 @@ class Disk(NamedTuple):
 
 
 class Stator(NamedTuple):
-    """Readings and forces of the houses, and their accelerations without the ring's force."""
+    """Readings and forces of the housings, and their accelerations without the ring's force."""
 
     north: float  # [N]
     south: float
     east: float
     west: float
-    beam_x: float  # inner beam on the outer house [N]
-    beam_y: float  # outer beam on the ground [N]
+    beam_x: float  # force of the inner beam on the outer housing [N]
+    beam_y: float  # force of the outer beam on the ground [N]
     stretch: float  # of the inner beam [m]
     slip: float  # its rate [m/s]
     stored_vertical: float  # in the transducers [J]
@@ -51,7 +51,7 @@ class Stator(NamedTuple):
 
 @stage
 def hammer_force(inputs, tick, fraction):
-    """Half-sine pulse of the hammer [N] at `tick + fraction`: a whole tick and the part beyond, apart to stay exact."""
+    """Return the half-sine hammer pulse [N] at `tick + fraction`, two numbers that keep the time exact."""
     if tick >= inputs.hammer_end or tick + fraction < inputs.hammer_start or inputs.hammer_end <= inputs.hammer_start:
         return 0.0
     phase = (float(tick - inputs.hammer_start) + fraction) / float(inputs.hammer_end - inputs.hammer_start)
@@ -60,19 +60,19 @@ def hammer_force(inputs, tick, fraction):
 
 @stage
 def drive_speed(inputs, tick, fraction):
-    """Speed that the drive aims at [rad/s]."""
+    """Return the speed target of the drive [rad/s]."""
     return inputs.speed + inputs.speed_slope * ((float(tick - inputs.speed_tick) + fraction) * inputs.tick_s)
 
 
 @stage
 def drive_torque(constants, inputs, tick, fraction, state):
-    """Torque of a drive that is not ideal [N m]."""
+    """Return the torque of a non-ideal drive [N m]."""
     return constants.torque_gain * (drive_speed(inputs, tick, fraction) - state.dth)
 
 
 @stage
-def magnets_on(constants, inputs, pose):
-    """Force of the magnets and of their damping; 0 where they are released."""
+def magnet_forces(constants, inputs, pose):
+    """Return the force of the magnets and of their damping; 0 when they are released."""
     magnet, arm = constants.magnet, constants.shaft.arm_magnet
     if not inputs.magnet_engaged:
         return Magnets(0.0, 0.0, 0.0, 0.0, 0.0)
@@ -82,7 +82,7 @@ def magnets_on(constants, inputs, pose):
 
 @stage
 def disk_forces(constants, inputs, tick, fraction, state):
-    """Unbalance, which turns with theta, and hammer."""
+    """Return the forces of the unbalance, which rotates with theta, and of the hammer."""
     shaft = constants.shaft
     unbalance = shaft.unbalance * state.dth * state.dth
     angle = state.theta + shaft.unbalance_phase
@@ -98,7 +98,7 @@ def disk_forces(constants, inputs, tick, fraction, state):
 
 @stage
 def torques(constants, magnets, disk):
-    """Sum of arm times lateral force about the pivot, x and y [N m], without the ring's."""
+    """Return the sum of arm times lateral force about the pivot, x and y [N m], without the ring's."""
     shaft = constants.shaft
     weight = -shaft.mass * shaft.gravity
     lB, lI = shaft.arm_magnet, shaft.arm_disk
@@ -108,10 +108,12 @@ def torques(constants, magnets, disk):
 
 
 @stage
-def inner_house_on(constants, state):
-    """North and south [N], force of the inner beam [N], its stretch [m] and slip [m/s], energy of the pair [J], ax, ay.
+def inner_house_forces(constants, state):
+    """Return forces and accelerations of the inner housing, without the ring's force.
 
-    The acceleration [m/s^2] is without the ring's force.
+    Returns:
+        North and south [N], force of the inner beam [N], its stretch [m] and slip [m/s], energy of the pair [J],
+        acceleration x, y [m/s^2].
     """
     house = constants.house
     if not constants.levels.inner_house:
@@ -124,8 +126,12 @@ def inner_house_on(constants, state):
 
 
 @stage
-def outer_house_on(constants, state, north, south, beam_x):
-    """East and west [N], force of the outer beam [N], energy of the pair [J], its own acceleration x, y [m/s^2]."""
+def outer_house_forces(constants, state, north, south, beam_x):
+    """Return forces and accelerations of the outer housing.
+
+    Returns:
+        East and west [N], force of the outer beam [N], energy of the pair [J], acceleration x, y [m/s^2].
+    """
     house = constants.house
     if not constants.levels.outer_house:
         return house.preload, house.preload, 0.0, 0.0, 0.0, 0.0
@@ -136,24 +142,24 @@ def outer_house_on(constants, state, north, south, beam_x):
 
 
 @stage
-def stator_of(constants, state):
-    """Beams and transducers. A house that does not move passes its force on."""
-    north, south, beam_x, stretch, slip, stored_v, ax_ih, ay_ih = inner_house_on(constants, state)
-    east, west, beam_y, stored_h, ax_oh, ay_oh = outer_house_on(constants, state, north, south, beam_x)
+def stator_forces(constants, state):
+    """Return the forces of beams and transducers. A fixed housing transmits its force."""
+    north, south, beam_x, stretch, slip, stored_v, ax_ih, ay_ih = inner_house_forces(constants, state)
+    east, west, beam_y, stored_h, ax_oh, ay_oh = outer_house_forces(constants, state, north, south, beam_x)
     return Stator(
         north, south, east, west, beam_x, beam_y, stretch, slip, stored_v, stored_h, ax_ih, ay_ih, ax_oh, ay_oh
     )
 
 
 @stage
-def passed_on(constants, stator, Fx, Fy):
-    """The houses' readings where one does not move: the support carries what the inner house, or the ring, passes on.
+def support_forces(constants, stator, Fx, Fy):
+    """Return the transducer and outer beam forces, where a fixed housing transmits its load to the support.
 
     Args:
-        constants: Numbers of the model.
-        stator: Of houses that move.
+        constants: Model constants.
+        stator: Forces of housings that move.
         Fx: Force of the ring on the shaft, x [N].
-        Fy: The same, y [N].
+        Fy: Force as `Fx`, y [N].
 
     Returns:
         North, south, east, west and the outer beam's force [N].

@@ -1,4 +1,4 @@
-"""What is observed at one instant beside the contact: readings, reactions, displacements, energies and momenta."""
+"""Observed quantities at one instant, apart from the contact: readings, reactions, displacements, energies, momenta."""
 
 from __future__ import annotations
 
@@ -8,31 +8,31 @@ from rig.physics.kernels import signals as S
 from rig.physics.kernels.stage import stage
 
 KEYPHASOR_WIDTH = math.radians(10.0)
-"""Angle over which the mark is seen [rad], ..."""
-EDGE = math.radians(1.0)
-"""... and over which it comes into sight and goes, as wide as the probe's tip: both assumed [rad]."""
+"""Angle of the keyphasor mark [rad]; assumed."""
+EDGE_WIDTH = math.radians(1.0)
+"""Angle of each of its edges, equal to the width of the probe's tip [rad]; assumed."""
 
 
 @stage
 def write_observed(
     constants, state, pose, ring, magnets, disk, stator, support, motion, acceleration, Fx, Fy, out
 ):  # fmt: skip
-    """Enter the observed quantities.
+    """Write the observed quantities.
 
     Args:
-        constants: Numbers of the model.
-        state: The state.
-        pose: Of the shaft.
-        ring: Force of the ring, but for friction that depends on the whole motion.
-        magnets: Forces of the magnets.
+        constants: Model constants.
+        state: State.
+        pose: Pose of the shaft.
+        ring: Force of the ring, without friction that depends on the accelerations.
+        magnets: Magnet forces.
         disk: Forces at the disk.
-        stator: Of the houses.
-        support: What their transducers and the outer beam carry (`rig.physics.kernels.forces.passed_on`).
+        stator: Forces of the housings.
+        support: Transducer and outer beam forces (`rig.physics.kernels.forces.support_forces`).
         motion: Accelerations.
-        acceleration: Of the axis's direction, x, y, z [1/s^2].
+        acceleration: Acceleration of the axis's direction, x, y, z [1/s^2].
         Fx: Force of the ring on the shaft, x [N].
-        Fy: The same, y [N].
-        out: Out, shape (N_OBSERVED,).
+        Fy: Force as `Fx`, y [N].
+        out: Observed quantities, out, shape (N_OBSERVED,).
     """
     shaft, contact, house = constants.shaft, constants.contact, constants.house
     Ixx, Izz, lA, lI = shaft.transverse_inertia, shaft.polar_inertia, shaft.arm_ring, shaft.arm_disk
@@ -58,7 +58,7 @@ def write_observed(
     out[S.RING_Y] = lA * uy - state.y_ih - contact.offset_y
     out[S.SPIN_RATE] = state.dth
     ahead = (state.theta + math.pi) % (2.0 * math.pi) - math.pi
-    seen = 0.5 + min(ahead, KEYPHASOR_WIDTH - ahead) / EDGE
+    seen = 0.5 + min(ahead, KEYPHASOR_WIDTH - ahead) / EDGE_WIDTH
     out[S.KEYPHASOR] = min(max(seen, 0.0), 1.0)
     out[S.DRIVE_TORQUE] = motion.torque
     out[S.MAGNET_X] = magnets.x

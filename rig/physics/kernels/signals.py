@@ -1,9 +1,8 @@
-"""The row that an engine writes at every observed instant: its columns, their order, units and meaning.
+"""Columns of the row that an engine writes at every observed instant: order, units and meaning.
 
-The first columns are the state; then what the laws make of it at that instant; then the ledger: the momenta and
-energies that are stored, and the running integral of every torque, force and power. Each line below enters a column
-and names its position for the kernels: `dy[GAMMA_RATE]` in the vector that an engine integrates, `out[P_N]` in the
-observed part.
+The first columns are the state, then the observed quantities of that instant and the ledger: stored momenta and
+energies, and the running integral of every torque, force and power. Each line below adds a column and names its
+position for the kernels: `dy[GAMMA_RATE]` in the integrated vector, `out[P_N]` in the observed part.
 """
 
 from __future__ import annotations
@@ -14,17 +13,17 @@ import numpy as np
 
 
 class Signal(NamedTuple):
-    """One column."""
+    """Column of the row."""
 
     name: str
     unit: str
     label: str
     scale: float = 0.0
-    """What counts as 1 where errors of the state are added up, in its SI unit."""
+    """Unit of the scaled error of a state, in its SI unit."""
 
 
 class _Table:
-    """Columns in their order; a call enters one and returns its position."""
+    """Ordered columns; a call adds one and returns its position."""
 
     def __init__(self, first: int = 0) -> None:
         self.signals: list[Signal] = []
@@ -55,7 +54,7 @@ STATE = tuple(_state.signals)
 """Generalised coordinates and their rates, in the order of the state vector."""
 N_STATE = len(STATE)
 STATE_SCALE = np.array([signal.scale for signal in STATE])
-"""What counts as 1 in each state where errors are added up, in its SI unit: shape (N_STATE,)."""
+"""Unit of each state's scaled error, in its SI unit, shape (N_STATE,)."""
 
 _integral = _Table(N_STATE)
 DRIVE_WORK = _integral("drive_work", "J", "Work done by the drive torque")
@@ -75,9 +74,9 @@ HOUSE_IMPULSE_X = _integral("house_impulse_x", "N s", "Integral of the forces on
 HOUSE_IMPULSE_Y = _integral("house_impulse_y", "N s", "Integral of the forces on both houses, y")
 
 INTEGRALS = tuple(_integral.signals)
-"""Running integrals, carried by the engine behind the state with the engine's own quadrature."""
+"""Running integrals, which the engine appends to the state and integrates by its own quadrature."""
 N_VECTOR = N_STATE + len(INTEGRALS)
-"""Length of the vector that an engine integrates: the state, then the integrals."""
+"""Length of the integrated vector: the state, then the integrals."""
 
 _observed = _Table()
 PENETRATION = _observed("penetration", "m", "Shaft into ring; negative is the gap")
@@ -119,7 +118,7 @@ HOUSE_X = _observed("house_momentum_x", "N s", "Both houses, x")
 HOUSE_Y = _observed("house_momentum_y", "N s", "Both houses, y")
 
 OBSERVED = tuple(_observed.signals)
-"""What the laws make of the state at one instant."""
+"""Quantities computed from the state at one instant."""
 N_OBSERVED = len(OBSERVED)
 
 ROW = STATE + INTEGRALS + OBSERVED
@@ -139,4 +138,4 @@ TRUTH = {
         "bearing_loss", "house_loss", "contact_loss", "friction_loss",
     ),
 }  # fmt: skip
-"""Columns of each truth table that is published beside the sensors."""
+"""Columns of each truth table that is published with the sensors."""

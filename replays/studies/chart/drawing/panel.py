@@ -10,7 +10,7 @@ import numpy as np
 
 from replays.studies.chart.drawing.look import ALARM, FAILURES, Row, look, look_of_bound
 from replays.studies.chart.methods import ADDED_FAMILY, RIG_FAMILY
-from replays.studies.chart.profile import TARGET, shares
+from replays.studies.chart.profile import TARGET, profile_curves
 
 _STRIP_BEGIN, _STRIP_END = 2.0, 60.0
 """Begin and end of the strip of failures on the error axis."""
@@ -222,7 +222,7 @@ def draw_profile(axes: Any, rows: list[Row]) -> int:
     fair = [row for row in points if row["failure"] != "reference"]
     scenes = len({row["phase"] for row in fair})
     axes.set_xscale("log")
-    curves = shares(fair) if fair else {}
+    curves = profile_curves(fair) if fair else {}
     top = max((float(ratios[-1]) for ratios, _ in curves.values() if len(ratios)), default=10.0) * 1.6
     for method, (ratios, share) in curves.items():
         row = next(one for one in fair if one["method"] == method)
@@ -230,7 +230,7 @@ def draw_profile(axes: Any, rows: list[Row]) -> int:
         x = np.concatenate([[1.0], ratios, [top]]) if len(ratios) else np.array([1.0, top])
         y = np.concatenate([[0.0], share, [share[-1]]]) if len(ratios) else np.zeros(2)
         axes.step(x, 100.0 * y, where="post", gid=f"profile-{method}", clip_on=False, **style)
-    for method, (ratios, share) in (shares(fair, column="own_cpu_s") if fair else {}).items():
+    for method, (ratios, share) in (profile_curves(fair, column="own_cpu_s") if fair else {}).items():
         row = next(one for one in fair if one["method"] == method)
         style = look_of_bound(row, rows)
         # A bound below the best cost is drawn at that cost.

@@ -1,1 +1,1 @@
-"""Common parts of the peers: the problem, its right-hand side, the solution."""
+"""Common parts of the peers: problem, right-hand side, solution."""

@@ -1,8 +1,8 @@
-"""What a chart measures errors against: one run at the end of its tolerance, and its distance from an unlike second.
+"""Reference of a chart's errors: one run at its finest tolerance, and its distance from an independent second run.
 
-The first is heyoka's Taylor series on equations of its own, the second a Runge-Kutta or multistep method on the rig's
-compiled right-hand side: another method, another derivation, another library. Where heyoka is missing or has no words
-for a problem, the two others stand in, which then share the right-hand side.
+The first is heyoka's Taylor series on its own equations, the second a Runge-Kutta or multistep method on the rig's
+compiled right-hand side: method, derivation and library differ. Where heyoka is missing or cannot represent a problem,
+two other methods are used, which share the right-hand side.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ class Reference:
     """Reference of one problem.
 
     Attributes:
-        solution: The run to measure against.
+        solution: Reference solution.
         names: Names of both peers.
-        error: Their distance, as `scaled_error`: the reference's error bar.
-        compile_s: What compiling took for each [s].
+        error: Their distance, as `scaled_error`: the reference's error estimate.
+        compile_s: Compile time of each [s].
         independent: Whether the two share neither method nor derivation.
     """
 
@@ -38,11 +38,11 @@ def find_reference(problem: Problem, *, quick: bool = False) -> Reference | None
     """Solve a problem twice for reference.
 
     Args:
-        problem: The problem.
-        quick: The second by CVODE Adams, ten times quicker than DOP853 and ten times less sharp.
+        problem: Problem.
+        quick: Use CVODE Adams as the second method, ten times faster and ten times less accurate than DOP853.
 
     Returns:
-        The reference, or None where no two codes got through.
+        Reference, or None if fewer than two methods solve the problem.
     """
     first, *others = _CANDIDATES
     found: list[tuple[str, Solution]] = []

@@ -1,9 +1,8 @@
-"""The rig's own right-hand side as other people's solvers can call it: compiled, its numbers in one C struct.
+"""Compiled right-hand side of the rig for other authors' solvers, with its numbers in one C struct.
 
-`rig.physics.kernels.dynamics.evaluate` is called for the 14 states alone; its ledger goes to the stack, where the
-compiler drops most of it. Beside the rates stand the switching functions: what a solver's event location has to watch,
-and what a change of phase does. Everything that holds machine code of the kernels is in this one file, because numba's
-cache looks at no other.
+`rig.physics.kernels.dynamics.evaluate` is called for the 14 states alone. Its ledger goes to the stack, where the
+compiler drops most of it. The switching functions for a solver's event location, and the changes of phase, are here
+too. All machine code of the kernels is in this one file, because numba's cache checks no other.
 """
 
 from __future__ import annotations
@@ -22,42 +21,42 @@ from rig.physics.kernels import signals as S
 from rig.physics.kernels.constants import Constants, Inputs
 from rig.physics.kernels.dynamics import evaluate
 from rig.physics.kernels.frames.geometry import gap
-from rig.physics.kernels.laws.contact import BACKWARD, EXACT, FLIGHT, FORWARD, ROLLING, TOUCHING, held_speed
-from rig.physics.kernels.records import layout, plain
+from rig.physics.kernels.laws.contact import BACKWARD, EXACT, FLIGHT, FORWARD, ROLLING, TOUCHING, floor_onset_speed
+from rig.physics.kernels.records import as_tuple, struct_dtype
 
 N_STATE, N_VECTOR, N_OBSERVED = S.N_STATE, S.N_VECTOR, S.N_OBSERVED
 N_SWITCH = 2
-"""Switching functions: the gap, and the friction's (v_t while sliding, what is left of mu F_n while rolling)."""
+"""Number of switching functions: the gap, and the friction's (v_t in sliding, the margin below mu F_n in rolling)."""
 STATE_SCALE = S.STATE_SCALE
 _DIFFERENCE = 1.5e-8
-"""Relative step of differences: the root of the rounding unit."""
+"""Relative increment of differences: the root of the rounding unit."""
 
 PARAMETERS = np.dtype(
     [
-        ("constants", layout(Constants)),
-        ("inputs", layout(Inputs)),
+        ("constants", struct_dtype(Constants)),
+        ("inputs", struct_dtype(Inputs)),
         ("phase", np.int64),
         ("onset_speed", np.float64),
         ("evaluations", np.int64),
-        # Where CVODE's vectors keep the address of their numbers, in words of 8 bytes.
+        # Offset of the data address in CVODE's vectors, in words of 8 bytes.
         ("vector_word", np.int64),
     ],
     align=True,
 )
-"""The struct: the problem's numbers and, at the end, what changes during a solve."""
+"""Struct of the problem's numbers, followed by those that change during a solve."""
 
 
 def pack(problem: Problem) -> np.ndarray:
-    """The struct of a problem, shape (1,), of its own for each solve: the phase changes in place."""
+    """Return the struct of a problem, shape (1,). Each solve needs its own, as the phase changes in place."""
     parameters = np.zeros(1, PARAMETERS)
-    parameters[0] = (plain(problem.constants), plain(problem.inputs), problem.phase, problem.onset_speed, 0, 0)
+    parameters[0] = (as_tuple(problem.constants), as_tuple(problem.inputs), problem.phase, problem.onset_speed, 0, 0)
     return parameters
 
 
 def _stack_code(context, count):
-    """Room for `count` floats on the stack: an array that is never allocated can be optimised away."""
+    """Reserve `count` floats on the stack: without an allocation, the compiler can remove an array."""
     if not isinstance(count, types.IntegerLiteral):
-        return None  # numba then tries the literal
+        return None  # numba then tries the literal type
     size = count.literal_value
 
     def code(context, builder, signature, arguments):
@@ -67,7 +66,7 @@ def _stack_code(context, count):
 
 
 def _pointer_code(context, address):
-    """The floats at an address."""
+    """Convert an address to a pointer to floats."""
 
     def code(context, builder, signature, arguments):
         return builder.inttoptr(arguments[0], ir.DoubleType().as_pointer())
@@ -76,7 +75,7 @@ def _pointer_code(context, address):
 
 
 def _word_code(context, address, index):
-    """The word of 8 bytes at an address, `index` words on."""
+    """Load the word of 8 bytes at an address plus `index` words."""
 
     def code(context, builder, signature, arguments):
         words = builder.inttoptr(arguments[0], ir.IntType(64).as_pointer())
@@ -85,7 +84,7 @@ def _word_code(context, address, index):
     return types.int64(address, index), code
 
 
-# What the type checker takes for the code generators is called by numba with values.
+# numba calls these with values; the type checker sees the code generators.
 _stack: Any = extending.intrinsic(_stack_code)
 _pointer: Any = extending.intrinsic(_pointer_code)
 _word: Any = extending.intrinsic(_word_code)
@@ -102,7 +101,7 @@ def _rates(t, y, p, f):
 
 
 @njit(cache=True, forceinline=True)
-def _rates_by_sign(t, y, p, f):
+def _rates_by_gap_sign(t, y, p, f):
     phase = p.phase
     p.phase = TOUCHING if gap(p.constants, y)[0] > 0.0 else FLIGHT
     _rates(t, y, p, f)
@@ -111,7 +110,7 @@ def _rates_by_sign(t, y, p, f):
 
 @njit(cache=True)
 def contact_at(t, y, p, phase):
-    """Penetration [m], its rate, sliding speed [m/s], normal and friction force [N] under a phase."""
+    """Return penetration [m], its rate, sliding speed [m/s], normal and friction force [N] in a phase."""
     dy = carray(_stack(N_VECTOR), (N_VECTOR,))
     out = carray(_stack(N_OBSERVED), (N_OBSERVED,))
     evaluate(p.constants, p.inputs, 0, t / p.inputs.tick_s, p.onset_speed, phase, False, y, dy, out)
@@ -144,7 +143,7 @@ def _switches(t, y, p, g):
 
 @njit(cache=True)
 def derivative(t, y, parameters):
-    """Rates of the 14 states at `t` [s] from the window's start; the struct tells the phase."""
+    """Return the rates of the 14 states at `t` [s] from the window's start, in the struct's phase."""
     f = np.empty(N_STATE)
     _rates(t, y, parameters[0], f)
     return f
@@ -152,7 +151,7 @@ def derivative(t, y, parameters):
 
 @njit(cache=True)
 def jacobian(t, y, parameters):
-    """Slopes of the rates by the states, by differences, shape (14, 14)."""
+    """Return the derivatives of the rates by the states, by differences, shape (14, 14)."""
     slopes = np.empty((N_STATE, N_STATE))
     here, moved = derivative(t, y, parameters), y.copy()
     for i in range(N_STATE):
@@ -163,35 +162,36 @@ def jacobian(t, y, parameters):
 
 
 @njit(cache=True)
-def derivative_by_sign(t, y, parameters):
-    """The same for solvers without events: the right-hand side itself asks for the gap's sign."""
+def derivative_by_gap_sign(t, y, parameters):
+    """Return the rates for solvers without events, in the phase given by the sign of the gap."""
     f = np.empty(N_STATE)
-    _rates_by_sign(t, y, parameters[0], f)
+    _rates_by_gap_sign(t, y, parameters[0], f)
     return f
 
 
 @njit(cache=True)
 def switching(t, y, parameters):
-    """Switching functions, shape (N_SWITCH,): positive inside the phase, and it ends where one falls to 0."""
+    """Return the switching functions, shape (N_SWITCH,): positive within the phase, which ends where one falls to 0."""
     g = np.empty(N_SWITCH)
     _switches(t, y, parameters[0], g)
     return g
 
 
 @njit(cache=True)
-def follow_sign(t, y, parameters):
-    """For solvers without events: the phase is what the gap's sign says now, v0 the rate where it has just turned.
+def follow_gap_sign(t, y, parameters):
+    """Set the phase by the sign of the gap, for solvers without events.
 
-    The known trap: v0 is latched at a step's end, not where the contact began.
+    v0 is latched at the end of the step in which the sign changes, not where the contact starts: the known error of
+    this method.
 
     Returns:
-        Whether a contact began since the last call.
+        True if a contact started since the last call.
     """
     p = parameters[0]
     depth, rate = gap(p.constants, y)
     began = depth > 0.0 and p.phase == FLIGHT
     if began:
-        p.onset_speed = held_speed(rate, p.constants.contact)
+        p.onset_speed = floor_onset_speed(rate, p.constants.contact)
         p.phase = TOUCHING
     elif depth <= 0.0:
         p.phase = FLIGHT
@@ -199,11 +199,11 @@ def follow_sign(t, y, parameters):
 
 
 @njit(cache=True)
-def take_switch(t, y, parameters, which):
-    """Change the phase where a switching function has met 0; an onset latches v0 at the located crossing.
+def change_phase(t, y, parameters, which):
+    """Set the phase after a zero of a switching function; an onset latches v0 at the located instant.
 
     Returns:
-        Whether a contact began.
+        True if a contact started.
     """
     p = parameters[0]
     before = p.phase
@@ -212,17 +212,17 @@ def take_switch(t, y, parameters, which):
         return False
     if which == 0:
         _, rate, sliding, _, _ = contact_at(t, y, p, FLIGHT)
-        p.onset_speed = held_speed(rate, p.constants.contact)
+        p.onset_speed = floor_onset_speed(rate, p.constants.contact)
         p.phase = TOUCHING
         if p.constants.levels.friction == EXACT:
             if sliding == 0.0:
-                # No sliding to tell the direction by: where it is going to slide, if it is.
+                # Without sliding, the required friction determines the direction.
                 needed = contact_at(t, y, p, ROLLING)[4]
                 p.phase = ROLLING if needed == 0.0 else FORWARD if needed > 0.0 else BACKWARD
             else:
                 p.phase = FORWARD if sliding > 0.0 else BACKWARD
         return True
-    # Sliding has stopped, or rolling asks for more friction than there is.
+    # Sliding has stopped, or rolling requires more friction than mu F_n.
     _, _, _, normal, needed = contact_at(t, y, p, ROLLING)
     if before != ROLLING and abs(needed) <= p.constants.contact.friction * normal:
         p.phase = ROLLING
@@ -232,7 +232,7 @@ def take_switch(t, y, parameters, which):
 
 
 def _vector_rates(t, y, ydot, user_data):
-    """Right-hand side by CVODE's signature: CVRhsFn(t, y, ydot, user_data) -> 0."""
+    """Evaluate the right-hand side with CVODE's signature CVRhsFn(t, y, ydot, user_data) -> 0."""
     p = carray(user_data, (1,), PARAMETERS)[0]
     _rates(t, _numbers(y, p.vector_word), p, _numbers(ydot, p.vector_word))
     return 0
@@ -240,12 +240,12 @@ def _vector_rates(t, y, ydot, user_data):
 
 def _vector_rates_by_sign(t, y, ydot, user_data):
     p = carray(user_data, (1,), PARAMETERS)[0]
-    _rates_by_sign(t, _numbers(y, p.vector_word), p, _numbers(ydot, p.vector_word))
+    _rates_by_gap_sign(t, _numbers(y, p.vector_word), p, _numbers(ydot, p.vector_word))
     return 0
 
 
 def _vector_switches(t, y, g, user_data):
-    """Switching functions by CVODE's signature: CVRootFn(t, y, gout, user_data) -> 0."""
+    """Evaluate the switching functions with CVODE's signature CVRootFn(t, y, gout, user_data) -> 0."""
     p = carray(user_data, (1,), PARAMETERS)[0]
     _switches(t, _numbers(y, p.vector_word), p, carray(g, (N_SWITCH,), np.float64))
     return 0
@@ -261,22 +261,26 @@ def _numbers(vector, word):
 
 @functools.cache
 def compile_s() -> float:
-    """Compile what Python calls, or load it from numba's cache; how long the first call took [s]."""
+    """Compile the functions called from Python, or load them from numba's cache.
+
+    Returns:
+        Time of the first call [s].
+    """
     begin = time.perf_counter()
     vector, struct = types.float64[::1], from_dtype(PARAMETERS)[::1]
-    state_only: list[Any] = [derivative, jacobian, derivative_by_sign, switching, follow_sign]
+    state_only: list[Any] = [derivative, jacobian, derivative_by_gap_sign, switching, follow_gap_sign]
     for function in state_only:
         function.compile((types.float64, vector, struct))
-    take: Any = take_switch
+    take: Any = change_phase
     take.compile((types.float64, vector, struct, types.int64))
     return time.perf_counter() - begin
 
 
 @functools.cache
 def vector_callbacks() -> tuple[Any, Any, Any]:
-    """Rates, switching functions, and rates by the gap's sign, as C functions for CVODE; `.address` is where.
+    """Return rates, switching functions, and rates by the gap's sign as C functions for CVODE.
 
-    The first call compiles them, or loads them from numba's cache.
+    The first call compiles them, or loads them from numba's cache. `.address` is the address of a function.
     """
     c_function = types.intc(types.double, types.voidptr, types.voidptr, types.voidptr)
     compiled = cfunc(c_function, cache=True)

@@ -1,4 +1,4 @@
-"""What a solver is asked and what it hands back."""
+"""Settings and solutions of the solvers."""
 
 from __future__ import annotations
 
@@ -14,55 +14,56 @@ from rig.physics.kernels.signals import N_STATE
 
 MISSED_HAMMER = "missed the hammer: no step ended inside its pulse"
 STEP_CEILING = 20_000_000
-"""A solve that takes more steps than this has failed."""
+"""Number of steps above which a solve has failed."""
 SWITCH_CEILING = 100_000
-"""The same for changes of phase: a solver that stalls at a switch must not run for ever."""
+"""Number of phase changes above which a solve has failed: a solver that stalls at a switch must stop."""
 
 
 class Setting(NamedTuple):
-    """One setting of a method: of a solver that somebody else wrote, or of an engine of ours."""
+    """Setting of another author's solver or of one of our engines."""
 
     label: str
     tolerance: float
-    """Relative tolerance; for a solver of fixed step, its step [s]."""
+    """Relative tolerance; step [s] of a solver with fixed step."""
     absolute: float | None = None
-    """One absolute tolerance for all states; None for tolerance times `STATE_SCALE`."""
+    """Absolute tolerance of all states; None for tolerance times `STATE_SCALE`."""
     step_us: int = 0
-    """Step of an engine of ours, or the grid that its steps end on [µs]; 0 of other solvers."""
+    """Step of one of our engines, or grid on which its steps end [µs]; 0 for other solvers."""
 
 
 class Manner(NamedTuple):
-    """How a library's solver is driven: the default is the proper way, the others are those known to fail or to lag."""
+    """Mode of operation of a library's solver: the default is proper, the others are known to fail or to be slow."""
 
     plain: bool = False
-    """The right-hand side in plain Python through the library's own interface, instead of the compiled one."""
+    """Whether the right-hand side is plain Python, called through the library's own interface, instead of compiled."""
     stops: bool = True
-    """Whether it stops at the hammer's corners."""
+    """Whether it stops at the corners of the hammer pulse."""
     events: bool = True
-    """Whether changes of phase are located; where not, the right-hand side itself asks for the gap's sign."""
+    """Whether changes of phase are located; otherwise the right-hand side uses the sign of the gap."""
 
 
-PROPER = Manner()
+DEFAULT = Manner()
 
 
 @dataclass
 class Solution:
-    """One solve of one problem, under way or closed. A failure is a result like any other.
+    """Solution of a problem, in progress or closed. A failure is a result as any other.
 
     Attributes:
         times: The problem's instants [s], shape (n,).
-        budget_s: Wall time allowed [s].
-        compile_s: What compiling took in this process before the first solve could start [s].
-        states: States there, nan from where the solver failed, shape (n, 14).
-        reached: How many of them are there, where a solver counts by it.
-        onsets: Time [s] and impact speed v0 [m/s] of each contact that began.
-        switches: Changes of phase: onsets, lift-offs, those between sliding and rolling, and of heyoka the clamps.
-        steps: Accepted steps; 0 where the library does not tell.
-        evaluations: Of the right-hand side, with those for a Jacobian; of a Taylor series, its order times its steps.
-        failure: Why it failed, or None.
-        own_s: Processor time inside the library's own calls alone [s], where a Python loop of ours drives it: what is
-            left if that loop cost nothing. None where there is no such loop, or where it costs as good as nothing.
-        cpu_s: Processor time of the solve, without compilation [s]; there when it is closed.
+        budget_s: Permitted wall time [s].
+        compile_s: Compile time in this process before the first solve [s].
+        states: States at these instants, nan after a failure, shape (n, 14).
+        reached: Number of states written, for solvers that count them.
+        onsets: Time [s] and impact speed v0 [m/s] of each contact.
+        switches: Number of phase changes: onsets, lift-offs, changes between sliding and rolling, and heyoka's clamps.
+        steps: Accepted steps; 0 if the library does not report them.
+        evaluations: Evaluations of the right-hand side, including those for a Jacobian; order times steps for a Taylor
+            series.
+        failure: Reason for a failure, or None.
+        own_s: Processor time inside the library's own calls alone [s], without our Python loop. None if there is no
+            such loop, or if its cost is negligible.
+        cpu_s: Processor time of the solve, without compilation [s]; set by `close`.
     """
 
     times: np.ndarray
@@ -78,7 +79,7 @@ class Solution:
     own_s: float | None = None
     cpu_s: float = math.nan
     clock: Callable[[], float] = time.thread_time
-    """Clock of processor time: of the calling thread, or of the process where a library has threads of its own."""
+    """Clock of processor time: of the calling thread, or of the process for a library with threads."""
     _begin: float = field(default_factory=time.perf_counter)
     _cpu_begin: float = field(init=False)
 
@@ -88,11 +89,11 @@ class Solution:
 
     @property
     def contacts(self) -> int:
-        """How many contacts began."""
+        """Number of contacts."""
         return len(self.onsets)
 
     def overrun(self) -> bool:
-        """Whether a budget is spent; notes it as the failure."""
+        """Return whether a limit is exceeded, and set the failure."""
         if time.perf_counter() > self._begin + self.budget_s:
             self.failure = f"over the budget of {self.budget_s:g} s"
         elif self.steps > STEP_CEILING:
@@ -102,7 +103,7 @@ class Solution:
         return self.failure is not None
 
     def close(self) -> Solution:
-        """The same, with the time that it took."""
+        """Return the solution with its processor time."""
         self.cpu_s = self.clock() - self._cpu_begin
         if self.failure is None and not np.isfinite(self.states).all():
             self.failure = "the state is not finite"

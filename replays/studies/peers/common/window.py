@@ -1,4 +1,4 @@
-"""A window of a scene from its start, as a problem for our engines and other people's solvers."""
+"""Window of a scene from its start, as a problem for our engines and other authors' solvers."""
 
 from __future__ import annotations
 
@@ -32,21 +32,21 @@ def cut_window(
     friction: Literal["none", "smoothed", "exact"] | None = None,
     **contact: float,
 ) -> Problem:
-    """Cut a window out of a scene.
+    """Return a window of a scene as a problem.
 
-    Commands take effect at the tick nearest to their time. (A simulation moves them up to the next observed row, which
-    is the same for times of a whole 25 µs.)
+    Commands take effect at the nearest tick. (A simulation moves them to the next observed row, which is the same for
+    multiples of 25 µs.)
 
     Args:
-        scene: The scene.
-        end_s: Its end [s]; None for the scene's end.
-        sample_s: States are wanted this often [s], and at the end.
-        friction: Friction law instead of the scene's.
-        contact: What the contact has otherwise than the scene's, by field, such as `smoothing_speed`; a
-            `damping_factor` of 0 takes the damping term with its memory of the impact speed out of the law.
+        scene: Scene.
+        end_s: End of the window [s]; None for the scene's end.
+        sample_s: Interval of the required states [s]; the end is added.
+        friction: Friction law; None for the scene's.
+        contact: Changed contact constants by field, such as `smoothing_speed`; a `damping_factor` of 0 excludes the
+            damping term with its memory of the impact speed.
 
     Raises:
-        InputError: The window is empty, or drive, magnets or a second pulse change inside it.
+        InputError: The window is empty, or drive, magnets or a second pulse change within it.
     """
     model = build_model(scene.load_parameters(), scene.model)
     constants = model.constants._replace(contact=model.constants.contact._replace(**contact))
@@ -73,7 +73,7 @@ def cut_window(
 
 
 def _phase(problem: Problem) -> int:
-    """Phase of the contact that the state at the start alone tells; one that rolls is taken for one that slides."""
+    """Return the contact phase of the initial state; rolling counts as sliding."""
     penetration, _, sliding, _, _ = contact_at(0.0, problem.y0, pack(problem)[0], FLIGHT)
     if penetration <= 0.0:
         return FLIGHT
@@ -83,7 +83,7 @@ def _phase(problem: Problem) -> int:
 
 
 def _inputs(scene: Scene) -> tuple[Inputs, int]:
-    """Inputs in force from the start, with the first pulse, and the tick at which they change."""
+    """Return the inputs at the start, with the first pulse, and the tick at which they change."""
     timed = sorted(((round(one.at_s / TICK_S), one.request) for one in scene.commands), key=lambda pair: pair[0])
     drive = scene.drive
     points = [(round(time / TICK_S), 2.0 * math.pi * hz) for time, hz in (drive.profile or ((0.0, drive.speed_hz),))]

@@ -1,8 +1,8 @@
-"""Events of a march: onset, lift-off, and the changes of Coulomb's set-valued friction; phases behind them.
+"""Events of a march: onset, lift-off and changes of Coulomb's set-valued friction, and the phases that follow.
 
-Friction by Filippov: with the law EXACT the phase of the contact is sliding forward, sliding backward, or rolling.
-Rolling lasts while the force that it needs stays within mu F_n; a sliding speed that comes to 0 goes over to rolling
-where rolling is possible, else to sliding the other way.
+Friction by Filippov: with the law EXACT the contact slides forward, slides backward, or rolls. Rolling lasts while its
+friction force stays within mu F_n. When the sliding speed reaches 0, the contact rolls if that is possible, else it
+slides in the other direction.
 """
 
 from __future__ import annotations
@@ -10,45 +10,45 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from rig.physics.engines.common.memory import (
-    BEFORE,
-    BEFORE_SPAN,
     CONTACTS,
     EVALUATIONS,
     FLOORED,
-    LAST,
+    FORCE_SPAN,
+    LAST_FORCE,
+    OLD_FORCE,
     ONSET,
     PEAK_FORCE,
     PHASE,
 )
 from rig.physics.engines.common.method import Step, method_step, rates
-from rig.physics.engines.common.peak import peak
+from rig.physics.engines.common.peak import parabolic_peak
 from rig.physics.kernels import signals as S
-from rig.physics.kernels.laws.contact import BACKWARD, EXACT, FLIGHT, FORWARD, ROLLING, TOUCHING, held_speed
+from rig.physics.kernels.laws.contact import BACKWARD, EXACT, FLIGHT, FORWARD, ROLLING, TOUCHING, floor_onset_speed
 from rig.physics.kernels.stage import kernel
 
-NONE, ONSET_EVENT, LIFT_OFF, TURN, BREAK = range(5)
-"""Events: none; onset; lift-off; the sliding speed comes to 0; rolling needs more than mu F_n."""
+NO_EVENT, ONSET_EVENT, LIFT_OFF, TURN, BREAK = range(5)
+"""Events: none; onset; lift-off; zero of the sliding speed; rolling friction above mu F_n."""
 
 
-class Before(NamedTuple):
-    """What events are judged by, at the start of a step."""
+class EventQuantities(NamedTuple):
+    """Quantities at the start of a step that decide about events."""
 
     depth: float  # penetration [m]
-    rate: float  # of it [m/s]
-    sliding: float  # speed [m/s]
-    margin: float  # what rolling needs beyond mu F_n [N]
+    rate: float  # its rate [m/s]
+    sliding: float  # sliding speed [m/s]
+    margin: float  # rolling friction force above mu F_n [N]
 
 
 @kernel
-def seen(contact, out):
-    """What events are judged by, of what is observed."""
-    margin = surplus(BREAK, contact, out)
-    return Before(out[S.PENETRATION], out[S.PENETRATION_RATE], out[S.SLIDING_SPEED], margin)
+def event_quantities(contact, out):
+    """Return the quantities that decide about events."""
+    margin = event_function(BREAK, contact, out)
+    return EventQuantities(out[S.PENETRATION], out[S.PENETRATION_RATE], out[S.SLIDING_SPEED], margin)
 
 
 @kernel
-def surplus(event, contact, out):
-    """What is below 0 before an event and above 0 after it."""
+def event_function(event, contact, out):
+    """Return the function of an event, below 0 before the event and above 0 after it."""
     if event == ONSET_EVENT:
         return out[S.PENETRATION]
     if event == LIFT_OFF:
@@ -59,27 +59,27 @@ def surplus(event, contact, out):
 
 
 @kernel
-def event_at_end(phase, before, contact, out):
-    """The event that has happened by the end of a step, the gravest first."""
+def detect_event(phase, before, contact, out):
+    """Return the event within a step; of several, the one with the largest effect on the phase."""
     if phase == FLIGHT:
-        return ONSET_EVENT if out[S.PENETRATION] > 0.0 else NONE
+        return ONSET_EVENT if out[S.PENETRATION] > 0.0 else NO_EVENT
     if out[S.PENETRATION] <= 0.0:
-        # Friction may have changed on the way out.
-        if phase == ROLLING and before.margin < 0.0 and surplus(BREAK, contact, out) > 0.0:
+        # Friction may have changed before the lift-off.
+        if phase == ROLLING and before.margin < 0.0 and event_function(BREAK, contact, out) > 0.0:
             return BREAK
         if phase in (FORWARD, BACKWARD) and before.sliding * out[S.SLIDING_SPEED] < 0.0:
             return TURN
         return LIFT_OFF
-    if phase == ROLLING and surplus(BREAK, contact, out) > 0.0:
+    if phase == ROLLING and event_function(BREAK, contact, out) > 0.0:
         return BREAK
     if (phase == FORWARD and out[S.SLIDING_SPEED] < 0.0) or (phase == BACKWARD and out[S.SLIDING_SPEED] > 0.0):
         return TURN
-    return NONE
+    return NO_EVENT
 
 
 @kernel
-def surplus_before(event, before):
-    """The event's surplus at the start of the step."""
+def event_function_at_start(event, before):
+    """Return the event's function at the start of the step."""
     if event == LIFT_OFF:
         return -before.depth
     if event == TURN:
@@ -91,17 +91,35 @@ def surplus_before(event, before):
 
 @kernel
 def rates_at_end(method, constants, inputs, step, end, k, out):
-    """Rates at the end of a step into the last row of k, what is observed there into `out`."""
+    """Compute the rates at the end of a step into the last row of k, and the observed quantities into `out`."""
     fraction = step.fraction + step.ticks
     rates(constants, inputs, step.tick, fraction, step.onset_speed, step.phase, False, end, k[method.rows - 1], out)
 
 
 @kernel
-def locate(event, before, after, method, constants, inputs, step, memory, y, k, z, end, out):
-    """Part of a step after which the event happens, by bracketing secants on steps of the method itself.
+def locate_event(event, before, after, method, constants, inputs, step, memory, y, k, z, end, out):
+    """Locate an event within a step by bracketing secants on steps of the method itself.
 
-    `before` and `after` are the event's surplus at both ends of the step, of unlike sign; the step's first rates are in
-    k[0]. Leaves the state at the event in `end`, its rates in the last row of k, what is observed there in `out`.
+    Leaves the state at the event in `end`, its rates in the last row of k, and the observed quantities in `out`. The
+    step's first rates are in k[0].
+
+    Args:
+        event: Event.
+        before: Event function at the start of the step.
+        after: Event function at its end, of opposite sign.
+        method: Method.
+        constants: Model constants.
+        inputs: Hammer, drive, magnets.
+        step: Step.
+        memory: Memory of the engine.
+        y: State and integrals, shape (N_VECTOR,).
+        k: Workspace, shape (rows, N_VECTOR).
+        z: Workspace for a stage's state, shape (N_VECTOR,).
+        end: Out, shape (N_VECTOR,).
+        out: Out, shape (N_OBSERVED,).
+
+    Returns:
+        Fraction of the step up to the event.
     """
     low, high, value_low, value_high = 0.0, 1.0, before, after
     cut, side = 1.0, 0
@@ -113,12 +131,12 @@ def locate(event, before, after, method, constants, inputs, step, memory, y, k, 
         evaluations = method_step(method, constants, inputs, part, y, k, z, end, out)
         rates_at_end(method, constants, inputs, part, end, k, out)
         memory[EVALUATIONS] += evaluations + 1.0
-        value = surplus(event, constants.contact, out)
+        value = event_function(event, constants.contact, out)
         if value == 0.0:
             break
         if (value > 0.0) == (value_high > 0.0):
             high, value_high = cut, value
-            if side == 1:  # Illinois: halve the end that stays, or the secants creep
+            if side == 1:  # Illinois: halve the retained end to speed up convergence
                 value_low *= 0.5
             side = 1
         else:
@@ -133,7 +151,7 @@ def locate(event, before, after, method, constants, inputs, step, memory, y, k, 
 
 @kernel
 def sliding_phase(constants, speed):
-    """Phase of a contact that slides at a speed."""
+    """Return the phase of a contact with a sliding speed."""
     if constants.levels.friction != EXACT:
         return TOUCHING
     return FORWARD if speed > 0.0 else BACKWARD
@@ -141,21 +159,21 @@ def sliding_phase(constants, speed):
 
 @kernel
 def latch_onset(memory, speed, contact):
-    """Count a contact that begins at a speed [m/s], and keep the impact speed that it holds."""
+    """Count a contact and store its impact speed, from its approach speed [m/s]."""
     memory[CONTACTS] += 1.0
     if speed < contact.speed_floor:
         memory[FLOORED] += 1.0
-    memory[ONSET] = held_speed(speed, contact)
+    memory[ONSET] = floor_onset_speed(speed, contact)
 
 
 @kernel
 def change_phase(event, constants, inputs, tick, fraction, memory, y, dy, out):
-    """Go over to the phase behind an event, at the state where it happens."""
+    """Set the phase after an event, at the state where it happens."""
     phase = int(memory[PHASE])
     if event == ONSET_EVENT:
         latch_onset(memory, out[S.PENETRATION_RATE], constants.contact)
         memory[PHASE] = sliding_phase(constants, out[S.SLIDING_SPEED])
-        memory[BEFORE] = memory[LAST] = 0.0
+        memory[OLD_FORCE] = memory[LAST_FORCE] = 0.0
     elif event == LIFT_OFF:
         memory[PHASE] = FLIGHT
     elif event == BREAK:
@@ -168,7 +186,14 @@ def change_phase(event, constants, inputs, tick, fraction, memory, y, dy, out):
 
 
 @kernel
-def note_force(memory, force, ticks):
-    """Follow the largest normal force."""
-    memory[PEAK_FORCE] = max(memory[PEAK_FORCE], peak(memory[BEFORE], memory[BEFORE_SPAN], memory[LAST], ticks, force))
-    memory[BEFORE], memory[LAST], memory[BEFORE_SPAN] = memory[LAST], force, ticks
+def update_peak_force(memory, force, ticks):
+    """Update the largest normal force.
+
+    Args:
+        memory: Memory of the engine.
+        force: Normal force [N].
+        ticks: Time since the last force [ticks].
+    """
+    peak = parabolic_peak(memory[OLD_FORCE], memory[FORCE_SPAN], memory[LAST_FORCE], ticks, force)
+    memory[PEAK_FORCE] = max(memory[PEAK_FORCE], peak)
+    memory[OLD_FORCE], memory[LAST_FORCE], memory[FORCE_SPAN] = memory[LAST_FORCE], force, ticks

@@ -1,25 +1,26 @@
-"""What an engine keeps between calls beside the state: counters that every engine shares, then its own numbers.
+"""Memory of an engine between calls, apart from the state: common counters, then the engine's own numbers.
 
-Positions in the array `memory`, shape (MEMORY,).
+Constants are positions in the array `memory`, shape (MEMORY,).
 """
 
 from __future__ import annotations
 
 PHASE, ONSET = 0, 1
-"""Phase of the contact (`rig.physics.kernels.laws.contact`); impact speed of the running contact, floored [m/s]."""
+"""Contact phase (`rig.physics.kernels.laws.contact`); impact speed of the current contact, floored [m/s]."""
 CONTACTS, FLOORED, CLAMPS, CONTACT_STEPS = 2, 3, 4, 5
-"""Contacts begun; of these, slower than the speed floor; steps at which the law would have pulled; steps in contact."""
+"""Number of contacts; of those below the speed floor; of steps at which the law would have pulled; of steps in
+contact."""
 PEAK_FORCE = 6
-"""Largest normal force [N], by the engine's own steps."""
+"""Largest normal force at the engine's own steps [N]."""
 STEPS, EVALUATIONS, REJECTED, CEILING = 7, 8, 9, 10
-"""Steps taken; evaluations of the equations; steps taken again shorter; steps at the least length with an estimate
-still above the tolerance, or grids given up for want of parts."""
-TOLERANCE, SIZE = 11, 12
-"""Scaled error a step that is asked for; length proposed for the next part [ticks]."""
-BEFORE, BEFORE_SPAN, LAST = 13, 14, 15
-"""Normal force before the last [N], time between both [ticks], last normal force [N]."""
+"""Number of steps; of evaluations of the equations; of rejected steps; of steps of minimum length with an error above
+the tolerance, and grid steps given up for too many parts."""
+TOLERANCE, PART_LENGTH = 11, 12
+"""Required scaled error per step; length of the next part [ticks]."""
+OLD_FORCE, FORCE_SPAN, LAST_FORCE = 13, 14, 15
+"""Previous normal force [N], time from it to the last one [ticks], last normal force [N]."""
 ROLLED_S = 16
-"""Time in which contact that rolls was integrated by collocation [s]."""
-OWN = 17
-"""From here on an engine's own."""
+"""Time of rolling contact that was integrated by collocation [s]."""
+ENGINE_MEMORY = 17
+"""Start of the engine's own numbers."""
 MEMORY = 1280

@@ -1,14 +1,14 @@
-"""What a one-step method is to `rig.physics.engines.common.march`, and how the compiler finds its functions.
+"""Interface between one-step methods and `rig.physics.engines.common.march`, and dispatch of compiled functions.
 
-A method is a NamedTuple of a type of its own, with the fields
+A method is a NamedTuple of a separate type with the fields
 
-- `rows`: rows of its workspace k. The first holds the rates at the start of a step, the last those at its end, the
-  ones between are the method's;
-- `order`: of the estimate's leading error; 0: no estimate, steps are as long as they may be;
-- `graded`: steps shrink toward onset and lift-off.
+- `rows`: rows of its workspace k. The first holds the rates at the start of a step, the last those at its end; the
+method uses the rest;
+- `order`: order of the estimate's leading error; 0 for no estimate, with steps as long as possible;
+- `graded`: whether steps shrink toward onset and lift-off.
 
-The compiler picks a method's functions by that type (`numba.extending.overload`): numba cannot keep machine code that
-takes functions as arguments from one process to the next.
+The compiler selects a method's functions by that type (`numba.extending.overload`), as numba cannot cache machine code
+that takes functions as arguments.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ PER_SCALE = 1.0 / S.STATE_SCALE
 
 
 class Step(NamedTuple):
-    """Where a step begins, how long it is, and under which law it is taken."""
+    """Start and length of a step, and its contact law."""
 
     tick: int  # whole tick
     fraction: float  # ticks beyond it
-    ticks: float  # length, any part of a tick
-    onset_speed: float  # v0 of the running contact [m/s]
-    phase: int  # of the contact (rig.physics.kernels.laws.contact)
+    ticks: float  # length, not necessarily whole
+    onset_speed: float  # v0 of the current contact [m/s]
+    phase: int  # contact phase (rig.physics.kernels.laws.contact)
 
 
 class Functions(NamedTuple):
-    """What a type of method does; compiled, with the parameters of the functions below."""
+    """Compiled functions of a type of method, with the parameters of the functions below."""
 
     step: Any
     error: Any
@@ -43,39 +43,46 @@ class Functions(NamedTuple):
 
 
 FUNCTIONS: dict[type, Functions] = {}
-"""Of every type of method; its module enters it."""
+"""Functions by type of method, added by the method's module."""
 
 
 def method_step(method, constants, inputs, step, y, k, z, end, out):
-    """One step from `y`, whose rates are in k[0], to `end`.
+    """Take one step from `y`, with its rates in k[0], to `end`.
 
     Args:
-        method: The method.
-        constants: Numbers of the model.
+        method: Method.
+        constants: Model constants.
         inputs: Hammer, drive, magnets.
-        step: The step.
+        step: Step.
         y: State and integrals, shape (N_VECTOR,).
         k: Workspace, shape (rows, N_VECTOR).
-        z: Room for a stage's state, shape (N_VECTOR,).
+        z: Workspace for a stage's state, shape (N_VECTOR,).
         end: Out, shape (N_VECTOR,).
-        out: Room for what is observed, shape (N_OBSERVED,).
+        out: Workspace for the observed quantities, shape (N_OBSERVED,).
 
     Returns:
-        Evaluations of the equations.
+        Number of evaluations of the equations.
     """
     return FUNCTIONS[type(method)].step(method, constants, inputs, step, y, k, z, end, out)
 
 
 def method_error(method, h, k, scratch):
-    """Scaled error estimate of the step whose workspace is k; h [s]; scratch, shape (2, N_STATE)."""
+    """Return the scaled error estimate of the step in workspace k.
+
+    Args:
+        method: Method.
+        h: Length of the step [s].
+        k: Workspace, shape (rows, N_VECTOR).
+        scratch: Workspace, shape (2, N_STATE).
+    """
     return FUNCTIONS[type(method)].error(method, h, k, scratch)
 
 
 def method_prepare(method, constants, inputs, step, y, k, z, out):
-    """What all steps from one state share, whatever their length, before the first; the step is the longest of them.
+    """Prepare what all steps from one state share, regardless of their length; `step` is the longest of them.
 
     Returns:
-        Evaluations of the equations.
+        Number of evaluations of the equations.
     """
     return FUNCTIONS[type(method)].prepare(method, constants, inputs, step, y, k, z, out)
 
@@ -97,24 +104,24 @@ def _compiled_prepare(method, constants, inputs, step, y, k, z, out):
 
 @kernel
 def rates(constants, inputs, tick, fraction, onset_speed, phase, observe, y, dy, out):
-    """`evaluate` as a function of its own, so that only the stages' loop holds another copy of it."""
+    """Call `evaluate` as a separate function, so that only the stages' loop contains another copy of it."""
     evaluate(constants, inputs, tick, fraction, onset_speed, phase, observe, y, dy, out)
 
 
 @kernel
 def fill(target, source):
-    """Copy as many numbers as `target` has. numpy's own assignment compiles texts of errors as well, for seconds."""
+    """Copy as many numbers as `target` has. numpy's assignment also compiles error messages, which takes seconds."""
     for i in range(len(target)):
         target[i] = source[i]
 
 
 @kernel
-def nothing_to_prepare(method, constants, inputs, step, y, k, z, out):
-    """`method_prepare` of a method that has nothing to prepare."""
+def skip_preparation(method, constants, inputs, step, y, k, z, out):
+    """Return 0 evaluations, for a method without preparation."""
     return 0
 
 
 @kernel
-def no_estimate(method, h, k, scratch):
-    """`method_error` of a method that has no estimate."""
+def zero_error(method, h, k, scratch):
+    """Return 0, for a method without error estimate."""
     return 0.0

@@ -1,4 +1,4 @@
-"""The largest value of a force that is known at single instants."""
+"""Peak of a force that is known at discrete instants."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ from rig.physics.kernels.stage import kernel
 
 
 @kernel
-def peak(before, back, last, ahead, force):
-    """Largest of the latest value and of the parabola through the latest three, where the middle one is the largest.
+def parabolic_peak(before, back, last, ahead, force):
+    """Return the larger of the latest value and the parabola's peak, if the middle of three values is the largest.
 
     Args:
-        before: Value before the last; 0: there is none in this contact.
-        back: Time from it to the last value; 0: there is none.
+        before: Value before the last; 0 for none in this contact.
+        back: Time from it to the last value; 0 for none.
         last: Last value.
-        ahead: Time from it to the present one, in the same unit.
+        ahead: Time from it to the present value, in the same unit.
         force: Present value.
     """
     if last > before and last >= force and before > 0.0 and force > 0.0 and back > 0.0 and ahead > 0.0:

@@ -1,4 +1,4 @@
-"""Explicit Runge-Kutta steps: the methods are the tableaus of `rk4`, `tsit5` and `rk8`."""
+"""Explicit Runge-Kutta steps for the tableaus of `rk4`, `tsit5` and `rk8`."""
 
 from __future__ import annotations
 
@@ -6,28 +6,28 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rig.physics.engines.common.method import FUNCTIONS, PER_SCALE, Functions, nothing_to_prepare
+from rig.physics.engines.common.method import FUNCTIONS, PER_SCALE, Functions, skip_preparation
 from rig.physics.kernels import signals as S
 from rig.physics.kernels.dynamics import evaluate
 from rig.physics.kernels.stage import kernel
 
 
 class Tableau(NamedTuple):
-    """An explicit Runge-Kutta method of s stages, with its error estimate."""
+    """Explicit Runge-Kutta method of s stages with its error estimate."""
 
     a: np.ndarray  # (s, s)
     b: np.ndarray  # (s,)
     c: np.ndarray  # (s,)
     coarse: np.ndarray  # (s + 1,) weights of a lower-order estimate, the last for the rates at the end
-    fine: np.ndarray  # (s + 1,) weights of a higher-order estimate; all 0 where there is only the coarse one
-    order: float  # of the estimate's leading error; 0: no estimate
+    fine: np.ndarray  # (s + 1,) weights of a higher-order estimate; all 0 for none
+    order: float  # order of the estimate's leading error; 0: no estimate
     rows: int  # s + 1
     graded: bool = True
 
 
 @kernel
 def _step(method, constants, inputs, step, y, k, z, end, out):
-    """One step; k holds the stages' rates, then those at the end."""
+    """Take one step; k holds the stages' rates, then those at the end."""
     a, b, c = method.a, method.b, method.c
     h = step.ticks * inputs.tick_s
     for stage in range(1, len(b)):
@@ -56,7 +56,7 @@ def _step(method, constants, inputs, step, y, k, z, end, out):
 
 @kernel
 def _error(method, h, k, scratch):
-    """Scaled error estimate of a step (Hairer's form where there are two estimates)."""
+    """Return the scaled error estimate of a step, in Hairer's form where there are two estimates."""
     low, high = scratch[0], scratch[1]
     low[:] = 0.0
     high[:] = 0.0
@@ -76,4 +76,4 @@ def _error(method, h, k, scratch):
     return h * fine / np.sqrt((fine + 0.01 * coarse) * S.N_STATE)
 
 
-FUNCTIONS[Tableau] = Functions(step=_step, error=_error, prepare=nothing_to_prepare)
+FUNCTIONS[Tableau] = Functions(step=_step, error=_error, prepare=skip_preparation)

@@ -1,4 +1,4 @@
-"""The default engine; see `rig.physics.engines.split.method`."""
+"""Default engine; see `rig.physics.engines.split.method`."""
 
 from rig.physics.engines.split.method import MEMORY, ORDER, advance, start, warm_up
 

@@ -1,10 +1,10 @@
-"""Radau IIA on the rolling constraint, condensed to the ring's force at the nodes: one step.
+"""One step of Radau IIA on the rolling constraint, condensed to the ring's force at the nodes.
 
 Shaft, spin and housings are linear bodies (`rig.physics.engines.split.radau`), driven by the ring's force F and the
-nonlinear part of their accelerations. Two conditions hold at each node: the penetration is the one at which the normal
-law gives F_n, and the sliding speed is 0, or that at which smoothed friction gives F_t. The laws are inverted because
-Newton's method on K delta^1.5 does not converge from afar. Newton's method solves for F alone, shape (2, STAGES): the
-other unknowns follow from F, or change little and slowly.
+nonlinear part of their accelerations. Two conditions apply at each node: the penetration gives F_n by the normal law,
+and the sliding speed is 0, or that at which smoothed friction gives F_t. The laws are inverted because Newton's method
+on K delta^1.5 does not converge from a distant guess. Newton's method solves for F alone, shape (2, STAGES): the other
+unknowns follow from F or change little and slowly.
 """
 
 from __future__ import annotations
@@ -17,38 +17,38 @@ import numpy as np
 from rig.physics.engines.common.memory import ONSET
 from rig.physics.engines.split import layout
 from rig.physics.engines.split.radau import INTEGRALS, NODES, STAGES, TAIL, collocate, invert
-from rig.physics.engines.taylor.place import FRACTION, TICK
+from rig.physics.engines.taylor.memory import FRACTION, TICK
 from rig.physics.kernels import signals as S
 from rig.physics.kernels.dynamics import accelerations
-from rig.physics.kernels.forces import disk_forces, drive_torque, magnets_on, passed_on, stator_of, torques
-from rig.physics.kernels.frames.geometry import State, eccentricity_of, pose_of
+from rig.physics.kernels.forces import disk_forces, drive_torque, magnet_forces, stator_forces, support_forces, torques
+from rig.physics.kernels.frames.geometry import State, compute_eccentricity, compute_pose
 from rig.physics.kernels.laws.contact import SMOOTHED, RingForce
-from rig.physics.kernels.ledger import powers_of
+from rig.physics.kernels.ledger import get_powers
 from rig.physics.kernels.stage import kernel, stage
 
 _ITERATIONS = 8
-"""Most iterations; three are usual."""
-_SLOW = 0.4
-"""Least contraction with an inverse that was made for an earlier step."""
+"""Largest number of iterations; three are usual."""
+_MAX_CONTRACTION = 0.4
+"""Largest ratio of successive changes with an inverse from an earlier step."""
 FORCE_FLOOR_N = 100.0
-"""Least force that errors of the force are compared with, as in `rig.physics.accuracy`."""
+"""Smallest reference force for relative errors of the force, as in `rig.physics.accuracy`."""
 _MAX_UNLOADING = 0.9
-"""Part of the preload that nodes may take off a transducer: it may be more between them."""
-_MARGIN = 0.25
-"""Least distance from slip and lift-off over its range at the nodes, between which it may be smaller."""
+"""Largest unloading of a transducer at the nodes, as a share of the preload; it may be larger between them."""
+_MIN_MARGIN = 0.25
+"""Minimum distance from slip and lift-off, over its range at the nodes; it may be smaller between them."""
 FX, _FY, _AX, _AY, _AS, _Z = (layout.UNKNOWNS + row * STAGES for row in range(6))
-"""Unknowns: ring's force [N]; accelerations but for their linear part; penetration [m]."""
+"""Unknowns: ring's force [N]; nonlinear part of the accelerations; penetration [m]."""
 N_UNKNOWNS = 6
 _NX, _NY, _DISTANCE, _RATE, _ALONG, FN, FT, _BY_RATE, _BY_FORCE = (layout.AT_NODES + row * STAGES for row in range(9))
 _SLIP_BY_FORCE = layout.AT_NODES + 18 * STAGES
-"""Contact at the nodes: normal, distance [m], velocities [m/s], forces [N], derivatives of the penetration and of the
-sliding speed that the friction law asks for, by the friction force [m/s/N]."""
+"""Contact at the nodes: normal, distance [m], velocities [m/s], forces [N], derivatives of the penetration, and of the
+friction law's sliding speed by the friction force [m/s/N]."""
 _RHO_X, _RHO_Y, _RHO_S, _EX, _EY, _VX, _VY, _SPIN, _ROTATION = (layout.AT_NODES + row * STAGES for row in range(9, 18))
-"""Accelerations at the nodes less the unknown; eccentricity, velocity and spin that these add; rotation [rad/s]."""
+"""Accelerations at the nodes minus the unknowns; the resulting eccentricity, velocity and spin; rotation [rad/s]."""
 _R1, _R2 = layout.RESIDUALS, layout.RESIDUALS + STAGES
 _X = layout.NODE_STATES
 _B, _DB, _Q, _DQ, _TH, _DTH, _XI, _XO, _VXI, _VXO, _YI, _YO, _VYI, _VYO = (_X + row * STAGES for row in range(14))
-"""Node states, bodies one after another; q is -Gamma."""
+"""Node states, one body after another; q is -Gamma."""
 ROWS_OF_STATE = np.array([
     S.BETA, S.BETA_RATE, S.GAMMA, S.GAMMA_RATE, S.THETA, S.THETA_RATE, S.X_IH, S.X_OH, S.VX_IH, S.VX_OH,
     S.Y_IH, S.Y_OH, S.VY_IH, S.VY_OH,
@@ -65,13 +65,13 @@ class Rolling(NamedTuple):
     shaft_forced: np.ndarray  # shape (3, 2, STAGES, STAGES)
     house_free: np.ndarray  # shape (2, 4, 4, STAGES)
     house_forced: np.ndarray  # shape (2, 4, STAGES, STAGES)
-    inverses: np.ndarray  # of each place's Jacobian, shape (MAX_PLACES, 2, 2, STAGES, STAGES): F, residual, their nodes
+    inverses: np.ndarray  # inverse Jacobians, shape (MAX_PLACES, 2, 2, STAGES, STAGES): F, residual, their nodes
     history: np.ndarray  # unknowns of the last three turns, shape (3, MAX_PLACES, 6, STAGES)
 
 
 @kernel
-def rolling_in(memory):
-    """Views on the memory, and room for a step."""
+def view_rolling(memory):
+    """Return views on the memory, with workspace for a step."""
     n = STAGES
     return Rolling(
         memory[layout.NODE_VALUES : layout.SHAFT_FREE].reshape((n + 1, S.N_VECTOR)),
@@ -113,26 +113,27 @@ def body_matrices(constants, inputs):
 
 @kernel
 def set_step(constants, inputs, memory):
-    """Make the responses of the linear bodies over steps of the length in the memory.
+    """Compute the responses of the linear bodies over steps of the length in the memory.
 
-    Called from Python, since each compiled caller would compile all of it again.
+    Called from Python: each compiled caller would compile all of it again.
     """
     constants, inputs = constants[0], inputs[0]
     shafts, houses = body_matrices(constants, inputs)
     per_inner = 1.0 / constants.house.inner_mass if constants.levels.inner_house else 0.0
-    rolling, h = rolling_in(memory), memory[layout.STEP_S]
+    rolling, h = view_rolling(memory), memory[layout.STEP_S]
     for body in range(3):
         collocate(shafts[body], 1, 1.0, h, rolling.shaft_free[body], rolling.shaft_forced[body])
     for i in range(2):
         collocate(houses[i], 2, -per_inner, h, rolling.house_free[i], rolling.house_forced[i])
-    memory[layout.WAITS] = 0.0
+    memory[layout.STALE_RESPONSES] = 0.0
 
 
 @kernel
 def _respond(m, forced, u, out, n=STAGES):
-    """Add the response of one component to u at the nodes: positions in the memory, which views would slow down.
+    """Add the response of one component to u at the nodes.
 
-    Their number `n` comes as an argument: a loop of known length is unrolled instead of made into vectors.
+    Arguments are positions in the memory, as views would be slower. The number `n` is an argument because a loop of
+    constant length would be unrolled instead of vectorised.
     """
     a, b, c, d, e, f, g, h = m[u], m[u + 1], m[u + 2], m[u + 3], m[u + 4], m[u + 5], m[u + 6], m[u + 7]
     F, G, H, K, L, M, N, P = (
@@ -145,8 +146,8 @@ def _respond(m, forced, u, out, n=STAGES):
 
 
 @kernel
-def _let_go(m):
-    """Node states without any unknowns, by the state at the start."""
+def _compute_undriven_states(m):
+    """Compute the node states for zero unknowns, from the state at the start."""
     for body in range(5):
         n = 2 if body < 3 else 4
         first = 2 * body if body < 3 else 4 * body - 6
@@ -163,14 +164,14 @@ def _let_go(m):
 
 @stage
 def _begin_row(m, row):
-    """A row of node states without any unknowns."""
+    """Initialise a row of node states with those for zero unknowns."""
     for i in range(STAGES):
         m[_X + row * STAGES + i] = m[layout.UNDRIVEN + row * STAGES + i]
 
 
 @stage
 def _place_rotor(m):
-    """Node states of shaft and spin by the unknowns."""
+    """Compute the node states of shaft and spin from the unknowns."""
     for row in range(6):
         _begin_row(m, row)
         _respond(m, layout.SHAFT_FORCED + row * STAGES**2, _AX + row // 2 * STAGES, _X + row * STAGES)
@@ -178,7 +179,7 @@ def _place_rotor(m):
 
 @stage
 def _place_houses(m, every):
-    """Node states of houses by the unknowns: of the inner one from the first on to each `every`-th, 2 or 1."""
+    """Compute every `every`-th row (2 or 1) of the housings' node states from the unknowns, the inner housing first."""
     for row in range(0, 8, every):
         _begin_row(m, 6 + row)
         _respond(m, layout.HOUSE_FORCED + row * STAGES**2, FX + row // 4 * STAGES, _XI + row * STAGES)
@@ -186,7 +187,7 @@ def _place_houses(m, every):
 
 @stage
 def _state_at(m, i):
-    """State at a node."""
+    """Return the state at a node."""
     return State(
         -m[_Q + i], m[_B + i], m[_TH + i], m[_XI + i], m[_YI + i], m[_XO + i], m[_YO + i],
         -m[_DQ + i], m[_DB + i], m[_DTH + i], m[_VXI + i], m[_VYI + i], m[_VXO + i], m[_VYO + i],
@@ -195,7 +196,7 @@ def _state_at(m, i):
 
 @stage
 def root_of_law(load, guess, exponent):
-    """Penetration^exponent = load, by Halley's steps from a guess where the exponent is 1.5."""
+    """Solve penetration^exponent = load; for exponent 1.5 by Halley's method from a guess."""
     if load <= 0.0:
         return 0.0
     if exponent == 1.0:
@@ -215,16 +216,16 @@ def root_of_law(load, guess, exponent):
 
 @stage
 def slip_of_law(contact, friction, share):
-    """Sliding speed [m/s] at which a friction law gives a share of mu F_n: 0 unless it is smoothed."""
+    """Return the sliding speed [m/s] at which a friction law gives a share of mu F_n: 0 unless it is smoothed."""
     return contact.smoothing_speed * math.atanh(share) if friction == SMOOTHED else 0.0
 
 
 @stage
 def _evaluate_node(constants, inputs, m, h, i):
-    """Contact and motion at a node: geometry and force components into the memory, the rest returned."""
+    """Evaluate contact and motion at a node; geometry and force components go to the memory, the rest is returned."""
     state = _state_at(m, i)
-    pose = pose_of(constants.levels, state)
-    e = eccentricity_of(constants, state, pose)
+    pose = compute_pose(constants.levels, state)
+    e = compute_eccentricity(constants, state, pose)
     distance = math.sqrt(e.ex * e.ex + e.ey * e.ey)
     nx, ny = e.ex / distance, e.ey / distance
     m[_NX + i], m[_NY + i], m[_DISTANCE + i], m[_ROTATION + i] = nx, ny, distance, pose.w
@@ -232,15 +233,15 @@ def _evaluate_node(constants, inputs, m, h, i):
     Fx, Fy = m[FX + i], m[_FY + i]
     m[FN + i], m[FT + i] = -(Fx * nx + Fy * ny), Fx * ny - Fy * nx
     tick, at = int(m[TICK]), m[FRACTION] + NODES[i] * h / inputs.tick_s
-    magnets, disk = magnets_on(constants, inputs, pose), disk_forces(constants, inputs, tick, at, state)
+    magnets, disk = magnet_forces(constants, inputs, pose), disk_forces(constants, inputs, tick, at, state)
     Lx, Ly = torques(constants, magnets, disk)
-    drive, stator = drive_torque(constants, inputs, tick, at, state), stator_of(constants, state)
+    drive, stator = drive_torque(constants, inputs, tick, at, state), stator_forces(constants, state)
     motion = accelerations(constants, inputs, state, pose, stator, Lx, Ly, drive, Fx, Fy, m[FT + i])
     return state, pose, magnets, disk, stator, motion
 
 
 @stage
-def linear_part(constants, inputs):
+def linear_coefficients(constants, inputs):
     """Return stiffness [1/s^2] and damping x, y [1/s] of the shaft's linear bodies, and the spin's damping [1/s]."""
     shaft, magnet = constants.shaft, constants.magnet
     lever = shaft.arm_magnet * shaft.arm_magnet / shaft.transverse_inertia if inputs.magnet_engaged else 0.0
@@ -250,9 +251,9 @@ def linear_part(constants, inputs):
 
 @stage
 def _evaluate_nodes(constants, inputs, m, h):
-    """Residuals at the nodes, and what the used accelerations lack; returns whether all are finite."""
+    """Compute residuals and acceleration defects at the nodes; return whether all are finite."""
     shaft, contact = constants.shaft, constants.contact
-    stiffness, damping_x, damping_y, gain = linear_part(constants, inputs)
+    stiffness, damping_x, damping_y, gain = linear_coefficients(constants, inputs)
     friction = constants.levels.friction
     creeps = friction == SMOOTHED
     known = 0.0
@@ -281,8 +282,8 @@ def _evaluate_nodes(constants, inputs, m, h):
 
 
 @stage
-def _follow_rho(constants, inputs, m, h):
-    """Add to the residuals what the accelerations lack."""
+def _add_acceleration_defects(constants, inputs, m, h):
+    """Add the effect of the acceleration defects to the residuals."""
     shaft = constants.shaft
     for i in range(5 * STAGES):
         m[_EX + i] = 0.0
@@ -307,7 +308,7 @@ def _follow_rho(constants, inputs, m, h):
 
 @kernel
 def _make_inverse(constants, inputs, m, rolling, h, inverse):
-    """Inverse of the residuals' derivative by F at the present node states."""
+    """Compute the inverse of the residuals' derivative by F at the current node states; return False if singular."""
     n, shaft = STAGES, constants.shaft
     arm = shaft.arm_ring * shaft.arm_ring / shaft.transverse_inertia
     both = constants.contact.gap_counts_outer
@@ -345,7 +346,7 @@ def _make_inverse(constants, inputs, m, rolling, h, inverse):
 
 @stage
 def _improve(constants, inputs, m, inverse):
-    """Newton's step; returns its size over the largest normal force."""
+    """Apply Newton's step; return its size over the largest normal force."""
     n, shaft = STAGES, constants.shaft
     for i in range(2 * n):
         m[layout.CHANGES + i] = 0.0
@@ -368,24 +369,24 @@ def _improve(constants, inputs, m, inverse):
 
 
 @kernel
-def solve_step(constants, inputs, m, rolling, h, number, made, goal):
-    """Solve a step from the state in the first row of Y, from a guess of the unknowns.
+def solve_step(constants, inputs, m, rolling, h, number, has_inverse, goal):
+    """Solve a step from the state in the first row of Y and a guess of the unknowns.
 
     Args:
-        constants: Numbers of the model.
+        constants: Model constants.
         inputs: Hammer, drive, magnets.
         m: Memory of the engine; node states and unknowns are out.
-        rolling: Of rolling.
+        rolling: Views on the memory.
         h: Length of the step [s].
-        number: Place in the turn, whose inverse is taken.
-        made: Whether it has been made.
+        number: Index of the step in its turn, which selects the inverse.
+        has_inverse: Whether this inverse has been computed.
         goal: Change of F over the largest normal force at which to stop.
 
     Returns:
-        Iterations, 0 if it does not converge.
+        Number of iterations, 0 without convergence.
     """
     inverse = layout.INVERSES + number * 4 * STAGES**2
-    _let_go(m)
+    _compute_undriven_states(m)
     before = math.inf
     every = 2 if constants.contact.gap_counts_outer == 0.0 else 1
     for iteration in range(_ITERATIONS):
@@ -393,25 +394,25 @@ def solve_step(constants, inputs, m, rolling, h, number, made, goal):
         _place_houses(m, every)
         if not _evaluate_nodes(constants, inputs, m, h):
             return 0
-        if not made:
+        if not has_inverse:
             if not _make_inverse(constants, inputs, m, rolling, h, rolling.inverses[number]):
                 return 0
-            made = True
-        _follow_rho(constants, inputs, m, h)
+            has_inverse = True
+        _add_acceleration_defects(constants, inputs, m, h)
         size = _improve(constants, inputs, m, inverse)
         if not math.isfinite(size):
             return 0
         if size < goal:
             return iteration + 1
-        if size > _SLOW * before:
-            made = False
+        if size > _MAX_CONTRACTION * before:
+            has_inverse = False
         before = size
     return 0
 
 
 @kernel
 def write_nodes(constants, inputs, m, h):
-    """Enter states and integrals at the nodes of a solved step into Y."""
+    """Write states and integrals at the nodes of a solved step to Y."""
     _place_rotor(m)
     _place_houses(m, 1)
     contact = constants.contact
@@ -422,8 +423,8 @@ def write_nodes(constants, inputs, m, h):
         sliding, gap = m[_ALONG + i] + constants.shaft.radius * pose.w, m[_DISTANCE + i] - contact.clearance
         ring = RingForce(Fx, Fy, Fn, elastic, Ft, gap, rate, sliding, m[_NX + i], m[_NY + i])
         Lx, Ly = torques(constants, magnets, disk)
-        support = passed_on(constants, stator, Fx, Fy)
-        powers = powers_of(
+        support = support_forces(constants, stator, Fx, Fy)
+        powers = get_powers(
             constants, state, pose, ring, magnets, disk, stator, support, Lx, Ly, Fx, Fy, Ft, motion.torque
         )
         for k, power in enumerate(powers):
@@ -443,8 +444,8 @@ def write_nodes(constants, inputs, m, h):
 
 
 @stage
-def _tail(m, row):
-    """Sizes of the last two Legendre coefficients of node values, added."""
+def _sum_last_coefficients(m, row):
+    """Return the sum of the magnitudes of the last two Legendre coefficients of node values."""
     last = before = 0.0
     for i in range(STAGES):
         before += TAIL[0, i] * m[row + i]
@@ -454,22 +455,23 @@ def _tail(m, row):
 
 @kernel
 def estimate(m):
-    """Error of a solved step: what the last polynomials add to the force [N]; the same over the largest force [1].
+    """Return the error estimate of a solved step, from the last polynomials.
 
-    The second is that of the inner house's speed where that is larger.
+    Returns:
+        Error of the force [N], and the larger of the relative errors of the force and of the inner housing's speed [1].
     """
     force = FORCE_FLOOR_N
     for i in range(STAGES):
         force = max(force, abs(m[FN + i]))
-    house = max(_tail(m, _VXI), _tail(m, _VYI)) / S.STATE_SCALE[S.VX_IH]
-    added = max(_tail(m, FN), _tail(m, FT))
+    house = max(_sum_last_coefficients(m, _VXI), _sum_last_coefficients(m, _VYI)) / S.STATE_SCALE[S.VX_IH]
+    added = max(_sum_last_coefficients(m, FN), _sum_last_coefficients(m, FT))
     return added, max(added / force, house)
 
 
 @stage
-def _clears(low, high):
-    """Return whether a quantity between two limits at the nodes stays above 0 between the nodes."""
-    return low > _MARGIN * (high - low)
+def _stays_positive(low, high):
+    """Return whether a quantity with these limits at the nodes stays above 0 between the nodes."""
+    return low > _MIN_MARGIN * (high - low)
 
 
 @kernel
@@ -487,8 +489,8 @@ def keeps_rolling(constants, m):
         horizontal = max(horizontal, abs(m[_XO + i]))
     limit = 2.0 * house.preload * _MAX_UNLOADING
     return (
-        _clears(least, most)
-        and _clears(least_margin, most_margin)
+        _stays_positive(least, most)
+        and _stays_positive(least_margin, most_margin)
         and (not levels.inner_house or house.pair_stiffness_vertical * vertical < limit)
         and (not levels.outer_house or house.pair_stiffness_horizontal * horizontal < limit)
     )

@@ -1,7 +1,7 @@
-"""Radau IIA collocation: its nodes and weights, and the responses of linear bodies over one step.
+"""Radau IIA collocation: nodes and weights, and the responses of linear bodies over one step.
 
-A body z' = Z z + b u has node values that are linear in its state at the start of the step and in u at the nodes.
-E. Hairer and G. Wanner, Solving Ordinary Differential Equations II, 2nd ed., section IV.5.
+The node values of a body z' = Z z + b u are linear in its state at the start of the step and in u at the nodes. E.
+Hairer and G. Wanner, Solving Ordinary Differential Equations II, 2nd ed., section IV.5.
 """
 
 from __future__ import annotations
@@ -14,11 +14,12 @@ from numpy.polynomial import legendre
 from rig.physics.kernels.stage import kernel
 
 STAGES = 8
-"""Nodes of a step: with fewer, steps are too short for 1e-4; with more, a step costs more than it gains in length."""
+"""Nodes of a step: with fewer, steps are too short for 1e-4; with more, the cost of a step grows more than its
+length."""
 
 
 class Collocation(NamedTuple):
-    """Numbers of the method on a step of length 1."""
+    """Coefficients of the method for a step of length 1."""
 
     nodes: np.ndarray  # right Radau points, the last is 1, shape (STAGES,)
     integrals: np.ndarray  # integral of each node's polynomial up to each node, shape (STAGES, STAGES)
@@ -28,7 +29,7 @@ class Collocation(NamedTuple):
 
 
 def radau(stages: int) -> Collocation:
-    """Return the numbers of the right Radau points, whose polynomial is P_s - P_(s-1)."""
+    """Return the coefficients for the right Radau points, the zeros of P_s - P_(s-1)."""
     series = np.zeros(stages + 1)
     series[stages - 1 :] = -1.0, 1.0
     x = np.sort(legendre.legroots(series).real)
@@ -61,9 +62,12 @@ NODES, INTEGRALS, TAIL, INNER, OUTER = radau(STAGES)
 
 @kernel
 def interpolation(with_start, s, weights):
-    """Weights of node values in the value at the part s of a step, into `weights`, shape (STAGES + 1,).
+    """Write the weights of node values for the value at a fraction of a step.
 
-    The first is that of the value at the start of the step; 0 if it is no node.
+    Args:
+        with_start: Whether the start of the step is a node; its weight is 0 otherwise.
+        s: Fraction of the step.
+        weights: Out, shape (STAGES + 1,), the start of the step first.
     """
     left = s if with_start else 1.0
     weights[0] = 1.0
@@ -79,10 +83,10 @@ def interpolation(with_start, s, weights):
 
 @kernel
 def invert(matrix, n):
-    """Replace a matrix, shape (n, n), by its inverse: Gauss and Jordan, with pivots from each column.
+    """Replace a matrix, shape (n, n), by its inverse: Gauss-Jordan elimination with column pivots.
 
     Returns:
-        False where it has none.
+        False for a singular matrix.
     """
     order = np.empty(n)
     for k in range(n):
@@ -116,11 +120,11 @@ def invert(matrix, n):
 
 @kernel
 def collocate(Z, driven, gain, h, free, forced):
-    """Responses of a linear body over a step.
+    """Compute the responses of a linear body over a step.
 
     Args:
         Z: Matrix of the body, shape (n, n).
-        driven: Component whose rate u drives.
+        driven: Component whose rate contains u.
         gain: Rate of that component per u.
         h: Length of the step [s].
         free: Node values per initial component, out, shape (n, n, STAGES): component, initial component, node.

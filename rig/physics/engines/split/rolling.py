@@ -1,12 +1,12 @@
-"""Rolling as a phase of its own: entry from a series, steps of part of a whirl turn, their error, exit to a series.
+"""Rolling by collocation: entry from a series, steps of part of a whirl turn, their error, exit to a series.
 
-A settled whirl has few harmonics, but a series resolves the contact's own frequency, which no longer appears in the
-motion. `rig.physics.engines.split.condensed` takes from two to `MAX_PLACES` steps a turn, which does not resolve it.
-Each place keeps the inverse of its last solution; its unknowns are predicted from those of the last three turns.
+A settled whirl has few harmonics, but a series resolves the contact's natural frequency, which is no longer excited.
+`rig.physics.engines.split.condensed` takes from two to `MAX_PLACES` steps per turn and does not resolve it. Each step
+of a turn keeps the inverse of its last solution; its unknowns are predicted from those of the last three turns.
 
-A step that the contact may slip or lift off in, or a transducer lose its preload, that a hammer pulse falls into, or
-that cannot be solved, is not taken: a series continues from its start. The limits have a margin, so that no event is
-missed between nodes; the series locates it.
+A step is rejected if the contact may slip or lift off, a transducer may lose its preload, a hammer pulse overlaps it,
+or it cannot be solved: a series then continues from its start. Margins on these limits ensure that no event is missed
+between nodes; the series locates it.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import math
 import numpy as np
 from numba import njit
 
-from rig.physics.engines.common.events import note_force
+from rig.physics.engines.common.events import update_peak_force
 from rig.physics.engines.common.memory import (
     CONTACT_STEPS,
     EVALUATIONS,
@@ -36,12 +36,12 @@ from rig.physics.engines.split.condensed import (
     N_UNKNOWNS,
     estimate,
     keeps_rolling,
-    linear_part,
-    rolling_in,
+    linear_coefficients,
     root_of_law,
     set_step,
     slip_of_law,
     solve_step,
+    view_rolling,
     write_nodes,
 )
 from rig.physics.engines.split.layout import (
@@ -53,20 +53,20 @@ from rig.physics.engines.split.layout import (
     PLACES,
     READY_TICK,
     ROLLING_STEPS,
+    STALE_RESPONSES,
     START_FORCE,
     START_FRICTION,
     STEP_S,
+    TURN_ERROR,
     TURNS,
-    WAITS,
     WHIRL_RATE,
-    WORST,
 )
-from rig.physics.engines.split.place import SHARE
+from rig.physics.engines.split.memory import STEP_SHARE
 from rig.physics.engines.split.radau import NODES, STAGES, interpolation
-from rig.physics.engines.split.rigid import axis_at, mobility_of, motion_of, plant_of, strike
-from rig.physics.engines.taylor.events import NOTHING
-from rig.physics.engines.taylor.march import holds, same_inputs, write_row
-from rig.physics.engines.taylor.place import (
+from rig.physics.engines.split.rigid import apply_impulse, axis_state, contact_mobility, make_plant, relative_motion
+from rig.physics.engines.taylor.events import NO_EVENT
+from rig.physics.engines.taylor.march import compare_inputs, covers, write_row
+from rig.physics.engines.taylor.memory import (
     EAST,
     END_FRACTION,
     END_TICK,
@@ -82,32 +82,32 @@ from rig.physics.kernels import signals as S
 from rig.physics.kernels.laws.contact import ROLLING, SMOOTHED, TOUCHING
 from rig.physics.kernels.stage import kernel
 
-_LADDER = (2, 3, 4, 6, 8, 12, 16, 24, MAX_PLACES)
-"""Steps a turn."""
-_LONGEST_TURN_S = 0.1
-"""A contact that takes longer to go round does not whirl."""
-_ORDER, _ORDER_OF_LAST = 4.5, 8.0
-"""Power of the step that the estimate is proportional to, as measured in settled whirl; that with 2 or 3 steps."""
-_SPARE = 0.3
-"""Part of the limit that the estimate may come to with fewer steps."""
-_ITERATED = 0.02
-"""Change of the force, over the largest, at which iterations stop, over the tolerance."""
-_REJECTED = 2.0
-"""Estimate over its limit from which a step is taken again, shorter."""
+_TURN_STEPS = (2, 3, 4, 6, 8, 12, 16, 24, MAX_PLACES)
+"""Possible numbers of steps per turn."""
+_MAX_TURN_S = 0.1
+"""Longest turn of a whirl [s]; slower contacts do not whirl."""
+_ORDER, _FEW_STEPS_ORDER = 4.5, 8.0
+"""Exponent of the error estimate as a function of the step, measured in settled whirl; that with 2 or 3 steps."""
+_MAX_COARSENED_ERROR = 0.3
+"""Largest error estimate that permits fewer steps, over its limit."""
+_ITERATION_TOLERANCE = 0.02
+"""Relative change of the force at which iterations stop, over the tolerance."""
+_MAX_STEP_ERROR = 2.0
+"""Error estimate over its limit from which a step is repeated with a shorter length."""
 _STATE_GAIN = 15.0
-"""Scaled state error over the square of the relative force estimate, as measured in settled whirl."""
+"""Scaled state error over the square of the relative force estimate, measured in settled whirl."""
 
 
 @kernel
 def _normal_and_rate(constants, y):
-    """Contact normal, and about the rate of its angle [rad/s]."""
-    axis, w = axis_at(constants, y)
-    motion = motion_of(constants, axis, w, y)
+    """Return the contact normal and the approximate rate of its angle [rad/s]."""
+    axis, w = axis_state(constants, y)
+    motion = relative_motion(constants, axis, w, y)
     return motion.nx, motion.ny, (motion.sliding - constants.shaft.radius * w) / constants.contact.clearance
 
 
 @kernel
-def _hammer_within(inputs, tick, fraction, ticks):
+def _overlaps_hammer(inputs, tick, fraction, ticks):
     """Return whether a hammer pulse overlaps a step."""
     return (
         inputs.hammer_end > inputs.hammer_start
@@ -118,15 +118,15 @@ def _hammer_within(inputs, tick, fraction, ticks):
 
 @kernel
 def _set_places(memory, places, turns):
-    """Take `places` steps a turn from now on."""
-    memory[PLACES], memory[PLACE], memory[TURNS], memory[WORST] = places, 0.0, turns, 0.0
+    """Set the number of steps per turn."""
+    memory[PLACES], memory[PLACE], memory[TURNS], memory[TURN_ERROR] = places, 0.0, turns, 0.0
     memory[STEP_S] = 2.0 * math.pi / abs(memory[WHIRL_RATE]) / places
-    memory[WAITS] = 1.0
+    memory[STALE_RESPONSES] = 1.0
 
 
 @kernel
-def _rolls(constants, memory):
-    """Return whether the series at hand rolls, or creeps with smoothed friction."""
+def _is_rolling(constants, memory):
+    """Return whether the current series rolls, or creeps with smoothed friction."""
     smoothed = constants.levels.friction == SMOOTHED and constants.contact.friction > 0.0
     creeps = smoothed and memory[PHASE] == TOUCHING and memory[SLACK] == 0.0
     return memory[PHASE] == ROLLING or creeps
@@ -135,17 +135,17 @@ def _rolls(constants, memory):
 @kernel
 def watch_for_rolling(constants, memory, y):
     """Wait one turn from the start of rolling in a series; y is its first state."""
-    if not _rolls(constants, memory):
+    if not _is_rolling(constants, memory):
         memory[READY_TICK] = -1.0
     elif memory[READY_TICK] < 0.0:
-        _wait(constants, memory, y, memory[TICK])
+        _delay_entry(constants, memory, y, memory[TICK])
 
 
 @kernel
-def _wait(constants, memory, y, tick):
-    """Set the tick from which rolling may be tried, one whirl turn after a state."""
+def _delay_entry(constants, memory, y, tick):
+    """Set the tick from which collocation may start: one whirl turn after a state."""
     rate = abs(_normal_and_rate(constants, y)[2])
-    turn_s = 2.0 * math.pi / max(rate, 2.0 * math.pi / _LONGEST_TURN_S)
+    turn_s = 2.0 * math.pi / max(rate, 2.0 * math.pi / _MAX_TURN_S)
     memory[READY_TICK] = tick + math.ceil(turn_s / memory[INPUTS])
 
 
@@ -154,8 +154,8 @@ def may_roll(constants, memory):
     """Return whether collocation may replace the current series at its end."""
     return (
         memory[SPAN] >= 0.0
-        and _rolls(constants, memory)
-        and memory[EVENT] == NOTHING
+        and _is_rolling(constants, memory)
+        and memory[EVENT] == NO_EVENT
         and 0.0 <= memory[READY_TICK] <= memory[END_TICK]
         and memory[NORTH] == 0.0
         and memory[EAST] == 0.0
@@ -164,8 +164,8 @@ def may_roll(constants, memory):
 
 @kernel
 def _first_places(tolerance):
-    """Return the steps a turn to begin with: twelve suit a tolerance of 0.01, and more are taken where they fail."""
-    for places in _LADDER:
+    """Return the initial number of steps per turn, from twelve at a tolerance of 0.01; failing steps increase it."""
+    for places in _TURN_STEPS:
         if places >= 12.0 * (0.01 / tolerance) ** (0.5 / _ORDER):
             return float(places)
     return float(MAX_PLACES)
@@ -173,14 +173,14 @@ def _first_places(tolerance):
 
 @kernel
 def _enter(constants, inputs, memory, rolling, dy, out, y):
-    """Prepare rolling by collocation from the state y at the end of a series; returns whether it can be tried."""
+    """Prepare collocation from the state y at the end of a series; return whether it can be tried."""
     nx, ny, rate = _normal_and_rate(constants, y)
-    if not abs(rate) > 2.0 * math.pi / _LONGEST_TURN_S:
-        _wait(constants, memory, y, memory[END_TICK])
+    if not abs(rate) > 2.0 * math.pi / _MAX_TURN_S:
+        _delay_entry(constants, memory, y, memory[END_TICK])
         return False
     tick, phase = int(memory[END_TICK]), int(memory[PHASE])
     rates(constants, inputs, tick, memory[END_FRACTION], memory[ONSET], phase, True, y, dy, out)
-    stiffness, damping_x, damping_y, gain = linear_part(constants, inputs)
+    stiffness, damping_x, damping_y, gain = linear_coefficients(constants, inputs)
     ax = dy[S.BETA_RATE] + stiffness * y[S.BETA] + damping_x * y[S.BETA_RATE]
     ay = -(dy[S.GAMMA_RATE] + stiffness * y[S.GAMMA] + damping_y * y[S.GAMMA_RATE])
     last = memory[LAST_UNKNOWNS : LAST_UNKNOWNS + N_UNKNOWNS]
@@ -189,14 +189,14 @@ def _enter(constants, inputs, memory, rolling, dy, out, y):
     last[4] = dy[S.THETA_RATE] + gain * y[S.THETA_RATE]
     last[5] = out[S.PENETRATION]
     memory[WHIRL_RATE] = rate
-    _set_places(memory, _first_places(memory[TOLERANCE] / SHARE), 0.0)
+    _set_places(memory, _first_places(memory[TOLERANCE] / STEP_SHARE), 0.0)
     fill(rolling.Y[STAGES], y)
     return True
 
 
 @kernel
 def _turn_unknowns(m, cosine, sine):
-    """Turn force and accelerations by an angle."""
+    """Rotate force and accelerations by an angle."""
     for p in range(0, 4, 2):
         for i in range(STAGES):
             x, y = m[FX + p * STAGES + i], m[FX + (p + 1) * STAGES + i]
@@ -205,7 +205,7 @@ def _turn_unknowns(m, cosine, sine):
 
 @kernel
 def _predict(m, rolling, nx, ny):
-    """First guess of the unknowns: by the last turns at this place, else by those of the last node as it turns."""
+    """Predict the unknowns from the last turns at this place, or else from those of the last node, rotated."""
     place, turns = int(m[PLACE]), m[TURNS]
     first, second, third = rolling.history[0, place], rolling.history[1, place], rolling.history[2, place]
     if turns == 0.0:
@@ -229,15 +229,15 @@ def _predict(m, rolling, nx, ny):
 
 
 @kernel
-def _keep(m, rolling, nx, ny):
-    """Keep the unknowns of a step, as seen from the contact normal at its start, and those of its last node."""
+def _store_unknowns(m, rolling, nx, ny):
+    """Store the unknowns of a step relative to the contact normal at its start, and those of its last node."""
     place, last = int(m[PLACE]), STAGES - 1
     _turn_unknowns(m, nx, -ny)
     first, second, third = rolling.history[0, place], rolling.history[1, place], rolling.history[2, place]
     for p in range(N_UNKNOWNS):
         for i in range(STAGES):
             third[p, i], second[p, i], first[p, i] = second[p, i], first[p, i], m[FX + p * STAGES + i]
-    # From the normal at the start to that at the end.
+    # Rotate from the normal at the start to that at the end.
     Fx, Fy = m[FX + last], m[FX + STAGES + last]
     Fn, Ft = m[FN + last], m[FT + last]
     size = Fn * Fn + Ft * Ft
@@ -250,13 +250,13 @@ def _keep(m, rolling, nx, ny):
 
 @kernel
 def _coarsen(memory, rolling, places):
-    """Go over to fewer steps a turn; predictions by the polynomials of the last turn."""
+    """Reduce the number of steps per turn; the polynomials of the last turn predict the unknowns."""
     before, h = int(memory[PLACES]), memory[STEP_S]
     old = rolling.history[1]
     for place in range(before):
         for p in range(N_UNKNOWNS):
             fill(old[place, p], rolling.history[0, place, p])
-    # The turn as the contact has really taken.
+    # Time of the contact's actual turn.
     _set_places(memory, float(places), 1.0)
     ratio, rate, weights = before / places, memory[WHIRL_RATE], np.empty(STAGES + 1)
     for place in range(places):
@@ -278,24 +278,24 @@ def _coarsen(memory, rolling, places):
 
 @kernel
 def _choose_places(memory, rolling):
-    """At the end of a turn, as many steps for the next as its estimate asks for; returns whether there are as many."""
-    places, worst, wanted = memory[PLACES], memory[WORST], memory[PLACES]
+    """Choose the number of steps of the next turn by the error estimate; return False if it exceeds the maximum."""
+    places, worst, wanted = memory[PLACES], memory[TURN_ERROR], memory[PLACES]
     if worst > 1.0:
         return _refine(memory)
-    for fewer in _LADDER:
-        order = _ORDER if fewer > 3 else _ORDER_OF_LAST
-        if 0.5 * places <= fewer < wanted and worst * (places / fewer) ** order < _SPARE:
+    for fewer in _TURN_STEPS:
+        order = _ORDER if fewer > 3 else _FEW_STEPS_ORDER
+        if 0.5 * places <= fewer < wanted and worst * (places / fewer) ** order < _MAX_COARSENED_ERROR:
             wanted = fewer
     if wanted < places:
         _coarsen(memory, rolling, int(wanted))
-    memory[WORST] = 0.0
+    memory[TURN_ERROR] = 0.0
     return True
 
 
 @kernel
 def _refine(memory):
-    """Go over to more steps a turn; returns False where there are no more."""
-    for places in _LADDER:
+    """Increase the number of steps per turn; return False at the maximum."""
+    for places in _TURN_STEPS:
         if places > memory[PLACES]:
             _set_places(memory, float(places), 0.0)
             return True
@@ -304,7 +304,7 @@ def _refine(memory):
 
 @kernel
 def _begin_step(constants, memory, rolling):
-    """Go over to the next step, from the last node on; returns False where a turn asks for too many steps."""
+    """Start the next step at the last node; return False if its turn would need too many steps."""
     Y = rolling.Y
     fill(Y[0], Y[STAGES])
     memory[TICK], memory[FRACTION] = memory[END_TICK], memory[END_FRACTION]
@@ -312,12 +312,10 @@ def _begin_step(constants, memory, rolling):
         return True
     nx, ny, _ = _normal_and_rate(constants, Y[0])
     if memory[TURNS] > 0.0:
-        # The turn as the contact takes it.
-        behind = math.atan2(
-            ny * memory[NORMAL_X] - nx * memory[NORMAL_Y], nx * memory[NORMAL_X] + ny * memory[NORMAL_Y]
-        )
+        # Rate of the contact's actual turn.
+        lead = math.atan2(ny * memory[NORMAL_X] - nx * memory[NORMAL_Y], nx * memory[NORMAL_X] + ny * memory[NORMAL_Y])
         turn_s = memory[PLACES] * memory[STEP_S]
-        memory[WHIRL_RATE] = (math.copysign(2.0 * math.pi, memory[WHIRL_RATE]) + behind) / turn_s
+        memory[WHIRL_RATE] = (math.copysign(2.0 * math.pi, memory[WHIRL_RATE]) + lead) / turn_s
         if not _choose_places(memory, rolling):
             return False
     memory[NORMAL_X], memory[NORMAL_Y] = nx, ny
@@ -326,28 +324,28 @@ def _begin_step(constants, memory, rolling):
 
 @kernel
 def _take_step(constants, inputs, memory, rolling):
-    """Take the step that has begun.
+    """Take the step that was started.
 
     Returns:
-        False where it is not taken: a series has to continue from its start, unless responses are waited for.
+        False for a rejected step: a series has to continue from its start, unless the responses are stale.
     """
-    tolerance, tick_s = memory[TOLERANCE] / SHARE, memory[INPUTS]
+    tolerance, tick_s = memory[TOLERANCE] / STEP_SHARE, memory[INPUTS]
     nx, ny, _ = _normal_and_rate(constants, rolling.Y[0])
-    goal = min(max(_ITERATED * tolerance, 1e-10), 1e-5)
+    goal = min(max(_ITERATION_TOLERANCE * tolerance, 1e-10), 1e-5)
     limit = math.sqrt(tolerance / _STATE_GAIN)
     while True:
         h = memory[STEP_S]
-        if memory[WAITS] > 0.0 or _hammer_within(inputs, memory[TICK], memory[FRACTION], h / tick_s):
+        if memory[STALE_RESPONSES] > 0.0 or _overlaps_hammer(inputs, memory[TICK], memory[FRACTION], h / tick_s):
             return False
         _predict(memory, rolling, nx, ny)
-        place, made = int(memory[PLACE]), memory[TURNS] > 0.0
-        iterations = solve_step(constants, inputs, memory, rolling, h, place, made, goal)
+        place, has_inverse = int(memory[PLACE]), memory[TURNS] > 0.0
+        iterations = solve_step(constants, inputs, memory, rolling, h, place, has_inverse, goal)
         memory[EVALUATIONS] += STAGES * max(iterations, 1)
         if iterations > 0:
             force, relative = estimate(memory)
-            # Rows between the nodes hold what the polynomial of the force says.
+            # Rows between the nodes hold the interpolated force.
             worst = max(relative / limit, force / (tolerance * max(memory[PEAK_FORCE], FORCE_FLOOR_N)))
-            if worst < _REJECTED:
+            if worst < _MAX_STEP_ERROR:
                 break
         if not _refine(memory):
             return False
@@ -357,19 +355,19 @@ def _take_step(constants, inputs, memory, rolling):
     write_nodes(constants, inputs, memory, h)
     if not keeps_rolling(constants, memory):
         return False
-    memory[WORST] = max(memory[WORST], worst)
+    memory[TURN_ERROR] = max(memory[TURN_ERROR], worst)
     memory[START_FORCE], memory[START_FRICTION] = -memory[LAST_UNKNOWNS], -memory[LAST_UNKNOWNS + 1]
-    _keep(memory, rolling, nx, ny)
-    _finish(memory, h)
+    _store_unknowns(memory, rolling, nx, ny)
+    _finish_step(memory, h)
     return True
 
 
 @kernel
-def _finish(memory, h):
-    """Count a step and go on to the next place."""
+def _finish_step(memory, h):
+    """Count a step and advance to the next place."""
     tick_s, at = memory[INPUTS], 0.0
     for i in range(STAGES):
-        note_force(memory, memory[FN + i], (NODES[i] - at) * h / tick_s)
+        update_peak_force(memory, memory[FN + i], (NODES[i] - at) * h / tick_s)
         at = NODES[i]
     memory[STEPS] += 1.0
     memory[CONTACT_STEPS] += 1.0
@@ -385,13 +383,14 @@ def _finish(memory, h):
 
 @kernel
 def _match_force(constants, memory, y, force, friction):
-    """Move the shaft of the state y to where the laws give the forces that are interpolated themselves.
+    """Move the shaft in the state y to the position at which the laws give the interpolated forces.
 
-    They make newtons of the hundredth of a micrometre by which the polynomials of the motion err between nodes.
+    The interpolated motion has errors of a hundredth of a micrometre between nodes, which the laws would convert to
+    newtons.
     """
     contact, shaft = constants.contact, constants.shaft
-    axis, w = axis_at(constants, y)
-    motion = motion_of(constants, axis, w, y)
+    axis, w = axis_state(constants, y)
+    motion = relative_motion(constants, axis, w, y)
     gap = motion.distance - contact.clearance
     ratio = 1.0 + contact.damping_factor / memory[ONSET] * motion.rate
     load = force - contact.viscous_damping * motion.rate
@@ -407,10 +406,10 @@ def _match_force(constants, memory, y, force, friction):
 
 @kernel
 def _write_rows(constants, inputs, memory, Y, dy, out, y, grid, row, rows):
-    """As `rig.physics.engines.taylor.march.write_rows`, of the step at hand."""
+    """Write rows within the current step, as `rig.physics.engines.taylor.march.write_rows`."""
     first, every, end = grid
     now, weights = min(first + row * every, end), np.empty(STAGES + 1)
-    while holds(memory, now, 0.0):
+    while covers(memory, now, 0.0):
         part = ((now - memory[TICK]) - memory[FRACTION]) * memory[INPUTS] / memory[SPAN]
         interpolation(True, min(max(part, 0.0), 1.0), weights)
         force, friction = weights[0] * memory[START_FORCE], weights[0] * memory[START_FRICTION]
@@ -434,24 +433,38 @@ def _write_rows(constants, inputs, memory, Y, dy, out, y, grid, row, rows):
 def _leave(constants, inputs, memory, y):
     """Leave collocation at the state y, from which a series has to continue.
 
-    A series keeps the sliding speed that it begins with. Newton's method and the polynomials between nodes leave some,
-    which an impulse takes away.
+    A series keeps its initial sliding speed. An impulse removes the sliding speed left by Newton's method and
+    interpolation.
     """
     memory[PLACES], memory[SPAN] = 0.0, -1.0
     if constants.levels.friction == SMOOTHED:
         return
-    plant, (axis, w) = plant_of(constants, inputs), axis_at(constants, y)
-    motion = motion_of(constants, axis, w, y)
-    mobility = mobility_of(plant, constants.levels.euler, axis, motion.nx, motion.ny)
-    strike(constants, inputs, plant, y, axis, w, motion, mobility, 0.0, motion.sliding / mobility.tt)
+    plant, (axis, w) = make_plant(constants, inputs), axis_state(constants, y)
+    motion = relative_motion(constants, axis, w, y)
+    mobility = contact_mobility(plant, constants.levels.euler, axis, motion.nx, motion.ny)
+    apply_impulse(constants, inputs, plant, y, axis, w, motion, mobility, 0.0, motion.sliding / mobility.tt)
 
 
 @njit(cache=True, error_model="numpy", fastmath=False, nogil=True)
-def _roll(constants, inputs, y, memory, grid, row, rows, begun):
-    """As `roll`, up to where responses are waited for; `begun`: they have been, in the step at hand."""
+def _roll(constants, inputs, y, memory, grid, row, rows, started):
+    """Advance as `roll` does, until the responses are stale.
+
+    Args:
+        constants: Constants as a record.
+        inputs: Inputs as a record.
+        y: State and integrals, in and out, shape (N_VECTOR,).
+        memory: Memory, in and out, shape (MEMORY,).
+        grid: Tick of the first row, ticks per row, tick at the end.
+        row: Number of the next row.
+        rows: Rows, out.
+        started: Whether the current step was started before the responses were computed.
+
+    Returns:
+        Number of the next row.
+    """
     constants, inputs = constants[0], inputs[0]
-    rolling, dy, out = rolling_in(memory), np.empty(S.N_VECTOR), np.full(S.N_OBSERVED, np.nan)
-    if not same_inputs(inputs, memory):
+    rolling, dy, out = view_rolling(memory), np.empty(S.N_VECTOR), np.full(S.N_OBSERVED, np.nan)
+    if not compare_inputs(inputs, memory):
         _leave(constants, inputs, memory, y)
         return row
     if memory[PLACES] == 0.0 and not _enter(constants, inputs, memory, rolling, dy, out, y):
@@ -459,28 +472,30 @@ def _roll(constants, inputs, y, memory, grid, row, rows, begun):
     first, every, end = grid
     count = (end - first + every - 1) // every
     while True:
-        if memory[SPAN] >= 0.0 and not begun:
+        if memory[SPAN] >= 0.0 and not started:
             row = _write_rows(constants, inputs, memory, rolling.Y, dy, out, y, grid, row, rows)
             if row > count:
                 return row
-        taken = (begun or _begin_step(constants, memory, rolling)) and _take_step(constants, inputs, memory, rolling)
-        begun = False
-        if not taken:
-            if memory[WAITS] == 0.0:
+        advanced = (started or _begin_step(constants, memory, rolling)) and _take_step(
+            constants, inputs, memory, rolling
+        )
+        started = False
+        if not advanced:
+            if memory[STALE_RESPONSES] == 0.0:
                 fill(y, rolling.Y[0])
                 _leave(constants, inputs, memory, y)
-                _wait(constants, memory, y, memory[END_TICK])
+                _delay_entry(constants, memory, y, memory[END_TICK])
             return row
 
 
 def roll(constants, inputs, y, memory, grid, row, rows):
-    """Roll on by collocation, from the step at hand or from the state y at the end of a series.
+    """Advance by collocation, from the current step or the state y at the end of a series.
 
     Returns:
-        Number of the next row: behind the end, unless a series has to continue from the state y.
+        Number of the next row: beyond the last row, unless a series has to continue from the state y.
     """
     row = _roll(constants, inputs, y, memory, grid, row, rows, False)
-    while memory[WAITS] > 0.0:
+    while memory[STALE_RESPONSES] > 0.0:
         set_step(constants, inputs, memory)
         row = _roll(constants, inputs, y, memory, grid, row, rows, True)
     return row

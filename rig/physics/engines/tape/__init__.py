@@ -1,1 +1,1 @@
-"""The equations of motion as a tape, and the code that is made of it. Nothing here takes part in a run."""
+"""Generator of the Taylor series' code: the equations of motion as a tape. Not used during a run."""

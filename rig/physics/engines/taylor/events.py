@@ -1,4 +1,4 @@
-"""Events of the series: the functions whose zeros they are, and the phases behind them."""
+"""Events of the series: functions with a zero at the event, and the phases that follow."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from rig.physics.engines.common.events import latch_onset, sliding_phase
 from rig.physics.engines.common.memory import CLAMPS, EVALUATIONS, ONSET, PHASE
 from rig.physics.engines.common.method import fill, rates
 from rig.physics.engines.tape.columns import EVENTS, FORCE, ROOT
-from rig.physics.engines.taylor.place import EAST, EVENT, FRACTION, KNOWN, NORTH, SLACK, SPAN, TICK
+from rig.physics.engines.taylor.memory import EAST, EVENT, FRACTION, NORTH, SLACK, SPAN, TICK, ZERO_COEFFICIENTS
 from rig.physics.engines.taylor.polynomial import first_zero
 from rig.physics.kernels import signals as S
 from rig.physics.kernels.dynamics import unit_response
-from rig.physics.kernels.frames.geometry import State, eccentricity_of, pose_of
+from rig.physics.kernels.frames.geometry import State, compute_eccentricity, compute_pose
 from rig.physics.kernels.laws.contact import (
     BACKWARD,
     EXACT,
@@ -26,48 +26,49 @@ from rig.physics.kernels.laws.contact import (
 )
 from rig.physics.kernels.stage import kernel
 
-NOTHING, FIRST, _SECOND, _THIRD, _HOUSE_NS, _HOUSE_EW = range(6)
-"""What ends a series: a length or a corner of the hammer's; a zero of one of the events' functions; a transducer."""
+NO_EVENT, FIRST, _SECOND_EVENT, _THIRD_EVENT, _HOUSE_NS, _HOUSE_EW = range(6)
+"""Event that ends a series: none, or a corner of the hammer pulse; a zero of one of three event functions; a
+transducer."""
 
 _FRICTIONLESS_S = 1e-9
-"""Time [s] after an onset and before a lift-off in which a contact that does not slide has no friction: rolling needs a
-normal force. No depth says so: in a stiff contact, the load's own may be any. Shorter than any contact by far, as the
-series of a rolling one (in time) shrink toward both."""
-_AT_REST = 1e-9
-"""Sliding speed over that of the penetration below which a contact that begins does not slide."""
-_SLOWEST = 1e-6
-"""Speed of an onset [m/s] below which the contact begins at the least depth ..."""
-_LEAST_DEPTH = 1e-11
-"""... over the clearance: at 0, dt = s dtau would stand still."""
-_TOLD_DEPTH = 1e-10
-"""Depth over the clearance from which on a difference of distances tells it."""
+"""Time [s] after an onset and before a lift-off in which a contact that does not slide has no friction, as rolling
+needs a normal force. A depth would not serve, as the static depth of a stiff contact may be smaller. The time is far
+shorter than any contact, because the series of a rolling one (in time) shrink toward both."""
+_REST_RATIO = 1e-9
+"""Sliding speed over penetration speed below which a new contact does not slide."""
+_MIN_ONSET_SPEED = 1e-6
+"""Impact speed [m/s] below which the contact starts at the minimum depth."""
+_MIN_DEPTH_RATIO = 1e-11
+"""Minimum depth over the clearance: at 0, dt = s dtau would stop."""
+_MIN_RESOLVED_DEPTH_RATIO = 1e-10
+"""Minimum depth over the clearance that a difference of distances resolves."""
 
 _ROUNDING_M = 1e-20
-"""Rounding of a housing's displacement [m]."""
+"""Rounding error of a housing's displacement [m]."""
 
 
 @kernel
-def _edge(stiffness, preload):
-    """Force [N] to which it is known whether a transducer has its preload; one for state and series."""
+def _preload_tolerance(stiffness, preload):
+    """Return the force tolerance [N] for loss of preload, common to state and series."""
     return max(1e-12 * preload, _ROUNDING_M * stiffness)
 
 
 @kernel
-def _loses(displacement, rate, stiffness, preload):
-    """Which transducer of a pair has lost its preload, or is about to: 0, or the sign of the displacement."""
+def _lost_transducer(displacement, rate, stiffness, preload):
+    """Return the transducer of a pair that has lost its preload or is about to: 0, or the sign of the displacement."""
     change = 0.5 * stiffness * displacement
     sign = 1.0 if change > 0.0 else -1.0
     over = sign * change - preload
-    edge = _edge(stiffness, preload)
+    edge = _preload_tolerance(stiffness, preload)
     return sign if over > edge or (over > -edge and sign * rate > 0.0) else 0.0
 
 
 @kernel
 def ring_at(constants, inputs, x):
-    """Force of the ring without friction (penetration, its rate, sliding speed), and the response to friction, at x."""
+    """Return the ring's motion (penetration, its rate, sliding speed) without friction, and the friction response."""
     state = State(x[0], x[1], x[2], x[3], x[4], x[5], x[6], x[7], x[8], x[9], x[10], x[11], x[12], x[13])
-    pose = pose_of(constants.levels, state)
-    e = eccentricity_of(constants, state, pose)
+    pose = compute_pose(constants.levels, state)
+    e = compute_eccentricity(constants, state, pose)
     surface = constants.shaft.radius * pose.w
     ring = ring_force(e.ex, e.ey, e.vx, e.vy, surface, 1.0, NO_FRICTION, FLIGHT, constants.contact)
     return ring, unit_response(constants, inputs, pose, ring.nx, ring.ny)
@@ -75,13 +76,13 @@ def ring_at(constants, inputs, x):
 
 @kernel
 def _holds_at_rest(constants):
-    """Whether friction may keep the sliding speed at 0."""
+    """Return whether friction may keep the sliding speed at 0."""
     return constants.levels.friction == EXACT and constants.contact.friction > 0.0
 
 
 @kernel
-def enter_events(constants, memory, Y):
-    """Functions that fall through 0 where an event happens, of what the series has in their columns."""
+def set_events(constants, memory, Y):
+    """Write the event functions, which fall through 0 at an event, from the series' columns."""
     contact, phase = constants.contact, int(memory[PHASE])
     first, second, third, order = Y[:, EVENTS], Y[:, EVENTS + 1], Y[:, EVENTS + 2], len(Y) - 1
     if phase == FLIGHT:
@@ -93,7 +94,7 @@ def enter_events(constants, memory, Y):
         return
     if phase == ROLLING:
         for k in range(order):
-            # The depth that short time ahead.
+            # Depth at `_FRICTIONLESS_S` ahead.
             first[k] += _FRICTIONLESS_S * (k + 1.0) * first[k + 1]
             friction, limit = second[k], contact.friction * Y[k, FORCE]
             second[k], third[k] = limit - friction, limit + friction
@@ -115,21 +116,21 @@ def enter_events(constants, memory, Y):
         second[:] = 0.0
         second[0] = 1.0
     elif phase == TOUCHING:
-        # Far out the tanh is 1 to rounding, and no coefficient tells of the turn ahead: halve the way to it.
+        # At high speed tanh is 1 within rounding, and no coefficient shows a later reversal: stop half-way.
         second[0] = 0.5 * abs(speed)
     if phase == TOUCHING and _holds_at_rest(constants) and Y[1, ROOT] > 0.0:
-        # Frictionless up to the depth of that time, on the way in: s' = delta'/2.
+        # While approaching, frictionless up to the depth of `_FRICTIONLESS_S`: s' = delta'/2.
         for k in range(order + 1):
             second[k] = -Y[k, ROOT]
-        least = 2.0 * math.sqrt(_LEAST_DEPTH * contact.clearance)  # so slow a contact begins at half of it
+        least = 2.0 * math.sqrt(_MIN_DEPTH_RATIO * contact.clearance)  # slow contacts start at half of it
         second[0] += max(least, math.sqrt(_FRICTIONLESS_S * 2.0 * Y[1, ROOT]))
 
 
 @kernel
-def _settle(constants, inputs, memory, x, y, dy, out):
-    """Phase of a contact whose sliding speed is 0: rolling if that is possible, else the way it is pushed."""
+def _resolve_rest(constants, inputs, memory, x, y, dy, out):
+    """Set the phase of a contact with zero sliding speed: rolling if possible, else sliding in the force direction."""
     fill(y, x)
-    # Written so that it is the very call of `advance`: each kind of arguments would be compiled anew.
+    # Same argument types as the call in `advance`: other types would be compiled separately.
     memory[PHASE] = ROLLING
     tick, phase = int(memory[TICK]), int(memory[PHASE])
     rates(constants, inputs, tick, memory[FRACTION], memory[ONSET], phase, True, y, dy, out)
@@ -137,16 +138,16 @@ def _settle(constants, inputs, memory, x, y, dy, out):
     needed = out[S.FRICTION_FORCE]
     if abs(needed) > constants.contact.friction * out[S.NORMAL_FORCE]:
         memory[PHASE] = FORWARD if needed > 0.0 else BACKWARD
-        memory[KNOWN + 1] = 1.0
+        memory[ZERO_COEFFICIENTS + 1] = 1.0
 
 
 @kernel
 def change_phase(constants, inputs, memory, x, y, dy, out):
-    """Go over to what is behind the event that has ended a series, at the state x where it happens."""
+    """Set the phase after the event that ends a series, at its state x."""
     event, phase = int(memory[EVENT]), int(memory[PHASE])
     contact = constants.contact
-    memory[EVENT] = NOTHING
-    known = memory[KNOWN : KNOWN + 3]
+    memory[EVENT] = NO_EVENT
+    known = memory[ZERO_COEFFICIENTS : ZERO_COEFFICIENTS + 3]
     for i in range(3):
         known[i] = 0.0
     ring, _ = ring_at(constants, inputs, x)
@@ -155,17 +156,17 @@ def change_phase(constants, inputs, memory, x, y, dy, out):
     if phase == FLIGHT:
         if event == FIRST:
             latch_onset(memory, rate, contact)
-            memory[PHASE] = slides if abs(sliding) > _AT_REST * rate else TOUCHING
+            memory[PHASE] = slides if abs(sliding) > _REST_RATIO * rate else TOUCHING
             x[ROOT] = 0.0
             known[0] = 1.0
-            if rate < _SLOWEST or not (contact.exponent == 1.5 or contact.exponent == 1.0):
-                x[ROOT] = math.sqrt(_LEAST_DEPTH * contact.clearance)
+            if rate < _MIN_ONSET_SPEED or not (contact.exponent == 1.5 or contact.exponent == 1.0):
+                x[ROOT] = math.sqrt(_MIN_DEPTH_RATIO * contact.clearance)
                 known[0] = 0.0
     elif memory[SLACK] != 0.0:
         if event == FIRST:
             memory[PHASE], memory[SLACK] = FLIGHT, 0.0
             known[0] = 1.0
-        elif event == _THIRD:
+        elif event == _THIRD_EVENT:
             memory[PHASE], memory[SLACK] = slides, 0.0
             known[2] = 1.0
     elif event == FIRST:
@@ -175,37 +176,37 @@ def change_phase(constants, inputs, memory, x, y, dy, out):
             memory[PHASE] = FLIGHT
             known[0] = 1.0
     elif phase == ROLLING:
-        if event != NOTHING and event <= _THIRD:
-            memory[PHASE] = FORWARD if event == _SECOND else BACKWARD
+        if event != NO_EVENT and event <= _THIRD_EVENT:
+            memory[PHASE] = FORWARD if event == _SECOND_EVENT else BACKWARD
             known[1] = 2.0
-    elif event == _THIRD:
+    elif event == _THIRD_EVENT:
         memory[SLACK] = 1.0
         memory[CLAMPS] += 1.0
         known[2] = 1.0
-    elif event == _SECOND and _holds_at_rest(constants):
-        if phase == TOUCHING and abs(sliding) > _AT_REST * abs(rate):
+    elif event == _SECOND_EVENT and _holds_at_rest(constants):
+        if phase == TOUCHING and abs(sliding) > _REST_RATIO * abs(rate):
             memory[PHASE] = slides
         else:
-            _settle(constants, inputs, memory, x, y, dy, out)
-    # The depth itself, where it can be told, so that its root does not drift.
+            _resolve_rest(constants, inputs, memory, x, y, dy, out)
+    # Reset the root from the depth where that is resolved, to prevent drift.
     slowed = memory[PHASE] != FLIGHT and memory[PHASE] != ROLLING
-    if slowed and (depth > _TOLD_DEPTH * contact.clearance or phase == ROLLING or memory[SPAN] < 0.0):
-        x[ROOT] = math.sqrt(max(depth, _LEAST_DEPTH * contact.clearance))
+    if slowed and (depth > _MIN_RESOLVED_DEPTH_RATIO * contact.clearance or phase == ROLLING or memory[SPAN] < 0.0):
+        x[ROOT] = math.sqrt(max(depth, _MIN_DEPTH_RATIO * contact.clearance))
     house = constants.house
     memory[NORTH] = memory[EAST] = 0.0
     if constants.levels.inner_house:
-        memory[NORTH] = _loses(
+        memory[NORTH] = _lost_transducer(
             x[S.Y_IH] - x[S.Y_OH], x[S.VY_IH] - x[S.VY_OH], house.pair_stiffness_vertical, house.preload
         )
     if constants.levels.outer_house:
-        memory[EAST] = _loses(x[S.X_OH], x[S.VX_OH], house.pair_stiffness_horizontal, house.preload)
+        memory[EAST] = _lost_transducer(x[S.X_OH], x[S.VX_OH], house.pair_stiffness_horizontal, house.preload)
 
 
 @kernel
 def preload_end(constants, memory, Y, h):
-    """Where within h a transducer loses or finds its preload; and which pair's."""
+    """Return the position within h at which a transducer loses or regains its preload, and its pair."""
     house = constants.house
-    nearest, which = math.inf, NOTHING
+    nearest, which = math.inf, NO_EVENT
     for pair in range(2):
         if not (constants.levels.inner_house if pair == 0 else constants.levels.outer_house):
             continue
@@ -226,12 +227,12 @@ def preload_end(constants, memory, Y, h):
         for side in range(2):
             sign = lost if lost != 0.0 else (1.0 if side == 0 else -1.0)
             way = 1.0 if lost != 0.0 else -1.0
-            # Above 0 while nothing changes; in the last column, which events no longer need.
+            # Above 0 while nothing changes; stored in the last column, which events no longer need.
             for k in range(len(Y)):
                 value = Y[k, S.Y_IH] - Y[k, S.Y_OH] if pair == 0 else Y[k, S.X_OH]
                 Y[k, EVENTS + 2] = way * sign * value / limit
             Y[0, EVENTS + 2] -= way
-            shift = 1 if abs(Y[0, EVENTS + 2]) * house.preload < _edge(stiffness, house.preload) else 0
+            shift = 1 if abs(Y[0, EVENTS + 2]) * house.preload < _preload_tolerance(stiffness, house.preload) else 0
             zero = first_zero(Y, EVENTS + 2, shift, h)
             if zero < nearest and not (shift == 1 and zero == 0.0):
                 nearest, which = zero, _HOUSE_NS + pair

@@ -1,7 +1,7 @@
-"""What a series has lanes for: products and quotients, whose factors' coefficients A and B stand in a lane each.
+"""Lanes of a series: products and quotients, whose factors' coefficients A and B are stored in one lane each.
 
-The k-th coefficient of a product takes A_j B_(k-j) over all j: what those between give, `acc`, is summed up for all
-lanes at once. `later` is 0 for k = 0, else 1.
+The k-th coefficient of a product is the sum of A_j B_(k-j) over all j; `acc` holds the terms of 0 < j < k, computed for
+all lanes at once. `later` is 0 for k = 0, else 1.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ _FACTORS, _SUMS = float64[:, ::1], float64[::1]
 
 @stage
 def is_wide(constants, inputs):
-    """Whether a scene is one of the few that ask for the lanes behind."""
+    """Return whether a scene needs the additional lanes, as few scenes do."""
     contact = constants.contact
     return (
         contact.gap_counts_outer != 0.0
@@ -28,8 +28,8 @@ def is_wide(constants, inputs):
 
 
 @njit((_FACTORS, _FACTORS, _SUMS, int64, int64), **STAGE)
-def sum_below(A, B, acc, k, lanes):
-    """What the coefficients below the k-th give to the products of so many lanes."""
+def sum_lower_products(A, B, acc, k, lanes):
+    """Sum the products of the coefficients below the k-th, for a number of lanes."""
     for p in range(lanes):
         acc[p] = 0.0
     for j in range(1, k):
@@ -37,25 +37,27 @@ def sum_below(A, B, acc, k, lanes):
             acc[p] += A[j, p] * B[k - j, p]
 
 
-# Named types: each lane's number is a constant, which the compiler takes for a type of its own, and it would compile
-# the function once a lane.
+# With explicit types the function is compiled once; a lane's number is a literal, which would have its own type.
 @njit(float64(_FACTORS, _FACTORS, _SUMS, int64, float64, int64, float64, float64), **STAGE)
 def product(A, B, acc, k, later, p, left, right):
-    """The k-th coefficient of a product, whose factors go into lane p."""
+    """Return the k-th coefficient of a product and store its factors in lane p."""
     A[k, p], B[k, p] = left, right
     return acc[p] + A[0, p] * right + left * (later * B[0, p])
 
 
 @njit(float64(_FACTORS, _FACTORS, _SUMS, int64, float64, int64, float64, float64, float64), **STAGE)
 def quotient(A, B, acc, k, later, p, divisor, dividend, inverse):
-    """The k-th coefficient of a quotient, by the inverse of the divisor's first; both go into lane p, as factors."""
+    """Return the k-th coefficient of a quotient, from the inverse of the divisor's first coefficient.
+
+    Lane p holds divisor and quotient as factors.
+    """
     A[k, p], B[k, p] = divisor, (dividend - acc[p] - divisor * (later * B[0, p])) * inverse
     return B[k, p]
 
 
 @stage
 def complex_power(A, B, acc, k, later, p, x, y, exponent):
-    """The k-th coefficients of (x + i y)^exponent, by squaring as in `kernels.laws.magnet`; lanes from p on."""
+    """Return the k-th coefficients of (x + i y)^exponent, by squaring as in `kernels.laws.magnet`, from lane p on."""
     power_x, power_y, begun = 1.0 - later, 0.0, False
     while exponent > 0:
         if exponent & 1:

@@ -1,24 +1,25 @@
 """Taylor series of order 16 on the full model: the engine for errors below 1e-6.
 
-The solution's own power series by the recurrences of automatic differentiation; length of step from the last two terms
-(A. Jorba and M. Zou, A software package for the numerical integration of ODEs by means of high-order Taylor methods,
-Experimental Mathematics 14 (2005) 99-117). Their code, `rig.physics.engines.taylor.series`, is made of the equations in
-`rig.physics.kernels.dynamics` (`rig.physics.engines.tape` says how); here is how the series are marched.
+The solution's power series by the recurrences of automatic differentiation, with the step length from the last two
+terms (A. Jorba and M. Zou, A software package for the numerical integration of ODEs by means of high-order Taylor
+methods, Experimental Mathematics 14 (2005) 99-117). The recurrences, `rig.physics.engines.taylor.series`, are generated
+from the equations in `rig.physics.kernels.dynamics` (see `rig.physics.engines.tape`). This module marches the series.
 
-Events are roots of polynomials: onset, lift-off, a sliding speed that comes to 0, friction that rolling needs beyond
-mu F_n, a normal law that asks for tension, a transducer that loses its preload. Steps end there; friction by Filippov,
-as in `rig.physics.engines.common.events`.
+Events are roots of polynomials: onset, lift-off, zero of the sliding speed, rolling friction above mu F_n, a normal law
+that would pull, loss of a transducer's preload. Steps end there; friction by Filippov, as in
+`rig.physics.engines.common.events`.
 
-Contact. delta^1.5 has branch points at onset and lift-off, next to which a series in time converges as far as to the
-nearer one: a hundred steps a contact. While it slides, the series is therefore in tau with dt = s dtau, s the root of
-delta, itself a state, s' = delta'/2 by tau: the force goes as s^3, onset and lift-off are simple zeros of s, and an
-impact takes some 16 steps. (Levi-Civita and Sundman treat collisions of bodies so.) Where the law's exponent is neither
-1 nor 1.5, contacts begin at a depth of 1e-11 of the clearance. Rolling ends before the lift-off and stays with time.
+Contact: delta^1.5 has branch points at onset and lift-off, and a series in time converges only as far as the nearer
+one, which takes a hundred steps per contact. A sliding contact therefore uses tau with dt = s dtau, where s, the root
+of delta, is itself a state, s' = delta'/2 by tau. The force is proportional to s^3, onset and lift-off are simple zeros
+of s, and an impact takes about 16 steps. (Levi-Civita and Sundman treat collisions of bodies in this way.) Where the
+law's exponent is neither 1 nor 1.5, contacts start at a depth of 1e-11 of the clearance. Rolling ends before the
+lift-off and uses time.
 
-Steps run on beyond the rows, which are read off the series; so the memory holds one. Where the inputs change, it is
-dropped at that instant. So neither calls nor the density of rows change a bit of the motion.
+Steps extend beyond the rows, which are read from the series; so the memory holds one series. A change of the inputs
+discards it at that instant. Thus neither the division into calls nor the density of rows changes a bit of the motion.
 
-Smoothed friction is taken too, but a very small smoothing speed makes it stiff, and the steps short.
+Smoothed friction is supported, but a very small smoothing speed makes it stiff and the steps short.
 """
 
 from __future__ import annotations
@@ -42,15 +43,21 @@ from rig.physics.engines.common.memory import (
 )
 from rig.physics.engines.common.method import PER_SCALE, fill, rates
 from rig.physics.engines.tape.columns import EVENTS, FORCE, ROOT, TIME, WIDTH
-from rig.physics.engines.taylor.events import FIRST, NOTHING, change_phase, enter_events, preload_end, ring_at
-from rig.physics.engines.taylor.place import (
+from rig.physics.engines.taylor.events import (
+    FIRST,
+    NO_EVENT,
+    change_phase,
+    preload_end,
+    ring_at,
+    set_events,
+)
+from rig.physics.engines.taylor.memory import (
     EAST,
     END_FRACTION,
     END_TICK,
     EVENT,
     FRACTION,
     INPUTS,
-    KNOWN,
     LENGTH,
     NORTH,
     ORDER,
@@ -58,32 +65,33 @@ from rig.physics.engines.taylor.place import (
     SERIES,
     SERIES_ORDER,
     SPAN,
-    STALLED,
+    STALLED_STEPS,
     TICK,
+    ZERO_COEFFICIENTS,
 )
 from rig.physics.engines.taylor.polynomial import column_at, first_zero, refine, series_at
-from rig.physics.engines.taylor.ringing import RINGS, add_ringing, keep_clear, let_ring
+from rig.physics.engines.taylor.ringing import RINGS, add_clearance_margin, add_ringing, start_ringing
 from rig.physics.engines.taylor.series import LANES, flight, rolling, sliding
 from rig.physics.kernels import signals as S
 from rig.physics.kernels.forces import drive_speed
-from rig.physics.kernels.laws.contact import FLIGHT, ROLLING, TOUCHING, held_speed, normal_force
+from rig.physics.kernels.laws.contact import FLIGHT, ROLLING, TOUCHING, floor_onset_speed, normal_force
 from rig.physics.kernels.stage import kernel
 
 _SAFETY = 0.9
-_LONGEST_S, _SHORTEST_S = 6e-2, 1e-12
-"""Longest step, and the shortest that is no sign of trouble [s], in the variable of the series."""
-_NOTHING = 1e-60
-"""What counts as 0 in a state."""
-_ROUNDING = 1e-16
-"""Tolerance that no step can vouch for."""
+_MAX_STEP_S, _MIN_STEP_S = 6e-2, 1e-12
+"""Longest step, and the shortest that does not indicate a failure [s], in the variable of the series."""
+_MIN_STATE = 1e-60
+"""Magnitude below which a state is set to 0."""
+_MIN_TOLERANCE = 1e-16
+"""Smallest tolerance that rounding permits."""
 _SCALE_T, _SCALE_ROOT = 1e-4, 3e-3
-"""What counts as 1 in a step's error: 0.1 ms, 9 µm."""
+"""Scales of time and root in a step's error: 0.1 ms, 9 µm."""
 
 
 class Room(NamedTuple):
-    """Arrays that the series are worked out in."""
+    """Workspace of the series."""
 
-    Y: np.ndarray  # the series at hand, shape (order + 1, WIDTH): in the memory, so that it outlives the call
+    Y: np.ndarray  # current series, shape (order + 1, WIDTH), in the memory
     A: np.ndarray  # factors of products, shape (order + 1, LANES)
     B: np.ndarray
     D: np.ndarray  # rates, shape (order + 1, WIDTH)
@@ -95,7 +103,7 @@ class Room(NamedTuple):
 
 @kernel
 def _aligned(rows, columns):
-    """Zeros whose rows begin on cache lines: the sums over lanes take half as long again without."""
+    """Return zeros with rows on cache lines; without alignment the sums over lanes take half as long again."""
     room = np.zeros(rows * columns + 8)
     first = (-room.ctypes.data % 64) // 8
     return room[first : first + rows * columns].reshape((rows, columns))
@@ -103,7 +111,7 @@ def _aligned(rows, columns):
 
 @kernel
 def room_in(memory):
-    """Room for a call."""
+    """Return the workspace of a call."""
     rows = int(memory[SERIES_ORDER]) + 1
     return Room(
         memory[SERIES : SERIES + rows * WIDTH].reshape((rows, WIDTH)),
@@ -119,10 +127,10 @@ def room_in(memory):
 
 @kernel
 def start(constants, inputs, y, memory, step_ticks, tolerance):
-    """Prepare the memory for a state: a state that begins in contact holds the floored impact speed."""
+    """Initialise the memory for a state; a state in contact gets the floored impact speed."""
     constants, inputs = constants[0], inputs[0]
     memory[:] = 0.0
-    memory[ONSET] = held_speed(0.0, constants.contact)
+    memory[ONSET] = floor_onset_speed(0.0, constants.contact)
     memory[TOLERANCE] = tolerance
     memory[SPAN], memory[SERIES_ORDER] = -1.0, ORDER
     ring, _ = ring_at(constants, inputs, y)
@@ -132,10 +140,10 @@ def start(constants, inputs, y, memory, step_ticks, tolerance):
 
 @kernel
 def _make_series(constants, inputs, memory, room):
-    """All coefficients of a series from the state in its first row.
+    """Compute all coefficients of a series from the state in its first row.
 
     Returns:
-        Whether it is a series in slowed time.
+        True for a series in tau, the variable of sliding contacts.
     """
     Y, A, B, D, acc = room.Y, room.A, room.B, room.D, room.acc
     now, phase = int(memory[TICK]), int(memory[PHASE])
@@ -152,13 +160,13 @@ def _make_series(constants, inputs, memory, room):
         rolling(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B, D, acc)
     else:
         sliding(constants, inputs, memory, aim, pulse, along, 0.0, Y, A, B, D, acc)
-    enter_events(constants, memory, Y)
+    set_events(constants, memory, Y)
     return phase != FLIGHT and phase != ROLLING
 
 
 @kernel
 def _length(memory, Y, slowed):
-    """How far a series holds: its last two terms stay within the tolerance."""
+    """Return the length of a series at which its last two terms are within the tolerance."""
     tolerance, order = memory[TOLERANCE], len(Y) - 1
     last = before = known = 0.0
     for i in range(S.N_STATE):
@@ -168,7 +176,7 @@ def _length(memory, Y, slowed):
     if slowed:
         last = max(last, abs(Y[order, TIME]) / _SCALE_T, abs(Y[order, ROOT]) / _SCALE_ROOT)
         before = max(before, abs(Y[order - 1, TIME]) / _SCALE_T, abs(Y[order - 1, ROOT]) / _SCALE_ROOT)
-    if not math.isfinite(known):  # max leaves out what is none
+    if not math.isfinite(known):  # max ignores nan
         return math.nan
     return _SAFETY * min(
         (tolerance / max(last, 1e-200)) ** (1.0 / order), (tolerance / max(before, 1e-200)) ** (1.0 / (order - 1.0))
@@ -177,7 +185,7 @@ def _length(memory, Y, slowed):
 
 @kernel
 def _law_length(memory, Y):
-    """How far the normal law and its losses hold in a series."""
+    """Return the length of a series at which the normal law and its losses are within the tolerance."""
     tolerance, law, loss, order = memory[TOLERANCE], EVENTS + 2, S.CONTACT_LOSS, len(Y) - 1
     most = tolerance * max(1.0, abs(Y[0, law]))
     last = max(abs(Y[order - 1, law]) / most, abs(Y[order - 1, loss]) / tolerance)
@@ -187,7 +195,7 @@ def _law_length(memory, Y):
 
 @kernel
 def _force_at(constants, inputs, memory, Y, s, x):
-    """Normal force by the law, at s of a series [N]. Its own column says less: no length of step vouches for it."""
+    """Return the normal force by the law at s of a series [N]; the error of its column is not bounded."""
     series_at(Y, s, x)
     ring, _ = ring_at(constants, inputs, x)
     return normal_force(ring.delta, ring.rate, memory[ONSET], constants.contact)[0]
@@ -195,7 +203,7 @@ def _force_at(constants, inputs, memory, Y, s, x):
 
 @kernel
 def _note_peak(constants, inputs, memory, Y, x):
-    """The largest normal force within a series; x is room for a state."""
+    """Update the largest normal force by that within a series; x is workspace for a state."""
     h = memory[LENGTH]
     most, power = Y[0, FORCE], 1.0
     for k in range(1, len(Y) - 1):
@@ -226,15 +234,15 @@ def _note_peak(constants, inputs, memory, Y, x):
 
 @kernel
 def _state_at(memory, Y, s, x):
-    """State and integrals at s of the series at hand into x."""
+    """Evaluate state and integrals at s of the current series into x."""
     series_at(Y, s, x)
     if memory[RINGING] != 0.0:
         add_ringing(memory, s, x)
 
 
 @kernel
-def _rings(constants, inputs, memory, x, y):
-    """Take the housings out of the state x in flight where they ring by themselves; y is room for a state."""
+def _ring(constants, inputs, memory, x, y):
+    """Remove the ringing housings from the state x in flight where possible; y is workspace for a state."""
     memory[RINGING] = 0.0
     if memory[RINGS] == 0.0 or memory[PHASE] != FLIGHT or memory[NORTH] != 0.0 or memory[EAST] != 0.0:
         return False
@@ -242,15 +250,15 @@ def _rings(constants, inputs, memory, x, y):
     for row in range(S.X_IH, S.Y_OH + 1):
         y[row] = y[row + S.VX_IH - S.X_IH] = 0.0
     ring, _ = ring_at(constants, inputs, y)
-    return let_ring(constants, memory, x, ring.delta, ring.rate)
+    return start_ringing(constants, memory, x, ring.delta, ring.rate)
 
 
 @kernel
 def _next_series(constants, inputs, memory, room, y):
-    """From the end of one series to the next; y is room for a state.
+    """Advance from the end of one series to the next; y is workspace for a state.
 
     Returns:
-        False where there is none: the numbers are no longer finite.
+        False if the numbers are no longer finite.
     """
     Y, x = room.Y, room.x
     if memory[SPAN] >= 0.0:
@@ -259,29 +267,29 @@ def _next_series(constants, inputs, memory, room, y):
         _state_at(memory, Y, memory[LENGTH], x)
         memory[TICK], memory[FRACTION] = memory[END_TICK], memory[END_FRACTION]
     change_phase(constants, inputs, memory, x, y, room.dy, room.out)
-    rings = _rings(constants, inputs, memory, x, y)
+    rings = _ring(constants, inputs, memory, x, y)
     fill(Y[0, : ROOT + 1], x)
     for i in range(S.N_STATE):
-        # At rest, rates decay to where a processor takes a hundred times as long for a product.
-        if abs(Y[0, i]) < _NOTHING:
+        # At rest, rates decay to denormal numbers, which slow down products a hundredfold.
+        if abs(Y[0, i]) < _MIN_STATE:
             Y[0, i] = 0.0
     slowed = _make_series(constants, inputs, memory, room)
     memory[STEPS] += 1.0
     memory[EVALUATIONS] += memory[SERIES_ORDER]
     if memory[PHASE] != FLIGHT:
         memory[CONTACT_STEPS] += 1.0
-    if memory[TOLERANCE] < _ROUNDING:
+    if memory[TOLERANCE] < _MIN_TOLERANCE:
         memory[CEILING] += 1.0
     h = _length(memory, Y, slowed)
     if not math.isfinite(h):
         return False
     if slowed and not (constants.contact.exponent == 1.5 or constants.contact.exponent == 1.0):
-        # The law, by which events and losses go, has a radius that a motion it hardly moves yet does not show.
+        # The law's radius of convergence limits events and losses, and may not show in the motion yet.
         h = min(h, _law_length(memory, Y))
-    # Never further than it holds: what a series says beyond its radius is no number to go on with.
-    if h < _SHORTEST_S:
+    # A series is never used beyond its radius of convergence.
+    if h < _MIN_STEP_S:
         memory[CEILING] += 1.0
-    # No further than a corner of the hammer's pulse.
+    # At most up to a corner of the hammer pulse.
     now = memory[TICK]
     corner = math.inf
     if inputs.hammer_end > inputs.hammer_start:
@@ -289,25 +297,25 @@ def _next_series(constants, inputs, memory, room, y):
             corner = float(inputs.hammer_start)
         elif inputs.hammer_end > now:
             corner = float(inputs.hammer_end)
-    limit = min(_LONGEST_S, ((corner - now) - memory[FRACTION]) * inputs.tick_s)
+    limit = min(_MAX_STEP_S, ((corner - now) - memory[FRACTION]) * inputs.tick_s)
     at_corner = False
     if slowed:
         span = column_at(Y, TIME, 0, h)[0]
         if span > limit:
             h = refine(Y, TIME, 0, limit, 0.0, h)
-            at_corner = limit < _LONGEST_S
+            at_corner = limit < _MAX_STEP_S
     elif h >= limit:
         h = limit
-        at_corner = limit < _LONGEST_S
-    event = NOTHING
+        at_corner = limit < _MAX_STEP_S
+    event = NO_EVENT
     if rings:
-        keep_clear(constants, memory, Y, EVENTS)
+        add_clearance_margin(constants, memory, Y, EVENTS)
         zero = first_zero(Y, EVENTS, 0, h)
         if zero <= h:
             h, at_corner = zero, False
     else:
         for i in range(3):
-            shift = int(memory[KNOWN + i])
+            shift = int(memory[ZERO_COEFFICIENTS + i])
             zero = first_zero(Y, EVENTS + i, shift, h)
             if zero <= h:
                 h, event, at_corner = zero, FIRST + i, False
@@ -315,7 +323,7 @@ def _next_series(constants, inputs, memory, room, y):
         if zero <= h:
             h, event, at_corner = zero, which, False
     span = column_at(Y, TIME, 0, h)[0] if slowed else h
-    memory[STALLED] = memory[STALLED] + 1.0 if span < 1e-13 else 0.0
+    memory[STALLED_STEPS] = memory[STALLED_STEPS] + 1.0 if span < 1e-13 else 0.0
     memory[LENGTH], memory[SPAN], memory[EVENT] = h, span, event
     if at_corner:
         memory[END_TICK], memory[END_FRACTION] = corner, 0.0
@@ -327,29 +335,29 @@ def _next_series(constants, inputs, memory, room, y):
 
 
 @kernel
-def holds(memory, tick, fraction):
-    """Whether the series at hand holds at an instant: a whole tick and the ticks beyond it."""
+def covers(memory, tick, fraction):
+    """Return whether the current series covers an instant, a whole tick and the ticks beyond it."""
     return memory[SPAN] >= 0.0 and (tick - memory[END_TICK]) + (fraction - memory[END_FRACTION]) <= 0.0
 
 
 @kernel
 def continue_series(constants, inputs, memory, room, y):
-    """Go over to the next series; y is room for a state, and nan where the numbers are no longer finite.
+    """Start the next series; y is workspace for a state, and nan if the numbers are no longer finite.
 
     Returns:
-        Whether they are.
+        True if the numbers are finite.
     """
-    if memory[STALLED] > 1000.0 or not _next_series(constants, inputs, memory, room, y):
+    if memory[STALLED_STEPS] > 1000.0 or not _next_series(constants, inputs, memory, room, y):
         memory[CEILING] += 1.0
-        memory[STALLED] = 1e9
+        memory[STALLED_STEPS] = 1e9
         y[:] = np.nan
         return False
     return True
 
 
 @kernel
-def read_off(memory, Y, y, tick, fraction):
-    """State at an instant of the series at hand, into y."""
+def read_state(memory, Y, y, tick, fraction):
+    """Evaluate the state at an instant of the current series into y."""
     time = ((tick - memory[TICK]) + (fraction - memory[FRACTION])) * memory[INPUTS]
     s = time
     if time >= memory[SPAN]:
@@ -360,8 +368,8 @@ def read_off(memory, Y, y, tick, fraction):
 
 
 @kernel
-def same_inputs(inputs, memory):
-    """Whether the inputs are what they were; keeps them."""
+def compare_inputs(inputs, memory):
+    """Return whether the inputs are unchanged, and store them."""
     kept = memory[INPUTS : INPUTS + 11]
     same = (
         kept[0] == inputs.tick_s
@@ -386,15 +394,15 @@ def same_inputs(inputs, memory):
 
 @kernel
 def begin_series(constants, inputs, memory, room, y, tick, fraction, leaves):
-    """A new beginning from the state y, at a whole tick and the ticks beyond it, for the next series to continue from.
+    """Prepare the memory for a new series from the state y at `tick` + `fraction`.
 
-    `leaves` says that a contact ends there: its gap counts as closed, whatever rounding makes of it.
+    `leaves` marks the end of a contact: its gap counts as closed, regardless of rounding.
     """
     if memory[SPAN] >= 0.0 and memory[PHASE] != FLIGHT:
         _note_peak(constants, inputs, memory, room.Y, room.x)
     fill(room.x[: S.N_VECTOR], y)
     memory[SPAN] = -1.0
-    memory[EVENT] = NOTHING
+    memory[EVENT] = NO_EVENT
     if leaves:
         memory[EVENT], memory[PHASE] = FIRST, TOUCHING
     memory[TICK], memory[FRACTION] = float(tick), fraction
@@ -403,7 +411,7 @@ def begin_series(constants, inputs, memory, room, y, tick, fraction, leaves):
 
 @kernel
 def write_row(constants, inputs, memory, now, dy, out, y, row, rows):
-    """Write the row of the state y at a tick, where `rows` has room for it."""
+    """Write the row of the state y at a tick, if `rows` has room for it."""
     if row < len(rows):
         rates(constants, inputs, now, 0.0, memory[ONSET], int(memory[PHASE]), True, y, dy, out)
         fill(rows[row, : S.N_VECTOR], y)
@@ -412,29 +420,29 @@ def write_row(constants, inputs, memory, now, dy, out, y, row, rows):
 
 @kernel
 def write_rows(constants, inputs, memory, Y, dy, out, y, grid, row, rows):
-    """The rows that lie on the series at hand, and the state at the last of them into y.
+    """Write the rows within the current series, and the state at the last of them into y.
 
-    In a loop of its own without `Room`: to hand its arrays on takes as long as to read off a state.
+    A separate loop without `Room`: passing its arrays takes as long as reading a state.
 
     Args:
-        constants: Numbers of the model.
+        constants: Model constants.
         inputs: Hammer, drive, magnets.
-        memory: Of the engine.
-        Y: The series.
-        dy: Room for rates, shape (N_VECTOR,).
-        out: Room for what is observed, shape (N_OBSERVED,).
+        memory: Memory of the engine.
+        Y: Series.
+        dy: Workspace for rates, shape (N_VECTOR,).
+        out: Workspace for the observed quantities, shape (N_OBSERVED,).
         y: State and integrals, out, shape (N_VECTOR,).
-        grid: Tick of the first row, ticks a row, that at the end.
+        grid: Tick of the first row, ticks per row, tick at the end.
         row: Number of the next row.
-        rows: Out; instants beyond them are read off and not written.
+        rows: Out; instants without a row are read and not written.
 
     Returns:
-        Number of the next row: it does not lie on it, or is behind the end.
+        Number of the next row, which is beyond the series or the last row.
     """
     first, every, end = grid
     now = min(first + row * every, end)
-    while holds(memory, now, 0.0):
-        read_off(memory, Y, y, now, 0.0)
+    while covers(memory, now, 0.0):
+        read_state(memory, Y, y, now, 0.0)
         write_row(constants, inputs, memory, now, dy, out, y, row, rows)
         row += 1
         if now == end:
@@ -445,22 +453,22 @@ def write_rows(constants, inputs, memory, Y, dy, out, y, grid, row, rows):
 
 @njit(cache=True, error_model="numpy", fastmath=False, nogil=True)
 def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows):
-    """Take `steps` steps in place and write every `stride`-th instant's row (see `rig.physics.engines`).
+    """Take `steps` steps in place and write a row every `stride` steps (see `rig.physics.engines`).
 
     Args:
-        constants: Numbers of the model.
+        constants: Model constants.
         inputs: Hammer, drive, magnets; constant over the call.
-        y: State and integrals, in and out, shape (N_VECTOR,). Read only where no series goes on.
-        memory: In and out, shape (MEMORY,).
+        y: State and integrals, in and out, shape (N_VECTOR,). Read only if no series continues.
+        memory: Memory, in and out, shape (MEMORY,).
         tick: Time at the start.
-        step_ticks: Ticks a step of the grid that rows and calls lie on.
+        step_ticks: Length of a step of the grid of rows and calls [ticks].
         steps: Number of steps.
-        stride: Steps a row.
-        rows: Out, shape (ceil(steps / stride), N_ROW), or one longer: the last is that at the end.
+        stride: Steps per row.
+        rows: Out, shape (ceil(steps / stride), N_ROW), or one longer, with the row at the end.
     """
     constants, inputs = constants[0], inputs[0]
     room = room_in(memory)
-    if not same_inputs(inputs, memory) or memory[SPAN] < 0.0:
+    if not compare_inputs(inputs, memory) or memory[SPAN] < 0.0:
         begin_series(constants, inputs, memory, room, y, tick, 0.0, False)
     grid, count = (tick, stride * step_ticks, tick + steps * step_ticks), (steps + stride - 1) // stride
     row = write_rows(constants, inputs, memory, room.Y, room.dy, room.out, y, grid, 0, rows)

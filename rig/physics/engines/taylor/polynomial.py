@@ -9,19 +9,19 @@ from rig.physics.kernels.stage import kernel
 
 @kernel
 def series_at(Y, s, x):
-    """The first columns at s into x, as many as x has room for; the order is a multiple of 4."""
+    """Evaluate the first columns at s into x, as many as x has; the order is a multiple of 4."""
     order = len(Y) - 1
     for i in range(len(x)):
         x[i] = Y[order, i]
     for k in range(order - 4, -1, -4):
-        # Along the rows, so that the compiler takes several columns at once.
+        # Along the rows, so that the compiler vectorises over columns.
         for i in range(len(x)):
             x[i] = (((x[i] * s + Y[k + 3, i]) * s + Y[k + 2, i]) * s + Y[k + 1, i]) * s + Y[k, i]
 
 
 @kernel
 def column_at(Y, column, shift, s):
-    """One column at s without its first `shift` coefficients, over s**shift, and its slope."""
+    """Return value and slope of a column at s without its first `shift` coefficients, over s**shift."""
     value = slope = 0.0
     for k in range(len(Y) - 1, shift - 1, -1):
         slope = slope * s + value
@@ -31,7 +31,7 @@ def column_at(Y, column, shift, s):
 
 @kernel
 def refine(Y, column, shift, goal, low, high):
-    """Where a column passes a value between low and high, by guarded Newton steps."""
+    """Return the position at which a column passes a value between low and high, by guarded Newton steps."""
     below = column_at(Y, column, shift, low)[0] < goal
     s = 0.5 * (low + high)
     for _ in range(100):
@@ -54,9 +54,10 @@ def refine(Y, column, shift, goal, low, high):
 
 @kernel
 def first_zero(Y, column, shift, h):
-    """The first zero of a column (without what is known to be 0) up to h, if it falls through 0; else infinity.
+    """Return the first zero up to h at which a column falls through 0; infinity if there is none.
 
-    A bound by the coefficients rules out most; then samples, between which a minimum is looked for.
+    Excludes the `shift` leading coefficients, which are 0. A bound by the coefficients rules out most cases; otherwise
+    samples are taken, with a search for a minimum between them.
     """
     first = Y[shift, column]
     if first <= 0.0:

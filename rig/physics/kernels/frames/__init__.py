@@ -1,1 +1,1 @@
-"""Frames: the shaft's tilt, its axis, and its place in the ring."""
+"""Frames: tilt of the shaft, its axis, and its position in the ring."""

@@ -7,14 +7,14 @@ import math
 from rig.physics.kernels.stage import kernel
 
 SERIES_REACH = 0.06
-"""Up to this angle [rad] the series below are exact to rounding; the shaft's tilts stay below 0.02 rad."""
+"""Largest angle [rad] at which the series below are exact to rounding; the shaft's tilts stay below 0.02 rad."""
 
 
 @kernel
 def sin_cos(angle):
-    """Sine and cosine of an angle [rad].
+    """Return sine and cosine of an angle [rad].
 
-    By their series where those are exact to rounding, which costs a quarter of the library's functions.
+    Small angles use series that are exact to rounding and take a quarter of the library functions' time.
     """
     if abs(angle) > SERIES_REACH:
         return math.sin(angle), math.cos(angle)
@@ -33,7 +33,7 @@ def sin_cos(angle):
 
 @kernel
 def arc_sine(value):
-    """Angle [rad] of a sine, by its series where that is exact to rounding."""
+    """Return the angle [rad] of a sine, for small values by a series that is exact to rounding."""
     if abs(value) > SERIES_REACH:
         return math.asin(value)
     s = value * value

@@ -1,4 +1,4 @@
-"""The shaft's axis by its direction instead of two angles: what series and splitting calculate with.
+"""Direction of the shaft's axis in place of two angles, for the Taylor series and the split engine.
 
 u = (sin b, -sin G cos b, cos G cos b) is a unit vector along the axis, p = u' its rate. With small angles u is (b, -G).
 """
@@ -12,8 +12,8 @@ from rig.physics.kernels.stage import kernel
 
 
 @kernel
-def axis_of(euler, gamma, beta, gamma_rate, beta_rate):
-    """Lateral direction ux, uy [1] and rate px, py [1/s] of the axis, by its angles and their rates."""
+def axis_from_angles(euler, gamma, beta, gamma_rate, beta_rate):
+    """Return lateral direction ux, uy [1] and rate px, py [1/s] of the axis from its angles and their rates."""
     if not euler:
         return beta, -gamma, beta_rate, -gamma_rate
     sG, cG = sin_cos(gamma)
@@ -22,8 +22,8 @@ def axis_of(euler, gamma, beta, gamma_rate, beta_rate):
 
 
 @kernel
-def angles_of(euler, ux, uy, px, py):
-    """Gamma, beta [rad] and their rates [rad/s], by lateral direction and rate of the axis."""
+def angles_from_axis(euler, ux, uy, px, py):
+    """Return Gamma, beta [rad] and their rates [rad/s] from lateral direction and rate of the axis."""
     if not euler:
         return -uy, ux, -py, px
     cb2 = 1.0 - ux * ux

@@ -1,7 +1,7 @@
-"""Where the shaft is and how it moves: sines of its tilt, direction of its axis, and its place in the ring.
+"""Position and velocity of the shaft: sines of its tilt, direction of its axis, position in the ring.
 
-Frames and signs: x horizontal (EAST +), y up, z along the shaft toward its free end; Gamma turns about x, beta about
-the turned y, theta is the spin. A point of the axis at arm l is at l u with u = (sin b, -sin G cos b, cos G cos b).
+Frames and signs: x horizontal (EAST +), y up, z along the shaft toward its free end. Gamma rotates about x, beta about
+the rotated y, theta is the spin. A point of the axis at arm l is at l u with u = (sin b, -sin G cos b, cos G cos b).
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from rig.physics.kernels.stage import kernel, stage
 
 
 class State(NamedTuple):
-    """The state by name (`rig.physics.kernels.signals.STATE` has units and meaning)."""
+    """State by name (`rig.physics.kernels.signals.STATE` has units and meaning)."""
 
     Gamma: float
     beta: float
@@ -33,7 +33,7 @@ class State(NamedTuple):
 
 
 class Pose(NamedTuple):
-    """The shaft's tilt and its rates, and what the equations make of them."""
+    """Tilt of the shaft, its rates, and derived quantities."""
 
     sG: float  # sin Gamma
     cG: float
@@ -50,7 +50,7 @@ class Pose(NamedTuple):
 
 
 class Eccentricity(NamedTuple):
-    """The shaft's centre from the ring's, in the ring's plane, and its rate."""
+    """Position and velocity of the shaft's centre relative to the ring's, in the ring's plane."""
 
     ex: float  # [m]
     ey: float  # [m]
@@ -59,34 +59,34 @@ class Eccentricity(NamedTuple):
 
 
 @stage
-def large_of(levels):
-    """1 where tilts count as large, else 0: a factor of everything that small angles leave out."""
+def large_tilt_factor(levels):
+    """Return 1 for large tilts, else 0: a factor of all terms that small angles neglect."""
     return 1.0 if levels.euler else 0.0
 
 
 @stage
-def sines_of(levels, angle):
-    """Sine and cosine of a tilt; with small angles the angle and 1."""
+def tilt_sines(levels, angle):
+    """Return sine and cosine of a tilt; with small angles, the angle and 1."""
     if levels.euler:
         return sin_cos(angle)
     return angle, 1.0
 
 
 @stage
-def pose_of(levels, state):
-    """Pose of the shaft in a state."""
+def compute_pose(levels, state):
+    """Return the pose of the shaft in a state."""
     dG, db = state.dG, state.db
-    sG, cG = sines_of(levels, state.Gamma)
-    sb, cb = sines_of(levels, state.beta)
-    large = large_of(levels)
+    sG, cG = tilt_sines(levels, state.Gamma)
+    sb, cb = tilt_sines(levels, state.beta)
+    large = large_tilt_factor(levels)
     cross = large * (sb * sG)
     w = state.dth + large * (dG * sb)
     return Pose(sG, cG, sb, cb, w, large, cross, sb, -sG * cb, cG * cb, cb * db, -cG * cb * dG + cross * db)
 
 
 @stage
-def eccentricity_of(constants, state, pose):
-    """Place and speed of the shaft in the ring."""
+def compute_eccentricity(constants, state, pose):
+    """Return position and velocity of the shaft in the ring."""
     contact, arm = constants.contact, constants.shaft.arm_ring
     both = contact.gap_counts_outer
     return Eccentricity(
@@ -99,9 +99,14 @@ def eccentricity_of(constants, state, pose):
 
 @kernel
 def gap(constants, y):
-    """Penetration of the shaft into the ring [m] (negative: gap) and its rate [m/s], by y, shape (N_VECTOR,)."""
+    """Return penetration of the shaft into the ring [m] (negative: gap) and its rate [m/s].
+
+    Args:
+        constants: Model constants.
+        y: State and integrals, shape (N_VECTOR,); only the state is read.
+    """
     state = State(y[0], y[1], y[2], y[3], y[4], y[5], y[6], y[7], y[8], y[9], y[10], y[11], y[12], y[13])
-    e = eccentricity_of(constants, state, pose_of(constants.levels, state))
+    e = compute_eccentricity(constants, state, compute_pose(constants.levels, state))
     distance = math.sqrt(e.ex * e.ex + e.ey * e.ey)
     if distance == 0.0:
         return -constants.contact.clearance, 0.0

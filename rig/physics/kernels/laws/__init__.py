@@ -1,1 +1,1 @@
-"""Forces of single parts as laws: contact, magnet, bearing house."""
+"""Force laws of single parts: contact, magnet, housing."""

@@ -8,13 +8,13 @@ from typing import NamedTuple
 from rig.physics.kernels.stage import stage
 
 NO_FRICTION, SMOOTHED, SWITCH, EXACT = range(4)
-"""Friction laws: none; mu F_n tanh(v_t/v_s); clamped linear law that aims at rolling within v_s; Coulomb's, set-valued.
+"""Friction laws: none; mu F_n tanh(v_t/v_s); clamped linear law with rolling within v_s; Coulomb's set-valued law.
 
-The set-valued law is a matter of phases: sliding forward, sliding backward, rolling. An engine has to keep them.
+For the set-valued law an engine has to track the phase: sliding forward, sliding backward, rolling.
 """
 FLIGHT, TOUCHING, FORWARD, BACKWARD, ROLLING = range(5)
-"""Phases: apart; touching, with a friction that the state alone decides; touching and sliding with v_t > 0, with
-v_t < 0; touching and rolling, the friction force being what keeps v_t at 0."""
+"""Phases: separated; in contact with friction that the state determines; in contact and sliding with v_t > 0; with v_t
+< 0; rolling, with the friction force that keeps v_t at 0."""
 
 
 class RingForce(NamedTuple):
@@ -23,10 +23,10 @@ class RingForce(NamedTuple):
     Fx: float  # on the shaft [N]
     Fy: float
     Fn: float  # normal [N]
-    elastic: float  # part of it [N]
+    elastic: float  # its elastic part [N]
     Ft: float  # friction against the sliding speed [N]
     delta: float  # penetration [m]; negative is the gap
-    rate: float  # of it [m/s]
+    rate: float  # rate of the penetration [m/s]
     sliding: float  # speed of the shaft's surface along the ring [m/s]
     nx: float  # direction from the ring's centre to the shaft's
     ny: float
@@ -34,7 +34,7 @@ class RingForce(NamedTuple):
 
 @stage
 def elastic_force(penetration, stiffness, exponent):
-    """Elastic part of the normal force, K delta^n [N], for a penetration >= 0 [m]."""
+    """Return the elastic part of the normal force, K delta^n [N], for a penetration >= 0 [m]."""
     if exponent == 1.5:
         return stiffness * penetration * math.sqrt(penetration)
     if exponent == 1.0:
@@ -43,36 +43,36 @@ def elastic_force(penetration, stiffness, exponent):
 
 
 @stage
-def held_speed(speed, contact):
-    """Impact speed v0 that a contact holds until it ends, by that at its onset [m/s]."""
+def floor_onset_speed(speed, contact):
+    """Return the impact speed v0 that a contact keeps until it ends, for its approach speed at the onset [m/s]."""
     return max(speed, contact.speed_floor)
 
 
 @stage
 def damping_ratio(rate, onset_speed, contact):
-    """Force without viscous damping over its elastic part, 1 + c delta'/v0 [1]."""
+    """Return the force without viscous damping over its elastic part, 1 + c delta'/v0 [1]."""
     return 1.0 + contact.damping_factor * rate / onset_speed
 
 
 @stage
-def penetration_of(distance, contact):
-    """Penetration of the shaft into the ring [m] by the distance of their centres [m]; negative is the gap."""
+def penetration_at(distance, contact):
+    """Return the penetration of the shaft into the ring [m] at a distance of their centres [m]; negative is the gap."""
     return distance - contact.clearance
 
 
 @stage
 def normal_force(penetration, rate, onset_speed, contact):
-    """Compliant normal force, eq. 44 and its family.
+    """Return the compliant normal force, eq. 44 and its family.
 
     F = K delta^n (1 + c delta'/v0) + D delta', clamped at 0: a contact cannot pull.
 
-    Trap: v0 -> 0 at grazing onsets makes the damping term grow without bound; `held_speed` keeps v0 from 0.
+    Caution: the damping term grows without bound for v0 -> 0 in light impacts; `floor_onset_speed` limits v0.
 
     Args:
         penetration: delta [m]; no force unless positive.
         rate: delta' [m/s], positive while the bodies approach.
         onset_speed: v0 [m/s], delta' at the onset of this contact, floored.
-        contact: Constants of the contact: K, n, c, D.
+        contact: Contact constants K, n, c, D.
 
     Returns:
         Force [N] and its elastic part [N], both >= 0.
@@ -86,23 +86,23 @@ def normal_force(penetration, rate, onset_speed, contact):
 
 @stage
 def friction_force(law, phase, force, sliding_speed, contact):
-    """Friction against the sliding speed of eq. 39 (not sgn(theta') of eq. 12), where the state or the phase decides.
+    """Return the friction force against the sliding speed of eq. 39 (not sgn(theta') of eq. 12), by state or phase.
 
-    Smoothed: mu F_n tanh(v_t / v_s). Exact, while it slides: mu F_n with the sign of the phase.
+    Smoothed: mu F_n tanh(v_t / v_s). Exact, while sliding: mu F_n with the sign of the phase.
 
-    Trap: below sliding at about v_s the smoothed law creeps by v_s atanh(needed / mu), and an explicit step must stay
-    below about 2 m_t v_s / (mu F_n).
+    Caution: below about v_s the smoothed law creeps at v_s atanh(required / mu), and an explicit step must be below
+    about 2 m_t v_s / (mu F_n).
 
     Args:
-        law: One of the friction laws.
-        phase: One of the phases.
+        law: Friction law.
+        phase: Contact phase.
         force: F_n [N].
         sliding_speed: v_t [m/s].
-        contact: Constants of the contact: mu, v_s.
+        contact: Contact constants mu, v_s.
 
     Returns:
-        Force [N], positive against a positive sliding speed; 0 for a rolling phase and for the switch law, whose force
-        depends on the whole motion (`rig.physics.kernels.dynamics`).
+        Force [N], positive against a positive sliding speed; 0 for the rolling phase and for the switch law, whose
+        force depends on the accelerations (`rig.physics.kernels.dynamics`).
     """
     if phase == FORWARD:
         return contact.friction * force
@@ -115,24 +115,24 @@ def friction_force(law, phase, force, sliding_speed, contact):
 
 @stage
 def ring_force(ex, ey, vx, vy, surface_speed, onset_speed, law, phase, contact):
-    """Force of the ring on the shaft, eqs. 12 and 44 in the plane of the ring.
+    """Return the force of the ring on the shaft, eqs. 12 and 44 in the plane of the ring.
 
     Frame: n = e/|e| points from the ring's centre to the shaft's, t = (-n_y, n_x). F = -F_n n - F_t t acts on the
-    shaft, the opposite on the inner house; the shaft's spin feels -radius F_t.
+    shaft, the opposite on the inner housing, and -radius F_t on the shaft's spin.
 
     Args:
         ex: Shaft centre minus ring centre, x [m].
-        ey: The same, y [m].
-        vx: Its rate, x [m/s].
-        vy: Its rate, y [m/s].
+        ey: Shaft centre minus ring centre, y [m].
+        vx: Rate of `ex` [m/s].
+        vy: Rate of `ey` [m/s].
         surface_speed: Speed of the shaft's surface from spin, R_S w [m/s].
         onset_speed: v0 [m/s].
         law: Friction law.
-        phase: Phase of the contact; no force in flight.
-        contact: Constants of the contact.
+        phase: Contact phase; no force in flight.
+        contact: Contact constants.
     """
     distance = math.sqrt(ex * ex + ey * ey)
-    penetration = penetration_of(distance, contact)
+    penetration = penetration_at(distance, contact)
     if distance == 0.0:
         return RingForce(0.0, 0.0, 0.0, 0.0, 0.0, penetration, 0.0, 0.0, 1.0, 0.0)
     per_distance = 1.0 / distance

@@ -1,4 +1,4 @@
-"""Bearing house: two bodies on beams and pre-compressed transducers, eqs. 22-25 with absolute coordinates."""
+"""Housing law: two bodies on beams and pre-compressed transducers, eqs. 22-25 with absolute coordinates."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from rig.physics.kernels.stage import stage
 
 @stage
 def pair_readings(displacement, pair_stiffness, preload):
-    """Readings of one opposed, pre-compressed pair of transducers.
+    """Return the readings of an opposed, pre-compressed pair of transducers.
 
-    The pair carries `pair_stiffness` times the displacement: one side loads by half of that, the other unloads by
-    half. A transducer that has lost its preload reads 0 and has dropped out of the stiffness.
+    The pair's force is `pair_stiffness` times the displacement: one side gains half of it, the other loses half. A
+    transducer without preload reads 0 and no longer contributes to the stiffness.
 
     Args:
-        displacement: Of the body between them, positive toward the first [m].
+        displacement: Displacement of the body between them, positive toward the first [m].
         pair_stiffness: k_T of the pair with both loaded [N/m].
-        preload: Of each [N].
+        preload: Preload of each [N].
 
     Returns:
         Compression of the first and of the second transducer [N], and the energy stored above the preloaded rest [J].

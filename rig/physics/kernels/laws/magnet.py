@@ -1,17 +1,17 @@
-"""Magnet force at the shaft's end: the map that is fitted to the models in `rig.physics.magnets`."""
+"""Magnet force at the shaft's end: the map fitted to the models in `rig.physics.magnets`."""
 
 from __future__ import annotations
 
 from rig.physics.kernels.stage import stage
 
 LINEAR, RADIAL, RIPPLED = range(3)
-"""How many terms of the map take part: a spring; hardening with the radius; the magnets one by one as well."""
+"""Terms of the map: a spring; hardening with the radius; also the ripple of the single magnets."""
 
 
 @stage
 def complex_power(x, y, exponent):
-    """Real and imaginary part of (x + i y)^exponent by squaring: the exponent's bits say which squares take part."""
-    px, py = 0.0 * x + 1.0, 0.0 * x  # of the kind of x, which may be an array
+    """Return real and imaginary part of (x + i y)^exponent, by repeated squaring."""
+    px, py = 0.0 * x + 1.0, 0.0 * x  # same type as x, which may be an array
     qx, qy = x, y
     bits = exponent
     while bits > 0:
@@ -24,18 +24,18 @@ def complex_power(x, y, exponent):
 
 @stage
 def magnet_force(x, y, magnet):
-    """Restoring force and potential of the map.
+    """Return restoring force and potential of the map.
 
-    The potential is K [r^2/2 + a3 r^4/4 + a5 r^6/6 + a7 r^8/8 + ripple r^N (1 + growth r^2) cos(N angle)], the angle
-    counted from straight below, where one of the N magnets stands; the force is its exact gradient, so that the energy
+    The potential is K [r^2/2 + a3 r^4/4 + a5 r^6/6 + a7 r^8/8 + ripple r^N (1 + growth r^2) cos(N angle)], with the
+    angle from straight below, the position of one of the N magnets. The force is its exact gradient, so that the energy
     ledger closes. r^N cos(N angle) is the real part of w^N with w = -y + i x: products, no angle.
 
-    Left as it is written, the function takes numpy arrays of places too (`rig.physics.magnets`).
+    The Python function also takes numpy arrays of positions (`rig.physics.magnets`).
 
     Args:
         x: Shaft at the magnets, horizontal [m].
         y: Shaft at the magnets, vertical [m].
-        magnet: Constants of the magnets.
+        magnet: Magnet constants.
 
     Returns:
         Force x, y [N] and potential [J], 0 at the centre.
