@@ -16,7 +16,7 @@ EXCEPTIONS = {
     "drivers/can/bus/endpoints.py:forget_gone": "looks once at the age of each node, and does not wait",
     "drivers/can/bus/outlets/outlet.py:_write_all": _SILENCE,
     "drivers/sources/can.py:_read": _SILENCE,
-    "recorder/viewer/live.py:_draw_on": _PERIOD,
+    "recorder/viewer/live.py:_draw_until_end": _PERIOD,
     "recorder/viewer/live.py:take_in": "drops blocks that are too old to be drawn, and does not wait",
     "replays/studies/chart/measure.py:_time_frames": "the budget of a measured computation; charts are tied to this",
     "rig/serve/service.py:_publish_all": _PERIOD,

@@ -21,8 +21,8 @@ LONGEST_FUNCTION = 120
 SLACK = 50
 """Lines by which a budget may exceed the code before it must be lowered."""
 BUDGETS = {
-    "drivers": 686,
-    "drivers/can": 4397,
+    "drivers": 683,
+    "drivers/can": 4399,
     "drivers/examples": 86,
     "drivers/instruments": 845,
     "drivers/link": 572,
@@ -32,12 +32,12 @@ BUDGETS = {
     "recorder/contents": 1244,
     "recorder/files": 783,
     "recorder/output": 542,
-    "recorder/viewer": 1889,
+    "recorder/viewer": 1888,
     "replays": 0,
-    "replays/campaigns": 2297,
+    "replays/campaigns": 2296,
     "replays/estimate": 332,
     "replays/player": 816,
-    "replays/recordings": 10223,
+    "replays/recordings": 10220,
     "replays/report": 475,
     "replays/score": 4178,
     "replays/sessions": 73,
@@ -45,10 +45,10 @@ BUDGETS = {
     "rig": 53,
     "rig/base": 914,
     "rig/channels": 2411,
-    "rig/cli": 5133,
+    "rig/cli": 5126,
     "rig/physics": 5453,
     "rig/run": 1792,
-    "rig/serve": 2800,
+    "rig/serve": 2802,
 }
 _NO_CODE = (
     tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER,
