@@ -297,7 +297,7 @@ def test_a_rig_that_is_killed_ends_the_blocks() -> None:
         rig.publish("forces")
         rig.server.close()
         assert sum(map(len, daq)) == BLOCK
-        with pytest.raises(StreamEndedError, match="the rig has gone"):
+        with pytest.raises(StreamEndedError, match="the link to the rig is lost"):
             daq.read()
 
 
@@ -464,7 +464,7 @@ def test_a_bus_that_falls_silent_ends_the_blocks(monkeypatch: pytest.MonkeyPatch
         monkeypatch.setattr("drivers.sources.can._SILENCE_TIMEOUT_S", 0.3)
         gateway.close()
         assert sum(map(len, daq.blocks(timeout_s=5.0))) == 200
-        with pytest.raises(StreamEndedError, match="the rig has gone"):
+        with pytest.raises(StreamEndedError, match="the link to the rig is lost"):
             daq.read()
 
 
