@@ -34,7 +34,7 @@ from drivers.sources.stream import RigStream
 from drivers.sources.turns import PULSE_LEVEL, Turn, find_pulses, measure_turn
 from rig.base import wire
 from rig.base.errors import InputError, RefusedError, UnknownNameError, Words
-from rig.serve.stream_check import BlockEnd, Catalogue, block_end_in
+from rig.serve.stream_check import BlockEnd, Catalogue, parse_block_end
 from rig.serve.transport import DEFAULT_ENDPOINT, Client
 from rig.serve.waiting import Deadline
 
@@ -181,9 +181,9 @@ class Rig(Console):
             client = CanClient(url.removeprefix("can:"), wait_s=wait_s)
             arguments |= {"name": f"CAN {client.node}", "source": client.source}
         else:
-            from rig.serve.transport.zenoh import client_of
+            from rig.serve.transport.zenoh import connect_url
 
-            client = client_of(url, wait_s=wait_s)
+            client = connect_url(url, wait_s=wait_s)
             arguments |= {"name": name, "truth": truth}
         try:
             return cls(client, **arguments)
@@ -383,7 +383,7 @@ class Rig(Console):
     def _on_block_end(self, _: str, payload: bytes) -> None:
         assert self._block_ends is not None
         with contextlib.suppress(ValueError):
-            self._block_ends.put(block_end_in(payload))
+            self._block_ends.put(parse_block_end(payload))
 
     def _leave_lockstep(self) -> None:
         """Leave the rig if it may wait for this device."""

@@ -101,9 +101,9 @@ class Console(Closing):
             InputError: The URL is malformed.
             ConnectionError: No rig replies.
         """
-        from rig.serve.transport.zenoh import client_of
+        from rig.serve.transport.zenoh import connect_url
 
-        return cls(client_of(url, wait_s=wait_s), name=name)
+        return cls(connect_url(url, wait_s=wait_s), name=name)
 
     def close(self) -> None:
         """Disconnect; the rig continues."""

@@ -147,7 +147,7 @@ def _lost_ends(recording: Recording) -> tuple[dict[str, int], dict[str, int]]:
         rows = stream.missing - max(0, stream.lost - sum(noted))  # losses between blocks count as gaps
         if rows > 0:
             late_s = stream.first_time_s - (file.stated_begin_s or 0.0) if stream.rows else 0.0
-            rate_hz = file.promises[key].rate_hz if key in file.promises else 0.0
+            rate_hz = file.formats[key].rate_hz if key in file.formats else 0.0
             first = min(rows, stream.first, max(0, round(late_s * rate_hz)))
             due[key] = stream.first - first
             ends[key] = stream.due + rows - first

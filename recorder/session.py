@@ -23,7 +23,7 @@ from recorder.writer import RecordingError, RecordingWriter, check_view_rate
 from rig.base import wire
 from rig.base.errors import InputError
 from rig.base.text import printable
-from rig.serve.stream_check import Catalogue, Intake, Taken
+from rig.serve.stream_check import AcceptedBlock, BlockValidator, Catalogue
 from rig.serve.transport import Client
 from rig.serve.transport.clients import Reporter
 from rig.serve.waiting import BoundedQueue
@@ -210,7 +210,7 @@ class RecordingSession:
         streams = Catalogue.read(catalogue)
         self._rig_id = self._client.rig
         writer = self._open_sink(streams, catalogue, parameters, scene)
-        self._intake = Intake(streams)
+        self._validator = BlockValidator(streams)
         self._extent = _Extent(self._duration_s, streams, self._monotonic_s)
         self._table = streams.table
         thread = threading.Thread(target=self._write_all, args=(writer,), name="recorder-writer", daemon=True)
@@ -271,19 +271,19 @@ class RecordingSession:
             self._inbox.offer(document, room=self._inbox.room + _DOCUMENTS_BYTES)
             if key == wire.FAULTS and document.document is not None:
                 with self._order:
-                    self._offer(self._intake.declare(document.document))
+                    self._offer(self._validator.declare(document.document))
 
-    def _offer(self, taken: list[Taken]) -> None:
+    def _offer(self, taken: list[AcceptedBlock]) -> None:
         for each in taken if not self._replaced else ():
             self._inbox.offer(Payload.of(each))
 
     def _take(self, key: str, payload: bytes, wall_ns: int) -> None:
         """Process a block on the thread of its stream."""
-        due = self._intake.next.get(key, 0)
+        due = self._validator.next.get(key, 0)
         try:
-            taken = self._intake.take(key, payload, wall_ns)
+            taken = self._validator.take(key, payload, wall_ns)
         except ValueError:
-            if self._intake.knows(key):
+            if self._validator.has_stream(key):
                 self._inbox.offer(Payload.read(key, payload, wall_ns))  # recorded unchanged as malformed
             return
         if taken:
@@ -374,8 +374,8 @@ class RecordingSession:
         for count, what in (
             (self._client.foreign, "messages that are not from this rig were left out"),
             (
-                self._intake.refused,
-                f"blocks that cannot be of this rig were left out ({printable(self._intake.why, 300)})",
+                self._validator.refused,
+                f"blocks that cannot be of this rig were left out ({printable(self._validator.reason, 300)})",
             ),
         ):
             if count and not any(what in remark for remark in self._remarks):
@@ -387,7 +387,7 @@ class RecordingSession:
             return True
         # The end event can overtake blocks that are being recovered and documents about refused blocks, so wait
         # longer while a stream is incomplete.
-        due = self.waiting or self._intake.refused or self._end_rows is None
+        due = self.waiting or self._validator.refused or self._end_rows is None
         complete = not due and not writer.tally.short_of(self._end_rows or {})
         if complete and self._last_status and writer.tally.next.keys() >= (self._end_rows or {}).keys():
             return True
@@ -398,7 +398,7 @@ class RecordingSession:
         groups = list(self._table.groups)
         first = wire.sensor_key("probes" if "probes" in groups or not groups else groups[0])
         lost = writer.counts().really_lost
-        self._reporter.tell(writer.tally.next.get(first, 0), lost=lost, done=done)
+        self._reporter.send(writer.tally.next.get(first, 0), lost=lost, done=done)
 
     def _progress(self, writer: Sink) -> Progress:
         counts = writer.counts()
@@ -421,7 +421,9 @@ class RecordingSession:
         try:
             while self._misses:
                 writer.write_missed(*self._misses.popleft())
-            for each in self._intake.rest(self._end_rows) if not self._replaced and self._failure is None else ():
+            for each in (
+                self._validator.take_waiting(self._end_rows) if not self._replaced and self._failure is None else ()
+            ):
                 payload = Payload.of(each)
                 if self._extent.takes(payload):
                     writer.take(payload)
@@ -430,7 +432,7 @@ class RecordingSession:
             notes = {
                 "dropped_payloads": str(self._inbox.dropped),
                 "backlog_high_water_bytes": str(self._inbox.high_water),
-                "refused_blocks": str(self._intake.refused),
+                "refused_blocks": str(self._validator.refused),
                 "foreign_messages": str(self._client.foreign),
             }
             writer.finish(reason, notes=notes)
@@ -467,7 +469,7 @@ class RecordingSession:
             received_s=counts.extent_ns / NS,
             fired=writer.fired if isinstance(writer, Captures) else None,
             remarks=(*writer.remarks, *self._remarks),
-            refused=self._intake.refused + self._client.foreign,
+            refused=self._validator.refused + self._client.foreign,
             ended_early=self._ended_early(writer, reason, disk_error),
         )
 

@@ -72,9 +72,9 @@ def open_source(url: str, *, wait_s: float = 3.0) -> Source:
     kind, colon, rest = url.partition(":")
     if (kind == "zenoh" and rest) or (url and not colon):
         from drivers.sources.rig import RigSource
-        from rig.serve.transport.zenoh import client_of
+        from rig.serve.transport.zenoh import connect_url
 
-        client = client_of(url, wait_s=wait_s)
+        client = connect_url(url, wait_s=wait_s)
         return RigSource(client, close=client.close)
     if kind == "can" and rest:
         from drivers.sources.can import CanSource

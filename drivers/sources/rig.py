@@ -104,7 +104,7 @@ class RigSource:
     def _report(self, *, done: bool = False) -> None:
         self._reported_index, room, lost = self._position or (None, 0, 0)
         index = None if self._reported_index is None else int(self._reported_index * self._scale)
-        self._position_report.tell(index, lost=lost, room=int(room * self._scale), done=done)
+        self._position_report.send(index, lost=lost, room=int(room * self._scale), done=done)
 
     def close(self) -> None:
         """Stop listening, and report that this reader has finished."""

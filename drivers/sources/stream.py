@@ -16,7 +16,7 @@ from typing import Any
 from rig.base import wire
 from rig.base.errors import InputError
 from rig.channels.table import ChannelTable, Group
-from rig.serve.stream_check import Catalogue, Intake, Taken, event_in
+from rig.serve.stream_check import AcceptedBlock, BlockValidator, Catalogue, parse_event
 from rig.serve.transport import Client, NoReplyError
 
 GRACE_S = 2.0
@@ -78,7 +78,7 @@ class RigStream:
         rows before it."""
         self._listeners: dict[str, list[_Listener]] = {}
         self._subscribed: set[str] = set()
-        self._intake: Intake | None = None
+        self._validator: BlockValidator | None = None
         self._rig: str | None = None
         self._gone = False
         self._ends: dict[str, tuple[int, str]] = {}
@@ -131,13 +131,13 @@ class RigStream:
             A function that ends the subscription.
         """
         listener = _Listener(on_block, on_end)
-        intake = self._intake or Intake(self._catalogue())
+        validator = self._validator or BlockValidator(self._catalogue())
         with self._lock:
             self._listeners.setdefault(key, []).append(listener)
-            new, watch = key not in self._subscribed, self._intake is None
+            new, watch = key not in self._subscribed, self._validator is None
             self._subscribed.add(key)
             self._rig = self._client.rig if watch else self._rig
-            self._intake = self._intake or intake
+            self._validator = self._validator or validator
         # Not under the lock: a transport may deliver at once.
         if watch:
             if self._event_listener is None:
@@ -162,29 +162,29 @@ class RigStream:
 
     def _take_block(self, key: str, payload: bytes) -> None:
         with self._lock:
-            intake = self._intake
-            assert intake is not None
-            due, refused = intake.next.get(key, 0), intake.refused
+            validator = self._validator
+            assert validator is not None
+            due, refused = validator.next.get(key, 0), validator.refused
             try:
-                taken = intake.take(key, payload)
+                taken = validator.take(key, payload)
             except ValueError:
                 self.malformed += 1
                 return
-            self.malformed += intake.refused - refused
+            self.malformed += validator.refused - refused
             if taken:
                 self._last_block_s = time.monotonic()
-            if intake.next.get(key, 0) < due:
+            if validator.next.get(key, 0) < due:
                 # The run has been replaced by another.
                 self._ends.pop(key, None)
             ending = self._ends.get(key)
             if ending is not None:
-                taken += intake.rest({key: ending[0]}, key)
-            done = ending is not None and intake.next.get(key, 0) >= ending[0]
+                taken += validator.take_waiting({key: ending[0]}, key)
+            done = ending is not None and validator.next.get(key, 0) >= ending[0]
             if done:
                 del self._ends[key]
         self._deliver(key, taken, ending[1] if done and ending else None)
 
-    def _deliver(self, key: str, taken: list[Taken], reason: str | None) -> None:
+    def _deliver(self, key: str, taken: list[AcceptedBlock], reason: str | None) -> None:
         with self._lock:
             listeners = list(self._listeners.get(key, ()))
         for listener in listeners:
@@ -195,7 +195,7 @@ class RigStream:
 
     def _on_event(self, _: str, payload: bytes) -> None:
         try:
-            event = event_in(payload)
+            event = parse_event(payload)
         except ValueError:
             self.malformed += 1
             return
@@ -212,10 +212,10 @@ class RigStream:
         for key in list(self._subscribed):
             with self._order:
                 with self._lock:
-                    assert self._intake is not None
+                    assert self._validator is not None
                     # Blocks and events arrive separately: the last blocks may still be in transit.
-                    taken, total = self._intake.rest(rows, key), rows.get(key, 0)
-                    done = self._intake.next.get(key, 0) >= total
+                    taken, total = self._validator.take_waiting(rows, key), rows.get(key, 0)
+                    done = self._validator.next.get(key, 0) >= total
                     if not done:
                         self._ends[key] = (total, reason)
                 self._deliver(key, taken, reason if done else None)
@@ -245,7 +245,7 @@ class RigStream:
             self._give_up(replaced=True)
             self._rig = self._client.rig
             with contextlib.suppress(NoReplyError, ValueError):
-                self._intake = Intake(self._catalogue())
+                self._validator = BlockValidator(self._catalogue())
 
     def _give_up(self, *, replaced: bool = False) -> None:
         if (self._gone or replaced) and self._rig is not None:
@@ -257,5 +257,5 @@ class RigStream:
             with self._order:
                 with self._lock:
                     self._ends.pop(key, None)
-                    taken = self._intake.rest(None, key) if self._intake is not None else []
+                    taken = self._validator.take_waiting(None, key) if self._validator is not None else []
                 self._deliver(key, taken, reason)

@@ -124,7 +124,7 @@ class Survey:
     @cached_property
     def doubts(self) -> tuple[str, ...]:
         """Contradictions in a file whose checksums are all valid, one line each."""
-        promises, messages = self.file.promises, self.file.messages
+        formats, messages = self.file.formats, self.file.messages
         found = list(self.short)
         for key, stream in self.streams.items():
             if stream.invalid:
@@ -142,7 +142,7 @@ class Survey:
                 found.append(f"{stream.misplaced} blocks of {key} have {wrong}")
             if stream.rows > (stated := self.file.stated_rows.get(key, stream.rows)):
                 found.append(f"{key} has {stream.rows} rows, but the file states {stated}")
-            if stream.rows and key not in promises:
+            if stream.rows and key not in formats:
                 found.append(f"{key} is not in the catalogue")
         found += [f"malformed messages of {key}: {n}" for key, n in self._malformed.items()]
         for topic in sorted(set(messages) | set(self._counted)):
@@ -151,8 +151,8 @@ class Survey:
         filled = {key: one for key, one in self.streams.items() if one.rows}
         span_s = max((one.last_time_s for one in filled.values()), default=0.0)
         span_s -= min((one.first_time_s for one in filled.values()), default=0.0)
-        for key in sorted(set(promises) - {EDGES} - set(filled)):
-            if span_s > max(_MIN_SPAN_S, 2.0 / promises[key].rate_hz):
+        for key in sorted(set(formats) - {EDGES} - set(filled)):
+            if span_s > max(_MIN_SPAN_S, 2.0 / formats[key].rate_hz):
                 found.append(f"no rows of {key}, which is in the catalogue")
         sound = {key: self._steps.get(key, []) for key, one in self.streams.items() if not one.invalid}
         found += self._consistency.find_contradictions(self.streams, sound)
@@ -160,7 +160,7 @@ class Survey:
 
     def _add_block(self, key: str, time_ns: int, payload: bytes) -> Block | None:
         stream = self.streams.setdefault(key, Stream())
-        block, promise = self.file.block(key, payload), self.file.promises.get(key)
+        block, stream_format = self.file.block(key, payload), self.file.formats.get(key)
         if block is None:
             stream.invalid += 1
             return None
@@ -173,8 +173,8 @@ class Survey:
             self._steps.setdefault(key, []).append(gap)
         stream.messages += 1
         stream.back += gap is not None and gap.size < 0
-        if promise is not None and promise.rate_hz:
-            stream.off += abs(block.rate_hz / promise.rate_hz - 1.0) > _RATE_TOLERANCE
+        if stream_format is not None and stream_format.rate_hz:
+            stream.off += abs(block.rate_hz / stream_format.rate_hz - 1.0) > _RATE_TOLERANCE
         if key != EDGES:
             start_s, index = self._first_blocks.setdefault(key, (block.start_s, block.index))
             offset_s = block.start_s - start_s - (block.index - index) / block.rate_hz

@@ -139,9 +139,9 @@ class RecordingFile:
         return min(each.begin_ns for each in self.chunks) / 1e9, max(each.end_ns for each in self.chunks) / 1e9
 
     @cached_property
-    def promises(self) -> dict[str, stream_check.Promise]:
+    def formats(self) -> dict[str, stream_check.StreamFormat]:
         """Declared streams of the catalogue by key."""
-        return self._catalogue.promises()
+        return self._catalogue.get_formats()
 
     def between(self, from_s: float, to_s: float) -> Self:
         """Return the file limited to the rows between two times [s], with all events and gaps.
@@ -174,8 +174,8 @@ class RecordingFile:
         except ValueError:
             return None
         columns = block.values.shape[1]
-        promise = self.promises.get(key, stream_check.Promise(columns, 0.0, self._catalogue.tick_rate_hz))
-        return block if (columns, block.tick_rate_hz) == (promise.columns, promise.tick_rate_hz) else None
+        stream_format = self.formats.get(key, stream_check.StreamFormat(columns, 0.0, self._catalogue.tick_rate_hz))
+        return block if (columns, block.tick_rate_hz) == (stream_format.columns, stream_format.tick_rate_hz) else None
 
     def stamped(self, topics: Container[str] | None, chunks: Iterable[Chunk] | None = None) -> Iterator[Message]:
         """Yield the messages of some topics in file order, documents without their ROS 2 string wrapper.

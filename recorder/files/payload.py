@@ -14,7 +14,7 @@ from typing import Any, Self
 import numpy as np
 
 from rig.base.wire import EDGES, EVENTS, Block, decode_block, decode_document, schema_of
-from rig.serve.stream_check import Taken, event_in
+from rig.serve.stream_check import AcceptedBlock, parse_event
 
 _MAX_EXACT_TICK = 1 << 53
 """Largest tick that is exact as int64 and as float64; 285 years at one microsecond per tick."""
@@ -45,7 +45,7 @@ class Payload:
         return cls(key, data, wall_ns, block)
 
     @classmethod
-    def of(cls, taken: Taken) -> Self:
+    def of(cls, taken: AcceptedBlock) -> Self:
         """Return the payload of a block decoded by the intake; an invalid block makes it malformed."""
         block = taken.block if _is_sound(taken.key, taken.block) else None
         return cls(taken.key, taken.payload, taken.wall_ns, block)
@@ -55,7 +55,7 @@ class Payload:
         """Document, decoded on first access; None on a block key, and for a malformed payload."""
         if schema_of(self.key) is None:
             with contextlib.suppress(ValueError):
-                return event_in(self.data) if self.key == EVENTS else decode_document(self.data)
+                return parse_event(self.data) if self.key == EVENTS else decode_document(self.data)
         return None
 
     @property

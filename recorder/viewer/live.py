@@ -18,7 +18,7 @@ from recorder.viewer.painter import Painter
 from rig.base import wire
 from rig.base.text import printable
 from rig.channels.table import ChannelTable
-from rig.serve.stream_check import Catalogue, Intake, event_in
+from rig.serve.stream_check import BlockValidator, Catalogue, parse_event
 from rig.serve.transport import Client
 from rig.serve.transport.clients import Reporter
 
@@ -123,7 +123,7 @@ class LiveView:
         self._fresh = False
         self._missing: dict[str, int] = {}
         self._inbox: deque[tuple[float, str, bytes]] = deque(maxlen=_MAX_WAITING)
-        self._intake = Intake(described.catalogue)
+        self._validator = BlockValidator(described.catalogue)
         self._continuity = wire.Continuity()
         self._received_index = 0
         self._alive: bool | None = None
@@ -143,7 +143,7 @@ class LiveView:
     @property
     def malformed(self) -> int:
         """Number of payloads that do not fit the format of their key or the catalogue."""
-        return self._malformed + self._intake.refused
+        return self._malformed + self._validator.refused
 
     @property
     def received(self) -> int:
@@ -226,7 +226,7 @@ class LiveView:
         self._alive = alive
 
     def _report(self, *, done: bool = False) -> None:
-        self._reporter.tell(self._received_index, lost=self.lost, done=done)
+        self._reporter.send(self._received_index, lost=self.lost, done=done)
 
     def _check_canvas(self) -> None:
         """Stop drawing for a viewer that accepts no data, so that memory does not fill up."""
@@ -294,7 +294,7 @@ class LiveView:
     def _take_events(self, payloads: list[bytes]) -> None:
         for payload in payloads:
             try:
-                event = event_in(payload)
+                event = parse_event(payload)
             except ValueError:
                 self._malformed += 1
                 continue
@@ -306,7 +306,7 @@ class LiveView:
         taken = []
         for payload in payloads:
             try:
-                taken += self._intake.take(key, payload)
+                taken += self._validator.take(key, payload)
             except ValueError:
                 self._malformed += 1
         run: list[wire.Block] = []

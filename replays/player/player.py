@@ -24,7 +24,7 @@ from rig.base import wire
 from rig.base.errors import InputError, RefusedError, Words
 from rig.base.text import finite
 from rig.serve.pacing import FreeRun, RealTime
-from rig.serve.request_handler import Pending, Rate, Seek, Step
+from rig.serve.request_handler import PendingCommand, RateRequest, SeekRequest, StepRequest
 from rig.serve.served_run import ServedRun
 from rig.serve.service import COMMANDS, REPLAY_COMMANDS
 from rig.serve.transport import Server
@@ -46,7 +46,7 @@ _MAX_STEP_S = 3600
 class _Step:
     """A step in progress: until an instant [ns of the replay], or for a number of blocks."""
 
-    reply: Pending
+    reply: PendingCommand
     until_ns: int | None = None
     blocks: int = 0
 
@@ -97,7 +97,7 @@ class Player(ServedRun):
             scene=documents[wire.SCENE],
             tick_rate_hz=int(documents[wire.CATALOGUE]["tick_rate_hz"]),
             commands=_ACCEPTED_COMMANDS,
-            others={
+            unsupported={
                 name: f"a replay does not accept {name}; accepted commands: {', '.join(_ACCEPTED_COMMANDS)}"
                 for name in COMMANDS
                 if name not in _ACCEPTED_COMMANDS
@@ -203,7 +203,7 @@ class Player(ServedRun):
             warnings.append(f"has waited {held_s:.0f} s for client {self._held[0]} to receive the data")
         return warnings
 
-    def _scene_now(self) -> dict[str, Any]:
+    def _scene_document(self) -> dict[str, Any]:
         taken = {entry["id"]: entry for entry in self._scene.get("taken", ())}
         for entry in self._track.commands:
             if entry["tick"] * NS < self._position_ns * self._rate and entry["command"] not in _ACCEPTED_COMMANDS:
@@ -220,12 +220,12 @@ class Player(ServedRun):
 
     # ---- called on the playing thread ----
 
-    def _get_ready(self) -> tuple[dict[str, Any], dict[str, Any]]:
+    def _prepare_documents(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """Read the first batches; return the catalogue and the parameters."""
         self._open(self._passes.start_ns).ready(5.0)
         return self._edit.catalogue, self._parameters
 
-    def _go(self) -> str:
+    def _run_to_end(self) -> str:
         assert self._ahead is not None
         if not self._paused:
             self._playhead.start()
@@ -246,7 +246,7 @@ class Player(ServedRun):
                 if self._head is None and self._ahead.ended:
                     return "completed"
             if isinstance(self._head, Mark):
-                if self._burst and self._begun and self._desk.clients.behind(self.published):
+                if self._burst and self._begun and self._handler.clients.max_lag_rows(self.published):
                     # Row numbers may step back: clients must first acknowledge the earlier rows.
                     self._wait(_BURST_POLL_S)
                     continue
@@ -257,7 +257,7 @@ class Player(ServedRun):
 
     def _check_clients(self, deadline: Deadline) -> None:
         """Resume once all expected clients are present."""
-        present = self._desk.clients.present
+        present = self._handler.clients.active_count
         if present >= self._awaited:
             self._resume()
         elif deadline.passed:
@@ -279,7 +279,7 @@ class Player(ServedRun):
             try:
                 self._outlet.send(item)
             except Exception as error:
-                self._desk.trouble(f"publishing {item.key}", error)
+                self._handler.record_failure(f"publishing {item.key}", error)
         self._head = None
         self._playhead.play_ns = instant_ns
         self._position_ns = max(self._position_ns, *(item.position_ns for item in batch))
@@ -296,7 +296,7 @@ class Player(ServedRun):
     def _is_client_behind(self) -> bool:
         """Return whether the data sent exceed what a client has acknowledged by too much."""
         rows = min(_MAX_AHEAD_S * self._outlet.rate_hz, _MAX_AHEAD_BLOCKS * self._outlet.block_rows)
-        name = self._desk.clients.crowded(self.published, round(rows)) if rows > 0 else None
+        name = self._handler.clients.find_lagging(self.published, round(rows)) if rows > 0 else None
         if name is None:
             self._held = None
         elif self._held is None or self._held[0] != name:
@@ -328,7 +328,7 @@ class Player(ServedRun):
 
     def _end(self, reason: str) -> dict[str, Any]:
         """End the stream, with the recorded end event if the played part includes it."""
-        self._desk.close(f"{wire.ENDED}: {reason}", [] if self._step is None else [self._step.reply])
+        self._handler.close(f"{wire.ENDED}: {reason}", [] if self._step is None else [self._step.reply])
         self._playhead.hold(self._playhead.play_ns)
         if self._ahead is not None:
             self._ahead.close()
@@ -346,16 +346,16 @@ class Player(ServedRun):
 
     # Commands.
 
-    def _carry_out(self, pending: Pending) -> None:
-        arguments = pending.asked
-        if isinstance(arguments, Step):
+    def _execute(self, pending: PendingCommand) -> None:
+        arguments = pending.arguments
+        if isinstance(arguments, StepRequest):
             self._begin_step(pending, arguments)
             return
         if pending.command == "stop":
             self._stop_requested = True
-        elif isinstance(arguments, Seek):
+        elif isinstance(arguments, SeekRequest):
             self._seek(arguments.time_s)
-        elif isinstance(arguments, Rate):
+        elif isinstance(arguments, RateRequest):
             if self._burst:
                 raise InputError("rate", "sent to a replay without --burst", Words("a replay with --burst"))
             self._playhead.set_rate(arguments.rate, self._now_ns())
@@ -383,7 +383,7 @@ class Player(ServedRun):
         self._open(self._position_ns)
         self._playhead.jump(self._anchor_ns)
 
-    def _begin_step(self, pending: Pending, arguments: Step) -> None:
+    def _begin_step(self, pending: PendingCommand, arguments: StepRequest) -> None:
         if not self._paused or self._step is not None:
             raise InputError("step", "sent to a paused replay", Words("a replay that runs"))
         most = _MAX_STEP_S * self._rate

@@ -49,7 +49,7 @@ class Playhead:
     @property
     def behind_s(self) -> float:
         """Lateness of the last payload [s], or 0 if it is not worth reporting."""
-        late_s = self._clock.last_late_s
+        late_s = self._clock.last_lateness_s
         return late_s if late_s > _MIN_LATENESS_S else 0.0
 
     def release(self, at_ns: int) -> bool:

@@ -28,7 +28,7 @@ from rig.physics.kernels import has_compiled_kernels
 from rig.physics.kernels.signals import COLUMN, N_STATE
 from rig.run.scenes import Scene, load_scene
 from rig.run.simulation import Simulation
-from rig.serve.pacing import short_collections
+from rig.serve.pacing import freeze_start_objects
 
 ENGINE_ONLY = {**{f"sensors.{name}": value for name, value in bare_sensors().items()}, "model.friction": "exact"}
 """Settings for the engine alone: a row every 1 ms and almost no sensor chain."""
@@ -288,7 +288,7 @@ def _frames(frames: int, progress: Callable[[str], None]) -> dict[str, Any]:
         progress(f"{frames} frames of 1 ms, {name}")
         simulation = Simulation(load_scene("hammer", {**changes, "duration_s": 3600.0}))
         taken = np.empty(frames)
-        with short_collections():  # as in every run with a pace
+        with freeze_start_objects():  # as in every run with a pace
             for _ in range(100):
                 simulation.advance(_FRAME_TICKS)
             for n in range(frames):

@@ -13,7 +13,7 @@ _MAX_DEVICES = 64
 """Devices kept for the status. The devices lost first are removed first."""
 
 
-class Said(Protocol):
+class DeviceRequest(Protocol):
     """A request of a client, with the name that the client gives itself."""
 
     command: str
@@ -57,21 +57,21 @@ class Devices:
             raise InputError("join.device", "a name under which no other device has joined", name)
         self._devices.pop(name, None)
         while len(self._devices) >= _MAX_DEVICES:
-            gone = next((other for other, device in self._devices.items() if device.lost is not None), None)
-            if gone is None:
+            removable = next((other for other, device in self._devices.items() if device.lost is not None), None)
+            if removable is None:
                 raise InputError("join.device", f"one of at most {_MAX_DEVICES} devices", name)
-            del self._devices[gone]
+            del self._devices[removable]
         self._devices[name] = _Device(patience_s, tick)
-        self._tell()
+        self._update_rows()
 
-    def done(self, name: str, tick: int | None, end: int, said: str) -> str | None:
+    def done(self, name: str, tick: int | None, end: int, reported: str) -> str | None:
         """Record that a device has finished a block.
 
         Args:
             name: The device.
             tick: End of the block according to the device; None if the block does not exist.
             end: End of the last block.
-            said: The device's message, for the error.
+            reported: The block that the device named, for the error.
 
         Returns:
             The reason if the device was removed for a wrong tick; otherwise None.
@@ -79,11 +79,11 @@ class Devices:
         Raises:
             InputError: The device has not joined.
         """
-        device = self._joined("done", name)
+        device = self._get_joined("done", name)
         if tick is None or tick not in (device.tick, end):
-            return self._put_out(name, f"it was done with {said}; the block that it was given ends at tick {end}")
+            return self._remove(name, f"it reported the end of {reported}; the current block ends at tick {end}")
         device.tick = max(tick, device.tick)
-        self._tell()
+        self._update_rows()
         return None
 
     def leave(self, name: str) -> None:
@@ -92,32 +92,34 @@ class Devices:
         Raises:
             InputError: The device has not joined.
         """
-        self._joined("leave", name)
+        self._get_joined("leave", name)
         del self._devices[name]
-        self._tell()
+        self._update_rows()
 
-    def behind(self, end: int) -> list[str]:
+    def find_unfinished(self, end: int) -> list[str]:
         """Return the devices that have not finished the block that ends at a tick."""
         return [name for name, device in self._devices.items() if device.lost is None and device.tick < end]
 
-    def first_due(self, waiting: Sequence[Said], end: int) -> int | None:
+    def find_first_due(self, waiting: Sequence[DeviceRequest], end: int) -> int | None:
         """Return the index of the first request that can be handled; None if all must wait.
 
         The order of two devices must not depend on chance: a device's command is handled once all devices before it by
         name have finished the block that ends at `end`. Its own `done` is handled after its commands.
         """
-        behind = self.behind(end)
-        for place, said in enumerate(waiting):
-            own = self._devices.get(said.sender)
-            if said.command == "done":
-                waits = any(before.sender == said.sender for before in waiting[:place])
+        unfinished = self.find_unfinished(end)
+        for index, request in enumerate(waiting):
+            sender = self._devices.get(request.sender)
+            if request.command == "done":
+                waits = any(earlier.sender == request.sender for earlier in waiting[:index])
             else:
-                waits = own is not None and own.lost is None and any(other < said.sender for other in behind)
+                waits = (
+                    sender is not None and sender.lost is None and any(other < request.sender for other in unfinished)
+                )
             if not waits:
-                return place
+                return index
         return None
 
-    def put_out_late(self, end: int, since_s: float, now_s: float, waiting: Set[str]) -> tuple[dict[str, str], float]:
+    def remove_late(self, end: int, since_s: float, now_s: float, waiting: Set[str]) -> tuple[dict[str, str], float]:
         """Remove the devices that have not finished in time the block that ends at a tick.
 
         Args:
@@ -130,45 +132,53 @@ class Devices:
             The reasons by name, and the time until the next device is late [s].
         """
         late, left_s = dict[str, str](), math.inf
-        for name in self.behind(end):
+        for name in self.find_unfinished(end):
             device = self._devices[name]
             if name in waiting:
                 device.since_s = now_s
-            left = device.patience_s - (now_s - max(since_s, device.since_s))
-            if left <= 0.0:
+            remaining_s = device.patience_s - (now_s - max(since_s, device.since_s))
+            if remaining_s <= 0.0:
                 within = f"within {device.patience_s:g} s"
-                late[name] = self._put_out(name, f"it was not done with the block that ends at tick {end} {within}")
+                late[name] = self._remove(name, f"it did not finish the block that ends at tick {end} {within}")
             else:
-                left_s = min(left_s, left)
+                left_s = min(left_s, remaining_s)
         return late, left_s
 
-    def told(self, over: int, since_s: float, now_s: float) -> list[dict[str, Any]]:
+    def status_rows(self, notified_tick: int, since_s: float, now_s: float) -> list[dict[str, Any]]:
         """Return the rows for the status, with the time that each joined device is late [s]; from any thread.
 
         Args:
-            over: Last block end that the devices were notified of [ticks].
+            notified_tick: Last block end that the devices were notified of [ticks].
             since_s: When they were notified [s].
             now_s: Current time [s].
         """
         return [
-            {**row, "behind_s": round(now_s - since_s, 3) if row["reason"] is None and row["tick"] < over else 0.0}
+            {
+                **row,
+                "behind_s": round(now_s - since_s, 3) if row["reason"] is None and row["tick"] < notified_tick else 0.0,
+            }
             for row in self.rows
         ]
 
-    def _joined(self, command: str, name: str) -> _Device:
+    def _get_joined(self, command: str, name: str) -> _Device:
         device = self._devices.get(name)
         if device is None or device.lost is not None:
             why = "" if device is None else f" (it was removed: {device.lost})"
             raise InputError(f"{command}.device", f"one that has joined{why}", name)
         return device
 
-    def _put_out(self, name: str, reason: str) -> str:
+    def _remove(self, name: str, reason: str) -> str:
         self._devices[name].lost = self.lost[name] = reason
-        self._tell()
+        self._update_rows()
         return reason
 
-    def _tell(self) -> None:
+    def _update_rows(self) -> None:
         self.rows = tuple(
-            {"name": name, "state": "joined" if one.lost is None else "lost", "tick": one.tick, "reason": one.lost}
-            for name, one in self._devices.items()
+            {
+                "name": name,
+                "state": "joined" if device.lost is None else "lost",
+                "tick": device.tick,
+                "reason": device.lost,
+            }
+            for name, device in self._devices.items()
         )

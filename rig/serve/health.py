@@ -23,15 +23,15 @@ class Guard:
         self._last = ""
         self.failures = 0
 
-    def __call__(self, do: Callable[..., Any], *arguments: Any) -> Any:
+    def __call__(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """Return the result of the call; None if it fails, which is reported as a warning from then on."""
         try:
-            return do(*arguments)
+            return function(*arguments)
         except Exception as error:
-            self.tell(getattr(do, "__name__", "it"), error)
+            self.record_failure(getattr(function, "__name__", "it"), error)
             return None
 
-    def tell(self, where: str, error: BaseException) -> None:
+    def record_failure(self, where: str, error: BaseException) -> None:
         """Record a failure."""
         self.failures += 1
         self._last = printable(f"{where.strip('_')}: {type(error).__name__}: {error}", 200)
@@ -41,7 +41,7 @@ class Guard:
         return [f"{self._name} failed {self.failures} times (last {self._last})"] if self.failures else []
 
 
-class Rising:
+class IncreaseWarning:
     """A count that causes a warning while it rises.
 
     Args:

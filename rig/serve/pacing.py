@@ -17,7 +17,7 @@ _NS = 1_000_000_000
 
 
 @contextmanager
-def rare_collections() -> Iterator[None]:
+def reduce_garbage_collections() -> Iterator[None]:
     """Reduce garbage collections while a start imports and builds.
 
     Little of that is garbage; collecting it took a tenth of the time.
@@ -31,7 +31,7 @@ def rare_collections() -> Iterator[None]:
 
 
 @contextmanager
-def short_collections() -> Iterator[None]:
+def freeze_start_objects() -> Iterator[None]:
     """Exclude the objects of the start from garbage collections during a paced run.
 
     They are never garbage, and traversing them took 5 to 8 ms of a full collection. A process that has already frozen
@@ -69,19 +69,19 @@ class Histogram:
 
     def add(self, value: float) -> None:
         """Count one value."""
-        at = 0 if value <= self._LOW else math.ceil(math.log10(value / self._LOW) * self._BINS_PER_DECADE)
-        self.counts[min(at, len(self.counts) - 1)] += 1
+        index = 0 if value <= self._LOW else math.ceil(math.log10(value / self._LOW) * self._BINS_PER_DECADE)
+        self.counts[min(index, len(self.counts) - 1)] += 1
         self.count += 1
         self.largest = max(self.largest, value)
 
     def quantile(self, fraction: float) -> float:
         """Return the value that a fraction of all values does not exceed; 0 without values."""
         rank = math.ceil(fraction * self.count)
-        seen = 0
-        for at, count in enumerate(self.counts):
-            seen += count
-            if count and seen >= rank:
-                return min(self._LOW * 10 ** (at / self._BINS_PER_DECADE), self.largest)
+        cumulative_count = 0
+        for index, count in enumerate(self.counts):
+            cumulative_count += count
+            if count and cumulative_count >= rank:
+                return min(self._LOW * 10 ** (index / self._BINS_PER_DECADE), self.largest)
         return self.largest
 
 
@@ -131,20 +131,20 @@ class Clock:
         return self._last_tick
 
     @property
-    def last_late_s(self) -> float:
+    def last_lateness_s(self) -> float:
         """Lateness of the last result [s]."""
         return self._last_s
 
     def statistics(self) -> dict[str, object]:
         """Return the real-time factor since the start, the lateness of results [ms] and the number of overruns."""
         # Read without a lock: a value that is one block old is acceptable, and the simulation thread never waits.
-        late = self._lateness_s
+        lateness_s = self._lateness_s
         return {
             "real_time_factor": round(self._factor, 6),
             "lateness_ms": {
-                "p50": round(1e3 * late.quantile(0.5), 4),
-                "p99": round(1e3 * late.quantile(0.99), 4),
-                "max": round(1e3 * late.largest, 4),
+                "p50": round(1e3 * lateness_s.quantile(0.5), 4),
+                "p99": round(1e3 * lateness_s.quantile(0.99), 4),
+                "max": round(1e3 * lateness_s.largest, 4),
                 "last": round(1e3 * self._last_s, 4),
             },
             "overruns": self._overruns,
@@ -223,9 +223,9 @@ class RealTime(Clock):
             self._overruns += 1
         self._awaited = tick
         while now < deadline:
-            rest = deadline - now - self._spin_ns
-            if rest > 0:
-                self._sleep(rest / _NS)
+            remaining_ns = deadline - now - self._spin_ns
+            if remaining_ns > 0:
+                self._sleep(remaining_ns / _NS)
             now = self._now_ns()
             if now < deadline and self._woken.is_set():
                 self._woken.clear()

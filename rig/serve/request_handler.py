@@ -35,31 +35,31 @@ _MAX_KINDS = 100
 _FIGURES = re.compile(r"\d+(\.\d+)?(e[-+]?\d+)?")
 
 
-class Nothing(Outside):
+class EmptyRequest(Outside):
     """A command without fields: `stop`, `pause`, `resume`."""
 
 
-class Step(Outside):
+class StepRequest(Outside):
     """Length of a step of a lockstep run or a paused replay."""
 
     ticks: Annotated[int, Field(gt=0, le=LARGEST)] | None = None
     blocks: Annotated[int, Field(gt=0, le=LARGEST)] | None = None
 
 
-def _a_word(text: str) -> str:
+def _check_word(text: str) -> str:
     if " " in text:
         raise ValueError("a word")
     return text
 
 
-class Note(Outside):
+class NoteRequest(Outside):
     """A text line for all current recordings."""
 
     text: Annotated[str, a_line(1000)]
-    tags: list[Annotated[str, a_line(40), AfterValidator(_a_word)]] = Field(default=[], max_length=10)
+    tags: list[Annotated[str, a_line(40), AfterValidator(_check_word)]] = Field(default=[], max_length=10)
 
 
-class Join(Outside):
+class JoinRequest(Outside):
     """Registration of a device under test: each block waits until the device has finished the one before."""
 
     device: Name
@@ -67,7 +67,7 @@ class Join(Outside):
     """Time limit for the device per block, wall time [s]."""
 
 
-class Done(Outside):
+class DoneRequest(Outside):
     """Report that a device has finished a block."""
 
     device: Name
@@ -77,60 +77,60 @@ class Done(Outside):
     """Number of the block; alternative to `tick`."""
 
     @model_validator(mode="after")
-    def _one_of_both(self) -> Done:
+    def _require_one(self) -> DoneRequest:
         if (self.tick is None) == (self.block is None):
             raise ValueError("given by either a tick or a block")
         return self
 
 
-class Leave(Outside):
+class LeaveRequest(Outside):
     """End of a device's registration."""
 
     device: Name
 
 
-class Seek(Outside):
+class SeekRequest(Outside):
     """New position of a replay."""
 
     time_s: float
 
 
-class Rate(Outside):
+class RateRequest(Outside):
     """Speed of a replay: recorded over real time."""
 
     rate: float
 
 
 REQUESTS: dict[str, type[Outside]] = {
-    "stop": Nothing,
-    "step": Step,
-    "note": Note,
-    "join": Join,
-    "done": Done,
-    "leave": Leave,
-    "pause": Nothing,
-    "resume": Nothing,
-    "seek": Seek,
-    "rate": Rate,
+    "stop": EmptyRequest,
+    "step": StepRequest,
+    "note": NoteRequest,
+    "join": JoinRequest,
+    "done": DoneRequest,
+    "leave": LeaveRequest,
+    "pause": EmptyRequest,
+    "resume": EmptyRequest,
+    "seek": SeekRequest,
+    "rate": RateRequest,
 }
 """Commands of the run itself; commands of the rig are checked by the simulation (`rig.run.scenes`)."""
 
 
 @dataclass(slots=True)
-class Pending:
+class PendingCommand:
     """A command passed from a transport's thread to the run's thread.
 
     Attributes:
         command: Its name.
         request: Its fields as received, within the size limit of documents.
-        asked: The validated fields, for commands in `REQUESTS`.
+        arguments: The validated fields, for commands in `REQUESTS`.
         sender: Name that the sender gives itself.
         reply: Receives the payload of the reply.
     """
 
     command: str
     request: dict[str, Any]
-    asked: Any
+    arguments: Any
     sender: str
     reply: Future[bytes] = field(default_factory=Future)
 
@@ -143,16 +143,16 @@ class Pending:
         self.answer(refusal(error))
 
 
-class Desk:
+class RequestHandler:
     """Answers the requests to one run, until it is closed.
 
     Args:
         server: Transport; stays open.
         commands: Names of the accepted commands.
-        others: Known commands that are refused here, each with the error text.
+        unsupported: Known commands that are refused here, each with the error text.
         running: Condition for the error of a late command, such as "the rig runs".
         wake: Makes the run's thread check for commands.
-        tell: Receives each new kind of failure for an event, on any thread.
+        on_warning: Receives each new kind of failure for an event, on any thread.
         limit: Limit of commands per second, except `step` and `done`, which wait for their turn, and `stop`.
     """
 
@@ -161,35 +161,35 @@ class Desk:
         server: Server,
         *,
         commands: tuple[str, ...],
-        others: Mapping[str, str],
+        unsupported: Mapping[str, str],
         running: str,
         wake: Callable[[], None],
-        tell: Callable[[str], None],
+        on_warning: Callable[[str], None],
         limit: CommandLimit | None = None,
     ) -> None:
         self._server = server
         self._commands = commands
-        self._others = others
+        self._unsupported = unsupported
         self._running = running
         self._wake = wake
-        self._tell = tell
+        self._on_warning = on_warning
         self._limit = limit or CommandLimit()
-        self._pending: BoundedQueue[Pending] = BoundedQueue(_PENDING_COMMANDS)
+        self._pending: BoundedQueue[PendingCommand] = BoundedQueue(_PENDING_COMMANDS)
         self._lock = threading.Lock()
-        self._ended = ""
+        self._end_reason = ""
         self._kinds: set[str] = set()
-        self._troubles: dict[str, str] = {}
-        self._passing: set[str] = set()
+        self._failures: dict[str, str] = {}
+        self._transport_kinds: set[str] = set()
         """Kinds of the transports' current warnings."""
         self.clients = Clients()
 
     def open(self, documents: Mapping[str, Callable[[], dict[str, Any]]]) -> None:
         """Start answering, with these documents by key, and publish the token."""
-        self._server.on_trouble(self.trouble)
-        for key, make in documents.items():
-            self._server.answer(key, lambda _, make=make: wire.encode_document(make()))
+        self._server.on_failure(self.record_failure)
+        for key, build in documents.items():
+            self._server.answer(key, lambda _, build=build: wire.encode_document(build()))
         self._server.answer_all(wire.command_key("*"), self._on_command)
-        self._server.hear(f"{wire.CLIENTS}/*", self.clients.take)
+        self._server.subscribe_reports(f"{wire.CLIENTS}/*", self.clients.take)
         self._server.announce()
 
     def _on_command(self, key: str, payload: bytes) -> bytes | Future[bytes]:
@@ -198,27 +198,27 @@ class Desk:
         try:
             pending = self._parse(name, payload)
             if not self._pending.offer(pending):
-                if self._ended:
-                    raise InputError(name, f"sent while {self._running}", self._ended)
+                if self._end_reason:
+                    raise InputError(name, f"sent while {self._running}", self._end_reason)
                 raise InputError("commands", f"at most {_PENDING_COMMANDS} at a time", _PENDING_COMMANDS + 1)
         except InputError as error:
             return wire.encode_document(refusal(error))
         self._wake()
         return pending.reply
 
-    def _parse(self, name: str, payload: bytes) -> Pending:
-        if name in self._others:
-            raise RefusedError(self._others[name])
+    def _parse(self, name: str, payload: bytes) -> PendingCommand:
+        if name in self._unsupported:
+            raise RefusedError(self._unsupported[name])
         if name not in self._commands:
             raise InputError("command", f"one of {', '.join(self._commands)}", name)
         request = read_json(payload, field=name, most_bytes=REQUEST_BYTES)
-        sender = check(_Signed, {"from": request.pop("from", "unknown")}, field="").sender
+        sender = check(_SenderField, {"from": request.pop("from", "unknown")}, field="").sender
         if name not in ("step", "done", "stop"):
             self._limit.check(sender)
         model = REQUESTS.get(name)
-        return Pending(name, request, None if model is None else check(model, request, field=name), sender)
+        return PendingCommand(name, request, None if model is None else check(model, request, field=name), sender)
 
-    def taken(self) -> Iterator[Pending]:
+    def take_commands(self) -> Iterator[PendingCommand]:
         """Yield the received commands, oldest first, up to the limit per block."""
         for _ in range(_MAX_COMMANDS_PER_BLOCK):
             pending = self._pending.take(0.0)
@@ -227,85 +227,85 @@ class Desk:
             yield pending
         self._wake()  # there may be more
 
-    def close(self, ended: str, also: list[Pending]) -> None:
+    def close(self, end_reason: str, accepted: list[PendingCommand]) -> None:
         """Refuse all waiting and later commands.
 
         Args:
-            ended: Reason given to the sender.
-            also: Accepted commands that can no longer be completed.
+            end_reason: Reason given to the sender.
+            accepted: Accepted commands that can no longer be completed.
         """
-        self._ended = ended
+        self._end_reason = end_reason
         self._pending.close()
-        for pending in [*self._pending.take_many(_PENDING_COMMANDS), *also]:
-            pending.refuse(InputError("command", f"sent while {self._running}", ended))
+        for pending in [*self._pending.take_many(_PENDING_COMMANDS), *accepted]:
+            pending.refuse(InputError("command", f"sent while {self._running}", end_reason))
 
-    def trouble(self, where: str, error: BaseException) -> None:
+    def record_failure(self, where: str, error: BaseException) -> None:
         """Record a failure that must not end the run, from any thread: a warning, and an event for each new kind."""
         text = f"{where} failed: {type(error).__name__}: {one_line(error)}"
         with self._lock:
-            known = where in self._troubles
-            if known or len(self._troubles) < _MAX_KINDS:
-                self._troubles[where] = text
-        if not known:
+            is_known = where in self._failures
+            if is_known or len(self._failures) < _MAX_KINDS:
+                self._failures[where] = text
+        if not is_known:
             self.warn(text)
 
     def warn(self, text: str) -> None:
         """Report a warning of a new kind; a text with other figures is the same kind, and only updates the status."""
         kind = _FIGURES.sub("#", text)
         with self._lock:
-            new = kind not in self._kinds and len(self._kinds) < _MAX_KINDS
-            if new:
+            is_new = kind not in self._kinds and len(self._kinds) < _MAX_KINDS
+            if is_new:
                 self._kinds.add(kind)
-        if new:
-            self._tell(text)
+        if is_new:
+            self._on_warning(text)
 
     def warnings(self) -> list[str]:
         """Return the warnings for the status."""
-        told = getattr(self._server, "warnings", list)()
-        kinds = {_FIGURES.sub("#", text) for text in told}
+        server_warnings = getattr(self._server, "warnings", list)()
+        kinds = {_FIGURES.sub("#", text) for text in server_warnings}
         with self._lock:
             # A warning that has disappeared is reported again when it returns.
-            self._kinds -= self._passing - kinds
-            self._passing = kinds
-        for text in told:
+            self._kinds -= self._transport_kinds - kinds
+            self._transport_kinds = kinds
+        for text in server_warnings:
             self.warn(text)
-        warnings = [*self.troubles, *told]
+        warnings = [*self.failures, *server_warnings]
         if self.clients.malformed:
             warnings.append(f"{self.clients.malformed} client reports could not be read")
-        if self.clients.hidden:
-            warnings.append(f"{self.clients.hidden} more clients report than are shown")
+        if self.clients.hidden_count:
+            warnings.append(f"{self.clients.hidden_count} more clients report than are shown")
         return warnings
 
     @property
-    def troubles(self) -> list[str]:
+    def failures(self) -> list[str]:
         """Failures, the latest of each place."""
-        return list(self._troubles.values())
+        return list(self._failures.values())
 
 
-class Kept:
+class CommandHistory:
     """History of accepted commands for late clients; the oldest are removed at the size limit, and counted."""
 
     def __init__(self) -> None:
-        self.told: dict[str, Any] = {"taken": ()}
+        self.document: dict[str, Any] = {"taken": ()}
         """Part of the scene document, readable from any thread: `taken`, and the number of `forgotten` commands."""
         self._bytes = 0
 
-    def add(self, taken: dict[str, Any]) -> None:
+    def add(self, command: dict[str, Any]) -> None:
         """Add a command."""
-        rows, forgotten = (*self.told["taken"], taken), self.told.get("forgotten", 0)
-        self._bytes += _size(taken)
+        rows, forgotten = (*self.document["taken"], command), self.document.get("forgotten", 0)
+        self._bytes += _size(command)
         while self._bytes > _HISTORY_BYTES:
             self._bytes -= _size(rows[0])
             rows, forgotten = rows[1:], forgotten + 1
         # A new object, as other threads read it.
-        self.told = {"taken": rows, **({"forgotten": forgotten} if forgotten else {})}
+        self.document = {"taken": rows, **({"forgotten": forgotten} if forgotten else {})}
 
 
-def _size(taken: dict[str, Any]) -> int:
-    return len(wire.encode_document(taken))
+def _size(command: dict[str, Any]) -> int:
+    return len(wire.encode_document(command))
 
 
-class _Signed(Outside):
+class _SenderField(Outside):
     sender: Name = Field(alias="from")
 
 

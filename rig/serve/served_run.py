@@ -10,8 +10,8 @@ from typing import Any
 from rig.base import wire
 from rig.base.errors import InputError
 from rig.base.text import finite
-from rig.serve.pacing import Clock, StepTimeoutError, short_collections
-from rig.serve.request_handler import Desk, Pending, one_line
+from rig.serve.pacing import Clock, StepTimeoutError, freeze_start_objects
+from rig.serve.request_handler import PendingCommand, RequestHandler, one_line
 from rig.serve.transport import Server
 
 _SUMMARY_FIGURES = (
@@ -30,7 +30,7 @@ class ServedRun(ABC):
         scene: Scene document.
         tick_rate_hz: Ticks per simulated second [Hz].
         linger_s: Longest wait at the end of a run until clients have recovered missed messages [s].
-        desk: Settings of the request handler.
+        handler_settings: Settings of the request handler.
     """
 
     def __init__(
@@ -41,7 +41,7 @@ class ServedRun(ABC):
         scene: Mapping[str, Any],
         tick_rate_hz: int,
         linger_s: float,
-        **desk: Any,
+        **handler_settings: Any,
     ) -> None:
         self._server = server
         self._clock = clock
@@ -52,7 +52,7 @@ class ServedRun(ABC):
         self._prepared = False
         self._stop_requested = False
         self._accepted = 0
-        self._desk = Desk(server, wake=self._wake, tell=self._warn, **desk)
+        self._handler = RequestHandler(server, wake=self._wake, on_warning=self._warn, **handler_settings)
 
     # ---- to be implemented by subclasses ----
 
@@ -66,15 +66,15 @@ class ServedRun(ABC):
         """Index after the last published row, of the stream that clients report on."""
 
     @abstractmethod
-    def _get_ready(self) -> tuple[dict[str, Any], dict[str, Any]]:
+    def _prepare_documents(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """Do slow preparations before requests are answered; return the catalogue and the parameters."""
 
     @abstractmethod
-    def _scene_now(self) -> dict[str, Any]:
+    def _scene_document(self) -> dict[str, Any]:
         """Return the scene document with the accepted commands."""
 
     @abstractmethod
-    def _go(self) -> str:
+    def _run_to_end(self) -> str:
         """Run; return the reason for the end."""
 
     @abstractmethod
@@ -82,16 +82,16 @@ class ServedRun(ABC):
         """Close the request handler and end the stream; return further entries of the summary."""
 
     @abstractmethod
-    def _carry_out(self, pending: Pending) -> dict[str, Any] | None:
+    def _execute(self, pending: PendingCommand) -> dict[str, Any] | None:
         """Execute a command, and answer it now or later; return its event.
 
         Raises:
             InputError: The command cannot be executed.
         """
 
-    def _arrived(self) -> Iterator[Pending]:
+    def _received_commands(self) -> Iterator[PendingCommand]:
         """Yield the received commands, in the order of execution."""
-        return self._desk.taken()
+        return self._handler.take_commands()
 
     @abstractmethod
     def _warn(self, text: str) -> None:
@@ -134,12 +134,12 @@ class ServedRun(ABC):
                 **self._clock.statistics(),
                 "queue": queue,
                 "congestion": self._server.congestion(),
-                "clients": self._desk.clients.rows(self.published, rate_hz),
+                "clients": self._handler.clients.rows(self.published, rate_hz),
                 "spin_hz": health.get("spin_hz"),
                 "energy": health.get("energy", {}),
                 "engine": health.get("engine", {}),
                 "accuracy": health.get("accuracy"),
-                "warnings": warnings + self._desk.warnings(),
+                "warnings": warnings + self._handler.warnings(),
                 "samples_published": self.published,
                 "commands": self._accepted,
             }
@@ -154,12 +154,12 @@ class ServedRun(ABC):
         """Prepare, start to answer requests and publish the rig's token; `run` calls it if it was not called before."""
         if self._prepared:
             return
-        catalogue, parameters = self._get_ready()
-        self._desk.open(
+        catalogue, parameters = self._prepare_documents()
+        self._handler.open(
             {
                 wire.CATALOGUE: lambda: catalogue,
                 wire.PARAMETERS: lambda: parameters,
-                wire.SCENE: self._scene_now,
+                wire.SCENE: self._scene_document,
                 wire.STATUS: self.status,
             }
         )
@@ -175,9 +175,9 @@ class ServedRun(ABC):
         reason = "failed"
         began_s = time.monotonic()
         try:
-            with short_collections():
+            with freeze_start_objects():
                 began_s = time.monotonic()
-                reason = self._go()
+                reason = self._run_to_end()
         except KeyboardInterrupt:
             reason = "stopped"
             raise
@@ -190,17 +190,17 @@ class ServedRun(ABC):
             self._state = "ended"
             counts = self._end(reason)
             # Keep the cache until all connected clients have received everything.
-            self._desk.clients.settle(self._server, self.published, patience_s=self._linger_s)
+            self._handler.clients.settle(self._server, self.published, patience_s=self._linger_s)
         status = self.status()
         figures = {name: status[name] for name in _SUMMARY_FIGURES if name in status}
-        return {"reason": reason, "wall_s": wall_s, **figures, **counts, "troubles": self._desk.troubles}
+        return {"reason": reason, "wall_s": wall_s, **figures, **counts, "troubles": self._handler.failures}
 
     def _take_commands(self) -> list[dict[str, Any]]:
         """Execute all received commands; return their events."""
         events = []
-        for pending in self._arrived():
+        for pending in self._received_commands():
             try:
-                event = self._carry_out(pending)
+                event = self._execute(pending)
                 if event is not None:
                     events.append(event)
             except InputError as error:
@@ -208,10 +208,10 @@ class ServedRun(ABC):
             except Exception as error:
                 # A request that passes all checks must not end the run.
                 pending.refuse(InputError(pending.command, "readable", one_line(error)))
-                self._desk.trouble(pending.command, error)
+                self._handler.record_failure(pending.command, error)
         return events
 
-    def _accept(self, pending: Pending, tick: int) -> dict[str, Any]:
+    def _accept(self, pending: PendingCommand, tick: int) -> dict[str, Any]:
         """Count an accepted command; return its reply.
 
         Args:

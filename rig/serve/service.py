@@ -23,7 +23,15 @@ from rig.run.commands import SUMMARIES
 from rig.run.commands.table import SERVICE_COMMANDS
 from rig.serve.devices import Devices
 from rig.serve.pacing import Clock, Lockstep, RealTime
-from rig.serve.request_handler import Done, Join, Kept, Leave, Note, Pending, Step
+from rig.serve.request_handler import (
+    CommandHistory,
+    DoneRequest,
+    JoinRequest,
+    LeaveRequest,
+    NoteRequest,
+    PendingCommand,
+    StepRequest,
+)
 from rig.serve.served_run import ServedRun
 from rig.serve.transport import Server, doors_of
 from rig.serve.transport.limit import CommandLimit
@@ -53,16 +61,16 @@ _QUEUE_WARNING_S = 1.0
 class _Entry:
     """Unit of publishing: events, a block of all streams, events, the end of the block, and the waiting replies."""
 
-    before: list[dict[str, Any]]
+    events_before: list[dict[str, Any]]
     frame: Frame | None = None
-    after: list[dict[str, Any]] = field(default_factory=list)
-    over: dict[str, Any] | None = None
-    replies: list[tuple[Pending, dict[str, Any]]] = field(default_factory=list)
+    events_after: list[dict[str, Any]] = field(default_factory=list)
+    block_end: dict[str, Any] | None = None
+    replies: list[tuple[PendingCommand, dict[str, Any]]] = field(default_factory=list)
 
 
 def _inherit(dropped: _Entry, following: _Entry) -> None:
     """Pass events and replies of a dropped block to the next entry; they are few, and must not be lost."""
-    following.before = [*dropped.before, *dropped.after, *following.before]
+    following.events_before = [*dropped.events_before, *dropped.events_after, *following.events_before]
     following.replies = [*dropped.replies, *following.replies]
 
 
@@ -104,7 +112,7 @@ class Service(ServedRun):
             scene=simulation.scene_document(),
             tick_rate_hz=simulation.tick_rate_hz,
             commands=COMMANDS,
-            others={
+            unsupported={
                 name: f"{name} is for a recording that is replayed (rig replay); this is a simulator, which runs on"
                 for name in REPLAY_COMMANDS
             },
@@ -130,11 +138,11 @@ class Service(ServedRun):
         self._health: dict[str, Any] = {}
         self._next_health_s = 0.0
 
-        self._kept = Kept()
+        self._history = CommandHistory()
         """Accepted commands: a late client needs them to repeat the scene."""
-        self._waiting: list[Pending] = []
+        self._waiting: list[PendingCommand] = []
         """Commands of devices that wait for other devices."""
-        self._steps: list[tuple[int, Pending, dict[str, Any]]] = []
+        self._steps: list[tuple[int, PendingCommand, dict[str, Any]]] = []
         self._step_target: int | None = None
 
         self._devices = Devices()
@@ -142,11 +150,11 @@ class Service(ServedRun):
         """Number of blocks run."""
         self._ends: dict[int | None, int] = {}
         """Ends of the last two blocks [ticks], by number."""
-        self._over: tuple[int, float] = (-1, 0.0)
+        self._notified: tuple[int, float] = (-1, 0.0)
         """End of the last block of which devices were notified [ticks], and when [s, monotonic]."""
-        self._sent: dict[str, int] = {}
+        self._sent_counts: dict[str, int] = {}
         """Messages published by key, as zenoh numbers them."""
-        self._sent_before: dict[str, int] = {}
+        self._previous_counts: dict[str, int] = {}
         """The same at the end of the previous block."""
 
         self._rows = wire.Continuity()
@@ -184,23 +192,23 @@ class Service(ServedRun):
             health=self._health,
             warnings=warnings,
         )
-        return {**status, "devices": self._devices.told(*self._over, time.monotonic())}
+        return {**status, "devices": self._devices.status_rows(*self._notified, time.monotonic())}
 
     def _warn(self, text: str) -> None:
         self._queue.push(_Entry([self._event("warning", self._simulation.tick, text=text)]))
 
     # ---- on the simulation thread ----
 
-    def _get_ready(self) -> tuple[dict[str, Any], dict[str, Any]]:
+    def _prepare_documents(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """Compile all kernels."""
         self._simulation.warm_up()
         self._health = self._simulation.health()
         return self._simulation.catalogue(), self._simulation.parameters_document()
 
-    def _scene_now(self) -> dict[str, Any]:
-        return {**self._scene, **self._kept.told}
+    def _scene_document(self) -> dict[str, Any]:
+        return {**self._scene, **self._history.document}
 
-    def _go(self) -> str:
+    def _run_to_end(self) -> str:
         simulation = self._simulation
         start = {"scene": self._scene.get("name"), "seed": self._scene.get("seed"), "pace": self._clock.pace}
         self._queue.push(_Entry([self._event("start", simulation.tick, **start)]))
@@ -221,8 +229,8 @@ class Service(ServedRun):
             if self._stop_requested:
                 queue.push(_Entry(events))
                 return "stopped"
-            if self._devices.behind(simulation.tick):
-                self._hold(events)
+            if self._devices.find_unfinished(simulation.tick):
+                self._wait_for_devices(events)
                 continue
             if replies := self._finished_steps():
                 queue.push(_Entry(events, replies=replies))
@@ -234,14 +242,14 @@ class Service(ServedRun):
             if end is not None and simulation.tick >= end:
                 queue.push(_Entry(events))
                 return "completed"
-            want = self._block_ticks
+            ticks_due = self._block_ticks
             if end is not None:
-                rest = end - simulation.tick
-                want = min(want, math.ceil(rest / simulation.block_ticks) * simulation.block_ticks)
+                ticks_left = end - simulation.tick
+                ticks_due = min(ticks_due, math.ceil(ticks_left / simulation.block_ticks) * simulation.block_ticks)
             if not self._may_drop and not queue.wait_for_room(0.1):
                 self._defer(events)
                 continue
-            ticks = clock.grant(want)
+            ticks = clock.grant(ticks_due)
             if ticks == 0:
                 self._defer(events)
                 continue
@@ -251,12 +259,14 @@ class Service(ServedRun):
                 # A command received before the block is due takes effect at its end, and is answered now.
                 answered += self._take_commands()
             self._tick = simulation.tick
-            after = [{**event, "wall_s": time.time()} for event in frame.events]
+            events_after = [{**event, "wall_s": time.time()} for event in frame.events]
             self._blocks += 1
             self._ends = {self._blocks - 1: frame.tick, self._blocks: self._tick}
-            over = {"block": self._blocks, "tick": self._tick, "time_s": self._tick / self._rate}
-            entry = _Entry(events, frame, [*after, *answered], over if self._devices else None, self._finished_steps())
-            self._overflow(queue.push(entry))
+            block_end = {"block": self._blocks, "tick": self._tick, "time_s": self._tick / self._rate}
+            entry = _Entry(
+                events, frame, [*events_after, *answered], block_end if self._devices else None, self._finished_steps()
+            )
+            self._report_overflow(queue.push(entry))
             self._refresh_health()
 
     def _defer(self, events: list[dict[str, Any]]) -> None:
@@ -264,105 +274,107 @@ class Service(ServedRun):
         if events:
             self._queue.push(_Entry(events))
 
-    def _hold(self, events: list[dict[str, Any]]) -> None:
+    def _wait_for_devices(self, events: list[dict[str, Any]]) -> None:
         """Wait for devices that have not finished the last block; remove those that exceed their time limit."""
-        tick, now_s, (over, since_s) = self._simulation.tick, time.monotonic(), self._over
+        tick, now_s, (notified_tick, since_s) = self._simulation.tick, time.monotonic(), self._notified
         # Their time begins when they are notified of the end of the block.
-        since_s = since_s if over == tick else now_s
-        late, left_s = self._devices.put_out_late(tick, since_s, now_s, {each.sender for each in self._waiting})
-        self._defer([*events, *(self._device(name, "lost", reason=reason) for name, reason in late.items())])
+        since_s = since_s if notified_tick == tick else now_s
+        late, left_s = self._devices.remove_late(tick, since_s, now_s, {pending.sender for pending in self._waiting})
+        self._defer([*events, *(self._device_event(name, "lost", reason=reason) for name, reason in late.items())])
         if not late:
             self._clock.hold(min(left_s, _DEVICE_WAIT_S))
 
-    def _device(self, name: str, state: str, **more: Any) -> dict[str, Any]:
+    def _device_event(self, name: str, state: str, **more: Any) -> dict[str, Any]:
         return self._event("device", self._simulation.tick, device=name, state=state, **more)
 
-    def _overflow(self, dropped: int) -> None:
+    def _report_overflow(self, dropped: int) -> None:
         """Report each overflow of the queue once; the status has the count."""
         if dropped and not self._overflowing:
             text = "the publisher does not keep up: the oldest blocks in the queue are dropped"
             self._queue.push(_Entry([self._event("warning", self._simulation.tick, text=text)]))
         self._overflowing = bool(dropped)
 
-    def _arrived(self) -> Iterator[Pending]:
+    def _received_commands(self) -> Iterator[PendingCommand]:
         """Yield the received commands, those of devices in the order of their names, independent of their arrival.
 
         A device's command is executed once all devices before it have finished the block.
         """
-        for pending in self._desk.taken():
+        for pending in self._handler.take_commands():
             if len(self._waiting) < _MAX_HELD:
                 self._waiting.append(pending)
             else:
                 pending.refuse(
                     InputError("commands", f"at most {_MAX_HELD} that wait for other devices", _MAX_HELD + 1)
                 )
-        while (place := self._devices.first_due(self._waiting, self._simulation.tick)) is not None:
-            yield self._waiting.pop(place)
+        while (index := self._devices.find_first_due(self._waiting, self._simulation.tick)) is not None:
+            yield self._waiting.pop(index)
 
-    def _carry_out(self, pending: Pending) -> dict[str, Any] | None:
-        asked, tick, done_tick = pending.asked, self._simulation.tick, None
-        if isinstance(asked, Join | Done | Leave):
-            return self._take_device(pending, asked)
-        told: dict[str, Any] = {}
+    def _execute(self, pending: PendingCommand) -> dict[str, Any] | None:
+        arguments, tick, done_tick = pending.arguments, self._simulation.tick, None
+        if isinstance(arguments, JoinRequest | DoneRequest | LeaveRequest):
+            return self._handle_device(pending, arguments)
+        result: dict[str, Any] = {}
         if pending.command == "stop":
             self._stop_requested = True
-        elif isinstance(asked, Step):
-            done_tick = self._check_step(asked)
-        elif not isinstance(asked, Note):
+        elif isinstance(arguments, StepRequest):
+            done_tick = self._check_step(arguments)
+        elif not isinstance(arguments, NoteRequest):
             tick = self._simulation.submit(pending.command, dict(pending.request))
-            told = self._simulation.told
-            self._kept.add(
+            result = self._simulation.command_result
+            self._history.add(
                 {"id": self._accepted + 1, "tick": tick, "command": pending.command, "request": pending.request}
             )
         reply = self._accept(pending, tick if done_tick is None else done_tick)
         if done_tick is None:
-            pending.answer({**reply, **told})
+            pending.answer({**reply, **result})
         else:
             self._steps.append((done_tick, pending, reply))
-        if isinstance(asked, Note):
+        if isinstance(arguments, NoteRequest):
             # A separate event: it does not affect the rig, so it is skipped when commands are repeated.
-            return {**self._event("note", tick, id=self._accepted), **asked.model_dump(), "from": pending.sender}
+            return {**self._event("note", tick, id=self._accepted), **arguments.model_dump(), "from": pending.sender}
         detail = {"id": self._accepted, "command": pending.command, "request": pending.request, "from": pending.sender}
         return self._event("command", tick, **detail)
 
-    def _take_device(self, pending: Pending, asked: Join | Done | Leave) -> dict[str, Any] | None:
+    def _handle_device(
+        self, pending: PendingCommand, arguments: JoinRequest | DoneRequest | LeaveRequest
+    ) -> dict[str, Any] | None:
         """Handle a device that joins, has finished a block, or leaves."""
-        self._need_lockstep(pending.command)
-        tick, name = self._simulation.tick, asked.device
-        if isinstance(asked, Done):
-            by_block = asked.block is not None
-            said = self._ends.get(asked.block) if by_block else asked.tick
-            word = f"block {asked.block}" if by_block else f"tick {said}"
-            reason = self._devices.done(name, said, tick, word)
+        self._require_lockstep(pending.command)
+        tick, name = self._simulation.tick, arguments.device
+        if isinstance(arguments, DoneRequest):
+            by_block = arguments.block is not None
+            end = self._ends.get(arguments.block) if by_block else arguments.tick
+            text = f"block {arguments.block}" if by_block else f"tick {end}"
+            reason = self._devices.done(name, end, tick, text)
             if reason is not None:
                 must = f"with tick {tick}, the end of the last block ({self._blocks})"
-                pending.refuse(InputError("done", must, Words(word)))
-                return self._device(name, "lost", reason=reason)
+                pending.refuse(InputError("done", must, Words(text)))
+                return self._device_event(name, "lost", reason=reason)
             # Not counted, and without an event: there is one per block, and the order of several devices is random.
             pending.answer({"accepted": True, "id": 0, "command": "done", "tick": tick, "time_s": tick / self._rate})
             return None
-        if isinstance(asked, Join):
-            self._devices.join(name, asked.patience_s, tick)
+        if isinstance(arguments, JoinRequest):
+            self._devices.join(name, arguments.patience_s, tick)
             pending.answer(self._accept(pending, tick))
-            return self._device(name, "joined", **{"from": pending.sender}, patience_s=asked.patience_s)
+            return self._device_event(name, "joined", **{"from": pending.sender}, patience_s=arguments.patience_s)
         self._devices.leave(name)
         pending.answer(self._accept(pending, tick))
-        return self._device(name, "left", **{"from": pending.sender})
+        return self._device_event(name, "left", **{"from": pending.sender})
 
-    def _need_lockstep(self, command: str) -> Lockstep:
+    def _require_lockstep(self, command: str) -> Lockstep:
         if isinstance(self._clock, Lockstep):
             return self._clock
         raise InputError(command, "sent to a rig that runs with --pace lockstep", Words(f"--pace {self._clock.pace}"))
 
-    def _check_step(self, asked: Step) -> int:
+    def _check_step(self, arguments: StepRequest) -> int:
         """Grant a step; return the tick of its end."""
-        clock = self._need_lockstep("step")
-        ticks, unit = asked.ticks, self._simulation.block_ticks
-        most = _MAX_STEP_S * self._rate
-        if asked.blocks is not None:
-            raise InputError("step.blocks", "left out, except for a replay", asked.blocks)
-        if ticks is None or ticks > most or ticks % unit:
-            raise InputError("ticks", f"a positive whole multiple of {unit}, at most {most}", ticks)
+        clock = self._require_lockstep("step")
+        ticks, unit = arguments.ticks, self._simulation.block_ticks
+        max_ticks = _MAX_STEP_S * self._rate
+        if arguments.blocks is not None:
+            raise InputError("step.blocks", "left out, except for a replay", arguments.blocks)
+        if ticks is None or ticks > max_ticks or ticks % unit:
+            raise InputError("ticks", f"a positive whole multiple of {unit}, at most {max_ticks}", ticks)
         start = self._step_target if self._step_target is not None else self._simulation.tick
         end = self._simulation.end_tick
         if end is not None and start + ticks > end:
@@ -371,9 +383,9 @@ class Service(ServedRun):
         clock.allow(ticks)
         return self._step_target
 
-    def _finished_steps(self) -> list[tuple[Pending, dict[str, Any]]]:
+    def _finished_steps(self) -> list[tuple[PendingCommand, dict[str, Any]]]:
         """Return the steps completed by the last block, which are answered after publishing and all devices."""
-        if not self._steps or self._devices.behind(self._tick):
+        if not self._steps or self._devices.find_unfinished(self._tick):
             return []
         lost = {"lost": dict(self._devices.lost)} if self._devices.lost else {}
         done = [(reply, {**document, **lost}) for tick, reply, document in self._steps if tick <= self._tick]
@@ -392,10 +404,10 @@ class Service(ServedRun):
         self._next_health_s = now + self._status_period_s
         self._health = self._simulation.health()
         for text in self._health.get("warnings", []):
-            self._desk.warn(text)
+            self._handler.warn(text)
 
     def _end(self, reason: str) -> dict[str, Any]:
-        self._desk.close(f"{wire.ENDED}: {reason}", [*(each for _, each, _ in self._steps), *self._waiting])
+        self._handler.close(f"{wire.ENDED}: {reason}", [*(pending for _, pending, _ in self._steps), *self._waiting])
         self._end_event = self._event("end", self._simulation.tick, reason=reason)
         self._queue.close()
         if self._publisher.ident is not None:
@@ -415,59 +427,59 @@ class Service(ServedRun):
                 self._publish_entry(entry)
             now = time.monotonic()
             if now >= next_status_s:
-                self._guarded("publishing the status", self._publish_status)
+                self._run_guarded("publishing the status", self._publish_status)
                 # Not one period after the last one, so that a delayed status is not followed by a burst.
                 next_status_s = now + self._status_period_s
         # The last event: failures while the queue is published are reported before it.
-        self._guarded("publishing events", self._publish_event, self._end_event)
-        self._guarded("publishing the status", self._publish_status)
+        self._run_guarded("publishing events", self._publish_event, self._end_event)
+        self._run_guarded("publishing the status", self._publish_status)
 
-    def _guarded(self, what: str, work: Callable[..., None], *arguments: Any) -> None:
+    def _run_guarded(self, task: str, work: Callable[..., None], *arguments: Any) -> None:
         """Do one task of this thread; a failure does not affect other streams or the pace."""
         try:
             work(*arguments)
         except Exception as error:
-            self._desk.trouble(what, error)
+            self._handler.record_failure(task, error)
 
     def _publish_entry(self, entry: _Entry) -> None:
-        for event in entry.before:
-            self._guarded("publishing events", self._publish_event, event)
+        for event in entry.events_before:
+            self._run_guarded("publishing events", self._publish_event, event)
         if entry.frame is not None:
             for told in entry.frame.documents:
                 self._guarded(
                     "publishing faults", self._server.publish, wire.FAULTS, wire.encode_document(finite(told))
                 )
             for message in entry.frame.messages:
-                self._guarded(f"publishing {message.key}", self._publish_block, message)
+                self._run_guarded(f"publishing {message.key}", self._publish_block, message)
             self._count_samples(entry.frame)
-        for event in entry.after:
-            self._guarded("publishing events", self._publish_event, event)
-        if entry.over is not None:
-            self._guarded("publishing the end of a block", self._publish_over, entry.over)
-            self._over = (entry.over["tick"], time.monotonic())
+        for event in entry.events_after:
+            self._run_guarded("publishing events", self._publish_event, event)
+        if entry.block_end is not None:
+            self._run_guarded("publishing the end of a block", self._publish_block_end, entry.block_end)
+            self._notified = (entry.block_end["tick"], time.monotonic())
             self._wake()
         if entry.frame is not None:
-            self._sent_before = dict(self._sent)
+            self._previous_counts = dict(self._sent_counts)
         self._answer(entry)
 
     def _publish_block(self, message: Message) -> None:
         # A client that misses rows learns from the end event what is missing.
         self._rows.follow(message.key, message.row, len(message.block.values), late_rows=math.inf)
         if "zenoh" in message.doors:
-            self._sent[message.key] = self._sent.get(message.key, 0) + 1
+            self._sent_counts[message.key] = self._sent_counts.get(message.key, 0) + 1
         servers = [self._server]
         if message.doors != DOORS:
             servers = [server for door, server in doors_of(self._server).items() if door in message.doors]
         for server in servers:
             server.publish(message.key, wire.encode_block(message.block))
 
-    def _publish_over(self, over: dict[str, Any]) -> None:
+    def _publish_block_end(self, block_end: dict[str, Any]) -> None:
         """Publish the end of a block, with the number of the last message of each key that had new messages."""
-        last = {key: sent - 1 for key, sent in self._sent.items() if sent != self._sent_before.get(key)}
-        self._server.publish(wire.BLOCK, wire.encode_document({**over, "messages": last}))
+        last = {key: sent - 1 for key, sent in self._sent_counts.items() if sent != self._previous_counts.get(key)}
+        self._server.publish(wire.BLOCK, wire.encode_document({**block_end, "messages": last}))
 
     def _publish_event(self, event: dict[str, Any]) -> None:
-        self._sent[wire.EVENTS] = self._sent.get(wire.EVENTS, 0) + 1
+        self._sent_counts[wire.EVENTS] = self._sent_counts.get(wire.EVENTS, 0) + 1
         self._server.publish(wire.EVENTS, wire.encode_document(finite(self._rows.tell(event))))
 
     def _publish_status(self) -> None:

@@ -66,7 +66,7 @@ class BlockEnd(Outside):
     """Number of the last message by key, of keys with messages since the block before."""
 
 
-def block_end_in(payload: bytes) -> BlockEnd:
+def parse_block_end(payload: bytes) -> BlockEnd:
     """Return the end of a block from a payload.
 
     Raises:
@@ -75,7 +75,7 @@ def block_end_in(payload: bytes) -> BlockEnd:
     return check(BlockEnd, read_json(payload, field="block", most_bytes=_EVENT_BYTES), field="block")
 
 
-def event_in(payload: bytes) -> dict[str, Any]:
+def parse_event(payload: bytes) -> dict[str, Any]:
     """Return the event from a payload.
 
     Raises:
@@ -87,7 +87,7 @@ def event_in(payload: bytes) -> dict[str, Any]:
 
 
 @dataclass(frozen=True, slots=True)
-class Promise:
+class StreamFormat:
     """Common properties of all blocks of a stream.
 
     Attributes:
@@ -100,7 +100,7 @@ class Promise:
     rate_hz: float
     tick_rate_hz: float
 
-    def broken_by(self, block: wire.Block) -> str:
+    def find_mismatch(self, block: wire.Block) -> str:
         """Return the difference of a block from the catalogue; empty for a valid block."""
         rows, columns = block.values.shape
         if not rows or (columns, block.rate_hz, block.tick_rate_hz) != (self.columns, self.rate_hz, self.tick_rate_hz):
@@ -110,10 +110,10 @@ class Promise:
             )
         return ""
 
-    def untimely(self, block: wire.Block) -> str:
+    def find_timing_error(self, block: wire.Block) -> str:
         """Return the error of a block's time or row number; empty for a valid block."""
-        rows, most = len(block.values), _MAX_S * self.tick_rate_hz
-        if not (abs(block.tick) <= most and block.index >= 0 and block.index + rows <= _MAX_S * (self.rate_hz or 1e3)):
+        rows, limit = len(block.values), _MAX_S * self.tick_rate_hz
+        if not (abs(block.tick) <= limit and block.index >= 0 and block.index + rows <= _MAX_S * (self.rate_hz or 1e3)):
             return f"row {block.index} at tick {block.tick} is beyond {_MAX_S:g} s"
         if self.rate_hz:
             # Both begin at 0. Ticks are rounded, and a renumbered recording is shifted by whole rows.
@@ -148,23 +148,23 @@ class Catalogue(BaseModel):
             return cls.model_validate(document)
         except ValidationError as error:
             first = error.errors()[0]
-            where = ".".join(map(str, first["loc"]))
-            raise InputError("catalogue", f"that of a rig of this version ({first['msg']})", where) from None
+            location = ".".join(map(str, first["loc"]))
+            raise InputError("catalogue", f"that of a rig of this version ({first['msg']})", location) from None
 
-    def promises(self) -> dict[str, Promise]:
+    def get_formats(self) -> dict[str, StreamFormat]:
         """Return the properties of the declared streams, by key."""
         ticks = self.tick_rate_hz
-        found = {wire.EDGES: Promise(1, 0.0, ticks)}
+        found = {wire.EDGES: StreamFormat(1, 0.0, ticks)}
         for name, group in self.table.groups.items():
-            found[wire.sensor_key(name)] = Promise(
+            found[wire.sensor_key(name)] = StreamFormat(
                 len(group.channels), self.rates_hz.get(name, float(group.rate_hz)), ticks
             )
         for name, table in self.truth.items():
-            found[wire.truth_key(name)] = Promise(len(table.columns), table.rate_hz, ticks)
+            found[wire.truth_key(name)] = StreamFormat(len(table.columns), table.rate_hz, ticks)
         return found
 
 
-class Taken(NamedTuple):
+class AcceptedBlock(NamedTuple):
     """An accepted block.
 
     Attributes:
@@ -185,7 +185,7 @@ class Taken(NamedTuple):
         return self.block.index + len(self.block.values)
 
 
-class Intake:
+class BlockValidator:
     """Validates the blocks of one rig's streams; the blocks of a stream must come on one thread.
 
     Args:
@@ -193,25 +193,25 @@ class Intake:
     """
 
     def __init__(self, catalogue: Catalogue) -> None:
-        self._promises = catalogue.promises()
-        self._most = len(self._promises) + _MAX_UNKNOWN
-        self._waiting: dict[str, list[Taken]] = {}
+        self._formats = catalogue.get_formats()
+        self._max_streams = len(self._formats) + _MAX_UNKNOWN
+        self._waiting: dict[str, list[AcceptedBlock]] = {}
         """Blocks after a jump, as received, until another block shows which sequence continues."""
         self._rows = Declared()
-        self._left_out: dict[str, deque[Taken]] = {}
+        self._refused_blocks: dict[str, deque[AcceptedBlock]] = {}
         """The latest refused blocks: a declaration of a fault may arrive after them."""
         self.next = self._rows.next
         """Index of the next expected row, by key."""
         self.refused = 0
         """Number of blocks that are invalid or continue no sequence."""
-        self.why = ""
+        self.reason = ""
         """Reason for the first refusal."""
 
-    def knows(self, key: str) -> bool:
+    def has_stream(self, key: str) -> bool:
         """Return whether the catalogue has the stream."""
-        return key in self._promises
+        return key in self._formats
 
-    def take(self, key: str, payload: bytes, wall_ns: int = 0) -> list[Taken]:
+    def take(self, key: str, payload: bytes, wall_ns: int = 0) -> list[AcceptedBlock]:
         """Accept a payload; return the blocks that are valid now, in order.
 
         Raises:
@@ -223,60 +223,60 @@ class Intake:
             block = wire.decode_block(payload, wire.schema_of(key) or "")
         except wire.ImplausibleError as error:
             return self._refuse(key, str(error))
-        promise = self._promises.get(key)
-        if promise is None:
-            promise = Promise(block.values.shape[1], block.rate_hz, block.tick_rate_hz)
+        stream_format = self._formats.get(key)
+        if stream_format is None:
+            stream_format = StreamFormat(block.values.shape[1], block.rate_hz, block.tick_rate_hz)
             if (
-                len(self._promises) >= self._most
+                len(self._formats) >= self._max_streams
                 or not 0.0 <= block.rate_hz <= 1e9
                 or not 0.0 < block.tick_rate_hz <= 1e12
             ):
                 return self._refuse(key, "the catalogue has no such stream")
-        if why := promise.broken_by(block):
-            return self._refuse(key, why)
-        self._promises.setdefault(key, promise)
-        new, due = Taken(key, block, payload, wall_ns), self.next.get(key, block.index)
+        if reason := stream_format.find_mismatch(block):
+            return self._refuse(key, reason)
+        self._formats.setdefault(key, stream_format)
+        new, due = AcceptedBlock(key, block, payload, wall_ns), self.next.get(key, block.index)
         if self._rows.knows(key, block):
-            return self._believe([new])
-        if why := promise.untimely(block):
-            return self._refuse(key, why, new)
+            return self._accept([new])
+        if reason := stream_format.find_timing_error(block):
+            return self._refuse(key, reason, new)
         if block.index - due > _MAX_JUMP:
             return self._refuse(key, f"row {block.index} is {block.index - due} rows ahead")
         waiting = self._waiting.setdefault(key, [])
-        place = next((n for n, each in enumerate(waiting) if each.end == block.index), None)
-        if block.index != due and place is None:
+        index = next((n for n, each in enumerate(waiting) if each.end == block.index), None)
+        if block.index != due and index is None:
             waiting.append(new)
-            return self._first(key, behind=True) if len(waiting) > _MAX_WAITING else []
-        line = [new]
+            return self._take_next(key, allow_earlier=True) if len(waiting) > _MAX_WAITING else []
+        accepted = [new]
         for n, each in reversed(list(enumerate(waiting))):
             # The block that the new one continues; with several gaps, also those between it and the old sequence.
-            between = n != place and due <= each.block.index and each.end <= line[0].block.index
-            if block.index != due and (n == place or (between and len(line) > 1)):
-                line.insert(0, each)
+            between = n != index and due <= each.block.index and each.end <= accepted[0].block.index
+            if block.index != due and (n == index or (between and len(accepted) > 1)):
+                accepted.insert(0, each)
             else:
                 self._refuse_step(each)
         waiting.clear()
-        return self._believe(line)
+        return self._accept(accepted)
 
-    def declare(self, document: Mapping[str, Any]) -> list[Taken]:
+    def declare(self, document: Mapping[str, Any]) -> list[AcceptedBlock]:
         """Apply a declaration of faults; return the blocks that are valid because of it.
 
         Blocks that a fault duplicates, reorders or stamps with other times are valid only if declared.
         """
-        found = list[Taken]()
+        found = list[AcceptedBlock]()
         if not self._rows.declare(document):
             return found
-        for rest in (*self._left_out.values(), *self._waiting.values()):
-            for each in list(rest):
-                if self._rows.knows(each.key, each.block):
-                    found += self._believe([each])
-            left = [each for each in rest if all(each is not one for one in found)]
-            self.refused -= len(rest) - len(left) if isinstance(rest, deque) else 0
-            rest.clear()
-            rest.extend(left)
+        for blocks in (*self._refused_blocks.values(), *self._waiting.values()):
+            for block in list(blocks):
+                if self._rows.knows(block.key, block.block):
+                    found += self._accept([block])
+            remaining = [block for block in blocks if all(block is not accepted for accepted in found)]
+            self.refused -= len(blocks) - len(remaining) if isinstance(blocks, deque) else 0
+            blocks.clear()
+            blocks.extend(remaining)
         return found
 
-    def rest(self, rows: Mapping[str, int] | None, key: str | None = None) -> list[Taken]:
+    def take_waiting(self, rows: Mapping[str, int] | None, key: str | None = None) -> list[AcceptedBlock]:
         """Return the waiting blocks that were published, at the end of the stream.
 
         Args:
@@ -286,40 +286,40 @@ class Intake:
         found = []
         for name in list(self._waiting) if key is None else [key]:
             last = None if rows is None else rows.get(name, 0)
-            while taken := self._first(name, last=last):
+            while taken := self._take_next(name, last=last):
                 found += taken
         return found
 
-    def _first(self, key: str, *, last: int | None = None, behind: bool = False) -> list[Taken]:
-        """Return the next waiting block ahead, up to row `last`; otherwise, if `behind`, the first one behind."""
+    def _take_next(self, key: str, *, last: int | None = None, allow_earlier: bool = False) -> list[AcceptedBlock]:
+        """Return the next waiting block ahead, up to row `last`; otherwise, if `allow_earlier`, the first one back."""
         waiting, due = self._waiting.get(key, []), self.next.get(key, 0)
         ahead = [
             n
             for n, each in enumerate(waiting)
             if due <= each.block.index and each.end <= (each.end if last is None else last)
         ]
-        if not ahead and not (behind and waiting):
+        if not ahead and not (allow_earlier and waiting):
             return []
-        place = min(ahead, key=lambda n: waiting[n].block.index, default=0)
-        for each in waiting[:place]:
+        index = min(ahead, key=lambda n: waiting[n].block.index, default=0)
+        for each in waiting[:index]:
             self._refuse_step(each)
-        chosen = waiting[place]
-        del waiting[: place + 1]
-        return self._believe([chosen])
+        chosen = waiting[index]
+        del waiting[: index + 1]
+        return self._accept([chosen])
 
-    def _believe(self, line: list[Taken]) -> list[Taken]:
-        for each in line:
+    def _accept(self, accepted: list[AcceptedBlock]) -> list[AcceptedBlock]:
+        for each in accepted:
             self._rows.take(each.key, each.block)
-        return line
+        return accepted
 
-    def _refuse_step(self, waiting: Taken) -> None:
+    def _refuse_step(self, waiting: AcceptedBlock) -> None:
         due = self.next[waiting.key]
-        why = f"row {waiting.block.index} came where row {due} was due, and no block continued from it"
-        self._refuse(waiting.key, why, waiting)
+        reason = f"row {waiting.block.index} came where row {due} was due, and no block continued from it"
+        self._refuse(waiting.key, reason, waiting)
 
-    def _refuse(self, key: str, why: str, block: Taken | None = None) -> list[Taken]:
+    def _refuse(self, key: str, reason: str, block: AcceptedBlock | None = None) -> list[AcceptedBlock]:
         self.refused += 1
         if block is not None:
-            self._left_out.setdefault(key, deque(maxlen=_MAX_REFUSED)).append(block)
-        self.why = self.why or f"{key}: {why}"
+            self._refused_blocks.setdefault(key, deque(maxlen=_MAX_REFUSED)).append(block)
+        self.reason = self.reason or f"{key}: {reason}"
         return []

@@ -23,8 +23,24 @@ from cryptography.x509.oid import ExtendedKeyUsageOID as Usage  # noqa: TID253
 
 from rig.base.errors import InputError
 from rig.serve.transport import NoReplyError
-from rig.serve.transport.exposure.access import DOORS, PLAIN, ROLES, WITH_TRUTH, Door, Verb, allows, doors_of
-from rig.serve.transport.exposure.certificates import SIGNER, Issue, holder_in, make, subject_of, write_holder
+from rig.serve.transport.exposure.access import (
+    PERMISSIONS,
+    PLAIN,
+    ROLES,
+    WITH_TRUTH,
+    Action,
+    Permission,
+    get_permissions,
+    is_allowed,
+)
+from rig.serve.transport.exposure.certificates import (
+    SIGNER,
+    CertificateIssuer,
+    build_subject,
+    create_keys,
+    read_holder,
+    write_holder,
+)
 from rig.serve.transport.zenoh import Exposure, ZenohClient, ZenohServer
 from tests.processes import free_endpoint
 from tests.waiting import PATIENCE_S, time_limit, until
@@ -33,7 +49,7 @@ pytestmark = pytest.mark.wallclock
 
 NAMES = [name for role in ROLES for name in (role, role + WITH_TRUTH)]
 STRANGER = "stranger"
-KEYS = sorted({key for door in DOORS for key in door.keys})
+KEYS = sorted({key for permission in PERMISSIONS for key in permission.keys})
 FORGED = b"forged"
 
 
@@ -52,9 +68,9 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """One authority's certificates for every role, for an unknown role, and an expired one."""
     folder = tmp_path_factory.mktemp("keys")
     signing = ec.generate_private_key(ec.SECP256R1())
-    issue, late = Issue(signing, timedelta(days=1)), Issue(signing, timedelta(minutes=-1))
+    issue, late = CertificateIssuer(signing, timedelta(days=1)), CertificateIssuer(signing, timedelta(minutes=-1))
     authority = issue.certificate(SIGNER, signing, None, [])
-    hosts = [subject_of("127.0.0.1"), subject_of("localhost")]
+    hosts = [build_subject("127.0.0.1"), build_subject("localhost")]
     for holder, name, by, usage in (
         ("server", "the rig", issue, Usage.SERVER_AUTH),
         ("expired", "operator", late, Usage.CLIENT_AUTH),
@@ -63,7 +79,7 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> Path:
         key = ec.generate_private_key(ec.SECP256R1())
         subjects = hosts if usage is Usage.SERVER_AUTH else [x509.DNSName("client")]
         write_holder(folder / holder, authority, by.certificate(name, key, usage, subjects), key)
-    make(folder / "others", days=1)
+    create_keys(folder / "others", days=1)
     return folder
 
 
@@ -112,34 +128,34 @@ class Rig:
         self.heard: set[str] = set()
         self.shown: set[str] = set()
         self.server = server
-        for door in DOORS:
-            for pattern in door.keys:
+        for permission in PERMISSIONS:
+            for pattern in permission.keys:
                 key = example(pattern)
-                if door.verb is Verb.ASK:
+                if permission.action is Action.ASK:
                     server.answer(key, lambda _: b"honest")
-                elif door.verb is Verb.RECEIVE:
+                elif permission.action is Action.RECEIVE:
                     server.publish(key, b"honest")
-                elif door.verb is Verb.SEND:
-                    server.hear(pattern, lambda key, _: self.heard.add(key))
-                elif door.verb is Verb.SHOW:
+                elif permission.action is Action.SEND:
+                    server.subscribe_reports(pattern, lambda key, _: self.heard.add(key))
+                elif permission.action is Action.SHOW:
                     server.watch(pattern, lambda key, there: self.shown.add(key) if there else None)
 
     def publish(self) -> None:
-        for key in receivable(DOORS):
+        for key in receivable(PERMISSIONS):
             self.server.publish(key, b"honest")
 
     def announce(self) -> None:
-        for door in DOORS:
-            if door.verb is Verb.WATCH:
-                self.server.announce(example(door.keys[0]))
+        for permission in PERMISSIONS:
+            if permission.action is Action.WATCH:
+                self.server.announce(example(permission.keys[0]))
 
 
-def keys_of(doors: tuple[Door, ...], verb: Verb) -> set[str]:
-    return {example(key) for door in doors if door.verb is verb for key in door.keys}
+def keys_of(doors: tuple[Permission, ...], action: Action) -> set[str]:
+    return {example(key) for permission in doors if permission.action is action for key in permission.keys}
 
 
-def receivable(doors: tuple[Door, ...]) -> set[str]:
-    return keys_of(doors, Verb.RECEIVE)
+def receivable(doors: tuple[Permission, ...]) -> set[str]:
+    return keys_of(doors, Action.RECEIVE)
 
 
 class Attempt:
@@ -191,7 +207,7 @@ SUBJECTS = [
 @pytest.mark.parametrize(("name", "mode"), SUBJECTS)
 def test_each_role_has_exactly_the_rights_of_the_table(name: str | None, mode: str, folders: Path) -> None:
     plain, exposed = free_endpoint(), free_endpoint()
-    doors = doors_of(name)
+    doors = get_permissions(name)
     seen: list[tuple[str, bytes]] = []
     with (
         ZenohServer(plain, exposed=Exposure(exposed, holder_in(folders / "server", server=True))) as server,
@@ -215,28 +231,31 @@ def test_each_role_has_exactly_the_rights_of_the_table(name: str | None, mode: s
         rig.publish()
         allowed = receivable(doors)
         until(lambda: allowed <= attempt.received and allowed <= attempt.heartbeats)
-        until(lambda: rig.heard >= keys_of(doors, Verb.SEND) and rig.shown >= keys_of(doors, Verb.SHOW))
+        until(lambda: rig.heard >= keys_of(doors, Action.SEND) and rig.shown >= keys_of(doors, Action.SHOW))
         # Before any forged message, an honest client receives the rig's own messages or none.
         forged_tokens = {
-            key for door in DOORS if door.verb is Verb.WATCH for key in honest.tokens(example(door.keys[0]))
+            key
+            for permission in PERMISSIONS
+            if permission.action is Action.WATCH
+            for key in honest.tokens(example(permission.keys[0]))
         }
-        asked = {honest.request(key) for key in keys_of(DOORS, Verb.ASK)}
+        asked = {honest.request(key) for key in keys_of(PERMISSIONS, Action.ASK)}
         selectors = ("rig/command/unknown", "rig/**", "rig/**/@adv/**?_max=1", "rig/sensors/unknown/@adv/**")
         victims = (honest.session, beside)
         replies = [reply for victim in victims for selector in selectors for reply in get_all_replies(victim, selector)]
         for token in attempt.tokens:
             token.undeclare()
         rig.announce()
-        until(lambda: all(map(attempt.sees, keys_of(doors, Verb.WATCH))))
-        tokens = {key for key in keys_of(DOORS, Verb.WATCH) if attempt.sees(key)}
-        until(lambda: len({key for key, _ in seen}) >= len(receivable(DOORS)))
-        assert {key for key, found in answers.items() if found} == keys_of(doors, Verb.ASK)
+        until(lambda: all(map(attempt.sees, keys_of(doors, Action.WATCH))))
+        tokens = {key for key in keys_of(PERMISSIONS, Action.WATCH) if attempt.sees(key)}
+        until(lambda: len({key for key, _ in seen}) >= len(receivable(PERMISSIONS)))
+        assert {key for key, found in answers.items() if found} == keys_of(doors, Action.ASK)
         assert attempt.received == allowed
         assert attempt.heartbeats == allowed
         assert history == allowed
-        assert rig.heard == keys_of(doors, Verb.SEND)
-        assert {key for key in rig.shown if key in map(example, KEYS)} == keys_of(doors, Verb.SHOW)
-        assert tokens == keys_of(doors, Verb.WATCH)
+        assert rig.heard == keys_of(doors, Action.SEND)
+        assert {key for key in rig.shown if key in map(example, KEYS)} == keys_of(doors, Action.SHOW)
+        assert tokens == keys_of(doors, Action.WATCH)
         assert forged_tokens == set()
         assert asked == {b"honest"}
         assert FORGED not in {bytes(reply.result.payload) for reply in replies}
@@ -255,7 +274,7 @@ def test_each_role_has_exactly_the_rights_of_the_table(name: str | None, mode: s
 )
 def test_a_client_without_a_valid_certificate_is_refused(who: str | None, why: str, folders: Path) -> None:
     plain, exposed = free_endpoint(), free_endpoint()
-    holder = holder_in(folders / "server", server=True)
+    holder = read_holder(folders / "server", server=True)
     with ZenohServer(plain, exposed=Exposure(exposed, holder)) as server:
         server.announce()
         for locator in (f"tls/{exposed}", f"tcp/{exposed}"):
@@ -269,15 +288,17 @@ def test_a_client_without_a_valid_certificate_is_refused(who: str | None, why: s
 def test_a_link_ends_when_its_certificate_expires(folders: Path, tmp_path: Path) -> None:
     plain, exposed = free_endpoint(), free_endpoint()
     signing = ec.generate_private_key(ec.SECP256R1())
-    issue = Issue(signing, timedelta(days=1))
+    issue = CertificateIssuer(signing, timedelta(days=1))
     authority = issue.certificate(SIGNER, signing, None, [])
 
-    def write(holder: str, by: Issue, usage: x509.ObjectIdentifier) -> None:
+    def write(holder: str, by: CertificateIssuer, usage: x509.ObjectIdentifier) -> None:
         key = ec.generate_private_key(ec.SECP256R1())
-        write_holder(tmp_path / holder, authority, by.certificate(holder, key, usage, [subject_of("127.0.0.1")]), key)
+        write_holder(
+            tmp_path / holder, authority, by.certificate(holder, key, usage, [build_subject("127.0.0.1")]), key
+        )
 
     write("server", issue, Usage.SERVER_AUTH)
-    with ZenohServer(plain, exposed=Exposure(exposed, holder_in(tmp_path, server=True))) as server:
+    with ZenohServer(plain, exposed=Exposure(exposed, read_holder(tmp_path, server=True))) as server:
         for valid_s in (3, 30):  # on a busy machine the first connection may take longer than the shorter one
             write("viewer", Issue(signing, timedelta(seconds=valid_s)), Usage.CLIENT_AUTH)
             with contextlib.suppress(zenoh.ZError), open_hostile_session(f"tls/{exposed}", folder=tmp_path / "viewer"):
@@ -289,7 +310,7 @@ def test_a_link_ends_when_its_certificate_expires(folders: Path, tmp_path: Path)
 
 def test_clients_report_the_reason_of_a_refusal(folders: Path) -> None:
     plain, exposed = free_endpoint(), free_endpoint()
-    with ZenohServer(plain, exposed=Exposure(exposed, holder_in(folders / "server", server=True))) as server:
+    with ZenohServer(plain, exposed=Exposure(exposed, read_holder(folders / "server", server=True))) as server:
         server.answer("rig/command/hammer", lambda _: b"hit")
         server.answer("rig/status", lambda _: b"well")
         server.announce()
@@ -324,7 +345,7 @@ def test_an_exposed_rig_limits_links_and_message_size(folders: Path) -> None:
     plain, exposed = free_endpoint(), free_endpoint()
     heard: list[int] = []
     with ExitStack() as stack:
-        holder = holder_in(folders / "server", server=True)
+        holder = read_holder(folders / "server", server=True)
         server = stack.enter_context(ZenohServer(plain, exposed=Exposure(exposed, holder)))
         server.hear("rig/clients/*", lambda _, payload: heard.append(len(payload)))
         session = stack.enter_context(open_hostile_session(f"tls/{exposed}", folder=folders / "recorder"))
@@ -341,7 +362,7 @@ def test_an_exposed_rig_limits_links_and_message_size(folders: Path) -> None:
 @pytest.mark.parametrize("busy", ["plain", "exposed"])
 def test_without_its_ports_no_rig_opens(busy: str, folders: Path) -> None:
     ends = {"plain": free_endpoint(), "exposed": free_endpoint()}
-    exposed = Exposure(ends["exposed"], holder_in(folders / "server", server=True))
+    exposed = Exposure(ends["exposed"], read_holder(folders / "server", server=True))
     field = {"plain": "listen", "exposed": "expose"}[busy]
     with (
         ZenohServer(ends[busy]),
@@ -352,10 +373,10 @@ def test_without_its_ports_no_rig_opens(busy: str, folders: Path) -> None:
 
 
 def test_the_table_has_each_key_once_per_verb_and_distinct_roles() -> None:
-    pairs = [(door.verb, key) for door in DOORS for key in door.keys]
+    pairs = [(permission.action, key) for permission in PERMISSIONS for key in permission.keys]
     assert len(set(pairs)) == len(pairs)
-    assert len({doors_of(name) for name in (None, STRANGER, *NAMES)}) == len(NAMES) + 2
-    assert allows("viewer", Verb.RECEIVE, "rig/sensors/probes")
-    assert not allows("viewer", Verb.RECEIVE, "rig/truth/state")
-    assert allows("viewer" + WITH_TRUTH, Verb.RECEIVE, "rig/truth/state")
-    assert not allows(STRANGER + WITH_TRUTH, Verb.RECEIVE, "rig/truth/state")
+    assert len({get_permissions(name) for name in (None, STRANGER, *NAMES)}) == len(NAMES) + 2
+    assert is_allowed("viewer", Action.RECEIVE, "rig/sensors/probes")
+    assert not is_allowed("viewer", Action.RECEIVE, "rig/truth/state")
+    assert is_allowed("viewer" + WITH_TRUTH, Action.RECEIVE, "rig/truth/state")
+    assert not is_allowed(STRANGER + WITH_TRUTH, Action.RECEIVE, "rig/truth/state")

@@ -102,7 +102,7 @@ def test_a_killed_device_is_reported_and_the_rig_continues() -> None:
         machine.step(10_000)
         device.kill()
         device.wait()
-        reason = "it was not done with the block that ends at tick 20000 within 0.5 s"
+        reason = "it did not finish the block that ends at tick 20000 within 0.5 s"
         assert machine.step(50_000).lost == {"a": reason}
         lost = machine.event("device")
         assert (lost["state"], lost["tick"], lost["reason"]) == ("lost", 20_000, reason)

@@ -58,7 +58,7 @@ class Publisher:
         self.beats: list[dict] = []
         self.reached: set[str] = set()
         """Keys of the clients that have received a row."""
-        self.server.hear(f"{CLIENTS}/*", self._heard)
+        self.server.subscribe_reports(f"{CLIENTS}/*", self._heard)
         self.server.announce()
         self.sent: dict[str, list[bytes]] = {}
         self.rows: dict[str, int] = {}

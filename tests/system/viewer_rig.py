@@ -20,11 +20,11 @@ def main(port: int, duration_s: float) -> None:
             server.answer(key, lambda _, reply=reply: reply)
         met = threading.Event()
 
-        def hear(key: str, payload: bytes) -> None:
+        def subscribe_reports(key: str, payload: bytes) -> None:
             print(key, payload.decode(), flush=True)
             met.set()
 
-        server.hear(f"{wire.CLIENTS}/*", hear)
+        server.subscribe_reports(f"{wire.CLIENTS}/*", subscribe_reports)
         server.announce()
         print("ready", flush=True)
         met.wait(60.0)

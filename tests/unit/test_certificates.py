@@ -15,7 +15,7 @@ from rig.base.errors import InputError
 from rig.cli.connections.connection import Serving, print_addresses
 from rig.cli.main import main
 from rig.serve.transport.exposure.access import ROLES
-from rig.serve.transport.exposure.certificates import HOLDERS, SERVER, holder_in, make
+from rig.serve.transport.exposure.certificates import HOLDERS, SERVER, create_keys, read_holder
 
 
 def files(folder: Path) -> dict[str, bytes]:
@@ -24,7 +24,7 @@ def files(folder: Path) -> dict[str, bytes]:
 
 def test_every_holder_gets_a_complete_private_folder(tmp_path: Path) -> None:
     folder = tmp_path / "keys"
-    assert make(folder, hosts=["lab.example", "192.0.2.7", "::1"], days=2, truth=["viewer"]) == [
+    assert create_keys(folder, hosts=["lab.example", "192.0.2.7", "::1"], days=2, truth=["viewer"]) == [
         "lab.example",
         "192.0.2.7",
         "::1",
@@ -37,9 +37,9 @@ def test_every_holder_gets_a_complete_private_folder(tmp_path: Path) -> None:
         assert mode == (0o700 if path.is_dir() else 0o600 if path.name == "key.pem" else mode)
         assert not mode & 0o022
     assert stat.S_IMODE(folder.stat().st_mode) == 0o700
-    assert holder_in(folder, server=True).name == "lab.example"
-    assert holder_in(folder, server=True) == holder_in(folder / SERVER, server=True)
-    assert {role: holder_in(folder / role, server=False).name for role in ROLES} == {
+    assert read_holder(folder, server=True).name == "lab.example"
+    assert read_holder(folder, server=True) == read_holder(folder / SERVER, server=True)
+    assert {role: read_holder(folder / role, server=False).name for role in ROLES} == {
         "operator": "operator",
         "recorder": "recorder",
         "viewer": "viewer+truth",
@@ -50,26 +50,26 @@ def test_every_holder_gets_a_complete_private_folder(tmp_path: Path) -> None:
 def test_existing_keys_are_replaced_only_on_request_and_if_ours(tmp_path: Path) -> None:
     folder = tmp_path / "keys"
     folder.mkdir()
-    make(folder)  # an empty folder is not refused
+    create_keys(folder)  # an empty folder is not refused
     before = files(folder)
     with pytest.raises(InputError, match=r"^DIR must be a new folder"):
-        make(folder)
+        create_keys(folder)
     (folder / "viewer" / "key.pem").unlink()
     with pytest.raises(InputError, match=r"^DIR must be a new folder"):
-        make(folder)
-    make(folder, force=True)
+        create_keys(folder)
+    create_keys(folder, force=True)
     assert files(folder).keys() == before.keys()
     assert not set(files(folder).values()) & set(before.values())
     (folder / "viewer" / "notes.txt").write_text("mine")
     for other in (folder, folder / "viewer" / "notes.txt"):
         with pytest.raises(InputError, match=r"^DIR must be a new folder"):
-            make(other, force=True)
+            create_keys(other, force=True)
     assert (folder / "viewer" / "notes.txt").read_text() == "mine"
 
 
 def test_a_failure_keeps_the_existing_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = tmp_path / "keys"
-    make(folder)
+    create_keys(folder)
     before = files(folder)
     folders: set[Path] = set()
     write = Path.write_bytes
@@ -82,7 +82,7 @@ def test_a_failure_keeps_the_existing_folder(tmp_path: Path, monkeypatch: pytest
 
     monkeypatch.setattr(Path, "write_bytes", fail)
     with pytest.raises(OSError, match="No space"):
-        make(folder, force=True)
+        create_keys(folder, force=True)
     assert files(folder) == before
     assert [path.name for path in tmp_path.iterdir()] == ["keys"]
 
@@ -90,24 +90,24 @@ def test_a_failure_keeps_the_existing_folder(tmp_path: Path, monkeypatch: pytest
 @pytest.mark.parametrize("host", ["", "bad host", "a_b", "-a", "a..b", "x" * 65, "*", "lab.example:7463", "ä.example"])
 def test_invalid_names_are_refused(host: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"^--host must be the name or address"):
-        make(tmp_path / "keys", hosts=[host])
+        create_keys(tmp_path / "keys", hosts=[host])
     assert list(tmp_path.iterdir()) == []
 
 
 def test_folders_without_keys_are_refused(tmp_path: Path) -> None:
     folder = tmp_path / "keys"
-    make(folder, days=-0.01)
+    create_keys(folder, days=-0.01)
     with pytest.raises(InputError, match=r"^--tls must be a certificate that is valid .*, expired"):
-        holder_in(folder / "viewer", server=False)
-    make(folder, force=True)
+        read_holder(folder / "viewer", server=False)
+    create_keys(folder, force=True)
     for wrong, server in ((folder, False), (folder / "server", False), (folder / "viewer", True), (tmp_path, True)):
         with pytest.raises(InputError, match=r"^--tls must be a folder with the keys of "):
-            holder_in(wrong, server=server)
+            read_holder(wrong, server=server)
     for name, broken in (("certificate.pem", b"\xff\x00 no certificate"), ("key.pem", None)):
         part = folder / "viewer" / name
         part.unlink() if broken is None else part.write_bytes(broken)
         with pytest.raises(InputError, match=r"^--tls must be a folder with the keys of one role"):
-            holder_in(folder / "viewer", server=False)
+            read_holder(folder / "viewer", server=False)
 
 
 def test_the_command_explains_where_each_folder_belongs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -131,12 +131,12 @@ def test_the_command_explains_where_each_folder_belongs(tmp_path: Path, capsys: 
 
 
 def test_exposure_reports_the_admitted_roles(tmp_path: Path) -> None:
-    make(tmp_path / "keys")
+    create_keys(tmp_path / "keys")
     assert Serving().exposure() is None
     exposed = Serving(expose="192.0.2.1", tls=tmp_path / "keys").exposure()
     assert exposed is not None
     assert exposed.endpoint == "192.0.2.1:7463"
-    assert exposed.holder == holder_in(tmp_path / "keys" / "server", server=True)
+    assert exposed.holder == read_holder(tmp_path / "keys" / "server", server=True)
     assert Serving(expose="lab.example:9000", plaintext=True).exposure() == ("lab.example:9000", None)
     with pytest.raises(
         InputError, match=r"--expose must be given with --tls DIR \(made by: rig keys init DIR --host lab"

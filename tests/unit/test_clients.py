@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from rig.serve.transport.clients import MOST, SHOWN, Clients, Reporter
+from rig.serve.transport.clients import MAX_CLIENTS, MAX_STATUS_CLIENTS, Clients, Reporter
 
 
 class Time:
@@ -71,7 +71,7 @@ def test_a_report_out_of_bounds_is_counted_and_not_believed(clients: Clients, pa
 def test_a_name_with_control_characters_is_refused(clients: Clients, name: str) -> None:
     report(clients, name, received_index=1)
     assert clients.malformed == 1
-    assert clients.present == 0
+    assert clients.active_count == 0
 
 
 def test_false_names_do_not_hide_an_active_client(clients: Clients, time_: Time) -> None:
@@ -84,13 +84,13 @@ def test_false_names_do_not_hide_an_active_client(clients: Clients, time_: Time)
             made_up += 1
         rows = clients.rows(20_000 * second, 20_000.0)
         assert "recorder" in rows or second < 2
-        assert len(rows) <= SHOWN
-    assert len(rows) + clients.hidden <= MOST
-    assert clients.hidden > 0
+        assert len(rows) <= MAX_STATUS_CLIENTS
+    assert len(rows) + clients.hidden_count <= MAX_CLIENTS
+    assert clients.hidden_count > 0
 
 
 def test_a_recorder_is_shown_after_thousands_of_false_names(clients: Clients, time_: Time) -> None:
-    for number in range(3 * MOST):
+    for number in range(3 * MAX_CLIENTS):
         report(clients, f"made up {number}", received_index=5)
     for half_second in range(4):
         time_.now_s = 0.5 * half_second
@@ -103,12 +103,12 @@ def test_the_wait_for_a_client_without_progress_is_limited(clients: Clients, tim
         time_.now_s = float(second)
         report(clients, "stuck", received_index=0, room=0)
         if second in (2, 40):
-            assert clients.behind(1000) == 1000
-            assert clients.crowded(1000, 500)
-    assert clients.behind(1000) == 0
-    assert not clients.crowded(1000, 500)
+            assert clients.max_lag_rows(1000) == 1000
+            assert clients.find_lagging(1000, 500)
+    assert clients.max_lag_rows(1000) == 0
+    assert not clients.find_lagging(1000, 500)
     report(clients, "stuck", received_index=10)
-    assert clients.behind(1000) == 990, "it goes on"
+    assert clients.max_lag_rows(1000) == 990, "it goes on"
 
 
 def test_a_report_under_the_name_of_another_client_is_ignored(clients: Clients, time_: Time) -> None:
@@ -117,16 +117,16 @@ def test_a_report_under_the_name_of_another_client_is_ignored(clients: Clients, 
             clients.take(key, payload)
 
     recorder = Reporter(Rig(), "recorder")
-    recorder.tell(500, lost=0)
+    recorder.send(500, lost=0)
     time_.now_s = 3.5
     for forged in ({"received_index": 2**62 - 1, "lost": 7}, {"received_index": 1, "done": True}):
         report(clients, "recorder", **forged)
         report(clients, "recorder", **forged, secret="0" * 32)
     rows = clients.rows(1000, 20_000.0)
     assert [row["lost"] for row in rows.values() if row["received_index"] == 500] == [0]
-    assert clients.behind(1000, silent=True) == 500, "the end still waits for it"
-    recorder.tell(1000, lost=0, done=True)
-    assert clients.behind(1000, silent=True) == 0
+    assert clients.max_lag_rows(1000, silent=True) == 500, "the end still waits for it"
+    recorder.send(1000, lost=0, done=True)
+    assert clients.max_lag_rows(1000, silent=True) == 0
 
 
 def test_a_client_whose_count_oscillates_makes_no_progress(clients: Clients, time_: Time) -> None:

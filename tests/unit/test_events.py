@@ -22,7 +22,7 @@ from rig.run.scenes import parse_scene
 from rig.run.simulation import Simulation
 from rig.serve.pacing import Lockstep
 from rig.serve.service import Service
-from rig.serve.stream_check import event_in
+from rig.serve.stream_check import parse_event
 from rig.serve.transport.memory import MemoryClient, MemoryServer
 from tests.waiting import until
 
@@ -115,6 +115,6 @@ def test_a_scene_that_clears_all_faults_is_good(
 
 def test_events_of_earlier_recordings_are_read() -> None:
     cleared = {"event": "clear", "tick": 1, "time_s": 1e-6, "id": "all", "fault": [1]}
-    assert event_in(wire.encode_document(cleared)) == cleared
+    assert parse_event(wire.encode_document(cleared)) == cleared
     with pytest.raises(InputError):
-        event_in(wire.encode_document({**cleared, "id": "some"}))
+        parse_event(wire.encode_document({**cleared, "id": "some"}))

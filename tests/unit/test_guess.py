@@ -159,10 +159,10 @@ def test_samples_are_not_changed_without_a_request(
     assert conversion.pulses[0].force_n == pytest.approx(foreign.PULSE_FORCE_N, rel=0.01)
     assert conversion.pulses[0].at_s == pytest.approx(foreign.IMPACT_S, abs=2e-4)
     assert not recording.doubts
-    promises = Catalogue.read(recording.catalogue).promises()
+    formats = Catalogue.read(recording.catalogue).get_formats()
     for name in recording.table.groups:
         key = sensor_key(name)
-        assert {promises[key].broken_by(block) for block in recording.blocks(key)} == {""}
+        assert {formats[key].find_mismatch(block) for block in recording.blocks(key)} == {""}
     untold = [remark for remark in conversion.remarks if remark.startswith("no bandwidth_hz for")]
     assert len(untold) == 1
     assert "µs late" in untold[0]

@@ -99,7 +99,7 @@ def test_a_device_that_hangs_is_removed_and_the_rig_continues() -> None:
         well.done(well.wait(1))
         well.done(well.wait(2))
         (reply,) = steps.join()
-        reason = f"it was not done with the block that ends at tick {BLOCK} within 0.05 s"
+        reason = f"it did not finish the block that ends at tick {BLOCK} within 0.05 s"
         assert reply.lost == {"ill": reason}
         assert {row["name"]: (row["state"], row["reason"]) for row in rig.console.status()["devices"]} == {
             "well": ("joined", None),

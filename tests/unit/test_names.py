@@ -25,9 +25,9 @@ def runtime(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_a_name_exists_while_it_is_held_by_one_process(runtime: Path) -> None:
-    with names.registered("one", "127.0.0.1:7777"):
-        assert names.running() == [names.Named(name="one", endpoint="127.0.0.1:7777", pid=os.getpid())]
-        assert names.endpoint_of("one", field="connect") == ("127.0.0.1", 7777)
+    with names.register_name("one", "127.0.0.1:7777"):
+        assert names.list_running() == [names.NamedRig(name="one", endpoint="127.0.0.1:7777", pid=os.getpid())]
+        assert names.resolve_endpoint("one", field="connect") == ("127.0.0.1", 7777)
         with pytest.raises(
             InputError, match=r"--name must be one that no other rig has \(process \d+ at 127.0.0.1:7777"
         ):
@@ -35,7 +35,7 @@ def test_a_name_exists_while_it_is_held_by_one_process(runtime: Path) -> None:
         assert stat.S_IMODE(runtime.stat().st_mode) == 0o700
         assert stat.S_IMODE((runtime / "one.json").stat().st_mode) == 0o600
     names.check_name("one")
-    assert names.running() == []
+    assert names.list_running() == []
 
 
 def test_the_name_of_a_killed_process_is_removed(runtime: Path) -> None:
@@ -44,13 +44,13 @@ def test_the_name_of_a_killed_process_is_removed(runtime: Path) -> None:
     with processes.start_python("-c", code) as child:
         assert child.stdout is not None
         assert child.stdout.readline() == "1\n"
-        assert [entry.pid for entry in names.running()] == [child.pid]
+        assert [entry.pid for entry in names.list_running()] == [child.pid]
         child.kill()
         child.wait()
     assert (runtime / "gone.json").exists()
-    assert names.running() == []
-    with names.registered("gone", "127.0.0.1:2"):
-        assert names.endpoint_of("gone", field="connect") == ("127.0.0.1", 2)
+    assert names.list_running() == []
+    with names.register_name("gone", "127.0.0.1:2"):
+        assert names.resolve_endpoint("gone", field="connect") == ("127.0.0.1", 2)
 
 
 @pytest.mark.parametrize("name", ["", ".lock", "../x", "a b", "a:1", "é", "x" * 65])
@@ -64,7 +64,7 @@ def test_an_unknown_name_is_refused_with_the_known_ones() -> None:
         InputError, match=r"HOST:PORT such as 127.0.0.1:7460, or the name of a running rig \(none runs\)"
     ):
         Console.open("bench", wait_s=0.0)
-    with names.registered("bench-2", "127.0.0.1:7777"), pytest.raises(InputError, match="such as bench-2; instead"):
+    with names.register_name("bench-2", "127.0.0.1:7777"), pytest.raises(InputError, match="such as bench-2; instead"):
         Daq.open("bench", wait_s=0.0)
     with pytest.raises(InputError, match="url must be zenoh:HOST:PORT"):
         Console.open("http://x")
@@ -75,7 +75,7 @@ def test_a_folder_writable_by_others_is_not_trusted(runtime: Path) -> None:
     runtime.mkdir(mode=0o700)
     runtime.chmod(0o777)
     with pytest.raises(InputError, match=r"a folder private to its owner \(chmod 700"):
-        names.running()
+        names.list_running()
 
 
 def test_a_free_port_is_chosen_by_default_on_loopback_only() -> None:

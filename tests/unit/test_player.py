@@ -628,23 +628,23 @@ def test_a_clock_reports_its_position() -> None:
 def test_a_client_with_little_room_is_not_overrun() -> None:
     now = [0.0]
     clients = Clients(now_s=lambda: now[0])
-    assert not clients.crowded(10**9, 10)
+    assert not clients.find_lagging(10**9, 10)
     clients.take(f"{wire.CLIENTS}/a", b'{"received_index": 1000}')
-    assert clients.crowded(1101, 100)
-    assert not clients.crowded(1100, 100)
+    assert clients.find_lagging(1101, 100)
+    assert not clients.find_lagging(1100, 100)
     clients.take(f"{wire.CLIENTS}/b", b'{"received_index": 1000, "room": 60}')
-    assert clients.crowded(1031, 100)
-    assert not clients.crowded(1030, 100)
-    assert clients.behind(1030) == 30
+    assert clients.find_lagging(1031, 100)
+    assert not clients.find_lagging(1030, 100)
+    assert clients.max_lag_rows(1030) == 30
     now[0] = 10.0
-    assert not clients.crowded(10**6, 100), "who is not heard any more is not waited for"
+    assert not clients.find_lagging(10**6, 100), "who is not heard any more is not waited for"
     clients.take(f"{wire.CLIENTS}/c", b'{"received_index": 0, "room": "much"}')
     assert clients.malformed == 1
     clients.take(f"{wire.CLIENTS}/d", b'{"received_index": null, "room": 60}')
-    assert clients.present == 1
-    assert not clients.crowded(5000, 100), "it is measured from where it joined"
-    assert clients.crowded(5031, 100)
+    assert clients.active_count == 1
+    assert not clients.find_lagging(5000, 100), "it is measured from where it joined"
+    assert clients.find_lagging(5031, 100)
     clients.take(f"{wire.CLIENTS}/d", b'{"received_index": 5031, "room": 60}')
-    assert not clients.crowded(5061, 100)
+    assert not clients.find_lagging(5061, 100)
     clients.take(f"{wire.CLIENTS}/d", b'{"received_index": 5031, "done": true}')
-    assert clients.present == 0
+    assert clients.active_count == 0

@@ -156,7 +156,7 @@ def test_over_the_memory_transport(path):
     for key, document in make_documents().items():
         server.answer(key, lambda _, document=document: encode_document(document))
     beats: list[dict] = []
-    server.hear(f"{CLIENTS}/*", lambda _, payload: beats.append(decode_document(payload)))
+    server.subscribe_reports(f"{CLIENTS}/*", lambda _, payload: beats.append(decode_document(payload)))
     server.announce()
     items = list(generate_stream(20))
     for item in items[:60]:

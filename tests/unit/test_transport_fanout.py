@@ -22,7 +22,7 @@ def test_clients_of_all_transports_subscribe_request_and_report() -> None:
     heard: list[tuple[int, str, bytes]] = []
     reports: list[bytes] = []
     tokens: list[tuple[int, bool]] = []
-    both.hear("rig/clients/*", lambda _, payload: reports.append(payload))
+    both.subscribe_reports("rig/clients/*", lambda _, payload: reports.append(payload))
     both.answer(wire.STATUS, lambda payload: payload + b"!")
     for number, server in enumerate(servers):
         client = MemoryClient(server)

@@ -19,7 +19,7 @@ from rig.base.errors import InputError
 from rig.base.wire import ALIVE
 from rig.cli.connections.connection import Connection
 from rig.serve.transport import NoReplyError
-from rig.serve.transport.endpoint import backlog_of, parse_endpoint
+from rig.serve.transport.endpoint import parse_endpoint, read_backlogs
 from rig.serve.transport.recovery import Recovery
 from rig.serve.transport.zenoh import ZenohClient, ZenohServer
 from tests.processes import free_endpoint
@@ -138,7 +138,7 @@ def test_a_failing_handler_still_handles_the_next_request(server: ZenohServer) -
         return payload[::-1]
 
     told: list[tuple[str, str]] = []
-    server.on_trouble(lambda where, error: told.append((where, str(error))))
+    server.on_failure(lambda where, error: told.append((where, str(error))))
     server.answer("rig/status", handler)
     with ZenohClient(server.endpoint) as client:
         assert client.request("rig/status", b"abc") == b"cba"
@@ -182,7 +182,7 @@ def test_every_first_request_is_answered(server: ZenohServer) -> None:
 def test_reports_reach_the_rig_and_not_the_own_subscriptions(server: ZenohServer) -> None:
     heard: list[tuple[str, bytes]] = []
     own: list[tuple[str, bytes]] = []
-    server.hear("rig/clients/*", lambda key, payload: heard.append((key, payload)))
+    server.subscribe_reports("rig/clients/*", lambda key, payload: heard.append((key, payload)))
     with ZenohClient(server.endpoint) as client:
         client.subscribe("rig/**", lambda key, payload: own.append((key, payload)))
         client.report("rig/clients/a", b"1")
@@ -305,7 +305,7 @@ class Subscription:
         self.pauses += 1
 
     def heartbeat(self) -> None:
-        self.stream.at_least(("a", 1), "rig/x", self.publisher.sent - 1)
+        self.stream.record_sent(("a", 1), "rig/x", self.publisher.sent - 1)
 
 
 @pytest.mark.parametrize("seed", range(60))
@@ -557,12 +557,12 @@ def test_backlog_counts_unread_messages() -> None:
         listener.listen()
         port = listener.getsockname()[1]
         with socket.create_connection(("127.0.0.1", port)) as idle, listener.accept()[0] as sender:
-            if not backlog_of(port):
+            if not read_backlogs(port):
                 pytest.skip("this system does not tell")
             sender.sendall(bytes(100_000))
             peer = idle.getsockname()[1]
-            until(lambda: sum(backlog_of(port).values()) == 100_000)
-            assert backlog_of(port) == {peer: 100_000}
+            until(lambda: sum(read_backlogs(port).values()) == 100_000)
+            assert read_backlogs(port) == {peer: 100_000}
 
 
 def test_a_plain_subscriber_recovers_from_the_cache_as_documented(

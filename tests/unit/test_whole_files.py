@@ -14,7 +14,7 @@ from rig.base.checks import read_toml
 from rig.base.errors import DiskError, InputError, check_new_file, check_not_among, whole_file
 from rig.cli.app import start
 from rig.run.scenes import load_scene, parse_scene
-from rig.serve.transport.exposure.certificates import holder_in, make
+from rig.serve.transport.exposure.certificates import create_keys, read_holder
 
 
 @pytest.mark.parametrize("error", [OSError(28, "No space left on device"), RuntimeError("System error."), ValueError()])
@@ -89,11 +89,11 @@ def test_a_value_of_another_type_is_shown(words: list[str], field: str, capsys: 
 
 
 def test_a_key_readable_by_others_is_refused(tmp_path: Path) -> None:
-    make(tmp_path / "keys")
-    holder_in(tmp_path / "keys", server=True)
+    create_keys(tmp_path / "keys")
+    read_holder(tmp_path / "keys", server=True)
     (tmp_path / "keys" / "server" / "key.pem").chmod(0o640)
     with pytest.raises(InputError, match=r"chmod 600 .*key.pem"):
-        holder_in(tmp_path / "keys", server=True)
+        read_holder(tmp_path / "keys", server=True)
 
 
 def test_a_quoted_number_is_refused() -> None:

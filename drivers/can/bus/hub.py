@@ -27,7 +27,7 @@ from rig.base import wire
 from rig.base.checks import check
 from rig.base.closeable import Closing
 from rig.base.errors import InputError
-from rig.serve.health import Guard, Rising
+from rig.serve.health import Guard, IncreaseWarning
 from rig.serve.transport.limit import Bucket
 
 if TYPE_CHECKING:
@@ -102,8 +102,10 @@ class Hub(Closing):
         self._counts: Counter[str] = Counter()
         self.endpoints = Endpoints(model, self._counts, lambda: self._advance(self._now()))
         self._guard = Guard(f"CAN {channel}: the hub")
-        self._forging = Rising(f"CAN {channel}: " + "{} times a client used the name of another endpoint")
-        self._losing = Rising(f"CAN {channel}: " + "{} frames were not sent: more than the bus or a node accepts")
+        self._forging = IncreaseWarning(f"CAN {channel}: " + "{} times a client used the name of another endpoint")
+        self._losing = IncreaseWarning(
+            f"CAN {channel}: " + "{} frames were not sent: more than the bus or a node accepts"
+        )
         self._outbox: list[np.ndarray] = []
         self._report_due = False
         self._next_report_ns = 0
@@ -122,9 +124,9 @@ class Hub(Closing):
         if self._server is not None:
             for name in codec.REQUESTS:
                 self._server.answer(codec.request_key(self.channel, name), partial(self.reply, name))
-            self._server.on_trouble(self._guard.tell)
+            self._server.on_failure(self._guard.record_failure)
             self._server.watch(codec.node_key(self.channel, "*"), self.watch)
-            self._server.hear(
+            self._server.subscribe_reports(
                 codec.offer_key(self.channel, "*"), lambda key, payload: self.offer(key.rpartition("/")[2], payload)
             )
         self._thread.start()

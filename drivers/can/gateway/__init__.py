@@ -28,8 +28,8 @@ from rig.base import wire
 from rig.base.checks import DOCUMENT_BYTES, Outside, check, input_error
 from rig.base.closeable import Closing
 from rig.channels.table import ChannelTable
-from rig.serve.health import Guard, Rising
-from rig.serve.stream_check import block_end_in
+from rig.serve.health import Guard, IncreaseWarning
+from rig.serve.stream_check import parse_block_end
 from rig.serve.transport import Client
 from rig.serve.waiting import BoundedQueue
 
@@ -141,8 +141,8 @@ class Gateway(Closing):
         self.bus_errors = 0
         """Errors of the bus while receiving."""
         self.guard = Guard("the CAN gateway")
-        self.dropping = Rising("CAN: {} frames were dropped: the bus does not take them in time")
-        self._falling_behind = Rising("CAN: {} blocks were dropped: the gateway does not keep up")
+        self.dropping = IncreaseWarning("CAN: {} frames were dropped: the bus does not take them in time")
+        self._falling_behind = IncreaseWarning("CAN: {} blocks were dropped: the gateway does not keep up")
         room = math.ceil(_MAX_BACKLOG_S * sum(1.0 / period_s for period_s in schedule.messages().values()))
         self.outbox = Outbox(bus, room=room, paced=paced, now=now)
         self.commands = Commands(
@@ -283,7 +283,7 @@ class Gateway(Closing):
             self._status = wire.decode_document(payload)
             self._follow_pace(self._status)
         elif key == wire.BLOCK:
-            end = block_end_in(payload)
+            end = parse_block_end(payload)
             time_us = round(1e6 * end.time_s)
             self.outbox.put_one(
                 self._messages["Block"], end.time_s, block=end.block & _WORD_32, time=time_us & _WORD_32
@@ -428,7 +428,7 @@ class Gateway(Closing):
                 # Bus off, or no hub: it may recover, and the rig continues meanwhile.
                 self.bus_errors += 1
                 if not isinstance(error, (can.CanError, OSError, ValueError)):
-                    self.guard.tell("receiving from the bus", error)
+                    self.guard.record_failure("receiving from the bus", error)
                 time.sleep(0.1)
                 continue
             if message is not None:

@@ -161,7 +161,7 @@ class Commands:
         except Exception as error:
             reply = None
             if not isinstance(error, (NoReplyError, ValueError)):
-                self._guard.tell("sending a command to the rig", error)
+                self._guard.record_failure("sending a command to the rig", error)
         if not self._mark_answered(item):
             return
         if reply is None:

@@ -361,9 +361,9 @@ class Bench(Closing):
 
     def scene_document(self) -> dict[str, Any]:
         """Return the scene of an existing rig or recording, with its name."""
-        from rig.serve.transport.zenoh import client_of
+        from rig.serve.transport.zenoh import connect_url
 
-        with client_of(self.url, wait_s=30.0) as client:
+        with connect_url(self.url, wait_s=30.0) as client:
             document = wire.decode_document(client.request(wire.SCENE))
         return {**document.get("scene", {}), "name": document.get("name")}
 

@@ -29,10 +29,10 @@ class Record:
 
     def __init__(self, bench: Bench, path: Path) -> None:
         from recorder.session import RecordingSession
-        from rig.serve.transport.zenoh import client_of
+        from rig.serve.transport.zenoh import connect_url
 
         self.path, self._bench = path, bench
-        self._client = client_of(bench.url, wait_s=_BEGIN_S)
+        self._client = connect_url(bench.url, wait_s=_BEGIN_S)
         own = bench.target.own
         # Plots come from the evidence, so the whole recording needs no data for views.
         self._session: RecordingSession = RecordingSession(

@@ -101,9 +101,9 @@ def init(
     """
     from rig.serve.transport import EXPOSED_PORT
     from rig.serve.transport.exposure.access import ROLES
-    from rig.serve.transport.exposure.certificates import SERVER, make
+    from rig.serve.transport.exposure.certificates import SERVER, create_keys
 
-    names = make(folder, hosts=host or [], days=days, truth=truth or [], force=force)
+    names = create_keys(folder, hosts=host or [], days=days, truth=truth or [], force=force)
     echo(f"{folder / SERVER}: stays on this computer, {', '.join(names)}:")
     echo(f"    rig run SCENE --expose {names[0]} --tls {folder}")
     for role in ROLES:

@@ -118,9 +118,9 @@ def replay(
     From another terminal: `rig pause`, `rig resume`, `rig seek S`, `rig rate X`, `rig step`, `rig stop`, `rig status`.
     """
     serving.exposure()  # checks these options first
-    from rig.serve.pacing import FreeRun, RealTime, rare_collections
+    from rig.serve.pacing import FreeRun, RealTime, reduce_garbage_collections
 
-    with rare_collections():
+    with reduce_garbage_collections():
         from replays.player.messages import Track
         from replays.player.player import Player
         from replays.player.playhead import check_rate

@@ -44,9 +44,9 @@ def run(
     serving.exposure()  # checks these options first
     overrides = scene_changes.overrides()
 
-    from rig.serve.pacing import rare_collections
+    from rig.serve.pacing import reduce_garbage_collections
 
-    with rare_collections():
+    with reduce_garbage_collections():
         from rig.run.scenes import load_scene
         from rig.run.simulation import Simulation
         from rig.serve.service import Service

@@ -26,9 +26,9 @@ def simulate(
     """Simulate a scene at full speed and write it to a file: every state, force and sensor, with units."""
     import time
 
-    from rig.serve.pacing import rare_collections
+    from rig.serve.pacing import reduce_garbage_collections
 
-    with rare_collections():
+    with reduce_garbage_collections():
         from replays.recordings.export import check_run_output, write_run
         from rig.run.scenes import load_scene
 

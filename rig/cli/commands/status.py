@@ -40,9 +40,9 @@ def status(
 
 
 def _list(form: Form) -> None:
-    from rig.serve.transport.names import running
+    from rig.serve.transport.names import list_running
 
-    rigs = [entry.model_dump() for entry in running()]
+    rigs = [entry.model_dump() for entry in list_running()]
     if form.as_json:
         echo_json(rigs)
         return

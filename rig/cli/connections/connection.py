@@ -148,11 +148,11 @@ class Serving:
             made = f"rig keys init DIR --host {self.expose.partition(':')[0]}"
             must = f"given with --tls DIR (create it: {made}), or --plaintext"
             raise InputError("--expose", must, Words("both" if self.plaintext else "neither"))
-        from rig.serve.transport.exposure.certificates import holder_in
+        from rig.serve.transport.exposure.certificates import read_holder
         from rig.serve.transport.zenoh import Exposure
 
         endpoint = self.expose if ":" in self.expose else f"{self.expose}:{EXPOSED_PORT}"
-        return Exposure(endpoint, None if self.tls is None else holder_in(self.tls, server=True))
+        return Exposure(endpoint, None if self.tls is None else read_holder(self.tls, server=True))
 
 
 def show(accepted: Accepted, what: str) -> None:
@@ -161,7 +161,7 @@ def show(accepted: Accepted, what: str) -> None:
 
 
 def serve(
-    make: Callable[[Server], ServedRun],
+    create_keys: Callable[[Server], ServedRun],
     words: Callable[[dict[str, Any]], list[str]],
     tell: Callable[[dict[str, Any]], None],
     *,
@@ -173,7 +173,7 @@ def serve(
     """Serve a run to its end; exit status 1 if something failed without ending the run.
 
     Args:
-        make: Creates the run on a server.
+        create_keys: Creates the run on a server.
         words: Returns the parts of a progress line from a status.
         tell: Prints the summary.
         serving: Addresses to serve at.
@@ -181,18 +181,18 @@ def serve(
         paced: The run follows the wall clock.
         wait: The run waits for stalled clients.
     """
-    from rig.serve.pacing import rare_collections
-    from rig.serve.transport.names import registered
+    from rig.serve.pacing import reduce_garbage_collections
+    from rig.serve.transport.names import register_name
     from rig.serve.transport.zenoh import ZenohServer
 
     exposed = serving.exposure()
     with (
         ZenohServer(serving.listen, exposed=exposed, wait=wait) as server,
-        nullcontext() if serving.name is None else registered(serving.name, server.endpoint),
+        nullcontext() if serving.name is None else register_name(serving.name, server.endpoint),
         bus or nullcontext(),
     ):
-        with rare_collections():
-            run = make(server if bus is None else bus.join_server(server))
+        with reduce_garbage_collections():
+            run = create_keys(server if bus is None else bus.join_server(server))
             run.prepare()
             if bus is not None:
                 bus.start(paced=paced)

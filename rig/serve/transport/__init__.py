@@ -35,11 +35,11 @@ class Server(Protocol):
         """Answer requests on all matching keys by a handler of key and payload; the answer may come later."""
         ...
 
-    def on_trouble(self, tell: Callable[[str, BaseException], None]) -> None:
+    def on_failure(self, callback: Callable[[str, BaseException], None]) -> None:
         """Set the function that receives place and error of failures on the transport's threads, which continue."""
         ...
 
-    def hear(self, key: str, callback: Callable[[str, bytes], None]) -> None:
+    def subscribe_reports(self, key: str, callback: Callable[[str, bytes], None]) -> None:
         """Receive the clients' reports on keys that match `key` (for example `rig/clients/*`)."""
         ...
 

@@ -14,19 +14,19 @@ from rig.base.checks import Count, Name, Outside, a_line, check
 from rig.serve.transport import Client, Server
 from rig.serve.waiting import Deadline
 
-SHOWN = 64
+MAX_STATUS_CLIENTS = 64
 """Number of clients in the status."""
-MOST = 4096
+MAX_CLIENTS = 4096
 """Number of client names remembered; enough that invented names do not displace active clients."""
-_FORGOTTEN_S = 600.0
-_GONE_S = 3.0
+_RETENTION_S = 600.0
+_SILENCE_LIMIT_S = 3.0
 """Time without a report after which a client is no longer waited for [s]; clients report twice a second."""
-_QUIET_S = 0.6
+_SETTLING_S = 0.6
 """Time without a lagging client before the cache may be dropped at the end of a run [s]: two heartbeats."""
-_STUCK_S = 60.0
+_PROGRESS_LIMIT_S = 60.0
 """Time without progress after which a reporting client is no longer waited for, during a run [s]."""
-_STUCK_AT_END_S = 3.0
-_STRANGERS_S = 0.4
+_PROGRESS_LIMIT_AT_END_S = 3.0
+_STALLED_LINK_WAIT_S = 0.4
 """Extra wait for a stalled link at the end of a run, when all reporting clients have everything [s]."""
 
 
@@ -66,7 +66,7 @@ class Reporter:
         self._name = name
         self._secret = secrets.token_hex(16)
 
-    def tell(self, received_index: int | None, *, lost: int, room: int | None = None, done: bool = False) -> None:
+    def send(self, received_index: int | None, *, lost: int, room: int | None = None, done: bool = False) -> None:
         """Send a report; arguments as of `Report`."""
         report = Report(
             name=self._name, received_index=received_index, lost=lost, room=room, done=done, secret=self._secret
@@ -75,25 +75,25 @@ class Reporter:
 
 
 @dataclass(frozen=True, slots=True)
-class _Heard:
+class _LastReport:
     received_index: int | None
     """None: subscribed, and nothing received."""
     lost: int
-    heard_s: float
+    report_s: float
     room: int | None
-    moved_s: float
+    progress_s: float
     """When it last made progress."""
-    from_index: int
-    from_s: float
+    start_index: int
+    start_s: float
     """Its position at the first report, or after the last step back."""
 
     @property
     def pace(self) -> float:
         """Its progress [rows/s]."""
-        return ((self.received_index or 0) - self.from_index) / max(self.heard_s - self.from_s, 1.0)
+        return ((self.received_index or 0) - self.start_index) / max(self.report_s - self.start_s, 1.0)
 
 
-_Who = tuple[str, str | None]
+_ClientKey = tuple[str, str | None]
 """Name and secret."""
 
 
@@ -107,8 +107,8 @@ class Clients:
     def __init__(self, *, now_s: Callable[[], float] = time.monotonic) -> None:
         self._now_s = now_s
         self._lock = threading.Lock()
-        self._reports: dict[_Who, _Heard] = {}
-        self._joined: dict[_Who, int] = {}
+        self._reports: dict[_ClientKey, _LastReport] = {}
+        self._first_rows: dict[_ClientKey, int] = {}
         """Next row when a client without data was first seen: the reference for its lag."""
         self._swept_s = now_s()
         self.malformed = 0
@@ -122,41 +122,41 @@ class Clients:
         except ValueError:
             self.malformed += 1
             return
-        now_s, who, index = self._now_s(), (name, report.secret), report.received_index
+        now_s, client, index = self._now_s(), (name, report.secret), report.received_index
         with self._lock:
             if report.done:
-                self._forget(who)
+                self._forget(client)
                 return
-            before = self._reports.get(who)
-            if before is None:
+            previous = self._reports.get(client)
+            if previous is None:
                 self._make_room(now_s)
-                origin, moved_s = (index or 0, now_s), now_s
+                origin, progress_s = (index or 0, now_s), now_s
             else:
-                step = (index or 0) - (before.received_index or 0)
-                begins = step < 0 or before.received_index is None
-                origin = (index or 0, now_s) if begins else (before.from_index, before.from_s)
-                moved_s = now_s if step > 0 else before.moved_s
-            self._reports[who] = _Heard(index, report.lost, now_s, report.room, moved_s, *origin)
+                step = (index or 0) - (previous.received_index or 0)
+                begins = step < 0 or previous.received_index is None
+                origin = (index or 0, now_s) if begins else (previous.start_index, previous.start_s)
+                progress_s = now_s if step > 0 else previous.progress_s
+            self._reports[client] = _LastReport(index, report.lost, now_s, report.room, progress_s, *origin)
 
     def _make_room(self, now_s: float) -> None:
         """Remove silent clients, otherwise the slowest quarter."""
-        if len(self._reports) < MOST and now_s - self._swept_s < _FORGOTTEN_S:
+        if len(self._reports) < MAX_CLIENTS and now_s - self._swept_s < _RETENTION_S:
             return
         self._swept_s = now_s
-        for who in [who for who, row in self._reports.items() if now_s - row.heard_s > _FORGOTTEN_S]:
-            self._forget(who)
-        if len(self._reports) >= MOST:
-            for who in sorted(self._reports, key=lambda who: self._reports[who].pace)[: MOST // 4]:
-                self._forget(who)
+        for client in [client for client, row in self._reports.items() if now_s - row.report_s > _RETENTION_S]:
+            self._forget(client)
+        if len(self._reports) >= MAX_CLIENTS:
+            for client in sorted(self._reports, key=lambda client: self._reports[client].pace)[: MAX_CLIENTS // 4]:
+                self._forget(client)
 
-    def _forget(self, who: _Who) -> None:
-        self._reports.pop(who, None)
-        self._joined.pop(who, None)
+    def _forget(self, client: _ClientKey) -> None:
+        self._reports.pop(client, None)
+        self._first_rows.pop(client, None)
 
     @property
-    def present(self) -> int:
+    def active_count(self) -> int:
         """Number of clients that reported recently."""
-        return len(self._live())
+        return len(self._active_clients())
 
     def rows(self, published: int, rate_hz: float) -> dict[str, dict[str, Any]]:
         """Return the clients for the status.
@@ -170,55 +170,59 @@ class Clients:
             # The most active clients first: names can be invented in large numbers.
             first = sorted(self._reports.items(), key=lambda row: -row[1].pace)
         rows: dict[str, dict[str, Any]] = {}
-        for who, report in first[:SHOWN]:
-            name = who[0]
+        for client, report in first[:MAX_STATUS_CLIENTS]:
+            name = client[0]
             while name in rows:
                 name += " (another)"
             rows[name] = {
                 "received_index": report.received_index,
-                "lag_s": round(self._lacks(who, report, published) / rate_hz, 4) if rate_hz else 0.0,
-                "last_heard_s": round(now_s - report.heard_s, 3),
+                "lag_s": round(self._lag_rows(client, report, published) / rate_hz, 4) if rate_hz else 0.0,
+                "last_heard_s": round(now_s - report.report_s, 3),
                 "lost": report.lost,
             }
         return rows
 
     @property
-    def hidden(self) -> int:
+    def hidden_count(self) -> int:
         """Number of clients that the status does not show."""
-        return max(0, len(self._reports) - SHOWN)
+        return max(0, len(self._reports) - MAX_STATUS_CLIENTS)
 
-    def behind(self, published: int, *, silent: bool = False, stuck_s: float = _STUCK_S) -> int:
+    def max_lag_rows(self, published: int, *, silent: bool = False, progress_limit_s: float = _PROGRESS_LIMIT_S) -> int:
         """Return the lag of the slowest present client [rows]; 0 without clients.
 
         Args:
             published: Index after the last published row.
             silent: Include clients that no longer report.
-            stuck_s: Exclude clients without progress for this long [s].
+            progress_limit_s: Exclude clients without progress for this long [s].
         """
-        live = self._live(silent=silent, stuck_s=stuck_s)
-        return max((self._lacks(who, report, published) for who, report in live.items()), default=0)
+        active = self._active_clients(silent=silent, progress_limit_s=progress_limit_s)
+        return max((self._lag_rows(client, report, published) for client, report in active.items()), default=0)
 
-    def crowded(self, published: int, most: int) -> str | None:
-        """Return the name of a present client that lags by more than `most` rows, or than half of its room."""
-        for who, report in self._live().items():
-            if self._lacks(who, report, published) > (most if report.room is None else min(most, report.room // 2)):
-                return who[0]
+    def find_lagging(self, published: int, max_rows: int) -> str | None:
+        """Return the name of a present client that lags by more than `max_rows` rows, or than half of its room."""
+        for client, report in self._active_clients().items():
+            if self._lag_rows(client, report, published) > (
+                max_rows if report.room is None else min(max_rows, report.room // 2)
+            ):
+                return client[0]
         return None
 
-    def _lacks(self, who: _Who, report: _Heard, published: int) -> int:
+    def _lag_rows(self, client: _ClientKey, report: _LastReport, published: int) -> int:
         """Return the number of rows that a client has not received."""
-        has = report.received_index
-        return max(0, published - (self._joined.setdefault(who, published) if has is None else has))
+        next_row = report.received_index
+        return max(0, published - (self._first_rows.setdefault(client, published) if next_row is None else next_row))
 
-    def _live(self, *, silent: bool = False, stuck_s: float = _STUCK_S) -> dict[_Who, _Heard]:
+    def _active_clients(
+        self, *, silent: bool = False, progress_limit_s: float = _PROGRESS_LIMIT_S
+    ) -> dict[_ClientKey, _LastReport]:
         now_s = self._now_s()
         with self._lock:
             return {
-                who: row
-                for who, row in self._reports.items()
+                client: row
+                for client, row in self._reports.items()
                 # A silent client is suspended, not stuck, and may continue.
-                if (row.heard_s - row.moved_s < stuck_s and now_s - row.heard_s < _GONE_S)
-                or (silent and now_s - row.heard_s >= _GONE_S)
+                if (row.report_s - row.progress_s < progress_limit_s and now_s - row.report_s < _SILENCE_LIMIT_S)
+                or (silent and now_s - row.report_s >= _SILENCE_LIMIT_S)
             }
 
     def settle(self, server: Server, published: int, *, patience_s: float) -> None:
@@ -229,13 +233,13 @@ class Clients:
             published: Index after the last published row.
             patience_s: Longest wait [s].
         """
-        quiet_since = strangers_since = time.monotonic()
+        caught_up_since = stalled_since = time.monotonic()
         for _ in Deadline(patience_s).polls(0.1):
             counts, now = server.congestion(), time.monotonic()
-            if not counts.get("links", 0) or now - quiet_since >= _QUIET_S:
+            if not counts.get("links", 0) or now - caught_up_since >= _SETTLING_S:
                 return
             stalled = counts.get("stalled_links", 0) > 0
-            if self.behind(published, silent=stalled, stuck_s=_STUCK_AT_END_S):
-                quiet_since = strangers_since = now
-            elif stalled and now - strangers_since < _STRANGERS_S:
-                quiet_since = now
+            if self.max_lag_rows(published, silent=stalled, progress_limit_s=_PROGRESS_LIMIT_AT_END_S):
+                caught_up_since = stalled_since = now
+            elif stalled and now - stalled_since < _STALLED_LINK_WAIT_S:
+                caught_up_since = now

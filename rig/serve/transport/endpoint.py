@@ -49,7 +49,7 @@ def parse_loopback(text: str, *, field: str, least: int = 1) -> tuple[str, int]:
     return host, port
 
 
-def place_to_listen(text: str, *, field: str) -> tuple[str, int]:
+def choose_listen_address(text: str, *, field: str) -> tuple[str, int]:
     """Return host and port as `parse_loopback` does; port 0 is replaced by a free port.
 
     Raises:
@@ -66,7 +66,7 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def check_free(place: tuple[str, int], *, field: str) -> None:
+def check_free(address: tuple[str, int], *, field: str) -> None:
     """Raise an error early for an address that cannot be listened on.
 
     Raises:
@@ -75,18 +75,18 @@ def check_free(place: tuple[str, int], *, field: str) -> None:
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
-            probe.bind(place)
+            probe.bind(address)
         except OSError as error:
-            raise not_free(field, "{}:{}".format(*place), in_use=error.errno == errno.EADDRINUSE) from None
+            raise build_address_error(field, "{}:{}".format(*address), in_use=error.errno == errno.EADDRINUSE) from None
 
 
-def not_free(field: str, endpoint: str, *, in_use: bool) -> InputError:
+def build_address_error(field: str, endpoint: str, *, in_use: bool) -> InputError:
     """Return the error for an address that cannot be listened on."""
     must = "a free address (another rig runs there, or another program)"
     return InputError(field, must if in_use else "an address of this machine that can be listened on", endpoint)
 
 
-def backlog_of(port: int) -> dict[int, int]:
+def read_backlogs(port: int) -> dict[int, int]:
     """Return the bytes in flight of each link of a listening port, by the other side's port (Linux).
 
     Counts bytes that our socket has not sent and, if the other side is on this computer, those that it has not read.
@@ -98,7 +98,7 @@ def backlog_of(port: int) -> dict[int, int]:
                 fields = row.split()
                 if fields[3] != "01":  # established
                     continue
-                local, remote = (int(fields[n].rpartition(":")[2], 16) for n in (1, 2))
+                local, remote = (int(fields[column].rpartition(":")[2], 16) for column in (1, 2))
                 unsent, unread = (int(part, 16) for part in fields[4].split(":"))
                 if local == port:
                     found[remote] = found.get(remote, 0) + unsent
@@ -107,7 +107,7 @@ def backlog_of(port: int) -> dict[int, int]:
     return found
 
 
-def hang_up(port: int, peers: set[int]) -> None:
+def close_links(port: int, peers: set[int]) -> None:
     """Close the links of a listening port to some peer ports (Linux); data in transit still arrives."""
     for file in Path("/proc/self/fd").iterdir() if peers else ():
         with contextlib.suppress(OSError), socket.socket(fileno=os.dup(int(file.name))) as link:

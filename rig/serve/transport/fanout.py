@@ -46,15 +46,15 @@ class Fanout:
         for server in self._servers:
             server.answer_all(expression, handler)
 
-    def on_trouble(self, tell: Callable[[str, BaseException], None]) -> None:
+    def on_failure(self, callback: Callable[[str, BaseException], None]) -> None:
         """Report failures on the threads of all transports."""
         for server in self._servers:
-            server.on_trouble(tell)
+            server.on_failure(callback)
 
-    def hear(self, key: str, callback: Callable[[str, bytes], None]) -> None:
+    def subscribe_reports(self, key: str, callback: Callable[[str, bytes], None]) -> None:
         """Receive the reports of clients of all transports."""
         for server in self._servers:
-            server.hear(key, callback)
+            server.subscribe_reports(key, callback)
 
     def announce(self) -> None:
         """Publish the rig's token on all transports."""

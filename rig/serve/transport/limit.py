@@ -19,17 +19,17 @@ class Bucket:
 
     def __init__(self, rate_hz: float, burst: float, now_s: float) -> None:
         self._rate_hz, self._burst = rate_hz, burst
-        self._left, self._at_s = burst, now_s
+        self._tokens, self._updated_s = burst, now_s
 
-    def left(self, now_s: float) -> float:
+    def count_tokens(self, now_s: float) -> float:
         """Return the number of tokens now."""
-        self._left = min(self._burst, self._left + self._rate_hz * (now_s - self._at_s))
-        self._at_s = now_s
-        return self._left
+        self._tokens = min(self._burst, self._tokens + self._rate_hz * (now_s - self._updated_s))
+        self._updated_s = now_s
+        return self._tokens
 
-    def take(self) -> None:
+    def remove_token(self) -> None:
         """Remove a token."""
-        self._left -= 1.0
+        self._tokens -= 1.0
 
 
 class CommandLimit:
@@ -46,7 +46,7 @@ class CommandLimit:
     ) -> None:
         self._rate_hz, self._burst, self._now_s = rate_hz, burst, now_s
         self._lock = threading.Lock()
-        self._all = Bucket(_COMMON_FACTOR * rate_hz, _COMMON_FACTOR * burst, now_s())
+        self._common = Bucket(_COMMON_FACTOR * rate_hz, _COMMON_FACTOR * burst, now_s())
         self.senders: dict[str, Bucket] = {}
         """Senders with a separate limit, least recent first."""
         self.refused = 0
@@ -64,9 +64,9 @@ class CommandLimit:
             if len(self.senders) >= _MAX_SENDERS:
                 del self.senders[next(iter(self.senders))]  # the least recent sender
             self.senders[sender] = bucket
-            if bucket.left(now_s) >= 1.0 and self._all.left(now_s) >= 1.0:
-                bucket.take()
-                self._all.take()
+            if bucket.count_tokens(now_s) >= 1.0 and self._common.count_tokens(now_s) >= 1.0:
+                bucket.remove_token()
+                self._common.remove_token()
                 return
             self.refused += 1
         must = f"at most {self._rate_hz:g} per second from one sender, {_COMMON_FACTOR * self._rate_hz:g} from all"

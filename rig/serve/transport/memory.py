@@ -64,10 +64,10 @@ class MemoryServer(Closing):
         with self._lock:
             self._handlers[expression] = handler
 
-    def on_trouble(self, tell: Callable[[str, BaseException], None]) -> None:
+    def on_failure(self, callback: Callable[[str, BaseException], None]) -> None:
         """Ignore the function: without threads, failures reach the caller."""
 
-    def hear(self, key: str, callback: Callable[[str, bytes], None]) -> None:
+    def subscribe_reports(self, key: str, callback: Callable[[str, bytes], None]) -> None:
         """Receive the clients' reports on matching keys."""
         with self._lock:
             self._listeners.append((key, callback))

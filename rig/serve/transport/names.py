@@ -30,7 +30,7 @@ _POLL_S = 0.1
 """Period of looking for a rig that has not started yet [s]."""
 
 
-class Named(Outside):
+class NamedRig(Outside):
     """A running rig with a name."""
 
     name: str
@@ -53,7 +53,7 @@ def parse_name(text: str, *, field: str = "--name") -> str:
 
 
 @contextmanager
-def registered(name: str, endpoint: str) -> Iterator[None]:
+def register_name(name: str, endpoint: str) -> Iterator[None]:
     """Register a name until the end of the block or of the process.
 
     Raises:
@@ -62,27 +62,27 @@ def registered(name: str, endpoint: str) -> Iterator[None]:
     import fcntl
 
     file = _folder() / (parse_name(name) + _SUFFIX)
-    with _alone():
-        taken = _read(file)
-        if taken is not None:
-            raise InputError("--name", f"one that no other rig has (process {taken.pid} at {taken.endpoint})", name)
-        entry = Named(name=name, endpoint=endpoint, pid=os.getpid())
+    with _hold_lock():
+        owner = _read_entry(file)
+        if owner is not None:
+            raise InputError("--name", f"one that no other rig has (process {owner.pid} at {owner.endpoint})", name)
+        entry = NamedRig(name=name, endpoint=endpoint, pid=os.getpid())
         handle = os.open(file, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
         fcntl.flock(handle, fcntl.LOCK_EX)
         os.write(handle, entry.model_dump_json().encode())
     try:
         yield
     finally:
-        with _alone():
+        with _hold_lock():
             file.unlink(missing_ok=True)
             os.close(handle)
 
 
-def running() -> list[Named]:
+def list_running() -> list[NamedRig]:
     """Return the running rigs that have a name, sorted by name."""
-    with _alone():
+    with _hold_lock():
         files = sorted(_folder().glob(f"*{_SUFFIX}"))
-        return [entry for entry in map(_read, files) if entry is not None]
+        return [entry for entry in map(_read_entry, files) if entry is not None]
 
 
 def check_name(name: str) -> None:
@@ -91,11 +91,11 @@ def check_name(name: str) -> None:
     Raises:
         InputError: The name is invalid, or a running rig has it.
     """
-    with registered(name, DEFAULT_ENDPOINT):
+    with register_name(name, DEFAULT_ENDPOINT):
         pass
 
 
-def endpoint_of(text: str, *, field: str, wait_s: float = 0.0) -> tuple[str, int]:
+def resolve_endpoint(text: str, *, field: str, wait_s: float = 0.0) -> tuple[str, int]:
     """Return the address of a rig given by HOST:PORT or by its name; the only place that resolves names.
 
     Args:
@@ -111,14 +111,14 @@ def endpoint_of(text: str, *, field: str, wait_s: float = 0.0) -> tuple[str, int
         return parse_endpoint(text, field=field)
     found = {}
     for _ in Deadline(wait_s).polls(_POLL_S):
-        found = {entry.name: entry.endpoint for entry in running()} if _NAME.fullmatch(text) else {}
+        found = {entry.name: entry.endpoint for entry in list_running()} if _NAME.fullmatch(text) else {}
         if text in found:
             return parse_endpoint(found[text], field=field)
     must = f"HOST:PORT such as {DEFAULT_ENDPOINT}, or the name of a running rig"
     raise (UnknownNameError(field, must, text, found) if found else InputError(field, f"{must} (none runs)", text))
 
 
-def address_in(url: str) -> str:
+def parse_url(url: str) -> str:
     """Return the address part of a URL: zenoh:HOST:PORT[?tls=DIR], zenoh:NAME, or a name alone.
 
     Raises:
@@ -149,7 +149,7 @@ def _folder() -> Path:
 
 
 @contextmanager
-def _alone() -> Iterator[None]:
+def _hold_lock() -> Iterator[None]:
     """Hold the lock for reading and changing the names."""
     import fcntl
 
@@ -161,7 +161,7 @@ def _alone() -> Iterator[None]:
         os.close(handle)
 
 
-def _read(file: Path) -> Named | None:
+def _read_entry(file: Path) -> NamedRig | None:
     """Return the rig of a file; remove the file of an ended process."""
     import fcntl
 
@@ -170,7 +170,7 @@ def _read(file: Path) -> Named | None:
             fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             with contextlib.suppress(InputError):
-                return check(Named, opened.read(), field="name")
+                return check(NamedRig, opened.read(), field="name")
         else:
             file.unlink()
     return None

@@ -7,8 +7,8 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-_BLOCKS_A_SECOND = 100
-CACHE = 30 * _BLOCKS_A_SECOND
+_BLOCKS_PER_SECOND = 100
+CACHE = 30 * _BLOCKS_PER_SECOND
 """Number of messages that the rig keeps per key for recovery."""
 _BATCH = 200
 """Messages requested at a time, below 1 MB: a publisher waits while its cache answers, and sockets hold that much."""
@@ -27,7 +27,7 @@ class Recovery:
     without requesting it, if the gap appears while the query of a heartbeat is open, and loses history in the same way.
 
     Args:
-        ask: Returns selected messages from a publisher's cache: key, publisher, selection -> samples.
+        query_cache: Returns selected messages from a publisher's cache: key, publisher, selection -> samples.
         on_message: Receives key and payload, in order, each once.
         on_miss: Receives key and number of messages that cannot be recovered.
         history: Begin with the content of the caches, not with the first message that arrives.
@@ -37,7 +37,7 @@ class Recovery:
 
     def __init__(
         self,
-        ask: Callable[[str, Publisher, str], list[Any]],
+        query_cache: Callable[[str, Publisher, str], list[Any]],
         on_message: Callable[[str, bytes], None],
         on_miss: Callable[[str, int], None] | None,
         *,
@@ -45,7 +45,7 @@ class Recovery:
         cache: int = CACHE,
         pause: Callable[[float], None] = time.sleep,
     ) -> None:
-        self._ask = ask
+        self._query_cache = query_cache
         self._on_message = on_message
         self._on_miss = on_miss
         self._history = history
@@ -56,20 +56,20 @@ class Recovery:
         """Number of the last message of each publisher that was delivered or given up."""
         self._floor: dict[Publisher, int] = {}
         """Without history: last number of a publisher when it was first seen; later messages must be delivered."""
-        self._behind: dict[Publisher, int | None] = {}
+        self._heartbeat_numbers: dict[Publisher, int | None] = {}
         """Our last number at a publisher's previous heartbeat, if it was lower."""
-        self._handed: dict[str, int] = {}
-        self._news = threading.Condition()
+        self._delivered: dict[str, int] = {}
+        self._delivery = threading.Condition()
 
     def wait_for(self, key: str, number: int, *, timeout_s: float) -> bool:
         """Wait until the message of a key with this number, or a later one, was delivered; return whether it was."""
-        with self._news:
-            return self._news.wait_for(lambda: self._handed.get(key, -1) >= number, timeout_s)
+        with self._delivery:
+            return self._delivery.wait_for(lambda: self._delivered.get(key, -1) >= number, timeout_s)
 
     def take(self, sample: Any) -> None:
         """Deliver a message that arrived, after recovering those before it."""
         info = sample.source_info
-        publisher, number = publisher_of(info.source_id), info.source_sn
+        publisher, number = parse_publisher(info.source_id), info.source_sn
         with self._lock:
             last = self._last.get(publisher)
             if last is None and number > self._floor.get(publisher, number):
@@ -83,7 +83,7 @@ class Recovery:
     def begin(self, heads: list[Any]) -> None:
         """Recover the history of publishers without a received message, given the newest message of each cache."""
         for sample in heads:
-            publisher = publisher_of(sample.source_info.source_id)
+            publisher = parse_publisher(sample.source_info.source_id)
             with self._lock:
                 if publisher not in self._last:
                     self._recover(str(sample.key_expr), publisher, sample.source_info.source_sn)
@@ -98,9 +98,9 @@ class Recovery:
             publisher, number = (zid, int(eid)), int(ext.z_deserialize(ext.UInt32, sample.payload))
         except (ValueError, ext.ZDeserializeError):
             return
-        self.at_least(publisher, key, number)
+        self.record_sent(publisher, key, number)
 
-    def at_least(self, publisher: Publisher, key: str, number: int) -> None:
+    def record_sent(self, publisher: Publisher, key: str, number: int) -> None:
         """Record that a publisher has sent a message of this number."""
         # While a message is delivered, others wait in the channel, so it is not known yet whether any is missing.
         if not self._lock.acquire(blocking=False):
@@ -110,31 +110,31 @@ class Recovery:
             if last is None and not self._history:
                 last = self._floor.setdefault(publisher, number)
             if last is not None and number <= last:
-                self._behind.pop(publisher, None)
-            elif publisher in self._behind and self._behind[publisher] == last:
+                self._heartbeat_numbers.pop(publisher, None)
+            elif publisher in self._heartbeat_numbers and self._heartbeat_numbers[publisher] == last:
                 # Nothing arrived since the previous heartbeat, so the message is not just in flight.
-                del self._behind[publisher]
+                del self._heartbeat_numbers[publisher]
                 if last is not None:
                     self._last[publisher] = last
                 self._recover(key, publisher, number)
             else:
-                self._behind[publisher] = last
+                self._heartbeat_numbers[publisher] = last
         finally:
             self._lock.release()
 
-    def _recover(self, key: str, publisher: Publisher, until: int) -> None:
+    def _recover(self, key: str, publisher: Publisher, last_number: int) -> None:
         """Deliver missing messages up to a number from the cache; report and give up those that it no longer has."""
         last = self._last.get(publisher)
         # Messages sent before the first known one are history; those no longer in the cache are not a loss.
         known = last is not None
         missing = 0
         first = 0 if last is None else last + 1
-        oldest = max(first, until + 1 - self._cache)
+        oldest = max(first, last_number + 1 - self._cache)
         if known:
             missing += oldest - first
         first = oldest
-        while first <= until:
-            end = min(until, first + _BATCH - 1)
+        while first <= last_number:
+            end = min(last_number, first + _BATCH - 1)
             found = self._fetch(key, publisher, first, end)
             if found is None:
                 break
@@ -148,8 +148,8 @@ class Recovery:
                 missing += end + 1 - first
             first = end + 1
         if known:
-            missing += max(0, until + 1 - first)
-        self._last[publisher] = until
+            missing += max(0, last_number + 1 - first)
+        self._last[publisher] = last_number
         if missing and self._on_miss is not None:
             self._on_miss(key, missing)
 
@@ -160,14 +160,16 @@ class Recovery:
             if attempt:
                 # The link may have been lost, and return soon.
                 self._pause(_RETRY_S)
-            for reply in self._ask(key, publisher, f"_sn={first}..{end}"):
+            for reply in self._query_cache(key, publisher, f"_sn={first}..{end}"):
                 if first <= (number := reply.source_info.source_sn) <= end:
                     found[number] = reply
             if end in found:
                 # Replies come in order: those missing before this one are no longer in the cache.
                 return found
             # An empty reply may be a lost one. Only the newest number shows that these are no longer in the cache.
-            newest = max((reply.source_info.source_sn for reply in self._ask(key, publisher, "_max=1")), default=end)
+            newest = max(
+                (reply.source_info.source_sn for reply in self._query_cache(key, publisher, "_max=1")), default=end
+            )
             if newest - end >= self._cache:
                 return found
         return found or None
@@ -176,11 +178,11 @@ class Recovery:
         self._last[publisher] = number
         key = str(sample.key_expr)
         self._on_message(key, sample.payload.to_bytes())
-        with self._news:
-            self._handed[key] = number
-            self._news.notify_all()
+        with self._delivery:
+            self._delivered[key] = number
+            self._delivery.notify_all()
 
 
-def publisher_of(entity: Any) -> Publisher:
+def parse_publisher(entity: Any) -> Publisher:
     """Return the publisher from zenoh's source of a message."""
     return str(entity.zid), entity.eid

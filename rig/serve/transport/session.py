@@ -28,7 +28,7 @@ def locator(host: str, port: int, *, tls: bool = False) -> str:
     return f"{'tls' if tls else 'tcp'}/{'127.0.0.1' if host == 'localhost' else host}:{port}"
 
 
-def config_of(**settings: Any) -> Any:
+def build_config(**settings: Any) -> Any:
     """Return a configuration with the shared settings and the given ones (`__` means `/`)."""
     import zenoh
 
@@ -71,13 +71,13 @@ class Session:
         self._closing = threading.Lock()
         self._closed = False
         self._printed: set[str] = set()
-        self.on_trouble: Callable[[str, BaseException], None] = self._print_trouble
+        self.on_failure: Callable[[str, BaseException], None] = self._print_failure
         """Receives failures on receiving threads, which continue."""
         atexit.register(self._close_at_exit)
 
-    def _print_trouble(self, where: str, error: BaseException) -> None:
-        if where not in self._printed:  # each message may fail
-            self._printed.add(where)
+    def _print_failure(self, place: str, error: BaseException) -> None:
+        if place not in self._printed:  # each message may fail
+            self._printed.add(place)
             thread = threading.current_thread()
             threading.excepthook(threading.ExceptHookArgs((type(error), error, error.__traceback__, thread)))
 
@@ -90,20 +90,20 @@ class Session:
         """
         import zenoh
 
-        def guarded(work: Callable[..., None], *arguments: Any) -> None:
+        def run_guarded(work: Callable[..., None], *arguments: Any) -> None:
             try:
                 work(*arguments)
             except BaseException as error:
                 if not (self._closed and isinstance(error, zenoh.ZError)):
-                    self.on_trouble(f"zenoh {name}", error)
+                    self.on_failure(f"zenoh {name}", error)
 
         def loop() -> None:
             if first is not None:
-                guarded(first)
+                run_guarded(first)
             with contextlib.suppress(zenoh.ZError):  # the channel ends with the session
                 for item in channel:
                     if not self._closed:
-                        guarded(take, item)
+                        run_guarded(take, item)
 
         thread = threading.Thread(target=loop, name=f"zenoh {name}", daemon=True)
         self._threads.append(thread)
@@ -136,7 +136,7 @@ class Session:
                 thread.join(timeout=1.0)
 
 
-def encoding_of(key: str, schema: str | None) -> str:
+def get_encoding(key: str, schema: str | None) -> str:
     """Return zenoh's encoding for the payloads of a key."""
     if schema is not None:
         return f"application/cdr;{schema}"

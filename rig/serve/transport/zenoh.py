@@ -19,11 +19,17 @@ from rig.base import wire
 from rig.base.closeable import Closing
 from rig.base.errors import InputError
 from rig.serve.transport import DEFAULT_ENDPOINT, NoReplyError
-from rig.serve.transport.endpoint import backlog_of, hang_up, not_free, parse_endpoint, place_to_listen
-from rig.serve.transport.exposure.access import Verb, allows, rules
-from rig.serve.transport.names import address_in, endpoint_of
+from rig.serve.transport.endpoint import (
+    build_address_error,
+    choose_listen_address,
+    close_links,
+    parse_endpoint,
+    read_backlogs,
+)
+from rig.serve.transport.exposure.access import Action, is_allowed, rules
+from rig.serve.transport.names import parse_url, resolve_endpoint
 from rig.serve.transport.recovery import CACHE, Publisher, Recovery
-from rig.serve.transport.session import PATIENCE_S, Session, config_of, encoding_of, fifo, locator
+from rig.serve.transport.session import PATIENCE_S, Session, build_config, fifo, get_encoding, locator
 from rig.serve.waiting import Deadline
 
 if TYPE_CHECKING:
@@ -91,7 +97,7 @@ class ZenohServer(Closing):
     ) -> None:
         import zenoh
 
-        host, port = place_to_listen(endpoint, field="listen")
+        host, port = choose_listen_address(endpoint, field="listen")
         self.endpoint = f"{host}:{port}"
         self._ports = {port}
         locators, settings = [locator(host, port)], dict[str, Any](_FROM_CLIENTS)
@@ -103,12 +109,12 @@ class ZenohServer(Closing):
             if exposed.holder is not None:
                 settings["transport/link/tls"] = exposed.holder.settings(listens=True)
         try:
-            self._session = Session(config_of(listen__endpoints=locators, access_control=rules(), **settings))
+            self._session = Session(build_config(listen__endpoints=locators, access_control=rules(), **settings))
         except zenoh.ZError as error:
             field, where = "listen", self.endpoint
             if exposed is not None and f"{host}:{port}" in str(error):
                 field, where = "expose", exposed.endpoint
-            raise not_free(field, where, in_use="in use" in str(error)) from None
+            raise build_address_error(field, where, in_use="in use" in str(error)) from None
         self._congestion_control = zenoh.CongestionControl.BLOCK if wait else zenoh.CongestionControl.DROP
         self._publishers: dict[str, Any] = {}
         self._declared: list[Any] = []
@@ -124,10 +130,10 @@ class ZenohServer(Closing):
         publisher = self._publishers.get(key) or self._declare(key)
         start = time.perf_counter()
         publisher.put(payload)
-        taken = time.perf_counter() - start
-        if taken > _SLOW_PUT_S:
+        elapsed_s = time.perf_counter() - start
+        if elapsed_s > _SLOW_PUT_S:
             self._slow_puts += 1
-            self._longest_put_s = max(self._longest_put_s, taken)
+            self._longest_put_s = max(self._longest_put_s, elapsed_s)
 
     def _declare(self, key: str) -> Any:
         from zenoh import ext
@@ -136,7 +142,7 @@ class ZenohServer(Closing):
         publisher = ext.declare_advanced_publisher(
             self._session.session,
             key,
-            encoding=encoding_of(key, schema),
+            encoding=get_encoding(key, schema),
             congestion_control=self._congestion_control,
             cache=ext.CacheConfig(CACHE),
             sample_miss_detection=ext.MissDetectionConfig(heartbeat=_HEARTBEAT_S, sporadic_heartbeat=None),
@@ -174,11 +180,11 @@ class ZenohServer(Closing):
 
         self._session.drain(queryable, take, f"answers {expression}")
 
-    def on_trouble(self, tell: Callable[[str, BaseException], None]) -> None:
+    def on_failure(self, callback: Callable[[str, BaseException], None]) -> None:
         """Set the function that receives place and error of failures on receiving threads."""
-        self._session.on_trouble = tell
+        self._session.on_failure = callback
 
-    def hear(self, key: str, callback: Callable[[str, bytes], None]) -> None:
+    def subscribe_reports(self, key: str, callback: Callable[[str, bytes], None]) -> None:
         """Receive the clients' reports on matching keys."""
         subscriber = self._session.session.declare_subscriber(key, fifo())
         self._declared.append(subscriber)
@@ -211,7 +217,7 @@ class ZenohServer(Closing):
         """
         links = list(self._session.session.info.links())
         names = Counter(f"links_{link.auth_identifier}" for link in links if link.auth_identifier is not None)
-        backlog = {other: size for port in self._ports for other, size in backlog_of(port).items()}
+        backlog = {other: size for port in self._ports for other, size in read_backlogs(port).items()}
         stalled = {port for port, size in backlog.items() if size > _STALLED_BYTES}
         self._stalls += len(stalled - self._stalled)
         self._stalled = stalled
@@ -230,7 +236,7 @@ class ZenohServer(Closing):
         self._replies.put(None)
         # zenoh waits some seconds for a stalled link to accept the closing message.
         for port in self._ports:
-            hang_up(port, {other for other, size in backlog_of(port).items() if size > _STALLED_BYTES})
+            close_links(port, {other for other, size in read_backlogs(port).items() if size > _STALLED_BYTES})
         self._session.close()
 
 
@@ -256,12 +262,12 @@ class ZenohClient(Closing):
     """
 
     def __init__(self, endpoint: str = DEFAULT_ENDPOINT, *, wait_s: float = 1.0, tls: Path | str | None = None) -> None:
-        self._host, self._port = endpoint_of(endpoint, field="connect", wait_s=wait_s)
+        self._host, self._port = resolve_endpoint(endpoint, field="connect", wait_s=wait_s)
         self._holder: Holder | None = None
         if tls is not None:
-            from rig.serve.transport.exposure.certificates import holder_in
+            from rig.serve.transport.exposure.certificates import read_holder
 
-            self._holder = holder_in(tls, server=False)
+            self._holder = read_holder(tls, server=False)
         self.endpoint = f"{self._host}:{self._port}"
         self._declared: list[Any] = []
         self._rigs: set[str] = set()
@@ -274,23 +280,23 @@ class ZenohClient(Closing):
     @property
     def rig(self) -> str | None:
         """Identity of the linked rig; None without a link."""
-        return next(iter(self._linked()), None)
+        return next(iter(self._linked_rigs()), None)
 
-    def _linked(self) -> set[str]:
+    def _linked_rigs(self) -> set[str]:
         # A client does not listen, so its only peer is the rig that it connected to.
         found = set(map(str, self._session.session.info.peers_zid()))
         self._rigs |= found
         return found
 
-    def _is_rigs(self, publisher: str | None) -> bool:
+    def _is_linked_rig(self, publisher: str | None) -> bool:
         """Return whether a message is from the rig, by its publisher; others are counted and ignored."""
-        if publisher is not None and (publisher in self._rigs or publisher in self._linked()):
+        if publisher is not None and (publisher in self._rigs or publisher in self._linked_rigs()):
             return True
         self.foreign += 1
         return False
 
-    def _from_rig(self, sample: Any) -> bool:
-        return self._is_rigs(None if (info := sample.source_info) is None else str(info.source_id.zid))
+    def _is_from_rig(self, sample: Any) -> bool:
+        return self._is_linked_rig(None if (info := sample.source_info) is None else str(info.source_id.zid))
 
     def _open(self, wait_s: float) -> Session:
         import zenoh
@@ -300,7 +306,7 @@ class ZenohClient(Closing):
         if self._holder is not None:
             longest_s, settings = _OPENING_TLS_S, {"transport/link/tls": self._holder.settings(listens=False)}
         while True:
-            config = config_of(
+            config = build_config(
                 listen__endpoints=[],
                 connect__endpoints=[locator(self._host, self._port, tls=self._holder is not None)],
                 # Opening waits for the link, so that the first request is not too early; in slices, so that Ctrl-C
@@ -314,23 +320,23 @@ class ZenohClient(Closing):
                 return Session(config)
             except zenoh.ZError:
                 if deadline.passed:
-                    raise self._not_let_in() from None
+                    raise self._build_rejection_error() from None
 
-    def _not_let_in(self) -> NoReplyError:
+    def _build_rejection_error(self) -> NoReplyError:
         """Return the error for a failed connection: no rig listens, or it refuses this client."""
         try:
             if self._holder is None:
                 socket.create_connection((self._host, self._port), timeout=1.0).close()
                 why = "without a certificate: an exposed rig needs --tls FOLDER; otherwise it is not a rig, or it hangs"
-            elif (said := self._holder.turned_away(self._host, self._port)) is not None:
-                why = f"as {self._holder.name}, by the keys in {self._holder.folder}: {said}"
+            elif (rejection := self._holder.find_rejection(self._host, self._port)) is not None:
+                why = f"as {self._holder.name}, by the keys in {self._holder.folder}: {rejection}"
             else:
                 why = "although the certificates are valid: it has too many links, or hangs"
         except OSError:
-            return self._no_reply()
+            return self._no_reply_error()
         return NoReplyError(f"{self.endpoint} listens, but refuses this client {why}")
 
-    def _no_reply(self) -> NoReplyError:
+    def _no_reply_error(self) -> NoReplyError:
         start = "start one with: rig run stable-run (--wait-s 60 waits for one that still compiles)"
         return NoReplyError(f"no rig answers at {self.endpoint}; {start}")
 
@@ -363,16 +369,16 @@ class ZenohClient(Closing):
         if self._streams is None:
             self._streams = self._open(5.0)
         streams, session = self._streams, self._streams.session
-        self._linked()
+        self._linked_rigs()
         if not lossless:
             subscriber = session.declare_subscriber(key, zenoh.handlers.RingChannel(_RING))
             self._declared.append(subscriber)
 
-            def take_any(sample: Any) -> None:
-                if self._from_rig(sample):
+            def deliver(sample: Any) -> None:
+                if self._is_from_rig(sample):
                     on_message(str(sample.key_expr), sample.payload.to_bytes())
 
-            streams.drain(subscriber, take_any, f"takes {key}")
+            streams.drain(subscriber, deliver, f"takes {key}")
             return
 
         def get(link: Session, selector: str) -> list[Any]:
@@ -382,9 +388,9 @@ class ZenohClient(Closing):
                 consolidation=zenoh.ConsolidationMode.NONE,
                 accept_replies=zenoh.ReplyKeyExpr.ANY,
             )
-            return [reply.ok for reply in replies if reply.ok is not None and self._from_rig(reply.ok)]
+            return [reply.ok for reply in replies if reply.ok is not None and self._is_from_rig(reply.ok)]
 
-        def ask(name: str, publisher: Publisher, selection: str) -> list[Any]:
+        def query_cache(name: str, publisher: Publisher, selection: str) -> list[Any]:
             zid, eid = publisher
             return get(self._session, f"{name}/@adv/*/{zid}/{eid}/**?{selection}")
 
@@ -398,14 +404,14 @@ class ZenohClient(Closing):
                 stream.begin(heads)
 
         def take(sample: Any) -> None:
-            if self._from_rig(sample):
+            if self._is_from_rig(sample):
                 stream.take(sample)
 
         def heartbeat(sample: Any) -> None:
-            if self._is_rigs(str(sample.key_expr).partition("/@adv/pub/")[2].partition("/")[0]):
+            if self._is_linked_rig(str(sample.key_expr).partition("/@adv/pub/")[2].partition("/")[0]):
                 stream.heartbeat(sample)
 
-        stream = Recovery(ask, on_message, on_miss, history=history)
+        stream = Recovery(query_cache, on_message, on_miss, history=history)
         self._lossless.append((key, stream))
         subscriber = session.declare_subscriber(key, zenoh.handlers.FifoChannel(_FIFO))
         heartbeats = session.declare_subscriber(f"{key}/@adv/pub/**", zenoh.handlers.RingChannel(_HEARTBEATS))
@@ -432,7 +438,11 @@ class ZenohClient(Closing):
         """
         import zenoh
 
-        deadline, sooner, asked = Deadline(timeout_s), Deadline(min(timeout_s, _RESTART_S)), self._linked()
+        deadline, restart_deadline, linked = (
+            Deadline(timeout_s),
+            Deadline(min(timeout_s, _RESTART_S)),
+            self._linked_rigs(),
+        )
         while True:
             replies: Iterator[Any] = self._session.session.get(
                 key,
@@ -449,17 +459,17 @@ class ZenohClient(Closing):
                     return payload_back
                 if (text := payload_back.decode(errors="replace")) != "Timeout":
                     raise NoReplyError(f"the rig at {self.endpoint} could not answer {key}: {text}")
-            if asked and not asked & self._linked():
+            if linked and not linked & self._linked_rigs():
                 raise NoReplyError(f"the link to the rig at {self.endpoint} was lost before the reply to {key}")
             # Without a rig the reply is empty at once; the rig may be about to start. A denied request looks the same.
-            late = (deadline if self._linked() else sooner).left_s <= _RETRY_S
+            late = (deadline if self._linked_rigs() else restart_deadline).left_s <= _RETRY_S
             role = None if self._holder is None else self._holder.name
-            denied = not allows(role, Verb.ASK, key)
+            denied = not is_allowed(role, Action.ASK, key)
             if (late or denied) and self.tokens(wire.ALIVE):
-                what = f"denies {key} to {role or 'everybody'}" if denied else f"does not answer {key}"
-                raise NoReplyError(f"the rig at {self.endpoint} {what}")
+                reason = f"denies {key} to {role or 'everybody'}" if denied else f"does not answer {key}"
+                raise NoReplyError(f"the rig at {self.endpoint} {reason}")
             if late:
-                raise self._no_reply()
+                raise self._no_reply_error()
             time.sleep(_RETRY_S)
 
     def watch(self, key: str, callback: Callable[[bool], None]) -> None:
@@ -486,7 +496,7 @@ class ZenohClient(Closing):
         self._session.session.put(
             key,
             payload,
-            encoding=encoding_of(key, None),
+            encoding=get_encoding(key, None),
             congestion_control=zenoh.CongestionControl.DROP,
             allowed_destination=zenoh.Locality.REMOTE,  # not to the own subscriptions of this client
         )
@@ -498,7 +508,7 @@ class ZenohClient(Closing):
         self._session.close()
 
 
-def client_of(url: str, *, wait_s: float) -> ZenohClient:
-    """Return a client of the rig at a URL (see `names.address_in`), with the keys of a role in ?tls=DIR."""
-    endpoint, query, folder = address_in(url).partition("?tls=")
+def connect_url(url: str, *, wait_s: float) -> ZenohClient:
+    """Return a client of the rig at a URL (see `names.parse_url`), with the keys of a role in ?tls=DIR."""
+    endpoint, query, folder = parse_url(url).partition("?tls=")
     return ZenohClient(endpoint, wait_s=wait_s, tls=folder if query else None)

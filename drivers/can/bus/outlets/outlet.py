@@ -12,7 +12,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from drivers.can.bus import codec
-from rig.serve.health import Guard, Rising
+from rig.serve.health import Guard, IncreaseWarning
 
 if TYPE_CHECKING:
     import can
@@ -82,7 +82,7 @@ class Outlet:
         self._ending = False
         self._stalled = False
         self._guard = Guard(name)
-        self._dropping = Rising(f"{name}: " + "{} frames were dropped: the client does not read them in time")
+        self._dropping = IncreaseWarning(f"{name}: " + "{} frames were dropped: the client does not read them in time")
         self.counts: Counter[str] = Counter()
         self._writer = threading.Thread(target=self._write_all, name=f"{name} writes", daemon=True)
 
@@ -242,7 +242,7 @@ class Outlet:
                 self.counts["dropped"] += overflowed
         except Exception as error:
             if not isinstance(error, (can.CanError, OSError, ValueError)):
-                self._guard.tell("receiving from the bus", error)
+                self._guard.record_failure("receiving from the bus", error)
             self._lose()
         finally:
             self._guard(bus.shutdown)

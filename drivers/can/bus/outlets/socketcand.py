@@ -380,4 +380,4 @@ class SocketcandServer(socketserver.ThreadingTCPServer):
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Report a connection that failed."""
-        self._guard.tell("a connection", sys.exception() or RuntimeError())
+        self._guard.record_failure("a connection", sys.exception() or RuntimeError())

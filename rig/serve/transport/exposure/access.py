@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 from rig.base import wire
 
 
-class Verb(StrEnum):
+class Action(StrEnum):
     """Action of a client on a key."""
 
     ASK = "ask"
@@ -23,41 +23,41 @@ class Verb(StrEnum):
     SHOW = "show"
 
 
-class Door(NamedTuple):
+class Permission(NamedTuple):
     """Keys and the action allowed on them."""
 
-    what: str
-    verb: Verb
+    title: str
+    action: Action
     keys: tuple[str, ...]
 
 
-DOCUMENTS = Door("documents and status", Verb.ASK, (wire.CATALOGUE, wire.PARAMETERS, wire.SCENE, wire.STATUS))
-STREAMS = Door(
+DOCUMENTS = Permission("documents and status", Action.ASK, (wire.CATALOGUE, wire.PARAMETERS, wire.SCENE, wire.STATUS))
+STREAMS = Permission(
     "samples, events, status, ends of blocks",
-    Verb.RECEIVE,
+    Action.RECEIVE,
     (f"{wire.SENSORS}/**", wire.EVENTS, wire.STATUS, wire.BLOCK),
 )
-PRESENCE = Door("the rig's token", Verb.WATCH, (wire.ALIVE,))
-REPORTS = Door("reports of clients", Verb.SEND, (f"{wire.CLIENTS}/*",))
-COMMANDS = Door("commands, notes", Verb.ASK, (f"{wire.COMMAND}/*",))
-TRUTH = Door("truth", Verb.RECEIVE, (f"{wire.TRUTH}/**",))
+PRESENCE = Permission("the rig's token", Action.WATCH, (wire.ALIVE,))
+REPORTS = Permission("reports of clients", Action.SEND, (f"{wire.CLIENTS}/*",))
+COMMANDS = Permission("commands, notes", Action.ASK, (f"{wire.COMMAND}/*",))
+TRUTH = Permission("truth", Action.RECEIVE, (f"{wire.TRUTH}/**",))
 INSTRUMENTS = (
-    Door("instruments' replies", Verb.ASK, (f"{wire.ROOT}/instruments/*/request",)),
-    Door("instruments' data", Verb.RECEIVE, (f"{wire.ROOT}/instruments/*/data",)),
+    Permission("instruments' replies", Action.ASK, (f"{wire.ROOT}/instruments/*/request",)),
+    Permission("instruments' data", Action.RECEIVE, (f"{wire.ROOT}/instruments/*/data",)),
 )
 CAN = (
-    Door("requests to a CAN hub", Verb.ASK, (f"{wire.ROOT}/can/*/*",)),
-    Door("frames on a CAN bus", Verb.RECEIVE, (f"{wire.ROOT}/can/*/bus",)),
-    Door("frames for a CAN bus", Verb.SEND, (f"{wire.ROOT}/can/*/offer/*",)),
-    Door("the CAN hub's token", Verb.WATCH, (f"{wire.ROOT}/can/*/alive",)),
-    Door("tokens of CAN nodes", Verb.SHOW, (f"{wire.ROOT}/can/*/node/*",)),
+    Permission("requests to a CAN hub", Action.ASK, (f"{wire.ROOT}/can/*/*",)),
+    Permission("frames on a CAN bus", Action.RECEIVE, (f"{wire.ROOT}/can/*/bus",)),
+    Permission("frames for a CAN bus", Action.SEND, (f"{wire.ROOT}/can/*/offer/*",)),
+    Permission("the CAN hub's token", Action.WATCH, (f"{wire.ROOT}/can/*/alive",)),
+    Permission("tokens of CAN nodes", Action.SHOW, (f"{wire.ROOT}/can/*/node/*",)),
 )
-DOORS = (DOCUMENTS, STREAMS, PRESENCE, REPORTS, COMMANDS, TRUTH, *INSTRUMENTS, *CAN)
+PERMISSIONS = (DOCUMENTS, STREAMS, PRESENCE, REPORTS, COMMANDS, TRUTH, *INSTRUMENTS, *CAN)
 
 PLAIN = "plain"
 """Connections without TLS, which cannot be distinguished."""
 _VIEWER = (DOCUMENTS, STREAMS, PRESENCE)
-ROLES: Mapping[str, tuple[Door, ...]] = {
+ROLES: Mapping[str, tuple[Permission, ...]] = {
     "operator": (*_VIEWER, REPORTS, COMMANDS),
     "recorder": (*_VIEWER, REPORTS),
     "viewer": _VIEWER,
@@ -66,47 +66,47 @@ ROLES: Mapping[str, tuple[Door, ...]] = {
 WITH_TRUTH = "+truth"
 """Suffix of a role in a certificate's name that grants access to the truth."""
 
-_MESSAGES: Mapping[Verb, Mapping[str, list[str]]] = {
-    Verb.ASK: {"ingress": ["query"], "egress": ["declare_queryable", "reply"]},
-    Verb.RECEIVE: {"egress": ["put", "declare_queryable", "reply"]},
-    Verb.SEND: {"ingress": ["put"], "egress": ["declare_subscriber"]},
-    Verb.WATCH: {"ingress": ["liveliness_query", "declare_liveliness_subscriber"], "egress": ["liveliness_token"]},
-    Verb.SHOW: {"ingress": ["liveliness_token"], "egress": ["declare_liveliness_subscriber"]},
+_MESSAGES: Mapping[Action, Mapping[str, list[str]]] = {
+    Action.ASK: {"ingress": ["query"], "egress": ["declare_queryable", "reply"]},
+    Action.RECEIVE: {"egress": ["put", "declare_queryable", "reply"]},
+    Action.SEND: {"ingress": ["put"], "egress": ["declare_subscriber"]},
+    Action.WATCH: {"ingress": ["liveliness_query", "declare_liveliness_subscriber"], "egress": ["liveliness_token"]},
+    Action.SHOW: {"ingress": ["liveliness_token"], "egress": ["declare_liveliness_subscriber"]},
 }
 """Zenoh messages that each action needs, incoming and outgoing."""
-_ANYTHING, _CACHES = f"{wire.ROOT}/**", f"{wire.ROOT}/**/@adv/**"
-_TO_RECEIVE = {"subscribe": (["declare_subscriber"], [_ANYTHING, _CACHES]), "fetch": (["query"], [_CACHES])}
+_ALL_KEYS, _CACHES = f"{wire.ROOT}/**", f"{wire.ROOT}/**/@adv/**"
+_SUBSCRIBER_RULES = {"subscribe": (["declare_subscriber"], [_ALL_KEYS, _CACHES]), "fetch": (["query"], [_CACHES])}
 """A client that may receive at all may subscribe to anything; each outgoing message is checked."""
 
 
-def doors_of(name: str | None) -> tuple[Door, ...]:
+def get_permissions(name: str | None) -> tuple[Permission, ...]:
     """Return the permissions by the common name of a certificate; None is a connection without TLS."""
     if name is None:
-        return DOORS
+        return PERMISSIONS
     role = name.removesuffix(WITH_TRUTH)
     return (*ROLES.get(role, ()), *((TRUTH,) if role in ROLES and role != name else ()))
 
 
-def allows(name: str | None, verb: Verb, key: str) -> bool:
-    """Return whether an action on a key is allowed; arguments as of `doors_of`."""
+def is_allowed(name: str | None, action: Action, key: str) -> bool:
+    """Return whether an action on a key is allowed; arguments as of `get_permissions`."""
     import zenoh
 
     return any(
         zenoh.KeyExpr(pattern).includes(zenoh.KeyExpr(key))
-        for door in doors_of(name)
-        if door.verb is verb
-        for pattern in door.keys
+        for permission in get_permissions(name)
+        if permission.action is action
+        for pattern in permission.keys
     )
 
 
 def rules() -> dict[str, Any]:
     """Return the table as zenoh's `access_control` for the rig's session; ingress is data from clients."""
     rules = {
-        f"{flow} {door.what}": (flow, messages, _with_cache(door))
-        for door in DOORS
-        for flow, messages in _MESSAGES[door.verb].items()
+        f"{flow} {permission.title}": (flow, messages, _add_cache_keys(permission))
+        for permission in PERMISSIONS
+        for flow, messages in _MESSAGES[permission.action].items()
     }
-    rules |= {name: ("ingress", *rule) for name, rule in _TO_RECEIVE.items()}
+    rules |= {name: ("ingress", *rule) for name, rule in _SUBSCRIBER_RULES.items()}
     names = [None, *(name for role in ROLES for name in (role, role + WITH_TRUTH))]
     return {
         "enabled": True,
@@ -125,8 +125,12 @@ def rules() -> dict[str, Any]:
             {
                 "subjects": [name or PLAIN],
                 "rules": [
-                    *_TO_RECEIVE,
-                    *(f"{flow} {door.what}" for door in doors_of(name) for flow in _MESSAGES[door.verb]),
+                    *_SUBSCRIBER_RULES,
+                    *(
+                        f"{flow} {permission.title}"
+                        for permission in get_permissions(name)
+                        for flow in _MESSAGES[permission.action]
+                    ),
                 ],
             }
             for name in names
@@ -134,7 +138,7 @@ def rules() -> dict[str, Any]:
     }
 
 
-def _with_cache(door: Door) -> list[str]:
+def _add_cache_keys(permission: Permission) -> list[str]:
     # `**` does not match chunks that begin with `@`, as in the keys of caches and their heartbeats.
-    caches = [f"{key}/@adv/**" for key in door.keys] if door.verb is Verb.RECEIVE else []
-    return [*door.keys, *caches]
+    caches = [f"{key}/@adv/**" for key in permission.keys] if permission.action is Action.RECEIVE else []
+    return [*permission.keys, *caches]

@@ -59,7 +59,7 @@ class Holder(NamedTuple):
             "close_link_on_expiration": True,
         }
 
-    def turned_away(self, host: str, port: int, *, timeout_s: float = 1.0) -> str | None:
+    def find_rejection(self, host: str, port: int, *, timeout_s: float = 1.0) -> str | None:
         """Return why a rig refuses this holder, as reported by TLS; None if it accepts.
 
         Raises:
@@ -78,13 +78,13 @@ class Holder(NamedTuple):
             except (TimeoutError, ConnectionError):
                 return None if greeted else "no TLS is spoken there"
             except ssl.SSLError as error:
-                said = getattr(error, "verify_message", None) or error.reason or str(error)
-                return f"{said.replace('_', ' ').lower()} (keys of another rig, or expired?)"
+                error_text = getattr(error, "verify_message", None) or error.reason or str(error)
+                return f"{error_text.replace('_', ' ').lower()} (keys of another rig, or expired?)"
         return None
 
 
-def holder_in(folder: Path | str, *, server: bool) -> Holder:
-    """Return the holder of a folder; from a folder created by `make`, a server uses its own.
+def read_holder(folder: Path | str, *, server: bool) -> Holder:
+    """Return the holder of a folder; from a folder created by `create_keys`, a server uses its own.
 
     Raises:
         InputError: The folder is not of that kind, or its certificate has expired.
@@ -92,33 +92,33 @@ def holder_in(folder: Path | str, *, server: bool) -> Holder:
     from cryptography import x509
     from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-    where = Path(folder).expanduser().absolute()
-    if server and (where / SERVER).is_dir():
-        where /= SERVER
+    holder_folder = Path(folder).expanduser().absolute()
+    if server and (holder_folder / SERVER).is_dir():
+        holder_folder /= SERVER
     kind = "the rig" if server else f"one role ({', '.join(ROLES)})"
     must = f"a folder with the keys of {kind}, as made by: rig keys init"
     try:
-        certificate = x509.load_pem_x509_certificate((where / _CERTIFICATE).read_bytes())
+        certificate = x509.load_pem_x509_certificate((holder_folder / _CERTIFICATE).read_bytes())
         usage = certificate.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value
         name = str(certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)[0].value)
-        whole = all((where / file).is_file() for file in (_AUTHORITY, _KEY))
+        is_complete = all((holder_folder / file).is_file() for file in (_AUTHORITY, _KEY))
     except (OSError, ValueError, IndexError, x509.ExtensionNotFound):
         raise InputError("--tls", must, str(folder)) from None
-    wanted = ExtendedKeyUsageOID.SERVER_AUTH if server else ExtendedKeyUsageOID.CLIENT_AUTH
-    if not whole or wanted not in usage:
+    required_usage = ExtendedKeyUsageOID.SERVER_AUTH if server else ExtendedKeyUsageOID.CLIENT_AUTH
+    if not is_complete or required_usage not in usage:
         raise InputError("--tls", must, str(folder))
-    key = where / _KEY
+    key = holder_folder / _KEY
     if os.name == "posix" and key.stat().st_mode & 0o077:
         raise InputError("--tls", f"a folder whose key is private to its owner (chmod 600 {key})", Words("another"))
     expires = certificate.not_valid_after_utc
     if expires <= datetime.now(UTC):
         raise InputError(
-            "--tls", "a certificate that is valid (rig keys init makes new ones)", Words(f"{where}, expired")
+            "--tls", "a certificate that is valid (rig keys init makes new ones)", Words(f"{holder_folder}, expired")
         )
-    return Holder(where, name, expires)
+    return Holder(holder_folder, name, expires)
 
 
-def make(
+def create_keys(
     folder: Path,
     *,
     hosts: Sequence[str] = (),
@@ -146,7 +146,7 @@ def make(
     from cryptography.x509.oid import ExtendedKeyUsageOID
 
     names = list(dict.fromkeys([*hosts, "localhost", "127.0.0.1"]))
-    subjects = [subject_of(name) for name in names]
+    subjects = [build_subject(name) for name in names]
     if unknown := sorted(set(truth) - set(ROLES)):
         raise InputError("--truth", f"one of {', '.join(ROLES)}", unknown[0])
     if folder.exists() or folder.is_symlink():
@@ -160,7 +160,7 @@ def make(
         raise InputError("DIR", "in a folder that can be written", Words(f"{folder} ({error.strerror})")) from None
     try:
         signing = ec.generate_private_key(ec.SECP256R1())
-        issue = Issue(signing, timedelta(days=days))
+        issue = CertificateIssuer(signing, timedelta(days=days))
         authority = issue.certificate(SIGNER, signing, None, [])
         for holder in HOLDERS:
             key = ec.generate_private_key(ec.SECP256R1())
@@ -170,18 +170,18 @@ def make(
                 name = holder + WITH_TRUTH if holder in truth else holder
                 certificate = issue.certificate(name, key, ExtendedKeyUsageOID.CLIENT_AUTH, [x509.DNSName(holder)])
             write_holder(part / holder, authority, certificate, key)
-        old = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=part.parent))
+        replaced = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=part.parent))
         if folder.exists():
-            folder.rename(old)
+            folder.rename(replaced)
         part.rename(folder)
-        shutil.rmtree(old)
+        shutil.rmtree(replaced)
     except BaseException:
         shutil.rmtree(part, ignore_errors=True)
         raise
     return names
 
 
-class Issue(NamedTuple):
+class CertificateIssuer(NamedTuple):
     """The signing key and the validity of its certificates."""
 
     signing: EllipticCurvePrivateKey
@@ -200,10 +200,10 @@ class Issue(NamedTuple):
         from cryptography.x509.oid import NameOID
 
         now = datetime.now(UTC)
-        named = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
+        subject_name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
         issuer = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, SIGNER)])
         builder = (
-            x509.CertificateBuilder(issuer, named, key.public_key(), x509.random_serial_number())
+            x509.CertificateBuilder(issuer, subject_name, key.public_key(), x509.random_serial_number())
             .not_valid_before(now - _SKEW)
             .not_valid_after(now + self.valid)
             .add_extension(x509.BasicConstraints(ca=usage is None, path_length=None), critical=True)
@@ -214,7 +214,7 @@ class Issue(NamedTuple):
         return builder.sign(self.signing, hashes.SHA256())
 
 
-def subject_of(name: str) -> x509.GeneralName:
+def build_subject(name: str) -> x509.GeneralName:
     """Return a computer's name or address in the form of a certificate."""
     from cryptography import x509
 
