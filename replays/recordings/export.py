@@ -134,7 +134,7 @@ def table_rows(simulation: Simulation, frame: Frame) -> np.ndarray:
     blocks = frame.samples
     first = next(iter(blocks.values()))
     times = (first.index + np.arange(len(first.values)))[:, None] / first.rate_hz
-    step = simulation.kept_every
+    step = simulation.rows_per_kept_row
     truth = [frame.rows[-(frame.tick // simulation.row_ticks) % step :: step]] if _has_truth(simulation) else []
     sensors = [simulation.table.groups[group].engineering(block.values) for group, block in blocks.items()]
     return np.hstack([times, *truth, *sensors])

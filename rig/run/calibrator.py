@@ -81,13 +81,13 @@ class Calibrator:
         return source.at(source.shape(instants))
 
     def counts(
-        self, rows: np.ndarray, made: np.ndarray | None = None, faults: Generated | None = None
+        self, rows: np.ndarray, formula_values: np.ndarray | None = None, faults: GeneratedFaults | None = None
     ) -> dict[str, np.ndarray]:
-        """Return the samples from the first of these rows up to the last one.
+        """Return the samples from the first of these rows up to the last fault.
 
         Args:
             rows: Rows that follow those of the previous call, shape (n, N_ROW); only their number is used.
-            made: Ignored.
+            formula_values: Ignored.
             faults: Changes of volts and counts on faulty channels.
 
         Returns:
@@ -118,7 +118,7 @@ class Calibrator:
         return found
 
 
-class Generated:
+class GeneratedFaults:
     """Faults of test signals: changes of the volts at the exact instants of samples, and of the counts.
 
     Args:
@@ -132,44 +132,47 @@ class Generated:
         self._plugs = connect_swaps(swaps[number] for number in sorted(swaps))
         self._channels = {channel.name: channel for group in calibrator.groups for channel in group.channels}
 
-    def _ats(self, name: str, n: np.ndarray) -> Iterator[tuple[Kind, At]]:
+    def _iterate_faults(self, name: str, n: np.ndarray) -> Iterator[tuple[Kind, At]]:
         channel = self._channels[name]
         none = np.empty(0)
-        for one in self._faults.get(name, []):
-            t = n / channel.rate_hz - one.begin / TICKS_HZ
-            draw, kept = one.draws[name], one.kept
-            yield one.what, At(t, n, channel, draw, kept, lambda x: self._beyond(x, n, name), none, none, lambda x: x)
+        for fault in self._faults.get(name, []):
+            t = n / channel.rate_hz - fault.begin / TICKS_HZ
+            draw, kept = fault.draws[name], fault.kept
+            yield (
+                fault.what,
+                At(t, n, channel, draw, kept, lambda x: self._other_volts(x, n, name), none, none, lambda x: x),
+            )
 
-    def _conditioned(self, name: str, instants: Instants, ats: Iterable[tuple[Kind, At]]) -> np.ndarray:
+    def _sensor_volts(self, name: str, instants: Instants, faults_at: Iterable[tuple[Kind, At]]) -> np.ndarray:
         """Return the output of a sensor with the faults of its transducer [V]."""
         channel = self._channels[name]
         x = (self._calibrator.volts(name, instants) - channel.bias_v) / channel.sensitivity_v
-        for what, at in ats:
+        for what, at in faults_at:
             x = what.signal(x, at)
         return channel.bias_v + channel.sensitivity_v * x
 
-    def _beyond(self, name: str, n: np.ndarray, at: str) -> np.ndarray:
+    def _other_volts(self, name: str, n: np.ndarray, at: str) -> np.ndarray:
         channel = self._channels[name]
         instants = Instants.of_samples(n, self._channels[at].rate_hz)
-        return self._conditioned(name, instants, ()) - channel.bias_v
+        return self._sensor_volts(name, instants, ()) - channel.bias_v
 
     def volts(self, name: str, n: np.ndarray) -> np.ndarray | None:
         """Return the volts at the converter in the samples of these numbers, shape (n,); None for a healthy channel."""
         if name not in self._faults or not len(n):
             return None
-        ats, late_s = list(self._ats(name, n)), np.zeros(len(n))
-        for what, at in ats:
+        faults_at, late_s = list(self._iterate_faults(name, n)), np.zeros(len(n))
+        for what, at in faults_at:
             late_s += np.minimum(what.late_s(at), at.t)  # not before the fault
         source = self._plugs.get(name, name)
         instants = Instants.of_samples(n, self._channels[name].rate_hz).later(late_s)
-        volts = self._conditioned(source, instants, ats if source == name else self._ats(source, n))
-        for what, at in ats:
+        volts = self._sensor_volts(source, instants, faults_at if source == name else self._iterate_faults(source, n))
+        for what, at in faults_at:
             volts = what.volts(volts, at)
         return volts
 
     def counts(self, name: str, n: np.ndarray, counts: np.ndarray) -> np.ndarray:
         """Return the counts with the faults of the converter, before limiting, shape (n,)."""
-        for what, at in self._ats(name, n):
+        for what, at in self._iterate_faults(name, n):
             counts = what.counts(counts, at) if len(n) else counts
         return counts
 
@@ -183,7 +186,7 @@ def _normal(stream: np.ndarray) -> np.random.Generator:
     return np.random.Generator(bits)
 
 
-class Turns:
+class NominalKeyphasor:
     """Replacement of the keyphasor: edges at the whole turns of a nominal speed, none at speed 0.
 
     Args:
@@ -214,7 +217,7 @@ class Turns:
         return np.array([(round(n * turn * FRACTIONS) - start * FRACTIONS) / FRACTIONS for n in range(first, end)])
 
 
-def stand_ins(scene: Scene, *, row_ticks: int, tick: int) -> tuple[list[Any], Any]:
+def build_replacements(scene: Scene, *, row_ticks: int, tick: int) -> tuple[list[Any], Any]:
     """Return the replacements of the conditioners and of the keyphasor for a scene with a generator.
 
     Args:
@@ -226,12 +229,12 @@ def stand_ins(scene: Scene, *, row_ticks: int, tick: int) -> tuple[list[Any], An
     noise = sensors.noise and sensors.chain == "full"
     groups = scene.table.groups.values()
     calibrator = Calibrator(groups, scene.sources(), seed=scene.seed, noise=noise, row_ticks=row_ticks, tick=tick)
-    return [calibrator], Turns(scene.drive.speed_hz, tick)
+    return [calibrator], NominalKeyphasor(scene.drive.speed_hz, tick)
 
 
 def health(scene: Scene) -> dict[str, Any]:
     """Return the health of a run with a generator: nominal speed, and channels driven beyond the converter."""
     sources = scene.sources().items()
-    limited = [name for name, one in sources if one.largest_v > one.channel.adc_v + one.channel.lsb_v]
-    said = f"driven beyond the converter, which limits: {', '.join(limited)}"
-    return {"spin_hz": scene.drive.speed_hz, "contacts": 0, "warnings": [said] if limited else []}
+    limited = [name for name, source in sources if source.largest_v > source.channel.adc_v + source.channel.lsb_v]
+    warning = f"driven beyond the converter, which limits: {', '.join(limited)}"
+    return {"spin_hz": scene.drive.speed_hz, "contacts": 0, "warnings": [warning] if limited else []}

@@ -40,7 +40,7 @@ from rig.channels.sensors.conditioning import Conditioner
 from rig.channels.sensors.keyphasor import FRACTIONS, TURN
 from rig.channels.table import Channel, ChannelTable
 from rig.physics.kernels.signals import COLUMN, N_ROW
-from rig.run.calibrator import Calibrator, Generated
+from rig.run.calibrator import Calibrator, GeneratedFaults
 from rig.run.commands.table import ClearCommand, FaultCommand
 
 _MAX_FAULTS = 64
@@ -54,7 +54,7 @@ _NODES = 6
 _NODE_SCALES = [1.0 / math.prod(node - other for other in range(_NODES) if other != node) for node in range(_NODES)]
 _FINE_BITS = 32
 """Resolution of these samples: finer than that of any converter."""
-_OF_CONVERTER = 1
+_CONVERTER_NOISE_KEY = 1
 """Last part of the key of converter noise, which separates it from the fault's own random numbers."""
 _REACH_V = 1e3
 """Range of a faulty cable [V]; only the converter limits it."""
@@ -68,17 +68,17 @@ class _Twin:
     channels: dict[str, Channel]
     noise: np.ndarray
     """Noise of each channel added to interpolated samples [counts], shape (channels,)."""
-    of: tuple[tuple[str, tuple[int, ...]], ...]
+    fault_numbers: tuple[tuple[str, tuple[int, ...]], ...]
     """Numbers of the faults of each channel."""
     first: int
     """Index of its first sample."""
-    past: np.ndarray
+    stored: np.ndarray
     """Stored samples, shape (n, channels), ..."""
-    at: int
+    stored_start: int
     """... and the index of the first of them."""
 
 
-class Faulty:
+class FaultInjector:
     """All faults of a run.
 
     Args:
@@ -102,7 +102,7 @@ class Faulty:
         self._marks = {name for name, channel in self.channels.items() if channel.signal == "keyphasor"}
         """... and those with keyphasor pulses."""
         self.active: list[Active] = []
-        self._begun = 0
+        self._fault_count = 0
         self._last_edge = math.nan
         self._held = np.empty(0)
         """Delayed edges not yet shown [ticks]."""
@@ -125,7 +125,7 @@ class Faulty:
             found |= zip(names, conditioner.columns.tolist(), strict=True)
         return found
 
-    def targets(self, command: FaultCommand, tick: int) -> tuple[str, ...]:
+    def find_targets(self, command: FaultCommand, tick: int) -> tuple[str, ...]:
         """Return the channels that a fault changes, or whose blocks it affects.
 
         Raises:
@@ -147,11 +147,11 @@ class Faulty:
         Raises:
             InputError: A fault is impossible.
         """
-        number = self._begun
+        number = self._fault_count
         for tick, command in timed:
             if isinstance(command, FaultCommand):
                 number += 1
-                self._check_effect(command, self.targets(command, tick), tick, number)
+                self._check_effect(command, self.find_targets(command, tick), tick, number)
 
     def _check_effect(self, command: FaultCommand, names: tuple[str, ...], tick: int, number: int) -> None:
         """Raise an error for a fault that could not change a count or a block.
@@ -165,21 +165,24 @@ class Faulty:
         Raises:
             InputError: The fault is too small, too short or too rare; the message has the limit.
         """
-        what, places = command.what, {name: n for n, name in enumerate(self.channels)}
-        for name in names[:1] if isinstance(what, OfBlocks) else names:
+        kind, positions = command.what, {name: n for n, name in enumerate(self.channels)}
+        for name in names[:1] if isinstance(kind, OfBlocks) else names:
             channel = self.channels[name]
-            source = self.channels[what.reads[0]] if what.reads else None
-            check_time(what, channel.rate_hz, tick, self.row_ticks, command.for_s)
-            check_size(what, channel, source, command.for_s)
-            row, draws = first_row(self._row_at(tick), channel.rate_hz), self._draws(number, what, places[name])
-            check_draws(what, channel.rate_hz, row, tick, command.for_s, draws)
+            source = self.channels[kind.reads[0]] if kind.reads else None
+            check_time(kind, channel.rate_hz, tick, self.row_ticks, command.for_s)
+            check_size(kind, channel, source, command.for_s)
+            row, draws = (
+                first_row(self._next_row_tick(tick), channel.rate_hz),
+                self._build_draws(number, kind, positions[name]),
+            )
+            check_draws(kind, channel.rate_hz, row, tick, command.for_s, draws)
 
-    def _draws(self, number: int, what: Kind, place: int) -> Draws:
+    def _build_draws(self, number: int, kind: Kind, position: int) -> Draws:
         """Return a fault's random numbers on a channel.
 
         Hum, clock, loose contact and blocks are common to the channels of a group; noise is separate for each channel.
         """
-        return Draws(self._seed, number, place + 1 if what.stage == "converter" else 0)
+        return Draws(self._seed, number, position + 1 if kind.stage == "converter" else 0)
 
     def check(self, command: FaultCommand | ClearCommand, tick: int, waiting: Sequence[object]) -> dict[str, Any]:
         """Return the effect of a command sent now, in the form of `begin`.
@@ -192,21 +195,21 @@ class Faulty:
         Raises:
             InputError: The command is impossible.
         """
-        begun, known = self._begun, [one.id for one in self._all() if one.end > tick]
+        fault_count, active_ids = self._fault_count, [fault.id for fault in self._list_active() if fault.end > tick]
         for other in waiting:
             if isinstance(other, FaultCommand):
-                known.append(begun := begun + 1)
+                active_ids.append(fault_count := fault_count + 1)
             elif isinstance(other, ClearCommand):
-                known = [number for number in known if other.id not in ("all", number)]
+                active_ids = [number for number in active_ids if other.id not in ("all", number)]
         if isinstance(command, FaultCommand):
-            if len(known) >= _MAX_FAULTS:
+            if len(active_ids) >= _MAX_FAULTS:
                 raise InputError("fault", f"one of at most {_MAX_FAULTS} at a time", Words("another"))
-            names = self.targets(command, tick)
-            self._check_effect(command, names, tick, begun + 1)
-            return self._told(begun + 1, names, tick)
-        if command.id != "all" and command.id not in known:
-            there = ", ".join(map(str, known)) or "none"
-            raise InputError("clear.id", f"the number of an active fault ({there}), or all", command.id)
+            names = self.find_targets(command, tick)
+            self._check_effect(command, names, tick, fault_count + 1)
+            return self._describe_effect(fault_count + 1, names, tick)
+        if command.id != "all" and command.id not in active_ids:
+            known = ", ".join(map(str, active_ids)) or "none"
+            raise InputError("clear.id", f"the number of an active fault ({known}), or all", command.id)
         return {}
 
     def clear(self, command: ClearCommand, tick: int) -> list[dict[str, Any]]:
@@ -220,14 +223,14 @@ class Faulty:
             For each ended fault its number as `id` and in the list `fault`, its channels, and the first healthy rows by
             group. If none ends, one entry with an empty list, as every command reports an effect.
         """
-        row = self._row_at(tick)
-        ended = [one for one in self._all() if command.id in ("all", one.id) and one.end > row]
-        for one in ended:
-            one.end = row
+        row = self._next_row_tick(tick)
+        ended = [fault for fault in self._list_active() if command.id in ("all", fault.id) and fault.end > row]
+        for fault in ended:
+            fault.end = row
         if not ended:
             number = None if command.id == "all" else command.id
-            return [{**self._told(0, (), tick), "id": number, "fault": []}]
-        return [{**self._told(0, one.names, tick), "id": one.id, "fault": [one.id]} for one in ended]
+            return [{**self._describe_effect(0, (), tick), "id": number, "fault": []}]
+        return [{**self._describe_effect(0, fault.names, tick), "id": fault.id, "fault": [fault.id]} for fault in ended]
 
     def begin(self, command: FaultCommand, tick: int, pending: list[tuple[int, Any]]) -> dict[str, Any]:
         """Begin a fault at the first row at or after a tick.
@@ -240,80 +243,86 @@ class Faulty:
         Returns:
             Its number, its channels, and the first rows that it changes, by group.
         """
-        row = self._row_at(tick)
-        self._begun += 1
-        names, what = self.targets(command, tick), command.what
-        places = {name: n for n, name in enumerate(self.channels)}
-        draws = {name: self._draws(self._begun, what, places[name]) for name in names}
-        if isinstance(what, OfBlocks):
-            draws = {"": self._draws(self._begun, what, 0)}
-            self.sending.active.append(Active(self._begun, what, names, row, draws, sensor_key(command.channel)))
+        row = self._next_row_tick(tick)
+        self._fault_count += 1
+        names, kind = self.find_targets(command, tick), command.what
+        positions = {name: n for n, name in enumerate(self.channels)}
+        draws = {name: self._build_draws(self._fault_count, kind, positions[name]) for name in names}
+        if isinstance(kind, OfBlocks):
+            draws = {"": self._build_draws(self._fault_count, kind, 0)}
+            self.sending.active.append(Active(self._fault_count, kind, names, row, draws, sensor_key(command.channel)))
         else:
             noise: dict[str, np.random.Generator] = {}
-            if acts(what, "late_s"):
-                keys = {name: (self._seed, self._begun, places[name] + 1, _OF_CONVERTER) for name in names}
+            if acts(kind, "late_s"):
+                keys = {
+                    name: (self._seed, self._fault_count, positions[name] + 1, _CONVERTER_NOISE_KEY) for name in names
+                }
                 noise = {
                     name: np.random.Generator(np.random.SFC64(np.random.SeedSequence(key)))
                     for name, key in keys.items()
                 }
-            self.active.append(Active(self._begun, what, names, row, draws, noise=noise))
+            self.active.append(Active(self._fault_count, kind, names, row, draws, noise=noise))
         if command.for_s is not None:
-            over = tick + max(1, round(command.for_s * TICKS_HZ))
-            insort(pending, (over, ClearCommand(id=self._begun)), key=lambda entry: entry[0])
-        return self._told(self._begun, names, tick)
+            end_tick = tick + max(1, round(command.for_s * TICKS_HZ))
+            insort(pending, (end_tick, ClearCommand(id=self._fault_count)), key=lambda entry: entry[0])
+        return self._describe_effect(self._fault_count, names, tick)
 
-    def _all(self) -> list[Active]:
+    def _list_active(self) -> list[Active]:
         return [*self.active, *self.sending.active]
 
-    def _row_at(self, tick: int) -> int:
+    def _next_row_tick(self, tick: int) -> int:
         return -(-tick // self.row_ticks) * self.row_ticks
 
-    def _told(self, number: int, names: Sequence[str], tick: int) -> dict[str, Any]:
-        row = self._row_at(tick)
+    def _describe_effect(self, number: int, names: Sequence[str], tick: int) -> dict[str, Any]:
+        row = self._next_row_tick(tick)
         groups = {name: group for name, group in self.table.groups.items() if set(group.names) & set(names)}
         first = {name: first_row(row, group.rate_hz) for name, group in groups.items()}
         return {"fault": number, "channels": list(names), "first_row": first}
 
-    def counts(self, rows: np.ndarray, made: np.ndarray, tick: int) -> dict[str, np.ndarray]:
+    def counts(self, rows: np.ndarray, formula_values: np.ndarray, tick: int) -> dict[str, np.ndarray]:
         """Return the samples from the first of these rows up to the last one, by group.
 
         Args:
             rows: Observed rows, shape (n, N_ROW).
-            made: Signals by formulas, shape (n, m).
+            formula_values: Signals by formulas, shape (n, m).
             tick: Tick of the first row.
         """
         if not self.active:
-            return {name: counts for each in self.conditioners for name, counts in each.counts(rows, made).items()}
+            return {
+                name: counts for each in self.conditioners for name, counts in each.counts(rows, formula_values).items()
+            }
         end = tick + (len(rows) - 1) * self.row_ticks
-        changes = {int(at) for one in self.active for at in (one.begin, one.end) if tick < at < end}
+        changes = {int(limit) for fault in self.active for limit in (fault.begin, fault.end) if tick < limit < end}
         ticks = [tick, *sorted(changes), end]
-        places = [(each - tick) // self.row_ticks for each in ticks]
+        positions = [(each - tick) // self.row_ticks for each in ticks]
         parts = [
-            self._counts(rows[a : b + 1], made[a : b + 1], begin)
-            for begin, a, b in zip(ticks, places, places[1:], strict=False)
+            self._counts(rows[a : b + 1], formula_values[a : b + 1], begin)
+            for begin, a, b in zip(ticks, positions, positions[1:], strict=False)
         ]
         return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
-    def _counts(self, rows: np.ndarray, made: np.ndarray, tick: int) -> dict[str, np.ndarray]:
+    def _counts(self, rows: np.ndarray, formula_values: np.ndarray, tick: int) -> dict[str, np.ndarray]:
         """Return the samples of rows between which no fault begins or ends."""
-        active = [one for one in self.active if one.begin <= tick < one.end]
-        if (ids := [one.id for one in active]) != self._planned[0]:
+        active = [fault for fault in self.active if fault.begin <= tick < fault.end]
+        if (ids := [fault.id for fault in active]) != self._planned[0]:
             self._planned = ids, [Plan(conditioner.groups, active) for conditioner in self.conditioners]
         found: dict[str, np.ndarray] = {}
-        volts = Volts(self.scales, rows, made, tick, self.row_ticks, active)
-        for place, (conditioner, plan) in enumerate(zip(self.conditioners, self._planned[1], strict=True)):
+        volts = Volts(self.scales, rows, formula_values, tick, self.row_ticks, active)
+        for position, (conditioner, plan) in enumerate(zip(self.conditioners, self._planned[1], strict=True)):
             if isinstance(conditioner, Calibrator):
-                found |= conditioner.counts(rows, made, Generated(conditioner, plan.faulty) if plan.faulty else None)
+                found |= conditioner.counts(
+                    rows, formula_values, GeneratedFaults(conditioner, plan.faulty) if plan.faulty else None
+                )
                 continue
             if not plan.faulty:
-                self._twins = {key: twin for key, twin in self._twins.items() if key[0] != place}
-                found |= conditioner.counts(rows, made)
+                self._twins = {key: twin for key, twin in self._twins.items() if key[0] != position}
+                found |= conditioner.counts(rows, formula_values)
                 continue
             # Twins first: they start from the state of the healthy chain before these rows.
             rate = conditioner.groups[0].rate_hz
             n = np.arange(first_row(tick, rate), first_row(tick + (len(rows) - 1) * self.row_ticks, rate))
-            shown = self._shown(place, conditioner, plan, volts, n, tick)
-            counts = conditioner.counts(rows, made)
+            shown = self._twin_counts(position, conditioner, plan, volts, n, tick)
+            counts = conditioner.counts(rows, formula_values)
             for name, values in shown.items():
                 group, c = plan.homes[name]
                 counts[group][:, c] = values
@@ -336,38 +345,41 @@ class Faulty:
             tick: Tick of the first row.
         """
         # An edge may lie before the first row; faults that ended earlier have no effect.
-        self.active = [one for one in self.active if one.end > tick - self.row_ticks]
-        before = self._last_edge
+        self.active = [fault for fault in self.active if fault.end > tick - self.row_ticks]
+        previous = self._last_edge
         if len(edges):
             self._last_edge = float(edges[-1] + tick)
-        faults = [(one, mark) for one in self.active for mark in one.names if mark in self._marks]
-        faults = [(one, mark) for one, mark in faults if acts(one.what, "edges")]
+        faults = [(fault, mark) for fault in self.active for mark in fault.names if mark in self._marks]
+        faults = [(fault, mark) for fault, mark in faults if acts(fault.what, "edges")]
         if not faults:
             return edges
-        real, end = edges + tick, tick + self.row_ticks * len(rows)
+        true_edges, end = edges + tick, tick + self.row_ticks * len(rows)
         # Faults that have ended show no delayed edges.
-        lasts = [(self._held >= one.begin) & (self._held < one.end) for one, _ in faults]
-        self._held = self._held[np.any(lasts, axis=0)]
+        holds = [(self._held >= fault.begin) & (self._held < fault.end) for fault, _ in faults]
+        self._held = self._held[np.any(holds, axis=0)]
         # The rate from the edges: that of the rows would depend on where a block begins.
-        rate = 2e6 * math.pi / np.diff(real, prepend=before)
+        rate = 2e6 * math.pi / np.diff(true_edges, prepend=previous)
         # Before the first edge there is none: use the row after it, independent of where the block begins.
-        behind = np.ceil(edges / self.row_ticks).astype(int)
-        rate = np.where(np.isnan(rate), rows[np.minimum(behind, len(rows) - 1), COLUMN["theta_rate"]], rate)
+        next_rows = np.ceil(edges / self.row_ticks).astype(int)
+        rate = np.where(np.isnan(rate), rows[np.minimum(next_rows, len(rows) - 1), COLUMN["theta_rate"]], rate)
         turns = np.rint(np.interp(edges, self.row_ticks * np.arange(len(rows)), rows[:, COLUMN["theta"]]) / TURN) * TURN
-        found = real
-        for one, mark in faults:
-            inside = (found >= one.begin) & (found < one.end)
-            here, nearest = found[inside], np.maximum(np.searchsorted(real, found[inside], side="right") - 1, 0)
+        found = true_edges
+        for fault, mark in faults:
+            in_fault = (found >= fault.begin) & (found < fault.end)
+            here, nearest = (
+                found[in_fault],
+                np.maximum(np.searchsorted(true_edges, found[in_fault], side="right") - 1, 0),
+            )
             angles, rates = turns[nearest], rate[nearest]
-            if tick <= one.begin < end:
+            if tick <= fault.begin < end:
                 # The turn in which the fault begins has later pulses too; its edge follows from the angle and rate now.
-                at_rows = np.interp(one.begin, tick + self.row_ticks * np.arange(len(rows)), np.arange(len(rows)))
+                at_rows = np.interp(fault.begin, tick + self.row_ticks * np.arange(len(rows)), np.arange(len(rows)))
                 low, part = int(at_rows), at_rows % 1.0
-                theta, fast = (
+                theta, speed = (
                     rows[low, COLUMN[name]] * (1.0 - part) + rows[min(low + 1, len(rows) - 1), COLUMN[name]] * part
                     for name in ("theta", "theta_rate")
                 )
-                if fast > 0.0:
+                if speed > 0.0:
                     turn = math.floor(theta / TURN) * TURN
                     here = np.append(one.begin - TICKS_HZ * (theta - turn) / fast, here)
                     angles, rates = np.append(turn, angles), np.append(fast, rates)
@@ -375,27 +387,27 @@ class Faulty:
                 (here - one.begin) / TICKS_HZ, np.arange(len(here)), self.channels[mark], one.draws[mark], {},
                 read_nothing, angles, rates, mark_signal,
             )  # fmt: skip
-            shown = np.rint(one.what.edges(here, at) * FRACTIONS) / FRACTIONS
+            shown = np.rint(fault.what.edges(here, instants) * FRACTIONS) / FRACTIONS
             # As with the signal, the true edges apply after the end of the fault.
-            shown = shown[(shown >= one.begin) & (shown < one.end)]
-            found = np.sort(np.concatenate([found[~inside], shown]))
+            shown = shown[(shown >= fault.begin) & (shown < fault.end)]
+            found = np.sort(np.concatenate([found[~in_fault], shown]))
         found = np.sort(np.concatenate([self._held, found]))
         self._held = found[found >= end]
         return found[found < end] - tick
 
-    def _shown(
-        self, place: int, conditioner: Conditioner, plan: Plan, volts: Volts, n: np.ndarray, tick: int
+    def _twin_counts(
+        self, position: int, conditioner: Conditioner, plan: Plan, volts: Volts, n: np.ndarray, tick: int
     ) -> dict[str, np.ndarray]:
         """Return the counts of channels that differ before the converter, each of shape (samples,)."""
         found: dict[str, np.ndarray] = {}
         for fine, faulty in plan.twins.items():
-            twin = self._twin((place, fine), conditioner, faulty, tick)
+            twin = self._twin((position, fine), conditioner, faulty, tick)
             if twin is None:
                 continue
             names = list(faulty)
             (values,) = twin.conditioner.counts(volts.rows, volts.signals(names)).values()
             if fine:
-                values = self._late(twin, values, n, list(faulty.values()))
+                values = self._delay_samples(twin, values, n, list(faulty.values()))
             found |= zip(names, values.T, strict=True)
         return found
 
@@ -403,13 +415,13 @@ class Faulty:
         self, key: tuple[int, bool], conditioner: Conditioner, faulty: dict[str, list[Active]], tick: int
     ) -> _Twin | None:
         """Return the twin chain of some channels: the existing one, or one started from the healthy chain."""
-        before = self._twins.pop(key, None)
+        previous = self._twins.pop(key, None)
         if not faulty:
             return None
-        of = tuple((name, tuple(one.id for one in faults)) for name, faults in faulty.items())
-        if before is not None and before.of == of:
-            self._twins[key] = before
-            return before
+        fault_numbers = tuple((name, tuple(fault.id for fault in faults)) for name, faults in faulty.items())
+        if previous is not None and previous.fault_numbers == fault_numbers:
+            self._twins[key] = previous
+            return previous
         channels = {name: self._channel(name, faults) for name, faults in faulty.items()}
         noise = np.array([channel.noise_v / channel.lsb_v for channel in channels.values()])
         if not self._setting.noisy or self._setting.ideal:
@@ -418,34 +430,40 @@ class Faulty:
             # Interpolated samples have no noise or quantisation; those of the converter are added afterwards.
             fine = {"adc_bits": _FINE_BITS, "noise_v": 0.0}
             channels = {name: channel.model_copy(update=fine) for name, channel in channels.items()}
-        if before is not None and before.channels == channels:
-            before.of, before.noise = of, noise
-            self._twins[key] = before
-            return before
+        if previous is not None and previous.channels == channels:
+            previous.fault_numbers, previous.noise = fault_numbers, noise
+            self._twins[key] = previous
+            return previous
         rate = conditioner.groups[0].rate_hz * (_OVERSAMPLING if key[1] else 1)
         first = first_row(tick, rate)
-        made = conditioner.twin(channels, rate_hz=rate, first=first, row=tick // self.row_ticks, columns=N_ROW)
-        if before is not None:
-            made.take_over(
-                before.conditioner, [name for name in channels if channels[name] == before.channels.get(name)]
+        chain = conditioner.twin(channels, rate_hz=rate, first=first, row=tick // self.row_ticks, columns=N_ROW)
+        if previous is not None:
+            chain.take_over(
+                previous.conditioner, [name for name in channels if channels[name] == previous.channels.get(name)]
             )
-        twin = _Twin(made, channels, noise, of, first, np.empty((0, len(channels)), np.int32), first)
-        if before is not None and key[1] and set(channels) <= set(before.channels):
-            columns = [list(before.channels).index(name) for name in channels]
-            twin.first, twin.past, twin.at = before.first, before.past[:, columns], before.at
+        twin = _Twin(chain, channels, noise, fault_numbers, first, np.empty((0, len(channels)), np.int32), first)
+        if previous is not None and key[1] and set(channels) <= set(previous.channels):
+            columns = [list(previous.channels).index(name) for name in channels]
+            twin.first, twin.stored, twin.stored_start = (
+                previous.first,
+                previous.stored[:, columns],
+                previous.stored_start,
+            )
         self._twins[key] = twin
         return twin
 
     def _channel(self, name: str, faults: Sequence[Active]) -> Channel:
         """Return a channel as in its twin's chain: with its changed filter, limited only by the converter."""
         channel = self.channels[name]
-        for one in faults:
-            channel = one.what.chain(channel)
-        bare = any(type(one.what) is NoFilter for one in faults)
+        for fault in faults:
+            channel = fault.what.chain(channel)
+        bare = any(type(fault.what) is NoFilter for fault in faults)
         more = {"bandwidth_hz": _NO_CORNER_HZ} if bare else {}
         return channel.model_copy(update={"range_v": (-_REACH_V, _REACH_V), **more})
 
-    def _late(self, twin: _Twin, counts: np.ndarray, n: np.ndarray, faulty: Sequence[Sequence[Active]]) -> np.ndarray:
+    def _delay_samples(
+        self, twin: _Twin, counts: np.ndarray, n: np.ndarray, faulty: Sequence[Sequence[Active]]
+    ) -> np.ndarray:
         """Return the counts of delayed samples, each channel with its own converter noise.
 
         Args:
@@ -459,7 +477,7 @@ class Faulty:
         """
         channels = [self.channels[name] for name in twin.channels]
         rate = channels[0].rate_hz
-        late_s, loud = np.zeros((len(n), len(channels))), np.zeros((len(n), len(channels)))
+        late_s, noise_counts = np.zeros((len(n), len(channels))), np.zeros((len(n), len(channels)))
         for c, (channel, faults) in enumerate(zip(channels, faulty, strict=True)):
             late = [one for one in faults if acts(one.what, "late_s")]
             for one in late:
@@ -467,23 +485,23 @@ class Faulty:
             loud[:, c] = late[0].noise[channel.name].standard_normal(len(n))
         # Not before the fault, and with enough samples to interpolate.
         here = (n * _OVERSAMPLING)[:, None]
-        wanted = np.maximum(here - late_s * (rate * _OVERSAMPLING), np.minimum(here, twin.first + _NODES - 1))
-        known = np.concatenate([twin.past, counts])
-        whole = np.floor(wanted).astype(np.int64)
-        part, width = wanted - whole, len(channels)
+        instants = np.maximum(here - late_s * (rate * _OVERSAMPLING), np.minimum(here, twin.first + _NODES - 1))
+        samples = np.concatenate([twin.stored, counts])
+        whole = np.floor(instants).astype(np.int64)
+        part, width = instants - whole, len(channels)
         # Nodes outside the known samples have a weight of 0: there the instants coincide with samples.
-        places = (whole - (_NODES - 1) - twin.at) * width + np.arange(width)
+        positions = (whole - (_NODES - 1) - twin.stored_start) * width + np.arange(width)
         # Weights of the polynomial through the nodes -5 to 0: products of the distances from all others.
         apart = [part + (_NODES - 1 - node) for node in range(_NODES)]
-        values, flat = np.zeros(wanted.shape), known.ravel()
+        values, flat = np.zeros(instants.shape), samples.ravel()
         for node in range(_NODES):
             weight = apart[node - 1] * _NODE_SCALES[node]
             for other in range(_NODES):
                 if other not in (node, (node - 1) % _NODES):
                     weight *= apart[other]
-            values += weight * flat.take(places + node * width, mode="clip")
+            values += weight * flat.take(positions + node * width, mode="clip")
         kept = round(rate * _OVERSAMPLING * 0.0201) + 2 * _NODES
-        twin.at, twin.past = twin.at + max(0, len(known) - kept), known[-kept:]
+        twin.stored_start, twin.stored = twin.stored_start + max(0, len(samples) - kept), samples[-kept:]
         bits = np.array([channel.adc_bits for channel in channels])
-        most = 2.0 ** (bits - 1)
-        return np.clip(np.rint(values * 2.0 ** (bits - _FINE_BITS) + twin.noise * loud), -most, most - 1.0)
+        limit = 2.0 ** (bits - 1)
+        return np.clip(np.rint(values * 2.0 ** (bits - _FINE_BITS) + twin.noise * noise_counts), -limit, limit - 1.0)

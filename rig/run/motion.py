@@ -24,7 +24,7 @@ BRANCH_ALARM = 1e-2
 """Energy residual over dissipated energy above which a run may have missed a contact or added a false one."""
 
 
-class Begin(NamedTuple):
+class MotionStart(NamedTuple):
     """Start of a run that continues an earlier motion: the shaft in the ring, its housings at rest."""
 
     tick: int
@@ -35,7 +35,7 @@ class Begin(NamedTuple):
     angle: float = 0.0  # theta [rad]
 
 
-def initial_state(model: Model, initial: Initial, begin: Begin | None, *, spin: float) -> np.ndarray:
+def initial_state(model: Model, initial: Initial, begin: MotionStart | None, *, spin: float) -> np.ndarray:
     """Return state and integrals at the start of a run, shape (N_VECTOR,).
 
     Args:
@@ -50,8 +50,8 @@ def initial_state(model: Model, initial: Initial, begin: Begin | None, *, spin: 
     contact, inside = model.constants.contact, "inside the ring (r0 = {:g} mm)".format
     if begin is not None:
         if math.hypot(begin.ring_x, begin.ring_y) >= contact.clearance:
-            place = [begin.ring_x * 1e3, begin.ring_y * 1e3]
-            raise InputError("begin", inside(contact.clearance * 1e3), place)
+            position = [begin.ring_x * 1e3, begin.ring_y * 1e3]
+            raise InputError("begin", inside(contact.clearance * 1e3), position)
         return model.state(
             ring_x=begin.ring_x, ring_y=begin.ring_y, velocity=(begin.vx, begin.vy), spin=spin, angle=begin.angle
         )
@@ -59,13 +59,17 @@ def initial_state(model: Model, initial: Initial, begin: Begin | None, *, spin: 
         sag = model.sag
         if math.hypot(contact.offset_x, sag - contact.offset_y) > contact.clearance:
             r0 = contact.clearance * 1e3
-            place = f"within {r0:g} mm of the shaft at rest on its magnets, (0, {sag * 1e3:.4g}) mm"
-            raise InputError("ring.offset", place, [contact.offset_x * 1e3, contact.offset_y * 1e3])
+            position = f"within {r0:g} mm of the shaft at rest on its magnets, (0, {sag * 1e3:.4g}) mm"
+            raise InputError("ring.offset", position, [contact.offset_x * 1e3, contact.offset_y * 1e3])
         return model.state(spin=spin)
     # Just inside the clearance, so that rounding does not cause a contact.
-    within = contact.clearance * (1.0 - 1e-12)
-    places = {"top": (0.0, within), "bottom": (0.0, -within), "given": (initial.x_mm * 1e-3, initial.y_mm * 1e-3)}
-    x, y = places[initial.position]
+    radius = contact.clearance * (1.0 - 1e-12)
+    positions = {
+        "top": (0.0, radius),
+        "bottom": (0.0, -radius),
+        "given": (initial.x_mm * 1e-3, initial.y_mm * 1e-3),
+    }
+    x, y = positions[initial.position]
     if math.hypot(x, y) > contact.clearance:
         raise InputError("initial.position", inside(contact.clearance * 1e3), [initial.x_mm, initial.y_mm])
     return model.state(ring_x=x, ring_y=y, spin=spin)
@@ -118,20 +122,20 @@ class Motion:
         """
         row_ticks = self.stride * self.step_ticks
         while tick < stop:
-            row, beyond = divmod(tick - start, row_ticks)
-            whole = 0 if beyond else (stop - tick) // row_ticks
+            row, remainder = divmod(tick - start, row_ticks)
+            whole = 0 if remainder else (stop - tick) // row_ticks
             if whole:
                 step, steps, stride = self.step_ticks, whole * self.stride, self.stride
                 out = rows[row : row + whole + 1]
             else:
-                ticks = min(stop - tick, row_ticks - beyond)
+                ticks = min(stop - tick, row_ticks - remainder)
                 step = math.gcd(ticks, self.step_ticks)
                 stride = steps = ticks // step
                 out = np.full((2, S.N_ROW), np.nan)
             engine.advance(constants, inputs, self.y, self.memory, tick, step, steps, stride, out)
-            if not whole and not beyond:
+            if not whole and not remainder:
                 rows[row] = out[0]
-            elif not whole and beyond + steps * step == row_ticks and row + 1 < len(rows):
+            elif not whole and remainder + steps * step == row_ticks and row + 1 < len(rows):
                 rows[row + 1] = out[1]
             tick += steps * step
 

@@ -89,7 +89,7 @@ class Run:
         return ROW[COLUMN[self.names[place(name, self.names, must=_MUST)]]].unit
 
     def __repr__(self) -> str:
-        scene, rate = self.simulation.scene, _kept_rate(self.simulation)
+        scene, rate = self.simulation.scene, _get_signal_rate(self.simulation)
         return (
             f"Run({scene.name}: {len(self.times_s) / rate:g} s, {len(self.times_s)} rows at "
             f"{rate:g} Hz of {len(self.names)} signals and {len(self.table.channels)} channels; "
@@ -134,9 +134,9 @@ class Run:
         Raises:
             InputError: The run did not keep all signals of the ledger.
         """
-        lacking = [name for name in (*STORED, *SUPPLIED, *DISSIPATED) if name not in self.names]
-        if lacking:
-            raise InputError("signals", f"with {', '.join(lacking)} for an energy ledger", list(self.names))
+        missing = [name for name in (*STORED, *SUPPLIED, *DISSIPATED) if name not in self.names]
+        if missing:
+            raise InputError("signals", f"with {', '.join(missing)} for an energy ledger", list(self.names))
         columns, parts = [COLUMN[name] for name in self.names], []
         first = np.zeros(N_ROW)
         first[columns] = self.signals[0]
@@ -147,7 +147,7 @@ class Run:
             parts.append(energy_balance(rows, first))
         names = tuple(parts[0])
         values = np.column_stack([np.concatenate([part[name] for part in parts]) for name in names])
-        index, rate = np.arange(len(values)), _kept_rate(self.simulation)
+        index, rate = np.arange(len(values)), _get_signal_rate(self.simulation)
         return Samples("energy", self.times_s, index, values, names, ("J",) * len(names), rate)
 
 
@@ -223,26 +223,26 @@ def simulate(
         names = simulation.computed
     if names:
         check_computed({"signals": names}, simulation.first_row, engine=scene.engine.name)
-    every, end = simulation.kept_every, simulation.end_tick
+    every, end = simulation.rows_per_kept_row, simulation.end_tick
     n, table = -(-end // (every * simulation.row_ticks)), simulation.table
     columns = slice(None) if names == NAMES else [COLUMN[name] for name in names]
     edges, events = [], []
     rates = dict.fromkeys(group.rate_hz for group in table.groups.values())
-    alike = {rate: [group for group in table.groups.values() if group.rate_hz == rate] for rate in rates}
-    shown, counts = dict[int, _Rows](), dict[int, _Rows]()
+    groups_by_rate = {rate: [group for group in table.groups.values() if group.rate_hz == rate] for rate in rates}
+    sample_rows, counts = dict[int, _Rows](), dict[int, _Rows]()
     with ExitStack() as stack:
         kept = _Rows(stack, folder, "signals", (n, len(names)), np.float64)
-        for rate, groups in alike.items():
+        for rate, groups in groups_by_rate.items():
             shape = (-(-end * rate // simulation.tick_rate_hz), sum(len(group.channels) for group in groups))
-            of = f"-{rate}-hz" if len(alike) > 1 else ""
-            shown[rate] = _Rows(stack, folder, f"samples{of}", shape, np.float64)
-            counts[rate] = _Rows(stack, folder, f"counts{of}", shape, np.int32)
+            suffix = f"-{rate}-hz" if len(groups_by_rate) > 1 else ""
+            sample_rows[rate] = _Rows(stack, folder, f"samples{suffix}", shape, np.float64)
+            counts[rate] = _Rows(stack, folder, f"counts{suffix}", shape, np.int32)
         for frame in frames(simulation, commands=commands):
             kept.add(frame.rows[-(frame.tick // simulation.row_ticks) % every :: every, columns])
-            for rate, groups in alike.items():
+            for rate, groups in groups_by_rate.items():
                 blocks = [frame.samples[group.name].values for group in groups]
                 counts[rate].add(np.hstack(blocks))
-                shown[rate].add(
+                sample_rows[rate].add(
                     np.hstack([group.engineering(block) for group, block in zip(groups, blocks, strict=True)])
                 )
             if frame.edges is not None:
@@ -251,16 +251,16 @@ def simulate(
             if progress is not None:
                 progress(simulation.tick / simulation.end_tick)
     sampled, counted = [], []
-    for rate, groups in alike.items():
-        values, channels = shown[rate].array(), [channel for group in groups for channel in group.channels]
+    for rate, groups in groups_by_rate.items():
+        values, channels = sample_rows[rate].array(), [channel for group in groups for channel in group.channels]
         index = np.arange(len(values))
-        called = "sensors" if len(alike) == 1 else ", ".join(group.name for group in groups)
+        table_name = "sensors" if len(groups_by_rate) == 1 else ", ".join(group.name for group in groups)
         labels, units = tuple(channel.name for channel in channels), tuple(channel.unit for channel in channels)
-        sampled.append(Samples(called, index / rate, index, values, labels, units, float(rate)))
+        sampled.append(Samples(table_name, index / rate, index, values, labels, units, float(rate)))
         counted.append(replace(sampled[-1], values=counts[rate].array(), units=("count",) * len(units)))
     return Run(
         simulation=simulation,
-        times_s=np.arange(n) / _kept_rate(simulation),
+        times_s=np.arange(n) / _get_signal_rate(simulation),
         signals=kept.array(),
         names=names,
         sampled=tuple(sampled),
@@ -270,9 +270,9 @@ def simulate(
     )
 
 
-def _kept_rate(simulation: Simulation) -> float:
+def _get_signal_rate(simulation: Simulation) -> float:
     """Return the rate of the signals that a run keeps [Hz]."""
-    return simulation.tick_rate_hz / (simulation.kept_every * simulation.row_ticks)
+    return simulation.tick_rate_hz / (simulation.rows_per_kept_row * simulation.row_ticks)
 
 
 def _names(signals: Iterable[str]) -> tuple[str, ...]:
@@ -291,7 +291,7 @@ class _Rows:
     def __init__(
         self, stack: ExitStack, folder: str | Path | None, name: str, shape: tuple[int, int], dtype: type
     ) -> None:
-        self._seen, self._file = 0, None
+        self._row_count, self._file = 0, None
         if folder is None:
             self._values = np.empty(shape, dtype)
             return
@@ -307,8 +307,8 @@ class _Rows:
     def add(self, block: np.ndarray) -> None:
         """Add a block of rows."""
         if self._file is None:
-            self._values[self._seen : self._seen + len(block)] = block
-            self._seen += len(block)
+            self._values[self._row_count : self._row_count + len(block)] = block
+            self._row_count += len(block)
         else:
             self._file.write(block.tobytes())
 

@@ -94,29 +94,29 @@ class Scene(Written):
 
     @model_validator(mode="before")
     @classmethod
-    def _faults_too(cls, data: Any) -> Any:
-        return with_faults(data)
+    def _nest_faults(cls, data: Any) -> Any:
+        return nest_faults(data)
 
     @field_validator("commands", mode="before")
     @classmethod
-    def _tables(cls, commands: Any) -> Any:
+    def _check_command_tables(cls, commands: Any) -> Any:
         if not isinstance(commands, list | tuple):
             raise ValueError("a list of tables, each headed [[commands]]")
         return commands
 
     @field_validator("set")
     @classmethod
-    def _parameters_exist(cls, changes: dict[str, Any]) -> dict[str, Any]:
+    def _check_parameters(cls, changes: dict[str, Any]) -> dict[str, Any]:
         # Every set has the same keys and limits, so any will do to check them.
         load_parameters().override(changes)
         return changes
 
     @model_validator(mode="after")
-    def _engine_takes_model(self) -> Scene:
+    def _check_engine(self) -> Scene:
         method = ENGINES[self.engine.name]
-        for field, takes in (("friction", method.frictions), ("contact", method.contacts)):
-            if getattr(self.model, field) not in takes:
-                must = f"one of {', '.join(takes)} with engine {self.engine.name}"
+        for field, accepted in (("friction", method.frictions), ("contact", method.contacts)):
+            if getattr(self.model, field) not in accepted:
+                must = f"one of {', '.join(accepted)} with engine {self.engine.name}"
                 raise InputError(f"model.{field}", must, getattr(self.model, field))
         if self.engine.tolerance and not method.tolerance:
             must = f"left out with engine {self.engine.name}, whose steps are fixed"
@@ -138,7 +138,7 @@ class Scene(Written):
         return read_channels(Path(channels), lambda table: Formulas(numbers, table.curves).check(table))
 
     @model_validator(mode="after")
-    def _possible_sensors(self) -> Scene:
+    def _check_sensors(self) -> Scene:
         if self.channels is not None:
             check_table(self.channels)
         known = (self.channels or rig_table()).groups
@@ -150,7 +150,7 @@ class Scene(Written):
         return self
 
     @model_validator(mode="after")
-    def _possible_commands(self) -> Scene:
+    def _check_commands(self) -> Scene:
         last: dict[str, TimedCommand] = {}
         for timed in sorted(self.commands, key=lambda timed: timed.at_s):
             timed.request.check_in_scene(timed.at_s, last, magnets=self.initial.magnets)
@@ -158,7 +158,7 @@ class Scene(Written):
         return self
 
     @model_validator(mode="after")
-    def _possible_generator(self) -> Scene:
+    def _check_generator(self) -> Scene:
         if self.generator is not None:
             commands = [one for one in self.commands if one.request.MECHANICAL]
             limits = self.engine.limits.as_dict()
@@ -172,13 +172,13 @@ class Scene(Written):
         return self
 
     @model_validator(mode="after")
-    def _pick_in_force(self) -> Scene:
+    def _check_pick(self) -> Scene:
         if self.fidelity == "auto":
             if self.pick is None:
                 raise InputError("fidelity", '"given" until `rig ladder SCENE --write FILE` has stored a pick', "auto")
-            asked = self.pick.apply(self.model_dump())
+            picked = self.pick.apply(self.model_dump())
             own = self.model_dump()
-            if any(own[name] != asked[name] for name in ("model", "engine", "drive", "sensors")):
+            if any(own[name] != picked[name] for name in ("model", "engine", "drive", "sensors")):
                 raise InputError("fidelity", '"given" where model, engine, drive or sensors are chosen by hand', "auto")
         return self
 
@@ -202,14 +202,14 @@ class Scene(Written):
             return None
         pick = self.pick
         levels = ", ".join(getattr(pick, name) for name in ModelLevels.model_fields)
-        asked = ", ".join(
+        picked = ", ".join(
             f"{entry.quantity} within {entry.tolerance:g} (measured {entry.total_error:.1e})"
             for entry in pick.quantities
         )
         finest = f" at {pick.engine_tolerance:g}" if pick.engine_tolerance else ""
         return (
             f"fidelity auto: {levels}; drive {pick.drive}, sensors {pick.sensors}; {pick.engine} "
-            f"{pick.step_us} us{finest}; picked {pick.date} for {asked}"
+            f"{pick.step_us} us{finest}; picked {pick.date} for {picked}"
         )
 
     @property
@@ -238,8 +238,8 @@ class Scene(Written):
             raise InputError("scene", "one with a [generator]", self.name)
         rate = self.sensors.rate_hz or None
         # A channel's position among all channels does not depend on which are active.
-        made = sources(self.generator, (self.channels or rig_table()).only((), rate), self.drive.speed_hz)
-        return {name: made[name] for name in self.table.channels}
+        all_sources = sources(self.generator, (self.channels or rig_table()).only((), rate), self.drive.speed_hz)
+        return {name: all_sources[name] for name in self.table.channels}
 
     def check_physics(self) -> None:
         """Raise an error for a scene of test signals, in which nothing moves.
@@ -312,20 +312,20 @@ def load_scene(scene: Scene | str | Path, overrides: dict[str, Any] | None = Non
         if isinstance(table, dict) and isinstance(table.get(key), str):
             table[key] = path.parent / table[key]  # relative to the scene file
     try:
-        for key, value in _keyed(overrides or {}):
+        for key, value in _list_changes(overrides or {}):
             _override(data, key, read_value(value, field=key) if isinstance(value, str) else value)
-        return _checked(data, list(overrides or {}))
+        return _build_scene(data, list(overrides or {}))
     except InputError as error:
         if path.parent == SCENES or error.field in (overrides or {}):
             raise
         raise InputError(f"{path.name}: {error.field}", error.must, error.received) from None
 
 
-def _checked(data: dict[str, Any], overrides: list[str]) -> Scene:
+def _build_scene(data: dict[str, Any], overrides: list[str]) -> Scene:
     """Return the scene of a file with overrides, if it can run."""
     scene = parse_scene({**data, "fidelity": "given"} if data.get("fidelity") == "auto" else data)
     if data.get("fidelity") == "auto":
-        scene = _with_pick(scene, data, overrides)
+        scene = _apply_pick(scene, data, overrides)
     # Parameters are checked here, so that a scene that loads can run.
     top = scene.load_parameters().entries["drive.top_speed"].value
     speeds = {"drive.speed_hz": [scene.drive.speed_hz], "drive.profile": [speed for _, speed in scene.drive.profile]}
@@ -348,28 +348,28 @@ def change_scene(scene: Scene, changes: dict[str, Any]) -> Scene:
         InputError: A value is wrong; the message has the field.
     """
     data = scene.model_dump()
-    named = _keyed(changes)
+    pairs = _list_changes(changes)
     if "engine.name" in changes:
         data["engine"] = {}
     elif any(key.startswith("engine.limits") for key in changes) and scene.engine.tolerance_by_limits:
         data["engine"]["tolerance"] = 0.0
-    for key, value in named:
+    for key, value in pairs:
         _override(data, key, value)
     return parse_scene(data)
 
 
-def _keyed(changes: dict[str, Any]) -> list[tuple[str, Any]]:
+def _list_changes(changes: dict[str, Any]) -> list[tuple[str, Any]]:
     """Return keys and values of changes; a notebook may pass any object."""
     if not isinstance(changes, dict) or not all(isinstance(key, str) for key in changes):
         raise InputError("changes", "a dictionary of values by dotted key", changes)
     return list(changes.items())
 
 
-def _with_pick(scene: Scene, data: dict[str, Any], overrides: list[str]) -> Scene:
+def _apply_pick(scene: Scene, data: dict[str, Any], overrides: list[str]) -> Scene:
     """Return the scene with its stored pick applied, if the pick belongs to this scene."""
-    by_hand = [key for key in overrides if key.split(".")[0] in ("model", "engine") or key in _PICKED]
-    if by_hand:
-        raise InputError("fidelity", f'"given" where {by_hand[0]} is chosen by hand', "auto")
+    chosen_keys = [key for key in overrides if key.split(".")[0] in ("model", "engine") or key in _PICKED_KEYS]
+    if chosen_keys:
+        raise InputError("fidelity", f'"given" where {chosen_keys[0]} is chosen by hand', "auto")
     if scene.pick is not None:
         stored = (scene.pick.scene_digest, scene.pick.parameters_digest, scene.pick.code_digest)
         names = ("the scene", "its parameters", "the rig's equations or engines")
@@ -381,7 +381,7 @@ def _with_pick(scene: Scene, data: dict[str, Any], overrides: list[str]) -> Scen
     return parse_scene(data)
 
 
-_PICKED = ("drive.mode", "sensors.chain")
+_PICKED_KEYS = ("drive.mode", "sensors.chain")
 
 
 def pick_digests(scene: Scene) -> tuple[str, str, str]:
@@ -414,13 +414,13 @@ def _override(data: dict[str, Any], key: str, value: Any) -> None:
             known = [*_scene_keys(), *load_parameters().entries]
             raise InputError(key, such_as("a field of a scene or a parameter", key, known), value)
         fields = known[part].annotation
-    place = data
+    table = data
     for part in path:
-        place[part] = dict(table_in(place, part))
-        place = place[part]
-    place[last] = value
+        table[part] = dict(table_in(table, part))
+        table = table[part]
+    table[last] = value
     if key == "drive.speed_hz":
-        place.pop("profile", None)
+        table.pop("profile", None)
 
 
 def _scene_keys(table: Any = Scene) -> list[str]:

@@ -36,8 +36,8 @@ from rig.physics.model import build_model, describe
 from rig.run import calibrator
 from rig.run.commands.command import SceneCommand
 from rig.run.commands.table import check_command
-from rig.run.fault_injection import Faulty
-from rig.run.motion import BRANCH_ALARM, Begin, Motion, energy_balance, initial_state
+from rig.run.fault_injection import FaultInjector
+from rig.run.motion import BRANCH_ALARM, Motion, MotionStart, energy_balance, initial_state
 from rig.run.scenes import Scene, load_scene, scene_document
 from rig.run.speed_target import Segment, segments
 
@@ -49,12 +49,12 @@ class Snapshot:
     """State of a run at one tick, for `Simulation.restore`."""
 
     scene: Scene
-    changing: dict[str, Any] = field(repr=False)
+    state: dict[str, Any] = field(repr=False)
 
 
-_CHANGING = (
+_STATE_FIELDS = (
     "tick", "first_row", "_segments", "inputs", "pending", "_motion", "_companion", "_accuracy", "_last",
-    "_conditioners", "_keyphasor", "_edges_shown", "faulty",
+    "_conditioners", "_keyphasor", "_edge_count", "faults",
 )  # fmt: skip
 
 
@@ -71,11 +71,11 @@ class Simulation:
         end_tick: End of the scene [ticks].
         row_ticks: Ticks between observed rows.
         begin: Start from an earlier motion; None: the scene's start.
-        kept_every: Rows between those with samples; 1 if some samples fall between rows.
-        told: Result of the last command, except its tick: a fault's number, channels and first faulty rows.
+        rows_per_kept_row: Rows between those with samples; 1 if some samples fall between rows.
+        command_result: Result of the last command, except its tick: a fault's number, channels and first faulty rows.
         inputs: Inputs of the kernels that commands set.
         pending: Waiting commands with their ticks, in order.
-        faulty: Faults of the channels.
+        faults: Faults of the channels.
 
     Example:
         >>> import rig
@@ -85,7 +85,7 @@ class Simulation:
         (Simulation(hammer: at 0.05 of 2 s), (1000, 4), (2000, 66))
     """
 
-    def __init__(self, scene: Scene | str | Path, *, begin: Begin | None = None) -> None:
+    def __init__(self, scene: Scene | str | Path, *, begin: MotionStart | None = None) -> None:
         self.scene = scene = load_scene(scene)
         self.begin = begin
         self.tick_rate_hz = TICK_RATE_HZ
@@ -101,8 +101,8 @@ class Simulation:
         self._stride = self.row_ticks // self._step_ticks
         self.table: ChannelTable = scene.table
         groups = self.table.groups.values()
-        whole = [TICK_RATE_HZ // group.rate_hz for group in groups if TICK_RATE_HZ % group.rate_hz == 0]
-        self.kept_every = math.gcd(*whole) // self.row_ticks if len(whole) == len(groups) else 1
+        periods = [TICK_RATE_HZ // group.rate_hz for group in groups if TICK_RATE_HZ % group.rate_hz == 0]
+        self.rows_per_kept_row = math.gcd(*periods) // self.row_ticks if len(periods) == len(groups) else 1
         self.block_ticks = math.lcm(self.row_ticks, TICK_RATE_HZ // sensors.truth_rate_hz)
         self.end_tick = math.ceil(max(1, round(scene.duration_s * TICK_RATE_HZ)) / self.block_ticks) * self.block_ticks
         self._formulas = scene.formulas()
@@ -119,12 +119,12 @@ class Simulation:
         ]
         marked = any(channel.signal == "keyphasor" for channel in self.table.channels.values())
         self._keyphasor = Keyphasor() if marked else None
-        self._edges_shown = 0
+        self._edge_count = 0
         if scene.generator is not None:
             tick = 0 if begin is None else begin.tick
-            self._conditioners, turns = calibrator.stand_ins(scene, row_ticks=self.row_ticks, tick=tick)
+            self._conditioners, turns = calibrator.build_replacements(scene, row_ticks=self.row_ticks, tick=tick)
             self._keyphasor = turns if marked else None
-        self.faulty = Faulty(
+        self.faults = FaultInjector(
             self.table, self._conditioners, seed=scene.seed, row_ticks=self.row_ticks, setting=scene.setting
         )
         self._truth_every = TICK_RATE_HZ // sensors.truth_rate_hz // self.row_ticks
@@ -136,7 +136,7 @@ class Simulation:
             if scene.generator is None  # without the model there is no truth
         }
 
-        self.told: dict[str, Any] = {}
+        self.command_result: dict[str, Any] = {}
         self.tick = self._start = 0 if begin is None else begin.tick
         if self.tick % self.block_ticks:
             raise InputError("begin.tick", f"a multiple of {self.block_ticks}", self.tick)
@@ -145,9 +145,9 @@ class Simulation:
             "hammer_force": 0.0, "hammer_x": 1.0, "hammer_y": 0.0, "hammer_start": 0, "hammer_end": 0,
             "magnet_engaged": scene.initial.magnets,
         }  # fmt: skip
-        given = ((round(timed.at_s * TICK_RATE_HZ), timed.request) for timed in scene.commands)
-        self.pending: list[tuple[int, SceneCommand]] = sorted(given, key=lambda entry: entry[0])
-        self.faulty.check_all(self.pending)
+        scheduled = ((round(timed.at_s * TICK_RATE_HZ), timed.request) for timed in scene.commands)
+        self.pending: list[tuple[int, SceneCommand]] = sorted(scheduled, key=lambda entry: entry[0])
+        self.faults.check_all(self.pending)
         choice, initial = scene.engine, initial_state(self.model, scene.initial, begin, spin=self._speed())
         memory = np.zeros(self._engines[0].memory_size if choice.rolling == "collocation" else MEMORY)
         self._motion = Motion(initial, self._step_ticks, self._stride, choice.tolerance, memory)
@@ -210,40 +210,40 @@ class Simulation:
         n = ticks // self.row_ticks
         if len(self._rows) <= n:
             self._rows = np.full((n + 1, S.N_ROW), np.nan)
-        rows, seen = self._rows[: n + 1], 0
-        made = [rows]
+        rows, done = self._rows[: n + 1], 0
+        outputs = [rows]
         if self._companion is not None:
-            made.append(np.full((ticks // self.block_ticks, S.N_ROW), np.nan))
+            outputs.append(np.full((ticks // self.block_ticks, S.N_ROW), np.nan))
         events: list[dict[str, Any]] = []
         counts: list[dict[str, np.ndarray]] = []
         while self.tick < end:
             self._take_effect(events)
             stop, inputs = min(end, self._next_change()), self._inputs()
-            for motion, engine, out in zip(self._motions(), self._engines, made, strict=True):
+            for motion, engine, out in zip(self._motions(), self._engines, outputs, strict=True):
                 motion.run(engine, self.model.constants, inputs, out, start, self.tick, stop)
             self.tick = stop
             # A change on a row acts after it: sensors see the row before the change, then the one after it.
-            row, beyond = divmod(stop - start, self.row_ticks)
-            if not beyond:
-                counts.append(self._condition(rows[seen : row + 1], start + seen * self.row_ticks))
-                seen = row
+            row, remainder = divmod(stop - start, self.row_ticks)
+            if not remainder:
+                counts.append(self._condition(rows[done : row + 1], start + done * self.row_ticks))
+                done = row
         rows = rows[:n]
         self._last = rows[-1].copy()
         if not all(map(math.isfinite, self._motion.y.tolist())):
-            at_s = self._lost_s(rows, start)
+            at_s = self._find_divergence_s(rows, start)
             raise SimulationError(f"the state is no longer finite at {at_s:.6f} s; {self._method.advice}")
         if self._companion is not None:
-            events = sorted(events + self._doubts(rows, made[1], start), key=lambda event: event["tick"])
+            events = sorted(events + self._compare_companion(rows, outputs[1], start), key=lambda event: event["tick"])
         samples, edges, truth = self._sample(counts, start), self._edges(rows, start), self._truth(rows, start)
         frame = Frame(start, ticks, samples, edges, truth, events, rows)
-        return self.faulty.sending.pass_on(frame, last=self.tick >= self.end_tick)
+        return self.faults.sending.pass_on(frame, last=self.tick >= self.end_tick)
 
-    def _lost_s(self, rows: np.ndarray, start: int) -> float:
+    def _find_divergence_s(self, rows: np.ndarray, start: int) -> float:
         finite = np.isfinite(rows[:, : S.N_STATE]).all(axis=1)
         row = len(rows) if finite.all() else int(np.argmin(finite))
         return (start + row * self.row_ticks) / TICK_RATE_HZ
 
-    def _doubts(self, rows: np.ndarray, companion: np.ndarray, start: int) -> list[dict[str, Any]]:
+    def _compare_companion(self, rows: np.ndarray, companion: np.ndarray, start: int) -> list[dict[str, Any]]:
         every = self.block_ticks // self.row_ticks
         times_s = (start + self.block_ticks * np.arange(len(companion))) / TICK_RATE_HZ
         warnings = self._accuracy.compare(rows[::every], companion, times_s)
@@ -261,12 +261,12 @@ class Simulation:
         Raises:
             InputError: It is unknown, malformed, out of range, or not possible now.
         """
-        command, self.told = check_command(name, request), {}
+        command, self.command_result = check_command(name, request), {}
         if command.MECHANICAL and self.scene.generator is not None:
             raise InputError(name, "left out: signals of a [generator] replace the physics", Words("a command to it"))
-        if not command.is_carried_out():
+        if not command.is_implemented():
             raise command.refusal()
-        self.told = command.check(self, [other for tick, other in self.pending if tick <= self.tick])
+        self.command_result = command.check(self, [other for tick, other in self.pending if tick <= self.tick])
         insort(self.pending, (self.tick, command), key=lambda entry: entry[0])
         return self.tick
 
@@ -276,8 +276,8 @@ class Simulation:
         Raises:
             InputError: The scene has a fault of a transport that does not exist.
         """
-        self.faulty.doors = doors
-        self.faulty.check_all(self.pending)
+        self.faults.doors = doors
+        self.faults.check_all(self.pending)
 
     def warm_up(self) -> None:
         """Compile (or load) every kernel that `advance` will call, without advancing."""
@@ -310,9 +310,9 @@ class Simulation:
             warnings.append(text)
         if memory[CLAMPS]:
             warnings.append(f"the contact law would have pulled at {memory[CLAMPS]:.0f} steps and was held at 0")
-        late = sum(tick >= self.end_tick for tick, _ in self.pending)
-        if late:
-            warnings.append(f"{late} commands of the scene lie after its end and will not be given")
+        late_commands = sum(tick >= self.end_tick for tick, _ in self.pending)
+        if late_commands:
+            warnings.append(f"{late_commands} commands of the scene lie after its end and will not be executed")
         if memory[CEILING]:
             warnings.append(
                 f"{memory[CEILING]:.0f} steps with events that piled up, or above engine.tolerance at least size"
@@ -338,7 +338,7 @@ class Simulation:
     def snapshot(self) -> Snapshot:
         """Return the whole changing state of a run; `restore` continues from it bit for bit, with the same build."""
         _ = self.first_row
-        return Snapshot(scene=self.scene, changing=copy.deepcopy({name: self.__dict__[name] for name in _CHANGING}))
+        return Snapshot(scene=self.scene, state=copy.deepcopy({name: self.__dict__[name] for name in _STATE_FIELDS}))
 
     def restore(self, snapshot: Snapshot) -> None:
         """Continue from a snapshot of the same scene; at the start, also from one of the scene without commands.
@@ -348,14 +348,14 @@ class Simulation:
         Raises:
             InputError: The snapshot is of another scene, or after the first command.
         """
-        changing = copy.deepcopy(snapshot.changing)
+        state = copy.deepcopy(snapshot.state)
         if snapshot.scene != self.scene:
-            first_tick = min((tick for tick, _ in self.pending), default=changing["tick"])
-            alike = snapshot.scene == self.scene.model_copy(update={"commands": ()})
-            if self.tick > self._start or first_tick < changing["tick"] or not alike:
+            first_tick = min((tick for tick, _ in self.pending), default=state["tick"])
+            same_scene = snapshot.scene == self.scene.model_copy(update={"commands": ()})
+            if self.tick > self._start or first_tick < state["tick"] or not same_scene:
                 raise InputError("snapshot", f"one of this scene, {self.scene.name}", snapshot.scene.name)
-            changing["pending"] = self.pending
-        self.__dict__.update(changing)
+            state["pending"] = self.pending
+        self.__dict__.update(state)
 
     def catalogue(self) -> dict[str, Any]:
         """Return the channel table with calibrations, and the columns of the truth tables, as a JSON document."""
@@ -439,7 +439,7 @@ class Simulation:
         )
 
     def _condition(self, rows: np.ndarray, tick: int) -> dict[str, np.ndarray]:
-        return self.faulty.counts(rows, self._formulas.values(rows), tick)
+        return self.faults.counts(rows, self._formulas.values(rows), tick)
 
     def _sample(self, counts: list[dict[str, np.ndarray]], start: int) -> dict[str, Block]:
         found = {}
@@ -455,8 +455,8 @@ class Simulation:
         if self._keyphasor is None:
             return None
         edges = self._keyphasor.edges(rows, self.row_ticks)
-        edges = self.faulty.edges(edges, rows, start)
-        index, self._edges_shown = self._edges_shown, self._edges_shown + len(edges)
+        edges = self.faults.edges(edges, rows, start)
+        index, self._edge_count = self._edge_count, self._edge_count + len(edges)
         return self._block(start, index, 0, edges[:, None]) if len(edges) else None
 
     def _truth(self, rows: np.ndarray, start: int) -> dict[str, Block]:

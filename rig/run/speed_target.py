@@ -28,7 +28,7 @@ class Drive(Written):
 
     @field_validator("profile")
     @classmethod
-    def _ascending(cls, profile: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
+    def _check_ascending(cls, profile: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
         times = [time for time, _ in profile]
         if profile and (times[0] != 0.0 or any(b < a + _MIN_SPACING_S - 1e-9 for a, b in pairwise(times))):
             raise ValueError(f"points of ascending time, at least {_MIN_SPACING_S:g} s apart, the first at 0")

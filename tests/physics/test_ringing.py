@@ -105,7 +105,7 @@ def run(scene: str, duration_ticks: int, **changes: Any) -> tuple[np.ndarray, np
     dotted = {key.replace("__", "."): value for key, value in changes.items()}
     simulation = Simulation(load_scene(scene, {**QUIET, "engine.companion": False, **dotted}))
     rows = simulation.advance(duration_ticks).rows.copy()
-    return rows, simulation.snapshot().changing["_motion"].memory
+    return rows, simulation.snapshot().state["_motion"].memory
 
 
 @pytest.mark.parametrize(

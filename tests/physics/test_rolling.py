@@ -49,7 +49,7 @@ def make_simulation(engine: str, tolerance: float, **changes: Any) -> Simulation
 
 
 def memory_of(simulation: Simulation) -> np.ndarray:
-    return simulation.snapshot().changing["_motion"].memory
+    return simulation.snapshot().state["_motion"].memory
 
 
 def scaled_error(rows: np.ndarray, reference: np.ndarray) -> float:
@@ -188,7 +188,7 @@ def test_the_companion_also_rolls_and_estimates_the_error(tolerance: float) -> N
     exact = make_simulation("taylor", 1e-11).advance(600_000).rows
     run = make_simulation("split", tolerance, engine__companion=True)
     rows = run.advance(600_000).rows
-    own, finer = (run.snapshot().changing[name].memory for name in ("_motion", "_companion"))
+    own, finer = (run.snapshot().state[name].memory for name in ("_motion", "_companion"))
     assert finer[ROLLED_S] > 0.4
     assert finer[layout.ROLLING_STEPS] > own[layout.ROLLING_STEPS]
     away = (rows[:, : S.N_STATE] - exact[:, : S.N_STATE]) / S.STATE_SCALE

@@ -44,7 +44,7 @@ def find_missing(name: str, entry: type[SceneCommand]) -> Iterator[str]:
         yield f'{where}: the field `command` must be Literal["{name}"] = "{name}"'
     if not (entry.__doc__ or "").strip() or entry.__doc__ == SceneCommand.__doc__:
         yield f"{where}: {entry.__name__} has no docstring"
-    if not entry.is_carried_out():
+    if not entry.is_implemented():
         yield f"{where}: nothing carries it out in the simulation: take_effect is missing"
     if name not in commands.SUMMARIES:
         yield f'rig/run/commands/__init__.py: SUMMARIES has no line of help for "{name}" (empty: no command line)'

@@ -276,4 +276,4 @@ def test_only_enabled_sensors_are_returned() -> None:
 def test_commands_after_the_end_are_reported() -> None:
     run = simulate(load_scene("hammer"), duration_s=0.01)
     assert run.events == []
-    assert run.simulation.health()["warnings"] == ["1 commands of the scene lie after its end and will not be given"]
+    assert run.simulation.health()["warnings"] == ["1 commands of the scene lie after its end and will not be executed"]

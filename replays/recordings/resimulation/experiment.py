@@ -19,7 +19,7 @@ from rig.base.wire import EDGES, sensor_key, truth_key
 from rig.channels.faults import find_channels
 from rig.physics.parameters import DEFAULT_SET, load_parameters, set_names
 from rig.run.commands.table import COMMANDS, MECHANICAL, FaultCommand, check_command
-from rig.run.motion import Begin
+from rig.run.motion import MotionStart
 from rig.run.offline import Run, SentCommand, frames, simulate
 from rig.run.scenes import Scene, change_scene, parse_scene
 from rig.run.simulation import TICK_RATE_HZ, Frame, Simulation
@@ -46,7 +46,7 @@ class Experiment:
     scene: Scene
     commands: tuple[SentCommand, ...] = ()
     first_s: float = 0.0
-    begin: Begin | None = None
+    begin: MotionStart | None = None
     unsure: Mapping[str, float] = field(default_factory=dict)
 
     @classmethod
@@ -131,7 +131,7 @@ def starts_while_running(recording: Recording) -> bool:
     return mapped.get("commands", "scene") != "scene" and "lead_s" not in mapped
 
 
-def _initial_state(recording: Recording, scene: Scene, first_s: float) -> Begin:
+def _initial_state(recording: Recording, scene: Scene, first_s: float) -> MotionStart:
     """Return the initial state of such a log: shortly before the hammer pulse, at the angle of the edges."""
     hammer_s = min((timed.at_s for timed in scene.commands), default=first_s)
     begin_s = math.floor(round(max(first_s, hammer_s - PICKUP_S) / GRID_S, 6)) * GRID_S
@@ -139,10 +139,10 @@ def _initial_state(recording: Recording, scene: Scene, first_s: float) -> Begin:
     edges_s = edges_s[edges_s < hammer_s] if scene.commands else edges_s  # the shaft slows down after the pulse
     if len(edges_s) < 2:
         turns = (begin_s - edges_s.sum()) * scene.drive.speed_hz if len(edges_s) else 0.0
-        return Begin(round(begin_s * TICK_RATE_HZ), angle=2.0 * math.pi * (turns % 1.0))
+        return MotionStart(round(begin_s * TICK_RATE_HZ), angle=2.0 * math.pi * (turns % 1.0))
     near = max(0, min(int(np.searchsorted(edges_s, begin_s)) - 1, len(edges_s) - 2))
     turns = (begin_s - edges_s[near]) / (edges_s[near + 1] - edges_s[near])
-    return Begin(round(begin_s * TICK_RATE_HZ), angle=2.0 * math.pi * (turns % 1.0))
+    return MotionStart(round(begin_s * TICK_RATE_HZ), angle=2.0 * math.pi * (turns % 1.0))
 
 
 def _end_s(recording: Recording) -> float:

@@ -24,7 +24,7 @@ from rig.channels.sampling import ROW_TICKS
 from rig.physics.model import build_model
 from rig.physics.parameters import load_parameters
 from rig.run.commands.table import MECHANICAL, TimedCommand, check_command
-from rig.run.motion import Begin
+from rig.run.motion import MotionStart
 from rig.run.scenes import Scene, change_scene, parse_scene
 from rig.run.simulation import TICK_RATE_HZ
 
@@ -149,7 +149,7 @@ def with_values(experiment: Experiment, values: Mapping[str, float]) -> Experime
     return replace(changed, scene=parse_scene(data), commands=left)
 
 
-def _begin_of(experiment: Experiment, key: str) -> Begin:
+def _begin_of(experiment: Experiment, key: str) -> MotionStart:
     if experiment.begin is None:
         raise InputError(key, "used with a log of a rig that was already running", key)
     return experiment.begin

@@ -17,9 +17,13 @@ from rig.run.commands import SUMMARIES
 def scene_command(name: str) -> Callable[..., None]:
     """Return the command line of a scene command: required fields are arguments, others are options."""
     from rig.run.commands import mechanical
-    from rig.run.commands.command import as_number, entries
+    from rig.run.commands.command import as_number, find_commands
 
-    fields, hints, parameters = entries(mechanical)[name].quantities(), dict[str, Any](), list[inspect.Parameter]()
+    fields, hints, parameters = (
+        find_commands(mechanical)[name].quantities(),
+        dict[str, Any](),
+        list[inspect.Parameter](),
+    )
     for field, each in fields.items():
         quantity, unit = each.quantity, each.quantity.unit.replace(" ", "")
         shown = {"metavar": each.quantity.metavar, "help": each.quantity.help}

@@ -40,7 +40,7 @@ class _ChannelCommand(SceneCommand):
 
     def check(self, run: Run, waiting: Sequence[Any]) -> dict[str, Any]:
         """Raise an error for an impossible fault; return the number, channels and first rows of a new one."""
-        return run.faulty.check(self, run.tick, waiting)
+        return run.faults.check(self, run.tick, waiting)
 
 
 class FaultCommand(_ChannelCommand):
@@ -58,12 +58,12 @@ class FaultCommand(_ChannelCommand):
 
     @model_validator(mode="before")
     @classmethod
-    def _flat(cls, data: Any) -> Any:
+    def _nest_fields(cls, data: Any) -> Any:
         if not isinstance(data, dict) or "what" in data:
             return data
-        own = {key: value for key, value in data.items() if key in cls.model_fields}
-        rest = {key: value for key, value in data.items() if key not in own}
-        return {**own, "what": check_fault(rest)}
+        fields = {key: value for key, value in data.items() if key in cls.model_fields}
+        parameters = {key: value for key, value in data.items() if key not in fields}
+        return {**fields, "what": check_fault(parameters)}
 
     def request(self) -> dict[str, Any]:
         """Return the fields as a client sends them: the channel and the parameters of the kind in one table."""
@@ -72,7 +72,7 @@ class FaultCommand(_ChannelCommand):
 
     def take_effect(self, run: Run) -> list[dict[str, Any]]:
         """Inject the fault."""
-        return [run.faulty.begin(self, run.tick, run.pending)]
+        return [run.faults.begin(self, run.tick, run.pending)]
 
 
 class ClearCommand(_ChannelCommand):
@@ -85,4 +85,4 @@ class ClearCommand(_ChannelCommand):
 
     def take_effect(self, run: Run) -> list[dict[str, Any]]:
         """Clear the faults; each has a separate event."""
-        return run.faulty.clear(self, run.tick)
+        return run.faults.clear(self, run.tick)

@@ -100,7 +100,7 @@ class Run(Protocol):
     tick: int
     tick_rate_hz: int
     model: Any
-    faulty: Any
+    faults: Any
     pending: list[tuple[int, Any]]
     inputs: dict[str, Any]
     """Inputs of the kernels (`rig.physics.kernels.constants.Inputs`) from now on."""
@@ -137,8 +137,8 @@ class SceneCommand(Written):
         """Return the fields that have a unit, by name, with their limits."""
         found = {}
         for name, info in cls.model_fields.items():
-            if (quantity := next((each for each in info.metadata if isinstance(each, Quantity)), None)) is not None:
-                ends = [[getattr(each, end) for each in info.metadata if hasattr(each, end)] for end in ("ge", "le")]
+            if (quantity := next((entry for entry in info.metadata if isinstance(entry, Quantity)), None)) is not None:
+                ends = [[getattr(entry, end) for entry in info.metadata if hasattr(entry, end)] for end in ("ge", "le")]
                 low, high = (own[0] if own else edge for own, edge in zip(ends, quantity.span, strict=True))
                 takes_text = info.annotation is not float
                 found[name] = CommandField(quantity, low, high, info.default, info.is_required(), takes_text)
@@ -187,7 +187,7 @@ class SceneCommand(Written):
         raise self.refusal()
 
     @classmethod
-    def is_carried_out(cls) -> bool:
+    def is_implemented(cls) -> bool:
         """Return whether the command has an implementation."""
         return cls.take_effect is not SceneCommand.take_effect
 
@@ -196,10 +196,10 @@ class SceneCommand(Written):
         return InputError("command", "one that the simulation can execute", type(self).__name__)
 
 
-def entries(module: ModuleType) -> dict[str, type[SceneCommand]]:
+def find_commands(module: ModuleType) -> dict[str, type[SceneCommand]]:
     """Return the command classes of a module by name."""
     found = {name: vars(module).get(f"{name.capitalize()}Command") for name in SUMMARIES}
-    return {name: each for name, each in found.items() if each is not None}
+    return {name: entry for name, entry in found.items() if entry is not None}
 
 
 def as_number(text: str) -> str | float:

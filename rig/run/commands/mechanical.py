@@ -43,9 +43,9 @@ class HammerCommand(SceneCommand):
 
     @field_validator("direction")
     @classmethod
-    def _a_direction(cls, direction: str | float) -> str | float:
-        good = direction in _DIRECTIONS if isinstance(direction, str) else -360.0 <= direction <= 360.0
-        if not good:
+    def _check_direction(cls, direction: str | float) -> str | float:
+        is_valid = direction in _DIRECTIONS if isinstance(direction, str) else -360.0 <= direction <= 360.0
+        if not is_valid:
             raise ValueError(f"{', '.join(_DIRECTIONS)}, or an angle from -360 to 360 degrees")
         return direction
 
@@ -62,8 +62,8 @@ class HammerCommand(SceneCommand):
         if (other := last.get(self.command)) is not None:
             free_s = other.at_s + other.request.duration_ms * 1e-3
             if at_s < free_s:
-                again = Words(f"a pulse at {at_s:g} s")
-                raise InputError("hammer", f"idle (in a pulse until {free_s:g} s)", again)
+                received = Words(f"a pulse at {at_s:g} s")
+                raise InputError("hammer", f"idle (in a pulse until {free_s:g} s)", received)
 
     def check(self, run: Run, waiting: Sequence[Any]) -> dict[str, Any]:
         """Raise an error if the hammer is in a pulse, or about to be."""

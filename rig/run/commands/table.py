@@ -10,10 +10,10 @@ from rig.base.checks import Written, check
 from rig.base.errors import InputError
 from rig.run.commands import SUMMARIES, channel, mechanical
 from rig.run.commands.channel import ClearCommand, FaultCommand  # noqa: F401
-from rig.run.commands.command import SceneCommand, entries
+from rig.run.commands.command import SceneCommand, find_commands
 from rig.run.commands.mechanical import HammerCommand, ReleaseCommand, SpeedCommand  # noqa: F401
 
-_ENTRIES = entries(mechanical) | entries(channel)
+_ENTRIES = find_commands(mechanical) | find_commands(channel)
 COMMANDS: dict[str, type[SceneCommand]] = {name: _ENTRIES[name] for name in SUMMARIES if name in _ENTRIES}
 if TYPE_CHECKING:
     Command = SceneCommand
@@ -43,7 +43,7 @@ class TimedCommand(Written):
 
     @model_validator(mode="before")
     @classmethod
-    def _flat(cls, data: Any) -> Any:
+    def _nest_fields(cls, data: Any) -> Any:
         # In the file the command's own fields are next to at_s.
         if isinstance(data, dict) and "request" not in data:
             return {"at_s": data.get("at_s"), "request": {key: value for key, value in data.items() if key != "at_s"}}
@@ -61,7 +61,7 @@ def check_command(name: str, request: dict[str, Any]) -> SceneCommand:
     return check(COMMANDS[name], request, field=name)
 
 
-def with_faults(scene: Any) -> Any:
+def nest_faults(scene: Any) -> Any:
     """Return a scene file's data with the entries of [[faults]] moved to its commands.
 
     Raises:
