@@ -15,7 +15,7 @@ import numpy as np
 
 from recorder.contents.samples import row_times_s
 from recorder.reader import Recording
-from rig.base.wire import EDGES, Block, schema_of, sensor_key
+from rig.base.wire import EDGES, Block, get_schema, sensor_key
 from rig.channels.table import Channel, Group
 
 WINDOW_S = 2.0
@@ -264,7 +264,7 @@ def examine(recording: Recording, progress: Callable[[float], None] = lambda _: 
         recording: The recording.
         progress: Callback for the fraction of the blocks that was read, 0 to 1.
     """
-    blocks, seen = sum(count for key, count in recording.messages.items() if schema_of(key) is not None), 0
+    blocks, seen = sum(count for key, count in recording.messages.items() if get_schema(key) is not None), 0
     noisy = _has_noise(recording.scene)
     watches = {
         sensor_key(name): _GroupStatistics(group, noisy=noisy)

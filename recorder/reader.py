@@ -217,10 +217,12 @@ class Recording:
             if name not in groups and name not in homes:
                 raise UnknownNameError("samples", "a channel or a group of the recording", name, [*homes, *groups])
         wanted = dict.fromkeys(name if name in groups else homes[name] for name in names)
-        whole = joined([self._group(name) for name in wanted or groups if names or sensor_key(name) in self.messages])
+        whole = merge_samples(
+            [self._group(name) for name in wanted or groups if names or sensor_key(name) in self.messages]
+        )
         if all(name in groups for name in names):
             return whole
-        return whole.only(*(each for name in names for each in (groups[name].names if name in groups else (name,))))
+        return whole.select(*(each for name in names for each in (groups[name].names if name in groups else (name,))))
 
     def _group(self, name: str) -> Samples:
         group = self.table.groups[name]
@@ -270,7 +272,7 @@ class Recording:
     def blocks_of(self, keys: set[str]) -> Iterator[tuple[str, Block]]:
         """Yield keys and blocks of several streams in one pass, in file order; invalid payloads are skipped."""
         for key in keys:
-            if schema_of(key) is None:
+            if get_schema(key) is None:
                 raise InputError("key", "a key of blocks (sensors or truth)", key)
         found = self._blocks_as_sent(keys)
         return sort_blocks(found) if self.true else found

@@ -27,9 +27,9 @@ from recorder.files.records import COPY
 from recorder.files.unfinished_file import check_destination
 from recorder.reader import Recording
 from recorder.writer import RecordingWriter
-from rig.base.checks import open_file, unreadable
-from rig.base.errors import PART_SUFFIX, InputError, Words, check_not_among
-from rig.base.wire import EDGES, FAULTS, SENSORS, TRUTH, Block, encode_block, schema_of
+from rig.base.checks import build_read_error, open_file
+from rig.base.errors import PART_SUFFIX, InputError, Words, check_output_differs
+from rig.base.wire import EDGES, FAULTS, SENSORS, TRUTH, Block, encode_block, get_schema
 from rig.channels.faults.ledger import Declared
 
 _PROGRESS_MESSAGES = 5000
@@ -107,7 +107,7 @@ def recover(
         RecordingError: The disk reports an error.
     """
     output = output or recovered_path(source)
-    check_not_among([source], output)
+    check_output_differs([source], output)
     with _unlocked(source):
         recording = Recording.open(source, salvage=True)
         about = {
@@ -188,7 +188,7 @@ def cut(
         raise InputError("from and to", "times in ascending order", Words(f"{from_s:g} and {to_s:g}"))
     if only not in (None, "sensors", "truth"):
         raise InputError("only", "sensors or truth", only)
-    check_not_among([part.path for part in recording.parts], output)
+    check_output_differs([part.path for part in recording.parts], output)
     recording = recording.between(from_s, to_s)
     catalogue, columns = _select_columns(recording, channels, only)
     tick_rate_hz = recording.catalogue["tick_rate_hz"]
@@ -206,7 +206,7 @@ def cut(
         if key == FAULTS and payload.document is not None:
             declared.declare(payload.document)
             return None if only == "sensors" else payload  # may concern blocks of any time
-        if schema_of(key) is None:
+        if get_schema(key) is None:
             return payload if tick is None or from_tick <= tick < to_tick else None
         if key not in columns:
             return None
@@ -348,7 +348,7 @@ def _unlocked(path: Path) -> Iterator[None]:
     except OSError as error:
         if error.filename != str(path):
             raise
-        raise unreadable(path, error) from None
+        raise build_read_error(path, error) from None
 
 
 def _select_columns(
@@ -359,7 +359,7 @@ def _select_columns(
     for name in channels:
         if name not in known:
             raise InputError("channels", f"among {', '.join(known)}", name)
-    keys = {key for key in recording.messages if schema_of(key) is not None}
+    keys = {key for key in recording.messages if get_schema(key) is not None}
     if only is not None:
         keys = {key for key in keys if key.startswith((SENSORS if only == "sensors" else TRUTH) + "/")}
     columns: dict[str, list[int] | None] = dict.fromkeys(keys)

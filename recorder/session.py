@@ -263,7 +263,7 @@ class RecordingSession:
 
     def _on_message(self, key: str, payload: bytes) -> None:
         wall_ns = self._wall_ns()
-        if wire.schema_of(key) is not None:
+        if wire.get_schema(key) is not None:
             with self._order:
                 self._take(key, payload, wall_ns)
         elif not self._replaced:

@@ -77,9 +77,9 @@ if not TYPE_CHECKING:  # a type checker uses the imports above
         try:
             return getattr(import_module(f"rig.{home}"), name)
         except ModuleNotFoundError as error:
-            from rig.base.errors import need_of_full
+            from rig.base.errors import describe_missing_package
 
-            if need := need_of_full(error):
+            if need := describe_missing_package(error):
                 error.add_note(f"rig.{name} {need}")
             raise
 

@@ -368,7 +368,7 @@ def own_table(scene: Mapping[str, Any]) -> ChannelTable | None:
         return None
     own = scene.get("channels")
     table = default_table() if own is None else ChannelTable.model_validate(own)
-    return table.only(tuple(sensors.get("groups") or ()), sensors.get("rate_hz") or None)
+    return table.select_groups(tuple(sensors.get("groups") or ()), sensors.get("rate_hz") or None)
 
 
 def calibration_off(table: ChannelTable, own: ChannelTable) -> list[str]:

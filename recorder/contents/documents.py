@@ -11,7 +11,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 from recorder.files import schemas
 from rig.base.checks import Count, input_error, read_json
 from rig.base.errors import InputError
-from rig.base.wire import EVENTS, FAULTS, STATUS, schema_of
+from rig.base.wire import EVENTS, FAULTS, STATUS, get_schema
 from rig.channels.table import ChannelTable
 
 _MAX_KEPT_BYTES = 64 << 20
@@ -245,13 +245,13 @@ ATTACHED: dict[str, type[BaseModel]] = {"catalogue": Catalogue, "parameters": Pa
 
 def definition_of(key: str) -> schemas.Definition:
     """Return the message definition of a key's topic."""
-    schema = schema_of(key)
+    schema = get_schema(key)
     return schemas.TEXT if schema is None else schemas.BLOCKS[schema]
 
 
 def holds_documents(topic: str) -> bool:
     """Return whether a topic of a recording holds JSON documents, not blocks or plottable messages."""
-    return schema_of(topic) is None and not topic.startswith(schemas.VIEW + "/")
+    return get_schema(topic) is None and not topic.startswith(schemas.VIEW + "/")
 
 
 Model = TypeVar("Model", bound=BaseModel)

@@ -13,7 +13,7 @@ from recorder.contents.consistency import ConsistencyCheck
 from recorder.contents.recording_file import RecordingFile
 from recorder.contents.samples import row_times_s
 from recorder.files import schemas
-from rig.base.wire import EDGES, EVENTS, FAULTS, Block, Gap, schema_of
+from rig.base.wire import EDGES, EVENTS, FAULTS, Block, Gap, get_schema
 from rig.channels.faults.ledger import Declared
 
 _MIN_SPAN_S = 0.5
@@ -110,7 +110,7 @@ class Survey:
         self._noted_bytes = 0
         for key, time_ns, _, payload in file.stamped(None):
             self._counted[key] = self._counted.get(key, 0) + 1
-            if schema_of(key) is None:
+            if get_schema(key) is None:
                 self._add_document(key, time_ns, payload)
             elif (block := self._add_block(key, time_ns, payload)) is not None and on_block is not None:
                 on_block(key, block)

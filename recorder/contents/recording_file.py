@@ -17,7 +17,7 @@ from recorder.files import schemas
 from recorder.files.chunks import Chunk, DamagedError, messages, unpack
 from recorder.files.payload import block_in
 from recorder.files.records import COPY, MAGIC, read_contents
-from rig.base.checks import open_file, read_json, unreadable
+from rig.base.checks import build_read_error, open_file, read_json
 from rig.base.errors import InputError, Words
 from rig.base.wire import EVENTS, FAULTS, Block
 from rig.serve import stream_check
@@ -210,7 +210,7 @@ class RecordingFile:
         except InputError:
             raise
         except OSError as error:
-            raise unreadable(self.path, error) from None
+            raise build_read_error(self.path, error) from None
         except DamagedError as error:
             must = "an intact recording (`rig recover` passes over what is damaged)"
             raise InputError("file", must, Words(f"{self.path} ({error})")) from None

@@ -13,7 +13,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from rig.base.wire import EDGES, EVENTS, Block, decode_block, decode_document, schema_of
+from rig.base.wire import EDGES, EVENTS, Block, decode_block, decode_document, get_schema
 from rig.serve.stream_check import AcceptedBlock, parse_event
 
 _MAX_EXACT_TICK = 1 << 53
@@ -41,7 +41,7 @@ class Payload:
         """Decode a payload; a malformed one has neither block nor document."""
         block = None
         with contextlib.suppress(ValueError):
-            block = None if schema_of(key) is None else block_in(key, data)
+            block = None if get_schema(key) is None else block_in(key, data)
         return cls(key, data, wall_ns, block)
 
     @classmethod
@@ -53,7 +53,7 @@ class Payload:
     @cached_property
     def document(self) -> dict[str, Any] | None:
         """Document, decoded on first access; None on a block key, and for a malformed payload."""
-        if schema_of(self.key) is None:
+        if get_schema(self.key) is None:
             with contextlib.suppress(ValueError):
                 return parse_event(self.data) if self.key == EVENTS else decode_document(self.data)
         return None
@@ -83,7 +83,7 @@ def block_in(key: str, payload: bytes) -> Block:
     Raises:
         ValueError: The payload does not fit the format of the key.
     """
-    block = decode_block(payload, schema_of(key) or "")
+    block = decode_block(payload, get_schema(key) or "")
     if not _is_sound(key, block):
         raise ValueError(f"payload must have rows at a rate, or edges at times; instead received {key}: {block}")
     return block

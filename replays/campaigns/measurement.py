@@ -10,7 +10,7 @@ from typing import Any
 from rig.base import units
 from rig.base.errors import InputError, Words
 from rig.base.outcome import Outcome
-from rig.base.text import finite
+from rig.base.text import replace_nonfinite
 
 OPERATORS = ("<=", "<", ">=", ">", "==", "!=", "between")
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
@@ -149,7 +149,7 @@ class Measurement:
 
     def document(self) -> dict[str, Any]:
         """Return the measurement as a JSON document."""
-        return finite({
+        return replace_nonfinite({
             "name": self.name, "value": self.value, "unit": self.must.unit,
             "op": self.must.op, "limit": self.must.limit,
             "margin": self.must.margin(self.value), "outcome": self.outcome.value, "good": self.good,
@@ -195,8 +195,8 @@ def _factor(given: str, wanted: str, *, field: str, of: str, text: str) -> float
         return 1.0
     if given in _UNITLESS:
         raise InputError(field, f"with a unit, as {of} is in {wanted}", text)
-    if wanted in _UNITLESS or units.kind(given) != units.kind(wanted) or not units.kind(given):
-        what = units.kind(wanted)
+    if wanted in _UNITLESS or units.get_quantity(given) != units.get_quantity(wanted) or not units.get_quantity(given):
+        what = units.get_quantity(wanted)
         must = "without a unit" if wanted in _UNITLESS else f"in a unit of {what}" if what else f"in {wanted}"
         tail = "has none" if wanted in _UNITLESS else f"is in {wanted}"
         raise InputError(field, f"{must}, as {of} {tail}", text)

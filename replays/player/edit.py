@@ -50,7 +50,7 @@ class Edit:
         for old, new in self._keys.items():
             if old not in known:
                 raise InputError("remap", f"from one of {', '.join(known)}", old)
-            if not new.startswith(f"{wire.ROOT}/") or wire.schema_of(new) != wire.schema_of(old):
+            if not new.startswith(f"{wire.ROOT}/") or wire.get_schema(new) != wire.get_schema(old):
                 raise InputError("remap", f"to a key for the same kind of payload as {old}", new)
         after = [self._keys.get(key, key) for key in known]
         for key in after:

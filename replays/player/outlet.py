@@ -7,7 +7,7 @@ from typing import Any
 from replays.player.edit import Edit, Stamp
 from replays.player.timeline import Item
 from rig.base import wire
-from rig.base.text import finite
+from rig.base.text import replace_nonfinite
 from rig.serve.transport import Server
 
 
@@ -72,7 +72,7 @@ class Outlet:
         if self._stamp is not None:
             event = self._stamp.document(event, self._tick_rate_hz)
         if (key := self._edit.key(wire.EVENTS)) is not None:
-            self._publish(key, wire.encode_document(finite(self._rows.tell(event))))
+            self._publish(key, wire.encode_document(replace_nonfinite(self._rows.add_row_counts(event))))
 
     def end(self, *, as_recorded: bool) -> bool:
         """Publish the recorded end and return whether there was one.
@@ -82,7 +82,7 @@ class Outlet:
         """
         for payload in self._held[wire.EVENTS]:
             if not as_recorded:
-                payload = wire.encode_document(self._rows.tell(wire.decode_document(payload)))
+                payload = wire.encode_document(self._rows.add_row_counts(wire.decode_document(payload)))
             self._publish(self._edit.key(wire.EVENTS) or wire.EVENTS, payload)
         return bool(self._held[wire.EVENTS])
 

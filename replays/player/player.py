@@ -22,7 +22,7 @@ from replays.player.readahead import ReadAhead
 from replays.player.timeline import Batch, By, Timeline
 from rig.base import wire
 from rig.base.errors import InputError, RefusedError, Words
-from rig.base.text import finite
+from rig.base.text import replace_nonfinite
 from rig.serve.pacing import FreeRun, RealTime
 from rig.serve.request_handler import PendingCommand, RateRequest, SeekRequest, StepRequest
 from rig.serve.served_run import ServedRun
@@ -168,7 +168,7 @@ class Player(ServedRun):
             warnings=self._warnings(),
         )
         position_s = self._position_ns / NS
-        return finite(
+        return replace_nonfinite(
             {
                 **status,
                 "time_s": position_s,

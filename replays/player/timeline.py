@@ -135,7 +135,7 @@ class _Deadlines:
 
 
 def _block(message: Message) -> wire.Block | None:
-    schema = wire.schema_of(message.key)
+    schema = wire.get_schema(message.key)
     if schema is None:
         return None
     try:

@@ -26,7 +26,7 @@ from replays.recordings.formats.readers import columnar, delimited
 from replays.recordings.resimulation.background import Background
 from rig.base import wire
 from rig.base.errors import PART_SUFFIX, InputError, Words, whole_file
-from rig.base.text import finite
+from rig.base.text import replace_nonfinite
 from rig.physics.kernels.signals import ROW
 from rig.run.commands.table import FaultCommand
 from rig.run.offline import frames
@@ -295,12 +295,12 @@ class McapRun:
             "pace": "none",
             **{name: health[name] for name in copied if name in health},
         }
-        self._writer.write(wire.STATUS, wire.encode_document(finite(status)), self._wall(simulation.tick))
+        self._writer.write(wire.STATUS, wire.encode_document(replace_nonfinite(status)), self._wall(simulation.tick))
 
     def _event(self, event: dict[str, Any]) -> None:
         tick = int(event.get("tick", self.simulation.tick))  # the frame's tick; the simulation is further ahead
         stamp = {"tick": tick, "time_s": tick / self.simulation.tick_rate_hz}
-        payload = wire.encode_document(self._rows.tell({**stamp, **event}))
+        payload = wire.encode_document(self._rows.add_row_counts({**stamp, **event}))
         self._writer.write(wire.EVENTS, payload, self._wall(tick))
 
     def _wall(self, tick: int) -> int:

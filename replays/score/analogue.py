@@ -170,9 +170,9 @@ def in_unit(signal: Recorded, channel: Channel) -> tuple[np.ndarray, bool]:
     """Return values in the channel's unit, and whether the file has a unit; volts are divided by the sensitivity."""
     if signal.unit == channel.unit:
         return signal.values, True
-    if units.kind(signal.unit) == "voltage":
+    if units.get_quantity(signal.unit) == "voltage":
         return (signal.values * units.size_si(signal.unit) - channel.bias_v) / channel.sensitivity_v, True
-    if units.kind(signal.unit) and units.kind(signal.unit) == units.kind(channel.unit):
+    if units.get_quantity(signal.unit) and units.get_quantity(signal.unit) == units.get_quantity(channel.unit):
         return signal.values * units.factor(signal.unit, channel.unit, field=signal.name), True
     return signal.values, False
 

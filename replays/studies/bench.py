@@ -78,7 +78,7 @@ def _faults(kind: str, **numbers: float) -> list[dict[str, Any]]:
 
 def _laboratory() -> ChannelTable:
     """Return 24 channels at 51.2 kHz: the rig's own, and nine formulas as in docs/daq24.toml."""
-    table = default_table().only((), 51_200)
+    table = default_table().select_groups((), 51_200)
     probes = table.groups["probes"]
     added = tuple(probes.channels[0].model_copy(update={"name": f"x{n}", "signal": each}) for n, each in enumerate((
         "along(shaft_x(0.349), shaft_y(0.349), 45) + runout(theta - pi / 4)",

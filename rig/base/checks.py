@@ -1,7 +1,7 @@
 """Validation of input from clients, files and buses, done once where it enters.
 
-A document has limited size and depth, plain numbers, and each key once. A model derived from `Outside` has typed fields
-with ranges, and no others. Validated input is not checked again; invalid input raises `InputError`.
+A document has limited size and depth, plain numbers, and each key once. A model derived from `StrictModel` has typed
+fields with ranges, and no others. Validated input is not checked again; invalid input raises `InputError`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from typing import Annotated, Any, BinaryIO, TypeVar, get_args
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
 from rig.base.errors import InputError, RefusedError, Words, such_as
-from rig.base.text import nearest, printable
+from rig.base.text import find_similar, printable
 
 DOCUMENT_BYTES = 16 << 20
 """Largest document of a rig or a recording [bytes]."""
@@ -37,7 +37,7 @@ Count = Annotated[int, Field(ge=0, lt=2**62)]
 """A number of rows, messages or ticks; the sum of two still fits into 64 bits."""
 
 
-class Outside(BaseModel):
+class StrictModel(BaseModel):
     """A document from outside, or part of one: `"100"` and true are not numbers; unknown fields are refused."""
 
     model_config = ConfigDict(strict=True, extra="forbid", frozen=True, allow_inf_nan=False)
@@ -50,7 +50,7 @@ class Written(BaseModel):
 
     @model_validator(mode="before")
     @classmethod
-    def _no_truth_for_a_number(cls, data: Any) -> Any:
+    def _refuse_wrong_types(cls, data: Any) -> Any:
         # Python treats true as 1; a file with true means something else.
         for name, value in data.items() if isinstance(data, dict) else ():
             kind = cls.model_fields[name].annotation if name in cls.model_fields else bool
@@ -99,7 +99,11 @@ def read_json(payload: bytes, *, field: str = "payload", most_bytes: int = DOCUM
     try:
         text = payload.decode("utf-8")
         document = json.loads(
-            text, object_pairs_hook=_once, parse_int=_whole, parse_float=_finite, parse_constant=_finite
+            text,
+            object_pairs_hook=_refuse_duplicate_keys,
+            parse_int=_parse_int,
+            parse_float=_parse_float,
+            parse_constant=_parse_float,
         )
         if "\\u" in text:
             # Half of an escaped surrogate pair cannot be written anywhere.
@@ -134,13 +138,13 @@ def open_file(path: Path) -> BinaryIO:
     return open(path, "rb", opener=opener)
 
 
-def unreadable(path: Path, error: OSError) -> InputError:
+def build_read_error(path: Path, error: OSError) -> InputError:
     """Return the error for an unreadable file, with similar names in its folder, such as an unfinished recording."""
     names: list[str] = []
     if isinstance(error, FileNotFoundError):
         with contextlib.suppress(OSError):
             names = sorted(each.name for each in path.parent.iterdir() if path.suffix in each.name)
-    names = [name for name in names if name.startswith(f"{path.stem}.")][:3] or nearest(path.name, names)
+    names = [name for name in names if name.startswith(f"{path.stem}.")][:3] or find_similar(path.name, names)
     such = f", such as {', '.join(str(path.with_name(name)) for name in names)}" if names else ""
     return InputError("file", f"a file that can be read{such}", Words(f"{path} ({error.strerror})"))
 
@@ -215,7 +219,7 @@ def check_depth(document: Any, *, field: str) -> None:
     raise InputError(field, f"nested at most {DEPTH} deep", Words("a document nested deeper"))
 
 
-def table_in(data: Mapping[str, Any], name: str) -> dict[str, Any]:
+def get_table(data: Mapping[str, Any], name: str) -> dict[str, Any]:
     """Return a table in a document; an empty one if it is missing.
 
     Raises:
@@ -231,7 +235,7 @@ _LONG_NUMBER = re.compile(r"\d[\d_]{4000,}")
 _DOTTED = re.compile(r"\.[ \t]*[\w\"'-]")
 
 
-def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def _refuse_duplicate_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     document = dict(pairs)
     if len(document) < len(pairs):
         names = [name for name, _ in pairs]
@@ -239,14 +243,14 @@ def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return document
 
 
-def _whole(digits: str) -> int:
+def _parse_int(digits: str) -> int:
     # Well below Python's own limit of 4300 digits, above which it raises.
     if len(digits) > len(str(-LARGEST)) or not -LARGEST - 1 <= (number := int(digits)) <= LARGEST:
         raise InputError("", f"without whole numbers beyond +-{LARGEST}", printable(digits, 60))
     return number
 
 
-def _finite(digits: str) -> float:
+def _parse_float(digits: str) -> float:
     if not math.isfinite(number := float(digits)):
         raise InputError("", "with finite numbers only", printable(digits, 60))
     return number
@@ -323,12 +327,12 @@ def load_extensions(group: str, kind: type[Extension], taken: Iterable[str]) -> 
             try:
                 found[point.name] = TypeAdapter(kind).validate_python(entry, strict=True)
             except ValidationError as error:
-                wrong = input_error(error, "", BaseModel)
-                broken.append(f"{point.name} ({point.value}: {wrong})")
+                mismatch = input_error(error, "", BaseModel)
+                broken.append(f"{point.name} ({point.value}: {mismatch})")
     return found, broken
 
 
-def _place(parts: tuple[str | int, ...], kind: str) -> list[str]:
+def _name_location(parts: tuple[str | int, ...], kind: str) -> list[str]:
     """Return the names of an error's location that occur in the file."""
     named = kind in ("extra_forbidden", "missing")
     found = []
@@ -368,11 +372,11 @@ def _join(place: str, field: str) -> str:
     return ".".join([*parts, field])
 
 
-def input_error(error: ValidationError, where: str, model: type[BaseModel]) -> InputError:
+def input_error(error: ValidationError, field_prefix: str, model: type[BaseModel]) -> InputError:
     """Return the first error of a validation in the one-line form for users."""
     first = error.errors()[0]
     cause = first.get("ctx", {}).get("error")
-    field = ".".join(part for part in (where, *_place(first["loc"], first["type"])) if part)
+    field = ".".join(part for part in (field_prefix, *_name_location(first["loc"], first["type"])) if part)
     if isinstance(cause, InputError):  # a rule over several fields names its own
         named = _join(field, cause.field)
         whole = named == cause.field or isinstance(cause, RefusedError)

@@ -9,13 +9,13 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from rig.base.text import Words as Words
-from rig.base.text import nearest, printable, shown
+from rig.base.text import find_similar, format_value, printable
 
 PART_SUFFIX = ".part"
 """Suffix of a file while it is written."""
-FULL = frozenset({"scipy", "numba", "rerun", "matplotlib", "pyarrow", "jinja2", "fpdf"})
+FULL_PACKAGES = frozenset({"scipy", "numba", "rerun", "matplotlib", "pyarrow", "jinja2", "fpdf"})
 """Import names of the packages in the extra `full`; clients of a rig do not need them."""
-WHOLE_RIG = "pip install 'rotor-stator-rig[full]'"
+INSTALL_COMMAND = "pip install 'rotor-stator-rig[full]'"
 """Command that installs them."""
 _MAX_LINE = 5000
 _MAX_NAMES = 12
@@ -40,7 +40,7 @@ class InputError(ValueError):
         self.field = field
         self.must = must
         self.received = received
-        super().__init__(printable(f"{field} must be {must}; instead received {shown(received)}", _MAX_LINE))
+        super().__init__(printable(f"{field} must be {must}; instead received {format_value(received)}", _MAX_LINE))
 
 
 class UnknownNameError(InputError, KeyError):
@@ -52,7 +52,7 @@ class UnknownNameError(InputError, KeyError):
         ...     rig.simulate("hammer", duration_s=0.01).samples["disk_z"]
         ... except KeyError as error:
         ...     print(error)
-        name must be one of those that there are, such as disk_y, disk_x (15 in all); instead received 'disk_z'
+        name must be one of the existing names, such as disk_y, disk_x (15 in all); instead received 'disk_z'
     """
 
     def __init__(self, field: str, must: str, name: object, known: Iterable[str]) -> None:
@@ -65,7 +65,7 @@ class UnknownNameError(InputError, KeyError):
 def such_as(must: str, name: object, known: Iterable[str]) -> str:
     """Return a requirement with known names similar to an unknown one, otherwise with all."""
     known = list(dict.fromkeys(known))
-    shown = nearest(name, known) or known[:_MAX_NAMES]
+    shown = find_similar(name, known) or known[:_MAX_NAMES]
     more = f" ({len(known)} in all)" if len(known) > len(shown) else ""
     return f"{must}, such as {', '.join(shown)}{more}" if shown else must
 
@@ -88,16 +88,16 @@ class DiskError(RuntimeError):
     """The disk refused during writing; the message says what is kept."""
 
 
-def need_of_full(error: ModuleNotFoundError) -> str | None:
+def describe_missing_package(error: ModuleNotFoundError) -> str | None:
     """Return the hint for a missing package of the extra `full`; None for any other."""
-    if (name := (error.name or "").partition(".")[0]) not in FULL:
+    if (name := (error.name or "").partition(".")[0]) not in FULL_PACKAGES:
         return None
-    return f"needs {name}, which comes with the whole rig: {WHOLE_RIG}"
+    return f"needs {name}, which comes with the whole rig: {INSTALL_COMMAND}"
 
 
-def lacks_full() -> bool:
+def is_full_missing() -> bool:
     """Return whether a package of the extra `full` is missing, without importing any."""
-    return any(find_spec(module) is None for module in FULL)
+    return any(find_spec(module) is None for module in FULL_PACKAGES)
 
 
 def check_new_file(path: Path, *, field: str, suffixes: tuple[str, ...], force: bool) -> None:
@@ -133,16 +133,16 @@ def check_new_file(path: Path, *, field: str, suffixes: tuple[str, ...], force: 
         raise InputError(field, "in a folder that can be written", Words(f"{path} ({error.strerror})")) from None
 
 
-def check_not_among(sources: list[Path], output: Path, *, field: str = "output") -> None:
+def check_output_differs(sources: list[Path], output: Path, *, field: str = "output") -> None:
     """Raise an error for an output that is one of the sources, under any name.
 
     Raises:
         InputError: The output, or its temporary file, is one of the sources.
     """
-    for taken in (output, output.with_name(output.name + PART_SUFFIX)):
+    for candidate in (output, output.with_name(output.name + PART_SUFFIX)):
         for source in sources:
             with suppress(OSError):  # one of them does not exist
-                if source.samefile(taken):
+                if source.samefile(candidate):
                     raise InputError(field, "another file than those that are read", str(output))
 
 
@@ -161,10 +161,10 @@ def whole_file(path: Path) -> Iterator[Path]:
         raise
     except (OSError, RuntimeError, ValueError) as error:  # errors of writing libraries; any other is a bug
         # A library that closes after a failure may fail again: the system's first error is reported.
-        reason, earlier = str(error) or type(error).__name__, error
-        while earlier is not None:
-            reason = (isinstance(earlier, OSError) and earlier.strerror) or reason
-            earlier = earlier.__context__
+        reason, cause = str(error) or type(error).__name__, error
+        while cause is not None:
+            reason = (isinstance(cause, OSError) and cause.strerror) or reason
+            cause = cause.__context__
         raise DiskError(f"{path} could not be written: {reason}; nothing of it is kept") from error
     finally:
         with suppress(OSError):

@@ -24,7 +24,7 @@ _FOLDERS = {
 """Our packages, and the folders that modules of their top level may have moved to."""
 
 
-class Paths:
+class ModuleFinder:
     """Finds moved modules by their old names, and our modules in a user's package of the same name."""
 
     def find_spec(self, fullname: str, path: Any, target: object = None) -> ModuleSpec | None:
@@ -35,12 +35,12 @@ class Paths:
         if not rest:
             return _spec_of_file(package)
         ours = join(PLACE, package)  # noqa: PTH118
-        if _is_there(package, rest[0]):
+        if _module_exists(package, rest[0]):
             if len(rest) > 1 or ours in path or PathFinder.find_spec(fullname, path):
                 return None
             return PathFinder.find_spec(fullname, [ours])
-        folder = next((each for each in _FOLDERS[package] if _is_there(package, each, rest[0])), None)
-        if folder is None or not _is_there(package, folder, *rest):
+        folder = next((each for each in _FOLDERS[package] if _module_exists(package, each, rest[0])), None)
+        if folder is None or not _module_exists(package, folder, *rest):
             return None
         loader: Any = self
         return ModuleSpec(fullname, loader, origin=".".join([package, folder, *rest]))
@@ -70,16 +70,16 @@ def _spec_of_file(package: str) -> ModuleSpec | None:
     return spec_from_file_location(package, spec.origin, submodule_search_locations=[join(PLACE, package)])  # noqa: PTH118
 
 
-def _is_there(*names: str) -> bool:
+def _module_exists(*names: str) -> bool:
     path = join(PLACE, *names)  # noqa: PTH118
     return exists(path) or exists(f"{path}.py")  # noqa: PTH110
 
 
 def find_our_modules() -> None:
     """Install the finder of old names and of our modules in users' packages."""
-    if not any(isinstance(finder, Paths) for finder in sys.meta_path):
+    if not any(isinstance(finder, ModuleFinder) for finder in sys.meta_path):
         # Before the default finders, which would load a second copy of deeper modules.
-        finder: Any = Paths()
+        finder: Any = ModuleFinder()
         sys.meta_path.insert(0, finder)
         for package in _FOLDERS:
             module: Any = sys.modules.get(package)

@@ -22,17 +22,17 @@ class Outcome(StrEnum):
         return _EXIT_STATUS[self]
 
     @classmethod
-    def of(cls, *, failed: bool, shown: bool) -> Outcome:
+    def judge(cls, *, failed: bool, has_evidence: bool) -> Outcome:
         """Return FAIL after a failure, otherwise PASS with enough evidence, otherwise INCONCLUSIVE."""
         if failed:
             return cls.FAIL
-        return cls.PASS if shown else cls.INCONCLUSIVE
+        return cls.PASS if has_evidence else cls.INCONCLUSIVE
 
     @classmethod
     def worst(cls, outcomes: Iterable[Outcome]) -> Outcome:
         """Return the worst outcome: FAIL, then INCONCLUSIVE, then PASS; INCONCLUSIVE without outcomes."""
         found = set(outcomes)
-        return cls.of(failed=cls.FAIL in found, shown=found == {cls.PASS})
+        return cls.judge(failed=cls.FAIL in found, has_evidence=found == {cls.PASS})
 
 
 class InconclusiveError(Exception):

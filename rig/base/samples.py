@@ -17,7 +17,7 @@ _SAME_INSTANT_S = 1e-6
 """Instants closer than this are equal [s]."""
 
 
-def place(name: str, names: Sequence[str], *, must: str = "one of those that there are") -> int:
+def find_column(name: str, names: Sequence[str], *, must: str = "one of the existing names") -> int:
     """Return the position of a name.
 
     Raises:
@@ -58,7 +58,7 @@ class Columns:
         Raises:
             UnknownNameError: The column does not exist; also a KeyError.
         """
-        return self.values[:, place(name, self.names)]
+        return self.values[:, find_column(name, self.names)]
 
     def unit(self, name: str) -> str:
         """Return the unit of a column.
@@ -66,30 +66,30 @@ class Columns:
         Raises:
             UnknownNameError: The column does not exist.
         """
-        return self.units[place(name, self.names)]
+        return self.units[find_column(name, self.names)]
 
-    def only(self, *names: str) -> Self:
+    def select(self, *names: str) -> Self:
         """Return some of the columns, in this order.
 
         Raises:
             UnknownNameError: The column does not exist.
         """
-        places = [place(name, self.names) for name in names]
-        chosen = tuple(self.units[each] for each in places)
-        return cast(Self, replace(cast(Any, self), names=names, units=chosen, values=self.values[:, places]))
+        positions = [find_column(name, self.names) for name in names]
+        chosen = tuple(self.units[each] for each in positions)
+        return cast(Self, replace(cast(Any, self), names=names, units=chosen, values=self.values[:, positions]))
 
     def to_si(self) -> Self:
         """Return the rows in SI: mm to m, Hz of a speed to rad/s. Unknown units are unchanged."""
-        names, sizes, zeros = zip(*map(units.in_si, self.units), strict=True) if self.units else ((), (), ())
+        names, sizes, zeros = zip(*map(units.get_si_unit, self.units), strict=True) if self.units else ((), (), ())
         return cast(Self, replace(cast(Any, self), units=names, values=self.values * np.array(sizes) + np.array(zeros)))
 
     def __repr__(self) -> str:
         pairs = zip(self.units, self.names, strict=True)
-        shown = [(", ".join(name for _, name in alike), unit) for unit, alike in groupby(pairs, lambda pair: pair[0])]
-        of = cast(Any, self)
-        span = f", {of.times_s[0]:.6g} to {of.times_s[-1]:.6g} s" if len(self) else ""
-        columns = ", ".join(f"{names} [{unit}]" for names, unit in shown)
-        return f"{type(self).__name__}({columns}; {len(self)} rows at {of.rate_hz:g} Hz{span})"
+        labels = [(", ".join(name for _, name in group), unit) for unit, group in groupby(pairs, lambda pair: pair[0])]
+        table = cast(Any, self)
+        span = f", {table.times_s[0]:.6g} to {table.times_s[-1]:.6g} s" if len(self) else ""
+        columns = ", ".join(f"{names} [{unit}]" for names, unit in labels)
+        return f"{type(self).__name__}({columns}; {len(self)} rows at {table.rate_hz:g} Hz{span})"
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -112,7 +112,7 @@ class Samples(Columns):
         ((1000,), 'mm', 'm')
         >>> samples["disk_z"]
         Traceback (most recent call last):
-        rig.base.errors.UnknownNameError: name must be one of those that there are, such as disk_y, ...
+        rig.base.errors.UnknownNameError: name must be one of the existing names, such as disk_y, ...
     """
 
     name: str
@@ -124,7 +124,7 @@ class Samples(Columns):
     rate_hz: float
 
 
-def joined(parts: Sequence[Samples]) -> Samples:
+def merge_samples(parts: Sequence[Samples]) -> Samples:
     """Return the columns of several tables as one table, with the rows common to all.
 
     Raises:
@@ -135,8 +135,8 @@ def joined(parts: Sequence[Samples]) -> Samples:
     index = reduce(np.intersect1d, [part.index for part in parts]) if parts else np.empty(0)
     rows = [np.intersect1d(part.index, index, return_indices=True)[1] for part in parts]
     times = [part.times_s[chosen] for part, chosen in zip(parts, rows, strict=True)]
-    alike = len({part.rate_hz for part in parts}) == 1  # with different rates, a part may have no row in common
-    if not alike or any(np.abs(each - times[0]).max(initial=0.0) > _SAME_INSTANT_S for each in times):
+    same_rate = len({part.rate_hz for part in parts}) == 1  # with different rates, a part may have no row in common
+    if not same_rate or any(np.abs(each - times[0]).max(initial=0.0) > _SAME_INSTANT_S for each in times):
         rates = ", ".join(f"{part.name} at {part.rate_hz:g} Hz" for part in parts)
         raise InputError("groups", "sampled at the same instants", rates or None)
     return Samples(

@@ -34,7 +34,7 @@ def printable(text: str, most: int | None = None) -> str:
     return text
 
 
-def nearest(name: object, known: Iterable[str], *, most: int = 3) -> list[str]:
+def find_similar(name: object, known: Iterable[str], *, most: int = 3) -> list[str]:
     """Return known names similar to an unknown one, most similar first; case is ignored.
 
     Args:
@@ -52,18 +52,18 @@ def nearest(name: object, known: Iterable[str], *, most: int = 3) -> list[str]:
     return [folded[each] for each in difflib.get_close_matches(str(name)[:100].casefold(), folded, most, 0.5)]
 
 
-def finite(value: Any) -> Any:
+def replace_nonfinite(value: Any) -> Any:
     """Return the document with None for numbers that JSON cannot represent, as in a diverged run."""
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, dict):
-        return {name: finite(item) for name, item in value.items()}
+        return {name: replace_nonfinite(item) for name, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [finite(item) for item in value]
+        return [replace_nonfinite(item) for item in value]
     return value
 
 
-class _Shown(reprlib.Repr):
+class _BoundedRepr(reprlib.Repr):
     """A repr with limited depth and length for any object."""
 
     def __init__(self) -> None:
@@ -80,8 +80,8 @@ class _Shown(reprlib.Repr):
         return super().repr_int(x, level)
 
 
-def shown(value: object) -> str:
+def format_value(value: object) -> str:
     """Return a value as shown in errors: a bounded repr, or `nothing` for None, as for a missing field."""
     if isinstance(value, Words):
         return printable(value, 2 * _MAX_CHARACTERS)
-    return "nothing" if value is None else printable(_Shown().repr(value), 2 * _MAX_CHARACTERS)
+    return "nothing" if value is None else printable(_BoundedRepr().repr(value), 2 * _MAX_CHARACTERS)

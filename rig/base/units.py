@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rig.base.errors import InputError
-from rig.base.text import nearest
+from rig.base.text import find_similar
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ def _find(spelling: str) -> tuple[str, ...]:
 
 
 QUANTITIES = tuple(_TABLE)
-"""Quantities of the units, as `kind` returns them."""
+"""Quantities of the units, as `get_quantity` returns them."""
 
 
 def canonical(unit: str) -> str:
@@ -92,7 +92,7 @@ def canonical(unit: str) -> str:
     return found[0] if len(found) == 1 else unit.strip()
 
 
-def known(unit: str) -> bool:
+def is_known(unit: str) -> bool:
     """Return whether a unit can be converted; any known spelling is accepted."""
     return canonical(unit) in _UNITS
 
@@ -102,11 +102,11 @@ def _unknown(unit: str, also: Iterable[str] = ()) -> str:
     found = _find(unit)
     if len(found) > 1:
         return f"unambiguous: {' or '.join(found)}"
-    if (split := _DETECTOR.fullmatch(unit.strip())) and known(split[1]):
+    if (split := _DETECTOR.fullmatch(unit.strip())) and is_known(split[1]):
         name = canonical(split[1])
         return f"a unit of samples, such as {name} ({split[2]} is the reading of a detector; give {name} if it is not)"
-    close = nearest(canonical(unit), (*_UNITS, *_FOLDED, *also), most=1)
-    return f"a known unit{f', such as {canonical(close[0])}' if close else ''}"
+    similar = find_similar(canonical(unit), (*_UNITS, *_FOLDED, *also), most=1)
+    return f"a known unit{f', such as {canonical(similar[0])}' if similar else ''}"
 
 
 def parse(unit: str, *, field: str, also: Iterable[str] = ()) -> str:
@@ -120,12 +120,12 @@ def parse(unit: str, *, field: str, also: Iterable[str] = ()) -> str:
     Raises:
         InputError: The unit is unknown or ambiguous, or has a detector's suffix (rms, pk, pk-pk).
     """
-    if not known(unit):
+    if not is_known(unit):
         raise InputError(field, _unknown(unit, also), unit)
     return canonical(unit)
 
 
-def kind(unit: str) -> str:
+def get_quantity(unit: str) -> str:
     """Return the quantity that a unit measures: length, force, voltage, ...; empty if it is unknown."""
     found = _UNITS.get(canonical(unit))
     return found.quantity if found else ""
@@ -137,7 +137,7 @@ def size_si(unit: str) -> float:
     return found.size if found else 1.0
 
 
-def in_si(unit: str) -> tuple[str, float, float]:
+def get_si_unit(unit: str) -> tuple[str, float, float]:
     """Return the SI unit of a unit's quantity, and the size and zero of the unit in it.
 
     An unknown unit is returned unchanged, with 1 and 0.
@@ -157,25 +157,25 @@ def factor(unit: str, target: str, *, field: str) -> float:
     Raises:
         InputError: A unit is unknown, or the two differ in quantity or zero.
     """
-    source, wanted = canonical(unit), canonical(target)
-    if source == wanted:
+    source, target_unit = canonical(unit), canonical(target)
+    if source == target_unit:
         return 1.0
-    if wanted not in _UNITS:
+    if target_unit not in _UNITS:
         raise InputError(field, f"{target}, the unit of the channel, which has no conversion", unit)
-    quantity = _UNITS[wanted].quantity
+    quantity = _UNITS[target_unit].quantity
     allowed = [name for name, each in _UNITS.items() if each.quantity == quantity]
     if source not in _UNITS:
         if len(_find(unit)) > 1 or _DETECTOR.fullmatch(unit.strip()):
             raise InputError(field, _unknown(unit), unit)
-        close = nearest(source, allowed, most=1)
-        hint = f" (such as {close[0]})" if close else ""
+        similar = find_similar(source, allowed, most=1)
+        hint = f" (such as {similar[0]})" if similar else ""
         raise InputError(field, f"one of {', '.join(allowed)}, or V or mV with a sensitivity{hint}", unit)
     if _UNITS[source].quantity != quantity:
         hint = ", with a sensitivity" if _UNITS[source].quantity == "voltage" else ""
         raise InputError(field, f"a unit of {quantity} ({', '.join(allowed)}){hint}", unit)
-    if _UNITS[source].zero != _UNITS[wanted].zero:
-        raise InputError(field, f"{wanted}, as {source} counts from another zero", unit)
-    return _UNITS[source].size / _UNITS[wanted].size
+    if _UNITS[source].zero != _UNITS[target_unit].zero:
+        raise InputError(field, f"{target_unit}, as {source} counts from another zero", unit)
+    return _UNITS[source].size / _UNITS[target_unit].size
 
 
 def sensitivity_v(text: str, target: str, *, field: str) -> float:
@@ -189,10 +189,10 @@ def sensitivity_v(text: str, target: str, *, field: str) -> float:
         number = float(match[1]) if match else 0.0
     except ValueError:
         number = 0.0
-    if match is None or not number or not math.isfinite(number) or kind(match[2]) != "voltage":
+    if match is None or not number or not math.isfinite(number) or get_quantity(match[2]) != "voltage":
         raise InputError(field, 'volts per unit, such as "7.87 V/mm", "200 mV/mil" or "100 mV/g"', text)
-    if kind(match[3]) != kind(target):
-        allowed = [name for name, each in _UNITS.items() if each.quantity == kind(target)]
-        must = f"volts per unit of {kind(target)} ({', '.join(allowed)})" if allowed else f"volts per {target}"
+    if get_quantity(match[3]) != get_quantity(target):
+        allowed = [name for name, each in _UNITS.items() if each.quantity == get_quantity(target)]
+        must = f"volts per unit of {get_quantity(target)} ({', '.join(allowed)})" if allowed else f"volts per {target}"
         raise InputError(field, must, text)
     return number * size_si(match[2]) / factor(match[3], target, field=field)

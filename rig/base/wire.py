@@ -79,7 +79,7 @@ _MAX_RATE_HZ = 1e12
 _MAX_BLOCK_S = 1e6
 
 
-def schema_of(key: str) -> str | None:
+def get_schema(key: str) -> str | None:
     """Return the block schema of a key's payloads, or None for JSON documents."""
     if key == EDGES or (key.startswith(TRUTH + "/") and key != FAULTS):
         return TRUTH_SCHEMA
@@ -247,7 +247,7 @@ class Continuity:
         self.runs[key] = self.runs.get(key, 0) + (size < 0 and not late)
         return Gap(key=key, index=expected, size=size) if size else None
 
-    def tell(self, event: dict[str, Any]) -> dict[str, Any]:
+    def add_row_counts(self, event: dict[str, Any]) -> dict[str, Any]:
         """Return an event in its published form: `end` has the index after the last row, by key.
 
         Blocks and events travel separately: the `rows` of the end show the receiver what is missing.

@@ -148,7 +148,7 @@ class ChannelTable(BaseModel, frozen=True, extra="forbid"):
         """All channels by name, in table order."""
         return {channel.name: channel for group in self.groups.values() for channel in group.channels}
 
-    def only(self, names: tuple[str, ...], rate_hz: int | None = None) -> ChannelTable:
+    def select_groups(self, names: tuple[str, ...], rate_hz: int | None = None) -> ChannelTable:
         """Return the table limited to the named groups (none for all), with another sample rate if given [Hz]."""
         kept = {}
         for name in names or self.groups:

@@ -9,7 +9,14 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
-from rig.base.errors import WHOLE_RIG, DiskError, InputError, SimulationError, lacks_full, need_of_full
+from rig.base.errors import (
+    INSTALL_COMMAND,
+    DiskError,
+    InputError,
+    SimulationError,
+    describe_missing_package,
+    is_full_missing,
+)
 from rig.cli.command import Group, load_command, make_command, make_group, usage_error
 from rig.cli.output import provenance
 from rig.cli.output.tables import echo
@@ -105,8 +112,8 @@ def rig() -> Group:
     """Return the command line."""
     about = "A virtual rotor-stator test rig: simulate, serve, command, record, view and validate it."
     group = make_group("rig", COMMANDS, _load, _rig, about)
-    if lacks_full():
-        group.epilog = f"These need the whole rig, {WHOLE_RIG}: {', '.join(NEED_FULL)}."
+    if is_full_missing():
+        group.epilog = f"These need the whole rig, {INSTALL_COMMAND}: {', '.join(NEED_FULL)}."
     return group
 
 
@@ -155,7 +162,7 @@ def start(arguments: list[str] | None = None) -> None:
     except (typer.Abort, KeyboardInterrupt):
         _fail("interrupted", status=_INTERRUPTED)
     except ModuleNotFoundError as error:
-        if not (need := need_of_full(error)):
+        if not (need := describe_missing_package(error)):
             raise
         _fail(f"this {need}")
     except (BrokenPipeError, SystemExit) as error:

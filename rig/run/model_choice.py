@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from pydantic import FiniteFloat
 
-from rig.base.checks import Written, table_in
+from rig.base.checks import Written, get_table
 from rig.physics.levels import ModelLevels
 
 _RIG = Path(__file__).parents[1]
@@ -78,15 +78,15 @@ class Pick(Written):
         engine: dict[str, Any] = {"name": self.engine, "step_us": self.step_us, "tolerance": self.engine_tolerance}
         if self.companion is not None:
             engine["companion"] = self.companion
-        given = dict(table_in(data, "engine"))
+        given = dict(get_table(data, "engine"))
         if self.companion is False:
             given.pop("limits", None)  # without a companion there is no error estimate to limit
         return {
             **data,
             "model": levels,
             "engine": {**given, **engine},
-            "drive": {**table_in(data, "drive"), "mode": self.drive},
-            "sensors": {**table_in(data, "sensors"), "chain": self.sensors},
+            "drive": {**get_table(data, "drive"), "mode": self.drive},
+            "sensors": {**get_table(data, "sensors"), "chain": self.sensors},
         }
 
 

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rig.base.errors import InputError, UnknownNameError, Words, whole_file
-from rig.base.samples import Samples, joined, place
+from rig.base.samples import Samples, find_column, merge_samples
 from rig.channels.formula import check_computed
 from rig.channels.table import ChannelTable
 from rig.physics.kernels.signals import COLUMN, N_ROW, ROW
@@ -79,14 +79,14 @@ class Run:
         Raises:
             UnknownNameError: The signal does not exist or was not kept; also a KeyError.
         """
-        return self.signals[:, place(name, self.names, must=_MUST)]
+        return self.signals[:, find_column(name, self.names, must=_MUST)]
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.names)
 
     def unit(self, name: str) -> str:
         """Return the SI unit of one signal of the model, `run[name]`."""
-        return ROW[COLUMN[self.names[place(name, self.names, must=_MUST)]]].unit
+        return ROW[COLUMN[self.names[find_column(name, self.names, must=_MUST)]]].unit
 
     def __repr__(self) -> str:
         scene, rate = self.simulation.scene, _get_signal_rate(self.simulation)
@@ -103,12 +103,12 @@ class Run:
         Raises:
             InputError: Groups have different rates: use `run.groups`.
         """
-        return joined(self.sampled)
+        return merge_samples(self.sampled)
 
     @property
     def counts(self) -> Samples:
         """Readings of the sensors in counts of the converter, int32."""
-        return joined(self.counted)
+        return merge_samples(self.counted)
 
     @property
     def groups(self) -> dict[str, Samples]:

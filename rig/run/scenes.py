@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal, get_args
 
 from pydantic import Field, FiniteFloat, field_validator, model_validator
 
-from rig.base.checks import Written, check, parse_toml, read_toml, table_in
+from rig.base.checks import Written, check, get_table, parse_toml, read_toml
 from rig.base.errors import InputError, Words, such_as
 from rig.channels.channel_file import check_table, read_channels
 from rig.channels.faults import Setting
@@ -215,7 +215,7 @@ class Scene(Written):
     @property
     def table(self) -> ChannelTable:
         """Channel table of the active sensors, at their rates."""
-        return (self.channels or rig_table()).only(self.sensors.groups, self.sensors.rate_hz or None)
+        return (self.channels or rig_table()).select_groups(self.sensors.groups, self.sensors.rate_hz or None)
 
     @property
     def row_ticks(self) -> int:
@@ -238,7 +238,9 @@ class Scene(Written):
             raise InputError("scene", "one with a [generator]", self.name)
         rate = self.sensors.rate_hz or None
         # A channel's position among all channels does not depend on which are active.
-        all_sources = sources(self.generator, (self.channels or rig_table()).only((), rate), self.drive.speed_hz)
+        all_sources = sources(
+            self.generator, (self.channels or rig_table()).select_groups((), rate), self.drive.speed_hz
+        )
         return {name: all_sources[name] for name in self.table.channels}
 
     def check_physics(self) -> None:
@@ -404,7 +406,7 @@ def parse_scene(data: dict[str, Any]) -> Scene:
 
 def _override(data: dict[str, Any], key: str, value: Any) -> None:
     if key in load_parameters().entries:
-        data["set"] = {**table_in(data, "set"), key: value}
+        data["set"] = {**get_table(data, "set"), key: value}
         return
     *path, last = key.split(".")
     fields: Any = Scene
@@ -416,7 +418,7 @@ def _override(data: dict[str, Any], key: str, value: Any) -> None:
         fields = known[part].annotation
     table = data
     for part in path:
-        table[part] = dict(table_in(table, part))
+        table[part] = dict(get_table(table, part))
         table = table[part]
     table[last] = value
     if key == "drive.speed_hz":

@@ -16,7 +16,7 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, Field, model_validator
 
 from rig.base import wire
-from rig.base.checks import LARGEST, Name, Outside, a_line, check, read_json
+from rig.base.checks import LARGEST, Name, StrictModel, a_line, check, read_json
 from rig.base.errors import InputError, RefusedError
 from rig.base.text import printable
 from rig.serve.transport import Server
@@ -35,11 +35,11 @@ _MAX_KINDS = 100
 _FIGURES = re.compile(r"\d+(\.\d+)?(e[-+]?\d+)?")
 
 
-class EmptyRequest(Outside):
+class EmptyRequest(StrictModel):
     """A command without fields: `stop`, `pause`, `resume`."""
 
 
-class StepRequest(Outside):
+class StepRequest(StrictModel):
     """Length of a step of a lockstep run or a paused replay."""
 
     ticks: Annotated[int, Field(gt=0, le=LARGEST)] | None = None
@@ -52,14 +52,14 @@ def _check_word(text: str) -> str:
     return text
 
 
-class NoteRequest(Outside):
+class NoteRequest(StrictModel):
     """A text line for all current recordings."""
 
     text: Annotated[str, a_line(1000)]
     tags: list[Annotated[str, a_line(40), AfterValidator(_check_word)]] = Field(default=[], max_length=10)
 
 
-class JoinRequest(Outside):
+class JoinRequest(StrictModel):
     """Registration of a device under test: each block waits until the device has finished the one before."""
 
     device: Name
@@ -67,7 +67,7 @@ class JoinRequest(Outside):
     """Time limit for the device per block, wall time [s]."""
 
 
-class DoneRequest(Outside):
+class DoneRequest(StrictModel):
     """Report that a device has finished a block."""
 
     device: Name
@@ -83,25 +83,25 @@ class DoneRequest(Outside):
         return self
 
 
-class LeaveRequest(Outside):
+class LeaveRequest(StrictModel):
     """End of a device's registration."""
 
     device: Name
 
 
-class SeekRequest(Outside):
+class SeekRequest(StrictModel):
     """New position of a replay."""
 
     time_s: float
 
 
-class RateRequest(Outside):
+class RateRequest(StrictModel):
     """Speed of a replay: recorded over real time."""
 
     rate: float
 
 
-REQUESTS: dict[str, type[Outside]] = {
+REQUESTS: dict[str, type[StrictModel]] = {
     "stop": EmptyRequest,
     "step": StepRequest,
     "note": NoteRequest,
@@ -305,7 +305,7 @@ def _size(command: dict[str, Any]) -> int:
     return len(wire.encode_document(command))
 
 
-class _SenderField(Outside):
+class _SenderField(StrictModel):
     sender: Name = Field(alias="from")
 
 

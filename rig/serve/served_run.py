@@ -9,7 +9,7 @@ from typing import Any
 
 from rig.base import wire
 from rig.base.errors import InputError
-from rig.base.text import finite
+from rig.base.text import replace_nonfinite
 from rig.serve.pacing import Clock, StepTimeoutError, freeze_start_objects
 from rig.serve.request_handler import PendingCommand, RequestHandler, one_line
 from rig.serve.transport import Server
@@ -121,7 +121,7 @@ class ServedRun(ABC):
         warnings: list[str],
     ) -> dict[str, Any]:
         """Return the common part of every status (units and meaning: rig/KEYS.md)."""
-        return finite(
+        return replace_nonfinite(
             {
                 "scene": self._scene.get("name"),
                 "tick": tick,

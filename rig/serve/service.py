@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from rig.base import wire
 from rig.base.errors import InputError, Words
-from rig.base.text import finite
+from rig.base.text import replace_nonfinite
 from rig.channels.faults import DOORS, Message
 from rig.run.commands import SUMMARIES
 from rig.run.commands.table import SERVICE_COMMANDS
@@ -480,7 +480,7 @@ class Service(ServedRun):
 
     def _publish_event(self, event: dict[str, Any]) -> None:
         self._sent_counts[wire.EVENTS] = self._sent_counts.get(wire.EVENTS, 0) + 1
-        self._server.publish(wire.EVENTS, wire.encode_document(finite(self._rows.tell(event))))
+        self._server.publish(wire.EVENTS, wire.encode_document(replace_nonfinite(self._rows.add_row_counts(event))))
 
     def _publish_status(self) -> None:
         self._server.publish(wire.STATUS, wire.encode_document(self.status()))

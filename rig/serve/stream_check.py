@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from rig.base import wire
-from rig.base.checks import Count, Name, Outside, check, read_json
+from rig.base.checks import Count, Name, StrictModel, check, read_json
 from rig.base.errors import InputError
 from rig.channels.faults.ledger import Declared
 from rig.channels.table import ChannelTable
@@ -36,7 +36,7 @@ _Text = Annotated[str, Field(max_length=10_000)]
 _Rate = Annotated[float, Field(gt=0.0, le=1e12)]
 
 
-class Event(Outside):
+class Event(StrictModel):
     """An event of the stream: the fields that are used; further fields are only displayed."""
 
     model_config = ConfigDict(extra="allow")
@@ -54,7 +54,7 @@ class Event(Outside):
     rows: dict[str, Count] | None = None
 
 
-class BlockEnd(Outside):
+class BlockEnd(StrictModel):
     """The end of a block in lockstep: the whole block was published before."""
 
     block: Count
@@ -220,7 +220,7 @@ class BlockValidator:
         if len(payload) > _BLOCK_BYTES:
             raise InputError("block", f"at most {_BLOCK_BYTES} bytes", len(payload))
         try:
-            block = wire.decode_block(payload, wire.schema_of(key) or "")
+            block = wire.decode_block(payload, wire.get_schema(key) or "")
         except wire.ImplausibleError as error:
             return self._refuse(key, str(error))
         stream_format = self._formats.get(key)

@@ -221,7 +221,7 @@ def test_a_recording_contains_only_valid_rows(tmp_path: Path, limits: Limits) ->
 
 def is_block(key: str, payload: bytes) -> bool:
     try:
-        wire.decode_block(payload, wire.schema_of(key) or "")
+        wire.decode_block(payload, wire.get_schema(key) or "")
     except ValueError:
         return False
     return True
@@ -244,7 +244,7 @@ def test_captures_end_and_contain_only_valid_rows(tmp_path: Path) -> None:
         assert recording.complete
         for key in KEYS:
             found = [
-                wire.decode_block(p, wire.schema_of(key) or "").index
+                wire.decode_block(p, wire.get_schema(key) or "").index
                 for _, p in recording.payloads(key)
                 if is_block(key, p)
             ]

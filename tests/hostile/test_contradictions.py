@@ -14,7 +14,7 @@ from recorder.contents.metadata import Head
 from recorder.reader import Recording
 from recorder.rewrite import cut, recover
 from replays.recordings.parameters import parameter_doubts
-from rig.base.wire import EVENTS, STATUS, Block, decode_block, encode_block, encode_document, schema_of
+from rig.base.wire import EVENTS, STATUS, Block, decode_block, encode_block, encode_document, get_schema
 from rig.cli.main import main
 
 from .files import PROBES, SESSIONS, Layout
@@ -74,7 +74,7 @@ def change_block(key: str, change: Callable[[Block, int], tuple[dict[str, Any], 
     def spoil(layout: Layout) -> None:
         at = [n for n, (topic, *_) in enumerate(layout.messages) if topic == key][number]
         topic, payload, time_ns = layout.messages[at]
-        block = decode_block(payload, schema_of(key) or "")
+        block = decode_block(payload, get_schema(key) or "")
         fields = {name: getattr(block, name) for name in ("tick", "index", "rate_hz", "tick_rate_hz", "values")}
         changed, later_ns = change(block, time_ns)
         layout.messages[at] = (topic, encode_block(Block(**{**fields, **changed})), time_ns + later_ns)
@@ -85,7 +85,7 @@ def change_block(key: str, change: Callable[[Block, int], tuple[dict[str, Any], 
 def append_block(layout: Layout) -> None:
     """Append one block to one group, with continued numbers and times, and adapt the closing counts."""
     at = [n for n, (topic, *_) in enumerate(layout.messages) if topic == PROBES][-1]
-    block = decode_block(layout.messages[at][1], schema_of(PROBES) or "")
+    block = decode_block(layout.messages[at][1], get_schema(PROBES) or "")
     again = Block(block.tick + 100_000, block.index + 500, block.rate_hz, block.tick_rate_hz, block.values)
     layout.messages.insert(at + 1, (PROBES, encode_block(again), again.tick * 1000))
     rows = json.loads(layout.metadata["end"]["rows"])

@@ -22,7 +22,7 @@ from rig.base.wire import (
     decode_document,
     encode_block,
     encode_document,
-    schema_of,
+    get_schema,
     sensor_key,
 )
 from rig.serve.transport.zenoh import ZenohServer
@@ -39,7 +39,7 @@ CYCLE = list(generate_stream(50))[1:-1]
 
 
 def _later(key: str, payload: bytes, cycle: int) -> bytes:
-    schema = schema_of(key)
+    schema = get_schema(key)
     if schema is None:
         return payload
     block = decode_block(payload, schema)
@@ -96,7 +96,7 @@ class Publisher:
         self._thread.join()
         rows = {}
         for key, payloads in self.sent.items():
-            schema = schema_of(key)
+            schema = get_schema(key)
             if schema is not None:
                 block = decode_block(payloads[-1], schema)
                 rows[key] = block.index + len(block.values)
@@ -266,7 +266,7 @@ def test_a_rotating_recorder_loses_nothing_between_files(tmp_path):
         for key, sent in rig.sent.items():
             payloads = [payload for _, payload in recording.payloads(key)]
             assert payloads == sent[len(sent) - len(payloads) :], key
-            assert len(payloads) >= 200 or schema_of(key) is None, key
+            assert len(payloads) >= 200 or get_schema(key) is None, key
 
 
 def test_a_recorder_waits_for_a_rig_that_starts_later(tmp_path):

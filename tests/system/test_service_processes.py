@@ -46,7 +46,7 @@ class Listener:
         client.subscribe("rig/**", self._take, on_miss=self._miss, history=True)
 
     def _take(self, key: str, payload: bytes) -> None:
-        schema = wire.schema_of(key)
+        schema = wire.get_schema(key)
         if schema is not None:
             block = wire.decode_block(payload, schema)
             self.first.setdefault(key, block.index)

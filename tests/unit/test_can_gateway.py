@@ -54,7 +54,7 @@ class FakeChannels(FakeSimulation):
     groups = tuple(GROUPS)
 
     def catalogue(self) -> dict[str, Any]:
-        return {**super().catalogue(), "table": default_table().only(self.groups).model_dump(mode="json")}
+        return {**super().catalogue(), "table": default_table().select_groups(self.groups).model_dump(mode="json")}
 
     def advance(self, ticks: int) -> Any:
         frame = super().advance(ticks)
@@ -580,7 +580,10 @@ def test_100_000_random_frames_are_no_command_and_few_are_answered() -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda table: table.only(("probes",), 16_000), "--can-rate must be a divisor of the samples' rate, 16000 Hz"),
+        (
+            lambda table: table.select_groups(("probes",), 16_000),
+            "--can-rate must be a divisor of the samples' rate, 16000 Hz",
+        ),
         (lambda table: _calibrated(table), "channel disk_x must be calibrated as in the channel table"),
         (lambda table: _mixed(table), "sample rates must be the same for all channel groups"),
     ],
@@ -618,7 +621,7 @@ def _calibrated(table: Any) -> Any:
 
 
 def _mixed(table: Any) -> Any:
-    return table.model_copy(update={"groups": {**table.groups, **table.only(("hammer",), 10_000).groups}})
+    return table.model_copy(update={"groups": {**table.groups, **table.select_groups(("hammer",), 10_000).groups}})
 
 
 class Firmware:

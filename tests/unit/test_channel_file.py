@@ -170,7 +170,7 @@ def test_the_bench_times_a_laboratory_of_24_channels() -> None:
 
 def test_messages_follow_the_table(tmp_path: Path) -> None:
     assert messages_for(default_table()) is default_messages()
-    assert messages_for(default_table().only(("forces",), 5_000)) is default_messages()
+    assert messages_for(default_table().select_groups(("forces",), 5_000)) is default_messages()
     table = messages_for(read_channels(written(tmp_path)))
     assert table.layout != default_messages().layout
     sampled = [channel.name for row in table.fd if row.samples for channel in row.samples.channels]

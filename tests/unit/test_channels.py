@@ -218,7 +218,7 @@ def test_a_channel_without_sensitivity_or_signal_is_refused_in_one_line() -> Non
 @given(names=st.permutations(list(default_table().groups)), n=st.integers(0, 5), rate=st.none() | st.integers(1, 10**6))
 def test_only_keeps_the_groups_and_lowers_the_corner_with_the_rate(names: list[str], n: int, rate: int | None) -> None:
     before = default_table().model_dump()
-    table = default_table().only(tuple(names[:n]), rate)
+    table = default_table().select_groups(tuple(names[:n]), rate)
     assert list(table.groups) == (names[:n] or list(default_table().groups))
     for name, group in table.groups.items():
         original = default_table().groups[name]

@@ -187,7 +187,7 @@ def test_chosen_channels_come_aligned_in_engineering_units() -> None:
         si = samples.to_si()
         np.testing.assert_allclose(si["disk_x"], samples["disk_x"] * 1e-3, rtol=1e-15)
         assert (samples.unit("disk_x"), si.unit("disk_x"), si.unit("P_W"), len(si)) == ("mm", "m", "N", 3 * BLOCK)
-        with pytest.raises(KeyError, match=r"name must be one of those that there are, such as disk_x"):
+        with pytest.raises(KeyError, match=r"name must be one of the existing names, such as disk_x"):
             samples["disk_z"]
         shown = f"Samples(P_W [N], disk_x [mm], hammer [N]; {len(samples)} rows at 20000 Hz, 0 to"
         assert repr(samples).startswith(shown)

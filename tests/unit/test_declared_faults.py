@@ -53,7 +53,7 @@ def simulate_messages(kind: str) -> list[tuple[str, bytes]]:
             items.append((message.key, wire.encode_block(message.block)))
         items += [(wire.EVENTS, wire.encode_document(each)) for each in frame.events]
     end = {"event": "end", "tick": simulation.tick, "time_s": simulation.tick / 1e6, "reason": "completed"}
-    return [*items, (wire.EVENTS, wire.encode_document(rows.tell(end)))]
+    return [*items, (wire.EVENTS, wire.encode_document(rows.add_row_counts(end)))]
 
 
 def recorded(

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from rig.base.errors import FULL, WHOLE_RIG
+from rig.base.errors import FULL_PACKAGES, INSTALL_COMMAND
 from tests.processes import ROOT
 
 LEAN = """
@@ -31,14 +31,14 @@ CLIENTS = (
 
 def run_lean(code: str) -> subprocess.CompletedProcess[str]:
     """Run a program as on a machine without the extra."""
-    program = LEAN.format(full=set(FULL)) + code
+    program = LEAN.format(full=set(FULL_PACKAGES)) + code
     return subprocess.run([sys.executable, "-c", program], cwd=ROOT, text=True, capture_output=True, timeout=120)
 
 
 def test_the_message_names_the_extra() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     extra = {re.split(r"[>=<\[]", line)[0] for line in project["optional-dependencies"]["full"]}
-    assert {name.lower() for module in FULL for name in packages_distributions()[module]} == extra
+    assert {name.lower() for module in FULL_PACKAGES for name in packages_distributions()[module]} == extra
 
 
 def test_clients_need_no_more_than_the_lean_install() -> None:

@@ -83,7 +83,7 @@ class Received:
         return [wire.decode_document(payload) for payload in self.payloads.get(wire.EVENTS, [])]
 
     def blocks(self, key: str = PROBES) -> list[wire.Block]:
-        schema = wire.schema_of(key)
+        schema = wire.get_schema(key)
         assert schema is not None
         return [wire.decode_block(payload, schema) for payload in self.payloads.get(key, [])]
 

@@ -23,7 +23,7 @@ from rig.base.wire import (
     decode_block,
     encode_block,
     encode_document,
-    schema_of,
+    get_schema,
     sensor_key,
 )
 from tests.commands import run
@@ -82,7 +82,7 @@ def move_block(rows: list[tuple[str, bytes]]) -> list[tuple[str, bytes]]:
 
 def merge_blocks(rows: list[tuple[str, bytes]]) -> list[tuple[str, bytes]]:
     """Merge all blocks of a stream into one, as an import may have it."""
-    blocks = [decode_block(data, schema_of(key) or "") for key, data in rows if key == PROBES]
+    blocks = [decode_block(data, get_schema(key) or "") for key, data in rows if key == PROBES]
     first, values = blocks[0], [row for block in blocks for row in block.values.tolist()]
     data = encode_block(Block(first.tick, first.index, first.rate_hz, first.tick_rate_hz, _as(first, values)))
     return [(PROBES, data), *(row for row in rows if row[0] != PROBES)]

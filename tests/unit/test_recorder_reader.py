@@ -11,7 +11,7 @@ from recorder.files.schemas import unwrap_text
 from recorder.reader import Recording
 from recorder.writer import RecordingWriter
 from rig.base.errors import InputError
-from rig.base.samples import joined
+from rig.base.samples import merge_samples
 from rig.base.wire import CATALOGUE, EDGES, PARAMETERS, SCENE, STATUS, sensor_key, truth_key
 from rig.channels.table import default_table
 
@@ -131,17 +131,17 @@ def test_groups_are_joined_where_all_have_a_row(recording):
     few = opened.samples("ring_y", "P_N", "hammer")
     assert (few.names, few.units) == (("ring_y", "P_N", "hammer"), ("mm", "N", "N"))
     np.testing.assert_array_equal(few["ring_y"], probes["ring_y"])
-    for ask in (lambda: few.only("ring_z"), lambda: opened.samples("ring_z")):
+    for ask in (lambda: few.select("ring_z"), lambda: opened.samples("ring_z")):
         with pytest.raises(KeyError, match="such as ring_y"):
             ask()
     shorter = replace(probes, index=probes.index[7:], times_s=probes.times_s[7:], values=probes.values[7:])
-    np.testing.assert_array_equal(joined([opened.samples("forces"), shorter]).index, shorter.index)
+    np.testing.assert_array_equal(merge_samples([opened.samples("forces"), shorter]).index, shorter.index)
     late = replace(probes, times_s=probes.times_s + 20e-6)
     # A stretch of two rates, far from the start, has no row number in common.
     slow = replace(probes, rate_hz=probes.rate_hz / 4, index=probes.index + 10**9)
     for parts in ([], [opened.samples("forces"), late], [probes, slow]):
         with pytest.raises(InputError, match=r"^groups must be sampled at the same instants"):
-            joined(parts)
+            merge_samples(parts)
 
 
 def test_a_recording_is_shown_in_a_line(recording):

@@ -33,7 +33,7 @@ from rig.base.wire import (
     Gap,
     encode_block,
     encode_document,
-    schema_of,
+    get_schema,
     sensor_key,
 )
 from rig.channels.table import default_table
@@ -162,8 +162,8 @@ def test_rows_lost_at_a_seam_are_a_gap(tmp_path):
 
 def test_history_received_stream_by_stream_is_in_the_first_part(tmp_path, items):
     then, now = (
-        [item for item in items if schema_of(item[0])][:700],
-        [item for item in items if schema_of(item[0])][700:],
+        [item for item in items if get_schema(item[0])][:700],
+        [item for item in items if get_schema(item[0])][700:],
     )
     file = series(tmp_path / "run.mcap", rotate_s=0.1)
     write(file, sorted(then, key=lambda item: item[0]) + now)

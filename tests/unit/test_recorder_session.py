@@ -33,7 +33,7 @@ from rig.base.wire import (
     decode_document,
     encode_block,
     encode_document,
-    schema_of,
+    get_schema,
     sensor_key,
     truth_key,
 )

@@ -264,7 +264,7 @@ def test_corner_is_at_minus_3_db() -> None:
 
 
 def test_a_slower_rate_has_a_lower_corner() -> None:
-    group = default_table().only(("forces",), 2_000).groups["forces"]
+    group = default_table().select_groups(("forces",), 2_000).groups["forces"]
     times = np.arange(8_000) / ROW_RATE
     rows = rows_of("P_E", 5_000.0 * np.sin(2 * math.pi * 5_000.0 * times))
     seen = group.engineering(compute_counts(group, rows, noise=False))

@@ -38,7 +38,7 @@ class Listener:
 
     def _take(self, key: str, payload: bytes) -> None:
         self.order.append(key)
-        schema = wire.schema_of(key)
+        schema = wire.get_schema(key)
         if schema is not None:
             self.blocks.setdefault(key, []).append(wire.decode_block(payload, schema))
         elif key == wire.EVENTS:

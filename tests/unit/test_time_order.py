@@ -17,7 +17,7 @@ from replays.recordings.formats.clock import axis_of_stamps
 from replays.score.card.scorecard import FAIL, PASS
 from replays.score.judgement import judge
 from rig.base.errors import InputError
-from rig.base.wire import EDGES, Block, decode_block, encode_block, schema_of
+from rig.base.wire import EDGES, Block, decode_block, encode_block, get_schema
 from rig.channels.table import default_table
 from tests.commands import run_captured
 from tests.hostile.files import PROBES, SESSIONS, Layout
@@ -170,7 +170,7 @@ def test_blocks_out_of_order_in_time_are_a_doubt_in_each_command(
     spoilt, numbers = copy.deepcopy(layout), iter(range(1000))
     for at, (topic, payload, time_ns) in enumerate(spoilt.messages):
         if topic == key:
-            block = decode_block(payload, schema_of(topic) or "")
+            block = decode_block(payload, get_schema(topic) or "")
             spoilt.messages[at] = (topic, encode_block(replace(block, **change(block, next(numbers)))), time_ns)
     path = spoilt.write(tmp_path / "x.mcap")
     doubts = [line for line in Recording.open(path).doubts if doubt in line]

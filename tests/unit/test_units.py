@@ -66,7 +66,7 @@ SPELLINGS = {
 
 @pytest.mark.parametrize(("quantity", "name", "size"), [(q, n, s) for q, row in SIZES.items() for n, s in row.items()])
 def test_a_unit_has_its_quantity_and_its_size(quantity: str, name: str, size: float) -> None:
-    assert units.kind(name) == quantity
+    assert units.get_quantity(name) == quantity
     assert units.size_si(name) == pytest.approx(size, rel=1e-12)
     assert units.parse(name, field="x") == name
 
@@ -82,8 +82,8 @@ def test_any_unambiguous_spelling_is_the_unit() -> None:
 
 
 def test_every_quantity_has_its_si_unit() -> None:
-    si = {units.kind(name): units.in_si(name) for row in SIZES.values() for name in row}
-    assert all(units.size_si(name) == 1.0 and units.in_si(name) == (name, 1.0, 0.0) for name, _, _ in si.values())
+    si = {units.get_quantity(name): units.get_si_unit(name) for row in SIZES.values() for name in row}
+    assert all(units.size_si(name) == 1.0 and units.get_si_unit(name) == (name, 1.0, 0.0) for name, _, _ in si.values())
     assert si["speed of rotation"][0] == "rad/s"
     assert set(si) == set(units.QUANTITIES) - {"number"}
 
@@ -99,8 +99,8 @@ def test_every_unit_of_the_table_is_found_by_its_own_name() -> None:
      ("C", "degC or coulomb"), ("F", "degF or farad"), ("NM", "N m or nm"), ("MPA", "MPa or mPa"), ("k", "K or kilo")],
 )  # fmt: skip
 def test_an_ambiguous_spelling_is_no_unit_and_the_choices_are_named(text: str, choices: str) -> None:
-    assert not units.known(text)
-    assert units.kind(text) == ""
+    assert not units.is_known(text)
+    assert units.get_quantity(text) == ""
     with pytest.raises(InputError, match=f"x must be unambiguous: {choices}; instead received '{text}'"):
         units.parse(text, field="x")
     with pytest.raises(InputError, match="unambiguous"):
@@ -114,7 +114,7 @@ def test_an_ambiguous_spelling_is_no_unit_and_the_choices_are_named(text: str, c
      ("mm peak to peak", "mm"), ("Vpp", "V")],
 )  # fmt: skip
 def test_a_detectors_suffix_must_be_explained_and_is_never_dropped(text: str, unit: str) -> None:
-    assert not units.known(text)
+    assert not units.is_known(text)
     with pytest.raises(InputError, match=f"such as {unit} .* is the reading of a detector"):
         units.parse(text, field="x")
     with pytest.raises(InputError, match="detector"):
@@ -224,4 +224,4 @@ def test_an_unconvertible_unit_is_refused_with_valid_ones() -> None:
 def test_a_plural_name_is_a_unit_but_not_a_plural_symbol() -> None:
     plurals = {"mils": "mil", "volts": "V", "Newtons": "N", "gs": "g", "lbs": "lbf", "hrs": "h", "metres": "m"}
     assert {text: units.canonical(text) for text in plurals} == plurals
-    assert [text for text in ("Vs", "mVs", "as", "Ks", "HRSs") if units.known(text)] == []
+    assert [text for text in ("Vs", "mVs", "as", "Ks", "HRSs") if units.is_known(text)] == []

@@ -132,7 +132,7 @@ def test_probes_with_a_wrong_sign_of_y_do_not_pass(good: Recording, tmp_path: Pa
 
 
 def changed_block(payload: bytes, key: str, change: Callable[[np.ndarray], np.ndarray]) -> bytes:
-    block = wire.decode_block(payload, wire.schema_of(key) or "")
+    block = wire.decode_block(payload, wire.get_schema(key) or "")
     return wire.encode_block(dataclasses.replace(block, values=change(block.values)))
 
 

@@ -230,7 +230,7 @@ def test_missing_rows_interrupt_the_curves(tmp_path: Path) -> None:
 
 def test_groups_and_parameters_may_be_missing(tmp_path: Path) -> None:
     recording = Synthetic(duration_s=0.4)
-    recording.table = recording.table.only(("probes",))
+    recording.table = recording.table.select_groups(("probes",))
     recording.parameters = {"set": "unknown", "values": {}}
     recording.catalogue = {}
     save(recording, tmp_path / "probes.rrd")

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from rig.base.checks import read_toml
-from rig.base.errors import DiskError, InputError, check_new_file, check_not_among, whole_file
+from rig.base.errors import DiskError, InputError, check_new_file, check_output_differs, whole_file
 from rig.cli.app import start
 from rig.run.scenes import load_scene, parse_scene
 from rig.serve.transport.exposure.certificates import create_keys, read_holder
@@ -39,8 +39,8 @@ def test_an_input_is_not_overwritten_through_another_name(tmp_path: Path) -> Non
     os.link(source, tmp_path / "b.mcap")
     for output in (tmp_path / "other" / "a.mcap", tmp_path / "b.mcap"):
         with pytest.raises(InputError, match="output must be another file"):
-            check_not_among([source], output)
-    check_not_among([source], tmp_path / "c.mcap")
+            check_output_differs([source], output)
+    check_output_differs([source], tmp_path / "c.mcap")
 
 
 def test_long_file_names_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

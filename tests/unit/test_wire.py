@@ -213,11 +213,11 @@ def test_deep_nesting_is_refused(payload: bytes) -> None:
 
 
 def test_schemas_follow_from_the_key() -> None:
-    assert wire.schema_of(wire.sensor_key("probes")) == SAMPLE_SCHEMA
-    assert wire.schema_of(wire.EDGES) == TRUTH_SCHEMA
-    assert wire.schema_of(wire.truth_key("state")) == TRUTH_SCHEMA
+    assert wire.get_schema(wire.sensor_key("probes")) == SAMPLE_SCHEMA
+    assert wire.get_schema(wire.EDGES) == TRUTH_SCHEMA
+    assert wire.get_schema(wire.truth_key("state")) == TRUTH_SCHEMA
     for key in (wire.EVENTS, wire.STATUS, wire.CATALOGUE, wire.SCENE, wire.PARAMETERS, wire.command_key("hammer")):
-        assert wire.schema_of(key) is None, key
+        assert wire.get_schema(key) is None, key
 
 
 def test_schemas_describe_the_bytes() -> None:

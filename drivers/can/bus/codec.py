@@ -30,7 +30,7 @@ from drivers.can.bus.frame import (
     find_fault,
     pack_records,
 )
-from rig.base.checks import Count, Outside
+from rig.base.checks import Count, StrictModel
 
 if TYPE_CHECKING:
     import can
@@ -74,7 +74,7 @@ Endpoint = Annotated[str, Field(pattern=rf"\A{_NAME.pattern}\z")]
 Secret = Annotated[str, Field(pattern=rf"\A[0-9a-f]{{{2 * SECRET_BYTES}}}\z")]
 
 
-class JoinRequest(Outside):
+class JoinRequest(StrictModel):
     """Request to join; with its secret an endpoint joins again under its name."""
 
     endpoint: Endpoint
@@ -82,7 +82,7 @@ class JoinRequest(Outside):
     secret: Secret | None = None
 
 
-class FlushRequest(Outside):
+class FlushRequest(StrictModel):
     """Request to withdraw frames that wait to be sent."""
 
     endpoint: Endpoint
@@ -95,14 +95,14 @@ class SetRequest(FlushRequest):
     listen_only: bool
 
 
-class StatusRequest(Outside):
+class StatusRequest(StrictModel):
     """Request for the status."""
 
 
 REQUESTS = {"join": JoinRequest, "set": SetRequest, "flush": FlushRequest, "status": StatusRequest}
 
 
-class JoinReply(Outside):
+class JoinReply(StrictModel):
     """Reply to a request to join."""
 
     node: Annotated[int, Field(ge=1, lt=NO_NODE)]

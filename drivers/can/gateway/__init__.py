@@ -25,7 +25,7 @@ from drivers.can.gateway.samples import find_decimations, make_sample_frames
 from drivers.can.schedule import SLOT_S, Schedule
 from drivers.can.signals import EVENT_VALUES, EventKind, RigState
 from rig.base import wire
-from rig.base.checks import DOCUMENT_BYTES, Outside, check, input_error
+from rig.base.checks import DOCUMENT_BYTES, StrictModel, check, input_error
 from rig.base.closeable import Closing
 from rig.channels.table import ChannelTable
 from rig.serve.health import Guard, IncreaseWarning
@@ -51,20 +51,20 @@ _DOCUMENT_KEYS = (wire.EVENTS, wire.STATUS, wire.FAULTS, wire.BLOCK)
 """Keys of documents, which are few and never dropped."""
 
 
-class _Catalogue(Outside, extra="ignore"):
+class _Catalogue(StrictModel, extra="ignore"):
     """The rig's channel table, as received."""
 
     tick_rate_hz: Annotated[int, pydantic.Field(ge=1, le=10**12)]
     table: dict[str, Any]
 
 
-class _RowRange(Outside, extra="ignore"):
+class _RowRange(StrictModel, extra="ignore"):
     key: str
     row: int
     rows: int
 
 
-class _FaultReport(Outside, extra="ignore"):
+class _FaultReport(StrictModel, extra="ignore"):
     """The rig's report on faults: rows whose blocks were affected."""
 
     blocks: list[_RowRange] = pydantic.Field(default=[])

@@ -16,7 +16,7 @@ from drivers.can.devices import DeviceRequest
 from drivers.can.message import MessageTable
 from drivers.can.signals import FIELDS, LIMITS, Command, CommandKind, Field, Result, default_messages, parse_command
 from rig.base import wire
-from rig.base.checks import DOCUMENT_BYTES, Outside, check
+from rig.base.checks import DOCUMENT_BYTES, StrictModel, check
 from rig.serve.health import Guard
 from rig.serve.transport import Client, NoReplyError
 from rig.serve.transport.limit import Bucket
@@ -40,7 +40,7 @@ class _PendingCommand:
     answered: bool = False
 
 
-class _Reply(Outside, extra="ignore"):
+class _Reply(StrictModel, extra="ignore"):
     """The rig's reply to a command: the time at which it takes effect, or the invalid field."""
 
     accepted: bool
@@ -49,15 +49,15 @@ class _Reply(Outside, extra="ignore"):
     fault: Annotated[int, pydantic.Field(ge=0)] = 0
 
 
-class _Entry(Outside, extra="ignore"):
+class _Entry(StrictModel, extra="ignore"):
     value: float
 
 
-class _Values(Outside, extra="ignore"):
+class _Values(StrictModel, extra="ignore"):
     top_speed: Annotated[_Entry, pydantic.Field(alias="drive.top_speed")]
 
 
-class _Parameters(Outside, extra="ignore"):
+class _Parameters(StrictModel, extra="ignore"):
     """The parameters of the rig that limit a command."""
 
     values: _Values

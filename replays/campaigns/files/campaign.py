@@ -22,7 +22,7 @@ from replays.campaigns.files.expectation import KINDS, Expect
 from replays.campaigns.files.line_numbers import line_of, lines_of
 from replays.campaigns.measurement import split_quantity
 from rig.base import units
-from rig.base.checks import Written, check, open_file, parse_toml, unreadable
+from rig.base.checks import Written, build_read_error, check, open_file, parse_toml
 from rig.base.errors import InputError, UnknownNameError, Words, such_as
 from rig.channels.faults import find_channels, find_group
 from rig.channels.faults.blocks import OfBlocks
@@ -179,7 +179,7 @@ def load_campaign(path: Path) -> Campaign:
     except UnicodeDecodeError:
         raise InputError(str(path), "a TOML file", Words("bytes that are not UTF-8")) from None
     except OSError as error:
-        raise unreadable(path, error) from None
+        raise build_read_error(path, error) from None
     try:
         document = parse_toml(text, field=str(path))
     except tomllib.TOMLDecodeError as error:
@@ -355,8 +355,8 @@ def _fill_placeholders(value: Any, places: Mapping[str, str], field: str, kept: 
         if unit is None:
             return places[name]
         number, own = split_quantity(places[name], field=field)
-        if units.kind(own) != units.kind(unit) or not units.kind(unit):
-            raise InputError(field, f"with {name} in a unit of {units.kind(own) or own}", match[0])
+        if units.get_quantity(own) != units.get_quantity(unit) or not units.get_quantity(unit):
+            raise InputError(field, f"with {name} in a unit of {units.get_quantity(own) or own}", match[0])
         return f"{number * units.size_si(own) / units.size_si(unit):.12g}"
 
     return _PLACEHOLDER.sub(fill, value)

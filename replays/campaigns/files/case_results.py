@@ -78,7 +78,7 @@ class CaseRecording:
         key = truth, names
         if key not in self._rows:
             found = self.recording.truth(truth) if truth else self.recording.samples(*names)
-            self._rows[key] = found.only(*names)
+            self._rows[key] = found.select(*names)
         return self._rows[key]
 
     def card(

@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Any
 
 from replays.report import junit, write_report
 from replays.studies.common import provenance
-from rig.base.checks import open_file, read_json, unreadable
+from rig.base.checks import build_read_error, open_file, read_json
 from rig.base.errors import DiskError, InputError, whole_file
-from rig.base.text import finite, printable
+from rig.base.text import printable, replace_nonfinite
 
 if TYPE_CHECKING:
     import pytest
@@ -120,7 +120,7 @@ class Results:
             wall[name] = {"duration_s": round(case["duration_s"], 3), "floor_ms": case["floor_ms"]}
         counts = {outcome: sum(case["outcome"] == outcome for case in cases) for outcome in OUTCOMES}
         titles = list(dict.fromkeys(case["title"] for case in cases if case["title"]))
-        return finite({
+        return replace_nonfinite({
             "format": FORMAT, "titles": titles, "counts": counts, "cases": cases,
             "wall": {
                 "begun": datetime.fromtimestamp(self._begun_s, UTC).strftime("%Y-%m-%dT%H:%M:%S"),
@@ -193,7 +193,7 @@ def load_results(folder: Path) -> dict[str, Any]:
         with open_file(path) as file:
             document = read_json(file.read(), field=str(path))
     except OSError as error:
-        raise unreadable(path, error) from None
+        raise build_read_error(path, error) from None
     cases = document.get("cases")
     good = isinstance(cases, list) and all(
         isinstance(case, dict) and {"id", "outcome", "measurements"} <= set(case) for case in cases

@@ -15,7 +15,7 @@ from replays.recordings.formats.mapping import ChannelMapping, Mapping, SignalNa
 from replays.recordings.formats.source import Entry, FileSignal, Source, even_rate_hz, open_source
 from rig.base import units
 from rig.base.errors import InputError, UnknownNameError, Words
-from rig.base.text import nearest
+from rig.base.text import find_similar
 from rig.channels.table import Channel, default_table
 
 BITS = 32
@@ -149,7 +149,7 @@ class Log:
         target = default_table().channels.get(name)
         if target is None:
             if wanted.to is None or wanted.to_unit is None:
-                close = nearest(name, default_table().channels, most=1)
+                close = find_similar(name, default_table().channels, most=1)
                 hint = f" (such as {close[0]})" if close else ""
                 must = f"a channel of the rig{hint}, or one with `to` (a group) and `to_unit`"
                 raise InputError(where, must, name)
@@ -161,7 +161,7 @@ class Log:
                 f"{where}.to", f"omitted, as {name} is one of the rig's channels", wanted.to or wanted.to_unit
             )
         unit = entry.unit if wanted.unit is None else wanted.unit
-        volts = units.size_si(unit) if units.kind(unit) == "voltage" else None
+        volts = units.size_si(unit) if units.get_quantity(unit) == "voltage" else None
         if wanted.bits is not None:
             raise InputError(f"{where}.bits", "omitted, as only `rig score` uses it", wanted.bits)
         if wanted.sensitivity is not None:

@@ -64,7 +64,7 @@ class FileOptions(_Section):
     @field_validator("time_unit")
     @classmethod
     def _known_unit(cls, unit: str | None) -> str | None:
-        if unit not in (None, "datetime") and units.kind(_EPOCH.sub("", unit)) != "time":
+        if unit not in (None, "datetime") and units.get_quantity(_EPOCH.sub("", unit)) != "time":
             raise ValueError("s, ms, us, ns, min, h, d or datetime")
         return unit
 
@@ -93,10 +93,10 @@ class FileOptions(_Section):
             InputError: The unit is not a unit of time, or is ambiguous.
         """
         words = re.split(r"[ _]+", name.strip())
-        named = words[1] if len(words) == 2 and units.kind(words[1]) == "time" else ""
+        named = words[1] if len(words) == 2 and units.get_quantity(words[1]) == "time" else ""
         unit = _EPOCH.sub("", (self.time_unit if self.time_unit != "datetime" else None) or file_unit or named).strip()
         unit = unit or next((each for least, each in _EPOCH_UNITS if least <= first), "s")
-        if units.kind(unit) != "time":
+        if units.get_quantity(unit) != "time":
             must = "set to s, ms, us, ns, min, h or d, as the unit of the time column is unknown or ambiguous"
             raise InputError("file.time_unit", must, file_unit)
         return units.canonical(unit), units.size_si(unit)

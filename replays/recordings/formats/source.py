@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import numpy as np
 from pydantic import AfterValidator, Field
 
-from rig.base.checks import DOCUMENT_BYTES, describe_error, load_extensions, open_file, read_json, unreadable
+from rig.base.checks import DOCUMENT_BYTES, build_read_error, describe_error, load_extensions, open_file, read_json
 from rig.base.errors import InputError, RefusedError, Words
 
 if TYPE_CHECKING:
@@ -204,7 +204,7 @@ def open_source(path: Path, options: FileOptions) -> Source:
         with open_file(path) as file:
             empty = not file.read(1)
     except OSError as error:
-        raise unreadable(path, error) from None
+        raise build_read_error(path, error) from None
     if empty:
         raise InputError("file", "a file that is not empty", str(path))
     if form is not FORMATS["text"]:

@@ -14,7 +14,7 @@ from replays.recordings.resimulation.experiment import Experiment
 from replays.recordings.resimulation.prediction import Measured, measured
 from replays.recordings.resimulation.sensitivity import ANGLE, CLOCK, STATE, scale_of, value_of, with_values
 from rig.base.errors import InputError
-from rig.base.text import nearest
+from rig.base.text import find_similar
 from rig.base.wire import sensor_key
 from rig.channels.table import Channel
 from rig.physics.parameters import load_parameters
@@ -309,7 +309,7 @@ def _check_key(experiment: Experiment, key: str) -> None:
     if len(key.split(".")) == 3 and key.split(".")[0] in COMMANDS:
         value_of(experiment, key)
         return
-    close = nearest(key, own)
+    close = find_similar(key, own)
     must = "of a parameter, a number of the scene ("
     must += f"{', '.join(_SCENE_KEYS)}) or of a command (hammer.1.force_n)"
     if key in parameters or key.split(".")[0] in Scene.model_fields:

@@ -13,7 +13,7 @@ from typing import Any, Self
 import numpy as np
 
 from recorder.reader import Recording
-from rig.base.checks import table_in
+from rig.base.checks import get_table
 from rig.base.errors import InputError, Words
 from rig.base.wire import EDGES, sensor_key, truth_key
 from rig.channels.faults import find_channels
@@ -174,7 +174,7 @@ def recorded_scene(parameters: dict[str, Any], document: dict[str, Any]) -> dict
     Raises:
         InputError: This version does not know a parameter, or `engine` is not a table.
     """
-    engine = {"rolling": "series", **table_in(document, "engine")}
+    engine = {"rolling": "series", **get_table(document, "engine")}
     return {**document, **_recorded_parameters(parameters, document), "engine": engine, "fidelity": "given"}
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from recorder.reader import Recording
-from rig.base.wire import EDGES, Block, encode_block, schema_of, sensor_key, truth_key
+from rig.base.wire import EDGES, Block, encode_block, get_schema, sensor_key, truth_key
 from rig.channels.table import ChannelTable
 from rig.run.simulation import TICK_RATE_HZ, Frame
 
@@ -70,7 +70,7 @@ class Bits:
             recording: The recording.
             made: Channel table of the re-simulation.
         """
-        keys = sorted(key for key in recording.messages if schema_of(key) is not None and key in recording.streams)
+        keys = sorted(key for key in recording.messages if get_schema(key) is not None and key in recording.streams)
         self._edges: list[np.ndarray] = []
         self._names = {name: group.names for name, group in recording.table.groups.items()}
         self.streams = {key: _Follower(key, recording.blocks(key)) for key in keys}

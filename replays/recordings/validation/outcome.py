@@ -111,7 +111,7 @@ class Validation:
         """Pass if the recording is bit-exact, or within every criterion, and enough of it was compared."""
         held = (self.bit_exact and not self.declared) or not self.failures
         failed = bool(self.doubts or self.faults or self.beyond) or not held
-        return Outcome.of(failed=failed, shown=not self.unjudged)
+        return Outcome.judge(failed=failed, has_evidence=not self.unjudged)
 
     @property
     def good(self) -> bool:

@@ -86,7 +86,7 @@ class Limits(BaseModel):
         limit = getattr(self, path).get(quantity)
         if limit is None:
             return None
-        if limit.measures is not None and (channel is None or units.kind(channel.unit) != limit.measures):
+        if limit.measures is not None and (channel is None or units.get_quantity(channel.unit) != limit.measures):
             return None
         ends = []
         for bound, none in ((limit.low, -math.inf), (limit.high, math.inf)):

@@ -12,7 +12,7 @@ from typing import Any, Literal
 from replays.report import junit
 from rig.base.errors import UnknownNameError
 from rig.base.outcome import Outcome
-from rig.base.text import finite
+from rig.base.text import replace_nonfinite
 from rig.channels.faults.defects import defects_shown
 
 PASS, FAIL, INCONCLUSIVE, NO_LIMIT = "pass", "fail", "inconclusive", "no limit"
@@ -277,7 +277,7 @@ class Scorecard:
     def outcome(self) -> Outcome:
         """Fail if a quantity fails; pass if one passes without any doubt; otherwise inconclusive."""
         verdicts = {row.verdict for row in self.rows}
-        return Outcome.of(failed=FAIL in verdicts, shown=PASS in verdicts and not self.doubts)
+        return Outcome.judge(failed=FAIL in verdicts, has_evidence=PASS in verdicts and not self.doubts)
 
     @property
     def verdict_line(self) -> str:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from replays.score.records.recorded import Pieces, Recorded, Table
-from rig.base.checks import unreadable
+from rig.base.checks import build_read_error
 from rig.base.errors import InputError, Words
 from rig.channels.table import ChannelTable
 
@@ -24,7 +24,7 @@ def is_can_log(path: Path) -> bool:
         with path.open("rb") as file:
             return file.read(5).lower() == b"date "
     except OSError as error:
-        raise unreadable(path, error) from None
+        raise build_read_error(path, error) from None
 
 
 def open_can_log(path: Path, table: ChannelTable) -> list[Recorded]:

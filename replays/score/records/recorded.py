@@ -246,7 +246,7 @@ def map_signals(
         elif unit == "FS":
             unit, size = "V", size * channel.adc_v
         if wanted.sensitivity is not None:
-            if units.kind(unit) != "voltage":
+            if units.get_quantity(unit) != "voltage":
                 raise InputError(f"{where}.unit", "V or mV with a sensitivity", unit)
             per_unit_v = units.sensitivity_v(wanted.sensitivity, channel.unit, field=f"{where}.sensitivity")
             unit, size = channel.unit, size * units.size_si(unit) / per_unit_v

@@ -22,7 +22,7 @@ from replays.studies.peers import PEERS, Library, Peer, Setting
 from replays.studies.peers.common.problem import ERROR_COLUMNS, Problem
 from replays.studies.peers.common.reference import Reference
 from replays.studies.peers.common.solution import Solution
-from rig.base.checks import open_file, unreadable
+from rig.base.checks import build_read_error, open_file
 from rig.base.errors import InputError, UnknownNameError, Words, whole_file
 from rig.physics.engines import ENGINES
 from rig.physics.kernels.signals import STATE
@@ -122,7 +122,7 @@ def read_submission(path: Path) -> Submission:
         with open_file(path) as file:
             lines = file.read(_MAX_BYTES).decode("utf-8-sig", "replace").splitlines()
     except OSError as error:
-        raise unreadable(path, error) from None
+        raise build_read_error(path, error) from None
     comments = [line[1:].partition(":") for line in lines if line.startswith("#")]
     names = [name.strip() for name, _, _ in comments]
     for key in _KEYS:

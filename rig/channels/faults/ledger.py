@@ -14,7 +14,7 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
-from rig.base.checks import Count, Outside, check
+from rig.base.checks import Count, StrictModel, check
 from rig.base.errors import InputError
 from rig.base.wire import Block, Continuity, Gap
 
@@ -38,7 +38,7 @@ class _DeclaredBlock(Outside, extra="ignore"):
     sent: Annotated[list[_SentBlock], Field(max_length=100)]
 
 
-class _Document(Outside, extra="ignore", strict=False):
+class _Document(StrictModel, extra="ignore", strict=False):
     event: str
     blocks: tuple[_DeclaredBlock, ...] = ()
 

@@ -141,5 +141,7 @@ def _run(files: list[str], options: list[str], output: Path | None) -> int:
         return _INTERRUPTED
     if status in (pytest.ExitCode.OK, pytest.ExitCode.TESTS_FAILED):
         failed = bool(counts["failed"] or counts["error"])
-        return Outcome.of(failed=failed, shown=bool(counts["passed"]) and not counts["inconclusive"]).exit_status
+        return Outcome.judge(
+            failed=failed, has_evidence=bool(counts["passed"]) and not counts["inconclusive"]
+        ).exit_status
     return 2

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rig.base import units
-from rig.base.errors import InputError, Words, check_new_file, check_not_among, whole_file
+from rig.base.errors import InputError, Words, check_new_file, check_output_differs, whole_file
 from rig.cli.options import Force
 from rig.cli.output.tables import Form, echo, echo_json, new_table
 
@@ -82,7 +82,7 @@ def _import(files: list[Path], mapping: Path | str, output: Path, *, force: bool
     from rig.cli.output.progress import reporting
 
     check_destination(output, force=force)
-    check_not_among(files if isinstance(mapping, str) else [*files, mapping], output)
+    check_output_differs(files if isinstance(mapping, str) else [*files, mapping], output)
     name = "the guess (--template writes it)" if isinstance(mapping, str) else mapping.name
     checked = parse_mapping(tomllib.loads(mapping), name=name) if isinstance(mapping, str) else load_mapping(mapping)
     with reporting() as reporter:
@@ -120,7 +120,7 @@ def _guess(
     for wanted, field, suffixes in ((path, "--template", (".toml",)), (picture, "--picture", (".png", ".svg"))):
         if wanted is not None:
             check_new_file(wanted, field=field, suffixes=suffixes, force=force)
-            check_not_among(files, wanted, field=field)
+            check_output_differs(files, wanted, field=field)
     text, guesses = guess_mapping(files) if files else (example(), [])
     if path is not None:
         with whole_file(path) as draft:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rig.base.outcome import Outcome
-from rig.base.text import finite
+from rig.base.text import replace_nonfinite
 from rig.cli.options import RecordingFiles
 from rig.cli.output.progress import reporting
 from rig.cli.output.tables import Form, Table, echo_json, fact_table, make_printable, new_table
@@ -93,9 +93,9 @@ def describe(
         }
         document["health"] = health
         failures, doubts = _reasons(document)
-        document["outcome"] = Outcome.of(failed=bool(failures), shown=not doubts).value
+        document["outcome"] = Outcome.judge(failed=bool(failures), has_evidence=not doubts).value
         document["reasons"] = failures + doubts
-    return finite(document)
+    return replace_nonfinite(document)
 
 
 def _reasons(document: dict[str, Any]) -> tuple[list[str], list[str]]:

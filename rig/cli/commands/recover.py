@@ -28,7 +28,7 @@ def recover(
     """
     from recorder.files.unfinished_file import check_destination
     from recorder.rewrite import recovered_path
-    from rig.base.checks import open_file, unreadable
+    from rig.base.checks import build_read_error, open_file
 
     if output is not None and len(files) > 1:
         raise InputError("--output", "used with one FILE", Words(f"{len(files)} files"))
@@ -36,7 +36,7 @@ def recover(
         try:
             open_file(file).close()
         except OSError as error:
-            raise unreadable(file, error) from None
+            raise build_read_error(file, error) from None
     broken = [file for file in files if force or not _is_whole(file)]
     outputs = [output or recovered_path(file) for file in broken]
     for new in outputs:

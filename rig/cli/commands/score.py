@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from rig.base.errors import InputError, Words, check_new_file, check_not_among, whole_file
-from rig.base.text import finite
+from rig.base.errors import InputError, Words, check_new_file, check_output_differs, whole_file
+from rig.base.text import replace_nonfinite
 from rig.cli.connections.connection import Connection
 from rig.cli.groups import panel
 from rig.cli.options import Channels, Force, Wide, split_names
@@ -95,7 +95,7 @@ def score(
     for made, field, suffix in ((junit, "--junit", ".xml"), (as_json, "--json", ".json")):
         if made is not None:
             check_new_file(made, field=field, suffixes=(suffix,), force=force)
-            check_not_among([file, *(against or ())], made, field=field)
+            check_output_differs([file, *(against or ())], made, field=field)
     asked = load_limits(limits)
     mapped = None if mapping is None else load_mapping(mapping)
     due = None if channels is None else split_names(channels)
@@ -119,7 +119,9 @@ def score(
         write_junit(card, junit)
     if as_json is not None:
         with whole_file(as_json) as draft:
-            draft.write_text(json.dumps(finite(card.document()), indent=2, allow_nan=False) + "\n", encoding="utf-8")
+            draft.write_text(
+                json.dumps(replace_nonfinite(card.document()), indent=2, allow_nan=False) + "\n", encoding="utf-8"
+            )
     _show(card, table_console(wide=wide), wide=wide)
     for made in (output, junit, as_json):
         if made is not None:

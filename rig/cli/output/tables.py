@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from rig.base.text import finite, printable
+from rig.base.text import printable, replace_nonfinite
 from rig.cli.options import Json, Wide
 
 if TYPE_CHECKING:
@@ -91,7 +91,7 @@ def echo_json(document: Any, *, indent: int | None = 2) -> None:
     """Print a document as JSON, with null for a number that is not finite."""
     import json
 
-    echo_document(json.dumps(finite(document), indent=indent, allow_nan=False) + "\n")
+    echo_document(json.dumps(replace_nonfinite(document), indent=indent, allow_nan=False) + "\n")
 
 
 def make_printable(document: Any) -> Any:

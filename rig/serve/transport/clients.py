@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any
 
 from rig.base import wire
-from rig.base.checks import Count, Name, Outside, a_line, check
+from rig.base.checks import Count, Name, StrictModel, a_line, check
 from rig.serve.transport import Client, Server
 from rig.serve.waiting import Deadline
 
@@ -30,13 +30,13 @@ _STALLED_LINK_WAIT_S = 0.4
 """Extra wait for a stalled link at the end of a run, when all reporting clients have everything [s]."""
 
 
-class Sender(Outside):
+class Sender(StrictModel):
     """Sender of a report: the last part of the key."""
 
     name: Name
 
 
-class Report(Outside):
+class Report(StrictModel):
     """Report that a client sends twice a second on `rig/clients/NAME`."""
 
     name: Name | None = None

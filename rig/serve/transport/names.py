@@ -18,7 +18,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from rig.base.checks import Outside, check
+from rig.base.checks import StrictModel, check
 from rig.base.errors import InputError, UnknownNameError, Words
 from rig.serve.transport import DEFAULT_ENDPOINT
 from rig.serve.transport.endpoint import parse_endpoint
@@ -30,7 +30,7 @@ _POLL_S = 0.1
 """Period of looking for a rig that has not started yet [s]."""
 
 
-class NamedRig(Outside):
+class NamedRig(StrictModel):
     """A running rig with a name."""
 
     name: str

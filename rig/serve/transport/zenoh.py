@@ -138,7 +138,7 @@ class ZenohServer(Closing):
     def _declare(self, key: str) -> Any:
         from zenoh import ext
 
-        schema = wire.schema_of(key)
+        schema = wire.get_schema(key)
         publisher = ext.declare_advanced_publisher(
             self._session.session,
             key,

@@ -14,7 +14,7 @@ import numpy as np
 from replays.recordings.formats import clock
 from replays.recordings.formats.exporting.selection import ROWS, ExportChunk, ExportTable, Selection
 from replays.recordings.formats.source import formats, load_format
-from rig.base.errors import InputError, Words, check_new_file, check_not_among, whole_file
+from rig.base.errors import InputError, Words, check_new_file, check_output_differs, whole_file
 
 Method = Literal["polyphase", "linear"]
 _MAX_MISSING = 1_000_000
@@ -131,7 +131,7 @@ def export(
     for target, part in jobs:
         for output in [target, *([_sidecar_path(target)] if kind.sidecar else [])]:
             check_output(output, force=force, suffixes=(*written_suffixes(), ".json"))
-            check_not_among([each.path for each in selection.recording.parts], output)
+            check_output_differs([each.path for each in selection.recording.parts], output)
         for table in part.tables:
             names = [column.name for column in table.columns]
             if len(set(names)) < len(names):

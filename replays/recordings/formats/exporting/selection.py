@@ -17,7 +17,7 @@ from recorder.reader import Recording
 from replays.recordings.formats.exporting.history import ExportEvent, list_events
 from replays.recordings.formats.source import DOCUMENTS
 from rig.base.errors import InputError, Words
-from rig.base.text import nearest, printable
+from rig.base.text import find_similar, printable
 from rig.base.wire import Block, sensor_key, truth_key
 from rig.channels.table import Channel
 
@@ -410,13 +410,13 @@ def _suggest(channel: str, groups: dict[str, list[str]], truths: dict[str, list[
     prefix, _, rest = channel.partition(".")
     table, _, column = rest.partition(".")
     if prefix == "truth" and table in truths:
-        near = nearest(column, truths[table])
+        near = find_similar(column, truths[table])
         return f"truth.{table}.COLUMN with one of {', '.join(near or truths[table])}"
     if prefix == "truth":
         tables = ", ".join(f"truth.{name}" for name in truths)
         return f"one of {tables}" if truths else "one of the sensors: the recording has no truth"
     sensors = [*(name for group in groups.values() for name in group), *groups]
-    near = nearest(channel, sensors)
+    near = find_similar(channel, sensors)
     if near:
         return f"a channel of the recording, such as {', '.join(near)}"
     return f"a channel of the recording, one of its groups ({', '.join(groups)}) or truth.TABLE"

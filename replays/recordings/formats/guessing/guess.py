@@ -75,7 +75,7 @@ class Guess:
     @property
     def volts(self) -> bool:
         """True if the file's unit is a voltage."""
-        return units.kind(self.entry.unit) == "voltage"
+        return units.get_quantity(self.entry.unit) == "voltage"
 
     @property
     def zero(self) -> float:
@@ -95,7 +95,11 @@ class Guess:
                 / units.sensitivity_v(self.sensitivity, unit, field="sensitivity")
             )
         own = self.unit or self.entry.unit
-        return self.sign * units.size_si(own) / units.size_si(unit) if units.kind(own) == units.kind(unit) else 0.0
+        return (
+            self.sign * units.size_si(own) / units.size_si(unit)
+            if units.get_quantity(own) == units.get_quantity(unit)
+            else 0.0
+        )
 
     def assign(self, channel: str, sure: str, *reasons: str, ask: str = "") -> None:
         """Assign a channel with a confidence no higher than before; `ask` is the question about its name."""
@@ -153,19 +157,19 @@ def guess_channels(
 
 
 def _fits(each: Guess, unit: str) -> bool:
-    kind = units.kind(each.entry.unit)
-    return kind in ("", "voltage", "number") or kind == units.kind(unit)
+    kind = units.get_quantity(each.entry.unit)
+    return kind in ("", "voltage", "number") or kind == units.get_quantity(unit)
 
 
 def _channel_kind(name: str) -> str:
     if name in ("speed", "keyphasor", "hammer"):
         return name
-    return units.kind(default_table().channels[name].unit)
+    return units.get_quantity(default_table().channels[name].unit)
 
 
 def _kind(each: Guess) -> str:
     """Return the quantity of a signal from its unit, else its name, else its values; extend its `reasons`."""
-    by_unit, named, view = _KIND_OF_UNIT.get(units.kind(each.entry.unit), ""), each.name_parts, each.features
+    by_unit, named, view = _KIND_OF_UNIT.get(units.get_quantity(each.entry.unit), ""), each.name_parts, each.features
     word = f"name: {named.kind_word}" if named.kind_word else ""
     if by_unit == "force" and (named.kind == "hammer" or (view.is_hammer and not named.side)):
         each.reasons += [word] if named.kind == "hammer" else ["rests except for single pulses"]
@@ -176,7 +180,7 @@ def _kind(each: Guess) -> str:
         each.reasons += [*([word] if agree else []), f"unit {each.entry.unit}"]
         each.sure = SURE if agree or named.place or named.side else LIKELY
         return by_unit
-    if units.kind(each.entry.unit) not in ("", "voltage", "number"):
+    if units.get_quantity(each.entry.unit) not in ("", "voltage", "number"):
         return ""
     kind = named.kind if len(named.kind_word) > 1 else ""
     # A few pulses alone are not enough; a signal named like a speed that has two levels is a keyphasor.
@@ -300,7 +304,7 @@ def _places(
 
 def _moves_mm(each: Guess) -> float:
     """Return the amplitude of a probe [mm], by its own scale or an assumed one."""
-    size = units.size_si(each.entry.unit) if units.kind(each.entry.unit) == "length" else 1e-3
+    size = units.size_si(each.entry.unit) if units.get_quantity(each.entry.unit) == "length" else 1e-3
     return each.features.spread * size * 1e3
 
 
@@ -388,7 +392,7 @@ def _check_turns(guesses: Sequence[Guess]) -> None:
     if speed.volts:
         pulse.asks["pulses_per_turn"] = "the speed is in volts"
         return
-    speed_unit = speed.entry.unit if units.kind(speed.entry.unit) == "speed of rotation" else None
+    speed_unit = speed.entry.unit if units.get_quantity(speed.entry.unit) == "speed of rotation" else None
     pairs = [(unit, size) for unit, size in _TURN_UNITS if speed_unit is None or units.canonical(speed_unit) == unit]
     pairs = pairs or [(speed_unit or "", 6.283185307179586 / units.size_si(speed_unit or ""))]
     for unit, size in pairs:
@@ -416,7 +420,7 @@ def _find_speed(guesses: Sequence[Guess], rate_hz: float) -> Guess | None:
 
 def _scale(each: Guess, unit: str, usual_v: float) -> None:
     """Determine unit, sensitivity and zero of a signal with a channel."""
-    file_kind, view = units.kind(each.entry.unit), each.features
+    file_kind, view = units.get_quantity(each.entry.unit), each.features
     low, high = view.extent
     if each.channel == "hammer" and view.is_hammer and view.mean - low > high - view.mean:
         each.sign = -1
@@ -429,7 +433,7 @@ def _scale(each: Guess, unit: str, usual_v: float) -> None:
         return
     if each.volts:
         found = _SENSITIVITY.search(text)
-        if found is not None and units.kind(found[3]) == units.kind(unit):
+        if found is not None and units.get_quantity(found[3]) == units.get_quantity(unit):
             each.sensitivity = f"{float(found[1].replace(',', '.')):g} {found[2]}/{found[3]}"
             each.reasons.append(f"in the file: {each.sensitivity}")
         else:
@@ -440,12 +444,12 @@ def _scale(each: Guess, unit: str, usual_v: float) -> None:
             scale = units.size_si(bias[2]) / units.size_si(each.entry.unit)
             each.bias = round(float(bias[1].replace(",", ".")) * scale, 9)
             each.reasons.append(f"in the file: bias {each.bias:g} {each.entry.unit}")
-        elif units.kind(unit) == "length":
+        elif units.get_quantity(unit) == "length":
             each.bias = "mean"
             each.reasons.append("zero: its mean")
     elif file_kind in ("", "number") and each.unit is None:
         each.unit = unit
         each.asks["unit"] = f"the file says {each.entry.unit!r}" if each.entry.unit else "the file has none"
-    elif units.kind(unit) == "length" and abs(each.features.mean) > 5.0 * each.features.spread:
+    elif units.get_quantity(unit) == "length" and abs(each.features.mean) > 5.0 * each.features.spread:
         each.bias = "mean"
         each.reasons.append("zero: its mean")

@@ -266,7 +266,7 @@ def _channel(each: Guess, used_names: set[str], *, several: bool) -> list[str]:
         f"source = {_quoted(entry.name)}    # {entry.rows} values, {rate}{label}",
     ]
     lines += _location(each, several=several)
-    known = units.known(entry.unit) and entry.unit != ""
+    known = units.is_known(entry.unit) and entry.unit != ""
     if not each.channel:
         target = entry.unit if known else "1"
         mark = f"    # {CHECK}: the file has {entry.unit!r}" if entry.unit and not known else ""

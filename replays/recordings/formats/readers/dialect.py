@@ -94,7 +94,7 @@ def parse_heading(text: str) -> tuple[str, str]:
     if match and match[1]:
         return match[1], match[2]
     name, comma, unit = (part.strip() for part in text.rpartition(","))
-    return (name, unit) if comma and name and unit and units.known(unit) else (text.strip(), "")
+    return (name, unit) if comma and name and unit and units.is_known(unit) else (text.strip(), "")
 
 
 def is_time(name: str) -> bool:
@@ -270,7 +270,7 @@ def _names(
 
 
 def _looks_like_unit(text: str) -> bool:
-    return units.known(text.strip("[]()"))
+    return units.is_known(text.strip("[]()"))
 
 
 def _units(

@@ -159,7 +159,7 @@ def _second(mdf: Any, group: int) -> float | None:
     if getattr(master, "sync_type", _SYNC_TIME) not in (_SYNC_NONE, _SYNC_TIME):
         return None
     unit = str(master.unit or getattr(master.conversion, "unit", "") or "")
-    return units.size_si(unit) if units.kind(unit) == "time" else 1.0
+    return units.size_si(unit) if units.get_quantity(unit) == "time" else 1.0
 
 
 def _numeric(mdf: Any, group: int, index: int) -> bool:

@@ -147,7 +147,7 @@ def degrees_of_freedom(recording: Recording) -> dict[str, DegreeOfFreedom]:
     directions = {str(event.get("direction")) for event in recording.events if event["event"] == "hammer"}
     found: dict[str, tuple[str, int]] = {}
     for channel in recording.table.channels.values():
-        found[channel.name] = _placed(channel.name, 6 if units.kind(channel.unit) == "speed of rotation" else 0)
+        found[channel.name] = _placed(channel.name, 6 if units.get_quantity(channel.unit) == "speed of rotation" else 0)
     if "hammer" in found:
         found["hammer"] = ("disk", _IMPACT_DIRECTIONS.get(directions.pop(), 0) if len(directions) == 1 else 0)
     for table, about in recording.catalogue.get("truth", {}).items():
@@ -190,7 +190,7 @@ class UffWriter(export.FormatWriter):
 
 
 def _header(table: ExportTable, column: Column, selection: Selection, at: DegreeOfFreedom) -> bytes:
-    kind, length, force = _ORDINATE.get(units.kind(column.unit), (_UNKNOWN, 0, 0))
+    kind, length, force = _ORDINATE.get(units.get_quantity(column.unit), (_UNKNOWN, 0, 0))
     about = selection.metadata
     texts = (
         column.name,

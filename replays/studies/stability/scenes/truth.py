@@ -10,7 +10,7 @@ import numpy as np
 
 from replays.studies.peers.common.problem import scaled_error
 from replays.studies.stability.scenes.worker import Run, Task
-from rig.base.text import finite
+from rig.base.text import replace_nonfinite
 from rig.physics.engines import ENGINES
 from rig.run.scenes import Scene, scene_document
 
@@ -93,7 +93,7 @@ def measure(scene: Scene, engines: list[str], run: Callable[[Task], Run], *, lim
         "accurate": [_row(task, done, [], peak) for task, done in accurate],
         "tested": rows,
     }
-    return finite(document)
+    return replace_nonfinite(document)
 
 
 def _row(task: Task, done: Run, truths: list[tuple[Task, Run]], peak: float | None) -> Row:
