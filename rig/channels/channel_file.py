@@ -38,7 +38,7 @@ from rig.base.checks import TOML_BYTES, Written, check, open_file, read_toml
 from rig.base.errors import InputError, UnknownNameError, Words
 from rig.base.text import printable
 from rig.channels.sampling import TICKS_HZ
-from rig.channels.table import TABLE, Channel, ChannelTable, raw_groups, table_of
+from rig.channels.table import TABLE, Channel, ChannelTable, build_table, raw_groups
 
 KIND = "user"
 """Provenance of values from such a file."""
@@ -98,8 +98,8 @@ def read_channels(path: Path, check_more: Callable[[ChannelTable], None] = lambd
     """
     try:
         file = check(_File, read_toml(path), field="")
-        curves = {name: _curve(name, stated, path.parent) for name, stated in file.curves.items()}
-        table = table_of(_merge_groups(file), curves)
+        curves = {name: _curve(name, curve, path.parent) for name, curve in file.curves.items()}
+        table = build_table(_merge_groups(file), curves)
         check_table(table)
         check_more(table)
         return table
@@ -144,29 +144,33 @@ def check_table(table: ChannelTable) -> None:
 def _merge_groups(file: _File) -> dict[str, Any]:
     """Return the groups of the table with complete rows."""
     groups = raw_groups(TABLE.read_text()) if file.base == "rig" else {}
-    stated: dict[str, set[str]] = {}
+    fields_by_channel: dict[str, set[str]] = {}
     """Fields that the file states for each channel."""
     sources = [(f"groups.{name}.defaults", group.defaults) for name, group in file.groups.items()]
     sources += [(f"channel {row.name}", row.model_dump()) for group in file.groups.values() for row in group.channels]
-    for where, fields in [*sources, *((f"channels.{name}", changes) for name, changes in file.channels.items())]:
+    for field_prefix, fields in [*sources, *((f"channels.{name}", changes) for name, changes in file.channels.items())]:
         for name in {"rate_hz", "group", "kind"} & set(fields):
-            raise InputError(f"{where}.{name}", "left out: it is the group's", fields[name])
+            raise InputError(f"{field_prefix}.{name}", "left out: it is the group's", fields[name])
     for name, group in file.groups.items():
         if name not in groups and not group.channels:
             raise InputError(f"groups.{name}.channels", "given, as there is no such group yet", None)
-        whole = groups.setdefault(name, {"title": name, "rate_hz": _RATE_HZ, "kind": KIND, "channels": []})
-        whole |= group.model_dump(include={"title", "rate_hz"}, exclude_none=True)
-        old = whole["channels"]
-        same = (
-            {key: value for key, value in old[0].items() if all(row[key] == value for row in old)} if old else _DEFAULTS
+        merged = groups.setdefault(name, {"title": name, "rate_hz": _RATE_HZ, "kind": KIND, "channels": []})
+        merged |= group.model_dump(include={"title", "rate_hz"}, exclude_none=True)
+        existing = merged["channels"]
+        common = (
+            {key: value for key, value in existing[0].items() if all(row[key] == value for row in existing)}
+            if existing
+            else _DEFAULTS
         )
-        for row in old:
+        for row in existing:
             row |= group.defaults
-            stated.setdefault(row["name"], set()).update(group.defaults, {"rate_hz"} if group.rate_hz else ())
+            fields_by_channel.setdefault(row["name"], set()).update(
+                group.defaults, {"rate_hz"} if group.rate_hz else ()
+            )
         for row in group.channels:
             own = {**group.defaults, **row.model_dump()}
-            whole["channels"].append({"label": row.name, **same, **own})
-            stated.setdefault(row.name, set()).update(own)
+            merged["channels"].append({"label": row.name, **common, **own})
+            fields_by_channel.setdefault(row.name, set()).update(own)
     rows = {row["name"]: row for group in groups.values() for row in group["channels"]}
     for name, changes in file.channels.items():
         if name not in rows:
@@ -174,7 +178,7 @@ def _merge_groups(file: _File) -> dict[str, Any]:
         if "name" in changes:
             raise InputError(f"channels.{name}.name", "left out: drop the channel and add another", changes["name"])
         rows[name] |= changes
-        stated.setdefault(name, set()).update(changes)
+        fields_by_channel.setdefault(name, set()).update(changes)
     for name in file.drop:
         if name not in groups and name not in rows:
             raise UnknownNameError("drop", "names of groups or channels", name, [*groups, *rows])
@@ -184,9 +188,9 @@ def _merge_groups(file: _File) -> dict[str, Any]:
             del groups[name]
         for row in group["channels"]:
             _check_kinds(row)
-            if "bandwidth_hz" not in stated.get(row["name"], ()):
+            if "bandwidth_hz" not in fields_by_channel.get(row["name"], ()):
                 row["bandwidth_hz"] = min(row.get("bandwidth_hz", math.inf), group["rate_hz"] / 4.0)
-            row |= {"kind": KIND} if stated.get(row["name"]) else {}
+            row |= {"kind": KIND} if fields_by_channel.get(row["name"]) else {}
     if not groups:
         raise InputError("drop", "such that a channel is left", list(file.drop))
     return groups
@@ -200,19 +204,19 @@ def _check_kinds(row: dict[str, Any]) -> None:
             raise InputError(f"channel {row['name']}.{name}", "a number", value)
 
 
-def _curve(name: str, stated: str | tuple[tuple[float, float], ...], folder: Path) -> tuple[tuple[float, float], ...]:
+def _curve(name: str, source: str | tuple[tuple[float, float], ...], folder: Path) -> tuple[tuple[float, float], ...]:
     """Return the points of a curve, from its file or from the table."""
     field = f"curves.{name}"
-    if not isinstance(stated, str):
-        points = stated
+    if not isinstance(source, str):
+        points = source
     else:
         try:
-            with open_file(folder / stated) as file:
+            with open_file(folder / source) as file:
                 lines = file.read(TOML_BYTES).decode("utf-8-sig").splitlines()
             rows = [row.split(",") for line in lines if (row := line.partition("#")[0].strip())]
             points = tuple((float(degrees), float(value)) for degrees, value in rows)
         except OSError as error:
-            received = Words(f"{stated} ({error.strerror})")
+            received = Words(f"{source} ({error.strerror})")
             raise InputError(field, "a file that can be read, degrees and values", received) from None
         except ValueError as error:
             raise InputError(field, "a file of lines `degrees, value`", Words(printable(str(error), 100))) from None

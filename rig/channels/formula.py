@@ -25,7 +25,7 @@ def _project(x: Part, y: Part, degrees: Part) -> Part:
     return apply(np.add, apply(np.multiply, x, apply(np.cos, angle)), apply(np.multiply, y, apply(np.sin, angle)))
 
 
-PLACES = {"shaft_x": "disk_x", "shaft_y": "disk_y"}
+SHAFT_FUNCTIONS = {"shaft_x": "disk_x", "shaft_y": "disk_y"}
 """Functions of a distance from the pivot [m]: the rigid shaft scales `disk_x` to `shaft_x(arm)` by the arms' ratio."""
 _MAX_REACH = 2.0
 """Largest distance from the pivot, in multiples of the disk's; detects millimetres given as metres."""
@@ -33,10 +33,10 @@ _MAX_REACH = 2.0
 Curve = Sequence[tuple[float, float]]
 
 
-def names_in(signal: str) -> set[str]:
-    """Return the names in a channel's signal or formula, including signals used by `PLACES`."""
+def find_names(signal: str) -> set[str]:
+    """Return the names in a channel's signal or formula, including signals used by `SHAFT_FUNCTIONS`."""
     names = set(re.findall(r"[^\W\d]\w*", signal))
-    return names | {PLACES[name] for name in names & PLACES.keys()}
+    return names | {SHAFT_FUNCTIONS[name] for name in names & SHAFT_FUNCTIONS.keys()}
 
 
 def check_computed(needed: Mapping[str, Iterable[str]], row: np.ndarray, *, engine: str) -> tuple[str, ...]:
@@ -77,7 +77,7 @@ class Formulas(Grammar):
         super().__init__()
         self._parameters = parameters or {}
         for name in curves or {}:
-            if name in {*FUNCTIONS, "along", *PLACES, *COLUMN, "pi"}:
+            if name in {*FUNCTIONS, "along", *SHAFT_FUNCTIONS, *COLUMN, "pi"}:
                 raise InputError(f"curves.{name}", "of a name that no signal and no function has", name)
         self._curves = {name: np.array(points, float).T for name, points in (curves or {}).items()}
         self._formulas: list[Part] = []
@@ -108,7 +108,7 @@ class Formulas(Grammar):
         """
         self.columns(table.groups.values())
 
-    def knows(self, channel: str, signal: str) -> bool:
+    def is_valid(self, channel: str, signal: str) -> bool:
         """Return whether a signal exists or is a valid formula."""
         try:
             self.column(channel, signal)
@@ -141,19 +141,21 @@ class Formulas(Grammar):
         return np.float64(self._parameters[name])
 
     def functions(self) -> Mapping[str, int]:
-        """Return the number of arguments of each function, including `PLACES` and curves."""
-        return {**super().functions(), "along": 3, **dict.fromkeys([*PLACES, *self._curves], 1)}
+        """Return the number of arguments of each function, including `SHAFT_FUNCTIONS` and curves."""
+        return {**super().functions(), "along": 3, **dict.fromkeys([*SHAFT_FUNCTIONS, *self._curves], 1)}
 
     def call(self, name: str, of: list[Part], field: str) -> Part:
         """Return the result of a function of parts."""
         if name == "along":
             return _project(*of)
-        if name in PLACES:
-            column, arm = COLUMN[PLACES[name]], self._parameters["shaft.arm_disk"]
+        if name in SHAFT_FUNCTIONS:
+            column, arm = COLUMN[SHAFT_FUNCTIONS[name]], self._parameters["shaft.arm_disk"]
             distance = of[0](np.zeros((1, len(COLUMN)))) if callable(of[0]) else of[0]
-            place = float(np.ravel(distance)[0])
-            if not abs(place) <= _MAX_REACH * arm:  # probably millimetres
-                raise InputError(field, f"{name} of a distance from the pivot within {_MAX_REACH * arm:.3g} m", place)
+            arm_m = float(np.ravel(distance)[0])
+            if not abs(arm_m) <= _MAX_REACH * arm:  # probably millimetres
+                raise InputError(
+                    field, f"{name} of a distance from the pivot within {_MAX_REACH * arm:.3g} m", arm_m
+                )
             return apply(np.multiply, apply(np.divide, of[0], arm), lambda rows: rows[:, column])
         if name in self._curves:
             return apply(_interpolate(self._curves[name]), apply(np.degrees, of[0]))

@@ -50,39 +50,39 @@ _Kind = Literal["sine", "two-tone", "chirp", "step", "pulse", "prbs", "multisine
 class Instants(NamedTuple):
     """Instants as whole seconds, int64, and remainder, 0 to 1 s, both shape (n,)."""
 
-    whole: np.ndarray
-    rest: np.ndarray
+    seconds: np.ndarray
+    fraction: np.ndarray
 
     @classmethod
-    def of_samples(cls, index: np.ndarray, rate_hz: int) -> Instants:
+    def from_samples(cls, index: np.ndarray, rate_hz: int) -> Instants:
         """Return the instants of samples from their numbers and rate [Hz]."""
-        whole, rest = np.divmod(index, rate_hz)
-        return cls(whole, rest / rate_hz)
+        seconds, fraction = np.divmod(index, rate_hz)
+        return cls(seconds, fraction / rate_hz)
 
     @classmethod
-    def of_times(cls, times_s: np.ndarray) -> Instants:
+    def from_times(cls, times_s: np.ndarray) -> Instants:
         """Return the instants of arbitrary times [s]."""
-        whole = np.floor(times_s)
-        return cls(whole.astype(np.int64), times_s - whole)
+        seconds = np.floor(times_s)
+        return cls(seconds.astype(np.int64), times_s - seconds)
 
-    def later(self, delay_s: float | np.ndarray) -> Instants:
+    def delay(self, delay_s: float | np.ndarray) -> Instants:
         """Return the instants reduced by a delay [s], a number or one per instant, shape (n,)."""
-        rest = self.rest - delay_s
-        carry = np.floor(rest)
-        return Instants(self.whole + carry.astype(np.int64), rest - carry)
+        fraction = self.fraction - delay_s
+        carry = np.floor(fraction)
+        return Instants(self.seconds + carry.astype(np.int64), fraction - carry)
 
-    def cycles(self, frequency: Fraction, ahead: float = 0.0) -> np.ndarray:
+    def cycles(self, frequency: Fraction, phase_lead: float = 0.0) -> np.ndarray:
         """Return the phase in periods, 0 to 1, shape (n,).
 
         Args:
             frequency: Periods per second [Hz].
-            ahead: Phase at time zero [periods].
+            phase_lead: Phase at time zero [periods].
         """
-        if not len(self.whole):
+        if not len(self.seconds):
             return np.empty(0)
-        first = int(self.whole.min())
-        begun = np.array([float(frequency * second % 1) for second in range(first, int(self.whole.max()) + 1)])
-        turns = begun[self.whole - first] + float(frequency) * self.rest + ahead
+        first = int(self.seconds.min())
+        start_phases = np.array([float(frequency * second % 1) for second in range(first, int(self.seconds.max()) + 1)])
+        turns = start_phases[self.seconds - first] + float(frequency) * self.fraction + phase_lead
         turns -= np.floor(turns)
         turns[turns > 1.0 - _WRAP_TOLERANCE] = 0.0
         return turns
@@ -142,7 +142,7 @@ class Source:
         signal: Signal with all fields of its kind.
         amplitude_v: Peak [V].
         middle_v: Bias plus offset [V].
-        ahead: Phase at time zero [periods].
+        phase_lead: Phase at time zero [periods].
         waveform: Period and spline of a recorded waveform [unit of the channel]; None for other kinds.
     """
 
@@ -150,11 +150,11 @@ class Source:
     signal: Signal
     amplitude_v: float
     middle_v: float
-    ahead: float
+    phase_lead: float
     waveform: tuple[Fraction, np.ndarray] | None = None
 
     @property
-    def largest_v(self) -> float:
+    def max_abs_v(self) -> float:
         """Largest magnitude of the voltage [V]."""
         top = 1.0 if self.waveform is None else max(map(abs, self.waveform[1][3].tolist()))
         return abs(self.middle_v) + abs(self.amplitude_v) * (top if self.signal.kind != "quiet" else 0.0)
@@ -165,12 +165,12 @@ class Source:
         signal = self.signal
         differing = {"amplitude", "amplitude_v", "offset", "offset_v", "phase_deg", "delay_us"}
         shape = () if self.waveform is None else (self.channel.name,)
-        return (signal.model_dump_json(exclude=differing), signal.delay_us, self.ahead, *shape)
+        return (signal.model_dump_json(exclude=differing), signal.delay_us, self.phase_lead, *shape)
 
-    def shape(self, instants: Instants) -> np.ndarray:
+    def compute_wave(self, instants: Instants) -> np.ndarray:
         """Return the wave w, shape (n,)."""
         signal = self.signal
-        return KINDS[signal.kind or "quiet"].wave(self, instants.later((signal.delay_us or 0.0) * 1e-6))
+        return KINDS[signal.kind or "quiet"].wave(self, instants.delay((signal.delay_us or 0.0) * 1e-6))
 
     def volts(self, times_s: np.ndarray) -> np.ndarray:
         """Return the voltage at the converter, before noise and limits [V], shape (n,).
@@ -178,47 +178,49 @@ class Source:
         Args:
             times_s: Instants [s], shape (n,).
         """
-        return self.at(self.shape(Instants.of_times(np.asarray(times_s, float))))
+        return self.to_volts(self.compute_wave(Instants.from_times(np.asarray(times_s, float))))
 
-    def at(self, shape: np.ndarray) -> np.ndarray:
+    def to_volts(self, wave: np.ndarray) -> np.ndarray:
         """Return the voltage for a wave [V]."""
-        return self.middle_v + self.amplitude_v * shape
+        return self.middle_v + self.amplitude_v * wave
 
 
 def _sine(source: Source, instants: Instants) -> np.ndarray:
     """Return a sine: w = sin(2 pi (f t + phase/360))."""
-    return np.sin(2.0 * np.pi * instants.cycles(_frequency(source), source.ahead))
+    return np.sin(2.0 * np.pi * instants.cycles(_frequency(source), source.phase_lead))
 
 
 def _two_tone(source: Source, instants: Instants) -> np.ndarray:
     """Return two tones: w = (sin(2 pi (f1 t + phase/360)) + sin(2 pi (f2 t + phase/360))) / 2, at most 1."""
-    tones = [instants.cycles(exact(hz), source.ahead) for hz in source.signal.frequencies or ()]
+    tones = [instants.cycles(exact(hz), source.phase_lead) for hz in source.signal.frequencies or ()]
     return np.sum([0.5 * np.sin(2.0 * np.pi * turns) for turns in tones], axis=0)
 
 
 def _chirp(source: Source, instants: Instants) -> np.ndarray:
     """Return repeated linear sweeps from f1 to f2: w = sin(2 pi (f1 s + (f2 - f1) s^2 / (2 T))), s = t mod T."""
     low, high = source.signal.frequencies or (0.0, 0.0)
-    part, period_s = instants.cycles(1 / _period(source), source.ahead), float(_period(source))
+    part, period_s = instants.cycles(1 / _period(source), source.phase_lead), float(_period(source))
     turns = period_s * part * (low + 0.5 * (high - low) * part)
     return np.sin(2.0 * np.pi * (turns - np.floor(turns)))
 
 
 def _step(source: Source, instants: Instants) -> np.ndarray:
     """Return steps: w = -1 in the first half of each period, 1 in the second."""
-    return np.where(np.floor(2.0 * instants.cycles(1 / _period(source), source.ahead) + _EDGE_TOL) == 1.0, 1.0, -1.0)
+    return np.where(
+        np.floor(2.0 * instants.cycles(1 / _period(source), source.phase_lead) + _EDGE_TOL) == 1.0, 1.0, -1.0
+    )
 
 
 def _pulse(source: Source, instants: Instants) -> np.ndarray:
     """Return pulses: w = 1 in the first 10/360 of each period, else 0."""
-    return np.where(instants.cycles(_frequency(source), source.ahead) + _EDGE_TOL < float(_PULSE_LENGTH), 1.0, 0.0)
+    return np.where(instants.cycles(_frequency(source), source.phase_lead) + _EDGE_TOL < float(_PULSE_LENGTH), 1.0, 0.0)
 
 
 def _prbs(source: Source, instants: Instants) -> np.ndarray:
     """Return a pseudo-random binary sequence: w = 1 or -1, chip floor(f t) modulo 2^order - 1 (see `chips`)."""
     sequence = chips(source.signal.order or 0, source.signal.seed or 1)
     length = len(sequence)
-    turns = instants.cycles(_frequency(source) / length, round(source.ahead * length) / length)
+    turns = instants.cycles(_frequency(source) / length, round(source.phase_lead * length) / length)
     return sequence[np.floor(turns * length + _EDGE_TOL).astype(np.int64) % length]
 
 
@@ -226,20 +228,20 @@ def _multisine(source: Source, instants: Instants) -> np.ndarray:
     """Return a multisine: w = sum cos(2 pi (f_k t + phase/360) - s pi k^2 / N) / peak, k = 0..N-1, s by the crest."""
     frequencies = source.signal.frequencies or ()
     phases, peak = multisine_phases(frequencies, source.signal.crest)
-    total = np.zeros(len(instants.whole))
+    total = np.zeros(len(instants.seconds))
     for hz, phase in zip(frequencies, phases.tolist(), strict=True):
-        total += np.cos(2.0 * np.pi * instants.cycles(exact(hz), source.ahead) + phase)
+        total += np.cos(2.0 * np.pi * instants.cycles(exact(hz), source.phase_lead) + phase)
     return total / peak
 
 
 def _ramp(source: Source, instants: Instants) -> np.ndarray:
     """Return a ramp: w = 2 ((t/T) mod 1) - 1; without an amplitude, it passes every code of the converter."""
-    return 2.0 * instants.cycles(1 / _period(source), source.ahead) - 1.0
+    return 2.0 * instants.cycles(1 / _period(source), source.phase_lead) - 1.0
 
 
 def _quiet(source: Source, instants: Instants) -> np.ndarray:
     """Return w = 0, which leaves bias, offset and noise."""
-    return np.zeros(len(instants.whole))
+    return np.zeros(len(instants.seconds))
 
 
 def _recorded(source: Source, instants: Instants) -> np.ndarray:
@@ -247,33 +249,33 @@ def _recorded(source: Source, instants: Instants) -> np.ndarray:
     assert source.waveform is not None
     period, pieces = source.waveform
     rows = pieces.shape[1]
-    place = instants.cycles(1 / period, source.ahead) * rows
-    piece = np.minimum(place.astype(np.int64), rows - 1)
-    past, (a, b, c, d) = place - piece, pieces[:, piece]
-    return ((a * past + b) * past + c) * past + d
+    position = instants.cycles(1 / period, source.phase_lead) * rows
+    piece = np.minimum(position.astype(np.int64), rows - 1)
+    remainder, (a, b, c, d) = position - piece, pieces[:, piece]
+    return ((a * remainder + b) * remainder + c) * remainder + d
 
 
-class Kind(NamedTuple):
+class SignalKind(NamedTuple):
     """Kind of signal: wave, required fields, and optional fields other than phase, delay and offset."""
 
     wave: Callable[[Source, Instants], np.ndarray]
-    needs: tuple[str, ...] = ()
-    takes: tuple[str, ...] = ()
+    required: tuple[str, ...] = ()
+    optional: tuple[str, ...] = ()
     amplitude: bool | None = True
     """Amplitude: required (True), optional (None) or not allowed (False)."""
 
 
-KINDS: dict[str, Kind] = {
-    "sine": Kind(_sine, ("frequency_hz",)),
-    "two-tone": Kind(_two_tone, ("frequencies",)),
-    "chirp": Kind(_chirp, ("frequencies", "period_s")),
-    "step": Kind(_step, ("period_s",)),
-    "pulse": Kind(_pulse, ("frequency_hz",)),
-    "prbs": Kind(_prbs, ("frequency_hz", "order"), ("seed",)),
-    "multisine": Kind(_multisine, ("frequencies",), ("crest",)),
-    "ramp": Kind(_ramp, ("period_s",), amplitude=None),
-    "quiet": Kind(_quiet, amplitude=False),
-    "recorded": Kind(_recorded, amplitude=False),
+KINDS: dict[str, SignalKind] = {
+    "sine": SignalKind(_sine, ("frequency_hz",)),
+    "two-tone": SignalKind(_two_tone, ("frequencies",)),
+    "chirp": SignalKind(_chirp, ("frequencies", "period_s")),
+    "step": SignalKind(_step, ("period_s",)),
+    "pulse": SignalKind(_pulse, ("frequency_hz",)),
+    "prbs": SignalKind(_prbs, ("frequency_hz", "order"), ("seed",)),
+    "multisine": SignalKind(_multisine, ("frequencies",), ("crest",)),
+    "ramp": SignalKind(_ramp, ("period_s",), amplitude=None),
+    "quiet": SignalKind(_quiet, amplitude=False),
+    "recorded": SignalKind(_recorded, amplitude=False),
 }
 """All kinds by name; the docstring of each wave states its equation."""
 _OFFSETS, _AMPLITUDES, _SHIFTS = ("offset", "offset_v"), ("amplitude", "amplitude_v"), ("phase_deg", "delay_us")
@@ -303,7 +305,7 @@ def sources(generator: Generator, table: ChannelTable, speed_hz: float = 0.0) ->
     }
 
 
-def _source(generator: Generator, channel: Channel, place: float, speed_hz: float) -> Source:
+def _source(generator: Generator, channel: Channel, position: float, speed_hz: float) -> Source:
     own = generator.channels.get(channel.name)
     if own is None and speed_hz > 0.0:
         if channel.signal == "keyphasor":
@@ -313,16 +315,16 @@ def _source(generator: Generator, channel: Channel, place: float, speed_hz: floa
     signal = _merge_fields(generator, {}, generator.kind, "generator")
     if own is not None:
         signal = _merge_fields(own, signal, own.kind or generator.kind, f"generator.channels.{channel.name}")
-    made = Signal(**signal)
+    merged = Signal(**signal)
     field = "generator" if own is None else f"generator.channels.{channel.name}"
-    _check_rate(made, channel, field)
-    gain, ahead = channel.sensitivity_v, (made.phase_deg or 0.0) / 360.0 + (place if generator.apart else 0.0)
-    offset_v = made.offset_v if made.offset_v is not None else (made.offset or 0.0) * gain
-    peak_v = made.amplitude_v if made.amplitude_v is not None else (made.amplitude or 0.0) * gain
-    found = Source(channel, made, peak_v, channel.bias_v + offset_v, ahead)
-    if made.kind == "ramp" and not {*_AMPLITUDES} & {*signal}:
+    _check_rate(merged, channel, field)
+    gain, phase_lead = channel.sensitivity_v, (merged.phase_deg or 0.0) / 360.0 + (position if generator.apart else 0.0)
+    offset_v = merged.offset_v if merged.offset_v is not None else (merged.offset or 0.0) * gain
+    peak_v = merged.amplitude_v if merged.amplitude_v is not None else (merged.amplitude or 0.0) * gain
+    found = Source(channel, merged, peak_v, channel.bias_v + offset_v, phase_lead)
+    if merged.kind == "ramp" and not {*_AMPLITUDES} & {*signal}:
         found = replace(found, amplitude_v=channel.adc_v, middle_v=offset_v)
-    if made.kind == "recorded":
+    if merged.kind == "recorded":
         file = generator.file
         if file is None or file.units.get(channel.name) != channel.unit:
             must = f"with a column `{channel.name} [{channel.unit}]` (or another kind for this channel)"
@@ -331,7 +333,7 @@ def _source(generator: Generator, channel: Channel, place: float, speed_hz: floa
     return found
 
 
-def _merge_fields(given: Signal, base: dict[str, Any], kind: str | None, field: str) -> dict[str, Any]:
+def _merge_fields(signal: Signal, base: dict[str, Any], kind: str | None, field: str) -> dict[str, Any]:
     """Return the fields of a signal merged over those of another, limited to those of its kind.
 
     Raises:
@@ -340,18 +342,18 @@ def _merge_fields(given: Signal, base: dict[str, Any], kind: str | None, field: 
     if kind is None:
         raise InputError(f"{field}.kind", f"one of {', '.join(KINDS)}", None)
     rule = KINDS[kind]
-    takes = {*rule.needs, *rule.takes, *_OFFSETS, *(_AMPLITUDES if rule.amplitude is not False else ())}
-    takes |= {*_SHIFTS} if kind != "quiet" else set()
-    own = {name: value for name in Signal.model_fields if (value := getattr(given, name)) is not None}
+    accepted = {*rule.required, *rule.optional, *_OFFSETS, *(_AMPLITUDES if rule.amplitude is not False else ())}
+    accepted |= {*_SHIFTS} if kind != "quiet" else set()
+    own = {name: value for name in Signal.model_fields if (value := getattr(signal, name)) is not None}
     for name in own:
-        if name != "kind" and name not in takes:
+        if name != "kind" and name not in accepted:
             raise InputError(f"{field}.{name}", f"left out with kind {kind}", own[name])
     for pair in (_OFFSETS, _AMPLITUDES):
         if {*pair} <= {*own}:
             raise InputError(f"{field}.{pair[0]}", f"left out where {pair[1]} is given", own[pair[0]])
     restated = {name for pair in (_OFFSETS, _AMPLITUDES) if {*pair} & {*own} for name in pair}
-    found = {name: value for name, value in base.items() if name in takes - restated} | own | {"kind": kind}
-    for name in (*rule.needs, *(("amplitude_v",) if rule.amplitude and not {*_AMPLITUDES} & {*found} else ())):
+    found = {name: value for name, value in base.items() if name in accepted - restated} | own | {"kind": kind}
+    for name in (*rule.required, *(("amplitude_v",) if rule.amplitude and not {*_AMPLITUDES} & {*found} else ())):
         if name not in found:
             raise InputError(f"{field}.{name}", f"given with kind {kind}", None)
     if kind in ("two-tone", "chirp") and len(found["frequencies"]) != 2:
@@ -372,9 +374,9 @@ def _check_rate(signal: Signal, channel: Channel, field: str) -> None:
             continue
         highest = 1.0 / value if name == "period_s" else max(value if isinstance(value, tuple) else (value,))
         # A chip lasts at least one sample.
-        most = channel.rate_hz / (1.0 if signal.kind == "prbs" else 2.0)
-        if highest > most or (highest == most and signal.kind != "prbs"):
-            must = f"at most {most:g} Hz" if signal.kind == "prbs" else f"below {most:g} Hz, half of the rate"
+        limit = channel.rate_hz / (1.0 if signal.kind == "prbs" else 2.0)
+        if highest > limit or (highest == limit and signal.kind != "prbs"):
+            must = f"at most {limit:g} Hz" if signal.kind == "prbs" else f"below {limit:g} Hz, half of the rate"
             raise InputError(f"{field}.{name}", f"{must} of {channel.name}, whose converter has no filter", value)
 
 
@@ -443,15 +445,15 @@ def multisine_phases(frequencies: tuple[float, ...], crest: float | None) -> tup
         spectrum[lines] = 0.5 * points * np.exp(1j * s * schroeder)
         size = np.abs(np.fft.irfft(spectrum))
         top = int(np.argmax(size))
-        before, at, behind = size[top - 1], size[top], size[(top + 1) % points]
-        bend = before - 2.0 * at + behind  # the parabola through the three highest points
-        return float(at - (behind - before) ** 2 / (8.0 * bend)) if bend else float(at)
+        left, top_value, right = size[top - 1], size[top], size[(top + 1) % points]
+        bend = left - 2.0 * top_value + right  # the parabola through the three highest points
+        return float(top_value - (right - left) ** 2 / (8.0 * bend)) if bend else float(top_value)
 
     rms = math.sqrt(0.5 * n)
-    s, least, most = 1.0, peak(1.0) / rms, math.sqrt(2.0 * n)
+    s, min_crest, max_crest = 1.0, peak(1.0) / rms, math.sqrt(2.0 * n)
     if crest is not None:
-        if not least * (1.0 - 1e-6) <= crest <= most * (1.0 + 1e-6):
-            raise InputError("crest", f"from {least:.4g} to {most:.4g} with these frequencies", crest)
+        if not min_crest * (1.0 - 1e-6) <= crest <= max_crest * (1.0 + 1e-6):
+            raise InputError("crest", f"from {min_crest:.4g} to {max_crest:.4g} with these frequencies", crest)
         low, high = 0.0, 1.0
         for _ in range(40):
             s = 0.5 * (low + high)

@@ -152,9 +152,9 @@ def waterfall(
     starts = range(0, max(1, len(x) - size + 1), hop)
     spectra = [full_spectrum(x[s : s + size], y[s : s + size], rate_hz) for s in starts]
     frequency = spectra[0][0]
-    shown = np.abs(frequency) <= SPECTRUM_HZ
+    in_range = np.abs(frequency) <= SPECTRUM_HZ
     centres = np.array([times_s[min(s + size // 2, len(x) - 1)] for s in starts])
-    return centres, frequency[shown], np.array([amplitude[shown] for _, amplitude in spectra])
+    return centres, frequency[in_range], np.array([amplitude[in_range] for _, amplitude in spectra])
 
 
 def synchronous(values: ArrayLike, times_s: ArrayLike, edges_s: ArrayLike) -> tuple[np.ndarray, np.ndarray]:

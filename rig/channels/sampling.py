@@ -47,7 +47,7 @@ class SensorChoice(Written):
 
     @field_validator("truth_rate_hz")
     @classmethod
-    def _whole_period(cls, rate_hz: int) -> int:
+    def _check_period(cls, rate_hz: int) -> int:
         if 1_000_000 % rate_hz:
             raise ValueError("a rate whose period is a whole number of microseconds, such as 1000, 2000 or 10000")
         return rate_hz
@@ -70,7 +70,7 @@ def row_ticks(table: ChannelTable, *, truth_rate_hz: int, ideal: bool) -> int:
     fit = [
         ticks for ticks in (*_OTHER_ROW_TICKS, 1) if ticks <= longest and all(period % ticks == 0 for period in periods)
     ]
-    fitting = [ticks for ticks in fit if all(fits(rate, TICKS_HZ // ticks) for rate in rates)]
+    fitting = [ticks for ticks in fit if all(has_few_positions(rate, TICKS_HZ // ticks) for rate in rates)]
     return [*fitting, *fit, 1][0]
 
 
@@ -87,23 +87,23 @@ def check_rates(table: ChannelTable, row_rate_hz: int, *, field: str) -> None:
     """
     for group in table.groups.values():
         rate = group.rate_hz
-        if not fits(rate, row_rate_hz):
-            near = [other for offset in range(5000) for other in (rate - offset, rate + offset) if other > 0]
-            valid = sorted([other for other in near if fits(other, row_rate_hz)][:2])
+        if not has_few_positions(rate, row_rate_hz):
+            nearby = [other for offset in range(5000) for other in (rate - offset, rate + offset) if other > 0]
+            valid = sorted([other for other in nearby if has_few_positions(other, row_rate_hz)][:2])
             must = f"a rate with at most {_MAX_POSITIONS} sample positions between the rows of {row_rate_hz} Hz"
             must += f", such as {' or '.join(map(str, valid))}" if valid else ""
             raise InputError(field or f"groups.{group.name}.rate_hz", must, rate)
 
 
-def between(rate_hz: int, row_rate_hz: int) -> tuple[int, int]:
+def sample_spacing(rate_hz: int, row_rate_hz: int) -> tuple[int, int]:
     """Return the sample interval in parts of a row interval, and the number of parts per row interval."""
     common = math.gcd(rate_hz, row_rate_hz)
     return row_rate_hz // common, rate_hz // common
 
 
-def fits(rate_hz: int, row_rate_hz: int) -> bool:
+def has_few_positions(rate_hz: int, row_rate_hz: int) -> bool:
     """Return whether the samples of a rate have few enough different positions between rows."""
-    return between(rate_hz, row_rate_hz)[1] <= _MAX_POSITIONS
+    return sample_spacing(rate_hz, row_rate_hz)[1] <= _MAX_POSITIONS
 
 
 def first_row(tick: int, rate_hz: int) -> int:
@@ -113,10 +113,10 @@ def first_row(tick: int, rate_hz: int) -> int:
 
 def lagrange(places: np.ndarray, nodes: Sequence[int] | np.ndarray) -> np.ndarray:
     """Return the weights of the polynomial through nodes, evaluated at places, shape (nodes, places)."""
-    apart = [places - node for node in nodes]
-    found = np.ones((len(apart), *np.shape(places)))
+    distances = [places - node for node in nodes]
+    found = np.ones((len(distances), *np.shape(places)))
     for weight, node in zip(found, nodes, strict=True):
-        for other, distance in zip(nodes, apart, strict=True):
+        for other, distance in zip(nodes, distances, strict=True):
             if other != node:
                 weight *= distance
         weight /= math.prod(node - other for other in nodes if other != node)

@@ -57,7 +57,7 @@ class Channel(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
     """Provenance of the values, as for parameters."""
 
     @model_validator(mode="after")
-    def _whole_scale(self) -> Channel:
+    def _check_scale(self) -> Channel:
         if self.sensitivity_v == 0.0:
             raise InputError(f"channel {self.name}.sensitivity_v", "non-zero", self.sensitivity_v)
         low, high = self.range_v
@@ -134,7 +134,7 @@ class ChannelTable(BaseModel, frozen=True, extra="forbid"):
     __str__ = __repr__
 
     @model_validator(mode="after")
-    def _names_once(self) -> ChannelTable:
+    def _check_names(self) -> ChannelTable:
         names = [channel.name for group in self.groups.values() for channel in group.channels]
         if len(set(names)) < len(names):
             name = next(name for name in names if names.count(name) > 1)
@@ -150,7 +150,7 @@ class ChannelTable(BaseModel, frozen=True, extra="forbid"):
 
     def select_groups(self, names: tuple[str, ...], rate_hz: int | None = None) -> ChannelTable:
         """Return the table limited to the named groups (none for all), with another sample rate if given [Hz]."""
-        kept = {}
+        selected = {}
         for name in names or self.groups:
             group = self.groups[name]
             if rate_hz is not None:
@@ -162,8 +162,8 @@ class ChannelTable(BaseModel, frozen=True, extra="forbid"):
                     for channel in group.channels
                 )
                 group = group.model_copy(update={"rate_hz": rate_hz, "channels": rows})
-            kept[name] = group
-        return self.model_copy(update={"groups": kept})
+            selected[name] = group
+        return self.model_copy(update={"groups": selected})
 
 
 def parse_table(text: str) -> ChannelTable:
@@ -173,7 +173,7 @@ def parse_table(text: str) -> ChannelTable:
         InputError: The text is not TOML, or a value is missing or invalid.
     """
     try:
-        return table_of(raw_groups(text))
+        return build_table(raw_groups(text))
     except KeyError as error:
         raise InputError(f"channel table: {error.args[0]}", "given", None) from None
     except (TypeError, AttributeError):
@@ -191,21 +191,21 @@ def raw_groups(text: str) -> dict[str, Any]:
     return groups
 
 
-def table_of(groups: dict[str, Any], curves: dict[str, Any] | None = None) -> ChannelTable:
+def build_table(groups: dict[str, Any], curves: dict[str, Any] | None = None) -> ChannelTable:
     """Return the channel table of groups with complete rows, and of curves.
 
     Raises:
         InputError: A value is missing or invalid.
     """
-    made = {}
+    merged = {}
     for name, body in groups.items():
         own = {"group": name, "rate_hz": body["rate_hz"]}
         rows = [
             check(Channel, {**row, **own}, field=f"channel {row.get('name', number)}")
             for number, row in enumerate(body["channels"], 1)
         ]
-        made[name] = {"name": name, "title": body["title"], "rate_hz": body["rate_hz"], "channels": tuple(rows)}
-    table = {"groups": made, "version": VERSION, "curves": curves or {}}
+        merged[name] = {"name": name, "title": body["title"], "rate_hz": body["rate_hz"], "channels": tuple(rows)}
+    table = {"groups": merged, "version": VERSION, "curves": curves or {}}
     return check(ChannelTable, table, field="channel table")
 
 

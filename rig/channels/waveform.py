@@ -31,7 +31,7 @@ class Waveform(Written):
     values: dict[str, tuple[FiniteFloat, ...]]
 
     @model_validator(mode="after")
-    def _even(self) -> Waveform:
+    def _check_lengths(self) -> Waveform:
         lengths = {len(values) for values in self.values.values()}
         if len(lengths) != 1 or min(lengths) < 4 or self.units.keys() != self.values.keys():
             raise InputError(_FIELD, "of columns of one length, at least 4 rows, each with its unit", sorted(lengths))

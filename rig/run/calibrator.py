@@ -78,7 +78,7 @@ class Calibrator:
     def volts(self, name: str, instants: Instants) -> np.ndarray:
         """Return the voltage at the converter of a channel at any instants [V], shape (n,)."""
         source = self._sources[name]
-        return source.at(source.shape(instants))
+        return source.to_volts(source.compute_wave(instants))
 
     def counts(
         self, rows: np.ndarray, formula_values: np.ndarray | None = None, faults: GeneratedFaults | None = None
@@ -99,13 +99,13 @@ class Calibrator:
             rate = group.rate_hz
             first, end = (-(-tick * rate // TICKS_HZ) for tick in (start, self._tick))
             n = np.arange(first, end)
-            instants = Instants.of_samples(n, rate)
+            instants = Instants.from_samples(n, rate)
             counts = found[group.name] = np.empty((end - first, len(group.channels)), np.int32)
             for c, channel in enumerate(group.channels):
                 source, key = self._sources[channel.name], (rate, self._waves[channel.name])
                 if key not in shapes:
-                    shapes[key] = source.shape(instants)
-                volts = source.at(shapes[key])
+                    shapes[key] = source.compute_wave(instants)
+                volts = source.to_volts(shapes[key])
                 if faults is not None and (changed := faults.volts(channel.name, n)) is not None:
                     volts = changed
                 if self._noise:
@@ -153,7 +153,7 @@ class GeneratedFaults:
 
     def _other_volts(self, name: str, n: np.ndarray, at: str) -> np.ndarray:
         channel = self._channels[name]
-        instants = Instants.of_samples(n, self._channels[at].rate_hz)
+        instants = Instants.from_samples(n, self._channels[at].rate_hz)
         return self._sensor_volts(name, instants, ()) - channel.bias_v
 
     def volts(self, name: str, n: np.ndarray) -> np.ndarray | None:
@@ -164,7 +164,7 @@ class GeneratedFaults:
         for what, at in faults_at:
             late_s += np.minimum(what.late_s(at), at.t)  # not before the fault
         source = self._plugs.get(name, name)
-        instants = Instants.of_samples(n, self._channels[name].rate_hz).later(late_s)
+        instants = Instants.from_samples(n, self._channels[name].rate_hz).delay(late_s)
         volts = self._sensor_volts(source, instants, faults_at if source == name else self._iterate_faults(source, n))
         for what, at in faults_at:
             volts = what.volts(volts, at)
@@ -235,6 +235,6 @@ def build_replacements(scene: Scene, *, row_ticks: int, tick: int) -> tuple[list
 def health(scene: Scene) -> dict[str, Any]:
     """Return the health of a run with a generator: nominal speed, and channels driven beyond the converter."""
     sources = scene.sources().items()
-    limited = [name for name, source in sources if source.largest_v > source.channel.adc_v + source.channel.lsb_v]
+    limited = [name for name, source in sources if source.max_abs_v > source.channel.adc_v + source.channel.lsb_v]
     warning = f"driven beyond the converter, which limits: {', '.join(limited)}"
     return {"spin_hz": scene.drive.speed_hz, "contacts": 0, "warnings": [warning] if limited else []}

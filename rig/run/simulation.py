@@ -20,7 +20,7 @@ import numpy as np
 from rig.base.errors import InputError, SimulationError, Words
 from rig.base.wire import ROOT, Block
 from rig.channels.faults.delivery import Frame
-from rig.channels.formula import check_computed, names_in
+from rig.channels.formula import check_computed, find_names
 from rig.channels.sensors.conditioning import Conditioner
 from rig.channels.sensors.keyphasor import Keyphasor
 from rig.channels.table import ChannelTable
@@ -189,7 +189,7 @@ class Simulation:
         """
         if self.scene.generator is not None:
             return tuple(COLUMN)
-        needed = {f"channel {name}.signal": names_in(each.signal) for name, each in self.table.channels.items()}
+        needed = {f"channel {name}.signal": find_names(each.signal) for name, each in self.table.channels.items()}
         needed |= {f"truth table {name}": S.TRUTH[name] for name in self._truth_parts}
         return check_computed(needed, self.first_row, engine=self.scene.engine.name)
 

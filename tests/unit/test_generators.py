@@ -101,7 +101,7 @@ def test_counts_are_the_closed_form_to_half_a_step_of_the_converter(kind: str, r
 def test_a_wave_is_as_exact_after_a_day_as_at_the_start(kind: str) -> None:
     source = scene_of({"kind": kind, **SIGNALS[kind]}).sources()["disk_x"]
     index = 86_399 * 51_200 + 777 + np.arange(500)
-    found = source.shape(Instants.of_samples(index, 51_200))
+    found = source.compute_wave(Instants.from_samples(index, 51_200))
     expected = closed_form(kind, SIGNALS[kind], [Fraction(int(n), 51_200) for n in index], Fraction(0))
     assert np.abs(found - expected).max() < 1e-10
 
@@ -141,14 +141,14 @@ def test_a_prbs_correlates_with_itself_at_no_other_shift(order: int) -> None:
 def test_channels_of_a_prbs_differ_by_their_shift() -> None:
     sources = load_scene("test-prbs").sources()
     index = np.arange(0, 4095 * 5)
-    waves = {name: source.shape(Instants.of_samples(index, 20_000)) for name, source in sources.items()}
+    waves = {name: source.compute_wave(Instants.from_samples(index, 20_000)) for name, source in sources.items()}
     shifts = []
     for wave in waves.values():
         lagged = np.fft.irfft(np.fft.rfft(wave) * np.fft.rfft(waves["disk_x"]).conj(), len(wave))
         shifts.append(int(np.argmax(lagged)))
     assert shifts == [-round(4095 * n / 15) % 4095 * 5 for n in range(15)]
     fewer = load_scene("test-prbs", {"sensors.groups": ["forces"]}).sources()
-    assert np.array_equal(fewer["P_W"].shape(Instants.of_samples(index, 20_000)), waves["P_W"])
+    assert np.array_equal(fewer["P_W"].compute_wave(Instants.from_samples(index, 20_000)), waves["P_W"])
 
 
 @pytest.mark.parametrize("crest", [None, 2.0, 3.5, 7.0])

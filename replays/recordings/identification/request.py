@@ -221,7 +221,7 @@ def observe(
         channel.name: group.name
         for group in recording.table.groups.values()
         for channel in group.channels
-        if formulas.knows(channel.name, channel.signal) and recording.messages.get(sensor_key(group.name))
+        if formulas.is_valid(channel.name, channel.signal) and recording.messages.get(sensor_key(group.name))
     }
     usable = [name for name in groups if name not in NOT_FITTED]
     wanted = list(channels) if channels else usable

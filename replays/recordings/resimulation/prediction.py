@@ -17,7 +17,7 @@ from recorder.reader import Recording
 from replays.recordings.resimulation.experiment import Experiment
 from rig.base.errors import InputError
 from rig.channels.formula import Formulas
-from rig.channels.sampling import between, fits, lagrange
+from rig.channels.sampling import has_few_positions, lagrange, sample_spacing
 from rig.channels.sensors.conditioning import Conditioner
 from rig.channels.table import Channel, Group, default_table
 from rig.run.offline import frames
@@ -161,7 +161,7 @@ def measured(recording: Recording, scene: Scene, *, longest_s: float = math.inf)
     ideal = sensors.chain == "ideal"
     noise = sensors.noise and not ideal
     for name, group in recording.table.groups.items():
-        columns = [c for c, channel in enumerate(group.channels) if formulas.knows(channel.name, channel.signal)]
+        columns = [c for c, channel in enumerate(group.channels) if formulas.is_valid(channel.name, channel.signal)]
         samples = recording.samples(name)
         if not columns or len(samples.times_s) < 2:
             continue
@@ -212,7 +212,7 @@ class _Channels:
         self, parts: Sequence[Measured], *, rate_hz: int, row_rate_hz: int, formulas: Formulas, digital: bool
     ) -> None:
         self._parts, self._rate_hz = parts, rate_hz
-        self.apart, self._in_a_row = between(rate_hz, row_rate_hz)
+        self.apart, self._in_a_row = sample_spacing(rate_hz, row_rate_hz)
         groups = [Group(name=part.group, title=part.group, rate_hz=rate_hz, channels=part.fine) for part in parts]
         self._groups = {group.name: group for group in groups}
         self._conditioner = Conditioner(
@@ -275,7 +275,7 @@ def _channels(parts: dict[str, Measured], scene: Scene, *, row_rate_hz: int) -> 
         rate = part.channels[0].rate_hz
         places = part.times_s * rate
         digital = part.version < 2
-        even = row_rate_hz % rate == 0 if digital else fits(rate, row_rate_hz)
+        even = row_rate_hz % rate == 0 if digital else has_few_positions(rate, row_rate_hz)
         exact = even and bool(np.abs(places - np.rint(places)).max() < 1e-6)
         # At a rate that does not divide the model's, channels are interpolated between all rows of the model.
         rates.setdefault((rate if exact else row_rate_hz, part.ideal), []).append(part)

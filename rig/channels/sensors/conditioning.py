@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from rig.channels.sampling import between
+from rig.channels.sampling import sample_spacing
 from rig.channels.sensors.filters import POLE, channel_poles, coefficients, digital_coefficients
 from rig.channels.sensors.noise import draw, noise_streams
 from rig.channels.table import Channel, Group, check_signals
@@ -220,7 +220,7 @@ class Conditioner:
         columns: Sequence[int] | None = None,
     ) -> None:
         self.groups = tuple(groups)
-        self._apart, self._parts = between(self.groups[0].rate_hz, row_rate_hz)
+        self._apart, self._parts = sample_spacing(self.groups[0].rate_hz, row_rate_hz)
         self._late = 0
         channels = [channel for group in self.groups for channel in group.channels]
         if columns is None:
