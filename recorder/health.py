@@ -264,7 +264,7 @@ def examine(recording: Recording, progress: Callable[[float], None] = lambda _: 
         recording: The recording.
         progress: Callback for the fraction of the blocks that was read, 0 to 1.
     """
-    blocks, seen = sum(count for key, count in recording.messages.items() if get_schema(key) is not None), 0
+    blocks, scanned = sum(count for key, count in recording.messages.items() if get_schema(key) is not None), 0
     noisy = _has_noise(recording.scene)
     watches = {
         sensor_key(name): _GroupStatistics(group, noisy=noisy)
@@ -274,16 +274,16 @@ def examine(recording: Recording, progress: Callable[[float], None] = lambda _: 
     edges: list[np.ndarray] = []
 
     def watch(key: str, block: Block) -> None:
-        nonlocal seen
-        seen += 1
-        progress(min(seen / max(blocks, 1), 1.0))
+        nonlocal scanned
+        scanned += 1
+        progress(min(scanned / max(blocks, 1), 1.0))
         if key == EDGES:
             edges.append(row_times_s(key, block))
             return
         if key in watches:
             watches[key].add(block.index, block.values)
 
-    recording.look_through(watch)
+    recording.scan(watch)
     times_s = np.unique(np.concatenate(edges)) if edges else np.empty(0)
     spin_hz = 1.0 / float(np.median(np.diff(times_s))) if len(times_s) > 2 else 0.0
     channels = [health for one in watches.values() for health in one.results(spin_hz)]

@@ -16,7 +16,7 @@ import numpy as np
 from recorder.contents import documents
 from recorder.contents.inventory import OnBlock, Stream, Survey
 from recorder.contents.recording_file import Message, RecordingFile
-from recorder.contents.samples import row_times_s, samples_of
+from recorder.contents.samples import build_samples, row_times_s
 from recorder.files import schemas
 from recorder.files.chunks import Chunk
 from rig.base.errors import InputError, UnknownNameError, Words
@@ -69,9 +69,9 @@ class Recording:
         self.parameters, self.scene = first.parameters, first.scene
         self._surveys, self.in_part = surveys, False
         self.true = False
-        """True if the effects of faults on blocks are reversed; see `truly`."""
+        """True if the effects of faults on blocks are reversed; see `with_true_blocks`."""
         self.applies_faults = True
-        """True if the fault documents are applied; see `untold`."""
+        """True if the fault documents are applied; see `without_faults`."""
 
     @classmethod
     def open(cls, path: Path | str, *, salvage: bool = False) -> Self:
@@ -124,8 +124,8 @@ class Recording:
     @property
     def commands(self) -> list[dict[str, Any]]:
         """Commands received by the rig, including those before the recording: id, tick, command, request."""
-        told = [*self.scene.get("taken", []), *(event for event in self.events if event.get("event") == "command")]
-        found = {one["id"]: {name: one[name] for name in ("id", "tick", "command", "request")} for one in told}
+        declared = [*self.scene.get("taken", []), *(event for event in self.events if event.get("event") == "command")]
+        found = {one["id"]: {name: one[name] for name in ("id", "tick", "command", "request")} for one in declared}
         return [found[number] for number in sorted(found)]
 
     @cached_property
@@ -165,14 +165,14 @@ class Recording:
     @property
     def short(self) -> tuple[str, ...]:
         """Rows that the files state and do not contain, one line per stream."""
-        return self._said(lambda survey: survey.short)
+        return self._collect_remarks(lambda survey: survey.short)
 
     @property
     def doubts(self) -> tuple[str, ...]:
         """Contradictions in files whose checksums are all valid, one line each."""
-        return self._said(lambda survey: survey.doubts)
+        return self._collect_remarks(lambda survey: survey.doubts)
 
-    def look_through(self, on_block: OnBlock | None = None) -> None:
+    def scan(self, on_block: OnBlock | None = None) -> None:
         """Scan all files; `streams`, `short` and `doubts` then need no further pass.
 
         Args:
@@ -183,17 +183,17 @@ class Recording:
         """
         self._surveys = tuple(Survey(part, on_block, applies_faults=self.applies_faults) for part in self.parts)
 
-    def forget(self) -> None:
+    def clear_surveys(self) -> None:
         """Discard the result of the scan; the next access scans the files again."""
         self._surveys = ()
         self.__dict__.pop("streams", None)
 
     def _surveyed(self) -> tuple[Survey, ...]:
         if not self._surveys:
-            self.look_through()
+            self.scan()
         return self._surveys
 
-    def _said(self, what: Callable[[Survey], tuple[str, ...]]) -> tuple[str, ...]:
+    def _collect_remarks(self, what: Callable[[Survey], tuple[str, ...]]) -> tuple[str, ...]:
         """Return lines about each file, prefixed by its name if there are several."""
         if self.in_part:
             return ()
@@ -226,7 +226,7 @@ class Recording:
 
     def _group(self, name: str) -> Samples:
         group = self.table.groups[name]
-        found = samples_of(
+        found = build_samples(
             self.blocks(sensor_key(name)),
             name=name,
             names=group.names,
@@ -251,7 +251,7 @@ class Recording:
         if table not in tables:
             raise UnknownNameError("truth", "one of the recording's tables", table, tables)
         columns = tables[table]["columns"]
-        return samples_of(
+        return build_samples(
             self.blocks(truth_key(table)),
             name=table,
             names=tuple(column["name"] for column in columns),
@@ -278,15 +278,15 @@ class Recording:
         return sort_blocks(found) if self.true else found
 
     def _blocks_as_sent(self, keys: set[str]) -> Iterator[tuple[str, Block]]:
-        told = Declared() if self.true else None
+        declared = Declared() if self.true else None
         for part in self.parts:
-            for key, _, _, payload in part.stamped(keys if told is None else {*keys, FAULTS}):
-                if told is not None and key == FAULTS:
-                    told.declare(documents.document_in(key, payload) or {})
+            for key, _, _, payload in part.stamped(keys if declared is None else {*keys, FAULTS}):
+                if declared is not None and key == FAULTS:
+                    declared.declare(documents.parse_document(key, payload) or {})
                 elif (block := part.block(key, payload)) is not None:
-                    yield key, block if told is None else told.true(key, block)
+                    yield key, block if declared is None else declared.true(key, block)
 
-    def truly(self) -> Self:
+    def with_true_blocks(self) -> Self:
         """Return the recording with reported block faults reversed: each block once, in order, at its own time."""
         found = copy(self)
         found.true = FAULTS in self.messages
@@ -303,11 +303,11 @@ class Recording:
         found.true, found.applies_faults, found.in_part = self.true, self.applies_faults, True
         return found
 
-    def untold(self) -> Self:
+    def without_faults(self) -> Self:
         """Return the recording with its fault documents ignored; only `doubts` and `streams` differ."""
         found = copy(self)
         found.applies_faults = False
-        found.forget()
+        found.clear_surveys()
         return found
 
     def everything(self, topics: Container[str] | None = None) -> Iterator[Message]:
@@ -339,10 +339,10 @@ class Recording:
         """Yield simulated time [ns] and document of each valid message of a topic."""
         kept_bytes = 0
         for time_ns, payload in self.payloads(topic):
-            document = documents.document_in(topic, payload)
+            document = documents.parse_document(topic, payload)
             if document is not None:
                 if topic in (EVENTS, schemas.GAPS):
-                    kept_bytes = documents.check_kept(kept_bytes + len(payload), topic, self.path)
+                    kept_bytes = documents.check_total_size(kept_bytes + len(payload), topic, self.path)
                 yield time_ns, document
 
 
@@ -378,11 +378,11 @@ def join(paths: list[Path], *, in_part: bool = False) -> Recording:
 
 def _check_one_run(parts: list[RecordingFile]) -> None:
     for part in parts[1:]:
-        if _run_of(part) != _run_of(parts[0]):
+        if _get_run_key(part) != _get_run_key(parts[0]):
             raise InputError("files", "recordings of one run", Words(f"{parts[0].path} and {part.path}"))
 
 
-def _run_of(part: RecordingFile) -> tuple[Any, ...]:
+def _get_run_key(part: RecordingFile) -> tuple[Any, ...]:
     scene = {name: value for name, value in part.scene.items() if name not in ("taken", "forgotten")}
     return scene, part.parameters, part.catalogue
 

@@ -22,7 +22,7 @@ from recorder.contents import documents
 from recorder.contents.counts import Counts
 from recorder.contents.metadata import Beginning, Commands
 from recorder.files import schemas
-from recorder.files.payload import Payload, tick_in
+from recorder.files.payload import Payload, get_tick
 from recorder.files.records import COPY
 from recorder.files.unfinished_file import check_destination
 from recorder.reader import Recording
@@ -80,7 +80,7 @@ def is_whole(source: Path, *, on_progress: Callable[[float], None] | None = None
             if not recording.complete:
                 return False
             step = _progress(recording, on_progress)
-            recording.look_through(lambda key, block: step())
+            recording.scan(lambda key, block: step())
             return not recording.short
         except InputError:
             return False
@@ -195,7 +195,7 @@ def cut(
     from_tick, to_tick = (at_s if math.isinf(at_s) else float(round(at_s * tick_rate_hz)) for at_s in (from_s, to_s))
     commands = Commands(recording.scene)
     for event in recording.events:
-        tick = tick_in(event)
+        tick = get_tick(event)
         if tick is not None and tick < from_tick:
             commands.follow(event)
 

@@ -205,8 +205,8 @@ class RecordingSession:
             NoReplyError: No rig replies.
             InputError: The file cannot be created.
         """
-        asked = (wire.CATALOGUE, wire.PARAMETERS, wire.SCENE)
-        catalogue, parameters, scene = (wire.decode_document(self._client.request(key)) for key in asked)
+        keys = (wire.CATALOGUE, wire.PARAMETERS, wire.SCENE)
+        catalogue, parameters, scene = (wire.decode_document(self._client.request(key)) for key in keys)
         streams = Catalogue.read(catalogue)
         self._rig_id = self._client.rig
         writer = self._open_sink(streams, catalogue, parameters, scene)
@@ -275,7 +275,7 @@ class RecordingSession:
 
     def _offer(self, taken: list[AcceptedBlock]) -> None:
         for each in taken if not self._replaced else ():
-            self._inbox.offer(Payload.of(each))
+            self._inbox.offer(Payload.from_block(each))
 
     def _take(self, key: str, payload: bytes, wall_ns: int) -> None:
         """Process a block on the thread of its stream."""
@@ -388,7 +388,7 @@ class RecordingSession:
         # The end event can overtake blocks that are being recovered and documents about refused blocks, so wait
         # longer while a stream is incomplete.
         due = self.waiting or self._validator.refused or self._end_rows is None
-        complete = not due and not writer.tally.short_of(self._end_rows or {})
+        complete = not due and not writer.tally.find_missing_rows(self._end_rows or {})
         if complete and self._last_status and writer.tally.next.keys() >= (self._end_rows or {}).keys():
             return True
         quiet_s = now_s - max(ended_s, self._last_block_s)
@@ -397,7 +397,7 @@ class RecordingSession:
     def _report(self, writer: Sink, *, done: bool = False) -> None:
         groups = list(self._table.groups)
         first = wire.sensor_key("probes" if "probes" in groups or not groups else groups[0])
-        lost = writer.counts().really_lost
+        lost = writer.counts().undeclared_lost
         self._reporter.send(writer.tally.next.get(first, 0), lost=lost, done=done)
 
     def _progress(self, writer: Sink) -> Progress:
@@ -405,7 +405,7 @@ class RecordingSession:
         return Progress(
             time_s=0.0 if counts.first_time_ns is None else (counts.last_time_ns - counts.first_time_ns) / NS,
             rows=sum(rows for key, rows in counts.rows.items() if key.startswith(wire.SENSORS + "/")),
-            lost=counts.really_lost,
+            lost=counts.undeclared_lost,
             size_bytes=counts.size_bytes,
             waiting=self.waiting,
             backlog_bytes=self._inbox.used,
@@ -424,7 +424,7 @@ class RecordingSession:
             for each in (
                 self._validator.take_waiting(self._end_rows) if not self._replaced and self._failure is None else ()
             ):
-                payload = Payload.of(each)
+                payload = Payload.from_block(each)
                 if self._extent.takes(payload):
                     writer.take(payload)
             if reason == self._end_reason and self._end_rows:

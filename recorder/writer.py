@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any, Self
 
 from recorder.contents.counts import NS, Counts, Tally
-from recorder.contents.documents import definition_of
-from recorder.contents.metadata import Beginning, Head, about_view, instant
+from recorder.contents.documents import get_definition
+from recorder.contents.metadata import Beginning, Head, describe_view, instant
 from recorder.contents.views import Messages, View, Views
 from recorder.files import schemas
 from recorder.files.mcap_file import McapFile
@@ -95,14 +95,14 @@ class RecordingWriter:
         self._monotonic_s = monotonic_s
         self._synced_s = monotonic_s()
         self._draft = Draft(path, force=force)
-        self._begun = False
+        self._has_begun = False
         with self._guard():
             self.file = McapFile(self._draft)
             self._topics = _Topics(self.file, self.head, self.tally, view_rate_hz=view_rate_hz, wall_ns=wall_ns)
             self._topics.begin(beginning)
             self.sync()
             self._draft.sync_folder()
-            self._begun = True
+            self._has_begun = True
 
     def __enter__(self) -> Self:
         return self
@@ -208,7 +208,7 @@ class RecordingWriter:
             self.closed = True
             self._draft.close()
             kept = f"the earlier data are kept in {self.part}; `rig recover` finishes the file"
-            if not self._begun:
+            if not self._has_begun:
                 # A file without its calibration is useless.
                 self._draft.discard()
                 kept = f"{self.part} could not be started"
@@ -244,7 +244,7 @@ class _Topics:
         for key in (*self._head.streams, EDGES, EVENTS, schemas.GAPS, schemas.CLOCK):
             self._register(key)
         for view in self._views.all:
-            about = about_view(view, self._view_rate_hz)
+            about = describe_view(view, self._view_rate_hz)
             self._file.register(view.topic, schemas.JOINT_STATE, about)
         if self._view_rate_hz:
             self._file.register(schemas.VIEW_EVENTS, schemas.LOG, {"source": EVENTS})
@@ -303,7 +303,7 @@ class _Topics:
     def _register(self, key: str) -> None:
         """Register the topic of a key, with its calibration, at its first payload."""
         if key not in self._file:
-            self._file.register(key, definition_of(key), self._head.about(key))
+            self._file.register(key, get_definition(key), self._head.about(key))
 
     def _add_clock(self, payload: Payload, time_ns: int) -> None:
         """Write a pair of simulated and wall time, twice per second."""

@@ -15,7 +15,7 @@ from typing import Any
 from recorder.contents.metadata import Head
 from recorder.contents.recording_file import RecordingFile
 from recorder.files import schemas
-from recorder.files.payload import tick_in
+from recorder.files.payload import get_tick
 from rig.base.errors import InputError
 from rig.base.text import printable
 from rig.base.wire import EDGES, EVENTS, SENSORS, STATUS, TRUTH, Gap
@@ -67,7 +67,7 @@ class ConsistencyCheck:
             time_ns: Simulated time of the message [ns].
             document: Decoded document.
         """
-        tick, time_s = tick_in(document), document.get("time_s")
+        tick, time_s = get_tick(document), document.get("time_s")
         if tick is not None:
             told_s = time_s if isinstance(time_s, float | int) else tick / self._ticks_hz
             self.check_time(key, time_ns, tick, off_s=abs(tick / self._ticks_hz - told_s))
@@ -119,13 +119,13 @@ class ConsistencyCheck:
 
     def _state(self, what: str, **places: Any) -> None:
         """Add the value of a quantity at one or more places; None means that the place does not state it."""
-        said = self._values.setdefault(what, {})
+        by_place = self._values.setdefault(what, {})
         for where, value in places.items():
             if value is None:
                 continue
-            if where in said and said[where] != value:
+            if where in by_place and by_place[where] != value:
                 where = f"{where} again"
-            said.setdefault(where, value)
+            by_place.setdefault(where, value)
 
     def _report(self, text: str) -> None:
         self._findings[text] = None
@@ -165,7 +165,7 @@ class ConsistencyCheck:
                 if name in about and name != "formula":
                     self._state(f"{name} of {topic}", **{_CATALOGUE: value, "its topic": about[name]})
         text = self._file.attachments.get("README.txt", b"").decode(errors="replace")
-        if not head.explained_by(text):
+        if not head.has_text(text):
             self._report("README.txt differs from catalogue.json")
 
     def _check_table(self) -> None:
@@ -200,13 +200,15 @@ class ConsistencyCheck:
         end, metadata = self._file.metadata.get("end", {}), self._file.metadata
         if not self._file.complete or not end:
             return
-        check_time = [one for key, one in streams.items() if key != EDGES]
-        if check_time:
-            here = min(one.start_s for one in streams.values()), max(one.last_time_s for one in check_time)
-            for which, time_s in zip(("first", "last"), here, strict=True):
-                said = _to_float(end.get(f"{which}_time_s"))
-                if said is not None and abs(said - time_s) > 2e-6:
-                    self._report(f"{which} row: at {said:.6f} s in metadata end but at {time_s:.6f} s in the streams")
+        clocked = [one for key, one in streams.items() if key != EDGES]
+        if clocked:
+            span_s = min(one.start_s for one in streams.values()), max(one.last_time_s for one in clocked)
+            for which, time_s in zip(("first", "last"), span_s, strict=True):
+                stated_s = _to_float(end.get(f"{which}_time_s"))
+                if stated_s is not None and abs(stated_s - time_s) > 2e-6:
+                    self._report(
+                        f"{which} row: at {stated_s:.6f} s in metadata end but at {time_s:.6f} s in the streams"
+                    )
         rows = [gap for gap in self._gap_records if gap.get("kind") == "rows"]
         lost: dict[str, int] = {}
         for gap in rows:
@@ -301,34 +303,40 @@ class ConsistencyCheck:
     def _check_effects(self, streams: Mapping[str, Any]) -> None:
         """Check that each command took effect as sent, and that each effect has a command or a scene entry."""
         expected: dict[tuple[str, int], list[tuple[str, Any]]] = {}
-        for check_time in self._scene.get("commands") or ():
-            tick = round(check_time["at_s"] * self._ticks_hz)
-            expected.setdefault((check_time["request"]["command"], tick), []).append((_SCENE, check_time["request"]))
+        for timed in self._scene.get("commands") or ():
+            tick = round(timed["at_s"] * self._ticks_hz)
+            expected.setdefault((timed["request"]["command"], tick), []).append((_SCENE, timed["request"]))
         sources = [("scene.json, taken", one) for one in self._file.scene.get("taken", ())]
         sources += [(EVENTS, event) for event in self._events if event["event"] == "command"]
         accepted: dict[Any, dict[str, Any]] = {}
-        for where, one in sources:
-            about = f"command {one.get('id')}"
+        for source, command in sources:
+            about = f"command {command.get('id')}"
             for name in ("command", "tick", "request"):
-                self._state(f"{about}: {name}", **{where: one.get(name)})
-            accepted.setdefault(one.get("id"), one)
-        for number, one in accepted.items():
-            expected.setdefault((one["command"], one["tick"]), []).append(("its command", one["request"]))
-            if one["command"] in SERVICE_COMMANDS:
+                self._state(f"{about}: {name}", **{source: command.get(name)})
+            accepted.setdefault(command.get("id"), command)
+        for number, command in accepted.items():
+            expected.setdefault((command["command"], command["tick"]), []).append(("its command", command["request"]))
+            if command["command"] in SERVICE_COMMANDS:
                 continue
             try:
-                check_command(one["command"], one["request"])
+                check_command(command["command"], command["request"])
             except InputError as error:
                 self._report(f"command {number} is not valid: {error}")
-        effective = [(one["event"], one["tick"], one) for one in self._events if isinstance(one.get("tick"), int)]
+        effective = [
+            (event["event"], event["tick"], event) for event in self._events if isinstance(event.get("tick"), int)
+        ]
         effects = {at[:2]: at[2] for at in effective}
         # A fault with a duration clears itself, even if it began before this file.
-        begun = [(*at, request) for at, causes in expected.items() for _, request in causes if at not in effects]
-        for name, tick, one in [*begun, *effective]:
-            if name == "fault" and isinstance(one.get("for_s"), float | int) and 0.0 < one["for_s"] <= MAX_FAULT_S:
-                over = tick + max(1, round(one["for_s"] * self._ticks_hz))
-                known = {"id": one["fault"]} if "fault" in one else None
-                expected.setdefault(("clear", over), []).append(("its end", known))
+        pending = [(*at, request) for at, causes in expected.items() for _, request in causes if at not in effects]
+        for name, tick, fields in [*pending, *effective]:
+            if (
+                name == "fault"
+                and isinstance(fields.get("for_s"), float | int)
+                and 0.0 < fields["for_s"] <= MAX_FAULT_S
+            ):
+                end_tick = tick + max(1, round(fields["for_s"] * self._ticks_hz))
+                clear = {"id": fields["fault"]} if "fault" in fields else None
+                expected.setdefault(("clear", end_tick), []).append(("its end", clear))
         for (name, tick), event in effects.items():
             if name not in COMMANDS or not self._scene:
                 continue

@@ -40,7 +40,7 @@ class Counts:
     declared: dict[str, int] = field(default_factory=dict)
 
     @property
-    def really_lost(self) -> int:
+    def undeclared_lost(self) -> int:
         """Number of rows lost without a fault that explains the loss."""
         return sum(max(0, lost - self.declared.get(key, 0)) for key, lost in self.lost.items())
 
@@ -136,11 +136,11 @@ class Tally:
             self.last_time_ns = max(self.last_time_ns, end_ns)
         return gap
 
-    def miss(self, key: str, messages: int) -> None:
+    def count_missed(self, key: str, messages: int) -> None:
         """Count messages that the transport dropped."""
         self.missed[key] = self.missed.get(key, 0) + messages
 
-    def short_of(self, rows: dict[str, int]) -> dict[str, int]:
+    def find_missing_rows(self, rows: dict[str, int]) -> dict[str, int]:
         """Return the streams that received fewer rows than the rig published.
 
         Args:
@@ -153,8 +153,8 @@ class Tally:
         return {key: end for key, end in rows.items() if due.get(key, end) < end}
 
     def end(self, rows: dict[str, int]) -> list[Gap]:
-        """Count the rows missing at the end of each stream as gaps and return the gaps; see `short_of`."""
-        found = [self._continuity.follow(key, end, 0) for key, end in self.short_of(rows).items()]
+        """Count the rows missing at the end of each stream as gaps and return the gaps; see `find_missing_rows`."""
+        found = [self._continuity.follow(key, end, 0) for key, end in self.find_missing_rows(rows).items()]
         gaps = [gap for gap in found if gap is not None]
         self.gaps += len(gaps)
         return gaps

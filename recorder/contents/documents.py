@@ -243,13 +243,13 @@ METADATA: dict[str, type[BaseModel]] = {"rig": Rig, "end": End, "series": Series
 ATTACHED: dict[str, type[BaseModel]] = {"catalogue": Catalogue, "parameters": Parameters, "scene": Scene}
 
 
-def definition_of(key: str) -> schemas.Definition:
+def get_definition(key: str) -> schemas.Definition:
     """Return the message definition of a key's topic."""
     schema = get_schema(key)
     return schemas.TEXT if schema is None else schemas.BLOCKS[schema]
 
 
-def holds_documents(topic: str) -> bool:
+def has_documents(topic: str) -> bool:
     """Return whether a topic of a recording holds JSON documents, not blocks or plottable messages."""
     return get_schema(topic) is None and not topic.startswith(schemas.VIEW + "/")
 
@@ -270,7 +270,7 @@ def read(model: type[Model], payload: bytes, *, field: str) -> tuple[dict[str, A
         raise input_error(error, field, model) from None
 
 
-def document_in(topic: str, payload: bytes) -> dict[str, Any] | None:
+def parse_document(topic: str, payload: bytes) -> dict[str, Any] | None:
     """Return the document in a message of one of the topics in `KINDS`; None if it is invalid."""
     try:
         document, found = read(KINDS[topic], payload, field=topic)
@@ -281,7 +281,7 @@ def document_in(topic: str, payload: bytes) -> dict[str, Any] | None:
     return document
 
 
-def check_kept(kept_bytes: int, topic: str, path: Path) -> int:
+def check_total_size(kept_bytes: int, topic: str, path: Path) -> int:
     """Return the size of the documents of one kind, or refuse a recording that exceeds the memory limit [bytes].
 
     Raises:

@@ -33,15 +33,15 @@ class Stream:
         rows: Number of rows.
         lost: Number of rows missing between blocks, counted from the row numbers.
         declared: Rows among the lost that the rig reported as removed by a fault.
-        around: Declared losses outside the recorded rows: [first row number, number of rows] each.
+        gap_rows: Declared losses outside the recorded rows: [first row number, number of rows] each.
         first_time_s: Simulated time of the first row [s].
         last_time_s: Simulated time of the last row [s].
         start_s: Simulated time of the first block's tick [s]; edges lie after it.
         first: Number of the first row.
         due: Number of the row after the last one.
         invalid: Number of payloads that are not valid blocks or do not fit the catalogue.
-        back: Number of blocks that begin before the expected row.
-        off: Number of blocks whose rate differs from the catalogue's.
+        stepped_back: Number of blocks that begin before the expected row.
+        wrong_rate: Number of blocks whose rate differs from the catalogue's.
         misplaced: Number of blocks whose time does not fit their row number, or whose edges are not in ascending order.
         missing: Number of rows stated by the file or published by the rig that are not in the file.
     """
@@ -55,28 +55,38 @@ class Stream:
     first: int = 0
     due: int = 0
     invalid: int = 0
-    back: int = 0
-    off: int = 0
+    stepped_back: int = 0
+    wrong_rate: int = 0
     misplaced: int = 0
     missing: int = 0
     declared: int = 0
-    around: list[list[int]] = field(default_factory=list)
+    gap_rows: list[list[int]] = field(default_factory=list)
 
-    def then(self, later: Stream) -> Stream:
+    def extend(self, later: Stream) -> Stream:
         """Return this stream extended by its continuation in a later file."""
         sums = {
             name: getattr(self, name) + getattr(later, name)
-            for name in ("messages", "rows", "lost", "invalid", "back", "off", "misplaced", "missing", "declared")
+            for name in (
+                "messages",
+                "rows",
+                "lost",
+                "invalid",
+                "stepped_back",
+                "wrong_rate",
+                "misplaced",
+                "missing",
+                "declared",
+            )
         }
         if not (self.rows and later.rows):
-            return replace(self if self.rows else later, **sums, around=[*self.around, *later.around])
+            return replace(self if self.rows else later, **sums, gap_rows=[*self.gap_rows, *later.gap_rows])
         sums["lost"] += max(0, later.first - self.due)
         reached = self.due
-        for row, rows in sorted([*self.around, *later.around]):
+        for row, rows in sorted([*self.gap_rows, *later.gap_rows]):
             end = min(row + rows, later.first)
             sums["declared"] += max(0, end - max(row, reached))
             reached = max(reached, end)
-        return replace(self, **sums, last_time_s=later.last_time_s, due=later.due, around=later.around)
+        return replace(self, **sums, last_time_s=later.last_time_s, due=later.due, gap_rows=later.gap_rows)
 
 
 class Survey:
@@ -129,10 +139,10 @@ class Survey:
         for key, stream in self.streams.items():
             if stream.invalid:
                 found.append(f"payloads of {key} that are not blocks or do not fit the catalogue: {stream.invalid}")
-            if stream.back:
-                found.append(f"blocks of {key} with repeated or decreasing row numbers: {stream.back}")
-            if stream.off:
-                found.append(f"blocks of {key} whose rate differs from the catalogue: {stream.off}")
+            if stream.stepped_back:
+                found.append(f"blocks of {key} with repeated or decreasing row numbers: {stream.stepped_back}")
+            if stream.wrong_rate:
+                found.append(f"blocks of {key} whose rate differs from the catalogue: {stream.wrong_rate}")
             if stream.misplaced:
                 wrong = (
                     "edges that are not in ascending order"
@@ -164,17 +174,17 @@ class Survey:
         if block is None:
             stream.invalid += 1
             return None
-        here, block = block, self._continuity.true(key, block)
-        gap = self._continuity.take(key, here)
+        true_block, block = block, self._continuity.true(key, block)
+        gap = self._continuity.take(key, true_block)
         self._consistency.check_time(key, time_ns, block.tick)
         if not stream.messages or (gap is None and block.index < stream.first):
             stream.first, stream.start_s = block.index, block.tick / block.tick_rate_hz
         if gap is not None:
             self._steps.setdefault(key, []).append(gap)
         stream.messages += 1
-        stream.back += gap is not None and gap.size < 0
+        stream.stepped_back += gap is not None and gap.size < 0
         if stream_format is not None and stream_format.rate_hz:
-            stream.off += abs(block.rate_hz / stream_format.rate_hz - 1.0) > _RATE_TOLERANCE
+            stream.wrong_rate += abs(block.rate_hz / stream_format.rate_hz - 1.0) > _RATE_TOLERANCE
         if key != EDGES:
             start_s, index = self._first_blocks.setdefault(key, (block.start_s, block.index))
             offset_s = block.start_s - start_s - (block.index - index) / block.rate_hz
@@ -188,13 +198,13 @@ class Survey:
             stream.last_time_s = max(stream.last_time_s, last_s)
             stream.first_time_s = stream.first_time_s if stream.rows else first_s
             stream.rows += len(block.values)
-        return here
+        return true_block
 
     def _add_document(self, key: str, time_ns: int, payload: bytes) -> None:
         """Read row counts and faults published by the rig, and the gaps noted by the recorder."""
         if key not in documents.KINDS:
             return
-        if (document := documents.document_in(key, payload)) is None:
+        if (document := documents.parse_document(key, payload)) is None:
             self._malformed[key] = self._malformed.get(key, 0) + 1
             return
         if key == FAULTS:
@@ -203,7 +213,7 @@ class Survey:
             self._continuity.declare(document)
         self._consistency.add_document(key, time_ns, document)
         if key == schemas.GAPS:
-            self._noted_bytes = documents.check_kept(self._noted_bytes + len(payload), key, self.file.path)
+            self._noted_bytes = documents.check_total_size(self._noted_bytes + len(payload), key, self.file.path)
             if document["index"] >= 0:
                 self._noted_ends.add((document["key"], document["index"] + document["size"]))
         elif key == EVENTS and document["event"] in ("start", "end"):
@@ -213,13 +223,15 @@ class Survey:
         """Compare the counted rows with those stated by the file and published by the rig."""
         stated, continuity = self.file.stated_rows, self._continuity
         # A cut or triggered recording is complete without the end of the run.
-        whole = not {"trigger", "cut"} & set(self.file.metadata)
+        is_complete = not {"trigger", "cut"} & set(self.file.metadata)
         for key in {*self.streams, *continuity.faulty} | {key for key, rows in stated.items() if rows}:
             stream = self.streams.setdefault(key, Stream())
             stream.rows, stream.lost = continuity.received.get(key, 0), continuity.lost.get(key, 0)
-            stream.declared, stream.around = continuity.declared.get(key, 0), continuity.around(key)
+            stream.declared, stream.gap_rows = continuity.declared.get(key, 0), continuity.around(key)
             stream.due = continuity.next.get(key, 0)
             end = self._published_rows.get(key, stream.due)
-            short = end - stream.due if whole and key in continuity.next and (key, end) not in self._noted_ends else 0
+            short = (
+                end - stream.due if is_complete and key in continuity.next and (key, end) not in self._noted_ends else 0
+            )
             stream.missing = max(0, stated.get(key, stream.rows) - stream.rows, short)
         self.streams = dict(sorted(self.streams.items()))

@@ -127,7 +127,7 @@ class Head:
         for name, document in documents.items():
             yield name, "application/json", json.dumps(document, indent=1, allow_nan=False).encode()
 
-    def explained_by(self, text: str) -> bool:
+    def has_text(self, text: str) -> bool:
         """Return whether README.txt fits these documents; a text of another version always does."""
         return not text.startswith(_README) or text == self._readme()
 
@@ -166,7 +166,7 @@ class Head:
         return "\n".join(lines) + "\n"
 
 
-def about_view(view: View, rate_hz: float) -> dict[str, str]:
+def describe_view(view: View, rate_hz: float) -> dict[str, str]:
     """Return the metadata of a topic of plot messages."""
     return {
         "sources": json.dumps([sensor_key(group) for group in view.groups]),

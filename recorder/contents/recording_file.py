@@ -15,7 +15,7 @@ from mcap.exceptions import McapError
 from recorder.contents import documents
 from recorder.files import schemas
 from recorder.files.chunks import Chunk, DamagedError, messages, unpack
-from recorder.files.payload import block_in
+from recorder.files.payload import parse_block
 from recorder.files.records import COPY, MAGIC, read_contents
 from rig.base.checks import build_read_error, open_file, read_json
 from rig.base.errors import InputError, Words
@@ -170,7 +170,7 @@ class RecordingFile:
     def block(self, key: str, payload: bytes) -> Block | None:
         """Return the block in a payload; None if it is invalid or does not fit the catalogue."""
         try:
-            block = block_in(key, payload)
+            block = parse_block(key, payload)
         except ValueError:
             return None
         columns = block.values.shape[1]
@@ -190,7 +190,7 @@ class RecordingFile:
         wanted = {number: topic for number, topic in self._topics.items() if topics is None or topic in topics}
         if not wanted:
             return
-        texts = {topic for topic in wanted.values() if documents.holds_documents(topic)}
+        texts = {topic for topic in wanted.values() if documents.has_documents(topic)}
         with self._open() as file:
             for chunk in self.chunks if chunks is None else chunks:
                 here = self._topics_in(chunk, wanted)

@@ -10,7 +10,7 @@ from rig.base.samples import Samples
 from rig.base.wire import EDGES, Block
 
 
-def samples_of(
+def build_samples(
     blocks: Iterable[Block], *, name: str, names: tuple[str, ...], units: tuple[str, ...], rate_hz: float
 ) -> Samples:
     """Return the rows of blocks in their order, values unconverted.

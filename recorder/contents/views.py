@@ -28,7 +28,7 @@ History is delivered key by key, so this exceeds the size of a rig's cache. Each
 """
 
 
-def slot_of(channel: Channel) -> str:
+def get_slot(channel: Channel) -> str:
     """Return the message array for a channel, by its unit."""
     if channel.unit in _LENGTHS:
         return "position"
@@ -73,11 +73,11 @@ class View:
         """Return whether a group fits this topic: equal rate, and no second unit in any array."""
         units = {slot: channel.unit for slot, channel in zip(self.slots, self.channels, strict=True)}
         same = all(channel.rate_hz == group.rate_hz for channel in self.channels)
-        return same and all(units.get(slot_of(channel), channel.unit) == channel.unit for channel in group.channels)
+        return same and all(units.get(get_slot(channel), channel.unit) == channel.unit for channel in group.channels)
 
     def join(self, group: Group) -> None:
         """Append a group's channels."""
-        first, slots = len(self.channels), [slot_of(channel) for channel in group.channels]
+        first, slots = len(self.channels), [get_slot(channel) for channel in group.channels]
         # Adjacent columns of the same array are copied together.
         self._column_map[group.name] = []
         start = 0

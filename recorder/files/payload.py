@@ -41,14 +41,14 @@ class Payload:
         """Decode a payload; a malformed one has neither block nor document."""
         block = None
         with contextlib.suppress(ValueError):
-            block = None if get_schema(key) is None else block_in(key, data)
+            block = None if get_schema(key) is None else parse_block(key, data)
         return cls(key, data, wall_ns, block)
 
     @classmethod
-    def of(cls, taken: AcceptedBlock) -> Self:
-        """Return the payload of a block decoded by the intake; an invalid block makes it malformed."""
-        block = taken.block if _is_sound(taken.key, taken.block) else None
-        return cls(taken.key, taken.payload, taken.wall_ns, block)
+    def from_block(cls, accepted: AcceptedBlock) -> Self:
+        """Return the payload of a block decoded by the validator; an invalid block makes it malformed."""
+        block = accepted.block if _is_sound(accepted.key, accepted.block) else None
+        return cls(accepted.key, accepted.payload, accepted.wall_ns, block)
 
     @cached_property
     def document(self) -> dict[str, Any] | None:
@@ -66,14 +66,14 @@ class Payload:
     @property
     def tick(self) -> int | None:
         """Tick in the payload; None if it has none."""
-        return tick_in(self.document) if self.block is None else self.block.tick
+        return get_tick(self.document) if self.block is None else self.block.tick
 
     def event(self, name: str) -> bool:
         """Return whether the payload is an event of a name."""
         return self.key == EVENTS and self.document is not None and self.document.get("event") == name
 
 
-def block_in(key: str, payload: bytes) -> Block:
+def parse_block(key: str, payload: bytes) -> Block:
     """Return the block in a payload.
 
     Args:
@@ -96,7 +96,7 @@ def _is_sound(key: str, block: Block) -> bool:
     return block.rate_hz > 0.0
 
 
-def tick_in(document: dict[str, Any] | None) -> int | None:
+def get_tick(document: dict[str, Any] | None) -> int | None:
     """Return the tick in a document; None if it has none."""
     tick = document.get("tick") if document is not None else None
     return tick if isinstance(tick, int) and not isinstance(tick, bool) and abs(tick) <= _MAX_EXACT_TICK else None

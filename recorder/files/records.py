@@ -218,7 +218,7 @@ def _checksum(file: BinaryIO, end: int) -> int:
     """Return the CRC-32 of a file up to a position."""
     file.seek(0)
     checksum = 0
-    while (left := end - file.tell()) > 0 and (data := file.read(min(READ_BYTES, left))):
+    while (remaining := end - file.tell()) > 0 and (data := file.read(min(READ_BYTES, remaining))):
         checksum = zlib.crc32(data, checksum)
     return checksum
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from rig.base.errors import PART_SUFFIX, InputError, Words, check_new_file
 
 
-def part_of(path: Path) -> Path:
+def get_part_path(path: Path) -> Path:
     """Return the name of a recording in progress."""
     return path.with_name(path.name + PART_SUFFIX)
 
@@ -31,11 +31,11 @@ def check_destination(path: Path, *, force: bool = False) -> None:
         InputError: The name does not end in .mcap, the folder is missing or read-only, or the file exists.
     """
     check_new_file(path, field="output", suffixes=(".mcap",), force=force)
-    if (part := part_of(path)).exists() and not force:
+    if (part := get_part_path(path)).exists() and not force:
         raise InputError("output", "a new file (--force replaces one)", Words(f"{part}, which exists"))
 
 
-def files_like(path: Path, what: str) -> list[Path]:
+def find_files(path: Path, what: str) -> list[Path]:
     """Return the files named NAME.WHAT.mcap in the folder of NAME.mcap, finished or not.
 
     Args:
@@ -90,7 +90,7 @@ class Draft:
         import fcntl
 
         check_destination(path, force=force)
-        self.path, self.part = path, part_of(path)
+        self.path, self.part = path, get_part_path(path)
         self._force = force
         try:
             if force and self.part.exists():
@@ -146,13 +146,13 @@ class Draft:
         self.part.replace(self.path)
 
     def _save(self) -> None:
-        gone = self.part
-        folder = next(folder for folder in gone.absolute().parents if folder.is_dir())
+        part_path = self.part
+        folder = next(folder for folder in part_path.absolute().parents if folder.is_dir())
         with contextlib.suppress(OSError):
-            self.part = folder / gone.name
+            self.part = folder / part_path.name
             with self.part.open("xb") as copy:
                 position = 0
                 while data := os.pread(self.file.fileno(), 1 << 20, position):
                     copy.write(data)
                     position += len(data)
-        raise OSError(errno.ENOENT, f"{gone} was removed while it was being written")
+        raise OSError(errno.ENOENT, f"{part_path} was removed while it was being written")

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 from recorder.contents.counts import NS
 from recorder.contents.metadata import Beginning, Commands
 from recorder.files.payload import Payload
-from recorder.files.unfinished_file import files_like, remove
+from recorder.files.unfinished_file import find_files, remove
 from recorder.output.disk_limits import Limits, check_files
 from recorder.output.sink import Needs, Sink
 from recorder.output.trigger import Capture, Crossings, Trigger
@@ -91,7 +91,7 @@ class Captures(Sink):
         check_captures(path, capture, needs.limits, force=needs.force)
         self._crossings = {each: Crossings(each, needs.table) for each in capture.triggers if each.level is not None}
         if needs.force:
-            remove(files_like(path, _NUMBERED))
+            remove(find_files(path, _NUMBERED))
         super().__init__(path, needs)
         self.fired = 0
         self._capture = capture
@@ -147,8 +147,8 @@ class Captures(Sink):
         if self.ended:
             return
         writer.take(payload)
-        if why := self._room.lack_after(len(payload.data), writer):
-            self._end(why)
+        if reason := self._room.find_shortage_after(len(payload.data), writer):
+            self._end(reason)
 
     def _fired_by(self, payload: Payload, start_ns: int) -> list[tuple[Trigger, int, bool]]:
         """Return the triggers of a payload, their simulated times [ns], and whether each may start a capture."""
@@ -175,7 +175,7 @@ class Captures(Sink):
         writing.count += 1
         if len(writing.fired) < _MAX_LISTED_TRIGGERS:
             writing.fired.append(about)
-        if self._capture.extends(trigger):
+        if self._capture.is_extended_by(trigger):
             end_ns = max(writing.end_ns, time_ns + self._post_ns)
             writing.full = writing.full or end_ns > writing.latest_end_ns
             writing.end_ns = min(end_ns, writing.latest_end_ns)
@@ -186,8 +186,8 @@ class Captures(Sink):
             self._close_capture(self._open)
         if self.ended:
             return
-        if why := self._room.lack():
-            self._end(why)
+        if reason := self._room.find_shortage():
+            self._end(reason)
             return
         self._number += 1
         start_ns = max(0, time_ns - self._pre_ns)
@@ -196,8 +196,8 @@ class Captures(Sink):
             "time_s": f"{time_ns / NS:.9f}",
             "pre_s": f"{self._capture.pre_s:g}",
             "post_s": f"{self._capture.post_s:g}",
-            "again": "extend" if self._capture.extends(trigger) else "ignore",
-            "longest_s": f"{self._capture.most_s:g}",
+            "again": "extend" if self._capture.is_extended_by(trigger) else "ignore",
+            "longest_s": f"{self._capture.max_length_s:g}",
             "number": str(self._number),
         }
         path = capture_path(self.path, trigger, self._number)
@@ -205,20 +205,20 @@ class Captures(Sink):
             writer = self._needs.open_file(path, self._scene_before(start_ns), Beginning(metadata={"trigger": entries}))
         except InputError as error:
             raise RecordingError(f"recording stopped: {error}; the captures before it are kept") from None
-        latest_end_ns = time_ns - self._pre_ns + round(self._capture.most_s * NS)
+        latest_end_ns = time_ns - self._pre_ns + round(self._capture.max_length_s * NS)
         self._writer = writer
         self._open = _OpenCapture(writer, time_ns + self._post_ns, latest_end_ns, [about])
-        for held in self._ring:
-            inside = held.end_ns >= start_ns and held.start_ns <= self._open.end_ns
-            if inside or held.payload.key == FAULTS:  # may concern blocks of the capture
-                self._write(writer, held.payload)
+        for entry in self._ring:
+            inside = entry.end_ns >= start_ns and entry.start_ns <= self._open.end_ns
+            if inside or entry.payload.key == FAULTS:  # may concern blocks of the capture
+                self._write(writer, entry.payload)
 
     def _scene_before(self, start_ns: int) -> dict[str, Any]:
         """Return the scene with the commands sent before the start of a file."""
         commands = Commands(self._commands.scene)
-        for held in self._ring:
-            if held.payload.key == EVENTS and held.end_ns < start_ns:
-                commands.follow(held.payload.document)
+        for entry in self._ring:
+            if entry.payload.key == EVENTS and entry.end_ns < start_ns:
+                commands.follow(entry.payload.document)
         return commands.scene
 
     def _close_if_over(self) -> None:
@@ -231,7 +231,7 @@ class Captures(Sink):
 
     def _close_capture(self, writing: _OpenCapture, reason: str = "", notes: dict[str, str] | None = None) -> None:
         """Close a capture; without a reason, because it is complete."""
-        full = f", up to its longest length of {self._capture.most_s:g} s" if writing.full else ""
+        full = f", up to its longest length of {self._capture.max_length_s:g} s" if writing.full else ""
         self._open = None
         fired = {"triggers": json.dumps(writing.fired), "trigger_count": str(writing.count)}
         self._close(writing.writer, reason or f"captured{full}", {**(notes or {}), **fired})

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from recorder.files.unfinished_file import check_destination, files_like
+from recorder.files.unfinished_file import check_destination, find_files
 from recorder.writer import RecordingWriter
 from rig.base.errors import InputError, Words
 
@@ -68,7 +68,7 @@ def check_files(path: Path, first: Iterable[Path], others: str, limits: Limits, 
     Args:
         path: Name of the recording.
         first: Possible names of the first file.
-        others: Regular expression for the numbered files (`files_like`); empty if there are none.
+        others: Regular expression for the numbered files (`find_files`); empty if there are none.
         limits: Limits of the disk space.
         force: Allow replacing existing files.
 
@@ -77,13 +77,13 @@ def check_files(path: Path, first: Iterable[Path], others: str, limits: Limits, 
     """
     for name in first:
         check_destination(name, force=force)
-    if others and not force and (taken := files_like(path, others)):
+    if others and not force and (taken := find_files(path, others)):
         raise InputError("output", "new files (--force replaces them)", Words(f"{taken[0]}, which exists"))
-    if why := _lack_of_room(path.parent, limits.keep_free_mb):
-        raise InputError("output", f"on a disk with room: {why} (--keep-free-mb)", str(path))
+    if reason := _find_disk_shortage(path.parent, limits.keep_free_mb):
+        raise InputError("output", f"on a disk with room: {reason} (--keep-free-mb)", str(path))
 
 
-def _lack_of_room(folder: Path, keep_free_mb: float, *, index_bytes: int = 0) -> str:
+def _find_disk_shortage(folder: Path, keep_free_mb: float, *, index_bytes: int = 0) -> str:
     """Return why the disk has too little space; empty if it has enough.
 
     The end of the file needs space even with `keep_free_mb` of 0.
@@ -119,13 +119,13 @@ class Room:
         self._checked_s = -1e9
         self._unchecked_bytes = 0
 
-    def lack_after(self, payload_bytes: int, writer: RecordingWriter) -> str:
-        """Return the result of `lack` after a payload of a size; checks the disk only at intervals."""
+    def find_shortage_after(self, payload_bytes: int, writer: RecordingWriter) -> str:
+        """Return the result of `find_shortage` after a payload of a size; checks the disk only at intervals."""
         self._unchecked_bytes += payload_bytes
         due = self._unchecked_bytes >= MB // 2 or self._monotonic_s() - self._checked_s >= _CHECK_S
-        return self.lack(writer) if self._over_budget(writer) or due else ""
+        return self.find_shortage(writer) if self._over_budget(writer) or due else ""
 
-    def lack(self, writer: RecordingWriter | None = None) -> str:
+    def find_shortage(self, writer: RecordingWriter | None = None) -> str:
         """Return why there is no more space; empty if there is enough.
 
         Args:
@@ -139,7 +139,7 @@ class Room:
             if self._over_budget(writer):
                 return f"the budget of {self._limits.budget_mb:g} MB is used up"
         index_bytes = 0 if writer is None else writer.file.index_bytes
-        return _lack_of_room(self._folder, self._limits.keep_free_mb, index_bytes=index_bytes)
+        return _find_disk_shortage(self._folder, self._limits.keep_free_mb, index_bytes=index_bytes)
 
     def _over_budget(self, writer: RecordingWriter | None) -> bool:
         if self._limits.budget_mb is None:

@@ -16,7 +16,7 @@ from pathlib import Path
 from recorder.contents.counts import NS, Counts
 from recorder.contents.metadata import Beginning
 from recorder.files.payload import Payload
-from recorder.files.unfinished_file import files_like, remove
+from recorder.files.unfinished_file import find_files, remove
 from recorder.output.disk_limits import MB, Limits, check_files
 from recorder.output.sink import Needs, Sink
 from recorder.writer import RecordingError, RecordingWriter
@@ -69,7 +69,7 @@ class Series(Sink):
         """Latest fault documents."""
         self._series = f"{path.stem} {time.time_ns():x}"
         if needs.force and rotates:
-            remove(files_like(path, _NUMBER))
+            remove(find_files(path, _NUMBER))
         self._file = self._writer = self._open(part_path(path, 0) if rotates else path, from_start=from_start)
         self._expected = set(self._file.head.streams)
 
@@ -149,7 +149,7 @@ class Series(Sink):
             self._file.take(fault)
 
     def _make_room(self, payload_bytes: int) -> None:
-        reason = self._room.lack_after(payload_bytes, self._file)
+        reason = self._room.find_shortage_after(payload_bytes, self._file)
         while reason:
             if self._limits.when_full == "stop" or not self.files:
                 self._end(reason)
@@ -163,4 +163,4 @@ class Series(Sink):
             self._room.finished_bytes -= self._sizes.pop(0)
             self._kept.pop(0)
             self.removed += 1
-            reason = self._room.lack(self._file)
+            reason = self._room.find_shortage(self._file)

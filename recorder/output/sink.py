@@ -128,6 +128,6 @@ class Sink(ABC):
         self._kept.append(counts)
         self._writer = None
 
-    def _end(self, why: str) -> None:
+    def _end(self, reason: str) -> None:
         """End the recording because the disk space is used up."""
-        self.ended, self.out_of_room = why, True
+        self.ended, self.out_of_room = reason, True

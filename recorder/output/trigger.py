@@ -68,12 +68,12 @@ class Trigger:
             raise InputError("trigger", must, text)
         return cls(text=text, name=match[2], level=level, above=match[4] == ">", magnitude=bool(match[1]))
 
-    def crossed(self, values: np.ndarray) -> np.ndarray:
+    def is_beyond(self, values: np.ndarray) -> np.ndarray:
         """Return which values are beyond the level, shape (n,)."""
         values = np.abs(values) if self.magnitude else values
         return values > self.level if self.above else values < self.level
 
-    def already(self, unit: str) -> str:
+    def describe_initial_state(self, unit: str) -> str:
         """Return the message for a first value beyond the level, in a unit."""
         name = f"|{self.name}|" if self.magnitude else self.name
         side, other = ("above", "below") if self.above else ("below", "above")
@@ -117,11 +117,11 @@ class Capture:
             raise InputError("longest_s", f"at least pre_s and post_s, {least_s:g}, at most 1e6", self.longest_s)
 
     @property
-    def most_s(self) -> float:
+    def max_length_s(self) -> float:
         """Effective maximum length of a capture [s of simulated time]."""
         return max(LONGEST_S, self.pre_s + self.post_s) if self.longest_s is None else self.longest_s
 
-    def extends(self, trigger: Trigger) -> bool:
+    def is_extended_by(self, trigger: Trigger) -> bool:
         """Return whether a trigger extends a capture in progress."""
         return trigger.level is None if self.again is None else self.again == "extend"
 
@@ -166,22 +166,22 @@ class Crossings:
         if not len(block.values) or block.values.shape[1] != self._columns:
             return []
         channel = self._channel
-        beyond = self._trigger.crossed(block.values[:, self._column] * channel.scale + channel.offset)
+        beyond = self._trigger.is_beyond(block.values[:, self._column] * channel.scale + channel.offset)
         # A signal that is beyond the level from the first row on has not crossed it.
         if self._beyond is None and beyond[0]:
-            self.remark = self._trigger.already(channel.unit)
-        before = np.concatenate(([self._beyond is not False], beyond[:-1]))
+            self.remark = self._trigger.describe_initial_state(channel.unit)
+        was_beyond = np.concatenate(([self._beyond is not False], beyond[:-1]))
         self._beyond = bool(beyond[-1])
         beyond_rows = np.flatnonzero(beyond)
         if not len(beyond_rows):
             return []
         row_ns = NS / block.rate_hz
-        crossings = np.flatnonzero(beyond & ~before)
+        crossings = np.flatnonzero(beyond & ~was_beyond)
         # Time without a value beyond the level, before each crossing.
         positions = np.searchsorted(beyond_rows, crossings)
-        before_ns = np.where(positions > 0, beyond_rows[positions - 1] * row_ns, self._beyond_ns - begin_ns)
-        is_new = crossings * row_ns - before_ns >= REARM_S * NS
+        previous_ns = np.where(positions > 0, beyond_rows[positions - 1] * row_ns, self._beyond_ns - begin_ns)
+        is_new = crossings * row_ns - previous_ns >= REARM_S * NS
         self._beyond_ns = begin_ns + round(int(beyond_rows[-1]) * row_ns)
         # Report the crossing that may start a capture, or else the first, and the last, which may extend it.
         reported = dict.fromkeys((int(np.argmax(is_new)), len(crossings) - 1)) if len(crossings) else ()
-        return [(begin_ns + round(int(crossings[which]) * row_ns), bool(is_new[which])) for which in reported]
+        return [(begin_ns + round(int(crossings[number]) * row_ns), bool(is_new[number])) for number in reported]

@@ -147,7 +147,7 @@ def _curve_views(table: ChannelTable, geometry: Geometry, *, live: bool) -> dict
         "Hammer [N]": [f"{series.ROOT}/hammer/hammer"],
     }
     limits = {f"{series.ROOT}/probes/{plane}": 1.15 * geometry.clearance_mm(plane) for plane in orbit.PLANES}
-    known = series.paths_of(table)
+    known = series.get_paths(table)
     planned = {path for paths in plots.values() for path in paths}
     views = {
         title: _curve_view(title, [path for path in paths if path in known], limit=limits.get(paths[0]), live=live)

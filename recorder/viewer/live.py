@@ -64,7 +64,7 @@ class Described:
         return self.catalogue.table
 
 
-def ask(client: Client) -> Described:
+def request_document(client: Client) -> Described:
     """Request the description of a rig.
 
     Args:
@@ -155,12 +155,14 @@ class LiveView:
         """Number of sensor rows lost; the viewer does not request lost data again."""
         return sum(rows for key, rows in self._continuity.lost.items() if key in self._groups)
 
-    def run(self, *, stop: Callable[[], bool] = lambda: False, tell: Callable[[str], None] = lambda text: None) -> str:
+    def run(
+        self, *, stop: Callable[[], bool] = lambda: False, on_message: Callable[[str], None] = lambda text: None
+    ) -> str:
         """Draw until the rig ends or disappears, or until `stop` returns True.
 
         Args:
             stop: Polled in each cycle.
-            tell: Receives a progress message every second.
+            on_message: Receives a progress message every second.
 
         Returns:
             The reason for the end, in one line.
@@ -172,18 +174,18 @@ class LiveView:
         self._client.subscribe(wire.EVENTS, self.take, history=True)
         self._client.watch(wire.ALIVE, self._watch)
         try:
-            return self._draw_until_end(stop, tell)
+            return self._draw_until_end(stop, on_message)
         finally:
             self._report(done=True)
 
-    def _draw_until_end(self, stop: Callable[[], bool], tell: Callable[[str], None]) -> str:
+    def _draw_until_end(self, stop: Callable[[], bool], on_message: Callable[[str], None]) -> str:
         received_s, heartbeat_s, check_s = time.monotonic(), 0.0, 0.0
         while True:
             now_s = time.monotonic()
             if self.take_in():
                 received_s = now_s
             if self._pace is not None and self._taken is not None:
-                self._pace.taken_in(self._taken(), now_s=now_s)
+                self._pace.record_displayed(self._taken(), now_s=now_s)
             if self._pace is None or self._pace.due(now_s):
                 self._draw(now_s)
             elif now_s - self._folded_s >= CURVE_INTERVAL_S:
@@ -192,7 +194,7 @@ class LiveView:
             if now_s - check_s >= _CHECK_INTERVAL_S:
                 self._check_canvas()
                 if self._pace is not None:
-                    self._tell_pace(self._pace, now_s, tell)
+                    self._report_pace(self._pace, now_s, on_message)
                 check_s = now_s
             if now_s - heartbeat_s >= _HEARTBEAT_INTERVAL_S:
                 self._report()
@@ -244,7 +246,7 @@ class LiveView:
             return
         if self._pace is not None:
             self._canvas.picture += 1
-            self._pace.drew(self._canvas.picture, now_s=now_s)
+            self._pace.record_drawn(self._canvas.picture, now_s=now_s)
         for name in self._groups.values():
             self._painter.frame(name)
         if now_s - self._curves_s >= CURVE_INTERVAL_S - 1e-6:
@@ -257,15 +259,15 @@ class LiveView:
             self._painter.note(self._painter.now_s, text, level="WARN")
             self._missing = {}
 
-    def _tell_pace(self, pace: Pace, now_s: float, tell: Callable[[str], None]) -> None:
+    def _report_pace(self, pace: Pace, now_s: float, on_message: Callable[[str], None]) -> None:
         """Report the viewer's delay and the thinning; if they changed, also in the event log."""
         every_s, behind_s = max(pace.every_s, pace.interval_s), pace.behind_s(now_s)
-        state = "viewer loading" if pace.looked_at else "no viewer open"
+        state = "viewer loading" if pace.is_viewed else "no viewer open"
         if behind_s is not None:
             state = f"viewer late by {behind_s:.1f} s"
         points = min(ROWS_PER_S, MAX_POINTS / max(every_s, CURVE_INTERVAL_S))
         rates = f"{1 / every_s:.1f} of {1 / MIN_INTERVAL_S:.0f} pictures/s, {points:.0f} of {ROWS_PER_S:.0f} points/s"
-        tell(f"{state}, {rates}; {self.waits_s:.2f} s here")
+        on_message(f"{state}, {rates}; {self.waits_s:.2f} s here")
         changed = not 0.4 < every_s / self._noted_every_s < 2.5
         if changed and behind_s is not None and now_s - self._noted_s >= _NOTE_INTERVAL_S:
             self._noted_s, self._noted_every_s = now_s, every_s

@@ -41,8 +41,8 @@ class Pace:
         self._drawn_s = -math.inf
         self._changed_s = -math.inf
         self._delay_s = 0.0
-        self._shown_s: float | None = None  # time of the latest picture that the viewer has
-        self.looked_at = False
+        self._displayed_s: float | None = None  # time of the latest picture that the viewer has
+        self.is_viewed = False
         """True if a viewer is open, including one that is still loading."""
 
     def due(self, now_s: float) -> bool:
@@ -52,27 +52,27 @@ class Pace:
             return False
         if not self._pending or since_s >= MAX_WAIT_S:
             return True
-        return self._shown_s is not None and now_s - self._pending[0][1] < SLOW_PROCESSING_S
+        return self._displayed_s is not None and now_s - self._pending[0][1] < SLOW_PROCESSING_S
 
-    def drew(self, picture: int, *, now_s: float) -> None:
+    def record_drawn(self, picture: int, *, now_s: float) -> None:
         """Register a drawn picture."""
         self.interval_s, self._drawn_s = min(now_s - self._drawn_s, MAX_WAIT_S), now_s
         self._pending.append((picture, now_s))
 
-    def taken_in(self, picture: int | None, *, now_s: float) -> None:
+    def record_displayed(self, picture: int | None, *, now_s: float) -> None:
         """Register that the slowest viewer has all pictures up to a number; None if no viewer is open."""
         if picture is None:
             self._pending.clear()
-            self.looked_at, self.every_s, self._shown_s = False, MAX_WAIT_S, None
+            self.is_viewed, self.every_s, self._displayed_s = False, MAX_WAIT_S, None
             return
-        if not self.looked_at:
-            self.looked_at, self.every_s = True, FIRST_INTERVAL_S
+        if not self.is_viewed:
+            self.is_viewed, self.every_s = True, FIRST_INTERVAL_S
         drawn_s = None
         while self._pending and self._pending[0][0] <= picture:
             drawn_s = self._pending.popleft()[1]
         if drawn_s is None:
             return
-        self._shown_s, self._delay_s = drawn_s, now_s - drawn_s
+        self._displayed_s, self._delay_s = drawn_s, now_s - drawn_s
         if drawn_s < self._changed_s:
             return  # drawn before the last change of pace
         if self._delay_s > max(SLOW_PROCESSING_S, 1.5 * self.every_s):
@@ -85,6 +85,6 @@ class Pace:
 
     def behind_s(self, now_s: float) -> float | None:
         """Return the age of the displayed picture [s]; None if nothing is displayed."""
-        if self._shown_s is None:
+        if self._displayed_s is None:
             return None
-        return now_s - self._shown_s if self._pending else self._delay_s
+        return now_s - self._displayed_s if self._pending else self._delay_s

@@ -17,7 +17,7 @@ from recorder.viewer.drawings.geometry import Geometry
 from recorder.viewer.drawings.marks import Marks
 from recorder.viewer.drawings.orbit import OrbitPlot
 from recorder.viewer.drawings.scene3d import Scene3D
-from recorder.viewer.drawings.series import REACTIONS, SeriesPlot, Span, reaction_of
+from recorder.viewer.drawings.series import REACTIONS, SeriesPlot, Span, find_reaction
 from recorder.viewer.drawings.spectrum import SpectrumPlot
 from rig.channels.table import ChannelTable, Group
 
@@ -50,7 +50,7 @@ class _Plane:
         return (values[:, self.x] + 1j * values[:, self.y]) * self.millimetres
 
 
-def planes_of(group: Group) -> list[_Plane]:
+def find_group_planes(group: Group) -> list[_Plane]:
     """Return the measuring planes of a group, in the order of `orbit.PLANES`."""
     return [
         _Plane(
@@ -64,15 +64,15 @@ def planes_of(group: Group) -> list[_Plane]:
     ]
 
 
-def planes_in(table: ChannelTable) -> set[str]:
+def find_table_planes(table: ChannelTable) -> set[str]:
     """Return the names of the measuring planes in a channel table."""
-    return {plane.name for group in table.groups.values() for plane in planes_of(group)}
+    return {plane.name for group in table.groups.values() for plane in find_group_planes(group)}
 
 
-def not_drawn(table: ChannelTable) -> list[str]:
+def list_missing_views(table: ChannelTable) -> list[str]:
     """Return the drawings that a channel table, such as that of an imported log, does not support, with reasons."""
     missing = []
-    if not planes_in(table):
+    if not find_table_planes(table):
         pairs = " or ".join(f"{plane}_x and {plane}_y" for plane in orbit.PLANES)
         missing.append(f"orbit, spectrum, contact (no channels {pairs})")
     if not any(set(group.names) >= REACTIONS for group in table.groups.values()):
@@ -124,13 +124,13 @@ class Painter:
         }
         self._scene = Scene3D(canvas, geometry)
         self._parts = {
-            name: _parts_of(group, canvas, self._scene, geometry, whole=whole, frame_s=frame_s)
+            name: _build_parts(group, canvas, self._scene, geometry, whole=whole, frame_s=frame_s)
             for name, group in table.groups.items()
         }
         self._groups = table.groups
         self._marks = Marks(canvas)
         self._truth = ContactPlot(canvas, path=contact.TRUTH, touch=Touch(enter=1e-9, leave=1e-9))
-        if geometry.assumed and planes_in(table):
+        if geometry.assumed and find_table_planes(table):
             names = ", ".join(geometry.assumed)
             self.note(0.0, f"the stream does not state {names}: drawn with default values", level="WARN")
 
@@ -147,8 +147,10 @@ class Painter:
     @property
     def last_contact_s(self) -> float | None:
         """Last instant of contact sensed by the probes [s]; None without contact."""
-        seen = [part.last_contact_s for parts in self._parts.values() for part in parts if isinstance(part, _Probes)]
-        return max((time for time in seen if time is not None), default=None)
+        contact_times = [
+            part.last_contact_s for parts in self._parts.values() for part in parts if isinstance(part, _Probes)
+        ]
+        return max((time for time in contact_times if time is not None), default=None)
 
     def add(self, name: str, times_s: np.ndarray, values: np.ndarray) -> None:
         """Add consecutive rows of a group.
@@ -363,14 +365,14 @@ class _Spin(_Part):
         self._scene.draw_spin(time_s, self._turned_rad)
 
 
-def _parts_of(
+def _build_parts(
     group: Group, canvas: Canvas, scene: Scene3D, geometry: Geometry, *, whole: bool, frame_s: float
 ) -> list[_Part]:
     parts: list[_Part] = []
-    if planes := planes_of(group):
+    if planes := find_group_planes(group):
         parts.append(_Probes(canvas, scene, group, planes, geometry, whole=whole, frame_s=frame_s))
     if set(group.names) >= REACTIONS:
-        parts.append(_Reaction(scene, reaction_of(group)))
+        parts.append(_Reaction(scene, find_reaction(group)))
     if "speed" in group.names:
         parts.append(_Spin(scene, group))
     return parts

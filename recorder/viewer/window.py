@@ -93,7 +93,7 @@ class Window(Closing):
         *,
         size: tuple[int, int] = (1920, 1080),
         live: bool = False,
-        tell: Callable[[str], None] = lambda text: None,
+        on_message: Callable[[str], None] = lambda text: None,
     ) -> None:
         """Start the viewer and wait until it listens.
 
@@ -101,7 +101,7 @@ class Window(Closing):
             kind: Window, browser page or headless.
             size: Size of the picture [pixels].
             live: Whether the stream has no end, so that only little history is kept.
-            tell: Receives a message if something takes long.
+            on_message: Receives a message if something takes long.
 
         Raises:
             WindowError: The viewer ended at once, or does not listen in time.
@@ -109,7 +109,7 @@ class Window(Closing):
         memory = "512MiB" if live else "2GiB"
         # A browser opened later first processes everything that the server has kept.
         history = "1MiB" if live else memory
-        self._tell = tell
+        self._on_message = on_message
         self._taken: int | None = None
         self.page: Page | None = None
         port, web_port, own_port = free_port(_PORT), free_port(_WEB_PORT), free_port(0)
@@ -172,9 +172,9 @@ class Window(Closing):
             self._process.wait(timeout_s)
         return not self.open
 
-    def taken(self) -> int | None:
+    def saved_count(self) -> int | None:
         """Return the number of the latest picture processed by the viewer or the slowest browser; None without one."""
-        return self._taken if self.page is None else self.page.taken()
+        return self._taken if self.page is None else self.page.saved_count()
 
     def _watch(self) -> None:
         """Poll the progress of a viewer on the screen; it replies with its next frame."""
@@ -253,7 +253,7 @@ class Window(Closing):
             if report.passed:
                 report = Deadline(_MESSAGE_INTERVAL_S)
                 waited_s = timeout_s - deadline.left_s
-                self._tell(f"waiting for the viewer for {waited_s:.0f} s, at most {timeout_s:.0f} s")
+                self._on_message(f"waiting for the viewer for {waited_s:.0f} s, at most {timeout_s:.0f} s")
             yield
 
 
@@ -263,14 +263,14 @@ def _end_of(timeline: str, state: ViewerState) -> int:
     return max((line.end or 0 for line in lines), default=0)
 
 
-def picture_of(path: Path, *, tell: Callable[[str], None], size: tuple[int, int]) -> Window:
-    """Start a viewer that draws a picture of a size [px]; `tell` receives a text if something takes long.
+def open_headless(path: Path, *, on_message: Callable[[str], None], size: tuple[int, int]) -> Window:
+    """Start a viewer that draws a picture of a size [px]; `on_message` receives a text if something takes long.
 
     Raises:
         InputError: This machine cannot draw.
     """
     try:
-        return Window("headless", tell=tell, size=size)
+        return Window("headless", on_message=on_message, size=size)
     except WindowError as error:
         must = "used where a Vulkan driver is installed (Debian: libvulkan1 mesa-vulkan-drivers)"
         raise InputError("--screenshot", must, Words(f"{path}; {error}")) from None

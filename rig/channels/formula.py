@@ -153,9 +153,7 @@ class Formulas(Grammar):
             distance = of[0](np.zeros((1, len(COLUMN)))) if callable(of[0]) else of[0]
             arm_m = float(np.ravel(distance)[0])
             if not abs(arm_m) <= _MAX_REACH * arm:  # probably millimetres
-                raise InputError(
-                    field, f"{name} of a distance from the pivot within {_MAX_REACH * arm:.3g} m", arm_m
-                )
+                raise InputError(field, f"{name} of a distance from the pivot within {_MAX_REACH * arm:.3g} m", arm_m)
             return apply(np.multiply, apply(np.divide, of[0], arm), lambda rows: rows[:, column])
         if name in self._curves:
             return apply(_interpolate(self._curves[name]), apply(np.degrees, of[0]))

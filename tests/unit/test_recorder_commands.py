@@ -70,7 +70,7 @@ def test_quick_info_reads_no_samples(path, capsys, monkeypatch):
         raise AssertionError("samples were read")
 
     monkeypatch.setattr(Recording, "blocks_of", fail)
-    monkeypatch.setattr(Recording, "look_through", fail)
+    monkeypatch.setattr(Recording, "scan", fail)
     monkeypatch.setattr(Recording, "streams", property(fail))
     assert run("info", "--quick", path) == 0
     assert "rig/sensors/probes 60" in " ".join(capsys.readouterr().out.split())

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from recorder.contents.documents import holds_documents
+from recorder.contents.documents import has_documents
 from recorder.files.schemas import unwrap_text
 from recorder.reader import Recording
 from recorder.writer import RecordingWriter
@@ -176,7 +176,7 @@ def _chunks(path: Path) -> list[tuple[int, dict[str, list[bytes]]]]:
             for record in breakup_chunk(Chunk.read(ReadDataStream(file))):
                 if isinstance(record, Message):
                     topic = summary.channels[record.channel_id].topic
-                    data = unwrap_text(record.data) if holds_documents(topic) else record.data
+                    data = unwrap_text(record.data) if has_documents(topic) else record.data
                     payloads.setdefault(topic, []).append(data)
             chunks.append((index.chunk_start_offset + index.chunk_length, payloads))
     return chunks

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from recorder.contents.documents import document_in
+from recorder.contents.documents import parse_document
 from recorder.contents.metadata import Beginning
 from recorder.contents.views import Views
 from recorder.files import schemas
@@ -525,4 +525,4 @@ def test_a_document_is_wrapped_as_a_ros2_string_and_unwrapped_byte_for_byte(text
 def test_a_damaged_string_message_is_no_document(spoil):
     data = spoil(schemas.wrap_text(b'{"event": "end"}'))
     assert schemas.unwrap_text(data) == data
-    assert document_in(EVENTS, data) is None
+    assert parse_document(EVENTS, data) is None

@@ -12,8 +12,8 @@ from recorder.viewer.drawings import orbit, spectrum
 from recorder.viewer.drawings.contact import Touch, resolution_mm
 from recorder.viewer.drawings.geometry import Geometry
 from recorder.viewer.drawings.history import History
-from recorder.viewer.drawings.series import Envelope, paths_of, reaction_of, series_of
-from recorder.viewer.drawings.whirl import whirl_of
+from recorder.viewer.drawings.series import Envelope, build_curves, find_reaction, get_paths
+from recorder.viewer.drawings.whirl import compute_whirl
 from rig.channels.table import default_table
 
 RATE_HZ = 20_000
@@ -25,7 +25,7 @@ def whirling(frequency_hz: float, radius_mm: float, *, seconds: float = 0.5) -> 
 
 @pytest.mark.parametrize(("frequency_hz", "sense"), [(-83.0, "backward"), (83.0, "forward"), (6.2, "forward")])
 def test_whirl_has_the_sign_of_its_rotation(frequency_hz: float, sense: str) -> None:
-    whirl = whirl_of(whirling(frequency_hz, 0.926), RATE_HZ)
+    whirl = compute_whirl(whirling(frequency_hz, 0.926), RATE_HZ)
     assert whirl.sense == sense
     # Half a second is not a multiple of the period at 6.2 Hz: its mean is not exactly its centre.
     assert whirl.frequency_hz == pytest.approx(frequency_hz, rel=5e-2 if abs(frequency_hz) < 10 else 2e-3)
@@ -35,7 +35,7 @@ def test_whirl_is_about_its_own_centre_and_noise_does_not_slow_it() -> None:
     rng = np.random.default_rng(1)
     noise = rng.standard_normal((2, RATE_HZ // 2)) * 1.3e-4
     z = 0.4 - 0.3j + whirling(-83.0, 0.01) + noise[0] + 1j * noise[1]
-    whirl = whirl_of(z, RATE_HZ)
+    whirl = compute_whirl(z, RATE_HZ)
     assert whirl.frequency_hz == pytest.approx(-83.0, rel=2e-2)
     assert whirl.radius_mm == pytest.approx(0.01, rel=2e-2)
 
@@ -43,8 +43,8 @@ def test_whirl_is_about_its_own_centre_and_noise_does_not_slow_it() -> None:
 def test_noise_alone_is_no_whirl() -> None:
     rng = np.random.default_rng(2)
     z = 1e-4 * (rng.standard_normal(RATE_HZ) + 1j * rng.standard_normal(RATE_HZ))
-    assert whirl_of(z, RATE_HZ).sense == "none"
-    assert orbit.reading_of(whirl_of(z, RATE_HZ))[0] == "no whirl"
+    assert compute_whirl(z, RATE_HZ).sense == "none"
+    assert orbit.format_reading(compute_whirl(z, RATE_HZ))[0] == "no whirl"
 
 
 def test_screen_coordinates_flip_y_and_keep_the_sense() -> None:
@@ -57,9 +57,9 @@ def test_screen_coordinates_flip_y_and_keep_the_sense() -> None:
 
 
 def test_orbit_shows_a_few_turns_within_a_time_limit() -> None:
-    fast, slow = whirl_of(whirling(-83.0, 0.9), RATE_HZ), whirl_of(whirling(2.0, 0.9), RATE_HZ)
-    assert 2.0 <= orbit.shown_s(fast) * 83.0 <= 6.0
-    assert orbit.shown_s(slow) < 0.5
+    fast, slow = compute_whirl(whirling(-83.0, 0.9), RATE_HZ), compute_whirl(whirling(2.0, 0.9), RATE_HZ)
+    assert 2.0 <= orbit.get_display_span_s(fast) * 83.0 <= 6.0
+    assert orbit.get_display_span_s(slow) < 0.5
 
 
 @pytest.mark.parametrize("frequency_hz", [-83.0, 83.0, 6.0])
@@ -143,10 +143,10 @@ def test_envelope_does_not_depend_on_the_blocks(chunk: int) -> None:
 
 def test_curves_carry_the_names_and_units_of_the_channel_table() -> None:
     table = default_table()
-    labels = [label for group in table.groups.values() for series in series_of(group) for label in series.labels]
+    labels = [label for group in table.groups.values() for series in build_curves(group) for label in series.labels]
     for channel in table.channels.values():
         assert (f"{channel.name} [{channel.unit}]" in labels) == (channel.name != "keyphasor")
-    assert len(set(paths_of(table))) == len(paths_of(table))
+    assert len(set(get_paths(table))) == len(get_paths(table))
 
 
 def test_reaction_is_the_difference_of_the_opposed_pair() -> None:
@@ -154,7 +154,7 @@ def test_reaction_is_the_difference_of_the_opposed_pair() -> None:
     values = np.zeros((1, 4))
     for name, value in {"P_N": 10.0, "P_S": 4.0, "P_E": 1.0, "P_W": 8.0}.items():
         values[0, group.names.index(name)] = value
-    np.testing.assert_array_equal(reaction_of(group)(values), [[-7.0, 6.0]])
+    np.testing.assert_array_equal(find_reaction(group)(values), [[-7.0, 6.0]])
 
 
 def test_contact_has_hysteresis_and_continues_across_blocks() -> None:

@@ -35,10 +35,10 @@ class Viewer:
                     break
                 self.busy_until_s = done_s
                 self.taken, _ = self.waiting.popleft()
-            self.pace.taken_in(self.taken, now_s=self.now_s)
+            self.pace.record_displayed(self.taken, now_s=self.now_s)
             if self.pace.due(self.now_s):
                 self.drawn.append(self.now_s)
-                self.pace.drew(len(self.drawn), now_s=self.now_s)
+                self.pace.record_drawn(len(self.drawn), now_s=self.now_s)
                 self.waiting.append((len(self.drawn), self.now_s))
             if (behind_s := self.pace.behind_s(self.now_s)) is not None:
                 self.behind_s.append(behind_s)
@@ -80,9 +80,9 @@ def test_without_a_viewer_nothing_is_drawn() -> None:
     drawn = 0
     for tick in range(1000):
         now_s = tick * TICK_S
-        pace.taken_in(None, now_s=now_s)
+        pace.record_displayed(None, now_s=now_s)
         if pace.due(now_s):
             drawn += 1
-            pace.drew(drawn, now_s=now_s)
+            pace.record_drawn(drawn, now_s=now_s)
     assert drawn == pytest.approx(1000 * TICK_S / MAX_WAIT_S, abs=1)
-    assert not pace.looked_at
+    assert not pace.is_viewed

@@ -14,7 +14,7 @@ import rerun as rr
 
 from recorder.viewer.canvas import Canvas, Place, pixels
 from recorder.viewer.drawings.history import History
-from recorder.viewer.drawings.whirl import Whirl, whirl_of
+from recorder.viewer.drawings.whirl import Whirl, compute_whirl
 
 ROOT = "/orbit"
 PLANES = ("ring", "disk")
@@ -38,11 +38,11 @@ def screen(z: np.ndarray) -> np.ndarray:
     return np.stack((np.real(z), -np.imag(z)), axis=-1)
 
 
-def _to_places(words: dict[complex, str]) -> dict[Place, str]:
+def _to_points(words: dict[complex, str]) -> dict[Place, str]:
     return {(float(np.real(z)), float(-np.imag(z))): text for z, text in words.items()}
 
 
-def shown_s(whirl: Whirl) -> float:
+def get_display_span_s(whirl: Whirl) -> float:
     """Return the time span of an orbit [s]: a few revolutions of the whirl."""
     if whirl.sense == "none":
         return _MAX_SPAN_S
@@ -78,7 +78,7 @@ class OrbitPlot:
             1.42j * radius: "UP +y",
             1.80j * radius: f"clearance {radius:.3f} mm{at_ring}",
         }
-        self._canvas.write(f"{self._path}/words", _to_places(words), [_TEXT_RGB, _TEXT_RGB, _CLEARANCE_RGB])
+        self._canvas.write(f"{self._path}/words", _to_points(words), [_TEXT_RGB, _TEXT_RGB, _CLEARANCE_RGB])
 
     def add(self, z: np.ndarray) -> None:
         """Add rows of x + j y [mm], shape (n,)."""
@@ -90,8 +90,8 @@ class OrbitPlot:
 
     def draw(self, time_s: float) -> None:
         """Draw the orbit that ends at a time [s], with an arrow in its direction and a text for its sense."""
-        whirl = whirl_of(self._history.last(math.ceil(_WHIRL_SPAN_S * self._rate_hz)), self._rate_hz)
-        z = self._history.last(math.ceil(shown_s(whirl) * self._rate_hz))
+        whirl = compute_whirl(self._history.last(math.ceil(_WHIRL_SPAN_S * self._rate_hz)), self._rate_hz)
+        z = self._history.last(math.ceil(get_display_span_s(whirl) * self._rate_hz))
         if len(z) < 2:
             return
         points = z[np.linspace(0, len(z) - 1, min(len(z), _POINTS)).round().astype(int)]
@@ -109,9 +109,9 @@ class OrbitPlot:
             rr.Points2D(screen(points[-1:]), colors=[(255, 255, 255)], radii=pixels(5.0), draw_order=4.0),
         )
         self._draw_turn(time_s, complex(points[-1] - z.mean()), whirl)
-        first, second = reading_of(whirl)
+        first, second = format_reading(whirl)
         at = -1.16j * self._clearance_mm
-        words = _to_places({at: first, 1.31 * at: second})
+        words = _to_points({at: first, 1.31 * at: second})
         self._canvas.write(f"{self._path}/reading", words, [whirl.color], time_s=time_s)
 
     def _draw_turn(self, time_s: float, position: complex, whirl: Whirl) -> None:
@@ -135,7 +135,7 @@ class OrbitPlot:
         )
 
 
-def reading_of(whirl: Whirl) -> tuple[str, str]:
+def format_reading(whirl: Whirl) -> tuple[str, str]:
     """Return two lines that describe the orbit."""
     if whirl.sense == "none":
         return "no whirl", f"radius {whirl.radius_mm:.3f} mm"

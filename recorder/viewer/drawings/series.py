@@ -52,7 +52,7 @@ class Curves:
     select: Callable[[np.ndarray], np.ndarray]
 
 
-def series_of(group: Group) -> list[Curves]:
+def build_curves(group: Group) -> list[Curves]:
     """Return the curves of a sensor group; channels with the same first part of the name share a plot."""
     planes: dict[str, list[int]] = {}
     for column, channel in enumerate(group.channels):
@@ -62,7 +62,7 @@ def series_of(group: Group) -> list[Curves]:
         Curves(
             path=f"{ROOT}/{group.name}/{plane}",
             labels=tuple(f"{group.channels[column].name} [{group.channels[column].unit}]" for column in columns),
-            colors=tuple(_color_of(group.channels[column].name) for column in columns),
+            colors=tuple(_get_color(group.channels[column].name) for column in columns),
             select=lambda values, columns=columns: values[:, columns],
         )
         for plane, columns in planes.items()
@@ -72,26 +72,26 @@ def series_of(group: Group) -> list[Curves]:
             Curves(
                 path=REACTION,
                 labels=("x: P_E - P_W [N]", "y: P_N - P_S [N]"),
-                colors=(_color_of("x"), _color_of("y")),
-                select=reaction_of(group),
+                colors=(_get_color("x"), _get_color("y")),
+                select=find_reaction(group),
             )
         )
     return found
 
 
-def _color_of(name: str) -> tuple[int, int, int]:
+def _get_color(name: str) -> tuple[int, int, int]:
     """Return the colour of a channel's direction, the same in all plots."""
     red, green, blue = _COLORS.get(name.split("_")[-1], _DEFAULT_RGB)
     shade = _SHADES.get(name.split("_")[0], 1.0)
     return round(shade * red), round(shade * green), round(shade * blue)
 
 
-def paths_of(table: ChannelTable) -> list[str]:
+def get_paths(table: ChannelTable) -> list[str]:
     """Return the entity paths of all curves, in table order."""
-    return [series.path for group in table.groups.values() for series in series_of(group)]
+    return [series.path for group in table.groups.values() for series in build_curves(group)]
 
 
-def reaction_of(group: Group) -> Callable[[np.ndarray], np.ndarray]:
+def find_reaction(group: Group) -> Callable[[np.ndarray], np.ndarray]:
     """Return a function that maps rows of the force group to the reaction [N], shape (n, 2).
 
     Each component is the difference of opposite transducers.
@@ -173,17 +173,17 @@ def _reduce(times_s: np.ndarray, values: np.ndarray, bucket: int, windows: list[
         for start, end in windows:
             full |= (bucket_times[:, -1] >= start) & (bucket_times[:, 0] <= end)
         parts = np.split(np.arange(whole), np.flatnonzero(np.diff(full)) + 1)
-        reduces = [_flat if full[part[0]] or bucket <= 2 else _extremes for part in parts]
+        reduces = [_keep_rows if full[part[0]] or bucket <= 2 else _keep_extremes for part in parts]
         points = [reduce(bucket_times[part], bucket_values[part]) for part, reduce in zip(parts, reduces, strict=True)]
         points.append((times_s[rows:], values[rows:]))
     return _merge(points)
 
 
-def _flat(times: np.ndarray, values: np.ndarray) -> Points:
+def _keep_rows(times: np.ndarray, values: np.ndarray) -> Points:
     return times.reshape(-1), values.reshape(times.size, -1)
 
 
-def _extremes(times: np.ndarray, values: np.ndarray) -> Points:
+def _keep_extremes(times: np.ndarray, values: np.ndarray) -> Points:
     low, high = values.min(axis=1), values.max(axis=1)
     low_first = values.argmin(axis=1) <= values.argmax(axis=1)
     first, second = np.where(low_first, low, high), np.where(low_first, high, low)
@@ -197,7 +197,7 @@ class SeriesPlot:
     def __init__(self, canvas: Canvas, group: Group, *, rows_per_s: float) -> None:
         self._canvas = canvas
         self._rate_hz = group.rate_hz
-        self._series = series_of(group)
+        self._series = build_curves(group)
         self._bucket = max(1, round(2 * group.rate_hz / rows_per_s))
         self._envelopes = [Envelope(bucket=self._bucket) for _ in self._series]
         self.points = 0

@@ -29,7 +29,7 @@ FLOOR_DB, CEILING_DB = 0.0, 62.0
 _MARKS_RGB = (150, 155, 165)
 
 
-def shown_spectrum(z: np.ndarray, rate_hz: int) -> tuple[np.ndarray, np.ndarray]:
+def limit_spectrum(z: np.ndarray, rate_hz: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the amplitude of each circular component of z about its centre, at whole hertz.
 
     See `rig.channels.orbit.full_spectrum`.
@@ -87,7 +87,7 @@ class SpectrumPlot:
         if len(z) < math.ceil(WINDOW_S * self._rate_hz) or time_s - self._drawn_s < 0.9 * self._interval_s:
             return
         self._drawn_s = time_s
-        _, amplitude = shown_spectrum(z, self._rate_hz)
+        _, amplitude = limit_spectrum(z, self._rate_hz)
         bars = amplitude.astype(np.float32)
         self._canvas.draw(BACKWARD, time_s, rr.BarChart(bars[:LIMIT_HZ]))
         self._canvas.draw(FORWARD, time_s, rr.BarChart(bars[LIMIT_HZ + 1 :]))

@@ -41,7 +41,7 @@ class Whirl:
         return {"forward": FORWARD_RGB, "backward": BACKWARD_RGB, "none": STILL_RGB}[self.sense]
 
 
-def whirl_of(z: np.ndarray, rate_hz: float) -> Whirl:
+def compute_whirl(z: np.ndarray, rate_hz: float) -> Whirl:
     """Return the rotation of z about its mean.
 
     Args:

@@ -70,7 +70,7 @@ def validate(
     experiment = Experiment.of(recording)
     if changes:
         experiment = experiment.changed(changes)
-    recording = recording.untold() if blind else recording.truly()
+    recording = recording.without_faults() if blind else recording.with_true_blocks()
     if blind:
         experiment = experiment.without_faults()
     again = _resimulate(recording, experiment, criteria, step)

@@ -206,7 +206,7 @@ def _lost_at_ends(recording: Recording, key: str) -> int:
     gaps = [(gap.index, gap.size) for gap in recording.gaps if gap.key == key and gap.index >= 0 < gap.size]
     lost, taken = (
         sum(rows for row, rows in each if row + rows <= stream.first or row >= stream.due)
-        for each in (gaps, stream.around)
+        for each in (gaps, stream.gap_rows)
     )
     return max(0, lost - taken)
 

@@ -63,7 +63,7 @@ def _recover(file: Path, new: Path, *, force: bool) -> bool:
     with reporting() as report:
         made = recover_file(file, new, force=force, on_progress=lambda done: report.part(done, f"recovering {file}"))
     counts = made.counts
-    lost = counts.really_lost
+    lost = counts.undeclared_lost
     echo(
         f"{new}: {(counts.first_time_ns or 0) / 1e9:.3f} s to {counts.last_time_ns / 1e9:.3f} s, "
         f"{sum(counts.rows.values())} rows, {new.stat().st_size / 1e6:.1f} MB"

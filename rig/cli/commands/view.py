@@ -47,7 +47,7 @@ def view(
     With a display it opens a window; otherwise it serves the viewer on 127.0.0.1 and prints the address.
     """
     _check(files, live=live, web=web, save=save, screenshot=screenshot, at_s=at_s, force=force)
-    _hush()
+    _suppress_logging()
     from recorder.viewer.window import WindowError
 
     try:
@@ -92,11 +92,11 @@ def _view_file(
     from recorder.viewer.canvas import Canvas, new_stream
     from recorder.viewer.drawings.geometry import Geometry
     from recorder.viewer.file import paint
-    from recorder.viewer.painter import not_drawn
+    from recorder.viewer.painter import list_missing_views
 
     recording = join(files)
     name = recording.path.name + (f" and {len(files) - 1} more" if len(files) > 1 else "")
-    for text in not_drawn(recording.table):
+    for text in list_missing_views(recording.table):
         echo(f"not shown: {text}", err=True)
     stream = new_stream(name, batch_s=2.0)
     plan = blueprint.layout(recording.table, Geometry.from_parameters(recording.parameters), live=False, only=only)
@@ -121,7 +121,7 @@ def _view_file(
             shown.picture(screenshot, at_s=at_s, end_s=painted.end_s)
             echo(f"{screenshot}: at {at_s:.3f} s")
         else:
-            _tell(shown, name)
+            _print_address(shown, name)
             _wait_for_the_end(shown)
 
 
@@ -142,17 +142,17 @@ def _view_live(connection: Connection, *, web: bool, save: Path | None, only: st
             return
         with window.Window(_kind(web=web), live=True) as shown:
             _connect(stream, shown, plan)
-            _tell(shown, f"the rig at {connection.connect}")
+            _print_address(shown, f"the rig at {connection.connect}")
             try:
                 view = live.LiveView(client, Canvas(stream), described, taken=shown.taken)
                 with reporting() as reporter:
 
-                    def tell(text: str) -> None:
+                    def report(text: str) -> None:
                         if shown.page is not None:
                             shown.page.title = f"rig: {text}"
                         reporter.show(text, every_s=_PROGRESS_PERIOD_S)
 
-                    reason = view.run(stop=lambda: not shown.open, tell=tell)
+                    reason = view.run(stop=lambda: not shown.open, on_message=report)
                 echo(reason)
             finally:
                 _close(stream)
@@ -170,7 +170,7 @@ def _window_of_file(screenshot: Path | None, *, web: bool, size: tuple[int, int]
 
     if screenshot is None:
         return window.Window(_kind(web=web))
-    return window.picture_of(screenshot, tell=lambda text: echo(text, err=True), size=size)
+    return window.open_headless(screenshot, on_message=lambda text: echo(text, err=True), size=size)
 
 
 def _kind(*, web: bool) -> Kind:
@@ -179,7 +179,7 @@ def _kind(*, web: bool) -> Kind:
     return "web" if web or not screen_is_there() else "native"
 
 
-def _tell(shown: Window, what: str) -> None:
+def _print_address(shown: Window, what: str) -> None:
     # The address comes first, so that no terminal wraps it.
     echo(f"{shown.address} shows {what}" if shown.address else f"viewing {what}")
     if shown.page is not None:
@@ -197,7 +197,7 @@ def _wait_for_the_end(shown: Window) -> None:
         raise RefusedError(f"the viewer failed: {shown.failure} (--web needs no graphics driver)")
 
 
-def _hush() -> None:
+def _suppress_logging() -> None:
     """Keep rerun's own log off the terminal: a closed window is not an error here."""
     import os
 
