@@ -102,7 +102,7 @@ class Captures(Sink):
         self._open: _OpenCapture | None = None
 
     @property
-    def held(self) -> int:
+    def payload_count(self) -> int:
         """Number of payloads in the ring buffer."""
         return len(self._ring)
 

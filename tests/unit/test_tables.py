@@ -242,7 +242,7 @@ def test_compilation_is_reported_while_it_lasts(monkeypatch: pytest.MonkeyPatch)
         beside.append("started")
         return Process()
 
-    monkeypatch.setattr(compiling, "start_beside", start)
+    monkeypatch.setattr(compiling, "start_second_process", start)
     begun: list[str] = []
     told: list[str] = []
     listener = Compiling(begun.append, told.append)

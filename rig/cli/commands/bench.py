@@ -21,7 +21,7 @@ def bench(
     from replays.studies.bench import measure
 
     with reporting(compiles=True, live=False) as reporter:  # a live line would disturb the timing
-        report = measure(runs=runs, peers=peers, frames=frames, progress=reporter.say)
+        report = measure(runs=runs, peers=peers, frames=frames, progress=reporter.show_activity)
     if form.as_json:
         echo_json(report)
         return

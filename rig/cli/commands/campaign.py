@@ -64,8 +64,8 @@ def campaign(
     if output is not None:
         check_folder(output, field="--output")
     files = _checked(files, against, replay)
-    told = {"--rig-results": output, "--rig-against": against, "--rig-url": url, "--rig-replay": replay}
-    options = [word for name, value in told.items() if value is not None for word in (name, str(value))]
+    plugin_options = {"--rig-results": output, "--rig-against": against, "--rig-url": url, "--rig-replay": replay}
+    options = [word for name, value in plugin_options.items() if value is not None for word in (name, str(value))]
     options += ["-k", keyword] if keyword is not None else []
     options += ["-n", str(jobs)] if jobs > 1 else ["-n", "0"] if importlib.util.find_spec("xdist") else []
     status = _run(files, options, output)
@@ -125,16 +125,16 @@ def _run(files: list[str], options: list[str], output: Path | None) -> int:
     with bypass_capture(progress_bar(transient=True)) as bar:
         progress = Progress(bar)
         status = pytest.main([*plugins, *options, *files], plugins=[progress])
-    if progress.reader_gone:
+    if progress.is_reader_closed:
         raise BrokenPipeError
     if status == pytest.ExitCode.INTERNAL_ERROR:
         echo(progress.pytest_output.getvalue().strip(), err=True)
     counts = progress.counts
-    told = (
+    summary = (
         ", ".join(f"{counts[outcome]} {outcome}" for outcome in OUTCOME_WORDS if counts[outcome]) or "nothing was run"
     )
     left = len(progress.planned) - sum(counts.values())
-    echo(f"{told}{f', {left} not run' if left > 0 else ''}")
+    echo(f"{summary}{f', {left} not run' if left > 0 else ''}")
     if output is not None and (output / "index.html").is_file():
         echo(f"written  {output / 'index.html'}, results.json, junit.xml")
     if status == pytest.ExitCode.INTERRUPTED and not progress.collecting_failed:

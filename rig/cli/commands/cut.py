@@ -38,7 +38,7 @@ def cut(
 
     check_destination(output, force=force)
     with reporting() as report:
-        made = cut_recording(
+        result = cut_recording(
             join(files, in_part=from_s is not None or to_s is not None),
             output,
             from_s=-math.inf if from_s is None else from_s,
@@ -48,9 +48,9 @@ def cut(
             force=force,
             on_progress=lambda done: report.part(done, f"writing {output}"),
         )
-    for line in made.short:
+    for line in result.short:
         echo(f"rig: {line}", err=True)
-    counts = made.counts
+    counts = result.counts
     echo(
         f"{output}: {(counts.first_time_ns or 0) / 1e9:.4f} s to {counts.last_time_ns / 1e9:.4f} s, "
         f"{sum(counts.rows.values())} rows in {len(counts.rows)} streams, {output.stat().st_size / 1e6:.1f} MB"

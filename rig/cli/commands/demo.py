@@ -48,13 +48,13 @@ def demo(
         raise InputError("--output", "a folder that can be made", Words(f"{folder} ({error.strerror})")) from None
     begin = time.perf_counter()
 
-    def say(text: str) -> None:
+    def print_line(text: str) -> None:
         echo(f"[{time.perf_counter() - begin:5.1f} s] {text}")
 
     file, picture = folder / "demo.mcap", folder / "demo.png"
-    _record_session(file, speed_hz=speed_hz, whirl_s=whirl_s, say=say)
+    _record_session(file, speed_hz=speed_hz, whirl_s=whirl_s, print_line=print_line)
 
-    say("reading the recording")
+    print_line("reading the recording")
     from rich.text import Text
 
     from recorder.reader import Recording
@@ -68,13 +68,13 @@ def demo(
     console.print(verdict_table(verdict))
     if verdict.remark:
         console.print(Text(verdict.remark, "yellow"))
-    say(f"verdict: {'pass' if verdict.good else 'fail'}")
+    print_line(f"verdict: {'pass' if verdict.good else 'fail'}")
     echo(f"\nrecording   {file}\npicture     {picture}\nview        rig view {file}   (or: rerun {file})")
     if not verdict.good:
         raise typer.Exit(1)
 
 
-def _record_session(file: Path, *, speed_hz: float, whirl_s: float, say: Callable[[str], None]) -> None:
+def _record_session(file: Path, *, speed_hz: float, whirl_s: float, print_line: Callable[[str], None]) -> None:
     """Run service and recorder as processes, and command them until the file is closed."""
     import time
 
@@ -86,33 +86,33 @@ def _record_session(file: Path, *, speed_hz: float, whirl_s: float, say: Callabl
     from rig.serve.transport.zenoh import ZenohClient
 
     with reporting(compiles=True) as reporter:
-        reporter.say("loading the kernels")
+        reporter.show_activity("loading the kernels")
         Simulation(load_scene("stable-run")).warm_up()  # compiles here, where the user sees the progress
     endpoint = f"127.0.0.1:{free_port()}"
     with _processes(file.with_name("processes.log")) as start:
-        say(f"starting the service: rig run stable-run --set drive.speed_hz={speed_hz:g} --listen {endpoint}")
+        print_line(f"starting the service: rig run stable-run --set drive.speed_hz={speed_hz:g} --listen {endpoint}")
         arguments = ("--set", f"drive.speed_hz={speed_hz}", "--duration-s", "3600", "--listen", endpoint)
         service = start("run", "stable-run", *arguments)
         _wait_until_up(endpoint, service)
         recorder = start("record", "-o", str(file), "--connect", endpoint, "--history")
         with ZenohClient(endpoint, wait_s=5.0) as client:
             console = Console(client, name="rig demo")
-            say(f"service up, recording to {file}; spinning without contact for {_STABLE_S:g} s")
+            print_line(f"service up, recording to {file}; spinning without contact for {_STABLE_S:g} s")
             time.sleep(_STABLE_S)
             pulse = console.hammer(force_n=100.0, duration_ms=5.0, direction="x")
             effect = f"takes effect at {pulse.time_s:.3f} s of simulated time"
-            say(f"hammer: 100 N for 5 ms along x; command {pulse.id}, {effect}")
+            print_line(f"hammer: 100 N for 5 ms along x; command {pulse.id}, {effect}")
             for _ in range(3):
                 time.sleep(whirl_s / 3)
                 status = console.status()
                 late = status["lateness_ms"]
                 lateness = f"{late['p50']:.3f} ms (p50), {late['p99']:.3f} ms (p99)"
-                say(f"spin {status['spin_hz']:.3f} Hz; blocks late by {lateness}")
+                print_line(f"spin {status['spin_hz']:.3f} Hz; blocks late by {lateness}")
             console.stop()
-        say("stopped; the recorder closes its file")
+        print_line("stopped; the recorder closes its file")
         service.wait(_CLOSE_S)
         if recorder.wait(_CLOSE_S) != 0:
-            raise typer.Exit(_complain(file.with_name("processes.log"), "the recorder failed"))
+            raise typer.Exit(_report_failure(file.with_name("processes.log"), "the recorder failed"))
 
 
 @contextmanager
@@ -157,11 +157,11 @@ def _wait_until_up(endpoint: str, service: Process) -> None:
             client.request(STATUS)
             return
     raise typer.Exit(
-        _complain(None, f"the service did not start (status {service.poll()}); see processes.log in the folder")
+        _report_failure(None, f"the service did not start (status {service.poll()}); see processes.log in the folder")
     )
 
 
-def _complain(log: Path | None, text: str) -> int:
+def _report_failure(log: Path | None, text: str) -> int:
     echo(f"rig: {text}" + (f"; see {log}" if log else ""), err=True)
     return 1
 

@@ -60,18 +60,18 @@ def export(
     )  # fmt: skip
     with reporting() as reporter:
 
-        def tell(part: float) -> None:
+        def report_progress(part: float) -> None:
             reporter.part(part, f"exporting {recording.path.name}")
 
-        written = write(selection, output, rate_hz=rate_hz, method=method, force=force, progress=tell)
+        written = write(selection, output, rate_hz=rate_hz, method=method, force=force, progress=report_progress)
     for line in recording.doubts:  # the export is incomplete or uncertain
         echo(f"rig: {line}", err=True)
-    for made in written:
-        size = made.path.stat().st_size / 1e6
-        echo(f"{made.path}: {made.columns} columns, {size:.1f} MB, {unit}")
-        for name, rate, rows, missing in made.tables:
+    for exported in written:
+        size = exported.path.stat().st_size / 1e6
+        echo(f"{exported.path}: {exported.columns} columns, {size:.1f} MB, {unit}")
+        for name, rate, rows, missing in exported.tables:
             lost = f", {missing} missing" if missing else ""
             echo(f"  {name}: {rows} rows at {rate:g} Hz{lost}")
-        echo(f"  {made.documents}")
+        echo(f"  {exported.documents}")
     if EDGES in recording.streams:
         echo("left out: the exact times of the keyphasor's edges (the channel keyphasor has the pulses)")

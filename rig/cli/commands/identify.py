@@ -100,7 +100,7 @@ class FitRequest:
                 return found, [one.key for one in found.question.unknowns if one.nuisance]
             experiment = fit_initial_state(recording, experiment)
             along = find_free_nuisances(experiment, keys)
-            priors = {key: told for key, told in along.items() if told is not None} | priors
+            priors = {key: prior_value for key, prior_value in along.items() if prior_value is not None} | priors
         window = (self.from_s, self.to_s)
         question = ask(recording, experiment, [*keys, *along], **given, priors=priors, nuisances=along, window=window)
         return identify_recording(question, **asdict(search), progress=progress), list(along)
@@ -188,14 +188,14 @@ def identify(
         echo_json(identification_document(found, recording=name))
     else:
         _show(found, name, form.console())
-        _tell(along, output if fits else None, report)
+        _print_files(along, output if fits else None, report)
     if not fits:
         if output is not None:
             echo(f"not written  {output}: the model does not explain the recording", err=True)
         raise typer.Exit(1)
 
 
-def _tell(along: list[str], output: Path | None, report: Path | None) -> None:
+def _print_files(along: list[str], output: Path | None, report: Path | None) -> None:
     if along:
         echo(f"also fitted, as an imported log does not contain them exactly: {', '.join(along)}")
     if output is not None:
@@ -231,11 +231,11 @@ def _show(found: Identification, name: str, console: Console) -> None:
     for finding in found.judgement.findings:
         table.add_row(*cells(finding), style="" if finding.standing == "identified" else "yellow")
     console.print(table)
-    asked = [place for place, unknown in enumerate(found.question.unknowns) if not unknown.nuisance]
-    keys = [found.question.keys[place] for place in asked]
+    positions = [place for place, unknown in enumerate(found.question.unknowns) if not unknown.nuisance]
+    keys = [found.question.keys[place] for place in positions]
     if len(keys) > 1:
         table = new_table("correlation", "", *(f">{key}" for key in keys))
-        for key, row in zip(keys, found.judgement.correlation[asked][:, asked], strict=True):
+        for key, row in zip(keys, found.judgement.correlation[positions][:, positions], strict=True):
             table.add_row(key, *("-" if value != value else f"{value:+.4f}" for value in row))
         console.print()
         console.print(table)

@@ -88,7 +88,7 @@ def _import(files: list[Path], mapping: Path | str, output: Path, *, force: bool
     with reporting() as reporter:
         try:
             doubts = (
-                [f"assumed, not in the mapping: {question}" for question in _asked(mapping)]
+                [f"assumed, not in the mapping: {question}" for question in _find_questions(mapping)]
                 if isinstance(mapping, str)
                 else []
             )
@@ -99,14 +99,14 @@ def _import(files: list[Path], mapping: Path | str, output: Path, *, force: bool
                 raise
             raise InputError(f"{name}: {error.field}", error.must, error.received) from None
 
-        def tell(part: float) -> None:
+        def report_progress(part: float) -> None:
             reporter.part(part, "writing")
 
-        write_recording(conversion, output, force=force, progress=tell)
+        write_recording(conversion, output, force=force, progress=report_progress)
     if form.as_json:
         echo_json(conversion.document)
     else:
-        _tell(conversion, output, form.console())
+        _print_result(conversion, output, form.console())
         if isinstance(mapping, str):
             echo("imported by the guess; to correct it: --template FILE.toml, then --mapping FILE.toml")
 
@@ -134,10 +134,12 @@ def _guess(
     elif guesses and not form.as_json:
         _tell_guesses(guesses, text, form.console())
     if path is not None and not form.as_json:
-        asked = len(_asked(text))
-        told = "a mapping to start from" if files else "an example with every option"
-        told += f"; {asked} {'line' if asked == 1 else 'lines'} to check" if asked else ""
-        echo(f"{path}: {told}")
+        question_count = len(_find_questions(text))
+        description = "a mapping to start from" if files else "an example with every option"
+        description += (
+            f"; {question_count} {'line' if question_count == 1 else 'lines'} to check" if question_count else ""
+        )
+        echo(f"{path}: {description}")
     if output is not None:
         for guess in guesses:
             if "unit" in guess.asks and guess.entry.unit:
@@ -145,7 +147,7 @@ def _guess(
         _import(files, text, output, force=force, form=form)
 
 
-def _asked(text: str) -> list[str]:
+def _find_questions(text: str) -> list[str]:
     """Return the questions of a mapping, each with its table."""
     from replays.recordings.formats.guessing.template import CHECK
 
@@ -182,7 +184,7 @@ def _tell_guesses(guesses: list[Guess], text: str, console: Console) -> None:
             style=style,
         )
     console.print(table)
-    if questions := _asked(text):
+    if questions := _find_questions(text):
         echo("Not contained in the logs:")
         for question in questions:
             echo(f"  {question}")
@@ -201,7 +203,7 @@ _JITTER_US, _DRIFT_PPM, _DUST = 1e-3, 1e-2, 1e-6
 """Rounding limits: time stamps [us], clocks [ppm], and relative to a channel's largest value. Less is not shown."""
 
 
-def _tell(conversion: Conversion, output: Path, console: Console) -> None:
+def _print_result(conversion: Conversion, output: Path, console: Console) -> None:
     size = output.stat().st_size / 1e6
     seconds = conversion.end_tick / 1e6
     console.print(f"{output}: {len(conversion.channels)} channels, {seconds:.6g} s, {size:.1f} MB, from "
@@ -214,7 +216,7 @@ def _tell(conversion: Conversion, output: Path, console: Console) -> None:
         trouble = channel.missing or channel.overrange
         table.add_row(*row, style="yellow" if trouble else "")
     console.print(table)
-    for line in _in_common(conversion):
+    for line in _common_lines(conversion):
         console.print(line)
     for remark in conversion.remarks:
         console.print(remark)
@@ -242,7 +244,7 @@ def _columns(conversion: Conversion) -> dict[str, list[str]]:
     return {heading: cells for heading, cells in columns.items() if any(cells)}
 
 
-def _in_common(conversion: Conversion) -> list[str]:
+def _common_lines(conversion: Conversion) -> list[str]:
     """Return one line per processing step, with the channels it applied to."""
     done: dict[str, list[str]] = {}
     for channel in conversion.channels:

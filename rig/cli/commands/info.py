@@ -146,8 +146,8 @@ def _print(recording: Recording, document: dict[str, Any], console: Console) -> 
     if streams:
         tables.append(_streams_table(streams))
     tables.append(_channels_table(recording, document.get("health")))
-    if "health" in document and (told := _health(document["health"])):
-        tables.append(fact_table("", told, doubt="yellow"))
+    if "health" in document and (health_rows := _health(document["health"])):
+        tables.append(fact_table("", health_rows, doubt="yellow"))
     if document["events"]:
         tables.append(events_table(document["events"]))
     for table in tables:
@@ -190,9 +190,9 @@ def _lost_rows(document: dict[str, Any]) -> list[str]:
     noted = bool(document["gaps"])  # missing rows without a noted gap are reported once
     lost = sum(_lost(each) - (0 if noted else min(_lost(each), each["missing"])) for each in streams.values())
     declared = sum(each["declared"] for each in streams.values())
-    gone = [f"{lost} rows in {len(document['gaps'])} gaps"] if lost or (document["gaps"] and not declared) else []
+    losses = [f"{lost} rows in {len(document['gaps'])} gaps"] if lost or (document["gaps"] and not declared) else []
     missing = {key: stream["missing"] for key, stream in streams.items() if stream["missing"]}
-    return gone + [f"{rows} rows of {key} are missing" for key, rows in missing.items()]
+    return losses + [f"{rows} rows of {key} are missing" for key, rows in missing.items()]
 
 
 def _lost(stream: dict[str, Any]) -> int:
@@ -257,11 +257,13 @@ def _channels_table(recording: Recording, health: dict[str, Any] | None) -> Tabl
         for channel in group.channels:
             ends = sorted((volts - channel.bias_v) / channel.sensitivity_v for volts in channel.range_v)
             reach = f"{ends[0]:.4g} to {ends[1]:.4g}" if channel.has_range else "not known"
-            seen = found.get(make_printable(channel.name), {})
-            numbers = [_number(seen.get(name), seen.get("noise") or channel.scale) for name in ("mean", "low", "high")]
-            noise = ("" if seen.get(name) is None else f"{seen[name]:.2g}" for name in ("noise", "noise_calibrated"))
-            findings = seen.get("findings", [])
-            verdict = "; ".join(findings) or ("good" if seen else "")
+            entry = found.get(make_printable(channel.name), {})
+            numbers = [
+                _number(entry.get(name), entry.get("noise") or channel.scale) for name in ("mean", "low", "high")
+            ]
+            noise = ("" if entry.get(name) is None else f"{entry[name]:.2g}" for name in ("noise", "noise_calibrated"))
+            findings = entry.get("findings", [])
+            verdict = "; ".join(findings) or ("good" if entry else "")
             table.add_row(
                 *(channel.name, channel.unit, *((*numbers, *noise, verdict) if found else ())),
                 *(reach, f"{abs(channel.scale):.2g}", f"{group.rate_hz}", channel.label),

@@ -47,7 +47,7 @@ def paper(
         reporter.begin(steps(quick=quick))
         findings = find(quick=quick, processes=processes, progress=reporter.step)
         if output is not None:
-            reporter.say("report")
+            reporter.show_activity("report")
             sets = f"as-printed, corrected; {'few, short' if quick else 'all'} runs"
             write_report(write_up(findings, quick=quick, origin=origin(parameter_sets=sets)), output)
         drawn = []

@@ -190,7 +190,7 @@ def record(
     session_of(None)  # checks the options before it connects
     with connection.client() as client:
         summary = run_session(session_of(client))
-    tell(summary)
+    print_result(summary)
     if not summary.good:
         raise typer.Exit(1)
 
@@ -207,25 +207,25 @@ def run_session(session: RecordingSession) -> Summary:
             signal.signal(each, before[each])
 
     def remark(lines: tuple[str, ...]) -> None:
-        nonlocal told
-        for line in lines[told:]:
+        nonlocal printed_count
+        for line in lines[printed_count:]:
             console.print(line, soft_wrap=True)
-        told = len(lines)
+        printed_count = len(lines)
 
     before = {number: signal.signal(number, stop) for number in ends}
     console = table_console(stderr=True)
-    told, begun, files = 0, False, session.first_files
+    printed_count, has_begun, files = 0, False, session.first_files
     more = "" if files == [session.path] else ", ..."
     name = f"recording {printable(' or '.join(file.name for file in files), 30)}{more}"
     try:
         with console.status(plain_text(f"{name}: waiting for the rig")) as status:
 
             def show(progress: Progress) -> None:
-                nonlocal begun
-                if progress.rows and not begun and not console.is_terminal:
+                nonlocal has_begun
+                if progress.rows and not has_begun and not console.is_terminal:
                     into = printable(" or ".join(map(str, files))) + more
                     echo(f"rig: recording {into}; Ctrl-C ends it well", err=True)  # scripts wait for this line
-                begun = begun or progress.rows > 0
+                has_begun = has_begun or progress.rows > 0
                 remark(progress.remarks)
                 lost = f"{progress.lost} lost"
                 parts = [
@@ -248,7 +248,7 @@ def run_session(session: RecordingSession) -> Summary:
             signal.signal(number, before[number])
 
 
-def tell(summary: Summary) -> None:
+def print_result(summary: Summary) -> None:
     """Print the result of a recording."""
     from rig.base.wire import SENSORS, TRUTH
 
@@ -261,8 +261,8 @@ def tell(summary: Summary) -> None:
         files = f"{summary.path}: no file"
     triggers = "1 trigger" if summary.fired == 1 else f"{summary.fired} triggers"
     if summary.fired is not None and not summary.files:
-        came = triggers if summary.fired else "no trigger"
-        echo(f"{came} in {summary.received_s:.3f} s; nothing written; ended: {summary.reason}")
+        trigger_text = triggers if summary.fired else "no trigger"
+        echo(f"{trigger_text} in {summary.received_s:.3f} s; nothing written; ended: {summary.reason}")
     else:
         around = ""
         if summary.fired is not None:

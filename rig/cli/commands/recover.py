@@ -61,15 +61,15 @@ def _recover(file: Path, new: Path, *, force: bool) -> bool:
     from recorder.rewrite import recover as recover_file
 
     with reporting() as report:
-        made = recover_file(file, new, force=force, on_progress=lambda done: report.part(done, f"recovering {file}"))
-    counts = made.counts
+        result = recover_file(file, new, force=force, on_progress=lambda done: report.part(done, f"recovering {file}"))
+    counts = result.counts
     lost = counts.undeclared_lost
     echo(
         f"{new}: {(counts.first_time_ns or 0) / 1e9:.3f} s to {counts.last_time_ns / 1e9:.3f} s, "
         f"{sum(counts.rows.values())} rows, {new.stat().st_size / 1e6:.1f} MB"
-        + (f"; {made.damaged} damaged record{'s' * (made.damaged > 1)} skipped" if made.damaged else "")
-        + "".join(f"; {text}: no checksum covers them" for text in made.unchecked)
+        + (f"; {result.damaged} damaged record{'s' * (result.damaged > 1)} skipped" if result.damaged else "")
+        + "".join(f"; {text}: no checksum covers them" for text in result.unchecked)
         + (f"; {lost} {'row is' if lost == 1 else 'rows are'} missing in it" if lost else "")
-        + "".join(f"; {text}" for text in made.short)
+        + "".join(f"; {text}" for text in result.short)
     )
-    return not (made.damaged or lost or made.short)
+    return not (result.damaged or lost or result.short)

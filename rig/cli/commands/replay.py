@@ -159,7 +159,7 @@ def replay(
         return player
 
     # At higher rates the transport's history covers less time, so the replay waits for slow clients.
-    serve(make, _words, _tell, serving=serving, bus=bus, paced=not burst, wait=burst or rate > 1.0)
+    serve(make, _words, _print_summary, serving=serving, bus=bus, paced=not burst, wait=burst or rate > 1.0)
 
 
 def _clients(count: int) -> str:
@@ -180,7 +180,7 @@ def _words(status: dict[str, Any]) -> list[str]:
     return words
 
 
-def _tell(summary: dict[str, Any]) -> None:
+def _print_summary(summary: dict[str, Any]) -> None:
     play = summary["replay"]
     echo(
         f"replay: {summary['reason']} at {summary['time_s']:.3f} s, pass {play['pass']}; "

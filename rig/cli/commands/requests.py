@@ -37,9 +37,9 @@ def scene_command(name: str) -> Callable[..., None]:
 
     def command(*, connection: Connection, **given: Any) -> None:
         values = {field: as_number(value) if isinstance(value, str) else value for field, value in given.items()}
-        told = [f"{values[field]:g} {each.quantity.unit}" for field, each in fields.items() if each.required]
+        value_texts = [f"{values[field]:g} {each.quantity.unit}" for field, each in fields.items() if each.required]
         with connection.console(name) as rig:
-            show(rig.send(name, **values), " ".join([name, *told]))
+            show(rig.send(name, **values), " ".join([name, *value_texts]))
 
     parameters.append(inspect.Parameter("connection", inspect.Parameter.KEYWORD_ONLY))
     command.__name__, command.__doc__ = name, f"{SUMMARIES[name]}."

@@ -31,7 +31,7 @@ _MATRIX_COLUMNS = 28
 """Number of channels per matrix that fits 80 columns."""
 
 
-class _Way(StrEnum):
+class _Method(StrEnum):
     DIGITAL = "digital"
     ANALOGUE = "analogue"
 
@@ -74,7 +74,7 @@ def score(
         Path | None,
         typer.Option("--mapping", "-m", metavar="FILE.toml", help="Names, units and bits, in the form of `rig import`"),
     ] = None,
-    path: Annotated[_Way | None, typer.Option(help="Input of the DAQ; default: detected from the file")] = None,
+    path: Annotated[_Method | None, typer.Option(help="Input of the DAQ; default: detected from the file")] = None,
     force: Force = False,
     wide: Wide = False,
 ) -> None:
@@ -92,14 +92,14 @@ def score(
 
     if output is not None:
         check_report(output, force=force, field="--output")
-    for made, field, suffix in ((junit, "--junit", ".xml"), (as_json, "--json", ".json")):
-        if made is not None:
-            check_new_file(made, field=field, suffixes=(suffix,), force=force)
-            check_output_differs([file, *(against or ())], made, field=field)
-    asked = load_limits(limits)
+    for target, field, suffix in ((junit, "--junit", ".xml"), (as_json, "--json", ".json")):
+        if target is not None:
+            check_new_file(target, field=field, suffixes=(suffix,), force=force)
+            check_output_differs([file, *(against or ())], target, field=field)
+    score_limits = load_limits(limits)
     mapped = None if mapping is None else load_mapping(mapping)
     due = None if channels is None else split_names(channels)
-    way = None if path is None else "digital" if path is _Way.DIGITAL else "analogue"
+    method = None if path is None else "digital" if path is _Method.DIGITAL else "analogue"
     live = str(file) == "-"
     if live == (against is not None):
         must = "left out where FILE is -: what the rig at --connect sends" if live else "given: what the rig sent"
@@ -107,9 +107,9 @@ def score(
     if for_s is not None and not live:
         raise InputError("--for-s", "left out where a file is judged", for_s)
     if live:
-        card = _judge_live(connection, _FOR_S if for_s is None else for_s, asked, way, due, mapped)
+        card = _judge_live(connection, _FOR_S if for_s is None else for_s, score_limits, method, due, mapped)
     else:
-        card = judge(file, against or [], limits=asked, path=way, channels=due, mapping=mapped)
+        card = judge(file, against or [], limits=score_limits, path=method, channels=due, mapping=mapped)
     if output is not None:
         from replays.score.report import make_report
 
@@ -123,9 +123,9 @@ def score(
                 json.dumps(replace_nonfinite(card.document()), indent=2, allow_nan=False) + "\n", encoding="utf-8"
             )
     _show(card, table_console(wide=wide), wide=wide)
-    for made in (output, junit, as_json):
-        if made is not None:
-            echo(f"written  {made}")
+    for target in (output, junit, as_json):
+        if target is not None:
+            echo(f"written  {target}")
     if card.outcome.exit_status:
         raise typer.Exit(card.outcome.exit_status)
 
@@ -182,10 +182,10 @@ def _show(card: Scorecard, console: Console, *, wide: bool) -> None:
         "", "quantity", "channel", ">value", "95 %", "unit", "limit", "verdict", "note", "to show it", "source",
         wrapped=("note", "to show it", "source"), spare=("source", "to show it", "note", "95 %"),
     )  # fmt: skip
-    told = [row for row in card.rows if wide or row.verdict in (FAIL, INCONCLUSIVE)]
-    for row in told:
+    printed = [row for row in card.rows if wide or row.verdict in (FAIL, INCONCLUSIVE)]
+    for row in printed:
         source = "" if row.limit is None else row.limit.source
         table.add_row(*row.cells(), row.note, row.run, source, style=_STYLES[row.verdict])
     console.print(table)
-    if len(told) < len(card.rows):
+    if len(printed) < len(card.rows):
         echo("passed quantities and those without a limit: see --wide, the report, JUnit or JSON")

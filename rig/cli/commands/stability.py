@@ -90,7 +90,7 @@ def stability(
         if output is not None:
             from replays.studies.stability.maps.figure import draw_all
 
-            reporter.say("pictures")
+            reporter.show_activity("pictures")
             pictures = draw_all(output, names, quick=not full)
     wrong = [cell for cell in cells if not cell.agrees]
     if form.as_json:

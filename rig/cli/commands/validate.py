@@ -89,13 +89,13 @@ def _show(found: Validation, console: Console) -> None:
         if found.explained is None or fault.line not in found.explained.conclusion:
             console.print(make_printable(f"signal: {fault.line}"))
     console.print(found.bits_line)
-    for one in found.fitted:
-        console.print(one.line)
+    for item in found.fitted:
+        console.print(item.line)
     if found.calibration:
         console.print(f"calibration: {found.calibration_line}")
     if found.bit_exact and not found.declared:
         return
-    if found.explained is not None and any(_counts(one) for one in found.explained.ranked):
+    if found.explained is not None and any(_counts(item) for item in found.explained.ranked):
         console.print()
         console.print(_explanations(found.explained))
         console.print("left: RMS of the remaining residual over the noise; 1 is noise alone")
@@ -113,16 +113,16 @@ def _show(found: Validation, console: Console) -> None:
 def _trajectory(found: Validation) -> Table:
     headings = ("channel", ">noise", ">RMS", ">limit", ">largest", ">drift", ">first at", "verdict")
     table = new_table("Trajectory: residual over the channel's own noise", *headings)
-    for one in found.residuals:
+    for item in found.residuals:
         table.add_row(
-            one.channel,
-            f"{one.floor:.3g} {one.unit}".rstrip(),
-            f"{one.rms:.3f}",
-            "" if math.isinf(one.limit) else f"{one.limit:.3f}",
-            f"{one.peak:.2f}",
-            f"{one.drift:.2f}",
-            "" if one.first_s is None else f"{one.first_s:.4f} s",
-            _VERDICTS[one.good],
+            item.channel,
+            f"{item.floor:.3g} {item.unit}".rstrip(),
+            f"{item.rms:.3f}",
+            "" if math.isinf(item.limit) else f"{item.limit:.3f}",
+            f"{item.peak:.2f}",
+            f"{item.drift:.2f}",
+            "" if item.first_s is None else f"{item.first_s:.4f} s",
+            _VERDICTS[item.good],
         )
     return table
 
@@ -130,21 +130,23 @@ def _trajectory(found: Validation) -> Table:
 def _truth(found: Validation) -> Table:
     headings = ("table", "column with largest error", ">error", ">limit", "verdict")
     table = new_table("Truth: largest difference as a part of the column's largest value", *headings)
-    for one in found.truth:
-        table.add_row(one.table, one.column, f"{one.relative:.1e}", f"{one.limit:.1e}", _VERDICTS[one.good])
+    for item in found.truth:
+        table.add_row(item.table, item.column, f"{item.relative:.1e}", f"{item.limit:.1e}", _VERDICTS[item.good])
     return table
 
 
 def _statistics(found: Validation) -> Table:
     table = new_table("Phases", "phase", "quantity", ">recorded", ">predicted", ">limit", "verdict")
-    for one in found.statistics:
-        limit = "" if one.limit is None else f"± {one.limit:.2g}"
-        table.add_row(one.phase, one.title, f"{one.recorded:.6g}", f"{one.foretold:.6g}", limit, _VERDICTS[one.good])
+    for item in found.statistics:
+        limit = "" if item.limit is None else f"± {item.limit:.2g}"
+        table.add_row(
+            item.phase, item.title, f"{item.recorded:.6g}", f"{item.foretold:.6g}", limit, _VERDICTS[item.good]
+        )
     return table
 
 
-def _counts(one: Explanation) -> bool:
-    return one.explained >= _MIN_EXPLAINED
+def _counts(item: Explanation) -> bool:
+    return item.explained >= _MIN_EXPLAINED
 
 
 def _explanations(explained: Explained) -> Table:

@@ -56,25 +56,25 @@ class Connection:
         from rig.serve.transport.zenoh import ZenohClient
         from rig.serve.waiting import Deadline
 
-        by_environment = self.tls is not None and os.environ.get(_TLS) == str(self.tls)
+        from_environment = self.tls is not None and os.environ.get(_TLS) == str(self.tls)
         deadline = Deadline(self.wait_s)
         try:
             with ExitStack() as stack:
-                with self._waiting() if self.wait_s else nullcontext():
+                with self._show_waiting() if self.wait_s else nullcontext():
                     wait_s = max(_LINK_S, self.wait_s)
                     client = stack.enter_context(ZenohClient(self.connect, wait_s=wait_s, tls=self.tls))
                     # A rig that is still starting already listens.
                     any(client.tokens(ALIVE) for _ in deadline.polls(0.1))
                 yield client
         except NoReplyError as error:
-            source = f" (the keys are those of {_TLS})" if by_environment and str(self.tls) in str(error) else ""
+            source = f" (the keys are those of {_TLS})" if from_environment and str(self.tls) in str(error) else ""
             raise RefusedError(f"{error}{source}") from None
         except InputError as error:
-            if not by_environment or error.field != "--tls":
+            if not from_environment or error.field != "--tls":
                 raise
             raise InputError(_TLS, error.must, error.received) from None
 
-    def _waiting(self) -> Any:
+    def _show_waiting(self) -> Any:
         return table_console(stderr=True).status(plain_text(f"waiting for a rig at {self.connect}"))
 
     @contextmanager
@@ -145,8 +145,8 @@ class Serving:
                 raise InputError(option, "given with --expose HOST", Words("no --expose"))
             return None
         if (self.tls is not None) == self.plaintext:
-            made = f"rig keys init DIR --host {self.expose.partition(':')[0]}"
-            must = f"given with --tls DIR (create it: {made}), or --plaintext"
+            hint = f"rig keys init DIR --host {self.expose.partition(':')[0]}"
+            must = f"given with --tls DIR (create it: {hint}), or --plaintext"
             raise InputError("--expose", must, Words("both" if self.plaintext else "neither"))
         from rig.serve.transport.exposure.certificates import read_holder
         from rig.serve.transport.zenoh import Exposure
@@ -163,7 +163,7 @@ def show(accepted: Accepted, what: str) -> None:
 def serve(
     create_keys: Callable[[Server], ServedRun],
     words: Callable[[dict[str, Any]], list[str]],
-    tell: Callable[[dict[str, Any]], None],
+    print_summary: Callable[[dict[str, Any]], None],
     *,
     serving: Serving,
     bus: CanOutput | None,
@@ -175,7 +175,7 @@ def serve(
     Args:
         create_keys: Creates the run on a server.
         words: Returns the parts of a progress line from a status.
-        tell: Prints the summary.
+        print_summary: Prints the summary.
         serving: Addresses to serve at.
         bus: CAN bus to serve on as well.
         paced: The run follows the wall clock.
@@ -200,7 +200,7 @@ def serve(
         print_addresses(server, exposed, serving.name)
         with stop_on_signals(run.stop), display_status(run.status, words):
             summary = run.run()
-    tell(summary)
+    print_summary(summary)
     if bus is not None:
         echo(bus.summary())
     exit_if_failed(summary["troubles"])

@@ -37,7 +37,7 @@ class Progress:
     running: dict[str, None] = field(default_factory=dict)
     collecting_failed: bool = False
     task: Any = None
-    reader_gone: bool = False
+    is_reader_closed: bool = False
     """The reader of the output has exited."""
     pytest_output: io.StringIO = field(default_factory=io.StringIO)
     """Output of pytest itself, which is not shown."""
@@ -78,13 +78,13 @@ class Progress:
         from replays.campaigns.reporting.results import outcome_of, reason_of
 
         name = report.nodeid
-        before = self.outcomes.get(name, "passed")
+        outcome = self.outcomes.get(name, "passed")
         if report.failed:
-            before = outcome_of(report) if before in ("passed", "inconclusive") else "error"
+            outcome = outcome_of(report) if outcome in ("passed", "inconclusive") else "error"
         elif report.skipped:
-            before = "skipped"
-        self.outcomes[name] = before
-        if before != "passed" and name not in self.reasons:
+            outcome = "skipped"
+        self.outcomes[name] = outcome
+        if outcome != "passed" and name not in self.reasons:
             # A campaign file has a line for each value that fails.
             lines = report.longrepr.splitlines() if isinstance(report.longrepr, str) else ()
             self.reasons[name] = "\n      ".join([reason_of(report), *map(printable, lines[1:])])
@@ -92,24 +92,24 @@ class Progress:
             self.done.add(name)
             self.running.pop(name, None)
             reason = f": {self.reasons[name]}" if name in self.reasons else ""
-            for line in f"{OUTCOME_WORDS[before]:5} {name}{reason}".split("\n"):
-                self._tell(line)
+            for line in f"{OUTCOME_WORDS[outcome]:5} {name}{reason}".split("\n"):
+                self._print_line(line)
             self._show()
 
-    def _tell(self, line: str) -> None:
+    def _print_line(self, line: str) -> None:
         if self.bar.console.is_terminal and sys.stdout.isatty():
             self.bar.console.print(plain_text(printable(line)))  # above the live line
             return
         try:
             echo(line)
         except BrokenPipeError:
-            self.reader_gone = True
+            self.is_reader_closed = True
             raise
 
     def _show(self) -> None:
         if self.task is None:
             self.task = self.bar.add_task("", total=len(self.planned) or None)
-        bad = sum(self.counts[each] for each in ("failed", "error", "inconclusive"))
-        now = next(iter(self.running), "").rpartition("::")[2]
-        told = f"{len(self.done)} of {len(self.planned)} cases, {bad} bad; {now}"
-        self.bar.update(self.task, description=printable(told, 70), completed=len(self.done))
+        unsuccessful = sum(self.counts[each] for each in ("failed", "error", "inconclusive"))
+        current = next(iter(self.running), "").rpartition("::")[2]
+        status = f"{len(self.done)} of {len(self.planned)} cases, {unsuccessful} not passed; {current}"
+        self.bar.update(self.task, description=printable(status, 70), completed=len(self.done))

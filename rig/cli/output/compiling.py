@@ -22,45 +22,45 @@ class Compiling(Listener):
     busy computer needs several times as long.
 
     Args:
-        begun: Called with the first text.
-        going_on: Called with each further text, and with an empty text when compiling pauses.
+        on_first_text: Called with the first text.
+        on_text: Called with each further text, and with an empty text when compiling pauses.
     """
 
-    def __init__(self, begun: Callable[[str], None], going_on: Callable[[str], None]) -> None:
-        self._begun, self._going_on = begun, going_on
-        self._under_way: list[str] = []
+    def __init__(self, on_first_text: Callable[[str], None], on_text: Callable[[str], None]) -> None:
+        self._on_first_text, self._on_text = on_first_text, on_text
+        self._modules: list[str] = []
         """Modules of the functions under compilation, outermost first."""
-        self._told = self._began = False
-        self._beside: subprocess.Popen[bytes] | None = None
+        self._has_reported = self._process_started = False
+        self._second_process: subprocess.Popen[bytes] | None = None
         self._spent_s, self._since_s = 0.0, 0.0
 
     def on_start(self, event: Any) -> None:
         """Report a function that begins to compile."""
         now_s = time.process_time()
-        if not self._under_way:
+        if not self._modules:
             self._since_s = now_s
-        self._under_way.append(event.data["dispatcher"].py_func.__module__)
-        ours = [module for module in self._under_way if module.startswith(("rig.", "drivers."))]
-        if not ours:
+        self._modules.append(event.data["dispatcher"].py_func.__module__)
+        own_modules = [module for module in self._modules if module.startswith(("rig.", "drivers."))]
+        if not own_modules:
             return
-        if ours[0].startswith(SERIES) and not self._began:
-            self._began, self._beside = True, start_second_process()
-        name, spent_s = ".".join(ours[-1].split(".")[-2:]), self._spent_s + now_s - self._since_s
+        if own_modules[0].startswith(SERIES) and not self._process_started:
+            self._process_started, self._second_process = True, start_second_process()
+        name, spent_s = ".".join(own_modules[-1].split(".")[-2:]), self._spent_s + now_s - self._since_s
         text = f"compiling {name} ({spent_s:.0f} s of CPU; some {_ENGINE_S} s an engine)"
-        if self._told:
-            self._going_on(text)
+        if self._has_reported:
+            self._on_text(text)
         else:
-            self._begun(f"{text}, once on this machine")
-        self._told = True
+            self._on_first_text(f"{text}, once on this machine")
+        self._has_reported = True
 
     def on_end(self, event: Any) -> None:
         """Report the end of a function's compilation."""
-        module = self._under_way.pop()
-        if not self._under_way:
-            if module == MARCH and self._beside is not None:
+        module = self._modules.pop()
+        if not self._modules:
+            if module == MARCH and self._second_process is not None:
                 # Otherwise the rest would be compiled twice.
-                self._going_on("compiling in a second process")
-                self._beside.wait()
+                self._on_text("compiling in a second process")
+                self._second_process.wait()
             self._spent_s += time.process_time() - self._since_s
-            if self._told:
-                self._going_on("")
+            if self._has_reported:
+                self._on_text("")

@@ -54,9 +54,9 @@ def _parts(status: dict[str, Any], words: Line) -> list[str]:
         "stalled links": status["congestion"].get("stalled_links", 0),
         "dropped": status["queue"]["dropped"],
     }
-    told = [f"{name} {count:.0f}" for name, count in counts.items() if count]
+    counters = [f"{name} {count:.0f}" for name, count in counts.items() if count]
     overruns = [f"overruns {status['overruns']}"] if status["overruns"] else []
-    return [*words(status), *told, f"clients {len(status['clients'])}", *overruns]
+    return [*words(status), *counters, f"clients {len(status['clients'])}", *overruns]
 
 
 def fit_width(parts: list[str], width: int, between: str = "  ") -> str:

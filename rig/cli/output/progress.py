@@ -27,7 +27,7 @@ class Reporter:
     task: Any = None
     total: int | None = None
     done: int = 0
-    doing: str = ""
+    activity: str = ""
     _percent: bool = False
     _printed_s: float = field(default_factory=time.monotonic)
 
@@ -43,7 +43,7 @@ class Reporter:
     def step(self, text: str) -> None:
         """Count a finished step, and show the next one."""
         self.done += 1
-        self.doing = text
+        self.activity = text
         self.show(text)
 
     def part(self, done: float, text: str) -> None:
@@ -56,9 +56,9 @@ class Reporter:
             self.done = percent - 1
             self.step(text)
 
-    def say(self, text: str) -> None:
+    def show_activity(self, text: str) -> None:
         """Show the current activity."""
-        self.doing = text
+        self.activity = text
         self.show(text, every_s=0.0)
 
     def show(self, text: str, *, every_s: float = _LINE_PERIOD_S) -> None:
@@ -90,7 +90,7 @@ def reporting(*, live: bool = True, compiles: bool = False) -> Iterator[Reporter
         from rig.cli.output.compiling import Compiling
 
         compiling = Compiling(
-            lambda text: reporter.show(text, every_s=0.0), lambda text: reporter.show(text or reporter.doing)
+            lambda text: reporter.show(text, every_s=0.0), lambda text: reporter.show(text or reporter.activity)
         )
         with install_listener("numba:compile", compiling):
             yield reporter

@@ -154,8 +154,8 @@ class Table:
                 for row in range(max(map(len, wrapped.values()))):
                     parts = {at: texts[row] if row < len(texts) else Text() for at, texts in wrapped.items()}
                     lines.append(self._line(parts, widths, style))
-        if gone := [heading for at, heading in enumerate(self.headings) if all(at not in block for block in blocks)]:
-            lines += Text(f"without {', '.join(gone)}: see --wide", "dim").wrap(console, room)
+        if omitted := [heading for at, heading in enumerate(self.headings) if all(at not in block for block in blocks)]:
+            lines += Text(f"without {', '.join(omitted)}: see --wide", "dim").wrap(console, room)
         for line in lines:
             line.rstrip()
             yield from line.render(console)
@@ -264,8 +264,8 @@ def fact_table(title: str, rows: Iterable[tuple[str, str]], **styles: str) -> Ta
     from rich.text import Text
 
     table = Table(title, ("", ""), wrapped=(1,), spare=(), keys=1)
-    for name, said in rows:
-        table.add_row(Text(name, "bold"), said, style=styles.get(name, ""))
+    for name, fact in rows:
+        table.add_row(Text(name, "bold"), fact, style=styles.get(name, ""))
     return table
 
 
