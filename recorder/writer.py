@@ -144,7 +144,7 @@ class RecordingWriter:
             messages: Number of messages.
             wall_ns: Wall time of the report [unix ns].
         """
-        self.tally.miss(key, messages)
+        self.tally.count_missed(key, messages)
         with self._guard():
             self._topics.add_missed(key, messages, wall_ns)
 

@@ -97,7 +97,7 @@ class Sink(ABC):
 
     def write_missed(self, key: str, messages: int, wall_ns: int) -> None:
         """Record messages that the transport dropped; see `RecordingWriter.write_missed`."""
-        self.tally.miss(key, messages)
+        self.tally.count_missed(key, messages)
         if self._writer is not None:
             self._writer.write_missed(key, messages, wall_ns)
 

@@ -36,7 +36,7 @@ def layout(table: ChannelTable, geometry: Geometry, *, live: bool, only: str | N
     """
     curves = _curve_views(table, geometry, live=live)
     small = [curves.pop(name) for name in _LOW_PLOTS if name in curves]
-    planes = [plane for plane in orbit.PLANES if plane in painter.planes_in(table)]
+    planes = [plane for plane in orbit.PLANES if plane in painter.find_table_planes(table)]
     # Views with their heights. An imported log with other channels gets only the views that it has data for.
     motion: list[tuple[rrb.View | rrb.Container, float]] = []
     frequency: list[tuple[rrb.View | rrb.Container, float]] = []

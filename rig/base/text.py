@@ -43,7 +43,7 @@ def find_similar(name: object, known: Iterable[str], *, most: int = 3) -> list[s
         most: Largest number of names.
 
     Example:
-        >>> nearest("p_n", ["P_N", "P_S", "disk_x"], most=1)
+        >>> find_similar("p_n", ["P_N", "P_S", "disk_x"], most=1)
         ['P_N']
     """
     import difflib

@@ -33,7 +33,7 @@ from rig.serve.request_handler import (
     StepRequest,
 )
 from rig.serve.served_run import ServedRun
-from rig.serve.transport import Server, doors_of
+from rig.serve.transport import Server, get_doors
 from rig.serve.transport.limit import CommandLimit
 from rig.serve.waiting import BoundedQueue
 
@@ -121,7 +121,7 @@ class Service(ServedRun):
             # In lockstep many commands cause no delay, and none may be refused because of the wall clock.
             limit=limit or (CommandLimit(_UNLIMITED_HZ) if isinstance(clock, Lockstep) else None),
         )
-        simulation.serve(tuple(doors_of(server)))
+        simulation.serve(tuple(get_doors(server)))
         self._simulation = simulation
         self._block_ticks = block_ticks
         self._status_period_s = status_period_s
@@ -469,7 +469,7 @@ class Service(ServedRun):
             self._sent_counts[message.key] = self._sent_counts.get(message.key, 0) + 1
         servers = [self._server]
         if message.doors != DOORS:
-            servers = [server for door, server in doors_of(self._server).items() if door in message.doors]
+            servers = [server for door, server in get_doors(self._server).items() if door in message.doors]
         for server in servers:
             server.publish(message.key, wire.encode_block(message.block))
 

@@ -31,7 +31,7 @@ from recorder.viewer import live
 from rig.base import wire
 from rig.base.errors import InputError
 from rig.channels.table import default_table
-from rig.serve.stream_check import BlockValidator, Catalogue
+from rig.serve.stream_check import Catalogue
 from rig.serve.transport.memory import MemoryClient, MemoryServer
 from rig.serve.transport.zenoh import ZenohClient, ZenohServer
 from tests.hostile import input_count
@@ -342,7 +342,7 @@ def test_a_jump_is_accepted_only_with_a_following_block() -> None:
         ([5, 6, 5, 7, 8], [5, 6, 7, 8], 1),  # repeated
         ([5, 6, 900, 3, 900, 7, 8], [5, 6, 7, 8], 3),
     ):
-        intake = Intake(Catalogue.read(make_documents()[wire.CATALOGUE]))
+        intake = BlockValidator(Catalogue.read(make_documents()[wire.CATALOGUE]))
         found = []
         for number in numbers:
             rows = truth.rows[PROBES]

@@ -300,7 +300,7 @@ def test_a_link_ends_when_its_certificate_expires(folders: Path, tmp_path: Path)
     write("server", issue, Usage.SERVER_AUTH)
     with ZenohServer(plain, exposed=Exposure(exposed, read_holder(tmp_path, server=True))) as server:
         for valid_s in (3, 30):  # on a busy machine the first connection may take longer than the shorter one
-            write("viewer", Issue(signing, timedelta(seconds=valid_s)), Usage.CLIENT_AUTH)
+            write("viewer", CertificateIssuer(signing, timedelta(seconds=valid_s)), Usage.CLIENT_AUTH)
             with contextlib.suppress(zenoh.ZError), open_hostile_session(f"tls/{exposed}", folder=tmp_path / "viewer"):
                 if server.congestion().get("links_viewer") == 1:
                     until(lambda: "links_viewer" not in server.congestion(), every_s=0.1)
@@ -347,7 +347,7 @@ def test_an_exposed_rig_limits_links_and_message_size(folders: Path) -> None:
     with ExitStack() as stack:
         holder = read_holder(folders / "server", server=True)
         server = stack.enter_context(ZenohServer(plain, exposed=Exposure(exposed, holder)))
-        server.hear("rig/clients/*", lambda _, payload: heard.append(len(payload)))
+        server.subscribe_reports("rig/clients/*", lambda _, payload: heard.append(len(payload)))
         session = stack.enter_context(open_hostile_session(f"tls/{exposed}", folder=folders / "recorder"))
         for size in (100, 500_000, 2 << 20, 101):
             session.put("rig/clients/a", bytes(size), congestion_control=zenoh.CongestionControl.BLOCK)

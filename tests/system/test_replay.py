@@ -43,7 +43,7 @@ def generate_payloads() -> Iterator[tuple[str, bytes]]:
     """Yield a short run whose end event has the number of rows."""
     rows: dict[str, int] = {}
     for key, payload in generate_stream(BLOCKS):
-        schema = wire.schema_of(key)
+        schema = wire.get_schema(key)
         if schema is not None:
             block = wire.decode_block(payload, schema)
             rows[key] = block.index + len(block.values)

@@ -236,7 +236,7 @@ def test_a_busy_viewer_is_retried_and_then_refused_in_one_line(tmp_path: Path, m
     monkeypatch.setattr(window, "ViewerClient", BusyViewer)
     said: list[str] = []
     monkeypatch.setattr(window, "_MESSAGE_INTERVAL_S", 0.0)
-    with Window("web", tell=said.append) as shown:
+    with Window("web", on_message=said.append) as shown:
         shown.picture(tmp_path / "busy.png", at_s=1.0, end_s=2.0)
         assert (tmp_path / "busy.png").read_bytes() == BusyViewer.picture
         assert said[-1].startswith("waiting for the viewer for ")

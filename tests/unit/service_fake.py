@@ -49,7 +49,7 @@ class FakeSimulation:
         warn_at_tick: int | None = None,
     ) -> None:
         self.tick = 0
-        self.told = {}
+        self.command_result = {}
         self.end_tick = None if duration_s is None else round(duration_s * self.tick_rate_hz)
         self.fail_at_tick = fail_at_tick
         self.warn_at_tick = warn_at_tick

@@ -34,7 +34,7 @@ from rig.base import wire
 from rig.base.errors import InputError
 from rig.channels.table import default_table
 from rig.run.commands.table import HammerCommand, SpeedCommand, check_command
-from rig.serve.health import Rising
+from rig.serve.health import IncreaseWarning
 from rig.serve.pacing import FreeRun, RealTime
 from rig.serve.service import Service
 from rig.serve.transport.fanout import Fanout

@@ -272,7 +272,7 @@ def test_impossible_faults_are_refused_in_one_line(request_: dict[str, Any], say
 def test_only_an_active_fault_can_be_cleared() -> None:
     simulation = Simulation(SCENE)
     simulation.submit("fault", {"channel": "P_E", "kind": "open"})
-    assert simulation.told == {"fault": 1, "channels": ["P_E"], "first_row": {"forces": 0}}
+    assert simulation.command_result == {"fault": 1, "channels": ["P_E"], "first_row": {"forces": 0}}
     with pytest.raises(InputError, match=r"clear\.id must be the number of an active fault"):
         simulation.submit("clear", {"id": 2})
     simulation.submit("clear", {"id": 1})

@@ -68,7 +68,7 @@ def test_the_help_names_the_commands_that_need_the_whole_rig(tmp_path: Path) -> 
     from rig.cli.app import COMMANDS, NEED_FULL
 
     shown = " ".join(run_lean("from rig.cli.main import main; main(['-h'])").stdout.split())
-    assert shown.endswith(f"{WHOLE_RIG}: {', '.join(NEED_FULL)}.")
+    assert shown.endswith(f"{INSTALL_COMMAND}: {', '.join(NEED_FULL)}.")
     assert set(NEED_FULL) <= {name for commands in COMMANDS.values() for name in commands}
     given = {name: FULL_ARGUMENTS.get(name, "").format(rec=RECORDING, folder=tmp_path).split() for name in NEED_FULL}
     done = run_lean(

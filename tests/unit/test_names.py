@@ -39,8 +39,8 @@ def test_a_name_exists_while_it_is_held_by_one_process(runtime: Path) -> None:
 
 
 def test_the_name_of_a_killed_process_is_removed(runtime: Path) -> None:
-    hold = "with registered('gone', '127.0.0.1:1'): print(1, flush=True); time.sleep(60)"
-    code = f"import time; from rig.serve.transport.names import registered\n{hold}"
+    hold = "with register_name('gone', '127.0.0.1:1'): print(1, flush=True); time.sleep(60)"
+    code = f"import time; from rig.serve.transport.names import register_name\n{hold}"
     with processes.start_python("-c", code) as child:
         assert child.stdout is not None
         assert child.stdout.readline() == "1\n"

@@ -180,7 +180,7 @@ def test_late_sleeps_do_not_accumulate(track: Track, rate: float) -> None:
     played, summary = play(track, rate=rate)
     begin_ns = played.begin_ns  # type: ignore[attr-defined]
     for (key, payload), at_ns in zip(played.all, played.at_ns, strict=True):
-        schema = wire.schema_of(key)
+        schema = wire.get_schema(key)
         if schema is not None:
             due_ns = begin_ns + (wire.decode_block(payload, schema).tick * 1000 + BLOCK_NS) / rate
             assert -1 <= at_ns - due_ns <= 700_001
@@ -291,7 +291,7 @@ def test_complete_passes_keep_every_payload_except_intermediate_ends(track: Trac
 def test_new_numbers_run_on_through_passes_and_belong_together(track: Track) -> None:
     played, _ = play(track, part=Part(from_s=0.1, to_s=0.3, start_s=0.2, loops=3), renumber=True)
     continuity = wire.Continuity()
-    keys = [key for key in played.payloads if wire.schema_of(key) is not None]
+    keys = [key for key in played.payloads if wire.get_schema(key) is not None]
     for key in keys:
         for block in played.blocks(key):
             assert continuity.follow(key, block.index, len(block.values)) is None

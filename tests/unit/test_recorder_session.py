@@ -33,7 +33,6 @@ from rig.base.wire import (
     decode_document,
     encode_block,
     encode_document,
-    get_schema,
     sensor_key,
     truth_key,
 )
@@ -258,7 +257,7 @@ def test_a_time_to_record_ends_for_all_streams_at_the_same_block(path):
 
 def test_streams_starting_a_block_apart_have_the_full_duration(path):
     client = ScriptedClient()
-    items = [item for item in generate_stream(60) if schema_of(item[0])]
+    items = [item for item in generate_stream(60) if get_schema(item[0])]
     place = items.index((sensor_key("hammer"), encode_block(make_block(sensor_key("hammer"), 3))))
     summary = record(RecordingSession(client, path, duration_s=0.2), client, play(client, items[place:]))
     streams = Recording.open(path).streams

@@ -297,8 +297,8 @@ def test_rows_missing_at_the_end_are_a_gap(tmp_path):
     path = tmp_path / "run.mcap"
     with writer(path) as file:
         file.write(PROBES, encode_block(make_block(PROBES, 0)), 0)
-        assert file.tally.short_of({PROBES: 200}) == {}
-        assert file.tally.short_of({PROBES: 300, truth_key("state"): 9}) == {PROBES: 300}
+        assert file.tally.find_missing_rows({PROBES: 200}) == {}
+        assert file.tally.find_missing_rows({PROBES: 300, truth_key("state"): 9}) == {PROBES: 300}
         file.note_short({PROBES: 300}, 0)
         file.finish("completed")
     assert Recording.open(path).gaps == [Gap(PROBES, 200, 100)]

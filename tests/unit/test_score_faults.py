@@ -21,7 +21,7 @@ from rig.channels.table import default_table
 from rig.physics.kernels.observe import EDGE_WIDTH, KEYPHASOR_WIDTH
 from rig.physics.kernels.signals import COLUMN, N_ROW
 from rig.run.commands.table import FaultCommand
-from rig.run.fault_injection import Faulty
+from rig.run.fault_injection import FaultInjector
 from tests.fault_cases import DEFECT_OF, SCORED, size_of
 from tests.score_daqs import Tones, write_parquet, write_session
 
@@ -58,7 +58,7 @@ class Rig:
     def counts(self, faults: tuple[str, ...], *, noisy: bool) -> dict[str, np.ndarray]:
         """Return counts by group with faults from the beginning."""
         chain = Conditioner(GROUPS, row_rate_hz=ROWS_HZ, seed=2, noise=noisy, columns=self.columns)
-        faulty = Faulty(default_table(), [chain], seed=2, row_ticks=10, setting=Setting())
+        faulty = FaultInjector(default_table(), [chain], seed=2, row_ticks=10, setting=Setting())
         for kind in faults:
             command = {"channel": SCORED[kind].channel, "kind": kind, **SCORED[kind].numbers}
             faulty.begin(FaultCommand.model_validate(command), 0, [])

@@ -54,7 +54,7 @@ def test_requests_reports_and_the_token() -> None:
     with pytest.raises(NoReplyError, match="rig/status"):
         client.request("rig/status")
     server.answer("rig/status", lambda payload: payload + b"!")
-    server.hear("rig/clients/*", lambda *report: received.append(report))
+    server.subscribe_reports("rig/clients/*", lambda *report: received.append(report))
     client.watch("rig/alive", seen.append)
     assert seen == []
     server.announce()

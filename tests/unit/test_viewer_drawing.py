@@ -64,7 +64,7 @@ def test_orbit_shows_a_few_turns_within_a_time_limit() -> None:
 
 @pytest.mark.parametrize("frequency_hz", [-83.0, 83.0, 6.0])
 def test_spectrum_puts_a_whirl_at_its_signed_frequency_with_its_radius(frequency_hz: float) -> None:
-    frequencies, amplitude = spectrum.shown_spectrum(0.2 + whirling(frequency_hz, 0.926), RATE_HZ)
+    frequencies, amplitude = spectrum.limit_spectrum(0.2 + whirling(frequency_hz, 0.926), RATE_HZ)
     assert frequencies[np.argmax(amplitude)] == frequency_hz
     assert amplitude.max() == pytest.approx(0.926, rel=1e-2)
     # Nothing on the other side, and the offset from the centre is not shown.
@@ -74,13 +74,13 @@ def test_spectrum_puts_a_whirl_at_its_signed_frequency_with_its_radius(frequency
 
 
 def test_a_straight_vibration_is_as_much_forward_as_backward() -> None:
-    frequencies, amplitude = spectrum.shown_spectrum(whirling(40.0, 0.5) + whirling(-40.0, 0.5), RATE_HZ)
+    frequencies, amplitude = spectrum.limit_spectrum(whirling(40.0, 0.5) + whirling(-40.0, 0.5), RATE_HZ)
     assert amplitude[frequencies == 40].item() == pytest.approx(amplitude[frequencies == -40].item(), rel=1e-6)
 
 
 def test_spectrum_of_a_slow_stream_is_empty_above_its_nyquist_frequency() -> None:
     z = np.exp(-2j * math.pi * 20.0 * np.arange(100) / 200.0)
-    frequencies, amplitude = spectrum.shown_spectrum(z, 200)
+    frequencies, amplitude = spectrum.limit_spectrum(z, 200)
     assert frequencies[np.argmax(amplitude)] == -20
     assert not amplitude[np.abs(frequencies) >= 100].any()
 

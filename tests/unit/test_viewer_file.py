@@ -15,7 +15,7 @@ from recorder.viewer import blueprint, file
 from recorder.viewer.canvas import Canvas, new_stream
 from recorder.viewer.drawings import spectrum
 from recorder.viewer.drawings.geometry import Geometry
-from recorder.viewer.painter import not_drawn
+from recorder.viewer.painter import list_missing_views
 from replays.recordings.export import write_run
 from rig.base import wire
 from rig.channels.table import ChannelTable, default_table
@@ -269,12 +269,12 @@ def test_event_texts_are_one_line() -> None:
 
 def test_other_channels_get_the_matching_views() -> None:
     table = default_table()
-    assert not_drawn(table) == []
+    assert list_missing_views(table) == []
     foreign = table.groups["forces"].model_copy(
         update={"name": "log", "channels": (table.channels["P_N"].model_copy(update={"name": "rpm"}),)}
     )
     other = ChannelTable(groups={"log": foreign})
-    assert [text.split(" (no")[0] for text in not_drawn(other)] == [
+    assert [text.split(" (no")[0] for text in list_missing_views(other)] == [
         "orbit, spectrum, contact",
         "reaction",
         "turning of the rotor",

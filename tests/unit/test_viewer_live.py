@@ -186,7 +186,7 @@ def test_a_slow_viewer_gets_fewer_pictures_with_all_peaks(recording: Synthetic, 
         del blocks[:5]
         return False
 
-    assert view.run(stop=publish, tell=said.append) == "the rig ended: completed"
+    assert view.run(stop=publish, on_message=said.append) == "the rig ended: completed"
     stream.flush()
     stream.disconnect()
     saved = Saved(tmp_path / "paced.rrd")
