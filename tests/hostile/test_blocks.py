@@ -31,7 +31,7 @@ from recorder.viewer import live
 from rig.base import wire
 from rig.base.errors import InputError
 from rig.channels.table import default_table
-from rig.serve.stream_check import Catalogue
+from rig.serve.stream_check import BlockValidator, Catalogue
 from rig.serve.transport.memory import MemoryClient, MemoryServer
 from rig.serve.transport.zenoh import ZenohClient, ZenohServer
 from tests.hostile import input_count

@@ -33,6 +33,7 @@ from rig.base.wire import (
     decode_document,
     encode_block,
     encode_document,
+    get_schema,
     sensor_key,
     truth_key,
 )
