@@ -323,7 +323,7 @@ def test_status_and_validation_escape_control_sequences_in_names(name: str, caps
     tables.table_console().print(status_table(document))
     for text in (name, f"scene {name}"):
         tables.echo(text.replace("\n", " "))
-        with tables.table_console().status(tables.plain(text)):
+        with tables.table_console().status(tables.plain_text(text)):
             pass
         with tables.progress_bar() as bar:
             bar.add_task(text.replace("\n", " "), total=1)

@@ -58,6 +58,6 @@ def test_the_second_process_ignores_modules_in_the_working_directory(
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("PYTHONPATH", raising=False)
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1}, raising=False)
-    child = background_compiling.start_beside()
+    child = background_compiling.start_second_process()
     assert child is not None
     assert child.wait() == 0

@@ -210,7 +210,7 @@ def test_each_role_has_exactly_the_rights_of_the_table(name: str | None, mode: s
     doors = get_permissions(name)
     seen: list[tuple[str, bytes]] = []
     with (
-        ZenohServer(plain, exposed=Exposure(exposed, holder_in(folders / "server", server=True))) as server,
+        ZenohServer(plain, exposed=Exposure(exposed, read_holder(folders / "server", server=True))) as server,
         NormalClient(plain) as honest,
         open_hostile_session(f"tcp/{plain}") as beside,
         open_hostile_session(

@@ -354,7 +354,7 @@ def test_drops_are_a_warning_in_the_status_and_one_event_each_time_while_they_ha
     bus = RefusingBus()
     now = 0.0
     with rig(FakeChannels(duration_s=None), paced=True, bus=bus) as setup:
-        setup.gateway.dropping = Rising("CAN: {} frames were dropped", clock=lambda: now)
+        setup.gateway.dropping = IncreaseWarning("CAN: {} frames were dropped", clock=lambda: now)
         replies = []
         setup.client.subscribe(wire.EVENTS, lambda _, payload: replies.append(wire.decode_document(payload)))
         setup.start()

@@ -14,7 +14,7 @@ from recorder.files.chunks import Chunk
 from recorder.reader import Recording
 from recorder.writer import RecordingWriter
 from rig.base.wire import CATALOGUE, EVENTS, PARAMETERS, SCENE, encode_document, sensor_key
-from rig.cli.commands.record import run_session, tell
+from rig.cli.commands.record import print_result, run_session
 from rig.cli.main import main
 from tests.commands import run
 
@@ -200,10 +200,12 @@ def _summary(**values: Any) -> Summary:
 
 
 def test_a_triggered_recording_counts_its_own_rows(capsys):
-    tell(_summary(fired=0, received_s=6.4))
+    print_result(_summary(fired=0, received_s=6.4))
     assert capsys.readouterr().out.splitlines()[0] == ("no trigger in 6.400 s; nothing written; ended: completed")
     files = (Path("run.hammer-001.mcap"),)
-    tell(_summary(path=files[0], files=files, fired=2, received_s=9.0, duration_s=2.5, rows={sensor_key("probes"): 50}))
+    print_result(
+        _summary(path=files[0], files=files, fired=2, received_s=9.0, duration_s=2.5, rows={sensor_key("probes"): 50})
+    )
     assert capsys.readouterr().out.startswith(
         "run.hammer-001.mcap: 2.500 s from 0.000 s on (around 2 triggers, of 9.000 s received), 50 samples in 1 streams"
     )

@@ -64,7 +64,7 @@ class ScriptedClient:
 def run(client: ScriptedClient, path: Path, **options: Any) -> tuple[str, live.LiveView, Saved]:
     stream = new_stream("live test")
     stream.save(path)
-    view = live.LiveView(client, Canvas(stream), live.ask(client), **options)
+    view = live.LiveView(client, Canvas(stream), live.request_document(client), **options)
     reason = view.run()
     stream.flush()
     stream.disconnect()
@@ -178,7 +178,9 @@ def test_a_slow_viewer_gets_fewer_pictures_with_all_peaks(recording: Synthetic, 
     stream = new_stream("paced")
     stream.save(tmp_path / "paced.rrd")
     said: list[str] = []
-    view = live.LiveView(client, Canvas(stream), live.ask(client), taken=lambda: 1_000_000 if prompt else 0)
+    view = live.LiveView(
+        client, Canvas(stream), live.request_document(client), taken=lambda: 1_000_000 if prompt else 0
+    )
 
     def publish() -> bool:
         for message in [message for block in blocks[:5] for message in block]:
@@ -209,7 +211,7 @@ def test_closing_the_viewer_ends_the_view(recording: Synthetic, tmp_path: Path) 
     stream.save(tmp_path / "closed.rrd")
     client = ScriptedClient(recording, payloads_of(recording)[:10])
     with time_limit(PATIENCE_S):
-        reason = live.LiveView(client, Canvas(stream), live.ask(client)).run(stop=lambda: True)
+        reason = live.LiveView(client, Canvas(stream), live.request_document(client)).run(stop=lambda: True)
     stream.flush()
     stream.disconnect()
     assert reason == "the viewer was closed"
@@ -224,7 +226,7 @@ def test_a_stalled_window_is_not_drawn(recording: Synthetic, tmp_path: Path, mon
     client = ScriptedClient(recording, early)
     stream = new_stream("stalled")
     stream.save(tmp_path / "stalled.rrd")
-    view = live.LiveView(client, Canvas(stream), live.ask(client))
+    view = live.LiveView(client, Canvas(stream), live.request_document(client))
     ticks = iter(range(100))
 
     def publish_later() -> bool:

@@ -130,7 +130,7 @@ def _view_live(connection: Connection, *, web: bool, save: Path | None, only: st
     from recorder.viewer.canvas import Canvas, new_stream
 
     with connection.client() as client:
-        described = live.ask(client)
+        described = live.request_document(client)
         stream = new_stream(f"rig at {connection.connect}")
         plan = blueprint.layout(described.table, described.geometry, live=True, only=only)
         if save is not None:
