@@ -286,7 +286,7 @@ def examine(recording: Recording, progress: Callable[[float], None] = lambda _: 
     recording.scan(watch)
     times_s = np.unique(np.concatenate(edges)) if edges else np.empty(0)
     spin_hz = 1.0 / float(np.median(np.diff(times_s))) if len(times_s) > 2 else 0.0
-    channels = [health for one in watches.values() for health in one.results(spin_hz)]
+    channels = [health for statistics in watches.values() for health in statistics.results(spin_hz)]
     return _build_health(recording, channels)
 
 
@@ -313,7 +313,7 @@ def _build_health(recording: Recording, channels: list[ChannelHealth]) -> Health
         jitter_ms=jitter_ms,
         jitter_max_ms=jitter_max_ms,
         strays=strays,
-        misplaced={key: one.misplaced for key, one in recording.streams.items() if one.misplaced},
+        misplaced={key: stream.misplaced for key, stream in recording.streams.items() if stream.misplaced},
         status={name: last[name] for name in kept if name in last},
         warnings=list(warnings),
         findings=findings,

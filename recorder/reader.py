@@ -125,7 +125,9 @@ class Recording:
     def commands(self) -> list[dict[str, Any]]:
         """Commands received by the rig, including those before the recording: id, tick, command, request."""
         declared = [*self.scene.get("taken", []), *(event for event in self.events if event.get("event") == "command")]
-        found = {one["id"]: {name: one[name] for name in ("id", "tick", "command", "request")} for one in declared}
+        found = {
+            entry["id"]: {name: entry[name] for name in ("id", "tick", "command", "request")} for entry in declared
+        }
         return [found[number] for number in sorted(found)]
 
     @cached_property

@@ -236,7 +236,7 @@ class RecordingSession:
     def first_files(self) -> list[Path]:
         """Output file, or the first of several for each trigger."""
         if self._capture is not None:
-            return list(dict.fromkeys(capture_path(self.path, each, 1) for each in self._capture.triggers))
+            return list(dict.fromkeys(capture_path(self.path, trigger, 1) for trigger in self._capture.triggers))
         return [part_path(self.path, 0) if self._limits.rotates else self.path]
 
     def _open_sink(self, streams: Catalogue, catalogue: Document, parameters: Document, scene: Document) -> Sink:
@@ -273,24 +273,24 @@ class RecordingSession:
                 with self._order:
                     self._offer(self._validator.declare(document.document))
 
-    def _offer(self, taken: list[AcceptedBlock]) -> None:
-        for each in taken if not self._replaced else ():
-            self._inbox.offer(Payload.from_block(each))
+    def _offer(self, blocks: list[AcceptedBlock]) -> None:
+        for accepted in blocks if not self._replaced else ():
+            self._inbox.offer(Payload.from_block(accepted))
 
     def _take(self, key: str, payload: bytes, wall_ns: int) -> None:
         """Process a block on the thread of its stream."""
         due = self._validator.next.get(key, 0)
         try:
-            taken = self._validator.take(key, payload, wall_ns)
+            blocks = self._validator.take(key, payload, wall_ns)
         except ValueError:
             if self._validator.has_stream(key):
                 self._inbox.offer(Payload.read(key, payload, wall_ns))  # recorded unchanged as malformed
             return
-        if taken:
+        if blocks:
             # A rig whose row numbers restart after a lost link is a different one.
-            self._replaced = self._replaced or (self._rig_lost and taken[0].block.index < due)
+            self._replaced = self._replaced or (self._rig_lost and blocks[0].block.index < due)
             self._last_block_s = self._monotonic_s()
-        self._offer(taken)
+        self._offer(blocks)
 
     def _on_miss(self, key: str, messages: int) -> None:
         self._misses.append((key, messages, self._wall_ns()))
@@ -421,10 +421,10 @@ class RecordingSession:
         try:
             while self._misses:
                 writer.write_missed(*self._misses.popleft())
-            for each in (
+            for accepted in (
                 self._validator.take_waiting(self._end_rows) if not self._replaced and self._failure is None else ()
             ):
-                payload = Payload.from_block(each)
+                payload = Payload.from_block(accepted)
                 if self._extent.takes(payload):
                     writer.take(payload)
             if reason == self._end_reason and self._end_rows:
@@ -454,7 +454,7 @@ class RecordingSession:
             reason=reason,
             error=disk_error or (writer.ended if writer.out_of_room else ""),
             first_time_s=(in_files.first_time_ns or 0) / NS,
-            duration_s=sum(each.extent_ns for each in kept) / NS,
+            duration_s=sum(counts.extent_ns for counts in kept) / NS,
             rows=in_files.rows,
             lost={key: more for key, lost in counts.lost.items() if (more := lost - counts.declared.get(key, 0)) > 0},
             declared={key: rows for key, rows in counts.declared.items() if rows},

@@ -102,7 +102,7 @@ class ConsistencyCheck:
             streams: Extent of every stream by key.
             steps: Steps of the row numbers by key, of the streams whose payloads can all be read.
         """
-        filled = {key: one for key, one in streams.items() if one.rows}
+        filled = {key: stream for key, stream in streams.items() if stream.rows}
         self._check_end_metadata(filled)
         self._check_gaps(filled, steps)
         self._check_cut(filled)
@@ -200,9 +200,9 @@ class ConsistencyCheck:
         end, metadata = self._file.metadata.get("end", {}), self._file.metadata
         if not self._file.complete or not end:
             return
-        clocked = [one for key, one in streams.items() if key != EDGES]
+        clocked = [stream for key, stream in streams.items() if key != EDGES]
         if clocked:
-            span_s = min(one.start_s for one in streams.values()), max(one.last_time_s for one in clocked)
+            span_s = min(stream.start_s for stream in streams.values()), max(stream.last_time_s for stream in clocked)
             for which, time_s in zip(("first", "last"), span_s, strict=True):
                 stated_s = _to_float(end.get(f"{which}_time_s"))
                 if stated_s is not None and abs(stated_s - time_s) > 2e-6:
@@ -249,11 +249,11 @@ class ConsistencyCheck:
         """Compare the streams with the selection in the metadata of a cut."""
         about = self._file.metadata.get("cut", {})
         low, high = (_to_float(about.get(name)) for name in ("from_s", "to_s"))
-        for key, one in streams.items() if about else ():
-            if low is not None and one.first_time_s < low - 1e-5 * abs(low) - 2e-6:
-                self._report(f"{key} begins at {one.first_time_s:.6f} s, before the start of the cut at {low:g} s")
-            if high is not None and one.last_time_s > high + 1e-5 * abs(high) + 2e-6:
-                self._report(f"{key} ends at {one.last_time_s:.6f} s, after the end of the cut at {high:g} s")
+        for key, stream in streams.items() if about else ():
+            if low is not None and stream.first_time_s < low - 1e-5 * abs(low) - 2e-6:
+                self._report(f"{key} begins at {stream.first_time_s:.6f} s, before the start of the cut at {low:g} s")
+            if high is not None and stream.last_time_s > high + 1e-5 * abs(high) + 2e-6:
+                self._report(f"{key} ends at {stream.last_time_s:.6f} s, after the end of the cut at {high:g} s")
             if (only := {"sensors": SENSORS, "truth": TRUTH}.get(about.get("only", ""))) and not key.startswith(only):
                 self._report(f"{key} is present, although the cut keeps only {about['only']}")
         kept = _load_json(about.get("channels"))
@@ -272,7 +272,7 @@ class ConsistencyCheck:
         for name in ("start", "end"):
             if sum(event["event"] == name for event in self._events) > 1:
                 self._report(f"more than one {name} of the run among the events")
-        last_s = max((one.last_time_s for key, one in streams.items() if key != EDGES), default=0.0)
+        last_s = max((stream.last_time_s for key, stream in streams.items() if key != EDGES), default=0.0)
         due_s = _to_float(self._scene.get("duration_s"))
         block_s = _MAX_BLOCK_PERIODS / ((self._scene.get("sensors") or {}).get("truth_rate_hz") or 10.0)
         if due_s is not None and last_s > due_s + block_s:
@@ -290,12 +290,12 @@ class ConsistencyCheck:
         end_s = end["tick"] / self._ticks_hz
         if due_s is not None and end.get("reason") == "completed" and not -1e-6 <= end_s - due_s <= block_s:
             self._report(f"end: completed at {end_s:g} s in {EVENTS} but {due_s:g} s long in {_SCENE}")
-        for key, one in streams.items():
-            if one.last_time_s > end_s + 1.5e-6:
-                self._report(f"{key} continues to {one.last_time_s:.6f} s, after the end of the run at {end_s:g} s")
+        for key, stream in streams.items():
+            if stream.last_time_s > end_s + 1.5e-6:
+                self._report(f"{key} continues to {stream.last_time_s:.6f} s, after the end of the run at {end_s:g} s")
             published = (end.get("rows") or {}).get(key)
-            if published is not None and one.due > published:
-                self._report(f"{key} continues to row {one.due}, but the rig published {published}")
+            if published is not None and stream.due > published:
+                self._report(f"{key} continues to row {stream.due}, but the rig published {published}")
         for other in self._events:
             if isinstance(other.get("tick"), int) and other["tick"] > end["tick"]:
                 self._report(f"{other['event']} at {other['tick'] / self._ticks_hz:g} s, after the end at {end_s:g} s")
@@ -306,7 +306,7 @@ class ConsistencyCheck:
         for timed in self._scene.get("commands") or ():
             tick = round(timed["at_s"] * self._ticks_hz)
             expected.setdefault((timed["request"]["command"], tick), []).append((_SCENE, timed["request"]))
-        sources = [("scene.json, taken", one) for one in self._file.scene.get("taken", ())]
+        sources = [("scene.json, taken", command) for command in self._file.scene.get("taken", ())]
         sources += [(EVENTS, event) for event in self._events if event["event"] == "command"]
         accepted: dict[Any, dict[str, Any]] = {}
         for source, command in sources:
@@ -351,10 +351,10 @@ class ConsistencyCheck:
                     self._state(f"{at}, {field}", **{where: value, EVENTS: event.get(field)})
         if not self._events or {"series", "recovered"} & set(self._file.metadata):
             return  # the events of one file of a series may be in the next file, or lost
-        even = [one for key, one in streams.items() if key != EDGES]
+        even = [stream for key, stream in streams.items() if key != EDGES]
         if any(gap["key"] == EVENTS for gap in self._gap_records) or not even:
             return
-        first_s, last_s = max(one.first_time_s for one in even), min(one.last_time_s for one in even)
+        first_s, last_s = max(stream.first_time_s for stream in even), min(stream.last_time_s for stream in even)
         warned = {event["tick"] for event in self._events if event["event"] == "warning"}
         for name, tick in expected:
             inside = first_s < tick / self._ticks_hz < last_s

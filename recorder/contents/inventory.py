@@ -129,7 +129,9 @@ class Survey:
     @cached_property
     def short(self) -> tuple[str, ...]:
         """Rows that the file states and does not contain, one line per stream."""
-        return tuple(f"{one.missing} rows of {key} are missing" for key, one in self.streams.items() if one.missing)
+        return tuple(
+            f"{stream.missing} rows of {key} are missing" for key, stream in self.streams.items() if stream.missing
+        )
 
     @cached_property
     def doubts(self) -> tuple[str, ...]:
@@ -158,13 +160,13 @@ class Survey:
         for topic in sorted(set(messages) | set(self._counted)):
             if (counted := self._counted.get(topic, 0)) != (stated := messages.get(topic, 0)):
                 found.append(f"{counted} messages of {topic}, but the file states {stated}")
-        filled = {key: one for key, one in self.streams.items() if one.rows}
-        span_s = max((one.last_time_s for one in filled.values()), default=0.0)
-        span_s -= min((one.first_time_s for one in filled.values()), default=0.0)
+        filled = {key: stream for key, stream in self.streams.items() if stream.rows}
+        span_s = max((stream.last_time_s for stream in filled.values()), default=0.0)
+        span_s -= min((stream.first_time_s for stream in filled.values()), default=0.0)
         for key in sorted(set(formats) - {EDGES} - set(filled)):
             if span_s > max(_MIN_SPAN_S, 2.0 / formats[key].rate_hz):
                 found.append(f"no rows of {key}, which is in the catalogue")
-        sound = {key: self._steps.get(key, []) for key, one in self.streams.items() if not one.invalid}
+        sound = {key: self._steps.get(key, []) for key, stream in self.streams.items() if not stream.invalid}
         found += self._consistency.find_contradictions(self.streams, sound)
         return tuple(found)
 

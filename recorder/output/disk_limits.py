@@ -62,13 +62,13 @@ class Limits:
         return self.rotate_mb is not None or self.rotate_s is not None
 
 
-def check_files(path: Path, first: Iterable[Path], others: str, limits: Limits, *, force: bool) -> None:
+def check_files(path: Path, first: Iterable[Path], pattern: str, limits: Limits, *, force: bool) -> None:
     """Refuse names that cannot become the files of a recording, without removing anything.
 
     Args:
         path: Name of the recording.
         first: Possible names of the first file.
-        others: Regular expression for the numbered files (`find_files`); empty if there are none.
+        pattern: Regular expression for the numbered files (`find_files`); empty if there are none.
         limits: Limits of the disk space.
         force: Allow replacing existing files.
 
@@ -77,8 +77,8 @@ def check_files(path: Path, first: Iterable[Path], others: str, limits: Limits, 
     """
     for name in first:
         check_destination(name, force=force)
-    if others and not force and (taken := find_files(path, others)):
-        raise InputError("output", "new files (--force replaces them)", Words(f"{taken[0]}, which exists"))
+    if pattern and not force and (existing := find_files(path, pattern)):
+        raise InputError("output", "new files (--force replaces them)", Words(f"{existing[0]}, which exists"))
     if reason := _find_disk_shortage(path.parent, limits.keep_free_mb):
         raise InputError("output", f"on a disk with room: {reason} (--keep-free-mb)", str(path))
 

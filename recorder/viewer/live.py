@@ -94,7 +94,7 @@ class LiveView:
         described: Described,
         *,
         wall: Callable[[], float] = time.time,
-        taken: Callable[[], int | None] | None = None,
+        get_processed: Callable[[], int | None] | None = None,
     ) -> None:
         """Prepare the canvas without receiving anything yet.
 
@@ -103,8 +103,8 @@ class LiveView:
             canvas: Canvas to draw on.
             described: Description of the rig.
             wall: Wall clock [unix s].
-            taken: Returns the number of the latest picture that the viewer has processed, or None if no viewer is open.
-                Without this function, pictures are not counted and curves are not thinned for the viewer.
+            get_processed: Returns the number of the latest picture that the viewer has processed, or None if no viewer
+                is open. Without this function, pictures are not counted and curves are not thinned for the viewer.
         """
         self._client = client
         self._reporter = Reporter(client, NAME)
@@ -116,8 +116,8 @@ class LiveView:
         self._beat_key = next(iter(self._groups), "")
         columns = described.contact_columns
         self._force_column = columns.index("normal_force") if "normal_force" in columns else None
-        self._taken = taken
-        self._pace = None if taken is None else Pace()
+        self._get_processed = get_processed
+        self._pace = None if get_processed is None else Pace()
         self._curves_s = self._folded_s = self._noted_s = -math.inf
         self._noted_every_s = MIN_INTERVAL_S
         self._fresh = False
@@ -184,8 +184,8 @@ class LiveView:
             now_s = time.monotonic()
             if self.take_in():
                 received_s = now_s
-            if self._pace is not None and self._taken is not None:
-                self._pace.record_displayed(self._taken(), now_s=now_s)
+            if self._pace is not None and self._get_processed is not None:
+                self._pace.record_displayed(self._get_processed(), now_s=now_s)
             if self._pace is None or self._pace.due(now_s):
                 self._draw(now_s)
             elif now_s - self._folded_s >= CURVE_INTERVAL_S:
@@ -305,14 +305,14 @@ class LiveView:
                 self.ended = printable(event.get("reason") or "no reason given", 500)
 
     def _take_blocks(self, key: str, payloads: list[bytes]) -> None:
-        taken = []
+        blocks = []
         for payload in payloads:
             try:
-                taken += self._validator.take(key, payload)
+                blocks += self._validator.take(key, payload)
             except ValueError:
                 self._malformed += 1
         run: list[wire.Block] = []
-        for _, block, *_ in taken:
+        for _, block, *_ in blocks:
             gap = self._continuity.follow(key, block.index, len(block.values))
             if gap is not None:
                 self._take_run(key, run)

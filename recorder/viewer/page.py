@@ -101,7 +101,7 @@ class Page:
         self._server = _Server((host, port), Handler)
         threading.Thread(target=self._server.serve_forever, args=(0.1,), name="page", daemon=True).start()
 
-    def taken(self) -> int | None:
+    def get_processed_picture(self) -> int | None:
         """Return the number of the latest picture that the slowest browser has, 0 for none; None without a browser."""
         now_s = time.monotonic()
         with self._lock:

@@ -110,7 +110,7 @@ class Window(Closing):
         # A browser opened later first processes everything that the server has kept.
         history = "1MiB" if live else memory
         self._on_message = on_message
-        self._taken: int | None = None
+        self._processed_picture: int | None = None
         self.page: Page | None = None
         port, web_port, own_port = free_port(_PORT), free_port(_WEB_PORT), free_port(0)
         ports = [port]
@@ -172,16 +172,16 @@ class Window(Closing):
             self._process.wait(timeout_s)
         return not self.open
 
-    def saved_count(self) -> int | None:
+    def get_processed_picture(self) -> int | None:
         """Return the number of the latest picture processed by the viewer or the slowest browser; None without one."""
-        return self._taken if self.page is None else self.page.saved_count()
+        return self._processed_picture if self.page is None else self.page.get_processed_picture()
 
     def _watch(self) -> None:
         """Poll the progress of a viewer on the screen; it replies with its next frame."""
         viewer = ViewerClient.connect(self.url)
         while self.open:
             with contextlib.suppress(*_NO_REPLY):
-                self._taken = _end_of(PICTURE, viewer.get_state())
+                self._processed_picture = _end_of(PICTURE, viewer.get_state())
             time.sleep(_POLL_INTERVAL_S)
 
     def picture(self, path: Path, *, at_s: float, end_s: float) -> None:

@@ -309,7 +309,7 @@ def load_extensions(group: str, kind: type[Extension], taken: Iterable[str]) -> 
     Args:
         group: Group of the entry points.
         kind: Class of an entry.
-        taken: Names in the table.
+        used_names: Names in the table.
     """
     found: dict[str, Extension] = {}
     broken = []
@@ -319,8 +319,8 @@ def load_extensions(group: str, kind: type[Extension], taken: Iterable[str]) -> 
         except (Exception, SystemExit) as error:  # external code may raise anything
             broken.append(f"{point.name} ({point.value} cannot be loaded: {describe_error(error)})")
             continue
-        if point.name in {*taken, *found}:
-            broken.append(f"{point.name} ({point.value} has a name that is taken)")
+        if point.name in {*used_names, *found}:
+            broken.append(f"{point.name} ({point.value} has a name that is in use)")
         elif not isinstance(entry, kind):
             broken.append(f"{point.name} ({point.value} must be a {kind.__module__}.{kind.__qualname__})")
         else:

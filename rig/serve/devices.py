@@ -163,8 +163,8 @@ class Devices:
     def _get_joined(self, command: str, name: str) -> _Device:
         device = self._devices.get(name)
         if device is None or device.lost is not None:
-            why = "" if device is None else f" (it was removed: {device.lost})"
-            raise InputError(f"{command}.device", f"one that has joined{why}", name)
+            detail = "" if device is None else f" (it was removed: {device.lost})"
+            raise InputError(f"{command}.device", f"one that has joined{detail}", name)
         return device
 
     def _remove(self, name: str, reason: str) -> str:

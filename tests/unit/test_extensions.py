@@ -194,7 +194,7 @@ def test_errors_in_an_external_package_are_one_line(package: Path) -> None:
     for words in (
         "exits (my_wrong.exits:ROW cannot be loaded: SystemExit: no licence)",
         "mute (my_wrong.mute:ROW cannot be loaded: Mute)",
-        "text (my_formats.raw:RAW has a name that is taken)",
+        "text (my_formats.raw:RAW has a name that is in use)",
         "twice (.raw is the ending of another format)",
         "number (my_wrong.formats:NUMBER: module must be a valid string; instead received 3)",
         "endless (my_wrong.formats:ENDLESS: suffixes must be a value of at least 1 item",

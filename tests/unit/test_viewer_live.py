@@ -179,7 +179,7 @@ def test_a_slow_viewer_gets_fewer_pictures_with_all_peaks(recording: Synthetic, 
     stream.save(tmp_path / "paced.rrd")
     said: list[str] = []
     view = live.LiveView(
-        client, Canvas(stream), live.request_document(client), taken=lambda: 1_000_000 if prompt else 0
+        client, Canvas(stream), live.request_document(client), get_processed=lambda: 1_000_000 if prompt else 0
     )
 
     def publish() -> bool:

@@ -69,14 +69,14 @@ def test_the_page_adds_a_script_and_uses_no_other_site(served: tuple[page.Page, 
 
 def test_the_slowest_browser_sets_the_rate(served: tuple[page.Page, str]) -> None:
     shown, address = served
-    assert shown.taken() is None
+    assert shown.get_processed_picture() is None
     shown.title = "rig: 0.1 s behind"
     assert post(f"{address}/state?a", STATE) == "rig: 0.1 s behind"
-    assert shown.taken() == 5_699_950_000
+    assert shown.get_processed_picture() == 5_699_950_000
     post(f"{address}/state?b", b"")  # a page that is still loading
-    assert shown.taken() == 0
+    assert shown.get_processed_picture() == 0
     post(f"{address}/closed?b", b"")
-    assert shown.taken() == 5_699_950_000
+    assert shown.get_processed_picture() == 5_699_950_000
 
 
 @pytest.mark.parametrize(
@@ -93,7 +93,7 @@ def test_reports_of_other_sites_are_refused(served: tuple[page.Page, str], heade
         request = urllib.request.Request(f"{served[1]}/state?a", data=data, headers=headers)
         with pytest.raises(urllib.error.HTTPError, match="400"):
             urllib.request.urlopen(request, timeout=10)
-    assert served[0].taken() is None
+    assert served[0].get_processed_picture() is None
 
 
 @pytest.mark.parametrize("begun", [b"GET /?url=x", b"POST /state?a"])
@@ -130,7 +130,7 @@ def test_invalid_reports_are_refused(
     connection.request(method, path, headers={"Content-Length": size})
     assert connection.getresponse().status == status
     connection.close()
-    assert served[0].taken() is None
+    assert served[0].get_processed_picture() is None
 
 
 def test_pages_are_not_without_number(served: tuple[page.Page, str]) -> None:
@@ -138,7 +138,7 @@ def test_pages_are_not_without_number(served: tuple[page.Page, str]) -> None:
     for number in range(32):
         post(f"{address}/state?{number}", STATE)
     post(f"{address}/state?more", b"")
-    assert shown.taken() == 5_699_950_000
+    assert shown.get_processed_picture() == 5_699_950_000
 
 
 @pytest.mark.parametrize("cut", range(0, len(STATE), 7))

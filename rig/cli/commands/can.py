@@ -71,19 +71,19 @@ def hub(
         stopped = threading.Event()
         with stop_on_signals(stopped.set):
             with reporting(compiles=True):
-                for one in hubs:
-                    stack.enter_context(one)
-            buses = {one.channel: partial(HubBus, one) for one in hubs}
+                for can_hub in hubs:
+                    stack.enter_context(can_hub)
+            buses = {can_hub.channel: partial(HubBus, can_hub) for can_hub in hubs}
             outlets = stack.enter_context(CanOutlets(buses, rates, socketcand=socketcand, slcan=slcan))
             for line in outlets.lines():
                 echo(f"rig: {line}", err=True)
             echo(f"rig: CAN {', '.join(channels)} at {rates} on {listen}; Ctrl-C ends it", err=True)
             while not stopped.wait(5.0):
-                for one in hubs:
-                    echo(_line(one.status()), err=True)
+                for can_hub in hubs:
+                    echo(_line(can_hub.status()), err=True)
                 for text in (text for part in (*hubs, outlets) for text in part.warnings()):
                     echo(f"rig: warning: {text}", err=True)
-        for line in (*(_line(one.status()) for one in hubs), *outlets.summary()):
+        for line in (*(_line(can_hub.status()) for can_hub in hubs), *outlets.summary()):
             echo(line)
 
 

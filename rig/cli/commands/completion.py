@@ -214,8 +214,8 @@ def _list_of(names: Callable[[str], Choices]) -> Callable[[str], Choices]:
 
     def joined(start: str) -> Choices:
         head = start[: start.rfind(",") + 1]
-        taken = head.split(",")
-        return [(head + name, says) for name, says in names(start) if name not in taken]
+        given_names = head.split(",")
+        return [(head + name, says) for name, says in names(start) if name not in given_names]
 
     return joined
 

@@ -95,9 +95,9 @@ class FitRequest:
                 rules = load_criteria().imported
                 found = identify_log(
                     recording, experiment, keys, **given, priors=priors, to_s=self.to_s, bandwidth=rules.bandwidth,
-                    variants=[one.set for one in rules.variants], progress=progress,
+                    variants=[variant.set for variant in rules.variants], progress=progress,
                 )  # fmt: skip
-                return found, [one.key for one in found.question.unknowns if one.nuisance]
+                return found, [unknown.key for unknown in found.question.unknowns if unknown.nuisance]
             experiment = fit_initial_state(recording, experiment)
             along = find_free_nuisances(experiment, keys)
             priors = {key: prior_value for key, prior_value in along.items() if prior_value is not None} | priors

@@ -172,7 +172,7 @@ def _tell_guesses(guesses: list[Guess], text: str, console: Console) -> None:
     for guess in guesses:
         unit = f" [{guess.entry.unit}]" if guess.entry.unit else ""
         where = f"{guess.entry.group} " if len({each.entry.group for each in guesses}) > 1 else ""
-        why = guess.why if guess.channel else "not a channel of the rig; kept as a new channel"
+        reason = guess.why if guess.channel else "not a channel of the rig; kept as a new channel"
         course = guess.features.sparkline(_SPARK)
         style = "" if guess.channel and guess.sure != "ask" else "yellow"
         table.add_row(
@@ -180,7 +180,7 @@ def _tell_guesses(guesses: list[Guess], text: str, console: Console) -> None:
             course,
             guess.channel or "-",
             guess.sure if guess.channel else "-",
-            why,
+            reason,
             style=style,
         )
     console.print(table)

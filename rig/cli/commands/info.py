@@ -204,11 +204,11 @@ def _lost_at_ends(recording: Recording, key: str) -> int:
     """Return the rows noted as lost before the first and after the last row, without those that a fault removed."""
     stream = recording.streams[key]
     gaps = [(gap.index, gap.size) for gap in recording.gaps if gap.key == key and gap.index >= 0 < gap.size]
-    lost, taken = (
+    lost, explained = (
         sum(rows for row, rows in each if row + rows <= stream.first or row >= stream.due)
         for each in (gaps, stream.gap_rows)
     )
-    return max(0, lost - taken)
+    return max(0, lost - explained)
 
 
 def _number(value: float | None, noise: float) -> str:
@@ -305,13 +305,13 @@ def events_table(events: list[dict[str, Any]]) -> Table:
         return str(event.get("tick")), str(event.get(name))
 
     effects = {of(event, "event") for event in events}
-    taken: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    commands_by_effect: dict[tuple[str, str], list[dict[str, Any]]] = {}
     table = new_table("", ">time [s]", "event", wrapped=["event"])
     for event in events:
         if event.get("event") == "command" and of(event, "command") in effects:
-            taken.setdefault(of(event, "command"), []).append(event)
+            commands_by_effect.setdefault(of(event, "command"), []).append(event)
             continue
-        if commands := taken.get(of(event, "event")):
+        if commands := commands_by_effect.get(of(event, "event")):
             event = event | {name: value for name, value in commands.pop(0).items() if name in ("id", "from")}
         time_s = event.get("time_s")
         stamp = f"{time_s:.4f}" if isinstance(time_s, float | int) else ""

@@ -203,8 +203,8 @@ def run_session(session: RecordingSession) -> Summary:
 
     def stop(number: int, _: object) -> None:
         session.stop(f"interrupted by {signal.Signals(number).name}")
-        for each in ends:
-            signal.signal(each, before[each])
+        for ending in ends:
+            signal.signal(ending, before[ending])
 
     def remark(lines: tuple[str, ...]) -> None:
         nonlocal printed_count

@@ -23,17 +23,17 @@ def sessions(
     """Record the reference sessions again: small recordings, with their quantities as text for review as a diff."""
     from replays.sessions import SESSIONS, make
 
-    wanted = names or list(SESSIONS)
-    for name in wanted:
+    chosen = names or list(SESSIONS)
+    for name in chosen:
         if name not in SESSIONS:
             raise InputError("session", f"one of {', '.join(SESSIONS)}", name)
     check_folder(output, field="--output")
-    taken = [path for name in wanted for path in (output / f"{name}.mcap", output / f"{name}.toml") if path.exists()]
-    if taken and not force:
-        raise InputError("output", "a folder without these files (--force replaces them)", str(taken[0]))
+    existing = [path for name in chosen for path in (output / f"{name}.mcap", output / f"{name}.toml") if path.exists()]
+    if existing and not force:
+        raise InputError("output", "a folder without these files (--force replaces them)", str(existing[0]))
     output.mkdir(exist_ok=True)
     with reporting() as reporter:
-        reporter.begin(len(wanted))
-        for name in wanted:
+        reporter.begin(len(chosen))
+        for name in chosen:
             recording, text = make(SESSIONS[name], output, step=reporter.step)
             echo(f"{recording}  {recording.stat().st_size / 1e3:.0f} kB, {text.name}")

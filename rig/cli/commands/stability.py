@@ -72,7 +72,7 @@ def stability(
         if not scenes:
             raise InputError("--law", "given with --scenes", str(law))
         name = add_law_scene(law)
-        only = only and ",".join(name if one == "law" else one for one in split_names(only))
+        only = only and ",".join(name if part == "law" else part for part in split_names(only))
     names = chosen_engines(engines)
     if scenes:
         _twelve(only, None if engines is None else names, output, form)
@@ -158,14 +158,14 @@ def _twelve(only: str | None, engines: list[str] | None, folder: Path | None, fo
         prepare_folder(folder)
     with reporting(compiles=True) as reporter:
         try:
-            for one in outcomes(names, engines, peers=engines is None):
-                found.append(one)
-                reporter.step(f"{one.scene}, {one.method} {one.setting}: {one.kind}")
+            for outcome in outcomes(names, engines, peers=engines is None):
+                found.append(outcome)
+                reporter.step(f"{outcome.scene}, {outcome.method} {outcome.setting}: {outcome.kind}")
         except KeyboardInterrupt:
             interrupted = True
     pictures = [] if folder is None or interrupted else draw_scene_atlas(folder, found)
     if form.as_json:
-        echo_json({"outcomes": [one.document() for one in found], "pictures": [str(path) for path in pictures]})
+        echo_json({"outcomes": [outcome.document() for outcome in found], "pictures": [str(path) for path in pictures]})
     else:
         form.console().print(scenes_table(found))
         for path in pictures:
@@ -173,7 +173,7 @@ def _twelve(only: str | None, engines: list[str] | None, folder: Path | None, fo
     if interrupted:
         echo("stopped; only the runs shown were measured, and no picture was drawn", err=True)
         raise typer.Exit(130)
-    if any(is_silent(one) for one in found if one.method == found[0].method):
+    if any(is_silent(outcome) for outcome in found if outcome.method == found[0].method):
         raise typer.Exit(1)
 
 
@@ -181,12 +181,12 @@ def scenes_table(found: list[Outcome]) -> Table:
     """Return a table of how often each method had each outcome."""
     from replays.studies.stability.scenes.scene_atlas import OUTCOMES
 
-    scenes = len({one.scene for one in found})
+    scenes = len({outcome.scene for outcome in found})
     table = new_table(
         f"{scenes} scenes, each method at its settings: number of runs", "method", *(f">{k}" for k in OUTCOMES)
     )
-    for method in dict.fromkeys(one.method for one in found):
-        kinds = [one.kind for one in found if one.method == method]
+    for method in dict.fromkeys(outcome.method for outcome in found):
+        kinds = [outcome.kind for outcome in found if outcome.method == method]
         table.add_row(method, *(str(kinds.count(kind) or "-") for kind in OUTCOMES))
     return table
 
@@ -201,12 +201,12 @@ def sweep_table(found: dict[str, Any], seed: int) -> Table:
         "engine", ">told", *(f">{share:.0%}" for share in QUANTILES), ">within", ">silent", ">false", ">crash", ">hang",
         ">absurd", ">slowest", ">median",
     )  # fmt: skip
-    for name, one in found["engines"].items():
-        errors = [f"{error:.0e}" for error in one["error"] or []] or ["-"] * len(QUANTILES)
-        within = "-" if one["within"] is None else f"{one['within']:.0%}"
-        faults = [str(len(one[kind])) for kind in ("silent", "false_alarms", "crashes", "hangs", "absurd")]
-        speeds = ["-" if speed is None else f"{speed:.3g}" for speed in (one["slowest"], one["median_speed"])]
-        table.add_row(name, str(one["told"]), *errors, within, *faults, *speeds)
+    for name, result in found["engines"].items():
+        errors = [f"{error:.0e}" for error in result["error"] or []] or ["-"] * len(QUANTILES)
+        within = "-" if result["within"] is None else f"{result['within']:.0%}"
+        faults = [str(len(result[kind])) for kind in ("silent", "false_alarms", "crashes", "hangs", "absurd")]
+        speeds = ["-" if speed is None else f"{speed:.3g}" for speed in (result["slowest"], result["median_speed"])]
+        table.add_row(name, str(result["told"]), *errors, within, *faults, *speeds)
     return table
 
 
@@ -218,11 +218,11 @@ def _sweep_lines(found: dict[str, Any]) -> Iterator[str]:
         "within; speeds: simulated s over processor s. Untold: scenes that fewer than two accurate engines accept; "
         "unbounded: scenes in which the model gains energy without limit; faults there do not count."
     )
-    for name, one in found["engines"].items():
+    for name, result in found["engines"].items():
         for kind in ("silent", "false_alarms", "crashes", "hangs", "absurd"):
-            if one[kind]:
-                yield f"{name}, {kind.replace('_', ' ')}: scenes {', '.join(map(str, one[kind]))}"
-        for reason, number in one["refused"].items():
+            if result[kind]:
+                yield f"{name}, {kind.replace('_', ' ')}: scenes {', '.join(map(str, result[kind]))}"
+        for reason, number in result["refused"].items():
             if "accurate" not in name:
                 yield f"{name} refuses {number}: {reason}"
     for scene in found["undecided"]:
@@ -257,12 +257,12 @@ def trials_table(cells: list[Cell], names: list[str]) -> Table:
     from replays.studies.stability.trials.trials import TRIALS
 
     table = new_table("trials by engine: measured", "trial", "case", *(f">{name}" for name in names), keys=2)
-    seen = ""
+    previous_trial = ""
     for trial, case in dict.fromkeys((cell.trial, cell.case) for cell in cells):
         found = {cell.method: cell for cell in cells if (cell.trial, cell.case) == (trial, case)}
-        if trial != seen:
+        if trial != previous_trial:
             table.add_row(Text(f"{trial}: {TRIALS[trial].title}", "bold"))
-            seen = trial
+            previous_trial = trial
         table.add_row(trial, case, *(_text(found.get(name)) for name in names))
     return table
 

@@ -144,7 +144,7 @@ def _view_live(connection: Connection, *, web: bool, save: Path | None, only: st
             _connect(stream, shown, plan)
             _print_address(shown, f"the rig at {connection.connect}")
             try:
-                view = live.LiveView(client, Canvas(stream), described, taken=shown.taken)
+                view = live.LiveView(client, Canvas(stream), described, get_processed=shown.get_processed_picture)
                 with reporting() as reporter:
 
                     def report(text: str) -> None:

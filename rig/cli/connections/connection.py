@@ -218,5 +218,5 @@ def print_addresses(server: ZenohServer, exposed: Exposure | None, name: str | N
         doors = ", ".join(door.what for door in (*ROLES["operator"], TRUTH))
         echo(f"rig: WARNING: {exposed.endpoint} is open to every client, unencrypted:", err=True)
         echo(f"rig: WARNING: {doors}", err=True)
-    called = "" if name is None else f" as {name}"
-    echo(f"rig: listening on {server.endpoint}{called}; Ctrl-C or `rig stop` ends it", err=True)
+    name_text = "" if name is None else f" as {name}"
+    echo(f"rig: listening on {server.endpoint}{name_text}; Ctrl-C or `rig stop` ends it", err=True)

@@ -100,10 +100,12 @@ def accuracy_text(accuracy: dict[str, Any]) -> str:
     if not isinstance(quantities, dict):
         return number_text(accuracy.get("estimate"), "(scaled)")
     parts = []
-    for one in (one for one in quantities.values() if isinstance(one, dict)):
-        limit = one.get("tolerance")
+    for quantity in (quantity for quantity in quantities.values() if isinstance(quantity, dict)):
+        limit = quantity.get("tolerance")
         within = f" (tolerance {limit:.2g})" if isinstance(limit, float | int) else ""
-        parts.append(f"{one.get('label')} {number_text(one.get('error'), one.get('unit', ''), digits=2)}{within}")
+        parts.append(
+            f"{quantity.get('label')} {number_text(quantity.get('error'), quantity.get('unit', ''), digits=2)}{within}"
+        )
     return ", ".join(parts)
 
 

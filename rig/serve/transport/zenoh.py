@@ -327,14 +327,16 @@ class ZenohClient(Closing):
         try:
             if self._holder is None:
                 socket.create_connection((self._host, self._port), timeout=1.0).close()
-                why = "without a certificate: an exposed rig needs --tls FOLDER; otherwise it is not a rig, or it hangs"
+                explanation = (
+                    "without a certificate: an exposed rig needs --tls FOLDER; otherwise it is not a rig, or it hangs"
+                )
             elif (rejection := self._holder.find_rejection(self._host, self._port)) is not None:
-                why = f"as {self._holder.name}, by the keys in {self._holder.folder}: {rejection}"
+                explanation = f"as {self._holder.name}, by the keys in {self._holder.folder}: {rejection}"
             else:
-                why = "although the certificates are valid: it has too many links, or hangs"
+                explanation = "although the certificates are valid: it has too many links, or hangs"
         except OSError:
             return self._no_reply_error()
-        return NoReplyError(f"{self.endpoint} listens, but refuses this client {why}")
+        return NoReplyError(f"{self.endpoint} listens, but refuses this client {explanation}")
 
     def _no_reply_error(self) -> NoReplyError:
         start = "start one with: rig run stable-run (--wait-s 60 waits for one that still compiles)"
