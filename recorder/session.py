@@ -454,7 +454,7 @@ class RecordingSession:
             reason=reason,
             error=disk_error or (writer.ended if writer.out_of_room else ""),
             first_time_s=(in_files.first_time_ns or 0) / NS,
-            duration_s=sum(counts.extent_ns for counts in kept) / NS,
+            duration_s=sum(part.extent_ns for part in kept) / NS,
             rows=in_files.rows,
             lost={key: more for key, lost in counts.lost.items() if (more := lost - counts.declared.get(key, 0)) > 0},
             declared={key: rows for key, rows in counts.declared.items() if rows},
